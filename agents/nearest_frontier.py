@@ -9,7 +9,7 @@ from slam_backend.core.validation import FloatArray
 from vslam_env.belief.team_belief import Belief
 from vslam_env.navigation import centre_of, distance_map, follow_path, plan_path
 
-WORTH_TURNING = 0.5  # leave a goal for one whose path is less than this share of the way that is left
+SWITCH_RATIO = 0.5  # leave a goal for one whose path is less than this share of the way that is left
 REPLAN_TICKS = 10
 FAR_SHARE = 0.3  # patrols lead to one of the farthest places
 ARRIVED = 0.5  # [m]
@@ -38,7 +38,7 @@ def choose_slot(belief: Belief, held: int | None = None) -> int | None:
     choices = own if len(own) else slots
     nearest = int(choices[np.argmin(candidates.lengths[choices])])
     if held is not None and held in choices:
-        turns_off = candidates.lengths[nearest] < WORTH_TURNING * candidates.lengths[held]
+        turns_off = candidates.lengths[nearest] < SWITCH_RATIO * candidates.lengths[held]
         return nearest if turns_off else held
     return nearest
 
@@ -104,7 +104,7 @@ class NearestFrontier:
         else:
             here = belief.pose[:2]
             if self._patrol is None or np.linalg.norm(self._patrol - here) < ARRIVED:
-                self._patrol = far_place(belief, rng)
+                self._patrol = patrol_goal(belief, rng)
             goal, self._heading = self._patrol, None
         self._path = plan_path(belief.grid.cells, belief.pose[:2], goal)
         if self._path is None:
@@ -113,7 +113,7 @@ class NearestFrontier:
             self._patrol = self._path[-1]  # as near as one gets to a place beside which a wall has come to be seen
 
 
-def far_place(belief: Belief, rng: np.random.Generator) -> FloatArray:
+def patrol_goal(belief: Belief, rng: np.random.Generator) -> FloatArray:
     """Draw one of the farthest places (2,) [m], start frame, that the robot can reach over floor it has seen.
 
     Where it can reach nothing it is the robot's own place.

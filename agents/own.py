@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from agents.policy import Policy
-from slam_backend.core.validation import bad_argument, check_choice, is_built_in
+from slam_backend.core.validation import argument_error, check_choice, is_built_in
 
 ACTION_TYPES = ("continuous", "discrete", "goal")
 EXPECTED = "MODULE:NAME of a policy"
@@ -20,13 +20,13 @@ NEEDED = (
 )
 
 
-def is_own(name: str) -> bool:
+def is_plugin(name: str) -> bool:
     """Tell whether a name is meant as a module and what makes a policy in it, not as a path."""
     module, colon, factory = name.partition(":")
     return bool(colon) and factory.isidentifier() and all(part.isidentifier() for part in module.split("."))
 
 
-def own_action_type(name: str) -> str:
+def plugin_action_type(name: str) -> str:
     """Return the type of action that a policy is for: its attribute `action_type`, or `"goal"` if it has none.
 
     Raises:
@@ -35,7 +35,7 @@ def own_action_type(name: str) -> str:
     return check_choice(f"{name}.action_type", getattr(_find(name), "action_type", "goal"), ACTION_TYPES)
 
 
-def make_own(name: str) -> Policy:
+def load_plugin(name: str) -> Policy:
     """Make a policy for one robot by calling what the name stands for, without arguments.
 
     Modules are looked for as usual, and first in the current folder.
@@ -50,7 +50,7 @@ def make_own(name: str) -> Policy:
     missing = [method for method in METHODS if not callable(getattr(policy, method, None))]
     if missing:
         got = f"a {type(policy).__name__} without {missing[0]}"
-        raise bad_argument("policy", EXPECTED, got, NEEDED)
+        raise argument_error("policy", EXPECTED, got, NEEDED)
     made: Policy = policy
     return made
 
@@ -65,12 +65,12 @@ def _find(name: str) -> Any:
         if error.name is None or not f"{module}.".startswith(f"{error.name}."):
             raise  # the module is there, and asks for one that is not
         cure = "Name a module that is installed, or work in the folder that holds it."
-        raise bad_argument("policy", EXPECTED, f"no module {module!r}", cure) from error
+        raise argument_error("policy", EXPECTED, f"no module {module!r}", cure) from error
     made = getattr(found, factory, None)
     if not callable(made):
-        raise bad_argument("policy", EXPECTED, f"no class or function {factory!r} in {module}", "Check the name.")
+        raise argument_error("policy", EXPECTED, f"no class or function {factory!r} in {module}", "Check the name.")
     if not _may_make_policies(made):
-        raise bad_argument("policy", EXPECTED, f"no maker of policies: {name}", NEEDED)
+        raise argument_error("policy", EXPECTED, f"no maker of policies: {name}", NEEDED)
     return made
 
 

@@ -3,12 +3,12 @@
 from pathlib import Path
 
 from agents.nearest_frontier import NearestFrontier, NearestFrontierGoals
-from agents.own import ACTION_TYPES, is_own, make_own, own_action_type
+from agents.own import ACTION_TYPES, is_plugin, load_plugin, plugin_action_type
 from agents.policy import Policy
 from agents.random_goals import RandomGoals
 from agents.random_walk import RandomWalk
-from agents.trained import SUFFIX, TrainedGoals, load_model
-from slam_backend.core.validation import bad_argument, check_choice
+from agents.trained import SUFFIX, TrainedGoalPolicy, load_model
+from slam_backend.core.validation import argument_error, check_choice
 
 POLICIES = {  # and the types of action that each knows, that with which policies are compared first
     "frontier": ("goal", "continuous", "discrete"),
@@ -28,8 +28,8 @@ def action_types(name: str) -> tuple[str, ...]:
     """
     if is_model(name):
         return ("goal",)
-    if is_own(name):
-        return (own_action_type(name),)
+    if is_plugin(name):
+        return (plugin_action_type(name),)
     cure = "Choose one of these names, the path of a trained model, or MODULE:NAME of your own."
     return POLICIES[check_choice("policy", name, tuple(POLICIES), cure)]
 
@@ -50,11 +50,11 @@ def make_policy(name: str, action_type: str) -> Policy:
     known = action_types(name)
     if check_choice("action_type", action_type, ACTION_TYPES) not in known:
         expected = f"{' or '.join(map(repr, known))} for policy {name!r}"
-        raise bad_argument("action_type", expected, action_type, "Change one of the two.")
+        raise argument_error("action_type", expected, action_type, "Change one of the two.")
     if is_model(name):
-        return TrainedGoals(load_model(name)[0])
-    if is_own(name):
-        return make_own(name)
+        return TrainedGoalPolicy(load_model(name)[0])
+    if is_plugin(name):
+        return load_plugin(name)
     discrete = action_type == "discrete"
     if name == "frontier":
         return NearestFrontierGoals() if action_type == "goal" else NearestFrontier(discrete)

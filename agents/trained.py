@@ -1,4 +1,4 @@
-"""`TrainedGoals`: plays a network that `vslam train` taught; numpy alone, so that no learner need be installed."""
+"""`TrainedGoalPolicy`: plays a network that `vslam train` taught; numpy alone, so that no learner need be installed."""
 
 import hashlib
 import io
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from agents.goal_network import NAMES, SHAPES, Weights, logits
 from slam_backend.core.array_files import read_arrays
 from slam_backend.core.files import write_file
-from slam_backend.core.validation import bad_argument
+from slam_backend.core.validation import argument_error
 from vslam_env.belief.team_belief import Belief
 
 FORMAT = 1  # raised when the network, or what observations mean, changes
@@ -22,7 +22,7 @@ MODEL_FILE = "model" + SUFFIX
 ABOUT = "about"
 
 
-class TrainedGoals:
+class TrainedGoalPolicy:
     """A trained policy for `goal` actions and dict observations.
 
     Args:
@@ -65,7 +65,7 @@ def check_observation(shapes: Mapping[str, tuple[int, ...]]) -> None:
         if shapes.get(name) != shape:
             cure = "Use goal actions, dict observations and the standard scan."
             got = f"no {name!r}" if name not in shapes else f"shape {shapes[name]}"
-            raise bad_argument("observation", f"{name!r} of shape {shape}, as the model was trained on", got, cure)
+            raise argument_error("observation", f"{name!r} of shape {shape}, as the model was trained on", got, cure)
 
 
 def save_model(file: Path, weights: Weights, about: Mapping[str, Any]) -> None:
@@ -101,19 +101,19 @@ def load_model(path: str | Path) -> tuple[Weights, dict[str, Any]]:
     file = Path(path) / MODEL_FILE if Path(path).is_dir() else Path(path)
     expected = "a model that vslam train wrote"
     if not file.is_file():
-        raise bad_argument("model", expected, "no such file", f"Check {str(file)!r}.")
+        raise argument_error("model", expected, "no such file", f"Check {str(file)!r}.")
     try:
         arrays: dict[str, NDArray[Any]] = dict(read_arrays(file))
         about = json.loads(str(arrays.pop(ABOUT)))
         version, digest = about["format"], about["weights"]
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         cure = f"{str(file)!r} cannot be read: copy or train it anew."
-        raise bad_argument("model", expected, "a broken file", cure) from error
+        raise argument_error("model", expected, "a broken file", cure) from error
     if version != FORMAT:
         cure = f"Train it anew, or use the release that made it, {about.get('version', 'unknown')}."
-        raise bad_argument("model", f"one of format {FORMAT}", f"a model of format {version}", cure)
+        raise argument_error("model", f"one of format {FORMAT}", f"a model of format {version}", cure)
     if _digest(arrays) != digest:
-        raise bad_argument("model", expected, "a broken file", f"{str(file)!r} was changed: copy or train it anew.")
+        raise argument_error("model", expected, "a broken file", f"{str(file)!r} was changed: copy or train it anew.")
     return arrays, about
 
 

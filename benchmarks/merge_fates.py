@@ -14,10 +14,10 @@ import numpy as np
 from slam_backend.core.validation import FloatArray
 from slam_backend.fastslam.reports import MergeEvent
 from slam_backend.geometry import between
-from slam_backend.team.merge_monitor import moved_share
+from slam_backend.team.merge_monitor import deformed_fraction
 from slam_backend.team.team import TeamSlam
 from training.episodes.runner import is_false_merge
-from vslam_env.evaluation.map_scores import FALSE, ClaimLedger
+from vslam_env.evaluation.map_scores import FALSE, GroundTruthAssociation
 
 WINDOW = 200  # [steps] after which a false merge counts
 
@@ -41,7 +41,7 @@ class MergeFate:
             of the run if that is earlier; NaN if undone by then.
         end_m, end_deg: The same at the end; NaN if undone.
         moved: Largest share of a side's landmarks that was seen out of place while the merge was watched; beyond
-            `MergeOptions.max_moved` it is undone. NaN if it was not watched.
+            `MergeOptions.max_deformed` it is undone. NaN if it was not watched.
         doubt: Doubt of the attempt that led to it, see `MergeEvent`; NaN if it was forced.
         undone_m, undone_deg: How far off the merge was, as the team had it, just before it was undone; NaN if it was
             not.
@@ -141,7 +141,7 @@ class Follower:
         moved: Largest share of a side's landmarks that was seen out of place while the merge was watched.
     """
 
-    def __init__(self, team: TeamSlam, ledger: ClaimLedger, starts: FloatArray) -> None:
+    def __init__(self, team: TeamSlam, ledger: GroundTruthAssociation, starts: FloatArray) -> None:
         self._team, self._ledger, self._starts = team, ledger, starts
         self.wrong_pairs: dict[int, float] = {}
         self.later: dict[int, tuple[float, float]] = {}
@@ -170,12 +170,12 @@ class Follower:
         """Note which shares of the maps of watched merges are out of place."""
         numbers = {id(event.alignment): i for i, event in enumerate(self._team.events) if event.kind == "merge"}
         for group in self._team._groups:
-            if not group.trunk.watches:
+            if not group.trunk.monitors:
                 continue
             joint = group.trunk.filter.map("mixture")
-            for watch in group.trunk.watches:
+            for watch in group.trunk.monitors:
                 i = numbers[id(watch.alignment)]
-                share = max(moved_share(old, joint, self._team._alignment) for old in watch.before)
+                share = max(deformed_fraction(old, joint, self._team._alignment) for old in watch.pre_merge_maps)
                 self.moved[i] = max(share, self.moved.get(i, 0.0))
 
     def off_now(self, merge: MergeEvent) -> tuple[float, float]:
@@ -187,7 +187,7 @@ class Follower:
 
     def _share_of_wrong_pairs(self, merge: MergeEvent) -> float:
         """Return it for a merge just made; false points are no landmarks, and a pair with one is wrong."""
-        watches = (watch for group in self._team._groups for watch in group.trunk.watches)
+        watches = (watch for group in self._team._groups for watch in group.trunk.monitors)
         sides = next(watch.sides for watch in watches if watch.alignment is merge.alignment)
         claims = []
         for side, joined, rows in zip(sides, self._team.merged_maps(merge), merge.alignment.inliers.T, strict=True):
@@ -241,7 +241,7 @@ def undone_in(events: Sequence[MergeEvent], merge: MergeEvent) -> int | None:
 
 def doubt_of(before: Sequence[MergeEvent], merge: MergeEvent) -> float:
     """Return the doubt of the attempt that led to a merge; NaN if it was forced."""
-    return next((event.doubt for event in before if event.alignment is merge.alignment), float("nan"))
+    return next((event.uncertainty for event in before if event.alignment is merge.alignment), float("nan"))
 
 
 def off_if_bent(starts: FloatArray, before: Sequence[MergeEvent], merge: MergeEvent) -> tuple[float, float]:
@@ -254,14 +254,18 @@ def off_if_bent(starts: FloatArray, before: Sequence[MergeEvent], merge: MergeEv
     """
     attempt = next((event for event in before if event.alignment is merge.alignment), None)
     nothing = float("nan"), float("nan")
-    return nothing if attempt is None or attempt.bent is None else off_by(starts, attempt, attempt.bent.transform)
+    return (
+        nothing
+        if attempt is None or attempt.unsmoothed_alignment is None
+        else off_by(starts, attempt, attempt.unsmoothed_alignment.transform)
+    )
 
 
 def delays(events: Sequence[MergeEvent], seed: int) -> list[Delay]:
     """Return the attempts of a run that were refused only because maps were straightened."""
     found = []
     for i, event in enumerate(events):
-        if event.bent is not None and not event.alignment.success:
+        if event.unsmoothed_alignment is not None and not event.alignment.success:
             pair = {event.robots_a[0], event.robots_b[0]}
             merged = (e.step for e in events[i:] if e.kind == "merge" and len(pair & {*e.robots_a, *e.robots_b}) == 2)
             later = next(merged, None)

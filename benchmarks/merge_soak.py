@@ -37,7 +37,7 @@ from rich.console import Console
 
 from agents.registry import make_policy
 from slam_backend.core.files import check_writable, write_file
-from slam_backend.core.validation import FloatArray, IntArray, bad_argument, check_choice, check_int
+from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_choice, check_int
 from slam_backend.geometry import between, rotation
 from slam_backend.maps.alignment import Alignment
 from slam_backend.maps.landmark_map import LandmarkMap
@@ -50,7 +50,7 @@ from training.episodes.metrics import score_episode
 from training.episodes.runner import Progress, is_false_merge, run_episode
 from training.experiments.run_folder import plain
 from vslam_env import ExplorationEnv, preset_config
-from vslam_env.evaluation.map_scores import ClaimLedger
+from vslam_env.evaluation.map_scores import GroundTruthAssociation
 
 KINDS = ("aisles", "environment", "both")
 WORLDS = ("office", "loops", "maze", "hall", "fig5")
@@ -71,21 +71,21 @@ class Setting:
         shift: How [m]; None: by the motion that fits best.
         rejuvenate_every: Of the filters; None: their default.
         straighten: Maps before a merge.
-        sure, least_sure: Of the motion a merge has to be, see `MergeOptions`; None: as it is by default.
+        sure, min_sigmas_on_trial: Of the motion a merge has to be, see `MergeOptions`; None: as it is by default.
     """
 
     forced: bool = False
     shift: float | None = None
     rejuvenate_every: int | None = None
     straighten: bool = True
-    sure: float = MergeOptions().sure
-    least_sure: float | None = None
+    sure: float = MergeOptions().min_sigmas
+    min_sigmas_on_trial: float | None = None
 
     @property
     def merging(self) -> dict[str, Any]:
         """Options of merges."""
         told = {"straighten": self.straighten, "sure": self.sure}
-        return told if self.least_sure is None else told | {"least_sure": self.least_sure}
+        return told if self.min_sigmas_on_trial is None else told | {"min_sigmas_on_trial": self.min_sigmas_on_trial}
 
     @property
     def filter(self) -> dict[str, Any]:
@@ -197,7 +197,7 @@ def play_aisles(seed: int, cycles: int, setting: Setting) -> Fates:
         **setting.filter,
     )  # fmt: skip
     starts = run.true_paths[:, 0]
-    ledger = ClaimLedger(robots, run.landmarks, np.ones(len(run.landmarks), dtype=np.bool_), cutoff=1.0)
+    ledger = GroundTruthAssociation(robots, run.landmarks, np.ones(len(run.landmarks), dtype=np.bool_), cutoff=1.0)
     follower = Follower(team, ledger, starts)
     broken = not setting.forced and rng.random() < 0.5
     up = np.ones((robots, robots), dtype=np.bool_)
@@ -218,7 +218,7 @@ def force(env: ExplorationEnv, rng: np.random.Generator, shift: float | None) ->
     map_a, map_b = belief.filter_map(0), belief.filter_map(1)
     if min(len(map_a), len(map_b)) < ENOUGH:
         return
-    ledger.rename(belief.merge(0, 1, forced_alignment(env.true_start_poses, map_a, map_b, rng, shift)))
+    ledger.merge(belief.merge(0, 1, forced_alignment(env.true_start_poses, map_a, map_b, rng, shift)))
 
 
 def forced_alignment(
@@ -309,8 +309,10 @@ def main(
         int | None, typer.Option(help="Steps of a filter between its rejuvenations.", show_default="the default")
     ] = None,
     straighten: Annotated[bool, typer.Option(help="Straighten maps before they merge.")] = True,
-    sure: Annotated[float, typer.Option(help="Deviations a merge has to be sure by; 0: none.")] = MergeOptions().sure,
-    least_sure: Annotated[
+    sure: Annotated[
+        float, typer.Option(help="Deviations a merge has to be sure by; 0: none.")
+    ] = MergeOptions().min_sigmas,
+    min_sigmas_on_trial: Annotated[
         float | None, typer.Option(help="As MergeOptions has it; 0: no trials.", show_default="the default")
     ] = None,
     world: Annotated[list[str] | None, typer.Option(help="A family, a floor plan or a folder of these.")] = None,
@@ -319,21 +321,21 @@ def main(
 ) -> None:
     """Run the soak and print it."""
     if not minutes > 0.0:
-        raise bad_argument("minutes", "a number above 0", minutes, "Run for some time.")
+        raise argument_error("minutes", "a number above 0", minutes, "Run for some time.")
     check_choice("kind", kind, KINDS)
     if shift is not None and not (forced and shift >= 0.0):
-        raise bad_argument("shift", "metres, with --forced", shift, "Add --forced, or leave it out.")
+        raise argument_error("shift", "metres, with --forced", shift, "Add --forced, or leave it out.")
     if cycles is not None:
         check_int("cycles", cycles, 2, "Give a number of steps.")
     check_int("first_seed", first_seed, 0, "Seeds are not negative.")
     check_int("seeds", seeds, 1, "Play at least one seed.")
     if world and (forced or cycles is not None):
-        raise bad_argument("world", "no --forced and no --cycles with it", world, "Leave them out.")
+        raise argument_error("world", "no --forced and no --cycles with it", world, "Leave them out.")
     if json_file is not None:
         check_writable(json_file, "json")
     setting = Setting(
         forced=forced, shift=shift, rejuvenate_every=rejuvenate_every, straighten=straighten, sure=sure,
-        least_sure=least_sure,
+        min_sigmas_on_trial=min_sigmas_on_trial,
     )  # fmt: skip
     console = Console(highlight=False, soft_wrap=True)
     merges: list[MergeFate] = []

@@ -15,7 +15,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from slam_backend.core.validation import FloatArray, bad_argument, check_int
+from slam_backend.core.validation import FloatArray, argument_error, check_int
 from training.episodes.runner import is_false_merge
 
 FAR = 0.3  # [m]
@@ -28,9 +28,9 @@ def read_soaks(files: Sequence[Path]) -> list[dict[str, Any]]:
         try:
             soak = json.loads(file.read_text())
         except (OSError, ValueError) as error:
-            raise bad_argument("files", "soaks of merge_soak.py --json", str(file), str(error)) from error
+            raise argument_error("files", "soaks of merge_soak.py --json", str(file), str(error)) from error
         if not isinstance(soak, dict) or not {"setting", "summary", "merges", "delays"} <= set(soak):
-            raise bad_argument("files", "soaks of merge_soak.py --json", str(file), "Give files that it has written.")
+            raise argument_error("files", "soaks of merge_soak.py --json", str(file), "Give files that it has written.")
         soaks.append(soak | {"name": file.stem})
     return soaks
 

@@ -19,7 +19,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from slam_backend.core.validation import FloatArray, bad_argument, check_int
+from slam_backend.core.validation import FloatArray, argument_error, check_int
 
 BURST = 20  # steps
 WARM_UP = 60  # steps of each episode that do not count
@@ -120,7 +120,7 @@ def main(
     check_int("steps", steps, 1, "Time at least one.")
     for root in roots:
         if not (root / "vslam_env").is_dir():
-            raise bad_argument("roots", "checkouts of this repository", str(root), "Name folders with vslam_env.")
+            raise argument_error("roots", "checkouts of this repository", str(root), "Name folders with vslam_env.")
     with tempfile.TemporaryDirectory() as folder:
         players = []
         try:

@@ -9,11 +9,11 @@ from slam_backend.fastslam.existence import ExistenceModel
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.options import FilterOptions
 from slam_backend.fastslam.reports import (
-    Findings,
+    Associations,
+    LandmarkIdMap,
     MergeEvent,
     PoseEstimate,
     RejuvenationReport,
-    Renaming,
     StepReport,
     TeamReport,
 )
@@ -33,12 +33,13 @@ from slam_backend.warm_up import warm_up
 __all__ = [
     "Alignment",
     "AlignmentOptions",
+    "Associations",
     "AttemptOptions",
     "Consistency",
     "ExistenceModel",
     "FastSlam",
     "FilterOptions",
-    "Findings",
+    "LandmarkIdMap",
     "LandmarkMap",
     "Measurements",
     "MergeEvent",
@@ -46,7 +47,6 @@ __all__ = [
     "OdometryModel",
     "PoseEstimate",
     "RejuvenationReport",
-    "Renaming",
     "SmoothingOptions",
     "StepReport",
     "StereoCamera",

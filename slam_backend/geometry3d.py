@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from slam_backend.core.validation import BoolArray, FloatArray, bad_argument, check_array, check_float, check_int
+from slam_backend.core.validation import BoolArray, FloatArray, argument_error, check_array, check_float, check_int
 
 MINIMAL = 3  # points that fix a rigid motion
 THINNEST = 1e-3  # m; a triangle less high than this says nothing of the turn about its long side
@@ -60,7 +60,7 @@ def fit_rigid(points_a: Any, points_b: Any, weights: Any | None = None) -> tuple
     a, b = _checked(points_a, points_b)
     share = np.ones(len(a)) if weights is None else check_array("weights", weights, (len(a),), "Give one per pair.")
     if share.min() <= 0.0:
-        raise bad_argument("weights", "numbers > 0", float(share.min()), "Leave such pairs out.")
+        raise argument_error("weights", "numbers > 0", float(share.min()), "Leave such pairs out.")
     share = (share / share.sum())[:, None]
     mean_a, mean_b = (share * a).sum(axis=0), (share * b).sum(axis=0)
     u, _, vt = np.linalg.svd((share * (a - mean_a)).T @ (b - mean_b))
@@ -133,5 +133,5 @@ def _checked(points_a: Any, points_b: Any, least: int = MINIMAL) -> tuple[FloatA
     a = check_array("points_a", points_a, (None, 3), "Give one row x y z per point.")
     b = check_array("points_b", points_b, (len(a), 3), "Give the partner of each point of a.")
     if len(a) < least:
-        raise bad_argument("points_a", f"at least {least} points", f"shape {a.shape}", "Fewer fix no motion.")
+        raise argument_error("points_a", f"at least {least} points", f"shape {a.shape}", "Fewer fix no motion.")
     return a, b

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from slam_backend.core.state_codec import SEEDS, Kind, Kinds
+from slam_backend.core.state_codec import SEEDS, StateType, StateTypes
 from slam_backend.fastslam import reports
 from slam_backend.fastslam.existence import ExistenceModel
 from slam_backend.fastslam.options import FilterOptions
@@ -14,10 +14,10 @@ from slam_backend.models.measurements import Measurements, TeamMeasurements
 from slam_backend.models.odometry import OdometryModel
 from slam_backend.smoother.log_arrays import LogArrays
 from slam_backend.smoother.options import SmoothingOptions
-from slam_backend.smoother.reassociation import Refused
+from slam_backend.smoother.reassociation import RejectedMeasurements
 from slam_backend.team.branches import ReplayedStep
-from slam_backend.team.merge_monitor import Side, Watch
-from slam_backend.team.merge_scheduler import AttemptOptions, AttemptRecord, Straightening
+from slam_backend.team.merge_monitor import MergeMonitor, PreMergeSnapshot
+from slam_backend.team.merge_scheduler import AttemptOptions, AttemptRecord, PendingAttempt
 from slam_backend.team.options import MergeOptions
 
 CONFIGURATIONS = (
@@ -25,9 +25,9 @@ CONFIGURATIONS = (
     SmoothingOptions, StereoCamera,
 )  # fmt: skip
 RECORDS = (
-    Alignment, AttemptRecord, LogArrays, Measurements, Refused, ReplayedStep, Side, StepInput, Straightening,
-    TeamMeasurements, Watch, reports.Findings, reports.LandmarksCreated, reports.MapCopied, reports.MapDropped,
-    reports.MergeEvent, reports.MergeUndone, reports.PoseEstimates, reports.RejuvenationReport, reports.Renaming,
+    Alignment, AttemptRecord, LogArrays, Measurements, RejectedMeasurements, ReplayedStep, PreMergeSnapshot, StepInput, PendingAttempt,
+    TeamMeasurements, MergeMonitor, reports.Associations, reports.LandmarksCreated, reports.MapForked, reports.MapReleased,
+    reports.MergeEvent, reports.MergeUndone, reports.PoseEstimates, reports.RejuvenationReport, reports.LandmarkIdMap,
     reports.StepReport,
 )  # fmt: skip
 
@@ -36,9 +36,9 @@ def _parts_of_map(landmarks: LandmarkMap) -> list[Any]:
     return [getattr(landmarks, name) for name in FIELDS]
 
 
-BACKEND_KINDS = Kinds(
+BACKEND_KINDS = StateTypes(
     (*CONFIGURATIONS, *RECORDS),
     # A mixture's covariances are symmetric but for rounding: the constructor would change them.
-    {LandmarkMap: Kind("LandmarkMap", _parts_of_map, unchecked_map)},
+    {LandmarkMap: StateType("LandmarkMap", _parts_of_map, unchecked_map)},
 ).with_others(SEEDS)
 """All classes of this package whose objects may stand in the states of `FastSlam` and `TeamSlam`."""

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from slam_backend.core.files import checked_path, write_file
-from slam_backend.core.validation import FloatArray, bad_argument, check_array
+from slam_backend.core.validation import FloatArray, argument_error, check_array
 from slam_backend.geometry import wrap_angle
 
 PLANAR_TOLERANCE = 1e-6
@@ -36,11 +36,11 @@ class Trajectory:
         times = check_array("times", self.times, (None,), "Give one time per pose.")
         poses = check_array("poses", self.poses, (len(times), 3), "Give one pose (x, y, theta) per time.")
         if not len(times):
-            raise bad_argument("times", "at least one time", "an array of none", "Record a pose first.")
+            raise argument_error("times", "at least one time", "an array of none", "Record a pose first.")
         backwards = np.flatnonzero(np.diff(times) <= 0.0)
         if len(backwards):
             later = int(backwards[0]) + 1
-            raise bad_argument(
+            raise argument_error(
                 "times",
                 "strictly increasing times",
                 f"a time {times[later]!r} after {times[later - 1]!r} at index {later}",
@@ -68,10 +68,10 @@ class Trajectory:
         try:
             wanted = np.asarray(times, dtype=np.float64)
         except (TypeError, ValueError) as error:
-            raise bad_argument("times", "numbers", times, "Give times in seconds.") from error
+            raise argument_error("times", "numbers", times, "Give times in seconds.") from error
         outside = ~((wanted >= self.times[0]) & (wanted <= self.times[-1]))
         if outside.any():
-            raise bad_argument(
+            raise argument_error(
                 "times",
                 f"times from {self.times[0]:.6f} s to {self.times[-1]:.6f} s",
                 float(wanted[outside][0]),
@@ -113,7 +113,7 @@ class Trajectory:
         """
         path = checked_path(path)
         if not path.is_file():
-            raise bad_argument("path", "a TUM trajectory file", "no such file", f"Check the path {str(path)!r}.")
+            raise argument_error("path", "a TUM trajectory file", "no such file", f"Check the path {str(path)!r}.")
         times, poses = [], []
         lines = Path(path).read_text(encoding="utf-8", errors="replace").splitlines()
         for number, line in enumerate(lines, start=1):
@@ -130,14 +130,14 @@ def _parse_tum_line(line: str, where: str) -> tuple[float, tuple[float, float, f
     try:
         values = np.array([float(word) for word in line.split()])
     except ValueError as error:
-        raise bad_argument("path", expected, repr(line), cure) from error
+        raise argument_error("path", expected, repr(line), cure) from error
     if len(values) != 8 or not np.isfinite(values).all():
-        raise bad_argument("path", f"8 finite numbers {expected}", repr(line), cure)
+        raise argument_error("path", f"8 finite numbers {expected}", repr(line), cure)
     time, x, y, _, qx, qy, qz, qw = (float(v) for v in values)
     if abs(np.linalg.norm(values[4:]) - 1.0) > 1e-3:
-        raise bad_argument("path", "a unit quaternion qx qy qz qw", repr(line), cure)
+        raise argument_error("path", "a unit quaternion qx qy qz qw", repr(line), cure)
     if max(abs(qx), abs(qy)) > PLANAR_TOLERANCE:
-        raise bad_argument("path", "a rotation about the vertical (qx = qy = 0)", repr(line), cure)
+        raise argument_error("path", "a rotation about the vertical (qx = qy = 0)", repr(line), cure)
     return time, (x, y, float(wrap_angle(2.0 * np.arctan2(qz, qw))))
 
 

@@ -19,12 +19,12 @@ from slam_backend.metrics.maps import map_error
 from slam_backend.models.camera import StereoCamera
 from slam_backend.models.measurements import Measurements, TeamMeasurements
 from slam_backend.smoother import gauge as holding
-from slam_backend.smoother._kernels import look_at_keys
-from slam_backend.smoother.graph import PathGraph
-from slam_backend.smoother.graph_building import Guesses
+from slam_backend.smoother._kernels import recent_key_mask
+from slam_backend.smoother.graph import SlamGraph
+from slam_backend.smoother.graph_building import InitialPoses
 from slam_backend.smoother.options import SmoothingOptions
 from slam_backend.smoother.reassociation import find_only
-from slam_backend.smoother.sampling import bend
+from slam_backend.smoother.sampling import retract_on_se2
 from slam_backend.team.merge_scheduler import AttemptOptions
 from slam_backend.team.options import MergeOptions
 from slam_backend.team.team import TeamSlam
@@ -36,7 +36,7 @@ EXTRAS = {
     "clique": ("slam_backend.maps._kernels.max_clique.",),
     "images": ("slam_backend.frontend.",),
 }
-STEP = "slam_backend.fastslam._kernels.step.take_turns"  # the filter's kernel
+STEP = "slam_backend.fastslam._kernels.step.step_robots"  # the filter's kernel
 FASTSLAM2 = "none"  # ends its signature without FastSLAM 1.0
 STEPS = 4
 LANDMARKS = 12  # more than an alignment asks for
@@ -110,7 +110,7 @@ def run_all_paths(extras: Collection[str]) -> float:
                     slam.step([move, None], [frame, frame])
                 slam.step([None, None], [frame, frame], [names, some], [still, None])
                 slam.step([move, move], [None, None])
-        few_keys = SmoothingOptions(max_keys=2, fresh_keys=1)  # logs come in parts, between which keys are joined
+        few_keys = SmoothingOptions(max_keys=2, recent_keys=1)  # logs come in parts, between which keys are joined
         smoothing = FastSlam(num_particles=4, rejuvenate_every=STEPS + 1, smoothing=few_keys)
         for _ in range(2 * (STEPS + 1)):
             smoothing.step([move], [plain])
@@ -120,24 +120,26 @@ def run_all_paths(extras: Collection[str]) -> float:
             for _ in range(STEPS):
                 watching.step([move], [plain])
             watching.set_state(watching.get_state())
-        state_checks.warm()
+        state_checks.compile_checks()
         root = np.array([-1])
         are_linked(root, root)  # of a state that was a pickle
         root.setflags(write=False)
         are_linked(root, root)
-        bend(np.zeros((1, 3)), root, np.zeros((1, 3, 1)))
-        PathGraph.at_starts(np.zeros((1, 3))).known_as(names)  # of groups that merge
-        Guesses.none().at(root)  # of what was refused
+        retract_on_se2(np.zeros((1, 3)), root, np.zeros((1, 3, 1)))
+        SlamGraph.at_starts(np.zeros((1, 3))).resolve_ids(names)  # of groups that merge
+        InitialPoses.empty().at(root)  # of what was refused
         inverse(np.zeros((2, 3)))  # of starts that are held
         find_only(points, descriptors, points, descriptors, 1.0, 1.0, names.copy())
-        look_at_keys(root, root[:0], 1, 1, np.empty(1, dtype=np.bool_), np.empty(1, dtype=np.bool_))  # and contradicted
+        recent_key_mask(
+            root, root[:0], 1, 1, np.empty(1, dtype=np.bool_), np.empty(1, dtype=np.bool_)
+        )  # and contradicted
         holding.move(np.zeros((1, 3, 1)), np.zeros((1, 3)), np.zeros((1, 3, 1)))  # of starts that are sought
         team = TeamSlam(2, num_particles=4, attempts=AttemptOptions(every=1), merging=MergeOptions(watch_every=1))
         for _ in range(STEPS):
             team.step([None, None], [plain, plain])
         both = np.tile(points, (2, 1)), np.tile(descriptors, (2, 1))
         team.step(np.zeros((2, 3)), TeamMeasurements(*both, np.array([LANDMARKS, 2 * LANDMARKS])))
-        team.standpoints(), team.outlines()
+        team.team_poses(), team.map_summaries()
         own = team.map(0)
         map_error(own.means, names, points)
         if "clique" in extras:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
-from slam_backend.core.validation import BoolArray, FloatArray, bad_argument, check_int
+from slam_backend.core.validation import BoolArray, FloatArray, argument_error, check_int
 from training.experiments.compilation import prepare
 from training.rl.slots import MASK, WHOLE, MakeEnv, SlotBatch, Stepped
 from training.rl.workers import SlotWorkers
@@ -117,7 +117,7 @@ class ExplorationVecEnv(VecEnv):  # type: ignore[misc]   # its types are not loo
             ValueError: If there are not as many actions as slots, or one is outside its space.
         """
         if len(actions) != self.num_envs:
-            raise bad_argument("actions", f"{self.num_envs} of them", len(actions), "Give one for each slot.")
+            raise argument_error("actions", f"{self.num_envs} of them", len(actions), "Give one for each slot.")
         self._slots.send(np.asarray(actions))
 
     def step_wait(self) -> tuple[Any, NDArray[np.float32], BoolArray, list[dict[str, Any]]]:
@@ -167,7 +167,7 @@ class ExplorationVecEnv(VecEnv):  # type: ignore[misc]   # its types are not loo
         """
         given = state["environments"]
         if len(given) != len(self.first_slots):
-            raise bad_argument("state", f"one of {len(self.first_slots)} environments", len(given), "Make as many.")
+            raise argument_error("state", f"one of {len(self.first_slots)} environments", len(given), "Make as many.")
         for slot, one in zip(self.first_slots, given, strict=True):
             self.env_method("set_state", one, indices=[slot])
         self._masks = state["masks"]

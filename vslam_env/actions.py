@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from slam_backend.core.validation import FloatArray, bad_argument, check_array
+from slam_backend.core.validation import FloatArray, argument_error, check_array
 from vslam_env.belief.observation import NUM_ACTIONS
 
 MAX_SPEED, MAX_REVERSE, MAX_TURN = 1.0, 0.3, 1.5  # [m/s], [m/s], [rad/s]
 DISCRETE_COMMANDS = ((0.0, 0.0), (MAX_SPEED, 0.0), (0.0, MAX_TURN), (0.0, -MAX_TURN))  # stay ahead left right
-PAIR_CURE = "Give (speed, turn) in [-1, 1]."
+PAIR_HINT = "Give (speed, turn) in [-1, 1]."
 
 
 def action_space(action_type: str) -> spaces.Space[Any]:
@@ -36,13 +36,13 @@ def checked_actions(actions: Any, agents: Sequence[str], action_type: str) -> Fl
         ValueError: If an agent is unknown or missing, or an action is outside its space.
     """
     if type(actions) is not dict and not isinstance(actions, Mapping):  # asking a dict of its kin takes 1 us
-        raise bad_argument("actions", "a dict from agent to action", actions, "Pass {agent: action}.")
+        raise argument_error("actions", "a dict from agent to action", actions, "Pass {agent: action}.")
     if list(actions) != agents and actions.keys() != set(agents):  # nearly all come in order
         unknown = [agent for agent in actions if agent not in agents]
         if unknown:
-            raise bad_argument("actions", f"actions of {list(agents)}", unknown[0], "Drop agents that are not there.")
+            raise argument_error("actions", f"actions of {list(agents)}", unknown[0], "Drop agents that are not there.")
         gone = next(agent for agent in agents if agent not in actions)
-        raise bad_argument("actions", f"an action of {gone!r}", f"no {gone!r}", "All agents act at once.")
+        raise argument_error("actions", f"an action of {gone!r}", f"no {gone!r}", "All agents act at once.")
     if action_type == "continuous":
         return _continuous_commands(actions, agents)
     if action_type == "discrete":
@@ -66,7 +66,7 @@ def _continuous_commands(actions: Mapping[str, Any], agents: Sequence[str]) -> F
         if type(speed) is not float or type(turn) is not float:
             speed, turn = _pair(agent, action)
         if not (-1.0 <= speed <= 1.0 and -1.0 <= turn <= 1.0):  # false for NaN
-            raise bad_argument(f"actions[{agent!r}]", "two numbers in [-1, 1]", [speed, turn], PAIR_CURE)
+            raise argument_error(f"actions[{agent!r}]", "two numbers in [-1, 1]", [speed, turn], PAIR_HINT)
         commands[robot, 0] = speed * (MAX_SPEED if speed > 0.0 else MAX_REVERSE)
         commands[robot, 1] = turn * MAX_TURN
     return commands
@@ -77,10 +77,10 @@ def _pair(agent: str, action: Any) -> tuple[float, float]:
     if isinstance(action, (list, tuple)) and len(action) == 2 and all(type(part) is float for part in action):
         return action[0], action[1]
     name = f"actions[{agent!r}]"
-    speed, turn = check_array(name, action, (2,), PAIR_CURE, finite=False).tolist()
+    speed, turn = check_array(name, action, (2,), PAIR_HINT, finite=False).tolist()
     parts = np.asarray(action, dtype=object).tolist()
     if any(isinstance(part, (bool, np.bool_)) for part in parts):  # they could be turned into floats, but are no speeds
-        raise bad_argument(name, "an array of shape (2,) of real numbers", action, PAIR_CURE)
+        raise argument_error(name, "an array of shape (2,) of real numbers", action, PAIR_HINT)
     return speed, turn
 
 
@@ -89,5 +89,5 @@ def _checked_index(agent: str, action: Any, limit: int) -> int:
     value = action.item() if isinstance(action, (np.generic, np.ndarray)) and np.size(action) == 1 else action
     if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < limit:
         cure = "Sample from env.action_space(agent)."
-        raise bad_argument(f"actions[{agent!r}]", f"an int from 0 to {limit - 1}", action, cure)
+        raise argument_error(f"actions[{agent!r}]", f"an int from 0 to {limit - 1}", action, cure)
     return value

@@ -12,7 +12,7 @@ import numpy as np
 import tomli_w
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
-from slam_backend.core.validation import bad_argument, check_choice, check_float, check_int
+from slam_backend.core.validation import argument_error, check_choice, check_float, check_int
 from vslam_env.belief.belief import BeliefConfig
 from vslam_env.sensors import LandmarkSensorConfig, ScanConfig, StereoSensorConfig
 from vslam_env.world import SPLITS, LandmarkConfig, OdometryNoise
@@ -23,12 +23,12 @@ T = TypeVar("T")
 NONE = "none"  # what TOML, which has no word for it, says for None
 
 
-def validated(cls: type[T], values: Mapping[str, Any]) -> T:
+def validate(cls: type[T], values: Mapping[str, Any]) -> T:
     """Build `cls` from nested dicts, or raise the project's one error for the first thing that is wrong."""
     try:
-        text = json.dumps(plain(values), default=str)
+        text = json.dumps(to_plain(values), default=str)
     except (ValueError, RecursionError) as error:  # an int of 5000 digits, or a part that holds itself
-        raise bad_argument("config", "values that JSON can hold", "no such values", f"It says: {error}.") from error
+        raise argument_error("config", "values that JSON can hold", "no such values", f"It says: {error}.") from error
     try:
         # Strict on JSON refuses 2.0, "2" and True as ints, but takes dicts for parts, lists for tuples, int for float.
         return TypeAdapter(cls).validate_json(text, strict=True)
@@ -39,29 +39,29 @@ def validated(cls: type[T], values: Mapping[str, Any]) -> T:
             raise own from None
         name = ".".join(str(part) for part in first["loc"])
         if first["type"] == "unexpected_keyword_argument":
-            raise bad_argument(name, "a known field", first["input"], "Check the spelling.") from None
+            raise argument_error(name, "a known field", first["input"], "Check the spelling.") from None
         expected = first["msg"].removeprefix("Input should be ")
-        raise bad_argument(name, expected, first["input"], "Correct this value.") from None
+        raise argument_error(name, expected, first["input"], "Correct this value.") from None
 
 
-def plain(value: Any) -> Any:
+def to_plain(value: Any) -> Any:
     """Turn nested configurations into dicts, lists and numbers."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        return {f.name: to_plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
     if isinstance(value, Mapping):
-        return {key: plain(entry) for key, entry in value.items()}
+        return {key: to_plain(entry) for key, entry in value.items()}
     if isinstance(value, tuple):
-        return [plain(entry) for entry in value]
+        return [to_plain(entry) for entry in value]
     return value.item() if isinstance(value, np.generic) else value
 
 
-def merged(values: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+def merge(values: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
     """Return nested dicts with some entries changed; weights of rewards are replaced as a whole."""
     result = dict(values)
     for key, change in changes.items():
-        change = plain(change)
+        change = to_plain(change)
         nested = isinstance(change, dict) and isinstance(result.get(key), dict) and key != "reward"
-        result[key] = merged(result[key], change) if nested else change
+        result[key] = merge(result[key], change) if nested else change
     return result
 
 
@@ -93,8 +93,8 @@ SENSORS = ("landmark", "stereo")
 MAX_ROBOTS = 8
 TICK = 0.1  # [s]
 GOAL_DECISION_TICKS = 10
-MOST_TICKS = 10**9  # in a step; they would last three years
-PARTS = {
+MAX_TICKS = 10**9  # in a step; they would last three years
+NESTED_CONFIGS = {
     "landmarks": LandmarkConfig,
     "odometry": OdometryNoise,
     "landmark_sensor": LandmarkSensorConfig,
@@ -176,25 +176,25 @@ class EnvConfig:
     def __post_init__(self) -> None:
         robots = check_int("num_robots", self.num_robots, 1, "Use 1 to 8 robots.")
         if robots > MAX_ROBOTS:
-            raise bad_argument("num_robots", f"an int from 1 to {MAX_ROBOTS}", robots, "Use 1 to 8 robots.")
+            raise argument_error("num_robots", f"an int from 1 to {MAX_ROBOTS}", robots, "Use 1 to 8 robots.")
         if not isinstance(self.world, str):
-            raise bad_argument("world", "a name or a path, as a string", self.world, "Pass a World to parallel_env.")
+            raise argument_error("world", "a name or a path, as a string", self.world, "Pass a World to parallel_env.")
         if self.world_split is not None:
             check_choice("world_split", self.world_split, tuple(SPLITS))
         check_choice("sensor", self.sensor, SENSORS)
         check_choice("action_type", self.action_type, ACTION_TYPES)
         check_choice("observation_type", self.observation_type, OBSERVATION_TYPES)
         if self.decision_ticks is not None:
-            check_int("decision_ticks", self.decision_ticks, 1, "Give a number of ticks of 0.1 s.", MOST_TICKS)
+            check_int("decision_ticks", self.decision_ticks, 1, "Give a number of ticks of 0.1 s.", MAX_TICKS)
         check_int("max_cycles", self.max_cycles, 1, "Give a number of steps.")
         if self.stop_at_recall is not None:
             check_float("stop_at_recall", self.stop_at_recall, "Give a share or None.", above=0.0, at_most=1.0)
         switches = ("oracle_pose", "oracle_association", "oracle_merge", "shared_start_view", "shared_reward")
         for name in (*switches, "comm_line_of_sight", "observe_images"):
             if not isinstance(getattr(self, name), bool):
-                raise bad_argument(name, "True or False", getattr(self, name), "Give a bool.")
+                raise argument_error(name, "True or False", getattr(self, name), "Give a bool.")
         if not isinstance(self.reward, Mapping):
-            raise bad_argument("reward", "weights by name", self.reward, "E.g. {'map_error': 1.0}.")
+            raise argument_error("reward", "weights by name", self.reward, "E.g. {'map_error': 1.0}.")
         for name, weight in self.reward.items():
             check_float(f"reward[{name!r}]", weight, "Give the weight of the term.")
         if self.comm_range is not None:
@@ -203,19 +203,21 @@ class EnvConfig:
         check_float("robot_radius", self.robot_radius, "Give metres.", above=0.0, at_most=LARGEST_EXTENT)
         check_float("min_start_distance", self.min_start_distance, "Give metres.", at_least=0.0)
         check_float("map_error_cutoff", self.map_error_cutoff, "Give metres.", at_least=1e-6, at_most=1e6)
-        for name, kind in PARTS.items():
+        for name, kind in NESTED_CONFIGS.items():
             if not isinstance(getattr(self, name), kind):
-                raise bad_argument(name, f"a {kind.__name__}", getattr(self, name), f"Build one: {kind.__name__}(...).")
+                raise argument_error(
+                    name, f"a {kind.__name__}", getattr(self, name), f"Build one: {kind.__name__}(...)."
+                )
         if self.observe_images and (self.sensor, self.observation_type) != ("stereo", "dict"):
             cure = 'Use sensor="stereo" and observation_type="dict".'
-            raise bad_argument("observe_images", "False without rendered eyes or named arrays", True, cure)
+            raise argument_error("observe_images", "False without rendered eyes or named arrays", True, cure)
         check_float("scan.half_fov", self.scan.half_fov, "A scan spans less than a half circle.", at_most=1.57)
         eyes = self.stereo if self.sensor == "stereo" else self.landmark_sensor
         usable = self.belief.filter.camera.farthest_usable
         if eyes.farthest > usable:
             expected = f"noise under which points {eyes.farthest:g} m away can be used"
             cure = "Raise sigma_px or baseline, lower sigma_disparity_px, or the max_range of the true camera."
-            raise bad_argument("belief.filter.camera", expected, f"a limit of {usable:g} m", cure)
+            raise argument_error("belief.filter.camera", expected, f"a limit of {usable:g} m", cure)
 
     @property
     def always_in_contact(self) -> bool:
@@ -244,12 +246,12 @@ class EnvConfig:
         Raises:
             ValueError: If a field is unknown or a value is refused; the text names it.
         """
-        return validated(type(self), merged(plain(self), changes))
+        return validate(type(self), merge(to_plain(self), changes))
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
         """Build a configuration from nested dicts; what is left out has the value of the `standard` preset."""
-        return validated(cls, merged(plain(cls()), values))
+        return validate(cls, merge(to_plain(cls()), values))
 
     @classmethod
     def from_toml(cls, path: str | Path) -> Self:
@@ -261,18 +263,18 @@ class EnvConfig:
         try:
             values = tomllib.loads(Path(path).read_text(encoding="utf-8"))
         except (OSError, TypeError, ValueError) as error:  # of the path, of the encoding and of the syntax
-            raise bad_argument("config", "a readable TOML file", str(path), f"The reader says: {error}.") from error
+            raise argument_error("config", "a readable TOML file", str(path), f"The reader says: {error}.") from error
         return cls._of_file(values)
 
     @classmethod
     def from_toml_text(cls, text: str) -> Self:
         """Build a configuration from what `to_toml` returned."""
         if not isinstance(text, str):
-            raise bad_argument("config", "TOML as text", text, "Pass what to_toml returned, or use from_toml.")
+            raise argument_error("config", "TOML as text", text, "Pass what to_toml returned, or use from_toml.")
         try:
             values = tomllib.loads(text)
         except tomllib.TOMLDecodeError as error:
-            raise bad_argument("config", "TOML", text, f"The reader says: {error}.") from error
+            raise argument_error("config", "TOML", text, f"The reader says: {error}.") from error
         return cls._of_file(values)
 
     @classmethod
@@ -281,7 +283,7 @@ class EnvConfig:
         found = values.pop("format", FORMAT)
         if type(found) is not int or found != FORMAT:
             cure = "Use the release that wrote it, or set the values again."
-            raise bad_argument("config", f"one of format {FORMAT}", f"a configuration of format {found!r}", cure)
+            raise argument_error("config", f"one of format {FORMAT}", f"a configuration of format {found!r}", cure)
         return cls.from_dict(with_none(values))
 
     def to_toml(self) -> str:
@@ -289,5 +291,5 @@ class EnvConfig:
 
         None is left out where it is the standard, else it is the text "none".
         """
-        values = without_none(plain(self), plain(type(self)()))
+        values = without_none(to_plain(self), to_plain(type(self)()))
         return tomli_w.dumps({"format": FORMAT} | values)

@@ -10,24 +10,24 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
-from slam_backend.core.state_checks import refusing
-from slam_backend.core.validation import FloatArray, bad_argument, check_choice, check_int
+from slam_backend.core.state_checks import refuse_malformed
+from slam_backend.core.validation import FloatArray, argument_error, check_choice, check_int
 from slam_backend.fastslam.reports import MergeEvent
 from vslam_env.actions import action_space, checked_actions
-from vslam_env.belief.observation import flatten, observation_space, observed
+from vslam_env.belief.observation import flatten, observation_space, observe_team
 from vslam_env.belief.readings import Readings, TeamReadings
 from vslam_env.belief.team_belief import Belief, TeamBelief
 from vslam_env.config import EnvConfig
-from vslam_env.evaluation.team_metrics import Standing
+from vslam_env.evaluation.team_metrics import TeamMetrics
 from vslam_env.rendering import Scene, draw_frame
-from vslam_env.rendering.from_episode import scene_of
+from vslam_env.rendering.from_episode import build_scene
 from vslam_env.rendering.window import Window
 from vslam_env.reward import RewardSpec, evaluate, make_terms, totals
-from vslam_env.simulation.controllers import Drivers
-from vslam_env.simulation.episode import Episode, Recorder, Tap
-from vslam_env.simulation.scenario import draw_setting
-from vslam_env.snapshots import EnvState, check_parts, check_state, objects_of, sequence_state, state_version
-from vslam_env.world import World, WorldSource, check_source, is_one_building
+from vslam_env.simulation.controllers import ActionExecutor
+from vslam_env.simulation.episode import Episode, ReadingsHook, Recorder
+from vslam_env.simulation.scenario import sample_scenario
+from vslam_env.snapshots import EnvState, check_parts, check_state, sequence_state, snapshot_objects, state_version
+from vslam_env.world import World, WorldSource, check_source, is_single_layout
 
 AgentID = str
 STATE_PER_ROBOT = 12
@@ -68,12 +68,12 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
             check_choice("render_mode", render_mode, RENDER_MODES, "Choose one of these, or None.")
         self.render_mode = render_mode
         self.max_cycles = config.max_cycles
-        self._tap = Tap()  # kept apart, so that an episode does not keep its environment alive
+        self._tap = ReadingsHook()  # kept apart, so that an episode does not keep its environment alive
         self._source: WorldSource = config.world if world is None else world
         check_source(self._source)
-        if config.world_split is not None and is_one_building(self._source):
+        if config.world_split is not None and is_single_layout(self._source):
             cure = "Use a family, a folder or a function, or leave the split out."
-            raise bad_argument("world_split", "None for a world of which there is one", config.world_split, cure)
+            raise argument_error("world_split", "None for a world of which there is one", config.world_split, cure)
         self._terms = make_terms(config.reward if reward is None else reward)
         self.config = dataclasses.replace(config, reward={term.name: term.weight for term in self._terms})
         self.possible_agents = config.agents
@@ -92,9 +92,9 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         self._root: np.random.SeedSequence | None = None
         self._episode: Episode | None = None
         self._cycle = 0
-        self._standing: Standing  # set at a reset
+        self._standing: TeamMetrics  # set at a reset
         self._window = Window(self.metadata["name"])
-        self._objects = objects_of(self._source, self._terms)
+        self._objects = snapshot_objects(self._source, self._terms)
 
     # ------------------------------------------------------------------ PettingZoo
 
@@ -121,19 +121,19 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
             root = np.random.SeedSequence() if self._root is None else copy.deepcopy(self._root)
         options = {} if options is None else options
         if not isinstance(options, Mapping):
-            raise bad_argument("options", "a dict or None", options, "E.g. {'world_seed': 3}.")
+            raise argument_error("options", "a dict or None", options, "E.g. {'world_seed': 3}.")
         world_seed = options.get("world_seed")
         if world_seed is not None:
             check_int("options['world_seed']", world_seed, 0, "Give an int >= 0.")
-        setting = draw_setting(self.config, self._source, root.spawn(1)[0], world_seed, options.get("start_poses"))
+        setting = sample_scenario(self.config, self._source, root.spawn(1)[0], world_seed, options.get("start_poses"))
         episode = Episode(self.config, setting, self._tap)
         episode.begin()
-        self._standing = episode.standing()
-        self._root, self._episode, self._drivers = root, episode, Drivers(self.config)
+        self._standing = episode.team_metrics()
+        self._root, self._episode, self._drivers = root, episode, ActionExecutor(self.config)
         self.agents = self.possible_agents[:]
         self._cycle = 0
         nothing = dict.fromkeys((term.name for term in self._terms), self._nothing)
-        return self._told(self._episode, nothing, [0] * len(self.agents))
+        return self._observe(self._episode, nothing, [0] * len(self.agents))
 
     def step(
         self, actions: Mapping[AgentID, Any]
@@ -161,16 +161,16 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
             raise RuntimeError("step: expected a running episode, got one that has ended. Call reset() first.")
         agents = self.agents
         chosen = checked_actions(actions, agents, self.config.action_type)
-        invalid = self._drivers.carry_out(episode, chosen)
+        invalid = self._drivers.execute(episode, chosen)
         before = self._standing
-        self._standing = episode.standing()
+        self._standing = episode.team_metrics()
         self._cycle += 1
 
         terms = evaluate(self._terms, before, self._standing, self.config.shared_reward)
         goal = self.config.stop_at_recall
         terminated = goal is not None and bool(self._standing.map_recalls.min() >= goal)
         truncated = not terminated and self._cycle >= self._max_cycles
-        observations, infos = self._told(episode, terms, invalid)
+        observations, infos = self._observe(episode, terms, invalid)
         results = (
             observations,
             dict(zip(agents, totals(terms), strict=True)),
@@ -192,7 +192,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         """
         if self.render_mode is None:
             return None
-        frame = draw_frame(scene_of(self._running_episode("render"), self._standing))
+        frame = draw_frame(build_scene(self._running_episode("render"), self._standing))
         if self.render_mode == "rgb_array":
             return frame
         self._window.show(frame)
@@ -219,7 +219,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         map error, map recall, heading error, first robot of its group; then coverage and merges of the team.
         """
         episode = self._running_episode("state")
-        true, believed = episode.true_path[-1], episode.believed_poses()
+        true, believed = episode.true_path[-1], episode.estimated_poses()
         rows = [np.column_stack([poses[:, :2], np.cos(poses[:, 2]), np.sin(poses[:, 2])]) for poses in (true, believed)]
         standing = self._standing
         frames = [group[0] for group in episode.belief.known_groups]
@@ -242,7 +242,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
     @property
     def readings(self) -> tuple[Readings, ...]:
         """What each robot perceived in the last tick."""
-        return self._running_episode("readings").readings.of_each()
+        return self._running_episode("readings").readings.per_robot()
 
     @property
     def world(self) -> World:
@@ -277,7 +277,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
     @recorder.setter
     def recorder(self, recorder: Recorder | None) -> None:
         if recorder is not None and not callable(recorder):
-            raise bad_argument("recorder", "a function or None", recorder, "It is called with a tuple of Readings.")
+            raise argument_error("recorder", "a function or None", recorder, "It is called with a tuple of Readings.")
         self._tap.recorder = recorder
 
     @property
@@ -291,7 +291,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
 
     def scene(self) -> Scene:
         """Return what a picture shows now."""
-        return scene_of(self._running_episode("scene"), self._standing)
+        return build_scene(self._running_episode("scene"), self._standing)
 
     # ------------------------------------------------------------------ snapshots
 
@@ -325,7 +325,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
             ValueError: If it is no state, one of another version of the package or of another configuration, or a part
                 of it is damaged; the environment is then as before.
         """
-        with refusing("state"):
+        with refuse_malformed("state"):
             state = check_state(state, self.config, self._objects)
             root, setting = check_parts(state, self.config, self._episode)
         self._root, self.agents = root, []
@@ -335,7 +335,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         if self._episode is None:
             self._episode = Episode(self.config, setting, self._tap)
         self._episode.set_state(state["episode"], setting)
-        self._drivers = Drivers(self.config)
+        self._drivers = ActionExecutor(self.config)
         self._drivers.set_state(state["drivers"])
         self._standing, self._cycle, self.agents = state["standing"], state["cycle"], list(state["agents"])
 
@@ -356,13 +356,13 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
 
     # ------------------------------------------------------------------ within
 
-    def _told(
+    def _observe(
         self, episode: Episode, terms: Mapping[str, Sequence[float]], invalid: list[int]
     ) -> tuple[dict[AgentID, Any], dict[AgentID, dict[str, Any]]]:
         """Return each agent's observation after the last tick, and its figures after a step that paid `terms`."""
         agents, belief = self.possible_agents, episode.belief
-        observations = observations_of(agents, belief, episode.readings, *self._shown_as)
-        return observations, infos_of(agents, belief.known_groups, self._standing, terms, invalid)
+        observations = build_observations(agents, belief, episode.readings, *self._shown_as)
+        return observations, build_infos(agents, belief.known_groups, self._standing, terms, invalid)
 
     def _running_episode(self, name: str) -> Episode:
         if self._episode is None:
@@ -371,7 +371,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
 
     def _index(self, agent: AgentID) -> int:
         if not isinstance(agent, str) or agent not in self.possible_agents:
-            raise bad_argument("agent", f"one of {self.possible_agents}", agent, "Use a name of possible_agents.")
+            raise argument_error("agent", f"one of {self.possible_agents}", agent, "Use a name of possible_agents.")
         return self.possible_agents.index(agent)
 
 
@@ -383,10 +383,10 @@ def _unpickled(made_from: tuple[Any, ...], max_cycles: int, state: EnvState) -> 
     return env
 
 
-def infos_of(
+def build_infos(
     agents: Sequence[str],
     groups: Sequence[tuple[int, ...]],
-    standing: Standing,
+    standing: TeamMetrics,
     terms: Mapping[str, Sequence[float]],
     invalid: Sequence[int],
 ) -> dict[str, dict[str, Any]]:
@@ -401,7 +401,7 @@ def infos_of(
         terms: By name, per robot: what each term of the reward has paid for the step.
         invalid: Per robot 1 if its action was masked.
     """
-    errors, rmses, recalls, precisions, _, pose_errors, heading_errors, _, _, distances, _ = standing.figures
+    errors, rmses, recalls, precisions, _, pose_errors, heading_errors, _, _, distances, _ = standing.table
     collisions, bytes_sent = standing.counts
     infos: dict[str, dict[str, Any]] = {}
     for robot, agent in enumerate(agents):
@@ -427,7 +427,7 @@ def infos_of(
     return infos
 
 
-def observations_of(
+def build_observations(
     agents: Sequence[str], belief: TeamBelief, readings: TeamReadings | Sequence[Readings], goal: bool, flat: bool
 ) -> dict[str, Any]:
     """Return each agent's observation after a tick.
@@ -444,8 +444,8 @@ def observations_of(
         `{"observation", "action_mask"}` where actions are masked.
     """
     if not isinstance(readings, TeamReadings):
-        readings = TeamReadings.gathered(readings)
-    shown = observed(belief.view(), readings.scans, goal)
+        readings = TeamReadings.stack(readings)
+    shown = observe_team(belief.view(), readings.scans, goal)
     if readings.images is not None:
         for observation, image in zip(shown, readings.images, strict=True):
             observation["image"] = image[:, :, None].copy()

@@ -5,7 +5,7 @@ from typing import Any
 
 from slam_backend.core.validation import check_choice
 from slam_backend.fastslam.existence import ExistenceModel
-from slam_backend.frontend import KINDS
+from slam_backend.frontend import DESCRIPTOR_TYPES
 from slam_backend.models.odometry import OdometryModel
 from vslam_env.belief.belief import BeliefConfig
 from vslam_env.config import SENSORS, EnvConfig
@@ -71,7 +71,7 @@ def stereo_belief(eyes: StereoSensorConfig, belief: BeliefConfig) -> BeliefConfi
     optics = {name: getattr(eyes.camera, name) for name in ("focal_px", "baseline", "width", "height", "max_range")}
     doubled = dataclasses.replace(belief.filter.camera, mount=eyes.camera.mount, **optics)
     existence = ExistenceModel(detection=0.7, frame_limit=eyes.front_end.max_measurements)
-    gate = KINDS[eyes.front_end.descriptor].gate
+    gate = DESCRIPTOR_TYPES[eyes.front_end.descriptor].gate
     changes: dict[str, Any] = {"existence": existence, "descriptor_gate": gate, "recovery_position": 0.0}
     changes["rejuvenate_every"] = None
     assumed = dataclasses.replace(belief.filter, camera=doubled, **changes)

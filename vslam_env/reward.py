@@ -14,20 +14,20 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from slam_backend.core.validation import bad_argument, check_array, check_float
+from slam_backend.core.validation import argument_error, check_array, check_float
 from vslam_env.evaluation.team_metrics import (
+    ACCURATE_RECALLS,
     COLLISIONS,
+    DISCOVERED,
     DISTANCES,
     ERROR_INTEGRALS,
-    FOUND,
     MAP_ERRORS,
-    PLACED_RECALLS,
     POSE_SIGMAS,
-    Standing,
+    TeamMetrics,
 )
 
 __all__ = [
-    "COSTS", "POTENTIALS", "RUNNING_COST", "TERMS", "RewardSpec", "RewardTerm", "Standing", "evaluate",
+    "COSTS", "POTENTIALS", "RUNNING_COST", "TERMS", "RewardSpec", "RewardTerm", "TeamMetrics", "evaluate",
     "make_terms", "totals",
 ]  # fmt: skip
 
@@ -44,11 +44,11 @@ class RewardTerm(Protocol):
     def weight(self) -> float:
         """What the term is multiplied with."""
 
-    def __call__(self, before: Standing, after: Standing) -> ArrayLike:
+    def __call__(self, before: TeamMetrics, after: TeamMetrics) -> ArrayLike:
         """Return what each robot gains (K,) by a step, unweighted. Neither standing may be written to."""
 
 
-Gain = Callable[[Standing, Standing], list[float]]
+RewardFunction = Callable[[TeamMetrics, TeamMetrics], list[float]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,59 +56,59 @@ class _NamedTerm:
     name: str
     weight: float
 
-    def __call__(self, before: Standing, after: Standing) -> list[float]:
+    def __call__(self, before: TeamMetrics, after: TeamMetrics) -> list[float]:
         return TERMS[self.name](before, after)
 
 
-def _rise_of(row: int) -> Gain:
+def _rise_of(row: int) -> RewardFunction:
     """Return the gain that pays how much a row of the figures has risen."""
-    return lambda before, after: list(map(sub, after.figures[row], before.figures[row]))
+    return lambda before, after: list(map(sub, after.table[row], before.table[row]))
 
 
-def _fall_of(row: int) -> Gain:
+def _fall_of(row: int) -> RewardFunction:
     """Return the gain that pays how much a row of the figures has fallen."""
-    return lambda before, after: list(map(sub, before.figures[row], after.figures[row]))
+    return lambda before, after: list(map(sub, before.table[row], after.table[row]))
 
 
-def _map_error_squared(before: Standing, after: Standing) -> list[float]:
-    errors = zip(before.figures[MAP_ERRORS], after.figures[MAP_ERRORS], strict=True)
+def _map_error_squared(before: TeamMetrics, after: TeamMetrics) -> list[float]:
+    errors = zip(before.table[MAP_ERRORS], after.table[MAP_ERRORS], strict=True)
     return [then * then - now * now for then, now in errors]
 
 
-def _team_map_error(before: Standing, after: Standing) -> list[float]:
-    return _to_each(float(before.map_errors.mean() - after.map_errors.mean()), after)
+def _team_map_error(before: TeamMetrics, after: TeamMetrics) -> list[float]:
+    return _shared_by_all(float(before.map_errors.mean() - after.map_errors.mean()), after)
 
 
-def _coverage(before: Standing, after: Standing) -> list[float]:
-    return _to_each(after.coverage - before.coverage, after)
+def _coverage(before: TeamMetrics, after: TeamMetrics) -> list[float]:
+    return _shared_by_all(after.coverage - before.coverage, after)
 
 
-def _collisions(before: Standing, after: Standing) -> list[float]:
+def _collisions(before: TeamMetrics, after: TeamMetrics) -> list[float]:
     return list(map(float, map(sub, before.counts[COLLISIONS], after.counts[COLLISIONS])))
 
 
-def _time(before: Standing, after: Standing) -> list[float]:
-    return _to_each(before.time - after.time, after)
+def _time(before: TeamMetrics, after: TeamMetrics) -> list[float]:
+    return _shared_by_all(before.time - after.time, after)
 
 
-def _to_each(gain: float, after: Standing) -> list[float]:
+def _shared_by_all(gain: float, after: TeamMetrics) -> list[float]:
     """Return what all robots gain alike, robot by robot."""
-    return [gain] * len(after.figures[MAP_ERRORS])
+    return [gain] * len(after.table[MAP_ERRORS])
 
 
 # Potentials telescope: what an episode pays in all is where it ends minus where it began, so that nothing is gained by
 # going to and fro. Costs only ever fall.
-POTENTIALS: dict[str, Gain] = {
+POTENTIALS: dict[str, RewardFunction] = {
     "map_error": _fall_of(MAP_ERRORS),
     "map_error_squared": _map_error_squared,
     "team_map_error": _team_map_error,
-    "recall": _rise_of(PLACED_RECALLS),
+    "recall": _rise_of(ACCURATE_RECALLS),
     "pose_uncertainty": _fall_of(POSE_SIGMAS),
     "coverage": _coverage,
-    "own_coverage": _rise_of(FOUND),
+    "own_coverage": _rise_of(DISCOVERED),
 }
 RUNNING_COST = "running_cost"
-COSTS: dict[str, Gain] = {
+COSTS: dict[str, RewardFunction] = {
     "collisions": _collisions,
     "distance": _fall_of(DISTANCES),
     "time": _time,
@@ -126,26 +126,28 @@ def make_terms(reward: RewardSpec) -> tuple[RewardTerm, ...]:
         ValueError: If there is no term, a name is unknown, repeats or is no text, or an object is no term.
     """
     if isinstance(reward, (Mapping, list, tuple)) and not reward:
-        raise bad_argument("reward", "at least one term", reward, "E.g. {'map_error': 1.0}.")
+        raise argument_error("reward", "at least one term", reward, "E.g. {'map_error': 1.0}.")
     if isinstance(reward, Mapping):
         for name in reward:
             if name not in TERMS:
                 names = "one of " + ", ".join(repr(known) for known in TERMS)
-                raise bad_argument("reward", names, name, "Choose one of these names, or pass a term of your own.")
+                raise argument_error("reward", names, name, "Choose one of these names, or pass a term of your own.")
         cure = "Give the weight of the term."
         return tuple(_NamedTerm(n, check_float(f"reward[{n!r}]", weight, cure)) for n, weight in reward.items())
     if not isinstance(reward, (list, tuple)):
-        raise bad_argument("reward", "weights by name, or a list of terms", reward, "E.g. {'map_error': 1.0}.")
+        raise argument_error("reward", "weights by name, or a list of terms", reward, "E.g. {'map_error': 1.0}.")
     for term in reward:
         if isinstance(term, type):
-            raise bad_argument("reward", "terms, not their classes", term, f"Make one: {term.__name__}(...).")
+            raise argument_error("reward", "terms, not their classes", term, f"Make one: {term.__name__}(...).")
         if not isinstance(term, RewardTerm):
-            raise bad_argument("reward", "terms with name, weight and a call", term, "See vslam_env.reward.RewardTerm.")
+            raise argument_error(
+                "reward", "terms with name, weight and a call", term, "See vslam_env.reward.RewardTerm."
+            )
         if not isinstance(term.name, str) or not term.name:
-            raise bad_argument("reward", "terms whose name is a text", term.name, "Infos show it as reward/<name>.")
+            raise argument_error("reward", "terms whose name is a text", term.name, "Infos show it as reward/<name>.")
     names_used = [term.name for term in reward]
     if len(set(names_used)) < len(names_used):
-        raise bad_argument("reward", "terms with different names", names_used, "Rename one of them.")
+        raise argument_error("reward", "terms with different names", names_used, "Rename one of them.")
     return tuple(reward)
 
 
@@ -155,7 +157,7 @@ def is_named(term: RewardTerm) -> bool:
 
 
 def evaluate(
-    terms: Sequence[RewardTerm], before: Standing, after: Standing, shared: bool = False
+    terms: Sequence[RewardTerm], before: TeamMetrics, after: TeamMetrics, shared: bool = False
 ) -> dict[str, list[float]]:
     """Return the weighted reward of each term for a step, by name, one for each of the K robots.
 
@@ -172,18 +174,18 @@ def evaluate(
     for term in terms:
         paid = term(before, after) if isinstance(term, _NamedTerm) else _own(term, before, after)
         if shared:
-            paid = _to_each(float(np.mean(paid)), after)
+            paid = _shared_by_all(float(np.mean(paid)), after)
         rewards[term.name] = list(map(mul, repeat(float(term.weight)), paid))
     return rewards
 
 
-def _own(term: RewardTerm, before: Standing, after: Standing) -> list[float]:
+def _own(term: RewardTerm, before: TeamMetrics, after: TeamMetrics) -> list[float]:
     """Return what a term of one's own pays for a step, or raise unless that is a finite number for each robot."""
     given = term(before, after)
-    paid, robots = _floats(given), len(after.figures[MAP_ERRORS])
+    paid, robots = _floats(given), len(after.table[MAP_ERRORS])
     if len(paid) != robots or not all(map(math.isfinite, paid)):
         cure = "Return one number for each robot."
-        raise bad_argument(f"reward term {term.name!r}", f"{robots} finite numbers", given, cure)
+        raise argument_error(f"reward term {term.name!r}", f"{robots} finite numbers", given, cure)
     return paid
 
 

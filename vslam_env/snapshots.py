@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 
 from slam_backend.core import state_checks as check
-from slam_backend.core.files import refusing, write_file
-from slam_backend.core.state_codec import ForeignObjectError, decoded, encoded, read_file, sequence_of
-from slam_backend.core.validation import bad_argument
+from slam_backend.core.files import os_errors_as_argument_errors, write_file
+from slam_backend.core.state_codec import ForeignObjectError, decode, encode, read_file, sequence_of
+from slam_backend.core.validation import argument_error
 from vslam_env.config import EnvConfig
 from vslam_env.reward import RewardTerm, is_named
 from vslam_env.simulation.episode import Episode
-from vslam_env.simulation.scenario import Setting
+from vslam_env.simulation.scenario import Scenario
 from vslam_env.state_checks import EpisodeCheck, check_drivers, check_standing
 from vslam_env.state_kinds import ENV_KINDS
 from vslam_env.world import WorldSource
@@ -40,7 +40,7 @@ def state_version() -> str:
     return f"{STATE_FORMAT}/{package}"
 
 
-def objects_of(source: WorldSource, terms: Sequence[RewardTerm]) -> dict[str, str]:
+def snapshot_objects(source: WorldSource, terms: Sequence[RewardTerm]) -> dict[str, str]:
     """Return what of an environment are objects of the caller's, which no state holds: a word for each."""
     objects = {} if isinstance(source, (str, Path)) else {"world": type(source).__qualname__}
     return objects | {f"reward {term.name!r}": type(term).__qualname__ for term in terms if not is_named(term)}
@@ -60,23 +60,23 @@ def check_state(state: Any, config: EnvConfig, objects: Mapping[str, str]) -> Ma
     found = _checked("state", state)
     theirs_own = found["objects"]
     if not isinstance(theirs_own, dict) or not all(isinstance(name, str) for name in theirs_own):
-        check.refuse("state['objects']", "a word for each object of the caller's", theirs_own)
+        check.raise_refusal("state['objects']", "a word for each object of the caller's", theirs_own)
     if found["config"] != config:
         name, ours, theirs = _difference(config, found["config"])
         cure = "Restore into an environment of the same configuration."
         if theirs_own and name in ("world", "reward"):
             cure = f"No state holds objects of your own: make the environment with the same {', '.join(theirs_own)}."
-        raise bad_argument("state", f"one made with {name} = {_short(ours)}", theirs, cure)
+        raise argument_error("state", f"one made with {name} = {_short(ours)}", theirs, cure)
     if theirs_own != objects:
         named = [", ".join(f"{name} ({kind})" for name, kind in each.items()) for each in (objects, theirs_own)]
         cure = "No state holds these: make the environment with the same ones."
-        raise bad_argument("state", f"one made with {named[0] or 'no'} objects", f"'{named[1] or 'none'}'", cure)
+        raise argument_error("state", f"one made with {named[0] or 'no'} objects", f"'{named[1] or 'none'}'", cure)
     return found
 
 
 def check_parts(
     state: Mapping[str, Any], config: EnvConfig, own: Episode | None
-) -> tuple[np.random.SeedSequence | None, Setting | None]:
+) -> tuple[np.random.SeedSequence | None, Scenario | None]:
     """Return the root of all seeds of a state that `check_state` passed, and its setting, if each part is whole.
 
     Args:
@@ -90,14 +90,14 @@ def check_parts(
     try:
         root = restored_sequence(state["root"])
     except Exception as error:  # whatever numpy says of what are no parts of one
-        raise bad_argument("state['root']", "a seed sequence", f"'{error}'", "Pass it unchanged.") from error
-    check.of_kind("state['agents']", state["agents"], tuple)
+        raise argument_error("state['root']", "a seed sequence", f"'{error}'", "Pass it unchanged.") from error
+    check.check_type("state['agents']", state["agents"], tuple)
     if state["agents"] not in ((), tuple(config.agents)):
-        check.refuse("state['agents']", f"{tuple(config.agents)} or none", state["agents"])
-    check.whole("state['cycle']", state["cycle"])
+        check.raise_refusal("state['agents']", f"{tuple(config.agents)} or none", state["agents"])
+    check.check_int("state['cycle']", state["cycle"])
     if state["episode"] is None:
         if state["agents"]:
-            check.refuse("state['episode']", "a running episode", "none")
+            check.raise_refusal("state['episode']", "a running episode", "none")
         return root, None
     episode = EpisodeCheck(config, own)
     episode.check("state['episode']", state["episode"])
@@ -118,14 +118,14 @@ def save_state(state: Mapping[str, Any], path: str | Path) -> None:
     _checked("state", state)
     path = _checked_path(path)
     try:
-        body = encoded(dict(state), ENV_KINDS)
+        body = encode(dict(state), ENV_KINDS)
     except ForeignObjectError as error:
         cure = "Objects of your own are not stored: make the environment that loads with them."
-        raise bad_argument("state", "numbers, arrays and configurations of this package", str(error), cure) from error
-    with refusing(path, "path"):
+        raise argument_error("state", "numbers, arrays and configurations of this package", str(error), cure) from error
+    with os_errors_as_argument_errors(path, "path"):
         is_other = path.exists() and not path.is_file()
     if is_other:
-        raise bad_argument("path", "a file that can be written", Path(path), "There is something else, no file.")
+        raise argument_error("path", "a file that can be written", Path(path), "There is something else, no file.")
     write_file(path, MAGIC + f"{state['version']}\n{_fingerprint(body)}\n".encode() + body)
 
 
@@ -139,19 +139,19 @@ def load_state(path: str | Path) -> EnvState:
     try:
         content = read_file(path)
     except OSError as error:
-        raise bad_argument("path", "the file of a state", Path(path), f"The system says: {error}.") from error
+        raise argument_error("path", "the file of a state", Path(path), f"The system says: {error}.") from error
     head, _, body = content.partition(b"\n")
     if not head.startswith(MAGIC):
-        raise bad_argument("path", "the file of a state", Path(path), "Write one with save_state.")
+        raise argument_error("path", "the file of a state", Path(path), "Write one with save_state.")
     _check_version(str(path), head[len(MAGIC) :].decode(errors="replace"))  # before anything of it is read
     mark, _, body = body.partition(b"\n")
     if mark.decode(errors="replace") != _fingerprint(body):
-        raise bad_argument("path", "a whole file of a state", f"a damaged file {path}", "Save it again.")
+        raise argument_error("path", "a whole file of a state", f"a damaged file {path}", "Save it again.")
     try:
-        state = decoded(body, ENV_KINDS)
+        state = decode(body, ENV_KINDS)
     except ValueError as error:
         cure = f"Save it again; reading says: {error}."
-        raise bad_argument("path", "the file of a state that can be read here", Path(path), cure) from error
+        raise argument_error("path", "the file of a state that can be read here", Path(path), cure) from error
     return dict(_checked(str(path), state))
 
 
@@ -175,28 +175,28 @@ def restored_sequence(state: Mapping[str, Any] | None) -> np.random.SeedSequence
 def _checked_path(path: Any) -> Path:
     """Return a path that can name a file."""
     if not isinstance(path, (str, PathLike)) or "\0" in str(path):
-        raise bad_argument("path", "the path of a file", path, "Give a text or a Path, without NUL characters.")
+        raise argument_error("path", "the path of a file", path, "Give a text or a Path, without NUL characters.")
     return Path(path)
 
 
 def _check_version(name: str, found: Any) -> None:
     if found != state_version():
         cure = "Go on with the version that made it; only the same one goes on bit by bit."
-        raise bad_argument(name, f"a state of version {state_version()!r}", found, cure)
+        raise argument_error(name, f"a state of version {state_version()!r}", found, cure)
 
 
 def _checked(name: str, state: Any) -> Mapping[str, Any]:
     """Return a state of this version, or refuse it; another version's may have other parts, so that is said first."""
     expected, cure = "what get_state returned", "Pass it unchanged."
     if not isinstance(state, Mapping):
-        raise bad_argument(name, expected, f"a {type(state).__name__}", cure)
+        raise argument_error(name, expected, f"a {type(state).__name__}", cure)
     if "version" in state:
         _check_version(name, state["version"])
     for key in KEYS:
         if key not in state:
-            raise bad_argument(name, expected, f"a mapping without {key!r}", cure)
+            raise argument_error(name, expected, f"a mapping without {key!r}", cure)
     if not isinstance(state["config"], EnvConfig):
-        raise bad_argument(name, expected, f"a mapping whose config is a {type(state['config']).__name__}", cure)
+        raise argument_error(name, expected, f"a mapping whose config is a {type(state['config']).__name__}", cure)
     return state
 
 

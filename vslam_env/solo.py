@@ -6,7 +6,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.core.validation import bad_argument, check_int
+from slam_backend.core.validation import argument_error, check_int
 from slam_backend.fastslam.reports import MergeEvent
 from vslam_env.belief.team_belief import Belief
 from vslam_env.config import EnvConfig
@@ -34,7 +34,7 @@ class SoloExplorationEnv(gymnasium.Env[Any, Any]):
 
     def __init__(self, render_mode: str | None = None, **kwargs: Any) -> None:
         if kwargs.get("num_robots", 1) != 1:
-            raise bad_argument("num_robots", "1", kwargs["num_robots"], "Use vslam_v0.parallel_env for a team.")
+            raise argument_error("num_robots", "1", kwargs["num_robots"], "Use vslam_v0.parallel_env for a team.")
         self.parallel = parallel_env(**kwargs | {"num_robots": 1, "render_mode": render_mode})
         self.render_mode = render_mode
         self.observation_space = self.parallel.observation_space(AGENT)

@@ -1,18 +1,18 @@
 """Of which classes objects may stand in states of environments that are kept in files."""
 
-from slam_backend.core.state_codec import Kind, Kinds
+from slam_backend.core.state_codec import StateType, StateTypes
 from slam_backend.frontend import CornerOptions, FrontEndOptions, StereoFrame
 from slam_backend.frontend.stereo import StereoMatches
 from slam_backend.state_kinds import BACKEND_KINDS
 from vslam_env.belief.belief import BeliefConfig
 from vslam_env.belief.readings import TeamReadings
-from vslam_env.belief.shared_grids import Kept, Strokes
+from vslam_env.belief.shared_grids import GridSnapshot, GridUpdate
 from vslam_env.config import EnvConfig
-from vslam_env.evaluation.team_metrics import Standing
-from vslam_env.sensors import EyeFrames, Frames, LandmarkSensorConfig, ScanConfig, StereoSensorConfig
+from vslam_env.evaluation.team_metrics import TeamMetrics
+from vslam_env.sensors import LandmarkSensorConfig, ScanConfig, StereoSensorConfig, TeamRenderedFrames, TeamSensorFrames
 from vslam_env.sensors.stereo.cameras import ImagingConfig
 from vslam_env.sensors.stereo.textures import TextureConfig, WallTextures
-from vslam_env.simulation.scenario import Setting
+from vslam_env.simulation.scenario import Scenario
 from vslam_env.world import LandmarkConfig, Landmarks, OdometryNoise, World
 
 CONFIGURATIONS = (
@@ -20,12 +20,12 @@ CONFIGURATIONS = (
     OdometryNoise, ScanConfig, StereoSensorConfig, TextureConfig,
 )  # fmt: skip
 RECORDS = (
-    EyeFrames, Frames, Kept, Landmarks, Standing, StereoFrame, StereoMatches, Strokes, TeamReadings, WallTextures,
+    TeamRenderedFrames, TeamSensorFrames, GridSnapshot, Landmarks, TeamMetrics, StereoFrame, StereoMatches, GridUpdate, TeamReadings, WallTextures,
     World,
 )  # fmt: skip
 
 
-ENV_KINDS = Kinds((*CONFIGURATIONS, *RECORDS), {Setting: Kind("Setting", Setting.parts, Setting.of_parts)}).with_others(
-    BACKEND_KINDS
-)
+ENV_KINDS = StateTypes(
+    (*CONFIGURATIONS, *RECORDS), {Scenario: StateType("Scenario", Scenario.to_parts, Scenario.from_parts)}
+).with_others(BACKEND_KINDS)
 """All classes whose objects may stand in the state of an environment."""

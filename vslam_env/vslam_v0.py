@@ -8,7 +8,7 @@ from pettingzoo import AECEnv
 from pettingzoo.utils.conversions import parallel_to_aec
 from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
-from slam_backend.core.validation import bad_argument
+from slam_backend.core.validation import argument_error
 from vslam_env.config import EnvConfig
 from vslam_env.environment import ExplorationEnv
 from vslam_env.presets import preset_config
@@ -76,13 +76,13 @@ def parallel_env(
         ValueError: If an argument is refused; the text names it, what was expected and the cure.
     """
     if config is not None and preset is not None:
-        raise bad_argument("preset", "None beside a config", preset, "Give one of the two.")
+        raise argument_error("preset", "None beside a config", preset, "Give one of the two.")
     if isinstance(config, (str, Path)):
         config = EnvConfig.from_toml(config)
     elif config is None:
         config = preset_config("standard" if preset is None else preset, "landmark" if sensor is None else sensor)
     elif not isinstance(config, EnvConfig):
-        raise bad_argument("config", "an EnvConfig, a path or None", config, "Build one with EnvConfig(...).")
+        raise argument_error("config", "an EnvConfig, a path or None", config, "Build one with EnvConfig(...).")
     changes: dict[str, Any] = {
         "world": None if world is None else _world_name(world),
         "world_split": world_split,

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from slam_backend.core.state_codec import MOST_BYTES, read_file
+from slam_backend.core.state_codec import MAX_BYTES, read_file
 
 HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 KINDS = "biufUS"  # of numbers and texts; objects would be pickles
@@ -35,8 +35,8 @@ def read_arrays(path: Path, names: Iterable[str] | None = None) -> dict[str, NDA
         with zipfile.ZipFile(io.BytesIO(read_file(path))) as archive:
             members = {member.filename.removesuffix(".npy"): member for member in archive.infolist()}
             wanted = {name: members[name] for name in (members if names is None else names) if name in members}
-            if sum(member.file_size for member in wanted.values()) > MOST_BYTES:
-                raise UnreadableArchiveError(f"it unpacks to more than {MOST_BYTES >> 20} MiB")
+            if sum(member.file_size for member in wanted.values()) > MAX_BYTES:
+                raise UnreadableArchiveError(f"it unpacks to more than {MAX_BYTES >> 20} MiB")
             return {name: _array(archive, member) for name, member in wanted.items()}
     except UnreadableArchiveError:
         raise

@@ -11,18 +11,18 @@ R = TypeVar("R")
 
 
 @cache
-def _libraries() -> list[LibController]:
+def _blas_libraries() -> list[LibController]:
     """Return what sets the threads of the BLAS loaded by now, found once, as finding it takes milliseconds."""
     libraries: list[LibController] = ThreadpoolController().select(user_api="blas").lib_controllers
     return libraries
 
 
-def on_one_thread(function: Callable[P, R]) -> Callable[P, R]:
+def single_threaded_blas(function: Callable[P, R]) -> Callable[P, R]:
     """Let BLAS work on one thread while `function` runs; as before afterwards."""
 
     @wraps(function)
     def limited(*args: P.args, **kwargs: P.kwargs) -> R:
-        threads = [(library, library.num_threads) for library in _libraries()]
+        threads = [(library, library.num_threads) for library in _blas_libraries()]
         many = [(library, number) for library, number in threads if number != 1]
         for library, _ in many:
             library.set_num_threads(1)

@@ -13,7 +13,7 @@ PACKAGES = ("slam_backend", "vslam_env", "agents", "training")  # whose kernels 
 MESSAGE = "Compiling the kernels (once, one to two minutes) ..."
 
 
-class CompilationWatch(numba_event.Listener):
+class CompilationListener(numba_event.Listener):
     """Hears of each kernel that numba compiles; of those that it finds in its cache it hears nothing.
 
     A kernel that another one calls is a part of that one. numba compiles under one lock, so that two threads never do
@@ -51,13 +51,13 @@ class CompilationWatch(numba_event.Listener):
 
 
 @contextmanager
-def watch_compilation(tell: Callable[[str], None]) -> Iterator[CompilationWatch]:
+def watch_compilation(tell: Callable[[str], None]) -> Iterator[CompilationListener]:
     """Watch, within a block, which kernels are compiled.
 
     Args:
         tell: Called with a kernel's name when its compilation begins; never where all come from the cache.
     """
-    with numba_event.install_listener("numba:compile", CompilationWatch(tell)) as watch:
+    with numba_event.install_listener("numba:compile", CompilationListener(tell)) as watch:
         yield watch
 
 
@@ -74,7 +74,7 @@ def log_compilation(tell_first: Callable[[str], object] = LOGGER.info) -> None:
             tell_first(MESSAGE)
         LOGGER.debug("Compiling %s", name)
 
-    numba_event.register("numba:compile", CompilationWatch(tell))  # type: ignore[no-untyped-call]
+    numba_event.register("numba:compile", CompilationListener(tell))  # type: ignore[no-untyped-call]
 
 
 def _name(event: Any) -> str:

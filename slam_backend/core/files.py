@@ -11,7 +11,7 @@ from pathlib import Path
 from secrets import token_hex
 from typing import Any
 
-from slam_backend.core.validation import bad_argument
+from slam_backend.core.validation import argument_error
 
 READER_S = 10.0  # a FIFO that nothing reads is refused after so long
 POLL_S = 0.02
@@ -42,7 +42,7 @@ def write_file(path: AnyPath, content: str | bytes, name: str = "path") -> Path:
     """
     data = content.encode() if isinstance(content, str) else content
     checked = checked_path(path, name)
-    with refusing(path, name):
+    with os_errors_as_argument_errors(path, name):
         _write(checked, data)
     return checked
 
@@ -59,7 +59,7 @@ def move_file(part: AnyPath, path: AnyPath, name: str = "path") -> None:
         ValueError: If it cannot be put there.
     """
     try:
-        with refusing(path, name):
+        with os_errors_as_argument_errors(path, name):
             target = _replaceable(path)
             if target is None or not _renamed(Path(part), target):
                 _write_into(path, Path(part).read_bytes())
@@ -73,7 +73,7 @@ def append_text(path: AnyPath, text: str, name: str = "path") -> None:
     Raises:
         ValueError: If it cannot be written; the file is left as it was.
     """
-    with refusing(path, name):
+    with os_errors_as_argument_errors(path, name):
         number = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o666)
         try:
             before = os.fstat(number).st_size
@@ -93,9 +93,9 @@ def check_writable(path: AnyPath, name: str) -> None:
         ValueError: If `write_file` could not write it as things are.
     """
     path = checked_path(path, name)
-    with refusing(path, name):
+    with os_errors_as_argument_errors(path, name):
         if path.is_dir():
-            raise bad_argument(name, "a file", "a folder", f"Name a file in {str(path)!r}.")
+            raise argument_error(name, "a file", "a folder", f"Name a file in {str(path)!r}.")
         if (number := _own_descriptor(path)) is not None:
             os.fstat(number)
         else:
@@ -115,18 +115,18 @@ def resolved(path: AnyPath) -> Path:
 def checked_path(path: Any, name: str = "path") -> Path:
     """Return a path that can name a file, or raise a `ValueError`."""
     if not isinstance(path, (str, PathLike)) or "\0" in str(path):
-        raise bad_argument(name, "the path of a file", path, "Give a text or a Path, without NUL characters.")
+        raise argument_error(name, "the path of a file", path, "Give a text or a Path, without NUL characters.")
     return Path(path)
 
 
 @contextmanager
-def refusing(path: AnyPath, name: str) -> Iterator[None]:
+def os_errors_as_argument_errors(path: AnyPath, name: str) -> Iterator[None]:
     """Turn an error of the system within a block that writes a file into a `ValueError` that gives the reason."""
     try:
         yield
     except OSError as error:
         cure = f"The system says: {error.strerror or error}."
-        raise bad_argument(name, "a file that can be written", Path(path), cure) from error
+        raise argument_error(name, "a file that can be written", Path(path), cure) from error
 
 
 def _write(path: AnyPath, data: bytes) -> None:

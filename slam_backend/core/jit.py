@@ -32,7 +32,7 @@ SIMD_MATH = Path(__file__).with_name("simd_math.py")  # which those of other fol
 # kernel costs two atomic instructions. A kernel that only works in arrays which it is given can do without. numba
 # refuses to make an array in one of those, but not to call a kernel that returns some, which nobody would free: a test
 # looks for that. The option is numba's own; in a version that does not know it references are counted everywhere.
-CAN_LEAVE_UNCOUNTED = hasattr(CPUTargetOptions, "_nrt")
+HAS_NRT_OPTION = hasattr(CPUTargetOptions, "_nrt")
 
 # A kernel inherits `fastmath`, `error_model`, `forceinline` and `_nrt` from the kernel whose compilation first
 # asked for it, where it does not set them: results would depend on the order. Each kind of kernel sets all four.
@@ -68,7 +68,7 @@ def jit(function: Callable[P, T]) -> Callable[P, T]:
     return _compiled(function, counted=True, forceinline=False, **_STRICT)
 
 
-def fused(function: Callable[P, T]) -> Callable[P, T]:
+def jit_fma(function: Callable[P, T]) -> Callable[P, T]:
     """Compile a kernel that may make arrays and does little but add products: each is rounded once, as by `lanes`."""
     return _compiled(function, counted=True, forceinline=False, **_LANES)
 
@@ -81,22 +81,22 @@ def in_place(function: Callable[P, T]) -> Callable[P, T]:
     return _compiled(function, counted=False, forceinline=False, **_STRICT)
 
 
-def inlined(function: Callable[P, T]) -> Callable[P, T]:
+def inline(function: Callable[P, T]) -> Callable[P, T]:
     """Compile a small building block into each kernel that calls it: passing arrays costs more than its arithmetic."""
     return device(_compiled(function, counted=False, forceinline=True, **_STRICT))
 
 
-def lanes(function: Callable[P, T]) -> Callable[P, T]:
+def simd(function: Callable[P, T]) -> Callable[P, T]:
     """Compile a kernel whose loops over lanes are to become vector instructions, or one as of `fused` in place."""
     return _compiled(function, counted=False, forceinline=False, **_LANES)
 
 
-def lanes_inlined(function: Callable[P, T]) -> Callable[P, T]:
+def simd_inline(function: Callable[P, T]) -> Callable[P, T]:
     """Compile the arithmetic of one lane into the loops that call it."""
     return device(_compiled(function, counted=False, forceinline=True, **_LANES))
 
 
-def any_order(function: Callable[P, T]) -> Callable[P, T]:
+def simd_sum(function: Callable[P, T]) -> Callable[P, T]:
     """Compile a sum over an array that may be taken in any order, the same one each time, so that it is vectorised."""
     return device(_compiled(function, counted=False, forceinline=True, **_ANY_ORDER))
 
@@ -115,7 +115,7 @@ def device(kernel: Callable[P, T]) -> Callable[P, T]:
 
 def _compiled(function: Callable[P, T], counted: bool, **options: Any) -> Callable[P, T]:
     """Compile without the interpreter lock and with the cache on disk, if there is a place for it."""
-    if CAN_LEAVE_UNCOUNTED:
+    if HAS_NRT_OPTION:
         options["_nrt"] = counted
     options |= {"nogil": True, "no_cfunc_wrapper": True}  # no C code calls a kernel
     try:
@@ -202,5 +202,5 @@ def _room_of(typing_context: Any, size: Any, dtype: Any) -> Any:
 
 # An array of as many numbers as a constant says, unset, that lives as long as the call of a kernel: it costs nothing,
 # and even a kernel that works `in_place` may have it, but not return it.
-room = cast(Callable[[int], FloatArray], intrinsic(prefer_literal=True)(_room))
-room_of = cast(Callable[[int, type[Scalar]], NDArray[Scalar]], intrinsic(prefer_literal=True)(_room_of))
+stack_array = cast(Callable[[int], FloatArray], intrinsic(prefer_literal=True)(_room))
+stack_array_of = cast(Callable[[int, type[Scalar]], NDArray[Scalar]], intrinsic(prefer_literal=True)(_room_of))

@@ -61,7 +61,7 @@ def compiled_signatures(package: str) -> dict[str, list[str]]:
         if isinstance(value, CPUDispatcher) and not isinstance(value, DeviceKernel)
     }
     own = {name: kernel for name, kernel in kernels.items() if name.split(".")[0] == package and kernel.signatures}
-    return {name: sorted(map(encoded, own[name].signatures)) for name in sorted(own)}
+    return {name: sorted(map(encode_signature, own[name].signatures)) for name in sorted(own)}
 
 
 def kernel_name(kernel: CPUDispatcher) -> str:
@@ -76,7 +76,7 @@ def find_kernel(name: str) -> CPUDispatcher | None:
     return kernel if isinstance(kernel, CPUDispatcher) else None
 
 
-def encoded(signature: Sequence[types.Type]) -> str:
+def encode_signature(signature: Sequence[types.Type]) -> str:
     """Return argument types as words: `float64` a number, `float64[2C]` an array, `float64[2Cr]` a read-only one."""
     return " ".join(map(_word, signature))
 
@@ -88,7 +88,7 @@ def _word(argument: types.Type) -> str:
     return str(argument)
 
 
-def decoded(words: str) -> tuple[types.Type, ...]:
+def decode_signature(words: str) -> tuple[types.Type, ...]:
     """Return the argument types that `encoded` wrote down."""
     return tuple(map(_type, words.split()))
 
@@ -135,7 +135,7 @@ def missing_tasks(signatures: Signatures) -> list[Task]:
             continue
         for signature in words:
             context: Any = kernel.targetctx
-            if not cache.holds(decoded(signature), context.codegen()):
+            if not cache.holds(decode_signature(signature), context.codegen()):
                 tasks.append(Task(name, signature, _code_sizes(kernel), cache.folder))
     return tasks
 
@@ -154,7 +154,7 @@ def _code_sizes(kernel: CPUDispatcher) -> dict[str, int]:
     return sizes
 
 
-def shared_out(tasks: Sequence[Task], workers: int) -> list[list[Task]]:
+def divide_tasks(tasks: Sequence[Task], workers: int) -> list[list[Task]]:
     """Divide tasks so that all workers have about as much to do; what two tasks both call is compiled once by each."""
     shares: list[list[Task]] = [[] for _ in range(workers)]
     known: list[dict[str, int]] = [{} for _ in range(workers)]
@@ -192,7 +192,7 @@ def compile_kernels(signatures: Signatures, workers: int | None = None, progress
             LOGGER.info("Waiting for another process, which compiles the kernels ...")
             lock.acquire()
         tasks = missing_tasks(signatures)  # another process may have compiled them meanwhile
-        for done, left in _compiled(shared_out(tasks, workers), begun):
+        for done, left in _compiled(divide_tasks(tasks, workers), begun):
             if progress is not None:
                 progress(done, len(tasks), left)
     except OSError as error:  # kernels are compiled when they are called, then
@@ -231,7 +231,7 @@ def _compiled(shares: Sequence[Sequence[Task]], begun: float) -> Iterator[tuple[
             assert process.stdin is not None
             process.stdin.write("".join(f"{task.name} {task.signature}\n" for task in share))
             process.stdin.close()
-            threading.Thread(target=_pass_on, args=(process, lines), daemon=True).start()
+            threading.Thread(target=_forward_lines, args=(process, lines), daemon=True).start()
         ended = 0
         while ended < len(processes):
             line = lines.get()
@@ -246,7 +246,7 @@ def _compiled(shares: Sequence[Sequence[Task]], begun: float) -> Iterator[tuple[
             process.wait()
 
 
-def _pass_on(process: subprocess.Popen[str], lines: "Queue[str | None]") -> None:
+def _forward_lines(process: subprocess.Popen[str], lines: "Queue[str | None]") -> None:
     """Put what a process prints into a queue, and None when it ends."""
     assert process.stdout is not None
     for line in process.stdout:
@@ -260,5 +260,5 @@ def compile_lines(lines: Iterator[str], report: Callable[[str], Any]) -> None:
         name, _, words = line.strip().partition(" ")
         kernel = find_kernel(name)
         if kernel is not None:
-            kernel.compile(decoded(words))
+            kernel.compile(decode_signature(words))
         report(line.strip())

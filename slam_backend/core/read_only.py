@@ -54,17 +54,17 @@ def with_read_only(tree: Tree) -> Tree:
     A part in which nothing can be written comes back itself. Objects that hold arrays take part by a method
     `with_arrays(act)`, which returns the same with `act` done to each array.
     """
-    result: Tree = mapped(tree, as_read_only)
+    result: Tree = map_arrays(tree, as_read_only)
     return result
 
 
 def with_constants(tree: Tree) -> Tree:
     """Return such a tree whose arrays no other holder can change: copies unless they are read-only already."""
-    result: Tree = mapped(tree, as_constant)
+    result: Tree = map_arrays(tree, as_constant)
     return result
 
 
-def mapped(tree: Any, act: Act) -> Any:
+def map_arrays(tree: Any, act: Act) -> Any:
     """Return a tree with `act` done to all arrays in it; parts in which that changes nothing come back themselves."""
     cls = type(tree)
     if cls in PLAIN:
@@ -74,11 +74,11 @@ def mapped(tree: Any, act: Act) -> Any:
     if hasattr(cls, "with_arrays"):
         return tree.with_arrays(act)
     if isinstance(tree, tuple) or cls is list:
-        parts = [mapped(part, act) for part in tree]
+        parts = [map_arrays(part, act) for part in tree]
         if all(map(is_, parts, tree)):
             return tree
         return parts if cls is list else tuple.__new__(cls, parts)
     if cls is dict:
-        values = [mapped(part, act) for part in tree.values()]
+        values = [map_arrays(part, act) for part in tree.values()]
         return tree if all(map(is_, values, tree.values())) else dict(zip(tree, values, strict=True))
     return tree

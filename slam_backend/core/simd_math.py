@@ -2,7 +2,7 @@
 
 import math
 
-from slam_backend.core.jit import bits_float, float_bits, lanes_inlined
+from slam_backend.core.jit import bits_float, float_bits, simd_inline
 from slam_backend.fastslam._kernels.layout import LN2
 
 HALF_PI_HIGH = 1.5707963267341256  # pi / 2 in two parts: the first has 33 bits, so that small multiples are exact
@@ -10,7 +10,7 @@ HALF_PI_LOW = 6.077100506506192e-11
 ROUND = 6755399441055744.0  # 1.5 * 2^52: adding and subtracting it rounds to the nearest integer
 
 
-@lanes_inlined
+@simd_inline
 def inverted(
     a: float, b: float, c: float, d: float, e: float, f: float
 ) -> tuple[float, float, float, float, float, float, float]:
@@ -23,7 +23,7 @@ def inverted(
     return p * g, q * g, r * g, (a * f - c * c) * g, (b * c - a * e) * g, (a * d - b * b) * g, det
 
 
-@lanes_inlined
+@simd_inline
 def cofactors_cancel(a: float, b: float, c: float, d: float, e: float, f: float, least: float) -> bool:
     """Tell whether the determinant by cofactors is less than this share of the product of the diagonal.
 
@@ -33,7 +33,7 @@ def cofactors_cancel(a: float, b: float, c: float, d: float, e: float, f: float,
     return det < least * a * d * f
 
 
-@lanes_inlined
+@simd_inline
 def inverted_by_parts(
     a: float, b: float, c: float, d: float, e: float, f: float
 ) -> tuple[float, float, float, float, float, float, float]:
@@ -54,7 +54,7 @@ def inverted_by_parts(
     )  # fmt: skip
 
 
-@lanes_inlined
+@simd_inline
 def quadratic_form(
     i00: float, i01: float, i02: float, i11: float, i12: float, i22: float, x: float, y: float, z: float
 ) -> float:
@@ -62,7 +62,7 @@ def quadratic_form(
     return i00 * x * x + i11 * y * y + i22 * z * z + 2.0 * (i01 * x * y + i02 * x * z + i12 * y * z)
 
 
-@lanes_inlined
+@simd_inline
 def sine_cosine(angle: float) -> tuple[float, float]:
     """Return sine and cosine to the last bits but one, for angles up to some thousand turns, without a branch.
 
@@ -97,7 +97,7 @@ def sine_cosine(angle: float) -> tuple[float, float]:
     return sine, cosine
 
 
-@lanes_inlined
+@simd_inline
 def log_of(x: float) -> float:
     """Return the natural logarithm of a positive normal number, without a branch: x = 2^e m, and atanh's series."""
     bits = float_bits(x)
@@ -121,14 +121,14 @@ def log_of(x: float) -> float:
     return exponent * LN2 + 2.0 * (f + f * z * s)
 
 
-@lanes_inlined
+@simd_inline
 def mantissa_exponent(x: float) -> tuple[float, float]:
     """Return mantissa in [1, 2) and exponent of a positive normal number: products of many never overflow."""
     bits = float_bits(x)
     return bits_float((bits & 0x000FFFFFFFFFFFFF) | 0x3FF0000000000000), float((bits >> 52) - 1023)
 
 
-@lanes_inlined
+@simd_inline
 def wrapped(angle: float) -> float:
     """Return the angle in [-pi, pi)."""
     return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))

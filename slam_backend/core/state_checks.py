@@ -13,14 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.core.jit import in_place
-from slam_backend.core.validation import bad_argument
+from slam_backend.core.validation import argument_error
 
 CURE = "Pass it unchanged."
 LARGEST = 1e12  # of plain numbers [m, rad, 1]; squares and products of a few of them are finite
-FARTHEST = 1e7  # [m, rad] of poses and landmarks
-MOST = 1 << 62  # of counts and steps: sums of two of them are int64
-MOST_LANDMARKS = 1 << 30  # names of landmarks: tables are as long as the largest of them
-LANDMARK = (0, MOST_LANDMARKS)
+MAX_DISTANCE = 1e7  # [m, rad] of poses and landmarks
+MAX_INT = 1 << 62  # of counts and steps: sums of two of them are int64
+MAX_LANDMARKS = 1 << 30  # names of landmarks: tables are as long as the largest of them
+LANDMARK = (0, MAX_LANDMARKS)
 
 BOOL, INT8, UINT8 = np.dtype(np.bool_), np.dtype(np.int8), np.dtype(np.uint8)
 INT32, INT64 = np.dtype(np.int32), np.dtype(np.int64)
@@ -53,13 +53,13 @@ def count_falls(values: Any) -> int:
     return falls
 
 
-def refuse(name: str, expected: str, got: object) -> NoReturn:
+def raise_refusal(name: str, expected: str, got: object) -> NoReturn:
     """Raise the error for a part of a state."""
-    raise bad_argument(name, expected, got, CURE)
+    raise argument_error(name, expected, got, CURE)
 
 
 @contextmanager
-def refusing(name: str) -> Iterator[None]:
+def refuse_malformed(name: str) -> Iterator[None]:
     """Turn what a check trips over, in a state of a form that it does not expect, into a refusal as well."""
     try:
         yield
@@ -67,71 +67,71 @@ def refusing(name: str) -> Iterator[None]:
         raise
     except Exception as error:
         got = f"'{type(error).__name__}: {error}' as it was looked at"
-        raise bad_argument(name, "what get_state returned", got, CURE) from error
+        raise argument_error(name, "what get_state returned", got, CURE) from error
 
 
-def of_kind(name: str, value: Any, *kinds: type) -> None:
+def check_type(name: str, value: Any, *kinds: type) -> None:
     """Refuse what is of none of some types; subclasses are other types."""
     if type(value) not in kinds:
-        refuse(name, f"a {' or '.join(kind.__name__ for kind in kinds)}", f"a {type(value).__name__}")
+        raise_refusal(name, f"a {' or '.join(kind.__name__ for kind in kinds)}", f"a {type(value).__name__}")
 
 
-def keys(name: str, value: Any, keys: Iterable[str]) -> None:
+def check_keys(name: str, value: Any, keys: Iterable[str]) -> None:
     """Refuse what is no dict, or lacks a key."""
     if not isinstance(value, Mapping):
-        refuse(name, "a dict from get_state", f"a {type(value).__name__}")
+        raise_refusal(name, "a dict from get_state", f"a {type(value).__name__}")
     for key in keys:
         if key not in value:
-            refuse(name, "a dict from get_state", f"no {key!r}")
+            raise_refusal(name, "a dict from get_state", f"no {key!r}")
 
 
-def of_length(name: str, value: Any, length: int | None = None) -> None:
+def check_length(name: str, value: Any, length: int | None = None) -> None:
     """Refuse what is neither a tuple nor a list, or of another length."""
-    of_kind(name, value, tuple, list)
+    check_type(name, value, tuple, list)
     if length is not None and len(value) != length:
-        refuse(name, f"{length} of them", len(value))
+        raise_refusal(name, f"{length} of them", len(value))
 
 
-def whole(name: str, value: Any, low: int = 0, high: int = MOST) -> None:
+def check_int(name: str, value: Any, low: int = 0, high: int = MAX_INT) -> None:
     """Refuse what is no int, or not within bounds."""
     if type(value) is not int or not low <= value <= high:
-        refuse(name, f"an int from {low} to {high}", value)
+        raise_refusal(name, f"an int from {low} to {high}", value)
 
 
-def number(name: str, value: Any, low: float = -LARGEST, high: float = LARGEST) -> None:
+def check_float(name: str, value: Any, low: float = -LARGEST, high: float = LARGEST) -> None:
     """Refuse what is no float, or not within bounds."""
     if not isinstance(value, float) or not low <= value <= high:
-        refuse(name, f"a float from {low:g} to {high:g}", value)
+        raise_refusal(name, f"a float from {low:g} to {high:g}", value)
 
 
-def flag(name: str, value: Any) -> None:
+def check_bool(name: str, value: Any) -> None:
     """Refuse what is no bool."""
-    of_kind(name, value, bool)
+    check_type(name, value, bool)
 
 
-def wholes(name: str, values: Any, low: int = 0, high: int = MOST, kind: type = tuple) -> None:
+def check_ints(name: str, values: Any, low: int = 0, high: int = MAX_INT, kind: type = tuple) -> None:
     """Refuse what is no collection of a type, of ints within bounds."""
-    of_kind(name, values, kind)
+    check_type(name, values, kind)
     for value in values:
         if type(value) is not int or not low <= value <= high:
-            refuse(name, f"ints from {low} to {high}", value)
+            raise_refusal(name, f"ints from {low} to {high}", value)
 
 
-def table(name: str, value: Any, of_keys: tuple[int, int], of_values: tuple[int, int] = (0, MOST)) -> None:
+def check_int_dict(name: str, value: Any, of_keys: tuple[int, int], of_values: tuple[int, int] = (0, MAX_INT)) -> None:
     """Refuse what is no dict whose keys and values are ints within bounds."""
-    of_kind(name, value, dict)
-    wholes(name, tuple(value), *of_keys)
-    wholes(name, tuple(value.values()), *of_values)
+    check_type(name, value, dict)
+    check_ints(name, tuple(value), *of_keys)
+    check_ints(name, tuple(value.values()), *of_values)
 
 
-def robots(name: str, robots: Any, count: int) -> None:
+def check_robots(name: str, robots: Any, count: int) -> None:
     """Refuse what is no tuple of some of so many robots, at least one, in ascending order."""
-    wholes(name, robots, 0, count - 1)
+    check_ints(name, robots, 0, count - 1)
     if not robots or list(robots) != sorted(set(robots)):
-        refuse(name, "robots in ascending order", robots)
+        raise_refusal(name, "robots in ascending order", robots)
 
 
-def array(
+def check_array(
     name: str, value: Any, dtype: np.dtype[Any], shape: tuple[int | None, ...], low: Any = None, high: Any = None,
     columns: int | None = None,
 ) -> int:  # fmt: skip
@@ -147,55 +147,55 @@ def array(
     """
     if type(value) is not np.ndarray or value.dtype != dtype:
         got = f"an array of {value.dtype}" if isinstance(value, np.ndarray) else f"a {type(value).__name__}"
-        refuse(name, f"an array of {dtype}", got)
+        raise_refusal(name, f"an array of {dtype}", got)
     found = value.shape
     if found != shape and (
         len(found) != len(shape) or found != tuple([m if n is None else n for n, m in zip(shape, found, strict=True)])
     ):
         wanted = tuple("n" if n is None else n for n in shape)
-        refuse(name, f"an array of shape {wanted}".replace("'", ""), f"shape {found}")
+        raise_refusal(name, f"an array of shape {wanted}".replace("'", ""), f"shape {found}")
     if low is not None and value.size:
         wide = value.reshape(-1, value.size if columns is None else found[-1])
         if count_outside(wide, wide.shape[1] if columns is None else columns, low, high):
             kind = "numbers from {:g} to {:g}" if dtype.kind == "f" else "integers from {} to {}"
-            refuse(name, kind.format(low, high), "others, or NaN" if dtype.kind == "f" else "others")
+            raise_refusal(name, kind.format(low, high), "others, or NaN" if dtype.kind == "f" else "others")
     return len(value)
 
 
-def floats(
+def check_floats(
     name: str, value: Any, shape: tuple[int | None, ...], low: float = -LARGEST, high: float = LARGEST,
     columns: int | None = None, dtype: np.dtype[Any] = FLOAT64,
 ) -> int:  # fmt: skip
     """Return the length of an array of floats within bounds, as `array`."""
-    return array(name, value, dtype, shape, float(low), float(high), columns)
+    return check_array(name, value, dtype, shape, float(low), float(high), columns)
 
 
-def places(name: str, value: Any, shape: tuple[int | None, ...], columns: int | None = None) -> int:
+def check_positions(name: str, value: Any, shape: tuple[int | None, ...], columns: int | None = None) -> int:
     """Return the length of an array of poses or points, as `array`."""
-    return array(name, value, FLOAT64, shape, -FARTHEST, FARTHEST, columns)
+    return check_array(name, value, FLOAT64, shape, -MAX_DISTANCE, MAX_DISTANCE, columns)
 
 
-def indices(
-    name: str, value: Any, shape: tuple[int | None, ...], low: int = 0, high: int = MOST, columns: int | None = None,
+def check_indices(
+    name: str, value: Any, shape: tuple[int | None, ...], low: int = 0, high: int = MAX_INT, columns: int | None = None,
     dtype: np.dtype[Any] = INT64,
 ) -> int:  # fmt: skip
     """Return the length of an array of integers within bounds, as `array`."""
-    return array(name, value, dtype, shape, low, high, columns)
+    return check_array(name, value, dtype, shape, low, high, columns)
 
 
-def ascending(name: str, values: NDArray[Any]) -> None:
+def check_ascending(name: str, values: NDArray[Any]) -> None:
     """Refuse values (n,) of which one is not above the one before."""
     if count_falls(values):
-        refuse(name, "numbers in ascending order, each once", "others")
+        raise_refusal(name, "numbers in ascending order, each once", "others")
 
 
-def different(name: str, values: NDArray[Any]) -> None:
+def check_unique(name: str, values: NDArray[Any]) -> None:
     """Refuse values (n,) of which two are equal."""
     if len(np.unique(values)) < len(values):
-        refuse(name, "each number once", "one that repeats")
+        raise_refusal(name, "each number once", "one that repeats")
 
 
-def options(name: str, options: Any, kind: type, known: Iterable[Any] = ()) -> None:
+def check_options(name: str, options: Any, kind: type, known: Iterable[Any] = ()) -> None:
     """Refuse what are no options of a type, or such that its constructor refuses.
 
     Args:
@@ -204,12 +204,12 @@ def options(name: str, options: Any, kind: type, known: Iterable[Any] = ()) -> N
         kind: A frozen dataclass.
         known: Options that need not be looked at again.
     """
-    of_kind(name, options, kind)
+    check_type(name, options, kind)
     try:
         if not any(options is other or options == other for other in known):
             _rebuilt(options)
     except Exception as error:  # of whatever kind: options may hold anything where no constructor looked at them
-        raise bad_argument(name, f"{kind.__name__} that can be built", f"'{error}'", CURE) from error
+        raise argument_error(name, f"{kind.__name__} that can be built", f"'{error}'", CURE) from error
 
 
 def _rebuilt(options: Any) -> Any:
@@ -218,30 +218,30 @@ def _rebuilt(options: Any) -> Any:
     return type(options)(**{name: _rebuilt(part) if is_dataclass(part) else part for name, part in parts.items()})
 
 
-def generator(name: str, state: Any) -> None:
+def check_generator(name: str, state: Any) -> None:
     """Refuse what is no state of one of numpy's random streams; numpy itself would read beyond its buffers."""
-    keys(name, state, ("bit_generator", "state"))
+    check_keys(name, state, ("bit_generator", "state"))
     kind = state["bit_generator"]
     if type(kind) is not str or kind not in STREAMS:
-        refuse(f"{name}['bit_generator']", "one of " + ", ".join(STREAMS), kind)
+        raise_refusal(f"{name}['bit_generator']", "one of " + ", ".join(STREAMS), kind)
     inner = state["state"]
-    keys(f"{name}['state']", inner, STREAMS[kind])
+    check_keys(f"{name}['state']", inner, STREAMS[kind])
     for part, (dtype, shape) in STREAMS[kind].items():
-        array(f"{name}['state'][{part!r}]", inner[part], dtype, shape)
+        check_array(f"{name}['state'][{part!r}]", inner[part], dtype, shape)
     if kind == "MT19937":
-        whole(f"{name}['state']['pos']", inner.get("pos"), 0, 624)
+        check_int(f"{name}['state']['pos']", inner.get("pos"), 0, 624)
         return
-    whole(f"{name}['has_uint32']", state.get("has_uint32"), 0, 1)
-    whole(f"{name}['uinteger']", state.get("uinteger"), 0, 2**32 - 1)
+    check_int(f"{name}['has_uint32']", state.get("has_uint32"), 0, 1)
+    check_int(f"{name}['uinteger']", state.get("uinteger"), 0, 2**32 - 1)
     if kind in ("PCG64", "PCG64DXSM"):
         for part in ("state", "inc"):
-            whole(f"{name}['state'][{part!r}]", inner.get(part), 0, 2**128 - 1)
+            check_int(f"{name}['state'][{part!r}]", inner.get(part), 0, 2**128 - 1)
     elif kind == "Philox":
-        whole(f"{name}['buffer_pos']", state.get("buffer_pos"), 0, 4)
-        array(f"{name}['buffer']", state.get("buffer"), np.dtype(np.uint64), (4,))
+        check_int(f"{name}['buffer_pos']", state.get("buffer_pos"), 0, 4)
+        check_array(f"{name}['buffer']", state.get("buffer"), np.dtype(np.uint64), (4,))
 
 
-def generator_of(state: Mapping[str, Any]) -> np.random.Generator:
+def restore_generator(state: Mapping[str, Any]) -> np.random.Generator:
     """Return a random stream that goes on from a state that `generator` passed."""
     kinds: dict[str, Any] = {name: getattr(np.random, name) for name in STREAMS}
     stream = np.random.Generator(kinds[state["bit_generator"]](0))
@@ -249,20 +249,20 @@ def generator_of(state: Mapping[str, Any]) -> np.random.Generator:
     return stream
 
 
-def each(name: str, values: Sequence[Any], length: int | None = None) -> Iterable[tuple[str, Any]]:
+def named_items(name: str, values: Sequence[Any], length: int | None = None) -> Iterable[tuple[str, Any]]:
     """Return each of so many parts with its name, or refuse what is no tuple or list of them."""
-    of_length(name, values, length)
+    check_length(name, values, length)
     return [(f"{name}[{i}]", value) for i, value in enumerate(values)]
 
 
-def warm() -> None:
+def compile_checks() -> None:
     """Make all versions of the kernels ready that states need."""
     for is_open in (True, False):
         for dtype in (FLOAT64, FLOAT32, INT64, INT32):
             values = np.zeros((1, 1), dtype)
             values.setflags(write=is_open)
-            check = floats if dtype.kind == "f" else indices
+            check = check_floats if dtype.kind == "f" else check_indices
             check("warm", values, (1, 1), 0, 1, dtype=dtype)
         names = np.zeros(1, np.int64)
         names.setflags(write=is_open)
-        ascending("warm", names)
+        check_ascending("warm", names)

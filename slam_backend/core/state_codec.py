@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 from slam_backend.core.read_only import as_read_only
 
 ALIGNMENT = 64  # bytes; where arrays begin
-MOST_BYTES = 1 << 30  # of a file: a state has some megabytes
-MOST_TABLE = 1 << 26  # bytes of a table: Python takes up to twenty times as many to hold it
+MAX_BYTES = 1 << 30  # of a file: a state has some megabytes
+MAX_TABLE = 1 << 26  # bytes of a table: Python takes up to twenty times as many to hold it
 LARGEST_INT = 1 << 63  # ints from here on are written as hexadecimal digits, as many as it takes
 DTYPES = {
     np.dtype(kind).newbyteorder("<").str: np.dtype(kind)
@@ -42,7 +42,7 @@ SEQUENCES: dict[type, tuple[str, Callable[[list[Any]], Any]]] = {
 BUILT = dict(SEQUENCES.values())
 
 
-class Kind(NamedTuple):
+class StateType(NamedTuple):
     """How objects of one class are taken apart and built.
 
     Attributes:
@@ -56,7 +56,7 @@ class Kind(NamedTuple):
     build: Callable[..., Any]
 
 
-class Kinds:
+class StateTypes:
     """The classes of which objects may stand in a tree: no other class is ever named or called.
 
     Args:
@@ -64,29 +64,29 @@ class Kinds:
         special: How objects of other classes are taken apart and built.
     """
 
-    def __init__(self, classes: Iterable[type] = (), special: dict[type, Kind] | None = None) -> None:
-        self.by_class: dict[type, Kind] = {cls: _kind_of(cls) for cls in classes} | (special or {})
+    def __init__(self, classes: Iterable[type] = (), special: dict[type, StateType] | None = None) -> None:
+        self.by_class: dict[type, StateType] = {cls: _kind_of(cls) for cls in classes} | (special or {})
         self.by_name = {kind.name: kind for kind in self.by_class.values()}
         assert len(self.by_name) == len(self.by_class)
 
-    def with_others(self, others: "Kinds") -> Self:
+    def with_others(self, others: "StateTypes") -> Self:
         """Return these and others."""
         return type(self)((), self.by_class | others.by_class)
 
 
-def _kind_of(cls: type) -> Kind:
+def _kind_of(cls: type) -> StateType:
     """Return how objects of a class are taken apart into their fields, and built of these by its constructor."""
     if issubclass(cls, Enum):
-        return Kind(cls.__name__, lambda member: (member.value,), cls)
+        return StateType(cls.__name__, lambda member: (member.value,), cls)
     if is_dataclass(cls):
         names = [field.name for field in fields(cls) if field.init]
-        return Kind(
+        return StateType(
             cls.__name__,
             lambda each: [getattr(each, name) for name in names],
             lambda *parts: cls(**dict(zip(names, parts, strict=True))),
         )
     assert issubclass(cls, tuple)
-    return Kind(cls.__name__, tuple, cls)
+    return StateType(cls.__name__, tuple, cls)
 
 
 def sequence_parts(sequence: SeedSequence) -> tuple[Any, ...]:
@@ -101,7 +101,7 @@ def sequence_of(entropy: Any, spawn_key: Any, pool_size: int, n_children_spawned
     return SeedSequence(entropy, spawn_key=spawn_key, pool_size=pool_size, n_children_spawned=n_children_spawned)
 
 
-SEEDS = Kinds(special={SeedSequence: Kind("SeedSequence", sequence_parts, sequence_of)})
+SEEDS = StateTypes(special={SeedSequence: StateType("SeedSequence", sequence_parts, sequence_of)})
 
 
 class ForeignObjectError(ValueError):
@@ -118,7 +118,7 @@ class _Writer:
         kinds: Which objects may stand in it.
     """
 
-    def __init__(self, kinds: Kinds) -> None:
+    def __init__(self, kinds: StateTypes) -> None:
         self.rows: list[list[Any]] = []
         self.blobs: list[bytes | NDArray[Any]] = []
         self._kinds = kinds.by_class
@@ -188,7 +188,7 @@ class _Writer:
         return ["array", value.dtype.str, list(value.shape), int(by_columns), int(value.flags.writeable)]
 
 
-def encoded(tree: Any, kinds: Kinds) -> bytes:
+def encode(tree: Any, kinds: StateTypes) -> bytes:
     """Return a tree as bytes.
 
     Raises:
@@ -219,9 +219,9 @@ class _Reader:
         kinds: Which objects may stand in it.
     """
 
-    def __init__(self, body: bytes, kinds: Kinds) -> None:
+    def __init__(self, body: bytes, kinds: StateTypes) -> None:
         digits, newline, _ = body[:16].partition(b"\n")
-        if not newline or not digits.isdigit() or not 0 < (length := int(digits)) <= MOST_TABLE:
+        if not newline or not digits.isdigit() or not 0 < (length := int(digits)) <= MAX_TABLE:
             raise ValueError("no table")
         self._body, self._kinds = body, kinds.by_name
         self._at = len(digits) + 1 + length
@@ -291,7 +291,7 @@ class _Reader:
         return memoryview(self._body)[start : self._at]
 
 
-def decoded(body: bytes, kinds: Kinds) -> Any:
+def decode(body: bytes, kinds: StateTypes) -> Any:
     """Return the tree that `encoded` wrote; nothing of the bytes is run, whatever they are.
 
     Raises:
@@ -312,6 +312,6 @@ def read_file(path: Path) -> bytes:
     found = path.stat()
     if not S_ISREG(found.st_mode):
         raise OSError("not a regular file")
-    if found.st_size > MOST_BYTES:
-        raise OSError(f"the file has more than {MOST_BYTES >> 20} MiB")
+    if found.st_size > MAX_BYTES:
+        raise OSError(f"the file has more than {MAX_BYTES >> 20} MiB")
     return path.read_bytes()

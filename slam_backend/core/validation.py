@@ -23,7 +23,7 @@ MOST = 10**9  # of steps and the like: kernels hold such numbers, and no run tak
 NUMBERS = "biuf"  # kinds of dtypes that are real numbers
 
 
-def bad_argument(name: str, expected: str, got: object, cure: str) -> ValueError:
+def argument_error(name: str, expected: str, got: object, cure: str) -> ValueError:
     """Build the error for a bad argument.
 
     Args:
@@ -35,19 +35,19 @@ def bad_argument(name: str, expected: str, got: object, cure: str) -> ValueError
     Returns:
         The exception, for the caller to raise.
 
-    >>> print(bad_argument("num_particles", "an int >= 1", 0, "Use at least one particle."))
+    >>> print(argument_error("num_particles", "an int >= 1", 0, "Use at least one particle."))
     num_particles: expected an int >= 1, got 0. Use at least one particle.
     """
     if isinstance(got, PurePath):
         return ValueError(f"{name}: expected {expected}, got {str(got)!r}. {cure}")
     described = isinstance(got, str) and got.startswith(("shape ", "an array ", "a ", "'", "no ", "NaN"))
-    text = str(got) if described else _shown(got)
+    text = str(got) if described else _short_text(got)
     if len(text) > 80:
         text = text[:77] + "..."
     return ValueError(f"{name}: expected {expected}, got {text}. {cure}")
 
 
-def _shown(got: object) -> str:
+def _short_text(got: object) -> str:
     """Return the `repr` of something, or its type where that fails."""
     try:
         return repr(got)
@@ -65,11 +65,11 @@ def check_kind(name: str, value: Any, kind: type[T], cure: str = "") -> T:
         cure: Advice for another, a full sentence; empty: to build one.
 
     Raises:
-        ValueError: As `bad_argument` words it.
+        ValueError: As `argument_error` words it.
     """
     if not isinstance(value, kind):
         article = "an" if kind.__name__[0] in "AEIOU" else "a"
-        raise bad_argument(name, f"{article} {kind.__name__}", value, cure or f"Build one: {kind.__name__}(...).")
+        raise argument_error(name, f"{article} {kind.__name__}", value, cure or f"Build one: {kind.__name__}(...).")
     return value
 
 
@@ -97,7 +97,7 @@ def known_names(kind: type[T]) -> type[T]:
         for name in named:
             if name not in known:
                 got, cure = f"a name that {kind.__name__} does not have", f"It has {', '.join(known)}."
-                raise bad_argument(name, "a known argument", got, cure)
+                raise argument_error(name, "a known argument", got, cure)
         begin(self, *values, **named)
 
     kind.__init__ = checked  # type: ignore[method-assign]
@@ -115,13 +115,13 @@ def check_int(name: str, value: Any, minimum: int, cure: str, maximum: int | Non
         maximum: The most that is accepted; None: any.
 
     Raises:
-        ValueError: As `bad_argument` words it.
+        ValueError: As `argument_error` words it.
     """
     is_int = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
     if not is_int or value < minimum:
-        raise bad_argument(name, f"an int >= {minimum}", value, cure)
+        raise argument_error(name, f"an int >= {minimum}", value, cure)
     if maximum is not None and value > maximum:
-        raise bad_argument(name, f"an int <= {maximum}", value, cure)
+        raise argument_error(name, f"an int <= {maximum}", value, cure)
     return int(value)
 
 
@@ -145,7 +145,7 @@ def check_float(
         at_most: It must not be greater than this.
 
     Raises:
-        ValueError: As `bad_argument` words it.
+        ValueError: As `argument_error` words it.
     """
     expected = "a finite number"
     if above is not None:
@@ -165,7 +165,7 @@ def check_float(
         or (at_least is not None and number < at_least)
         or (at_most is not None and number > at_most)
     ):
-        raise bad_argument(name, expected, value, cure)
+        raise argument_error(name, expected, value, cure)
     return number
 
 
@@ -175,7 +175,7 @@ def check_seed(seed: Any) -> Any:
         return seed
     if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
         cure = "Give an int, so that the run can be repeated."
-        raise bad_argument("seed", "an int >= 0, a SeedSequence or a Generator", seed, cure)
+        raise argument_error("seed", "an int >= 0, a SeedSequence or a Generator", seed, cure)
     return int(seed)
 
 
@@ -189,10 +189,10 @@ def check_choice(name: str, value: Any, choices: tuple[str, ...], cure: str = "C
         cure: What to do about another, a full sentence.
 
     Raises:
-        ValueError: As `bad_argument` words it.
+        ValueError: As `argument_error` words it.
     """
     if not isinstance(value, str) or value not in choices:
-        raise bad_argument(name, "one of " + ", ".join(repr(c) for c in choices), value, cure)
+        raise argument_error(name, "one of " + ", ".join(repr(c) for c in choices), value, cure)
     return value
 
 
@@ -221,20 +221,20 @@ def check_array(
         An array of that shape. Integer dtypes accept floats only if these are whole numbers.
 
     Raises:
-        ValueError: As `bad_argument` words it.
+        ValueError: As `argument_error` words it.
     """
     given = value if type(value) is np.ndarray and value.dtype.kind in NUMBERS else _read(name, value, shape, cure)
     is_ready = dtype is None or given.dtype == dtype
     array = np.array(given, order="C") if is_ready else _cast(name, value, given, dtype, cure)
     if array.ndim != len(shape) or any(s is not None and s != n for s, n in zip(shape, array.shape, strict=True)):
-        raise bad_argument(name, f"an array of shape {_shape_text(shape)}", f"shape {array.shape}", cure)
+        raise argument_error(name, f"an array of shape {_shape_text(shape)}", f"shape {array.shape}", cure)
     if finite and array.size and not np.isfinite(array).all():
         where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
         if np.isfinite(given[where]):
-            raise bad_argument(name, f"numbers that {array.dtype} can hold", given[where].item(), cure)
-        raise bad_argument(name, "finite numbers", f"NaN or infinity at index {where}", cure)
+            raise argument_error(name, f"numbers that {array.dtype} can hold", given[where].item(), cure)
+        raise argument_error(name, "finite numbers", f"NaN or infinity at index {where}", cure)
     if within is not None and array.size and (largest := float(np.abs(array).max())) > within:
-        raise bad_argument(name, f"numbers within +-{within:g}", largest, cure)
+        raise argument_error(name, f"numbers within +-{within:g}", largest, cure)
     return array
 
 
@@ -242,17 +242,17 @@ def _read(name: str, value: Any, shape: tuple[int | None, ...], cure: str) -> ND
     """Return what is not plainly an array of real numbers as one, perhaps the caller's own, or raise."""
     expected = f"an array of shape {_shape_text(shape)}"
     if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value):  # numpy would take what the mask hides
-        raise bad_argument(name, expected, "a masked array with hidden entries", cure)
+        raise argument_error(name, expected, "a masked array with hidden entries", cure)
     try:
         given = np.asarray(value)
         if given.dtype.kind == "O" and all(isinstance(entry, Real) for entry in given.flat):
             given = np.asarray(given.tolist())  # of the kind that the numbers have
             given = given.astype(np.float64) if given.dtype.kind == "O" else given
     except (TypeError, ValueError, OverflowError) as error:
-        raise bad_argument(name, expected, value, cure) from error
+        raise argument_error(name, expected, value, cure) from error
     if given.dtype.kind not in NUMBERS:  # of complex numbers numpy would drop a part, and it would read texts
         got = f"an array of {given.dtype}" if given.dtype.kind == "c" else value
-        raise bad_argument(name, expected + " of real numbers", got, cure)
+        raise argument_error(name, expected + " of real numbers", got, cure)
     return given
 
 
@@ -263,10 +263,10 @@ def _cast(name: str, value: Any, given: NDArray[Any], dtype: Any, cure: str) -> 
     """
     if np.issubdtype(dtype, np.integer):
         if given.dtype.kind == "f" and not np.array_equal(given, np.rint(given)):
-            raise bad_argument(name, "whole numbers", value, cure)
+            raise argument_error(name, "whole numbers", value, cure)
         bounds = np.iinfo(dtype)
         if given.size and not bounds.min <= given.min().item() <= given.max().item() <= bounds.max:
-            raise bad_argument(name, f"whole numbers that {np.dtype(dtype)} can hold", value, cure)
+            raise argument_error(name, f"whole numbers that {np.dtype(dtype)} can hold", value, cure)
     with np.errstate(over="ignore"):  # infinity is refused by the caller
         return np.array(given, dtype=dtype, order="C")
 

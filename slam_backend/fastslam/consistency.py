@@ -30,7 +30,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
-FALSE_ALARMS = 0.01  # at most this share of honest filters is ever warned of, all signs together
+FALSE_ALARM_RATE = 0.01  # at most this share of honest filters is ever warned of, all signs together
 NIS_BOUNDS = (7.81, 11.34)  # 95 and 99 % of chi-square with three degrees of freedom; with two it is more
 LOW_ESS = 0.1  # of the particles
 LEAST_MEASURED = 3  # measurements of a frame of which most may be rejected
@@ -48,7 +48,7 @@ FACTORS = tuple(
 RENEWED = 25  # frames
 SHARE = 0.47  # the sum of 1 / (n ln^2 n) over n = 2, 3, ... is 2.11
 WEIGHTS = tuple(SHARE / len(BETS) / SIGN_OF.count(sign) for sign in SIGN_OF for _ in BETS)
-THRESHOLD = len(SIGNS) / FALSE_ALARMS
+THRESHOLD = len(SIGNS) / FALSE_ALARM_RATE
 HIGHEST = 1e6 * THRESHOLD  # of the evidence: what is certain need not grow
 SUMS, LISTS = ("frames", "begun", "quiet", "nis", "matched"), ("counts", "evidence", "since")
 CURES = {
@@ -61,7 +61,7 @@ CURES = {
 
 
 @dataclass(frozen=True, slots=True)
-class Warned:
+class ConsistencyWarning:
     """A sign that a filter is not consistent.
 
     Attributes:
@@ -99,7 +99,7 @@ class Consistency:
     nis_share: float
     ess_share: float
     rejected_share: float
-    warnings: tuple[Warned, ...]
+    warnings: tuple[ConsistencyWarning, ...]
 
     def to_mapping(self) -> dict[str, Any]:
         """Return it as plain numbers and texts."""
@@ -127,7 +127,7 @@ class ConsistencyTest:
         self._evidence = [0.0] * len(WEIGHTS)
         self._since = [-1] * len(SIGNS)  # step of the warning
 
-    def note(self, step: int, nis: float, ess: float, used: int, rejected: int) -> None:
+    def update(self, step: int, nis: float, ess: float, used: int, rejected: int) -> None:
         """Take note of a frame.
 
         Args:
@@ -138,18 +138,18 @@ class ConsistencyTest:
             rejected: How many of these neither matched nor began a landmark.
         """
         if (self._frames - self._begun) % RENEWED == 0:
-            self._renew()
+            self._restart()
         self._frames += 1
         if nis == nis:  # not NaN
             self._nis += nis
             self._matched += 1
         if nis > NIS_BOUNDS[0] or ess < LOW_ESS or 2 * rejected > used >= LEAST_MEASURED:
             answers = 4 * (ess < LOW_ESS) + 8 * (2 * rejected > used >= LEAST_MEASURED)
-            self._heed(answers + (nis > NIS_BOUNDS[0]) + 2 * (nis > NIS_BOUNDS[1]), step)
+            self._test(answers + (nis > NIS_BOUNDS[0]) + 2 * (nis > NIS_BOUNDS[1]), step)
         else:
             self._quiet += 1
 
-    def _renew(self) -> None:
+    def _restart(self) -> None:
         """Let a filter that fails from here on be found, too."""
         n = 2 + (self._frames - self._begun) // RENEWED
         begun = 1.0 / (n * math.log(n) ** 2)
@@ -157,7 +157,7 @@ class ConsistencyTest:
         self._evidence = [old + begun * weight for old, weight in zip(self._evidence, WEIGHTS, strict=True)]
         self._quiet = 0
 
-    def _heed(self, answers: int, step: int) -> None:
+    def _test(self, answers: int, step: int) -> None:
         """Weigh a frame that answers yes to a question, count it, and see whether the evidence is enough."""
         self._multiply(FACTORS[0], self._quiet)
         self._multiply(FACTORS[answers], 1)
@@ -184,7 +184,7 @@ class ConsistencyTest:
         beyond, _, low, rejected = (count / max(self._frames, 1) for count in self._counts)
         shares = (beyond, low, rejected)
         told = tuple(
-            Warned(sign, since, share)
+            ConsistencyWarning(sign, since, share)
             for sign, since, share in zip(SIGNS, self._since, shares, strict=True)
             if since >= 0
         )

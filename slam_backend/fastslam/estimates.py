@@ -4,12 +4,12 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.core.jit import any_order, device, jit, lanes_inlined
+from slam_backend.core.jit import device, jit, simd_inline, simd_sum
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.fastslam import _kernels
 from slam_backend.fastslam._kernels import LANES
 from slam_backend.fastslam._kernels.layout import IDS, MAP_OF, ROW_OF
-from slam_backend.fastslam.particle_maps import ParticleMaps, slots_held
+from slam_backend.fastslam.particle_maps import ParticleMaps, present_slots
 from slam_backend.fastslam.reports import PoseEstimates
 
 
@@ -30,7 +30,7 @@ def pose_mixtures(means: FloatArray, covariances: FloatArray, weights: FloatArra
     return mixed
 
 
-@any_order
+@simd_sum
 def _shared_mean(shares: FloatArray, tile: FloatArray) -> tuple[float, float, float]:
     """Return the weighted sums of the means in a block of lanes (9, lanes); what has no share may be anything."""
     x, y, z = 0.0, 0.0, 0.0
@@ -42,7 +42,7 @@ def _shared_mean(shares: FloatArray, tile: FloatArray) -> tuple[float, float, fl
     return x, y, z
 
 
-@any_order
+@simd_sum
 def _shared_spread(
     shares: FloatArray, tile: FloatArray, x: float, y: float, z: float
 ) -> tuple[float, float, float, float, float, float]:
@@ -63,8 +63,8 @@ def _shared_spread(
     return xx, xy, xz, yy, yz, zz
 
 
-@lanes_inlined
-def widen(scatter: FloatArray, x: float, y: float, covariance: FloatArray) -> None:
+@simd_inline
+def add_gauge_covariance(scatter: FloatArray, x: float, y: float, covariance: FloatArray) -> None:
     """Add to the covariance (3, 3) of a point what a scattered motion of the whole map gives it, to first order.
 
     J C J^T with J = [[1, 0, -y], [0, 1, x]]: heights stay.
@@ -79,7 +79,7 @@ def widen(scatter: FloatArray, x: float, y: float, covariance: FloatArray) -> No
 
 @device
 @jit
-def _weigh_places(ancestors: Any, weights: FloatArray, places: FloatArray) -> None:
+def _slot_weights(ancestors: Any, weights: FloatArray, places: FloatArray) -> None:
     """Write the weight of each place (P,) of a row: that of all particles that read there by a map of ancestors."""
     places[:] = 0.0
     for m in range(len(weights)):
@@ -107,7 +107,7 @@ def _mix(
         names[i], times[i] = ids[slots[i]], counts[row, maps[e, best] if e > 0 else best]
         if not is_weighed[e]:
             is_weighed[e] = True
-            _weigh_places(maps[e] if e > 0 else identity, weights, of_maps[e])
+            _slot_weights(maps[e] if e > 0 else identity, weights, of_maps[e])
         whole = 0.0
         for place in range(padded):
             shares[place] = of_maps[e, place] if counts[row, place] > 0 else 0.0
@@ -130,7 +130,7 @@ def _mix(
             covariance[0, 2] += scale * xz
             covariance[1, 2] += scale * yz
         covariance[1, 0], covariance[2, 0], covariance[2, 1] = covariance[0, 1], covariance[0, 2], covariance[1, 2]
-        widen(scatter, x, y, covariance)
+        add_gauge_covariance(scatter, x, y, covariance)
     return means, covariances, times, names
 
 
@@ -154,7 +154,7 @@ def map_mixture(
         Means (n, 3) [m] and covariances (n, 3, 3) [m^2], map frame, descriptors (n, d) float32, counts (n,) of
         particle `best`, and ids (n,): all fresh.
     """
-    slots, weights = slots_held(maps, best, min_count), np.exp(log_weights)
+    slots, weights = present_slots(maps, best, min_count), np.exp(log_weights)
     means, covariances, times, names = _mix(
         slots, maps.table, maps.maps, maps.values, maps.counts, best, weights, scatter, LANES
     )

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.core.validation import MOST, FloatArray, IntArray, bad_argument, check_float, check_int, known_names
+from slam_backend.core.validation import MOST, FloatArray, IntArray, argument_error, check_float, check_int, known_names
 from slam_backend.fastslam._kernels import existence as kernels
 from slam_backend.fastslam.particle_maps import ParticleMaps
 from slam_backend.models.camera import StereoCamera
@@ -59,12 +59,12 @@ class ExistenceModel:
         for name in ("detection", "false_alarm", "prior", "delete_below", "cap"):
             value = check_float(f"existence.{name}", getattr(self, name), "Give a probability.", above=0.0)
             if value >= 1.0:
-                raise bad_argument(f"existence.{name}", "a number < 1", value, "Nothing is certain.")
+                raise argument_error(f"existence.{name}", "a number < 1", value, "Nothing is certain.")
         ascending = (("false_alarm", "detection"), ("delete_below", "prior"), ("prior", "cap"))
         for lower, upper in ascending:
             if getattr(self, lower) >= getattr(self, upper):
                 expected = f"a number > {lower} ({getattr(self, lower):g})"
-                raise bad_argument(f"existence.{upper}", expected, getattr(self, upper), "Check which is which.")
+                raise argument_error(f"existence.{upper}", expected, getattr(self, upper), "Check which is which.")
         check_float("existence.margin_px", self.margin_px, "Use 0 for the whole image.", at_least=0.0)
         check_float("existence.range_share", self.range_share, "Use 1 for the whole range.", above=0.0, at_most=1.0)
         check_float("existence.nearest", self.nearest, "Use 0 for all points ahead.", at_least=0.0)
@@ -118,7 +118,7 @@ class ExistenceModel:
         from_prior = exp(self.log_odds_floor - self.log_odds_prior)
         return min(1.0, from_prior + looks * exp(self.log_odds_floor - self.log_odds_cap))
 
-    def view(self, camera: StereoCamera) -> "View":
+    def view(self, camera: StereoCamera) -> "FieldOfView":
         """Return where landmarks are expected to be seen by a camera.
 
         Raises:
@@ -127,15 +127,15 @@ class ExistenceModel:
         side, rise = 0.5 * camera.width - self.margin_px, 0.5 * camera.height - self.margin_px
         if min(side, rise) <= 0.0:
             expected = f"a number < {0.5 * min(camera.width, camera.height):g}, half of the image"
-            raise bad_argument("existence.margin_px", expected, self.margin_px, "Leave some of the image.")
+            raise argument_error("existence.margin_px", expected, self.margin_px, "Leave some of the image.")
         reach = self.range_share * camera.max_range
         if reach <= self.nearest:
             cure = "Leave some of the range."
-            raise bad_argument("existence.nearest", f"a number < {reach:g}, the range", self.nearest, cure)
-        return View(self.nearest, side / camera.focal_px, rise / camera.focal_px, reach * reach)
+            raise argument_error("existence.nearest", f"a number < {reach:g}, the range", self.nearest, cure)
+        return FieldOfView(self.nearest, side / camera.focal_px, rise / camera.focal_px, reach * reach)
 
 
-class View(NamedTuple):
+class FieldOfView(NamedTuple):
     """Where landmarks are expected to be seen: bounds relative to a camera, for compiled loops.
 
     Attributes:
@@ -156,7 +156,7 @@ def _log_odds(probability: float) -> float:
     return log(probability / (1.0 - probability))
 
 
-class ExistenceStep:
+class ExistenceUpdate:
     """An existence model together with the camera that sees the landmarks.
 
     Args:
@@ -171,7 +171,7 @@ class ExistenceStep:
         self._bounds = (model.log_odds_floor, model.log_odds_cap)
         self._near = 2.0 * float(np.sqrt(self._view.reach_squared))
 
-    def weigh(
+    def update(
         self, maps: ParticleMaps, poses: FloatArray, best: int, found: NDArray[np.int32], new_slots: IntArray
     ) -> IntArray:
         """Update the log-odds after one robot's frame, which may be empty; particles drop what is too improbable.
@@ -186,10 +186,10 @@ class ExistenceStep:
         Returns:
             Slots that no particle holds any more. They are to be released once nobody asks for their ids.
         """
-        maps.start_odds(new_slots)
+        maps.add_odds(new_slots)
         view = self._view
         seen_from = (poses, np.cos(poses[2]), np.sin(poses[2]), self._mount)
-        slots = kernels.landmarks_told_of(
+        slots = kernels.landmarks_in_view(
             maps.ids, maps.row_of, maps.map_of, maps.maps, maps.blocks, maps.counts, maps.num_particles, best,
             *seen_from, self._near, view.nearest, view.side, view.reach_squared, found, new_slots,
         )  # fmt: skip
@@ -199,7 +199,7 @@ class ExistenceStep:
         pose = np.ascontiguousarray(poses[:, best])
         store = (maps.row_of, maps.blocks, maps.counts)
         expected = kernels.count_expected(slots, *store, best, pose, self._mount, *view)
-        return kernels.weigh_existence(
+        return kernels.update_existence(
             slots, kernels.mark_seen(slots, len(maps.ids), found), maps.odds, *store,
             *seen_from, *view, *self._model.increments(expected), *self._bounds,
         )  # fmt: skip

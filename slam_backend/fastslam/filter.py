@@ -12,23 +12,23 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from slam_backend.core.state_checks import CURE, refusing
-from slam_backend.core.validation import FloatArray, IntArray, bad_argument, check_array, check_choice, known_names
+from slam_backend.core.state_checks import CURE, refuse_malformed
+from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_array, check_choice, known_names
 from slam_backend.fastslam import _kernels
 from slam_backend.fastslam.consistency import Consistency
 from slam_backend.fastslam.estimates import map_mixture
 from slam_backend.fastslam.existence import ExistenceModel
 from slam_backend.fastslam.options import FilterOptions
-from slam_backend.fastslam.particle_maps import best_map, slots_held, write_outline
-from slam_backend.fastslam.rejuvenation import RejuvenationStep
-from slam_backend.fastslam.relative_poses import Standpoints, members_of
-from slam_backend.fastslam.reports import Findings, PoseEstimate, RejuvenationReport, StepReport
+from slam_backend.fastslam.particle_maps import best_map, present_slots, write_summary
+from slam_backend.fastslam.rejuvenation import RejuvenationScheduler
+from slam_backend.fastslam.relative_poses import TeamPoses, membership_table
+from slam_backend.fastslam.reports import Associations, PoseEstimate, RejuvenationReport, StepReport
 from slam_backend.fastslam.run_log import RobotLog
 from slam_backend.fastslam.state import FilterState
 from slam_backend.fastslam.state_checks import check_filter, last_step
-from slam_backend.fastslam.step_input import FARTHEST_POSE, Seats, StepInput, check_step, seats_of
+from slam_backend.fastslam.step_input import MAX_POSE, RobotRows, StepInput, rows_of, validate_step
 from slam_backend.geometry import between
-from slam_backend.maps.landmark_map import LandmarkMap, MapOutline, OutlineRows, unchecked_map
+from slam_backend.maps.landmark_map import LandmarkMap, MapSummary, MapSummaryRows, unchecked_map
 from slam_backend.models.camera import StereoCamera
 from slam_backend.models.measurements import Measurements
 from slam_backend.models.odometry import OdometryModel
@@ -46,7 +46,7 @@ class FastSlam:
         seed: Of the filter's own random stream: an int, a `numpy.random.SeedSequence` or a Generator.
         initial_poses: (K, 3) [m, m, rad], map frame. None: all at the origin.
         num_particles, camera, motion, proposal, resampling, resample_threshold, position_gate, descriptor_gate,
-        dead_zone, dead_radius, recovery_position, recovery_heading, descriptor_sigma, ambiguity,
+        new_landmark_gate, new_landmark_radius, recovery_position, recovery_heading, descriptor_sigma, ambiguity,
         new_landmark_density, one_to_one, landmark_noise, existence, rejuvenate_every, smoothing: See
         `FilterOptions`.
 
@@ -73,8 +73,8 @@ class FastSlam:
         resample_threshold: float = 0.5,
         position_gate: float = 11.34,
         descriptor_gate: float = 0.45,
-        dead_zone: float = 25.0,
-        dead_radius: float = 1.0,
+        new_landmark_gate: float = 25.0,
+        new_landmark_radius: float = 1.0,
         recovery_position: float = 0.5,
         recovery_heading: float = 0.1,
         descriptor_sigma: float = 0.1,
@@ -97,12 +97,12 @@ class FastSlam:
             resample_threshold=resample_threshold,
             position_gate=position_gate,
             descriptor_gate=descriptor_gate,
-            dead_zone=dead_zone,
-            dead_radius=dead_radius,
+            new_landmark_gate=new_landmark_gate,
+            new_landmark_radius=new_landmark_radius,
             recovery_position=recovery_position,
             recovery_heading=recovery_heading,
             descriptor_sigma=descriptor_sigma,
-            ambiguity=ambiguity,
+            ambiguity_margin=ambiguity,
             new_landmark_density=new_landmark_density,
             one_to_one=one_to_one,
             landmark_noise=landmark_noise,
@@ -114,9 +114,7 @@ class FastSlam:
         self.may_smooth = True
         if initial_poses is not None:
             cure = "Give one pose (x, y, theta) per robot."
-            self.state.start_at(
-                check_array("initial_poses", initial_poses, (num_robots, 3), cure, within=FARTHEST_POSE)
-            )
+            self.state.start_at(check_array("initial_poses", initial_poses, (num_robots, 3), cure, within=MAX_POSE))
 
     @classmethod
     def from_options(
@@ -167,19 +165,19 @@ class FastSlam:
             ValueError: If an argument is ill-formed; the filter is then as before.
         """
         count, size = self.num_robots, self.descriptor_size
-        inputs = check_step(count, size, self.options.camera, odometry, measurements, identities, poses)
-        return self.step_checked(inputs, seats_of(tuple(range(count))), *Findings.none_yet(inputs))
+        inputs = validate_step(count, size, self.options.camera, odometry, measurements, identities, poses)
+        return self.step_checked(inputs, rows_of(tuple(range(count))), *Associations.allocate(inputs))
 
     def step_checked(
-        self, inputs: StepInput, seats: Seats, findings: Findings, told: IntArray, step: int | None = None
+        self, inputs: StepInput, seats: RobotRows, findings: Associations, told: IntArray, step: int | None = None
     ) -> StepReport:
-        """Do what `step` does with readings that `check_step` returned.
+        """Do what `step` does with readings that `validate_step` returned.
 
         Args:
             inputs: What these robots, and perhaps others, read; it is not written to.
             seats: Rows of these robots there.
             findings: Of `inputs`.
-            told: Their buffer, see `Findings.none_yet`; what becomes of these robots' measurements is written there.
+            told: Their buffer, see `Findings.allocate`; what becomes of these robots' measurements is written there.
             step: Number of the step in the logs; None: the next one.
         """
         state = self.state
@@ -190,8 +188,8 @@ class FastSlam:
             state.resample()
         report = StepReport(findings, seats.rows, created, new, matched, rejected, ess, nis, is_depleted)
         if (smoother := state.rejuvenation) is not None:
-            smoother.count(new + matched, long_unseen)
-            is_busy = self.may_smooth and not smoother.waits(state.next_step - 1)
+            smoother.record_step(new + matched, long_unseen)
+            is_busy = self.may_smooth and not smoother.is_waiting(state.next_step - 1)
             if is_busy and (news := state.rejuvenate(smoother)) is not None:
                 return report._replace(rejuvenation=news)
         return report
@@ -206,26 +204,26 @@ class FastSlam:
         """
         smoother = self.state.rejuvenation
         if smoother is None:
-            smoother = RejuvenationStep(replace(self.options, rejuvenate_every=1), self.num_robots)
-        smoother.hasten()
+            smoother = RejuvenationScheduler(replace(self.options, rejuvenate_every=1), self.num_robots)
+        smoother.request()
         while (report := self.state.rejuvenate(smoother)) is None:
             pass
         return report
 
     @property
-    def smooths_in_slices(self) -> bool:
+    def smooths_incrementally(self) -> bool:
         """Whether the filter keeps a smoother that works in slices, one at a time."""
         return self.state.rejuvenation is not None and self.options.smoothing.slice_steps is not None
 
-    def hasten(self) -> None:
-        """Request a rejuvenation as soon as possible, in slices if the smoother works so; see `is_hastened`."""
+    def request_rejuvenation(self) -> None:
+        """Request a rejuvenation as soon as possible, in slices if the smoother works so; see `rejuvenation_requested`."""
         if self.state.rejuvenation is not None:
-            self.state.rejuvenation.hasten()
+            self.state.rejuvenation.request()
 
     @property
-    def is_hastened(self) -> bool:
+    def rejuvenation_requested(self) -> bool:
         """Whether `hasten` was called and nothing has come of it yet."""
-        return self.state.rejuvenation is not None and self.state.rejuvenation.asked
+        return self.state.rejuvenation is not None and self.state.rejuvenation.requested
 
     # ------------------------------------------------------------------ estimates
 
@@ -261,7 +259,7 @@ class FastSlam:
         return int(np.count_nonzero(self.state.maps.of_particle(self.state.best, slots)[1]))
 
     @property
-    def map_room(self) -> int:
+    def map_capacity(self) -> int:
         """Landmarks for which there is room: no particle holds more."""
         return int(self.state.maps.table.shape[1])
 
@@ -312,17 +310,17 @@ class FastSlam:
         know of the start, after a merge, does not blur it.
         """
         index, every = self._check_robot(robot), tuple(range(self.num_robots))
-        points = Standpoints(len(every))
+        points = TeamPoses(len(every))
         self.write_team_poses(every, every, 1.0, points)
         return PoseEstimate(points.own[index].copy(), points.covariances[index].copy())
 
-    def write_team_poses(self, names: tuple[int, ...], live: tuple[int, ...], ess: float, points: Standpoints) -> None:
+    def write_team_poses(self, names: tuple[int, ...], live: tuple[int, ...], ess: float, points: TeamPoses) -> None:
         """Write where the robots stand, which the team calls by these names, of those that are live; `ess` as it is."""
         state = self.state
         weights = NO_WEIGHTS if state.starts_at_origin else np.exp(state.log_weights)
-        _kernels.stand(
+        _kernels.write_team_poses(
             state.pose_arrays, state.start_covariances, weights, state.best, state.starts_at_origin, *state.estimates,
-            members_of(names, live), ess, points.poses, points.beliefs,
+            membership_table(names, live), ess, points.poses, points.beliefs,
         )  # fmt: skip
 
     def particles_from_start(self, robot: int = 0) -> FloatArray:
@@ -354,14 +352,14 @@ class FastSlam:
         mixture = map_mixture(maps, best, self.state.log_weights, self.state.gauge_covariance, min_count)
         return unchecked_map(*mixture)
 
-    def looks(self) -> NDArray[np.float32]:
+    def descriptors(self) -> NDArray[np.float32]:
         """Return the descriptors (n, d) of the landmarks of `map()`. A copy."""
-        return np.asarray(self.state.maps.descriptors[slots_held(self.state.maps, self.state.best, 1)])
+        return np.asarray(self.state.maps.descriptors[present_slots(self.state.maps, self.state.best, 1)])
 
-    def outline(self, min_count: int = 1) -> MapOutline:
+    def map_summary(self, min_count: int = 1) -> MapSummary:
         """Return the outline of `map(min_count=min_count)`, much faster. Fresh arrays."""
-        rows = OutlineRows.unwritten(self.map_room)
-        return rows.part(0, write_outline(self.state.maps, self.state.best, min_count, rows, 0))
+        rows = MapSummaryRows.allocate(self.map_capacity)
+        return rows.part(0, write_summary(self.state.maps, self.state.best, min_count, rows, 0))
 
     def existence(self) -> tuple[IntArray, FloatArray]:
         """Return the ids (n,) of the landmarks of `map()`, ascending, and the probability (n,) that each exists.
@@ -371,7 +369,7 @@ class FastSlam:
         """
         if self.state.existence is None:
             cure = "Build the filter with existence=ExistenceModel()."
-            raise bad_argument("existence", "a filter that keeps it", "one that does not", cure)
+            raise argument_error("existence", "a filter that keeps it", "one that does not", cure)
         maps, best = self.state.maps, self.state.best
         slots = maps.used_slots()
         slots = slots[maps.of_particle(best, slots)[1] > 0]
@@ -380,7 +378,7 @@ class FastSlam:
     def _check_robot(self, robot: int) -> int:
         """Return the index of a robot that there is."""
         if isinstance(robot, bool) or not isinstance(robot, (int, np.integer)) or not 0 <= robot < self.num_robots:
-            raise bad_argument("robot", f"an index from 0 to {self.num_robots - 1}", robot, "Count robots from 0.")
+            raise argument_error("robot", f"an index from 0 to {self.num_robots - 1}", robot, "Count robots from 0.")
         return int(robot)
 
     # ------------------------------------------------------------------ snapshots
@@ -399,13 +397,13 @@ class FastSlam:
         Raises:
             ValueError: If `state` is not one of `get_state`.
         """
-        with refusing("state"):
+        with refuse_malformed("state"):
             check_filter("state", state, (self.options,))
         if (last := max(map(last_step, state["logs"]))) >= state["steps"]:
-            raise bad_argument("state['steps']", f"an int > {last}, the last step logged", state["steps"], CURE)
-        self.go_on_from(state)
+            raise argument_error("state['steps']", f"an int > {last}, the last step logged", state["steps"], CURE)
+        self.restore_checked(state)
 
-    def go_on_from(self, state: Mapping[str, Any]) -> None:
+    def restore_checked(self, state: Mapping[str, Any]) -> None:
         """Go on from a state that was checked."""
         previous = self.state
         self.state = FilterState.restored(state, previous)

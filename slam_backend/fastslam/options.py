@@ -8,7 +8,7 @@ import numpy as np
 from slam_backend.core.validation import (
     MOST,
     FloatArray,
-    bad_argument,
+    argument_error,
     check_choice,
     check_float,
     check_int,
@@ -22,7 +22,7 @@ from slam_backend.resampling import RESAMPLING
 from slam_backend.smoother.options import SmoothingOptions
 
 PROPOSALS = ("fastslam2", "fastslam1")
-MOST_ROBOTS, MOST_PARTICLES = 1_000, 1_000_000  # memory ends before
+MAX_ROBOTS, MAX_PARTICLES = 1_000, 1_000_000  # memory ends before
 CALIBRATED_NOISE = 0.005  # [m]; chosen on simulated stereo runs, see docs/explanation/smoothing.md
 
 
@@ -41,9 +41,9 @@ class FilterOptions:
         resample_threshold: Resample when ESS / M falls below this; 1 = at every step with a measurement.
         position_gate: D0, largest squared Mahalanobis distance of a match [-] (11.34: 99 % at 3 degrees of freedom).
         descriptor_gate: Square root of E0, largest L2 distance between matched descriptors [-].
-        dead_zone: Measurements whose nearest candidate lies between `position_gate` and this are neither matched nor
+        new_landmark_gate: Measurements whose nearest candidate lies between `position_gate` and this are neither matched nor
             new (`fastslam2`) [-].
-        dead_radius: Nor is a measurement new within this distance of a landmark that looks like it (`fastslam2`) [m].
+        new_landmark_radius: Nor is a measurement new within this distance of a landmark that looks like it (`fastslam2`) [m].
         recovery_position: Where a pose this uncertain explains three or more measurements, and most of all that it can
             explain, which a particle's stated uncertainty does not, the particle is lost and corrected from there
             (`fastslam2`) [m]; 0: its own uncertainty is always believed.
@@ -74,12 +74,12 @@ class FilterOptions:
     resample_threshold: float = 0.5
     position_gate: float = 11.34
     descriptor_gate: float = 0.45
-    dead_zone: float = 25.0
-    dead_radius: float = 1.0
+    new_landmark_gate: float = 25.0
+    new_landmark_radius: float = 1.0
     recovery_position: float = 0.5
     recovery_heading: float = 0.1
     descriptor_sigma: float = 0.1
-    ambiguity: float = 6.0
+    ambiguity_margin: float = 6.0
     new_landmark_density: float = 0.01
     one_to_one: bool = True
     landmark_noise: float | None = None
@@ -89,10 +89,12 @@ class FilterOptions:
 
     def __post_init__(self) -> None:
         cure = "Use at least one particle; 100 is a good start."
-        check_int("num_particles", self.num_particles, 1, cure, MOST_PARTICLES)
+        check_int("num_particles", self.num_particles, 1, cure, MAX_PARTICLES)
         for name, kind in (("camera", StereoCamera), ("motion", OdometryModel)):
             if not isinstance(getattr(self, name), kind):
-                raise bad_argument(name, f"a {kind.__name__}", getattr(self, name), f"Build one: {kind.__name__}(...).")
+                raise argument_error(
+                    name, f"a {kind.__name__}", getattr(self, name), f"Build one: {kind.__name__}(...)."
+                )
         check_choice("proposal", self.proposal, PROPOSALS)
         check_choice("resampling", self.resampling, tuple(RESAMPLING))
         check_float("resample_threshold", self.resample_threshold, "Give a share of M.", at_least=0.0, at_most=1.0)
@@ -101,26 +103,28 @@ class FilterOptions:
         for name in ("descriptor_gate", "descriptor_sigma"):
             value = getattr(self, name)
             check_float(name, value, "Give a positive number.", at_least=1e-9, at_most=2.0 * LARGEST_DESCRIPTOR)
-        check_float("dead_zone", self.dead_zone, "It starts where the gate ends.", at_least=self.position_gate)
-        check_float("dead_radius", self.dead_radius, "Use 0 to switch it off.", at_least=0.0)
+        check_float(
+            "new_landmark_gate", self.new_landmark_gate, "It starts where the gate ends.", at_least=self.position_gate
+        )
+        check_float("new_landmark_radius", self.new_landmark_radius, "Use 0 to switch it off.", at_least=0.0)
         for name in ("recovery_position", "recovery_heading"):
             check_float(name, getattr(self, name), "Use 0 to switch it off.", at_least=0.0, at_most=LARGEST_SIGMA)
         if self.landmark_noise is not None:
             cure = "Use 0 for landmarks that stand still."
             check_float("landmark_noise", self.landmark_noise, cure, at_least=0.0, at_most=LARGEST_SIGMA)
-        check_float("ambiguity", self.ambiguity, "Use 0 to hold nothing back.", at_least=0.0)
+        check_float("ambiguity", self.ambiguity_margin, "Use 0 to hold nothing back.", at_least=0.0)
         existence: object = self.existence
         if not isinstance(existence, ExistenceModel | None):
             cure = "Build one: ExistenceModel()."
-            raise bad_argument("existence", "ExistenceModel or None", self.existence, cure)
+            raise argument_error("existence", "ExistenceModel or None", self.existence, cure)
         if self.existence is not None:
             self.existence.view(self.camera)  # raises if nothing is left of the view
         if self.rejuvenate_every is not None:
             check_int("rejuvenate_every", self.rejuvenate_every, 1, "Give a number of steps, or None for never.", MOST)
         if not isinstance(self.smoothing, SmoothingOptions):
-            raise bad_argument("smoothing", "SmoothingOptions", self.smoothing, "Build them: SmoothingOptions().")
+            raise argument_error("smoothing", "SmoothingOptions", self.smoothing, "Build them: SmoothingOptions().")
         if not isinstance(self.one_to_one, bool):
-            raise bad_argument("one_to_one", "a bool", self.one_to_one, "Say True or False.")
+            raise argument_error("one_to_one", "a bool", self.one_to_one, "Say True or False.")
 
     @property
     def landmark_walk(self) -> float:
@@ -130,7 +134,7 @@ class FilterOptions:
         return float(self.landmark_noise) ** 2
 
 
-def assumed(options: FilterOptions) -> FloatArray:
+def pack_options(options: FilterOptions) -> FloatArray:
     """Return what a filter assumes, (27,) float64, as `_kernels.layout` names the numbers.
 
     The noise of the odometry (6,), see `OdometryModel`; of the camera (7,) the focal length [px], the baseline [m], the
@@ -142,15 +146,15 @@ def assumed(options: FilterOptions) -> FloatArray:
         *astuple(options.motion),
         camera.focal_px, camera.baseline, camera.sigma_px, camera.sigma_disparity_px, *camera.mount,
         options.recovery_position, options.recovery_position, options.recovery_heading,
-        options.descriptor_gate**2, options.descriptor_sigma**2, options.position_gate, options.dead_zone,
-        options.dead_radius, options.ambiguity,
+        options.descriptor_gate**2, options.descriptor_sigma**2, options.position_gate, options.new_landmark_gate,
+        options.new_landmark_radius, options.ambiguity_margin,
         np.log(options.new_landmark_density), options.landmark_walk,
         options.one_to_one,
         options.smoothing.closure_after, options.resample_threshold,
     ], np.float64)  # fmt: skip
 
 
-def spans_of(num_robots: int, one_by_one: bool) -> tuple[tuple[int, int, bool], ...]:
+def robot_batches(num_robots: int, one_by_one: bool) -> tuple[tuple[int, int, bool], ...]:
     """Return whose turns are taken in each call of a step, from which robot to before which, and if it is over then."""
     if one_by_one:
         return (*((robot, robot + 1, False) for robot in range(num_robots)), (num_robots, num_robots, True))

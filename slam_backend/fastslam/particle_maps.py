@@ -20,10 +20,10 @@ from slam_backend.fastslam import _kernels
 from slam_backend.fastslam._kernels import LANES
 from slam_backend.fastslam._kernels import existence as _existence_kernels
 from slam_backend.fastslam._kernels.layout import FREE_SLOTS, IDENTITIES, IDS, LAST_SEEN, MAP_OF, ROW_OF
-from slam_backend.maps.landmark_map import OutlineRows
+from slam_backend.maps.landmark_map import MapSummaryRows
 
 
-def aligned(shape: tuple[int, ...], dtype: Any) -> Any:
+def empty_aligned(shape: tuple[int, ...], dtype: Any) -> Any:
     """Return an array, yet to be written, that starts at a cache line: vectors that straddle two are slow."""
     kind = np.dtype(dtype)
     size = math.prod(shape) * kind.itemsize
@@ -32,9 +32,9 @@ def aligned(shape: tuple[int, ...], dtype: Any) -> Any:
     return raw[start : start + size].view(kind).reshape(shape)
 
 
-def aligned_zeros(shape: tuple[int, ...], dtype: Any) -> Any:
+def zeros_aligned(shape: tuple[int, ...], dtype: Any) -> Any:
     """Return zeros of a shape and a numpy type that start at a cache line."""
-    array = aligned(shape, dtype)
+    array = empty_aligned(shape, dtype)
     array.fill(0)
     return array
 
@@ -76,9 +76,9 @@ class MapStore:
         """Hold nothing, for M particles."""
         self.num_particles = num_particles
         self.padded = -(-num_particles // LANES) * LANES
-        self.values: FloatArray = aligned((0,), np.float64)
-        self.counts: NDArray[np.int32] = aligned((0, self.padded), np.int32)
-        self.odds: FloatArray = aligned((0, self.padded), np.float64)
+        self.values: FloatArray = empty_aligned((0,), np.float64)
+        self.counts: NDArray[np.int32] = empty_aligned((0, self.padded), np.int32)
+        self.odds: FloatArray = empty_aligned((0, self.padded), np.float64)
         self.maps: NDArray[np.int32] = np.zeros((1, self.padded), dtype=np.int32)
         self.users: IntArray = np.zeros(1, dtype=np.int64)
         self.table: IntArray = np.zeros((6, 0), dtype=np.int64)
@@ -144,7 +144,7 @@ class MapStore:
 
     # ------------------------------------------------------------------ room
 
-    def make_room(self, new: int, descriptor_size: int) -> None:
+    def reserve(self, new: int, descriptor_size: int) -> None:
         """See to it that `new` landmarks can start, and a row is left to bring landmarks up to date.
 
         Args:
@@ -184,17 +184,17 @@ class MapStore:
         old = len(self.ids)
         table = np.zeros((len(self.table), old + extra), dtype=np.int64)
         table[:, :old], table[IDS, old:], table[IDENTITIES, old:] = self.table, -1, -1
-        descriptors = aligned_zeros((old + extra, descriptor_size), np.float32)
+        descriptors = zeros_aligned((old + extra, descriptor_size), np.float32)
         if old and self.descriptors.shape[1]:
             descriptors[:old] = self.descriptors
         self.descriptors = descriptors
-        heads = aligned((_num_heads(descriptor_size), old + extra), np.float32)
+        heads = empty_aligned((_num_heads(descriptor_size), old + extra), np.float32)
         heads[:] = _kernels.FAR
         if old and len(self.heads):
             heads[:, :old] = self.heads
         self.heads = heads
         if self.log_odds_prior is not None:
-            odds = aligned_zeros((old + extra, self.padded), np.float64)
+            odds = zeros_aligned((old + extra, self.padded), np.float64)
             odds[:old] = self.odds
             self.odds = odds
         top = int(self.tops[1])
@@ -207,9 +207,9 @@ class MapStore:
     def _grow_rows(self, extra: int) -> None:
         """Provide so many more rows, written as a whole when they are taken."""
         old, padded = len(self.counts), self.padded
-        values = aligned(((old + extra) * 9 * padded,), np.float64)
+        values = empty_aligned(((old + extra) * 9 * padded,), np.float64)
         values[: len(self.values)] = self.values
-        counts = aligned((old + extra, padded), np.int32)
+        counts = empty_aligned((old + extra, padded), np.int32)
         counts[:old] = self.counts
         self.values, self.counts = values, counts
         top = int(self.tops[0])
@@ -219,7 +219,7 @@ class MapStore:
         self.free_rows = free
         self.tops[0] = extra + top
 
-    def _set_heads(self, n: int) -> None:
+    def _set_descriptor_prefixes(self, n: int) -> None:
         """Write the heads of the first n slots; the others are free."""
         if len(self.heads):
             self.heads[:, :n] = self.descriptors[:n, :: self.descriptors.shape[1] // len(self.heads)].T
@@ -277,19 +277,19 @@ class ParticleMaps(MapStore):
         """Bring slots up to date: afterwards they are read in place."""
         if not self.tops[0]:
             self._grow_rows(64)
-        self.carry_odds(slots)
-        _kernels.refresh(
+        self.gather_odds(slots)
+        _kernels.apply_resampling(
             slots, self.values, self.counts, self.row_of, self.map_of, self.maps, self.users, self.free_rows, self.tops
         )
 
     # ------------------------------------------------------------------ existence
 
-    def carry_odds(self, slots: IntArray) -> None:
+    def gather_odds(self, slots: IntArray) -> None:
         """Bring the log-odds of slots up to date, just before a kernel does so with all else that they hold."""
         if self.log_odds_prior is not None:
-            _kernels.carry_odds(slots, self.odds, self.map_of, self.maps)
+            _kernels.gather_odds(slots, self.odds, self.map_of, self.maps)
 
-    def start_odds(self, new_slots: IntArray) -> None:
+    def add_odds(self, new_slots: IntArray) -> None:
         """Give landmarks that were just started their prior; -1 among `new_slots` stands for none."""
         self.odds[new_slots[new_slots >= 0]] = self.log_odds_prior
 
@@ -306,7 +306,7 @@ class ParticleMaps(MapStore):
 
     def release(self, slots: IntArray) -> None:
         """Forget the landmarks of slots (n,), up to date, that no particle holds."""
-        _existence_kernels.release(
+        _existence_kernels.delete_landmarks(
             slots, self.ids, self.row_of, self.heads, self.free_rows, self.free_slots, self.tops, _kernels.FAR
         )
 
@@ -327,7 +327,7 @@ class ParticleMaps(MapStore):
         values = blocks.transpose(0, 2, 1, 3).reshape(len(rows), 9, self.padded)[:, :, :m]
         return np.ascontiguousarray(values), self.counts[rows, :m]
 
-    def load_names(
+    def load_metadata(
         self, counts: NDArray[np.integer[Any]], descriptors: NDArray[np.float32], ids: IntArray, identities: IntArray,
         next_id: int, odds: FloatArray | None = None, last_seen: IntArray | None = None,
     ) -> None:  # fmt: skip
@@ -350,7 +350,7 @@ class ParticleMaps(MapStore):
         self.descriptors[:n] = descriptors
         if self.log_odds_prior is not None:
             self.odds[:n, :m] = self.log_odds_prior if odds is None else odds
-        self._set_heads(n)
+        self._set_descriptor_prefixes(n)
 
     # ------------------------------------------------------------------ snapshots
 
@@ -388,14 +388,14 @@ class ParticleMaps(MapStore):
             self.odds[:n] = state["odds"]
         for name in ("map_of", "ids", "identities", "last_seen", "descriptors"):
             getattr(self, name)[:n] = state[name]
-        self._set_heads(n)
+        self._set_descriptor_prefixes(n)
         self.maps = np.concatenate([np.zeros((1, self.padded), dtype=np.int32), maps])
         self.users = np.bincount(state["map_of"], minlength=len(maps) + 1).astype(np.int64)
         self.users[0], self._free_maps = 0, 0
         self.tops[2] = state["next_id"]
 
 
-def write_outline(maps: ParticleMaps, m: int, min_count: int, rows: OutlineRows, first: int) -> int:
+def write_summary(maps: ParticleMaps, m: int, min_count: int, rows: MapSummaryRows, first: int) -> int:
     """Write the outline of `best_map`, which takes the same: the same landmarks in the same order.
 
     Args:
@@ -408,17 +408,17 @@ def write_outline(maps: ParticleMaps, m: int, min_count: int, rows: OutlineRows,
     Returns:
         The row after the last, be it there or not.
     """
-    last, ascending = _kernels.outline(maps.table, maps.maps, maps.values, maps.counts, m, min_count, *rows, first)
+    last, ascending = _kernels.map_summary(maps.table, maps.maps, maps.values, maps.counts, m, min_count, *rows, first)
     if not ascending:
-        order = first + np.argsort(rows.names[first:last, 1])
+        order = first + np.argsort(rows.counts_and_ids[first:last, 1])
         for column in rows:
             column[first:last] = column[order]
     return last
 
 
-def slots_held(maps: ParticleMaps, m: int, min_count: int) -> IntArray:
+def present_slots(maps: ParticleMaps, m: int, min_count: int) -> IntArray:
     """Return the slots (n,) of `best_map`, which takes the same, by ascending id."""
-    slots, ascending = _kernels.hold(maps.table, maps.maps, maps.counts, m, min_count)
+    slots, ascending = _kernels.present_slots(maps.table, maps.maps, maps.counts, m, min_count)
     return slots if ascending else slots[np.argsort(maps.ids[slots])]
 
 
@@ -434,6 +434,6 @@ def best_map(maps: ParticleMaps, m: int, min_count: int) -> tuple[FloatArray, Fl
         Means (n, 3) [m], covariances (n, 3, 3) [m^2], map frame, descriptors (n, d) float32, counts (n,) and ids (n,):
         all fresh.
     """
-    slots = slots_held(maps, m, min_count)
+    slots = present_slots(maps, m, min_count)
     means, covariances, times, names = _kernels.gather(slots, maps.table, maps.maps, maps.values, maps.counts, m)
     return means, covariances, maps.descriptors[slots], times, names

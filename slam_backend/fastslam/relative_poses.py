@@ -10,7 +10,7 @@ from slam_backend.core.validation import FloatArray, IntArray
 OWN, START, ESS, COVARIANCE, SIGMAS = 0, 3, 6, 7, 16
 
 
-class Standpoints:
+class TeamPoses:
     """What some robots of a team believe, each in its own start frame: a row for each of them.
 
     Of a robot out of contact others know where it was when contact was lost. The arrays begin unwritten.
@@ -51,6 +51,6 @@ class Standpoints:
 
 
 @lru_cache(maxsize=256)
-def members_of(robots: tuple[int, ...], live: tuple[int, ...]) -> IntArray:
+def membership_table(robots: tuple[int, ...], live: tuple[int, ...]) -> IntArray:
     """Return the robots (n,) of a filter, and below each 1 if it goes by it, as kernels take them; only looked at."""
     return np.array([robots, [robot in live for robot in robots]], np.int64)

@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
 
 import numpy as np
 
-from slam_backend.core.read_only import Act, as_constant, as_read_only, mapped
+from slam_backend.core.read_only import Act, as_constant, as_read_only, map_arrays
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
-from slam_backend.fastslam._kernels import STOOD
+from slam_backend.fastslam._kernels import STATIONARY
 from slam_backend.fastslam._kernels.layout import ASSOCIATED, COUNT, CREATED, REJECTED
-from slam_backend.fastslam.step_input import UNHEARD, StepInput, Turn
+from slam_backend.fastslam.step_input import NO_INPUT, RobotInput, StepInput
 
 
-class Findings(NamedTuple):
+class Associations(NamedTuple):
     """What became of N robots' measurements in one step; read-only.
 
     Attributes:
@@ -23,66 +23,66 @@ class Findings(NamedTuple):
         masks: By robot which of its measurements were used, as there.
     """
 
-    told: IntArray
-    turns: Sequence[Turn]
+    ids: IntArray
+    inputs: Sequence[RobotInput]
     masks: Mapping[int, BoolArray]
 
     @classmethod
-    def none_yet(cls, inputs: StepInput) -> tuple[Self, IntArray]:
+    def allocate(cls, inputs: StepInput) -> tuple[Self, IntArray]:
         """Return what becomes of some readings, and the room (2, n) int64 where the step is to write it.
 
         Until it is written all measurements are rejected.
         """
-        room = np.empty((2, len(inputs.sightings)), np.int64)
+        room = np.empty((2, len(inputs.measurements)), np.int64)
         room.fill(REJECTED)
-        return cls(as_read_only(room), inputs.turns, inputs.masks), room
+        return cls(as_read_only(room), inputs.inputs, inputs.masks), room
 
     @classmethod
-    def gathered(cls, associations: Sequence[IntArray], created: Sequence[IntArray]) -> Self:
+    def from_arrays(cls, associations: Sequence[IntArray], created: Sequence[IntArray]) -> Self:
         """Return those of robots of each of which both are known, (n_i,) ids."""
         told = as_read_only(np.stack([np.concatenate(associations), np.concatenate(created)]))
         turns, begin = [], 0
         for own in associations:
-            turns.append((STOOD, begin, begin + len(own), False, False, len(own)))
+            turns.append((STATIONARY, begin, begin + len(own), False, False, len(own)))
             begin += len(own)
         return cls(told, turns, {})
 
     def with_arrays(self, act: Act) -> Self:
         """Return the same with `act` done to each array; itself if that changes nothing."""
-        before = self.told, self.masks
-        after = mapped(before, act)
-        return self if after is before else type(self)(after[0], self.turns, after[1])
+        before = self.ids, self.masks
+        after = map_arrays(before, act)
+        return self if after is before else type(self)(after[0], self.inputs, after[1])
 
-    def num_given(self, row: int) -> int:
+    def num_measurements(self, row: int) -> int:
         """Return how many measurements a robot was given, used or not."""
-        return max(self.turns[row][COUNT], 0)
+        return max(self.inputs[row][COUNT], 0)
 
     def associated(self, row: int) -> IntArray:
         """Return what the measurements (n_i,) of a robot were taken for; there are none of robot -1. A copy."""
-        return self._cut(row, ASSOCIATED)
+        return self._per_measurement(row, ASSOCIATED)
 
     def created(self, row: int) -> IntArray:
         """Return likewise which landmarks they created."""
-        return self._cut(row, CREATED)
+        return self._per_measurement(row, CREATED)
 
-    def names_associated(self, row: int) -> list[int]:
+    def associated_ids(self, row: int) -> list[int]:
         """Return the landmarks that measurements of a robot were taken for, in their order."""
-        return self._names(row, ASSOCIATED)
+        return self._valid_ids(row, ASSOCIATED)
 
-    def names_created(self, row: int) -> list[int]:
+    def created_ids(self, row: int) -> list[int]:
         """Return likewise the landmarks that they created."""
-        return self._names(row, CREATED)
+        return self._valid_ids(row, CREATED)
 
-    def _names(self, row: int, kind: int) -> list[int]:
+    def _valid_ids(self, row: int, kind: int) -> list[int]:
         """Return the names among what became of the measurements of a robot."""
-        _, begin, end, _, _, _ = self.turns[row] if row >= 0 else UNHEARD
-        found: list[int] = self.told[kind, begin:end].tolist()
+        _, begin, end, _, _, _ = self.inputs[row] if row >= 0 else NO_INPUT
+        found: list[int] = self.ids[kind, begin:end].tolist()
         return [name for name in found if name != REJECTED]
 
-    def _cut(self, row: int, kind: int) -> IntArray:
+    def _per_measurement(self, row: int, kind: int) -> IntArray:
         """Return what became of the measurements of a robot, -1 for those that were not used."""
-        _, begin, end, _, _, _ = self.turns[row] if row >= 0 else UNHEARD
-        used: IntArray = self.told[kind, begin:end].copy()
+        _, begin, end, _, _, _ = self.inputs[row] if row >= 0 else NO_INPUT
+        used: IntArray = self.ids[kind, begin:end].copy()
         if row not in self.masks:
             return used
         every: IntArray = np.full(len(self.masks[row]), REJECTED)
@@ -143,7 +143,7 @@ class StepReport(NamedTuple):
         rejuvenation: What came of drawing particles anew from smoothed paths; None: it was not tried in this step.
     """
 
-    findings: Findings
+    all_associations: Associations
     rows: tuple[int, ...]
     num_created: int
     num_new: int
@@ -160,7 +160,7 @@ class StepReport(NamedTuple):
 
         That is the id of a new one if it made one; -1 = rejected. Copies.
         """
-        return tuple([self.findings.associated(row) for row in self.rows])
+        return tuple([self.all_associations.associated(row) for row in self.rows])
 
     @property
     def created(self) -> tuple[IntArray, ...]:
@@ -168,7 +168,7 @@ class StepReport(NamedTuple):
 
         -1 if none did. A landmark stems from exactly one measurement. Copies.
         """
-        return tuple([self.findings.created(row) for row in self.rows])
+        return tuple([self.all_associations.created(row) for row in self.rows])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -209,19 +209,19 @@ class MergeEvent:
     robots_a: tuple[int, ...]
     robots_b: tuple[int, ...]
     alignment: "Alignment"
-    bent: "Alignment | None" = None
-    doubt: float = float("nan")
+    unsmoothed_alignment: "Alignment | None" = None
+    uncertainty: float = float("nan")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Renaming:
+class LandmarkIdMap:
     """How landmark ids of two groups became ids of their joint map.
 
     Attributes:
         robots_a: Group a before the merge; its landmark ids stay.
         robots_b: Group b before the merge.
         ids_b: (k, 2) int64, read-only. Rows (id in b's map, id in the joint map); fused landmarks carry the id of a.
-        maps: Numbers of a's map, of b's and of the joint one. The first two are kept until their `MapDropped`: an undo
+        maps: Numbers of a's map, of b's and of the joint one. The first two are kept until their `MapReleased`: an undo
             takes them up again as they were.
     """
 
@@ -235,11 +235,11 @@ class Renaming:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Let copies and what was pickled be read-only, too."""
-        return Renaming, (self.robots_a, self.robots_b, self.ids_b, self.maps)
+        return LandmarkIdMap, (self.robots_a, self.robots_b, self.ids_b, self.maps)
 
 
 @dataclass(frozen=True, slots=True)
-class MapCopied:
+class MapForked:
     """A filter forked: map number `copy` begins as what map number `source` is now."""
 
     source: int
@@ -247,7 +247,7 @@ class MapCopied:
 
 
 @dataclass(frozen=True, slots=True)
-class MapDropped:
+class MapReleased:
     """Map number `number` is gone for good."""
 
     number: int
@@ -280,7 +280,7 @@ class MergeUndone:
     maps: tuple[int, int, int]
 
 
-MapEntry = MapCopied | MapDropped | LandmarksCreated | MergeUndone | Renaming
+MapChange = MapForked | MapReleased | LandmarksCreated | MergeUndone | LandmarkIdMap
 
 
 class TeamReport(NamedTuple):
@@ -301,21 +301,21 @@ class TeamReport(NamedTuple):
     """
 
     step: int
-    findings: Findings
+    all_associations: Associations
     groups: tuple[tuple[int, ...], ...]
     events: tuple[MergeEvent, ...]
-    renamings: tuple[Renaming, ...]
+    id_maps: tuple[LandmarkIdMap, ...]
     maps: tuple[int, ...]
-    entries: tuple[MapEntry, ...]
+    map_changes: tuple[MapChange, ...]
     oldest_step: int
     rejuvenations: tuple[tuple[tuple[int, ...], RejuvenationReport], ...] = ()
 
     @property
     def associations(self) -> tuple[IntArray, ...]:
         """Per robot (n_i,) int64, as in `StepReport`, ids in the robot's map BEFORE this step's merges and undos."""
-        return tuple([self.findings.associated(robot) for robot in range(len(self.maps))])
+        return tuple([self.all_associations.associated(robot) for robot in range(len(self.maps))])
 
     @property
     def created(self) -> tuple[IntArray, ...]:
         """Per robot (n_i,) int64, as in `StepReport`, ids likewise."""
-        return tuple([self.findings.created(robot) for robot in range(len(self.maps))])
+        return tuple([self.all_associations.created(robot) for robot in range(len(self.maps))])

@@ -8,14 +8,24 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from slam_backend.core.read_only import with_constants, with_read_only
-from slam_backend.core.validation import FloatArray, IntArray, bad_argument, check_array, check_choice, check_int
-from slam_backend.fastslam._kernels.layout import COVERED, DID, LOGGED, MOTION, MOVED, NAME, PLACED, THOUGHT, USED
+from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_array, check_choice, check_int
+from slam_backend.fastslam._kernels.layout import (
+    ESTIMATE,
+    EXACT_POSE,
+    HAS_COVARIANCES,
+    LOGGED,
+    LOGGED_KIND,
+    MOTION,
+    MOVED,
+    NAME,
+    USED,
+)
 from slam_backend.fastslam._kernels.run_log import write_rows
 from slam_backend.smoother.log_arrays import (
     EXACT,
     ODOMETRY,
     REJECTED,
-    STOOD,
+    STATIONARY,
     LogArrays,
     LogStep,
     has_been_checked,
@@ -109,7 +119,7 @@ class RobotLog:
             self._points, self._ids = np.empty((n, 3)), np.empty(n, dtype=np.int64)
         end = start + n
         self._steps[t] = step
-        self._kinds[t] = STOOD if motion is None else ODOMETRY if pose is None else EXACT
+        self._kinds[t] = STATIONARY if motion is None else ODOMETRY if pose is None else EXACT
         self._motions[t] = NO_MOTION if motion is None else motion
         self._given[t] = covariances is not None
         self._starts[t + 1] = end
@@ -117,7 +127,7 @@ class RobotLog:
             self._points[start:end] = points
             self._ids[start:end] = ids
             if covariances is not None or self._covariances is not None:
-                self._room_for_covariances()[start:end] = np.nan if covariances is None else covariances
+                self._reserve_covariances()[start:end] = np.nan if covariances is None else covariances
         self._num_rows, self._num_measurements, self._last = t + 1, end, step
 
     def extend(self, robot: int, steps: IntArray, noted: FloatArray, measured: FloatArray) -> None:
@@ -152,15 +162,15 @@ class RobotLog:
             return
         begin = int(noted[:k, :, USED].sum() + noted[k, :robot, USED].sum())
         own = measured[begin : begin + int(note[USED])]
-        move = note[MOTION:THOUGHT] if note[DID] in (MOVED, PLACED) else None
-        pose = move if note[DID] == PLACED else None
-        spreads = own[:, 3:NAME] if note[COVERED] else None
+        move = note[MOTION:ESTIMATE] if note[LOGGED_KIND] in (MOVED, EXACT_POSE) else None
+        pose = move if note[LOGGED_KIND] == EXACT_POSE else None
+        spreads = own[:, 3:NAME] if note[HAS_COVARIANCES] else None
         self.append(int(steps[k]), move, pose, own[:, :3], own[:, NAME].astype(np.int64), spreads)
 
     def _refusal(self, step: int, odometry: Any, pose: Any, points: Any, ids: Any, covariances: Any) -> ValueError:
         """Say what is wrong with a step; told apart only then, for `append` is in the filter's loop."""
         if step <= self._last:
-            return bad_argument("step", f"an int > {self._last}", step, "Log steps in order, each once.")
+            return argument_error("step", f"an int > {self._last}", step, "Log steps in order, each once.")
         n = len(ids)
         per_id, motion = "Give one row per id.", "Give (x, y, theta)."
         wanted = {
@@ -171,9 +181,9 @@ class RobotLog:
         }
         name = next(key for key, (value, shape, _) in wanted.items() if value is not None and value.shape != shape)
         value, shape, cure = wanted[name]
-        return bad_argument(name, f"an array of shape {shape}", f"shape {value.shape}", cure)
+        return argument_error(name, f"an array of shape {shape}", f"shape {value.shape}", cure)
 
-    def _room_for_covariances(self) -> FloatArray:
+    def _reserve_covariances(self) -> FloatArray:
         """Return the open chunk's covariances, NaN where none were given."""
         if self._covariances is None:
             self._covariances = np.full((len(self._ids), 6), np.nan)
@@ -284,10 +294,10 @@ class RobotLog:
         new: IntArray = check_array("new_ids", new_ids, old.shape, "Give one per old id.", dtype=np.int64)
         for name, values, least in (("old_ids", old, 0), ("new_ids", new, REJECTED)):
             if len(values) and values.min() < least:
-                raise bad_argument(name, f"ids >= {least}", int(values.min()), "Give landmark ids.")
+                raise argument_error(name, f"ids >= {least}", int(values.min()), "Give landmark ids.")
         unique, order = np.unique(old, return_index=True)
         if len(unique) < len(old):
-            raise bad_argument("old_ids", "each id once", old.tolist(), "Give one new name per landmark.")
+            raise argument_error("old_ids", "each id once", old.tolist(), "Give one new name per landmark.")
         keep = check_choice("others", others, ("reject", "keep")) == "keep"
         state = self.get_state()
         chunks = tuple(chunk.renamed(unique, new[order], keep) for chunk in state["chunks"])
@@ -305,7 +315,7 @@ class RobotLog:
         """
         for name in ("chunks", "unfinished"):
             if name not in state:
-                raise bad_argument("state", "a dict from RobotLog.get_state", f"no {name!r}", "Pass it unchanged.")
+                raise argument_error("state", "a dict from RobotLog.get_state", f"no {name!r}", "Pass it unchanged.")
         last: LogArrays = state["unfinished"]
         t, n = len(last), len(last.ids)
         self._chunks = [chunk if has_been_checked(chunk) else with_constants(chunk) for chunk in state["chunks"]]
@@ -316,7 +326,7 @@ class RobotLog:
         )  # fmt: skip
         self._starts[: t + 1], self._points[:n], self._ids[:n] = last.starts, last.points, last.ids
         if last.covariances is not None:
-            self._room_for_covariances()[:n] = last.covariances
+            self._reserve_covariances()[:n] = last.covariances
         newest = last if t else self._chunks[-1] if self._chunks else None
         self._last = -1 if newest is None else int(newest.steps[-1])
 

@@ -7,11 +7,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from slam_backend.core.packed_symmetric import UNPACK, UPPER
-from slam_backend.core.state_checks import generator_of
+from slam_backend.core.packed_symmetric import UNPACK_INDEX, UPPER
+from slam_backend.core.state_checks import restore_generator
 from slam_backend.core.validation import BoolArray, FloatArray, Int32Array, IntArray, check_int, check_seed
 from slam_backend.fastslam import _kernels
-from slam_backend.fastslam._kernels import IDLE, PLACED, add_share
+from slam_backend.fastslam._kernels import EXACT_POSE, NO_READING, add_gauge_covariance
 from slam_backend.fastslam._kernels.layout import (
     ASSOCIATED,
     CAMERA,
@@ -27,17 +27,17 @@ from slam_backend.fastslam._kernels.layout import (
     STARTS,
     WEIGHTS,
 )
-from slam_backend.fastslam._kernels.run_log import write_guesses
+from slam_backend.fastslam._kernels.run_log import write_initial_poses
 from slam_backend.fastslam.consistency import ConsistencyTest
 from slam_backend.fastslam.estimates import pose_mixtures
-from slam_backend.fastslam.existence import ExistenceStep
-from slam_backend.fastslam.options import MOST_ROBOTS, FilterOptions, assumed, spans_of
-from slam_backend.fastslam.particle_maps import ParticleMaps, aligned_zeros
-from slam_backend.fastslam.rejuvenation import RejuvenationStep, write_maps
+from slam_backend.fastslam.existence import ExistenceUpdate
+from slam_backend.fastslam.options import MAX_ROBOTS, FilterOptions, pack_options, robot_batches
+from slam_backend.fastslam.particle_maps import ParticleMaps, zeros_aligned
+from slam_backend.fastslam.rejuvenation import RejuvenationScheduler, write_maps
 from slam_backend.fastslam.reports import PoseEstimates, RejuvenationReport
 from slam_backend.fastslam.run_log import RobotLog
 from slam_backend.fastslam.state_checks import KEPT
-from slam_backend.fastslam.step_input import Seats, StepInput
+from slam_backend.fastslam.step_input import RobotRows, StepInput
 from slam_backend.geometry import compose, rotation, wrap_angle
 from slam_backend.resampling import RESAMPLING
 from slam_backend.smoother.rejuvenation import Particles
@@ -67,7 +67,7 @@ class PendingSteps:
         self.measured = np.empty((ROOM, NUM_MEASURED))
         self.num_measured = 0
 
-    def make_room(self, used: int) -> None:
+    def reserve(self, used: int) -> None:
         """Provide room for so many more measurements."""
         needed = self.num_measured + used
         if needed > len(self.measured):
@@ -80,7 +80,7 @@ class PendingSteps:
         self.steps.clear()
         self.num_measured = 0
 
-    def flush(self, logs: Sequence[RobotLog], smoother: RejuvenationStep | None) -> None:
+    def flush(self, logs: Sequence[RobotLog], smoother: RejuvenationScheduler | None) -> None:
         """Enter what waits into the logs of K robots, and tell the smoother of the filter, if it has one.
 
         A step in which a robot did nothing and was given no measurement gets no row.
@@ -91,17 +91,19 @@ class PendingSteps:
             log.extend(robot, steps, noted, measured)
             if smoother is not None:
                 heard, poses = np.empty_like(steps), np.empty((len(steps), 3))
-                count, is_placed = write_guesses(robot, steps, noted, heard, poses)
-                smoother.note(robot, heard[:count], poses[:count], is_placed)
+                count, is_placed = write_initial_poses(robot, steps, noted, heard, poses)
+                smoother.add_initial_poses(robot, heard[:count], poses[:count], is_placed)
         self.clear()
 
 
-def note_refused(smoother: RejuvenationStep, step: int, inputs: StepInput, seats: Seats, told: IntArray) -> None:
+def record_rejected(
+    smoother: RejuvenationScheduler, step: int, inputs: StepInput, seats: RobotRows, told: IntArray
+) -> None:
     """Tell the smoother what of a step's measurements, those with names left out, was neither matched nor new."""
-    for robot, row in seats.heard:
-        _, begin, end, _, named, _ = inputs.turns[row]
+    for robot, row in seats.active:
+        _, begin, end, _, named, _ = inputs.inputs[row]
         if not named:
-            smoother.note_refused(robot, step, told[ASSOCIATED, begin:end], inputs.descriptors[begin:end])
+            smoother.add_rejected(robot, step, told[ASSOCIATED, begin:end], inputs.descriptors[begin:end])
 
 
 class StepSummary(NamedTuple):
@@ -144,7 +146,7 @@ class FilterState:
         gauge_covariance: (3, 3) float64 [m, m, rad]. Covariance of a motion of the whole map that the particles do not
             show, because their frame was fixed when they were sampled from smoothed paths; estimates include it.
         start_covariances: (K, 3, 3) float64 [m, m, rad], start frames. Covariance of where each robot started in the
-            map, as far as the particles do not show it, see `hold_start`; poses seen from there include it.
+            map, as far as the particles do not show it, see `fix_start`; poses seen from there include it.
         maps: Landmarks of all particles.
         estimates: Poses of all robots over all particles; written in each step.
         best: Index of the most probable particle, by accumulated log-weight (Eq. 12).
@@ -160,20 +162,20 @@ class FilterState:
     """
 
     def __init__(self, num_robots: int, options: FilterOptions, seed: Any, num_particles: int | None = None) -> None:
-        k = check_int("num_robots", num_robots, 1, "Use at least one robot.", MOST_ROBOTS)
+        k = check_int("num_robots", num_robots, 1, "Use at least one robot.", MAX_ROBOTS)
         m = options.num_particles if num_particles is None else num_particles
         existence = options.existence
         self.options = options
         self.num_particles = m
         self.rng = np.random.default_rng(check_seed(seed))
-        self.packed_options = assumed(options)
+        self.packed_options = pack_options(options)
         self.packed_camera = self.packed_options[CAMERA:RECOVERY]
-        self.existence = None if existence is None else ExistenceStep(existence, options.camera)
-        self.rejuvenation = None if options.rejuvenate_every is None else RejuvenationStep(options, k)
+        self.existence = None if existence is None else ExistenceUpdate(existence, options.camera)
+        self.rejuvenation = None if options.rejuvenate_every is None else RejuvenationScheduler(options, k)
         self.maps = ParticleMaps(m, None if existence is None else existence.log_odds_prior)
         padded = self.maps.padded
-        self.pose_arrays: FloatArray = aligned_zeros((5, k, 3, padded), np.float64)
-        self.weight_arrays: FloatArray = aligned_zeros((4, padded), np.float64)
+        self.pose_arrays: FloatArray = zeros_aligned((5, k, 3, padded), np.float64)
+        self.weight_arrays: FloatArray = zeros_aligned((4, padded), np.float64)
         self.log_weights[:] = -np.log(m)
         self.weights[:] = 1.0 / m
         self.propagated_only: IntArray = np.zeros(k, np.int64)
@@ -184,7 +186,7 @@ class FilterState:
         self.next_step = 0
         self.consistency = ConsistencyTest()
         self.estimates = self._mixtures()
-        self._batches = spans_of(k, existence is not None)  # robots of each kernel call: one by one with existence
+        self._batches = robot_batches(k, existence is not None)  # robots of each kernel call: one by one with existence
         self._logs = [RobotLog() for _ in range(k)]
         self._pending = PendingSteps(k)  # not in the logs yet
         self._associations: Int32Array = np.empty((0, padded), np.int32)  # work space of `update_fastslam2`
@@ -251,13 +253,13 @@ class FilterState:
         """Update `starts_at_origin` after the start poses were written."""
         self.starts_at_origin = not self.starts[:, :, : self.num_particles].any()
 
-    def _refresh_best(self) -> None:
+    def _refresh_best_particle(self) -> None:
         """Update `best` after the weights along paths were written."""
         self.best = int(self.path_log_weights.argmax())
 
     # ------------------------------------------------------------------ one step
 
-    def update(self, inputs: StepInput, seats: Seats, told: IntArray) -> StepSummary:
+    def update(self, inputs: StepInput, seats: RobotRows, told: IntArray) -> StepSummary:
         """Move all robots, match what they saw, weigh and update (Algorithm 1, l. 6-8).
 
         Where a robot did and saw nothing no random number is drawn.
@@ -269,45 +271,45 @@ class FilterState:
         """
         maps, pending = self.maps, self._pending
         active = used = 0
-        for robot, row in seats.heard:
-            act, begin, end, _, _, _ = inputs.turns[row]
-            active, used = active + (act != IDLE), used + end - begin
-            if act == PLACED:
+        for robot, row in seats.active:
+            act, begin, end, _, _, _ = inputs.inputs[row]
+            active, used = active + (act != NO_READING), used + end - begin
+            if act == EXACT_POSE:
                 self._set_exact_pose(robot, inputs.moves[row])
         if used:
-            maps.make_room(used, inputs.descriptors.shape[1])
-            if len(self._associations) < len(inputs.sightings):
-                shape = 2 * len(inputs.sightings), maps.padded
+            maps.reserve(used, inputs.descriptors.shape[1])
+            if len(self._associations) < len(inputs.measurements):
+                shape = 2 * len(inputs.measurements), maps.padded
                 self._associations, self._mahalanobis_sq = np.empty(shape, np.int32), np.empty(shape)
         if len(pending.steps) == LONGEST:
             pending.flush(self._logs, self.rejuvenation)
-        pending.make_room(used)
+        pending.reserve(used)
         now = 0 if self.rejuvenation is None else self.rejuvenation.steps + 1
         normals = self.rng.standard_normal((active, maps.num_particles, 3))
         means, covariances = self.estimates
         deleted: list[IntArray] = []
         fastslam1 = None if self.options.proposal == "fastslam2" else 1
         for low, high, is_over in self._batches:
-            summary = _kernels.take_turns(
-                low, high, is_over, now, self.packed_options, seats.array, inputs.table, inputs.moves, normals,
+            summary = _kernels.step_robots(
+                low, high, is_over, now, self.packed_options, seats.array, inputs.inputs_table, inputs.moves, normals,
                 self.pose_arrays, self.propagated_only, self.weight_arrays, self.gauge_covariance,
                 maps.values, maps.counts, maps.odds, maps.table, maps.maps, maps.users, maps.free_rows, maps.tops,
-                maps.descriptors, maps.heads, inputs.sightings, inputs.descriptors, inputs.names,
+                maps.descriptors, maps.heads, inputs.measurements, inputs.descriptors, inputs.names,
                 self._associations, self._mahalanobis_sq, told, means, covariances,
                 pending.noted[len(pending.steps)], pending.measured, pending.num_measured, fastslam1,
             )  # fmt: skip
             if self.existence is not None and not is_over and (row := seats.rows[low]) >= 0:
-                _, begin, end, _, _, count = inputs.turns[row]
+                _, begin, end, _, _, count = inputs.inputs[row]
                 if count >= 0:
                     found, new_slots = self._associations[begin:end], told[CREATED, begin:end]
-                    deleted.append(self.existence.weigh(maps, self.poses[low], self.best, found, new_slots))
+                    deleted.append(self.existence.update(maps, self.poses[low], self.best, found, new_slots))
         self.best, long_unseen, created, new, matched, rejected, ess, nis, is_depleted = summary
         pending.steps.append(self.next_step)
         pending.num_measured += used
         if used:
-            self.consistency.note(self.next_step, nis, ess / self.num_particles, used, used - new - matched)
+            self.consistency.update(self.next_step, nis, ess / self.num_particles, used, used - new - matched)
         if rejected and self.rejuvenation is not None:
-            note_refused(self.rejuvenation, self.next_step, inputs, seats, told)
+            record_rejected(self.rejuvenation, self.next_step, inputs, seats, told)
         self.next_step += 1
         for slots in deleted:  # only now: until here their ids were asked for
             maps.release(slots)
@@ -325,9 +327,9 @@ class FilterState:
         ancestors = RESAMPLING[self.options.resampling](self.weights, self.rng, self.num_particles)
         self.best = self.maps.resample(ancestors, self.pose_arrays, self.weight_arrays)
 
-    def rejuvenate(self, smoother: RejuvenationStep) -> RejuvenationReport | None:
+    def rejuvenate(self, smoother: RejuvenationScheduler) -> RejuvenationReport | None:
         """Sample the particles from the smoothed paths, if it is time and those can be found."""
-        if smoother.rests(self.logs):
+        if smoother.is_idle(self.logs):
             return None
         starts = self.starts[:, :, : self.num_particles]
         result = smoother.run(
@@ -350,7 +352,7 @@ class FilterState:
         self.gauge_covariance[:], self.start_covariances[:] = new.frame, new.start_scatters
         self.propagated_only.fill(0)
         self.log_weights[:], self.path_log_weights[:] = new.log_weights, new.log_densities
-        self._refresh_best()
+        self._refresh_best_particle()
         self.weights[:] = np.exp(new.log_weights)
         self.estimates.means[:], self.estimates.covariances[:] = new.means, new.covariances
 
@@ -403,7 +405,7 @@ class FilterState:
         joint._refresh_starts()
         turn = np.zeros((count, 3, 3))
         turn[:, :2, :2], turn[:, 2, 2] = rotation(motion[:, 2]), 1.0
-        spread_b = b.covariances[:, :, from_b].transpose(0, 2, 1)[..., UNPACK]
+        spread_b = b.covariances[:, :, from_b].transpose(0, 2, 1)[..., UNPACK_INDEX]
         moved = turn @ spread_b @ turn.transpose(0, 2, 1)
         joint.covariances[:k, :, :count] = a.covariances[:, :, from_a]
         joint.covariances[k:, :, :count] = moved[..., *UPPER].transpose(0, 2, 1)
@@ -420,12 +422,12 @@ class FilterState:
             a, b: State of either group.
             renamed: (n, 2) int64 rows (id in b, id in the joint map) of all of b's landmarks.
         """
-        self._refresh_best()
+        self._refresh_best_particle()
         self.next_step = max(a.next_step, b.next_step)
         self.consistency = ConsistencyTest.joined(a.consistency, b.consistency)
         self.estimates = self._mixtures()
         if self.gauge_covariance.any():
-            add_share(self.gauge_covariance, *self.estimates)
+            add_gauge_covariance(self.gauge_covariance, *self.estimates)
         self._logs = [log.copy() for log in a.logs] + [log.renamed(renamed[:, 0], renamed[:, 1]) for log in b.logs]
         if self.rejuvenation is not None and a.rejuvenation is not None and b.rejuvenation is not None:
             starts = [state.starts[:, :, : state.num_particles] for state in (a, b, self)]
@@ -456,7 +458,7 @@ class FilterState:
         for name in KEPT:
             getattr(self, name)[:] = state[name]
         self._refresh_starts()
-        self._refresh_best()
+        self._refresh_best_particle()
         self.maps.set_state(state["maps"])
         self._pending.clear()
         for log, logged in zip(self._logs, state["logs"], strict=True):
@@ -465,5 +467,5 @@ class FilterState:
             self.rejuvenation.set_state(state["rejuvenation"])
         self.consistency.set_state(state["consistency"])
         self.next_step, self.estimates = state["steps"], state["estimates"].copy()
-        self.rng = generator_of(state["rng"])  # a new one: the old one may be the caller's, or of another kind
+        self.rng = restore_generator(state["rng"])  # a new one: the old one may be the caller's, or of another kind
         return self

@@ -10,17 +10,17 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from slam_backend.core.read_only import Act, as_read_only, mapped, with_constants, with_read_only
-from slam_backend.core.validation import BoolArray, Float32Array, FloatArray, IntArray, bad_argument, check_array
+from slam_backend.core.read_only import Act, as_read_only, map_arrays, with_constants, with_read_only
+from slam_backend.core.validation import BoolArray, Float32Array, FloatArray, IntArray, argument_error, check_array
 from slam_backend.fastslam import _kernels
-from slam_backend.fastslam._kernels import IDLE
-from slam_backend.models.camera import FARTHEST_POINT, StereoCamera
+from slam_backend.fastslam._kernels import NO_READING
+from slam_backend.models.camera import MAX_POINT_DISTANCE, StereoCamera
 from slam_backend.models.measurements import LARGEST_DESCRIPTOR, Measurements, TeamMeasurements
 
 # Of one robot: what it did, where its used measurements begin and end among all n, whether these come with covariances,
 # and with names; and how many it was given, used or not, -1 where it has no frame. `_kernels.layout` names the numbers.
-Turn = Sequence[int]
-UNHEARD = (IDLE, 0, 0, 0, 0, -1)
+RobotInput = Sequence[int]
+NO_INPUT = (NO_READING, 0, 0, 0, 0, -1)
 
 
 class StepInput(NamedTuple):
@@ -43,27 +43,27 @@ class StepInput(NamedTuple):
             to see.
     """
 
-    turns: Sequence[Turn]
-    table: IntArray
+    inputs: Sequence[RobotInput]
+    inputs_table: IntArray
     moves: FloatArray
     masks: Mapping[int, BoolArray]
-    sightings: FloatArray
+    measurements: FloatArray
     descriptors: Float32Array
     names: IntArray
-    silent: frozenset[int]
+    inactive: frozenset[int]
 
     def with_arrays(self, act: Act) -> Self:
         """Return the same with `act` done to each array; itself if that changes nothing."""
         before = self[1:-1]  # turns and silent hold none
-        after = mapped(before, act)
-        return self if after is before else type(self)._make((self.turns, *after, self.silent))
+        after = map_arrays(before, act)
+        return self if after is before else type(self)._make((self.inputs, *after, self.inactive))
 
     def with_copies(self) -> Self:
         """Return the same with arrays of its own, which kernels take."""
         return self.with_arrays(np.ndarray.copy)
 
 
-class Seats(NamedTuple):
+class RobotRows(NamedTuple):
     """Where the readings of a filter's K robots stand in a `StepInput`.
 
     Attributes:
@@ -73,18 +73,18 @@ class Seats(NamedTuple):
     """
 
     rows: tuple[int, ...]
-    heard: tuple[tuple[int, int], ...]
+    active: tuple[tuple[int, int], ...]
     array: IntArray
 
 
 @lru_cache(maxsize=256)
-def seats_of(rows: tuple[int, ...]) -> Seats:
+def rows_of(rows: tuple[int, ...]) -> RobotRows:
     """Return the seats in these rows."""
     heard = tuple((robot, row) for robot, row in enumerate(rows) if row >= 0)
-    return Seats(rows, heard, np.array(rows, np.int64))
+    return RobotRows(rows, heard, np.array(rows, np.int64))
 
 
-class InputLog:
+class InputBuffer:
     """The readings of all robots, step by step."""
 
     def __init__(self) -> None:
@@ -95,7 +95,7 @@ class InputLog:
         return len(self._steps)
 
     @property
-    def kept(self) -> Mapping[int, StepInput]:
+    def buffered(self) -> Mapping[int, StepInput]:
         """The steps that are kept, by their numbers; to be looked at."""
         return self._steps
 
@@ -125,7 +125,7 @@ class InputLog:
         }
 
 
-NO_SIGHTINGS = np.zeros((0, 9))
+NO_MEASUREMENTS = np.zeros((0, 9))
 NO_DESCRIPTORS = np.zeros((0, 0), dtype=np.float32)
 NO_NAMES = np.zeros(0, dtype=np.int64)
 KINDS = *map(np.dtype, (np.float64, np.float32, np.int64)), 2, 2, 1  # of `TeamMeasurements`
@@ -137,7 +137,7 @@ Used = tuple[FloatArray, FloatArray | None, Float32Array, IntArray | None]
 Seen = tuple[list[Span], dict[int, BoolArray], FloatArray, Float32Array, IntArray]
 
 
-def are_kinds(frames: TeamMeasurements) -> bool:
+def has_kernel_dtypes(frames: TeamMeasurements) -> bool:
     """Return whether the frames of a team are arrays of the numbers of axes and the types that kernels take."""
     points, looks, ends = frames
     if not (type(points) is np.ndarray and type(looks) is np.ndarray and type(ends) is np.ndarray):
@@ -145,19 +145,19 @@ def are_kinds(frames: TeamMeasurements) -> bool:
     return (points.dtype, looks.dtype, ends.dtype, points.ndim, looks.ndim, ends.ndim) == KINDS
 
 
-def read_by_team(
+def pack_team_input(
     k: int, size: int, odometry: Any, frames: TeamMeasurements, farthest_move: float, farthest_point: float
 ) -> StepInput | None:
     """Return what k robots read if all moved and looked and nothing is amiss; None: it has to be looked at one by one.
 
     Args:
-        k, size, odometry, frames: As of `check_step`, which takes all that is taken here.
+        k, size, odometry, frames: As of `validate_step`, which takes all that is taken here.
         farthest_move, farthest_point: Limits [m, rad] to the odometry and [m] to points, as of `_kernels.read_team`.
     """
     if type(odometry) is not np.ndarray or odometry.dtype != np.float64 or odometry.shape != (k, 3):
         return None
     points, descriptors, ends = frames
-    if not are_kinds(frames):
+    if not has_kernel_dtypes(frames):
         return None
     count, own_size = descriptors.shape
     if len(ends) != k or points.shape != (count, 3) or (size and own_size != size):
@@ -170,7 +170,7 @@ def read_by_team(
     return StepInput(table.tolist(), table, moves, {}, sightings, looks, NO_NAMES, frozenset())
 
 
-def in_one_table(
+def pack_step_input(
     moves: FloatArray, moved: Sequence[bool], exact: Mapping[int, FloatArray], spans: Sequence[Span],
     masks: Mapping[int, BoolArray], sightings: FloatArray, descriptors: Float32Array, names: IntArray,
 ) -> StepInput:  # fmt: skip
@@ -186,11 +186,11 @@ def in_one_table(
     silent: list[int] = []
     for robot, (begin, end, covered, named, count) in enumerate(spans):
         if robot in exact:
-            act, moves[robot] = _kernels.PLACED, exact[robot]
+            act, moves[robot] = _kernels.EXACT_POSE, exact[robot]
         elif moved[robot]:
             act = _kernels.MOVED
         else:
-            act = _kernels.STOOD if end > begin else _kernels.IDLE
+            act = _kernels.STATIONARY if end > begin else _kernels.NO_READING
             if count < 0:
                 silent.append(robot)
         turns.append((act, begin, end, covered, named, count))
@@ -198,7 +198,7 @@ def in_one_table(
     return StepInput(table.tolist(), table, moves, masks, sightings, descriptors, names, frozenset(silent))
 
 
-def seen_by_each(frames: Sequence[Measurements | None], names: Sequence[IntArray | None]) -> Seen:
+def pack_measurements(frames: Sequence[Measurements | None], names: Sequence[IntArray | None]) -> Seen:
     """Return what the robots' frames hold, None where there is none, with the names of their measurements, if any."""
     spans: list[Span] = []
     masks: dict[int, BoolArray] = {}
@@ -234,7 +234,7 @@ def _masked(
 def _joined(used: Sequence[Used]) -> tuple[FloatArray, Float32Array, IntArray]:
     """Return sightings, descriptors and names of all measurements, one robot's after the other's."""
     if not used:
-        return NO_SIGHTINGS, NO_DESCRIPTORS, NO_NAMES
+        return NO_MEASUREMENTS, NO_DESCRIPTORS, NO_NAMES
     points, covariances, _, names = used[0]
     descriptors = np.concatenate([own[2] for own in used])
     if len(used) > 1:
@@ -256,11 +256,11 @@ def _joined(used: Sequence[Used]) -> tuple[FloatArray, Float32Array, IntArray]:
     return sightings, descriptors, NO_NAMES if names is None else names
 
 
-FARTHEST_MOVE = 1e4  # [m, rad]; no robot moves so far between two steps
-FARTHEST_POSE = 1e6  # [m, rad]; no robot goes so far from its start
+MAX_MOVE = 1e4  # [m, rad]; no robot moves so far between two steps
+MAX_POSE = 1e6  # [m, rad]; no robot goes so far from its start
 
 
-def check_step(
+def validate_step(
     k: int, size: int, camera: StereoCamera, odometry: Any, measurements: Any, identities: Any, poses: Any
 ) -> StepInput:
     """Return the arguments of `FastSlam.step` for k robots, checked.
@@ -277,10 +277,10 @@ def check_step(
     limit = camera.farthest_usable
     if isinstance(measurements, TeamMeasurements):
         if identities is None and poses is None:
-            inputs = read_by_team(k, size, odometry, measurements, FARTHEST_MOVE, limit)
+            inputs = pack_team_input(k, size, odometry, measurements, MAX_MOVE, limit)
             if inputs is not None:
                 return inputs
-        measurements = _cut_out(measurements)
+        measurements = _split_by_robot(measurements)
     moves, moved = _check_moves(odometry, k)
     exact = {} if poses is None else _check_poses(poses, k)
     frames = _one_each("measurements", measurements, k)
@@ -290,25 +290,25 @@ def check_step(
             size = _check_frame(robot, frame, size, limit)
         if names[robot] is not None:
             names[robot] = _check_names(robot, names[robot], 0 if frame is None else len(frame))
-    return in_one_table(moves, moved, exact, *seen_by_each(frames, names))
+    return pack_step_input(moves, moved, exact, *pack_measurements(frames, names))
 
 
-def _cut_out(frames: TeamMeasurements) -> list[Measurements]:
+def _split_by_robot(frames: TeamMeasurements) -> list[Measurements]:
     """Return each robot's frame of those of a team, or raise unless they fit together."""
-    if not are_kinds(frames) or frames.points.shape[1] != 3:
+    if not has_kernel_dtypes(frames) or frames.points.shape[1] != 3:
         expected = "points (n, 3) float64, descriptors (n, d) float32 and ends (K,) int64"
         got = ", ".join(f"{np.shape(array)} {getattr(array, 'dtype', type(array).__name__)}" for array in frames)
-        raise bad_argument("measurements", expected, got, "Give arrays of these types, or a frame per robot.")
-    ends, count = frames.ends.tolist(), len(frames.points)
+        raise argument_error("measurements", expected, got, "Give arrays of these types, or a frame per robot.")
+    ends, count = frames.offsets.tolist(), len(frames.points)
     if not ends or ends[0] < 0 or ends[-1] != count or len(frames.descriptors) != count or ends != sorted(ends):
         got = f"ends {ends} of {count} points and {len(frames.descriptors)} descriptors"
         cure = "Say per robot where its points end."
-        raise bad_argument("measurements", "a descriptor per point, and rising ends up to the last one", got, cure)
+        raise argument_error("measurements", "a descriptor per point, and rising ends up to the last one", got, cure)
     largest = float(np.abs(frames.descriptors).max(initial=0.0))
     if not largest <= LARGEST_DESCRIPTOR:
         expected = f"numbers within +-{LARGEST_DESCRIPTOR:g}"
-        raise bad_argument("measurements.descriptors", expected, largest, "Scale them, best to unit length.")
-    return frames.of_each()
+        raise argument_error("measurements.descriptors", expected, largest, "Scale them, best to unit length.")
+    return frames.per_robot()
 
 
 def _one_each(name: str, value: Any, k: int) -> Any:
@@ -318,7 +318,7 @@ def _one_each(name: str, value: Any, k: int) -> Any:
     if isinstance(value, Measurements) or not hasattr(value, "__len__") or len(value) != k:
         got = f"a sequence of {len(value)}" if hasattr(value, "__len__") else value
         got = "a bare frame" if isinstance(value, Measurements) else got
-        raise bad_argument(name, f"a sequence with one entry per robot ({k})", got, "Use None for no reading.")
+        raise argument_error(name, f"a sequence with one entry per robot ({k})", got, "Use None for no reading.")
     return value
 
 
@@ -335,13 +335,13 @@ def _check_move(robot: int, move: Any) -> FloatArray:
     """Return a robot's odometry as a checked array, perhaps the caller's."""
     if type(move) is np.ndarray and move.dtype == np.float64 and move.shape == (3,):
         own: FloatArray = move
-        if math.hypot(*own.tolist()) <= FARTHEST_MOVE:
+        if math.hypot(*own.tolist()) <= MAX_MOVE:
             return own
     cure = "Give the motion (dx, dy, dtheta) in the previous robot frame, or None."
     checked = check_array(f"odometry[{robot}]", move, (3,), cure)
-    if np.abs(checked).max() > FARTHEST_MOVE:
+    if np.abs(checked).max() > MAX_MOVE:
         cure = "Check the units: metres and radians since the robot's last step."
-        raise bad_argument(f"odometry[{robot}]", f"numbers within +-{FARTHEST_MOVE:g}", move, cure)
+        raise argument_error(f"odometry[{robot}]", f"numbers within +-{MAX_MOVE:g}", move, cure)
     return checked
 
 
@@ -352,9 +352,9 @@ def _check_poses(poses: Any, k: int) -> dict[int, FloatArray]:
         if pose is not None:
             cure = "Give (x, y, theta) in the robot's own start frame, or None."
             exact[robot] = check_array(f"poses[{robot}]", pose, (3,), cure)
-            if np.abs(exact[robot]).max() > FARTHEST_POSE:
+            if np.abs(exact[robot]).max() > MAX_POSE:
                 cure = "Check the units: metres and radians from the robot's start."
-                raise bad_argument(f"poses[{robot}]", f"numbers within +-{FARTHEST_POSE:g}", pose, cure)
+                raise argument_error(f"poses[{robot}]", f"numbers within +-{MAX_POSE:g}", pose, cure)
     return exact
 
 
@@ -380,11 +380,11 @@ def _check_frame(robot: int, frame: Any, size: int, limit: float) -> int:
         The length of the map's descriptors from there on.
     """
     if type(frame) is not Measurements and not isinstance(frame, Measurements):
-        raise bad_argument(f"measurements[{robot}]", "Measurements or None", frame, "Wrap the arrays.")
+        raise argument_error(f"measurements[{robot}]", "Measurements or None", frame, "Wrap the arrays.")
     own_size = frame.descriptors.shape[1]
     if own_size != size and len(frame):
         if size:
-            raise bad_argument(
+            raise argument_error(
                 f"measurements[{robot}].descriptors",
                 f"vectors of size {size} as in the map",
                 f"shape {frame.descriptors.shape}",
@@ -400,12 +400,12 @@ def _check_frame(robot: int, frame: Any, size: int, limit: float) -> int:
 def _check_points(robot: int, frame: Measurements, limit: float) -> None:
     """Raise unless all points are so near that their covariances can be used, and ahead where they have none yet."""
     nearest, farthest = frame.extent
-    limit = limit if frame.covariances is None else FARTHEST_POINT
+    limit = limit if frame.covariances is None else MAX_POINT_DISTANCE
     if not farthest <= limit:
         cure = "Check the units, metres, and drop points without disparity."
-        raise bad_argument(f"measurements[{robot}].points", f"numbers within +-{limit:g}", farthest, cure)
+        raise argument_error(f"measurements[{robot}].points", f"numbers within +-{limit:g}", farthest, cure)
     if frame.covariances is None and nearest < _kernels.MIN_DEPTH:
-        raise bad_argument(
+        raise argument_error(
             f"measurements[{robot}].points",
             f"depths Z >= {_kernels.MIN_DEPTH} m",
             nearest,

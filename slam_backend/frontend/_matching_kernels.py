@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from slam_backend.core.jit import device, fused, jit, lanes
+from slam_backend.core.jit import device, jit, jit_fma, simd
 from slam_backend.core.validation import BoolArray, Float32Array, FloatArray, IntArray
 from slam_backend.frontend.images import Image
 
@@ -65,8 +65,8 @@ def match_rows(
 
 
 @device
-@lanes
-def _lay_over(
+@simd
+def _align_patch(
     source: Image,
     target: Image,
     column: int,
@@ -180,7 +180,7 @@ def _lay_over(
     return px, py, correlation
 
 
-@fused
+@jit_fma
 def refine(
     left_image: Image, right_image: Image, left: FloatArray, right: FloatArray, half: int, iterations: int
 ) -> FloatArray:
@@ -206,7 +206,7 @@ def refine(
     sums = np.empty((6, side), dtype=np.float32)
     for n in range(len(left)):
         column, row = int(np.rint(left[n, 0])), int(np.rint(left[n, 1]))
-        x, y, forward = _lay_over(
+        x, y, forward = _align_patch(
             left_image,
             right_image,
             column,
@@ -223,7 +223,7 @@ def refine(
         if forward < 0.0:
             continue
         column, row = int(np.rint(x)), int(np.rint(y))
-        x, y, backward = _lay_over(
+        x, y, backward = _align_patch(
             right_image,
             left_image,
             column,

@@ -99,11 +99,11 @@ def find_corners(image: Image, options: CornerOptions) -> Corners:
     points, strengths = np.empty((len(found), 2)), np.empty(len(found))
     count = _peaks(response, found, options.spacing, points, strengths)
     points, strengths = points[:count], strengths[:count]
-    order = spread_order(points, strengths, options.cell)[: options.most]
+    order = grid_order(points, strengths, options.cell)[: options.most]
     return Corners(points[order], strengths[order])
 
 
-def spread_order(points: FloatArray, quality: FloatArray, cell: float) -> IntArray:
+def grid_order(points: FloatArray, quality: FloatArray, cell: float) -> IntArray:
     """Return the order (n,) int64 that takes the best of each square cell first, then the second best, and so on.
 
     Args:
@@ -111,7 +111,7 @@ def spread_order(points: FloatArray, quality: FloatArray, cell: float) -> IntArr
         quality: (n,) float64. Larger is better; decides within a cell, and among the cells' equals.
         cell: Side of a cell [px].
 
-    >>> spread_order(np.array([[1.0, 1.0], [2.0, 2.0], [40.0, 2.0]]), np.array([5.0, 9.0, 1.0]), 32.0).tolist()
+    >>> grid_order(np.array([[1.0, 1.0], [2.0, 2.0], [40.0, 2.0]]), np.array([5.0, 9.0, 1.0]), 32.0).tolist()
     [1, 2, 0]
     """
     best_first = np.argsort(-quality, kind="stable")

@@ -14,7 +14,7 @@ SIFT_DIAMETER = 5.0  # of a SIFT keypoint per scale [px]: its 16 cells then cove
 ORB_BITS = 256
 
 
-class Kind(NamedTuple):
+class DescriptorType(NamedTuple):
     """What a descriptor is like.
 
     Attributes:
@@ -28,10 +28,10 @@ class Kind(NamedTuple):
     stereo_gate: float
 
 
-KINDS = {
-    "usurf": Kind(SIZE, 0.45, 0.45),
-    "sift": Kind(128, 0.6, 0.6),
-    "orb": Kind(ORB_BITS, 0.8, 0.8),  # unit vectors that differ in 64 of 256 signs are 1.0 apart
+DESCRIPTOR_TYPES = {
+    "usurf": DescriptorType(SIZE, 0.45, 0.45),
+    "sift": DescriptorType(128, 0.6, 0.6),
+    "orb": DescriptorType(ORB_BITS, 0.8, 0.8),  # unit vectors that differ in 64 of 256 signs are 1.0 apart
 }
 
 
@@ -53,7 +53,7 @@ def describe_points(image: Image, points: FloatArray, scales: FloatArray, kind: 
     """
     if kind == "usurf":
         return describe(integral_of(image), points, scales)
-    size = KINDS[kind].size
+    size = DESCRIPTOR_TYPES[kind].size
     described = np.zeros((len(points), size), dtype=np.float32)
     if not len(points):
         return described

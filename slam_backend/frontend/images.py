@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.core.validation import bad_argument
+from slam_backend.core.validation import argument_error
 
 Image = NDArray[np.uint8]
 
@@ -31,14 +31,14 @@ def check_image(name: str, image: Any) -> Image:
     array = np.asarray(image)
     if array.ndim == 3 and array.shape[2] in (1, 3, 4):
         cure = "Convert it first."
-        raise bad_argument(name, "a grey image (H, W)", f"a colour image {array.shape}", cure)
+        raise argument_error(name, "a grey image (H, W)", f"a colour image {array.shape}", cure)
     if array.ndim != 2:
-        raise bad_argument(name, "a grey image (H, W)", f"shape {array.shape}", "Give rows and columns.")
+        raise argument_error(name, "a grey image (H, W)", f"shape {array.shape}", "Give rows and columns.")
     if array.dtype != np.uint8:
         cure = "Scale it to 0..255 and round."
-        raise bad_argument(name, "an image of dtype uint8", f"an array of dtype {array.dtype}", cure)
+        raise argument_error(name, "an image of dtype uint8", f"an array of dtype {array.dtype}", cure)
     if min(array.shape) < SMALLEST or array.size > LARGEST:
         expected = f"at least {SMALLEST} rows and columns and at most {LARGEST} pixels"
-        raise bad_argument(name, expected, f"shape {array.shape}", "Crop or scale it.")
+        raise argument_error(name, expected, f"shape {array.shape}", "Crop or scale it.")
     # Kernels are compiled for arrays that can be written; others would be compiled for anew.
     return np.ascontiguousarray(array) if array.flags.writeable else array.copy()

@@ -20,7 +20,7 @@ from slam_backend.core.validation import (
     BoolArray,
     Float32Array,
     FloatArray,
-    bad_argument,
+    argument_error,
     check_array,
     check_choice,
     check_float,
@@ -28,13 +28,13 @@ from slam_backend.core.validation import (
     known_names,
 )
 from slam_backend.frontend._matching_kernels import LARGEST_PATCH, match_rows, refine
-from slam_backend.frontend.corners import CornerOptions, Corners, find_corners, spread_order
-from slam_backend.frontend.descriptors import DESCRIPTORS, KINDS, describe_points
+from slam_backend.frontend.corners import CornerOptions, Corners, find_corners, grid_order
+from slam_backend.frontend.descriptors import DESCRIPTOR_TYPES, DESCRIPTORS, describe_points
 from slam_backend.frontend.images import Image, check_image
 from slam_backend.models.camera import StereoCamera
 from slam_backend.models.measurements import Measurements, TeamMeasurements
 
-GUARDS = ("mutual", "patch", "rows", "back", "range")
+MATCH_CHECKS = ("mutual", "patch", "rows", "back", "range")
 LEAST_SCALE, LARGEST_SCALE = 1.0, 8.0  # px; of windows of constant physical size
 SWAPPED = 12  # so many points the other way round, and three times as many as the right way, tell of swapped images
 
@@ -56,7 +56,7 @@ class FrontEndOptions:
         row_difference: Largest difference of their rows [px].
         back_difference: Largest difference between the ways forward and back [px].
         nearest: Points nearer than this are dropped [m].
-        max_measurements: At most so many; those in front of `spread_order` are kept. None: all.
+        max_measurements: At most so many; those in front of `grid_order` are kept. None: all.
     """
 
     descriptor: Literal["usurf", "sift", "orb"] = "usurf"
@@ -75,7 +75,7 @@ class FrontEndOptions:
     def __post_init__(self) -> None:
         check_choice("front_end.descriptor", self.descriptor, DESCRIPTORS)
         if not isinstance(self.corners, CornerOptions):
-            raise bad_argument(
+            raise argument_error(
                 "front_end.corners", "CornerOptions", self.corners, "Build them with CornerOptions(...)."
             )
         for name in ("row_tolerance", "row_difference", "back_difference"):
@@ -87,7 +87,7 @@ class FrontEndOptions:
         half = check_int("front_end.patch_half", self.patch_half, 1, "5 is a good one.")
         if 2 * half + 1 > LARGEST_PATCH:
             expected = f"an int <= {LARGEST_PATCH // 2}"
-            raise bad_argument("front_end.patch_half", expected, half, "Large patches cover several depths.")
+            raise argument_error("front_end.patch_half", expected, half, "Large patches cover several depths.")
         check_int("front_end.iterations", self.iterations, 1, "8 are enough.", 1000)
         cure = "Give a correlation."
         check_float("front_end.least_correlation", self.least_correlation, cure, at_least=0.0, at_most=1.0)
@@ -150,13 +150,13 @@ class StereoFrontEnd:
     def __init__(self, camera: Any, options: FrontEndOptions | None = None, centre_px: Any | None = None) -> None:
         if not isinstance(camera, StereoCamera):
             cure = "Points need a focal length and a baseline: read them with slam_backend.readers.calibration."
-            raise bad_argument("camera", "a StereoCamera", camera, cure)
+            raise argument_error("camera", "a StereoCamera", camera, cure)
         self.camera: StereoCamera = camera
         self.options = FrontEndOptions() if options is None else options
         middle = (0.5 * (camera.width - 1), 0.5 * (camera.height - 1))
         centre = check_array("centre_px", middle if centre_px is None else centre_px, (2,), "Give column and row.")
         self._centre: FloatArray = as_read_only(np.append(centre, 0.0))
-        self._kind = KINDS[self.options.descriptor]
+        self._kind = DESCRIPTOR_TYPES[self.options.descriptor]
         span = camera.focal_px * camera.baseline
         self._least, self._largest = span / camera.max_range, span / self.options.nearest
 
@@ -184,7 +184,7 @@ class StereoFrontEnd:
         kept = np.flatnonzero(matches.passed.all(axis=0))
         if len(kept) < SWAPPED:
             self._check_order(left, right, len(kept))
-        order = spread_order(matches.corners[kept], matches.responses[kept], self.options.corners.cell)
+        order = grid_order(matches.corners[kept], matches.responses[kept], self.options.corners.cell)
         kept = kept[order]
         pixels = np.column_stack([matches.corners[kept], matches.disparity[kept]])
         points = self.camera.triangulate(pixels - self._centre)
@@ -198,7 +198,7 @@ class StereoFrontEnd:
             descriptors = describe_points(left, pixels[:, :2], scales, self.options.descriptor)
             known = descriptors.any(axis=1)
             pixels, points, descriptors, kept = pixels[known], points[known], descriptors[known], kept[known]
-        (frame,) = TeamMeasurements(points, descriptors, np.array([len(points)])).of_each()
+        (frame,) = TeamMeasurements(points, descriptors, np.array([len(points)])).per_robot()
         return StereoFrame(frame, pixels, matches.responses[kept], matches)
 
     def match(self, left: Image, right: Image) -> StereoMatches:
@@ -243,7 +243,7 @@ class StereoFrontEnd:
         expected = (self.camera.height, self.camera.width)
         if checked.shape != expected:
             cure = "Rectify it to the camera's size, or correct the camera."
-            raise bad_argument(name, f"an image of {expected[1]} x {expected[0]} px", f"shape {checked.shape}", cure)
+            raise argument_error(name, f"an image of {expected[1]} x {expected[0]} px", f"shape {checked.shape}", cure)
         return checked
 
     def _check_order(self, left: Image, right: Image, count: int) -> None:
@@ -251,7 +251,7 @@ class StereoFrontEnd:
         reverse = int(self.match(right, left).passed.all(axis=0).sum())
         if reverse >= SWAPPED and reverse > 3 * count:
             got = f"a pair with {reverse} points at negative disparities and {count} at positive ones"
-            raise bad_argument("left, right", "the left image first", got, "Swap the images.")
+            raise argument_error("left, right", "the left image first", got, "Swap the images.")
 
     def _describe(self, image: Image) -> tuple[Corners, Float32Array]:
         """Return the corners of an image and their descriptors; those that cannot be described are left out."""

@@ -17,8 +17,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.core.jit import fused
-from slam_backend.core.validation import Float32Array, FloatArray, bad_argument, check_array
+from slam_backend.core.jit import jit_fma
+from slam_backend.core.validation import Float32Array, FloatArray, argument_error, check_array
 from slam_backend.frontend.images import Image, check_image
 
 SIZE = 64
@@ -50,7 +50,7 @@ def usurf_descriptors(image: Any, points_xy: Any, scales: Any) -> Float32Array:
     sizes = np.broadcast_to(np.asarray(scales, dtype=np.float64), (len(points),)) if np.ndim(scales) == 0 else scales
     checked: Any = check_array("scales", sizes, (len(points),), "Give one scale per point, or one for all.")
     if len(checked) and checked.min() <= 0.0:
-        raise bad_argument("scales", "numbers > 0", float(checked.min()), "Scales are in pixels; 2.3 is a good one.")
+        raise argument_error("scales", "numbers > 0", float(checked.min()), "Scales are in pixels; 2.3 is a good one.")
     return describe(integral_of(image), points, checked)
 
 
@@ -66,7 +66,7 @@ def describe(integral: NDArray[np.int32], points: FloatArray, scales: FloatArray
     return descriptors
 
 
-@fused
+@jit_fma
 def _describe(
     integral: NDArray[np.int32],
     points: FloatArray,

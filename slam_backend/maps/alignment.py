@@ -4,28 +4,43 @@ import math
 
 import numpy as np
 
-from slam_backend.core.validation import BoolArray, FloatArray, IntArray, bad_argument, check_choice
+from slam_backend.core.validation import BoolArray, FloatArray, IntArray, argument_error, check_choice
 from slam_backend.maps import _kernels as kernels
 from slam_backend.maps import initial_estimates as proposals
-from slam_backend.maps.alignment_types import REASONS, RIVAL_ANGLE, RIVAL_DISTANCE, Alignment, AlignmentOptions, Reason
+from slam_backend.maps.alignment_types import (
+    DISTINCT_ROTATION,
+    DISTINCT_TRANSLATION,
+    REASONS,
+    Alignment,
+    AlignmentOptions,
+    Reason,
+)
 from slam_backend.maps.correspondences import candidates, match_table, too_many
 from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.maps.verification import (
-    by_chance,
     covariance_of,
-    extent,
-    fitting,
+    has_perceptual_alias,
+    inlier_mask,
+    is_chance_alignment,
     is_mirrored,
     one_to_one,
-    recurs,
-    strongest_rival,
+    principal_extent,
+    runner_up_ratio,
     worst_bound,
 )
 from slam_backend.metrics import align_se2
 
 __all__ = [
-    "METHODS", "REASONS", "RIVAL_ANGLE", "RIVAL_DISTANCE", "Alignment", "AlignmentOptions", "Reason", "align_maps",
-    "candidate_matches", "propose_motion",
+    "DISTINCT_ROTATION",
+    "DISTINCT_TRANSLATION",
+    "METHODS",
+    "REASONS",
+    "Alignment",
+    "AlignmentOptions",
+    "Reason",
+    "align_maps",
+    "candidate_matches",
+    "propose_motion",
 ]  # fmt: skip
 
 METHODS = ("ransac", "svd", "icp", "impicp", "gnc", "clique")
@@ -97,27 +112,28 @@ def align_maps(
     if start is None:
         return Alignment.refused("too few inliers")
     pose, members, variance = kernels.refine(table, start, floor, gate)
-    inside = fitting(table, matches, pose, floor, gate)
+    inside = inlier_mask(table, matches, pose, floor, gate)
     if not one_to_one(matches):  # of look-alikes that all fit, only the closest shapes the motion
         members = np.zeros(len(matches), np.bool_)
         pose, members[inside], variance = kernels.refine(table[inside], pose, floor, gate)
-        inside = fitting(table, matches, pose, floor, gate)
+        inside = inlier_mask(table, matches, pose, floor, gate)
     inliers = matches[inside]
-    if len(inliers) < options.min_inliers or by_chance(table, map_a, matches, pose, variance, options):
+    if len(inliers) < options.min_inliers or is_chance_alignment(table, map_a, matches, pose, variance, options):
         return Alignment.refused("too few inliers")
     points_b = map_b.means[inliers[:, 1], :2]
-    ratio = strongest_rival(table, matches, hypotheses, pose, variance, points_b.mean(axis=0), options)
+    ratio = runner_up_ratio(table, matches, hypotheses, pose, variance, points_b.mean(axis=0), options)
     if ratio > options.max_ratio:
         return Alignment.refused("ambiguous", ratio)
     if options.appearance and any(
-        recurs(landmarks, rows, variance, options) for landmarks, rows in zip((map_a, map_b), inliers.T, strict=True)
+        has_perceptual_alias(landmarks, rows, variance, options)
+        for landmarks, rows in zip((map_a, map_b), inliers.T, strict=True)
     ):
         return Alignment.refused("ambiguous", ratio)
     if is_mirrored(table, matches, pose, inside, options):
         return Alignment.refused("mirrored", ratio)
-    if extent(points_b) < options.min_spread:
+    if principal_extent(points_b) < options.min_spread:
         return Alignment.refused("poorly spread", ratio)
-    contradiction = kernels.unexplained(table, members, pose, variance)
+    contradiction = kernels.reduced_chi2(table, members, pose, variance)
     covariance = covariance_of(kernels.information(table, members, pose, variance)[0] / contradiction)
     influence = kernels.largest_influence(table, members, pose, variance)
     missed, excess = worst_bound(covariance, influence, options)
@@ -171,10 +187,10 @@ def _checked(
         ("map_a", map_a, LandmarkMap), ("map_b", map_b, LandmarkMap), ("options", options, AlignmentOptions)
     ):  # fmt: skip
         if not isinstance(value, kind):
-            raise bad_argument(name, f"a {kind.__name__}", value, f"Build one: {kind.__name__}(...).")
+            raise argument_error(name, f"a {kind.__name__}", value, f"Build one: {kind.__name__}(...).")
     rng = np.random.default_rng(0) if rng is None else rng
     if not isinstance(rng, np.random.Generator):
-        raise bad_argument("rng", "a numpy.random.Generator or None", rng, "Give np.random.default_rng(seed).")
+        raise argument_error("rng", "a numpy.random.Generator or None", rng, "Give np.random.default_rng(seed).")
     return options, rng
 
 
@@ -198,14 +214,14 @@ def _propose(
     if method == "ransac":
         return hypotheses[hypotheses[:, 4].argmax(), :3].copy() if len(hypotheses) else None
     if method == "gnc":
-        return proposals.graduated(table, floor, gate)
+        return proposals.gnc_tls(table, floor, gate)
     if method == "clique":
         unlike = np.linalg.norm(map_a.descriptors[matches[:, 0]] - map_b.descriptors[matches[:, 1]], axis=1)
-        return proposals.consistent(table, matches, unlike, floor, gate)
+        return proposals.clique_estimate(table, matches, unlike, floor, gate)
     if method == "impicp":
-        return proposals.two_starts(map_a, map_b, matches, table, floor, gate)
+        return proposals.improved_icp(map_a, map_b, matches, table, floor, gate)
     fit = align_se2(table[:, :2], table[:, 3:5])
-    return fit if method == "svd" else proposals.closest_points(map_a, map_b, fit)
+    return fit if method == "svd" else proposals.icp(map_a, map_b, fit)
 
 
 def _search(table: FloatArray, rng: np.random.Generator, options: AlignmentOptions) -> FloatArray:

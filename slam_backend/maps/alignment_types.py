@@ -13,7 +13,7 @@ from slam_backend.core.validation import (
     MOST,
     FloatArray,
     IntArray,
-    bad_argument,
+    argument_error,
     check_array,
     check_float,
     check_int,
@@ -43,14 +43,14 @@ HINTS: dict[str, str] = {  # what helps, by the reason of a refusal
     "mirrored": "The mirror image fits better: check the sign of the measured coordinates.",
     "poorly spread": "The shared landmarks stand too close together: let robots see more of the same places.",
     "too uncertain": "The way of a robot to what the maps share is too uncertain: close loops or set"
-    " `rejuvenate_every`; or accept it, by a lower `MergeOptions.least_sure` where paths leave it open, by a higher"
+    " `rejuvenate_every`; or accept it, by a lower `MergeOptions.min_sigmas_on_trial` where paths leave it open, by a higher"
     " `AlignmentOptions.max_sigma_position` or `max_sigma_heading` where landmarks do.",
 }
 BOUNDS = ("translation", "rotation", "one match", "paths", "repeat")  # that a refusal as "too uncertain" may miss
-RIVAL_DISTANCE = 0.5  # [m]; beyond these two an alignment counts as another one, and as a false one
-RIVAL_ANGLE = math.radians(5.0)
+DISTINCT_TRANSLATION = 0.5  # [m]; beyond these two an alignment counts as another one, and as a false one
+DISTINCT_ROTATION = math.radians(5.0)
 LARGEST = 1e9  # of gates and distances; their squares are far from infinite
-MOST_LOOK_ALIKES = 10_000  # as many pairs as geometry alone may make
+MAX_SIMILAR = 10_000  # as many pairs as geometry alone may make
 FEWEST_INLIERS = 3  # two matches fit any motion between them: only a third is evidence
 
 
@@ -82,7 +82,7 @@ class AlignmentOptions:
     appearance: bool = True
     descriptor_gate: float = 0.45
     descriptor_ratio: float = 0.8
-    look_alikes: int = 6
+    max_similar: int = 6
     same_place: float = 1.0
     position_gate: float = 11.34
     position_floor: float = 0.1
@@ -96,7 +96,7 @@ class AlignmentOptions:
 
     def __post_init__(self) -> None:
         if not isinstance(self.appearance, bool):
-            raise bad_argument("options.appearance", "a bool", self.appearance, "Say True or False.")
+            raise argument_error("options.appearance", "a bool", self.appearance, "Say True or False.")
         above = ("descriptor_gate", "position_gate", "position_floor", "max_sigma_position", "max_sigma_heading")
         for name in above:
             check_float(f"options.{name}", getattr(self, name), "Give a positive number.", above=0.0, at_most=LARGEST)
@@ -108,7 +108,7 @@ class AlignmentOptions:
             )
         probability = self.success_probability
         check_float("options.success_probability", probability, "Use e.g. 0.999.", above=0.0, at_most=1.0 - 1e-12)
-        check_int("options.look_alikes", self.look_alikes, 0, "Use 0 to demand that all stand out.", MOST_LOOK_ALIKES)
+        check_int("options.look_alikes", self.max_similar, 0, "Use 0 to demand that all stand out.", MAX_SIMILAR)
         check_int("options.min_inliers", self.min_inliers, FEWEST_INLIERS, "Two fit any motion: demand more.", MOST)
         check_int("options.max_samples", self.max_samples, 1, "Allow at least one sample.", MOST)
 
@@ -148,7 +148,7 @@ class Alignment:
     def __post_init__(self) -> None:
         if self.reason not in (REASONS if not self.success else ("",)):
             expected = "'' on success, else one of " + ", ".join(REASONS)
-            raise bad_argument("reason", expected, self.reason, "Name why it was refused.")
+            raise argument_error("reason", expected, self.reason, "Name why it was refused.")
         cure = "A successful alignment has a finite motion and covariance."
         pose = check_array("tx, ty, theta", (self.tx, self.ty, self.theta), (3,), cure, finite=self.success)
         for name, value in zip(("tx", "ty", "theta"), pose, strict=True):

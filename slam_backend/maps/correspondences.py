@@ -6,32 +6,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.core.packed_symmetric import OF_NINE
-from slam_backend.core.validation import BoolArray, Float32Array, FloatArray, IntArray, bad_argument
+from slam_backend.core.validation import BoolArray, Float32Array, FloatArray, IntArray, argument_error
 from slam_backend.maps import _kernels as kernels
 from slam_backend.maps._kernels import descriptor_matching
 from slam_backend.maps.alignment_types import AlignmentOptions
 from slam_backend.maps.landmark_map import LandmarkMap
 
-MOST_PAIRS = 10_000  # candidates by geometry alone
+MAX_PAIRS = 10_000  # candidates by geometry alone
 
 
 def too_many(map_a: LandmarkMap, map_b: LandmarkMap, options: AlignmentOptions) -> bool:
     """Tell whether two maps have more pairs than are tried without appearance."""
-    return not options.appearance and len(map_a) * len(map_b) > MOST_PAIRS
+    return not options.appearance and len(map_a) * len(map_b) > MAX_PAIRS
 
 
 def candidates(map_a: LandmarkMap, map_b: LandmarkMap, options: AlignmentOptions) -> tuple[IntArray, BoolArray]:
     """Return the candidates (k, 2), and which of them stand out (k,): these are one-to-one."""
     if map_a.descriptors.shape[1] != map_b.descriptors.shape[1]:
-        raise bad_argument(
+        raise argument_error(
             "map_b",
             f"descriptors of size {map_a.descriptors.shape[1]}, as in map_a",
             map_b.descriptors.shape[1],
             "Describe the landmarks of both maps with the same front end.",
         )
     if too_many(map_a, map_b, options):
-        raise bad_argument(
-            "map_b", f"at most {MOST_PAIRS} pairs of landmarks without appearance", len(map_a) * len(map_b),
+        raise argument_error(
+            "map_b", f"at most {MAX_PAIRS} pairs of landmarks without appearance", len(map_a) * len(map_b),
             "Give smaller maps, or tell landmarks apart.",
         )  # fmt: skip
     if options.appearance:
@@ -39,10 +39,10 @@ def candidates(map_a: LandmarkMap, map_b: LandmarkMap, options: AlignmentOptions
         for one, other, here, there in ((map_a, map_b, 0, 1), (map_b, map_a, 1, 0)):
             descriptors, partners = one.descriptors[clear[:, here]], clear[:, there]
             limits = (options.same_place, options.descriptor_ratio)
-            clear = clear[unlike_other_places(descriptors, partners, other.descriptors, other.means, *limits)]
+            clear = clear[passes_ratio_test(descriptors, partners, other.descriptors, other.means, *limits)]
         alike = clear[:0]
-        if options.look_alikes:
-            alike = look_alikes(map_a.descriptors, map_b.descriptors, options.descriptor_gate, options.look_alikes)
+        if options.max_similar:
+            alike = similar_pairs(map_a.descriptors, map_b.descriptors, options.descriptor_gate, options.max_similar)
     else:
         clear, alike = np.empty((0, 2), np.int64), np.argwhere(np.ones((len(map_a), len(map_b)), np.bool_))
     names = np.concatenate([clear, alike]) @ np.array([max(len(map_b), 1), 1])
@@ -56,14 +56,14 @@ def candidates(map_a: LandmarkMap, map_b: LandmarkMap, options: AlignmentOptions
     return matches[level], stands_out[level]
 
 
-def may_suffice(descriptors_a: Float32Array, descriptors_b: Float32Array, options: AlignmentOptions) -> bool:
+def has_enough_candidates(descriptors_a: Float32Array, descriptors_b: Float32Array, options: AlignmentOptions) -> bool:
     """Tell by descriptors (n, d), (m, d) alone whether two maps may have candidates enough for an alignment.
 
     By appearance every candidate is a pair within the gate: so few of them are not worth making maps for.
     """
     if not options.appearance or descriptors_a.shape[1] != descriptors_b.shape[1]:
         return True
-    return num_alike(descriptors_a, descriptors_b, options.descriptor_gate) >= options.min_inliers
+    return count_similar(descriptors_a, descriptors_b, options.descriptor_gate) >= options.min_inliers
 
 
 def match_table(map_a: LandmarkMap, map_b: LandmarkMap, matches: IntArray) -> FloatArray:
@@ -87,7 +87,7 @@ def match_table(map_a: LandmarkMap, map_b: LandmarkMap, matches: IntArray) -> Fl
 Scalar = TypeVar("Scalar", bound=np.generic)
 
 
-def look_alikes(a: Float32Array, b: Float32Array, gate: float, most: int) -> IntArray:
+def similar_pairs(a: Float32Array, b: Float32Array, gate: float, most: int) -> IntArray:
     """Pair all descriptors within `gate`, but none that so pairs with more than `most`: those tell nothing.
 
     Args:
@@ -101,12 +101,12 @@ def look_alikes(a: Float32Array, b: Float32Array, gate: float, most: int) -> Int
     """
     if not len(a) or not len(b):
         return np.empty((0, 2), np.int64)
-    return descriptor_matching.pairs_alike(_fresh(a), _fresh(b.T), gate * gate, most)
+    return descriptor_matching.similar_pairs(_fresh(a), _fresh(b.T), gate * gate, most)
 
 
-def num_alike(a: Float32Array, b: Float32Array, gate: float) -> int:
+def count_similar(a: Float32Array, b: Float32Array, gate: float) -> int:
     """Return how many pairs of descriptors (n, d) and (m, d) are no farther apart than `gate`."""
-    return descriptor_matching.num_alike(_fresh(a), _fresh(b.T), gate * gate) if len(a) and len(b) else 0
+    return descriptor_matching.count_similar(_fresh(a), _fresh(b.T), gate * gate) if len(a) and len(b) else 0
 
 
 def mutual_nearest(a: Float32Array, b: Float32Array, gate: float) -> IntArray:
@@ -125,7 +125,7 @@ def mutual_nearest(a: Float32Array, b: Float32Array, gate: float) -> IntArray:
     return descriptor_matching.mutual_pairs(_fresh(a), _fresh(b.T), gate * gate)
 
 
-def unlike_other_places(
+def passes_ratio_test(
     descriptors: Float32Array,
     partners: IntArray,
     others: Float32Array,
@@ -147,7 +147,7 @@ def unlike_other_places(
         (k,) mask of the matches that pass. Without any competitor a match passes.
     """
     arrays = _fresh(descriptors), _fresh(partners), _fresh(others.T), _fresh(positions)
-    return descriptor_matching.stands_out(*arrays, same_place, ratio)
+    return descriptor_matching.ratio_test_mask(*arrays, same_place, ratio)
 
 
 def _fresh(array: NDArray[Scalar]) -> NDArray[Scalar]:

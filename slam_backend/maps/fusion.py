@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from slam_backend.core.validation import FloatArray, IntArray, bad_argument, check_kind
+from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_kind
 from slam_backend.geometry import rotate_covariances, rotation, transform_points
 from slam_backend.maps.alignment import Alignment
 from slam_backend.maps.landmark_map import LandmarkMap
@@ -38,7 +38,7 @@ def fuse_landmarks(
         gain = _transposed(np.linalg.solve(sigma1 + sigma2, sigma1))  # Eq. 13
     except np.linalg.LinAlgError as error:
         cure = "Give each landmark some uncertainty in every direction."
-        raise bad_argument("cov1 + cov2", "positive definite matrices", "a singular one", cure) from error
+        raise argument_error("cov1 + cov2", "positive definite matrices", "a singular one", cure) from error
     mean = mu1 + (gain @ (mu2 - mu1)[..., None])[..., 0]  # Eq. 14, with mu2 - mu1: printed, it moves away from mu2
     rest = np.eye(3) - gain
     # Eq. 15, of Sigma_1 and not of mu_1, in the form that stays symmetric and positive whatever the rounding.
@@ -53,9 +53,9 @@ def _estimate(name: str, value: ArrayLike, shape: tuple[int, ...]) -> FloatArray
     try:
         array = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise bad_argument(name, expected, value, cure) from error
+        raise argument_error(name, expected, value, cure) from error
     if array.shape[-len(shape) :] != shape:
-        raise bad_argument(name, expected, f"shape {array.shape}", cure)
+        raise argument_error(name, expected, f"shape {array.shape}", cure)
     return array
 
 
@@ -138,11 +138,11 @@ def fuse_maps(map_a: LandmarkMap, map_b: LandmarkMap, alignment: Alignment) -> L
     check_kind("alignment", alignment, Alignment, "Give what align_maps(map_a, map_b) returned.")
     if not alignment.success:
         cure = "Fuse maps only after a successful alignment."
-        raise bad_argument("alignment", "a successful alignment", f"a refusal: {alignment.reason}", cure)
+        raise argument_error("alignment", "a successful alignment", f"a refusal: {alignment.reason}", cure)
     if map_a.descriptors.shape[1] != map_b.descriptors.shape[1]:
         expected = f"descriptors of size {map_a.descriptors.shape[1]}, as in map_a"
         cure = "Describe the landmarks of both maps with the same front end."
-        raise bad_argument("map_b", expected, map_b.descriptors.shape[1], cure)
+        raise argument_error("map_b", expected, map_b.descriptors.shape[1], cure)
     check_inliers(alignment.inliers, len(map_a), len(map_b))
     rows_a, rows_b = alignment.inliers.T
     means_b = transform_points(alignment.transform, map_b.means)
@@ -184,7 +184,7 @@ def check_inliers(inliers: IntArray, size_a: int, size_b: int) -> None:
     if outside.any() or repeated:
         expected = f"one-to-one pairs of rows below {size_a} and {size_b}"
         got = "an index outside" if outside.any() else "a row that repeats"
-        raise bad_argument("alignment.inliers", expected, got, "Fuse the two maps that were aligned.")
+        raise argument_error("alignment.inliers", expected, got, "Fuse the two maps that were aligned.")
 
 
 def _fresh_ids(ids_a: IntArray, ids_b: IntArray, added: IntArray) -> IntArray:

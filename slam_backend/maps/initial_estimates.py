@@ -25,7 +25,7 @@ MOST_IN_GRAPH = 1000  # candidates in a graph: a megabyte of pairs
 MAX_NODES = 20_000  # branchings of the search for a clique
 
 
-def closest_points(map_a: LandmarkMap, map_b: LandmarkMap, start: FloatArray) -> FloatArray:
+def icp(map_a: LandmarkMap, map_b: LandmarkMap, start: FloatArray) -> FloatArray:
     """Return where iterated pairing with the closest landmark leads (ICP).
 
     Args:
@@ -46,7 +46,7 @@ def closest_points(map_a: LandmarkMap, map_b: LandmarkMap, start: FloatArray) ->
     return pose
 
 
-def two_starts(
+def improved_icp(
     map_a: LandmarkMap, map_b: LandmarkMap, matches: IntArray, table: FloatArray, floor: float, gate: float
 ) -> FloatArray:
     """Return the better end of ICP from two starts: all candidates, and the half of them that look most alike.
@@ -56,12 +56,12 @@ def two_starts(
     unlike = np.linalg.norm(map_a.descriptors[matches[:, 0]] - map_b.descriptors[matches[:, 1]], axis=1)
     closer = matches[unlike <= np.median(unlike)]
     starts = (align_se2(map_a.means[some[:, 0], :2], map_b.means[some[:, 1], :2]) for some in (matches, closer))
-    ends = [closest_points(map_a, map_b, start) for start in starts]
+    ends = [icp(map_a, map_b, start) for start in starts]
     scores = [np.maximum(0.0, 1.0 - kernels.squared_distances(table, end, floor) / gate).sum() for end in ends]
     return ends[int(np.argmax(scores))]
 
 
-def graduated(table: FloatArray, floor: float, gate: float) -> FloatArray:
+def gnc_tls(table: FloatArray, floor: float, gate: float) -> FloatArray:
     """Return the motion (3,) of truncated least squares, by graduated non-convexity.
 
     Args:
@@ -92,7 +92,7 @@ def graduated(table: FloatArray, floor: float, gate: float) -> FloatArray:
     return pose
 
 
-def consistent(table: FloatArray, matches: IntArray, unlike: FloatArray, floor: float, gate: float) -> FloatArray:
+def clique_estimate(table: FloatArray, matches: IntArray, unlike: FloatArray, floor: float, gate: float) -> FloatArray:
     """Return the motion (3,) fitted to the largest set of candidates whose distances agree pairwise.
 
     Args:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from slam_backend.core.array_files import read_arrays
 from slam_backend.core.files import checked_path, write_file
 from slam_backend.core.read_only import as_read_only
-from slam_backend.core.validation import FloatArray, IntArray, bad_argument, check_array, check_int
+from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_array, check_int
 from slam_backend.geometry import rotate_covariances, transform_points
 
 FORMAT = "vslam landmark map"
@@ -20,7 +20,7 @@ FORMAT_VERSION = 1
 FIELDS = ("means", "covariances", "descriptors", "counts", "ids")
 
 
-class MapOutline(NamedTuple):
+class MapSummary(NamedTuple):
     """What can be asked of a map at every step, for it costs microseconds: no descriptors, no whole covariances.
 
     Attributes:
@@ -36,7 +36,7 @@ class MapOutline(NamedTuple):
     ids: IntArray
 
 
-class OutlineRows(NamedTuple):
+class MapSummaryRows(NamedTuple):
     """Outlines of one map or several, one after the other, in as few arrays as can be: kernels pay for each.
 
     Attributes:
@@ -44,27 +44,27 @@ class OutlineRows(NamedTuple):
         names: (N, 2) int64. `counts` and `ids`.
     """
 
-    places: FloatArray
-    names: IntArray
+    positions: FloatArray
+    counts_and_ids: IntArray
 
     @classmethod
-    def unwritten(cls, room: int) -> Self:
+    def allocate(cls, room: int) -> Self:
         """Return room for so many landmarks."""
         return cls(np.empty((room, 4)), np.empty((room, 2), np.int64))
 
     @classmethod
-    def of(cls, outlines: Sequence[MapOutline]) -> Self:
+    def of(cls, outlines: Sequence[MapSummary]) -> Self:
         """Return these behind one another."""
         means, variances, counts, ids = map(np.concatenate, zip(*outlines, strict=True))
         return cls(np.column_stack([means, variances]), np.column_stack([counts, ids]))
 
-    def part(self, first: int, last: int) -> MapOutline:
+    def part(self, first: int, last: int) -> MapSummary:
         """Return the outline of these landmarks; it shares memory with this."""
-        places, names = self.places[first:last], self.names[first:last]
-        return MapOutline(places[:, :3], places[:, 3], names[:, 0], names[:, 1])
+        places, names = self.positions[first:last], self.counts_and_ids[first:last]
+        return MapSummary(places[:, :3], places[:, 3], names[:, 0], names[:, 1])
 
 
-class TeamOutlines(NamedTuple):
+class TeamMapSummaries(NamedTuple):
     """The outlines of the maps that the robots of a team go by.
 
     Attributes:
@@ -72,22 +72,22 @@ class TeamOutlines(NamedTuple):
         parts: (K, 2) int64. Where each robot's map begins in `rows`, and where it ends; robots of one filter share one.
     """
 
-    rows: OutlineRows
+    rows: MapSummaryRows
     parts: IntArray
 
     @classmethod
-    def unwritten(cls, num_robots: int, room: int) -> Self:
+    def allocate(cls, num_robots: int, room: int) -> Self:
         """Return room for the maps of K robots with so many landmarks in all."""
-        return cls(OutlineRows.unwritten(room), np.empty((num_robots, 2), np.int64))
+        return cls(MapSummaryRows.allocate(room), np.empty((num_robots, 2), np.int64))
 
     @classmethod
-    def joined(cls, outlines: Sequence[MapOutline]) -> Self:
+    def from_maps(cls, outlines: Sequence[MapSummary]) -> Self:
         """Return these, one for each robot, behind one another."""
         ends = np.cumsum([len(outline.ids) for outline in outlines])
         parts = np.column_stack([np.concatenate([[0], ends[:-1]]), ends])
-        return cls(OutlineRows.of(outlines), parts.astype(np.int64))
+        return cls(MapSummaryRows.of(outlines), parts.astype(np.int64))
 
-    def of(self, robot: int) -> MapOutline:
+    def of(self, robot: int) -> MapSummary:
         """Return that of one robot; it shares memory with this."""
         return self.rows.part(*self.parts[robot])
 
@@ -132,7 +132,7 @@ class LandmarkMap:
         }
         values, repeats = np.unique(fields["ids"], return_counts=True)
         if n and repeats.max() > 1:
-            raise bad_argument(
+            raise argument_error(
                 "ids", "unique ids", f"a repeated id {int(values[repeats.argmax()])}", "Give each its own name."
             )
         for name, array in fields.items():
@@ -146,10 +146,10 @@ class LandmarkMap:
         return len(self.means)
 
     @property
-    def outline(self) -> MapOutline:
+    def summary(self) -> MapSummary:
         """Its places, spreads, counts and names, in the map's order."""
         spread = self.covariances
-        return MapOutline(self.means, spread[:, 0, 0] + spread[:, 1, 1] + spread[:, 2, 2], self.counts, self.ids)
+        return MapSummary(self.means, spread[:, 0, 0] + spread[:, 1, 1] + spread[:, 2, 2], self.counts, self.ids)
 
     @classmethod
     def empty(cls, descriptor_size: int = 64) -> Self:
@@ -193,10 +193,10 @@ class LandmarkMap:
             return unchecked_map(*(getattr(self, name)[chosen] for name in FIELDS))
         cure = f"Give integers from 0 to {len(self) - 1}, or a mask of shape ({len(self)},)."
         if chosen.ndim != 1 or not (chosen.size == 0 or np.issubdtype(chosen.dtype, np.integer)):
-            raise bad_argument("indices", "(k,) integers or a mask", f"an array {chosen.dtype} {chosen.shape}", cure)
+            raise argument_error("indices", "(k,) integers or a mask", f"an array {chosen.dtype} {chosen.shape}", cure)
         rows = chosen.astype(np.int64)
         if rows.size and (rows.min() < 0 or rows.max() >= len(self) or len(np.unique(rows)) < len(rows)):
-            raise bad_argument("indices", "rows of the map, each at most once", rows.tolist(), cure)
+            raise argument_error("indices", "rows of the map, each at most once", rows.tolist(), cure)
         return unchecked_map(*(getattr(self, name)[rows] for name in FIELDS))
 
     def save(self, path: str | Path) -> None:
@@ -219,16 +219,16 @@ class LandmarkMap:
         """
         path, expected = checked_path(path), "a file written by LandmarkMap.save"
         if not Path(path).is_file():
-            raise bad_argument("path", expected, "no such file", f"Check the path {str(path)!r}.")
+            raise argument_error("path", expected, "no such file", f"Check the path {str(path)!r}.")
         cure = f"Save the map again; {str(path)!r} cannot be used."
         try:
             found = read_arrays(Path(path))
             kind, version = str(found["format"]), int(found["version"])
             arrays = {name: found[name] for name in FIELDS} if version == FORMAT_VERSION else {}
         except (ValueError, KeyError, TypeError) as error:
-            raise bad_argument("path", expected, "a broken file", cure) from error
+            raise argument_error("path", expected, "a broken file", cure) from error
         if kind != FORMAT or version != FORMAT_VERSION:
-            raise bad_argument("path", f"{FORMAT!r} version {FORMAT_VERSION}", f"{kind!r} version {version}", cure)
+            raise argument_error("path", f"{FORMAT!r} version {FORMAT_VERSION}", f"{kind!r} version {version}", cure)
         return cls(**arrays)  # type: ignore[arg-type]
 
 
@@ -237,11 +237,11 @@ def _checked_covariances(value: Any, n: int) -> FloatArray:
     array: FloatArray = check_array("covariances", value, (n, 3, 3), "Give one 3x3 matrix per landmark.")
     transposed = array.transpose(0, 2, 1)
     if not np.allclose(array, transposed, rtol=1e-6, atol=1e-12):
-        raise bad_argument("covariances", "symmetric matrices", "an asymmetric one", "Symmetrise them first.")
+        raise argument_error("covariances", "symmetric matrices", "an asymmetric one", "Symmetrise them first.")
     array = 0.5 * (array + transposed)
     # A rank-deficient matrix has eigenvalues of either sign at the rounding error of its size.
     if n and (np.linalg.eigvalsh(array)[:, 0] < -1e-9 * np.abs(array).max(axis=(1, 2))).any():
-        raise bad_argument(
+        raise argument_error(
             "covariances",
             "positive semi-definite matrices",
             "a negative eigenvalue",
@@ -255,7 +255,7 @@ def _checked_integers(name: str, value: Any, n: int, minimum: int) -> IntArray:
     cure = f"Give one integer >= {minimum} per landmark."
     as_float = check_array(name, value, (n,), cure)
     if n and (as_float.min() < minimum or (as_float != np.round(as_float)).any()):
-        raise bad_argument(name, f"integers >= {minimum}", as_float.tolist(), cure)
+        raise argument_error(name, f"integers >= {minimum}", as_float.tolist(), cure)
     array: IntArray = check_array(name, value, (n,), cure, dtype=np.int64)
     return array
 

@@ -6,12 +6,12 @@ import numpy as np
 from scipy.spatial import KDTree
 from scipy.special import bdtrc
 
-from slam_backend.core.packed_symmetric import UNPACK, UPPER
+from slam_backend.core.packed_symmetric import UNPACK_INDEX, UPPER
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.geometry import transform_points, wrap_angle
 from slam_backend.maps import _kernels as kernels
-from slam_backend.maps.alignment_types import RIVAL_ANGLE, RIVAL_DISTANCE, AlignmentOptions
-from slam_backend.maps.correspondences import look_alikes, match_table
+from slam_backend.maps.alignment_types import DISTINCT_ROTATION, DISTINCT_TRANSLATION, AlignmentOptions
+from slam_backend.maps.correspondences import match_table, similar_pairs
 from slam_backend.maps.landmark_map import LandmarkMap
 
 MOST_RECURRING = 0.2  # of the shared landmarks, but for the two that any motion can be made to fit
@@ -22,7 +22,7 @@ SAMPLES = 4000  # pairs of pairs that are tried
 STRONGEST = 3  # motions that are refined
 
 
-def recurs(landmarks: LandmarkMap, rows: IntArray, variance: float, options: AlignmentOptions) -> bool:
+def has_perceptual_alias(landmarks: LandmarkMap, rows: IntArray, variance: float, options: AlignmentOptions) -> bool:
     """Tell whether a constellation of a map occurs in it a second time, as far as two maps of one place agree.
 
     It does if by some motion a fifth of its landmarks come to lie on landmarks that look like them, and so many would
@@ -37,12 +37,12 @@ def recurs(landmarks: LandmarkMap, rows: IntArray, variance: float, options: Ali
     points, variance = landmarks.means, max(variance, options.position_floor**2)
     rows = rows[:: 1 + len(rows) // MOST_LANDMARKS]
     looks = landmarks.descriptors
-    pairs = look_alikes(looks[rows], looks, options.descriptor_gate, MOST_ALIKE)
+    pairs = similar_pairs(looks[rows], looks, options.descriptor_gate, MOST_ALIKE)
     matches = np.column_stack([rows[pairs[:, 0]], pairs[:, 1]])
     apart = points[matches[:, 0]] - points[matches[:, 1]]
     climb = landmarks.covariances[matches, 2, 2].sum(axis=1) + variance
     level = apart[:, 2] ** 2 <= options.position_gate * climb
-    matches = matches[level & (np.hypot(apart[:, 0], apart[:, 1]) > RIVAL_DISTANCE)]
+    matches = matches[level & (np.hypot(apart[:, 0], apart[:, 1]) > DISTINCT_TRANSLATION)]
     beyond = max(3, math.ceil(MOST_RECURRING * (len(rows) - 2)))
     if len(np.unique(matches[:, 0])) < beyond + 2:
         return False
@@ -53,11 +53,11 @@ def recurs(landmarks: LandmarkMap, rows: IntArray, variance: float, options: Ali
         table, samples, variance, options.position_gate, 0.25 * options.min_spread, beyond + 2, options.max_ratio,
         math.log(1.0 - options.success_probability),
     )  # fmt: skip
-    found = found[differ(found[:, :3], np.zeros(3), points[rows, :2].mean(axis=0))]
+    found = found[are_distinct(found[:, :3], np.zeros(3), points[rows, :2].mean(axis=0))]
     chance = _chance(table, landmarks, matches, len(rows), variance, options)
     for start in found[np.argsort(-found[:, 3], kind="stable")[:STRONGEST], :3]:
         pose = kernels.refine(table, start.copy(), variance, options.position_gate)[0]
-        more = np.count_nonzero(fitting(table, matches, pose, variance, options.position_gate)) - 2
+        more = np.count_nonzero(inlier_mask(table, matches, pose, variance, options.position_gate)) - 2
         if more >= beyond and count * bdtrc(more - 1, len(rows) - 2, chance) <= NEEDLESS:
             return True
     return False
@@ -86,7 +86,7 @@ def one_to_one(matches: IntArray) -> bool:
     return all(len(set(rows)) == len(rows) for rows in matches.T.tolist())
 
 
-def fitting(table: FloatArray, matches: IntArray, pose: FloatArray, floor: float, gate: float) -> BoolArray:
+def inlier_mask(table: FloatArray, matches: IntArray, pose: FloatArray, floor: float, gate: float) -> BoolArray:
     """Tell which candidates (k,) lie within the gate under `pose`; of several of one landmark the closest, greedily."""
     distances = kernels.squared_distances(table, pose, floor)
     inside = distances <= gate
@@ -102,7 +102,7 @@ def fitting(table: FloatArray, matches: IntArray, pose: FloatArray, floor: float
     return inside
 
 
-def by_chance(
+def is_chance_alignment(
     table: FloatArray,
     map_a: LandmarkMap,
     matches: IntArray,
@@ -121,7 +121,7 @@ def by_chance(
     """
     if one_to_one(matches):
         return False
-    inside = fitting(table, matches, pose, variance, options.position_gate)
+    inside = inlier_mask(table, matches, pose, variance, options.position_gate)
     spread = (table[:, 6] + table[:, 9] + table[:, 12] + table[:, 15]) / 2.0 + variance
     reach = np.sqrt(options.position_gate * spread)
     if options.appearance:
@@ -139,7 +139,7 @@ def by_chance(
     return bool(0.5 * len(matches) * (len(matches) - 1.0) * tail > FALSE_ALARMS)
 
 
-def strongest_rival(
+def runner_up_ratio(
     table: FloatArray,
     matches: IntArray,
     hypotheses: FloatArray,
@@ -151,14 +151,14 @@ def strongest_rival(
     """Return how near the best hypothesis that differs even when refined comes to `pose`, as `Alignment.ratio` says."""
     floor, gate = options.position_floor**2, options.position_gate
 
-    ours = fitting(table, matches, pose, variance, gate)
-    others = np.ascontiguousarray(hypotheses[differ(hypotheses[:, :3], pose, centre_b), :3])
+    ours = inlier_mask(table, matches, pose, variance, gate)
+    others = np.ascontiguousarray(hypotheses[are_distinct(hypotheses[:, :3], pose, centre_b), :3])
     promise = kernels.own_support(table, others, ours, floor, gate)
     strongest = 0.0
     for i in np.argsort(-promise, kind="stable")[:RIVALS]:
         refined = kernels.refine(table, others[i].copy(), floor, gate)[0]
-        if differ(refined[None], pose, centre_b)[0]:
-            theirs = fitting(table, matches, refined, variance, gate)
+        if are_distinct(refined[None], pose, centre_b)[0]:
+            theirs = inlier_mask(table, matches, refined, variance, gate)
             own = max(float(np.count_nonzero(ours & ~theirs)), 0.5 * float(np.count_nonzero(ours)), 1.0)
             strongest = max(strongest, float(np.count_nonzero(theirs & ~ours)) / own)
     return strongest
@@ -177,24 +177,24 @@ def is_mirrored(
     mirror = np.array([[2.0 * x * x - 1.0, 2.0 * x * y, 0.0], [2.0 * x * y, 2.0 * y * y - 1.0, 0.0], [0.0, 0.0, 1.0]])
     image = table.copy()
     image[:, 3:5] = centre + (table[:, 3:5] - centre) @ mirror[:2, :2]
-    image[:, 12:] = (mirror @ table[:, 12:][:, UNPACK] @ mirror)[:, *UPPER]
-    fits = fitting(image, matches, pose, options.position_floor**2, options.position_gate)
+    image[:, 12:] = (mirror @ table[:, 12:][:, UNPACK_INDEX] @ mirror)[:, *UPPER]
+    fits = inlier_mask(image, matches, pose, options.position_floor**2, options.position_gate)
     more = np.count_nonzero(fits & ~inside) - np.count_nonzero(inside & ~fits)
     share = min(OF_INLIERS * np.count_nonzero(inside), OF_REST * np.count_nonzero(~inside))
     return bool(more >= max(MIRRORED, share))
 
 
-def differ(poses: FloatArray, pose: FloatArray, centre_b: FloatArray) -> BoolArray:
+def are_distinct(poses: FloatArray, pose: FloatArray, centre_b: FloatArray) -> BoolArray:
     """Tell which of `poses` (h, 3) put the point `centre_b` (2,) elsewhere than `pose` does, or turn otherwise."""
     cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     here = transform_points(pose, centre_b)
     x = poses[:, 0] + cos * centre_b[0] - sin * centre_b[1] - here[0]
     y = poses[:, 1] + sin * centre_b[0] + cos * centre_b[1] - here[1]
     turned = np.abs(wrap_angle(poses[:, 2] - pose[2]))
-    return np.asarray((np.hypot(x, y) > RIVAL_DISTANCE) | (turned > RIVAL_ANGLE))
+    return np.asarray((np.hypot(x, y) > DISTINCT_TRANSLATION) | (turned > DISTINCT_ROTATION))
 
 
-def extent(points: FloatArray) -> float:
+def principal_extent(points: FloatArray) -> float:
     """Return how far points (k, 2) [m] reach along their main axis [m]."""
     centred = points - points.mean(axis=0)
     main_axis = np.linalg.eigh(centred.T @ centred)[1][:, -1]
@@ -226,7 +226,7 @@ def worst_bound(
     figures = {
         "translation": position / options.max_sigma_position,
         "rotation": math.sqrt(covariance[2, 2]) / options.max_sigma_heading,
-        "one match": max(influence[0] / (0.5 * RIVAL_DISTANCE), influence[1] / (0.5 * RIVAL_ANGLE)),
+        "one match": max(influence[0] / (0.5 * DISTINCT_TRANSLATION), influence[1] / (0.5 * DISTINCT_ROTATION)),
     }
     name = max(figures, key=lambda bound: figures[bound])
     return name, figures[name]

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from slam_backend.core.validation import FloatArray, bad_argument, check_array
+from slam_backend.core.validation import FloatArray, argument_error, check_array
 
 
 def nees(errors: ArrayLike, covariances: ArrayLike) -> FloatArray:
@@ -29,7 +29,7 @@ def nees(errors: ArrayLike, covariances: ArrayLike) -> FloatArray:
         solved = np.linalg.solve(p, e[..., None])[..., 0]
     except np.linalg.LinAlgError as error:
         cure = "Leave out directions that are known exactly."
-        raise bad_argument("covariances", "positive definite matrices", "a singular one", cure) from error
+        raise argument_error("covariances", "positive definite matrices", "a singular one", cure) from error
     return np.asarray(np.einsum("nd,nd->n", e, solved))
 
 
@@ -45,7 +45,7 @@ def anees(errors: ArrayLike, covariances: ArrayLike) -> float:
     """
     values = nees(errors, covariances)
     if not len(values):
-        raise bad_argument("errors", "at least one error", "an array of none", "There is nothing to average.")
+        raise argument_error("errors", "at least one error", "an array of none", "There is nothing to average.")
     return float(values.mean() / np.shape(errors)[1])
 
 

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from scipy.optimize import linear_sum_assignment
 
 from slam_backend.core.jit import jit
-from slam_backend.core.validation import FloatArray, IntArray, bad_argument, check_array, check_float
+from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_array, check_float
 
 FALSE, UNCOUNTED = -1, -2
 
@@ -112,9 +112,11 @@ def map_error(means: FloatArray, claims: IntArray, true_positions: FloatArray, c
     """
     least, _, surplus = _claimed(means, claims, true_positions)
     if not cutoff > 0.0:
-        raise bad_argument("cutoff", "a number > 0", cutoff, "Give the cutoff distance in metres.")
+        raise argument_error("cutoff", "a number > 0", cutoff, "Give the cutoff distance in metres.")
     if not len(least):
-        raise bad_argument("true_positions", "at least one landmark", "an array of none", "Use a world with landmarks.")
+        raise argument_error(
+            "true_positions", "at least one landmark", "an array of none", "Use a world with landmarks."
+        )
     return _map_error(least, surplus, cutoff)
 
 
@@ -123,16 +125,16 @@ def _claimed(means: FloatArray, claims: IntArray, truths: FloatArray) -> tuple[F
     means, truths = np.ascontiguousarray(means, np.float64), np.ascontiguousarray(truths, np.float64)
     claims = np.ascontiguousarray(claims, np.int64)
     if means.shape != (len(claims), 3):
-        raise bad_argument("means", f"an array of shape ({len(claims)}, 3)", f"shape {means.shape}", "One per claim.")
+        raise argument_error("means", f"an array of shape ({len(claims)}, 3)", f"shape {means.shape}", "One per claim.")
     if truths.ndim != 2 or truths.shape[1] != 3:
-        raise bad_argument("true_positions", "an array of shape (N, 3)", f"shape {truths.shape}", "One row each.")
+        raise argument_error("true_positions", "an array of shape (N, 3)", f"shape {truths.shape}", "One row each.")
     least, holder, surplus, bad = _nearest_claimants(means, claims, truths)
     if bad >= 0:
         if not np.isfinite(means[bad]).all():
             cure = "Drop landmarks that are not finite."
-            raise bad_argument("means", "finite numbers", f"NaN or infinity in row {bad}", cure)
+            raise argument_error("means", "finite numbers", f"NaN or infinity in row {bad}", cure)
         expected = f"indices below {len(truths)}, -1 for false or -2 for uncounted ones"
-        raise bad_argument("claims", expected, int(claims[bad]), "Claim landmarks that exist.")
+        raise argument_error("claims", expected, int(claims[bad]), "Claim landmarks that exist.")
     return least, holder, surplus
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from slam_backend.core.validation import FloatArray, bad_argument, check_array, check_int
+from slam_backend.core.validation import FloatArray, argument_error, check_array, check_int
 from slam_backend.geometry import between, rotation, transform_points
 
 
@@ -60,9 +60,9 @@ def align_se2(points_a: ArrayLike, points_b: ArrayLike, weights: ArrayLike | Non
     cure = "Give weights >= 0, at least one of them positive."
     w = np.ones(len(a)) if weights is None else check_array("weights", weights, (len(a),), cure)
     if not len(a):
-        raise bad_argument("points_a", "at least one point", "an array of none", "There is nothing to align.")
+        raise argument_error("points_a", "at least one point", "an array of none", "There is nothing to align.")
     if w.min() < 0.0 or w.sum() <= 0.0:
-        raise bad_argument("weights", "weights >= 0 with a positive sum", w.tolist(), cure)
+        raise argument_error("weights", "weights >= 0 with a positive sum", w.tolist(), cure)
     w = w / w.sum()
     centre_a, centre_b = w @ a, w @ b
     a, b = a - centre_a, b - centre_b
@@ -107,7 +107,7 @@ def rpe(estimated: ArrayLike, truth: ArrayLike, delta: int = 1) -> RpeResult:
     true = check_array("truth", truth, guess.shape, "Give one true pose per estimated one.")
     check_int("delta", delta, 1, "Compare motions over at least one step.")
     if len(guess) <= delta:
-        raise bad_argument("estimated", f"more than delta = {delta} poses", len(guess), "Give a longer path.")
+        raise argument_error("estimated", f"more than delta = {delta} poses", len(guess), "Give a longer path.")
     error = between(between(true[:-delta], true[delta:]), between(guess[:-delta], guess[delta:]))
     return RpeResult(_rms(error[:, :2]), _rms(error[:, 2:]))
 
@@ -120,7 +120,7 @@ def _paired(estimated: ArrayLike, truth: ArrayLike) -> tuple[FloatArray, FloatAr
     columns = 2 if np.ndim(truth) == 2 and np.shape(truth)[1] == 2 else 3
     true = check_array("truth", truth, (len(guess), columns), cure)
     if not len(guess):
-        raise bad_argument("estimated", "at least one pose", "an array of none", cure)
+        raise argument_error("estimated", "at least one pose", "an array of none", cure)
     return guess[:, :2], true[:, :2]
 
 

@@ -4,13 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam_backend.core.validation import FloatArray, bad_argument, check_array, check_float, check_int, known_names
+from slam_backend.core.validation import FloatArray, argument_error, check_array, check_float, check_int, known_names
 
-FARTHEST_POINT = 1e4  # [m]; no camera measures so far; at a million times this, covariances overflow
+MAX_POINT_DISTANCE = 1e4  # [m]; no camera measures so far; at a million times this, covariances overflow
 FLATTEST = 1e4  # depth over breadth of a stereo point's covariance; flatter ones lose their digits
 LEAST, LARGEST = 1e-12, 1e6  # pixels and metres of a camera; squares of what is made of them keep their digits
 WIDEST = 1 << 20  # px
-FARTHEST_MOUNT = 1e3  # [m]
+MAX_MOUNT_DISTANCE = 1e3  # [m]
 # Columns: the camera's X (right), Y (down), Z (ahead) axes in the robot's x (ahead), y (left), z (up).
 ROBOT_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
@@ -47,7 +47,7 @@ class StereoCamera:
         for name in ("width", "height"):
             check_int(f"camera.{name}", getattr(self, name), 1, "Give a number of pixels.", WIDEST)
         cure = "Give (x, y, z) of the left camera on the robot."
-        mount = check_array("camera.mount", self.mount, (3,), cure, within=FARTHEST_MOUNT)
+        mount = check_array("camera.mount", self.mount, (3,), cure, within=MAX_MOUNT_DISTANCE)
         object.__setattr__(self, "mount", tuple(float(m) for m in mount))
 
     @property
@@ -63,7 +63,7 @@ class StereoCamera:
     @property
     def farthest_usable(self) -> float:
         """Largest coordinate [m] of a point whose covariance under this noise is not too flat for a filter."""
-        return min(FARTHEST_POINT, FLATTEST * self.baseline * self.sigma_px / self.sigma_disparity_px)
+        return min(MAX_POINT_DISTANCE, FLATTEST * self.baseline * self.sigma_px / self.sigma_disparity_px)
 
     def robot_from_camera(self, points: FloatArray) -> FloatArray:
         """Move points (..., 3) [m] from the camera frame to the robot frame."""
@@ -86,7 +86,9 @@ class StereoCamera:
         """
         disparity = pixels[..., 2]
         if np.any(disparity <= 0.0):
-            raise bad_argument("pixels", "disparities > 0 px", float(disparity.min()), "Drop points at infinity first.")
+            raise argument_error(
+                "pixels", "disparities > 0 px", float(disparity.min()), "Drop points at infinity first."
+            )
         scale = self.baseline / disparity
         return np.stack([pixels[..., 0] * scale, pixels[..., 1] * scale, self.focal_px * scale], axis=-1)
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.core.read_only import as_read_only
-from slam_backend.core.validation import FloatArray, IntArray, bad_argument, check_array
+from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_array
 from slam_backend.fastslam import _kernels
 
 LARGEST_DESCRIPTOR = 1e6  # of one component; squares of distances then stay far from the end of float32
@@ -43,7 +43,7 @@ class Measurements:
         if descriptors.size and np.abs(descriptors).max() > LARGEST_DESCRIPTOR:
             largest = float(np.abs(descriptors).max())
             expected = f"numbers within +-{LARGEST_DESCRIPTOR:g}"
-            raise bad_argument("descriptors", expected, largest, "Scale them, best to unit length.")
+            raise argument_error("descriptors", expected, largest, "Scale them, best to unit length.")
         object.__setattr__(self, "points", points)
         object.__setattr__(self, "descriptors", descriptors)
         if self.covariances is not None:
@@ -81,11 +81,11 @@ class TeamMeasurements(NamedTuple):
 
     points: FloatArray
     descriptors: NDArray[np.float32]
-    ends: IntArray
+    offsets: IntArray
 
-    def of_each(self) -> list[Measurements]:
+    def per_robot(self) -> list[Measurements]:
         """Return the frame of each robot. They are read-only, and share memory with this, not to be written to then."""
-        ends = self.ends.tolist()
+        ends = self.offsets.tolist()
         points, looks = as_read_only(self.points), as_read_only(self.descriptors)
         cut = [(points[a:b], looks[a:b]) for a, b in zip([0, *ends[:-1]], ends, strict=True)]
         return [_restored(own, described, None, _kernels.extent(own)) for own, described in cut]
@@ -107,11 +107,11 @@ def _check_covariances(covariances: FloatArray) -> None:
         return
     scale = np.abs(covariances).max(axis=(1, 2), keepdims=True)
     if (np.abs(covariances - covariances.transpose(0, 2, 1)) > 1e-6 * scale).any():
-        raise bad_argument("covariances", "symmetric matrices", "a different transpose", "Symmetrise them first.")
+        raise argument_error("covariances", "symmetric matrices", "a different transpose", "Symmetrise them first.")
     eigenvalues = np.linalg.eigvalsh(covariances)
     least, largest = eigenvalues[:, 0], eigenvalues[:, 2]
     if least.min() <= 0.0:
-        raise bad_argument(
+        raise argument_error(
             "covariances",
             "positive definite matrices",
             "a smallest eigenvalue <= 0",
@@ -120,8 +120,8 @@ def _check_covariances(covariances: FloatArray) -> None:
     if least.min() < LEAST_VARIANCE or largest.max() > LARGEST_VARIANCE:
         got = float(least.min() if least.min() < LEAST_VARIANCE else largest.max())
         expected = f"eigenvalues from {LEAST_VARIANCE:g} to {LARGEST_VARIANCE:g} m^2"
-        raise bad_argument("covariances", expected, got, "Check the units: metres squared.")
+        raise argument_error("covariances", expected, got, "Check the units: metres squared.")
     if (largest > LARGEST_CONDITION * least).any():
         got = float((largest / least).max())
         cure = "Raise the least variance: float64 cannot keep so flat a covariance positive definite."
-        raise bad_argument("covariances", f"ratios of eigenvalues up to {LARGEST_CONDITION:g}", got, cure)
+        raise argument_error("covariances", f"ratios of eigenvalues up to {LARGEST_CONDITION:g}", got, cure)

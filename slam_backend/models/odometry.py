@@ -41,7 +41,7 @@ class OdometryModel:
             check_float(f"motion.{name}", getattr(self, name), cure, at_least=0.0, at_most=LARGEST_SIGMA)
 
     @property
-    def is_exact(self) -> bool:
+    def is_noiseless(self) -> bool:
         """Whether no odometry has any noise."""
         of_motion = self.sigma_along, self.sigma_across, self.sigma_heading, self.sigma_turn
         return not any((*of_motion, self.floor_position, self.floor_heading))

@@ -8,7 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from slam_backend.core.validation import Float32Array, FloatArray, bad_argument, check_array, check_float
+from slam_backend.core.validation import Float32Array, FloatArray, argument_error, check_array, check_float
 from slam_backend.frontend.images import Image, check_image
 from slam_backend.models.camera import StereoCamera
 
@@ -35,7 +35,7 @@ class RectifiedPair:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Eye:
+class CameraCalibration:
     """One camera as its maker calibrated it: a pinhole with radial and tangential distortion.
 
     Attributes:
@@ -68,10 +68,10 @@ class Rectifier:
         ValueError: If the images differ in size, or the right eye does not stand to the right of the left one.
     """
 
-    def __init__(self, left: Eye, right: Eye) -> None:
+    def __init__(self, left: CameraCalibration, right: CameraCalibration) -> None:
         if (left.width, left.height) != (right.width, right.height):
             got = f"a pair of {left.width} x {left.height} and {right.width} x {right.height} px"
-            raise bad_argument("right", "an eye with images of the left one's size", got, "Check the calibrations.")
+            raise argument_error("right", "an eye with images of the left one's size", got, "Check the calibrations.")
         self._size = left.width, left.height
         right_from_left = np.linalg.solve(right.body_from_camera, left.body_from_camera)
         found: Any = cv2.stereoRectify(
@@ -90,7 +90,9 @@ class Rectifier:
         baseline = -float(right_projection[0, 3]) / focal
         if baseline <= 0.0 or abs(float(right_projection[1, 3])) > abs(float(right_projection[0, 3])):
             cure = "Swap the calibrations; eyes above each other are not supported."
-            raise bad_argument("right", "an eye to the right of the left one", f"a baseline of {baseline:.3f} m", cure)
+            raise argument_error(
+                "right", "an eye to the right of the left one", f"a baseline of {baseline:.3f} m", cure
+            )
         self.pair = RectifiedPair(focal, left_projection[:2, 2].copy(), baseline)
         back = np.eye(4)
         back[:3, :3] = rectified_from_left.T
@@ -123,11 +125,13 @@ class Rectifier:
             checked = check_image(name, image)
             if checked.shape != (self._size[1], self._size[0]):
                 expected = f"an image of {self._size[0]} x {self._size[1]} px"
-                raise bad_argument(name, expected, f"shape {checked.shape}", "Check that the calibration is its own.")
+                raise argument_error(name, expected, f"shape {checked.shape}", "Check that the calibration is its own.")
             rectified.append(np.asarray(cv2.remap(checked, columns, rows, cv2.INTER_LINEAR), dtype=np.uint8))
         return rectified[0], rectified[1]
 
-    def _map(self, eye: Eye, turn: FloatArray, projection: FloatArray) -> tuple[Float32Array, Float32Array]:
+    def _map(
+        self, eye: CameraCalibration, turn: FloatArray, projection: FloatArray
+    ) -> tuple[Float32Array, Float32Array]:
         """Return where each pixel of the rectified image comes from."""
         maps: Any = cv2.initUndistortRectifyMap(
             eye.matrix, eye.distortion, turn, projection[:, :3], self._size, cv2.CV_32FC1
@@ -166,7 +170,7 @@ class Rectified:
         for name, image in (("left", left), ("right", right)):
             if check_image(name, image).shape != (self._size[1], self._size[0]):
                 expected = f"an image of {self._size[0]} x {self._size[1]} px"
-                raise bad_argument(name, expected, f"shape {np.shape(image)}", "Give images of one size.")
+                raise argument_error(name, expected, f"shape {np.shape(image)}", "Give images of one size.")
         return left, right
 
 
@@ -190,12 +194,12 @@ def load_kitti_calibration(path: str | Path) -> RectifiedPair:
             rows.append(numbers)
     if len(rows) < 2 or not np.isfinite(rows).all():
         expected = f"{file.name} with two matrices of 12 numbers"
-        raise bad_argument("calibration", expected, f"a file with {len(rows)}", f"Get {str(file)!r} again.")
+        raise argument_error("calibration", expected, f"a file with {len(rows)}", f"Get {str(file)!r} again.")
     left, right = (np.array(row).reshape(3, 4) for row in rows[:2])
     focal, baseline = left[0, 0], (left[0, 3] - right[0, 3]) / left[0, 0]
     if not (np.allclose(left[:, :3], right[:, :3]) and np.isclose(left[1, 1], focal) and focal > 0.0 and baseline > 0):
         expected = f"{file.name} with a rectified pair of square pixels, the left eye first"
-        raise bad_argument("calibration", expected, "other matrices", f"Correct {str(file)!r}.")
+        raise argument_error("calibration", expected, "other matrices", f"Correct {str(file)!r}.")
     return RectifiedPair(float(focal), left[:2, 2].copy(), float(baseline))
 
 
@@ -209,10 +213,10 @@ def load_euroc_calibration(left: str | Path, right: str | Path) -> Rectifier:
     Raises:
         ValueError: If a file is missing or lacks an entry, or the two are no stereo pair.
     """
-    return Rectifier(load_euroc_eye(left), load_euroc_eye(right))
+    return Rectifier(load_euroc_camera(left), load_euroc_camera(right))
 
 
-def load_euroc_eye(path: str | Path) -> Eye:
+def load_euroc_camera(path: str | Path) -> CameraCalibration:
     """Read one file `sensor.yaml` of EuRoC's cameras: pinhole, radial-tangential distortion, place on the body.
 
     Raises:
@@ -222,17 +226,19 @@ def load_euroc_eye(path: str | Path) -> Eye:
     text = re.sub(r"#[^\n]*", "", _text(file))
     model = re.search(r"distortion_model:\s*(\S+)", text)
     if model is not None and model.group(1) not in ("radial-tangential", "radtan", "plumb_bob"):
-        raise bad_argument("calibration", "the distortion model radial-tangential", repr(model.group(1)), "Undistort.")
+        raise argument_error(
+            "calibration", "the distortion model radial-tangential", repr(model.group(1)), "Undistort."
+        )
     pose = _numbers(file, text, "data", (16,)).reshape(4, 4)
     turn = pose[:3, :3]
     rigid = np.abs(turn @ turn.T - np.eye(3)).max() < SMOOTH_ROTATION and np.linalg.det(turn) > 0.0
     if not rigid or not np.array_equal(pose[3], [0.0, 0.0, 0.0, 1.0]):
-        raise bad_argument("calibration", f"{file.name} with a rigid motion T_BS", "another matrix", "Correct it.")
+        raise argument_error("calibration", f"{file.name} with a rigid motion T_BS", "another matrix", "Correct it.")
     fu, fv, cu, cv = _numbers(file, text, "intrinsics", (4,))
     for focal in (fu, fv):
         check_float("calibration.intrinsics", float(focal), "Focal lengths are positive.", above=0.0)
     width, height = _numbers(file, text, "resolution", (2,))
-    return Eye(
+    return CameraCalibration(
         int(width),
         int(height),
         np.array([[fu, 0.0, cu], [0.0, fv, cv], [0.0, 0.0, 1.0]]),
@@ -247,7 +253,7 @@ def _text(file: Path) -> str:
         return file.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         cure = f"Check {str(file)!r}."
-        raise bad_argument("calibration", "a readable file of a calibration", "no such file", cure) from error
+        raise argument_error("calibration", "a readable file of a calibration", "no such file", cure) from error
 
 
 def _numbers(file: Path, text: str, key: str, counts: tuple[int, ...]) -> FloatArray:
@@ -256,10 +262,10 @@ def _numbers(file: Path, text: str, key: str, counts: tuple[int, ...]) -> FloatA
     words = [] if found is None else [word for word in re.split(r"[,\s]+", found.group(1)) if word]
     if len(words) not in counts:
         expected = f"{file.name} with {counts[0]} numbers {key!r}"
-        raise bad_argument("calibration", expected, f"a list of {len(words)}", f"Get {str(file)!r} again.")
+        raise argument_error("calibration", expected, f"a list of {len(words)}", f"Get {str(file)!r} again.")
     cure = f"Correct {key!r} in {str(file)!r}."
     try:
         numbers = [float(word) for word in words]
     except ValueError as error:
-        raise bad_argument("calibration", f"numbers after {key!r}", words, cure) from error
+        raise argument_error("calibration", f"numbers after {key!r}", words, cure) from error
     return np.asarray(check_array("calibration", numbers, (len(words),), cure))

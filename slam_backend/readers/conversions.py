@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from slam_backend.core.validation import FloatArray, bad_argument, check_array
+from slam_backend.core.validation import FloatArray, argument_error, check_array
 from slam_backend.geometry import compose, rotation, wrap_angle
 from slam_backend.models.camera import ROBOT_FROM_CAMERA
 
@@ -60,19 +60,19 @@ def integrate_commands(commands: ArrayLike, times: ArrayLike, hold: float = HOLD
     table: FloatArray = check_array("commands", commands, (None, 3), "Give rows (time, velocity, angular velocity).")
     wanted: FloatArray = check_array("times", times, (None,), "Give times in seconds.")
     if not len(table):
-        raise bad_argument("commands", "at least one row", "no row", "Give the robot's first command.")
+        raise argument_error("commands", "at least one row", "no row", "Give the robot's first command.")
     held = np.minimum(np.diff(table[:, 0]), hold)
     headings = np.concatenate([[0.0], np.cumsum(table[:-1, 2] * held)])
-    chords = arc(table[:-1, 1], table[:-1, 2], held)
+    chords = integrate_arc(table[:-1, 1], table[:-1, 2], held)
     moved = (rotation(headings[:-1]) @ chords[:, :2, None])[..., 0]
     knots = np.column_stack([np.concatenate([np.zeros((1, 2)), np.cumsum(moved, axis=0)]), headings])
     last = np.searchsorted(table[:, 0], wanted, side="right") - 1
     row = np.maximum(last, 0)
     since = np.where(last < 0, 0.0, np.minimum(wanted - table[row, 0], hold))
-    return compose(knots[row], arc(table[row, 1], table[row, 2], since))
+    return compose(knots[row], integrate_arc(table[row, 1], table[row, 2], since))
 
 
-def arc(velocity: FloatArray, angular_velocity: FloatArray, duration: FloatArray) -> FloatArray:
+def integrate_arc(velocity: FloatArray, angular_velocity: FloatArray, duration: FloatArray) -> FloatArray:
     """Return the motions of a unicycle at constant velocities.
 
     Args:

@@ -16,7 +16,7 @@ import numpy as np
 
 from slam_backend.core.array_files import read_arrays
 from slam_backend.core.files import checked_path
-from slam_backend.core.validation import FloatArray, IntArray, bad_argument, check_float
+from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_float
 from slam_backend.models.camera import ROBOT_FROM_CAMERA, StereoCamera
 from slam_backend.models.measurements import Measurements
 from slam_backend.models.odometry import OdometryModel
@@ -138,7 +138,7 @@ def _find(path: Path) -> Path:
     if len(found) != 1 or not found[0].is_file():
         got = f"a folder with {len(found)} of them" if path.is_dir() else "no such file"
         expected = "an archive (.npz) of KITTI features, or a folder with one"
-        raise bad_argument("path", expected, got, f"Check {str(path)!r}.")
+        raise argument_error("path", expected, got, f"Check {str(path)!r}.")
     return found[0]
 
 
@@ -148,7 +148,7 @@ def _find_truth(file: Path, truth: str | Path | None) -> Path | None:
         found = sorted((file.parent / "poses").glob("*.txt"))
         return found[0] if len(found) == 1 else None
     if not Path(truth).is_file():
-        raise bad_argument("truth", "a file of true poses", "no such file", f"Check {str(truth)!r}.")
+        raise argument_error("truth", "a file of true poses", "no such file", f"Check {str(truth)!r}.")
     return Path(truth)
 
 
@@ -159,10 +159,10 @@ def _read(file: Path) -> dict[str, FloatArray]:
         missing = [key for key in KEYS if key not in archive]
         content = {} if missing else {key: np.asarray(archive[key], dtype=np.float64) for key in KEYS}
     except ValueError as error:
-        raise bad_argument("path", "a numpy archive", "a broken file", f"Get {str(file)!r} again.") from error
+        raise argument_error("path", "a numpy archive", "a broken file", f"Get {str(file)!r} again.") from error
     if missing:
         expected = f"{file.name} with the arrays {', '.join(KEYS)}"
-        raise bad_argument("path", expected, f"no array {missing[0]!r}", f"Get {str(file)!r} again.")
+        raise argument_error("path", expected, f"no array {missing[0]!r}", f"Get {str(file)!r} again.")
     for key, values in content.items():
         _check(file, key, bool(np.isfinite(values).all()), "finite numbers")
     return content
@@ -183,10 +183,10 @@ def read_truth(file: Path, times: FloatArray) -> Trajectory:
     try:
         rows = np.array([[float(w) for w in line.split()] for line in file.read_text("utf-8").splitlines() if line])
     except ValueError as error:
-        raise bad_argument("truth", expected, "a row that is no such", cure) from error
+        raise argument_error("truth", expected, "a row that is no such", cure) from error
     shaped = rows.ndim == 2 and rows.shape[1] in (12, 13) and 1 < len(rows) <= len(times)
     if not shaped or not np.isfinite(rows).all():
-        raise bad_argument("truth", expected, f"an array {rows.shape} for {len(times)} frames", cure)
+        raise argument_error("truth", expected, f"an array {rows.shape} for {len(times)} frames", cure)
     matrices = rows[:, -12:].reshape(-1, 3, 4)
     heading = np.arctan2(-matrices[:, 0, 2], matrices[:, 2, 2])
     return Trajectory(times[: len(rows)], np.stack([matrices[:, 2, 3], -matrices[:, 0, 3], heading], axis=-1))
@@ -196,7 +196,7 @@ def _check(file: Path, key: str, fine: bool, expected: str) -> None:
     """Raise unless an entry of a file is fine."""
     if not fine:
         cure = f"Get {str(file)!r} again."
-        raise bad_argument("path", f"{file.name} with {expected} in {key!r}", "a different one", cure)
+        raise argument_error("path", f"{file.name} with {expected} in {key!r}", "a different one", cure)
 
 
 DIGITS = 32  # a track's number is written with three digits of this base: a descriptor that is its own and no other's
@@ -235,7 +235,7 @@ def make_camera(log: KittiLog, sigma_px: float, sigma_disparity_px: float) -> St
     )
 
 
-def steps(log: KittiLog, camera: StereoCamera) -> KittiSteps:
+def to_filter_steps(log: KittiLog, camera: StereoCamera) -> KittiSteps:
     """Turn a drive into planar odometry and measurements.
 
     The filter's robot moves in the plane while a car pitches and rolls by degrees, which moves rows of the image by

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from slam_backend.core.files import checked_path
-from slam_backend.core.validation import FloatArray, bad_argument, check_float
+from slam_backend.core.validation import FloatArray, argument_error, check_float
 from slam_backend.frontend.images import Image
 from slam_backend.readers.calibration import Rectified, RectifiedPair, Rectifier, load_kitti_calibration
 from slam_backend.readers.kitti import read_truth
@@ -51,7 +51,7 @@ class KittiImages:
         return pair if self.rig is None else self.rig.rectify(*pair)
 
 
-def holds_images(path: str | Path) -> bool:
+def is_image_folder(path: str | Path) -> bool:
     """Tell whether a folder has images of two eyes, as `load_kitti_images` reads them."""
     return _eyes(Path(path)) is not None
 
@@ -71,11 +71,13 @@ def load_kitti_images(path: str | Path, truth: str | Path | None = None, duratio
     eyes = _eyes(folder)
     if eyes is None:
         names = " or ".join(f"{left} and {right}" for left, right in EYES)
-        raise bad_argument("path", f"a folder with {names}", "a different one", f"Check {str(folder)!r}.")
+        raise argument_error("path", f"a folder with {names}", "a different one", f"Check {str(folder)!r}.")
     left, right = (sorted(eye.glob("*.png")) for eye in eyes)
     if [file.name for file in left] != [file.name for file in right] or len(left) < 2:
         got = f"a pair of folders with {len(left)} and {len(right)}"
-        raise bad_argument("path", "two or more images of the same names in both eyes", got, f"Check {str(folder)!r}.")
+        raise argument_error(
+            "path", "two or more images of the same names in both eyes", got, f"Check {str(folder)!r}."
+        )
     times = read_times(folder / "times.txt" if (folder / "times.txt").is_file() else None, len(left))
     keep = len(times)
     if duration is not None:
@@ -83,7 +85,7 @@ def load_kitti_images(path: str | Path, truth: str | Path | None = None, duratio
         keep = max(2, int(np.searchsorted(times, end, side="right")))
     file = folder / "poses.txt" if truth is None else Path(truth)
     if truth is not None and not file.is_file():
-        raise bad_argument("truth", "a file of true poses", "no such file", f"Check {str(file)!r}.")
+        raise argument_error("truth", "a file of true poses", "no such file", f"Check {str(file)!r}.")
     height, width = read_grey(left[0]).shape
     return KittiImages(
         times=times[:keep],
@@ -105,7 +107,7 @@ def read_grey(file: Path) -> Image:
     image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
     if image is None:
         got = "a file that is none" if file.is_file() else "no such file"
-        raise bad_argument("path", "an image file", got, f"Get {str(file)!r} again.")
+        raise argument_error("path", "an image file", got, f"Get {str(file)!r} again.")
     return np.asarray(image, dtype=np.uint8)
 
 
@@ -131,5 +133,5 @@ def read_times(file: Path | None, count: int) -> FloatArray:
         times = np.empty(0)
     if len(times) < count or not np.isfinite(times).all() or not (np.diff(times) > 0.0).all():
         expected = f"{file.name} with {count} rising times"
-        raise bad_argument("path", expected, "another file", f"Correct {str(file)!r}: seconds, one for each image.")
+        raise argument_error("path", expected, "another file", f"Correct {str(file)!r}: seconds, one for each image.")
     return times[:count]

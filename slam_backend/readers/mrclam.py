@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from slam_backend.core.files import checked_path
-from slam_backend.core.validation import BoolArray, FloatArray, IntArray, bad_argument, check_float
+from slam_backend.core.validation import BoolArray, FloatArray, IntArray, argument_error, check_float
 from slam_backend.models.measurements import Measurements
 from slam_backend.readers.conversions import integrate_commands
 from slam_backend.readers.range_bearing import even_times, frames_at, motions
@@ -18,7 +18,7 @@ ROBOTS = (1, 2, 3, 4, 5)  # subjects with these numbers are the robots themselve
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RobotLog:
+class MrclamRobot:
     """What one robot recorded, and where it really was. The arrays are read-only.
 
     Attributes:
@@ -46,7 +46,7 @@ class MrclamLog:
         notes: Lines about the files: which were sorted by time, and where times hardly can be right.
     """
 
-    robots: tuple[RobotLog, ...]
+    robots: tuple[MrclamRobot, ...]
     subjects: IntArray
     positions: FloatArray | None
     notes: tuple[str, ...] = ()
@@ -81,7 +81,7 @@ def load_mrclam(
     """
     folder = checked_path(path)
     if not folder.is_dir():
-        raise bad_argument("path", "a folder of the MR.CLAM log", "no such folder", f"Check {str(path)!r}.")
+        raise argument_error("path", "a folder of the MR.CLAM log", "no such folder", f"Check {str(path)!r}.")
     numbers = _check_robots(folder, robots)
     barcodes, _ = _read_table(folder / "Barcodes.dat", ("subject", "barcode"))
     subject_of = {int(barcode): int(subject) for subject, barcode in barcodes}
@@ -89,9 +89,9 @@ def load_mrclam(
     positions = _read_positions(folder / "Landmark_Groundtruth.dat", subjects)
     if truth is not None and len(numbers) != 1:
         cure = "Name the robot whose poses these are with robots."
-        raise bad_argument("truth", "a file of one robot's poses", f"a log of robots {numbers}", cure)
+        raise argument_error("truth", "a file of one robot's poses", f"a log of robots {numbers}", cure)
     if truth is not None and not Path(truth).is_file():
-        raise bad_argument("truth", "a file of true poses", "no such file", f"Check {str(truth)!r}.")
+        raise argument_error("truth", "a file of true poses", "no such file", f"Check {str(truth)!r}.")
     truths = {numbers[0]: Path(truth)} if truth is not None else {}
     sorted_files: list[str] = []
     logs = [_read_robot(folder, robot, subject_of, truths.get(robot), sorted_files) for robot in numbers]
@@ -106,7 +106,7 @@ def load_mrclam(
     return MrclamLog(tuple(logs), subjects, positions, notes)
 
 
-def _overlap_notes(log: RobotLog) -> Iterator[str]:
+def _overlap_notes(log: MrclamRobot) -> Iterator[str]:
     """Yield a line for each kind of reading that does not overlap a robot's odometry: clocks differ, probably."""
     first, last = log.commands[0, 0], log.commands[-1, 0]
     stamps = {"sightings": log.sightings[:, 0], "true poses": np.empty(0) if log.truth is None else log.truth.times}
@@ -127,7 +127,7 @@ def _read_positions(file: Path, subjects: IntArray) -> FloatArray | None:
     unplaced = [int(subject) for subject in subjects if int(subject) not in place_of]
     if unplaced:
         got = f"no position of subject {unplaced[0]}"
-        raise bad_argument("path", "a position of each landmark", got, f"Add it to {file}.")
+        raise argument_error("path", "a position of each landmark", got, f"Add it to {file}.")
     return np.array([place_of[int(subject)] for subject in subjects]).reshape(-1, 2)
 
 
@@ -137,18 +137,18 @@ def _check_robots(folder: Path, robots: Sequence[int] | None) -> tuple[int, ...]
         present = tuple(robot for robot in ROBOTS if (folder / f"Robot{robot}_Odometry.dat").is_file())
         if not present:
             cure = f"Check {str(folder / 'Robot1_Odometry.dat')!r}."
-            raise bad_argument("path", "a folder of the MR.CLAM log", "no odometry of any robot", cure)
+            raise argument_error("path", "a folder of the MR.CLAM log", "no odometry of any robot", cure)
         return present
     numbers = tuple(robots)
     unknown = [robot for robot in numbers if robot not in ROBOTS]
     if not numbers or unknown or len(set(numbers)) < len(numbers):
-        raise bad_argument("robots", "different numbers from 1 to 5", numbers, "Name each robot once, e.g. 1,2,3.")
+        raise argument_error("robots", "different numbers from 1 to 5", numbers, "Name each robot once, e.g. 1,2,3.")
     return numbers
 
 
 def _read_robot(
     folder: Path, robot: int, subject_of: dict[int, int], truth_file: Path | None, sorted_files: list[str]
-) -> RobotLog:
+) -> MrclamRobot:
     """Read the files of one robot, and add those that had to be sorted; what it saw of other robots is left out."""
     commands, words = _read_table(folder / f"Robot{robot}_Odometry.dat", ("time", "velocity", "angular_velocity"))
     sorted_files.append(words)
@@ -159,7 +159,7 @@ def _read_robot(
         expected = f"sightings of robot {robot} since its first odometry at {commands[0, 0]:.3f} s"
         got = f"a log of sightings from {rows[0, 0]:.3f} to {rows[-1, 0]:.3f} s"
         cure = f"Check that the times in {folder / f'Robot{robot}_Measurement.dat'} are of the same clock."
-        raise bad_argument("path", expected, got, cure)
+        raise argument_error("path", expected, got, cure)
     seen = np.array([subject_of.get(int(barcode), 0) for barcode in rows[:, 1]], dtype=np.float64)
     sightings = np.column_stack([rows[:, 0], seen, rows[:, 2:]])[seen > max(ROBOTS)]
     own = folder / f"Robot{robot}_Groundtruth.dat"
@@ -169,13 +169,13 @@ def _read_robot(
         sorted_files.append(words)
         fresh = np.diff(poses[:, 0], prepend=-np.inf) > 0.0  # a repeated stamp says nothing new
         truth = Trajectory(poses[fresh, 0], poses[fresh, 1:])
-    return RobotLog(robot, commands, sightings, truth)
+    return MrclamRobot(robot, commands, sightings, truth)
 
 
-def _cut(log: RobotLog, end: float) -> RobotLog:
+def _cut(log: MrclamRobot, end: float) -> MrclamRobot:
     """Drop the readings after `end` [s]; a robot that has not started by then keeps its first command."""
     kept = log.commands[log.commands[:, 0] <= end]
-    return RobotLog(
+    return MrclamRobot(
         log.robot, kept if len(kept) else log.commands[:1], log.sightings[log.sightings[:, 0] <= end], log.truth
     )
 
@@ -191,7 +191,7 @@ def _read_table(file: Path, columns: tuple[str, ...], empty: bool = False) -> tu
             more than `MOST_JITTER`.
     """
     if not file.is_file():
-        raise bad_argument("path", f"a folder with {file.name}", "no such file", f"Check {str(file)!r}.")
+        raise argument_error("path", f"a folder with {file.name}", "no such file", f"Check {str(file)!r}.")
     lines = file.read_text(encoding="utf-8", errors="replace").split("\n")
     rows: list[list[float]] = []
     numbers: list[int] = []
@@ -204,7 +204,7 @@ def _read_table(file: Path, columns: tuple[str, ...], empty: bool = False) -> tu
             rows.append(row)
             numbers.append(number)
     if not rows and not empty:
-        raise bad_argument("path", f"rows ({' '.join(columns)})", "no rows", f"{file} is empty: get it again.")
+        raise argument_error("path", f"rows ({' '.join(columns)})", "no rows", f"{file} is empty: get it again.")
     table = np.array(rows, dtype=np.float64).reshape(-1, len(columns))
     for rule, broken in _faults(table, columns):
         if broken.any():
@@ -246,7 +246,7 @@ def _parse(body: str) -> list[float] | None:
 def _bad_line(file: Path, number: int, line: str, columns: tuple[str, ...], rule: str) -> ValueError:
     """Say what is wrong with a line of a file."""
     expected = f"{len(columns)} numbers ({' '.join(columns)}){rule}"
-    return bad_argument("path", expected, repr(line.strip()), f"Correct line {number} of {file}.")
+    return argument_error("path", expected, repr(line.strip()), f"Correct line {number} of {file}.")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -334,7 +334,7 @@ class MrclamSteps:
     robots: tuple[RobotSteps, ...]
 
 
-def steps(
+def to_filter_steps(
     log: MrclamLog, dt: float = 0.25, noise: SightingNoise | None = None, drive: Drive | None = None
 ) -> MrclamSteps:
     """Resample a log at common times, from its earliest command to its last reading.
@@ -361,7 +361,7 @@ def steps(
 
 
 def _robot_steps(
-    log: RobotLog, times: FloatArray, subjects: IntArray, noise: SightingNoise, drive: Drive
+    log: MrclamRobot, times: FloatArray, subjects: IntArray, noise: SightingNoise, drive: Drive
 ) -> RobotSteps:
     """Return the steps of one robot at these times (T,) [s]."""
     velocities = drive.driven(log.commands)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from slam_backend.core.validation import FloatArray, IntArray, bad_argument, check_array, check_float
+from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_array, check_float
 from slam_backend.geometry import between
 from slam_backend.models.measurements import Measurements
 from slam_backend.readers.conversions import HOLD, integrate_commands, points_from_polar
@@ -75,12 +75,12 @@ def range_bearing_steps(
     seen, order, seen_words = _table("sightings", sightings, "Give rows (time, range, bearing).")
     if (seen[:, 1] <= 0.0).any():
         least = float(seen[:, 1].min())
-        raise bad_argument("sightings", "ranges > 0 m", least, "Drop readings without an echo.")
+        raise argument_error("sightings", "ranges > 0 m", least, "Drop readings without an echo.")
     first, last = driven[0, 0], driven[-1, 0]
     if not ((seen[:, 0] >= first) & (seen[:, 0] <= last + hold)).any():
         among = f"times among those of the velocities, {first:.3f} to {last:.3f} s"
         got = f"a log of sightings from {seen[0, 0]:.3f} to {seen[-1, 0]:.3f} s"
-        raise bad_argument("sightings", among, got, "Give both in seconds of one clock.")
+        raise argument_error("sightings", among, got, "Give both in seconds of one clock.")
     names, column = _identities(identities, len(seen))
     column = column[order]
     times = even_times(min(first, seen[0, 0]), max(last, seen[-1, 0]), dt)
@@ -115,7 +115,7 @@ def even_times(start: float, end: float, dt: float) -> FloatArray:
     dt = check_float("dt", dt, "Give seconds between steps.", above=0.0)
     if (end - start) / dt > MAX_STEPS:
         cure = "Take longer steps, and give all times in seconds of one clock."
-        raise bad_argument("dt", f"at most {MAX_STEPS:,} steps", (end - start) / dt, cure)
+        raise argument_error("dt", f"at most {MAX_STEPS:,} steps", (end - start) / dt, cure)
     return np.asarray(start + dt * np.arange(int(np.ceil((end - start) / dt)) + 1, dtype=np.float64))
 
 
@@ -169,12 +169,12 @@ def _table(name: str, value: ArrayLike, cure: str) -> tuple[FloatArray, IntArray
     """Return rows (n, 3) in order of time, that order, and what `time_order` says."""
     table: FloatArray = check_array(name, value, (None, 3), cure)
     if not len(table):
-        raise bad_argument(name, "at least one row", "no row", cure)
+        raise argument_error(name, "at least one row", "no row", cure)
     late = np.flatnonzero(steps_back(table[:, 0]) > MOST_JITTER)
     if len(late):
         row = int(late[0])
         got = f"a time {table[row, 0]:.3f} s after {table[:row, 0].max():.3f} s in row {row}"
-        raise bad_argument(name, f"times that go back by at most {MOST_JITTER:g} s", got, "Look at the log there.")
+        raise argument_error(name, f"times that go back by at most {MOST_JITTER:g} s", got, "Look at the log there.")
     order, words = time_order(name, table[:, 0])
     return table[order], order, words
 
@@ -184,7 +184,7 @@ def _variances(name: str, sigma: float | ArrayLike, count: int) -> FloatArray:
     cure = "Give a standard deviation, or one per sighting."
     given: FloatArray = check_array(name, np.full(count, sigma) if np.ndim(sigma) == 0 else sigma, (count,), cure)
     if (given <= 0.0).any():
-        raise bad_argument(name, "standard deviations > 0", float(given.min()), cure)
+        raise argument_error(name, "standard deviations > 0", float(given.min()), cure)
     return given**2
 
 
@@ -196,8 +196,8 @@ def _identities(identities: ArrayLike | None, count: int) -> tuple[NDArray[Any],
     cure = "Give one number or name per sighting, or None."
     if given.shape != (count,) or given.dtype.kind not in "iufUS":
         got = f"an array of {given.dtype}, shape {given.shape}"
-        raise bad_argument("identities", f"numbers or names of shape ({count},)", got, cure)
+        raise argument_error("identities", f"numbers or names of shape ({count},)", got, cure)
     if given.dtype.kind == "f" and not np.array_equal(given, np.round(given)):
-        raise bad_argument("identities", "whole numbers or names", "NaN or fractions", cure)
+        raise argument_error("identities", "whole numbers or names", "NaN or fractions", cure)
     names, column = np.unique(given, return_inverse=True)
     return names, column.astype(np.int64)

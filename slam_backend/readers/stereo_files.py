@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from slam_backend.core.validation import bad_argument, check_float
+from slam_backend.core.validation import argument_error, check_float
 from slam_backend.readers.calibration import Rectified, Rectifier, load_euroc_calibration, load_kitti_calibration
 from slam_backend.readers.kitti import read_truth
 from slam_backend.readers.kitti_images import KittiImages, read_grey, read_times
@@ -43,11 +43,11 @@ def find_pairs(folder: str | Path, files: StereoFiles) -> tuple[tuple[Path, ...]
     """
     root = Path(folder)
     if not root.is_dir():
-        raise bad_argument("path", "a folder with two stereo pairs", "no such folder", f"Check {str(root)!r}.")
+        raise argument_error("path", "a folder with two stereo pairs", "no such folder", f"Check {str(root)!r}.")
     left, right = (_images(root, option, getattr(files, option)) for option in ("left", "right"))
     if len(left) != len(right) or len(left) < LEAST_PAIRS:
         got = f"a folder with {len(left)} {files.left!r} and {len(right)} {files.right!r}"
-        raise bad_argument(
+        raise argument_error(
             "path", "two or more images, as many of both eyes", got, "Name them with --left and --right."
         )
     return left, right
@@ -67,7 +67,7 @@ def load_rig(folder: str | Path, calibration: str, size: tuple[int, int]) -> Rec
     names = _words(calibration)
     if len(names) not in (1, 2):
         cure = "Name calib.txt, or sensor.yaml of the left and of the right camera with a comma between."
-        raise bad_argument("calibration", "one file or two", repr(calibration), cure)
+        raise argument_error("calibration", "one file or two", repr(calibration), cure)
     places = [Path(folder) / name for name in names]
     if len(places) == 2:
         return load_euroc_calibration(*places)
@@ -119,7 +119,7 @@ def _images(folder: Path, option: str, names: str) -> tuple[Path, ...]:
         found = [folder / name for name in _words(names)]
     if not found or not all(file.is_file() for file in found):
         missing = next((str(file) for file in found if not file.is_file()), str(folder / names))
-        raise bad_argument(
+        raise argument_error(
             "path", "an image file", "no such file", f"Check {missing!r}, or name yours with --{option}."
         )
     return tuple(found)
@@ -140,5 +140,5 @@ def _existing(option: str, folder: Path, name: str) -> Path:
     place = folder / name
     if not place.is_file():
         what = {"times": "a file of the seconds of the frames", "truth": "a file of true poses"}[option]
-        raise bad_argument(option, what, "no such file", f"Check {str(place)!r}.")
+        raise argument_error(option, what, "no such file", f"Check {str(place)!r}.")
     return place

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.core.validation import FloatArray, IntArray, bad_argument, check_choice
+from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_choice
 
 MOST_JITTER = 1.0  # [s]; loggers that write from several threads swap rows by tenths of a second, no more
 
@@ -91,14 +91,16 @@ def read_csv(
     """
     file = Path(path)
     if not file.is_file():
-        raise bad_argument("path", "a CSV file", "no such file", f"Check {str(file)!r}.")
+        raise argument_error("path", "a CSV file", "no such file", f"Check {str(file)!r}.")
     try:
         lines = file.read_text(encoding="utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
-        raise bad_argument("path", f"{file.name} in UTF-8", "a file in another encoding", f"Save {file} so.") from error
+        raise argument_error(
+            "path", f"{file.name} in UTF-8", "a file in another encoding", f"Save {file} so."
+        ) from error
     first = next((number for number, line in enumerate(lines) if line.strip()), None)
     if first is None:
-        raise bad_argument("path", f"{file.name} with a line of names", "no lines", f"{file} is empty.")
+        raise argument_error("path", f"{file.name} with a line of names", "no lines", f"{file} is empty.")
     if delimiter is None:
         delimiter = next((sign for sign in DELIMITERS if sign in lines[first]), ",")
     check_choice("delimiter", delimiter, DELIMITERS)
@@ -117,7 +119,7 @@ def read_csv(
         values.append([_number(file, number, name, word) for name, word in zip(numbers, found, strict=False)])
         words.append(found[len(numbers) :])
     if not values:
-        raise bad_argument("path", f"{file.name} with rows", "no rows", f"{file} ends after its line of names.")
+        raise argument_error("path", f"{file.name} with rows", "no rows", f"{file} ends after its line of names.")
     return CsvTable(
         np.array(values, dtype=np.float64).reshape(len(values), len(numbers)),
         np.array(words, dtype=np.str_).reshape(len(words), len(labels)),
@@ -129,7 +131,7 @@ def _place(file: Path, names: list[str], wanted: str) -> int:
     if names.count(wanted) != 1:
         got = f"a line of names {', '.join(names)!r}"
         cure = f"Correct the first line of {file}, or ask for the name that the column has."
-        raise bad_argument("path", f"{file.name} with one column {wanted!r}", got, cure)
+        raise argument_error("path", f"{file.name} with one column {wanted!r}", got, cure)
     return names.index(wanted)
 
 
@@ -146,4 +148,4 @@ def _number(file: Path, number: int, name: str, word: str) -> float:
 
 def _bad_entry(file: Path, number: int, name: str, expected: str, got: str) -> ValueError:
     """Say what is wrong with an entry of a file."""
-    return bad_argument("path", f"{expected} in column {name!r}", got, f"Correct line {number} of {file}.")
+    return argument_error("path", f"{expected} in column {name!r}", got, f"Correct line {number} of {file}.")

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.io import loadmat
 
 from slam_backend.core.files import checked_path
-from slam_backend.core.validation import FloatArray, bad_argument, check_float
+from slam_backend.core.validation import FloatArray, argument_error, check_float
 from slam_backend.geometry import between
 from slam_backend.models.measurements import Measurements
 from slam_backend.readers.conversions import integrate_commands, points_from_polar
@@ -65,7 +65,7 @@ def load_victoria(path: str | Path, duration: float | None = None) -> VictoriaLo
     """
     folder = checked_path(path)
     if not folder.is_dir():
-        raise bad_argument("path", "a folder of the Victoria Park log", "no such folder", f"Check {str(path)!r}.")
+        raise argument_error("path", "a folder of the Victoria Park log", "no such folder", f"Check {str(path)!r}.")
     end = np.inf
     driven = _read(folder / CONTROLS_FILE, ("time", "speed", "steering"))
     controls, words = _sorted(CONTROLS_FILE, _table(folder / CONTROLS_FILE, driven, tuple(driven), MILLISECONDS))
@@ -89,7 +89,7 @@ def load_victoria(path: str | Path, duration: float | None = None) -> VictoriaLo
         gps, gps_words = _sorted(GPS_FILE, _table(folder / GPS_FILE, fixes, tuple(fixes), MILLISECONDS))
     kept = int(np.searchsorted(times, end, side="right"))
     if not kept:
-        raise bad_argument("duration", "long enough for a scan", duration, f"The first one is at {times[0]:.1f} s.")
+        raise argument_error("duration", "long enough for a scan", duration, f"The first one is at {times[0]:.1f} s.")
     controls, times = controls[controls[:, 0] <= end], times[:kept]
     for array in (controls, times, *scans, *([] if gps is None else [gps])):
         array.setflags(write=False)
@@ -105,7 +105,7 @@ def _sorted(name: str, table: FloatArray) -> tuple[FloatArray, str]:
 def _read(file: Path, names: tuple[str, ...]) -> dict[str, Any]:
     """Return the named variables of a MATLAB file."""
     if not file.is_file():
-        raise bad_argument("path", f"a folder with {file.name}", "no such file", f"Check {str(file)!r}.")
+        raise argument_error("path", f"a folder with {file.name}", "no such file", f"Check {str(file)!r}.")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # scipy warns of what it cannot make out
@@ -159,7 +159,7 @@ def _trees(file: Path, number: int, cell: Any) -> FloatArray:
 
 def _bad(file: Path, expected: str, got: str) -> ValueError:
     """Say what is wrong with a file."""
-    return bad_argument("path", f"{file.name} with {expected}", got, f"Get {str(file)!r} again.")
+    return argument_error("path", f"{file.name} with {expected}", got, f"Get {str(file)!r} again.")
 
 
 # Where laser and GPS antenna are, from the middle of the rear axle [m], and the encoder's wheel: the vehicle model that
@@ -209,7 +209,7 @@ class VictoriaSteps:
     measurements: tuple[Measurements | None, ...]
 
 
-def steps(log: VictoriaLog, noise: TreeNoise | None = None) -> VictoriaSteps:
+def to_filter_steps(log: VictoriaLog, noise: TreeNoise | None = None) -> VictoriaSteps:
     """Turn a log into odometry and measurements.
 
     Args:

@@ -12,7 +12,7 @@ from slam_backend.reference.particles import Particle, RobotStep
 from slam_backend.reference.pose_gaussian import turn_about_vertical
 
 
-def weigh_existence(
+def update_existence(
     particles: Sequence[Particle],
     best: Particle,
     robot: int,

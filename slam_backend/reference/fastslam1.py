@@ -5,13 +5,13 @@ import numpy as np
 from slam_backend.core.validation import FloatArray
 from slam_backend.fastslam.options import FilterOptions
 from slam_backend.reference.measurement_model import Frame
-from slam_backend.reference.particles import NEW, REJECTED, Candidates, Landmarks, Turn, is_held
-from slam_backend.reference.pose_gaussian import PoseBelief
+from slam_backend.reference.particles import NEW, REJECTED, Candidates, Landmarks, RobotUpdate, is_held
+from slam_backend.reference.pose_gaussian import GaussianPose
 
 
-def fastslam1_turn(
+def update_fastslam1(
     landmarks: Landmarks, pose: FloatArray, frame: Frame, candidates: Candidates, options: FilterOptions
-) -> Turn:
+) -> RobotUpdate:
     """Match, weigh and update one measurement after the other at the sampled pose.
 
     Args:
@@ -46,4 +46,4 @@ def fastslam1_turn(
         chosen.append(match)
         distances.append(distance)
         total += log_likelihood
-    return Turn(PoseBelief.known(pose), pose, chosen, distances, total)
+    return RobotUpdate(GaussianPose.known(pose), pose, chosen, distances, total)

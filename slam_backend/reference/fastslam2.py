@@ -10,25 +10,25 @@ import numpy as np
 from slam_backend.core.validation import FloatArray
 from slam_backend.fastslam.options import FilterOptions
 from slam_backend.reference.measurement_model import Frame, Innovation, log_density
-from slam_backend.reference.particles import NEW, REJECTED, Candidates, Landmarks, Turn, is_held
-from slam_backend.reference.pose_gaussian import PoseBelief, WhitenedPose
+from slam_backend.reference.particles import NEW, REJECTED, Candidates, Landmarks, RobotUpdate, is_held
+from slam_backend.reference.pose_gaussian import GaussianPose, WhitenedPose
 
 WIDE_HEADING = 0.03  # [rad]; a predicted heading less certain than this asks for more iterations
 MORE_ITERATIONS = 3
-YOUNG = 4  # a landmark seen up to so many times is updated by the iterated EKF: its depth is still vague
+RELINEARISE_BELOW = 4  # a landmark seen up to so many times is updated by the iterated EKF: its depth is still vague
 
 Gates = dict[tuple[int, int], Innovation]  # by measurement and landmark, for the candidates that can be seen
 
 
-def fastslam2_turn(
+def update_fastslam2(
     landmarks: Landmarks,
-    prior: PoseBelief,
+    prior: GaussianPose,
     frame: Frame,
     candidates: Candidates,
     normals: FloatArray,
     options: FilterOptions,
     is_exact: bool,
-) -> Turn:
+) -> RobotUpdate:
     """Associate in two passes, sample the pose, weigh the particle and update its map.
 
     Args:
@@ -48,11 +48,11 @@ def fastslam2_turn(
     gates = gates_at(predicted, landmarks, frame, candidates)  # pass A
     if options.recovery_position > 0.0 and not is_exact:
         doubt = np.diag([options.recovery_position, options.recovery_position, options.recovery_heading]) ** 2
-        doubtful = WhitenedPose.of(PoseBelief(prior.mean, doubt))
+        doubtful = WhitenedPose.of(GaussianPose(prior.mean, doubt))
         wide_gates = gates_at(doubtful, landmarks, frame, candidates)
         if is_lost(gates, wide_gates, candidates, options):
             predicted, gates, iterations = doubtful, wide_gates, 1 + MORE_ITERATIONS
-    tentative = beyond_doubt(gates, frame, candidates, options)
+    tentative = unambiguous_matches(gates, frame, candidates, options)
     refined = refine(predicted, landmarks, frame, tentative, iterations, options.position_gate)
     chosen, log_unmatched = decide(refined, landmarks, frame, candidates, options)  # pass B
     matches = {b: name for b, name in enumerate(chosen) if name >= 0}
@@ -61,14 +61,16 @@ def fastslam2_turn(
     walk = options.landmark_walk
     for b, name in enumerate(chosen):
         if name >= 0:
-            frame.update(pose, landmarks[name], b, walk, iterations=2 if landmarks[name].count <= YOUNG else 1)
+            frame.update(
+                pose, landmarks[name], b, walk, iterations=2 if landmarks[name].count <= RELINEARISE_BELOW else 1
+            )
         elif name != REJECTED:
             landmarks[name] = frame.new_landmark(pose, b, walk)
     distances = [np.nan] * len(frame)
     for b, name in matches.items():
         distances[b] = gates[b, name].distance if (b, name) in gates else np.inf
-    belief = PoseBelief(posterior.pose, posterior.covariance)
-    return Turn(belief, pose, chosen, distances, log_unmatched + log_evidence)
+    belief = GaussianPose(posterior.pose, posterior.covariance)
+    return RobotUpdate(belief, pose, chosen, distances, log_unmatched + log_evidence)
 
 
 def gates_at(here: WhitenedPose, landmarks: Landmarks, frame: Frame, candidates: Candidates) -> Gates:
@@ -111,7 +113,7 @@ def is_lost(gates: Gates, wide_gates: Gates, candidates: Candidates, options: Fi
     return sum(verdicts) >= 3 and 2 * sum(verdicts) > len(verdicts)
 
 
-def beyond_doubt(gates: Gates, frame: Frame, candidates: Candidates, options: FilterOptions) -> dict[int, int]:
+def unambiguous_matches(gates: Gates, frame: Frame, candidates: Candidates, options: FilterOptions) -> dict[int, int]:
     """Match, at the predicted pose, each measurement that has one good candidate and no good second.
 
     Args:
@@ -130,7 +132,7 @@ def beyond_doubt(gates: Gates, frame: Frame, candidates: Candidates, options: Fi
             if gate is not None and (frame.names is not None or gate.distance <= options.position_gate):
                 costs.append((gate.distance + gate.log_det + e / options.descriptor_sigma**2, name))
         costs.sort()
-        if not costs or (len(costs) > 1 and costs[1][0] - costs[0][0] < options.ambiguity):
+        if not costs or (len(costs) > 1 and costs[1][0] - costs[0][0] < options.ambiguity_margin):
             continue
         name = costs[0][1]
         if not (options.one_to_one and name in matches.values()):
@@ -197,13 +199,13 @@ def decide(
             if gate is None:
                 continue
             distance = gate.distance if frame.names is None else min(gate.distance, options.position_gate)
-            is_dead |= distance <= options.dead_zone
-            is_dead |= frame.metres(refined.pose, landmarks[name], b) <= options.dead_radius
+            is_dead |= distance <= options.new_landmark_gate
+            is_dead |= frame.metres(refined.pose, landmarks[name], b) <= options.new_landmark_radius
             if distance <= options.position_gate and not (options.one_to_one and name in chosen):
                 cost = distance + gate.log_det + e / options.descriptor_sigma**2
                 costs.append((cost, name, log_density(distance, gate.log_det)))
         costs.sort()
-        if len(costs) > 1 and costs[1][0] - costs[0][0] < options.ambiguity:
+        if len(costs) > 1 and costs[1][0] - costs[0][0] < options.ambiguity_margin:
             chosen.append(REJECTED)  # held back; yet it is explained as well as its better candidate explains it
             total += costs[0][2]
         elif costs:

@@ -1,4 +1,4 @@
-"""`PlainFastSlam`: the particle filter over the paths of K robots as Algorithm 1 has it, in Python, line by line.
+"""`ReferenceFastSlam`: the particle filter over the paths of K robots as Algorithm 1 has it, in Python, line by line.
 
 Random numbers are consumed in this order: for each robot that moved or measured one normal triple per particle, then
 the resampling.
@@ -19,22 +19,22 @@ from slam_backend.core.validation import (
     check_kind,
     check_seed,
 )
-from slam_backend.fastslam.options import MOST_ROBOTS, FilterOptions
+from slam_backend.fastslam.options import MAX_ROBOTS, FilterOptions
 from slam_backend.fastslam.reports import PoseEstimate, StepReport
-from slam_backend.fastslam.step_input import check_step
+from slam_backend.fastslam.step_input import validate_step
 from slam_backend.geometry import compose, wrap_angle
 from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.models.measurements import Measurements
-from slam_backend.reference.existence import weigh_existence
-from slam_backend.reference.fastslam1 import fastslam1_turn
-from slam_backend.reference.fastslam2 import fastslam2_turn
+from slam_backend.reference.existence import update_existence
+from slam_backend.reference.fastslam1 import update_fastslam1
+from slam_backend.reference.fastslam2 import update_fastslam2
 from slam_backend.reference.measurement_model import Frame, Landmark
-from slam_backend.reference.particles import NEW, Candidates, Particle, RobotStep, Turn, descendants, report_of
-from slam_backend.reference.pose_gaussian import PoseBelief, wrapped
+from slam_backend.reference.particles import NEW, Candidates, Particle, RobotStep, RobotUpdate, descendants, report_of
+from slam_backend.reference.pose_gaussian import GaussianPose, wrapped
 from slam_backend.resampling import RESAMPLING
 
 
-class PlainFastSlam:
+class ReferenceFastSlam:
     """What `FastSlam` does, slowly: the same decisions, and the same numbers up to rounding, from the same seed.
 
     Args:
@@ -46,7 +46,7 @@ class PlainFastSlam:
     Raises:
         ValueError: If an argument is out of its range; the text names it.
 
-    >>> slam = PlainFastSlam(1, FilterOptions(num_particles=7))
+    >>> slam = ReferenceFastSlam(1, FilterOptions(num_particles=7))
     >>> slam.step([None], [Measurements([[0.0, 0.0, 2.0]], [[1.0, 0.0]])]).num_new
     1
     >>> slam.map().means.round(3).tolist()
@@ -60,7 +60,7 @@ class PlainFastSlam:
         seed: int | np.random.SeedSequence | np.random.Generator = 0,
         initial_poses: ArrayLike | None = None,
     ) -> None:
-        k = check_int("num_robots", num_robots, 1, "Use at least one robot.", MOST_ROBOTS)
+        k = check_int("num_robots", num_robots, 1, "Use at least one robot.", MAX_ROBOTS)
         check_kind("options", options, FilterOptions)
         given = np.zeros((k, 3)) if initial_poses is None else initial_poses
         starts = check_array("initial_poses", given, (k, 3), "Give one pose (x, y, theta) per robot.")
@@ -69,7 +69,7 @@ class PlainFastSlam:
         self.rng = np.random.default_rng(check_seed(seed))
         weight = -np.log(options.num_particles)
         self.particles = [
-            Particle(list(poses), [PoseBelief.known(pose) for pose in poses], list(poses), weight)
+            Particle(list(poses), [GaussianPose.known(pose) for pose in poses], list(poses), weight)
             for _ in range(options.num_particles)
         ]
         self.is_blind = [False] * k  # moved without measuring since its pose was last sampled
@@ -131,7 +131,7 @@ class PlainFastSlam:
             ValueError: If an argument is ill-formed; the filter is then as before.
         """
         k = len(self.is_blind)
-        check_step(k, self._descriptor_size, self.options.camera, odometry, measurements, identities, poses)
+        validate_step(k, self._descriptor_size, self.options.camera, odometry, measurements, identities, poses)
         moves, names, exact = _arrays(odometry, k), _arrays(identities, k, np.int64), _arrays(poses, k)
         records = []
         for robot, frame in enumerate(measurements):
@@ -139,7 +139,7 @@ class PlainFastSlam:
             if self.options.existence is not None and frame is not None:
                 best = self.particles[self.best_particle]  # weights change once all robots have had their turns
                 model, camera = self.options.existence, self.options.camera
-                weigh_existence(self.particles, best, robot, records[robot], model, camera)
+                update_existence(self.particles, best, robot, records[robot], model, camera)
         for record in records:  # Algorithm 1, l. 9, in logarithms; weights of before are kept
             for particle, value in zip(self.particles, record.log_likelihoods, strict=True):
                 particle.path_log_weight += value  # Eq. 12, along the ancestral line
@@ -213,30 +213,30 @@ class PlainFastSlam:
         move: FloatArray | None,
         exact: FloatArray | None,
         normals: FloatArray,
-    ) -> Turn:
+    ) -> RobotUpdate:
         """Let one particle live through one robot's step."""
         options = self.options
         sampled = particle.poses[robot]
-        prior = particle.posteriors[robot] if self.is_blind[robot] else PoseBelief.known(sampled)
+        prior = particle.posteriors[robot] if self.is_blind[robot] else GaussianPose.known(sampled)
         if exact is not None:
             sampled = compose(particle.starts[robot], exact)
-            prior = PoseBelief.known(sampled)
+            prior = GaussianPose.known(sampled)
         elif move is not None:
             sigmas = options.motion.sigmas(move)
             sampled = compose(sampled, move + sigmas * normals)  # l. 14, Eq. 4
             prior = prior.moved(move, sigmas)
         candidates = [[one for one in looks if one[1] in particle.landmarks] for looks in possible]
         if options.proposal == "fastslam1":
-            turn = fastslam1_turn(particle.landmarks, sampled, frame, candidates, options)
+            turn = update_fastslam1(particle.landmarks, sampled, frame, candidates, options)
         elif len(frame):
             is_exact = exact is not None
-            turn = fastslam2_turn(particle.landmarks, prior, frame, candidates, normals, options, is_exact)
+            turn = update_fastslam2(particle.landmarks, prior, frame, candidates, normals, options, is_exact)
         else:
-            turn = Turn(prior, sampled, [], [], 0.0)
+            turn = RobotUpdate(prior, sampled, [], [], 0.0)
         particle.posteriors[robot], particle.poses[robot] = turn.posterior, turn.pose
         return turn
 
-    def _name_new(self, turns: list[Turn], frame: Frame) -> dict[int, int]:
+    def _name_new(self, turns: list[RobotUpdate], frame: Frame) -> dict[int, int]:
         """Give each landmark that at least one particle has started its lasting name, one per measurement."""
         lasting = {}
         for b in range(len(frame)):
@@ -271,7 +271,7 @@ def _arrays(values: Sequence[ArrayLike | None] | None, k: int, dtype: Any = np.f
     return [None if value is None else np.asarray(value, dtype) for value in given]
 
 
-def pose_mixture(beliefs: Sequence[PoseBelief], weights: FloatArray) -> PoseEstimate:
+def pose_mixture(beliefs: Sequence[GaussianPose], weights: FloatArray) -> PoseEstimate:
     """Return mean and covariance of a weighted mixture of Gaussian poses; headings are averaged on the circle.
 
     Args:

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from slam_backend.core.validation import FloatArray, IntArray
-from slam_backend.fastslam.reports import Findings, StepReport
+from slam_backend.fastslam.reports import Associations, StepReport
 from slam_backend.reference.measurement_model import Landmark
-from slam_backend.reference.pose_gaussian import PoseBelief
+from slam_backend.reference.pose_gaussian import GaussianPose
 from slam_backend.resampling import effective_sample_size
 
 REJECTED = -1
@@ -20,7 +20,7 @@ Candidates = list[list[tuple[float, int]]]  # per measurement (squared descripto
 
 
 @dataclass(frozen=True)
-class Turn:
+class RobotUpdate:
     """What one particle made of one robot's step.
 
     Attributes:
@@ -32,7 +32,7 @@ class Turn:
         log_likelihood: Of the measurements, given the particle's past.
     """
 
-    posterior: PoseBelief
+    posterior: GaussianPose
     pose: FloatArray
     chosen: list[int]
     distances: list[float]
@@ -90,7 +90,7 @@ def report_of(records: Sequence[RobotStep], best: int, weights: FloatArray, resa
     threshold = resample_threshold * len(weights) * (1.0 + 1e-9)  # rounding must not decide
     measured = any(record.measured for record in records)
     return StepReport(
-        findings=Findings.gathered(associations, created),
+        all_associations=Associations.from_arrays(associations, created),
         rows=tuple(range(len(records))),
         num_created=int(np.sum(started >= 0)),
         num_new=num_new,
@@ -116,14 +116,14 @@ class Particle:
     """
 
     poses: list[FloatArray]
-    posteriors: list[PoseBelief]
+    posteriors: list[GaussianPose]
     starts: list[FloatArray]
     log_weight: float
     path_log_weight: float = 0.0
     landmarks: Landmarks = field(default_factory=dict)
 
 
-def settled(ancestors: IntArray) -> IntArray:
+def keep_survivors_in_place(ancestors: IntArray) -> IntArray:
     """Reorder ancestors (M,) so that every particle that is drawn keeps its own place.
 
     The surplus copies, by ascending parent, fill the places of those that were not drawn, in ascending order.
@@ -144,7 +144,7 @@ def descendants(particles: list[Particle], ancestors: IntArray) -> list[Particle
         particles: M; those that keep their place are used again.
         ancestors: (M,) int64, the index of each one's ancestor, in any order.
     """
-    parents = settled(ancestors)
+    parents = keep_survivors_in_place(ancestors)
     drawn = [
         particles[parent] if parent == place else copy.deepcopy(particles[parent])
         for place, parent in enumerate(parents)

@@ -35,18 +35,18 @@ def lower_root(covariance: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class PoseBelief:
+class GaussianPose:
     """A Gaussian pose: mean (3,) [m, m, rad], map frame, heading on any branch; covariance (3, 3), 0 where known."""
 
     mean: FloatArray
     covariance: FloatArray
 
     @classmethod
-    def known(cls, pose: FloatArray) -> "PoseBelief":
+    def known(cls, pose: FloatArray) -> "GaussianPose":
         """Return the belief of a pose without any doubt."""
         return cls(pose, np.zeros((3, 3)))
 
-    def moved(self, odometry: FloatArray, sigmas: FloatArray) -> "PoseBelief":
+    def moved(self, odometry: FloatArray, sigmas: FloatArray) -> "GaussianPose":
         """Predict the pose after a motion: F P F^T + T diag(sigmas^2) T^T, to first order.
 
         Args:
@@ -57,7 +57,7 @@ class PoseBelief:
         x, y, _ = turn @ odometry
         by_before = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])  # F = d(mean o u) / d mean
         carried = by_before @ self.covariance @ by_before.T
-        return PoseBelief(self.mean + turn @ odometry, carried + turn @ np.diag(sigmas**2) @ turn.T)
+        return GaussianPose(self.mean + turn @ odometry, carried + turn @ np.diag(sigmas**2) @ turn.T)
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class WhitenedPose:
         return cls(start, root, np.zeros(3), np.eye(3))
 
     @classmethod
-    def of(cls, belief: PoseBelief) -> "WhitenedPose":
+    def of(cls, belief: GaussianPose) -> "WhitenedPose":
         """Whiten a belief along the robot's own axes, however the map frame happens to be turned."""
         turn = turn_about_vertical(belief.mean[2])
         return cls.before_measurements(belief.mean, turn @ lower_root(turn.T @ belief.covariance @ turn))

@@ -3,20 +3,20 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.core.blas import on_one_thread
-from slam_backend.core.jit import inlined, jit
-from slam_backend.core.packed_symmetric import UNPACK
+from slam_backend.core.blas import single_threaded_blas
+from slam_backend.core.jit import inline, jit
+from slam_backend.core.packed_symmetric import UNPACK_INDEX
 from slam_backend.core.validation import FloatArray, IntArray
-from slam_backend.smoother.graph import PathGraph
-from slam_backend.smoother.optimizer import Mode
-from slam_backend.smoother.sampling import Draws
+from slam_backend.smoother.graph import SlamGraph
+from slam_backend.smoother.optimizer import MapEstimate
+from slam_backend.smoother.sampling import PathSamples
 
 REACH = 0.5  # [m]; no duplicates are sought farther apart
 GATE = 7.81  # squared Mahalanobis distance, 95 % of 3 degrees of freedom
 
 
 def find_duplicates(
-    graph: PathGraph, mode: Mode, draws: Draws, descriptors: NDArray[np.float32], descriptor_gate: float
+    graph: SlamGraph, mode: MapEstimate, draws: PathSamples, descriptors: NDArray[np.float32], descriptor_gate: float
 ) -> IntArray:
     """Return rows (id to give up, id to keep), each landmark in at most one of them; the older id is kept.
 
@@ -30,7 +30,7 @@ def find_duplicates(
         descriptor_gate: L2 distance beyond which two do not look alike.
     """
     order, seen = mode.landmarks[:, 0].argsort(), mode.sightings
-    pairs = alike_pairs(order, mode.landmarks, descriptors, seen.keys, seen.starts, REACH, descriptor_gate)
+    pairs = similar_pairs(order, mode.landmarks, descriptors, seen.keys, seen.starts, REACH, descriptor_gate)
     if not len(pairs):
         return pairs
     taken: set[int] = set()
@@ -42,7 +42,7 @@ def find_duplicates(
     return np.array(rows, dtype=np.int64).reshape(-1, 2)
 
 
-@inlined
+@inline
 def _squared_distance(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
     """Return the squared L2 distance of two descriptors (d,)."""
     total = 0.0
@@ -51,7 +51,7 @@ def _squared_distance(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
     return total
 
 
-@inlined
+@inline
 def _apart(a: IntArray, b: IntArray) -> bool:
     """Return whether two ascending rows, have elements, and none in common."""
     i, j = 0, 0
@@ -66,7 +66,7 @@ def _apart(a: IntArray, b: IntArray) -> bool:
 
 
 @jit
-def alike_pairs(
+def similar_pairs(
     order: IntArray, landmarks: FloatArray, descriptors: NDArray[np.float32], keys: IntArray, starts: IntArray,
     reach: float, gate: float,
 ) -> IntArray:  # fmt: skip
@@ -101,8 +101,8 @@ def alike_pairs(
     return pairs[:num]
 
 
-@on_one_thread
-def _together(draws: Draws, pairs: IntArray) -> list[tuple[float, int, int]]:
+@single_threaded_blas
+def _together(draws: PathSamples, pairs: IntArray) -> list[tuple[float, int, int]]:
     """Return those of the pairs (n, 2) that may lie in one place: squared distance, and which."""
     found = []
     for a, b in pairs.tolist():
@@ -112,7 +112,7 @@ def _together(draws: Draws, pairs: IntArray) -> list[tuple[float, int, int]]:
     return found
 
 
-def _values(draws: Draws, row: int) -> FloatArray:
+def _values(draws: PathSamples, row: int) -> FloatArray:
     """Return means and covariances (9, M) of one landmark."""
     return np.asarray(draws.tiles[row].transpose(1, 0, 2).reshape(9, -1)[:, : draws.poses.shape[2]])
 
@@ -121,11 +121,11 @@ def _distance(a: FloatArray, b: FloatArray) -> float:
     """Return the squared Mahalanobis distance of two landmarks (9, M), paths included, at the first path."""
     apart = a[:3] - b[:3]
     scatter = apart[:, 1:] - apart[:, :1]
-    covariance = (a[3:, 0] + b[3:, 0])[UNPACK] + scatter @ scatter.T / max(scatter.shape[1], 1)
+    covariance = (a[3:, 0] + b[3:, 0])[UNPACK_INDEX] + scatter @ scatter.T / max(scatter.shape[1], 1)
     return float(apart[:, 0] @ np.linalg.solve(covariance, apart[:, 0]))
 
 
-def without_duplicates(graph: PathGraph, duplicates: IntArray) -> PathGraph:
+def without_duplicates(graph: SlamGraph, duplicates: IntArray) -> SlamGraph:
     """Return the graph in which each given-up landmark (rows of `find_duplicates`) is the one that is kept."""
     if not len(duplicates):
         return graph
@@ -136,6 +136,6 @@ def without_duplicates(graph: PathGraph, duplicates: IntArray) -> PathGraph:
         new[old] = kept
     return graph.with_columns(
         point_landmarks=new[graph.point_landmarks],
-        frozen_landmarks=new[graph.frozen_landmarks],
-        aliases=np.concatenate([graph.aliases, duplicates]),
+        condensed_landmarks=new[graph.condensed_landmarks],
+        merged_ids=np.concatenate([graph.merged_ids, duplicates]),
     )

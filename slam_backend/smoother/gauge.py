@@ -13,17 +13,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from slam_backend.core.jit import device, in_place, jit, lanes, room
+from slam_backend.core.jit import device, in_place, jit, simd, stack_array
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.geometry import between, wrap_angle
 from slam_backend.smoother._kernels import LANES
-from slam_backend.smoother.graph import LEVER
+from slam_backend.smoother.graph import LEVER_ARM
 
 XX, YY = 3, 6  # rows of a tile: variances of a landmark in the plane
-LEAST_SHARED = 2  # landmarks that say how a particle is turned
+MIN_SHARED = 2  # landmarks that say how a particle is turned
 
 
-class Held(NamedTuple):
+class GaugeFix(NamedTuple):
     """How particles are moved.
 
     Attributes:
@@ -37,9 +37,9 @@ class Held(NamedTuple):
     scatter: FloatArray
 
 
-def holding(
+def fix_gauge(
     tiles: FloatArray, seen: IntArray, landmarks: FloatArray, poses: FloatArray, means: FloatArray, weights: FloatArray
-) -> Held | None:
+) -> GaugeFix | None:
     """Return the motions that bring each particle's landmarks to those of the most probable path.
 
     The fit of each particle is one of least squares, landmarks weighed by the inverse of how much they scatter.
@@ -55,15 +55,15 @@ def holding(
     Returns:
         None where it does not help: too few landmarks, or the newest poses would scatter more than they do.
     """
-    if len(seen) < LEAST_SHARED:
+    if len(seen) < MIN_SHARED:
         return None
     moved, motions, scatter = np.empty_like(poses), np.empty((len(weights), 3)), np.zeros((3, 3))
-    if not hold(tiles, seen, landmarks, poses, means, LEVER, weights, moved, motions, scatter):
+    if not compute_gauge_fix(tiles, seen, landmarks, poses, means, LEVER_ARM, weights, moved, motions, scatter):
         return None
-    return Held(moved, motions, scatter)
+    return GaugeFix(moved, motions, scatter)
 
 
-def hold_start(
+def fix_start(
     starts: FloatArray, poses: FloatArray, start: FloatArray, mean: FloatArray, weights: FloatArray
 ) -> FloatArray:
     """Let all particles have the start of the most probable path, where their poses then agree better from there.
@@ -84,7 +84,7 @@ def hold_start(
     own, apart = between(start, mean), between(starts.T, start)
     off = [between(origins, poses.T) - own for origins in (starts.T, start)]
     squares = [
-        weights @ (each * each) for each in (np.column_stack([d[:, :2], LEVER * wrap_angle(d[:, 2])]) for d in off)
+        weights @ (each * each) for each in (np.column_stack([d[:, :2], LEVER_ARM * wrap_angle(d[:, 2])]) for d in off)
     ]
     if squares[1].sum() >= squares[0].sum():
         return np.zeros((3, 3))
@@ -93,7 +93,7 @@ def hold_start(
 
 
 @jit
-def hold(
+def compute_gauge_fix(
     tiles: FloatArray, seen: IntArray, landmarks: FloatArray, poses: FloatArray, means: FloatArray, lever: float,
     weights: FloatArray, moved: FloatArray, motions: FloatArray, scatter: FloatArray,
 ) -> bool:  # fmt: skip
@@ -106,19 +106,19 @@ def hold(
     """
     n, m = len(seen), len(weights)
     targets, points, squares = landmarks[seen], np.empty((n, 2, m)), np.empty((n, m))
-    look_at(tiles, seen, targets, points, squares)
+    gather_landmarks(tiles, seen, targets, points, squares)
     shares = np.empty(n)
-    share(squares, weights, shares)
-    fit(points, targets, shares, motions)
-    if not bring_nearer(poses, motions, means, lever, weights, moved):
+    landmark_weights(squares, weights, shares)
+    fit_rigid_2d(points, targets, shares, motions)
+    if not apply_if_closer(poses, motions, means, lever, weights, moved):
         return False
-    add_scatter(motions, weights, scatter)
+    add_covariance(motions, weights, scatter)
     return True
 
 
 @device
 @in_place
-def share(squares: FloatArray, weights: FloatArray, shares: FloatArray) -> None:
+def landmark_weights(squares: FloatArray, weights: FloatArray, shares: FloatArray) -> None:
     """Write weights of landmarks (n,) that sum to 1, by the inverse of the mean of squares (n, M), weighed by (M,)."""
     total = 0.0
     for n in range(len(squares)):
@@ -133,7 +133,7 @@ def share(squares: FloatArray, weights: FloatArray, shares: FloatArray) -> None:
 
 @device
 @in_place
-def fit(points: FloatArray, targets: FloatArray, shares: FloatArray, motions: FloatArray) -> None:
+def fit_rigid_2d(points: FloatArray, targets: FloatArray, shares: FloatArray, motions: FloatArray) -> None:
     """Write the rigid motions (M, 3) that bring points (n, 2, M) to targets (n, 2 or 3) best, weighed by (n,)."""
     target_x, target_y = 0.0, 0.0
     for n in range(len(shares)):
@@ -159,7 +159,7 @@ def fit(points: FloatArray, targets: FloatArray, shares: FloatArray, motions: Fl
 
 @device
 @in_place
-def add_scatter(motions: FloatArray, weights: FloatArray, scatter: FloatArray) -> None:
+def add_covariance(motions: FloatArray, weights: FloatArray, scatter: FloatArray) -> None:
     """Add the mean square (3, 3) of the inverses of motions (M, 3), weighed by (M,)."""
     for i in range(len(motions)):
         x, y, turn = motions[i, 0], motions[i, 1], motions[i, 2]
@@ -172,7 +172,7 @@ def add_scatter(motions: FloatArray, weights: FloatArray, scatter: FloatArray) -
 
 @device
 @in_place
-def look_at(
+def gather_landmarks(
     tiles: FloatArray, seen: IntArray, targets: FloatArray, points: FloatArray, squares: FloatArray
 ) -> None:  # fmt: skip
     """Write where particles hold some landmarks to be in the plane, and how far off that may be.
@@ -216,7 +216,7 @@ def wrap(poses: FloatArray) -> None:
 
 @device
 @in_place
-def measure_off(poses: FloatArray, means: FloatArray, lever: float, squares: FloatArray) -> None:
+def squared_error(poses: FloatArray, means: FloatArray, lever: float, squares: FloatArray) -> None:
     """Write how far off particles are.
 
     Args:
@@ -235,27 +235,27 @@ def measure_off(poses: FloatArray, means: FloatArray, lever: float, squares: Flo
 
 @device
 @jit
-def bring_nearer(
+def apply_if_closer(
     poses: FloatArray, motions: FloatArray, means: FloatArray, lever: float, weights: FloatArray, moved: FloatArray
 ) -> bool:
-    """Move particles as `move` does; return whether they are then less far off, see `measure_off`, weighed by (M,)."""
+    """Move particles as `move` does; return whether they are then less far off, see `squared_error`, weighed by (M,)."""
     before, after = np.empty(len(weights)), np.empty(len(weights))
     move(poses, motions, moved)
-    measure_off(poses, means, lever, before)
-    measure_off(moved, means, lever, after)
+    squared_error(poses, means, lever, before)
+    squared_error(moved, means, lever, after)
     gained = 0.0
     for i in range(len(weights)):
         gained += weights[i] * (before[i] - after[i])
     return gained > 0.0
 
 
-def move_tiles(tiles: FloatArray, motions: FloatArray) -> None:
+def transform_tiles(tiles: FloatArray, motions: FloatArray) -> None:
     """Move landmarks (l, P / LANES, 9, LANES) of each particle, in place, by its motion (M, 3); surplus lanes stay."""
-    moved_tiles(tiles.reshape(-1), len(tiles), tiles.shape[1], motions)
+    transformed_tiles(tiles.reshape(-1), len(tiles), tiles.shape[1], motions)
 
 
-@lanes
-def moved_tiles(tiles: FloatArray, num_landmarks: int, num_blocks: int, motions: FloatArray) -> None:
+@simd
+def transformed_tiles(tiles: FloatArray, num_landmarks: int, num_blocks: int, motions: FloatArray) -> None:
     """Move means and covariances of landmarks, in place.
 
     Args:
@@ -263,7 +263,7 @@ def moved_tiles(tiles: FloatArray, num_landmarks: int, num_blocks: int, motions:
         num_landmarks, num_blocks: How many there are.
         motions: (M, 3) [m, m, rad] of the particles.
     """
-    cosine, sine, ahead, left = room(LANES), room(LANES), room(LANES), room(LANES)
+    cosine, sine, ahead, left = stack_array(LANES), stack_array(LANES), stack_array(LANES), stack_array(LANES)
     for block in range(num_blocks):
         first = block * LANES
         for i in range(LANES):

@@ -1,4 +1,4 @@
-"""`PathGraph`: key poses of all robots, the odometry between them, and what was measured there. It never changes."""
+"""`SlamGraph`: key poses of all robots, the odometry between them, and what was measured there. It never changes."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -13,8 +13,8 @@ from slam_backend.geometry import between, wrap_angle
 from slam_backend.smoother._kernels import rename
 
 NONE = -1
-VAGUE = (1e4, 1e4, 10.0)  # variances [m^2, m^2, rad^2] of a start of which nothing is known
-LEVER = 3.0  # [m]; where an error of the heading between two keys is felt
+UNINFORMATIVE = (1e4, 1e4, 10.0)  # variances [m^2, m^2, rad^2] of a start of which nothing is known
+LEVER_ARM = 3.0  # [m]; where an error of the heading between two keys is felt
 RIGID = 1e-4  # [m, rad]; starts that scatter less against each other do not move
 
 
@@ -22,7 +22,7 @@ RIGID = 1e-4  # [m, rad]; starts that scatter less against each other do not mov
 OF_KEYS = ("robots", "poses", "previous", "motions", "noises", "spreads", "slack")
 OF_FRAMES = ("frame_keys", "frame_offsets")
 OF_POINTS = ("points", "point_noises", "given", "point_frames", "point_landmarks")
-OF_FROZEN = ("frozen_keys", "frozen_landmarks", "centres", "infos", "slopes", "counts")
+OF_FROZEN = ("condensed_keys", "condensed_landmarks", "centres", "infos", "slopes", "counts")
 OF_LANDMARKS = ("landmark_ids", "landmarks")
 
 
@@ -37,7 +37,7 @@ def _no_index() -> IntArray:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class PathGraph:
+class SlamGraph:
     """What a smoother knows of a run.
 
     A *key* is a pose that is sought. A *frame* is where measurements were taken: it stands rigidly to its key. Raw
@@ -57,7 +57,7 @@ class PathGraph:
         points, point_noises, given: (n, 3), (n, 6), (n,) raw measurements, robot axes from the camera centre; their
             covariances where the sensor gave them.
         point_frames, point_landmarks: (n,) int64. Frame of each, and its row of `landmark_ids`.
-        frozen_keys, frozen_landmarks: (s,) int64. Of the frozen sightings.
+        condensed_keys, condensed_landmarks: (s,) int64. Of the frozen sightings.
         centres, infos, slopes: (s, 3), (s, 6), (s, 3) float64. Their quadratic forms, see `_kernels`.
         counts: (s,) int64. Measurements in each.
         landmark_ids: (l,) int64. Names of the landmarks.
@@ -70,41 +70,41 @@ class PathGraph:
 
     robots: IntArray = field(default_factory=_no_index)
     poses: FloatArray = field(default_factory=lambda: _empty(0, 3))
-    previous: IntArray = field(default_factory=_no_index)
-    motions: FloatArray = field(default_factory=lambda: _empty(0, 3))
-    noises: FloatArray = field(default_factory=lambda: _empty(0, 3, 3))
-    spreads: FloatArray = field(default_factory=lambda: _empty(0))
-    slack: FloatArray = field(default_factory=lambda: _empty(0))
+    parents: IntArray = field(default_factory=_no_index)
+    odometry: FloatArray = field(default_factory=lambda: _empty(0, 3))
+    odometry_covariances: FloatArray = field(default_factory=lambda: _empty(0, 3, 3))
+    transition_variances: FloatArray = field(default_factory=lambda: _empty(0))
+    rigid_variances: FloatArray = field(default_factory=lambda: _empty(0))
     frame_keys: IntArray = field(default_factory=_no_index)
     frame_offsets: FloatArray = field(default_factory=lambda: _empty(0, 3))
     points: FloatArray = field(default_factory=lambda: _empty(0, 3))
     point_noises: FloatArray = field(default_factory=lambda: _empty(0, 6))
-    given: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
+    has_covariance: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
     point_frames: IntArray = field(default_factory=_no_index)
     point_landmarks: IntArray = field(default_factory=_no_index)
-    frozen_keys: IntArray = field(default_factory=_no_index)
-    frozen_landmarks: IntArray = field(default_factory=_no_index)
-    centres: FloatArray = field(default_factory=lambda: _empty(0, 3))
-    infos: FloatArray = field(default_factory=lambda: _empty(0, 6))
-    slopes: FloatArray = field(default_factory=lambda: _empty(0, 3))
+    condensed_keys: IntArray = field(default_factory=_no_index)
+    condensed_landmarks: IntArray = field(default_factory=_no_index)
+    linearisation_points: FloatArray = field(default_factory=lambda: _empty(0, 3))
+    information: FloatArray = field(default_factory=lambda: _empty(0, 6))
+    gradients: FloatArray = field(default_factory=lambda: _empty(0, 3))
     counts: IntArray = field(default_factory=_no_index)
     landmark_ids: IntArray = field(default_factory=_no_index)
     landmarks: FloatArray = field(default_factory=lambda: _empty(0, 3))
-    aliases: IntArray = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
-    heads: IntArray
-    tips: IntArray
+    merged_ids: IntArray = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
+    first_keys: IntArray
+    last_keys: IntArray
     latest: IntArray
 
     def __post_init__(self) -> None:
         vars(self).update({name: as_read_only(column) for name, column in vars(self).items()})
 
     @classmethod
-    def at_starts(cls, starts: FloatArray) -> "PathGraph":
+    def at_starts(cls, starts: FloatArray) -> "SlamGraph":
         """Return the graph of K robots that stand at `starts` (K, 3) [m, m, rad], map frame, and have seen nothing."""
         return cls.at_uncertain_starts(np.asarray(starts, dtype=np.float64)[:, :, None])
 
     @classmethod
-    def at_uncertain_starts(cls, starts: FloatArray, held: BoolArray | None = None) -> "PathGraph":
+    def at_uncertain_starts(cls, starts: FloatArray, held: BoolArray | None = None) -> "SlamGraph":
         """Return the graph of K robots whose starts particles may hold to be different, as after a merge.
 
         A start on which all particles agree is given, unless it is held. Another is sought: nothing but measurements
@@ -113,7 +113,7 @@ class PathGraph:
 
         Args:
             starts: (K, 3, M) float64 [m, m, rad], map frame.
-            held: (K,) whether particles agree on a start that is open, see `hold_start`. None: they do on none.
+            held: (K,) whether particles agree on a start that is open, see `fix_start`. None: they do on none.
         """
         k = len(starts)
         held = np.zeros(k, dtype=np.bool_) if held is None else held
@@ -121,7 +121,7 @@ class PathGraph:
         poses, previous, motions, noises = list(starts[:, :, 0]), [NONE] * k, [np.zeros(3)] * k, [np.zeros((3, 3))] * k
         for place, i in enumerate(loose):
             poses[i] = mean_pose(starts[i])
-            previous[i], motions[i], noises[i] = k, poses[i], np.diag(VAGUE)
+            previous[i], motions[i], noises[i] = k, poses[i], np.diag(UNINFORMATIVE)
             for other in loose[:place]:
                 if held[i] or held[other]:
                     continue
@@ -134,46 +134,46 @@ class PathGraph:
         return cls(
             robots=robots,
             poses=np.array([*poses, *np.zeros((extra, 3))]),
-            previous=np.array([*previous, *[NONE] * extra], dtype=np.int64),
-            motions=np.array([*motions, *np.zeros((extra, 3))]),
-            noises=np.array([*noises, *np.zeros((extra, 3, 3))]),
-            spreads=np.zeros(k + extra),
-            slack=np.zeros(k + extra),
-            heads=np.arange(k),
-            tips=np.arange(k),
+            parents=np.array([*previous, *[NONE] * extra], dtype=np.int64),
+            odometry=np.array([*motions, *np.zeros((extra, 3))]),
+            odometry_covariances=np.array([*noises, *np.zeros((extra, 3, 3))]),
+            transition_variances=np.zeros(k + extra),
+            rigid_variances=np.zeros(k + extra),
+            first_keys=np.arange(k),
+            last_keys=np.arange(k),
             latest=np.full(k, -1),
         )
 
     @classmethod
-    def of_mapping(cls, columns: Mapping[str, NDArray[Any]]) -> "PathGraph":
+    def of_mapping(cls, columns: Mapping[str, NDArray[Any]]) -> "SlamGraph":
         """Return the graph of which `to_mapping` returned the arrays; what can be written of them is copied."""
         graph = object.__new__(cls)
         vars(graph).update(with_constants(columns))
         return graph
 
-    def reordered(self, order: IntArray) -> "PathGraph":
+    def reordered(self, order: IntArray) -> "SlamGraph":
         """Return the graph in which robot i is the one that was `order[i]`; (K,) a permutation."""
         robots = self.robots.copy()
         robots[self.robots >= 0] = np.argsort(order)[self.robots[self.robots >= 0]]
         return self.with_columns(
-            robots=robots, heads=self.heads[order], tips=self.tips[order], latest=self.latest[order]
+            robots=robots, first_keys=self.first_keys[order], last_keys=self.last_keys[order], latest=self.latest[order]
         )
 
-    def with_columns(self, **columns: NDArray[Any]) -> "PathGraph":
+    def with_columns(self, **columns: NDArray[Any]) -> "SlamGraph":
         """Return the graph with read-only views of some columns in place of its own.
 
         As `dataclasses.replace`, but that those that stay are not looked at again. The caller must not write to the
         arrays afterwards.
         """
         assert columns.keys() <= vars(self).keys()
-        other = object.__new__(PathGraph)
+        other = object.__new__(SlamGraph)
         vars(other).update(vars(self), **{name: as_read_only(column) for name, column in columns.items()})
         return other
 
-    def known_as(self, ids: IntArray) -> IntArray:
+    def resolve_ids(self, ids: IntArray) -> IntArray:
         """Return the names by which landmarks `ids` (n,) int64 go, `aliases` applied."""
         result = ids.copy()
-        rename(result, self.aliases)
+        rename(result, self.merged_ids)
         return result
 
     def to_mapping(self) -> dict[str, Any]:
@@ -188,7 +188,7 @@ class PathGraph:
     @property
     def num_sightings(self) -> int:
         """Frozen sightings, and raw measurements that may become some: what the effort of a rejuvenation grows with."""
-        return len(self.frozen_keys) + len(self.points)
+        return len(self.condensed_keys) + len(self.points)
 
     @property
     def nbytes(self) -> int:

@@ -6,13 +6,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.core.validation import BoolArray, FloatArray, IntArray, bad_argument
+from slam_backend.core.validation import BoolArray, FloatArray, IntArray, argument_error
 from slam_backend.geometry import between, compose, rotation
 from slam_backend.models.odometry import OdometryModel
 from slam_backend.smoother import _kernels
-from slam_backend.smoother._kernels import look_up
+from slam_backend.smoother._kernels import find_initial_poses
 from slam_backend.smoother.graph import (
-    LEVER,
+    LEVER_ARM,
     NONE,
     OF_FRAMES,
     OF_FROZEN,
@@ -20,13 +20,13 @@ from slam_backend.smoother.graph import (
     OF_LANDMARKS,
     OF_POINTS,
     RIGID,
-    VAGUE,
-    PathGraph,
+    UNINFORMATIVE,
+    SlamGraph,
 )
 from slam_backend.smoother.log_arrays import EXACT, LogArrays
 
 
-class Guesses(NamedTuple):
+class InitialPoses(NamedTuple):
     """Poses of a robot after some steps.
 
     Attributes:
@@ -38,33 +38,33 @@ class Guesses(NamedTuple):
     poses: FloatArray
 
     @classmethod
-    def none(cls) -> "Guesses":
+    def empty(cls) -> "InitialPoses":
         """Return those of a robot of which nobody says anything."""
         return cls(np.empty(0, dtype=np.int64), np.empty((0, 3)))
 
-    def with_later(self, steps: IntArray, poses: FloatArray) -> "Guesses":
+    def with_later(self, steps: IntArray, poses: FloatArray) -> "InitialPoses":
         """Return these and others of later steps (m,), (m, 3)."""
-        return Guesses(np.concatenate([self.steps, steps]), np.concatenate([self.poses, poses]))
+        return InitialPoses(np.concatenate([self.steps, steps]), np.concatenate([self.poses, poses]))
 
-    def after(self, step: int) -> "Guesses":
+    def after(self, step: int) -> "InitialPoses":
         """Return those of the steps after one; views."""
         first = self.steps.searchsorted(step, side="right")
-        return Guesses(self.steps[first:], self.poses[first:])
+        return InitialPoses(self.steps[first:], self.poses[first:])
 
     def at(self, steps: IntArray) -> FloatArray:
         """Return the poses (m, 3) after steps (m,), ascending; NaN where nobody says."""
         poses = np.empty((len(steps), 3))
-        look_up(self.steps, self.poses, steps, poses)
+        find_initial_poses(self.steps, self.poses, steps, poses)
         return poses
 
 
-LEAST_NOISE = 1e-5  # [m, rad] of odometry in one step: where a part has none, as with no floors, nothing is singular
+MIN_NOISE = 1e-5  # [m, rad] of odometry in one step: where a part has none, as with no floors, nothing is singular
 NO_COVARIANCES = np.empty((0, 6))
 NO_COVARIANCES.setflags(write=False)  # as those of logs are
-NO_GUESSES = Guesses.none()
+NO_INITIAL_POSES = InitialPoses.empty()
 
 
-class Places(NamedTuple):
+class LandmarkPositions(NamedTuple):
     """Where a filter holds landmarks to be.
 
     Attributes:
@@ -76,18 +76,18 @@ class Places(NamedTuple):
     means: FloatArray
 
 
-NO_PLACES = Places(np.empty(0, dtype=np.int64), np.empty((0, 3)))
+NO_LANDMARK_POSITIONS = LandmarkPositions(np.empty(0, dtype=np.int64), np.empty((0, 3)))
 
 
-def extended(
-    graph: PathGraph,
+def extend_graph(
+    graph: SlamGraph,
     logs: Sequence[LogArrays],
     motion: OdometryModel,
     mount: FloatArray,
-    guesses: Sequence[Guesses] | None = None,
+    guesses: Sequence[InitialPoses] | None = None,
     rigid_within: float = 0.0,
-    places: Places | None = None,
-) -> PathGraph:
+    places: LandmarkPositions | None = None,
+) -> SlamGraph:
     """Return the graph with what the robots did since.
 
     Each step that measured something, and each robot's last, becomes a key, unless it is near enough to the key before
@@ -111,25 +111,25 @@ def extended(
     steps, most = sum(map(len, logs)), sum(len(log.ids) for log in logs)
     room = {OF_KEYS: steps, OF_FRAMES: steps, OF_POINTS: most, OF_LANDMARKS: most}
     columns = {name: _with_room(getattr(graph, name), more) for names, more in room.items() for name in names}
-    keys, frames, points, tips, is_guided = _walked(graph, logs, motion, guesses, rigid_within, columns)
-    new, held = slice(len(graph.points), points), NO_PLACES if places is None else places
-    landmarks = _kernels.settle(
-        graph.aliases, len(graph.landmarks), columns["point_landmarks"][new], columns["points"][new],
+    keys, frames, points, tips, is_guided = _add_keyframes(graph, logs, motion, guesses, rigid_within, columns)
+    new, held = slice(len(graph.points), points), NO_LANDMARK_POSITIONS if places is None else places
+    landmarks = _kernels.close_keyframe(
+        graph.merged_ids, len(graph.landmarks), columns["point_landmarks"][new], columns["points"][new],
         columns["point_frames"][new], columns["poses"], columns["frame_keys"], columns["frame_offsets"], mount,
-        is_guided and len(held.ids) > 0, graph.frozen_landmarks, graph.counts, graph.point_landmarks, held.ids,
+        is_guided and len(held.ids) > 0, graph.condensed_landmarks, graph.counts, graph.point_landmarks, held.ids,
         held.means, columns["landmark_ids"], columns["landmarks"],
     )  # fmt: skip
     latest = [int(log.steps[-1]) if len(log) else before for log, before in zip(logs, graph.latest, strict=True)]
     used = {OF_KEYS: keys, OF_FRAMES: frames, OF_POINTS: points, OF_LANDMARKS: landmarks}
     return graph.with_columns(
         **{name: columns[name][:num] for names, num in used.items() for name in names},
-        tips=tips,
+        last_keys=tips,
         latest=np.array(latest, dtype=np.int64),
     )
 
 
-def _walked(
-    graph: PathGraph, logs: Sequence[LogArrays], motion: OdometryModel, guesses: Sequence[Guesses] | None,
+def _add_keyframes(
+    graph: SlamGraph, logs: Sequence[LogArrays], motion: OdometryModel, guesses: Sequence[InitialPoses] | None,
     rigid_within: float, columns: dict[str, NDArray[Any]],
 ) -> tuple[int, int, int, IntArray, bool]:  # fmt: skip
     """Walk through the robots' new steps: which of them become keys, and what was measured.
@@ -143,20 +143,20 @@ def _walked(
         How many keys, frames and measurements there are then, the newest key of each robot (K,), and whether each robot
         is supposed to be anywhere where it measured something.
     """
-    tips, is_guided = graph.tips.copy(), guesses is not None
+    tips, is_guided = graph.last_keys.copy(), guesses is not None
     written = [columns[name] for name in (*OF_KEYS, *OF_FRAMES, *OF_POINTS)]
     keys, frames, points = graph.num_keys, len(graph.frame_keys), len(graph.points)
     for robot, log in enumerate(logs):
         if EXACT in log.kinds.tolist():
-            raise bad_argument("logs", "odometry", "a pose that was given as exact", "There is nothing to smooth.")
+            raise argument_error("logs", "odometry", "a pose that was given as exact", "There is nothing to smooth.")
         variances = motion.variances(log.motions)
-        if not motion.is_exact:
-            variances = np.maximum(variances, LEAST_NOISE**2)
-        guessed = NO_GUESSES if guesses is None else guesses[robot]
+        if not motion.is_noiseless:
+            variances = np.maximum(variances, MIN_NOISE**2)
+        guessed = NO_INITIAL_POSES if guesses is None else guesses[robot]
         covariances = NO_COVARIANCES if log.covariances is None else log.covariances
-        keys, frames, points, is_own = _kernels.take_in(
+        keys, frames, points, is_own = _kernels.add_log(
             log.steps, log.kinds, log.motions, log.given, log.starts, log.points, log.ids, covariances, variances,
-            *guessed, robot, rigid_within, LEVER, keys, frames, points, tips, *written,
+            *guessed, robot, rigid_within, LEVER_ARM, keys, frames, points, tips, *written,
         )  # fmt: skip
         is_guided = is_guided and is_own
     return keys, frames, points, tips, is_guided
@@ -169,7 +169,7 @@ def _with_room(column: NDArray[Any], extra: int) -> NDArray[Any]:
     return longer
 
 
-def first_rows(log: LogArrays, count: int) -> LogArrays:
+def log_head(log: LogArrays, count: int) -> LogArrays:
     """Return the first `count` steps of a log, all if it has no more; the arrays are views."""
     if count >= len(log):
         return log
@@ -184,9 +184,9 @@ def first_rows(log: LogArrays, count: int) -> LogArrays:
 FIXES = 3  # landmarks in common from which measurements alone say how two groups lie
 
 
-def joined(
-    a: PathGraph, b: PathGraph, motion: FloatArray, renamed: IntArray, uncertainty: FloatArray | None = None
-) -> PathGraph:
+def merge_graphs(
+    a: SlamGraph, b: SlamGraph, motion: FloatArray, renamed: IntArray, uncertainty: FloatArray | None = None
+) -> SlamGraph:
     """Return the graph of both groups' robots, a's first, in a's frame.
 
     Measurements and odometry are seen from key poses, so that they stay as they are. All keys and landmarks of b are
@@ -201,85 +201,85 @@ def joined(
         renamed: (n, 2) int64 rows (name in b, name in the joint map), each name in b once. What else b saw is left out.
         uncertainty: (3, 3) covariance of where b's first robot started [m, m, rad], a's frame. None: nothing is known.
     """
-    names = dict(zip(renamed[:, 0].tolist(), a.known_as(renamed[:, 1]).tolist(), strict=True))
+    names = dict(zip(renamed[:, 0].tolist(), a.resolve_ids(renamed[:, 1]).tolist(), strict=True))
     b = _named(_moved(b, motion), names)
     fixed = uncertainty is None or len(np.intersect1d(a.landmark_ids, b.landmark_ids)) >= FIXES
-    loose, b = _unpinned(b, np.diag(VAGUE) if fixed else np.asarray(uncertainty))
+    loose, b = _unpinned(b, np.diag(UNINFORMATIVE) if fixed else np.asarray(uncertainty))
     origin = np.flatnonzero(a.robots == NONE)
     if not len(origin):
         a, origin = _with_origin(a), np.array([a.num_keys])
     keys, frames = a.num_keys, len(a.frame_keys)
-    previous = np.where(b.previous >= 0, b.previous + keys, NONE)
+    previous = np.where(b.parents >= 0, b.parents + keys, NONE)
     previous[loose] = origin[0]
     ids, rows = np.unique(np.concatenate([a.landmark_ids, b.landmark_ids]), return_inverse=True)
     landmarks = np.empty((len(ids), 3))
     of_b = rows[len(a.landmark_ids) :]
     landmarks[of_b], landmarks[rows[: len(a.landmark_ids)]] = b.landmarks, a.landmarks
     shifted = {
-        "robots": b.robots + len(a.tips),
+        "robots": b.robots + len(a.last_keys),
         "previous": previous,
         "frame_keys": b.frame_keys + keys,
         "point_frames": b.point_frames + frames,
         "point_landmarks": of_b[b.point_landmarks],
-        "frozen_keys": b.frozen_keys + keys,
-        "frozen_landmarks": of_b[b.frozen_landmarks],
-        "heads": b.heads + keys,
-        "tips": b.tips + keys,
+        "condensed_keys": b.condensed_keys + keys,
+        "condensed_landmarks": of_b[b.condensed_landmarks],
+        "heads": b.first_keys + keys,
+        "tips": b.last_keys + keys,
     }
     both = {
         name: np.concatenate([getattr(a, name), shifted.get(name, getattr(b, name))])
         for name in a.__dataclass_fields__
         if name not in ("landmark_ids", "landmarks")
     }
-    for name in ("point_landmarks", "frozen_landmarks"):
+    for name in ("point_landmarks", "condensed_landmarks"):
         own = len(getattr(a, name))
         both[name][:own] = rows[: len(a.landmark_ids)][both[name][:own]]
-    return PathGraph(**both, landmark_ids=ids, landmarks=landmarks)
+    return SlamGraph(**both, landmark_ids=ids, landmarks=landmarks)
 
 
-def _moved(graph: PathGraph, motion: FloatArray) -> PathGraph:
+def _moved(graph: SlamGraph, motion: FloatArray) -> SlamGraph:
     """Return the graph with poses and landmarks in another frame; links from the origin are as they were."""
     landmarks = graph.landmarks.copy()
     landmarks[:, :2] = landmarks[:, :2] @ rotation(motion[2]).T + motion[:2]
     return graph.with_columns(poses=compose(motion, graph.poses), landmarks=landmarks)
 
 
-def _named(graph: PathGraph, names: Mapping[int, int]) -> PathGraph:
+def _named(graph: SlamGraph, names: Mapping[int, int]) -> SlamGraph:
     """Return the graph with its landmarks under new names; those that have none, and what was seen of them, go."""
     new = np.array([names.get(name, NONE) for name in graph.landmark_ids.tolist()], dtype=np.int64)
     kept = new >= 0
     row = np.cumsum(kept) - 1
-    aliases = [(names[old], names[by]) for old, by in graph.aliases.tolist() if old in names and by in names]
+    aliases = [(names[old], names[by]) for old, by in graph.merged_ids.tolist() if old in names and by in names]
     return graph.with_columns(
         **_rows(graph, OF_POINTS, kept[graph.point_landmarks], row),
-        **_rows(graph, OF_FROZEN, kept[graph.frozen_landmarks], row),
+        **_rows(graph, OF_FROZEN, kept[graph.condensed_landmarks], row),
         landmark_ids=new[kept],
         landmarks=graph.landmarks[kept],
-        aliases=np.array(aliases, dtype=np.int64).reshape(-1, 2),
+        merged_ids=np.array(aliases, dtype=np.int64).reshape(-1, 2),
     )
 
 
-def _rows(graph: PathGraph, names: tuple[str, ...], kept: BoolArray, row: IntArray) -> dict[str, Any]:
+def _rows(graph: SlamGraph, names: tuple[str, ...], kept: BoolArray, row: IntArray) -> dict[str, Any]:
     """Return some rows of columns; landmarks are counted anew."""
     columns = {name: getattr(graph, name)[kept] for name in names}
     return columns | {name: row[column] for name, column in columns.items() if name.endswith("_landmarks")}
 
 
-def _unpinned(graph: PathGraph, prior: FloatArray) -> tuple[IntArray, PathGraph]:
+def _unpinned(graph: SlamGraph, prior: FloatArray) -> tuple[IntArray, SlamGraph]:
     """Return the starts that hang on nothing of the group (n,), and the group without an origin, none of it given.
 
     These starts are where they are but for a prior covariance (3, 3).
     """
     origin = np.flatnonzero(graph.robots == NONE)
-    given = np.flatnonzero((graph.previous == NONE) & (graph.robots >= 0))
-    loose = np.flatnonzero(np.isin(graph.previous, origin) & (graph.robots >= 0))
-    previous, motions, noises = graph.previous.copy(), graph.motions.copy(), graph.noises.copy()
+    given = np.flatnonzero((graph.parents == NONE) & (graph.robots >= 0))
+    loose = np.flatnonzero(np.isin(graph.parents, origin) & (graph.robots >= 0))
+    previous, motions, noises = graph.parents.copy(), graph.odometry.copy(), graph.odometry_covariances.copy()
     free = np.concatenate([given[:1], loose]).astype(np.int64)
     previous[given], motions[given], noises[given] = given[:1], 0.0, RIGID**2 * np.eye(3)
     if len(given):
         motions[given] = between(graph.poses[given[0]], graph.poses[given])
     previous[free], motions[free], noises[free] = NONE, graph.poses[free], prior
-    graph = graph.with_columns(previous=previous, motions=motions, noises=noises)
+    graph = graph.with_columns(parents=previous, odometry=motions, odometry_covariances=noises)
     if not len(origin):
         return free, graph
     kept = graph.robots >= 0
@@ -287,19 +287,19 @@ def _unpinned(graph: PathGraph, prior: FloatArray) -> tuple[IntArray, PathGraph]
     per_key = ("robots", "poses", "motions", "noises", "spreads", "slack")
     return number[free], graph.with_columns(
         **{name: getattr(graph, name)[kept] for name in per_key},
-        previous=np.where(previous >= 0, number[previous], NONE)[kept],
-        **{name: number[getattr(graph, name)] for name in ("frame_keys", "frozen_keys", "heads", "tips")},
+        parents=np.where(previous >= 0, number[previous], NONE)[kept],
+        **{name: number[getattr(graph, name)] for name in ("frame_keys", "condensed_keys", "heads", "tips")},
     )
 
 
-def _with_origin(graph: PathGraph) -> PathGraph:
+def _with_origin(graph: SlamGraph) -> SlamGraph:
     """Return the graph with a key at the origin of its frame."""
     return graph.with_columns(
         robots=np.append(graph.robots, NONE),
         poses=np.concatenate([graph.poses, np.zeros((1, 3))]),
-        previous=np.append(graph.previous, NONE),
-        motions=np.concatenate([graph.motions, np.zeros((1, 3))]),
-        noises=np.concatenate([graph.noises, np.zeros((1, 3, 3))]),
-        spreads=np.append(graph.spreads, 0.0),
-        slack=np.append(graph.slack, 0.0),
+        parents=np.append(graph.parents, NONE),
+        odometry=np.concatenate([graph.odometry, np.zeros((1, 3))]),
+        odometry_covariances=np.concatenate([graph.odometry_covariances, np.zeros((1, 3, 3))]),
+        transition_variances=np.append(graph.transition_variances, 0.0),
+        rigid_variances=np.append(graph.rigid_variances, 0.0),
     )

@@ -8,10 +8,10 @@ from weakref import WeakSet
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.core.read_only import Act, mapped, with_constants, with_read_only
+from slam_backend.core.read_only import Act, map_arrays, with_constants, with_read_only
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 
-STOOD: Final = 0  # kinds of motion
+STATIONARY: Final = 0  # kinds of motion
 ODOMETRY: Final = 1
 EXACT: Final = 2
 REJECTED: Final = -1
@@ -83,7 +83,7 @@ class LogArrays:
     def with_arrays(self, act: Act) -> "LogArrays":
         """Return the same with `act` done to each array; itself if that changes nothing."""
         before = self._columns()
-        after = mapped(before, act)
+        after = map_arrays(before, act)
         return self if after is before else LogArrays(**after)
 
     @property

@@ -6,11 +6,11 @@ import numpy as np
 
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.smoother import _kernels
-from slam_backend.smoother.graph import LEVER, PathGraph
+from slam_backend.smoother.graph import LEVER_ARM, SlamGraph
 from slam_backend.smoother.options import SmoothingOptions
 
 
-class Sightings(NamedTuple):
+class LandmarkFactors(NamedTuple):
     """Forms of s sightings, by landmark; those of raw measurements change with the point of linearisation.
 
     Attributes:
@@ -35,15 +35,15 @@ class Sightings(NamedTuple):
     squares: FloatArray
 
     @classmethod
-    def of(cls, graph: PathGraph) -> Self:
+    def of(cls, graph: SlamGraph) -> Self:
         """Gather a graph's sightings; those of raw measurements are still to be linearised."""
-        most, n = len(graph.frozen_keys) + len(graph.points), len(graph.points)
+        most, n = len(graph.condensed_keys) + len(graph.points), len(graph.points)
         keys, landmarks, counts = (np.empty(most, dtype=np.int64) for _ in range(3))
         starts, of_points = np.empty(len(graph.landmark_ids) + 1, dtype=np.int64), np.empty(n, dtype=np.int64)
         frozen = np.empty(most, dtype=np.bool_)
         centres, infos, slopes = np.empty((most, 3)), np.empty((most, 6)), np.empty((most, 3))
         num = _kernels.gather(
-            graph.frozen_keys, graph.frozen_landmarks, graph.centres, graph.infos, graph.slopes, graph.counts,
+            graph.condensed_keys, graph.condensed_landmarks, graph.linearisation_points, graph.information, graph.gradients, graph.counts,
             graph.point_frames, graph.point_landmarks, graph.frame_keys, graph.num_keys, keys, landmarks, starts,
             frozen, centres, infos, slopes, counts, of_points,
         )  # fmt: skip
@@ -53,7 +53,7 @@ class Sightings(NamedTuple):
         )  # fmt: skip
 
     def linearise(
-        self, graph: PathGraph, poses: FloatArray, landmarks: FloatArray, camera: FloatArray, scale: float,
+        self, graph: SlamGraph, poses: FloatArray, landmarks: FloatArray, camera: FloatArray, scale: float,
         kernel: float,
     ) -> float:  # fmt: skip
         """Linearise the raw measurements, whose forms and `squares` are written.
@@ -70,20 +70,22 @@ class Sightings(NamedTuple):
             Half the sum of their (robust) squared distances.
         """
         return _kernels.condense(
-            graph.points, graph.point_noises, graph.given, graph.point_frames, self.of_points, graph.frame_keys,
+            graph.points, graph.point_noises, graph.has_covariance, graph.point_frames, self.of_points, graph.frame_keys,
             graph.frame_offsets, poses, landmarks, self.keys, self.landmarks, self.frozen, camera, scale, kernel,
             self.centres, self.infos, self.slopes, self.squares,
         )  # fmt: skip
 
 
-FIRST_DAMPING, MOST_DAMPING = 1e-4, 1e8
+FIRST_DAMPING, MAX_DAMPING = 1e-4, 1e8
 LARGEST_STEP = 1e3  # [m, rad]; nothing is sought so far away
 LONG_COLUMNS = 16  # blocks in a mean column, longer ones counting more: then draws are cheaper than the inverse
 NO_POSE = "no pose to seek"  # the reason where all poses are given
-CREEP = 10.0  # times the tolerance: so far from its end a descent may be that has used up the options' iterations
+SLOW_PROGRESS = (
+    10.0  # times the tolerance: so far from its end a descent may be that has used up the options' iterations
+)
 
 
-class Mode(NamedTuple):
+class MapEstimate(NamedTuple):
     """The most probable paths, and the Gaussian about them.
 
     Attributes:
@@ -102,13 +104,13 @@ class Mode(NamedTuple):
     poses: FloatArray
     landmarks: FloatArray
     columns: IntArray
-    sightings: Sightings
+    sightings: LandmarkFactors
     odometry_infos: FloatArray
     cost: float
     iterations: int
     damping: float
     reason: str
-    system: "_System | None" = None
+    system: "NormalEquations | None" = None
 
     @property
     def unfinished(self) -> bool:
@@ -149,10 +151,10 @@ class Mode(NamedTuple):
         return self.system.spreads(self.poses)
 
 
-def find_mode(
-    graph: PathGraph, camera: FloatArray, options: SmoothingOptions, most: int | None = None, damping: float = 0.0,
+def optimize(
+    graph: SlamGraph, camera: FloatArray, options: SmoothingOptions, most: int | None = None, damping: float = 0.0,
     looseness: float = 1.0,
-) -> Mode:  # fmt: skip
+) -> MapEstimate:  # fmt: skip
     """Descend from where the graph stands.
 
     A step that does not lower the cost is tried again with more damping (Levenberg, Marquardt). Where measurements lie
@@ -168,22 +170,22 @@ def find_mode(
         damping: Of the first one.
         looseness: Times the tolerance of the options.
     """
-    columns, informations = np.empty(graph.num_keys, dtype=np.int64), np.empty(graph.noises.shape)
-    size, is_noisy = _kernels.seek_poses(graph.previous, graph.noises, columns, informations)
-    sightings = Sightings.of(graph)
+    columns, informations = np.empty(graph.num_keys, dtype=np.int64), np.empty(graph.odometry_covariances.shape)
+    size, is_noisy = _kernels.sum_pose_information(graph.parents, graph.odometry_covariances, columns, informations)
+    sightings = LandmarkFactors.of(graph)
     poses, landmarks = graph.poses.copy(), graph.landmarks.copy()
     tolerance = looseness * options.tolerance
-    creep = CREEP if most is None else 1.0
+    creep = SLOW_PROGRESS if most is None else 1.0
     most = options.max_iterations if most is None else most
 
-    def given_up(reason: str, iterations: int = 0, cost: float = np.inf) -> Mode:
-        return Mode(poses, landmarks, columns, sightings, informations, cost, iterations, damping, reason)
+    def given_up(reason: str, iterations: int = 0, cost: float = np.inf) -> MapEstimate:
+        return MapEstimate(poses, landmarks, columns, sightings, informations, cost, iterations, damping, reason)
 
     if not size:
         return given_up(NO_POSE)
     if not is_noisy:
         return given_up("odometry without noise")
-    system = _System(graph, columns, size, informations, sightings, camera, options)
+    system = NormalEquations(graph, columns, size, informations, sightings, camera, options)
     cost = system.form(poses, landmarks)
     for iteration in range(1, most + 1):
         if not np.isfinite(cost):
@@ -197,7 +199,7 @@ def find_mode(
         expected = -0.5 * rise - system.eased  # if the cost were a parabola
         near = creep * tolerance if iteration == most else tolerance
         if expected <= near and damping == 0.0:
-            return Mode(
+            return MapEstimate(
                 trial_poses, trial_landmarks, columns, sightings, informations, cost - expected, iteration, damping,
                 "", system,
             )  # fmt: skip
@@ -207,13 +209,13 @@ def find_mode(
             damping = damping / 10.0 if damping > FIRST_DAMPING else 0.0
         else:
             damping = max(10.0 * damping, FIRST_DAMPING)
-            if damping > MOST_DAMPING:
+            if damping > MAX_DAMPING:
                 return given_up("no descent", iteration)
             cost = system.form(poses, landmarks)
     return given_up(f"no convergence in {most} iterations", most, cost)
 
 
-class _Pattern(NamedTuple):
+class SymbolicFactor(NamedTuple):
     """Where the blocks of a factor lie, how many nodes are drawn, and how long columns are; see `_kernels.lay_out`."""
 
     order: IntArray
@@ -229,34 +231,34 @@ class _Pattern(NamedTuple):
     squares: int
 
     @classmethod
-    def of(cls, graph: PathGraph, columns: IntArray, seen: Sightings, num: int) -> Self:
+    def of(cls, graph: SlamGraph, columns: IntArray, seen: LandmarkFactors, num: int) -> Self:
         """Choose an order in which the `num` poses and landmarks are eliminated, and lay out what that fills in."""
         near = np.zeros((num, -(-num // 64)), dtype=np.uint64)
-        _kernels.neighbours(columns, graph.previous, seen.keys, seen.starts, near)
+        _kernels.neighbours(columns, graph.parents, seen.keys, seen.starts, near)
         order, ranks = np.empty(num, dtype=np.int64), np.empty(num, dtype=np.int64)
         filled = _kernels.minimum_degree(near, order)
         tops, row_tops = np.empty(num + 1, dtype=np.int64), np.empty(num + 1, dtype=np.int64)
         rows, row_columns, row_places = (np.empty(filled, dtype=np.int64) for _ in range(3))
         links, cross = np.empty(len(columns), dtype=np.int64), np.empty(len(seen.keys), dtype=np.int64)
         drawn, squares = _kernels.lay_out(
-            near, order, columns, graph.previous, seen.keys, seen.starts, ranks, tops, rows, links, cross, row_tops,
+            near, order, columns, graph.parents, seen.keys, seen.starts, ranks, tops, rows, links, cross, row_tops,
             row_columns, row_places,
         )  # fmt: skip
         return cls(order, ranks, tops, rows, links, cross, row_tops, row_columns, row_places, drawn, squares)
 
 
-class _System:
+class NormalEquations:
     """Room for the normal equations, and what they are formed of."""
 
     def __init__(
-        self, graph: PathGraph, columns: IntArray, size: int, informations: FloatArray, sightings: Sightings,
+        self, graph: SlamGraph, columns: IntArray, size: int, informations: FloatArray, sightings: LandmarkFactors,
         camera: FloatArray, options: SmoothingOptions,
     ) -> None:  # fmt: skip
         self.graph, self.columns, self.sightings = graph, columns, sightings
         self.informations, self.camera, self.options = informations, camera, options
         num, k = size + len(graph.landmark_ids), graph.num_keys
         self.num_poses = size
-        self.pattern = _Pattern.of(graph, columns, sightings, num)
+        self.pattern = SymbolicFactor.of(graph, columns, sightings, num)
         self.blocks, self.links, self.turns = np.empty((num, 6)), np.empty((k, 3, 3)), np.empty((k, 2))
         self.cross = np.empty((len(sightings.keys), 3, 3))
         self.vector = np.empty((num, 3))
@@ -269,7 +271,7 @@ class _System:
         seen, graph = self.sightings, self.graph
         loss = seen.linearise(graph, poses, landmarks, self.camera, self.options.noise_scale, self.options.kernel)
         cost, self.eased = _kernels.form(
-            poses, landmarks, self.columns, graph.previous, graph.motions, self.informations, seen.keys, seen.starts,
+            poses, landmarks, self.columns, graph.parents, graph.odometry, self.informations, seen.keys, seen.starts,
             seen.centres, seen.infos, seen.slopes, self.turns, self.blocks, self.links, self.cross, self.vector,
         )  # fmt: skip
         return loss + cost
@@ -318,6 +320,6 @@ class _System:
         """Return how far motions to each pose (k, 3) scatter, see `Mode.spreads`."""
         p = self.pattern
         return _kernels.scatter_of_links(
-            poses, self.columns, self.graph.previous, LEVER, self.pivots, self.values, p.order, p.ranks, p.tops,
+            poses, self.columns, self.graph.parents, LEVER_ARM, self.pivots, self.values, p.order, p.ranks, p.tops,
             p.rows, p.row_tops, p.link_places,
         )  # fmt: skip

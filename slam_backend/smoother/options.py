@@ -14,7 +14,7 @@ class SmoothingOptions:
         max_keys: Most key poses of one robot; where there are more, the most rigid neighbours become one. Effort grows
             hardly faster, for few keys see the same; memory with its product with the landmarks in view.
         further_keys: So many more for each further robot of the filter.
-        fresh_keys: Newest keys, of all robots together, that keep their raw measurements, which are linearised anew
+        recent_keys: Newest keys, of all robots together, that keep their raw measurements, which are linearised anew
             each time.
         kernel: Squared Mahalanobis distance of a measurement (3 degrees of freedom) above which it loses weight; 0:
             none does.
@@ -42,7 +42,7 @@ class SmoothingOptions:
 
     max_keys: int = 120
     further_keys: int = 30
-    fresh_keys: int = 60
+    recent_keys: int = 60
     kernel: float = 16.0
     noise_scale: float = 1.0
     closure_after: int = 100
@@ -58,7 +58,7 @@ class SmoothingOptions:
     def __post_init__(self) -> None:
         check_int("max_keys", self.max_keys, 2, "Two poses are the least that can be smoothed.", MOST)
         check_int("further_keys", self.further_keys, 0, "Use 0 to let all robots share those of one.", MOST)
-        check_int("fresh_keys", self.fresh_keys, 1, "The newest pose is always fresh.", MOST)
+        check_int("recent_keys", self.recent_keys, 1, "The newest pose is always fresh.", MOST)
         check_int("more_draws", self.more_draws, 1, "Use 1 to draw no more than M.", MOST)
         if self.slice_steps is not None:
             check_int("slice_steps", self.slice_steps, 1, "Use 90, or None for all at once.", MOST)

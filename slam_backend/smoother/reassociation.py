@@ -14,19 +14,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.core.jit import in_place
-from slam_backend.core.packed_symmetric import UNPACK
+from slam_backend.core.packed_symmetric import UNPACK_INDEX
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.fastslam.options import FilterOptions
 from slam_backend.geometry import rotation
 from slam_backend.models.camera import ROBOT_FROM_CAMERA
-from slam_backend.smoother.graph_building import Guesses
+from slam_backend.smoother.graph_building import InitialPoses
 from slam_backend.smoother.log_arrays import LogArrays
 
 NO_ONE = -1
 ROUNDING = 1e-12  # [m^2]; keeps covariances of sensors without noise invertible
 
 
-class Refused(NamedTuple):
+class RejectedMeasurements(NamedTuple):
     """What of one robot's step was neither matched nor new.
 
     Attributes:
@@ -38,7 +38,7 @@ class Refused(NamedTuple):
     descriptors: NDArray[np.float32]
 
 
-class Known(NamedTuple):
+class LandmarkTable(NamedTuple):
     """Landmarks of a map that no caller has named.
 
     Attributes:
@@ -67,18 +67,18 @@ class _Points(NamedTuple):
     descriptors: NDArray[np.float32]
 
 
-def taken_up(
+def reassociate(
     logs: Sequence[LogArrays],
-    refused: Sequence[Mapping[int, Refused]],
-    guesses: Sequence[Guesses],
-    known: Known,
+    refused: Sequence[Mapping[int, RejectedMeasurements]],
+    guesses: Sequence[InitialPoses],
+    known: LandmarkTable,
     options: FilterOptions,
 ) -> list[LogArrays]:
     """Return the logs in which refused measurements bear the name of the landmark that they must be of.
 
-    A refused measurement can be of the only landmark within `dead_radius` that looks like it, if nothing else of its
+    A refused measurement can be of the only landmark within `new_landmark_radius` that looks like it, if nothing else of its
     frame is. Those of one landmark that agree on its place, within `position_gate` of one from another frame, are taken
-    up if they outnumber its own sightings, and their mean is within `dead_zone` of it: farther off it is another one.
+    up if they outnumber its own sightings, and their mean is within `new_landmark_gate` of it: farther off it is another one.
 
     Args:
         logs: Per robot.
@@ -87,10 +87,10 @@ def taken_up(
         known: The map.
         options: Gates and camera of the filter.
     """
-    points = _located(logs, refused, guesses, options)
+    points = _locate(logs, refused, guesses, options)
     if points is None or not len(known.ids):
         return list(logs)
-    owners = _owners(points, logs, known, options)
+    owners = _find_owners(points, logs, known, options)
     ids = [log.ids for log in logs]
     for owner in np.unique(owners[owners != NO_ONE]):
         members = np.flatnonzero(owners == owner)
@@ -98,8 +98,8 @@ def taken_up(
         if len(members) <= max(1, known.counts[owner]):
             continue
         mean, covariance = _mean(points, members)
-        off, joint = mean - known.means[owner], covariance + known.covariances[owner][UNPACK]
-        if off @ np.linalg.solve(joint, off) <= options.dead_zone:
+        off, joint = mean - known.means[owner], covariance + known.covariances[owner][UNPACK_INDEX]
+        if off @ np.linalg.solve(joint, off) <= options.new_landmark_gate:
             for n in members:
                 robot = int(points.robots[n])
                 if ids[robot] is logs[robot].ids:
@@ -108,10 +108,10 @@ def taken_up(
     return [replace(log, ids=own) for log, own in zip(logs, ids, strict=True)]
 
 
-def _located(
+def _locate(
     logs: Sequence[LogArrays],
-    refused: Sequence[Mapping[int, Refused]],
-    guesses: Sequence[Guesses],
+    refused: Sequence[Mapping[int, RejectedMeasurements]],
+    guesses: Sequence[InitialPoses],
     options: FilterOptions,
 ) -> _Points | None:
     """Return where what was refused lies in the map, seen from the guessed poses; None if there is nothing."""
@@ -129,7 +129,7 @@ def _located(
         spread = ROBOT_FROM_CAMERA @ options.camera.covariance(own @ ROBOT_FROM_CAMERA) @ ROBOT_FROM_CAMERA.T
         if log.covariances is not None:
             given = log.given[t]
-            spread[given] = log.covariances[places[given]][:, UNPACK]
+            spread[given] = log.covariances[places[given]][:, UNPACK_INDEX]
         means = (turns @ (own + np.asarray(options.camera.mount))[:, :, None])[:, :, 0]
         means[:, :2] += poses[t, :2]
         covariances = turns @ spread @ turns.transpose(0, 2, 1) + ROUNDING * np.eye(3)
@@ -138,11 +138,11 @@ def _located(
     return _Points(*(np.concatenate(column) for column in zip(*found, strict=True))) if found else None
 
 
-def _owners(points: _Points, logs: Sequence[LogArrays], known: Known, options: FilterOptions) -> IntArray:
+def _find_owners(points: _Points, logs: Sequence[LogArrays], known: LandmarkTable, options: FilterOptions) -> IntArray:
     """Return the row (n,) in `known` of the only landmark that each point can be of; `NO_ONE`: none, or several."""
     owners = np.empty(len(points.means), dtype=np.int64)
     find_only(
-        points.means, points.descriptors, np.ascontiguousarray(known.means), known.descriptors, options.dead_radius,
+        points.means, points.descriptors, np.ascontiguousarray(known.means), known.descriptors, options.new_landmark_radius,
         options.descriptor_gate, owners,
     )  # fmt: skip
     for n in np.flatnonzero(owners != NO_ONE):

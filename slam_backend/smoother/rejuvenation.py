@@ -18,19 +18,19 @@ from slam_backend.models.odometry import OdometryModel
 from slam_backend.resampling import systematic
 from slam_backend.smoother import _kernels
 from slam_backend.smoother.duplicates import find_duplicates, without_duplicates
-from slam_backend.smoother.gauge import hold_start, holding, move, move_tiles, wrap
-from slam_backend.smoother.graph import PathGraph
-from slam_backend.smoother.graph_building import Guesses, Places, extended, first_rows
-from slam_backend.smoother.graph_reduction import at_mode, coarsened, compacted
+from slam_backend.smoother.gauge import fix_gauge, fix_start, move, transform_tiles, wrap
+from slam_backend.smoother.graph import SlamGraph
+from slam_backend.smoother.graph_building import InitialPoses, LandmarkPositions, extend_graph, log_head
+from slam_backend.smoother.graph_reduction import reduce_keyframes, relinearise, without_unused_frames
 from slam_backend.smoother.log_arrays import EXACT, REJECTED, LogArrays
-from slam_backend.smoother.optimizer import NO_POSE, Mode, find_mode
+from slam_backend.smoother.optimizer import NO_POSE, MapEstimate, optimize
 from slam_backend.smoother.options import SmoothingOptions
-from slam_backend.smoother.sampling import Draws, draw_paths, drawn_spreads
+from slam_backend.smoother.sampling import PathSamples, sample_paths, sample_transition_variances
 
 DRAFT_TOLERANCE = 10.0  # times the tolerance: a descent that is not followed by draws may end so much sooner
 
 
-class Looks(NamedTuple):
+class LandmarkDescriptors(NamedTuple):
     """Appearance of landmarks that no caller has named.
 
     Attributes:
@@ -85,7 +85,7 @@ class Rejuvenation(NamedTuple):
         particles: The new ones, or None.
     """
 
-    graph: PathGraph
+    graph: SlamGraph
     reason: str
     ess: float
     iterations: int
@@ -93,16 +93,16 @@ class Rejuvenation(NamedTuple):
 
 
 def rejuvenate(
-    graph: PathGraph,
+    graph: SlamGraph,
     logs: Sequence[LogArrays],
     motion: OdometryModel,
     camera: FloatArray,
     num_particles: int,
     rng: np.random.Generator,
     options: SmoothingOptions,
-    guesses: Sequence[Guesses] | None = None,
-    looks: Looks | None = None,
-    places: Places | None = None,
+    guesses: Sequence[InitialPoses] | None = None,
+    looks: LandmarkDescriptors | None = None,
+    places: LandmarkPositions | None = None,
 ) -> Rejuvenation:
     """Take in what the robots did since, smooth, and draw particles.
 
@@ -110,7 +110,7 @@ def rejuvenate(
     for what may happen in a run: the reason says why there are no new particles.
 
     Args:
-        graph: As the last attempt left it, or `PathGraph.at_starts`.
+        graph: As the last attempt left it, or `SlamGraph.at_starts`.
         logs: Per robot, of the steps after `graph.latest`.
         motion: Noise of the odometry.
         camera: (7,) focal length, baseline, sigma_px, sigma_disparity, mount.
@@ -130,9 +130,9 @@ def rejuvenate(
     rest = list(logs)
     while True:
         last = all(len(log) <= share for log in rest)
-        first = [first_rows(log, share) for log in rest]
-        grown = extended(graph, first, motion, camera[4:], guesses, options.rigid_within, places)
-        mode = find_mode(grown, camera, options, looseness=1.0 if last else DRAFT_TOLERANCE)
+        first = [log_head(log, share) for log in rest]
+        grown = extend_graph(graph, first, motion, camera[4:], guesses, options.rigid_within, places)
+        mode = optimize(grown, camera, options, looseness=1.0 if last else DRAFT_TOLERANCE)
         if mode.reason == NO_POSE:
             unmoved = at_given_poses(grown, camera, options)
             if last:
@@ -141,25 +141,25 @@ def rejuvenate(
         elif mode.reason:
             return Rejuvenation(graph, mode.reason, float("nan"), mode.iterations, None)
         elif last:
-            return drawn(grown, mode, camera, num_particles, rng, options, looks)
+            return sample_particles(grown, mode, camera, num_particles, rng, options, looks)
         else:
-            graph = settled(grown, mode, camera, options, rng)
+            graph = relinearised_and_reduced(grown, mode, camera, options, rng)
         rest = [log.since(int(graph.latest[i]) + 1) for i, log in enumerate(rest)]
 
 
-def at_given_poses(graph: PathGraph, camera: FloatArray, options: SmoothingOptions) -> Rejuvenation:
+def at_given_poses(graph: SlamGraph, camera: FloatArray, options: SmoothingOptions) -> Rejuvenation:
     """Tell that there is no pose to seek yet; all that was measured is kept, for robots may move later.
 
     Args:
         graph: With all that the logs hold; its landmarks are where the filter has them, which knows the poses as well.
         camera, options: As of `rejuvenate`.
     """
-    return Rejuvenation(coarsened(graph, camera, options), NO_POSE, float("nan"), 0, None)
+    return Rejuvenation(reduce_keyframes(graph, camera, options), NO_POSE, float("nan"), 0, None)
 
 
-def settled(
-    graph: PathGraph, mode: Mode, camera: FloatArray, options: SmoothingOptions, rng: np.random.Generator
-) -> PathGraph:
+def relinearised_and_reduced(
+    graph: SlamGraph, mode: MapEstimate, camera: FloatArray, options: SmoothingOptions, rng: np.random.Generator
+) -> SlamGraph:
     """Return the graph at its mode; if it has too many keys some are joined, those whose motions scatter least.
 
     Args:
@@ -168,20 +168,20 @@ def settled(
         camera, options: As of `rejuvenate`.
         rng: Source of draws, where these are the cheaper way to see what scatters.
     """
-    if graph.num_keys <= options.most_keys(len(graph.tips)):
-        return at_mode(graph, mode)
-    spreads = drawn_spreads(graph, mode, rng) if mode.crowded else mode.spreads()
-    return coarsened(at_mode(graph, mode, spreads), camera, options, mode.sightings)
+    if graph.num_keys <= options.most_keys(len(graph.last_keys)):
+        return relinearise(graph, mode)
+    spreads = sample_transition_variances(graph, mode, rng) if mode.crowded else mode.spreads()
+    return reduce_keyframes(relinearise(graph, mode, spreads), camera, options, mode.sightings)
 
 
-def drawn(
-    grown: PathGraph,
-    mode: Mode,
+def sample_particles(
+    grown: SlamGraph,
+    mode: MapEstimate,
     camera: FloatArray,
     num_particles: int,
     rng: np.random.Generator,
     options: SmoothingOptions,
-    looks: Looks | None = None,
+    looks: LandmarkDescriptors | None = None,
 ) -> Rejuvenation:
     """Draw particles about the mode of a graph.
 
@@ -190,24 +190,24 @@ def drawn(
         mode: Of it, of use.
         camera, num_particles, rng, options, looks: As of `rejuvenate`.
     """
-    draws = draw_paths(grown, mode, num_particles, rng)
+    draws = sample_paths(grown, mode, num_particles, rng)
     chosen, ess = draws, draws.sample_size
     needed = options.least_ess * num_particles
     if needed > ess >= needed / options.more_draws:
-        many = draw_paths(grown, mode, options.more_draws * num_particles, rng)
+        many = sample_paths(grown, mode, options.more_draws * num_particles, rng)
         chosen = many.taken(systematic(many.weights, rng, num_particles))
         ess = min(many.sample_size, float(num_particles))
-    graph = coarsened(at_mode(grown, mode, draws.spreads), camera, options, mode.sightings)
+    graph = reduce_keyframes(relinearise(grown, mode, draws.spreads), camera, options, mode.sightings)
     if not ess >= needed:
         return Rejuvenation(graph, f"an effective sample size of {ess:.1f}", ess, mode.iterations, None)
     if looks is not None and len(looks.ids):
         duplicates = find_duplicates(grown, mode, draws, _descriptors(grown, looks), looks.gate)
         if len(duplicates):
-            graph = compacted(without_duplicates(graph, duplicates))
+            graph = without_unused_frames(without_duplicates(graph, duplicates))
     return Rejuvenation(graph, "", ess, mode.iterations, _particles(grown, mode, chosen))
 
 
-def _descriptors(graph: PathGraph, looks: Looks) -> NDArray[np.float32]:
+def _descriptors(graph: SlamGraph, looks: LandmarkDescriptors) -> NDArray[np.float32]:
     """Return descriptors (l, d) by row of the graph's landmarks, NaN where there is none."""
     at = np.minimum(np.searchsorted(looks.ids, graph.landmark_ids), len(looks.ids) - 1)
     result = looks.descriptors[at]
@@ -215,7 +215,7 @@ def _descriptors(graph: PathGraph, looks: Looks) -> NDArray[np.float32]:
     return result
 
 
-def _particles(graph: PathGraph, mode: Mode, draws: Draws) -> Particles:
+def _particles(graph: SlamGraph, mode: MapEstimate, draws: PathSamples) -> Particles:
     """Gather what particles hold."""
     weights, tiles, ids, landmarks = draws.weights, draws.tiles, graph.landmark_ids, mode.landmarks
     counts, in_view = np.empty(len(ids), dtype=np.int64), np.empty(len(ids), dtype=np.bool_)
@@ -223,11 +223,11 @@ def _particles(graph: PathGraph, mode: Mode, draws: Draws) -> Particles:
     if not counts.all():
         seen = counts > 0
         tiles, ids, landmarks, in_view, counts = tiles[seen], ids[seen], landmarks[seen], in_view[seen], counts[seen]
-    poses, starts = draws.poses[graph.tips], draws.poses[graph.heads]
-    means = mode.poses[graph.tips]
+    poses, starts = draws.poses[graph.last_keys], draws.poses[graph.first_keys]
+    means = mode.poses[graph.last_keys]
     covariances = np.zeros((len(means), 3, 3))
-    (sought,) = (mode.columns[graph.tips] >= 0).nonzero()
-    joint = mode.covariance(graph.tips[sought])
+    (sought,) = (mode.columns[graph.last_keys] >= 0).nonzero()
+    joint = mode.covariance(graph.last_keys[sought])
     off, densities = (poses - means[:, :, None])[sought].reshape(-1, poses.shape[2]), np.empty(len(weights))
     for place, robot in enumerate(sought):
         covariances[robot] = joint[3 * place : 3 * place + 3, 3 * place : 3 * place + 3]
@@ -235,16 +235,16 @@ def _particles(graph: PathGraph, mode: Mode, draws: Draws) -> Particles:
         raise np.linalg.LinAlgError("the joint covariance of the robots' poses is not positive definite")
     frame, start_scatters = np.zeros((3, 3)), np.zeros((len(means), 3, 3))
     (in_sight,) = in_view.nonzero()
-    held = holding(tiles, in_sight, landmarks, poses, means, weights)
+    held = fix_gauge(tiles, in_sight, landmarks, poses, means, weights)
     if held is not None:
-        move_tiles(tiles, held.motions)
+        transform_tiles(tiles, held.motions)
         poses, frame = held.poses, held.scatter
-    for index in (mode.columns[graph.heads] >= 0).nonzero()[0].tolist():
+    for index in (mode.columns[graph.first_keys] >= 0).nonzero()[0].tolist():
         own = starts[index : index + 1]
         if held is not None:
             move(own, held.motions, own)
-        at = mode.poses[graph.heads[index]], means[index]
-        start_scatters[index] = hold_start(own[0], poses[index], *at, weights)
+        at = mode.poses[graph.first_keys[index]], means[index]
+        start_scatters[index] = fix_start(own[0], poses[index], *at, weights)
     for array in (poses, starts, means[:, :, None]):
         wrap(array)
     return Particles(
@@ -267,7 +267,7 @@ class Draft(NamedTuple):
         steps: Done so far.
     """
 
-    graph: PathGraph
+    graph: SlamGraph
     damping: float = 0.0
     steps: int = 0
 
@@ -287,9 +287,9 @@ class Smoother(NamedTuple):
     options: SmoothingOptions
     rng: np.random.Generator
 
-    def take_in(
-        self, graph: PathGraph, logs: Sequence[LogArrays], guesses: Sequence[Guesses], places: Places
-    ) -> PathGraph | Draft | str:
+    def add_logs(
+        self, graph: SlamGraph, logs: Sequence[LogArrays], guesses: Sequence[InitialPoses], places: LandmarkPositions
+    ) -> SlamGraph | Draft | str:
         """Take in all rows of the logs, which are few, and do the first steps.
 
         Args:
@@ -301,10 +301,10 @@ class Smoother(NamedTuple):
         Returns:
             As of `descend`.
         """
-        grown = extended(graph, logs, self.motion, self.camera[4:], guesses, self.options.rigid_within, places)
-        return self.descend(Draft(graph=grown))
+        grown = extend_graph(graph, logs, self.motion, self.camera[4:], guesses, self.options.rigid_within, places)
+        return self.optimise_slice(Draft(graph=grown))
 
-    def descend(self, draft: Draft) -> PathGraph | Draft | str:
+    def optimise_slice(self, draft: Draft) -> SlamGraph | Draft | str:
         """Do the next steps of a descent.
 
         Args:
@@ -313,18 +313,18 @@ class Smoother(NamedTuple):
         Returns:
             The graph if that ended the descent, how it now stands if not, or what is wrong.
         """
-        mode = find_mode(draft.graph, self.camera, self.options, STEPS, draft.damping, SLICE_TOLERANCE)
+        mode = optimize(draft.graph, self.camera, self.options, STEPS, draft.damping, SLICE_TOLERANCE)
         return self._after(draft, mode)
 
     def draw(
         self,
-        graph: PathGraph,
+        graph: SlamGraph,
         logs: Sequence[LogArrays],
-        guesses: Sequence[Guesses],
-        places: Places,
+        guesses: Sequence[InitialPoses],
+        places: LandmarkPositions,
         num_particles: int,
-        looks: Looks,
-    ) -> Rejuvenation | PathGraph | Draft | str:
+        looks: LandmarkDescriptors,
+    ) -> Rejuvenation | SlamGraph | Draft | str:
         """Take in the logs' last rows, and draw particles, if so few steps end the descent.
 
         Args:
@@ -335,24 +335,24 @@ class Smoother(NamedTuple):
         Returns:
             What came of the draws, or else as of `descend`.
         """
-        grown = extended(graph, logs, self.motion, self.camera[4:], guesses, self.options.rigid_within, places)
+        grown = extend_graph(graph, logs, self.motion, self.camera[4:], guesses, self.options.rigid_within, places)
         draft = Draft(graph=grown)
-        mode = find_mode(grown, self.camera, self.options, LAST_STEPS)
+        mode = optimize(grown, self.camera, self.options, LAST_STEPS)
         if not mode.reason:
-            return drawn(grown, mode, self.camera, num_particles, self.rng, self.options, looks)
+            return sample_particles(grown, mode, self.camera, num_particles, self.rng, self.options, looks)
         if mode.reason == NO_POSE:
             return at_given_poses(grown, self.camera, self.options)
         return self._after(draft, mode)
 
-    def without_measurements(self, graph: PathGraph, logs: Sequence[LogArrays]) -> PathGraph:
+    def without_measurements(self, graph: SlamGraph, logs: Sequence[LogArrays]) -> SlamGraph:
         """Return the graph after all rows of the logs, of which only the odometry is believed."""
         blind = [replace(log, ids=np.full_like(log.ids, REJECTED)) for log in logs]
-        return extended(graph, blind, self.motion, self.camera[4:], rigid_within=self.options.rigid_within)
+        return extend_graph(graph, blind, self.motion, self.camera[4:], rigid_within=self.options.rigid_within)
 
-    def _after(self, draft: Draft, mode: Mode) -> PathGraph | Draft | str:
+    def _after(self, draft: Draft, mode: MapEstimate) -> SlamGraph | Draft | str:
         """Return what a step came to, as of `descend`."""
         if not mode.reason:
-            return settled(draft.graph, mode, self.camera, self.options, self.rng)
+            return relinearised_and_reduced(draft.graph, mode, self.camera, self.options, self.rng)
         if mode.reason == NO_POSE:
             return at_given_poses(draft.graph, self.camera, self.options).graph
         steps = draft.steps + mode.iterations
@@ -360,4 +360,4 @@ class Smoother(NamedTuple):
             return mode.reason
         if steps >= self.options.max_iterations:
             return f"no convergence in {steps} iterations"
-        return Draft(graph=at_mode(draft.graph, mode), damping=mode.damping, steps=steps)
+        return Draft(graph=relinearise(draft.graph, mode), damping=mode.damping, steps=steps)

@@ -14,12 +14,12 @@ from slam_backend.core.jit import jit
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.smoother import _kernels
 from slam_backend.smoother._kernels import LANES, POSE_ROWS
-from slam_backend.smoother.graph import LEVER, PathGraph
-from slam_backend.smoother.optimizer import Mode
+from slam_backend.smoother.graph import LEVER_ARM, SlamGraph
+from slam_backend.smoother.optimizer import MapEstimate
 
 
 @jit
-def bend(mode: FloatArray, previous: IntArray, offsets: FloatArray) -> FloatArray:
+def retract_on_se2(mode: FloatArray, previous: IntArray, offsets: FloatArray) -> FloatArray:
     """Return paths (k, 3, M) whose motions differ from those of the mode as offsets say to first order.
 
     With r_b the first-order change of the motion from the previous pose a to b that the offsets of a and b make, and
@@ -68,7 +68,7 @@ def bend(mode: FloatArray, previous: IntArray, offsets: FloatArray) -> FloatArra
 BENT_BELOW = 0.5  # share of M: where the sample size of straight paths is less, bent ones are tried
 
 
-class Draws(NamedTuple):
+class PathSamples(NamedTuple):
     """M paths with the landmarks that each of them asks for.
 
     Attributes:
@@ -101,16 +101,16 @@ class Draws(NamedTuple):
         rows = self.tiles.transpose(0, 2, 1, 3).reshape(count, 9, blocks * LANES)
         return np.ascontiguousarray(rows[:, :, : self.poses.shape[2]])
 
-    def taken(self, ancestors: IntArray) -> "Draws":
+    def taken(self, ancestors: IntArray) -> "PathSamples":
         """Return as many paths as there are ancestors (M',), each a copy of its ancestor, weighed alike."""
         m = len(ancestors)
         padded = np.concatenate([ancestors, np.repeat(ancestors[:1], -m % LANES)])  # surplus lanes are copies
         blocks = len(padded) // LANES
         tiles = self.landmarks[:, :, padded].reshape(len(self.tiles), 9, blocks, LANES).transpose(0, 2, 1, 3)
-        return Draws.weighed(self.poses[:, :, ancestors], np.ascontiguousarray(tiles), np.zeros(m), self.spreads)
+        return PathSamples.weighed(self.poses[:, :, ancestors], np.ascontiguousarray(tiles), np.zeros(m), self.spreads)
 
 
-def draw_paths(graph: PathGraph, mode: Mode, num_particles: int, rng: np.random.Generator) -> Draws:
+def sample_paths(graph: SlamGraph, mode: MapEstimate, num_particles: int, rng: np.random.Generator) -> PathSamples:
     """Draw x^(i) from the Gaussian about the mode, and replay each path.
 
     log w = log p(path given odometry) + log p(measurements given path) - log q(path). The first path is the mode. Where
@@ -124,14 +124,16 @@ def draw_paths(graph: PathGraph, mode: Mode, num_particles: int, rng: np.random.
         rng: Source of the draws.
     """
     poses, log_proposals = mode.paths(num_particles, rng)
-    straight = _weighed(graph, mode, poses, log_proposals)
+    straight = _importance_weights(graph, mode, poses, log_proposals)
     if straight.sample_size >= BENT_BELOW * num_particles:
         return straight
-    bent = _weighed(graph, mode, bend(mode.poses, graph.previous, poses - mode.poses[:, :, None]), log_proposals)
+    bent = _importance_weights(
+        graph, mode, retract_on_se2(mode.poses, graph.parents, poses - mode.poses[:, :, None]), log_proposals
+    )
     return max(straight, bent, key=lambda draws: np.nan_to_num(draws.sample_size))
 
 
-def drawn_spreads(graph: PathGraph, mode: Mode, rng: np.random.Generator) -> FloatArray:
+def sample_transition_variances(graph: SlamGraph, mode: MapEstimate, rng: np.random.Generator) -> FloatArray:
     """Return how far the motions from the keys before scatter (k,) [m^2] over `LANES` paths, each to 14 % or so.
 
     Args:
@@ -140,16 +142,18 @@ def drawn_spreads(graph: PathGraph, mode: Mode, rng: np.random.Generator) -> Flo
         rng: Source of the draws.
     """
     paths, _ = mode.paths(LANES, rng)
-    return weigh_odometry(graph, mode, lane_rows(paths), LANES)[1]
+    return odometry_log_density(graph, mode, lane_rows(paths), LANES)[1]
 
 
-def _weighed(graph: PathGraph, mode: Mode, poses: FloatArray, log_proposals: FloatArray) -> Draws:
+def _importance_weights(
+    graph: SlamGraph, mode: MapEstimate, poses: FloatArray, log_proposals: FloatArray
+) -> PathSamples:
     """Replay paths (k, 3, M) and weigh them."""
     num_paths = poses.shape[2]
     rows = lane_rows(poses)
     tiles, log_likelihood = replay(mode, rows, num_paths)
-    log_odometry, spreads = weigh_odometry(graph, mode, rows, num_paths)
-    return Draws.weighed(poses, tiles, log_likelihood + log_odometry - log_proposals, spreads)  # (2)
+    log_odometry, spreads = odometry_log_density(graph, mode, rows, num_paths)
+    return PathSamples.weighed(poses, tiles, log_likelihood + log_odometry - log_proposals, spreads)  # (2)
 
 
 def lane_rows(poses: FloatArray) -> FloatArray:
@@ -167,7 +171,7 @@ def lane_rows(poses: FloatArray) -> FloatArray:
     return rows
 
 
-def replay(mode: Mode, rows: FloatArray, num_particles: int) -> tuple[FloatArray, FloatArray]:
+def replay(mode: MapEstimate, rows: FloatArray, num_particles: int) -> tuple[FloatArray, FloatArray]:
     """Return the landmarks of M paths, and log p(measurements given path) up to a constant.
 
     Args:
@@ -189,7 +193,9 @@ def replay(mode: Mode, rows: FloatArray, num_particles: int) -> tuple[FloatArray
     return tiles, log_likelihood[:num_particles]
 
 
-def weigh_odometry(graph: PathGraph, mode: Mode, rows: FloatArray, num_particles: int) -> tuple[FloatArray, FloatArray]:
+def odometry_log_density(
+    graph: SlamGraph, mode: MapEstimate, rows: FloatArray, num_particles: int
+) -> tuple[FloatArray, FloatArray]:
     """Weigh M paths by the odometry.
 
     Args:
@@ -204,8 +210,8 @@ def weigh_odometry(graph: PathGraph, mode: Mode, rows: FloatArray, num_particles
     """
     blocks, k = rows.shape[:2]
     log_density, spreads = np.empty(blocks * LANES), np.empty(k)
-    _kernels.odometry_of_paths(
-        rows.reshape(-1), k, blocks, num_particles, graph.previous, mode.poses, graph.motions, mode.odometry_infos,
-        LEVER, log_density, spreads,
+    _kernels.odometry_log_density(
+        rows.reshape(-1), k, blocks, num_particles, graph.parents, mode.poses, graph.odometry, mode.odometry_infos,
+        LEVER_ARM, log_density, spreads,
     )  # fmt: skip
     return log_density[:num_particles], spreads

@@ -14,11 +14,11 @@ import numpy as np
 from slam_backend.core.read_only import with_constants
 from slam_backend.core.validation import IntArray
 from slam_backend.fastslam.filter import FastSlam
-from slam_backend.fastslam.reports import Findings, StepReport
-from slam_backend.fastslam.step_input import InputLog, Seats, StepInput, seats_of
-from slam_backend.team.merge_monitor import Watch
+from slam_backend.fastslam.reports import Associations, StepReport
+from slam_backend.fastslam.step_input import InputBuffer, RobotRows, StepInput, rows_of
+from slam_backend.team.merge_monitor import MergeMonitor
 
-MOST_REPLAYED = 20  # buffered steps that a filter takes in per tick
+MAX_REPLAYED = 20  # buffered steps that a filter takes in per tick
 TURNS = 4  # filters smooth in turn: that of a robot only in every fourth step
 
 
@@ -41,17 +41,17 @@ class Branch:
     """
 
     robots: tuple[int, ...]
-    live: tuple[int, ...]
+    active_robots: tuple[int, ...]
     filter: FastSlam
-    known: dict[int, int]
+    last_steps: dict[int, int]
     number: int
     epoch: int = 0
     report: StepReport | None = None
-    watches: list[Watch] = field(default_factory=list)
+    monitors: list[MergeMonitor] = field(default_factory=list)
     split_from: int | None = None
     split_counts: dict[int, int] = field(default_factory=dict)
 
-    def told_by(self, main: "Branch", replayed: Sequence["ReplayedStep"]) -> dict[int, int]:
+    def known_landmarks(self, main: "Branch", replayed: Sequence["ReplayedStep"]) -> dict[int, int]:
         """Return which landmarks of the filter they return to the robots know, those included that they just created.
 
         Args:
@@ -61,9 +61,9 @@ class Branch:
         if self.split_from != main.number:
             self.split_from, self.split_counts = main.number, {}
         for done in replayed:
-            for robot in set(done.robots) & set(self.live):
+            for robot in set(done.robots) & set(self.active_robots):
                 row = done.report.rows[main.robots.index(robot)]
-                for name in done.report.findings.names_created(row):
+                for name in done.report.all_associations.created_ids(row):
                     self.split_counts.setdefault(name, 0)
         return self.split_counts
 
@@ -71,13 +71,13 @@ class Branch:
         """Return all that decides how the branch goes on."""
         return {
             "robots": self.robots,
-            "live": self.live,
+            "live": self.active_robots,
             "filter": self.filter.get_state(),
-            "known": dict(self.known),
+            "known": dict(self.last_steps),
             "number": self.number,
             "epoch": self.epoch,
             "report": self.report,
-            "watches": tuple(watch.copy() for watch in self.watches),
+            "watches": tuple(watch.copy() for watch in self.monitors),
             "split_from": self.split_from,
             "split_counts": dict(self.split_counts),
         }
@@ -89,8 +89,8 @@ class Branch:
         rest = {name: state[name] for name in ("robots", "live", "number", "epoch", "split_from")}
         return cls(
             filter=slam,
-            known=dict(state["known"]),
-            watches=[watch.copy() for watch in state["watches"]],
+            last_steps=dict(state["known"]),
+            monitors=[watch.copy() for watch in state["watches"]],
             split_counts=dict(state["split_counts"]),
             report=with_constants(state["report"]),
             **rest,
@@ -116,7 +116,7 @@ class ReplayedStep(NamedTuple):
 def restored_filter(state: Mapping[str, Any], at_hand: FastSlam | None = None) -> FastSlam:
     """Return a filter that goes on from `FastSlam.get_state`; one at hand is filled, which is faster than building."""
     slam = at_hand if at_hand is not None else FastSlam.from_options(len(state["poses"]), state["options"])
-    slam.go_on_from(state)
+    slam.restore_checked(state)
     return slam
 
 
@@ -126,7 +126,7 @@ def landmark_counts(slam: FastSlam) -> dict[int, int]:
     return dict(zip(held.ids.tolist(), held.counts.tolist(), strict=True))
 
 
-class Intake(NamedTuple):
+class StepRouting(NamedTuple):
     """How a filter takes in steps, as long as nobody joins or leaves.
 
     Attributes:
@@ -136,19 +136,19 @@ class Intake(NamedTuple):
     """
 
     robots: tuple[int, ...]
-    seats: Seats
-    turns: frozenset[int]
+    rows: RobotRows
+    batches: frozenset[int]
 
     @classmethod
     def of(cls, branch: Branch, robots: tuple[int, ...]) -> Self:
         """Return how a filter takes in what some of its robots read."""
         rows = tuple(robot if robot in robots else -1 for robot in branch.robots)
-        smoothing = branch.robots if branch.split_from is None else branch.live
-        return cls(robots, seats_of(rows), frozenset(robot % TURNS for robot in smoothing))
+        smoothing = branch.robots if branch.split_from is None else branch.active_robots
+        return cls(robots, rows_of(rows), frozenset(robot % TURNS for robot in smoothing))
 
 
-def take_in(
-    branch: Branch, step: int, intake: Intake, inputs: StepInput, findings: Findings, told: IntArray
+def process_step(
+    branch: Branch, step: int, intake: StepRouting, inputs: StepInput, findings: Associations, told: IntArray
 ) -> StepReport:
     """Let a filter take in what some of its robots read in one step.
 
@@ -158,28 +158,28 @@ def take_in(
         branch: Whose filter steps; its `known`, `report` and watches move on.
         step: Number of the step; the filter's logs bear it, whenever it is taken in.
         intake: Of the branch and these robots.
-        inputs: Of all robots of the team, checked by `check_step`.
+        inputs: Of all robots of the team, checked by `validate_step`.
         findings: Of `inputs`.
-        told: Their buffer, see `Findings.none_yet`; what becomes of these robots' measurements is written there.
+        told: Their buffer, see `Findings.allocate`; what becomes of these robots' measurements is written there.
     """
     robots, seats, turns = intake
     for robot in robots:
-        branch.known[robot] = step
-    for watch in branch.watches:
-        watch.steps += len(robots) == len(branch.robots) or watch.together(robots)
-    if inputs.silent and inputs.silent.issuperset(robots):
+        branch.last_steps[robot] = step
+    for watch in branch.monitors:
+        watch.steps += len(robots) == len(branch.robots) or watch.both_sides_connected(robots)
+    if inputs.inactive and inputs.inactive.issuperset(robots):
         branch.report = report = _silent_report(branch, seats, findings)
         return report
     slam = branch.filter
     slam.may_smooth = step % TURNS in turns
     branch.report = report = slam.step_checked(inputs, seats, findings, told, step)
     if report.num_created:
-        for watch in branch.watches:
-            watch.note(branch.robots, report)
+        for watch in branch.monitors:
+            watch.update(branch.robots, report)
     return report
 
 
-def _silent_report(branch: Branch, seats: Seats, findings: Findings) -> StepReport:
+def _silent_report(branch: Branch, seats: RobotRows, findings: Associations) -> StepReport:
     """Return the report of a step in which nothing happened."""
     ess = float(branch.filter.num_particles) if branch.report is None else branch.report.ess
     return StepReport(findings, seats.rows, 0, 0, 0, 0, ess, float("nan"), False)
@@ -191,19 +191,19 @@ def fork(branch: Branch, live: tuple[int, ...], number: int, rng: np.random.Gene
     slam = restored_filter(branch.filter.get_state() | {"rng": stream})
     return Branch(
         robots=branch.robots,
-        live=live,
+        active_robots=live,
         filter=slam,
-        known=dict(branch.known),
+        last_steps=dict(branch.last_steps),
         number=number,
         epoch=branch.epoch,
         report=branch.report,
-        watches=[watch.copy() for watch in branch.watches],
+        monitors=[watch.copy() for watch in branch.monitors],
         split_from=branch.number if branch.split_from is None else branch.split_from,
         split_counts=landmark_counts(slam) if branch.split_from is None else dict(branch.split_counts),
     )
 
 
-def parts(live: Sequence[int], networks: IntArray) -> list[tuple[int, ...]]:
+def split_by_component(live: Sequence[int], networks: IntArray) -> list[tuple[int, ...]]:
     """Divide robots by their networks: the largest part first, of equal ones that with the lowest robot."""
     by_network: dict[int, list[int]] = {}
     for robot in live:
@@ -215,13 +215,13 @@ def missing(branch: Branch, other: Branch) -> dict[int, int]:
     """Return per robot the last step that `other` knows of it, where `branch` has not taken in so much."""
     return {
         robot: last
-        for robot, last in other.known.items()
-        if robot in branch.known and robot not in branch.live and branch.known[robot] < last
+        for robot, last in other.last_steps.items()
+        if robot in branch.last_steps and robot not in branch.active_robots and branch.last_steps[robot] < last
     }
 
 
 def replay(
-    branch: Branch, log: InputLog, wanted: Mapping[int, int], most: int | None = MOST_REPLAYED
+    branch: Branch, log: InputBuffer, wanted: Mapping[int, int], most: int | None = MAX_REPLAYED
 ) -> list[ReplayedStep]:
     """Let a filter take in what it lacks, in order of time.
 
@@ -236,13 +236,13 @@ def replay(
     """
     done: list[ReplayedStep] = []
     while wanted and (most is None or len(done) < most):
-        due = {robot: branch.known[robot] + 1 for robot, last in wanted.items() if branch.known[robot] < last}
+        due = {robot: branch.last_steps[robot] + 1 for robot, last in wanted.items() if branch.last_steps[robot] < last}
         if not due:
             break
         step = min(due.values())
         robots = tuple(sorted(robot for robot, first in due.items() if first == step))
         inputs = log.read(step)
-        intake = Intake.of(branch, robots)
-        report = take_in(branch, step, intake, inputs.with_copies(), *Findings.none_yet(inputs))
+        intake = StepRouting.of(branch, robots)
+        report = process_step(branch, step, intake, inputs.with_copies(), *Associations.allocate(inputs))
         done.append(ReplayedStep(step, robots, inputs, report))
     return done

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.sparse.csgraph import connected_components
 
-from slam_backend.core.validation import BoolArray, IntArray, bad_argument, check_array
-from slam_backend.fastslam._kernels import MOVED, PLACED
+from slam_backend.core.validation import BoolArray, IntArray, argument_error, check_array
+from slam_backend.fastslam._kernels import EXACT_POSE, MOVED
 from slam_backend.fastslam.reports import StepReport
 from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.team.branches import ReplayedStep
@@ -29,11 +29,11 @@ def check_contacts(contacts: ArrayLike, num_robots: int) -> BoolArray:
     touch = check_array("contacts", contacts, (num_robots, num_robots), cure, dtype=None, finite=False)
     if touch.dtype != np.bool_ or not np.array_equal(touch, touch.T):
         got = f"an array of {touch.dtype}" if touch.dtype != np.bool_ else "a matrix that is not symmetric"
-        raise bad_argument("contacts", "a symmetric array of bools", got, cure)
+        raise argument_error("contacts", "a symmetric array of bools", got, cure)
     return np.asarray(touch)
 
 
-def reach(contacts: BoolArray | None, num_robots: int) -> IntArray:
+def contact_components(contacts: BoolArray | None, num_robots: int) -> IntArray:
     """Number the networks: robots pass on what they hear, so that those who reach each other by steps are in contact.
 
     Args:
@@ -58,7 +58,7 @@ POINT_BYTES = 3 * 8
 COVARIANCE_BYTES = 6 * 8
 
 
-class ExchangeLedger:
+class TrafficCounter:
     """Counts the bytes that each robot sends.
 
     Args:
@@ -79,11 +79,13 @@ class ExchangeLedger:
             report: Of the step; those of its robots that were heard hear each other.
             descriptor_size: d.
         """
-        findings = report.findings
+        findings = report.all_associations
         for robot in report.rows:
             if robot >= 0:
-                touched = len(findings.names_associated(robot)) if report.num_rejected else findings.num_given(robot)
-                created = len(findings.names_created(robot)) if report.num_created else 0
+                touched = (
+                    len(findings.associated_ids(robot)) if report.num_rejected else findings.num_measurements(robot)
+                )
+                created = len(findings.created_ids(robot)) if report.num_created else 0
                 self.sent[robot] += POSE_BYTES + touched * LANDMARK_BYTES + created * 4 * descriptor_size
 
     def record_replay(self, replayed: Sequence[ReplayedStep]) -> None:
@@ -91,8 +93,8 @@ class ExchangeLedger:
         for done in replayed:
             each = POINT_BYTES + 4 * done.inputs.descriptors.shape[1]
             for robot in done.robots:
-                act, _, _, covered, _, count = done.inputs.turns[robot]
-                if act in (MOVED, PLACED):
+                act, _, _, covered, _, count = done.inputs.inputs[robot]
+                if act in (MOVED, EXACT_POSE):
                     self.sent[robot] += POSE_BYTES
                 self.sent[robot] += max(count, 0) * (each + covered * COVARIANCE_BYTES)
 
@@ -121,7 +123,7 @@ class ExchangeLedger:
             self.sent[sender] += (new + changed) * LANDMARK_BYTES + new * 4 * landmarks.descriptors.shape[1]
             known.update(counts)
 
-    def record_straightened(self, robot_a: int, robot_b: int, map_a: LandmarkMap, map_b: LandmarkMap) -> None:
+    def record_smoothed(self, robot_a: int, robot_b: int, map_a: LandmarkMap, map_b: LandmarkMap) -> None:
         """Count the maps once more, after both were straightened: all landmarks have moved, none looks otherwise."""
         for sender, landmarks in ((robot_a, map_a), (robot_b, map_b)):
             self.sent[sender] += len(landmarks) * LANDMARK_BYTES

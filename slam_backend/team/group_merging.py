@@ -8,23 +8,29 @@ import numpy as np
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.fastslam import _kernels
 from slam_backend.fastslam.filter import FastSlam
-from slam_backend.fastslam.reports import MergeUndone, Renaming
+from slam_backend.fastslam.reports import LandmarkIdMap, MergeUndone
 from slam_backend.geometry import rotate_covariances
-from slam_backend.maps.alignment import RIVAL_ANGLE, RIVAL_DISTANCE, Alignment, AlignmentOptions
+from slam_backend.maps.alignment import DISTINCT_ROTATION, DISTINCT_TRANSLATION, Alignment, AlignmentOptions
 from slam_backend.maps.fusion import check_inliers
 from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.smoother.graph import mean_pose, scattered
 from slam_backend.team.branches import Branch, fork
-from slam_backend.team.filter_merging.merging import merge_filters, motion_covariance, paired
+from slam_backend.team.filter_merging.merging import merge_filters, pair_filters, transform_covariance
 from slam_backend.team.filter_merging.pairing import Pairing
 from slam_backend.team.groups import Group
-from slam_backend.team.merge_monitor import Side, Watch, begin_watch, moved_share, renamed_map
-from slam_backend.team.merge_rollback import Undoing
+from slam_backend.team.merge_monitor import (
+    MergeMonitor,
+    PreMergeSnapshot,
+    begin_monitoring,
+    deformed_fraction,
+    renamed_map,
+)
+from slam_backend.team.merge_rollback import MergeRollback
 from slam_backend.team.options import MergeOptions
-from slam_backend.team.shared_records import Records
+from slam_backend.team.shared_records import SharedRecords
 
 
-def straightened(group_a: Group, group_b: Group) -> tuple[LandmarkMap, LandmarkMap] | None:
+def smoothed_maps(group_a: Group, group_b: Group) -> tuple[LandmarkMap, LandmarkMap] | None:
     """Draw the particles of both joint filters anew from their smoothed paths.
 
     Where a smoother finds nothing better the filter stays as it is.
@@ -76,9 +82,9 @@ class MergePlan(NamedTuple):
         rows = self.alignment.inliers
         return np.column_stack([self.maps[0].ids[rows[:, 0]], self.maps[1].ids[rows[:, 1]]])
 
-    def paired(self, merging: MergeOptions, rng: np.random.Generator) -> Self:
+    def with_pairing(self, merging: MergeOptions, rng: np.random.Generator) -> Self:
         """Return the plan with the particles paired, as a merge of particles would draw it from `rng`."""
-        pairing = paired(*self.filters, self.alignment, self.pairs, rng, merging.merged_particles)
+        pairing = pair_filters(*self.filters, self.alignment, self.pairs, rng, merging.merged_particles)
         return self._replace(pairing=pairing)
 
     def on_trial(
@@ -90,7 +96,7 @@ class MergePlan(NamedTuple):
         may know well how the groups began where neither map does.
 
         Returns:
-            The plan by the motion that the joint filter has, and the doubt about that, see `doubt_about`: infinite
+            The plan by the motion that the joint filter has, and the doubt about that, see `transform_uncertainty`: infinite
             where the merge would be undone for the shape of the joint map. None if the smoother finds nothing.
         """
         a, b = self.filters
@@ -103,16 +109,16 @@ class MergePlan(NamedTuple):
         motion = mean_pose(starts)
         own = rotate_covariances(float(motion[2]), joint.state.start_covariances[a.num_robots])
         covariance = scattered(starts) + own
-        _kernels.add_share(joint.state.gauge_covariance, motion[None], covariance[None])
+        _kernels.add_gauge_covariance(joint.state.gauge_covariance, motion[None], covariance[None])
         x, y, theta = motion.tolist()
         alignment = Alignment(True, "", x, y, theta, covariance, self.alignment.inliers, self.alignment.ratio)
         sides, straight = (self.maps[0], renamed_map(self.maps[1], dict(renamed.tolist()))), joint.map("mixture")
-        bent = any(moved_share(old, straight, options) > merging.max_moved for old in sides)
+        bent = any(deformed_fraction(old, straight, options) > merging.max_deformed for old in sides)
         plan = self._replace(alignment=alignment, joint=(joint, renamed))
         return plan, math.inf if bent else _in_bounds(covariance)
 
 
-def doubt_about(plan: MergePlan) -> float:
+def transform_uncertainty(plan: MergePlan) -> float:
     """Return how uncertain the motion between two maps is, as the particles of a merge have it, which are paired.
 
     Landmarks of one map err together where its paths are uncertain. Their covariances, and the alignment's, do not say
@@ -124,25 +130,25 @@ def doubt_about(plan: MergePlan) -> float:
     """
     assert plan.pairing is not None
     a, b = plan.filters
-    covariance = motion_covariance(plan.pairing.motion, plan.alignment)
-    covariance += _of_frames(a.state.gauge_covariance, b.state.gauge_covariance, plan.alignment)
+    covariance = transform_covariance(plan.pairing.motion, plan.alignment)
+    covariance += _gauge_covariance(a.state.gauge_covariance, b.state.gauge_covariance, plan.alignment)
     return _in_bounds(covariance)
 
 
 def _in_bounds(covariance: FloatArray) -> float:
     """Return the largest standard deviation of a motion over what makes it another one."""
     position, heading = math.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1]), math.sqrt(covariance[2, 2])
-    return max(position / RIVAL_DISTANCE, heading / RIVAL_ANGLE)
+    return max(position / DISTINCT_TRANSLATION, heading / DISTINCT_ROTATION)
 
 
 def merge_groups(
     plan: MergePlan,
     merging: MergeOptions,
-    records: Records,
+    records: SharedRecords,
     rng: np.random.Generator,
     epoch: int,
     known: bool = False,
-) -> tuple[Group, Renaming]:
+) -> tuple[Group, LandmarkIdMap]:
     """Merge the joint filters of two groups; robots out of contact keep their forks. The merge is then watched.
 
     Args:
@@ -158,39 +164,43 @@ def merge_groups(
     joint, renamed = plan.joint or merge_filters(
         a.filter, b.filter, alignment, pairs, rng, merging.merged_particles, known, plan.pairing
     )
-    robots, live = a.robots + b.robots, a.live + b.live
+    robots, live = a.robots + b.robots, a.active_robots + b.active_robots
     joint.reorder(np.argsort(robots))
     number = records.new_number()
-    trunk = Branch(tuple(sorted(robots)), tuple(sorted(live)), joint, a.known | b.known, number, epoch)
+    trunk = Branch(tuple(sorted(robots)), tuple(sorted(live)), joint, a.last_steps | b.last_steps, number, epoch)
     if merging.watch_steps:
         new_ids = dict(renamed.tolist())
-        older = [*(watch.copy() for watch in a.watches), *(watch.copy(new_ids) for watch in b.watches)]
-        sides = Side.of(a.get_state()), Side.of(b.get_state())
+        older = [*(watch.copy() for watch in a.monitors), *(watch.copy(new_ids) for watch in b.monitors)]
+        sides = PreMergeSnapshot.of(a.get_state()), PreMergeSnapshot.of(b.get_state())
         common = renamed[np.isin(renamed[:, 1], a.filter.state.maps.ids), ::-1]
-        fresh = begin_watch(number, alignment, sides, plan.maps, renamed, common)
-        trunk.watches = [*sorted(older, key=lambda watch: watch.number), fresh]
-    renaming = Renaming(a.robots, b.robots, renamed, (a.number, b.number, number))
+        fresh = begin_monitoring(number, alignment, sides, plan.maps, renamed, common)
+        trunk.monitors = [*sorted(older, key=lambda watch: watch.number), fresh]
+    renaming = LandmarkIdMap(a.robots, b.robots, renamed, (a.number, b.number, number))
     records.entries.append(renaming)
     return Group(trunk, [*group_a.branches[1:], *group_b.branches[1:]]), renaming
 
 
-def contradicted(trunk: Branch, merging: MergeOptions, options: AlignmentOptions) -> Watch | None:
+def find_inconsistent_merge(trunk: Branch, merging: MergeOptions, options: AlignmentOptions) -> MergeMonitor | None:
     """Return the oldest merge that the evidence contradicts, and that can be undone with those on top of it now.
 
     For that, robots of both sides of each of them have to be in contact.
     """
-    watches = [w for w in trunk.watches if w.steps <= merging.watch_steps and w.together(trunk.live)]
+    watches = [
+        w for w in trunk.monitors if w.steps <= merging.watch_steps and w.both_sides_connected(trunk.active_robots)
+    ]
     if not watches:
         return None
     joint = trunk.filter.map("mixture")
     for watch in watches:
-        above = [newer for newer in trunk.watches if newer.number > watch.number]
-        if all(newer.together(trunk.live) for newer in above) and watch.is_contradicted(joint, merging, options):
+        above = [newer for newer in trunk.monitors if newer.number > watch.number]
+        if all(newer.both_sides_connected(trunk.active_robots) for newer in above) and watch.is_inconsistent(
+            joint, merging, options
+        ):
             return watch
     return None
 
 
-def undone(group: Group, undoing: Undoing, records: Records, epoch: int) -> list[Group]:
+def restore_groups(group: Group, undoing: MergeRollback, records: SharedRecords, epoch: int) -> list[Group]:
     """Take back a merge of a group, and those on top of it: all sides go on as if they had not been.
 
     Robots out of contact keep their forks until they return.
@@ -207,29 +217,29 @@ def undone(group: Group, undoing: Undoing, records: Records, epoch: int) -> list
         records.entries.append(MergeUndone((number_a, number_b, watch.number)))
     restored = []
     for trunk, replayed in zip(undoing.sides, undoing.replayed, strict=True):
-        trunk.live, trunk.epoch = tuple(robot for robot in trunk.robots if robot in now.live), epoch
+        trunk.active_robots, trunk.epoch = tuple(robot for robot in trunk.robots if robot in now.active_robots), epoch
         records.note_replay(trunk.number, replayed)
         restored.append(Group(trunk))
     for branch in group.branches[1:]:
-        _hand_over(branch, restored, records)
+        _reassign_branch(branch, restored, records)
     return restored
 
 
-def _hand_over(branch: Branch, restored: list[Group], records: Records) -> None:
+def _reassign_branch(branch: Branch, restored: list[Group], records: SharedRecords) -> None:
     """Give a fork to the restored group of its robots; one that several need is copied."""
-    homes = [group for group in restored if any(robot in group.robots for robot in branch.live)]
+    homes = [group for group in restored if any(robot in group.robots for robot in branch.active_robots)]
     for group in homes[1:]:
-        own = tuple(robot for robot in branch.live if robot in group.robots)
+        own = tuple(robot for robot in branch.active_robots if robot in group.robots)
         copied = fork(branch, own, records.new_number(), records.rng)
         records.copied(branch.number, copied.number)
         group.branches.append(copied)
-    branch.live = tuple(robot for robot in branch.live if robot in homes[0].robots)
+    branch.active_robots = tuple(robot for robot in branch.active_robots if robot in homes[0].robots)
     homes[0].branches.append(branch)
 
 
-def _of_frames(frame_a: FloatArray, frame_b: FloatArray, alignment: Alignment) -> FloatArray:
+def _gauge_covariance(frame_a: FloatArray, frame_b: FloatArray, alignment: Alignment) -> FloatArray:
     """Return what two frames that are held, (3, 3) each, leave open of the motion between where the groups began."""
     covariance = rotate_covariances(alignment.theta, frame_b)
     transform = alignment.transform.copy()  # can be written: the kernel is compiled for such arrays alone
-    _kernels.add_share(frame_a, transform[None], covariance[None])
+    _kernels.add_gauge_covariance(frame_a, transform[None], covariance[None])
     return covariance

@@ -7,10 +7,10 @@ import numpy as np
 
 from slam_backend.core.validation import IntArray
 from slam_backend.fastslam.filter import FastSlam
-from slam_backend.team.branches import Branch, Intake, fork, landmark_counts, missing, parts, replay
-from slam_backend.team.merge_monitor import Watch
-from slam_backend.team.merge_rollback import Undoing
-from slam_backend.team.shared_records import Records
+from slam_backend.team.branches import Branch, StepRouting, fork, landmark_counts, missing, replay, split_by_component
+from slam_backend.team.merge_monitor import MergeMonitor
+from slam_backend.team.merge_rollback import MergeRollback
+from slam_backend.team.shared_records import SharedRecords
 
 
 class Group:
@@ -27,7 +27,7 @@ class Group:
 
     def __init__(self, trunk: Branch, forks: Sequence[Branch] = ()) -> None:
         self.branches = [trunk, *forks]
-        self.undoing: Undoing | None = None
+        self.undoing: MergeRollback | None = None
 
     @property
     def trunk(self) -> Branch:
@@ -41,7 +41,7 @@ class Group:
 
     # ------------------------------------------------------------------ contact lost and found
 
-    def regroup(self, networks: IntArray, records: Records) -> None:
+    def update_connectivity(self, networks: IntArray, records: SharedRecords) -> None:
         """Fork filters whose robots have lost contact, and tell filters what returning robots have read.
 
         Args:
@@ -51,35 +51,35 @@ class Group:
         if len(self.robots) == 1:
             return
         for branch in list(self.branches):
-            for part in parts(branch.live, networks)[1:]:
+            for part in split_by_component(branch.active_robots, networks)[1:]:
                 copied = fork(branch, part, records.new_number(), records.rng)
                 records.copied(branch.number, copied.number)
-                branch.live = tuple(robot for robot in branch.live if robot not in part)
+                branch.active_robots = tuple(robot for robot in branch.active_robots if robot not in part)
                 self.branches.append(copied)
         if len(self.branches) > 1:
-            self._settle_trunk(networks)
+            self._choose_trunk(networks)
             for network in np.unique(networks[list(self.robots)]):
-                here = [branch for branch in self.branches if networks[branch.live[0]] == network]
+                here = [branch for branch in self.branches if networks[branch.active_robots[0]] == network]
                 if len(here) > 1:
-                    self._reunite(here, records)
+                    self._rejoin(here, records)
 
-    def _settle_trunk(self, networks: IntArray) -> None:
+    def _choose_trunk(self, networks: IntArray) -> None:
         """Hand the joint filter to those who meet other groups, if those who have it meet none: so they can merge.
 
         A fork can take its place unless the joint filter has lived through a merge or an undo since.
         """
         outside = set(np.delete(networks, self.robots).tolist())
-        meeting = [branch for branch in self.branches if networks[branch.live[0]] in outside]
+        meeting = [branch for branch in self.branches if networks[branch.active_robots[0]] in outside]
         meeting = [branch for branch in meeting if branch.epoch == self.trunk.epoch]
         if meeting and self.trunk not in meeting:
             old, new = self.trunk, meeting[0]
             old.split_from, old.split_counts = new.number, dict(new.split_counts)
             self.branches = [new, *(branch for branch in self.branches if branch is not new)]
 
-    def _reunite(self, here: list[Branch], records: Records) -> None:
+    def _rejoin(self, here: list[Branch], records: SharedRecords) -> None:
         """Let the best informed of some branches in contact take in what the others know, and end those it caught."""
         main = max(here, key=self._rank)
-        others = [branch for branch in here if branch is not main and set(branch.live) <= set(main.robots)]
+        others = [branch for branch in here if branch is not main and set(branch.active_robots) <= set(main.robots)]
         wanted: dict[int, int] = {}
         for other in others:
             for robot, last in missing(main, other).items():
@@ -88,29 +88,32 @@ class Group:
         records.note_replay(main.number, done)
         records.exchange.record_replay(done)
         for other in others:
-            known = other.told_by(main, done)
-            if all(main.known[robot] == other.known[robot] for robot in other.live):
+            known = other.known_landmarks(main, done)
+            if all(main.last_steps[robot] == other.last_steps[robot] for robot in other.active_robots):
                 counts, size = landmark_counts(main.filter), main.filter.descriptor_size
-                records.exchange.record_return(main.live[0], known, counts, size)
-                main.live = tuple(sorted(main.live + other.live))
+                records.exchange.record_return(main.active_robots[0], known, counts, size)
+                main.active_robots = tuple(sorted(main.active_robots + other.active_robots))
                 self.branches = [branch for branch in self.branches if branch is not other]
 
     def _rank(self, branch: Branch) -> tuple[bool, int, int, int]:
         """Return by what branches in contact are ranked: the trunk, then who has lived through more merges."""
-        return branch is self.trunk, branch.epoch, len(branch.live), -branch.live[0]
+        return branch is self.trunk, branch.epoch, len(branch.active_robots), -branch.active_robots[0]
 
     # ------------------------------------------------------------------ snapshots
 
     def steps_unknown(self) -> list[int]:
         """Return from which past steps on its filters may have to take in readings yet; none if they know all."""
         held = [
-            1 + last for branch in self.branches for robot, last in branch.known.items() if robot not in branch.live
+            1 + last
+            for branch in self.branches
+            for robot, last in branch.last_steps.items()
+            if robot not in branch.active_robots
         ]
-        return held + [side.oldest for branch in self.branches for watch in branch.watches for side in watch.sides]
+        return held + [side.oldest for branch in self.branches for watch in branch.monitors for side in watch.sides]
 
     def numbers(self) -> set[int]:
         """Return the numbers of all maps that the group uses or may take up again."""
-        watches = [watch for branch in self.branches for watch in branch.watches]
+        watches = [watch for branch in self.branches for watch in branch.monitors]
         return {branch.number for branch in self.branches}.union(*map(_numbers, watches))
 
     def get_state(self) -> dict[str, Any]:
@@ -128,17 +131,17 @@ class Group:
         group = cls(
             Branch.from_state(trunk, at_hand.get(trunk["robots"])), [Branch.from_state(branch) for branch in forks]
         )
-        group.undoing = None if state["undoing"] is None else Undoing.from_state(state["undoing"])
+        group.undoing = None if state["undoing"] is None else MergeRollback.from_state(state["undoing"])
         return group
 
 
-def _numbers(watch: Watch) -> set[int]:
+def _numbers(watch: MergeMonitor) -> set[int]:
     """Return the numbers of the maps that an undo of a merge would take up again."""
     older = [_numbers(one) for side in watch.sides for one in side.watches]
     return {side.trunk["number"] for side in watch.sides}.union(*older)
 
 
-class Lineup(NamedTuple):
+class TeamTopology(NamedTuple):
     """What the groups of a team come to, as long as no group, branch or watch of a merge begins or ends.
 
     Attributes:
@@ -152,38 +155,38 @@ class Lineup(NamedTuple):
         numbers: Of all maps that are in use or may be taken up again.
         oldest: The first step that some filter may have to take in yet; None: there is none.
         is_split: Whether some robots are out of contact with their group's joint filter.
-        is_watched: Whether some merge can still be undone, or is being taken back.
+        has_monitors: Whether some merge can still be undone, or is being taken back.
     """
 
     groups: tuple[tuple[int, ...], ...]
     branches: tuple[Branch, ...]
-    intakes: tuple[Intake, ...]
+    routings: tuple[StepRouting, ...]
     places: tuple[tuple[Group, Branch, int], ...]
-    members: tuple[tuple[int, ...], ...]
-    mates: tuple[tuple[int, ...], ...]
+    known_robots: tuple[tuple[int, ...], ...]
+    same_filter: tuple[tuple[int, ...], ...]
     maps: tuple[int, ...]
     numbers: frozenset[int]
     oldest: int | None
     is_split: bool
-    is_watched: bool
+    has_monitors: bool
 
     @classmethod
     def of(cls, groups: Sequence[Group]) -> Self:
         """Return that of these groups."""
         owned = [(group, branch) for group in groups for branch in group.branches]
-        by_robot = {r: (group, branch, branch.robots.index(r)) for group, branch in owned for r in branch.live}
+        by_robot = {r: (group, branch, branch.robots.index(r)) for group, branch in owned for r in branch.active_robots}
         places = tuple(by_robot[robot] for robot in sorted(by_robot))
         oldest = [step for group in groups for step in group.steps_unknown()]
         return cls(
             groups=tuple(group.robots for group in groups),
             branches=tuple(branch for _, branch in owned),
-            intakes=tuple(Intake.of(branch, branch.live) for _, branch in owned),
+            routings=tuple(StepRouting.of(branch, branch.active_robots) for _, branch in owned),
             places=places,
-            members=tuple(branch.robots for _, branch, _ in places),
-            mates=tuple(branch.live for _, branch, _ in places),
+            known_robots=tuple(branch.robots for _, branch, _ in places),
+            same_filter=tuple(branch.active_robots for _, branch, _ in places),
             maps=tuple(branch.number for _, branch, _ in places),
             numbers=frozenset[int]().union(*(group.numbers() for group in groups)),
             oldest=min(oldest, default=None),
             is_split=len(owned) > len(groups),
-            is_watched=any(branch.watches or group.undoing is not None for group, branch in owned),
+            has_monitors=any(branch.monitors or group.undoing is not None for group, branch in owned),
         )

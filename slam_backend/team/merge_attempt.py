@@ -14,13 +14,13 @@ import numpy as np
 from slam_backend.core.validation import IntArray
 from slam_backend.fastslam.reports import MergeEvent
 from slam_backend.maps.alignment import Alignment, AlignmentOptions, align_maps
-from slam_backend.maps.correspondences import may_suffice
+from slam_backend.maps.correspondences import has_enough_candidates
 from slam_backend.maps.landmark_map import LandmarkMap
-from slam_backend.team.group_merging import MergePlan, doubt_about, straightened
+from slam_backend.team.group_merging import MergePlan, smoothed_maps, transform_uncertainty
 from slam_backend.team.groups import Group
-from slam_backend.team.merge_scheduler import AttemptSchedule, PairKey, Straightening
+from slam_backend.team.merge_scheduler import MergeScheduler, PairKey, PendingAttempt
 from slam_backend.team.options import MergeOptions
-from slam_backend.team.shared_records import Records
+from slam_backend.team.shared_records import SharedRecords
 
 LEAST_KEPT = 0.8  # of the landmarks on which two bent maps agree, the straight ones have to agree on so many
 MOST_STEPS = 40  # for which an attempt waits for straight maps and for contact; then it takes maps as they are
@@ -29,17 +29,17 @@ Pair = tuple[Group, Group]
 Maps = tuple[LandmarkMap, LandmarkMap]
 
 
-class Tried(NamedTuple):
+class AttemptResult(NamedTuple):
     """An attempt that has come to its end, and the merge to be made if it is a success."""
 
     event: MergeEvent
     plan: MergePlan | None
 
 
-def attempt(
-    groups: Sequence[Group], networks: IntArray, step: int, schedule: AttemptSchedule, alignment: AlignmentOptions,
-    merging: MergeOptions, records: Records, rng: np.random.Generator,
-) -> Tried | None:  # fmt: skip
+def run_attempt(
+    groups: Sequence[Group], networks: IntArray, step: int, schedule: MergeScheduler, alignment: AlignmentOptions,
+    merging: MergeOptions, records: SharedRecords, rng: np.random.Generator,
+) -> AttemptResult | None:  # fmt: skip
     """Let the most promising pair of groups try, or go on with an attempt whose maps are straightened; when it is due.
 
     Args:
@@ -57,58 +57,58 @@ def attempt(
     """
     pending = schedule.straightening
     if pending is None:
-        return _begun(groups, networks, step, schedule, alignment, merging, records, rng)
+        return _start(groups, networks, step, schedule, alignment, merging, records, rng)
     pair = next((pair for pair in _pairs(groups) if _is_meant(pending, pair)), None)
     late = step - pending.since >= MOST_STEPS
-    if pair is None or (late and not _in_touch(pair, networks)):
+    if pair is None or (late and not _are_connected(pair, networks)):
         schedule.straightening = None
         return None
-    if not pending.ready or not _in_touch(pair, networks):
-        ready = pending.ready or late or not any(group.trunk.filter.is_hastened for group in pair)
+    if not pending.ready or not _are_connected(pair, networks):
+        ready = pending.ready or late or not any(group.trunk.filter.rejuvenation_requested for group in pair)
         schedule.straightening = replace(pending, ready=ready)  # to go on would be too much for one step
         return None
     schedule.straightening = None
     maps = _mixtures(pair)
-    outcome = _straight(pair, pending.bent, maps, alignment, records, rng)
-    return _concluded(MergePlan(pair, maps, outcome), step, pending.bent, schedule, alignment, merging, rng)
+    outcome = _realign(pair, pending.alignment, maps, alignment, records, rng)
+    return _finish(MergePlan(pair, maps, outcome), step, pending.alignment, schedule, alignment, merging, rng)
 
 
-def _begun(
-    groups: Sequence[Group], networks: IntArray, step: int, schedule: AttemptSchedule, options: AlignmentOptions,
-    merging: MergeOptions, records: Records, rng: np.random.Generator,
-) -> Tried | None:  # fmt: skip
+def _start(
+    groups: Sequence[Group], networks: IntArray, step: int, schedule: MergeScheduler, options: AlignmentOptions,
+    merging: MergeOptions, records: SharedRecords, rng: np.random.Generator,
+) -> AttemptResult | None:  # fmt: skip
     """Choose a pair and align its maps as the filters have bent them."""
     if len(groups) < 2:
         return None
-    able = (pair for pair in _pairs(groups) if _in_touch(pair, networks))
+    able = (pair for pair in _pairs(groups) if _are_connected(pair, networks))
     pairs = {_key(pair): pair for pair in able if schedule.may_try(_key(pair), step)}
-    looks = {group.robots: group.trunk.filter.looks() for group in _unique(pairs)}
-    pairs = {key: pair for key, pair in pairs.items() if may_suffice(looks[key[0]], looks[key[1]], options)}
+    looks = {group.robots: group.trunk.filter.descriptors() for group in _unique(pairs)}
+    pairs = {key: pair for key, pair in pairs.items() if has_enough_candidates(looks[key[0]], looks[key[1]], options)}
     maps = {group.robots: group.trunk.filter.map("mixture") for group in _unique(pairs)}
     chosen = schedule.choose({key: (maps[key[0]], maps[key[1]]) for key in pairs}, step)
     if chosen is None:
         return None
     pair, (map_a, map_b) = pairs[chosen], (maps[chosen[0]], maps[chosen[1]])
     bent = align_maps(map_a, map_b, rng=rng, options=options)
-    records.exchange.record_maps(*speakers(pair), map_a, map_b)
+    records.exchange.record_maps(*representatives(pair), map_a, map_b)
     plan = MergePlan(pair, (map_a, map_b), bent)
-    if not bent.success or not merging.straighten:
-        return _concluded(plan, step, None, schedule, options, merging, rng)
-    if all(group.trunk.filter.smooths_in_slices for group in pair):
+    if not bent.success or not merging.smooth_first:
+        return _finish(plan, step, None, schedule, options, merging, rng)
+    if all(group.trunk.filter.smooths_incrementally for group in pair):
         for group in pair:
-            group.trunk.filter.hasten()
-        schedule.straightening = Straightening(chosen, _numbers(pair), bent, step)
+            group.trunk.filter.request_rejuvenation()
+        schedule.straightening = PendingAttempt(chosen, _numbers(pair), bent, step)
         return None
     before = [group.trunk.filter.get_state() for group in pair]
-    straight = straightened(*pair)
+    straight = smoothed_maps(*pair)
     if straight is None:
-        return _concluded(plan, step, None, schedule, options, merging, rng)
-    outcome = _straight(pair, bent, straight, options, records, rng, before)
-    return _concluded(MergePlan(pair, straight, outcome), step, bent, schedule, options, merging, rng)
+        return _finish(plan, step, None, schedule, options, merging, rng)
+    outcome = _realign(pair, bent, straight, options, records, rng, before)
+    return _finish(MergePlan(pair, straight, outcome), step, bent, schedule, options, merging, rng)
 
 
-def _straight(
-    pair: Pair, bent: Alignment, maps: Maps, options: AlignmentOptions, records: Records, rng: np.random.Generator,
+def _realign(
+    pair: Pair, bent: Alignment, maps: Maps, options: AlignmentOptions, records: SharedRecords, rng: np.random.Generator,
     before: Sequence[Mapping[str, Any]] = (),
 ) -> Alignment:  # fmt: skip
     """Align straight maps, which must agree on most of what the bent ones did.
@@ -116,26 +116,26 @@ def _straight(
     Where they do not, filters that were straightened on purpose go on from their states `before` that.
     """
     alignment = align_maps(*maps, rng=rng, options=options)
-    records.exchange.record_straightened(*speakers(pair), *maps)
+    records.exchange.record_smoothed(*representatives(pair), *maps)
     fewer = alignment.success and len(alignment.inliers) < LEAST_KEPT * len(bent.inliers)
     if fewer or alignment.reason == "too few inliers":
         alignment = Alignment.refused("too few inliers", alignment.ratio)
         for group, state in zip(pair, before, strict=bool(before)):  # the smoother has lost its way
-            group.trunk.filter.go_on_from(state)
+            group.trunk.filter.restore_checked(state)
     return alignment
 
 
-def _concluded(
-    plan: MergePlan, step: int, bent: Alignment | None, schedule: AttemptSchedule, alignment: AlignmentOptions,
+def _finish(
+    plan: MergePlan, step: int, bent: Alignment | None, schedule: MergeScheduler, alignment: AlignmentOptions,
     merging: MergeOptions, rng: np.random.Generator,
-) -> Tried:  # fmt: skip
+) -> AttemptResult:  # fmt: skip
     """Ask whether a merge would be sure enough, and remember what came of the attempt."""
     pair, found, doubt = plan.groups, plan.alignment, float("nan")
-    if found.success and merging.sure:
+    if found.success and merging.min_sigmas:
         before = rng.bit_generator.state
-        plan, doubt, change = _on_trial(plan.paired(merging, rng), schedule, alignment, merging, rng)
+        plan, doubt, change = _on_trial(plan.with_pairing(merging, rng), schedule, alignment, merging, rng)
         found = plan.alignment
-        if schedule.should_wait(_key(pair), doubt, merging.most_doubt):
+        if schedule.should_defer(_key(pair), doubt, merging.max_uncertainty):
             found = Alignment.refused("too uncertain", found.ratio, "paths", doubt)
         elif change > 1.0:
             found = Alignment.refused("too uncertain", found.ratio, "repeat", change)
@@ -144,11 +144,11 @@ def _concluded(
             plan = plan._replace(pairing=None, joint=None)
     schedule.record(_key(pair), step, found.success, straightened=bent is not None)
     event = MergeEvent(step, "attempt", pair[0].robots, pair[1].robots, found, bent, doubt)
-    return Tried(event, plan if found.success else None)
+    return AttemptResult(event, plan if found.success else None)
 
 
 def _on_trial(
-    plan: MergePlan, schedule: AttemptSchedule, alignment: AlignmentOptions, merging: MergeOptions,
+    plan: MergePlan, schedule: MergeScheduler, alignment: AlignmentOptions, merging: MergeOptions,
     rng: np.random.Generator,
 ) -> tuple[MergePlan, float, float]:  # fmt: skip
     """Merge on trial where two maps alone are not sure enough.
@@ -157,18 +157,18 @@ def _on_trial(
         The plan, by the motion that was found last; the doubt about it, 1 = just sure enough; and by how much the last
         trial of this pair found another one, 1 = just too much, 0 without a trial.
     """
-    doubt = merging.sure * doubt_about(plan)
-    if doubt <= 1.0 or not (merging.least_sure and merging.straighten):
+    doubt = merging.min_sigmas * transform_uncertainty(plan)
+    if doubt <= 1.0 or not (merging.min_sigmas_on_trial and merging.smooth_first):
         return plan, doubt, 0.0
     trial = plan.on_trial(merging, alignment, rng)
     if trial is None:
         return plan, doubt, 0.0
-    return trial[0], merging.sure * trial[1], schedule.change(_key(plan.groups), trial[0].alignment.transform)
+    return trial[0], merging.min_sigmas * trial[1], schedule.change(_key(plan.groups), trial[0].alignment.transform)
 
 
-def speakers(pair: Pair) -> tuple[int, int]:
+def representatives(pair: Pair) -> tuple[int, int]:
     """Return the robots by whom two groups exchange their maps."""
-    return pair[0].trunk.live[0], pair[1].trunk.live[0]
+    return pair[0].trunk.active_robots[0], pair[1].trunk.active_robots[0]
 
 
 def _pairs(groups: Sequence[Group]) -> list[Pair]:
@@ -177,9 +177,9 @@ def _pairs(groups: Sequence[Group]) -> list[Pair]:
     return [(a, b) for i, a in enumerate(able) for b in able[i + 1 :]]
 
 
-def _in_touch(pair: Pair, networks: IntArray) -> bool:
+def _are_connected(pair: Pair, networks: IntArray) -> bool:
     """Tell whether two groups hear each other."""
-    one, other = speakers(pair)
+    one, other = representatives(pair)
     return bool(networks[one] == networks[other])
 
 
@@ -196,7 +196,7 @@ def _numbers(pair: Pair) -> tuple[int, int]:
     return pair[0].trunk.number, pair[1].trunk.number
 
 
-def _is_meant(pending: Straightening, pair: Pair) -> bool:
+def _is_meant(pending: PendingAttempt, pair: Pair) -> bool:
     """Tell whether a pair is the one whose maps are straightened, with the filters that it had."""
     return (pending.pair, pending.numbers) == (_key(pair), _numbers(pair))
 

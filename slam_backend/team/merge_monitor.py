@@ -26,14 +26,14 @@ from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.fastslam.reports import StepReport
 from slam_backend.geometry import transform_points
 from slam_backend.maps import _kernels as kernels
-from slam_backend.maps.alignment import RIVAL_ANGLE, RIVAL_DISTANCE, Alignment, AlignmentOptions, align_maps
-from slam_backend.maps.correspondences import may_suffice
+from slam_backend.maps.alignment import DISTINCT_ROTATION, DISTINCT_TRANSLATION, Alignment, AlignmentOptions, align_maps
+from slam_backend.maps.correspondences import has_enough_candidates
 from slam_backend.maps.landmark_map import LandmarkMap, unchecked_map
 from slam_backend.team.options import MergeOptions
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Side:
+class PreMergeSnapshot:
     """One group as it was just before a merge; its arrays are read-only.
 
     Attributes:
@@ -45,7 +45,7 @@ class Side:
     oldest: int
 
     @classmethod
-    def of(cls, trunk: Mapping[str, Any]) -> "Side":
+    def of(cls, trunk: Mapping[str, Any]) -> "PreMergeSnapshot":
         """Return a side with this trunk, whose arrays nobody is to write to afterwards."""
         earlier = [side.oldest for watch in trunk["watches"] for side in watch.sides]
         return cls(with_read_only(trunk), min([1 + min(trunk["known"].values()), *earlier]))
@@ -55,7 +55,7 @@ class Side:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Let copies and what was pickled be read-only, too."""
-        return Side, (self.trunk, self.oldest)
+        return PreMergeSnapshot, (self.trunk, self.oldest)
 
     @property
     def robots(self) -> tuple[int, ...]:
@@ -64,14 +64,14 @@ class Side:
         return robots
 
     @property
-    def watches(self) -> tuple["Watch", ...]:
+    def watches(self) -> tuple["MergeMonitor", ...]:
         """Of earlier merges in it, as they stood."""
-        watches: tuple[Watch, ...] = self.trunk["watches"]
+        watches: tuple[MergeMonitor, ...] = self.trunk["watches"]
         return watches
 
 
 @dataclass(slots=True, eq=False)
-class Watch:
+class MergeMonitor:
     """The evidence about one merge. Landmarks bear their names in the joint map.
 
     Attributes:
@@ -86,54 +86,58 @@ class Watch:
 
     number: int
     alignment: Alignment
-    sides: tuple[Side, Side]
-    before: tuple[LandmarkMap, LandmarkMap]
-    own: tuple[set[int], set[int]]
+    sides: tuple[PreMergeSnapshot, PreMergeSnapshot]
+    pre_merge_maps: tuple[LandmarkMap, LandmarkMap]
+    exclusive_landmarks: tuple[set[int], set[int]]
     steps: int = field(default=0)
 
-    def copy(self, new_ids: Mapping[int, int] | None = None) -> "Watch":
+    def copy(self, new_ids: Mapping[int, int] | None = None) -> "MergeMonitor":
         """Return a watch that goes on by itself, with landmarks renamed if need be; what does not change is shared."""
-        before, own = self.before, (set(self.own[0]), set(self.own[1]))
+        before, own = self.pre_merge_maps, (set(self.exclusive_landmarks[0]), set(self.exclusive_landmarks[1]))
         if new_ids is not None:
             before = (renamed_map(before[0], new_ids), renamed_map(before[1], new_ids))
             own = ({new_ids[i] for i in own[0] if i in new_ids}, {new_ids[i] for i in own[1] if i in new_ids})
-        return Watch(self.number, self.alignment, self.sides, before, own, self.steps)
+        return MergeMonitor(self.number, self.alignment, self.sides, before, own, self.steps)
 
-    def note(self, robots: Sequence[int], report: StepReport) -> None:
+    def update(self, robots: Sequence[int], report: StepReport) -> None:
         """Note which side has found which landmarks, from a step of the joint filter of `robots`."""
         for robot, row in zip(robots, report.rows, strict=True):
             if row >= 0:
-                self.own[robot not in self.sides[0].robots].update(report.findings.names_created(row))
+                self.exclusive_landmarks[robot not in self.sides[0].robots].update(
+                    report.all_associations.created_ids(row)
+                )
 
-    def together(self, live: Sequence[int]) -> bool:
+    def both_sides_connected(self, live: Sequence[int]) -> bool:
         """Tell whether robots of both sides are among those that go by the joint filter."""
         here = set(live)
         return not (here.isdisjoint(self.sides[0].robots) or here.isdisjoint(self.sides[1].robots))
 
-    def is_contradicted(self, joint: LandmarkMap, merging: MergeOptions, options: AlignmentOptions) -> bool:
+    def is_inconsistent(self, joint: LandmarkMap, merging: MergeOptions, options: AlignmentOptions) -> bool:
         """Tell whether the joint map, with mixture covariances, contradicts the merge by its shape or by its places."""
-        if any(moved_share(old, joint, options) > merging.max_moved for old in self.before):
+        if any(deformed_fraction(old, joint, options) > merging.max_deformed for old in self.pre_merge_maps):
             return True
         ids = joint.ids.tolist()
-        masks = [np.fromiter(map(own.__contains__, ids), np.bool_, len(ids)) for own in self.own]
+        masks = [np.fromiter(map(own.__contains__, ids), np.bool_, len(ids)) for own in self.exclusive_landmarks]
         looks = [joint.descriptors[mask] for mask in masks]
-        if min(map(len, looks)) < options.min_inliers or not may_suffice(looks[0], looks[1], options):
+        if min(map(len, looks)) < options.min_inliers or not has_enough_candidates(looks[0], looks[1], options):
             return False
         parts = [joint.subset(mask) for mask in masks]
         rival = align_maps(parts[0], parts[1], options=options)
         if not rival.success or self._joined(options) > options.max_ratio * len(rival.inliers):
             return False
-        return differs(rival.transform, parts[1].means[rival.inliers[:, 1]])
+        return is_significant_motion(rival.transform, parts[1].means[rival.inliers[:, 1]])
 
     def _joined(self, options: AlignmentOptions) -> int:
         """Return how many landmarks the merge joined that look alike."""
-        _, rows, others = np.intersect1d(self.before[0].ids, self.before[1].ids, return_indices=True)
-        apart = np.linalg.norm(self.before[0].descriptors[rows] - self.before[1].descriptors[others], axis=1)
+        _, rows, others = np.intersect1d(self.pre_merge_maps[0].ids, self.pre_merge_maps[1].ids, return_indices=True)
+        apart = np.linalg.norm(
+            self.pre_merge_maps[0].descriptors[rows] - self.pre_merge_maps[1].descriptors[others], axis=1
+        )
         alike = apart <= options.descriptor_gate
         return int(np.count_nonzero(alike)) if options.appearance else len(rows)
 
 
-def moved_share(old: LandmarkMap, joint: LandmarkMap, options: AlignmentOptions) -> float:
+def deformed_fraction(old: LandmarkMap, joint: LandmarkMap, options: AlignmentOptions) -> float:
     """Return the share of a map's landmarks that have left their places among each other.
 
     Args:
@@ -147,13 +151,13 @@ def moved_share(old: LandmarkMap, joint: LandmarkMap, options: AlignmentOptions)
     """
     # Copies: the kernel is compiled for arrays that can be written alone.
     now, then = ((each.means.copy(), each.covariances.copy(), each.ids.copy()) for each in (joint, old))
-    return kernels.moved_share(*now, *then, options.min_inliers, options.position_floor**2, options.position_gate)
+    return kernels.deformed_fraction(*now, *then, options.min_inliers, options.position_floor**2, options.position_gate)
 
 
-def differs(motion: FloatArray, points: FloatArray) -> bool:
+def is_significant_motion(motion: FloatArray, points: FloatArray) -> bool:
     """Tell whether a motion (3,) moves points (n, 3), on average, by 0.5 m, or turns them by 5 degrees."""
     moved: FloatArray = transform_points(motion, points) - points
-    return bool(np.hypot(*moved.mean(axis=0)[:2]) > RIVAL_DISTANCE or abs(motion[2]) > RIVAL_ANGLE)
+    return bool(np.hypot(*moved.mean(axis=0)[:2]) > DISTINCT_TRANSLATION or abs(motion[2]) > DISTINCT_ROTATION)
 
 
 def renamed_map(landmarks: LandmarkMap, new_ids: Mapping[int, int]) -> LandmarkMap:
@@ -163,14 +167,14 @@ def renamed_map(landmarks: LandmarkMap, new_ids: Mapping[int, int]) -> LandmarkM
     return unchecked_map(kept.means, kept.covariances, kept.descriptors, kept.counts, names[names >= 0])
 
 
-def begin_watch(
+def begin_monitoring(
     number: int,
     alignment: Alignment,
-    sides: tuple[Side, Side],
+    sides: tuple[PreMergeSnapshot, PreMergeSnapshot],
     before: tuple[LandmarkMap, LandmarkMap],
     renamed: IntArray,
     pairs: IntArray,
-) -> Watch:
+) -> MergeMonitor:
     """Return the watch of a fresh merge.
 
     Args:
@@ -183,4 +187,4 @@ def begin_watch(
     """
     common = set(pairs[:, 0].tolist())
     own = (set(before[0].ids.tolist()) - common, set(renamed[:, 1].tolist()) - common)
-    return Watch(number, alignment, sides, (before[0], renamed_map(before[1], dict(renamed.tolist()))), own)
+    return MergeMonitor(number, alignment, sides, (before[0], renamed_map(before[1], dict(renamed.tolist()))), own)

@@ -7,15 +7,21 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from slam_backend.core.read_only import as_constant, with_constants
-from slam_backend.core.validation import MOST, FloatArray, bad_argument, check_int, known_names
+from slam_backend.core.validation import MOST, FloatArray, argument_error, check_int, known_names
 from slam_backend.geometry import wrap_angle
-from slam_backend.maps.alignment import RIVAL_ANGLE, RIVAL_DISTANCE, Alignment, AlignmentOptions, candidate_matches
+from slam_backend.maps.alignment import (
+    DISTINCT_ROTATION,
+    DISTINCT_TRANSLATION,
+    Alignment,
+    AlignmentOptions,
+    candidate_matches,
+)
 from slam_backend.maps.correspondences import too_many
 from slam_backend.maps.landmark_map import LandmarkMap
 
 PairKey = tuple[tuple[int, ...], tuple[int, ...]]  # two groups, as tuples of robots
-GROWN = 0.125  # of all that was read has to be new before logs are smoothed once more for the same pair
-HELPS = 0.7  # waiting has helped where no more of a doubt is left
+MIN_LOG_GROWTH = 0.125  # of all that was read has to be new before logs are smoothed once more for the same pair
+MIN_IMPROVEMENT = 0.7  # waiting has helped where no more of a doubt is left
 
 
 @known_names
@@ -29,7 +35,7 @@ class AttemptOptions:
             attempt is more than `longest_wait` steps ago: by then the same landmarks are known better. If its maps did
             align, and were refused only when they were straight, it needs no new ones.
         longest_wait: After each refusal a pair waits twice as long as before, at most so many steps; or longer, after
-            one for which logs were smoothed (`AttemptSchedule.record`).
+            one for which logs were smoothed (`MergeScheduler.record`).
         enabled: Whether any pair tries at all.
     """
 
@@ -42,7 +48,7 @@ class AttemptOptions:
         for name in ("every", "new_candidates", "longest_wait"):
             check_int(f"attempts.{name}", getattr(self, name), 1, "Give a number of at least 1.", MOST)
         if not isinstance(self.enabled, bool):
-            raise bad_argument("attempts.enabled", "True or False", self.enabled, "Give a bool.")
+            raise argument_error("attempts.enabled", "True or False", self.enabled, "Give a bool.")
 
 
 @dataclass(slots=True)
@@ -56,7 +62,7 @@ class AttemptRecord:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Straightening:
+class PendingAttempt:
     """An attempt whose maps fit as the filters bent them, and which goes on when these have straightened them.
 
     Attributes:
@@ -69,12 +75,12 @@ class Straightening:
 
     pair: PairKey
     numbers: tuple[int, int]
-    bent: Alignment
+    alignment: Alignment
     since: int
     ready: bool = False
 
 
-class AttemptSchedule:
+class MergeScheduler:
     """The memory of past attempts.
 
     Args:
@@ -91,9 +97,9 @@ class AttemptSchedule:
         self._records: dict[PairKey, AttemptRecord] = {}
         self._proposed: dict[PairKey, set[tuple[int, int]]] = {}
         self._bars: list[tuple[PairKey, int]] = []
-        self._doubts: dict[tuple[int, int], float] = {}  # robot of either side -> the least that there has been
+        self._uncertainties: dict[tuple[int, int], float] = {}  # robot of either side -> the least that there has been
         self._trials: dict[tuple[int, int], FloatArray] = {}  # robots whose starts are the frames -> the last motion
-        self.straightening: Straightening | None = None
+        self.straightening: PendingAttempt | None = None
 
     def is_due(self, step: int) -> bool:
         """Tell whether a pair may try at this step, or an attempt goes on."""
@@ -128,7 +134,7 @@ class AttemptSchedule:
                 self._proposed = {pair: found}
         return best
 
-    def should_wait(self, pair: PairKey, doubt: float, most: float = math.inf) -> bool:
+    def should_defer(self, pair: PairKey, doubt: float, most: float = math.inf) -> bool:
         """Tell whether a pair whose maps align had better try again later, and remember its doubt.
 
         It had at first, as long as the doubt falls by a good part from one attempt to the next, and while the doubt is
@@ -141,9 +147,9 @@ class AttemptSchedule:
             most: Doubt beyond which no pair merges, whether waiting helps or not [-].
         """
         robots = [(a, b) for a in pair[0] for b in pair[1]]
-        before = min(self._doubts.get(key, math.inf) for key in robots)
-        self._doubts |= {key: min(doubt, self._doubts.get(key, math.inf)) for key in robots}
-        return doubt > 1.0 and (doubt > most or doubt < HELPS * before)
+        before = min(self._uncertainties.get(key, math.inf) for key in robots)
+        self._uncertainties |= {key: min(doubt, self._uncertainties.get(key, math.inf)) for key in robots}
+        return doubt > 1.0 and (doubt > most or doubt < MIN_IMPROVEMENT * before)
 
     def change(self, pair: PairKey, motion: FloatArray) -> float:
         """Return by how much the last trial of two groups was another motion, and remember this one.
@@ -162,7 +168,9 @@ class AttemptSchedule:
         if before is None:
             return math.inf
         x, y, turn = (motion - before).tolist()
-        return max(math.hypot(x, y) / (0.5 * RIVAL_DISTANCE), abs(float(wrap_angle(turn))) / (0.5 * RIVAL_ANGLE))
+        return max(
+            math.hypot(x, y) / (0.5 * DISTINCT_TRANSLATION), abs(float(wrap_angle(turn))) / (0.5 * DISTINCT_ROTATION)
+        )
 
     def record(self, pair: PairKey, step: int, success: bool, straightened: bool = False) -> None:
         """Remember an attempt of the pair that `choose` returned: its evidence, and how long it now waits.
@@ -182,17 +190,17 @@ class AttemptSchedule:
         record = self._records.setdefault(pair, AttemptRecord(self._options.every))
         record.tried = set() if straightened else self._proposed.get(pair, set())
         record.last_step = step
-        record.next_step = step + max(record.wait, math.ceil(GROWN * step) if straightened else 0)
+        record.next_step = step + max(record.wait, math.ceil(MIN_LOG_GROWTH * step) if straightened else 0)
         record.wait = min(2 * record.wait, self._options.longest_wait)
 
-    def bar(self, pair: PairKey, until: int) -> None:
+    def block(self, pair: PairKey, until: int) -> None:
         """Keep a pair, and every pair of groups that robots of either side belong to, from trying before this step."""
         self._bars = [*(bar for bar in self._bars if bar[0] != pair), (pair, until)]
 
     def get_state(self) -> dict[str, Any]:
         """Return the options and a copy of the memory; arrays are read-only."""
         memory: dict[str, Any] = {"records": copy.deepcopy(self._records), "bars": tuple(self._bars)}
-        memory |= {"doubts": dict(self._doubts), "trials": dict(self._trials)}
+        memory |= {"doubts": dict(self._uncertainties), "trials": dict(self._trials)}
         fixed = {"options": self._options, "alignment": self._alignment, "straightening": self.straightening}
         return fixed | memory
 
@@ -202,7 +210,7 @@ class AttemptSchedule:
         self.straightening = state["straightening"]
         self._records = copy.deepcopy(state["records"])
         self._bars = list(state["bars"])
-        self._doubts, self._trials = dict(state["doubts"]), dict(with_constants(state["trials"]))
+        self._uncertainties, self._trials = dict(state["doubts"]), dict(with_constants(state["trials"]))
 
 
 def _touches(pair: PairKey, barred: PairKey) -> bool:

@@ -3,8 +3,8 @@
 import math
 from dataclasses import dataclass
 
-from slam_backend.core.validation import MOST, bad_argument, check_float, check_int, known_names
-from slam_backend.fastslam.options import MOST_PARTICLES
+from slam_backend.core.validation import MOST, argument_error, check_float, check_int, known_names
+from slam_backend.fastslam.options import MAX_PARTICLES
 
 
 @known_names
@@ -19,42 +19,42 @@ class MergeOptions:
             more. False: maps are taken as the filters bent them.
         sure: An attempt is refused, as long as waiting helps, while so many standard deviations of the motion among the
             particles that the merge would make reach 0.5 m or 5 degrees; 0: never for that.
-        least_sure: Above 0 a pair that is less than `sure` merges on trial: the joint filter is smoothed, and kept if
+        min_sigmas_on_trial: Above 0 a pair that is less than `sure` merges on trial: the joint filter is smoothed, and kept if
             the motion that it has passes twice running; where waiting does not help, so many standard deviations of it
             suffice. 0: there are no trials, and where waiting does not help the pair merges however uncertain it is, as
             is right where nothing would ever tell more about the robots' starts.
         watch_steps: A merge is watched for so many steps in which robots of both sides are in contact, and can be
             undone so long; then its snapshot is freed. 0: merges are final.
         watch_every: In so many steps the evidence is weighed once.
-        barred_steps: After an undo the two sides do not try again for so long.
-        max_moved: A merge is undone if a larger share of the landmarks of either side have left their places among
+        blocked_steps: After an undo the two sides do not try again for so long.
+        max_deformed: A merge is undone if a larger share of the landmarks of either side have left their places among
             each other [-].
     """
 
     merged_particles: int | None = None
-    straighten: bool = True
-    sure: float = 5.0
-    least_sure: float = 0.0
+    smooth_first: bool = True
+    min_sigmas: float = 5.0
+    min_sigmas_on_trial: float = 0.0
     watch_steps: int = 200
     watch_every: int = 20
-    barred_steps: int = 200
-    max_moved: float = 0.2
+    blocked_steps: int = 200
+    max_deformed: float = 0.2
 
     def __post_init__(self) -> None:
         if self.merged_particles is not None:
             cure = "Use None for the larger of the two."
-            check_int("merging.merged_particles", self.merged_particles, 1, cure, MOST_PARTICLES)
-        if not isinstance(self.straighten, bool):
-            raise bad_argument("merging.straighten", "True or False", self.straighten, "Give a bool.")
-        check_float("merging.sure", self.sure, "Use 5, or 0 to merge however uncertain it is.", at_least=0.0)
+            check_int("merging.merged_particles", self.merged_particles, 1, cure, MAX_PARTICLES)
+        if not isinstance(self.smooth_first, bool):
+            raise argument_error("merging.straighten", "True or False", self.straighten, "Give a bool.")
+        check_float("merging.sure", self.min_sigmas, "Use 5, or 0 to merge however uncertain it is.", at_least=0.0)
         cure = "Use 5, or 0 to merge in the end however uncertain it is."
-        check_float("merging.least_sure", self.least_sure, cure, at_least=0.0)
+        check_float("merging.min_sigmas_on_trial", self.min_sigmas_on_trial, cure, at_least=0.0)
         check_int("merging.watch_steps", self.watch_steps, 0, "Use 0 to make merges final.", MOST)
         check_int("merging.watch_every", self.watch_every, 1, "Weigh the evidence at every step or less often.", MOST)
-        check_int("merging.barred_steps", self.barred_steps, 0, "Use 0 to let them try at once.", MOST)
-        check_float("merging.max_moved", self.max_moved, "Give a share.", at_least=0.0, at_most=1.0)
+        check_int("merging.blocked_steps", self.blocked_steps, 0, "Use 0 to let them try at once.", MOST)
+        check_float("merging.max_deformed", self.max_deformed, "Give a share.", at_least=0.0, at_most=1.0)
 
     @property
-    def most_doubt(self) -> float:
+    def max_uncertainty(self) -> float:
         """Doubt, 1 = `sure`, beyond which no pair merges; infinite if any merges in the end."""
-        return self.sure / self.least_sure if self.least_sure else math.inf
+        return self.min_sigmas / self.min_sigmas_on_trial if self.min_sigmas_on_trial else math.inf

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 
 from slam_backend.core.read_only import as_read_only, with_constants
-from slam_backend.fastslam.reports import LandmarksCreated, MapCopied, MapEntry, StepReport
-from slam_backend.fastslam.step_input import InputLog
+from slam_backend.fastslam.reports import LandmarksCreated, MapChange, MapForked, StepReport
+from slam_backend.fastslam.step_input import InputBuffer
 from slam_backend.team.branches import ReplayedStep
-from slam_backend.team.communication import ExchangeLedger
+from slam_backend.team.communication import TrafficCounter
 
 
-class Records:
+class SharedRecords:
     """The common records of a team.
 
     Args:
@@ -28,10 +28,10 @@ class Records:
     """
 
     def __init__(self, num_robots: int, seed: np.random.SeedSequence) -> None:
-        self.log = InputLog()
-        self.exchange = ExchangeLedger(num_robots)
+        self.log = InputBuffer()
+        self.exchange = TrafficCounter(num_robots)
         self.rng = np.random.default_rng(seed)
-        self.entries: list[MapEntry] = []
+        self.entries: list[MapChange] = []
         self._next_number = num_robots
 
     def new_number(self) -> int:
@@ -41,13 +41,13 @@ class Records:
 
     def copied(self, source: int, copy: int) -> None:
         """Write down that a filter forked."""
-        self.entries.append(MapCopied(source, copy))
+        self.entries.append(MapForked(source, copy))
 
     def note_created(self, number: int, step: int, report: StepReport) -> None:
         """Write down which landmarks a step of the filter of a map created."""
         for robot in report.rows:
-            if robot >= 0 and report.findings.names_created(robot):
-                created = as_read_only(report.findings.created(robot))
+            if robot >= 0 and report.all_associations.created_ids(robot):
+                created = as_read_only(report.all_associations.created(robot))
                 self.entries.append(LandmarksCreated(number, robot, step, created))
 
     def note_replay(self, number: int, replayed: Sequence[ReplayedStep]) -> None:

@@ -6,18 +6,18 @@ from typing import Any
 import numpy as np
 
 from slam_backend.core import state_checks as check
-from slam_backend.core.validation import bad_argument
+from slam_backend.core.validation import argument_error
 from slam_backend.fastslam import reports
-from slam_backend.fastslam._kernels import PLACED
-from slam_backend.fastslam._kernels.layout import ACT, BEGIN, COUNT, END, GIVEN, NAMED
+from slam_backend.fastslam._kernels import EXACT_POSE
+from slam_backend.fastslam._kernels.layout import BEGIN, COUNT, COVARIANCES_GIVEN, END, HAS_IDS, MOTION_KIND
 from slam_backend.fastslam.options import FilterOptions
 from slam_backend.fastslam.state_checks import check_descriptors, check_filter, check_landmarks, last_step
 from slam_backend.fastslam.step_input import StepInput
 from slam_backend.maps.alignment_types import Alignment, AlignmentOptions
 from slam_backend.smoother.log_arrays import REJECTED
 from slam_backend.team.branches import ReplayedStep
-from slam_backend.team.merge_monitor import Side, Watch
-from slam_backend.team.merge_scheduler import AttemptOptions, AttemptRecord, Straightening
+from slam_backend.team.merge_monitor import MergeMonitor, PreMergeSnapshot
+from slam_backend.team.merge_scheduler import AttemptOptions, AttemptRecord, PendingAttempt
 from slam_backend.team.options import MergeOptions
 
 BY_ROBOTS = ("doubts", "trials")  # parts of the schedule with an entry for each pair of robots
@@ -53,62 +53,62 @@ class TeamCheck:
         Raises:
             ValueError: By name of the part that is wrong.
         """
-        check.keys(name, state, KEYS)
-        for of_group, group in check.each(f"{name}['groups']", state["groups"]):
-            check.keys(of_group, group, ("branches", "undoing"))
-            for where, branch in check.each(f"{of_group}['branches']", group["branches"]):
-                check.keys(where, branch, BRANCH)
-                check.of_kind(f"{where}['robots']", branch["robots"], tuple)
+        check.check_keys(name, state, KEYS)
+        for of_group, group in check.named_items(f"{name}['groups']", state["groups"]):
+            check.check_keys(of_group, group, ("branches", "undoing"))
+            for where, branch in check.named_items(f"{of_group}['branches']", group["branches"]):
+                check.check_keys(where, branch, BRANCH)
+                check.check_type(f"{where}['robots']", branch["robots"], tuple)
         found = sum(len(group["branches"][0]["robots"]) for group in state["groups"] if group["branches"])
         if found != self._count:
-            raise bad_argument(name, f"one of {self._count} robots", found, "Build a team of the same size.")
-        check.whole(f"{name}['step']", state["step"])
-        check.whole(f"{name}['epoch']", state["epoch"])
-        check.generator(f"{name}['rng']", state["rng"])
-        check.options(f"{name}['alignment']", state["alignment"], AlignmentOptions)
-        check.options(f"{name}['merging']", state["merging"], MergeOptions)
+            raise argument_error(name, f"one of {self._count} robots", found, "Build a team of the same size.")
+        check.check_int(f"{name}['step']", state["step"])
+        check.check_int(f"{name}['epoch']", state["epoch"])
+        check.check_generator(f"{name}['rng']", state["rng"])
+        check.check_options(f"{name}['alignment']", state["alignment"], AlignmentOptions)
+        check.check_options(f"{name}['merging']", state["merging"], MergeOptions)
         self._step = state["step"]
         self._check_records(f"{name}['records']", state["records"])
-        for where, event in check.each(f"{name}['events']", state["events"]):
+        for where, event in check.named_items(f"{name}['events']", state["events"]):
             self._check_event(where, event)
-        check.wholes(f"{name}['numbers']", state["numbers"], 0, self._next_number - 1, list)
+        check.check_ints(f"{name}['numbers']", state["numbers"], 0, self._next_number - 1, list)
         self._check_schedule(f"{name}['schedule']", state["schedule"])
-        for where, group in check.each(f"{name}['groups']", state["groups"]):
+        for where, group in check.named_items(f"{name}['groups']", state["groups"]):
             self._check_group(where, group)
         trunks = [group["branches"][0]["robots"] for group in state["groups"]]
         if sorted(sum(trunks, ())) != list(range(self._count)) or trunks != sorted(trunks):
-            check.refuse(f"{name}['groups']", "groups of all robots, in the order of their first ones", trunks)
+            check.raise_refusal(f"{name}['groups']", "groups of all robots, in the order of their first ones", trunks)
         if len(self.descriptor_sizes) > 1:
-            check.refuse(name, "descriptors of one length", sorted(self.descriptor_sizes))
+            check.raise_refusal(name, "descriptors of one length", sorted(self.descriptor_sizes))
 
     # ------------------------------------------------------------------ groups
 
     def _check_group(self, name: str, group: Mapping[str, Any]) -> None:
         live: list[int] = []
-        for where, branch in check.each(f"{name}['branches']", group["branches"]):
+        for where, branch in check.named_items(f"{name}['branches']", group["branches"]):
             self._check_branch(where, branch)
             if not branch["live"]:
-                check.refuse(f"{where}['live']", "some robots", "none")
+                check.raise_refusal(f"{where}['live']", "some robots", "none")
             live += branch["live"]
             self._check_oldest(where, branch)
         trunk = group["branches"][0]
         if sorted(live) != list(trunk["robots"]):
-            check.refuse(f"{name}['branches']", f"branches by which {trunk['robots']} go, each by one", live)
+            check.raise_refusal(f"{name}['branches']", f"branches by which {trunk['robots']} go, each by one", live)
         if group["undoing"] is not None:
             self._check_undoing(f"{name}['undoing']", group["undoing"], trunk)
 
     def _check_undoing(self, name: str, undoing: Any, trunk: Mapping[str, Any]) -> None:
         """Refuse what is no undoing of a merge that the branch of the joint filter had."""
-        check.keys(name, undoing, ("number", "sides", "replayed"))
-        check.whole(f"{name}['number']", undoing["number"], 0, self._next_number - 1)
-        sides = check.each(f"{name}['sides']", undoing["sides"])
+        check.check_keys(name, undoing, ("number", "sides", "replayed"))
+        check.check_int(f"{name}['number']", undoing["number"], 0, self._next_number - 1)
+        sides = check.named_items(f"{name}['sides']", undoing["sides"])
         for where, side in sides:
             self._check_branch(where, side)
         parts = [side["robots"] for _, side in sides]
         if sorted(sum(parts, ())) != list(trunk["robots"]):
-            check.refuse(f"{name}['sides']", f"parts of {trunk['robots']}", parts)
-        for of_side, replayed in check.each(f"{name}['replayed']", undoing["replayed"], len(parts)):
-            for where, done in check.each(of_side, replayed):
+            check.raise_refusal(f"{name}['sides']", f"parts of {trunk['robots']}", parts)
+        for of_side, replayed in check.named_items(f"{name}['replayed']", undoing["replayed"], len(parts)):
+            for where, done in check.named_items(of_side, replayed):
                 self._check_replayed(where, done)
         if all(watch.number != undoing["number"] for watch in trunk["watches"]):
             return  # the joint filter is another one now
@@ -116,27 +116,29 @@ class TeamCheck:
             for robot, last in side["known"].items():
                 self._need_from(where, last + 1)
                 if last > trunk["known"].get(robot, -1):
-                    check.refuse(where, "sides that know no more than the joint filter", last)
+                    check.raise_refusal(where, "sides that know no more than the joint filter", last)
 
     def _check_branch(self, name: str, branch: Any) -> None:
         """Refuse what is no branch, whose filter and watches are checked with it."""
-        check.keys(name, branch, BRANCH)
+        check.check_keys(name, branch, BRANCH)
         robots, live, known = branch["robots"], branch["live"], branch["known"]
-        check.robots(f"{name}['robots']", robots, self._count)
-        check.wholes(f"{name}['live']", live, 0, self._count - 1)
+        check.check_robots(f"{name}['robots']", robots, self._count)
+        check.check_ints(f"{name}['live']", live, 0, self._count - 1)
         if list(live) != sorted(set(live)) or not set(live) <= set(robots):
-            check.refuse(f"{name}['live']", f"some of {robots}, in ascending order", live)
-        check.table(f"{name}['known']", known, (0, self._count), (-1, self._step - 1))
+            check.raise_refusal(f"{name}['live']", f"some of {robots}, in ascending order", live)
+        check.check_int_dict(f"{name}['known']", known, (0, self._count), (-1, self._step - 1))
         if set(known) != set(robots):
-            check.refuse(f"{name}['known']", f"the last step of each of {robots}", known)
-        check.whole(f"{name}['number']", branch["number"], 0, self._next_number - 1)
-        check.whole(f"{name}['epoch']", branch["epoch"])
+            check.raise_refusal(f"{name}['known']", f"the last step of each of {robots}", known)
+        check.check_int(f"{name}['number']", branch["number"], 0, self._next_number - 1)
+        check.check_int(f"{name}['epoch']", branch["epoch"])
         check_filter(f"{name}['filter']", branch["filter"], self._known)
         if len(branch["filter"]["poses"]) != len(robots):
-            check.refuse(f"{name}['filter']", f"one of {len(robots)} robots", len(branch["filter"]["poses"]))
+            check.raise_refusal(f"{name}['filter']", f"one of {len(robots)} robots", len(branch["filter"]["poses"]))
         for robot, log in zip(robots, branch["filter"]["logs"], strict=True):
             if last_step(log) > known[robot]:
-                check.refuse(f"{name}['known']", f"at least {last_step(log)}, the last step logged", known[robot])
+                check.raise_refusal(
+                    f"{name}['known']", f"at least {last_step(log)}, the last step logged", known[robot]
+                )
         self.options.append(branch["filter"]["options"])
         looks = branch["filter"]["maps"]["descriptors"]
         if len(looks):
@@ -144,13 +146,13 @@ class TeamCheck:
         if branch["report"] is not None:
             self._check_report(f"{name}['report']", branch["report"], len(robots))
         if branch["split_from"] is not None:
-            check.whole(f"{name}['split_from']", branch["split_from"], 0, self._next_number - 1)
-        check.table(f"{name}['split_counts']", branch["split_counts"], check.LANDMARK)
-        for where, watch in check.each(f"{name}['watches']", branch["watches"]):
+            check.check_int(f"{name}['split_from']", branch["split_from"], 0, self._next_number - 1)
+        check.check_int_dict(f"{name}['split_counts']", branch["split_counts"], check.LANDMARK)
+        for where, watch in check.named_items(f"{name}['watches']", branch["watches"]):
             self._check_watch(where, watch, robots)
         numbers = [watch.number for watch in branch["watches"]]
         if numbers != sorted(set(numbers)):
-            check.refuse(f"{name}['watches']", "merges from the oldest to the newest", numbers)
+            check.raise_refusal(f"{name}['watches']", "merges from the oldest to the newest", numbers)
 
     def _check_oldest(self, name: str, branch: Mapping[str, Any]) -> None:
         """Refuse a branch that may have to take in steps that are not kept."""
@@ -158,7 +160,7 @@ class TeamCheck:
             if robot not in branch["live"]:
                 self._need_from(name, last + 1)
             elif last != self._step - 1 and self._step:
-                check.refuse(f"{name}['known']", f"{self._step - 1} of a robot that goes by it", last)
+                check.raise_refusal(f"{name}['known']", f"{self._step - 1} of a robot that goes by it", last)
         for watch in branch["watches"]:
             for side in watch.sides:
                 self._need_from(name, side.oldest)
@@ -166,106 +168,108 @@ class TeamCheck:
     def _need_from(self, name: str, first: int) -> None:
         """Refuse a state in which a step from `first` on is not kept."""
         if first < self._step and (first not in self._inputs or len(self._inputs) < self._step - first):
-            check.refuse(name, "steps whose readings are kept", f"one that knows nothing from step {first} on")
+            check.raise_refusal(name, "steps whose readings are kept", f"one that knows nothing from step {first} on")
 
     def _check_watch(self, name: str, watch: Any, robots: Sequence[int]) -> None:
         """Refuse what is no watch of a merge of some of these robots."""
-        check.of_kind(name, watch, Watch)
-        check.whole(f"{name}.number", watch.number, 0, self._next_number - 1)
-        check.whole(f"{name}.steps", watch.steps)
-        check.of_kind(f"{name}.alignment", watch.alignment, Alignment)
-        for where, landmarks in check.each(f"{name}.before", watch.before, 2):
+        check.check_type(name, watch, MergeMonitor)
+        check.check_int(f"{name}.number", watch.number, 0, self._next_number - 1)
+        check.check_int(f"{name}.steps", watch.steps)
+        check.check_type(f"{name}.alignment", watch.alignment, Alignment)
+        for where, landmarks in check.named_items(f"{name}.before", watch.before, 2):
             check_landmarks(where, landmarks)
-        for where, own in check.each(f"{name}.own", watch.own, 2):
-            check.wholes(where, own, *check.LANDMARK, set)
-        for where, side in check.each(f"{name}.sides", watch.sides, 2):
-            check.of_kind(where, side, Side)
+        for where, own in check.named_items(f"{name}.own", watch.own, 2):
+            check.check_ints(where, own, *check.LANDMARK, set)
+        for where, side in check.named_items(f"{name}.sides", watch.sides, 2):
+            check.check_type(where, side, PreMergeSnapshot)
             if id(side) not in self._done:
                 self._done.add(id(side))
                 self._check_branch(f"{where}.trunk", side.trunk)
             earliest = [1 + min(side.trunk["known"].values()), *(s.oldest for w in side.watches for s in w.sides)]
-            check.whole(f"{where}.oldest", side.oldest, 0, min(earliest))
+            check.check_int(f"{where}.oldest", side.oldest, 0, min(earliest))
         one, two = (side.robots for side in watch.sides)
         if set(one) & set(two) or not {*one, *two} <= set(robots):
-            check.refuse(f"{name}.sides", f"two parts of {robots}", (one, two))
+            check.raise_refusal(f"{name}.sides", f"two parts of {robots}", (one, two))
 
     # ------------------------------------------------------------------ readings and reports
 
     def _check_inputs(self, name: str, inputs: Any) -> None:
         """Refuse what are no readings of K robots in one step."""
-        check.of_kind(name, inputs, StepInput)
-        n, table = check.places(f"{name}.sightings", inputs.sightings, (None, 9), 3), inputs.table
-        check.indices(f"{name}.table", table, (self._count, 6), -1)
+        check.check_type(name, inputs, StepInput)
+        n, table = check.check_positions(f"{name}.sightings", inputs.sightings, (None, 9), 3), inputs.table
+        check.check_indices(f"{name}.table", table, (self._count, 6), -1)
         check_turns(f"{name}.turns", inputs.turns, n, self._count)
         if [list(turn) for turn in inputs.turns] != table.tolist():
-            check.refuse(f"{name}.table", "the turns", "others")
-        check.places(f"{name}.moves", inputs.moves, (self._count, 3))
+            check.raise_refusal(f"{name}.table", "the turns", "others")
+        check.check_positions(f"{name}.moves", inputs.moves, (self._count, 3))
         size = check_descriptors(f"{name}.descriptors", inputs.descriptors, n)
         if n:
             self.descriptor_sizes.add(size)
-        named = check.indices(f"{name}.names", inputs.names, (None,), -1)
-        if named != n and (named or table[:, NAMED].any()):
-            check.refuse(f"{name}.names", "one for each measurement, or none", named)
+        named = check.check_indices(f"{name}.names", inputs.names, (None,), -1)
+        if named != n and (named or table[:, HAS_IDS].any()):
+            check.raise_refusal(f"{name}.names", "one for each measurement, or none", named)
         for _, begin, end, given, _, _ in inputs.turns:
             if given:
-                check.floats(f"{name}.sightings", inputs.sightings[begin:end], (None, 9))
+                check.check_floats(f"{name}.sightings", inputs.sightings[begin:end], (None, 9))
         check_masks(f"{name}.masks", inputs.masks, inputs.turns)
-        check.wholes(f"{name}.silent", inputs.silent, 0, self._count - 1, frozenset)
+        check.check_ints(f"{name}.silent", inputs.silent, 0, self._count - 1, frozenset)
 
     def _check_replayed(self, name: str, done: Any) -> None:
         """Refuse what is no step that was taken in late."""
-        check.of_kind(name, done, ReplayedStep)
-        check.whole(f"{name}.step", done.step, 0, self._step)
-        check.robots(f"{name}.robots", done.robots, self._count)
+        check.check_type(name, done, ReplayedStep)
+        check.check_int(f"{name}.step", done.step, 0, self._step)
+        check.check_robots(f"{name}.robots", done.robots, self._count)
         if self._inputs.get(done.step) is not done.inputs:
             self._check_inputs(f"{name}.inputs", done.inputs)
         self._check_report(f"{name}.report", done.report, None)
 
     def _check_report(self, name: str, report: Any, robots: int | None) -> None:
         """Refuse what is no report of a step of a filter of some robots; None: of any number."""
-        check.of_kind(name, report, reports.StepReport)
+        check.check_type(name, report, reports.StepReport)
         found = report.findings
-        check.of_kind(f"{name}.findings", found, reports.Findings)
-        check.indices(f"{name}.findings.told", found.told, (2, None), REJECTED, check.MOST_LANDMARKS)
+        check.check_type(f"{name}.findings", found, reports.Associations)
+        check.check_indices(f"{name}.findings.told", found.told, (2, None), REJECTED, check.MAX_LANDMARKS)
         check_turns(f"{name}.findings.turns", found.turns, found.told.shape[1], None)
         check_masks(f"{name}.findings.masks", found.masks, found.turns)
-        check.wholes(f"{name}.rows", report.rows, -1, min(len(found.turns), self._count) - 1)
+        check.check_ints(f"{name}.rows", report.rows, -1, min(len(found.turns), self._count) - 1)
         if robots is not None and len(report.rows) != robots:
-            check.refuse(f"{name}.rows", f"a row for each of {robots} robots", report.rows)
+            check.raise_refusal(f"{name}.rows", f"a row for each of {robots} robots", report.rows)
         for part in ("num_created", "num_new", "num_matched", "num_rejected"):
-            check.whole(f"{name}.{part}", getattr(report, part))
-        check.number(f"{name}.ess", report.ess, 0.0)
+            check.check_int(f"{name}.{part}", getattr(report, part))
+        check.check_float(f"{name}.ess", report.ess, 0.0)
         if not (isinstance(report.nis, float) and (report.nis >= 0.0 or report.nis != report.nis)):
-            check.refuse(f"{name}.nis", "a float at least 0, or NaN", report.nis)
+            check.raise_refusal(f"{name}.nis", "a float at least 0, or NaN", report.nis)
         if report.rejuvenation is not None:
-            check.of_kind(f"{name}.rejuvenation", report.rejuvenation, reports.RejuvenationReport)
+            check.check_type(f"{name}.rejuvenation", report.rejuvenation, reports.RejuvenationReport)
 
     # ------------------------------------------------------------------ what is written down
 
     def _check_records(self, name: str, records: Any) -> None:
-        check.keys(name, records, ("log", "exchange", "rng", "entries", "next_number"))
-        check.whole(f"{name}['next_number']", records["next_number"], self._count, check.MOST_LANDMARKS)
+        check.check_keys(name, records, ("log", "exchange", "rng", "entries", "next_number"))
+        check.check_int(f"{name}['next_number']", records["next_number"], self._count, check.MAX_LANDMARKS)
         self._next_number = records["next_number"]
-        check.keys(f"{name}['log']", records["log"], ("steps",))
+        check.check_keys(f"{name}['log']", records["log"], ("steps",))
         steps = records["log"]["steps"]
-        check.of_kind(f"{name}['log']['steps']", steps, dict)
-        check.wholes(f"{name}['log']['steps']", tuple(steps), 0, self._step - 1)
+        check.check_type(f"{name}['log']['steps']", steps, dict)
+        check.check_ints(f"{name}['log']['steps']", tuple(steps), 0, self._step - 1)
         if list(steps) != list(range(self._step - len(steps), self._step)):
-            check.refuse(f"{name}['log']['steps']", "the last steps, in order", "others")
+            check.raise_refusal(f"{name}['log']['steps']", "the last steps, in order", "others")
         for step, inputs in steps.items():
             if self._kept.get(step) is not inputs:
                 self._check_inputs(f"{name}['log']['steps'][{step}]", inputs)
         self._inputs = steps
         exchange = records["exchange"]
-        check.keys(f"{name}['exchange']", exchange, ("bytes_sent", "known"))
-        for where, number in check.each(f"{name}['exchange']['bytes_sent']", exchange["bytes_sent"], self._count):
-            check.whole(where, number)
-        check.of_kind(f"{name}['exchange']['known']", exchange["known"], dict)
+        check.check_keys(f"{name}['exchange']", exchange, ("bytes_sent", "known"))
+        for where, number in check.named_items(
+            f"{name}['exchange']['bytes_sent']", exchange["bytes_sent"], self._count
+        ):
+            check.check_int(where, number)
+        check.check_type(f"{name}['exchange']['known']", exchange["known"], dict)
         for pair, counts in exchange["known"].items():
-            check.wholes(f"{name}['exchange']['known']", pair, 0, self._count - 1)
-            check.table(f"{name}['exchange']['known']", counts, check.LANDMARK)
-        check.generator(f"{name}['rng']", records["rng"])
-        for where, entry in check.each(f"{name}['entries']", records["entries"]):
+            check.check_ints(f"{name}['exchange']['known']", pair, 0, self._count - 1)
+            check.check_int_dict(f"{name}['exchange']['known']", counts, check.LANDMARK)
+        check.check_generator(f"{name}['rng']", records["rng"])
+        for where, entry in check.named_items(f"{name}['entries']", records["entries"]):
             self._check_entry(where, entry)
 
     def _check_entry(self, name: str, entry: Any) -> None:
@@ -273,103 +277,105 @@ class TeamCheck:
         kind = type(entry)
         if kind is reports.LandmarksCreated:
             numbers: tuple[Any, ...] = (entry.number,)
-            check.whole(f"{name}.robot", entry.robot, 0, self._count - 1)
-            check.whole(f"{name}.step", entry.step, 0, self._step)
-            check.indices(f"{name}.ids", entry.ids, (None,), REJECTED, check.MOST_LANDMARKS)
-        elif kind is reports.Renaming:
+            check.check_int(f"{name}.robot", entry.robot, 0, self._count - 1)
+            check.check_int(f"{name}.step", entry.step, 0, self._step)
+            check.check_indices(f"{name}.ids", entry.ids, (None,), REJECTED, check.MAX_LANDMARKS)
+        elif kind is reports.LandmarkIdMap:
             numbers = entry.maps
-            check.indices(f"{name}.ids_b", entry.ids_b, (None, 2), *check.LANDMARK)
-            check.robots(f"{name}.robots_a", entry.robots_a, self._count)
-            check.robots(f"{name}.robots_b", entry.robots_b, self._count)
-        elif kind is reports.MapCopied:
+            check.check_indices(f"{name}.ids_b", entry.ids_b, (None, 2), *check.LANDMARK)
+            check.check_robots(f"{name}.robots_a", entry.robots_a, self._count)
+            check.check_robots(f"{name}.robots_b", entry.robots_b, self._count)
+        elif kind is reports.MapForked:
             numbers = entry.source, entry.copy
         elif kind is reports.MergeUndone:
             numbers = entry.maps
         else:
-            check.of_kind(name, entry, reports.MapDropped)
+            check.check_type(name, entry, reports.MapReleased)
             numbers = (entry.number,)
-        check.wholes(name, numbers, 0, self._next_number - 1)
+        check.check_ints(name, numbers, 0, self._next_number - 1)
 
     def _check_event(self, name: str, event: Any) -> None:
-        check.of_kind(name, event, reports.MergeEvent)
-        check.whole(f"{name}.step", event.step, 0, self._step)
+        check.check_type(name, event, reports.MergeEvent)
+        check.check_int(f"{name}.step", event.step, 0, self._step)
         if event.kind not in KINDS:
-            check.refuse(f"{name}.kind", f"one of {KINDS}", event.kind)
-        check.robots(f"{name}.robots_a", event.robots_a, self._count)
-        check.robots(f"{name}.robots_b", event.robots_b, self._count)
-        check.of_kind(f"{name}.alignment", event.alignment, Alignment)
+            check.raise_refusal(f"{name}.kind", f"one of {KINDS}", event.kind)
+        check.check_robots(f"{name}.robots_a", event.robots_a, self._count)
+        check.check_robots(f"{name}.robots_b", event.robots_b, self._count)
+        check.check_type(f"{name}.alignment", event.alignment, Alignment)
         if event.bent is not None:
-            check.of_kind(f"{name}.bent", event.bent, Alignment)
+            check.check_type(f"{name}.bent", event.bent, Alignment)
 
     def _check_schedule(self, name: str, schedule: Any) -> None:
-        check.keys(name, schedule, ("options", "alignment", "straightening", "records", "bars", *BY_ROBOTS))
-        check.options(f"{name}['options']", schedule["options"], AttemptOptions)
-        check.options(f"{name}['alignment']", schedule["alignment"], AlignmentOptions)
+        check.check_keys(name, schedule, ("options", "alignment", "straightening", "records", "bars", *BY_ROBOTS))
+        check.check_options(f"{name}['options']", schedule["options"], AttemptOptions)
+        check.check_options(f"{name}['alignment']", schedule["alignment"], AlignmentOptions)
         pending, where = schedule["straightening"], f"{name}['straightening']"
         if pending is not None:
-            check.of_kind(where, pending, Straightening)
+            check.check_type(where, pending, PendingAttempt)
             self._check_pair(f"{where}.pair", pending.pair)
-            check.wholes(f"{where}.numbers", pending.numbers)
-            check.of_length(f"{where}.numbers", pending.numbers, 2)
-            check.of_kind(f"{where}.bent", pending.bent, Alignment)
-            check.whole(f"{where}.since", pending.since, 0, self._step)
-            check.flag(f"{where}.ready", pending.ready)
-        check.of_kind(f"{name}['records']", schedule["records"], dict)
+            check.check_ints(f"{where}.numbers", pending.numbers)
+            check.check_length(f"{where}.numbers", pending.numbers, 2)
+            check.check_type(f"{where}.bent", pending.bent, Alignment)
+            check.check_int(f"{where}.since", pending.since, 0, self._step)
+            check.check_bool(f"{where}.ready", pending.ready)
+        check.check_type(f"{name}['records']", schedule["records"], dict)
         for pair, record in schedule["records"].items():
             self._check_pair(f"{name}['records']", pair)
-            check.of_kind(f"{name}['records']", record, AttemptRecord)
+            check.check_type(f"{name}['records']", record, AttemptRecord)
             for part in ("wait", "last_step", "next_step"):
-                check.whole(f"{name}['records'].{part}", getattr(record, part))
-            check.of_kind(f"{name}['records'].tried", record.tried, set)
+                check.check_int(f"{name}['records'].{part}", getattr(record, part))
+            check.check_type(f"{name}['records'].tried", record.tried, set)
             for match in record.tried:
-                check.wholes(f"{name}['records'].tried", match, *check.LANDMARK)
-        for where, bar in check.each(f"{name}['bars']", schedule["bars"]):
-            check.of_length(where, bar, 2)
+                check.check_ints(f"{name}['records'].tried", match, *check.LANDMARK)
+        for where, bar in check.named_items(f"{name}['bars']", schedule["bars"]):
+            check.check_length(where, bar, 2)
             self._check_pair(where, bar[0])
-            check.whole(where, bar[1])
+            check.check_int(where, bar[1])
         for part in BY_ROBOTS:
             where = f"{name}[{part!r}]"
-            check.of_kind(where, schedule[part], dict)
+            check.check_type(where, schedule[part], dict)
             for robots in schedule[part]:
-                check.wholes(where, robots, 0, self._count - 1)
-                check.of_length(where, robots, 2)
+                check.check_ints(where, robots, 0, self._count - 1)
+                check.check_length(where, robots, 2)
         for doubt in schedule["doubts"].values():
             if not (isinstance(doubt, float) and doubt >= 0.0):
-                check.refuse(f"{name}['doubts']", "a float at least 0", doubt)
+                check.raise_refusal(f"{name}['doubts']", "a float at least 0", doubt)
         for motion in schedule["trials"].values():
-            check.floats(f"{name}['trials']", motion, (3,))
+            check.check_floats(f"{name}['trials']", motion, (3,))
 
     def _check_pair(self, name: str, pair: Any) -> None:
         """Refuse what are no two groups of robots."""
-        check.of_kind(name, pair, tuple)
-        check.of_length(name, pair, 2)
+        check.check_type(name, pair, tuple)
+        check.check_length(name, pair, 2)
         for robots in pair:
-            check.robots(name, robots, self._count)
+            check.check_robots(name, robots, self._count)
 
 
 def check_turns(name: str, turns: Any, n: int, robots: int | None) -> None:
     """Refuse what are no turns of robots whose measurements lie among n, one robot's after the other's."""
-    check.of_length(name, turns, robots)
+    check.check_length(name, turns, robots)
     last = 0
     for turn in turns:
-        check.of_length(name, turn, 6)
+        check.check_length(name, turn, 6)
         for number in turn:
             if type(number) is not int and type(number) is not bool:
-                check.refuse(name, "ints", turn)
-        fine = (0 <= turn[ACT] <= PLACED and last <= turn[BEGIN] <= turn[END] <= n) or turn[BEGIN] == turn[END] == 0
+                check.raise_refusal(name, "ints", turn)
+        fine = (0 <= turn[MOTION_KIND] <= EXACT_POSE and last <= turn[BEGIN] <= turn[END] <= n) or turn[BEGIN] == turn[
+            END
+        ] == 0
         if not fine or not (
-            0 <= turn[GIVEN] <= 1 and 0 <= turn[NAMED] <= 1 and -1 <= turn[COUNT] <= check.MOST_LANDMARKS
+            0 <= turn[COVARIANCES_GIVEN] <= 1 and 0 <= turn[HAS_IDS] <= 1 and -1 <= turn[COUNT] <= check.MAX_LANDMARKS
         ):
-            check.refuse(name, f"measurements among {n}", turn)
+            check.raise_refusal(name, f"measurements among {n}", turn)
         last = max(last, turn[END])
 
 
 def check_masks(name: str, masks: Any, turns: Sequence[Sequence[int]]) -> None:
     """Refuse what does not say which measurements of some robots are used."""
     if not isinstance(masks, Mapping):
-        check.refuse(name, "a dict", f"a {type(masks).__name__}")
+        check.raise_refusal(name, "a dict", f"a {type(masks).__name__}")
     for robot, mask in masks.items():
-        check.whole(name, robot, 0, len(turns) - 1)
-        check.array(name, mask, check.BOOL, (max(turns[robot][COUNT], 0),))
+        check.check_int(name, robot, 0, len(turns) - 1)
+        check.check_array(name, mask, check.BOOL, (max(turns[robot][COUNT], 0),))
         if np.count_nonzero(mask) != turns[robot][END] - turns[robot][BEGIN]:
-            check.refuse(name, "as many as are used", int(np.count_nonzero(mask)))
+            check.raise_refusal(name, "as many as are used", int(np.count_nonzero(mask)))

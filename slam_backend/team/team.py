@@ -16,38 +16,38 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from slam_backend.core.state_checks import refusing
-from slam_backend.core.validation import FloatArray, IntArray, bad_argument, check_int, check_kind, check_seed
+from slam_backend.core.state_checks import refuse_malformed
+from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_int, check_kind, check_seed
 from slam_backend.fastslam.consistency import Consistency
 from slam_backend.fastslam.filter import FastSlam
-from slam_backend.fastslam.options import MOST_ROBOTS, FilterOptions
-from slam_backend.fastslam.particle_maps import write_outline
-from slam_backend.fastslam.relative_poses import Standpoints
+from slam_backend.fastslam.options import MAX_ROBOTS, FilterOptions
+from slam_backend.fastslam.particle_maps import write_summary
+from slam_backend.fastslam.relative_poses import TeamPoses
 from slam_backend.fastslam.reports import (
-    Findings,
-    MapDropped,
+    Associations,
+    LandmarkIdMap,
+    MapReleased,
     MergeEvent,
     PoseEstimate,
     RejuvenationReport,
-    Renaming,
     TeamReport,
 )
-from slam_backend.fastslam.step_input import StepInput, check_step
+from slam_backend.fastslam.step_input import StepInput, validate_step
 from slam_backend.geometry import inverse
 from slam_backend.maps.alignment import Alignment, AlignmentOptions
 from slam_backend.maps.alignment_types import PairAttempts, count_attempts, refusals_of
-from slam_backend.maps.landmark_map import LandmarkMap, TeamOutlines
+from slam_backend.maps.landmark_map import LandmarkMap, TeamMapSummaries
 from slam_backend.models.measurements import Measurements, TeamMeasurements
-from slam_backend.team.branches import Branch, restored_filter, take_in
-from slam_backend.team.communication import ExchangeLedger, check_contacts, reach
+from slam_backend.team.branches import Branch, process_step, restored_filter
+from slam_backend.team.communication import TrafficCounter, check_contacts, contact_components
 from slam_backend.team.filter_merging.merging import inverse_alignment
-from slam_backend.team.group_merging import MergePlan, contradicted, merge_groups, undone
-from slam_backend.team.groups import Group, Lineup
-from slam_backend.team.merge_attempt import attempt
-from slam_backend.team.merge_rollback import Undoing
-from slam_backend.team.merge_scheduler import AttemptOptions, AttemptSchedule
+from slam_backend.team.group_merging import MergePlan, find_inconsistent_merge, merge_groups, restore_groups
+from slam_backend.team.groups import Group, TeamTopology
+from slam_backend.team.merge_attempt import run_attempt
+from slam_backend.team.merge_rollback import MergeRollback
+from slam_backend.team.merge_scheduler import AttemptOptions, MergeScheduler
 from slam_backend.team.options import MergeOptions
-from slam_backend.team.shared_records import Records
+from slam_backend.team.shared_records import SharedRecords
 from slam_backend.team.state_checks import TeamCheck
 
 Rejuvenation = tuple[tuple[int, ...], RejuvenationReport]  # of a filter: who goes by it, and what came of it
@@ -77,12 +77,12 @@ class TeamSlam:
         merging: MergeOptions | None = None,
         **fastslam_options: Any,
     ) -> None:
-        count = check_int("num_robots", num_robots, 1, "A team has at least one robot.", MOST_ROBOTS)
+        count = check_int("num_robots", num_robots, 1, "A team has at least one robot.", MAX_ROBOTS)
         known = {field.name for field in fields(FilterOptions)}
         for name in fastslam_options:
             if name not in known:
                 cure = f"Options of the filters are {', '.join(sorted(known))}."
-                raise bad_argument(name, "a known argument", "a name that no option has", cure)
+                raise argument_error(name, "a known argument", "a name that no option has", cure)
         options = FilterOptions(**fastslam_options)
         for name, value, kind in (
             ("alignment", alignment, AlignmentOptions),
@@ -90,25 +90,27 @@ class TeamSlam:
             ("merging", merging, MergeOptions),
         ):
             if value is not None and not isinstance(value, kind):
-                raise bad_argument(name, f"{kind.__name__} or None", value, f"Build one: {kind.__name__}(...).")
+                raise argument_error(name, f"{kind.__name__} or None", value, f"Build one: {kind.__name__}(...).")
         if isinstance(seed, np.random.Generator):
-            raise bad_argument("seed", "an int >= 0 or a SeedSequence", seed, "A team spawns a stream for each robot.")
+            raise argument_error(
+                "seed", "an int >= 0 or a SeedSequence", seed, "A team spawns a stream for each robot."
+            )
         sequence = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(check_seed(seed))
         own, *streams, of_forks = sequence.spawn(2 + count)
         self._rng = np.random.default_rng(own)
         self._alignment = AlignmentOptions() if alignment is None else alignment
         self._merging = MergeOptions() if merging is None else merging
-        self._schedule = AttemptSchedule(AttemptOptions() if attempts is None else attempts, self._alignment)
+        self._schedule = MergeScheduler(AttemptOptions() if attempts is None else attempts, self._alignment)
         groups = [
             Group(Branch((robot,), (robot,), FastSlam.from_options(1, options, rng), {robot: -1}, robot))
             for robot, rng in enumerate(map(np.random.default_rng, streams))
         ]
-        self._groups, self._records, self._num_robots = groups, Records(count, of_forks), count
+        self._groups, self._records, self._num_robots = groups, SharedRecords(count, of_forks), count
         self._events: list[MergeEvent] = []
-        self._together = reach(None, count)
+        self._together = contact_components(None, count)
         self._numbers = frozenset(range(count))
-        self._settle()
-        self._last_lineup: Lineup | None = None
+        self._refresh_topology()
+        self._last_lineup: TeamTopology | None = None
         self._step = 0
         self._epoch = 0
         self._size = 0
@@ -144,21 +146,21 @@ class TeamSlam:
         """
         count, networks = self._num_robots, self._together
         if contacts is not None:
-            networks = reach(check_contacts(contacts, count), count)
+            networks = contact_components(check_contacts(contacts, count), count)
         lineup, size = self.lineup, self._size or self._descriptor_size()
         camera = lineup.branches[0].filter.options.camera
-        inputs = check_step(count, size, camera, odometry, measurements, identities, poses)
+        inputs = validate_step(count, size, camera, odometry, measurements, identities, poses)
         records, before = self._records, len(self._events)
         if contacts is not None or lineup.is_split:
-            lineup = self._regrouped(networks)
+            lineup = self._update_groups(networks)
         if lineup.oldest is not None:
             records.log.record(self._step, inputs)
         findings, rejuvenations = self._advance(lineup, inputs)
-        if lineup.is_watched:
-            self._doubt()
+        if lineup.has_monitors:
+            self._check_merges()
         renamings = self._attempt(networks) if self._schedule.is_due(self._step) else ()
         if self._is_stale:
-            self._settle()
+            self._refresh_topology()
             lineup = self.lineup
         oldest = self._step + 1 if lineup.oldest is None else lineup.oldest
         if lineup is not self._last_lineup:
@@ -172,22 +174,22 @@ class TeamSlam:
         self._step += 1
         return report
 
-    def _regrouped(self, networks: IntArray) -> Lineup:
+    def _update_groups(self, networks: IntArray) -> TeamTopology:
         """Let robots of each group lose and find each other, and return who goes by which filter then."""
         was_split = self.lineup.is_split
         for group in self._groups:
-            group.regroup(networks, self._records)
+            group.update_connectivity(networks, self._records)
         if was_split or any(len(group.branches) > 1 for group in self._groups):
-            self._settle()
+            self._refresh_topology()
         return self.lineup
 
-    def _advance(self, lineup: Lineup, inputs: StepInput) -> tuple[Findings, tuple[Rejuvenation, ...]]:
+    def _advance(self, lineup: TeamTopology, inputs: StepInput) -> tuple[Associations, tuple[Rejuvenation, ...]]:
         """Step all filters with what their robots have just read; return what `TeamReport` tells of it."""
         step, records = self._step, self._records
-        findings, told = Findings.none_yet(inputs)
+        findings, told = Associations.allocate(inputs)
         rejuvenations: tuple[Rejuvenation, ...] = ()
-        for branch, intake in zip(lineup.branches, lineup.intakes, strict=True):
-            report = take_in(branch, step, intake, inputs, findings, told)
+        for branch, intake in zip(lineup.branches, lineup.routings, strict=True):
+            report = process_step(branch, step, intake, inputs, findings, told)
             if report.num_created:
                 records.note_created(branch.number, step, report)
             if len(intake.robots) > 1:  # a robot that nobody hears sends nothing
@@ -196,7 +198,7 @@ class TeamSlam:
                 rejuvenations += ((intake.robots, report.rejuvenation),)
         return findings, rejuvenations
 
-    def merge(self, robot_a: int, robot_b: int, alignment: Alignment, known: bool = False) -> Renaming:
+    def merge(self, robot_a: int, robot_b: int, alignment: Alignment, known: bool = False) -> LandmarkIdMap:
         """Merge the joint filters of two robots' groups with a given alignment, unasked whether it is right.
 
         The merge is then watched like any other; `MergeOptions(watch_steps=0)` makes it final.
@@ -220,21 +222,21 @@ class TeamSlam:
         groups = self._group_of(robot_a), self._group_of(robot_b)
         if groups[0] is groups[1]:
             expected = f"a robot outside the group {groups[0].robots}"
-            raise bad_argument("robot_b", expected, robot_b, "They share a map already.")
+            raise argument_error("robot_b", expected, robot_b, "They share a map already.")
         for name, robot, group in zip(("robot_a", "robot_b"), (robot_a, robot_b), groups, strict=True):
-            if robot not in group.trunk.live:
+            if robot not in group.trunk.active_robots:
                 cure = "Merge through a robot that goes by the joint filter."
-                raise bad_argument(name, f"one of {group.trunk.live}", robot, cure)
+                raise argument_error(name, f"one of {group.trunk.active_robots}", robot, cure)
         if not isinstance(alignment, Alignment) or not alignment.success:
             got = f"a refusal ({alignment.reason})" if isinstance(alignment, Alignment) else alignment
-            raise bad_argument("alignment", "a successful Alignment", got, "Align the two maps first.")
+            raise argument_error("alignment", "a successful Alignment", got, "Align the two maps first.")
         if groups[1].robots < groups[0].robots:
             groups, alignment = groups[::-1], inverse_alignment(alignment)
         renaming = self._merge(MergePlan.of(*groups, alignment), known)
-        self._settle()
+        self._refresh_topology()
         return renaming
 
-    def _merge(self, plan: MergePlan, known: bool = False) -> Renaming:
+    def _merge(self, plan: MergePlan, known: bool = False) -> LandmarkIdMap:
         """Merge two groups as planned, and write it down."""
         epoch = self._epoch + 1
         joint, renaming = merge_groups(plan, self._merging, self._records, self._rng, epoch, known)
@@ -249,49 +251,49 @@ class TeamSlam:
         self._groups.sort(key=lambda group: group.robots)
         self._is_stale = True
 
-    def _doubt(self) -> None:
+    def _check_merges(self) -> None:
         """Weigh the evidence about the merges that can still be undone, and undo what contradicts itself."""
         due = self._step % self._merging.watch_every == 0
         for group in list(self._groups):
             if due and group.undoing is None:
-                false = contradicted(group.trunk, self._merging, self._alignment)
-                group.undoing = None if false is None else Undoing.of(group.trunk, false.number)
+                false = find_inconsistent_merge(group.trunk, self._merging, self._alignment)
+                group.undoing = None if false is None else MergeRollback.of(group.trunk, false.number)
             if group.undoing is not None:
                 self._undo(group, group.undoing)
                 continue
             for branch in group.branches:
-                while branch.watches and branch.watches[0].steps >= self._merging.watch_steps:
-                    branch.watches.pop(0)
+                while branch.monitors and branch.monitors[0].steps >= self._merging.watch_steps:
+                    branch.monitors.pop(0)
                     self._is_stale = True
 
-    def _undo(self, group: Group, undoing: Undoing) -> None:
+    def _undo(self, group: Group, undoing: MergeRollback) -> None:
         """Go on with taking back a merge; it is done when all sides have caught up and are in contact."""
         merges = undoing.merges(group.trunk)
         if not merges:  # the joint filter is another one now, whose window is over
             group.undoing, self._is_stale = None, True
             return
         caught_up = undoing.catch_up(group.trunk, self._records.log)
-        if not caught_up or not all(watch.together(group.trunk.live) for watch in merges):
+        if not caught_up or not all(watch.both_sides_connected(group.trunk.active_robots) for watch in merges):
             return
         self._epoch += 1
-        self._replace([group], undone(group, undoing, self._records, self._epoch))
+        self._replace([group], restore_groups(group, undoing, self._records, self._epoch))
         for watch in merges:
             pair = (watch.sides[0].robots, watch.sides[1].robots)
             self._events.append(MergeEvent(self._step, "undo", *pair, watch.alignment))
-        self._schedule.bar(pair, self._step + self._merging.barred_steps)
+        self._schedule.block(pair, self._step + self._merging.blocked_steps)
 
-    def _attempt(self, networks: IntArray) -> tuple[Renaming, ...]:
+    def _attempt(self, networks: IntArray) -> tuple[LandmarkIdMap, ...]:
         """Let a pair of groups try, and merge those whose attempt is a success."""
         options = self._schedule, self._alignment, self._merging
-        tried = attempt(self._groups, networks, self._step, *options, self._records, self._rng)
+        tried = run_attempt(self._groups, networks, self._step, *options, self._records, self._rng)
         if tried is None:
             return ()
         self._events.append(tried.event)
         return () if tried.plan is None else (self._merge(tried.plan),)
 
-    def _note_dropped(self, lineup: Lineup) -> None:
+    def _note_dropped(self, lineup: TeamTopology) -> None:
         """Write down which maps are gone since the last lineup."""
-        self._records.entries += [MapDropped(number) for number in sorted(self._numbers - lineup.numbers)]
+        self._records.entries += [MapReleased(number) for number in sorted(self._numbers - lineup.numbers)]
         self._last_lineup, self._numbers = lineup, lineup.numbers
 
     def _descriptor_size(self) -> int:
@@ -299,9 +301,9 @@ class TeamSlam:
         self._size = max([branch.filter.descriptor_size for branch in self.lineup.branches])
         return self._size
 
-    def _settle(self) -> None:
+    def _refresh_topology(self) -> None:
         """Find out who goes by which filter now."""
-        self.lineup, self._is_stale = Lineup.of(self._groups), False
+        self.lineup, self._is_stale = TeamTopology.of(self._groups), False
 
     # ------------------------------------------------------------------ what is known
 
@@ -331,7 +333,7 @@ class TeamSlam:
         return np.array(self.exchange.sent, np.int64)
 
     @property
-    def exchange(self) -> ExchangeLedger:
+    def exchange(self) -> TrafficCounter:
         """Counts these bytes; to be looked at."""
         return self._records.exchange
 
@@ -378,7 +380,7 @@ class TeamSlam:
         """Return whether the filter that a robot goes by errs as little as it claims; see `FastSlam.consistency`."""
         return self._find(robot)[0].filter.consistency
 
-    def members(self, robot: int) -> tuple[int, ...]:
+    def known_robots(self, robot: int) -> tuple[int, ...]:
         """Return the robots whose places the robot's filter knows, itself included, in ascending order.
 
         They are its group, but for a robot that has been out of contact since before a merge or an undo: it knows of
@@ -386,13 +388,13 @@ class TeamSlam:
         """
         return self._find(robot)[0].robots
 
-    def mates(self, robot: int) -> tuple[int, ...]:
+    def same_filter(self, robot: int) -> tuple[int, ...]:
         """Return the robots that go by the same filter as this one now, itself included, in ascending order."""
-        return self._find(robot)[0].live
+        return self._find(robot)[0].active_robots
 
-    def keepers(self, robot: int) -> tuple[int, ...]:
+    def trunk_robots(self, robot: int) -> tuple[int, ...]:
         """Return the robots that go by the joint filter of a robot's group, in ascending order: it merges by them."""
-        return self._group_of(robot).trunk.live
+        return self._group_of(robot).trunk.active_robots
 
     def ess(self, robot: int) -> float:
         """Return the effective sample size of the robot's filter at its last step, in [1, M]."""
@@ -414,7 +416,7 @@ class TeamSlam:
         if seen_by is not None:
             branch = self._find(seen_by)[0]
             if robot not in branch.robots:
-                raise bad_argument("robot", f"one of {branch.robots}", robot, "Ask about members of its filter.")
+                raise argument_error("robot", f"one of {branch.robots}", robot, "Ask about members of its filter.")
             index = branch.robots.index(robot)
         return branch.filter.pose(index)
 
@@ -447,12 +449,12 @@ class TeamSlam:
         """
         check_kind("merge", merge, MergeEvent, "Give one of the events of a step's report.")
         for group in self._groups:
-            for watch in group.trunk.watches:
+            for watch in group.trunk.monitors:
                 if watch.alignment is merge.alignment:
                     map_a, map_b = (restored_filter(side.trunk["filter"]).map() for side in watch.sides)
                     return map_a, map_b
         expected, got = "a merge still watched", f"the {merge.kind} of step {merge.step}"
-        raise bad_argument("merge", expected, got, "Ask in the step in which it is made.")
+        raise argument_error("merge", expected, got, "Ask in the step in which it is made.")
 
     def start_from_group(self, robot: int) -> FloatArray:
         """Return (3,) the motion from the map frame of the robot's filter to the robot's own start frame.
@@ -462,35 +464,35 @@ class TeamSlam:
         branch, index = self._find(robot)
         return inverse(branch.filter.start_pose(index))
 
-    def outlines(self, min_count: int = 1, into: TeamOutlines | None = None) -> TeamOutlines:
+    def map_summaries(self, min_count: int = 1, into: TeamMapSummaries | None = None) -> TeamMapSummaries:
         """Return the outlines of `map(robot, min_count=min_count)` of all robots, much faster.
 
         Args:
             min_count: Landmarks that were measured fewer times are left out.
             into: What this has returned before; it is written to, as long as it has room. None: fresh arrays.
         """
-        outlines = TeamOutlines.unwritten(self._num_robots, 0) if into is None else into
+        outlines = TeamMapSummaries.allocate(self._num_robots, 0) if into is None else into
         (rows, parts), last = outlines, 0
         for branch in self.lineup.branches:
             slam = branch.filter
-            first, last = last, write_outline(slam.state.maps, slam.state.best, min_count, rows, last)
-            for robot in branch.live:
+            first, last = last, write_summary(slam.state.maps, slam.state.best, min_count, rows, last)
+            for robot in branch.active_robots:
                 parts[robot, 0], parts[robot, 1] = first, last
-        if last > len(rows.names):
-            return self.outlines(min_count, TeamOutlines.unwritten(self._num_robots, 2 * last))
+        if last > len(rows.counts_and_ids):
+            return self.map_summaries(min_count, TeamMapSummaries.allocate(self._num_robots, 2 * last))
         return outlines
 
-    def standpoints(self, into: Standpoints | None = None) -> Standpoints:
+    def team_poses(self, into: TeamPoses | None = None) -> TeamPoses:
         """Return where all robots stand: `pose_from_start`, `start_from_group`, `pose` at once.
 
         Args:
             into: What this has returned before; it is written to. None: fresh arrays.
         """
-        points = Standpoints(self._num_robots) if into is None else into
+        points = TeamPoses(self._num_robots) if into is None else into
         for branch in self.lineup.branches:
             slam, report = branch.filter, branch.report
             ess = 1.0 if report is None else report.ess / slam.num_particles
-            slam.write_team_poses(branch.robots, branch.live, ess, points)
+            slam.write_team_poses(branch.robots, branch.active_robots, ess, points)
         return points
 
     def _group_of(self, robot: int) -> Group:
@@ -507,14 +509,14 @@ class TeamSlam:
             return self.lineup.places[robot]
         if isinstance(robot, (int, np.integer)) and not isinstance(robot, bool) and 0 <= robot < self._num_robots:
             return self.lineup.places[robot]
-        raise bad_argument("robot", f"an index from 0 to {self.num_robots - 1}", robot, "Count robots from 0.")
+        raise argument_error("robot", f"an index from 0 to {self.num_robots - 1}", robot, "Count robots from 0.")
 
     # ------------------------------------------------------------------ snapshots
 
     @property
-    def kept_readings(self) -> Mapping[int, StepInput]:
+    def buffered_inputs(self) -> Mapping[int, StepInput]:
         """Readings of the last steps that some filter may take in later, by step; to be looked at."""
-        return self._records.log.kept
+        return self._records.log.buffered
 
     @property
     def filter_options(self) -> FilterOptions:
@@ -545,18 +547,18 @@ class TeamSlam:
         Raises:
             ValueError: If `state` is not one of `get_state`, or of a team of another size.
         """
-        with refusing("state"):
-            TeamCheck(self._num_robots, self.kept_readings, (self.filter_options,)).check("state", state)
-        self.go_on_from(state)
+        with refuse_malformed("state"):
+            TeamCheck(self._num_robots, self.buffered_inputs, (self.filter_options,)).check("state", state)
+        self.restore_checked(state)
 
-    def go_on_from(self, state: Mapping[str, Any]) -> None:
+    def restore_checked(self, state: Mapping[str, Any]) -> None:
         """Go on from a state that was checked."""
         self._step, self._epoch = state["step"], state["epoch"]
         self._rng.bit_generator.state = copy.deepcopy(state["rng"])
         self._events = list(state["events"])
         at_hand = {group.robots: group.trunk.filter for group in self._groups}  # filling is faster than building
         self._groups = [Group.from_state(group, at_hand) for group in state["groups"]]
-        self._settle()
+        self._refresh_topology()
         self._last_lineup, self._size = None, 0
         self._numbers = frozenset(state["numbers"])
         self._alignment, self._merging = state["alignment"], state["merging"]

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from agents import POLICIES, make_policy
-from agents.nearest_frontier import choose_slot, far_place
-from agents.own import is_own
+from agents.nearest_frontier import choose_slot, patrol_goal
+from agents.own import is_plugin
 from agents.registry import action_types
 from slam_backend.geometry import compose
 from vslam_env import ExplorationEnv, World, vslam_v0
@@ -110,7 +110,7 @@ def test_patrols_lead_far_over_seen_floor() -> None:
     while env.agents:
         env.step({"robot_0": np.array([0.1, 0.8])})
     belief = env.belief("robot_0")
-    places = np.array([far_place(belief, np.random.default_rng(seed)) for seed in range(5)])
+    places = np.array([patrol_goal(belief, np.random.default_rng(seed)) for seed in range(5)])
     for place in places:
         assert plan_path(belief.grid.cells, belief.pose[:2], place) is not None
     assert np.linalg.norm(places - belief.pose[:2], axis=1).min() > 2.0
@@ -124,12 +124,12 @@ def test_a_patrol_goes_on_where_a_wall_is_seen_at_its_place() -> None:
     grid = SeenGrid()
     grid.clear_disc([0.0, 0.0, 0.0], 4.0)
     policy, pose, way = make_policy("frontier", "continuous"), np.zeros(3), []
-    belief = _belief(env, pose=pose, candidates=_candidates(env, {}), grid=grid.frozen())
-    row, col = cell_of(far_place(belief, np.random.default_rng(0)))  # which the policy draws as well
+    belief = _belief(env, pose=pose, candidates=_candidates(env, {}), grid=grid.read_only_view())
+    row, col = cell_of(patrol_goal(belief, np.random.default_rng(0)))  # which the policy draws as well
     assert row > 150 < col
     rng = np.random.default_rng(0)
     for tick in range(400):
-        belief = _belief(env, pose=pose, candidates=_candidates(env, {}), grid=grid.frozen())
+        belief = _belief(env, pose=pose, candidates=_candidates(env, {}), grid=grid.read_only_view())
         speed, turn = policy.act(None, belief, rng)
         if tick == 0:
             state = grid.get_state()
@@ -249,5 +249,5 @@ def test_a_module_that_fails_tells_why_itself(module: str) -> None:
 
 def test_paths_are_not_taken_for_modules() -> None:
     """Drives, names with slashes and plain names are left to the registry."""
-    assert is_own("package.module:Name")
-    assert not any(map(is_own, ("C:\\models\\best.npz", "runs/train-0-1", "frontier", "module:", ":Name", "a:b.c")))
+    assert is_plugin("package.module:Name")
+    assert not any(map(is_plugin, ("C:\\models\\best.npz", "runs/train-0-1", "frontier", "module:", ":Name", "a:b.c")))

@@ -11,7 +11,7 @@ import pytest
 
 from agents import make_policy
 from agents.goal_network import CHANNELS, CONTEXT, PATCHES, PICTURE_SIZE, SHAPES, VECTOR_SIZE, logits
-from agents.trained import FORMAT, TrainedGoals, check_observation, load_model, save_model
+from agents.trained import FORMAT, TrainedGoalPolicy, check_observation, load_model, save_model
 from vslam_env import vslam_v0
 from vslam_env.belief.observation import observation_space
 
@@ -73,14 +73,14 @@ def test_actions_are_drawn_from_the_softmax_of_the_valid_ones() -> None:
     scores = logits(weights, {name: observation[name][None] for name in SHAPES})[0].astype(np.float64)
     valid = observation["action_mask"] != 0
     chances = np.where(valid, np.exp(scores), 0.0) / np.exp(scores[valid]).sum()
-    policy, rng = TrainedGoals(weights), np.random.default_rng(0)
+    policy, rng = TrainedGoalPolicy(weights), np.random.default_rng(0)
     policy.reset()
     belief: Any = None  # it decides by the observation alone
     counts = np.bincount([policy.act(observation, belief, rng) for _ in range(2000)], minlength=17)
     assert (counts[~valid] == 0).all()
     spread = np.sqrt(2000.0 * chances * (1.0 - chances))
     assert (np.abs(counts - 2000.0 * chances) <= 4.5 * spread + 1e-9).all()
-    greedy = TrainedGoals(weights, greedy=True)
+    greedy = TrainedGoalPolicy(weights, greedy=True)
     assert greedy.act(observation, belief, rng) == int(np.where(valid, scores, -np.inf).argmax())
 
 
@@ -160,7 +160,7 @@ def test_other_spaces_are_refused() -> None:
     observation = _observation()
     short = observation | {"scan": observation["scan"][:16]}
     with pytest.raises(ValueError, match=r"observation: expected 'scan' of shape \(32,\), .* got shape \(16,\)"):
-        TrainedGoals(_weights()).act(short, None, np.random.default_rng(0))  # type: ignore[arg-type]
+        TrainedGoalPolicy(_weights()).act(short, None, np.random.default_rng(0))  # type: ignore[arg-type]
     shapes = {name: np.shape(value) for name, value in observation.items() if name != "action_mask"}
     with pytest.raises(ValueError, match=r"observation: expected 'action_mask' .* got no 'action_mask'. Use goal"):
         check_observation(shapes)

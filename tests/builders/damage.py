@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.core.state_codec import ForeignObjectError, decoded, encoded
+from slam_backend.core.state_codec import ForeignObjectError, decode, encode
 
 REPEATED = 20  # refusals after which it is looked whether anything has changed
 STOP = 0.08  # chance that a container is damaged itself, and not something in it
@@ -161,7 +161,7 @@ def try_damaged(
         what, other = damaged(state, np.random.default_rng(seed))
         try:
             if seed % 4 == 0:
-                other = decoded(encoded(other, kinds), kinds)
+                other = decode(encode(other, kinds), kinds)
             subject.set_state(other)
         except ForeignObjectError:
             continue

@@ -5,12 +5,12 @@ from typing import Any
 import numpy as np
 
 from slam_backend.core.validation import FloatArray
-from slam_backend.fastslam.relative_poses import Standpoints
+from slam_backend.fastslam.relative_poses import TeamPoses
 from slam_backend.geometry import between, compose
-from slam_backend.maps.landmark_map import TeamOutlines
+from slam_backend.maps.landmark_map import TeamMapSummaries
 from vslam_env import ExplorationEnv, World, vslam_v0
-from vslam_env.evaluation.map_scores import ClaimLedger
-from vslam_env.evaluation.team_metrics import NUM_FIGURES, Standing
+from vslam_env.evaluation.map_scores import GroundTruthAssociation
+from vslam_env.evaluation.team_metrics import NUM_METRICS, TeamMetrics
 
 WALLS = np.array(
     [
@@ -52,9 +52,9 @@ def turning(agents: list[str], speed: float = 0.25, turn: float = 0.4) -> dict[s
     return {agent: np.array([speed, turn]) for agent in agents}
 
 
-def standing_at(starts: FloatArray) -> Standpoints:
+def standing_at(starts: FloatArray) -> TeamPoses:
     """Return where robots with these starts (K, 3) stand: at the origin of their own frames, without doubt."""
-    points = Standpoints(len(starts))
+    points = TeamPoses(len(starts))
     points.poses.fill(0.0)
     points.beliefs.fill(0.0)
     points.starts[:] = starts
@@ -62,13 +62,17 @@ def standing_at(starts: FloatArray) -> Standpoints:
 
 
 def scored(
-    ledger: ClaimLedger, outlines: TeamOutlines, points: Standpoints, true_starts: FloatArray, true_poses: FloatArray
-) -> Standing:
+    ledger: GroundTruthAssociation,
+    outlines: TeamMapSummaries,
+    points: TeamPoses,
+    true_starts: FloatArray,
+    true_poses: FloatArray,
+) -> TeamMetrics:
     """Return how a team stands of which nothing else is known."""
     robots = len(true_poses)
-    figures, nothing = np.full((NUM_FIGURES, robots), np.nan), (0,) * robots
+    figures, nothing = np.full((NUM_METRICS, robots), np.nan), (0,) * robots
     ledger.score(outlines, points, true_starts, true_poses, figures)
-    return Standing(figures.tolist(), (nothing, nothing), 0.0, 0, 0.0)
+    return TeamMetrics(figures.tolist(), (nothing, nothing), 0.0, 0, 0.0)
 
 
 ANGLES = np.deg2rad(np.linspace(-26.5, 26.5, 32))

@@ -158,8 +158,8 @@ def map_of(slam: FastSlam, particle: int) -> FloatArray:
 
 
 def load_landmarks(maps: ParticleMaps, values: FloatArray, *names: Any) -> None:
-    """Replace all landmarks by these: `values` (n, 9, M) as `dense` gives them, the rest as `load_names` takes it."""
-    maps.load_names(*names)
+    """Replace all landmarks by these: `values` (n, 9, M) as `dense` gives them, the rest as `load_metadata` takes it."""
+    maps.load_metadata(*names)
     padded = np.zeros((len(values), 9, maps.padded))
     padded[:, :, : maps.num_particles] = values
     maps.blocks[: len(values)] = padded.reshape(len(values), 9, -1, LANES).transpose(0, 2, 1, 3)

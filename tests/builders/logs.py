@@ -7,7 +7,7 @@ import numpy as np
 from scipy.io import savemat
 
 from slam_backend.models.camera import ROBOT_FROM_CAMERA
-from slam_backend.readers.calibration import Eye
+from slam_backend.readers.calibration import CameraCalibration
 from slam_backend.readers.kitti import ABSENT
 
 FILES = {
@@ -69,12 +69,14 @@ def write_victoria(folder: Path, **changes: Any) -> None:
         savemat(folder / file, {name: value for name, value in content.items() if value is not None})
 
 
-def eye_at(x: float, turn: float = 0.0) -> Eye:
+def eye_at(x: float, turn: float = 0.0) -> CameraCalibration:
     """Return an eye that looks along z, at `x` to the right, turned about its axis."""
     pose = np.eye(4)
     pose[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
     pose[0, 3] = x
-    return Eye(320, 240, np.array([[300.0, 0.0, 159.5], [0.0, 300.0, 119.5], [0.0, 0.0, 1.0]]), np.zeros(4), pose)
+    return CameraCalibration(
+        320, 240, np.array([[300.0, 0.0, 159.5], [0.0, 300.0, 119.5], [0.0, 0.0, 1.0]]), np.zeros(4), pose
+    )
 
 
 def kitti_content(**changes: Any) -> dict[str, Any]:

@@ -10,7 +10,7 @@ CENTRES = centre_of(np.stack(np.meshgrid(np.arange(GRID_SIZE), np.arange(GRID_SI
 def painted_plainly(
     evidence: np.ndarray, pose: np.ndarray, ranges: np.ndarray, angles: np.ndarray, max_range: float
 ) -> np.ndarray:
-    """Return the evidence (300, 300) int8 of a grid after a scan; arguments as in `SeenGrid.paint_scan`."""
+    """Return the evidence (300, 300) int8 of a grid after a scan; arguments as in `SeenGrid.update_from_scan`."""
     u, v = CENTRES[..., 0] - pose[0], CENTRES[..., 1] - pose[1]
     rays = np.stack([np.cos(pose[2] + angles), np.sin(pose[2] + angles)], axis=1)
     left = [c * v >= s * u for c, s in rays]  # of a ray or on it

@@ -5,12 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from slam_backend.core.packed_symmetric import UNPACK, UPPER
+from slam_backend.core.packed_symmetric import UNPACK_INDEX, UPPER
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.geometry import between, compose, rotation
-from slam_backend.smoother.graph import NONE, OF_POINTS, PathGraph
+from slam_backend.smoother.graph import NONE, OF_POINTS, SlamGraph
 from slam_backend.smoother.graph_reduction import CONTRADICTION
-from slam_backend.smoother.optimizer import Sightings
+from slam_backend.smoother.optimizer import LandmarkFactors
 from slam_backend.smoother.options import SmoothingOptions
 
 
@@ -24,28 +24,30 @@ def chained(
     return compose(chain, move), by_first @ noise @ by_first.T + by_second @ move_noise @ by_second.T
 
 
-def plainly_coarsened(graph: PathGraph, camera: FloatArray, options: SmoothingOptions) -> PathGraph:
+def plainly_coarsened(graph: SlamGraph, camera: FloatArray, options: SmoothingOptions) -> SlamGraph:
     """Return what `coarsened` does."""
-    share = max(1, options.fresh_keys // len(graph.tips))
+    share = max(1, options.recent_keys // len(graph.last_keys))
     fresh = np.zeros(graph.num_keys, dtype=np.bool_)
-    for robot in range(len(graph.tips)):
+    for robot in range(len(graph.last_keys)):
         fresh[np.flatnonzero(graph.robots == robot)[-share:]] = True
     condensed = _without_blind(_condensed(graph, fresh, camera, options), fresh)
-    representatives, slack = _representatives(condensed, graph.spreads, fresh, options.most_keys(len(graph.tips)))
-    return plainly_compacted(_joined(replace(condensed, slack=slack), representatives))
+    representatives, slack = _representatives(
+        condensed, graph.transition_variances, fresh, options.most_keys(len(graph.last_keys))
+    )
+    return plainly_compacted(_joined(replace(condensed, rigid_variances=slack), representatives))
 
 
-def plainly_compacted(graph: PathGraph) -> PathGraph:
+def plainly_compacted(graph: SlamGraph) -> SlamGraph:
     """Return what `compacted` does."""
     frames, of_frames = _used(len(graph.frame_keys), graph.point_frames)
-    landmarks, of_landmarks = _used(len(graph.landmark_ids), graph.point_landmarks, graph.frozen_landmarks)
+    landmarks, of_landmarks = _used(len(graph.landmark_ids), graph.point_landmarks, graph.condensed_landmarks)
     return replace(
         graph,
         frame_keys=graph.frame_keys[frames],
         frame_offsets=graph.frame_offsets[frames],
         point_frames=of_frames[graph.point_frames],
         point_landmarks=of_landmarks[graph.point_landmarks],
-        frozen_landmarks=of_landmarks[graph.frozen_landmarks],
+        condensed_landmarks=of_landmarks[graph.condensed_landmarks],
         landmark_ids=graph.landmark_ids[landmarks],
         landmarks=graph.landmarks[landmarks],
     )
@@ -59,12 +61,12 @@ def _used(num: int, *rows: IntArray) -> tuple[IntArray, IntArray]:
     return np.flatnonzero(used), np.cumsum(used) - 1
 
 
-def _linked(graph: PathGraph) -> BoolArray:
+def _linked(graph: SlamGraph) -> BoolArray:
     """Return (k,) whether a key comes after another of the same robot."""
-    return np.asarray((graph.previous >= 0) & (graph.robots[graph.previous] == graph.robots))
+    return np.asarray((graph.parents >= 0) & (graph.robots[graph.parents] == graph.robots))
 
 
-def _condensed(graph: PathGraph, fresh: BoolArray, camera: FloatArray, options: SmoothingOptions) -> PathGraph:
+def _condensed(graph: SlamGraph, fresh: BoolArray, camera: FloatArray, options: SmoothingOptions) -> SlamGraph:
     """Freeze what was measured from keys that are no longer fresh, but for what the smoothed path contradicts."""
     old = ~fresh[graph.frame_keys[graph.point_frames]]
     seen = _linearised(graph, camera, options)
@@ -76,54 +78,54 @@ def _condensed(graph: PathGraph, fresh: BoolArray, camera: FloatArray, options: 
     return replace(
         graph,
         **{name: getattr(graph, name)[keep] for name in OF_POINTS},
-        frozen_keys=seen.keys[frozen],
-        frozen_landmarks=seen.landmarks[frozen],
-        centres=seen.centres[frozen],
-        infos=seen.infos[frozen],
-        slopes=seen.slopes[frozen],
+        condensed_keys=seen.keys[frozen],
+        condensed_landmarks=seen.landmarks[frozen],
+        linearisation_points=seen.centres[frozen],
+        information=seen.infos[frozen],
+        gradients=seen.slopes[frozen],
         counts=seen.counts[frozen],
     )
 
 
-def _linearised(graph: PathGraph, camera: FloatArray, options: SmoothingOptions) -> Sightings:
+def _linearised(graph: SlamGraph, camera: FloatArray, options: SmoothingOptions) -> LandmarkFactors:
     """Return all that was measured as forms, linearised where the graph's poses and landmarks are."""
-    seen = Sightings.of(graph)
+    seen = LandmarkFactors.of(graph)
     seen.linearise(graph, graph.poses, graph.landmarks, camera, options.noise_scale, options.kernel)
     return seen
 
 
-def _without_blind(graph: PathGraph, fresh: BoolArray) -> PathGraph:
+def _without_blind(graph: SlamGraph, fresh: BoolArray) -> SlamGraph:
     """Chain the odometry over keys from which nothing was measured; they lose their successors."""
     sighted = np.zeros(graph.num_keys, dtype=np.bool_)
-    sighted[graph.frozen_keys] = True
+    sighted[graph.condensed_keys] = True
     sighted[graph.frame_keys[graph.point_frames]] = True
     blind = ~sighted & ~fresh & _linked(graph)
     if not blind.any():
         return graph
-    previous, motions, noises = graph.previous.copy(), graph.motions.copy(), graph.noises.copy()
+    previous, motions, noises = graph.parents.copy(), graph.odometry.copy(), graph.odometry_covariances.copy()
     for key in np.flatnonzero(_linked(graph)):  # in the order of time
         before = previous[key]
         while blind[before]:
             motions[key], noises[key] = chained(motions[before], noises[before], motions[key], noises[key])
             before = previous[before]
         previous[key] = before
-    return replace(graph, previous=previous, motions=motions, noises=noises)
+    return replace(graph, parents=previous, odometry=motions, odometry_covariances=noises)
 
 
 def _representatives(
-    graph: PathGraph, cost: FloatArray, fresh: BoolArray, most_keys: int
+    graph: SlamGraph, cost: FloatArray, fresh: BoolArray, most_keys: int
 ) -> tuple[IntArray, FloatArray]:
     """Return (k,) the key that each stands rigidly to, itself or an earlier one, or `NONE`; and new slacks (k,)."""
     k = graph.num_keys
     representative = np.arange(k)
     following = np.full(k, NONE)
     linked = np.flatnonzero(_linked(graph))
-    following[graph.previous[linked]] = linked  # a blind key was replaced by its successor, if it has one
+    following[graph.parents[linked]] = linked  # a blind key was replaced by its successor, if it has one
     needed = np.ones(k, dtype=np.bool_)
-    needed[linked] = following[graph.previous[linked]] == linked
+    needed[linked] = following[graph.parents[linked]] == linked
     representative[~needed] = NONE
     surplus = int(needed.sum()) - most_keys
-    slack, previous = graph.slack.copy(), graph.previous.copy()
+    slack, previous = graph.rigid_variances.copy(), graph.parents.copy()
     heap = [(cost[b] + slack[b] + slack[previous[b]], int(b)) for b in linked if needed[b] and not fresh[b]]
     heapq.heapify(heap)
     while surplus > 0 and heap:
@@ -143,7 +145,7 @@ def _representatives(
     return representative, slack
 
 
-def _joined(graph: PathGraph, representative: IntArray) -> PathGraph:
+def _joined(graph: SlamGraph, representative: IntArray) -> SlamGraph:
     """Move all that hangs on a key to the one it now stands rigidly to."""
     kept = representative == np.arange(len(representative))
     root = np.maximum(representative, 0)
@@ -152,41 +154,41 @@ def _joined(graph: PathGraph, representative: IntArray) -> PathGraph:
     offsets = between(graph.poses[root], graph.poses)
     offsets[kept] = 0.0
     number = np.cumsum(kept) - 1
-    before = np.maximum(graph.previous, 0)
+    before = np.maximum(graph.parents, 0)
     turn = np.zeros((len(kept), 3, 3))
     turn[:, :2, :2], turn[:, 2, 2] = rotation(offsets[before, 2]), 1.0
-    moved = _moved(graph, np.flatnonzero(~kept[graph.frozen_keys]), offsets)
-    sightings = _combined(root[graph.frozen_keys], graph.frozen_landmarks, *moved, graph.counts)
+    moved = _moved(graph, np.flatnonzero(~kept[graph.condensed_keys]), offsets)
+    sightings = _combined(root[graph.condensed_keys], graph.condensed_landmarks, *moved, graph.counts)
     return replace(
         graph,
         robots=graph.robots[kept],
         poses=graph.poses[kept],
-        previous=np.where(graph.previous >= 0, number[root[before]], NONE)[kept],
-        motions=compose(offsets[before], graph.motions)[kept],
-        noises=(turn @ graph.noises @ turn.transpose(0, 2, 1))[kept],
-        spreads=graph.spreads[kept],
-        slack=graph.slack[kept],
+        parents=np.where(graph.parents >= 0, number[root[before]], NONE)[kept],
+        odometry=compose(offsets[before], graph.odometry)[kept],
+        odometry_covariances=(turn @ graph.odometry_covariances @ turn.transpose(0, 2, 1))[kept],
+        transition_variances=graph.transition_variances[kept],
+        rigid_variances=graph.rigid_variances[kept],
         frame_keys=number[root[graph.frame_keys]],
-        frozen_keys=number[sightings[0]],
-        frozen_landmarks=sightings[1],
-        centres=sightings[2],
-        infos=sightings[3],
-        slopes=sightings[4],
+        condensed_keys=number[sightings[0]],
+        condensed_landmarks=sightings[1],
+        linearisation_points=sightings[2],
+        information=sightings[3],
+        gradients=sightings[4],
         counts=sightings[5],
-        heads=number[graph.heads],
-        tips=number[graph.tips],
+        first_keys=number[graph.first_keys],
+        last_keys=number[graph.last_keys],
     )
 
 
-def _moved(graph: PathGraph, rows: IntArray, offsets: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _moved(graph: SlamGraph, rows: IntArray, offsets: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return centres, informations and slopes of the frozen sightings, `rows` of them moved by their keys' offsets."""
-    centres, infos, slopes = graph.centres.copy(), graph.infos.copy(), graph.slopes.copy()
-    by = offsets[graph.frozen_keys[rows]]
+    centres, infos, slopes = graph.linearisation_points.copy(), graph.information.copy(), graph.gradients.copy()
+    by = offsets[graph.condensed_keys[rows]]
     turn = np.zeros((len(by), 3, 3))
     turn[:, :2, :2], turn[:, 2, 2] = rotation(by[:, 2]), 1.0
     centres[rows] = np.einsum("nij,nj->ni", turn, centres[rows])
     centres[rows, :2] += by[:, :2]
-    infos[rows] = (turn @ infos[rows][:, UNPACK] @ turn.transpose(0, 2, 1))[:, *UPPER]
+    infos[rows] = (turn @ infos[rows][:, UNPACK_INDEX] @ turn.transpose(0, 2, 1))[:, *UPPER]
     slopes[rows] = np.einsum("nij,nj->ni", turn, slopes[rows])
     return centres, infos, slopes
 
@@ -204,7 +206,7 @@ def _combined(
     new[1:] = (keys[1:] != keys[:-1]) | (landmarks[1:] != landmarks[:-1])
     first, other = np.flatnonzero(new), np.flatnonzero(~new)
     shift = centres[first][np.cumsum(new)[other] - 1] - centres[other]
-    slopes[other] -= np.einsum("nij,nj->ni", infos[other][:, UNPACK], shift)
+    slopes[other] -= np.einsum("nij,nj->ni", infos[other][:, UNPACK_INDEX], shift)
     return (
         keys[first], landmarks[first], centres[first], np.add.reduceat(infos, first), np.add.reduceat(slopes, first),
         np.add.reduceat(counts, first),

@@ -29,7 +29,7 @@ DEAREST = {
     "num_rays": 100, "density": 5.0, "descriptor_size": 100, "max_measurements": 50, "false_points": 20.0,
     "width": 200, "height": 150, "most": 300, "block": 15, "spacing": 30, "border": 40, "cell": 100, "iterations": 20,
     "parts": 4, "polygons": 20.0, "posters": 2.0, "max_samples": 20_000, "max_keys": 200, "further_keys": 50,
-    "fresh_keys": 100, "more_draws": 10, "max_iterations": 30, "slice_steps": 100,
+    "recent_keys": 100, "more_draws": 10, "max_iterations": 30, "slice_steps": 100,
 }  # fmt: skip
 CHEAPEST = {"texel": 0.02, "min_spacing": 0.02}
 OPTIONAL_INTS = ("decision_ticks", "merged_particles", "rejuvenate_every", "frame_limit", "slice_steps")

@@ -7,15 +7,15 @@ import numpy as np
 from slam_backend.core.validation import FloatArray
 from slam_backend.fastslam.run_log import RobotLog
 from slam_backend.geometry import between, inverse, transform_points, wrap_angle
-from slam_backend.smoother.graph import PathGraph
-from slam_backend.smoother.graph_building import extended
-from slam_backend.smoother.optimizer import Mode
+from slam_backend.smoother.graph import SlamGraph
+from slam_backend.smoother.graph_building import extend_graph
+from slam_backend.smoother.optimizer import MapEstimate
 from slam_backend.smoother.options import SmoothingOptions
 from training.bench.accuracy.batch_problem import BatchProblem
 from training.bench.accuracy.runs import RunSpec, StereoRun, simulate_run
 
 SPEC = RunSpec(length=5.0, landmarks=120, measurements=7)
-TIGHT = SmoothingOptions(kernel=0.0, tolerance=1e-12, max_iterations=50, max_keys=1000, fresh_keys=1000)
+TIGHT = SmoothingOptions(kernel=0.0, tolerance=1e-12, max_iterations=50, max_keys=1000, recent_keys=1000)
 
 
 @lru_cache
@@ -46,14 +46,14 @@ def logs_of(run: StereoRun, skip: tuple[int, ...] = ()) -> list[RobotLog]:
     return logs
 
 
-def graph_of(run: StereoRun, skip: tuple[int, ...] = ()) -> PathGraph:
+def graph_of(run: StereoRun, skip: tuple[int, ...] = ()) -> SlamGraph:
     """Return the graph of a whole run, each step a key unless it is skipped."""
-    start = PathGraph.at_starts(run.true_paths[:, 0])
+    start = SlamGraph.at_starts(run.true_paths[:, 0])
     logs = [log.arrays() for log in logs_of(run, skip)]
-    return extended(start, logs, run.spec.noise.motion, np.array(run.spec.noise.camera.mount))
+    return extend_graph(start, logs, run.spec.noise.motion, np.array(run.spec.noise.camera.mount))
 
 
-def upper(mode: Mode) -> FloatArray:
+def upper(mode: MapEstimate) -> FloatArray:
     """Return U with U^T U the information of all poses sought, landmarks integrated out, by columns of the mode."""
     covariance = mode.covariance(np.flatnonzero(mode.columns >= 0))
     return np.asarray(np.linalg.cholesky(np.linalg.inv(covariance)).T)

@@ -122,7 +122,7 @@ def links(num_robots: int, *pairs: tuple[int, int]) -> BoolArray:
 
 def true_alignment(simulation: SimulatedTeam, team: TeamSlam, robot_a: int, robot_b: int) -> Alignment:
     """Return the true motion between the map frames of two robots' groups, without pairs."""
-    motion = simulation.true_motion(team.members(robot_a)[0], team.members(robot_b)[0])
+    motion = simulation.true_motion(team.known_robots(robot_a)[0], team.known_robots(robot_b)[0])
     return Alignment(True, "", *motion, np.diag([1e-4, 1e-4, 1e-6]), NO_PAIRS, 0.0)
 
 

@@ -19,7 +19,7 @@ from builders.teams import SimulatedTeam, hand_made, standing_team
 import slam_backend
 from slam_backend import metrics
 from slam_backend.core.validation import (
-    bad_argument,
+    argument_error,
     check_array,
     check_choice,
     check_float,
@@ -43,7 +43,7 @@ from slam_backend.readers.kitti import load_kitti
 from slam_backend.readers.kitti_images import load_kitti_images
 from slam_backend.readers.mrclam import SightingNoise, load_mrclam
 from slam_backend.readers.victoria import TreeNoise, load_victoria
-from slam_backend.reference.filter import PlainFastSlam
+from slam_backend.reference.filter import ReferenceFastSlam
 from slam_backend.smoother.options import SmoothingOptions
 from slam_backend.team.merge_scheduler import AttemptOptions
 from slam_backend.team.options import MergeOptions
@@ -71,19 +71,19 @@ OPTIONS: dict[type[Any], tuple[str, dict[str, str | list[Any]]]] = {
     }),
     FilterOptions: ("", {
         "num_particles": "1..1000000", "resample_threshold": SHARE, "position_gate": POSITIVE, "ambiguity": FROM_ZERO,
-        "descriptor_gate": "[1e-9, 2e6]", "dead_zone": "[11.34, inf)", "dead_radius": FROM_ZERO,
+        "descriptor_gate": "[1e-9, 2e6]", "new_landmark_gate": "[11.34, inf)", "new_landmark_radius": FROM_ZERO,
         "recovery_position": SIGMA, "recovery_heading": SIGMA, "descriptor_sigma": "[1e-9, 2e6]",
         "new_landmark_density": POSITIVE, "landmark_noise": SIGMA, "rejuvenate_every": COUNT, "camera": [320.0],
         "motion": [StereoCamera()], "proposal": ["fastslam3"], "resampling": ["wheel"], "one_to_one": [1],
         "existence": [0.5], "smoothing": [{"max_keys": 9}],
     }),
     MergeOptions: ("merging.", {
-        "merged_particles": "1..1000000", "sure": FROM_ZERO, "least_sure": FROM_ZERO, "watch_steps": "0..1e9",
-        "watch_every": COUNT, "barred_steps": "0..1e9", "max_moved": SHARE, "straighten": [1],
+        "merged_particles": "1..1000000", "sure": FROM_ZERO, "min_sigmas_on_trial": FROM_ZERO, "watch_steps": "0..1e9",
+        "watch_every": COUNT, "blocked_steps": "0..1e9", "max_deformed": SHARE, "straighten": [1],
     }),
     OdometryModel: ("motion.", dict.fromkeys(OdometryModel.__slots__, SIGMA)),
     SmoothingOptions: ("", {
-        "max_keys": "2..1e9", "further_keys": "0..1e9", "fresh_keys": COUNT, "kernel": FROM_ZERO,
+        "max_keys": "2..1e9", "further_keys": "0..1e9", "recent_keys": COUNT, "kernel": FROM_ZERO,
         "noise_scale": POSITIVE, "closure_after": "0..1e9", "effort": POSITIVE, "free_sightings": "0..1e9",
         "least_ess": SHARE, "more_draws": COUNT, "slice_steps": COUNT, "rigid_within": FROM_ZERO,
         "max_iterations": COUNT, "tolerance": POSITIVE,
@@ -177,7 +177,7 @@ CALLS: dict[str, list[Callable[[], Any]]] = {
     "num_robots: expected an int >= 1": [
         *(partial(FastSlam, bad) for bad in (0, 1.0, True)),
         *(partial(TeamSlam, bad) for bad in (0, -2, 2.5, True, None)),
-        lambda: PlainFastSlam(0, FilterOptions()),
+        lambda: ReferenceFastSlam(0, FilterOptions()),
     ],
     "num_robots: expected an int <= 1000": [partial(kind, 10**400) for kind in (FastSlam, TeamSlam)],
     "seed: expected an int >= 0": [
@@ -194,10 +194,10 @@ CALLS: dict[str, list[Callable[[], Any]]] = {
     "merging: expected MergeOptions": [partial(TeamSlam, 2, merging=200)],
     "estimate: expected one of 'best', 'mixture'": [
         lambda: FastSlam().map("mean"),
-        lambda: PlainFastSlam(1, FilterOptions()).map("worst"),  # type: ignore[arg-type]
+        lambda: ReferenceFastSlam(1, FilterOptions()).map("worst"),  # type: ignore[arg-type]
     ],
     "odometry: expected": [
-        lambda: PlainFastSlam(2, FilterOptions()).step([None], [None, None]),
+        lambda: ReferenceFastSlam(2, FilterOptions()).step([None], [None, None]),
         lambda: dead_reckoning(np.zeros(3), np.zeros((4, 2))),
     ],
     "rng: expected": [lambda: align_maps(MAP, MAP, rng=7)],  # type: ignore[arg-type]
@@ -302,7 +302,7 @@ KINDS: dict[str, Callable[[Any], Any]] = {
     "cov1": lambda wrong: fuse_landmarks(TWO[0], wrong, *TWO[2:]),
     "mean2": lambda wrong: fuse_landmarks(*TWO[:2], wrong, TWO[3]),
     "cov2": lambda wrong: fuse_landmarks(*TWO[:3], wrong),
-    "options, plain": lambda wrong: PlainFastSlam(1, wrong),
+    "options, plain": lambda wrong: ReferenceFastSlam(1, wrong),
     "merge": lambda wrong: TeamSlam(2, num_particles=2).merged_maps(wrong),
     "descriptor_size": lambda wrong: LandmarkMap.empty(-7 if wrong == 3 else wrong),
     "path, map": LandmarkMap.load,
@@ -366,7 +366,7 @@ STEPS: dict[str, list[dict[str, Any]]] = {
     "measurements[1].points: expected": [
         *(seen([[0.0, 0.0, 2.0], bad]) for bad in ([0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 0.0, 2500.0])),
         seen([[0.0, 0.0, 2.0], [-1e150, 0.0, 1.0]], noise=[np.eye(3)] * 2),
-        *({"measurements": together(bad)["measurements"].of_each()} for bad in (BEHIND, SPOILT)),
+        *({"measurements": together(bad)["measurements"].per_robot()} for bad in (BEHIND, SPOILT)),
         *(together(bad, **more) for bad in (BEHIND, SPOILT) for more in ({}, AT_ONCE)),
     ],
     "measurements: expected a descriptor per po": [
@@ -534,9 +534,10 @@ def test_foreign_snapshots_are_refused() -> None:
 def test_an_error_says_argument_expected_got_and_cure() -> None:
     """The one form of all refusals, with long values shortened."""
     assert (
-        str(bad_argument("gate", "a number > 0", -1.5, CURE)) == "gate: expected a number > 0, got -1.5. Do otherwise."
+        str(argument_error("gate", "a number > 0", -1.5, CURE))
+        == "gate: expected a number > 0, got -1.5. Do otherwise."
     )
-    long = str(bad_argument("gate", "a number", list(range(100)), CURE))
+    long = str(argument_error("gate", "a number", list(range(100)), CURE))
     assert len(long) < 140
     assert "..." in long
 

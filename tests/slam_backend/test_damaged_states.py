@@ -9,12 +9,12 @@ import pytest
 from builders.damage import at, replaced, try_damaged
 from builders.teams import SimulatedTeam, driven, links, true_alignment
 
-from slam_backend.core.state_codec import encoded
+from slam_backend.core.state_codec import encode
 from slam_backend.fastslam.existence import ExistenceModel
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.smoother.options import SmoothingOptions
 from slam_backend.state_kinds import BACKEND_KINDS
-from slam_backend.team.merge_rollback import Undoing
+from slam_backend.team.merge_rollback import MergeRollback
 from slam_backend.team.merge_scheduler import AttemptOptions
 from slam_backend.team.options import MergeOptions
 from slam_backend.team.team import TeamSlam
@@ -64,7 +64,7 @@ def team_in_an_undo() -> Subject:
     simulation, team = merged(**SLICED, merging=MergeOptions(watch_every=10_000))
     simulation.run(team, 25)
     group = team._groups[0]
-    group.undoing = Undoing.of(group.trunk, group.trunk.watches[0].number)
+    group.undoing = MergeRollback.of(group.trunk, group.trunk.monitors[0].number)
     simulation.run(team, 2)
     return team, [simulation.read() for _ in range(6)]
 
@@ -96,7 +96,7 @@ def play(subject: FastSlam | TeamSlam, readings: list[Any]) -> None:
         subject.step(*read)
     subject.get_state()
     if isinstance(subject, TeamSlam):
-        subject.outlines(), subject.standpoints(), subject.diagnostics
+        subject.map_summaries(), subject.team_poses(), subject.diagnostics
         for robot in range(subject.num_robots):
             subject.map(robot, "mixture")
     else:
@@ -108,7 +108,7 @@ def play(subject: FastSlam | TeamSlam, readings: list[Any]) -> None:
 def test_damaged_states_are_refused_or_harmless(kind: str, seeds: range) -> None:
     """Of the damaged states of each kind most are refused, which changes nothing; from the others it goes on."""
     subject, readings = SUBJECTS[kind]()
-    whole = encoded(subject.get_state(), BACKEND_KINDS)
+    whole = encode(subject.get_state(), BACKEND_KINDS)
 
     def go_on(_: Any) -> None:
         try:
@@ -118,7 +118,7 @@ def test_damaged_states_are_refused_or_harmless(kind: str, seeds: range) -> None
                 raise
 
     counts = try_damaged(
-        subject, seeds, BACKEND_KINDS, lambda: encoded(subject.get_state(), BACKEND_KINDS) == whole, go_on
+        subject, seeds, BACKEND_KINDS, lambda: encode(subject.get_state(), BACKEND_KINDS) == whole, go_on
     )
     assert counts["refused"] > 0.57 * len(seeds)
     assert counts["accepted"] > 0.057 * len(seeds)

@@ -10,9 +10,9 @@ from builders.shared_arrays import scribble, shared, shared_and_writable
 from test_damaged_states import SUBJECTS, merged, play
 
 from slam_backend.core.read_only import as_constant, as_read_only, is_read_only, with_constants, with_read_only
-from slam_backend.core.state_codec import decoded, encoded
+from slam_backend.core.state_codec import decode, encode
 from slam_backend.state_kinds import BACKEND_KINDS
-from slam_backend.team.merge_rollback import Undoing
+from slam_backend.team.merge_rollback import MergeRollback
 from slam_backend.team.options import MergeOptions
 
 
@@ -24,7 +24,7 @@ def test_what_a_state_shares_cannot_be_written(name: str) -> None:
     assert shared(state, subject)
     assert not shared_and_writable(state, subject)
     assert not shared_and_writable(state, subject.get_state())
-    read = decoded(encoded(state, BACKEND_KINDS), BACKEND_KINDS)
+    read = decode(encode(state, BACKEND_KINDS), BACKEND_KINDS)
     for other in (pickle.loads(pickle.dumps(state)), copy.deepcopy(state), read, state):
         subject.set_state(other)
         assert not shared_and_writable(other, subject)
@@ -55,7 +55,7 @@ def test_what_is_replaced_in_a_state_from_before_a_merge_is_refused_at_its_undo(
     maps["map_of"] = np.full_like(maps["map_of"], 2**31)
     trunk = team._groups[0].trunk
     with pytest.raises(ValueError, match=r"state\['filter'\]\['maps'\]\['map_of'\]: expected integers"):
-        Undoing.of(trunk, trunk.watches[0].number)
+        MergeRollback.of(trunk, trunk.watches[0].number)
 
 
 def test_parts_of_trees_are_copied_only_where_they_can_be_written() -> None:

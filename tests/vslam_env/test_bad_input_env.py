@@ -457,11 +457,11 @@ def test_refused_readings_leave_beliefs_as_they_are() -> None:
     whole, refusing = (TeamBelief(env.config.belief, 2, episode.belief_seed, episode.body) for _ in range(2))
     whole.step(record[0]), refusing.step(record[0])
     for readings in record[1:]:
-        now, (first, second) = TeamReadings.gathered(readings), readings
+        now, (first, second) = TeamReadings.stack(readings), readings
         for name, bad in READINGS:
             other = second._replace(**{name: bad})
             refused(partial(refusing.step, [first, other]), f"readings[1].{name}: expected ")
-        odd = second._replace(heard=np.ones(2, np.int64))
+        odd = second._replace(contacts=np.ones(2, np.int64))
         refused(partial(refusing.step, [first, odd]), "contacts: expected a symmetric array of bools")
         for begins, other in (
             ("readings.scans: expected an array of shape (2, 32)", now._replace(scans=now.scans[:, 1:])),
@@ -477,20 +477,20 @@ def test_refused_readings_leave_beliefs_as_they_are() -> None:
 RANGES = np.full(32, 2.0)
 PAINTED: dict[str, list[Callable[[SeenGrid], Any]]] = {
     "pose: expected": [
-        lambda grid: grid.paint_scan((0.0, 0.0), RANGES, ANGLES), lambda grid: grid.clear_disc((INF, 0.0, 0.0)),
-        lambda grid: grid.paint_scan((NAN, 0.0, 0.0), RANGES, ANGLES),
+        lambda grid: grid.update_from_scan((0.0, 0.0), RANGES, ANGLES), lambda grid: grid.clear_disc((INF, 0.0, 0.0)),
+        lambda grid: grid.update_from_scan((NAN, 0.0, 0.0), RANGES, ANGLES),
     ],
-    "ranges: expected an array of shape (n,)": [lambda grid: grid.paint_scan(POSE, RANGES[:5], ANGLES)],
+    "ranges: expected an array of shape (n,)": [lambda grid: grid.update_from_scan(POSE, RANGES[:5], ANGLES)],
     "ranges: expected distances >= 0": [
-        lambda grid: grid.paint_scan(POSE, -RANGES, ANGLES), lambda grid: grid.paint_scan(POSE, RANGES * NAN, ANGLES),
+        lambda grid: grid.update_from_scan(POSE, -RANGES, ANGLES), lambda grid: grid.update_from_scan(POSE, RANGES * NAN, ANGLES),
     ],
     "angles: expected ascending": [
-        lambda grid: grid.paint_scan(POSE, RANGES, ANGLES[::-1]),
-        lambda grid: grid.paint_scan(POSE, RANGES, ANGLES * 5),
-        lambda grid: grid.paint_scan(POSE, RANGES, ANGLES * NAN),
+        lambda grid: grid.update_from_scan(POSE, RANGES, ANGLES[::-1]),
+        lambda grid: grid.update_from_scan(POSE, RANGES, ANGLES * 5),
+        lambda grid: grid.update_from_scan(POSE, RANGES, ANGLES * NAN),
     ],
     "radius: expected a finite number > 0": [lambda grid: grid.clear_disc(POSE, radius=0.0)],
-    "self_from_other: expected finite numbers": [lambda grid: grid.absorb(SeenGrid(), (0.0, NAN, 0.0))],
+    "self_from_other: expected finite numbers": [lambda grid: grid.merge(SeenGrid(), (0.0, NAN, 0.0))],
     "evidence: expected an array of shape": [lambda grid: grid.set_state({"evidence": np.zeros((2, 3))})],
 }  # fmt: skip
 
@@ -509,7 +509,7 @@ def test_refused_scans_paint_nothing() -> None:
     ):  # fmt: skip
         poses, scans = np.full((2, 2, 3), NAN), np.array([np.ones(3), ranges])
         poses[0, 0], poses[1, 1] = 0.0, pose
-        paint = partial(team.paint_readings, np.eye(2, dtype=np.int64), poses, scans, np.zeros(2, np.bool_))
+        paint = partial(team.update, np.eye(2, dtype=np.int64), poses, scans, np.zeros(2, np.bool_))
         refused(partial(paint, rays, MAX_RANGE, 0.2), f"{name}: expected")
     assert all((grid.cells == UNKNOWN).all() for grid in team.grids)
 

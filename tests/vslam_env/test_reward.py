@@ -7,13 +7,13 @@ from builders.comparison import digest
 from builders.environments import MEETING, scored, small_env, standing_at, turning, wander
 
 from agents import make_policy
-from slam_backend.fastslam.reports import Findings, LandmarksCreated, TeamReport
+from slam_backend.fastslam.reports import Associations, LandmarksCreated, TeamReport
 from slam_backend.maps.alignment import Alignment
-from slam_backend.maps.landmark_map import LandmarkMap, TeamOutlines
+from slam_backend.maps.landmark_map import LandmarkMap, TeamMapSummaries
 from vslam_env import ExplorationEnv, vslam_v0
 from vslam_env.config import TICK
-from vslam_env.evaluation.map_scores import FALSE, ClaimLedger
-from vslam_env.reward import POTENTIALS, RUNNING_COST, TERMS, Standing, evaluate, make_terms
+from vslam_env.evaluation.map_scores import FALSE, GroundTruthAssociation
+from vslam_env.reward import POTENTIALS, RUNNING_COST, TERMS, TeamMetrics, evaluate, make_terms
 from vslam_env.simulation.episode import true_alignment
 
 FIGURES: dict[str, list[float]] = {  # in the order of their rows
@@ -21,7 +21,7 @@ FIGURES: dict[str, list[float]] = {  # in the order of their rows
     "map_rmses": [0.3, 0.2],
     "map_recalls": [0.1, 0.2],
     "map_precisions": [1.0, 0.9],
-    "placed_recalls": [0.1, 0.15],
+    "accurate_recalls": [0.1, 0.15],
     "pose_errors": [0.0, 0.3],
     "heading_errors": [0.0, 0.04],
     "pose_sigmas": [0.02, 0.05],
@@ -31,9 +31,11 @@ FIGURES: dict[str, list[float]] = {  # in the order of their rows
 }
 
 
-def _standing(coverage: float = 0.25, collisions: tuple[int, int] = (0, 3), time: float = 3.0, **rows: Any) -> Standing:
-    return Standing(
-        figures=[*(FIGURES | rows).values()],
+def _standing(
+    coverage: float = 0.25, collisions: tuple[int, int] = (0, 3), time: float = 3.0, **rows: Any
+) -> TeamMetrics:
+    return TeamMetrics(
+        table=[*(FIGURES | rows).values()],
         counts=(collisions, (7, 8)),
         coverage=coverage,
         merges=0,
@@ -60,10 +62,10 @@ def test_named_terms() -> None:
     """Each named term is what its name says, times its weight."""
     after = _standing(
         map_errors=[0.5, 0.65],
-        placed_recalls=[0.3, 0.1],
+        accurate_recalls=[0.3, 0.1],
         pose_sigmas=[0.03, 0.01],
         coverage=0.5,
-        found=[0.25, 0.25],
+        discovered=[0.25, 0.25],
         collisions=(2, 3),
         distances=[1.25, 2.0],
         error_integrals=[2.25, 1.75],
@@ -112,7 +114,7 @@ def test_terms_of_ones_own() -> None:
     class Frugal:
         name, weight = "frugal", -0.5
 
-        def __call__(self, before: Standing, after: Standing) -> Any:
+        def __call__(self, before: TeamMetrics, after: TeamMetrics) -> Any:
             return after.distances - before.distances
 
     env = small_env(reward=[*make_terms({"map_error": 1.0}), Frugal()])
@@ -130,7 +132,7 @@ def test_potentials_telescope() -> None:
     """What each potential pays in an episode is where it ends minus where it began, a merge included."""
     env = small_env(max_cycles=120, reward=dict.fromkeys(POTENTIALS, 1.0))
     first_infos = env.reset(seed=5, options={"start_poses": MEETING})[1]
-    first = env.episode.standing()
+    first = env.episode.team_metrics()
     totals = {agent: dict.fromkeys(POTENTIALS, 0.0) for agent in env.agents}
     while env.agents:
         _, rewards, _, _, infos = env.step(turning(env.agents))
@@ -138,7 +140,7 @@ def test_potentials_telescope() -> None:
             assert np.isclose(reward, sum(infos[agent][f"reward/{name}"] for name in POTENTIALS))
             for name in POTENTIALS:
                 totals[agent][name] += infos[agent][f"reward/{name}"]
-    last = env.episode.standing()
+    last = env.episode.team_metrics()
     assert any(event.kind == "merge" for event in env.events)
     for robot, agent in enumerate(env.possible_agents):
         for name, term in POTENTIALS.items():
@@ -150,27 +152,27 @@ def test_potentials_telescope() -> None:
 def test_a_map_that_is_placed_wrong_has_no_recall() -> None:
     """The term `recall` pays for landmarks closer than 0.5 m to where they are; the info counts all that are held."""
     truths = np.array([[1.0, 2.0, 0.0], [4.0, 1.0, 0.2], [6.0, 6.0, 0.1]])
-    books = ClaimLedger(1, truths, np.ones(3, np.bool_), 1.0)
+    books = GroundTruthAssociation(1, truths, np.ones(3, np.bool_), 1.0)
     ids = np.arange(2)
     entries = (LandmarksCreated(0, 0, 0, ids),)
-    books.record(TeamReport(0, Findings.gathered([ids], [ids]), ((0,),), (), (), (0,), entries, 1), [ids])
+    books.record(TeamReport(0, Associations.from_arrays([ids], [ids]), ((0,),), (), (), (0,), entries, 1), [ids])
     held = LandmarkMap(truths[:2], np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 2)), ids=ids)
     for shift, placed in ((0.0, 2 / 3), (0.4, 2 / 3), (0.6, 0.0)):
-        outlines = TeamOutlines.joined([held.outline])
+        outlines = TeamMapSummaries.from_maps([held.summary])
         points = standing_at(np.array([[shift, 0.0, 0.0]]))
         scores = scored(books, outlines, points, np.zeros((1, 3)), np.zeros((1, 3)))
-        assert (scores.map_recalls[0], scores.placed_recalls[0]) == (2 / 3, placed)
+        assert (scores.map_recalls[0], scores.accurate_recalls[0]) == (2 / 3, placed)
 
 
 def _merge(env: ExplorationEnv, shift: list[float]) -> None:
     """Merge the maps of two robots with the true transform, moved by a shift (3,)."""
     episode = env.episode
-    claims = [episode.ledger.claims(r, episode.belief.filter_map(r).ids) for r in range(2)]
+    claims = [episode.ledger.true_ids(r, episode.belief.filter_map(r).ids) for r in range(2)]
     true = true_alignment(*claims, *episode.true_starts)
     assert true is not None
     inliers = np.empty((0, 2), np.int64) if any(shift) else true.inliers
     used = Alignment(True, "", *(true.transform + shift).tolist(), true.covariance, inliers, 0.0)
-    episode.ledger.rename(episode.belief.merge(0, 1, used))
+    episode.ledger.merge(episode.belief.merge(0, 1, used))
 
 
 def test_a_wrong_merge_costs() -> None:
@@ -183,7 +185,7 @@ def test_a_wrong_merge_costs() -> None:
         for _ in range(60):
             infos = env.step(turning(env.agents))[4]
         _merge(env, shift)
-        after = env.episode.standing().map_errors
+        after = env.episode.team_metrics().map_errors
         changes.append([error - infos[f"robot_{r}"]["map_error"] for r, error in enumerate(after)])
     assert max(changes[0]) < 0.0
     assert min(changes[1]) > 0.01
@@ -259,7 +261,7 @@ def test_a_worse_map_costs_more(gamma: float) -> None:
         return float(sum(gamma**t * reward for t, reward in enumerate(rewards)))
 
     held = env.belief("robot_0").map.ids
-    true_one = int(env.episode.ledger.claims(0, held[:1])[0])
+    true_one = int(env.episode.ledger.true_ids(0, held[:1])[0])
     assert true_one >= 0
 
     def claiming(claim: int) -> ExplorationEnv:

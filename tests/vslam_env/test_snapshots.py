@@ -15,7 +15,7 @@ from builders.comparison import digest
 from builders.damage import Trap
 from builders.environments import MEETING, small_env, wander
 
-from slam_backend.core.state_codec import encoded
+from slam_backend.core.state_codec import encode
 from vslam_env import ExplorationEnv, load_state, save_state, vslam_v0
 from vslam_env.reward import RUNNING_COST
 from vslam_env.snapshots import STATE_FORMAT, check_state, state_version
@@ -79,7 +79,7 @@ def test_a_state_goes_on_bit_by_bit(way: str, tmp_path: Path) -> None:
     reference = _go_on(env, FURTHER)
     assert any(event.kind == "merge" for event in env.events)
     assert env.state()[-1] == 1.0
-    assert env.episode.standing().collisions.sum() > 20
+    assert env.episode.team_metrics().collisions.sum() > 20
     assert _go_on(other, FURTHER) == reference
     digests = []
     for one in (env, other):  # resets to come are part of the state as well
@@ -262,7 +262,7 @@ def _marked(content: bytes, body: bytes) -> bytes:
         (lambda content: content + b".", "a damaged file"),
         (lambda content: content[: content.index(b"\n") + 1] + pickle.dumps(3), "a damaged file"),
         (lambda content: _marked(content, pickle.dumps(3)), "expected the file of a state that can be read here"),
-        (lambda content: _marked(content, encoded(3, ENV_KINDS)), "expected what get_state returned, got a int"),
+        (lambda content: _marked(content, encode(3, ENV_KINDS)), "expected what get_state returned, got a int"),
         (None, "path: expected the file of a state, .*no such file|No such file"),
     ],
 )
@@ -319,7 +319,7 @@ def test_what_a_file_holds_is_what_was_saved(tmp_path: Path) -> None:
     state = env.get_state()
     save_state(state, tmp_path / "state")
     loaded = load_state(tmp_path / "state")
-    assert encoded(loaded, ENV_KINDS) == encoded(state, ENV_KINDS)
+    assert encode(loaded, ENV_KINDS) == encode(state, ENV_KINDS)
     team = loaded["episode"]["belief"]["team"]
     event = next(event for event in team["events"] if event.kind == "merge")
     assert team["groups"][0]["branches"][0]["watches"][0].alignment is event.alignment

@@ -242,9 +242,9 @@ class ExplorationBenchConfig(ExperimentConfig):
 
     def environment(self, trial: ExplorationTrial) -> "EnvConfig":
         """Return the environment of a trial: of all policies with one seed in one combination the same world."""
-        from vslam_env.world import is_one_building
+        from vslam_env.world import is_single_layout
 
-        split = None if self.split == ANY_SPLIT or is_one_building(trial.world) else self.split
+        split = None if self.split == ANY_SPLIT or is_single_layout(trial.world) else self.split
         oracles = {f"oracle_{name}": trial.oracle in (name, ALL_ORACLES) for name in ORACLES}
         return self.run(trial).environment().replace(world_split=split, **oracles)
 
@@ -311,10 +311,10 @@ class TrainBenchConfig(ExperimentConfig):
 
     def check(self) -> None:
         """Refuse more workers than environments, and worlds that are not there."""
-        from slam_backend.core.validation import bad_argument
+        from slam_backend.core.validation import argument_error
 
         if (most := max(self.workers)) > self.envs:
-            raise bad_argument("workers", f"at most one per environment, {self.envs}", most, "Use fewer.")
+            raise argument_error("workers", f"at most one per environment, {self.envs}", most, "Use fewer.")
         self.environment()
 
     def training(self) -> "TrainConfig":

@@ -33,9 +33,9 @@ OUT = {False: "New run folder.", True: "Run folder: a new one, or that of a run 
 
 def _check_processes(number: int) -> int:
     if number < 1:
-        from slam_backend.core.validation import bad_argument
+        from slam_backend.core.validation import argument_error
 
-        raise bad_argument("processes", "an int >= 1", number, "Use one process or more.")
+        raise argument_error("processes", "an int >= 1", number, "Use one process or more.")
     return number
 
 
@@ -95,12 +95,12 @@ def numbers(name: str, text: str, kind: Callable[[str], Any] = int) -> tuple[Any
     Raises:
         ValueError: If one is no number; the message names the option.
     """
-    from slam_backend.core.validation import bad_argument
+    from slam_backend.core.validation import argument_error
 
     try:
         return tuple(kind(word) for word in text.split(","))
     except ValueError as error:
-        raise bad_argument(name, "numbers with commas between", repr(text), "Write them like 10,100.") from error
+        raise argument_error(name, "numbers with commas between", repr(text), "Write them like 10,100.") from error
 
 
 def _name(name: str, field: FieldInfo) -> str:

@@ -126,13 +126,13 @@ def write_json(json: Path, text: str) -> None:
     Raises:
         ValueError: If it cannot be written.
     """
-    from slam_backend.core.files import refusing, write_file
+    from slam_backend.core.files import os_errors_as_argument_errors, write_file
 
     if json != STDOUT:
         write_file(json, text, "json")
         return
     stream = _STREAM.get() or sys.stdout
-    with refusing("stdout", "json"):
+    with os_errors_as_argument_errors("stdout", "json"):
         stream.write(text)
         stream.flush()
 

@@ -127,14 +127,14 @@ def bench_stereo(
 
 def _parts(data: Path, descriptors: Sequence[str], real: Path | None) -> "list[RealPart]":
     """Return what is to be measured of real images, and refuse a folder that was named and holds none."""
-    from slam_backend.core.validation import bad_argument
+    from slam_backend.core.validation import argument_error
     from training.bench.stereo.real_images import EXPECTED, find_parts
 
     if not data.is_dir():
-        raise bad_argument("real", "a folder of real images", "no such folder", f"Check {str(data)!r}.")
+        raise argument_error("real", "a folder of real images", "no such folder", f"Check {str(data)!r}.")
     parts = find_parts(data, descriptors)
     if real is not None and not parts:
-        raise bad_argument("real", f"a folder with {EXPECTED}", "no such files", f"Check {str(data)!r}.")
+        raise argument_error("real", f"a folder with {EXPECTED}", "no such files", f"Check {str(data)!r}.")
     return parts
 
 

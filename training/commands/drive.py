@@ -22,19 +22,19 @@ def drive_by_hand(
     from contextlib import ExitStack
 
     from agents import make_policy
-    from slam_backend.core.validation import bad_argument
+    from slam_backend.core.validation import argument_error
     from training.episodes.teleoperation import KEYS, drive
     from training.episodes.video import VideoWriter
     from training.experiments.interrupt import interrupt_flag
     from vslam_env import vslam_v0
-    from vslam_env.rendering.window import Window, why_no_window
+    from vslam_env.rendering.window import Window, display_unavailable_reason
 
     env = vslam_v0.parallel_env(world=world, num_robots=robots, preset=preset, max_cycles=max_cycles)
     policies = {} if policy == "none" else {a: make_policy(policy, "continuous") for a in env.possible_agents}
     env.reset(seed=seed)  # a world that cannot be built shows first
-    reason = why_no_window()
+    reason = display_unavailable_reason()
     if reason:
-        raise bad_argument("drive", "a screen for a window", reason.split(".")[0], reason.split(". ", 1)[1] + ".")
+        raise argument_error("drive", "a screen for a window", reason.split(".")[0], reason.split(". ", 1)[1] + ".")
     prepare()
     console = Console(highlight=False)
     console.print(KEYS)

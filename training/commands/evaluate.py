@@ -19,7 +19,7 @@ def evaluate(call: Call[EvaluateConfig], processes: Processes = 1) -> None:
     Ctrl-C finishes the episode under way; the same command with --out FOLDER
     goes on from there.
     """
-    from slam_backend.core.validation import bad_argument
+    from slam_backend.core.validation import argument_error
     from training.experiments.run_folder import plain
     from training.rl.evaluation import leads, play, print_evaluation, summarise
     from vslam_env import vslam_v0
@@ -28,7 +28,7 @@ def evaluate(call: Call[EvaluateConfig], processes: Processes = 1) -> None:
     env = vslam_v0.parallel_env(config=chosen.environment())  # what cannot be built shows before there is a folder
     if "split" in call.given and env.config.world_split is None:
         cure = "Leave --split out: starts and noise differ from those of the training all the same."
-        raise bad_argument("split", "worlds of which there are many", env.config.world, cure)
+        raise argument_error("split", "worlds of which there are many", env.config.world, cure)
     console, folder = call.begin(lambda: _one_step(env, chosen))
     part = KeptPart(
         file=TRIALS_FILE, kind=EvaluateTrial, play=partial(play, chosen), trials=chosen.trials(), processes=processes,
@@ -45,8 +45,8 @@ def _one_step(env: Any, config: EvaluateConfig) -> None:
     """Let the model act once, so that one that knows another kind of observation is refused at once."""
     import numpy as np
 
-    from agents.trained import TrainedGoals, load_model
+    from agents.trained import TrainedGoalPolicy, load_model
 
     observations, _ = env.reset(seed=config.seed)
-    policy, rng = TrainedGoals(load_model(config.model)[0]), np.random.default_rng(0)
+    policy, rng = TrainedGoalPolicy(load_model(config.model)[0]), np.random.default_rng(0)
     env.step({agent: policy.act(observations[agent], env.belief(agent), rng) for agent in env.agents})

@@ -186,10 +186,10 @@ def replay_victoria(call: Call[VictoriaConfig]) -> None:
 def replay_kitti(call: Call[KittiConfig]) -> None:
     """A car in a town: stereo images, or stereo features whose tracks are the landmarks; motion taken to be planar."""
     from slam_backend.readers.kitti import load_kitti
-    from slam_backend.readers.kitti_images import holds_images
+    from slam_backend.readers.kitti_images import is_image_folder
     from training.replay.kitti import replay, score, summarise
 
-    if holds_images(call.values["path"]):
+    if is_image_folder(call.values["path"]):
         _replay_images(call, ImagesConfig.from_mapping(call.values))
         return
     log = load_kitti(call.config.path, call.config.truth, call.config.duration)
@@ -216,7 +216,7 @@ def replay_stereo(call: Call[ImagesConfig]) -> None:
 
     File names are looked up in the folder, unless they are whole paths.
     """
-    from slam_backend.core.validation import bad_argument
+    from slam_backend.core.validation import argument_error
     from slam_backend.readers.stereo_files import StereoFiles, find_pairs
 
     values, usual = call.values, StereoFiles()
@@ -227,7 +227,7 @@ def replay_stereo(call: Call[ImagesConfig]) -> None:
     for name in DRIVE_ALONE:
         if name in values:
             cure = "Leave it away: two pairs are aligned in space."
-            raise bad_argument(name, "a drive of three pairs or more", "a folder with two pairs", cure)
+            raise argument_error(name, "a drive of three pairs or more", "a folder with two pairs", cure)
     _align_pairs(call, PairsConfig.from_mapping(values))
 
 

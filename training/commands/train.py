@@ -40,7 +40,7 @@ def train(
     at once. --resume FOLDER then goes on from the last checkpoint and ends with
     the same weights as a training that never stopped, even if it was killed.
     """
-    from slam_backend.core.validation import bad_argument, check_int
+    from slam_backend.core.validation import argument_error, check_int
     from training.experiments.run_folder import RunFolder, installed_versions, read_config
 
     require_extra()
@@ -56,7 +56,7 @@ def train(
         others = [*call.given, *(name for name, value in (("out", call.out), ("config", call.file)) if value)]
         if others:
             cure = "A training goes on with its own; --workers, --device and --json may be given."
-            raise bad_argument("resume", "no other options that decide the training", others, cure)
+            raise argument_error("resume", "no other options that decide the training", others, cure)
         values, seed = read_config(resume, call.command, "resume")
         chosen = TrainConfig.from_mapping(values | {"seed": seed})
         kept = kept_of(resume, chosen)  # what is wrong with it shows before anything is compiled

@@ -50,12 +50,12 @@ def preview(
     import imageio.v3 as imageio
 
     from slam_backend.core.files import check_writable, write_file
-    from slam_backend.core.validation import bad_argument
+    from slam_backend.core.validation import argument_error
     from training.episodes.world_survey import contact_sheet
     from training.experiments.compilation import compilation_shown
 
     if out.suffix.lower() != ".png":
-        raise bad_argument("out", "a name that ends in .png", out, "Pictures are written as PNG.")
+        raise argument_error("out", "a name that ends in .png", out, "Pictures are written as PNG.")
     check_writable(out, "out")
     with compilation_shown(Console(stderr=True)):
         picture = contact_sheet(world, first_seed, seeds, robots)
@@ -97,19 +97,19 @@ def import_world(
     tolerance_px: Annotated[float, typer.Option(help="Outlines are straightened by less than this.")] = 1.0,
 ) -> None:
     """Trace the walls of a map and write them as .json, which can be edited."""
-    from slam_backend.core.validation import bad_argument
+    from slam_backend.core.validation import argument_error
     from vslam_env.world import FreeSpace, load_floorplan, load_ros_map, save_walls_json
 
     if plan.suffix.lower() in (".yaml", ".yml"):
         if metres_per_pixel is not None:
             cure = "Change resolution in the file instead."
-            raise bad_argument("metres_per_pixel", "none beside a ROS map", metres_per_pixel, cure)
+            raise argument_error("metres_per_pixel", "none beside a ROS map", metres_per_pixel, cure)
         traced = load_ros_map(plan, tolerance_px)
     else:
         traced = load_floorplan(plan, 0.045 if metres_per_pixel is None else metres_per_pixel, tolerance_px)
     FreeSpace(traced)  # what no robot fits in is refused
     if out.suffix.lower() != ".json":
-        raise bad_argument("out", "a name that ends in .json", out, "Worlds are known by the ends of their names.")
+        raise argument_error("out", "a name that ends in .json", out, "Worlds are known by the ends of their names.")
     save_walls_json(traced, out)
     x_min, y_min, x_max, y_max = traced.bounds
     size = f"{x_max - x_min:.1f} x {y_max - y_min:.1f} m"

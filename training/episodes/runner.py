@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from agents.policy import Policy
-from slam_backend.core.validation import FloatArray, IntArray, bad_argument
+from slam_backend.core.validation import FloatArray, IntArray, argument_error
 from slam_backend.fastslam.consistency import Consistency
 from slam_backend.fastslam.reports import MergeEvent
 from slam_backend.geometry import between
@@ -100,7 +100,7 @@ def run_episode(
     agents = list(env.possible_agents)
     missing = [agent for agent in agents if agent not in policies]
     if missing:
-        raise bad_argument("policies", "a policy for each agent", f"no policy for {missing}", "Add them.")
+        raise argument_error("policies", "a policy for each agent", f"no policy for {missing}", "Add them.")
     streams = np.random.SeedSequence([seed, len(agents)]).spawn(len(agents))
     rngs = {agent: np.random.default_rng(stream) for agent, stream in zip(agents, streams, strict=True)}
     odometry: list[FloatArray] = []
@@ -177,7 +177,7 @@ class _Log:
             infos=tuple(dict(self._infos[agent]) for agent in self._agents),
             own_maps=tuple(maps[robot] for robot in range(len(self._agents))),
             alone_until=tuple(self._alone_until.get(robot) for robot in range(len(self._agents))),
-            map_claims=tuple(self._env.episode.ledger.claims(robot, own.map.ids) for robot, own in last.items()),
+            map_claims=tuple(self._env.episode.ledger.true_ids(robot, own.map.ids) for robot, own in last.items()),
             maps=tuple(own.map for own in last.values()), true_landmarks=self._env.true_landmarks,
             consistency=tuple(map(self._env.episode.belief.consistency, last)), scene=self._env.scene(),
             complete=not self._env.agents,

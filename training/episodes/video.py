@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.core.files import check_writable, move_file, resolved
-from slam_backend.core.validation import bad_argument, check_float, check_int
+from slam_backend.core.validation import argument_error, check_float, check_int
 from slam_backend.fastslam.reports import MergeEvent
 from vslam_env.rendering import MergeFlash, Scene
 from vslam_env.rendering.merge_effect import FLASH_TICKS
-from vslam_env.sensors import EyeFrame
+from vslam_env.sensors import RenderedFrame
 
 FPS = 25
 SLOWEST_FPS = 5
@@ -77,10 +77,10 @@ class VideoWriter:
 
     def __init__(self, path: Path, size: tuple[int, int], fps: int = FPS) -> None:
         if path.suffix != ".mp4" or not path.parent.is_dir():
-            raise bad_argument("path", "a file name ending in .mp4 in a folder that exists", Path(path), "Change it.")
+            raise argument_error("path", "a file name ending in .mp4 in a folder that exists", Path(path), "Change it.")
         for name, length in zip(("size[0]", "size[1]"), size, strict=True):
             if check_int(name, length, 2, "Give the picture's size in pixels.") % 2:
-                raise bad_argument(name, "an even number", length, "Add one pixel.")
+                raise argument_error(name, "an even number", length, "Add one pixel.")
         check_int("fps", fps, 1, "Show at least one frame a second.")
         check_writable(path, "path")
         self._path, self._size = path, size
@@ -105,7 +105,9 @@ class VideoWriter:
         width, height = self._size
         if frame.shape != (height, width, 3) or frame.dtype != np.uint8:
             got = f"shape {frame.shape} of {frame.dtype}"
-            raise bad_argument("frame", f"an array of shape ({height}, {width}, 3) of uint8", got, "Draw it so large.")
+            raise argument_error(
+                "frame", f"an array of shape ({height}, {width}, 3) of uint8", got, "Draw it so large."
+            )
         try:
             self._sink.send(np.ascontiguousarray(frame))
         except (OSError, StopIteration) as error:
@@ -138,18 +140,18 @@ class VideoWriter:
     def _unwritten(self) -> ValueError:
         """Return the error of a video that its encoder could not write."""
         text = "The encoder stopped: make room on the disk, or go without a video."
-        return bad_argument("path", "a file that can be written", Path(self._path), text)
+        return argument_error("path", "a file that can be written", Path(self._path), text)
 
 
 def beside_the_map(picture: NDArray[np.uint8], frame: Any, width: int) -> NDArray[np.uint8]:
     """Return a picture (H, W + width, 3) with a robot's two images at its right.
 
     Args:
-        frame: An `EyeFrame`; where it is none, the room stays empty.
+        frame: An `RenderedFrame`; where it is none, the room stays empty.
     """
     height = picture.shape[0]
     panel = np.full((height, width, 3), 24, dtype=np.uint8)
-    if isinstance(frame, EyeFrame):
+    if isinstance(frame, RenderedFrame):
         tall = min(height // 2, round(width * frame.left.shape[0] / frame.left.shape[1]))
         wide = round(tall * frame.left.shape[1] / frame.left.shape[0])
         for row, image in enumerate((draw_eye(frame, (wide, tall)), _large(frame.right, (wide, tall)))):
@@ -157,7 +159,7 @@ def beside_the_map(picture: NDArray[np.uint8], frame: Any, width: int) -> NDArra
     return np.concatenate([picture, panel], axis=1)
 
 
-def draw_eye(frame: EyeFrame, size: tuple[int, int]) -> NDArray[np.uint8]:
+def draw_eye(frame: RenderedFrame, size: tuple[int, int]) -> NDArray[np.uint8]:
     """Return the left image (h, w, 3) with circles at measured corners, coloured by depth, and their disparities."""
     picture = _large(frame.left, size)
     scale = size[0] / frame.left.shape[1]

@@ -12,7 +12,7 @@ from slam_backend.core.validation import check_int
 from vslam_env import vslam_v0
 from vslam_env.config import EnvConfig
 from vslam_env.rendering import draw_frame
-from vslam_env.simulation.scenario import draw_setting
+from vslam_env.simulation.scenario import sample_scenario
 from vslam_env.world import FreeSpace
 
 TILE = (640, 480)  # [px]
@@ -39,13 +39,13 @@ def survey(world: str, world_seed: int, robots: int = 3) -> WorldFigures:
     """
     check_int("seed", world_seed, 0, "Use 0 or a positive number.")
     config = EnvConfig(world=world, num_robots=robots)
-    setting = draw_setting(config, world, np.random.SeedSequence(world_seed), world_seed)
+    setting = sample_scenario(config, world, np.random.SeedSequence(world_seed), world_seed)
     x_min, y_min, x_max, y_max = setting.world.bounds
     starts = setting.true_starts[:, :2]
     gaps = np.linalg.norm(starts[:, None] - starts, axis=2)[~np.eye(robots, dtype=bool)]
     squares = FreeSpace(setting.world, config.robot_radius).free_area_cells
     return WorldFigures(
-        name=setting.world.name, walls=len(setting.world.walls), landmarks=int(np.count_nonzero(setting.countable)),
+        name=setting.world.name, walls=len(setting.world.walls), landmarks=int(np.count_nonzero(setting.observable_landmarks)),
         floor_m2=0.04 * len(squares), width_m=x_max - x_min, height_m=y_max - y_min,
         start_gap_m=float(gaps.min(initial=np.inf)),
     )  # fmt: skip

@@ -198,6 +198,6 @@ def _range(kind: Any, constraints: list[Any]) -> str:
 
 
 def _error(name: str, expected: str, got: Any, hint: str) -> ValueError:
-    from slam_backend.core.validation import bad_argument
+    from slam_backend.core.validation import argument_error
 
-    return bad_argument(name, expected, got, hint)
+    return argument_error(name, expected, got, hint)

@@ -15,7 +15,7 @@ import numpy as np
 import tomli_w
 
 from slam_backend.core.files import write_file
-from slam_backend.core.validation import bad_argument, check_int
+from slam_backend.core.validation import argument_error, check_int
 from slam_backend.trajectory import Trajectory
 
 PACKAGES = (
@@ -80,19 +80,19 @@ def read_config(path: Path, command: str, option: str = "config") -> tuple[dict[
     file = path / CONFIG_FILE if path.is_dir() else path
     expected = f"the {CONFIG_FILE} of an earlier run"
     if not file.is_file():
-        raise bad_argument(option, expected, "no such file", f"Check {str(file)!r}.")
+        raise argument_error(option, expected, "no such file", f"Check {str(file)!r}.")
     try:
         content = tomllib.loads(file.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise bad_argument(option, expected, "a broken file", f"Correct {str(file)!r}: {error}.") from error
+        raise argument_error(option, expected, "a broken file", f"Correct {str(file)!r}: {error}.") from error
     if (found := content.get("format", FORMAT)) != FORMAT or type(found) is not int:
         cure = f"Use the release that wrote {str(file)!r}."
-        raise bad_argument(option, f"one of format {FORMAT}", f"a run folder of format {found!r}", cure)
+        raise argument_error(option, f"one of format {FORMAT}", f"a run folder of format {found!r}", cure)
     if content.get("command") != command:
-        raise bad_argument(option, f"a run of {command!r}", content.get("command"), "Use the command that wrote it.")
+        raise argument_error(option, f"a run of {command!r}", content.get("command"), "Use the command that wrote it.")
     config, seed = content.get("config"), content.get("seed")
     if not isinstance(config, dict) or not isinstance(seed, int):
-        raise bad_argument(option, "a table [config] and a whole number seed", "none", f"Add them to {str(file)!r}.")
+        raise argument_error(option, "a table [config] and a whole number seed", "none", f"Add them to {str(file)!r}.")
     return config, seed
 
 
@@ -145,7 +145,7 @@ def check_free(folder: Path) -> None:
     cure = f"Choose another than {str(folder)!r}, or leave --out away."
     try:
         if folder.is_file():
-            raise bad_argument("out", "a new or empty folder", "a file", cure)
+            raise argument_error("out", "a new or empty folder", "a file", cure)
         full = folder.is_dir() and any(folder.iterdir())
         if not full:
             there = next(place for place in (folder, *folder.absolute().parents) if place.exists())
@@ -153,7 +153,7 @@ def check_free(folder: Path) -> None:
     except OSError as error:
         raise _no_folder(folder, error, "leave --out away") from error
     if full:
-        raise bad_argument("out", "a new or empty folder", "a folder with files", cure)
+        raise argument_error("out", "a new or empty folder", "a folder with files", cure)
 
 
 def _claim(folder: Path) -> Path:
@@ -177,10 +177,10 @@ def _next_free(parent: Path, stem: str) -> Path:
         except OSError as error:
             raise _no_folder(parent, error, "name one with --out") from error
         return folder
-    raise bad_argument("out", "a free number", f"a million folders {stem!r}", "Clean up runs.")
+    raise argument_error("out", "a free number", f"a million folders {stem!r}", "Clean up runs.")
 
 
 def _no_folder(folder: Path, error: OSError, cure: str) -> ValueError:
     """Return the error that says why a folder cannot be made or written."""
     text = f"The system says: {error.strerror}. Choose another folder, or {cure}."
-    return bad_argument("out", "a folder that can be written", Path(folder), text)
+    return argument_error("out", "a folder that can be written", Path(folder), text)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from slam_backend.core.files import append_text
-from slam_backend.core.validation import bad_argument
+from slam_backend.core.validation import argument_error
 from training.experiments.interrupt import begin_worker, signals_held
 from training.experiments.run_folder import CONFIG_FILE, RunFolder, installed_versions, plain, read_config
 
@@ -35,7 +35,7 @@ def open_folder(out: Path | None, command: str, config: Mapping[str, Any], seed:
     if (values, kept_seed) != (asked, seed):
         cure = f"Repeat the options in {str(out / CONFIG_FILE)!r}, or choose another folder."
         expected = f"a folder of this very {command.split()[0]}"
-        raise bad_argument("out", expected, "a folder of one with other options", cure)
+        raise argument_error("out", expected, "a folder of one with other options", cure)
     return RunFolder(out, command, values, seed, installed_versions())
 
 
@@ -63,7 +63,7 @@ def finished_trials(folder: RunFolder, name: str, kind: type[TrialT]) -> dict[Tr
         trials = {trial_of(row, kind): row for row in rows}
     except (KeyError, TypeError, ValueError) as error:
         cure = f"Take {str(file)!r} away, or choose another folder: {error}."
-        raise bad_argument("out", "trials that a run kept", "others", cure) from error
+        raise argument_error("out", "trials that a run kept", "others", cure) from error
     folder.write_text(name, "".join(json.dumps(row) + "\n" for row in rows))
     return trials
 

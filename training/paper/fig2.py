@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from slam_backend.core.validation import FloatArray
 from slam_backend.geometry import wrap_angle
-from slam_backend.maps.alignment import RIVAL_ANGLE, RIVAL_DISTANCE, align_maps, propose_motion
+from slam_backend.maps.alignment import DISTINCT_ROTATION, DISTINCT_TRANSLATION, align_maps, propose_motion
 from training.experiments.plotting import add_legend, save_png
 from training.experiments.tables import csv_text
 from training.paper.map_pairs import map_alone, simulate_pair, true_motion
@@ -105,7 +105,7 @@ def refusals(rows: Iterable[Mapping[str, Any]]) -> dict[str, int]:
     false = [
         stage for row in rows for stage in row["stages"]
         if stage[OURS] is not None
-        and (stage[OURS]["translation_m"] > RIVAL_DISTANCE or stage[OURS]["rotation_deg"] > np.rad2deg(RIVAL_ANGLE))
+        and (stage[OURS]["translation_m"] > DISTINCT_TRANSLATION or stage[OURS]["rotation_deg"] > np.rad2deg(DISTINCT_ROTATION))
     ]  # fmt: skip
     return {"share_too_little": len(poor), "false": len(false)}
 

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
-from slam_backend.core.validation import FloatArray, IntArray, bad_argument
+from slam_backend.core.validation import FloatArray, IntArray, argument_error
 from slam_backend.geometry import transform_points, wrap_angle
 from slam_backend.maps.alignment import Alignment, align_maps, candidate_matches
 from slam_backend.maps.alignment_types import AlignmentOptions
@@ -67,7 +67,7 @@ def align_pair(config: PairConfig) -> AlignedPair:
     found = align_maps(*stage.maps, rng=np.random.default_rng(config.seed))
     if not found.success:
         cure = "Let the robots drive farther, or take another seed."
-        raise bad_argument("length", "maps that can be aligned", f"a refusal: {found.reason}", cure)
+        raise argument_error("length", "maps that can be aligned", f"a refusal: {found.reason}", cure)
     return AlignedPair(stage, candidate_matches(*stage.maps, AlignmentOptions()), found, true_motion(run))
 
 

@@ -167,13 +167,13 @@ def find_log(path: str | None, below: Path, what: str) -> str:
     Raises:
         ValueError: If nothing is there, or `path` is None and the variable is not set.
     """
-    from slam_backend.core.validation import bad_argument
+    from slam_backend.core.validation import argument_error
 
     data = os.environ.get("VSLAM_DATA")
     if path is None and not data:
-        raise bad_argument("path", what, "no --path", "Name it, or set VSLAM_DATA.")
+        raise argument_error("path", what, "no --path", "Name it, or set VSLAM_DATA.")
     place = str(Path(data or "").resolve() / below) if path is None else path
     if not Path(place).exists():
         cure = f"Check {place!r}; if --path is left away, it is {str(below)!r} in the folder that VSLAM_DATA names."
-        raise bad_argument("path", what, "no such path", cure)
+        raise argument_error("path", what, "no such path", cure)
     return place

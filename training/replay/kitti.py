@@ -10,7 +10,7 @@ from slam_backend.core.validation import FloatArray
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.options import FilterOptions
 from slam_backend.geometry import between, compose
-from slam_backend.readers.kitti import KittiLog, make_camera, motion_noise, steps
+from slam_backend.readers.kitti import KittiLog, make_camera, motion_noise, to_filter_steps
 from slam_backend.trajectory import Trajectory
 from training.replay.config import KittiConfig
 from training.replay.single_robot import (
@@ -27,7 +27,7 @@ from training.replay.single_robot import (
 # A track has its number for a descriptor, so that none is taken for another, and unlike a given identity leaves the
 # gate in force: tracks on other cars are refused, and a refused track never starts a second landmark.
 OWN_TRACK = 0.5
-DEAD_ZONE = 1e9
+NEW_LANDMARK_GATE = 1e9
 # Other cars can outvote what stands: the pose is not widened because most tracks contradict it.
 RECOVERY_POSITION = 0.0
 LOOP_AFTER = 100.0  # [m] driven before a place counts as seen again
@@ -59,10 +59,10 @@ class DriveScore:
 def replay(log: KittiLog, config: KittiConfig, on_step: Callable[[float], None] = lambda done: None) -> OneReplay:
     """Let a filter live through a drive; poses are those of the inertial unit."""
     camera = make_camera(log, config.sigma_px, config.sigma_disparity_px)
-    readings = steps(log, camera)
+    readings = to_filter_steps(log, camera)
     options = FilterOptions(
         num_particles=config.particles, camera=camera, motion=motion_noise(log), proposal=config.estimator,
-        rejuvenate_every=config.rejuvenate_every or None, position_gate=PLANAR_GATE, dead_zone=DEAD_ZONE,
+        rejuvenate_every=config.rejuvenate_every or None, position_gate=PLANAR_GATE, new_landmark_gate=NEW_LANDMARK_GATE,
         recovery_position=RECOVERY_POSITION, descriptor_gate=OWN_TRACK,
     )  # fmt: skip
     slam = FastSlam.from_options(1, options, config.seed)

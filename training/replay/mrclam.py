@@ -18,12 +18,12 @@ from slam_backend.maps.alignment_types import PairAttempts
 from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.models.measurements import Measurements
 from slam_backend.models.odometry import OdometryModel
-from slam_backend.readers.mrclam import MrclamLog, steps
+from slam_backend.readers.mrclam import MrclamLog, to_filter_steps
 from slam_backend.team.merge_scheduler import AttemptOptions
 from slam_backend.team.team import TeamSlam
 from training.replay.config import MRCLAM_MOTION, MrclamConfig
 from training.replay.single_robot import PLANAR_GATE, RejuvenationCount
-from vslam_env.evaluation.map_scores import ClaimLedger
+from vslam_env.evaluation.map_scores import GroundTruthAssociation
 
 # A joint filter's particles are weighed by what all its robots see, and die out so much faster: with the starts known,
 # five robots in 100 particles were 13 % farther from their paths than in 500.
@@ -35,8 +35,8 @@ MOTION = OdometryModel(**MRCLAM_MOTION)
 # gate is that of two degrees of freedom, as all is seen in one plane; one landmark is new only far beyond it. With one
 # to three look-alikes in view, most of them contradict a right pose too easily to widen it.
 GATES: dict[str, dict[str, Any]] = {
-    "given": {"position_gate": 1e4, "dead_zone": 1e6},
-    "hidden": {"position_gate": PLANAR_GATE, "dead_zone": 40.0, "recovery_position": 0.0},
+    "given": {"position_gate": 1e4, "new_landmark_gate": 1e6},
+    "hidden": {"position_gate": PLANAR_GATE, "new_landmark_gate": 40.0, "recovery_position": 0.0},
 }
 # Young maps of these robots are bent by tenths of a metre: landmarks need not fit closely, but nearly all have to. On
 # two logs and four seeds, merges on 12 of the 15 landmarks were up to 24 degrees off, on 14 never more than 4.
@@ -91,14 +91,14 @@ def replay_team(
     Returns:
         Paths as they were known at each step, maps and merges as they came.
     """
-    readings = steps(log, config.dt, config.sensor, config.drive)
+    readings = to_filter_steps(log, config.dt, config.sensor, config.drive)
     robots, num_steps = range(len(log.robots)), len(readings.times)
     team = _make_team(log, config)
     contacts = np.eye(len(robots), dtype=np.bool_) if config.alone else None
     flat = np.zeros((len(log.subjects), 3))
     if log.positions is not None:
         flat[:, :2] = log.positions
-    ledger = ClaimLedger(len(robots), flat, np.ones(len(flat), dtype=np.bool_), cutoff=1.0)
+    ledger = GroundTruthAssociation(len(robots), flat, np.ones(len(flat), dtype=np.bool_), cutoff=1.0)
     paths = np.zeros((len(robots), num_steps, 3))
     merges: list[Merge] = []
     attempts, seconds, rejuvenations = 0, 0.0, RejuvenationCount()
@@ -120,7 +120,7 @@ def replay_team(
                 since = float(readings.times[step] - readings.times[0])
                 sides = [groups[side[0]] for side in (event.robots_a, event.robots_b)]
                 joined = [_those_of(new, maps[side]) for side, new in zip(sides, team.merged_maps(event), strict=True)]
-                claims = [ledger.claims(side[0], own.ids) for side, own in zip(sides, joined, strict=True)]
+                claims = [ledger.true_ids(side[0], own.ids) for side, own in zip(sides, joined, strict=True)]
                 merges.append(Merge(since, event, joined[0], joined[1], claims[0], claims[1]))
             if event.kind == "undo":
                 when = float(readings.times[step] - readings.times[0])
@@ -134,7 +134,7 @@ def replay_team(
     return Replay(
         times=readings.times, paths=paths, reckoned=np.array([own.reckoned for own in readings.robots]),
         maps=tuple(own.moved(frame) for own, frame in zip(maps_of, frames, strict=True)),
-        claims=tuple(ledger.claims(robot, maps_of[robot].ids) for robot in robots), start_from_group=frames,
+        claims=tuple(ledger.true_ids(robot, maps_of[robot].ids) for robot in robots), start_from_group=frames,
         groups=team.groups, merges=tuple(merges), attempts=attempts, pairs=None if config.alone else team.pair_attempts,
         rejuvenations=rejuvenations.to_mapping(), consistency=tuple(map(team.consistency, robots)), seconds=seconds,
     )  # fmt: skip

@@ -16,7 +16,7 @@ from slam_backend.fastslam.existence import ExistenceModel
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.options import FilterOptions
 from slam_backend.fastslam.reports import StepReport
-from slam_backend.frontend import KINDS, CornerOptions, FrontEndOptions, StereoFrame, StereoFrontEnd
+from slam_backend.frontend import DESCRIPTOR_TYPES, CornerOptions, FrontEndOptions, StereoFrame, StereoFrontEnd
 from slam_backend.frontend.odometry import camera_motion
 from slam_backend.models.camera import StereoCamera
 from slam_backend.models.measurements import Measurements
@@ -82,7 +82,7 @@ def replay_images(
         proposal=config.estimator,
         rejuvenate_every=config.rejuvenate_every or None,
         position_gate=PLANAR_GATE,
-        descriptor_gate=KINDS[config.descriptor].gate,
+        descriptor_gate=DESCRIPTOR_TYPES[config.descriptor].gate,
         # A street repeats itself: many look-alikes at once would be taken for a lost pose.
         recovery_position=0.0,
         existence=ExistenceModel(detection=0.6),
@@ -105,7 +105,7 @@ class _Eye:
     ids: IntArray
 
     def __init__(self, log: KittiImages, config: ImagesConfig, rng: np.random.Generator) -> None:
-        self._log, self._rng, self._gate = log, rng, KINDS[config.descriptor].gate
+        self._log, self._rng, self._gate = log, rng, DESCRIPTOR_TYPES[config.descriptor].gate
         self._camera = make_camera(log, config.max_range, ODOMETRY_SIGMA, ODOMETRY_SIGMA_DISPARITY)
         seen = FrontEndOptions(descriptor=config.descriptor, corners=CornerOptions(most=CORNERS), nearest=NEAREST)
         self._front_end = StereoFrontEnd(self._camera, seen, log.pair.centre_px)

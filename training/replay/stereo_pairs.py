@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from slam_backend.core.validation import FloatArray, bad_argument
-from slam_backend.frontend import KINDS, CornerOptions, FrontEndOptions, StereoFrame, StereoFrontEnd
+from slam_backend.core.validation import FloatArray, argument_error
+from slam_backend.frontend import DESCRIPTOR_TYPES, CornerOptions, FrontEndOptions, StereoFrame, StereoFrontEnd
 from slam_backend.frontend.images import Image
 from slam_backend.frontend.odometry import CameraMotion, camera_motion
 from slam_backend.geometry3d import rotation_angle
@@ -66,7 +66,7 @@ def load_pairs(path: str | Path, files: StereoFiles = FILES) -> RoomPairs:
     left, right = find_pairs(path, files)
     if len(left) != PAIRS:
         got = f"a folder with {len(left)}"
-        raise bad_argument("path", "two stereo pairs", got, "Replay a drive with `vslam replay stereo`.")
+        raise argument_error("path", "two stereo pairs", got, "Replay a drive with `vslam replay stereo`.")
     images = [(read_grey(one), read_grey(other)) for one, other in zip(left, right, strict=True)]
     height, width = images[0][0].shape
     file, usual = truth_file(path, files), Path(path) / POSES_FILE
@@ -89,7 +89,7 @@ def align_pairs(log: RoomPairs, config: PairsConfig) -> PairsResult:
     rectified = [rectifier.rectify(*pair) for pair in log.images]
     first, second = (eye.measure(*pair) for pair in rectified)
     rng = np.random.default_rng(config.seed)
-    gate = 2.0 * KINDS[config.descriptor].gate  # places far apart look less alike; RANSAC tells
+    gate = 2.0 * DESCRIPTOR_TYPES[config.descriptor].gate  # places far apart look less alike; RANSAC tells
     motion = camera_motion(first.measurements, second.measurements, camera, gate, rng, ITERATIONS)
     nan = float("nan")
     error_m, error_deg, true_m, true_deg = nan, nan, nan, nan
@@ -134,7 +134,7 @@ def _read_poses(file: Path) -> tuple[FloatArray, FloatArray]:
         values = np.empty(0)
     if values.shape not in ((2, 8), (2, 12), (2, 13)) or not np.isfinite(values).all():
         expected = f"{file.name} with two rows of 8 numbers, or of 12"
-        raise bad_argument("path", expected, "a different one", f"Correct {str(file)!r}.")
+        raise argument_error("path", expected, "a different one", f"Correct {str(file)!r}.")
     poses = []
     for row in values:
         pose = np.eye(4)

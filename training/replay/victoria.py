@@ -13,14 +13,14 @@ from slam_backend.geometry import compose, transform_points
 from slam_backend.metrics import align_se2
 from slam_backend.models.camera import ROBOT_FROM_CAMERA, StereoCamera
 from slam_backend.models.measurements import Measurements
-from slam_backend.readers.victoria import SENSOR, VictoriaLog, steps
+from slam_backend.readers.victoria import SENSOR, VictoriaLog, to_filter_steps
 from slam_backend.trajectory import Trajectory
 from training.replay.config import VictoriaConfig
 from training.replay.single_robot import PLANAR_GATE, OneReplay, PositionScore, metrics_of, replay_one, score_positions
 
 # Trees stand metres apart: what lies within 1.5 m of a known one, or is not far beyond its gate, is no new one.
-DEAD_ZONE = 40.0
-DEAD_RADIUS = 1.5
+NEW_LANDMARK_GATE = 40.0
+NEW_LANDMARK_RADIUS = 1.5
 # One thing in 10 m x 10 m x the 1 m that a planar sensor does not resolve is not in the map.
 NEW_LANDMARK_DENSITY = 0.01
 # A filter lets most contradicting trees widen its pose at once. Here a bush and a passer-by outvote the map now and
@@ -44,11 +44,11 @@ class VictoriaScore:
 
 def replay(log: VictoriaLog, config: VictoriaConfig, on_step: Callable[[float], None] = lambda done: None) -> OneReplay:
     """Let a filter live through a log; poses are those of the rear axle."""
-    readings = steps(log, config.sensor)
+    readings = to_filter_steps(log, config.sensor)
     options = FilterOptions(
         num_particles=config.particles, camera=StereoCamera(mount=SENSOR), motion=config.motion,
         proposal=config.estimator, rejuvenate_every=config.rejuvenate_every or None, position_gate=PLANAR_GATE,
-        dead_zone=DEAD_ZONE, dead_radius=DEAD_RADIUS, new_landmark_density=NEW_LANDMARK_DENSITY,
+        new_landmark_gate=NEW_LANDMARK_GATE, new_landmark_radius=NEW_LANDMARK_RADIUS, new_landmark_density=NEW_LANDMARK_DENSITY,
         recovery_position=RECOVERY_POSITION, descriptor_gate=SEARCH_RADIUS, descriptor_sigma=NO_WEIGHT,
     )  # fmt: skip
     slam = FastSlam.from_options(1, options, config.seed)

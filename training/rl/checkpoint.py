@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from slam_backend.core.files import write_file
-from slam_backend.core.state_codec import MOST_BYTES, decoded, encoded, read_file
-from slam_backend.core.validation import bad_argument
+from slam_backend.core.state_codec import MAX_BYTES, decode, encode, read_file
+from slam_backend.core.validation import argument_error
 from training.experiments.run_folder import installed_versions
 from vslam_env.state_kinds import ENV_KINDS
 
@@ -26,7 +26,7 @@ def write_checkpoint(file: Path, content: Mapping[str, Any]) -> None:
     Raises:
         ValueError: If it cannot be written.
     """
-    packed = encoded(dict(content), ENV_KINDS)
+    packed = encode(dict(content), ENV_KINDS)
     mark = {
         "format": FORMAT, "versions": _versions(), "bytes": len(packed), "sha256": hashlib.sha256(packed).hexdigest(),
     }  # fmt: skip
@@ -42,35 +42,35 @@ def read_checkpoint(file: Path) -> dict[str, Any]:
     expected = "the checkpoint of a training"
     if not file.is_file():
         cure = f"There is no {str(file)!r}: the run ended before its first checkpoint. Train anew."
-        raise bad_argument("resume", expected, "no such file", cure)
+        raise argument_error("resume", expected, "no such file", cure)
     try:
         head, _, packed = read_file(file).partition(b"\n")
     except OSError as error:
         cure = f"{str(file)!r} cannot be read: {error}."
-        raise bad_argument("resume", f"{expected} of at most {MOST_BYTES >> 20} MiB", "another file", cure) from error
+        raise argument_error("resume", f"{expected} of at most {MAX_BYTES >> 20} MiB", "another file", cure) from error
     try:
         if not head.startswith(MAGIC):
             raise ValueError("another kind of file")
         mark = json.loads(head[len(MAGIC) :])
         size, digest, version, versions = (mark[name] for name in ("bytes", "sha256", "format", "versions"))
     except (ValueError, KeyError, TypeError) as error:
-        raise bad_argument("resume", expected, "a broken file", f"{str(file)!r} is none: train anew.") from error
+        raise argument_error("resume", expected, "a broken file", f"{str(file)!r} is none: train anew.") from error
     if version != FORMAT:
-        raise bad_argument("resume", f"one of format {FORMAT}", f"a checkpoint of format {version}", "Train again.")
+        raise argument_error("resume", f"one of format {FORMAT}", f"a checkpoint of format {version}", "Train again.")
     if len(packed) != size or hashlib.sha256(packed).hexdigest() != digest:
         cure = f"{str(file)!r} was cut off or changed: copy it again, or train anew."
-        raise bad_argument("resume", f"{expected}, {size} bytes", f"a broken file of {len(packed)}", cure)
+        raise argument_error("resume", f"{expected}, {size} bytes", f"a broken file of {len(packed)}", cure)
     for package, here in _versions().items():
         if versions.get(package) != here:
             cure = f"Install {package}=={versions.get(package)}, or train anew."
-            raise bad_argument("resume", f"a checkpoint made with {package} {here}", versions.get(package), cure)
+            raise argument_error("resume", f"a checkpoint made with {package} {here}", versions.get(package), cure)
     try:
-        content = decoded(packed, ENV_KINDS)
+        content = decode(packed, ENV_KINDS)
         if not isinstance(content, dict) or not all(isinstance(name, str) for name in content):
             raise ValueError("it holds no parts by name")
     except ValueError as error:
         cure = f"{str(file)!r} was made by something else: train again. Reading says: {error}."
-        raise bad_argument("resume", expected, "a broken file", cure) from error
+        raise argument_error("resume", expected, "a broken file", cure) from error
     return content
 
 

@@ -90,10 +90,10 @@ class TrainConfig(ExperimentConfig):
     def make_env_config(self, split: str | None) -> "EnvConfig":
         """Return the environment for worlds of a split; files of one building have none."""
         from vslam_env.presets import preset_config
-        from vslam_env.world import is_one_building
+        from vslam_env.world import is_single_layout
 
         return preset_config(self.noise).replace(
-            world=self.world, world_split=None if is_one_building(self.world) else split, num_robots=self.robots,
+            world=self.world, world_split=None if is_single_layout(self.world) else split, num_robots=self.robots,
             action_type="goal", decision_ticks=self.decision_ticks, max_cycles=self.max_cycles,
             reward=dict(self.reward),
             belief={
@@ -134,10 +134,10 @@ class EvaluateConfig(ExperimentConfig):
     @classmethod
     def completed(cls, values: Mapping[str, Any]) -> Mapping[str, Any]:
         """Refuse an evaluation of no model."""
-        from slam_backend.core.validation import bad_argument
+        from slam_backend.core.validation import argument_error
 
         if "model" not in values:
-            raise bad_argument("model", "a model that vslam train wrote", "no model", "Name it, or its run folder.")
+            raise argument_error("model", "a model that vslam train wrote", "no model", "Name it, or its run folder.")
         return values
 
     def to_mapping(self) -> dict[str, Any]:
@@ -152,12 +152,12 @@ class EvaluateConfig(ExperimentConfig):
         """
         from agents.trained import load_model
         from vslam_env.config import EnvConfig
-        from vslam_env.world import is_one_building
+        from vslam_env.world import is_single_layout
 
         config = EnvConfig.from_toml_text(load_model(self.model)[1]["environment"])
         given = {"world": self.world, "num_robots": self.robots, "max_cycles": self.max_cycles}
         changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
-        changes["world_split"] = None if is_one_building(changes.get("world", config.world)) else self.split
+        changes["world_split"] = None if is_single_layout(changes.get("world", config.world)) else self.split
         return config.replace(**changes, reward={"map_error": 1.0}, shared_reward=False)
 
     def trials(self) -> list[EvaluateTrial]:
@@ -172,9 +172,9 @@ def require_extra() -> None:
     Raises:
         ValueError: If one is missing.
     """
-    from slam_backend.core.validation import bad_argument
+    from slam_backend.core.validation import argument_error
 
     missing = [name for name in NEEDED if find_spec(name) is None]
     if missing:
         cure = "Install them: pip install torch==2.13.0, which is small, then pip install '.[train]' in a checkout."
-        raise bad_argument("train", "the packages of the extra 'train'", f"no {', '.join(missing)}", cure)
+        raise argument_error("train", "the packages of the extra 'train'", f"no {', '.join(missing)}", cure)

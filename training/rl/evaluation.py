@@ -10,7 +10,7 @@ from rich.console import Console
 
 from agents.policy import Policy
 from agents.registry import make_policy
-from agents.trained import TrainedGoals, load_model
+from agents.trained import TrainedGoalPolicy, load_model
 from training.episodes.runner import run_episode
 from training.experiments.statistics import ahead_by, mean_of, shown, summarise_means
 from training.experiments.tables import console_table
@@ -45,7 +45,7 @@ def _environment(config: EvaluateConfig) -> ExplorationEnv:
 
 
 def _policy(config: EvaluateConfig, name: str) -> Policy:
-    return TrainedGoals(load_model(config.model)[0], config.greedy) if name == MODEL else make_policy(name, "goal")
+    return TrainedGoalPolicy(load_model(config.model)[0], config.greedy) if name == MODEL else make_policy(name, "goal")
 
 
 def summarise(rows: Rows) -> list[dict[str, Any]]:

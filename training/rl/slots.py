@@ -10,7 +10,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
-from slam_backend.core.validation import BoolArray, Float32Array, FloatArray, bad_argument
+from slam_backend.core.validation import BoolArray, Float32Array, FloatArray, argument_error
 
 MakeEnv = Callable[[], ParallelEnv[str, Any, Any]]
 Infos = list[dict[str, Any]]
@@ -51,7 +51,7 @@ def row_layout(space: spaces.Space[Any]) -> Layout:
     """
     boxes = dict(space.spaces) if isinstance(space, spaces.Dict) else {WHOLE: space}
     if not all(isinstance(box, spaces.Box) for box in boxes.values()):
-        raise bad_argument("observation_space", "a Box or a Dict of these", space, "Flatten what is nested.")
+        raise argument_error("observation_space", "a Box or a Dict of these", space, "Flatten what is nested.")
     return tuple((name, box.shape or (), np.dtype(box.dtype)) for name, box in boxes.items())
 
 
@@ -97,7 +97,7 @@ class SlotBatch:
 
     def __init__(self, makers: Sequence[MakeEnv]) -> None:
         if not makers:
-            raise bad_argument("makers", "at least one function", list(makers), "Give a function per environment.")
+            raise argument_error("makers", "at least one function", list(makers), "Give a function per environment.")
         self.envs: list[Any] = [make() for make in makers]
         self.slots = [Slot(env, agent) for env in self.envs for agent in env.possible_agents]
         self._agents: list[tuple[str, ...]] = [tuple(env.possible_agents) for env in self.envs]
@@ -110,9 +110,9 @@ class SlotBatch:
             for kind in ("observation_space", "action_space"):
                 theirs = getattr(slot.env, kind)(slot.agent)
                 if theirs != getattr(self, kind):
-                    raise bad_argument(kind, "the same for all agents", theirs, "Give robots of one kind.")
+                    raise argument_error(kind, "the same for all agents", theirs, "Give robots of one kind.")
             if slot.env.render_mode != self.render_mode:
-                raise bad_argument("render_mode", "the same for all", slot.env.render_mode, "Make all alike.")
+                raise argument_error("render_mode", "the same for all", slot.env.render_mode, "Make all alike.")
         self.layout = row_layout(self.observation_space)
         self._results: Stepped | None = None
 

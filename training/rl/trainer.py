@@ -11,8 +11,8 @@ from sb3_contrib import MaskablePPO
 from stable_baselines3.common.logger import configure
 
 from agents.trained import MODEL_FILE, save_model
-from slam_backend.core.state_checks import generator as check_generator
-from slam_backend.core.validation import bad_argument
+from slam_backend.core.state_checks import check_generator as check_generator
+from slam_backend.core.validation import argument_error
 from training.experiments.run_folder import installed_versions
 from training.rl.callbacks import Row, TrainingWatch
 from training.rl.checkpoint import CHECKPOINT_FILE, read_checkpoint, write_checkpoint
@@ -115,7 +115,7 @@ class Training:
             self._go_on_from(kept)
         except Exception as error:  # whatever torch says of parts that are none of this model's
             cure = f"Copy the checkpoint again, or train again. It says: {error}."
-            raise bad_argument("resume", "the parts that a training saved", "'others'", cure) from error
+            raise argument_error("resume", "the parts that a training saved", "'others'", cure) from error
 
     def _go_on_from(self, kept: Mapping[str, Any]) -> None:
         """Take over the parts of a checkpoint."""
@@ -147,7 +147,7 @@ def kept_of(folder: Path, config: TrainConfig) -> dict[str, Any]:
     kept = read_checkpoint(folder / CHECKPOINT_FILE)
     if (kept["config"], kept["seed"]) != (config.to_mapping(), config.seed):
         cure = "Give back the folder its own config.toml, or train anew."
-        raise bad_argument("resume", "a checkpoint of the folder's configuration", "a checkpoint of another", cure)
+        raise argument_error("resume", "a checkpoint of the folder's configuration", "a checkpoint of another", cure)
     return kept
 
 
@@ -160,14 +160,14 @@ def check_device(device: str) -> str:
     try:
         kind = torch.device(device).type
     except RuntimeError as error:
-        raise bad_argument("device", "cpu, cuda or cuda:0", device, "Leave it out to use the processor.") from error
+        raise argument_error("device", "cpu, cuda or cuda:0", device, "Leave it out to use the processor.") from error
     if kind not in ("cpu", "cuda"):
-        raise bad_argument("device", "cpu, cuda or cuda:0", device, "Leave it out to use the processor.")
+        raise argument_error("device", "cpu, cuda or cuda:0", device, "Leave it out to use the processor.")
     if kind == "cuda":
         found = torch.cuda.device_count() if torch.cuda.is_available() else 0
         if (torch.device(device).index or 0) >= found:
             cure = "Leave --device out to use the processor, or install a torch that finds the GPU."
-            raise bad_argument("device", "a GPU that torch can use", f"a machine with {found} of them", cure)
+            raise argument_error("device", "a GPU that torch can use", f"a machine with {found} of them", cure)
     return device
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from slam_backend.core.validation import bad_argument
+from slam_backend.core.validation import argument_error
 from training.experiments.interrupt import begin_worker, signals_held
 from training.experiments.trial_store import one_thread_each
 from training.rl.slots import NOTHING_SENT, Infos, Layout, MakeEnv, SlotBatch, Stepped, buffers
@@ -51,7 +51,7 @@ class SlotWorkers:
         sample = SlotBatch(makers)
         if workers > len(makers):
             cure = "Use fewer workers, or more environments."
-            raise bad_argument("workers", f"at most one per environment, {len(makers)}", workers, cure)
+            raise argument_error("workers", f"at most one per environment, {len(makers)}", workers, cure)
         self.observation_space: spaces.Space[Any] = sample.observation_space
         self.action_space: spaces.Space[Any] = sample.action_space
         self.render_mode, self.counts = sample.render_mode, sample.counts

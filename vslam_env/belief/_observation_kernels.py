@@ -5,14 +5,14 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.core.jit import device, in_place, room_of
+from slam_backend.core.jit import device, in_place, stack_array_of
 from slam_backend.fastslam.relative_poses import COVARIANCE, ESS, OWN, SIGMAS, START
 from vslam_env.navigation import CELL, FREE, GRID_SIZE, OCCUPIED, UNKNOWN
 
-MOST_TEAMMATES = 7
+MAX_TEAMMATES = 7
 POSE_LIMIT = np.array([30.0, 30.0, np.pi])
-FAR = 90.0  # [m] more than the diagonal of the seen grid
-MAP_STATS_LIMIT = np.array([10_000.0, 10.0, 10.0, 10_000.0, 1.0, 1.0 + MOST_TEAMMATES])
+MAX_POSITION = 90.0  # [m] more than the diagonal of the seen grid
+MAP_STATS_LIMIT = np.array([10_000.0, 10.0, 10.0, 10_000.0, 1.0, 1.0 + MAX_TEAMMATES])
 
 
 @device
@@ -37,7 +37,7 @@ def write_map_stats(places: Any, names: Any, belief: Any, group_size: int, stats
     """Write `map_stats` of a robot.
 
     Args:
-        places, names: (m, 4), (m, 2) int64. Of its landmarks, see `OutlineRows`.
+        places, names: (m, 4), (m, 2) int64. Of its landmarks, see `MapSummaryRows`.
         belief: As in `write_pose`.
         group_size: Robots that share its map.
         stats: (6,) float32. Written to.
@@ -79,9 +79,12 @@ def write_teammates(robot: int, poses: Any, belief: Any, teammates: Any, present
             known += 1
             to, place = teammates[mate - (mate > robot)], poses[mate]
             dx, dy, turn = place[0] - x, place[1] - y, place[2] - theta
-            to[0], to[1] = _clip(c * dx + s * dy, -FAR, FAR), _clip(c * dy - s * dx, -FAR, FAR)
+            to[0], to[1] = (
+                _clip(c * dx + s * dy, -MAX_POSITION, MAX_POSITION),
+                _clip(c * dy - s * dx, -MAX_POSITION, MAX_POSITION),
+            )
             to[2], to[3] = np.float32(math.cos(turn)), np.float32(math.sin(turn))
-            to[4] = _clip(belief[SIGMAS + mate], -FAR, FAR)
+            to[4] = _clip(belief[SIGMAS + mate], -MAX_POSITION, MAX_POSITION)
             present[mate - (mate > robot)] = 1
     return known
 
@@ -92,12 +95,12 @@ def clip_candidates(features: Any) -> None:
     """Clip the features (16, 5) float32 of a robot's candidates."""
     for i in range(features.shape[0]):
         for j in range(features.shape[1]):
-            features[i, j] = _clip(features[i, j], -FAR, FAR)
+            features[i, j] = _clip(features[i, j], -MAX_POSITION, MAX_POSITION)
 
 
 SIZE = 48
 CHANNELS = ("free", "occupied", "landmarks")
-MARK = 255
+GRID_ON = 255
 REACH = 0.75 * SIZE  # [cells] more than from the robot to a corner of its picture
 
 
@@ -112,7 +115,7 @@ def paint(cells: Any, belief: Any, places: Any, local: Any) -> None:
     Args:
         cells: (300, 300) uint8. Of the seen grid.
         belief: (16 or more,). Of the robot, see `Standpoints`: where it is, and what moves landmarks to its frame.
-        places: (n, 4). Of the landmarks, see `OutlineRows`.
+        places: (n, 4). Of the landmarks, see `MapSummaryRows`.
         local: (3, 48, 48) uint8. Channels free, occupied, landmarks, of cells of 0.2 m, 0 or 255. Written to.
     """
     x, y = belief[OWN], belief[OWN + 1]
@@ -121,7 +124,7 @@ def paint(cells: Any, belief: Any, places: Any, local: Any) -> None:
     flat = cells.reshape(cells.size)
     low, high = REACH - 0.5 * GRID_SIZE, 0.5 * GRID_SIZE - REACH
     surely_inside = low < x / CELL < high and low < y / CELL < high
-    place, seen = room_of(SIZE, np.int32), room_of(SIZE, np.uint8)
+    place, seen = stack_array_of(SIZE, np.int32), stack_array_of(SIZE, np.uint8)
     for row in range(SIZE):
         ahead = middle - 0.5 - row  # [cells], as what follows
         first_i, first_j = y / CELL + s * ahead + 0.5 * GRID_SIZE, x / CELL + c * ahead + 0.5 * GRID_SIZE
@@ -139,8 +142,8 @@ def paint(cells: Any, belief: Any, places: Any, local: Any) -> None:
                 seen[col] = cells[int(i), int(j)] if inside else UNKNOWN
         free, occupied, landmarks = local[0, row], local[1, row], local[2, row]
         for col in range(SIZE):
-            free[col] = MARK if seen[col] == FREE else 0
-            occupied[col] = MARK if seen[col] == OCCUPIED else 0
+            free[col] = GRID_ON if seen[col] == FREE else 0
+            occupied[col] = GRID_ON if seen[col] == OCCUPIED else 0
             landmarks[col] = 0
     start_x, start_y = belief[START], belief[START + 1]
     start_c, start_s = math.cos(belief[START + 2]), math.sin(belief[START + 2])
@@ -150,11 +153,11 @@ def paint(cells: Any, belief: Any, places: Any, local: Any) -> None:
         row = math.floor(middle - (c * dx + s * dy) / CELL)
         col = math.floor(middle - (c * dy - s * dx) / CELL)
         if 0 <= row < SIZE and 0 <= col < SIZE:
-            local[2, row, col] = MARK
+            local[2, row, col] = GRID_ON
 
 
 @in_place
-def observe_team(
+def write_observations(
     robots: Any, poses: Any, beliefs: Any, places: Any, names: Any, parts: Any, cells: Any, scans: Any,
     clipped: Any, deviations: Any, stats: Any, ranges: Any, candidates: Any, teammates: Any, present: Any,
     pictures: Any,

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from slam_backend.core.read_only import as_read_only
 from slam_backend.core.validation import MOST, BoolArray, FloatArray, IntArray, check_int
 from slam_backend.fastslam.options import FilterOptions
-from slam_backend.fastslam.relative_poses import Standpoints
+from slam_backend.fastslam.relative_poses import TeamPoses
 from slam_backend.maps.alignment import AlignmentOptions
-from slam_backend.maps.landmark_map import LandmarkMap, TeamOutlines
+from slam_backend.maps.landmark_map import LandmarkMap, TeamMapSummaries
 from slam_backend.models.camera import StereoCamera
 from slam_backend.smoother.options import SmoothingOptions
 from slam_backend.team.merge_scheduler import AttemptOptions
@@ -21,7 +21,7 @@ from slam_backend.team.options import MergeOptions
 from vslam_env.navigation import SeenGrid
 
 
-def cautious_filter() -> FilterOptions:
+def default_filter_options() -> FilterOptions:
     """Return the default filter: it assumes twice the camera noise of the default camera, and is rejuvenated in slices.
 
     Particle filters are over-confident. In the recorded readings of four office episodes of 220 s (seeds 100-103,
@@ -42,19 +42,19 @@ class BeliefConfig:
     """What the robots assume about their sensors, and how they align their maps.
 
     Attributes:
-        filter: Of each robot's FastSLAM; its camera and motion hold the assumed noise, by default `cautious_filter`.
+        filter: Of each robot's FastSLAM; its camera and motion hold the assumed noise, by default `default_filter_options`.
         alignment: When two maps are believed to fit together.
         attempts: When a pair of groups tries.
         merging: How their filters are merged, and when a merge is undone. By default robots merge on trial where they
-            are not sure (`MergeOptions.least_sure`): they are scored in the frames of their own starts.
+            are not sure (`MergeOptions.min_sigmas_on_trial`): they are scored in the frames of their own starts.
         confirm_after: Landmarks measured fewer times than this are not yet part of a robot's map: what is seen but
             once may be a false point.
     """
 
-    filter: FilterOptions = field(default_factory=cautious_filter)
+    filter: FilterOptions = field(default_factory=default_filter_options)
     alignment: AlignmentOptions = field(default_factory=AlignmentOptions)
     attempts: AttemptOptions = field(default_factory=AttemptOptions)
-    merging: MergeOptions = field(default_factory=lambda: MergeOptions(least_sure=5.0))
+    merging: MergeOptions = field(default_factory=lambda: MergeOptions(min_sigmas_on_trial=5.0))
     confirm_after: int = 2
 
     def __post_init__(self) -> None:
@@ -62,7 +62,7 @@ class BeliefConfig:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Body:
+class RobotHardware:
     """What each robot knows of its own hardware.
 
     Attributes:
@@ -168,7 +168,7 @@ class Belief:
         return self.group_map.moved(self.start_from_group)
 
 
-class View(NamedTuple):
+class BeliefBatch(NamedTuple):
     """The part of some robots' beliefs that observations show, gathered without copies: read it before the next step.
 
     Attributes:
@@ -180,17 +180,17 @@ class View(NamedTuple):
     """
 
     robots: IntArray
-    points: Standpoints
-    outlines: TeamOutlines
+    points: TeamPoses
+    map_summaries: TeamMapSummaries
     cells: NDArray[np.uint8]
     features: NDArray[np.float32]
 
     @classmethod
-    def of(cls, belief: Belief) -> "View":
+    def of(cls, belief: Belief) -> "BeliefBatch":
         """Return what an observation shows of one belief."""
         known = {mate.robot: (mate.pose, mate.position_sigma) for mate in belief.teammates}
         known[belief.robot] = belief.pose, position_sigma(belief.covariance)
-        points = Standpoints(1, max(known) + 1)
+        points = TeamPoses(1, max(known) + 1)
         points.own[0], points.starts[0] = belief.pose, belief.start_from_group
         points.covariances[0], points.ess[0] = belief.covariance, belief.ess
         points.poses.fill(np.nan)
@@ -200,7 +200,7 @@ class View(NamedTuple):
         return cls(
             robots=np.array([belief.robot]),
             points=points,
-            outlines=TeamOutlines.joined([belief.group_map.outline]),
+            map_summaries=TeamMapSummaries.from_maps([belief.group_map.summary]),
             cells=belief.grid.cells[None],
             features=belief.candidates.features[None].copy(),
         )

@@ -25,15 +25,15 @@ from numpy.typing import NDArray
 from slam_backend.core.validation import FloatArray
 from vslam_env.belief._observation_kernels import (
     CHANNELS,
-    FAR,
+    GRID_ON,
     MAP_STATS_LIMIT,
-    MARK,
-    MOST_TEAMMATES,
+    MAX_POSITION,
+    MAX_TEAMMATES,
     POSE_LIMIT,
     SIZE,
-    observe_team,
+    write_observations,
 )
-from vslam_env.belief.belief import Belief, View
+from vslam_env.belief.belief import Belief, BeliefBatch
 from vslam_env.navigation.candidate_slots import FRONTIER_SIZE, NUM_FEATURES, NUM_SLOTS
 
 NUM_ACTIONS = 1 + NUM_SLOTS
@@ -52,10 +52,10 @@ def observe(belief: Belief, scan: FloatArray, goal_actions: bool) -> Observation
     Returns:
         Fresh arrays by name, as the table of this module says.
     """
-    return observed(View.of(belief), scan[None], goal_actions)[0]
+    return observe_team(BeliefBatch.of(belief), scan[None], goal_actions)[0]
 
 
-def observed(view: View, scans: FloatArray, goal_actions: bool) -> list[Observation]:
+def observe_team(view: BeliefBatch, scans: FloatArray, goal_actions: bool) -> list[Observation]:
     """Return the observations of some robots.
 
     Args:
@@ -69,10 +69,10 @@ def observed(view: View, scans: FloatArray, goal_actions: bool) -> list[Observat
     count, candidates = len(view.robots), view.features
     poses, deviations = np.empty((count, 3), np.float32), np.empty((count, 3), np.float32)
     stats, ranges = np.empty((count, 6), np.float32), np.empty(scans.shape, np.float32)
-    teammates, present = np.empty((count, MOST_TEAMMATES, 5), np.float32), np.empty((count, MOST_TEAMMATES), np.int8)
+    teammates, present = np.empty((count, MAX_TEAMMATES, 5), np.float32), np.empty((count, MAX_TEAMMATES), np.int8)
     pictures = np.empty((count, len(CHANNELS), SIZE, SIZE), np.uint8)
-    points, ((places, names), parts) = view.points, view.outlines
-    observe_team(
+    points, ((places, names), parts) = view.points, view.map_summaries
+    write_observations(
         view.robots, points.poses, points.beliefs, places, names, parts, view.cells, scans,
         poses, deviations, stats, ranges, candidates, teammates, present, pictures,
     )  # fmt: skip
@@ -104,7 +104,7 @@ def action_mask(candidates: NDArray[np.float32]) -> NDArray[np.int8]:
 def flatten(observation: Observation) -> NDArray[np.float32]:
     """Return everything but the action mask as one float32 vector, in the order of the table; the grid as 0 and 1."""
     parts = [
-        (value / np.float32(MARK) if name == "local_grid" else value).ravel()
+        (value / np.float32(GRID_ON) if name == "local_grid" else value).ravel()
         for name, value in observation.items()
         if name != "action_mask"
     ]
@@ -127,11 +127,13 @@ def observation_space(num_rays: int, scan_range: float, goal_actions: bool, flat
         "pose": _box(-POSE_LIMIT, POSE_LIMIT),
         "pose_std": _box(np.zeros(3), POSE_LIMIT),
         "map_stats": _box(np.zeros(6), MAP_STATS_LIMIT),
-        "local_grid": spaces.Box(0, MARK, (len(CHANNELS), SIZE, SIZE), np.uint8),
+        "local_grid": spaces.Box(0, GRID_ON, (len(CHANNELS), SIZE, SIZE), np.uint8),
         "scan": _box(np.zeros(num_rays), np.full(num_rays, scan_range)),
-        "candidates": _box(np.full((NUM_SLOTS, NUM_FEATURES), -FAR), np.full((NUM_SLOTS, NUM_FEATURES), FAR)),
-        "teammates": _box(np.full((MOST_TEAMMATES, 5), -FAR), np.full((MOST_TEAMMATES, 5), FAR)),
-        "teammates_mask": spaces.Box(0, 1, (MOST_TEAMMATES,), np.int8),
+        "candidates": _box(
+            np.full((NUM_SLOTS, NUM_FEATURES), -MAX_POSITION), np.full((NUM_SLOTS, NUM_FEATURES), MAX_POSITION)
+        ),
+        "teammates": _box(np.full((MAX_TEAMMATES, 5), -MAX_POSITION), np.full((MAX_TEAMMATES, 5), MAX_POSITION)),
+        "teammates_mask": spaces.Box(0, 1, (MAX_TEAMMATES,), np.int8),
     }
     mask = spaces.Box(0, 1, (NUM_ACTIONS,), np.int8)
     if not flat:

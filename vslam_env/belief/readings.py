@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.core.validation import BoolArray, FloatArray, IntArray, bad_argument, check_array
+from slam_backend.core.validation import BoolArray, FloatArray, IntArray, argument_error, check_array
 from slam_backend.models.measurements import Measurements, TeamMeasurements
 
 
@@ -31,7 +31,7 @@ class Readings(NamedTuple):
     bump: bool
     pose: FloatArray | None = None
     identities: IntArray | None = None
-    heard: BoolArray | None = None
+    contacts: BoolArray | None = None
     image: NDArray[np.uint8] | None = None
 
 
@@ -57,10 +57,10 @@ class TeamReadings(NamedTuple):
     bumps: BoolArray
     poses: FloatArray | None = None
     identities: Sequence[IntArray] | None = None
-    heard: BoolArray | None = None
+    contacts: BoolArray | None = None
     images: Sequence[NDArray[np.uint8]] | None = None
 
-    def of_each(self) -> tuple[Readings, ...]:
+    def per_robot(self) -> tuple[Readings, ...]:
         """Return what each robot reads; arrays that can be written are copies."""
         frames = self.measurements
         nothing = [None] * len(self.bumps)
@@ -68,18 +68,18 @@ class TeamReadings(NamedTuple):
             map(
                 Readings,
                 nothing if self.odometry is None else self.odometry.copy(),
-                frames.of_each() if isinstance(frames, TeamMeasurements) else frames,
+                frames.per_robot() if isinstance(frames, TeamMeasurements) else frames,
                 self.scans.copy(),
                 self.bumps.tolist(),
                 nothing if self.poses is None else self.poses.copy(),
                 nothing if self.identities is None else [names.copy() for names in self.identities],
-                nothing if self.heard is None else self.heard.copy(),
+                nothing if self.contacts is None else self.contacts.copy(),
                 nothing if self.images is None else [image.copy() for image in self.images],
             )
         )
 
     @classmethod
-    def gathered(cls, readings: Sequence[Readings]) -> "TeamReadings":
+    def stack(cls, readings: Sequence[Readings]) -> "TeamReadings":
         """Return the readings of all K robots as those of a team.
 
         Raises:
@@ -87,13 +87,13 @@ class TeamReadings(NamedTuple):
                 reading is no array of its shape.
         """
         if not readings:
-            raise bad_argument("readings", "those of each robot", readings, "Give one for each robot.")
+            raise argument_error("readings", "those of each robot", readings, "Give one for each robot.")
         columns = list(zip(*readings, strict=True))
         for name, column in zip(Readings._fields, columns, strict=True):
             missing = [reading is None for reading in column]
             if any(missing) and not all(missing):
                 cure = "Give this reading of all robots or of none."
-                raise bad_argument(f"readings[{missing.index(True)}].{name}", "an array", None, cure)
+                raise argument_error(f"readings[{missing.index(True)}].{name}", "an array", None, cure)
         odometry, measurements, scans, bumps, poses, identities, heard, images = columns
         each = (len(readings),)
         return cls(
@@ -103,7 +103,7 @@ class TeamReadings(NamedTuple):
             bumps=_stacked("bump", bumps, (), np.bool_),
             poses=None if poses[0] is None else _stacked("pose", poses, (3,)),
             identities=None if identities[0] is None else identities,
-            heard=None if heard[0] is None else _stacked("heard", heard, each, dtype=None, finite=False),
+            contacts=None if heard[0] is None else _stacked("heard", heard, each, dtype=None, finite=False),
             images=None if images[0] is None else images,
         )
 

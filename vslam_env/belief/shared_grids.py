@@ -9,15 +9,15 @@ import numpy as np
 
 from slam_backend.core.read_only import as_constant, as_read_only, with_constants, with_read_only
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
-from slam_backend.fastslam.relative_poses import Standpoints
-from slam_backend.fastslam.reports import MapDropped, MergeUndone, Renaming, TeamReport
+from slam_backend.fastslam.relative_poses import TeamPoses
+from slam_backend.fastslam.reports import LandmarkIdMap, MapReleased, MergeUndone, TeamReport
 from slam_backend.geometry import compose, inverse
-from vslam_env.belief.belief import Body
+from vslam_env.belief.belief import RobotHardware
 from vslam_env.navigation import SeenGrid, TeamGrids, ray_directions
 
 
-class Strokes(NamedTuple):
-    """What the readings of one tick wrote into the grids, as `TeamGrids.paint_readings` takes it. Arrays are read-only.
+class GridUpdate(NamedTuple):
+    """What the readings of one tick wrote into the grids, as `TeamGrids.update` takes it. Arrays are read-only.
 
     Attributes:
         tick: Of the readings.
@@ -34,7 +34,7 @@ class Strokes(NamedTuple):
     bumps: BoolArray
 
 
-class Telling(NamedTuple):
+class GridTransfer(NamedTuple):
     """That one robot's grid takes what another's has.
 
     Attributes:
@@ -44,14 +44,16 @@ class Telling(NamedTuple):
         is_whole: Whether the taker absorbs the whole of it, strokes that are forgotten included.
     """
 
-    giver: int
-    taker: int
+    source: int
+    target: int
     motion: FloatArray
     since: int
     is_whole: bool
 
 
-def caught_up(history: Sequence[Strokes], tellings: Iterable[Telling]) -> tuple[list[Strokes], list[Strokes]]:
+def plan_catch_up(
+    history: Sequence[GridUpdate], tellings: Iterable[GridTransfer]
+) -> tuple[list[GridUpdate], list[GridUpdate]]:
     """Return a history in which robots have told each other what they had before, and what is to be painted for that.
 
     Args:
@@ -79,9 +81,9 @@ def caught_up(history: Sequence[Strokes], tellings: Iterable[Telling]) -> tuple[
     return after, [after[row]._replace(shared=missed[row]) for row in late.tolist()]
 
 
-def separated(
-    history: Iterable[Strokes], before: Iterable[Strokes], sides: Sequence[Sequence[int]]
-) -> tuple[list[Strokes], list[Strokes]]:
+def split_history(
+    history: Iterable[GridUpdate], before: Iterable[GridUpdate], sides: Sequence[Sequence[int]]
+) -> tuple[list[GridUpdate], list[GridUpdate]]:
     """Return a history in which two sides were never together, and what is to be painted into their grids of before.
 
     Args:
@@ -104,11 +106,11 @@ def separated(
     return after, again
 
 
-TOGETHER, STRANGERS = -1, -2  # in place of the tick in which two robots lost each other; strangers come first
-LONGEST_ABSENCE = 1000  # [ticks] whoever is away for longer comes back as a stranger: to paint takes 10 us a tick
+CONNECTED, NEVER_MET = -1, -2  # in place of the tick in which two robots lost each other; strangers come first
+MAX_ABSENCE = 1000  # [ticks] whoever is away for longer comes back as a stranger: to paint takes 10 us a tick
 
 
-class Kept(NamedTuple):
+class GridSnapshot(NamedTuple):
     """Grids as they were just before a merge.
 
     Attributes:
@@ -123,7 +125,7 @@ class Kept(NamedTuple):
     sides: tuple[tuple[int, ...], tuple[int, ...]]
     maps: tuple[int, int, int]
     grids: dict[int, dict[str, Any]]
-    strokes: tuple[Strokes, ...]
+    updates: tuple[GridUpdate, ...]
 
 
 class SharedGrids:
@@ -144,19 +146,19 @@ class SharedGrids:
         team: All grids, in the order of robots.
     """
 
-    def __init__(self, num_robots: int, body: Body) -> None:
+    def __init__(self, num_robots: int, body: RobotHardware) -> None:
         self.team = TeamGrids(num_robots)
         self._grids = self.team.grids
         self._hardware = ray_directions(body.ray_angles), float(body.scan_range), float(body.radius)
-        self._parted = np.full((num_robots, num_robots), STRANGERS)  # since which tick two do not share what they scan
+        self._parted = np.full((num_robots, num_robots), NEVER_MET)  # since which tick two do not share what they scan
         self._settle(0, [(robot,) for robot in range(num_robots)])
-        self._kept: list[Kept] = []
-        self._strokes: deque[Strokes] = deque()
+        self._kept: list[GridSnapshot] = []
+        self._strokes: deque[GridUpdate] = deque()
 
     def __getitem__(self, robot: int) -> SeenGrid:
         return self._grids[robot]
 
-    def keep(self, tick: int, renaming: Renaming) -> None:
+    def save_for_undo(self, tick: int, renaming: LandmarkIdMap) -> None:
         """Keep the grids of both sides of a merge, before they absorb each other's.
 
         Args:
@@ -165,14 +167,14 @@ class SharedGrids:
         """
         sides = renaming.robots_a, renaming.robots_b
         grids = with_read_only({robot: self._grids[robot].get_state() for robot in sides[0] + sides[1]})
-        self._kept.append(Kept(tick, sides, renaming.maps, grids, tuple(self._strokes)))
+        self._kept.append(GridSnapshot(tick, sides, renaming.maps, grids, tuple(self._strokes)))
 
     def step(
         self,
         tick: int,
         report: TeamReport,
         mates: Sequence[tuple[int, ...]],
-        points: Standpoints,
+        points: TeamPoses,
         scans: FloatArray,
         bumps: BoolArray,
     ) -> None:
@@ -191,28 +193,28 @@ class SharedGrids:
         Raises:
             ValueError: If a range is out of its limits.
         """
-        if report.entries or self._strokes:
-            self._follow(tick, report)
+        if report.map_changes or self._strokes:
+            self._apply_report(tick, report)
         if mates != self._mates:
-            self.meet(tick, mates, points.starts)
-        self.team.paint_readings(self._shared, points.poses, scans, bumps, *self._hardware)
+            self.share_on_contact(tick, mates, points.starts)
+        self.team.update(self._shared, points.poses, scans, bumps, *self._hardware)
         if self._kept or self._oldest_parting is not None:
-            self._strokes.append(with_constants(Strokes(tick, self._shared_then, points.poses, scans, bumps)))
+            self._strokes.append(with_constants(GridUpdate(tick, self._shared_then, points.poses, scans, bumps)))
 
-    def _follow(self, tick: int, report: TeamReport) -> None:
+    def _apply_report(self, tick: int, report: TeamReport) -> None:
         """Keep grids for an undo, undo, and forget what can no longer be undone."""
-        for entry in report.entries:
-            if isinstance(entry, Renaming) and entry in report.renamings:
-                self.keep(tick, entry)
+        for entry in report.map_changes:
+            if isinstance(entry, LandmarkIdMap) and entry in report.id_maps:
+                self.save_for_undo(tick, entry)
             elif isinstance(entry, MergeUndone):
                 self._undo(tick, entry)
-            elif isinstance(entry, MapDropped):
+            elif isinstance(entry, MapReleased):
                 self._kept = [kept for kept in self._kept if entry.number not in kept.maps[:2]]
-        if self._oldest_parting is not None and self._oldest_parting < tick - LONGEST_ABSENCE:
-            self._look_for_parted(tick)
+        if self._oldest_parting is not None and self._oldest_parting < tick - MAX_ABSENCE:
+            self._update_absences(tick)
         oldest = tick
         if self._kept:  # in order of time; what somebody missed then may be told since
-            oldest = self._kept[0].strokes[0].tick if self._kept[0].strokes else self._kept[0].tick
+            oldest = self._kept[0].updates[0].tick if self._kept[0].updates else self._kept[0].tick
         if self._oldest_parting is not None:
             oldest = min(oldest, self._oldest_parting)
         while self._strokes and self._strokes[0].tick < oldest:
@@ -226,11 +228,11 @@ class SharedGrids:
         self._kept.remove(kept)
         for robot in kept.sides[0] + kept.sides[1]:
             self._grids[robot].set_state(kept.grids[robot])
-        self._strokes, again = map(deque, separated(self._strokes, kept.strokes, kept.sides))
+        self._strokes, again = map(deque, split_history(self._strokes, kept.updates, kept.sides))
         for strokes in again:
-            self._paint(strokes)
+            self._replay(strokes)
         one, two = kept.sides
-        self._parted[np.ix_(one, two)] = self._parted[np.ix_(two, one)] = STRANGERS
+        self._parted[np.ix_(one, two)] = self._parted[np.ix_(two, one)] = NEVER_MET
         side_of = {robot: side for side in kept.sides for robot in side}
         mates = [
             tuple(mate for mate in group if mate in side_of.get(robot, group))
@@ -238,7 +240,7 @@ class SharedGrids:
         ]
         self._settle(tick, mates)
 
-    def meet(self, tick: int, mates: Sequence[tuple[int, ...]], starts: FloatArray) -> None:
+    def share_on_contact(self, tick: int, mates: Sequence[tuple[int, ...]], starts: FloatArray) -> None:
         """Let robots that have come together absorb, or paint, what the others have seen.
 
         Args:
@@ -246,21 +248,21 @@ class SharedGrids:
             mates: Per robot those that go by the same filter now, itself included.
             starts: (K, 3) [m, m, rad]. The motion from the map frame to each robot's start frame.
         """
-        tellings = [telling for now in sorted(set(mates)) for telling in self._tellings(now, starts)]
+        tellings = [telling for now in sorted(set(mates)) for telling in self._plan_transfers(now, starts)]
         if tellings:
-            grids = {telling.giver: self._grids[telling.giver].copy() for telling in tellings if telling.is_whole}
+            grids = {telling.source: self._grids[telling.source].copy() for telling in tellings if telling.is_whole}
             for telling in tellings:
                 if telling.is_whole:
-                    self._grids[telling.taker].absorb(grids[telling.giver], telling.motion)
+                    self._grids[telling.target].merge(grids[telling.source], telling.motion)
             first = max(0, len(self._strokes) - max(tick - telling.since for telling in tellings))
-            after, missed = caught_up(list(islice(self._strokes, first, None)), tellings)
+            after, missed = plan_catch_up(list(islice(self._strokes, first, None)), tellings)
             for row, strokes in enumerate(after, first):
                 self._strokes[row] = strokes
             for strokes in missed:
-                self._paint(strokes)
+                self._replay(strokes)
         self._settle(tick, mates)
 
-    def _tellings(self, now: tuple[int, ...], starts: FloatArray) -> Iterator[Telling]:
+    def _plan_transfers(self, now: tuple[int, ...], starts: FloatArray) -> Iterator[GridTransfer]:
         """Yield who of those who are together now is told by whom; of strangers one is told all that the other has."""
         before = sorted({tuple(mate for mate in self._mates[robot] if mate in now) for robot in now})
         for part, other in permutations(before, 2):
@@ -268,13 +270,13 @@ class SharedGrids:
             since = int(self._parted[np.ix_(part, other)].min())
             for robot in part:
                 motion = compose(starts[robot], inverse(starts[other[0]]))
-                yield Telling(other[0], robot, motion, since, since == STRANGERS)
+                yield GridTransfer(other[0], robot, motion, since, since == NEVER_MET)
 
-    def _paint(self, strokes: Strokes) -> None:
+    def _replay(self, strokes: GridUpdate) -> None:
         """Paint what was read in an earlier tick."""
         _, shared, poses, scans, bumps = strokes
         # Copies: kernels are compiled for arrays as the world gives them, of which bumps alone are read-only.
-        self.team.paint_readings(shared.copy(), poses.copy(), scans.copy(), bumps, *self._hardware)
+        self.team.update(shared.copy(), poses.copy(), scans.copy(), bumps, *self._hardware)
 
     def _settle(self, tick: int, mates: Sequence[tuple[int, ...]]) -> None:
         """Take note of who goes by the same filter as whom from a tick on."""
@@ -282,20 +284,20 @@ class SharedGrids:
         together = np.array([[robot in group for robot in range(len(mates))] for group in mates])
         self._shared = together.astype(np.int64)
         self._shared_then = as_constant(self._shared)  # as strokes hold it
-        self._parted[(self._parted == TOGETHER) & ~together] = tick
-        self._parted[together] = TOGETHER
-        self._look_for_parted(tick)
+        self._parted[(self._parted == CONNECTED) & ~together] = tick
+        self._parted[together] = CONNECTED
+        self._update_absences(tick)
 
-    def _look_for_parted(self, tick: int) -> None:
+    def _update_absences(self, tick: int) -> None:
         """Note since when strokes are needed because robots lost each other; forget who has been away for long."""
-        self._parted[(self._parted >= 0) & (self._parted < tick - LONGEST_ABSENCE)] = STRANGERS
+        self._parted[(self._parted >= 0) & (self._parted < tick - MAX_ABSENCE)] = NEVER_MET
         since = self._parted[self._parted >= 0]
         self._oldest_parting = int(since.min()) if len(since) else None
 
     @property
-    def kept_strokes(self) -> dict[int, Strokes]:
+    def grid_updates(self) -> dict[int, GridUpdate]:
         """All strokes that are kept, by `id`; to be looked at."""
-        return {id(one): one for history in (self._strokes, *(k.strokes for k in self._kept)) for one in history}
+        return {id(one): one for history in (self._strokes, *(k.updates for k in self._kept)) for one in history}
 
     def get_state(self) -> dict[str, Any]:
         """Return all that decides how the grids go on; what is shared is read-only."""

@@ -7,24 +7,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.core.validation import FloatArray, bad_argument
+from slam_backend.core.validation import FloatArray, argument_error
 from slam_backend.fastslam.consistency import Consistency
 from slam_backend.fastslam.options import FilterOptions
-from slam_backend.fastslam.relative_poses import Standpoints
-from slam_backend.fastslam.reports import MergeEvent, Renaming, TeamReport
+from slam_backend.fastslam.relative_poses import TeamPoses
+from slam_backend.fastslam.reports import LandmarkIdMap, MergeEvent, TeamReport
 from slam_backend.fastslam.step_input import StepInput
 from slam_backend.geometry import rotate_covariances
 from slam_backend.maps.alignment import Alignment
-from slam_backend.maps.landmark_map import LandmarkMap, TeamOutlines
+from slam_backend.maps.landmark_map import LandmarkMap, TeamMapSummaries
 from slam_backend.team.merge_scheduler import AttemptOptions
 from slam_backend.team.options import MergeOptions
 from slam_backend.team.team import TeamSlam
-from vslam_env.belief.belief import Belief, BeliefConfig, Body, Candidates, Teammate, View
+from vslam_env.belief.belief import Belief, BeliefBatch, BeliefConfig, Candidates, RobotHardware, Teammate
 from vslam_env.belief.readings import Readings, TeamReadings
-from vslam_env.belief.shared_grids import SharedGrids, Strokes
+from vslam_env.belief.shared_grids import GridUpdate, SharedGrids
 from vslam_env.navigation import TeamSlots
 
-__all__ = ["Belief", "BeliefConfig", "Body", "Candidates", "TeamBelief", "Teammate"]
+__all__ = ["Belief", "BeliefConfig", "Candidates", "RobotHardware", "TeamBelief", "Teammate"]
 
 CANDIDATE_TICKS = 10  # once a second
 
@@ -53,7 +53,7 @@ class TeamBelief:
         config: BeliefConfig,
         num_robots: int,
         seed: int | np.random.SeedSequence,
-        body: Body,
+        body: RobotHardware,
         decision_ticks: int | None = None,
         attempts: bool = True,
     ) -> None:
@@ -61,7 +61,7 @@ class TeamBelief:
             # A sequence remembers how often it spawned: a fresh one makes the result depend on its seed alone.
             seed = np.random.SeedSequence(seed.entropy, spawn_key=seed.spawn_key)
         options = {f.name: getattr(config.filter, f.name) for f in fields(FilterOptions)}
-        rhythm, merging = assumed_of_merges(config, attempts)
+        rhythm, merging = merge_options(config, attempts)
         self._team = TeamSlam(num_robots, config.alignment, seed, rhythm, merging, **options)
         self.exchange = self._team.exchange
         self._grids = SharedGrids(num_robots, body)
@@ -70,15 +70,15 @@ class TeamBelief:
         self._slots = self._candidates.slots
         self._robots = np.arange(num_robots)
         self._scanned = num_robots, len(body.ray_angles)  # shape of a tick's scans
-        self._turns = _turns(num_robots, decision_ticks)
+        self._turns = _candidate_schedule(num_robots, decision_ticks)
         self._tick = -1
         self._confirm_after = config.confirm_after
         self._beliefs: dict[int, Belief] = {}  # of this tick, made when asked for
         self._maps: dict[int, LandmarkMap] = {}  # of this tick, by the number of the map
-        self.points = Standpoints(num_robots)
-        self._outlines = TeamOutlines.unwritten(num_robots, 0)  # likewise, when asked for
+        self.points = TeamPoses(num_robots)
+        self._outlines = TeamMapSummaries.allocate(num_robots, 0)  # likewise, when asked for
         self._has_outlines = False
-        self._look_up_poses()
+        self._refresh_poses()
 
     @property
     def num_robots(self) -> int:
@@ -110,39 +110,39 @@ class TeamBelief:
             ValueError: If a reading is ill-formed, or some robots have a kind of reading that others have not.
         """
         if not isinstance(readings, TeamReadings):
-            readings = TeamReadings.gathered(readings)
+            readings = TeamReadings.stack(readings)
         if readings.scans.shape != self._scanned:
             got, cure = f"shape {readings.scans.shape}", "Give a range for each ray of each robot."
-            raise bad_argument("readings.scans", f"an array of shape {self._scanned}", got, cure)
+            raise argument_error("readings.scans", f"an array of shape {self._scanned}", got, cure)
         if len(readings.bumps) != len(self._robots):
             got, cure = f"shape {readings.bumps.shape}", "Say of each robot whether it bumped into something."
-            raise bad_argument("readings.bumps", f"an array of shape ({len(self._robots)},)", got, cure)
+            raise argument_error("readings.bumps", f"an array of shape ({len(self._robots)},)", got, cure)
         report = self._team.step(
             [None] * len(self._robots) if readings.odometry is None else readings.odometry,
             readings.measurements,
-            readings.heard,
+            readings.contacts,
             readings.identities,
             None if readings.poses is None else list(readings.poses),
         )
         self._tick += 1
-        self._look_up_poses()
+        self._refresh_poses()
         points = self.points
-        self._grids.step(self._tick, report, self._lineup.mates, points, readings.scans, readings.bumps)
+        self._grids.step(self._tick, report, self._lineup.same_filter, points, readings.scans, readings.bumps)
         for robot in self._turns[self._tick % len(self._turns)] if self._tick else range(len(self._robots)):
             self._candidates.update(robot, self.grids, points.poses)
         return report
 
-    def merge(self, robot_a: int, robot_b: int, alignment: Alignment, known: bool = False) -> Renaming:
+    def merge(self, robot_a: int, robot_b: int, alignment: Alignment, known: bool = False) -> LandmarkIdMap:
         """Merge the groups of two robots with a given alignment of their filter maps; see `TeamSlam.merge`."""
         renaming = self._team.merge(robot_a, robot_b, alignment, known)
-        self._look_up_poses()
-        self._grids.keep(self._tick + 1, renaming)
-        self._grids.meet(self._tick + 1, self._lineup.mates, self.points.starts)
+        self._refresh_poses()
+        self._grids.save_for_undo(self._tick + 1, renaming)
+        self._grids.share_on_contact(self._tick + 1, self._lineup.same_filter, self.points.starts)
         return renaming
 
-    def speaker(self, group: tuple[int, ...]) -> int:
+    def representative(self, group: tuple[int, ...]) -> int:
         """Return the first robot of a group that goes by its joint filter, and so can merge it with another."""
-        return self._team.keepers(group[0])[0]
+        return self._team.trunk_robots(group[0])[0]
 
     def consistency(self, robot: int) -> Consistency:
         """Return whether the filter that a robot goes by errs as little as it claims; see `FastSlam.consistency`."""
@@ -160,10 +160,10 @@ class TeamBelief:
         return self._maps[number]
 
     @property
-    def outlines(self) -> TeamOutlines:
+    def map_summaries(self) -> TeamMapSummaries:
         """The outlines of the `group_map` of all robots, much faster; to be looked at before the next step."""
         if not self._has_outlines:
-            self._outlines = self._team.outlines(self._confirm_after, self._outlines)
+            self._outlines = self._team.map_summaries(self._confirm_after, self._outlines)
             self._has_outlines = True
         return self._outlines
 
@@ -181,20 +181,20 @@ class TeamBelief:
             self._beliefs[robot] = self._make_belief(robot)
         return self._beliefs[robot]
 
-    def view(self) -> View:
+    def view(self) -> BeliefBatch:
         """Return what observations show of all robots' beliefs; it shares memory with the grids."""
         features = self._candidates.features(self.points.poses)
-        return View(self._robots, self.points, self.outlines, self.grids.cells, features)
+        return BeliefBatch(self._robots, self.points, self.map_summaries, self.grids.cells, features)
 
     @property
-    def kept_readings(self) -> Mapping[int, StepInput]:
+    def buffered_inputs(self) -> Mapping[int, StepInput]:
         """Readings of the last ticks that some filter may take in later, by step; to be looked at."""
-        return self._team.kept_readings
+        return self._team.buffered_inputs
 
     @property
-    def kept_strokes(self) -> dict[int, Strokes]:
+    def grid_updates(self) -> dict[int, GridUpdate]:
         """What the grids may have to paint again, by `id`; to be looked at."""
-        return self._grids.kept_strokes
+        return self._grids.grid_updates
 
     def get_state(self) -> dict[str, Any]:
         """Return all that decides how the beliefs go on; it shares nothing with them."""
@@ -207,27 +207,27 @@ class TeamBelief:
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Go on exactly as the beliefs that gave `state`, which was checked."""
-        self._team.go_on_from(state["team"])
+        self._team.restore_checked(state["team"])
         self._tick = state["tick"]
         self._grids.set_state(state["grids"])
         for slots, candidates in zip(self._slots, state["slots"], strict=True):
             slots.set_state(candidates)
-        self._look_up_poses()
+        self._refresh_poses()
 
-    def _look_up_poses(self) -> None:
+    def _refresh_poses(self) -> None:
         """Take note of the groups and poses after a step or a merge, and forget what was derived from those before."""
         self._lineup = self._team.lineup
-        self.known_groups = self._lineup.members
-        self._team.standpoints(self.points)
+        self.known_groups = self._lineup.known_robots
+        self._team.team_poses(self.points)
         self._beliefs.clear()
         self._maps.clear()
         self._has_outlines = False
 
     def _others(self, robot: int) -> list[int]:
         """Return the other robots that a robot knows of, ascending."""
-        return [mate for mate in self._lineup.members[robot] if mate != robot]
+        return [mate for mate in self._lineup.known_robots[robot] if mate != robot]
 
-    def _mates_around(self, robot: int) -> FloatArray:
+    def _teammate_positions(self, robot: int) -> FloatArray:
         """Return where a robot believes these to be (n, 2) [m], in its own start frame."""
         return self.points.poses[robot, self._others(robot), :2]
 
@@ -242,7 +242,7 @@ class TeamBelief:
 
     def _make_belief(self, robot: int) -> Belief:
         """Put together what `belief` returns."""
-        points, slots, group = self.points, self._slots[robot], self._lineup.members[robot]
+        points, slots, group = self.points, self._slots[robot], self._lineup.known_robots[robot]
         return Belief(
             robot=robot,
             tick=self._tick,
@@ -253,13 +253,13 @@ class TeamBelief:
             particles=self._team.particles_from_start(robot),
             log_weights=self._team.particles(robot)[1],
             ess=float(points.ess[robot]),
-            grid=self._grids[robot].frozen(),
+            grid=self._grids[robot].read_only_view(),
             candidates=Candidates(
                 goals=slots.goals,
                 headings=slots.headings,
                 lengths=slots.lengths,
                 valid=slots.valid,
-                features=slots.features(points.own[robot], self._mates_around(robot)),
+                features=slots.features(points.own[robot], self._teammate_positions(robot)),
             ),
             teammates=self._teammates(robot),
             start_from_group=points.starts[robot],
@@ -267,14 +267,14 @@ class TeamBelief:
         )
 
 
-def assumed_of_merges(config: BeliefConfig, attempts: bool) -> tuple[AttemptOptions, MergeOptions]:
+def merge_options(config: BeliefConfig, attempts: bool) -> tuple[AttemptOptions, MergeOptions]:
     """Return when groups try to align their maps, and how they merge; where they do not try, merges are final."""
     if attempts:
         return config.attempts, config.merging
     return replace(config.attempts, enabled=False), replace(config.merging, watch_steps=0)
 
 
-def _turns(num_robots: int, decision_ticks: int | None) -> Sequence[Sequence[int]]:
+def _candidate_schedule(num_robots: int, decision_ticks: int | None) -> Sequence[Sequence[int]]:
     """Return per tick, after the first one, whose candidates are renewed; then it begins anew."""
     if decision_ticks is not None:
         return [range(num_robots), *[()] * (decision_ticks - 1)]

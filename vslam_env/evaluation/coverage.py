@@ -13,7 +13,7 @@ from slam_backend.geometry import inverse, transform_points
 from vslam_env.navigation import FREE, GRID_SIZE, TeamGrids, cell_of
 
 PLACE, CELL = 0, 1  # rows of what is laid
-SEERS, EVER = 0, 1  # rows of the floor
+OBSERVER_COUNT, EVER_SEEN = 0, 1  # rows of the floor
 
 
 @device
@@ -34,7 +34,7 @@ def _recount(changes: Any, cells: Any, places: Any, laid: Any, seen: Any, floor:
     Returns:
         How many more floor cells are seen by some robot than before.
     """
-    seers, ever = floor[SEERS], floor[EVER]
+    seers, ever = floor[OBSERVER_COUNT], floor[EVER_SEEN]
     more, flat, all_may_have = 0, cells.reshape(cells.size), changes[0] < 0
     for k in range(1 if all_may_have else changes[0]):
         for i in range(0 if all_may_have else np.searchsorted(places, changes[1 + k]), len(places)):
@@ -67,7 +67,7 @@ def _find(fresh: Any, floor: Any, area: Any, positions: Any, found: Any) -> None
         positions: (K, 2 or 3) float64 [m], world frame.
         found: (K,) int64. How many each robot has found; changed.
     """
-    seers, ever = floor[SEERS], floor[EVER]
+    seers, ever = floor[OBSERVER_COUNT], floor[EVER_SEEN]
     for k in range(len(ever) if fresh[0] < 0 else fresh[0]):
         i = k if fresh[0] < 0 else fresh[1 + k]
         if seers[i] > 0 and not ever[i]:
@@ -91,7 +91,7 @@ def _update(
     Args:
         changes: (K, 1 + n) int32. Of the grids, see `TeamGrids`; none afterwards.
         cells: (K, 300, 300) uint8. Of the grids.
-        laid, bounds: Of the floor, see `CoverageMeter`.
+        laid, bounds: Of the floor, see `CoverageCells`.
         seen: As in `_recount`, of all robots.
         floor, fresh: As in `_recount`.
         area, positions, found: As in `_find`.
@@ -108,7 +108,7 @@ def _update(
     return more
 
 
-class CoverageMeter:
+class CoverageCells:
     """Where the cells of the free floor lie in each robot's grid, laid at its true start pose; read-only.
 
     Args:
@@ -129,7 +129,7 @@ class CoverageMeter:
         self.bounds = as_read_only(np.cumsum([0, *(part.shape[1] for part in own)]))
 
 
-class Coverage:
+class CoverageTracker:
     """Share of the free floor inside the union of the robots' grids, and each robot's part in it.
 
     It goes by what has changed in the grids since it was asked last, so it is asked about the same ones throughout.
@@ -138,7 +138,7 @@ class Coverage:
         meter: Of the world and the robots' starts.
     """
 
-    def __init__(self, meter: CoverageMeter) -> None:
+    def __init__(self, meter: CoverageCells) -> None:
         self._meter = meter
         count = len(meter.cells)
         self._seen = np.zeros(meter.laid.shape[1], np.int8)
@@ -175,11 +175,11 @@ class Coverage:
 
     def get_state(self) -> dict[str, Any]:
         """Return a copy of what cannot be counted again from the grids."""
-        return {"ever": self._floor[EVER] > 0, "found": self._found.copy()}
+        return {"ever": self._floor[EVER_SEEN] > 0, "found": self._found.copy()}
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Go on with what `get_state` returned; the grids are asked for their changes as ever."""
-        self._floor[EVER], self._found = state["ever"], state["found"].copy()
+        self._floor[EVER_SEEN], self._found = state["ever"], state["found"].copy()
         self._fresh[0] = -1
 
 

@@ -7,18 +7,18 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.core.jit import in_place, inlined
+from slam_backend.core.jit import in_place, inline
 from slam_backend.core.read_only import with_constants, with_read_only
 from slam_backend.core.validation import FloatArray, IntArray, check_float
-from slam_backend.fastslam.relative_poses import OWN, SIGMAS, START, Standpoints
-from slam_backend.fastslam.reports import LandmarksCreated, MapCopied, MapDropped, Renaming, TeamReport
-from slam_backend.maps.landmark_map import TeamOutlines
+from slam_backend.fastslam.relative_poses import OWN, SIGMAS, START, TeamPoses
+from slam_backend.fastslam.reports import LandmarkIdMap, LandmarksCreated, MapForked, MapReleased, TeamReport
+from slam_backend.maps.landmark_map import TeamMapSummaries
 
 FALSE, UNCOUNTED = -1, -2  # claims of landmarks that are no true one, or one that does not matter
 PLACED = 0.5  # [m] a landmark held nearer than this is well placed
 
 
-@inlined
+@inline
 def pose_error(start: FloatArray, estimated: FloatArray, true: FloatArray) -> tuple[float, float]:
     """Return how far an estimated pose, laid at the true start, is from the true one.
 
@@ -37,7 +37,7 @@ def pose_error(start: FloatArray, estimated: FloatArray, true: FloatArray) -> tu
     return math.hypot(dx, dy), abs((turn + math.pi) % (2.0 * math.pi) - math.pi)
 
 
-@inlined
+@inline
 def _score_map(
     places: FloatArray, names: IntArray, book: IntArray, x0: float, y0: float, turn: float, truths: FloatArray,
     cutoff: float, least: FloatArray,
@@ -45,7 +45,7 @@ def _score_map(
     """Return the scores of a robot's map, in the order of `score_team`.
 
     Args:
-        places, names: (n, 4), (n, 2) int64. Of its landmarks, as in `OutlineRows`.
+        places, names: (n, 4), (n, 2) int64. Of its landmarks, as in `MapSummaryRows`.
         book: What the landmark of each name claims.
         x0, y0, turn: The motion [m, m, rad] of the places to the frame of the truths.
         truths: (N, 3) [m], N >= 1.
@@ -90,7 +90,7 @@ def score_team(
     """Write how wrong the robots' maps and poses are, in their own start frames and without fitting.
 
     Args:
-        places, names, parts: (N, 4), (N, 2) int64, (K, 2) int64. Of `TeamOutlines`.
+        places, names, parts: (N, 4), (N, 2) int64, (K, 2) int64. Of `TeamMapSummaries`.
         books: (B, n) int64. What the landmark of each name claims, map by map: a row of truths, or as above.
         book_of: (K,) int64. Which book is that of each robot's map.
         truths: (N', 3) [m], world frame. The landmarks that count, N' >= 1.
@@ -120,7 +120,7 @@ UNUSED = -3  # an id that no landmark has had so far
 
 
 @in_place
-def _note_claims(book: IntArray, ids: IntArray, true_ids: IntArray, claim_of: IntArray) -> int:
+def _record_true_ids(book: IntArray, ids: IntArray, true_ids: IntArray, claim_of: IntArray) -> int:
     """Note what new landmarks claim, if there is room for all of them.
 
     Args:
@@ -142,7 +142,7 @@ def _note_claims(book: IntArray, ids: IntArray, true_ids: IntArray, claim_of: In
     return needed
 
 
-class ClaimLedger:
+class GroundTruthAssociation:
     """Which true landmark each landmark of each map claims, kept outside the filters.
 
     Args:
@@ -159,7 +159,7 @@ class ClaimLedger:
         self._claim_of = np.where(countable, np.cumsum(countable) - 1, UNCOUNTED)
         self._books = np.empty((num_robots, 0), np.int64)  # in each row what the ids of one map claim
         self._row_of = {number: number for number in range(num_robots)}
-        self._go_by(tuple(range(num_robots)))
+        self._use_maps(tuple(range(num_robots)))
         self._seen: dict[int, Sequence[IntArray] | IntArray] = {}  # by step: true ids of what each robot measured then
 
     def record(self, report: TeamReport, true_ids: Sequence[IntArray] | IntArray) -> None:
@@ -170,21 +170,21 @@ class ClaimLedger:
             true_ids: Per robot (n_i or more,) int64. The landmark behind each measurement; -1 for a false point.
         """
         self._seen[report.step] = with_read_only(true_ids)
-        for entry in report.entries:
+        for entry in report.map_changes:
             if isinstance(entry, LandmarksCreated):
                 self._enter(entry.number, entry.ids, self._seen[entry.step][entry.robot])
-            elif isinstance(entry, MapCopied):
+            elif isinstance(entry, MapForked):
                 self._copy(entry.source, entry.copy)
-            elif isinstance(entry, MapDropped):
+            elif isinstance(entry, MapReleased):
                 del self._row_of[entry.number]
-            elif isinstance(entry, Renaming):
-                self.rename(entry)
+            elif isinstance(entry, LandmarkIdMap):
+                self.merge(entry)
         if report.maps != self._map_of:
-            self._go_by(report.maps)
+            self._use_maps(report.maps)
         while self._seen and (oldest := next(iter(self._seen))) < report.oldest_step:  # they stand in order of time
             del self._seen[oldest]
 
-    def rename(self, renaming: Renaming) -> None:
+    def merge(self, renaming: LandmarkIdMap) -> None:
         """Join the books of two groups: landmarks of a keep their claims, those of b bring theirs.
 
         A merge that is in the books already is not entered again.
@@ -193,20 +193,20 @@ class ClaimLedger:
         if joint in self._row_of:
             return
         self._copy(map_a, joint)
-        self._go_by(tuple([joint if number in (map_a, map_b) else number for number in self._map_of]))
+        self._use_maps(tuple([joint if number in (map_a, map_b) else number for number in self._map_of]))
         old, new = renaming.ids_b.T
-        self._make_room(int(new.max(initial=-1)) + 1)
+        self._reserve(int(new.max(initial=-1)) + 1)
         own = self._books[self._row_of[joint], new] == UNUSED  # the others were fused into landmarks of a
         self._books[self._row_of[joint], new[own]] = self._books[self._row_of[map_b], old[own]]
 
-    def claims(self, robot: int, ids: IntArray) -> IntArray:
+    def true_ids(self, robot: int, ids: IntArray) -> IntArray:
         """Return the claims (n,) int64 of landmarks of a robot's map: index of the true one, -1 false, -2 no matter."""
         return np.asarray(self._books[self._book_of[robot], ids])
 
     def score(
         self,
-        outlines: TeamOutlines,
-        points: Standpoints,
+        outlines: TeamMapSummaries,
+        points: TeamPoses,
         true_starts: FloatArray,
         true_poses: FloatArray,
         scores: FloatArray,
@@ -239,9 +239,9 @@ class ClaimLedger:
         """Go on with books that `get_state` returned."""
         self._books, self._row_of = state["books"].copy(), dict(state["row_of"])
         self._seen = dict(with_constants(state["seen"]))
-        self._go_by(state["map_of"])
+        self._use_maps(state["map_of"])
 
-    def _go_by(self, map_of: tuple[int, ...]) -> None:
+    def _use_maps(self, map_of: tuple[int, ...]) -> None:
         """Take note of the map that each robot goes by."""
         self._map_of = map_of
         self._book_of = np.array([self._row_of[number] for number in map_of])
@@ -255,7 +255,7 @@ class ClaimLedger:
         self._books[row] = self._books[self._row_of[source]]
         self._row_of[copy] = row
 
-    def _make_room(self, needed: int) -> None:
+    def _reserve(self, needed: int) -> None:
         """Make the books so long, or twice as long as they are, if they are shorter."""
         room = self._books.shape[1]
         if needed > room:
@@ -265,7 +265,7 @@ class ClaimLedger:
     def _enter(self, number: int, ids: IntArray, true_ids: IntArray) -> None:
         """Note what measurements (m,) of landmarks (m,) created in a map."""
         row = self._row_of[number]
-        needed = _note_claims(self._books[row], ids, true_ids, self._claim_of)
+        needed = _record_true_ids(self._books[row], ids, true_ids, self._claim_of)
         if needed > self._books.shape[1]:
-            self._make_room(needed)
-            _note_claims(self._books[row], ids, true_ids, self._claim_of)
+            self._reserve(needed)
+            _record_true_ids(self._books[row], ids, true_ids, self._claim_of)

@@ -7,12 +7,12 @@ import numpy as np
 
 from slam_backend.core.validation import FloatArray, IntArray
 
-NUM_FIGURES = 11
-MAP_ERRORS, PLACED_RECALLS, POSE_SIGMAS, FOUND, DISTANCES, ERROR_INTEGRALS = 0, 4, 7, 8, 9, 10  # rows of figures
+NUM_METRICS = 11
+MAP_ERRORS, ACCURATE_RECALLS, POSE_SIGMAS, DISCOVERED, DISTANCES, ERROR_INTEGRALS = 0, 4, 7, 8, 9, 10  # rows of figures
 COLLISIONS, BYTES_SENT = 0, 1  # rows of counts
 
 
-class Standing(NamedTuple):
+class TeamMetrics(NamedTuple):
     """How the team stands.
 
     Attributes:
@@ -24,7 +24,7 @@ class Standing(NamedTuple):
         time: Since the reset [s].
     """
 
-    figures: Sequence[Sequence[float]]
+    table: Sequence[Sequence[float]]
     counts: tuple[tuple[int, ...], tuple[int, ...]]
     coverage: float
     merges: int
@@ -33,52 +33,52 @@ class Standing(NamedTuple):
     @property
     def map_errors(self) -> FloatArray:
         """(K,) float64 [m]. E of each robot's map."""
-        return np.array(self.figures[MAP_ERRORS])
+        return np.array(self.table[MAP_ERRORS])
 
     @property
     def map_rmses(self) -> FloatArray:
         """(K,) float64 [m]. Of the landmarks that each holds; the cutoff of the map error where it holds none."""
-        return np.array(self.figures[1])
+        return np.array(self.table[1])
 
     @property
     def map_recalls(self) -> FloatArray:
         """(K,) float64. Share of the landmarks that each holds, wherever it has them."""
-        return np.array(self.figures[2])
+        return np.array(self.table[2])
 
     @property
     def map_precisions(self) -> FloatArray:
         """(K,) float64. Share of the landmarks in each map that are matched; of duplicates one is."""
-        return np.array(self.figures[3])
+        return np.array(self.table[3])
 
     @property
-    def placed_recalls(self) -> FloatArray:
+    def accurate_recalls(self) -> FloatArray:
         """(K,) float64. Share of the landmarks that each holds closer than 0.5 m to where they are."""
-        return np.array(self.figures[PLACED_RECALLS])
+        return np.array(self.table[ACCURATE_RECALLS])
 
     @property
     def pose_errors(self) -> FloatArray:
         """(K,) float64 [m]."""
-        return np.array(self.figures[5])
+        return np.array(self.table[5])
 
     @property
     def heading_errors(self) -> FloatArray:
         """(K,) float64 [rad], at least 0."""
-        return np.array(self.figures[6])
+        return np.array(self.table[6])
 
     @property
     def pose_sigmas(self) -> FloatArray:
         """(K,) float64 [m]. One sigma of the position in its own start frame, as each believes."""
-        return np.array(self.figures[POSE_SIGMAS])
+        return np.array(self.table[POSE_SIGMAS])
 
     @property
-    def found(self) -> FloatArray:
+    def discovered(self) -> FloatArray:
         """(K,) float64. Share of the free floor that each was nearest to when the team first saw it."""
-        return np.array(self.figures[FOUND])
+        return np.array(self.table[DISCOVERED])
 
     @property
     def distances(self) -> FloatArray:
         """(K,) float64 [m]. Way that each has gone since the reset."""
-        return np.array(self.figures[DISTANCES])
+        return np.array(self.table[DISTANCES])
 
     @property
     def error_integrals(self) -> FloatArray:
@@ -86,7 +86,7 @@ class Standing(NamedTuple):
 
         Zeros unless the reward has the term `running_cost`: maps are then scored at every tick.
         """
-        return np.array(self.figures[ERROR_INTEGRALS])
+        return np.array(self.table[ERROR_INTEGRALS])
 
     @property
     def collisions(self) -> IntArray:

@@ -10,7 +10,16 @@ from scipy.optimize import linear_sum_assignment
 from slam_backend.core.jit import in_place
 from slam_backend.core.validation import BoolArray, FloatArray
 from vslam_env.navigation._grid_kernels import GRID_SIZE, known_bounds
-from vslam_env.navigation._planning_kernels import HEADING, LENGTH, NUM_COLUMNS, SAME_GOAL, SIZE, XY, refill, renew
+from vslam_env.navigation._planning_kernels import (
+    HEADING,
+    LENGTH,
+    NUM_COLUMNS,
+    SAME_GOAL,
+    SIZE,
+    XY,
+    fill_slots,
+    update_slots,
+)
 from vslam_env.navigation.planning import start_of
 from vslam_env.navigation.team_grids import TeamGrids
 from vslam_env.navigation.validation import check_cells, pose_floats, positions_array
@@ -23,7 +32,7 @@ NO_TEAMMATE = 60.0  # [m] stands for the distance of a teammate when there is no
 
 
 @in_place
-def _describe(slots: Any, poses: Any, features: Any) -> None:
+def _write_features(slots: Any, poses: Any, features: Any) -> None:
     """Write `CandidateSlots.features` (K, 16, 5) of the rows of all slots (K, 16, ...).
 
     Poses (K, n, 3), n >= K, are as in `TeamSlots.features`.
@@ -130,11 +139,11 @@ class CandidateSlots:
         """
         x, y, _ = poses[robot].tolist()
         slots = self._rows, self._visits
-        found, costs, is_clear = renew(
+        found, costs, is_clear = update_slots(
             cells, bounds, *start_of(x, y, ROBOT_RADIUS), poses, robot, *slots, self._given_up
         )  # fmt: skip
         if not is_clear:
-            refill(_of_least_total(costs), found, *slots)
+            fill_slots(_assign(costs), found, *slots)
 
     def features(self, pose: ArrayLike, teammates: ArrayLike = ()) -> NDArray[np.float32]:
         """Describe the candidates to a policy.
@@ -149,7 +158,7 @@ class CandidateSlots:
             empty slots.
         """
         features = np.empty((1, NUM_SLOTS, NUM_FEATURES), np.float32)
-        _describe(self._rows[None], _together(pose, teammates)[None], features)
+        _write_features(self._rows[None], _together(pose, teammates)[None], features)
         return np.asarray(features[0])
 
     def get_state(self) -> dict[str, Any]:
@@ -198,7 +207,7 @@ class TeamSlots:
             `CandidateSlots.features` (K, 16, 5). A fresh array.
         """
         features = np.empty((len(self._rows), NUM_SLOTS, NUM_FEATURES), np.float32)
-        _describe(self._rows, poses, features)
+        _write_features(self._rows, poses, features)
         return features
 
 
@@ -210,7 +219,7 @@ def _together(pose: ArrayLike, teammates: ArrayLike) -> FloatArray:
     return poses
 
 
-def _of_least_total(costs: FloatArray) -> FloatArray:
+def _assign(costs: FloatArray) -> FloatArray:
     """Return costs (m, n) that are `SAME_GOAL` but for the pairs, each of other rows and columns, of least total."""
     chosen, pairs = np.full_like(costs, SAME_GOAL), linear_sum_assignment(costs)
     chosen[pairs] = costs[pairs]

@@ -6,13 +6,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slam_backend.core.read_only import as_read_only
-from slam_backend.core.validation import FloatArray, IntArray, bad_argument, check_array, check_float
+from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_array, check_float
 from vslam_env.navigation import _grid_kernels as _painting
 from vslam_env.navigation._grid_kernels import CELL, FREE, GRID_SIZE, HALF_WIDTH, OCCUPIED, UNKNOWN
 from vslam_env.navigation.validation import check_ranges, pose_floats, ray_directions
 
 # What each evidence, as an unsigned byte, says of a cell.
-_VERDICTS = np.where(np.arange(256) == 0, UNKNOWN, np.where(np.arange(256) < 128, OCCUPIED, FREE)).astype(np.uint8)
+_CELL_STATES = np.where(np.arange(256) == 0, UNKNOWN, np.where(np.arange(256) < 128, OCCUPIED, FREE)).astype(np.uint8)
 
 __all__ = ["CELL", "FREE", "GRID_SIZE", "OCCUPIED", "UNKNOWN", "SeenGrid", "cell_of", "centre_of"]
 
@@ -91,7 +91,7 @@ class SeenGrid:
         """The grid as kernels paint it."""
         return self._evidence, self._cells, self._changes, self._bounds
 
-    def paint_scan(self, pose: ArrayLike, ranges: ArrayLike, angles: ArrayLike, max_range: float = 8.0) -> None:
+    def update_from_scan(self, pose: ArrayLike, ranges: ArrayLike, angles: ArrayLike, max_range: float = 8.0) -> None:
         """Mark what a range scan saw: free before the first surface, occupied on it.
 
         Args:
@@ -109,7 +109,7 @@ class SeenGrid:
         ranges = np.ascontiguousarray(ranges, dtype=np.float64)
         angles = np.ascontiguousarray(angles, dtype=np.float64)
         if ranges.ndim != 1 or ranges.shape != angles.shape or len(ranges) < 2:
-            raise bad_argument(
+            raise argument_error(
                 "ranges",
                 "an array of shape (n,), n >= 2, like angles",
                 f"shape {ranges.shape} with angles {angles.shape}",
@@ -117,7 +117,7 @@ class SeenGrid:
             )
         check_ranges(ranges)
         directions = ray_directions(angles)
-        _painting.paint_scan(*self._arrays, x, y, theta, ranges, directions, float(max_range))
+        _painting.update_from_scan(*self._arrays, x, y, theta, ranges, directions, float(max_range))
 
     def clear_disc(self, pose: ArrayLike, radius: float = 0.2) -> None:
         """Mark as free what the body of a robot covers.
@@ -129,7 +129,7 @@ class SeenGrid:
         self._refuse_if_read_only()
         x, y, _ = pose_floats(pose)
         radius = check_float("radius", radius, "Give the robot's radius in metres.", above=0.0)
-        _painting.paint_disc(*self._arrays, x, y, radius)
+        _painting.clear_disc(*self._arrays, x, y, radius)
 
     def bump(self, pose: ArrayLike, radius: float = 0.2) -> None:
         """Mark the cell just ahead of a robot's rim as occupied: it bumped into something there.
@@ -142,9 +142,9 @@ class SeenGrid:
         """
         self._refuse_if_read_only()
         x, y, theta = pose_floats(pose)
-        _painting.paint_bump(*self._arrays, x, y, theta, radius)
+        _painting.mark_bump(*self._arrays, x, y, theta, radius)
 
-    def absorb(self, other: "SeenGrid", self_from_other: ArrayLike) -> None:
+    def merge(self, other: "SeenGrid", self_from_other: ArrayLike) -> None:
         """Add the evidence of another robot's grid.
 
         Args:
@@ -153,13 +153,13 @@ class SeenGrid:
         """
         self._refuse_if_read_only()
         x, y, theta = pose_floats(self_from_other, "self_from_other")
-        _painting.paint_grid(*self._arrays, other._evidence.copy(), x, y, theta)
+        _painting.merge_grid(*self._arrays, other._evidence.copy(), x, y, theta)
 
     def copy(self) -> "SeenGrid":
         """Return an independent grid, which can be written to, with the same content."""
         return SeenGrid.over(self._evidence.copy(), self._cells.copy(), _no_changes(), self._bounds.copy())
 
-    def frozen(self) -> "SeenGrid":
+    def read_only_view(self) -> "SeenGrid":
         """Return a view that refuses changes and shares memory with this grid: it follows changes made here."""
         return SeenGrid.over(*self._arrays, read_only=True)
 
@@ -175,7 +175,7 @@ class SeenGrid:
         if not (isinstance(evidence, np.ndarray) and evidence.dtype == np.int8 and evidence.shape == shape):
             evidence = check_array("evidence", evidence, shape, "Use what get_state returned.", dtype=np.int8)
         self._evidence[:] = evidence
-        np.take(_VERDICTS, evidence.view(np.uint8), out=self._cells, mode="wrap")
+        np.take(_CELL_STATES, evidence.view(np.uint8), out=self._cells, mode="wrap")
         self._changes[0] = -1
         self._bounds[:] = _painting.known_bounds(self.cells)  # read-only: as planners ask, so that it is compiled once
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slam_backend.core.jit import in_place
-from slam_backend.core.validation import BoolArray, FloatArray, bad_argument, check_array, check_float
+from slam_backend.core.validation import BoolArray, FloatArray, argument_error, check_array, check_float
 from vslam_env.navigation._grid_kernels import CELL, GRID_SIZE, HALF_WIDTH, known_bounds
 from vslam_env.navigation._planning_kernels import (
     HEADING,
@@ -25,11 +25,11 @@ from vslam_env.navigation._planning_kernels import (
     SIZE,
     UNREACHED,
     XY,
-    frontiers_over,
+    compute_frontiers,
+    dijkstra,
     nearest_open,
     parents_of,
-    straight_path,
-    ways_over,
+    shorten_path,
 )
 from vslam_env.navigation.occupancy_grid import centre_of
 from vslam_env.navigation.validation import check_cells, point_floats, pose_floats
@@ -76,7 +76,7 @@ def find_frontiers(
         ignored = np.zeros((GRID_SIZE, GRID_SIZE), np.bool_)
     mask = check_array("ignored", ignored, (GRID_SIZE, GRID_SIZE), "Mark cells of the grid.", dtype=np.bool_)
     check_cells(cells)
-    rows = frontiers_over(cells, known_bounds(cells), *checked_start(start_xy, radius), mask)
+    rows = compute_frontiers(cells, known_bounds(cells), *checked_start(start_xy, radius), mask)
     return Frontiers(
         goals=rows[:, XY].copy(),
         headings=rows[:, HEADING].copy(),
@@ -147,7 +147,7 @@ def distance_map(cells: NDArray[np.uint8], start_xy: ArrayLike, radius: float = 
     """
     check_cells(cells)
     start = checked_start(start_xy, radius)
-    box, weights, cost, ways, row, col = ways_over(cells, known_bounds(cells), *start)
+    box, weights, cost, ways, row, col = dijkstra(cells, known_bounds(cells), *start)
     return DistanceMap(corner=(row, col), box=box, weights=weights, cost=cost, parent=parents_of(ways))
 
 
@@ -159,7 +159,7 @@ def checked_start(start_xy: ArrayLike, radius: float) -> tuple[int, int, float, 
 
 
 def start_of(x: float, y: float, radius: float) -> tuple[int, int, float, int]:
-    """Return how `ways_over` looks for ways of a robot [m] from a place [m]: row and column, reach and escape."""
+    """Return how `dijkstra` looks for ways of a robot [m] from a place [m]: row and column, reach and escape."""
     return *_cell_in_box((0, 0), x, y), radius / CELL + 0.5, ESCAPE_CELLS
 
 
@@ -186,7 +186,7 @@ def plan_path(
     end_cell = nearest_open(ways.box, ways.weights, *goal_cell, GOAL_CELLS)
     if end_cell[0] < 0 or ways.cost[end_cell] == UNREACHED:
         return None
-    corners = straight_path(ways.weights, ways.cost, ways.parent, *end_cell)
+    corners = shorten_path(ways.weights, ways.cost, ways.parent, *end_cell)
     centres = centre_of(corners + np.array(ways.corner))
     between = centres[1:-1] if tuple(corners[0]) == ways.cell_of(start) else centres[:-1]
     return np.vstack([start, between, goal if end_cell == goal_cell else centres[-1]])
@@ -244,7 +244,7 @@ def follow_path(
     x, y, theta = pose_floats(pose)
     path_array = np.ascontiguousarray(path, dtype=np.float64)
     if path_array.ndim != 2 or path_array.shape[1] != 2 or len(path_array) == 0:
-        raise bad_argument(
+        raise argument_error(
             "path", "an array of shape (n, 2), n >= 1", f"shape {path_array.shape}", "Give what plan_path returned."
         )
     target_x, target_y, left = _pursue(x, y, path_array)

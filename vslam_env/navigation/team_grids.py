@@ -32,7 +32,7 @@ class TeamGrids:
         self._room = np.empty((0, 0))
         self.grids = list(map(SeenGrid.over, self._evidence, self.cells, self.changes, self.bounds))
 
-    def paint_readings(
+    def update(
         self,
         shared: IntArray,
         poses: FloatArray,
@@ -42,12 +42,12 @@ class TeamGrids:
         max_range: float,
         radius: float,
     ) -> None:
-        """Paint what robots read in a tick: what `paint_scan`, `clear_disc` and, after a bump, `bump` paint in turn.
+        """Paint what robots read in a tick: what `update_from_scan`, `clear_disc` and, after a bump, `bump` paint in turn.
 
         Args:
             shared: (K, K) int64. 1 where what robot j reads is painted into i's grid; of the robots in ascending order.
             poses: (K, K, 3) float64 [m, m, rad]. Where robot j was, in the start frame of i's grid.
-            scans: (K, R) float64 [m]. As `SeenGrid.paint_scan` expects each.
+            scans: (K, R) float64 [m]. As `SeenGrid.update_from_scan` expects each.
             bumps: (K,) bool. Which robots bumped into something.
             directions: (2, R) float64. Of the rays, as `ray_directions` returns them.
             max_range: [m].
@@ -58,8 +58,8 @@ class TeamGrids:
         """
         num_rays = scans.shape[1]
         if self._room.shape[1] != num_rays + 1:
-            self._room = _painting.room_to_paint(num_rays)
-        owner, robot = _painting.paint_readings(
+            self._room = _painting.scan_workspace(num_rays)
+        owner, robot = _painting.update_grids(
             self._evidence, self.cells, self.changes, self.bounds, shared, poses, scans, bumps, directions, max_range,
             radius, self._room,
         )  # fmt: skip

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from slam_backend.core.validation import FloatArray, bad_argument
+from slam_backend.core.validation import FloatArray, argument_error
 from vslam_env.navigation._grid_kernels import GRID_SIZE, directions_of, good_angles, good_ranges
 
 
@@ -13,10 +13,10 @@ def pose_floats(pose: ArrayLike, name: str = "pose") -> tuple[float, float, floa
     """Return a pose (3,) as three finite floats, or raise."""
     values = np.asarray(pose, dtype=np.float64)
     if values.shape != (3,):
-        raise bad_argument(name, "an array of shape (3,)", f"shape {values.shape}", "Give (x, y, theta).")
+        raise argument_error(name, "an array of shape (3,)", f"shape {values.shape}", "Give (x, y, theta).")
     x, y, theta = values.tolist()
     if not math.isfinite(x + y + theta):
-        raise bad_argument(name, "finite numbers", values, "Give (x, y, theta) in metres and radians.")
+        raise argument_error(name, "finite numbers", values, "Give (x, y, theta) in metres and radians.")
     return x, y, theta
 
 
@@ -24,10 +24,10 @@ def point_floats(point: ArrayLike, name: str) -> tuple[float, float]:
     """Return a point (2,) as two finite floats, or raise."""
     values = np.asarray(point, dtype=np.float64)
     if values.shape != (2,):
-        raise bad_argument(name, "an array of shape (2,)", f"shape {values.shape}", "Give (x, y).")
+        raise argument_error(name, "an array of shape (2,)", f"shape {values.shape}", "Give (x, y).")
     x, y = values.tolist()
     if not math.isfinite(x + y):
-        raise bad_argument(name, "finite numbers", values, "Give (x, y) in metres.")
+        raise argument_error(name, "finite numbers", values, "Give (x, y) in metres.")
     return x, y
 
 
@@ -38,21 +38,21 @@ def positions_array(positions: ArrayLike, name: str) -> FloatArray:
         return np.empty((0, 2))
     if values.ndim != 2 or values.shape[1] != 2 or not np.isfinite(values).all():
         got = "NaN or infinity" if values.ndim == 2 and values.shape[1] == 2 else f"shape {values.shape}"
-        raise bad_argument(name, "finite numbers in an array of shape (k, 2)", got, "Give one (x, y) per robot.")
+        raise argument_error(name, "finite numbers in an array of shape (k, 2)", got, "Give one (x, y) per robot.")
     return values
 
 
 def check_ranges(ranges: FloatArray) -> None:
     """Raise if ranges (n,) [m] are not at least 0."""
     if not good_ranges(ranges):
-        raise bad_argument("ranges", "distances >= 0 [m]", ranges, "Use max_range where a ray saw nothing.")
+        raise argument_error("ranges", "distances >= 0 [m]", ranges, "Use max_range where a ray saw nothing.")
 
 
 def ray_directions(angles: FloatArray) -> FloatArray:
     """Return the unit vectors (2, n) of rays at angles (n,) [rad], n >= 1, ascending over less than pi, or raise."""
     if not (len(angles) and good_angles(angles)):
         expected = "ascending angles spanning less than pi [rad]"
-        raise bad_argument("angles", expected, angles, "Order the rays from right to left.")
+        raise argument_error("angles", expected, angles, "Order the rays from right to left.")
     directions: FloatArray = directions_of(angles)
     return directions
 
@@ -61,4 +61,4 @@ def check_cells(cells: NDArray[np.uint8]) -> None:
     """Raise if an array is not the cells of a `SeenGrid`."""
     if not isinstance(cells, np.ndarray) or cells.shape != (GRID_SIZE, GRID_SIZE) or cells.dtype != np.uint8:
         got = f"shape {cells.shape} of {cells.dtype}" if isinstance(cells, np.ndarray) else cells
-        raise bad_argument("cells", "an array of shape (300, 300) of uint8", got, "Pass SeenGrid.cells.")
+        raise argument_error("cells", "an array of shape (300, 300) of uint8", got, "Pass SeenGrid.cells.")

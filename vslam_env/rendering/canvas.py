@@ -123,7 +123,7 @@ def dots(image: Image, centres: FloatArray, radius: float, colour: Colour) -> No
         cv2.fillConvexPoly(image, outline, colour, cv2.LINE_AA, SHIFT)
 
 
-def veils(image: Image, centres: FloatArray, radius: float, colour: Colour, opacity: float) -> None:
+def translucent_fill(image: Image, centres: FloatArray, radius: float, colour: Colour, opacity: float) -> None:
     """Draw equal translucent discs, which add up where they overlap.
 
     Args:

@@ -2,9 +2,19 @@
 
 import numpy as np
 
-from slam_backend.core.validation import FloatArray, bad_argument, check_int
+from slam_backend.core.validation import FloatArray, argument_error, check_int
 from vslam_env.rendering import palette
-from vslam_env.rendering.canvas import Image, Viewport, disc, dots, ellipse_outlines, fill, lines, path, veils
+from vslam_env.rendering.canvas import (
+    Image,
+    Viewport,
+    disc,
+    dots,
+    ellipse_outlines,
+    fill,
+    lines,
+    path,
+    translucent_fill,
+)
 from vslam_env.rendering.merge_effect import draw_captions, draw_flashes
 from vslam_env.rendering.overlays import draw_footer, draw_header
 from vslam_env.rendering.palette import mix, robot_colour
@@ -57,7 +67,7 @@ def draw_frame(scene: Scene, size: tuple[int, int] = (960, 720)) -> Image:
 def _checked_size(size: tuple[int, int]) -> tuple[int, int]:
     """Return width and height, or raise."""
     if not isinstance(size, (tuple, list)) or len(size) != 2:
-        raise bad_argument("size", "a pair (width, height)", size, "Give the picture's size in pixels.")
+        raise argument_error("size", "a pair (width, height)", size, "Give the picture's size in pixels.")
     width = check_int("size[0]", size[0], SMALLEST_SIZE[0], "Give the width in pixels.")
     height = check_int("size[1]", size[1], SMALLEST_SIZE[1], "Give the height in pixels.")
     return width, height
@@ -103,7 +113,7 @@ def _draw_belief(
         lines(plot, rays, mix(colour, palette.PAPER, 0.45), 1, False)
     stride = max(1, len(robot.particles) // PARTICLES_SHOWN)
     cloud = robot.particles[::stride]
-    veils(plot, view.pixels(cloud[np.isfinite(cloud).all(axis=1)]), max(1.6, 2.6 * unit), colour, 0.16)
+    translucent_fill(plot, view.pixels(cloud[np.isfinite(cloud).all(axis=1)]), max(1.6, 2.6 * unit), colour, 0.16)
     if np.isfinite(robot.estimated_pose).all():
         _outline(plot, view, robot.estimated_pose, max(radius * view.scale, 5.0 * unit), colour, unit)
 
@@ -125,7 +135,7 @@ def _draw_bodies(plot: Image, view: Viewport, scene: Scene, unit: float) -> None
         if groups.count(robot.group) > 1:
             accent = robot_colour(groups.index(robot.group))
             for reach in (2.1, 1.6):
-                veils(plot, centre[None], reach * radius, accent, 0.18)
+                translucent_fill(plot, centre[None], reach * radius, accent, 0.18)
         disc(plot, centre, radius + max(1.0, 1.5 * unit), palette.PAPER)
         disc(plot, centre, radius, colour)
         ahead = np.array([np.cos(robot.true_pose[2]), -np.sin(robot.true_pose[2])])

@@ -5,14 +5,14 @@ import numpy as np
 from slam_backend.core.validation import FloatArray
 from slam_backend.geometry import compose
 from vslam_env.config import TICK
-from vslam_env.evaluation.team_metrics import Standing
+from vslam_env.evaluation.team_metrics import TeamMetrics
 from vslam_env.rendering import MergeFlash, RobotView, Scene
 from vslam_env.simulation.episode import Episode
 
 FLASH_TICKS = 30
 
 
-def scene_of(episode: Episode, standing: Standing) -> Scene:
+def build_scene(episode: Episode, standing: TeamMetrics) -> Scene:
     """Return what a picture of an episode shows.
 
     Args:

@@ -22,17 +22,17 @@ def draw_flashes(plot: Image, view: Viewport, scene: Scene, unit: float) -> None
         scene: What is to be seen.
         unit: Size of the picture, 1 for 960 x 720.
     """
-    for merge in _young(scene):
+    for merge in _recent_merges(scene):
         _draw_glow(plot, view, scene, merge, unit)
 
 
 def draw_captions(plot: Image, scene: Scene, unit: float) -> None:
     """Write who merged, the youngest merge on top; the arguments are those of `draw_flashes`."""
-    for line, merge in enumerate(_young(scene)):
+    for line, merge in enumerate(_recent_merges(scene)):
         _draw_caption(plot, merge, line, unit)
 
 
-def _young(scene: Scene) -> list[MergeFlash]:
+def _recent_merges(scene: Scene) -> list[MergeFlash]:
     """Return the merges that still flash, the youngest first."""
     young = (merge for merge in scene.merges if merge.age_ticks < FLASH_TICKS)
     return sorted(young, key=lambda merge: merge.age_ticks)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-def why_no_window() -> str:
+def display_unavailable_reason() -> str:
     """Return why no window can be opened here, with the cure; the empty string where one can."""
     try:
         import pygame  # noqa: F401
@@ -72,7 +72,7 @@ class Window:
             self.close()
 
     def _open(self, width: int, height: int) -> None:
-        reason = why_no_window()
+        reason = display_unavailable_reason()
         if reason:
             self._useless = True
             warnings.warn(f"render_mode='human' shows nothing: {reason}.", stacklevel=4)

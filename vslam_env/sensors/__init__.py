@@ -1,18 +1,18 @@
 """What the robots' sensors report of the world: measured landmarks and scans, with the true noise."""
 
-from vslam_env.sensors.landmark_sensor import Frame, Frames, LandmarkSensor, LandmarkSensorConfig
-from vslam_env.sensors.range_finder import Scan, ScanConfig
-from vslam_env.sensors.stereo.sensor import EyeFrame, EyeFrames, StereoSensor, StereoSensorConfig
+from vslam_env.sensors.landmark_sensor import LandmarkSensor, LandmarkSensorConfig, SensorFrame, TeamSensorFrames
+from vslam_env.sensors.range_finder import RangeFinder, ScanConfig
+from vslam_env.sensors.stereo.sensor import RenderedFrame, StereoSensor, StereoSensorConfig, TeamRenderedFrames
 
 __all__ = [
-    "EyeFrame",
-    "EyeFrames",
-    "Frame",
-    "Frames",
     "LandmarkSensor",
     "LandmarkSensorConfig",
-    "Scan",
+    "RangeFinder",
+    "RenderedFrame",
     "ScanConfig",
+    "SensorFrame",
     "StereoSensor",
     "StereoSensorConfig",
+    "TeamRenderedFrames",
+    "TeamSensorFrames",
 ]

@@ -24,7 +24,7 @@ def _bring_to(length: float, vector: FloatArray) -> None:
 
 
 @in_place
-def make_up(
+def sample_clutter(
     places: FloatArray, looks: FloatArray, common: FloatArray, own_share: float, view: FloatArray, points: FloatArray
 ) -> None:
     """Make up points that are no landmarks: uniform in the image and in depth, unit descriptors like the others'.
@@ -53,7 +53,7 @@ def make_up(
 
 
 @in_place
-def mix_in(num_false: IntArray, keys: FloatArray, ids: IntArray, counts: IntArray) -> None:
+def shuffle_clutter(num_false: IntArray, keys: FloatArray, ids: IntArray, counts: IntArray) -> None:
     """Put the false points of each robot among its landmarks, in random order.
 
     Args:

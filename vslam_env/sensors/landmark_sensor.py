@@ -10,19 +10,19 @@ from slam_backend.core.validation import (
     BoolArray,
     FloatArray,
     IntArray,
-    bad_argument,
+    argument_error,
     check_array,
     check_float,
     check_int,
 )
 from slam_backend.models.camera import StereoCamera
 from slam_backend.models.measurements import Measurements, TeamMeasurements
-from vslam_env.sensors._landmark_kernels import BEYOND, FARTHEST, make_up, measure, mix_in
+from vslam_env.sensors._landmark_kernels import BEYOND, FARTHEST, measure, sample_clutter, shuffle_clutter
 from vslam_env.world._kernels import detect
 from vslam_env.world.spec import Landmarks
-from vslam_env.world.visibility import by_rows, marks_of, view_limits, visible_landmarks
+from vslam_env.world.visibility import as_coordinate_rows, landmark_geometry, view_limits, visible_landmarks
 
-MOST_POINTS = 10_000  # of a frame; time ends before
+MAX_POINTS = 10_000  # of a frame; time ends before
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,15 +47,13 @@ class LandmarkSensorConfig:
 
     def __post_init__(self) -> None:
         if not isinstance(self.camera, StereoCamera):
-            raise bad_argument("sensor.camera", "a StereoCamera", self.camera, "Build one with StereoCamera(...).")
-        check_int(
-            "sensor.max_measurements", self.max_measurements, 1, "Report at least one point a frame.", MOST_POINTS
-        )
+            raise argument_error("sensor.camera", "a StereoCamera", self.camera, "Build one with StereoCamera(...).")
+        check_int("sensor.max_measurements", self.max_measurements, 1, "Report at least one point a frame.", MAX_POINTS)
         check_float(
             "sensor.detection_probability", self.detection_probability, "Give a share.", at_least=0.0, at_most=1.0
         )
         cure = "Give points per frame."
-        check_float("sensor.false_points", self.false_points, cure, at_least=0.0, at_most=MOST_POINTS)
+        check_float("sensor.false_points", self.false_points, cure, at_least=0.0, at_most=MAX_POINTS)
         check_float("sensor.descriptor_noise", self.descriptor_noise, "Give an L2 length.", at_least=0.0, at_most=1e6)
         check_float("sensor.max_incidence", self.max_incidence, "Give radians.", above=0.0, at_most=np.pi / 2)
 
@@ -65,7 +63,7 @@ class LandmarkSensorConfig:
         return min(FARTHEST, BEYOND * self.camera.max_range)
 
 
-class Frame(NamedTuple):
+class SensorFrame(NamedTuple):
     """What one camera reports in one tick, and, for the simulator's books, what it was.
 
     Attributes:
@@ -77,7 +75,7 @@ class Frame(NamedTuple):
     true_ids: IntArray
 
 
-class Frames(NamedTuple):
+class TeamSensorFrames(NamedTuple):
     """The frames of all robots in one tick.
 
     Attributes:
@@ -92,12 +90,12 @@ class Frames(NamedTuple):
     @property
     def true_ids(self) -> list[IntArray]:
         """Per robot as of its `Frame`. Copies: the books go by `names`."""
-        ends = self.measurements.ends.tolist()
+        ends = self.measurements.offsets.tolist()
         return [row[: end - begin].copy() for row, begin, end in zip(self.names, [0, *ends[:-1]], ends, strict=True)]
 
-    def of_each(self) -> list[Frame]:
+    def per_robot(self) -> list[SensorFrame]:
         """Return the frame of each robot."""
-        return list(map(Frame, self.measurements.of_each(), self.true_ids))
+        return list(map(SensorFrame, self.measurements.per_robot(), self.true_ids))
 
 
 class LandmarkSensor:
@@ -127,7 +125,13 @@ class LandmarkSensor:
         lens = camera.focal_px, camera.baseline, camera.sigma_px, camera.sigma_disparity_px
         self._optics = as_read_only(np.array([*camera.mount, *lens, config.farthest]))
         self._view = view_limits(camera, config.max_incidence)
-        self._sight = marks_of(landmarks), landmarks.walls, by_rows(self._walls), self.robot_radius, self._view
+        self._sight = (
+            landmark_geometry(landmarks),
+            landmarks.walls,
+            as_coordinate_rows(self._walls),
+            self.robot_radius,
+            self._view,
+        )
         self._frame_shape = config.max_measurements, self._points.shape[1]
         self._no_false_points = np.empty((0, self._points.shape[1]))
         # False points look like landmarks of this world: the common part of all descriptors and a part of their own.
@@ -139,7 +143,7 @@ class LandmarkSensor:
         """Tell which landmarks (K, N) the robots at `poses` (K, 3) [m, m, rad], world frame, can see."""
         return visible_landmarks(poses, self._landmarks, self._walls, self.robot_radius, self._view)
 
-    def measure(self, poses: FloatArray, rng: np.random.Generator) -> Frames:
+    def measure(self, poses: FloatArray, rng: np.random.Generator) -> TeamSensorFrames:
         """Take a frame with each robot's camera.
 
         Each visible landmark is detected independently. False points take their places among the at most B points;
@@ -160,20 +164,20 @@ class LandmarkSensor:
         false_points = self._no_false_points
         if extra:
             total += extra
-            false_points = self._made_up(extra, rng)
-            mix_in(num_false, rng.random(total), ids, ends)
+            false_points = self._sample_clutter(extra, rng)
+            shuffle_clutter(num_false, rng.random(total), ids, ends)
         noise = rng.standard_normal((total, size))
         points, looks = np.empty((total, 3)), np.empty((total, size - 3), np.float32)
         truth = ids, ends, poses, self._points, false_points
         kept = measure(*truth, noise, self._optics, config.descriptor_noise, points, looks)
         if kept < total:
             points, looks = points[:kept], looks[:kept]
-        return Frames(TeamMeasurements(points, looks, ends), ids)
+        return TeamSensorFrames(TeamMeasurements(points, looks, ends), ids)
 
-    def _made_up(self, count: int, rng: np.random.Generator) -> FloatArray:
+    def _sample_clutter(self, count: int, rng: np.random.Generator) -> FloatArray:
         """Draw points that are no landmarks, and descriptors of them (count, 3 + d)."""
         size = len(self._common)
         places, looks = rng.random((3, count)), rng.standard_normal((count, size))
         points = np.empty((count, 3 + size))
-        make_up(places, looks, self._common, self._own_share, self._view, points)
+        sample_clutter(places, looks, self._common, self._own_share, self._view, points)
         return points

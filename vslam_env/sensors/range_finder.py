@@ -8,7 +8,7 @@ from slam_backend.core.read_only import as_read_only
 from slam_backend.core.validation import FloatArray, check_array, check_float, check_int
 from slam_backend.models.camera import StereoCamera
 from vslam_env.world._kernels import cast_scans
-from vslam_env.world.visibility import by_rows, ray_fan
+from vslam_env.world.visibility import as_coordinate_rows, ray_fan
 
 MOST_RAYS = 100_000  # of a robot; memory ends before
 
@@ -41,7 +41,7 @@ class ScanConfig:
         return np.linspace(-self.half_fov, self.half_fov, self.num_rays)
 
 
-class Scan:
+class RangeFinder:
     """Range finders of all robots in one world; they see walls and the other robots.
 
     Attributes:
@@ -54,7 +54,7 @@ class Scan:
         self.ray_angles = as_read_only(config.ray_angles)
         walls = check_array("walls", walls, (None, 4), "Give rows x1 y1 x2 y2 in metres.")
         robot_radius = check_float("robot_radius", robot_radius, "Give metres.", at_least=0.0)
-        fan = *ray_fan(config.ray_angles), by_rows(walls)
+        fan = *ray_fan(config.ray_angles), as_coordinate_rows(walls)
         self._sight = *fan, robot_radius, config.max_range, config.sigma  # as the kernel expects it
 
     def measure(self, poses: FloatArray, rng: np.random.Generator) -> FloatArray:

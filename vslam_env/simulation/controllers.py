@@ -14,7 +14,7 @@ from vslam_env.navigation import follow_path, plan_path
 from vslam_env.simulation.episode import Episode
 
 
-class GoalDriver:
+class GoalController:
     """Drives one robot to the candidate that it chose, over the floor of its own grid.
 
     A path is planned when the goal is set, and again when the robot bumps into something.
@@ -25,7 +25,7 @@ class GoalDriver:
         self._heading = 0.0
         self._path: FloatArray | None = None
 
-    def choose(self, candidate: tuple[FloatArray, float] | None, pose: FloatArray, cells: NDArray[np.uint8]) -> None:
+    def set_goal(self, candidate: tuple[FloatArray, float] | None, pose: FloatArray, cells: NDArray[np.uint8]) -> None:
         """Head for a goal (2,) [m], start frame, and look in a direction [rad] there; or stay with None.
 
         Args:
@@ -65,7 +65,7 @@ class GoalDriver:
         self._goal, self._path = (None if array is None else array.copy() for array in (goal, path))
 
 
-class Drivers:
+class ActionExecutor:
     """Drives all robots of an environment for a step.
 
     Args:
@@ -74,9 +74,9 @@ class Drivers:
 
     def __init__(self, config: EnvConfig) -> None:
         self._action_type, self._ticks = config.action_type, config.ticks_per_step
-        self._drivers = [GoalDriver() for _ in range(config.num_robots)]
+        self._drivers = [GoalController() for _ in range(config.num_robots)]
 
-    def carry_out(self, episode: Episode, chosen: Any) -> list[int]:
+    def execute(self, episode: Episode, chosen: Any) -> list[int]:
         """Let an episode advance by the ticks of a step.
 
         Args:
@@ -94,7 +94,7 @@ class Drivers:
         candidates = [beliefs.candidate(robot, action - 1) if action else None for robot, action in enumerate(chosen)]
         poses = beliefs.poses
         for robot, (driver, candidate) in enumerate(zip(self._drivers, candidates, strict=True)):
-            driver.choose(candidate, poses[robot], beliefs.cells(robot))
+            driver.set_goal(candidate, poses[robot], beliefs.cells(robot))
         for _ in range(self._ticks):
             poses, bumps = beliefs.poses, episode.readings.bumps.tolist()
             driven = [

@@ -13,16 +13,23 @@ from slam_backend.core.read_only import as_constant, with_constants, with_read_o
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.geometry import between, compose
 from slam_backend.maps.alignment import Alignment
-from slam_backend.team.communication import reach
+from slam_backend.team.communication import contact_components
 from vslam_env.belief.readings import Readings, TeamReadings
-from vslam_env.belief.team_belief import Body, TeamBelief
+from vslam_env.belief.team_belief import RobotHardware, TeamBelief
 from vslam_env.config import TICK, EnvConfig
-from vslam_env.evaluation.coverage import Coverage
-from vslam_env.evaluation.team_metrics import DISTANCES, ERROR_INTEGRALS, FOUND, MAP_ERRORS, NUM_FIGURES, Standing
+from vslam_env.evaluation.coverage import CoverageTracker
+from vslam_env.evaluation.team_metrics import (
+    DISCOVERED,
+    DISTANCES,
+    ERROR_INTEGRALS,
+    MAP_ERRORS,
+    NUM_METRICS,
+    TeamMetrics,
+)
 from vslam_env.reward import RUNNING_COST
-from vslam_env.sensors import EyeFrame, EyeFrames, Frame, Frames
+from vslam_env.sensors import RenderedFrame, SensorFrame, TeamRenderedFrames, TeamSensorFrames
 from vslam_env.simulation.communication import contacts
-from vslam_env.simulation.scenario import Setting
+from vslam_env.simulation.scenario import Scenario
 from vslam_env.world import Simulator, read_odometry
 
 MIN_SHARED = 3
@@ -69,7 +76,7 @@ def path_of(path: Sequence[FloatArray], own: list[FloatArray]) -> list[FloatArra
 
 
 @dataclass(slots=True)
-class Tap:
+class ReadingsHook:
     """Where readings can be listened to: an environment keeps it over its episodes."""
 
     recorder: Recorder | None = None
@@ -100,14 +107,14 @@ class Episode:
         merge_ticks: Tick and groups of each merge.
     """
 
-    def __init__(self, config: EnvConfig, setting: Setting, tap: Tap | None = None) -> None:
+    def __init__(self, config: EnvConfig, setting: Scenario, tap: ReadingsHook | None = None) -> None:
         self._config = config
-        self._tap = Tap() if tap is None else tap
+        self._tap = ReadingsHook() if tap is None else tap
         self._all_hear_all = config.always_in_contact
         self._streams = {name: np.random.default_rng(0) for name in setting.stream_states}
         self._given = ref(setting)
-        self._settle(setting)
-        self.body = Body(
+        self._load_scenario(setting)
+        self.body = RobotHardware(
             radius=config.robot_radius, ray_angles=config.scan.ray_angles, scan_range=config.scan.max_range
         )
         self.belief = TeamBelief(
@@ -121,23 +128,23 @@ class Episode:
 
         self.tick = 0
         self._collisions: tuple[int, ...] = (0,) * config.num_robots
-        self._figures = np.zeros((NUM_FIGURES, config.num_robots))  # of `Standing`; ways are added up in their row
-        self._found, self._distances = self._figures[FOUND], self._figures[DISTANCES]
+        self._figures = np.zeros((NUM_METRICS, config.num_robots))  # of `Standing`; ways are added up in their row
+        self._found, self._distances = self._figures[DISCOVERED], self._figures[DISTANCES]
         self._error_integrals = self._figures[ERROR_INTEGRALS]
         self._integrates = RUNNING_COST in config.reward  # scoring every tick costs time: only where it is asked for
         self.true_path: list[FloatArray] = []
         self.estimated_path: list[FloatArray] = []
         self.merge_ticks: list[tuple[int, tuple[int, ...], tuple[int, ...]]] = []
         self.readings: TeamReadings  # set by `begin`
-        self._frames: Frames | EyeFrames  # likewise
+        self._frames: TeamSensorFrames | TeamRenderedFrames  # likewise
 
-    def _settle(self, setting: Setting) -> None:
+    def _load_scenario(self, setting: Scenario) -> None:
         """Move into a setting, as at its reset."""
         self.setting = setting
         self.world, self.true_starts, self.belief_seed = setting.world, setting.true_starts, setting.belief_seed
         self._simulator = Simulator(setting.world, setting.true_starts, self._config.robot_radius, TICK)
-        self.ledger = setting.new_ledger(self._config.map_error_cutoff)
-        self._coverage = Coverage(setting.coverage)
+        self.ledger = setting.new_ground_truth(self._config.map_error_cutoff)
+        self._coverage = CoverageTracker(setting.coverage)
         for name, state in setting.stream_states.items():
             self._streams[name].bit_generator.state = state
 
@@ -146,7 +153,7 @@ class Episode:
         self._perceive(None)
 
     @property
-    def given_setting(self) -> Setting | None:
+    def given_scenario(self) -> Scenario | None:
         """The setting in the last state that was set, from which the own one was built again if it came from elsewhere.
 
         None if nobody else holds it; the episode goes by nothing in it.
@@ -159,9 +166,9 @@ class Episode:
         return self._simulator.poses.copy()
 
     @property
-    def frames(self) -> Sequence[Frame | EyeFrame]:
+    def frames(self) -> Sequence[SensorFrame | RenderedFrame]:
         """Each robot's frame of the last tick, with the true landmarks behind its measurements."""
-        return self._frames.of_each()
+        return self._frames.per_robot()
 
     def advance(self, commands: FloatArray) -> None:
         """Drive all robots with velocity commands (K, 2) [m/s, rad/s] for a tick, and let them perceive and believe.
@@ -179,17 +186,17 @@ class Episode:
             self._score(simulator.poses)
             self._error_integrals += self._figures[MAP_ERRORS] * TICK
 
-    def believed_poses(self) -> FloatArray:
+    def estimated_poses(self) -> FloatArray:
         """Return where the robots believe to be (K, 3) [m, m, rad], laid at their true starts, world frame."""
         return compose(self.true_starts, self.estimated_path[-1])
 
-    def standing(self) -> Standing:
+    def team_metrics(self) -> TeamMetrics:
         """Return how the team stands now: its maps and poses are scored."""
         belief, poses = self.belief, self._simulator.poses
         self._score(poses)
         coverage = self._coverage.update(belief.grids, poses, self._found)
         counts = self._collisions, tuple(belief.exchange.sent)
-        return Standing(self._figures.tolist(), counts, coverage, len(self.merge_ticks), self.tick * TICK)
+        return TeamMetrics(self._figures.tolist(), counts, coverage, len(self.merge_ticks), self.tick * TICK)
 
     # ------------------------------------------------------------------ snapshots
 
@@ -208,11 +215,11 @@ class Episode:
             "paths": (tuple(self.true_path), tuple(self.estimated_path), tuple(self.merge_ticks)),
         }
 
-    def set_state(self, state: Mapping[str, Any], setting: Setting) -> None:
+    def set_state(self, state: Mapping[str, Any], setting: Scenario) -> None:
         """Go on exactly as the episode that gave `state`, which was checked, in its setting."""
         self._given = ref(state["setting"])
         if setting is not self.setting:
-            self._settle(setting)
+            self._load_scenario(setting)
         self._simulator.set_state(state["simulator"])
         for name, stream in state["streams"].items():
             self._streams[name].bit_generator.state = stream
@@ -232,7 +239,7 @@ class Episode:
     def _score(self, poses: FloatArray) -> None:
         """Write the scores of all maps and poses, with robots at true poses (K, 3), into the first figures."""
         belief = self.belief
-        self.ledger.score(belief.outlines, belief.points, self.true_starts, poses, self._figures)
+        self.ledger.score(belief.map_summaries, belief.points, self.true_starts, poses, self._figures)
 
     def _perceive(self, odometry: FloatArray | None) -> None:
         """Read all other sensors at the true poses, and let the robots take it in."""
@@ -248,16 +255,16 @@ class Episode:
             between(self.true_starts, poses) if config.oracle_pose else None,
             frames.true_ids if config.oracle_association else None,
             heard,
-            frames.left if config.observe_images and isinstance(frames, EyeFrames) else None,
+            frames.left if config.observe_images and isinstance(frames, TeamRenderedFrames) else None,
         )
         if self._tap.recorder is not None:
-            self._tap.recorder(self.readings.of_each())
+            self._tap.recorder(self.readings.per_robot())
         report = self.belief.step(self.readings)
         self.ledger.record(report, frames.names)
-        for made in report.renamings:
+        for made in report.id_maps:
             self.merge_ticks.append((self.tick, made.robots_a, made.robots_b))
         if config.oracle_merge:
-            self._merge_by_oracle(reach(heard, config.num_robots))
+            self._merge_by_oracle(contact_components(heard, config.num_robots))
         self.true_path.append(as_constant(poses))
         self.estimated_path.append(as_constant(self.belief.points.own))
 
@@ -273,19 +280,19 @@ class Episode:
         while merged:
             merged = False
             for a, b in combinations(self.belief.groups, 2):
-                speakers = self.belief.speaker(a), self.belief.speaker(b)
+                speakers = self.belief.representative(a), self.belief.representative(b)
                 if networks[speakers[0]] != networks[speakers[1]]:
                     continue
                 alignment = true_alignment(
-                    self._claims(a), self._claims(b), self.true_starts[a[0]], self.true_starts[b[0]]
+                    self._true_ids(a), self._true_ids(b), self.true_starts[a[0]], self.true_starts[b[0]]
                 )
                 if alignment is not None:
-                    self.ledger.rename(self.belief.merge(*speakers, alignment, known=True))
+                    self.ledger.merge(self.belief.merge(*speakers, alignment, known=True))
                     self.merge_ticks.append((self.tick, a, b))
                     merged = True
                     break
 
-    def _claims(self, group: tuple[int, ...]) -> IntArray:
+    def _true_ids(self, group: tuple[int, ...]) -> IntArray:
         """Return which true landmark each row of a group's filter map claims."""
-        speaker = self.belief.speaker(group)
-        return self.ledger.claims(speaker, self.belief.filter_map(speaker).ids)
+        speaker = self.belief.representative(group)
+        return self.ledger.true_ids(speaker, self.belief.filter_map(speaker).ids)

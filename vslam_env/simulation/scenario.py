@@ -6,18 +6,18 @@ from typing import Any, Self
 import numpy as np
 
 from slam_backend.core.read_only import as_constant, as_read_only
-from slam_backend.core.validation import FloatArray, bad_argument
+from slam_backend.core.validation import FloatArray, argument_error
 from vslam_env.config import EnvConfig
-from vslam_env.evaluation.coverage import CoverageMeter
-from vslam_env.evaluation.map_scores import ClaimLedger
-from vslam_env.sensors import LandmarkSensor, Scan, ScanConfig, StereoSensor, StereoSensorConfig
+from vslam_env.evaluation.coverage import CoverageCells
+from vslam_env.evaluation.map_scores import GroundTruthAssociation
+from vslam_env.sensors import LandmarkSensor, RangeFinder, ScanConfig, StereoSensor, StereoSensorConfig
 from vslam_env.sensors.stereo.ground_truth import TextureCorners
 from vslam_env.sensors.stereo.textures import check_textures
 from vslam_env.world import FreeSpace, World, WorldSource, draw_bias, draw_world_seed, make_world, place_landmarks
 
 
 @dataclass(frozen=True, slots=True, weakref_slot=True, kw_only=True, eq=False)
-class Setting:
+class Scenario:
     """A world with the robots' starts and sensors in it. Episodes and their snapshots share it; arrays are read-only.
 
     Attributes:
@@ -38,15 +38,15 @@ class Setting:
     belief_seed: np.random.SeedSequence
     stream_states: dict[str, Any]
     sensor: LandmarkSensor | StereoSensor
-    scan: Scan
-    coverage: CoverageMeter
-    countable: np.ndarray
+    scan: RangeFinder
+    coverage: CoverageCells
+    observable_landmarks: np.ndarray
 
     def __post_init__(self) -> None:
         for name in ("true_starts", "bias", "countable"):
             object.__setattr__(self, name, as_constant(getattr(self, name)))
 
-    def parts(self) -> tuple[Any, ...]:
+    def to_parts(self) -> tuple[Any, ...]:
         """Return what the setting is made of; what follows from that is left out."""
         sensor = self.sensor
         painted = None
@@ -54,11 +54,11 @@ class Setting:
             painted = sensor.textures, sensor.corners.faces, sensor.corners.offsets
         return (
             self.world, self.true_starts, self.bias, self.belief_seed, self.stream_states, sensor.config,
-            sensor.robot_radius, painted, self.scan.config, self.coverage.cells, self.countable,
+            sensor.robot_radius, painted, self.scan.config, self.coverage.cells, self.observable_landmarks,
         )  # fmt: skip
 
     @classmethod
-    def of_parts(
+    def from_parts(
         cls, world: World, true_starts: FloatArray, bias: FloatArray, belief_seed: np.random.SeedSequence,
         stream_states: dict[str, Any], sensor: Any, robot_radius: float, painted: Any, scan: ScanConfig,
         cells: FloatArray, countable: np.ndarray,
@@ -86,25 +86,25 @@ class Setting:
             belief_seed=belief_seed,
             stream_states=stream_states,
             sensor=eyes,
-            scan=Scan(scan, world.walls, robot_radius),
-            coverage=CoverageMeter(cells, true_starts),
-            countable=countable,
+            scan=RangeFinder(scan, world.walls, robot_radius),
+            coverage=CoverageCells(cells, true_starts),
+            observable_landmarks=countable,
         )
 
-    def new_ledger(self, cutoff: float) -> ClaimLedger:
+    def new_ground_truth(self, cutoff: float) -> GroundTruthAssociation:
         """Return empty books for this world's landmarks; `cutoff` is c of the map error [m]."""
         landmarks = self.world.landmarks
         assert landmarks is not None
-        return ClaimLedger(len(self.true_starts), landmarks.positions, self.countable, cutoff)
+        return GroundTruthAssociation(len(self.true_starts), landmarks.positions, self.observable_landmarks, cutoff)
 
 
-def draw_setting(
+def sample_scenario(
     config: EnvConfig,
     source: WorldSource,
     seed: np.random.SeedSequence,
     world_seed: int | None = None,
     start_poses: Any = None,
-) -> Setting:
+) -> Scenario:
     """Draw an episode's setting. Each concern draws from a stream of its own, so that none shifts another.
 
     Args:
@@ -136,23 +136,23 @@ def draw_setting(
     countable = free_space.visible_landmarks(landmarks, eyes.config.camera, eyes.config.max_incidence)
     if not countable.any():
         got, cure = f"no such landmark among {len(landmarks)} in {bare.name!r}", "Put some on walls that robots pass."
-        raise bad_argument("world", "landmarks that robots can see", got, cure)
+        raise argument_error("world", "landmarks that robots can see", got, cure)
     world = World(bare.name, bare.walls, landmarks, bare.start_poses)
     true_starts = _starts(config, world, free_space, start_poses, np.random.default_rng(starts))
     streams = {
         name: np.random.default_rng(stream)
         for name, stream in (("odometry", odometry), ("sensor", sensor), ("scan", scan), ("radio", radio))
     }
-    return Setting(
+    return Scenario(
         world=world,
         true_starts=as_read_only(true_starts),
         bias=as_read_only(draw_bias(config.odometry, config.num_robots, streams["odometry"])),
         belief_seed=belief_seed,
         stream_states={name: stream.bit_generator.state for name, stream in streams.items()},
         sensor=eyes,
-        scan=Scan(config.scan, world.walls, config.robot_radius),
-        coverage=CoverageMeter(free_space.free_area_cells, true_starts),
-        countable=as_read_only(countable),
+        scan=RangeFinder(config.scan, world.walls, config.robot_radius),
+        coverage=CoverageCells(free_space.free_area_cells, true_starts),
+        observable_landmarks=as_read_only(countable),
     )
 
 
@@ -169,7 +169,7 @@ def _starts(
         return free_space.check_starts(start_poses, config.num_robots)
     if given is not None:
         if len(given) < config.num_robots:
-            raise bad_argument(
+            raise argument_error(
                 "world.start_poses",
                 f"a row for each of {config.num_robots} robots",
                 f"shape {given.shape}",

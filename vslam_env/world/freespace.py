@@ -5,13 +5,13 @@ from typing import Any
 import cv2
 import numpy as np
 
-from slam_backend.core.validation import BoolArray, FloatArray, bad_argument, check_array, check_float, check_int
+from slam_backend.core.validation import BoolArray, FloatArray, argument_error, check_array, check_float, check_int
 from slam_backend.geometry import wrap_angle
 from slam_backend.models.camera import StereoCamera
-from vslam_env.world._kernels import cast_scans, seen_from_somewhere
+from vslam_env.world._kernels import cast_scans, observable_anywhere
 from vslam_env.world._kernels.clearance import clearance_raster, distances_to_walls
 from vslam_env.world.spec import FARTHEST_PLACE, Landmarks, World
-from vslam_env.world.visibility import by_rows, ray_fan, view_limits, visible_landmarks
+from vslam_env.world.visibility import as_coordinate_rows, ray_fan, view_limits, visible_landmarks
 
 CELL = 0.1  # [m] side of a raster cell
 AREA_STEP = 2  # free area is counted in squares of 2 x 2 raster cells
@@ -54,7 +54,7 @@ class FreeSpace:
         outside = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
         fits[np.isin(labels, outside)] = 0
         if not fits.any():
-            raise bad_argument(
+            raise argument_error(
                 "world",
                 f"walls that enclose a space in which a disc of radius {radius:g} m fits anywhere in a {CELL:g} m cell",
                 f"no such cell in {world.name!r}",
@@ -99,7 +99,7 @@ class FreeSpace:
         Returns:
             (N,) bool. The count of True is the N of the map error.
         """
-        return seen_from_somewhere(
+        return observable_anywhere(
             landmarks.positions,
             landmarks.normals,
             landmarks.walls,
@@ -159,7 +159,7 @@ class FreeSpace:
                 if len(starts) == num_robots:
                     return starts
         unshared = " with no shared view" if no_shared_view is not None else ""
-        raise bad_argument(
+        raise argument_error(
             "num_robots",
             f"as many as can start {min_distance:g} m apart{unshared} in {self.world.name!r}",
             num_robots,
@@ -171,7 +171,7 @@ class FreeSpace:
         headings = rng.uniform(-np.pi, np.pi, 8)
         poses, free = np.empty((len(headings), 3)), np.zeros((len(headings), 1))
         poses[:, :2], poses[:, 2] = position, headings
-        cast_scans(poses, *ray_fan(np.zeros(1)), by_rows(self.world.walls), 0.0, VIEW_AHEAD, 0.0, free)
+        cast_scans(poses, *ray_fan(np.zeros(1)), as_coordinate_rows(self.world.walls), 0.0, VIEW_AHEAD, 0.0, free)
         return float(headings[int(np.argmax(free[:, 0] >= VIEW_AHEAD))])
 
     def check_starts(self, start_poses: Any, num_robots: int | None = None) -> FloatArray:
@@ -193,11 +193,11 @@ class FreeSpace:
         for robot, (gap, inside) in enumerate(zip(gaps, near, strict=True)):
             name = f"start_poses[{robot}]"
             if not inside:
-                raise bad_argument(
+                raise argument_error(
                     name, "a place that robots can reach", starts[robot].tolist(), "Move the robot inside the walls."
                 )
             if gap < self.radius:
-                raise bad_argument(
+                raise argument_error(
                     name,
                     f"a place at least {self.radius:g} m (the robot's radius) from any wall",
                     f"a distance of {gap:.3f} m",
@@ -205,7 +205,7 @@ class FreeSpace:
                 )
             others = np.linalg.norm(starts[:robot, :2] - starts[robot, :2], axis=1)
             if robot and others.min() < 2.0 * self.radius:
-                raise bad_argument(
+                raise argument_error(
                     name,
                     f"a place at least {2 * self.radius:g} m from the other robots",
                     f"a distance of {others.min():.3f} m to robot {int(np.argmin(others))}",

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.core.validation import FloatArray, bad_argument, check_float, check_int
+from slam_backend.core.validation import FloatArray, argument_error, check_float, check_int
 from vslam_env.world.freespace import FreeSpace
 from vslam_env.world.spec import Landmarks, World
 
@@ -89,7 +89,7 @@ def place_landmarks(
     heights = rng.uniform(config.min_height, config.max_height, len(wall_of))
     keep = free_space.contains(positions + LOOK * normals)
     if not keep.any():
-        raise bad_argument(
+        raise argument_error(
             "landmarks.density",
             "enough for one landmark on the walls that robots can look at",
             config.density,

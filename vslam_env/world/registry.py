@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.core.validation import bad_argument, is_built_in
+from slam_backend.core.validation import argument_error, is_built_in
 from vslam_env.world.generators.fig5 import fig5
 from vslam_env.world.generators.hall import hall
 from vslam_env.world.generators.loops import loops
@@ -50,7 +50,7 @@ def make_world(world: WorldSource, rng: np.random.Generator, split: str | None =
         return _load(world, rng, split)
     made = world(rng)
     if not isinstance(made, World):
-        raise bad_argument("world", "a function that returns a World", made, "Return World(name, walls).")
+        raise argument_error("world", "a function that returns a World", made, "Return World(name, walls).")
     return made
 
 
@@ -69,13 +69,13 @@ def check_source(world: object) -> None:
         _check_maker(world)
     else:
         cure = f"Names: {', '.join(WORLD_FAMILIES)}."
-        raise bad_argument("world", "a name, a path, a World or a function", world, cure)
+        raise argument_error("world", "a name, a path, a World or a function", world, cure)
 
 
 def _check_maker(maker: Callable[..., Any]) -> None:
     """Refuse a function that cannot be called with a random generator alone."""
     if is_built_in(maker):
-        raise bad_argument("world", "a function of rng that returns a World", maker, "Write one in Python.")
+        raise argument_error("world", "a function of rng that returns a World", maker, "Write one in Python.")
     try:
         taken = signature(maker)
     except (TypeError, ValueError):  # some built-in functions do not tell
@@ -84,10 +84,10 @@ def _check_maker(maker: Callable[..., Any]) -> None:
         taken.bind(None)
     except TypeError as error:
         cure = f"Define it as def make(rng); the call says: {error}."
-        raise bad_argument("world", "a function of one argument, a random generator", maker, cure) from error
+        raise argument_error("world", "a function of one argument, a random generator", maker, cure) from error
 
 
-def is_one_building(world: WorldSource) -> bool:
+def is_single_layout(world: WorldSource) -> bool:
     """Tell whether all worlds of a source have the same walls, so that there is nothing to split."""
     named = isinstance(world, (str, Path)) and not (isinstance(world, str) and world in WORLD_FAMILIES)
     return isinstance(world, World) or (named and not Path(world).is_dir())  # type: ignore[arg-type]
@@ -122,18 +122,18 @@ def _files(world: str | Path) -> list[Path]:
     try:
         is_folder = path.is_dir()
     except OSError as error:  # e.g. a name too long for the system
-        raise bad_argument("world", "a file", Path(path), f"Check the path: {error.strerror}.") from error
+        raise argument_error("world", "a file", Path(path), f"Check the path: {error.strerror}.") from error
     if is_folder and world != "":  # the path of no characters would be the current folder
         files = sorted(p for p in path.iterdir() if p.suffix.lower() in FILE_SUFFIXES)
         maps = {file.stem for file in files if file.suffix.lower() in MAP_SUFFIXES}
         files = [file for file in files if file.stem not in maps or file.suffix.lower() not in IMAGE_SUFFIXES]
         if not files:
             cure = "Put .png, .jpg, .pgm, .yaml or .json files there."
-            raise bad_argument("world", "a folder with floor plans", Path(path), cure)
+            raise argument_error("world", "a folder with floor plans", Path(path), cure)
         return files
     if path.suffix.lower() not in FILE_SUFFIXES:
         names = ", ".join(repr(name) for name in WORLD_FAMILIES)
-        raise bad_argument(
+        raise argument_error(
             "world",
             f"one of {names}, or a path of an image, a .yaml or .json file or a folder",
             str(world),

@@ -15,7 +15,7 @@ SKIN = 9e-3  # [m] contacts begin this far outside the robot, so that the robot 
 SLOP = 1e-3  # [m] depth of contact, inside the skin, that is left alone
 CORRECTION = 0.2  # share of a deeper contact that is undone in each substep
 STANDING_MASS = 1e6  # [kg] a robot with its brakes on is not pushed away by one of 1 kg
-FASTEST = 1e3  # [m/s, rad/s] the way of a tick at a greater speed would be looked through for contacts for minutes
+MAX_SPEED = 1e3  # [m/s, rad/s] the way of a tick at a greater speed would be looked through for contacts for minutes
 SHORTFALL = 0.01  # share of the commanded way that must be missing for a bump
 
 
@@ -47,7 +47,7 @@ def _drive_freely(
         goals[k, 1] = poses[k, 1] + chord * np.sin(poses[k, 2] + half)
         goals[k, 2] = (poses[k, 2] + turn + np.pi) % (2.0 * np.pi) - np.pi
         reach[k] = radius + abs(chord)
-        clear &= abs(commands[k, 0]) <= FASTEST and abs(commands[k, 1]) <= FASTEST  # not so for NaN
+        clear &= abs(commands[k, 0]) <= MAX_SPEED and abs(commands[k, 1]) <= MAX_SPEED  # not so for NaN
     for k in range(len(poses)):
         for i in range(len(walls)):
             ex, ey = walls[i, 2] - walls[i, 0], walls[i, 3] - walls[i, 1]
@@ -131,7 +131,7 @@ class Simulator:
 
     def _checked(self, commands: Any) -> FloatArray:
         """Return commands (K, 2) as `step` needs them, or raise."""
-        return check_array("commands", commands, self._shape, "Give (v, omega) for each robot.", within=FASTEST)
+        return check_array("commands", commands, self._shape, "Give (v, omega) for each robot.", within=MAX_SPEED)
 
     def _move_in_contact(self, way: FloatArray) -> FloatArray:
         """Move the bodies by `way` (K, 2) [m] as far as contacts allow; return their positions (K, 2) [m].

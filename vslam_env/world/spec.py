@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.core.read_only import as_read_only
-from slam_backend.core.validation import FloatArray, IntArray, bad_argument, check_array
+from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_array
 
 SHORTEST_WALL = 1e-3  # [m] anything shorter has no direction worth the name
 LARGEST_EXTENT = 200.0  # [m] grids of free space grow with its square
@@ -46,7 +46,7 @@ class Landmarks:
             lengths = np.linalg.norm(vectors, axis=1)
             if len(lengths) and not np.allclose(lengths, 1.0, atol=1e-4):
                 worst = float(lengths[np.argmax(np.abs(lengths - 1.0))])
-                raise bad_argument(f"landmarks.{name}", "unit vectors", f"a length of {worst:g}", "Normalise them.")
+                raise argument_error(f"landmarks.{name}", "unit vectors", f"a length of {worst:g}", "Normalise them.")
         for name, array in zip(self.__slots__, (positions, normals, walls, descriptors), strict=True):
             object.__setattr__(self, name, as_read_only(array))
 
@@ -84,15 +84,15 @@ class World:
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str):
-            raise bad_argument("world.name", "a string", self.name, "Give the world a name.")
+            raise argument_error("world.name", "a string", self.name, "Give the world a name.")
         cure = "Give rows x1 y1 x2 y2 in metres."
         walls: Any = check_array("world.walls", self.walls, (None, 4), cure, within=FARTHEST_PLACE)
         if not len(walls):
-            raise bad_argument("world.walls", "at least one wall", "no rows", cure)
+            raise argument_error("world.walls", "at least one wall", "no rows", cure)
         lengths = np.hypot(walls[:, 2] - walls[:, 0], walls[:, 3] - walls[:, 1])
         if lengths.min() < SHORTEST_WALL:
             at = int(np.argmin(lengths))
-            raise bad_argument(
+            raise argument_error(
                 f"world.walls[{at}]",
                 f"a wall longer than {SHORTEST_WALL:g} m",
                 f"a length of {lengths[at]:g} m",
@@ -100,7 +100,7 @@ class World:
             )
         extent = float(np.ptp(walls.reshape(-1, 2), axis=0).max())
         if extent > LARGEST_EXTENT:
-            raise bad_argument(
+            raise argument_error(
                 "world.walls",
                 f"an extent of at most {LARGEST_EXTENT:g} m",
                 f"a width or height of {extent:g} m",
@@ -109,10 +109,12 @@ class World:
         object.__setattr__(self, "walls", as_read_only(walls))
         if self.landmarks is not None:
             if not isinstance(self.landmarks, Landmarks):
-                raise bad_argument("world.landmarks", "Landmarks or None", self.landmarks, "Build them with Landmarks.")
+                raise argument_error(
+                    "world.landmarks", "Landmarks or None", self.landmarks, "Build them with Landmarks."
+                )
             named = self.landmarks.walls
             if len(named) and (named.min() < 0 or named.max() >= len(walls)):
-                raise bad_argument(
+                raise argument_error(
                     "world.landmarks.walls",
                     f"wall indices 0 to {len(walls) - 1}",
                     [int(named.min()), int(named.max())],

@@ -5,7 +5,7 @@ import numpy as np
 from slam_backend.core.read_only import as_read_only
 from slam_backend.core.validation import BoolArray, FloatArray
 from slam_backend.models.camera import StereoCamera
-from vslam_env.world._kernels import rays_at, see
+from vslam_env.world._kernels import rays_at, visible
 from vslam_env.world.spec import Landmarks
 
 
@@ -24,12 +24,12 @@ def view_limits(camera: StereoCamera, max_incidence: float) -> FloatArray:
     return as_read_only(np.array([*camera.mount, camera.max_range, *tangents, np.cos(max_incidence)]))
 
 
-def marks_of(landmarks: Landmarks) -> FloatArray:
+def landmark_geometry(landmarks: Landmarks) -> FloatArray:
     """Return positions [m] and normals of landmarks (5, N), world frame, by rows as kernels expect them; read-only."""
     return as_read_only(np.vstack([landmarks.positions.T, landmarks.normals.T]))
 
 
-def by_rows(walls: FloatArray) -> FloatArray:
+def as_coordinate_rows(walls: FloatArray) -> FloatArray:
     """Return walls (S, 4) [m] as rows (4, S) of coordinates, as kernels expect them; read-only."""
     return as_read_only(walls.T.copy())
 
@@ -53,5 +53,5 @@ def visible_landmarks(
         view: From `view_limits`.
     """
     seen = np.empty((len(poses), len(landmarks)), dtype=np.bool_)
-    see(poses, marks_of(landmarks), landmarks.walls, by_rows(walls), robot_radius, view, seen)
+    visible(poses, landmark_geometry(landmarks), landmarks.walls, as_coordinate_rows(walls), robot_radius, view, seen)
     return seen

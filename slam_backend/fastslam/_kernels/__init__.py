@@ -21,14 +21,41 @@ g = A^T S^-1 r to the gradient. A gate takes S + A P A^T, with P the covariance 
 """
 
 from slam_backend.fastslam._kernels.inputs import extent, noises_to_robot_axes, read_team, to_robot_axes
-from slam_backend.fastslam._kernels.landmark_ekf import YOUNG
-from slam_backend.fastslam._kernels.layout import FAR, IDLE, LANES, MIN_DEPTH, MOVED, PLACED, STOOD
-from slam_backend.fastslam._kernels.map_storage import carry_odds, gather, hold, outline, refresh, resample
-from slam_backend.fastslam._kernels.step import take_turns, write_sigmas
-from slam_backend.fastslam._kernels.weights import add_share, mixture, stand
+from slam_backend.fastslam._kernels.landmark_ekf import RELINEARISE_BELOW
+from slam_backend.fastslam._kernels.layout import EXACT_POSE, FAR, LANES, MIN_DEPTH, MOVED, NO_READING, STATIONARY
+from slam_backend.fastslam._kernels.map_storage import (
+    apply_resampling,
+    gather,
+    gather_odds,
+    map_summary,
+    present_slots,
+    resample,
+)
+from slam_backend.fastslam._kernels.step import step_robots, write_sigmas
+from slam_backend.fastslam._kernels.weights import add_gauge_covariance, mixture, write_team_poses
 
 __all__ = [
-    "FAR", "IDLE", "LANES", "MIN_DEPTH", "MOVED", "PLACED", "STOOD", "YOUNG",
-    "add_share", "carry_odds", "extent", "gather", "hold", "mixture", "noises_to_robot_axes", "outline", "read_team",
-    "refresh", "resample", "stand", "take_turns", "to_robot_axes", "write_sigmas",
+    "EXACT_POSE",
+    "FAR",
+    "LANES",
+    "MIN_DEPTH",
+    "MOVED",
+    "NO_READING",
+    "RELINEARISE_BELOW",
+    "STATIONARY",
+    "add_gauge_covariance",
+    "apply_resampling",
+    "extent",
+    "gather",
+    "gather_odds",
+    "map_summary",
+    "mixture",
+    "noises_to_robot_axes",
+    "present_slots",
+    "read_team",
+    "resample",
+    "step_robots",
+    "to_robot_axes",
+    "write_sigmas",
+    "write_team_poses",
 ]  # fmt: skip

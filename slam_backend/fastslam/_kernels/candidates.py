@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from slam_backend.core.jit import any_order, device, fused, lanes
+from slam_backend.core.jit import device, jit_fma, simd, simd_sum
 from slam_backend.core.simd_math import log_of
 from slam_backend.core.validation import Float32Array, FloatArray, Int32Array, IntArray
 from slam_backend.fastslam._kernels.layout import (
@@ -22,14 +22,14 @@ from slam_backend.fastslam._kernels.layout import (
     SECOND,
     TAKEN,
 )
-from slam_backend.fastslam._kernels.measurement_model import count_likelihood, match_terms
+from slam_backend.fastslam._kernels.measurement_model import accumulate_likelihood, match_terms
 from slam_backend.fastslam._kernels.pose_posterior import add_terms
 
 RUN = 64  # descriptors looked at together
 
 
 @device
-@lanes
+@simd
 def _head_distances(
     measured: Float32Array, b: int, heads: Float32Array, stride: int, n: int, out: Float32Array
 ) -> None:
@@ -52,7 +52,7 @@ def _head_distances(
             out[slot] += difference * difference
 
 
-@any_order
+@simd_sum
 def _squared_distance(measured: Float32Array, b: int, stored: Float32Array, slot: int) -> float:
     """Return the squared distance of two descriptors, in double precision."""
     total = 0.0
@@ -63,7 +63,7 @@ def _squared_distance(measured: Float32Array, b: int, stored: Float32Array, slot
 
 
 @device
-@lanes
+@simd
 def _hits(partial: Float32Array, limit: float, hits: IntArray) -> int:
     """Write the indices of the entries up to `limit`, ascending; return how many. Runs without one are skipped."""
     count, n = 0, len(partial)
@@ -82,7 +82,7 @@ def _hits(partial: Float32Array, limit: float, hits: IntArray) -> int:
 
 
 @device
-@fused
+@jit_fma
 def find_candidates(
     measured: Float32Array, stored: Float32Array, heads: Float32Array, ids: IntArray, names: IntArray,
     identities: IntArray, named: bool, gate: float,
@@ -159,31 +159,31 @@ def find_candidates(
 
 
 @device
-@lanes
-def decide_alone(
+@simd
+def decide_single_candidate(
     work: FloatArray, tile: FloatArray, seen: Int32Array, match: FloatArray, q: float,
-    reach: float, dead_zone: float, dead_radius: float, log_clutter: float,
+    reach: float, new_landmark_gate: float, new_landmark_radius: float, log_clutter: float,
 ) -> None:  # fmt: skip
     """Pass B for a measurement with one candidate: match, reject or start, and sum.
 
     Row TAKEN says where an earlier measurement has taken the landmark; for `reach` see `_match_alone`.
     """
-    radius2 = dead_radius * dead_radius
+    radius2 = new_landmark_radius * new_landmark_radius
     for i in range(LANES):
         j00, j01, j02, j11, j12, j22, g0, g1, g2, square, det, _, depth, metres2, distance = match_terms(
             work, tile, i, True
         )
         front = (seen[i] > 0) & (distance < np.inf)  # "and" would make a branch of it, and of all that follows
-        near = front & ((distance <= dead_zone) | (metres2 <= radius2))
+        near = front & ((distance <= new_landmark_gate) | (metres2 <= radius2))
         ok = front & (distance <= reach) & (work[TAKEN + i] == 0.0)
         match[i] = q if ok else (-1.0 if near else -2.0)
         work[CLUTTER + i] += 0.0 if ok else log_clutter
         add_terms(work, i, ok, 1.0, j00, j01, j02, j11, j12, j22, g0, g1, g2)
-        count_likelihood(work, i, ok, square, det, depth)
+        accumulate_likelihood(work, i, ok, square, det, depth)
 
 
 @device
-@lanes
+@simd
 def begin_choice(work: FloatArray) -> None:
     for i in range(LANES):
         work[BEST + i] = np.inf
@@ -194,35 +194,35 @@ def begin_choice(work: FloatArray) -> None:
 
 
 @device
-@lanes
-def mark_taken(work: FloatArray, earlier: FloatArray, p: float) -> None:
+@simd
+def mark_assigned(work: FloatArray, earlier: FloatArray, p: float) -> None:
     for i in range(len(earlier)):
         work[TAKEN + i] = 1.0 if earlier[i] == p else work[TAKEN + i]
 
 
 @device
-@lanes
-def clear_taken(work: FloatArray) -> None:
+@simd
+def clear_assigned(work: FloatArray) -> None:
     for i in range(LANES):
         work[TAKEN + i] = 0.0
 
 
 @device
-@lanes
-def consider_again(
-    work: FloatArray, record: FloatArray, q: float, look: float, cap: float, gate: float, dead_zone: float,
-    dead_radius: float,
+@simd
+def consider_candidate(
+    work: FloatArray, record: FloatArray, q: float, look: float, cap: float, gate: float, new_landmark_gate: float,
+    new_landmark_radius: float,
 ) -> None:  # fmt: skip
     """Let candidate q compete for the measurement in pass B, unless row TAKEN says that its landmark is taken.
 
     D counts no more than `cap`: the gate where the caller names the landmarks.
     """
-    radius2 = dead_radius * dead_radius
+    radius2 = new_landmark_radius * new_landmark_radius
     for i in range(LANES):
         distance = record[Q_D + i]
         front = (record[Q_HELD + i] > 0.0) & (distance < np.inf)
         distance = cap if distance > cap else distance
-        near = front & ((distance <= dead_zone) | (record[Q_METRES2 + i] <= radius2))
+        near = front & ((distance <= new_landmark_gate) | (record[Q_METRES2 + i] <= radius2))
         ok = front & (distance <= gate) & (work[TAKEN + i] == 0.0)
         work[DEAD + i] = 1.0 if near else work[DEAD + i]
         depth = record[Q_DEPTH + i]
@@ -237,7 +237,7 @@ def consider_again(
 
 
 @device
-@lanes
+@simd
 def decide(work: FloatArray, match: FloatArray, ambiguity: float, log_clutter: float) -> None:
     """Write the candidate matched, -1 for rejected or -2 for new, and the log-likelihood of what is not matched."""
     for i in range(LANES):
@@ -250,7 +250,7 @@ def decide(work: FloatArray, match: FloatArray, ambiguity: float, log_clutter: f
 
 
 @device
-@lanes
+@simd
 def mask_of(match: FloatArray, code: float, mask: FloatArray) -> int:
     """Write 1 where `match` equals `code`, else 0; return how many."""
     count = 0
@@ -262,30 +262,30 @@ def mask_of(match: FloatArray, code: float, mask: FloatArray) -> int:
 
 
 @device
-@lanes
-def mark_held(record: FloatArray, seen: Int32Array) -> None:
+@simd
+def mark_present(record: FloatArray, seen: Int32Array) -> None:
     for i in range(len(seen)):
         record[Q_HELD + i] = 1.0 if seen[i] > 0 else 0.0
 
 
 @device
-@lanes
-def admit(chosen: FloatArray, seen: Int32Array, mask: FloatArray) -> None:
+@simd
+def mark_eligible(chosen: FloatArray, seen: Int32Array, mask: FloatArray) -> None:
     """Write 1 where the measurement is still without a match and the particle holds the candidate."""
     for i in range(len(chosen)):
         mask[i] = 1.0 if chosen[i] == -2.0 and seen[i] > 0 else 0.0
 
 
 @device
-@lanes
-def bar_taken(earlier: FloatArray, p: float, mask: FloatArray) -> None:
+@simd
+def exclude_assigned(earlier: FloatArray, p: float, mask: FloatArray) -> None:
     for i in range(len(earlier)):
         mask[i] = 0.0 if earlier[i] == p else mask[i]
 
 
 @device
-@lanes
-def start_none_beyond(match: FloatArray, real: int) -> None:
+@simd
+def mask_padding(match: FloatArray, real: int) -> None:
     """Let the surplus lanes of the last block start no landmark."""
     for b in range(len(match)):
         for i in range(real, LANES):
@@ -293,22 +293,22 @@ def start_none_beyond(match: FloatArray, real: int) -> None:
 
 
 @device
-@lanes
+@simd
 def start_none_held(match: FloatArray, seen: Int32Array) -> None:
     """Let a named measurement start no landmark in lanes that hold the one of its name, wherever they predict it."""
     for i in range(len(match)):
         match[i] = -1.0 if match[i] == -2.0 and seen[i] > 0 else match[i]
 
 
-@lanes
+@simd
 def start_none_again(match: FloatArray, earlier: FloatArray) -> None:
     """Let a named measurement start no landmark in lanes in which an earlier one of its name and frame starts it."""
     for i in range(len(match)):
         match[i] = -1.0 if match[i] == -2.0 and earlier[i] == -2.0 else match[i]
 
 
-@lanes
-def start_once(
+@simd
+def create_once(
     match: FloatArray, b: int, first: int, counts: Int32Array, row_of: IntArray, starts: IntArray, slots: IntArray,
     names: IntArray,
 ) -> None:  # fmt: skip
@@ -320,8 +320,8 @@ def start_once(
             start_none_again(match[b], match[a])
 
 
-@lanes
-def write_found(
+@simd
+def write_associations(
     found: Int32Array, distances: FloatArray, first: int, match: FloatArray, starts: IntArray, slots: IntArray,
     records: FloatArray, row: int, new_slots: IntArray,
 ) -> None:  # fmt: skip

@@ -9,17 +9,17 @@ import math
 
 import numpy as np
 
-from slam_backend.core.jit import device, lanes
+from slam_backend.core.jit import device, simd
 from slam_backend.core.simd_math import log_of
 from slam_backend.core.validation import FloatArray, Int32Array, IntArray
 from slam_backend.fastslam._kernels.candidates import (
     begin_choice,
-    clear_taken,
-    consider_again,
+    clear_assigned,
+    consider_candidate,
     decide,
-    decide_alone,
-    mark_held,
-    mark_taken,
+    decide_single_candidate,
+    mark_assigned,
+    mark_present,
     mask_of,
 )
 from slam_backend.fastslam._kernels.layout import (
@@ -34,7 +34,6 @@ from slam_backend.fastslam._kernels.layout import (
     CHOSEN,
     CONTRADICT,
     COS,
-    FARTHEST,
     KEPT00,
     KEPT01,
     KEPT10,
@@ -45,6 +44,7 @@ from slam_backend.fastslam._kernels.layout import (
     KEPT_WIDE,
     LANES,
     LOST,
+    MAX_DISTANCE,
     Q_D,
     Q_DEPTH,
     Q_DET_POSE,
@@ -61,9 +61,9 @@ from slam_backend.fastslam._kernels.measurement_model import add_likelihood, eva
 from slam_backend.fastslam._kernels.pose_posterior import (
     add_terms,
     clear_sums,
-    place,
+    gauss_newton_step,
     robust_weights,
-    step_pose,
+    set_linearisation_point,
     sum_matches,
 )
 
@@ -71,34 +71,34 @@ MORE_STEPS = 3  # a wide prior is a long way for one iteration
 
 
 @device
-@lanes
-def try_wide_prior(
+@simd
+def try_inflated_prior(
     work: FloatArray, records: FloatArray, values: FloatArray, counts: Int32Array, row_of: IntArray, block: int,
     points: FloatArray, noises: FloatArray, given: bool, camera: FloatArray, starts: IntArray, slots: IntArray,
     same: IntArray, position_gate: float, one_to_one: bool, recovery: FloatArray,
 ) -> None:  # fmt: skip
     """Give suspects of one block a wide prior, and keep it where it explains what the stated uncertainty does not."""
     padded, first = counts.shape[1], block * LANES
-    widen_suspects(work, recovery)
-    begin_judging(work)
+    inflate_prior(work, recovery)
+    reset_counters(work)
     for b in range(len(starts) - 1):
         for q in range(starts[b], starts[b + 1]):
             row = row_of[slots[q]]
             tile = values[tile_of(padded, row, block)]
             if starts[b + 1] - starts[b] > 1 or not (same[q] < 0 or not one_to_one):
                 keep_distance(records[q])
-            mark_held(records[q], counts[row, first : first + LANES])
+            mark_present(records[q], counts[row, first : first + LANES])
             innovate(work, tile, points, noises, b, given, camera)
             evaluate(work, tile, records[q], False)
-            nearest(work, records[q], q == starts[b])
+            update_minimum(work, records[q], q == starts[b])
         if starts[b] < starts[b + 1]:
             count_explained(work, position_gate)
-    acquit(work)
+    restore_prior(work)
 
 
 @device
-@lanes
-def refine_wide(
+@simd
+def iterate_inflated(
     work: FloatArray, records: FloatArray, match: FloatArray, mask: FloatArray, values: FloatArray, counts: Int32Array,
     row_of: IntArray, block: int, points: FloatArray, noises: FloatArray, given: bool, camera: FloatArray,
     starts: IntArray, slots: IntArray, position_gate: float,
@@ -106,7 +106,7 @@ def refine_wide(
     """Take more steps of Gauss-Newton in the lanes of one block whose prior is wide, with the matches as they are."""
     padded = counts.shape[1]
     for _ in range(MORE_STEPS):
-        place(work)
+        set_linearisation_point(work)
         clear_sums(work)
         for b in range(len(starts) - 1):
             for q in range(starts[b], starts[b + 1]):
@@ -116,23 +116,23 @@ def refine_wide(
                     evaluate(work, tile, records[q], True)
                     robust_weights(records[q], match[b], float(q), position_gate, mask)
                     sum_matches(work, records[q], mask)
-        step_pose(work, True)
+        gauss_newton_step(work, True)
 
 
 MIN_CONTRADICTIONS = 3.0  # three points fix a pose with one to spare
 
 
 @device
-@lanes
-def begin_judging(work: FloatArray) -> None:
+@simd
+def reset_counters(work: FloatArray) -> None:
     for i in range(LANES):
         work[SURE + i] = 0.0
         work[CONTRADICT + i] = 0.0
 
 
 @device
-@lanes
-def nearest(work: FloatArray, record: FloatArray, begin: bool) -> None:
+@simd
+def update_minimum(work: FloatArray, record: FloatArray, begin: bool) -> None:
     """Fold candidate after candidate: BEST = least D at hand of those held, SECOND = least of the D kept before."""
     for i in range(LANES):
         held = record[Q_HELD + i] > 0.0
@@ -143,7 +143,7 @@ def nearest(work: FloatArray, record: FloatArray, begin: bool) -> None:
 
 
 @device
-@lanes
+@simd
 def count_unexplained(work: FloatArray, gate: float) -> None:
     """Count a measurement that has candidates, none of which explains it at the predicted pose."""
     for i in range(LANES):
@@ -151,7 +151,7 @@ def count_unexplained(work: FloatArray, gate: float) -> None:
 
 
 @device
-@lanes
+@simd
 def count_explained(work: FloatArray, gate: float) -> None:
     """Count a measurement that the wide prior explains, and whether the narrow one did not."""
     for i in range(LANES):
@@ -161,8 +161,8 @@ def count_explained(work: FloatArray, gate: float) -> None:
 
 
 @device
-@lanes
-def any_suspect(work: FloatArray) -> int:
+@simd
+def count_lost(work: FloatArray) -> int:
     """Return in how many lanes enough is unexplained."""
     count = 0
     for i in range(LANES):
@@ -171,8 +171,8 @@ def any_suspect(work: FloatArray) -> int:
 
 
 @device
-@lanes
-def widen_suspects(work: FloatArray, recovery: FloatArray) -> None:
+@simd
+def inflate_prior(work: FloatArray, recovery: FloatArray) -> None:
     """Keep the factor C, and where enough is unexplained try T diag(recovery), T the turn by the predicted heading."""
     for i in range(LANES):
         work[KEPT00 + i], work[KEPT01 + i] = work[C00 + i], work[C01 + i]
@@ -193,8 +193,8 @@ def widen_suspects(work: FloatArray, recovery: FloatArray) -> None:
 
 
 @device
-@lanes
-def acquit(work: FloatArray) -> int:
+@simd
+def restore_prior(work: FloatArray) -> int:
     """Give the kept factor back to suspects that are not lost after all; return how many those are."""
     count = 0
     for i in range(LANES):
@@ -213,8 +213,8 @@ def acquit(work: FloatArray) -> int:
 
 
 @device
-@lanes
-def match_first(
+@simd
+def associate_initial(
     work: FloatArray, records: FloatArray, match: FloatArray, mask: FloatArray, values: FloatArray, counts: Int32Array,
     row_of: IntArray, block: int, points: FloatArray, noises: FloatArray, given: bool, camera: FloatArray,
     starts: IntArray, slots: IntArray, looks: FloatArray, owners: IntArray, same: IntArray, named: bool,
@@ -222,9 +222,9 @@ def match_first(
 ) -> None:  # fmt: skip
     """Pass A for one block: match at the predicted pose what is beyond doubt, sum it, and count what is unexplained."""
     padded, first = counts.shape[1], block * LANES
-    reach = FARTHEST if named else position_gate
+    reach = MAX_DISTANCE if named else position_gate
     clear_sums(work)
-    begin_judging(work)
+    reset_counters(work)
     for b in range(len(starts) - 1):
         low, high = starts[b], starts[b + 1]
         if high - low == 1 and (same[low] < 0 or not one_to_one):
@@ -239,7 +239,7 @@ def match_first(
         for q in range(low, high):
             row = row_of[slots[q]]
             tile = values[tile_of(padded, row, block)]
-            mark_held(records[q], counts[row, first : first + LANES])
+            mark_present(records[q], counts[row, first : first + LANES])
             innovate(work, tile, points, noises, b, given, camera)
             evaluate(work, tile, records[q], False)
             _consider(work, records[q], float(q), looks[q], reach)
@@ -247,19 +247,19 @@ def match_first(
         for q in range(low, high):
             p = same[q] if one_to_one else REJECTED
             while p >= 0:
-                _drop_taken(match[b], float(q), match[owners[p]], float(p))
+                _exclude_assigned(match[b], float(q), match[owners[p]], float(p))
                 p = same[p]
             if robust_weights(records[q], match[b], float(q), position_gate, mask) > 0:
                 sum_matches(work, records[q], mask)
             keep_distance(records[q])
         for q in range(low, high):  # the choice is made: rows BEST and CHOSEN are free
-            nearest(work, records[q], q == low)
+            update_minimum(work, records[q], q == low)
         if low < high:
             count_unexplained(work, position_gate)
 
 
 @device
-@lanes
+@simd
 def _match_alone(
     work: FloatArray, tile: FloatArray, record: FloatArray, seen: Int32Array, match: FloatArray, q: float,
     reach: float, gate: float,
@@ -280,7 +280,7 @@ def _match_alone(
 
 
 @device
-@lanes
+@simd
 def _consider(work: FloatArray, record: FloatArray, q: float, look: float, reach: float) -> None:
     """Let candidate q compete for the measurement in pass A; `look` is what its descriptor costs."""
     for i in range(LANES):
@@ -297,7 +297,7 @@ def _consider(work: FloatArray, record: FloatArray, q: float, look: float, reach
 
 
 @device
-@lanes
+@simd
 def _end_choice(work: FloatArray, chosen: FloatArray, ambiguity: float) -> None:
     """Write the tentative match of each lane: the best candidate, if no other comes near."""
     for i in range(len(chosen)):
@@ -307,15 +307,15 @@ def _end_choice(work: FloatArray, chosen: FloatArray, ambiguity: float) -> None:
 
 
 @device
-@lanes
-def _drop_taken(chosen: FloatArray, q: float, earlier: FloatArray, p: float) -> None:
+@simd
+def _exclude_assigned(chosen: FloatArray, q: float, earlier: FloatArray, p: float) -> None:
     """Unmatch lanes in which an earlier measurement took, as its candidate p, the landmark that is candidate q here."""
     for i in range(len(chosen)):
         chosen[i] = -1.0 if chosen[i] == q and earlier[i] == p else chosen[i]
 
 
 @device
-@lanes
+@simd
 def keep_distance(record: FloatArray) -> None:
     """Keep the squared distance at the predicted pose: it is the NIS."""
     for i in range(LANES):
@@ -323,16 +323,16 @@ def keep_distance(record: FloatArray) -> None:
 
 
 @device
-@lanes
-def match_again(
+@simd
+def associate_final(
     work: FloatArray, records: FloatArray, match: FloatArray, mask: FloatArray, values: FloatArray, counts: Int32Array,
     row_of: IntArray, block: int, points: FloatArray, noises: FloatArray, given: bool, camera: FloatArray,
     starts: IntArray, slots: IntArray, looks: FloatArray, owners: IntArray, same: IntArray, named: bool,
-    position_gate: float, dead_zone: float, dead_radius: float, ambiguity: float, log_p0: float, one_to_one: bool,
+    position_gate: float, new_landmark_gate: float, new_landmark_radius: float, ambiguity: float, log_p0: float, one_to_one: bool,
 ) -> None:  # fmt: skip
     """Pass B for one block: decide on all measurements, and sum what they say of the pose and of its likelihood."""
     padded, first = counts.shape[1], block * LANES
-    reach, cap = (FARTHEST, position_gate) if named else (position_gate, FARTHEST)
+    reach, cap = (MAX_DISTANCE, position_gate) if named else (position_gate, MAX_DISTANCE)
     clear_sums(work)
     for b in range(len(starts) - 1):
         low, high = starts[b], starts[b + 1]
@@ -340,20 +340,22 @@ def match_again(
         if high - low == 1:
             row = row_of[slots[low]]
             tile = values[tile_of(padded, row, block)]
-            _mark_all_taken(work, match, owners, same, low, one_to_one)
+            _mark_all_assigned(work, match, owners, same, low, one_to_one)
             innovate(work, tile, points, noises, b, given, camera)
-            decide_alone(
+            decide_single_candidate(
                 work, tile, counts[row, first : first + LANES], match[b], float(low), reach,
-                FARTHEST if named else dead_zone, dead_radius, log_clutter,
+                MAX_DISTANCE if named else new_landmark_gate, new_landmark_radius, log_clutter,
             )  # fmt: skip
             continue
         begin_choice(work)
         for q in range(low, high):
-            _mark_all_taken(work, match, owners, same, q, one_to_one)
+            _mark_all_assigned(work, match, owners, same, q, one_to_one)
             tile = values[tile_of(padded, row_of[slots[q]], block)]
             innovate(work, tile, points, noises, b, given, camera)
             evaluate(work, tile, records[q], True)
-            consider_again(work, records[q], float(q), looks[q], cap, position_gate, dead_zone, dead_radius)
+            consider_candidate(
+                work, records[q], float(q), looks[q], cap, position_gate, new_landmark_gate, new_landmark_radius
+            )
         decide(work, match[b], ambiguity, log_clutter)
         for q in range(low, high):
             if mask_of(match[b], float(q), mask) > 0:
@@ -362,13 +364,13 @@ def match_again(
 
 
 @device
-@lanes
-def _mark_all_taken(
+@simd
+def _mark_all_assigned(
     work: FloatArray, match: FloatArray, owners: IntArray, same: IntArray, q: int, one_to_one: bool
 ) -> None:
     """Write row TAKEN: where an earlier measurement has taken the landmark that is candidate q."""
-    clear_taken(work)
+    clear_assigned(work)
     p = same[q] if one_to_one else REJECTED
     while p >= 0:
-        mark_taken(work, match[owners[p]], float(p))
+        mark_assigned(work, match[owners[p]], float(p))
         p = same[p]

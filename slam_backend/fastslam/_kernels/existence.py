@@ -9,13 +9,13 @@ their cache would not notice a change of it.
 
 import numpy as np
 
-from slam_backend.core.jit import device, fused, in_place, jit, lanes, lanes_inlined
+from slam_backend.core.jit import device, in_place, jit, jit_fma, simd, simd_inline
 from slam_backend.core.validation import Float32Array, FloatArray, Int32Array, IntArray
 
 ROUNDED = 1.0 + 1e-9  # no rounding decides what is looked at in detail
 
 
-@lanes_inlined
+@simd_inline
 def in_view(
     depth: float, lateral: float, vertical: float, nearest: float, side: float, rise: float, reach_squared: float
 ) -> bool:
@@ -33,7 +33,7 @@ def in_view(
     )
 
 
-@lanes_inlined
+@simd_inline
 def updated_log_odds(log_odds: float, seen: bool, expected: bool, sighting: float, miss: float, cap: float) -> float:
     """Return a landmark's log-odds after a frame: Bayes' rule in logarithms, up to the cap.
 
@@ -48,7 +48,7 @@ def updated_log_odds(log_odds: float, seen: bool, expected: bool, sighting: floa
 
 
 @jit
-def landmarks_told_of(
+def landmarks_in_view(
     ids: IntArray, row_of: IntArray, map_of: IntArray, maps: Int32Array, values: FloatArray, counts: Int32Array,
     num_particles: int, best: int, poses: FloatArray, cosines: FloatArray, sines: FloatArray, mount: FloatArray,
     near: float, nearest: float, side: float, reach_squared: float, found: Int32Array, new_slots: IntArray,
@@ -106,7 +106,7 @@ def landmarks_told_of(
 
 
 @device
-@lanes
+@simd
 def _is_expected(
     places: Int32Array, values: FloatArray, counts: Int32Array, poses: FloatArray, cosines: FloatArray,
     sines: FloatArray, mount: FloatArray, nearest: float, side: float, reach_squared: float,
@@ -116,7 +116,7 @@ def _is_expected(
     Args:
         places: (M,) where each particle's values stand in the landmark's row.
         values, counts: (blocks, 9, lanes) and (P,) that row.
-        poses and the following: See `landmarks_told_of`.
+        poses and the following: See `landmarks_in_view`.
     """
     size = values.shape[2]  # a power of two
     shift = 0
@@ -180,8 +180,8 @@ def mark_seen(slots: IntArray, num_slots: int, found: Int32Array) -> Int32Array:
     return seen
 
 
-@fused
-def weigh_existence(
+@jit_fma
+def update_existence(
     slots: IntArray, seen: Int32Array, odds: FloatArray, row_of: IntArray, values: FloatArray, counts: Int32Array,
     poses: FloatArray, cosines: FloatArray, sines: FloatArray, mount: FloatArray, nearest: float, side: float,
     rise: float, reach_squared: float, sighting: float, miss: float, floor: float, cap: float,
@@ -233,7 +233,7 @@ def weigh_existence(
 
 
 @in_place
-def release(
+def delete_landmarks(
     slots: IntArray, ids: IntArray, row_of: IntArray, heads: Float32Array, free_rows: IntArray, free_slots: IntArray,
     tops: IntArray, far: np.float32,
 ) -> None:  # fmt: skip

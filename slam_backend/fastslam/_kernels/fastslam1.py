@@ -4,25 +4,31 @@ import math
 
 import numpy as np
 
-from slam_backend.core.jit import device, fused, room
+from slam_backend.core.jit import device, jit_fma, stack_array
 from slam_backend.core.validation import Float32Array, FloatArray, Int32Array, IntArray
 from slam_backend.fastslam._kernels.candidates import (
-    admit,
-    bar_taken,
+    create_once,
+    exclude_assigned,
     find_candidates,
+    mark_eligible,
     mask_of,
-    start_once,
-    write_found,
+    write_associations,
 )
 from slam_backend.fastslam._kernels.landmark_ekf import gate_and_update, new_landmark
 from slam_backend.fastslam._kernels.layout import CANDIDATE_ROWS, CLUTTER, LANES, Q_D, REJECTED
-from slam_backend.fastslam._kernels.map_storage import carry_odds, name_new, open_slot, refresh, tile_of
+from slam_backend.fastslam._kernels.map_storage import (
+    allocate_landmark,
+    apply_resampling,
+    gather_odds,
+    register_new,
+    tile_of,
+)
 from slam_backend.fastslam._kernels.measurement_model import clear_likelihood, innovate, total_log_likelihood
-from slam_backend.fastslam._kernels.motion_model import enter_pose, sample_motion, take_as_exact
+from slam_backend.fastslam._kernels.motion_model import load_pose, sample_motion, set_exact
 
 
 @device
-@fused
+@jit_fma
 def update_fastslam1(
     poses: FloatArray, means: FloatArray, covariances: FloatArray, moved: bool, odometry: FloatArray,
     sigmas: FloatArray, normals: FloatArray,
@@ -65,12 +71,12 @@ def update_fastslam1(
         descriptors, stored, heads, ids, names, identities, named, descriptor_gate
     )
     if len(odds) > 0:
-        carry_odds(unique, odds, map_of, maps)
-    refresh(unique, values, counts, row_of, map_of, maps, users, free_rows, tops)
+        gather_odds(unique, odds, map_of, maps)
+    apply_resampling(unique, values, counts, row_of, map_of, maps, users, free_rows, tops)
     records = np.empty((len(slots), CANDIDATE_ROWS * LANES))
     new_rows = np.empty(num, dtype=np.int64)
     match = np.empty((num, LANES))
-    mask = room(LANES)
+    mask = stack_array(LANES)
     gate = np.inf if named else position_gate
     for b in range(num):
         new_slots[b] = REJECTED
@@ -79,7 +85,7 @@ def update_fastslam1(
         real = min(LANES, num_particles - first)
         if moved:
             sample_motion(work, poses, first, odometry, sigmas, normals)
-        enter_pose(work, poses, first)
+        load_pose(work, poses, first)
         clear_likelihood(work)
         for b in range(num):
             chosen = match[b]
@@ -88,10 +94,10 @@ def update_fastslam1(
             for q in range(starts[b], starts[b + 1]):  # l. 15-24: the nearest descriptor inside the gate
                 row = row_of[slots[q]]
                 tile, record, seen = values[tile_of(padded, row, block)], records[q], counts[row, first : first + LANES]
-                admit(chosen, seen, mask)
+                mark_eligible(chosen, seen, mask)
                 p = same[q] if one_to_one else REJECTED
                 while p >= 0:
-                    bar_taken(match[owners[p]], float(p), mask)
+                    exclude_assigned(match[owners[p]], float(p), mask)
                     p = same[p]
                 innovate(work, tile, points, noises, b, given, camera)
                 gate_and_update(work, tile, record, chosen, seen, float(q), mask, gate, walk)  # l. 33-37, 39
@@ -100,16 +106,18 @@ def update_fastslam1(
             for i in range(LANES):
                 work[CLUTTER + i] += log_clutter if mask[i] > 0.0 else 0.0
             if named:
-                start_once(match, b, first, counts, row_of, starts, slots, names)
+                create_once(match, b, first, counts, row_of, starts, slots, names)
                 unmatched = mask_of(chosen, -2.0, mask)
             if unmatched > 0:  # l. 28-32
                 if new_slots[b] == REJECTED:
-                    open_slot(b, new_slots, new_rows, row_of, map_of, values, counts, free_rows, free_slots, tops)
+                    allocate_landmark(
+                        b, new_slots, new_rows, row_of, map_of, values, counts, free_rows, free_slots, tops
+                    )
                 new_landmark(
                     work, values, counts, new_rows[b], block, points, noises, b, given, camera, mask, walk
                 )  # fmt: skip
-        write_found(found, distances, first, match, starts, slots, records, Q_D, new_slots)
+        write_associations(found, distances, first, match, starts, slots, records, Q_D, new_slots)
         for i in range(LANES):
             log_likelihood[first + i] += total_log_likelihood(work, i)
-    take_as_exact(poses, means, covariances)
-    name_new(new_slots, descriptors, names, named, ids, identities, stored, heads, tops)
+    set_exact(poses, means, covariances)
+    register_new(new_slots, descriptors, names, named, ids, identities, stored, heads, tops)

@@ -6,7 +6,16 @@ import numpy as np
 
 from slam_backend.core.jit import device, in_place
 from slam_backend.core.validation import Float32Array, FloatArray, IntArray
-from slam_backend.fastslam._kernels.layout import ACT, BEGIN, COUNT, END, GIVEN, MIN_DEPTH, MOVED, NAMED
+from slam_backend.fastslam._kernels.layout import (
+    BEGIN,
+    COUNT,
+    COVARIANCES_GIVEN,
+    END,
+    HAS_IDS,
+    MIN_DEPTH,
+    MOTION_KIND,
+    MOVED,
+)
 
 
 @in_place
@@ -86,7 +95,14 @@ def read_team(
         end, turn = ends[robot], table[robot]
         if end < begin:
             return False
-        turn[ACT], turn[BEGIN], turn[END], turn[GIVEN], turn[NAMED], turn[COUNT] = MOVED, begin, end, 0, 0, end - begin
+        turn[MOTION_KIND], turn[BEGIN], turn[END], turn[COVARIANCES_GIVEN], turn[HAS_IDS], turn[COUNT] = (
+            MOVED,
+            begin,
+            end,
+            0,
+            0,
+            end - begin,
+        )
         begin = end
     to_robot_axes(points, sightings)
     nearest, farthest = extent(points)

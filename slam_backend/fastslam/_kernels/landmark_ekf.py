@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from slam_backend.core.jit import device, lanes, lanes_inlined, room
+from slam_backend.core.jit import device, simd, simd_inline, stack_array
 from slam_backend.core.simd_math import cofactors_cancel, inverted, inverted_by_parts, quadratic_form
 from slam_backend.core.validation import FloatArray, Int32Array, IntArray
 from slam_backend.fastslam._kernels.candidates import mask_of
@@ -27,13 +27,13 @@ from slam_backend.fastslam._kernels.layout import (
     Y,
 )
 from slam_backend.fastslam._kernels.map_storage import tile_of
-from slam_backend.fastslam._kernels.measurement_model import count_likelihood, innovate
+from slam_backend.fastslam._kernels.measurement_model import accumulate_likelihood, innovate
 
 FLAT = 1e-12  # where cofactors keep less, S has eigenvalues in a ratio of a million, and K R loses its digits
-YOUNG = 4  # a landmark seen up to so many times is updated by the iterated EKF: its depth is still vague
+RELINEARISE_BELOW = 4  # a landmark seen up to so many times is updated by the iterated EKF: its depth is still vague
 
 
-@lanes_inlined
+@simd_inline
 def _congruent(
     m00: float, m01: float, m02: float, m10: float, m11: float, m12: float, m20: float, m21: float, m22: float,
     a00: float, a01: float, a02: float, a11: float, a12: float, a22: float,
@@ -54,7 +54,7 @@ def _congruent(
     )  # fmt: skip
 
 
-@lanes_inlined
+@simd_inline
 def _updated(
     work: FloatArray, tile: FloatArray, i: int, i00: float, i01: float, i02: float, i11: float, i12: float, i22: float,
     match: bool, walk: float, flat: bool,
@@ -106,7 +106,7 @@ def _updated(
     tile[8 * LANES + i] = k20 * n02 + k21 * n12 + k22 * n22 + walk if match else p22
 
 
-@lanes_inlined
+@simd_inline
 def _sum(work: FloatArray, tile: FloatArray, i: int) -> tuple[float, float, float, float, float, float]:
     """Return S = Sigma + R (Eq. 7)."""
     return (
@@ -115,7 +115,7 @@ def _sum(work: FloatArray, tile: FloatArray, i: int) -> tuple[float, float, floa
     )  # fmt: skip
 
 
-@lanes_inlined
+@simd_inline
 def _inverse_of_sum(
     work: FloatArray, tile: FloatArray, i: int, flat: bool
 ) -> tuple[float, float, float, float, float, float, float]:
@@ -125,7 +125,7 @@ def _inverse_of_sum(
 
 
 @device
-@lanes
+@simd
 def _any_flat(work: FloatArray, tile: FloatArray) -> bool:
     """Tell whether S is flat in any lane."""
     count = 0
@@ -135,7 +135,7 @@ def _any_flat(work: FloatArray, tile: FloatArray) -> bool:
     return count > 0
 
 
-@lanes_inlined
+@simd_inline
 def _update(work: FloatArray, tile: FloatArray, mask: FloatArray, walk: float, flat: bool) -> None:
     """Do what `update` does."""
     for i in range(LANES):
@@ -145,7 +145,7 @@ def _update(work: FloatArray, tile: FloatArray, mask: FloatArray, walk: float, f
 
 
 @device
-@lanes
+@simd
 def update(work: FloatArray, tile: FloatArray, mask: FloatArray, walk: float) -> None:
     """At a known pose: update the landmark where `mask` is 1 and it lies ahead of the camera (Eqs. 5-10).
 
@@ -158,7 +158,7 @@ def update(work: FloatArray, tile: FloatArray, mask: FloatArray, walk: float) ->
         _update(work, tile, mask, walk, False)
 
 
-@lanes_inlined
+@simd_inline
 def _gate_and_update(
     work: FloatArray, tile: FloatArray, record: FloatArray, chosen: FloatArray, seen: Int32Array, q: float,
     admit: FloatArray, gate: float, walk: float, flat: bool,
@@ -170,14 +170,14 @@ def _gate_and_update(
         depth = work[DEPTH + i]
         match = admit[i] > 0.0 and distance <= gate and depth >= MIN_DEPTH
         _updated(work, tile, i, i00, i01, i02, i11, i12, i22, match, walk, flat)
-        count_likelihood(work, i, match, distance, det, depth)
+        accumulate_likelihood(work, i, match, distance, det, depth)
         record[Q_D + i] = distance
         chosen[i] = q if match else chosen[i]
         seen[i] += np.int32(1) if match else np.int32(0)
 
 
 @device
-@lanes
+@simd
 def gate_and_update(
     work: FloatArray, tile: FloatArray, record: FloatArray, chosen: FloatArray, seen: Int32Array, q: float,
     admit: FloatArray, gate: float, walk: float,
@@ -198,19 +198,19 @@ def gate_and_update(
 
 
 @device
-@lanes
-def find_young(seen: Int32Array, mask: FloatArray, young: FloatArray) -> int:
+@simd
+def find_recent(seen: Int32Array, mask: FloatArray, young: FloatArray) -> int:
     """Write 1 where a matched landmark was seen a few times only; return how many those are."""
     count = 0
     for i in range(len(seen)):
-        on = mask[i] > 0.0 and seen[i] <= YOUNG
+        on = mask[i] > 0.0 and seen[i] <= RELINEARISE_BELOW
         young[i] = 1.0 if on else 0.0
         count += 1 if on else 0
     return count
 
 
 @device
-@lanes
+@simd
 def relinearise(work: FloatArray, tile: FloatArray, before: FloatArray) -> None:
     """Refer the innovation, taken at the means in `tile`, to those in `before`, which come back (iterated EKF)."""
     for i in range(LANES):
@@ -222,14 +222,14 @@ def relinearise(work: FloatArray, tile: FloatArray, before: FloatArray) -> None:
 
 
 @device
-@lanes
+@simd
 def count_matches(seen: Int32Array, mask: FloatArray) -> None:
     for i in range(len(seen)):
         seen[i] += np.int32(1) if mask[i] > 0.0 else np.int32(0)
 
 
 @device
-@lanes
+@simd
 def update_matched(
     work: FloatArray, match: FloatArray, mask: FloatArray, values: FloatArray, counts: Int32Array, row_of: IntArray,
     block: int, points: FloatArray, noises: FloatArray, given: bool, camera: FloatArray, starts: IntArray,
@@ -237,14 +237,14 @@ def update_matched(
 ) -> None:  # fmt: skip
     """At a known pose: update the landmarks that the lanes of one block matched, young ones by the iterated EKF."""
     padded, first = counts.shape[1], block * LANES
-    young, before = room(LANES), room(TILE)
+    young, before = stack_array(LANES), stack_array(TILE)
     for b in range(len(starts) - 1):
         for q in range(starts[b], starts[b + 1]):
             if mask_of(match[b], float(q), mask) == 0:
                 continue
             row = row_of[slots[q]]
             tile, seen = values[tile_of(padded, row, block)], counts[row, first : first + LANES]
-            num_young = find_young(seen, mask, young)
+            num_young = find_recent(seen, mask, young)
             count_matches(seen, mask)
             innovate(work, tile, points, noises, b, given, camera)
             if num_young > 0:
@@ -257,7 +257,7 @@ def update_matched(
 
 
 @device
-@lanes
+@simd
 def new_landmark(
     work: FloatArray, values: FloatArray, counts: Int32Array, row: int, block: int, points: FloatArray,
     noises: FloatArray, n: int, given: bool, camera: FloatArray, mask: FloatArray, walk: float,

@@ -8,7 +8,7 @@ import numpy as np
 LANES = 52
 REJECTED = -1
 MIN_DEPTH = 0.05  # [m]; nothing is predicted nearer to the camera plane than this
-FARTHEST = float(np.finfo(np.float64).max)  # the largest squared distance that is not infinite
+MAX_DISTANCE = float(np.finfo(np.float64).max)  # the largest squared distance that is not infinite
 FAR = np.float32(1e18)  # no descriptor comes near a free slot's
 LOG_2PI = math.log(2.0 * math.pi)
 LN2 = math.log(2.0)
@@ -42,17 +42,22 @@ POSES, STARTS, MEANS, COVARIANCES = range(4)
 # The weights of all particles, (4, P): as of the last resampling, along paths, as they are, and what a step adds.
 LOG_WEIGHTS, PATH_LOG_WEIGHTS, WEIGHTS, LOG_LIKELIHOOD = range(4)
 ROW_OF, MAP_OF, IDS, IDENTITIES, LAST_SEEN, FREE_SLOTS = range(6)  # of the table of a map's slots, (6, slots)
-ACT, BEGIN, END, GIVEN, NAMED, COUNT = range(6)  # of a robot's turn
-IDLE, STOOD, MOVED, PLACED = 0, 1, 2, 3  # what a robot did: nothing at all, stood and looked, moved, was told its pose
+MOTION_KIND, BEGIN, END, COVARIANCES_GIVEN, HAS_IDS, COUNT = range(6)  # of a robot's turn
+NO_READING, STATIONARY, MOVED, EXACT_POSE = (
+    0,
+    1,
+    2,
+    3,
+)  # what a robot did: nothing at all, stood and looked, moved, was told its pose
 # What a journal holds of a robot's turn: whether it did or was given anything, what it did, whether its measurements
 # come with covariances, and how many were used; its odometry or pose (3), and where it was thought to be then (3).
-LOGGED, DID, COVERED, USED, MOTION, THOUGHT, NUM_NOTED = 0, 1, 2, 3, 4, 7, 10
+LOGGED, LOGGED_KIND, HAS_COVARIANCES, USED, MOTION, ESTIMATE, NUM_NOTED = 0, 1, 2, 3, 4, 7, 10
 NAME, NUM_MEASURED = 9, 10  # of a measurement there, behind point and covariance: the landmark it was taken for
 ASSOCIATED, CREATED = range(2)  # what becomes of measurements, (2, n)
 # What a filter assumes: the first of six numbers, seven and three, and then one each.
 NOISE, CAMERA, RECOVERY = 0, 6, 13
 (
-    DESCRIPTOR_GATE, DESCRIPTOR_VARIANCE, POSITION_GATE, DEAD_ZONE, DEAD_RADIUS, AMBIGUITY, LOG_P0, WALK,
+    DESCRIPTOR_GATE, DESCRIPTOR_VARIANCE, POSITION_GATE, NEW_LANDMARK_GATE, NEW_LANDMARK_RADIUS, AMBIGUITY_MARGIN, LOG_P0, WALK,
     IS_ONE_TO_ONE, LONG, RESAMPLE_THRESHOLD,
 ) = range(16, 27)  # fmt: skip
 

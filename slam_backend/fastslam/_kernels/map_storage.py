@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.core.jit import device, fused, in_place, inlined, jit, lanes, lanes_inlined
+from slam_backend.core.jit import device, in_place, inline, jit, jit_fma, simd, simd_inline
 from slam_backend.core.validation import Float32Array, FloatArray, Int32Array, IntArray
 from slam_backend.fastslam._kernels.layout import (
     BLOCK,
@@ -21,13 +21,13 @@ from slam_backend.fastslam._kernels.layout import (
 )
 
 
-@inlined
+@inline
 def _place_in(maps: Int32Array, ancestors: int, m: int) -> int:
     """Return where particle m's share of a landmark lies, whose `map_of` this is."""
     return int(maps[ancestors, m]) if ancestors > 0 else m
 
 
-@inlined
+@inline
 def _values_at(padded: int, row: int, place: int) -> int:
     """Return where the values of a landmark's row begin that lie at a place; the next is a number of lanes on."""
     own = np.uint32(place)
@@ -35,7 +35,9 @@ def _values_at(padded: int, row: int, place: int) -> int:
 
 
 @jit
-def hold(table: IntArray, maps: Int32Array, counts: Int32Array, m: int, min_count: int) -> tuple[IntArray, bool]:
+def present_slots(
+    table: IntArray, maps: Int32Array, counts: Int32Array, m: int, min_count: int
+) -> tuple[IntArray, bool]:
     """Return the slots that particle m holds with at least so many measurements, and whether their ids ascend.
 
     Args:
@@ -80,7 +82,7 @@ def gather(
 
 
 @in_place
-def outline(
+def map_summary(
     table: IntArray, maps: Int32Array, values: FloatArray, counts: Int32Array, m: int, min_count: int,
     places: FloatArray, names: IntArray, first: int,
 ) -> tuple[int, bool]:  # fmt: skip
@@ -88,7 +90,7 @@ def outline(
 
     Args:
         table, maps, values, counts, m, min_count: As above.
-        places, names: Of `OutlineRows`; written to.
+        places, names: Of `MapSummaryRows`; written to.
         first: Where to begin.
 
     Returns:
@@ -115,7 +117,7 @@ def outline(
     return n, ascending
 
 
-@lanes_inlined
+@simd_inline
 def tile_of(padded: int, row: int, block: int) -> slice:
     """Return where a block of a landmark that is up to date lies in the values."""
     start = row * 9 * padded + block * TILE
@@ -123,7 +125,7 @@ def tile_of(padded: int, row: int, block: int) -> slice:
 
 
 @device
-@lanes
+@simd
 def _copy_row(
     source: FloatArray, target: FloatArray, before: Int32Array, seen: Int32Array, ancestors: Int32Array
 ) -> None:
@@ -147,8 +149,8 @@ def _copy_row(
                 target[to + c * LANES] = source[at + c * LANES]
 
 
-@lanes
-def refresh(
+@simd
+def apply_resampling(
     slots: IntArray, values: FloatArray, counts: Int32Array, row_of: IntArray, map_of: IntArray, maps: Int32Array,
     users: IntArray, free_rows: IntArray, tops: IntArray,
 ) -> None:  # fmt: skip
@@ -174,8 +176,8 @@ def refresh(
         map_of[slot] = 0
 
 
-@fused
-def carry_odds(slots: IntArray, odds: FloatArray, map_of: IntArray, maps: Int32Array) -> None:
+@jit_fma
+def gather_odds(slots: IntArray, odds: FloatArray, map_of: IntArray, maps: Int32Array) -> None:
     """Copy log-odds from where each particle's ancestor left them to its own place; `refresh` does the rest.
 
     Args:
@@ -196,8 +198,8 @@ def carry_odds(slots: IntArray, odds: FloatArray, map_of: IntArray, maps: Int32A
 
 
 @device
-@lanes
-def open_slot(
+@simd
+def allocate_landmark(
     b: int, new_slots: IntArray, new_rows: IntArray, row_of: IntArray, map_of: IntArray, values: FloatArray,
     counts: Int32Array, free_rows: IntArray, free_slots: IntArray, tops: IntArray,
 ) -> None:  # fmt: skip
@@ -214,8 +216,8 @@ def open_slot(
 
 
 @device
-@lanes
-def name_new(
+@simd
+def register_new(
     new_slots: IntArray, measured: Float32Array, names: IntArray, named: bool, ids: IntArray,
     identities: IntArray, stored: Float32Array, heads: Float32Array, tops: IntArray,
 ) -> None:  # fmt: skip
@@ -242,7 +244,7 @@ def name_new(
 
 @device
 @in_place
-def settle(ancestors: IntArray, moved: Any) -> int:
+def keep_survivors_in_place(ancestors: IntArray, moved: Any) -> int:
     """Arrange resampled particles so that most stay in place.
 
     A particle with at least one copy keeps its place; surplus copies fill the places of the dead, in ascending order.
@@ -283,7 +285,7 @@ def resample(
 
     Args:
         ancestors: (M,) index of each new particle's parent, ascending; they are settled first.
-        robots: (5, K, 3, P) as in `take_turns`; columns are copied.
+        robots: (5, K, 3, P) as in `step_robots`; columns are copied.
         weights: (4, P); those along paths are copied, those since the last resampling begin anew.
         counts, ..., heads: The store, see `ParticleMaps`. At least one map is free.
         moved: Room for what `settle` writes.
@@ -291,7 +293,7 @@ def resample(
     Returns:
         How many maps are still free, and the particle of the largest weight along paths.
     """
-    count, moves = len(ancestors), settle(ancestors, moved)
+    count, moves = len(ancestors), keep_survivors_in_place(ancestors, moved)
     targets, sources = moved[0], moved[1]  # unsigned: none counts from the end
     path_log_weights, rows = weights[PATH_LOG_WEIGHTS], robots.reshape((-1, robots.shape[3]))
     for i in range(moves):

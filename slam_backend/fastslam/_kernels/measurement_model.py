@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from slam_backend.core.jit import device, lanes, lanes_inlined
+from slam_backend.core.jit import device, simd, simd_inline
 from slam_backend.core.simd_math import log_of, mantissa_exponent
 from slam_backend.core.validation import FloatArray
 from slam_backend.fastslam._kernels.layout import (
@@ -63,7 +63,7 @@ from slam_backend.fastslam._kernels.layout import (
 
 
 @device
-@lanes
+@simd
 def innovate(
     work: FloatArray, tile: FloatArray, points: FloatArray, noises: FloatArray, n: int, given: bool, camera: FloatArray
 ) -> None:
@@ -111,7 +111,7 @@ def innovate(
             work[DEPTH + i] = depth
 
 
-@lanes_inlined
+@simd_inline
 def match_terms(
     work: FloatArray, tile: FloatArray, i: int, refined: bool
 ) -> tuple[
@@ -170,7 +170,7 @@ def match_terms(
 
 
 @device
-@lanes
+@simd
 def evaluate(work: FloatArray, tile: FloatArray, record: FloatArray, refined: bool) -> None:
     """Write the terms of a match, see `match_terms`."""
     for i in range(LANES):
@@ -188,8 +188,8 @@ def evaluate(work: FloatArray, tile: FloatArray, record: FloatArray, refined: bo
         record[Q_D + i] = distance
 
 
-@lanes_inlined
-def count_likelihood(work: FloatArray, i: int, on: bool, square: float, det: float, depth: float) -> None:
+@simd_inline
+def accumulate_likelihood(work: FloatArray, i: int, on: bool, square: float, det: float, depth: float) -> None:
     """Where `on`, add a match's part of the log-likelihood: r^T S^-1 r, and |S| and the depth as products."""
     work[SUM_D + i] += square if on else 0.0
     work[MATCHED + i] += 1.0 if on else 0.0
@@ -202,15 +202,15 @@ def count_likelihood(work: FloatArray, i: int, on: bool, square: float, det: flo
 
 
 @device
-@lanes
+@simd
 def add_likelihood(work: FloatArray, record: FloatArray, mask: FloatArray) -> None:
     """Add a match's part of the log-likelihood where `mask` is 1."""
     for i in range(LANES):
-        count_likelihood(work, i, mask[i] > 0.0, record[Q_SQUARE + i], record[Q_DET + i], record[Q_DEPTH + i])
+        accumulate_likelihood(work, i, mask[i] > 0.0, record[Q_SQUARE + i], record[Q_DET + i], record[Q_DEPTH + i])
 
 
 @device
-@lanes
+@simd
 def clear_likelihood(work: FloatArray) -> None:
     for i in range(LANES):
         work[SUM_D + i] = 0.0
@@ -222,7 +222,7 @@ def clear_likelihood(work: FloatArray) -> None:
         work[CLUTTER + i] = 0.0
 
 
-@lanes_inlined
+@simd_inline
 def total_log_likelihood(work: FloatArray, i: int) -> float:
     """Return a lane's sum over matches of log N(r; 0, S) + 4 log depth (Eq. 11), and that of the unmatched."""
     log_det = log_of(work[DET + i]) + LN2 * work[DET_EXP + i]

@@ -2,7 +2,7 @@
 
 import math
 
-from slam_backend.core.jit import device, lanes, lanes_inlined
+from slam_backend.core.jit import device, simd, simd_inline
 from slam_backend.core.simd_math import sine_cosine, wrapped
 from slam_backend.core.validation import FloatArray
 from slam_backend.fastslam._kernels.layout import (
@@ -39,7 +39,7 @@ ZERO_PIVOT = 1e-12  # relative to the variance: below it a direction is taken to
 
 
 @device
-@lanes
+@simd
 def load_rows(work: FloatArray, low: int, rows: FloatArray, first: int) -> None:
     """Copy a block of rows (c, P), from lane `first` on, into the rows of the workspace from `low` on."""
     for c in range(len(rows)):
@@ -49,7 +49,7 @@ def load_rows(work: FloatArray, low: int, rows: FloatArray, first: int) -> None:
 
 
 @device
-@lanes
+@simd
 def store_rows(work: FloatArray, low: int, rows: FloatArray, first: int) -> None:
     """Copy rows of the workspace from `low` on into a block of rows (c, P), from lane `first` on."""
     for c in range(len(rows)):
@@ -59,7 +59,7 @@ def store_rows(work: FloatArray, low: int, rows: FloatArray, first: int) -> None
 
 
 @device
-@lanes
+@simd
 def prior(
     work: FloatArray, poses: FloatArray, means: FloatArray, covariances: FloatArray, blind: bool, first: int
 ) -> None:
@@ -77,7 +77,7 @@ def prior(
 
 
 @device
-@lanes
+@simd
 def predict(work: FloatArray, move: FloatArray, sigmas: FloatArray) -> None:
     """Move the poses in rows X0 .. N22 to the predicted x0, and write a factor C of its covariance P0 (Eq. 4).
 
@@ -119,7 +119,7 @@ def predict(work: FloatArray, move: FloatArray, sigmas: FloatArray) -> None:
 
 
 @device
-@lanes
+@simd
 def _to_map_axes(work: FloatArray) -> None:
     """Turn the covariance in rows N00 .. N22 from the robot's axes to the map's: T P T^T."""
     for i in range(LANES):
@@ -133,7 +133,7 @@ def _to_map_axes(work: FloatArray) -> None:
         work[N12 + i] = s * r02 + c * r12
 
 
-@lanes_inlined
+@simd_inline
 def _factorise(work: FloatArray, i: int) -> None:
     """Write C = T L, L L^T the covariance in rows N00 .. N22; a vanishing pivot gives L a column of zeros."""
     q00, q11, q22 = work[N00 + i], work[N11 + i], work[N22 + i]
@@ -154,15 +154,15 @@ def _factorise(work: FloatArray, i: int) -> None:
 
 
 @device
-@lanes
-def enter_pose(work: FloatArray, poses: FloatArray, first: int) -> None:
+@simd
+def load_pose(work: FloatArray, poses: FloatArray, first: int) -> None:
     load_rows(work, X, poses, first)
     for i in range(LANES):
         work[SIN + i], work[COS + i] = sine_cosine(work[T + i])
 
 
 @device
-@lanes
+@simd
 def take_draws(work: FloatArray, normals: FloatArray, first: int) -> None:
     """Write a block's normal draws (M, 3) into the rows DRAW0 .. DRAW2, zeros for surplus lanes."""
     for i in range(LANES):
@@ -172,13 +172,13 @@ def take_draws(work: FloatArray, normals: FloatArray, first: int) -> None:
 
 
 @device
-@lanes
+@simd
 def sample_motion(
     work: FloatArray, poses: FloatArray, first: int, odometry: FloatArray, sigmas: FloatArray, normals: FloatArray
 ) -> None:
     """Replace poses by draws from p(x_t | x_{t-1}, u_t), each particle from its own past (Eq. 4)."""
     take_draws(work, normals, first)
-    enter_pose(work, poses, first)
+    load_pose(work, poses, first)
     for i in range(LANES):
         dx = odometry[0] + work[DRAW0 + i] * sigmas[0]
         dy = odometry[1] + work[DRAW1 + i] * sigmas[1]
@@ -189,8 +189,8 @@ def sample_motion(
 
 
 @device
-@lanes
-def take_as_exact(poses: FloatArray, means: FloatArray, covariances: FloatArray) -> None:
+@simd
+def set_exact(poses: FloatArray, means: FloatArray, covariances: FloatArray) -> None:
     """Write N(x^, P^), (3, P) and (6, P), of poses (3, P) that are exactly where their particles have them."""
     for c in range(3):
         for m in range(poses.shape[1]):
@@ -199,8 +199,8 @@ def take_as_exact(poses: FloatArray, means: FloatArray, covariances: FloatArray)
 
 
 @device
-@lanes
-def move_blind(
+@simd
+def propagate(
     poses: FloatArray, means: FloatArray, covariances: FloatArray, blind: bool, odometry: FloatArray,
     sigmas: FloatArray, normals: FloatArray, work: FloatArray,
 ) -> None:  # fmt: skip

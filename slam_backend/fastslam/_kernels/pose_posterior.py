@@ -2,7 +2,7 @@
 
 import math
 
-from slam_backend.core.jit import device, lanes, lanes_inlined
+from slam_backend.core.jit import device, simd, simd_inline
 from slam_backend.core.simd_math import inverted, log_of, quadratic_form, sine_cosine, wrapped
 from slam_backend.core.validation import FloatArray
 from slam_backend.fastslam._kernels.layout import (
@@ -59,7 +59,7 @@ from slam_backend.fastslam._kernels.measurement_model import total_log_likelihoo
 
 
 @device
-@lanes
+@simd
 def begin_pose(work: FloatArray) -> None:
     """Start from xi = 0, at the predicted pose, whose turn is in rows COS and SIN already."""
     for i in range(LANES):
@@ -72,8 +72,8 @@ def begin_pose(work: FloatArray) -> None:
 
 
 @device
-@lanes
-def place(work: FloatArray) -> None:
+@simd
+def set_linearisation_point(work: FloatArray) -> None:
     """Write the pose rows X .. SIN of x0 + C xi."""
     for i in range(LANES):
         xi0, xi1, xi2 = work[XI0 + i], work[XI1 + i], work[XI2 + i]
@@ -85,7 +85,7 @@ def place(work: FloatArray) -> None:
 
 
 @device
-@lanes
+@simd
 def clear_sums(work: FloatArray) -> None:
     """Start the system of xi from its prior N(0, I)."""
     for i in range(LANES):
@@ -100,7 +100,7 @@ def clear_sums(work: FloatArray) -> None:
         work[G2 + i] = work[XI2 + i]
 
 
-@lanes_inlined
+@simd_inline
 def add_terms(
     work: FloatArray, i: int, on: bool, w: float, j00: float, j01: float, j02: float, j11: float, j12: float,
     j22: float, g0: float, g1: float, g2: float,
@@ -118,7 +118,7 @@ def add_terms(
 
 
 @device
-@lanes
+@simd
 def sum_matches(work: FloatArray, record: FloatArray, weights: FloatArray) -> None:
     """Add a candidate's share of the Gauss-Newton system, times `weights` (LANES)."""
     for i in range(LANES):
@@ -130,7 +130,7 @@ def sum_matches(work: FloatArray, record: FloatArray, weights: FloatArray) -> No
 
 
 @device
-@lanes
+@simd
 def robust_weights(record: FloatArray, chosen: FloatArray, q: float, gate: float, weights: FloatArray) -> int:
     """Write Cauchy's weights 1 / (1 + D / gate) where the lane chose candidate q, else 0; return how many chose it."""
     count = 0
@@ -142,7 +142,7 @@ def robust_weights(record: FloatArray, chosen: FloatArray, q: float, gate: float
 
 
 @device
-@lanes
+@simd
 def any_wide(work: FloatArray) -> int:
     count = 0
     for i in range(LANES):
@@ -151,8 +151,8 @@ def any_wide(work: FloatArray) -> int:
 
 
 @device
-@lanes
-def step_pose(work: FloatArray, only_wide: bool) -> None:
+@simd
+def gauss_newton_step(work: FloatArray, only_wide: bool) -> None:
     """Take one step of Gauss-Newton from the sums: xi <- xi - J^-1 G, with covariance J^-1."""
     for i in range(LANES):
         go = work[WIDE + i] > 0.0 or not only_wide
@@ -172,7 +172,7 @@ def step_pose(work: FloatArray, only_wide: bool) -> None:
 
 
 @device
-@lanes
+@simd
 def posterior(work: FloatArray, log_likelihood: FloatArray, first: int) -> None:
     """Weigh by the predictive likelihood and sample the pose, from the sums of pass B (Laplace's formula).
 

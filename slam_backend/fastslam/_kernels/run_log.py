@@ -5,8 +5,18 @@ from numpy.typing import NDArray
 
 from slam_backend.core.jit import in_place
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
-from slam_backend.fastslam._kernels.layout import COVERED, DID, LOGGED, MOTION, MOVED, NAME, PLACED, THOUGHT, USED
-from slam_backend.smoother.log_arrays import EXACT, ODOMETRY, STOOD
+from slam_backend.fastslam._kernels.layout import (
+    ESTIMATE,
+    EXACT_POSE,
+    HAS_COVARIANCES,
+    LOGGED,
+    LOGGED_KIND,
+    MOTION,
+    MOVED,
+    NAME,
+    USED,
+)
+from slam_backend.smoother.log_arrays import EXACT, ODOMETRY, STATIONARY
 
 
 @in_place
@@ -37,10 +47,12 @@ def write_rows(
             note = noted[k, other]
             end = begin + int(note[USED])
             if other == robot and k >= first and note[LOGGED] > 0.0:
-                if t == len(steps) or n + end - begin > most or note[COVERED] > 0.0:
+                if t == len(steps) or n + end - begin > most or note[HAS_COVARIANCES] > 0.0:
                     return k, t, n
                 steps[t], given[t] = numbers[k], False
-                kinds[t] = EXACT if note[DID] == PLACED else ODOMETRY if note[DID] == MOVED else STOOD
+                kinds[t] = (
+                    EXACT if note[LOGGED_KIND] == EXACT_POSE else ODOMETRY if note[LOGGED_KIND] == MOVED else STATIONARY
+                )
                 for axis in range(3):
                     motions[t, axis] = note[MOTION + axis]
                 for b in range(begin, end):
@@ -55,7 +67,7 @@ def write_rows(
 
 
 @in_place
-def write_guesses(
+def write_initial_poses(
     robot: int, numbers: IntArray, noted: FloatArray, steps: IntArray, poses: FloatArray
 ) -> tuple[int, bool]:
     """Write in which steps one of K robots did or measured anything, and where it was thought to be then.
@@ -74,7 +86,7 @@ def write_guesses(
         if note[LOGGED] > 0.0:
             steps[num] = numbers[k]
             for axis in range(3):
-                poses[num, axis] = note[THOUGHT + axis]
-            is_placed |= note[DID] == PLACED
+                poses[num, axis] = note[ESTIMATE + axis]
+            is_placed |= note[LOGGED_KIND] == EXACT_POSE
             num += 1
     return num, is_placed

@@ -2,69 +2,69 @@
 
 import math
 
-from slam_backend.core.jit import device, in_place, room
+from slam_backend.core.jit import device, in_place, stack_array
 from slam_backend.core.validation import Float32Array, FloatArray, Int32Array, IntArray
 from slam_backend.fastslam._kernels.fastslam1 import update_fastslam1
 from slam_backend.fastslam._kernels.fastslam2 import update_fastslam2
 from slam_backend.fastslam._kernels.layout import (
-    ACT,
-    AMBIGUITY,
+    AMBIGUITY_MARGIN,
     ASSOCIATED,
     BEGIN,
     CAMERA,
     COUNT,
     COVARIANCES,
-    COVERED,
+    COVARIANCES_GIVEN,
     CREATED,
-    DEAD_RADIUS,
-    DEAD_ZONE,
     DESCRIPTOR_GATE,
     DESCRIPTOR_VARIANCE,
-    DID,
     END,
+    ESTIMATE,
+    EXACT_POSE,
     FREE_SLOTS,
-    GIVEN,
+    HAS_COVARIANCES,
+    HAS_IDS,
     IDENTITIES,
-    IDLE,
     IDS,
     IS_ONE_TO_ONE,
     LAST_SEEN,
     LOG_LIKELIHOOD,
     LOG_P0,
     LOGGED,
+    LOGGED_KIND,
     LONG,
     MAP_OF,
     MEANS,
     MOTION,
+    MOTION_KIND,
     MOVED,
     NAME,
-    NAMED,
+    NEW_LANDMARK_GATE,
+    NEW_LANDMARK_RADIUS,
+    NO_READING,
     NOISE,
-    PLACED,
     POSES,
     POSITION_GATE,
     RECOVERY,
     RESAMPLE_THRESHOLD,
     ROW_OF,
-    THOUGHT,
     USED,
     WALK,
     WORK_SIZE,
 )
-from slam_backend.fastslam._kernels.motion_model import move_blind, take_as_exact
-from slam_backend.fastslam._kernels.weights import conclude
+from slam_backend.fastslam._kernels.motion_model import propagate, set_exact
+from slam_backend.fastslam._kernels.weights import finish_step
 
 
 @device
 @in_place
-def note_turns(
+def log_step(
     rows: IntArray, turns: IntArray, moves: FloatArray, sightings: FloatArray, told: IntArray, means: FloatArray,
     noted: FloatArray, measured: FloatArray, first: int,
 ) -> None:  # fmt: skip
     """Note the turns of a step.
 
     Args:
-        rows, turns, moves, sightings: As of `take_turns`.
+        rows, turns, moves, sightings: As of `step_robots`.
         told: (2, n) what became of the measurements, as in `Findings`.
         means: (K, 3) [m, m, rad] where the robots are thought to be now.
         noted: (K, 10) of the step, see `layout`; written.
@@ -77,13 +77,13 @@ def note_turns(
         if row < 0:
             continue
         turn = turns[row]
-        note[LOGGED] = 1.0 if turn[ACT] != IDLE or turn[COUNT] > 0 else 0.0
-        note[COVERED] = 1.0 if turn[GIVEN] > 0 and turn[COUNT] > 0 else 0.0
-        note[DID], note[USED] = turn[ACT], turn[END] - turn[BEGIN]
+        note[LOGGED] = 1.0 if turn[MOTION_KIND] != NO_READING or turn[COUNT] > 0 else 0.0
+        note[HAS_COVARIANCES] = 1.0 if turn[COVARIANCES_GIVEN] > 0 and turn[COUNT] > 0 else 0.0
+        note[LOGGED_KIND], note[USED] = turn[MOTION_KIND], turn[END] - turn[BEGIN]
         for axis in range(3):
-            note[MOTION + axis], note[THOUGHT + axis] = moves[row, axis], means[robot, axis]
+            note[MOTION + axis], note[ESTIMATE + axis] = moves[row, axis], means[robot, axis]
         for b in range(turn[BEGIN], turn[END]):
-            for c in range(NAME if turn[GIVEN] > 0 else 3):
+            for c in range(NAME if turn[COVARIANCES_GIVEN] > 0 else 3):
                 measured[first, c] = sightings[b, c]
             measured[first, NAME] = told[ASSOCIATED, b]
             first += 1
@@ -100,7 +100,7 @@ def write_sigmas(noise: FloatArray, move: FloatArray, sigmas: FloatArray) -> Non
 
 
 @in_place
-def take_turns(
+def step_robots(
     low: int, high: int, is_over: bool, now: int, assumed: FloatArray,
     rows: IntArray, turns: IntArray, moves: FloatArray, normals: FloatArray,
     robots: FloatArray, blind: IntArray, weights: FloatArray, frame: FloatArray,
@@ -136,7 +136,7 @@ def take_turns(
         found, distances: (n, P), written as in `update_fastslam2`.
         told: (2, n), written: the slots of the landmarks that were started, -1 = none; in the end as in `summarise`.
         mean, covariance: (K, 3), (K, 3, 3), written in the end, as in `conclude`.
-        noted, measured, num_measured: Of a journal, likewise, see `note_turns`.
+        noted, measured, num_measured: Of a journal, likewise, see `log_step`.
         fastslam1: None: the proposal of FastSLAM 2.0; a filter that has it never compiles the other one. Any number:
             that of FastSLAM 1.0.
 
@@ -152,19 +152,19 @@ def take_turns(
     row_of, map_of, ids, identities = table[ROW_OF], table[MAP_OF], table[IDS], table[IDENTITIES]
     free_slots = table[FREE_SLOTS]
     points, noises = sightings[:, :3], sightings[:, 3:]
-    work, still, move, sigmas, drawn = room(WORK_SIZE), room(3), room(3), room(3), -1
+    work, still, move, sigmas, drawn = stack_array(WORK_SIZE), stack_array(3), stack_array(3), stack_array(3), -1
     still[:] = 0.0
     if low == 0:
         log_likelihood[:] = 0.0
     for robot in range(high):
         row = rows[robot]
-        act = turns[row, ACT] if row >= 0 else IDLE
-        drawn += act != IDLE
-        if robot < low or act == IDLE:
+        act = turns[row, MOTION_KIND] if row >= 0 else NO_READING
+        drawn += act != NO_READING
+        if robot < low or act == NO_READING:
             continue
         a, b = turns[row, BEGIN], turns[row, END]
-        given, named = turns[row, GIVEN] > 0, turns[row, NAMED] > 0
-        placed = act == PLACED
+        given, named = turns[row, COVARIANCES_GIVEN] > 0, turns[row, HAS_IDS] > 0
+        placed = act == EXACT_POSE
         move[:] = 0.0
         sigmas[:] = 0.0
         if act == MOVED:
@@ -186,23 +186,23 @@ def take_turns(
                 own_poses, own_means, own_covariances, was_blind, move, sigmas, normals[drawn],
                 values, counts, odds, row_of, map_of, maps, users, free_rows, free_slots, tops, ids, identities, stored,
                 heads, points[a:b], noises[a:b], given, camera, descriptors[a:b], names[a:b], named,
-                assumed[DESCRIPTOR_GATE], assumed[DESCRIPTOR_VARIANCE], assumed[POSITION_GATE], assumed[DEAD_ZONE],
-                assumed[DEAD_RADIUS], assumed[AMBIGUITY], lost, assumed[LOG_P0],
+                assumed[DESCRIPTOR_GATE], assumed[DESCRIPTOR_VARIANCE], assumed[POSITION_GATE], assumed[NEW_LANDMARK_GATE],
+                assumed[NEW_LANDMARK_RADIUS], assumed[AMBIGUITY_MARGIN], lost, assumed[LOG_P0],
                 assumed[WALK], is_one_to_one,
                 work, found[a:b], distances[a:b], new_slots[a:b], log_likelihood,
             )  # fmt: skip
             was_blind = False
         elif placed:
-            take_as_exact(own_poses, own_means, own_covariances)
+            set_exact(own_poses, own_means, own_covariances)
         else:
-            move_blind(own_poses, own_means, own_covariances, was_blind, move, sigmas, normals[drawn], work)
+            propagate(own_poses, own_means, own_covariances, was_blind, move, sigmas, normals[drawn], work)
             was_blind = True
         blind[robot] = was_blind
     if not is_over:
         return 0, 0, 0, 0, 0, 0, 0.0, 0.0, False
-    summary = conclude(
+    summary = finish_step(
         weights, num_particles, means, covariances, frame, mean, covariance, rows, turns, found, distances, told, ids,
         table[LAST_SEEN], now, assumed[LONG], assumed[RESAMPLE_THRESHOLD],
     )  # fmt: skip
-    note_turns(rows, turns, moves, sightings, told, mean, noted, measured, num_measured)
+    log_step(rows, turns, moves, sightings, told, mean, noted, measured, num_measured)
     return summary

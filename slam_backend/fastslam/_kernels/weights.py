@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from slam_backend.core.jit import device, in_place, inlined, jit, lanes, lanes_inlined, room
+from slam_backend.core.jit import device, in_place, inline, jit, simd, simd_inline, stack_array
 from slam_backend.core.simd_math import sine_cosine, wrapped
 from slam_backend.core.validation import FloatArray, Int32Array, IntArray
 from slam_backend.fastslam._kernels.layout import (
@@ -61,14 +61,14 @@ def weigh(
     return 1.0 / squares
 
 
-@lanes_inlined
+@simd_inline
 def _load_weights(weights: FloatArray, first: int, block: FloatArray) -> None:
     """Write the weights (M,) of a block (LANES,) from `first` on, zeros for surplus lanes."""
     for i in range(LANES):
         block[i] = weights[first + i] if first + i < len(weights) else 0.0
 
 
-@lanes_inlined
+@simd_inline
 def _add_up(lanes_of: FloatArray, sums: FloatArray) -> None:
     """Write the sums (n,) of rows of lanes (n LANES,): each in order, one beside the other."""
     sums[:] = 0.0
@@ -77,7 +77,7 @@ def _add_up(lanes_of: FloatArray, sums: FloatArray) -> None:
             sums[c] += lanes_of[c * LANES + i]
 
 
-@lanes
+@simd
 def mixture(
     means: FloatArray, covariances: FloatArray, weights: FloatArray, mean: FloatArray, covariance: FloatArray
 ) -> None:
@@ -88,7 +88,7 @@ def mixture(
         covariances: (6, P), upper triangles.
         weights: (M,), summing to 1.
     """
-    w, sums, share = room(LANES), room(6), room(SPREAD_SIZE)
+    w, sums, share = stack_array(LANES), stack_array(6), stack_array(SPREAD_SIZE)
     share[:] = 0.0
     for first in range(0, len(weights), LANES):
         _load_weights(weights, first, w)
@@ -121,7 +121,7 @@ def mixture(
 
 
 @in_place
-def add_share(scatter: FloatArray, poses: FloatArray, covariances: FloatArray) -> None:
+def add_gauge_covariance(scatter: FloatArray, poses: FloatArray, covariances: FloatArray) -> None:
     """Add to the covariances of poses, in place, what a scattered motion of the whole map adds, to first order.
 
     Args:
@@ -153,7 +153,7 @@ def summarise(
     """Tell what became of the robots' measurements.
 
     Args:
-        rows, turns: Which of all n measurements they are, as in `take_turns`; those of others are passed over.
+        rows, turns: Which of all n measurements they are, as in `step_robots`; those of others are passed over.
         found: (n, P) slots to which the particles gave the measurements, -1 = rejected.
         distances: (n, P) squared distances of matches.
         told: (2, n), written: the id to which the most probable particle gave each measurement, -1 = rejected; and the
@@ -172,11 +172,11 @@ def summarise(
         none.
     """
     associated, created = told[ASSOCIATED], told[CREATED]
-    num_given, num_created, num_new, num_matched, num_long_unseen, squares, judged = 0, 0, 0, 0, 0, 0.0, 0
+    num_measurements, num_created, num_new, num_matched, num_long_unseen, squares, judged = 0, 0, 0, 0, 0, 0.0, 0
     for row in rows:
         if row < 0:
             continue
-        num_given += max(turns[row, COUNT], 0)
+        num_measurements += max(turns[row, COUNT], 0)
         for b in range(turns[row, BEGIN], turns[row, END]):
             slot, new = found[b, best], created[b]
             associated[b] = ids[slot] if slot >= 0 else REJECTED
@@ -195,18 +195,18 @@ def summarise(
                 if distances[b, best] < np.inf:
                     squares += distances[b, best]
                     judged += 1
-    num_rejected = num_given - num_new - num_matched
+    num_rejected = num_measurements - num_new - num_matched
     return num_long_unseen, num_created, num_new, num_matched, num_rejected, squares / judged if judged > 0 else np.nan
 
 
 @device
 @in_place
-def conclude(
+def finish_step(
     weights: FloatArray, count: int, means: FloatArray, covariances: FloatArray, frame: FloatArray,
     mean: FloatArray, covariance: FloatArray, rows: IntArray, turns: IntArray, found: Int32Array, distances: FloatArray,
     told: IntArray, ids: IntArray, last_seen: IntArray, now: int, long: float, threshold: float,
 ) -> tuple[int, int, int, int, int, int, float, float, bool]:  # fmt: skip
-    """Do what `weigh`, `mixture` and `add_share` for each of K robots and, for their measurements, `summarise` do.
+    """Do what `weigh`, `mixture` and `add_gauge_covariance` for each of K robots and, for their measurements, `summarise` do.
 
     Args:
         weights: (4, P) log-weights, those along paths, weights, and a step's log-likelihood; the first three change.
@@ -226,7 +226,7 @@ def conclude(
     for robot in range(len(means)):
         mixture(means[robot], covariances[robot], own, mean[robot], covariance[robot])
     if frame[0, 0] != 0.0 or frame[2, 2] != 0.0:
-        add_share(frame, mean, covariance)
+        add_gauge_covariance(frame, mean, covariance)
     best = int(path_log_weights.argmax())
     long_unseen, created, new, matched, rejected, nis = summarise(
         rows, turns, found, distances, told, best, ids, last_seen, now, long
@@ -254,8 +254,10 @@ def start_kind(starts: FloatArray, count: int) -> int:
     return AT_ORIGIN if at_origin else KNOWN if same else SPREAD
 
 
-@inlined
-def _see(start: FloatArray, pose: FloatArray, spread: FloatArray, seen: FloatArray, seen_spread: FloatArray) -> None:
+@inline
+def _relative_pose(
+    start: FloatArray, pose: FloatArray, spread: FloatArray, seen: FloatArray, seen_spread: FloatArray
+) -> None:
     """Write a pose (3,) and its covariance (6,), xx, xy, xt, yy, yt, tt, as they are seen from a start (3,)."""
     c, s = math.cos(start[2]), math.sin(start[2])
     dx, dy = pose[0] - start[0], pose[1] - start[1]
@@ -272,7 +274,7 @@ def _see(start: FloatArray, pose: FloatArray, spread: FloatArray, seen: FloatArr
 
 @device
 @in_place
-def see_from_starts(
+def relative_poses_from_starts(
     starts: FloatArray, means: FloatArray, covariances: FloatArray, count: int, seen: FloatArray, spread: FloatArray
 ) -> None:
     """Write each particle's pose estimate as seen from its own start pose.
@@ -285,12 +287,12 @@ def see_from_starts(
         seen, spread: (3, P), (6, P), written up to `count`: the same in the start frames.
     """
     for m in range(count):
-        _see(starts[:, m], means[:, m], covariances[:, m], seen[:, m], spread[:, m])
+        _relative_pose(starts[:, m], means[:, m], covariances[:, m], seen[:, m], spread[:, m])
 
 
 @device
 @jit
-def _see_own(
+def _relative_pose_of_self(
     starts: FloatArray, means: FloatArray, covariances: FloatArray, weights: FloatArray, best: int, kind: int,
     pose: FloatArray, spread: FloatArray,
 ) -> None:  # fmt: skip
@@ -298,7 +300,7 @@ def _see_own(
     if kind == SPREAD:
         padded = starts.shape[1]
         seen, seen_spread = np.zeros((3, padded)), np.zeros((6, padded))
-        see_from_starts(starts, means, covariances, len(weights), seen, seen_spread)
+        relative_poses_from_starts(starts, means, covariances, len(weights), seen, seen_spread)
         mixture(seen, seen_spread, weights, pose, spread)
     elif kind == KNOWN:
         packed, seen_packed, from_map = np.empty(6), np.empty(6), pose.copy()
@@ -307,7 +309,7 @@ def _see_own(
             for k in range(j, 3):
                 packed[entry] = spread[j, k]
                 entry += 1
-        _see(starts[:, best], from_map, packed, pose, seen_packed)
+        _relative_pose(starts[:, best], from_map, packed, pose, seen_packed)
         entry = 0
         for j in range(3):
             for k in range(j, 3):
@@ -316,7 +318,7 @@ def _see_own(
 
 
 @in_place
-def stand(
+def write_team_poses(
     robots: FloatArray, scatters: FloatArray, weights: FloatArray, best: int, at_origin: bool, estimates: FloatArray,
     spreads: FloatArray, members: IntArray, ess: float, poses: FloatArray, beliefs: FloatArray,
 ) -> None:  # fmt: skip
@@ -358,9 +360,9 @@ def stand(
             is_held = scatters[i, 2, 2] > 0.0  # then the estimate's share of the frame is not its own
             kind = SPREAD if is_held else start_kind(starts[i], len(weights))
             pose, spread = belief[OWN : OWN + 3], belief[COVARIANCE:SIGMAS].reshape((3, 3))
-            _see_own(starts[i], means[i], covariances[i], weights, best, kind, pose, spread)
+            _relative_pose_of_self(starts[i], means[i], covariances[i], weights, best, kind, pose, spread)
             if is_held:
-                add_share(scatters[i], pose.reshape((1, 3)), spread.reshape((1, 3, 3)))
+                add_gauge_covariance(scatters[i], pose.reshape((1, 3)), spread.reshape((1, 3, 3)))
         for mate in range(len(seen)):
             for j in range(3):
                 seen[mate, j] = belief[OWN + j] if mate == own else np.nan

@@ -104,7 +104,7 @@ def mutual_pairs(a: Float32Array, b_columns: Float32Array, limit: float) -> IntA
 
 
 @jit
-def stands_out(
+def ratio_test_mask(
     a: Float32Array,
     partners: IntArray,
     b_columns: Float32Array,
@@ -112,7 +112,7 @@ def stands_out(
     same_place: float,
     ratio: float,
 ) -> BoolArray:
-    """Tell which matches (k,) stand out, see `_matching.unlike_other_places`."""
+    """Tell which matches (k,) stand out, see `_matching.passes_ratio_test`."""
     passed = np.ones(len(a), np.bool_)
     lengths_b = _squared_lengths(b_columns)
     squares = np.empty(BLOCK, np.float32)
@@ -137,7 +137,7 @@ def stands_out(
 
 @device
 @jit
-def _alike(a: Float32Array, b_columns: Float32Array, limit: float, most: int) -> tuple[IntArray, IntArray, IntArray]:
+def _similar(a: Float32Array, b_columns: Float32Array, limit: float, most: int) -> tuple[IntArray, IntArray, IntArray]:
     """Return the b within a squared distance `limit` of each a (n, most), and how many each a (n,) and b (m,) has.
 
     Most descriptors are told apart by their heads: a . b is at most that of the heads and the product of the tails'
@@ -189,15 +189,15 @@ def _may_be_near(
 
 
 @jit
-def num_alike(a: Float32Array, b_columns: Float32Array, limit: float) -> int:
+def count_similar(a: Float32Array, b_columns: Float32Array, limit: float) -> int:
     """Return how many pairs are within a squared distance `limit`."""
-    return int(_alike(a, b_columns, limit, 0)[1].sum())
+    return int(_similar(a, b_columns, limit, 0)[1].sum())
 
 
 @jit
-def pairs_alike(a: Float32Array, b_columns: Float32Array, limit: float, most: int) -> IntArray:
+def similar_pairs(a: Float32Array, b_columns: Float32Array, limit: float, most: int) -> IntArray:
     """Return the pairs (k, 2) within a squared distance `limit` of which neither has more than `most`, by rising a."""
-    found, of_a, of_b = _alike(a, b_columns, limit, most)
+    found, of_a, of_b = _similar(a, b_columns, limit, most)
     pairs = np.empty((found.size, 2), np.int64)
     k = 0
     for i in range(len(a)):

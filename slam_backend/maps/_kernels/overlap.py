@@ -13,7 +13,7 @@ OUTSIDE = 1e-3  # weight of those beyond it; never nothing: the fit stays define
 
 
 @jit
-def moved_share(
+def deformed_fraction(
     means: FloatArray, covariances: FloatArray, ids: IntArray, old_means: FloatArray, old_covariances: FloatArray,
     old_ids: IntArray, least: int, floor: float, gate: float,
 ) -> float:  # fmt: skip

@@ -146,7 +146,7 @@ def gauss_newton_step(table: FloatArray, members: BoolArray, pose: FloatArray, f
 
 @device
 @jit
-def fitted_variance(table: FloatArray, members: BoolArray, pose: FloatArray, floor: float) -> float:
+def between_map_variance(table: FloatArray, members: BoolArray, pose: FloatArray, floor: float) -> float:
     """Return the added variance, at most `floor`, under which the members' median D is that of 3 degrees of freedom.
 
     Covariances that explain the residuals, up to what chance may do, get almost nothing added, so that weights stay
@@ -170,7 +170,7 @@ def fitted_variance(table: FloatArray, members: BoolArray, pose: FloatArray, flo
 
 
 @jit
-def unexplained(table: FloatArray, members: BoolArray, pose: FloatArray, floor: float) -> float:
+def reduced_chi2(table: FloatArray, members: BoolArray, pose: FloatArray, floor: float) -> float:
     """Return by how much, at least 1, the members' median D exceeds that of 3 degrees of freedom (a Birge ratio).
 
     Above 1 only by chance, and where covariances are more over-confident than any variance that may be added explains.
@@ -261,7 +261,7 @@ def refine(table: FloatArray, start: FloatArray, floor: float, gate: float) -> t
     variance = floor
     for _ in range(MAX_ROUNDS):
         support(table, pose, floor, gate, members)
-        variance = fitted_variance(table, members, pose, floor)
+        variance = between_map_variance(table, members, pose, floor)
         support(table, pose, variance, FIT_GATE * gate, members)
         drop_unverified(table, members, pose, variance)
         moved = gauss_newton_step(table, members, pose, variance)

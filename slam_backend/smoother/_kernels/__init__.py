@@ -1,8 +1,8 @@
 """Compiled inner loops of the smoother: forms of sightings, normal equations, their factor, many paths at a time."""
 
-from slam_backend.smoother._kernels.factors import FREE, condense, seek_poses
-from slam_backend.smoother._kernels.graph_reduction import coarsen, drop_unused, look_at_keys
-from slam_backend.smoother._kernels.keyframes import look_up, rename, settle, take_in
+from slam_backend.smoother._kernels.factors import FREE, condense, sum_pose_information
+from slam_backend.smoother._kernels.graph_reduction import drop_unused, recent_key_mask, reduce_keyframes
+from slam_backend.smoother._kernels.keyframes import add_log, close_keyframe, find_initial_poses, rename
 from slam_backend.smoother._kernels.marginal_covariances import scatter_of_links
 from slam_backend.smoother._kernels.normal_equations import count, form, gather, step
 from slam_backend.smoother._kernels.sampling import (
@@ -10,7 +10,7 @@ from slam_backend.smoother._kernels.sampling import (
     POSE_ROWS,
     draw,
     normalise,
-    odometry_of_paths,
+    odometry_log_density,
     replay,
     to_lanes,
     weigh_deviations,
@@ -18,8 +18,32 @@ from slam_backend.smoother._kernels.sampling import (
 from slam_backend.smoother._kernels.sparse_cholesky import covariance, factorise, lay_out, minimum_degree, neighbours
 
 __all__ = [
-    "FREE", "LANES", "POSE_ROWS", "coarsen", "condense", "count", "covariance", "draw", "drop_unused", "factorise",
-    "form", "gather", "lay_out", "look_at_keys", "look_up", "minimum_degree", "neighbours", "normalise",
-    "odometry_of_paths", "rename", "replay", "scatter_of_links", "seek_poses", "settle", "step", "take_in", "to_lanes",
+    "FREE",
+    "LANES",
+    "POSE_ROWS",
+    "add_log",
+    "close_keyframe",
+    "condense",
+    "count",
+    "covariance",
+    "draw",
+    "drop_unused",
+    "factorise",
+    "find_initial_poses",
+    "form",
+    "gather",
+    "lay_out",
+    "minimum_degree",
+    "neighbours",
+    "normalise",
+    "odometry_log_density",
+    "recent_key_mask",
+    "reduce_keyframes",
+    "rename",
+    "replay",
+    "scatter_of_links",
+    "step",
+    "sum_pose_information",
+    "to_lanes",
     "weigh_deviations",
 ]  # fmt: skip

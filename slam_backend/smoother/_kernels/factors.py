@@ -8,15 +8,15 @@ as their upper triangles by rows (6).
 
 import math
 
-from slam_backend.core.jit import device, in_place, inlined, room
+from slam_backend.core.jit import device, in_place, inline, stack_array
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 
 FREE = -1  # column of a pose that is given, not sought
 MIN_DEPTH = 0.05  # [m]; a landmark predicted nearer than this to the camera plane is linearised where it was measured
 
 
-@inlined
-def _spun(c: float, s: float, a: FloatArray, out: FloatArray) -> None:
+@inline
+def _rotate_in_plane(c: float, s: float, a: FloatArray, out: FloatArray) -> None:
     """Write R A R^T (6) for the rotation (c, s) about the vertical."""
     a00, a01, a02, a11, a12, a22 = a[0], a[1], a[2], a[3], a[4], a[5]
     out[0] = c * c * a00 - 2.0 * c * s * a01 + s * s * a11
@@ -27,7 +27,7 @@ def _spun(c: float, s: float, a: FloatArray, out: FloatArray) -> None:
     out[5] = a22
 
 
-@inlined
+@inline
 def _inverse(a: FloatArray, out: FloatArray) -> float:
     """Write the inverse of a symmetric matrix (6); return its determinant."""
     p = a[3] * a[5] - a[4] * a[4]
@@ -45,7 +45,7 @@ def _inverse(a: FloatArray, out: FloatArray) -> float:
 
 @device
 @in_place
-def seek(previous: IntArray, columns: IntArray) -> int:
+def optimise_landmark(previous: IntArray, columns: IntArray) -> int:
     """Give each pose that is sought the rows after those of the one before.
 
     Args:
@@ -70,7 +70,7 @@ def invert(matrices: FloatArray, columns: IntArray, out: FloatArray) -> bool:
     Zeros are written, whatever the matrix, where `columns` (n,) says `FREE`. Where one that is to be inverted is not
     positive definite, those after it are not written.
     """
-    upper, inverse = room(6), room(6)
+    upper, inverse = stack_array(6), stack_array(6)
     for n in range(len(matrices)):
         if columns[n] == FREE:
             out[n] = 0.0
@@ -90,7 +90,7 @@ def invert(matrices: FloatArray, columns: IntArray, out: FloatArray) -> bool:
 
 
 @in_place
-def seek_poses(
+def sum_pose_information(
     previous: IntArray, noises: FloatArray, columns: IntArray, informations: FloatArray
 ) -> tuple[int, bool]:  # fmt: skip
     """Say which poses are sought, and what the odometry that leads to these tells.
@@ -103,11 +103,11 @@ def seek_poses(
     Returns:
         How many are sought, and whether all of their odometry has noise.
     """
-    size = seek(previous, columns)
+    size = optimise_landmark(previous, columns)
     return size, invert(noises, columns, informations)
 
 
-@inlined
+@inline
 def linearise(
     point: FloatArray, noise: FloatArray, given: bool, camera: FloatArray, e: FloatArray, y: FloatArray,
     info: FloatArray,
@@ -167,8 +167,8 @@ def condense(
     Returns:
         Half the sum of the (robust) squared distances.
     """
-    e, y, d = room(3), room(3), room(3)
-    info, turned = room(6), room(6)
+    e, y, d = stack_array(3), stack_array(3), stack_array(3)
+    info, turned = stack_array(6), stack_array(6)
     for s in range(len(keys)):
         if frozen[s]:
             continue
@@ -203,7 +203,7 @@ def condense(
             weight = (2.0 * kernel / (kernel + square)) ** 2
             loss = kernel * (3.0 * square - kernel) / (kernel + square)
         total += 0.5 * loss
-        _spun(c, sn, info, turned)
+        _rotate_in_plane(c, sn, info, turned)
         for i in range(6):
             infos[s, i] += weight / scale * turned[i]
         slopes[s, 0] += weight * (c * v0 - sn * v1)

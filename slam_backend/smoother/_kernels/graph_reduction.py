@@ -4,14 +4,14 @@ import math
 
 import numpy as np
 
-from slam_backend.core.jit import device, in_place, inlined, jit, room
+from slam_backend.core.jit import device, in_place, inline, jit, stack_array
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
-from slam_backend.smoother._kernels.factors import _spun
+from slam_backend.smoother._kernels.factors import _rotate_in_plane
 
 
 @jit
 def drop_unused(
-    kept: BoolArray, frozen_landmarks: IntArray, points: FloatArray, point_noises: FloatArray, given: BoolArray,
+    kept: BoolArray, condensed_landmarks: IntArray, points: FloatArray, point_noises: FloatArray, given: BoolArray,
     point_frames: IntArray, point_landmarks: IntArray, frame_keys: IntArray, frame_offsets: FloatArray,
     landmark_ids: IntArray, landmarks: FloatArray,
 ) -> tuple[int, int, int]:  # fmt: skip
@@ -19,9 +19,9 @@ def drop_unused(
 
     Args:
         kept: (n,) which raw measurements are left.
-        frozen_landmarks: (s,) of the frozen sightings; changed: where these are then.
+        condensed_landmarks: (s,) of the frozen sightings; changed: where these are then.
         points, point_noises, given, point_frames, point_landmarks, frame_keys, frame_offsets, landmark_ids, landmarks:
-            Columns of `PathGraph`. Changed: what is left are the first rows, which name each other by where they are.
+            Columns of `SlamGraph`. Changed: what is left are the first rows, which name each other by where they are.
 
     Returns:
         How many measurements, frames and landmarks are left.
@@ -34,7 +34,7 @@ def drop_unused(
             points[num], point_noises[num], given[num] = points[n], point_noises[n], given[n]
             point_frames[num], point_landmarks[num] = point_frames[n], point_landmarks[n]
             num += 1
-    for landmark in frozen_landmarks:
+    for landmark in condensed_landmarks:
         landmark_numbers[landmark] = 0
     frames = 0
     for f in range(len(frame_keys)):
@@ -49,21 +49,21 @@ def drop_unused(
     for n in range(num):
         point_frames[n] = frame_numbers[point_frames[n]]
         point_landmarks[n] = landmark_numbers[point_landmarks[n]]
-    for s in range(len(frozen_landmarks)):
-        frozen_landmarks[s] = landmark_numbers[frozen_landmarks[s]]
+    for s in range(len(condensed_landmarks)):
+        condensed_landmarks[s] = landmark_numbers[condensed_landmarks[s]]
     return num, frames, left
 
 
 NONE = -1
 
 
-@inlined
+@inline
 def _wrapped_heading(angle: float) -> float:
     """Return an angle [rad] in [-pi, pi)."""
     return (angle + math.pi) % (2.0 * math.pi) - math.pi
 
 
-@inlined
+@inline
 def _compose(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
     """Write the motion a followed by b, all (3,) [m, m, rad]; `out` may be b."""
     c, s = math.cos(a[2]), math.sin(a[2])
@@ -71,7 +71,7 @@ def _compose(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
     out[0], out[1], out[2] = x, y, _wrapped_heading(a[2] + b[2])
 
 
-@inlined
+@inline
 def _turned(c: float, s: float, a: FloatArray, out: FloatArray) -> None:
     """Write R A R^T for a symmetric A (3, 3) and the rotation (c, s) about the vertical; `out` may be A."""
     a00, a01, a02, a11, a12, a22 = a[0, 0], a[0, 1], a[0, 2], a[1, 1], a[1, 2], a[2, 2]
@@ -108,7 +108,7 @@ def chain(first: FloatArray, first_noise: FloatArray, motion: FloatArray, noise:
 
 
 @jit
-def look_at_keys(
+def recent_key_mask(
     robots: IntArray, frame_keys: IntArray, share: int, most_frames: int, fresh: BoolArray, raw: BoolArray
 ) -> None:
     """Say which keys are each robot's newest, and from which of these measurements stay raw.
@@ -133,12 +133,12 @@ def look_at_keys(
 
 @device
 @in_place
-def to_freeze(frozen: BoolArray, keys: IntArray, raw: BoolArray, rows: IntArray, sighted: BoolArray) -> int:
+def condensed_mask(frozen: BoolArray, keys: IntArray, raw: BoolArray, rows: IntArray, sighted: BoolArray) -> int:
     """Say which sightings are frozen from now on: those that are, and those of keys that do not stay raw.
 
     Args:
         frozen, keys: (s,) whether each is by now, and its key.
-        raw: (k,) of `look_at_keys`.
+        raw: (k,) of `recent_key_mask`.
         rows: (s,), result, of which the first rows are written.
         sighted: (k,), result: whether any of them is of a key.
 
@@ -156,7 +156,7 @@ def to_freeze(frozen: BoolArray, keys: IntArray, raw: BoolArray, rows: IntArray,
 
 @device
 @jit
-def join_keys(
+def merge_keys(
     fresh: BoolArray, sighted: BoolArray, most_keys: int, roots: IntArray, numbers: IntArray, offsets: FloatArray,
     robots: IntArray, poses: FloatArray, previous: IntArray, motions: FloatArray, noises: FloatArray,
     costs: FloatArray, slack: FloatArray,
@@ -174,7 +174,7 @@ def join_keys(
         roots: (k,), result: the key to which each stands rigidly, itself if it is left, `NONE` if it was chained away.
         numbers: (k,), result: new number of each that is left, `NONE` of the others.
         offsets: (k, 3), result: pose of each seen from its root.
-        robots, poses, previous, motions, noises, costs, slack: (k, ...) columns of `PathGraph`, keys in the order of
+        robots, poses, previous, motions, noises, costs, slack: (k, ...) columns of `SlamGraph`, keys in the order of
             time; `costs` [m^2], its `spreads`, is what joining a key to the one before costs, `slack` what each has
             cost. Changed: the first rows are those of the keys that are left, whose odometry begins at another one that
             is left, by its new number.
@@ -260,7 +260,7 @@ def add_sightings(
     Args:
         rows: (n,) which sightings, those of a landmark one after the other; reordered: by key in each landmark.
         keys, landmarks, centres, infos, slopes, counts: Of all sightings.
-        roots, numbers, offsets: As `join_keys` wrote them.
+        roots, numbers, offsets: As `merge_keys` wrote them.
         new_keys, new_landmarks, new_centres, new_infos, new_slopes, new_counts: (n, ...), results, of which the first
             rows are written; keys by their new numbers. A sum lies about the centre of its first part.
 
@@ -274,7 +274,7 @@ def add_sightings(
             at -= 1
         rows[at] = row
     num = 0
-    info = room(6)
+    info = stack_array(6)
     for row in rows:
         key, landmark, offset = numbers[roots[keys[row]]], landmarks[row], offsets[keys[row]]
         x, y, z = centres[row, 0], centres[row, 1], centres[row, 2]
@@ -285,7 +285,7 @@ def add_sightings(
             c, s = math.cos(offset[2]), math.sin(offset[2])
             x, y = c * x - s * y + offset[0], s * x + c * y + offset[1]
             g0, g1 = c * g0 - s * g1, s * g0 + c * g1
-            _spun(c, s, infos[row], info)
+            _rotate_in_plane(c, s, infos[row], info)
         if num > 0 and new_keys[num - 1] == key and new_landmarks[num - 1] == landmark:
             d0, d1, d2 = new_centres[num - 1, 0] - x, new_centres[num - 1, 1] - y, new_centres[num - 1, 2] - z
             new_slopes[num - 1, 0] += g0 - (info[0] * d0 + info[1] * d1 + info[2] * d2)
@@ -305,7 +305,7 @@ def add_sightings(
 
 
 @jit
-def coarsen(
+def reduce_keyframes(
     share: int, most_frames: int, most_keys: int, frame_keys: IntArray, keys: IntArray, landmarks: IntArray,
     frozen: BoolArray, centres: FloatArray, infos: FloatArray, slopes: FloatArray, counts: IntArray, raw: BoolArray,
     numbers: IntArray, new_keys: IntArray, new_landmarks: IntArray, new_centres: FloatArray, new_infos: FloatArray,
@@ -315,13 +315,13 @@ def coarsen(
     """Leave few enough keys, and freeze what was seen from old ones.
 
     Args:
-        share, most_frames, frame_keys: As of `look_at_keys`.
-        most_keys: As of `join_keys`.
+        share, most_frames, frame_keys: As of `recent_key_mask`.
+        most_keys: As of `merge_keys`.
         keys, landmarks, frozen, centres, infos, slopes, counts: (s, ...) of all sightings.
-        raw: (k,), result of `look_at_keys`.
-        numbers: (k,), result of `join_keys`.
+        raw: (k,), result of `recent_key_mask`.
+        numbers: (k,), result of `merge_keys`.
         new_keys, new_landmarks, new_centres, new_infos, new_slopes, new_counts: (s, ...), results of `add_sightings`.
-        robots, poses, previous, motions, noises, costs, slack: (k, ...) as of `join_keys`, changed likewise.
+        robots, poses, previous, motions, noises, costs, slack: (k, ...) as of `merge_keys`, changed likewise.
 
     Returns:
         How many keys are left, and how many frozen sightings there are.
@@ -329,9 +329,9 @@ def coarsen(
     k = len(robots)
     fresh, sighted, rows = np.empty(k, np.bool_), np.empty(k, np.bool_), np.empty(len(keys), np.int64)
     roots, offsets = np.empty(k, np.int64), np.empty((k, 3))
-    look_at_keys(robots, frame_keys, share, most_frames, fresh, raw)
-    rows = rows[: to_freeze(frozen, keys, raw, rows, sighted)]
-    left = join_keys(
+    recent_key_mask(robots, frame_keys, share, most_frames, fresh, raw)
+    rows = rows[: condensed_mask(frozen, keys, raw, rows, sighted)]
+    left = merge_keys(
         fresh, sighted, most_keys, roots, numbers, offsets, robots, poses, previous, motions, noises, costs, slack
     )
     num = add_sightings(

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.core.jit import device, in_place, inlined, jit
+from slam_backend.core.jit import device, in_place, inline, jit
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.smoother.log_arrays import ODOMETRY, REJECTED
 
@@ -83,14 +83,14 @@ def place(
 
 @device
 @jit
-def start_anew(
-    frozen_landmarks: IntArray, counts: IntArray, point_landmarks: IntArray, new_landmarks: IntArray, names: IntArray,
+def start_keyframe(
+    condensed_landmarks: IntArray, counts: IntArray, point_landmarks: IntArray, new_landmarks: IntArray, names: IntArray,
     held: IntArray, means: FloatArray, landmarks: FloatArray,
 ) -> None:  # fmt: skip
     """Put those landmarks where a filter holds them to be that have more new measurements than old ones.
 
     Args:
-        frozen_landmarks, counts: (s,) landmark of each frozen sighting, and the measurements in it.
+        condensed_landmarks, counts: (s,) landmark of each frozen sighting, and the measurements in it.
         point_landmarks: (n,) of each old raw measurement.
         new_landmarks: (m,) of each new one.
         names: (l,) int64. Of the landmarks.
@@ -98,8 +98,8 @@ def start_anew(
         landmarks: (l, 3) float64 [m], map frame; changed.
     """
     more = np.zeros(len(names), dtype=np.int64)
-    for n in range(len(frozen_landmarks)):
-        more[frozen_landmarks[n]] -= counts[n]
+    for n in range(len(condensed_landmarks)):
+        more[condensed_landmarks[n]] -= counts[n]
     for landmark in point_landmarks:
         more[landmark] -= 1
     for landmark in new_landmarks:
@@ -112,9 +112,9 @@ def start_anew(
 
 
 @jit
-def settle(
+def close_keyframe(
     aliases: IntArray, known: int, names: IntArray, points: FloatArray, frames: IntArray, poses: FloatArray,
-    frame_keys: IntArray, offsets: FloatArray, mount: FloatArray, anew: bool, frozen_landmarks: IntArray,
+    frame_keys: IntArray, offsets: FloatArray, mount: FloatArray, anew: bool, condensed_landmarks: IntArray,
     counts: IntArray, point_landmarks: IntArray, held: IntArray, means: FloatArray, ids: IntArray,
     landmarks: FloatArray,
 ) -> int:  # fmt: skip
@@ -125,8 +125,8 @@ def settle(
         known: How many landmarks there are before.
         names, points, frames: (n,), (n, 3), (n,) of the new measurements, as of `number` and `place`; names change.
         poses, frame_keys, offsets, mount: As of `place`.
-        anew: Whether landmarks `start_anew`.
-        frozen_landmarks, counts, point_landmarks, held, means: As of that.
+        anew: Whether landmarks `start_keyframe`.
+        condensed_landmarks, counts, point_landmarks, held, means: As of that.
         ids, landmarks: (l + n,), (l + n, 3) names and places; those of the new ones are written from row l on.
 
     Returns:
@@ -137,17 +137,17 @@ def settle(
     num = number(names, np.argsort(ids[:known]), ids, first)
     place(poses, frame_keys, offsets, frames, points, first[: num - known], mount, landmarks[known:num])
     if anew:
-        start_anew(frozen_landmarks, counts, point_landmarks, names, ids[:num], held, means, landmarks[:num])
+        start_keyframe(condensed_landmarks, counts, point_landmarks, names, ids[:num], held, means, landmarks[:num])
     return num
 
 
-@inlined
+@inline
 def _wrapped(angle: float) -> float:
     """Return an angle [rad] in [-pi, pi)."""
     return (angle + math.pi) % (2.0 * math.pi) - math.pi
 
 
-@inlined
+@inline
 def _chain(chain: FloatArray, noise: FloatArray, move: FloatArray, variances: FloatArray) -> None:
     """Append a motion, whose parts err independently, to a chain (3,) and its covariance (3, 3), to first order."""
     c, s = math.cos(chain[2]), math.sin(chain[2])
@@ -167,7 +167,7 @@ def _chain(chain: FloatArray, noise: FloatArray, move: FloatArray, variances: Fl
 
 @device
 @jit
-def walk(
+def add_keyframes(
     kinds: NDArray[np.int8],
     motions: FloatArray,
     variances: FloatArray,
@@ -203,9 +203,9 @@ def walk(
         lever: [m]. Where an error of the heading is felt.
         keys, frames: How many there are before.
         tips: (K,) int64. The newest key of each robot, changed.
-        robots, poses, previous, key_motions, key_noises, spreads, slack: (k, ...) columns of `PathGraph` with room for
+        robots, poses, previous, key_motions, key_noises, spreads, slack: (k, ...) columns of `SlamGraph` with room for
             the new keys. Written from row `keys` on; and the slack of the newest old key, where frames stand to it.
-        frame_keys, offsets: (f,), (f, 3) columns of `PathGraph`, likewise from row `frames` on.
+        frame_keys, offsets: (f,), (f, 3) columns of `SlamGraph`, likewise from row `frames` on.
 
     Returns:
         The number of keys and of frames.
@@ -244,7 +244,7 @@ def walk(
 
 @device
 @jit
-def choose(
+def select_measurements(
     ids: IntArray, points: FloatArray, given: BoolArray, covariances: FloatArray, starts: IntArray, num: int,
     frame: int, counts: IntArray, taken: FloatArray, noises: FloatArray, taken_given: BoolArray, frames: IntArray,
     names: IntArray,
@@ -281,7 +281,7 @@ def choose(
 
 
 @in_place
-def look_up(known: IntArray, poses: FloatArray, steps: IntArray, found: FloatArray) -> None:
+def find_initial_poses(known: IntArray, poses: FloatArray, steps: IntArray, found: FloatArray) -> None:
     """Write the pose of each step, NaN if it is not known.
 
     Args:
@@ -301,7 +301,7 @@ def look_up(known: IntArray, poses: FloatArray, steps: IntArray, found: FloatArr
 
 
 @jit
-def take_in(
+def add_log(
     steps: IntArray, kinds: NDArray[np.int8], motions: FloatArray, given: BoolArray, starts: IntArray,
     measured: FloatArray, ids: IntArray, covariances: FloatArray, variances: FloatArray, known: IntArray,
     known_poses: FloatArray, robot: int, rigid_within: float, lever: float, keys: int, frames: int, num: int,
@@ -314,7 +314,7 @@ def take_in(
     Args:
         steps, kinds, motions, given, starts, measured, ids, covariances: Of the log, as of `walk` and `choose`.
         variances: As of `walk`.
-        known, known_poses: Poses after some steps, as of `look_up`.
+        known, known_poses: Poses after some steps, as of `find_initial_poses`.
         robot, rigid_within, lever, keys, frames, tips: As of `walk`.
         num: How many measurements there are before.
         robots, poses, previous, key_motions, key_noises, spreads, slack, frame_keys, offsets: As of `walk`, written.
@@ -326,11 +326,11 @@ def take_in(
     """
     count = len(steps)
     supposed, counts = np.empty((count, 3)), np.empty(count, dtype=np.int64)
-    look_up(known, known_poses, steps, supposed)
-    num = choose(
+    find_initial_poses(known, known_poses, steps, supposed)
+    num = select_measurements(
         ids, measured, given, covariances, starts, num, frames, counts, points, noises, taken_given, point_frames, names
     )
-    keys, frames = walk(
+    keys, frames = add_keyframes(
         kinds, motions, variances, counts, supposed, robot, rigid_within, lever, keys, frames, tips, robots, poses,
         previous, key_motions, key_noises, spreads, slack, frame_keys, offsets,
     )  # fmt: skip

@@ -4,11 +4,11 @@ import math
 
 import numpy as np
 
-from slam_backend.core.jit import fused, lanes_inlined
+from slam_backend.core.jit import jit_fma, simd_inline
 from slam_backend.core.validation import FloatArray, IntArray
 
 
-@lanes_inlined
+@simd_inline
 def _times(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
     """Add the product of two blocks."""
     for i in range(0, 9, 3):
@@ -16,7 +16,7 @@ def _times(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
             out[i + j] += a[i] * b[j] + a[i + 1] * b[3 + j] + a[i + 2] * b[6 + j]
 
 
-@lanes_inlined
+@simd_inline
 def _times_turned(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
     """Add the product of a block's transpose and a block."""
     for i in range(3):
@@ -24,7 +24,7 @@ def _times_turned(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
             out[3 * i + j] += a[i] * b[j] + a[3 + i] * b[3 + j] + a[6 + i] * b[6 + j]
 
 
-@fused
+@jit_fma
 def scatter_of_links(
     poses: FloatArray, columns: IntArray, previous: IntArray, lever: float, pivots: FloatArray, values: FloatArray,
     order: IntArray, ranks: IntArray, tops: IntArray, rows: IntArray, row_tops: IntArray, link_places: IntArray,

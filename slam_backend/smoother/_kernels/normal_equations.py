@@ -9,9 +9,9 @@ import math
 
 import numpy as np
 
-from slam_backend.core.jit import device, in_place, jit, room
+from slam_backend.core.jit import device, in_place, jit, stack_array
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
-from slam_backend.smoother._kernels.factors import FREE, _inverse, _spun
+from slam_backend.smoother._kernels.factors import FREE, _inverse, _rotate_in_plane
 from slam_backend.smoother._kernels.sparse_cholesky import solve
 
 
@@ -32,7 +32,7 @@ def _sorted_by(codes: IntArray, order: IntArray, num_codes: int) -> IntArray:
 
 @jit
 def gather(
-    frozen_keys: IntArray, frozen_landmarks: IntArray, frozen_centres: FloatArray, frozen_infos: FloatArray,
+    condensed_keys: IntArray, condensed_landmarks: IntArray, frozen_centres: FloatArray, frozen_infos: FloatArray,
     frozen_slopes: FloatArray, frozen_counts: IntArray, point_frames: IntArray, point_landmarks: IntArray,
     frame_keys: IntArray, num_keys: int, keys: IntArray, landmarks: IntArray, starts: IntArray, frozen: BoolArray,
     centres: FloatArray, infos: FloatArray, slopes: FloatArray, counts: IntArray, of_points: IntArray,
@@ -40,7 +40,7 @@ def gather(
     """Write the sightings of a graph by landmark and key, frozen ones before the others of a pair.
 
     Args:
-        frozen_keys, frozen_landmarks, frozen_centres, frozen_infos, frozen_slopes, frozen_counts: Of f frozen ones.
+        condensed_keys, condensed_landmarks, frozen_centres, frozen_infos, frozen_slopes, frozen_counts: Of f frozen ones.
         point_frames, point_landmarks: (n,) of the raw measurements.
         frame_keys: (F,) key of each frame.
         num_keys: k.
@@ -52,9 +52,9 @@ def gather(
     Returns:
         How many rows there are.
     """
-    num_frozen, num_points = len(frozen_keys), len(point_frames)
+    num_frozen, num_points = len(condensed_keys), len(point_frames)
     of_key, of_landmark = np.empty(num_frozen + num_points, np.int64), np.empty(num_frozen + num_points, np.int64)
-    of_key[:num_frozen], of_landmark[:num_frozen] = frozen_keys, frozen_landmarks
+    of_key[:num_frozen], of_landmark[:num_frozen] = condensed_keys, condensed_landmarks
     for n in range(num_points):
         of_key[num_frozen + n], of_landmark[num_frozen + n] = frame_keys[point_frames[n]], point_landmarks[n]
     order = _sorted_by(of_key, np.arange(num_frozen + num_points), num_keys)
@@ -147,8 +147,8 @@ def form(
     cost = 0.0
     for b in range(len(poses)):
         turns[b, 0], turns[b, 1] = math.cos(poses[b, 2]), math.sin(poses[b, 2])
-    f, g, h = room(9).reshape(3, 3), room(9).reshape(3, 3), room(9).reshape(3, 3)
-    r = room(3)
+    f, g, h = stack_array(9).reshape(3, 3), stack_array(9).reshape(3, 3), stack_array(9).reshape(3, 3)
+    r = stack_array(3)
     for b in range(len(poses)):  # odometry
         a = previous[b]
         if a < 0:
@@ -187,7 +187,7 @@ def form(
             for j in range(3):
                 cost += 0.5 * r[i] * w[i, j] * r[j]
     first_landmark = len(blocks) - len(landmarks)
-    turned, p = room(6), room(6)
+    turned, p = stack_array(6), stack_array(6)
     eased = 0.0
     for landmark in range(len(landmarks)):
         first, last = starts[landmark], starts[landmark + 1]
@@ -210,7 +210,7 @@ def form(
             force[0] += m0
             force[1] += m1
             force[2] += e2
-            _spun(c, s, n, turned)
+            _rotate_in_plane(c, s, n, turned)
             for i in range(6):
                 block[i] += turned[i]
             if columns[key] < 0:

@@ -4,14 +4,14 @@ import math
 
 import numpy as np
 
-from slam_backend.core.jit import fused, in_place, lanes, room
+from slam_backend.core.jit import in_place, jit_fma, simd, stack_array
 from slam_backend.core.simd_math import log_of, sine_cosine
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.smoother._kernels.factors import _inverse
 from slam_backend.smoother._kernels.normal_equations import WEAK
 
 
-@fused
+@jit_fma
 def weigh_deviations(covariance: FloatArray, off: FloatArray, log_densities: FloatArray) -> bool:
     """Write the logarithms of a Gaussian's density, up to a constant: 0 at its mean.
 
@@ -64,7 +64,7 @@ def normalise(log_weights: FloatArray, weights: FloatArray) -> float:
     return 1.0 / squares
 
 
-@fused
+@jit_fma
 def draw(
     draws: FloatArray, poses: FloatArray, columns: IntArray, keys: IntArray, starts: IntArray, blocks: FloatArray,
     cross: FloatArray, pivots: FloatArray, values: FloatArray, order: IntArray, ranks: IntArray, tops: IntArray,
@@ -159,7 +159,7 @@ A00, A01, A02, A11, A12, B0, B1, B2, ENERGY = (LANES * k for k in range(9))
 WORK_SIZE = 9 * LANES
 
 
-@lanes
+@simd
 def to_lanes(poses: FloatArray, rows: FloatArray) -> None:
     """Write paths in blocks of lanes; surplus lanes are copies of the first path.
 
@@ -183,7 +183,7 @@ def to_lanes(poses: FloatArray, rows: FloatArray) -> None:
                 row[SIN + i], row[COS + i] = sine_cosine(row[HEADING + i])
 
 
-@lanes
+@simd
 def replay(
     poses: FloatArray, num_keys: int, num_blocks: int, landmarks: FloatArray, keys: IntArray, starts: IntArray,
     centres: FloatArray, infos: FloatArray, slopes: FloatArray, tiles: FloatArray, log_likelihood: FloatArray,
@@ -200,7 +200,7 @@ def replay(
         log_likelihood: (num_blocks * LANES,), result.
     """
     log_likelihood[:] = 0.0
-    work = room(WORK_SIZE)
+    work = stack_array(WORK_SIZE)
     for block in range(num_blocks):  # one after the other, for the poses of one are as many as a cache holds
         out = log_likelihood[block * LANES : (block + 1) * LANES]
         for landmark in range(len(landmarks)):
@@ -265,8 +265,8 @@ def replay(
                 out[i] += work[ENERGY + i] - 0.5 * log_det  # (6)
 
 
-@lanes
-def odometry_of_paths(
+@simd
+def odometry_log_density(
     poses: FloatArray, num_keys: int, num_blocks: int, num_paths: int, previous: IntArray, mode: FloatArray,
     motions: FloatArray, infos: FloatArray, lever: float, log_density: FloatArray, spreads: FloatArray,
 ) -> None:  # fmt: skip
@@ -282,7 +282,7 @@ def odometry_of_paths(
         spreads: (k,), result [m^2]: mean square of what the motion from the previous key differs from that of the mode.
     """
     log_density[:] = 0.0
-    squares = room(LANES)
+    squares = stack_array(LANES)
     for b in range(num_keys):
         a = previous[b]
         spreads[b] = 0.0

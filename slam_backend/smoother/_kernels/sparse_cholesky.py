@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.core.jit import device, fused, in_place, inlined, jit, lanes, lanes_inlined
+from slam_backend.core.jit import device, in_place, inline, jit, jit_fma, simd, simd_inline
 from slam_backend.core.validation import FloatArray, IntArray
 
 Bits = NDArray[np.uint64]
@@ -19,7 +19,7 @@ ONE = np.uint64(1)
 WORD = 64
 
 
-@inlined
+@inline
 def _num_bits(word: Any) -> int:
     """Return how many bits are set in 64 (the compiler makes one instruction of it)."""
     word = word - ((word >> np.uint64(1)) & np.uint64(0x5555555555555555))
@@ -28,7 +28,7 @@ def _num_bits(word: Any) -> int:
     return int((word * np.uint64(0x0101010101010101)) >> np.uint64(56))
 
 
-@inlined
+@inline
 def _connect(near: Bits, a: int, b: int) -> None:
     """Note that nodes a and b share a block."""
     near[a, b >> 6] |= ONE << np.uint64(b & 63)
@@ -110,7 +110,7 @@ def neighbours(columns: IntArray, previous: IntArray, keys: IntArray, starts: In
                 _connect(near, columns[keys[q]] // 3, first_landmark + landmark)
 
 
-@inlined
+@inline
 def _place(tops: IntArray, rows: IntArray, a: int, b: int) -> int:
     """Return 1 + where the block of ranks (a, b) is, negative if it is kept as that of (b, a)."""
     low, high = (b, a) if a > b else (a, b)
@@ -194,7 +194,7 @@ def lay_out(
     return drawn, squares
 
 
-@lanes_inlined
+@simd_inline
 def _added(values: FloatArray, place: int, block: FloatArray) -> None:
     """Add a block (3, 3) where `lay_out` says."""
     if place == 0:
@@ -208,7 +208,7 @@ def _added(values: FloatArray, place: int, block: FloatArray) -> None:
                 out[3 * j + i] += block[i, j]
 
 
-@lanes
+@simd
 def factorise(
     blocks: FloatArray, links: FloatArray, cross: FloatArray, damping: float, num_poses: int, order: IntArray,
     tops: IntArray, rows: IntArray, link_places: IntArray, cross_places: IntArray, row_tops: IntArray,
@@ -282,7 +282,7 @@ def factorise(
 
 
 @device
-@fused
+@jit_fma
 def solve(
     pivots: FloatArray, values: FloatArray, order: IntArray, tops: IntArray, rows: IntArray, vector: FloatArray
 ) -> FloatArray:
@@ -302,7 +302,7 @@ def solve(
     return result
 
 
-@fused
+@jit_fma
 def covariance(
     pivots: FloatArray, values: FloatArray, ranks: IntArray, tops: IntArray, rows: IntArray, nodes: IntArray
 ) -> FloatArray:
@@ -341,7 +341,7 @@ def covariance(
 
 
 @device
-@fused
+@jit_fma
 def _sweep(
     pivots: FloatArray, values: FloatArray, tops: IntArray, rows: IntArray, columns: IntArray, x: FloatArray
 ) -> None:

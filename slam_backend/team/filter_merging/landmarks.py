@@ -5,8 +5,8 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.core.packed_symmetric import UNPACK
-from slam_backend.core.validation import FloatArray, IntArray, bad_argument
+from slam_backend.core.packed_symmetric import UNPACK_INDEX
+from slam_backend.core.validation import FloatArray, IntArray, argument_error
 from slam_backend.fastslam._kernels import LANES
 from slam_backend.fastslam.existence import ExistenceModel
 from slam_backend.fastslam.particle_maps import ParticleMaps
@@ -70,7 +70,7 @@ class Landmarks(NamedTuple):
         return np.asarray(self.maps.odds[self.slots[:, None], particles])
 
 
-def agreed(a: ParticleMaps, b: ParticleMaps, pairs: IntArray) -> tuple[IntArray, IntArray]:
+def merge_by_identity(a: ParticleMaps, b: ParticleMaps, pairs: IntArray) -> tuple[IntArray, IntArray]:
     """Let the caller's names decide which landmarks of two filters are the same, where there are names on both sides.
 
     Args:
@@ -100,7 +100,7 @@ def _used(*both: ParticleMaps) -> list[tuple[ParticleMaps, IntArray]]:
     return [(maps, maps.used_slots()) for maps in both]
 
 
-def hold_once(counts: IntArray, names: IntArray) -> None:
+def drop_repeated_identities(counts: IntArray, names: IntArray) -> None:
     """Let no particle hold two landmarks of one name: of those that it holds the first stays.
 
     Args:
@@ -147,10 +147,10 @@ def write_joint(
     sides = a.maps.values, a.where, a.counts, b.maps.values, b.where, b.counts
     if not join(*sides, rows_a, rows_b, motion, extra, scales, LANES, blocks):
         cure = "Give each landmark some uncertainty in every direction."
-        raise bad_argument("landmarks in common", "positive definite covariances", "singular ones", cure)
+        raise argument_error("landmarks in common", "positive definite covariances", "singular ones", cure)
 
 
-def contradictions(a: Landmarks, b: Landmarks, motion: FloatArray, extra: float) -> FloatArray:
+def birge_ratios(a: Landmarks, b: Landmarks, motion: FloatArray, extra: float) -> FloatArray:
     """Return by how much the covariances of landmarks that two filters share understate their differences (n,) [-].
 
     It is the Birge ratio of each: the median over the particles that hold it on both sides of chi^2 / 3, at least 1.
@@ -170,7 +170,7 @@ def contradictions(a: Landmarks, b: Landmarks, motion: FloatArray, extra: float)
         turn[:, :2, :2] = turns[both]
         moved = (turn @ two[:, :3, None])[..., 0]
         moved[:, :2] += motion[both, :2]
-        covariance = one[:, 3:][:, UNPACK] + turn @ two[:, 3:][:, UNPACK] @ turn.transpose(0, 2, 1)
+        covariance = one[:, 3:][:, UNPACK_INDEX] + turn @ two[:, 3:][:, UNPACK_INDEX] @ turn.transpose(0, 2, 1)
         apart = (one[:, :3] - moved)[..., None]
         chi2 = (apart * np.linalg.solve(covariance + 2.0 * extra * np.eye(3), apart)).sum(axis=(1, 2))
         ratios[row] = max(1.0, float(np.median(chi2)) / 3.0)

@@ -31,15 +31,15 @@ from slam_backend.maps.alignment import Alignment
 from slam_backend.maps.fusion import fuse_descriptors
 from slam_backend.team.filter_merging.landmarks import (
     Landmarks,
-    agreed,
-    contradictions,
+    birge_ratios,
+    drop_repeated_identities,
     fuse_odds,
-    hold_once,
     joint_counts,
+    merge_by_identity,
     stack_descriptors,
     write_joint,
 )
-from slam_backend.team.filter_merging.pairing import Pairing, pair_up
+from slam_backend.team.filter_merging.pairing import Pairing, pair_particles
 
 
 def inverse_alignment(alignment: Alignment) -> Alignment:
@@ -83,9 +83,9 @@ def merge_filters(
         landmarks.
     """
     if pairing is None:
-        pairing = paired(a, b, alignment, pairs, rng, num_particles, known)
+        pairing = pair_filters(a, b, alignment, pairs, rng, num_particles, known)
     from_a, from_b, motion, evidence, extra, scale = pairing
-    fitting, told = agreed(a.state.maps, b.state.maps, pairs)
+    fitting, told = merge_by_identity(a.state.maps, b.state.maps, pairs)
     pairs = np.concatenate([fitting, told])
     joint = FilterState.joined(a.state, from_a, b.state, from_b, motion, evidence, rng)
 
@@ -108,11 +108,11 @@ def merge_filters(
     rows_a, rows_b = np.arange(len(ids_a) + len(own)), np.full(len(ids_a) + len(own), -1)
     rows_a[len(ids_a) :], rows_b[len(ids_a) :], rows_b[shared_a] = -1, own, shared_b
     counts, names = joint_counts(of_a, of_b, rows_a, rows_b), np.concatenate([identities, of_b.identities[own]])
-    hold_once(counts, names)
+    drop_repeated_identities(counts, names)
     next_id = a.state.maps.next_id
     new_ids = next_id + np.arange(len(own))
     held = np.flatnonzero((counts > 0).any(axis=1))
-    joint.maps.load_names(
+    joint.maps.load_metadata(
         counts[held],
         stack_descriptors(descriptors, looks_b[own])[held],
         np.concatenate([ids_a, new_ids])[held],
@@ -124,14 +124,14 @@ def merge_filters(
     scales = np.full(len(counts), scale)
     if len(told):
         sides = Landmarks.of(a.state.maps, from_a, told[:, 0]), Landmarks.of(b.state.maps, from_b, told[:, 1])
-        scales[np.searchsorted(ids_a, told[:, 0])] = np.maximum(scale, contradictions(*sides, motion, 0.5 * extra))
+        scales[np.searchsorted(ids_a, told[:, 0])] = np.maximum(scale, birge_ratios(*sides, motion, 0.5 * extra))
     write_joint(of_a, of_b, rows_a[held], rows_b[held], motion, 0.5 * extra, scales[held], joint.maps.blocks)
     renamed = np.concatenate([pairs[:, ::-1], np.column_stack([ids_b[own], new_ids])]).astype(np.int64)
     joint.finish_join(a.state, b.state, renamed)
     return FastSlam.from_filter_state(joint), renamed
 
 
-def paired(
+def pair_filters(
     a: FastSlam, b: FastSlam, alignment: Alignment, pairs: IntArray, rng: np.random.Generator,
     num_particles: int | None = None, known: bool = False,
 ) -> Pairing:  # fmt: skip
@@ -141,12 +141,12 @@ def paired(
         a, b, alignment, pairs, rng, num_particles, known: As of `merge_filters`, which draws it first of all.
     """
     count = max(a.num_particles, b.num_particles) if num_particles is None else num_particles
-    pairs, _ = agreed(a.state.maps, b.state.maps, pairs)
+    pairs, _ = merge_by_identity(a.state.maps, b.state.maps, pairs)
     common_a, common_b = Landmarks.of(a.state.maps, ids=pairs[:, 0]), Landmarks.of(b.state.maps, ids=pairs[:, 1])
-    return pair_up(a.weights, common_a, b.weights, common_b, alignment, count, rng, known)
+    return pair_particles(a.weights, common_a, b.weights, common_b, alignment, count, rng, known)
 
 
-def motion_covariance(motion: FloatArray, alignment: Alignment) -> FloatArray:
+def transform_covariance(motion: FloatArray, alignment: Alignment) -> FloatArray:
     """Return how the motions between two maps differ among the particles that `merge_filters` makes.
 
     Where paths are uncertain this is more than the alignment of the two maps claims: landmarks of one map err together.

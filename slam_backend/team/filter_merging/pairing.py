@@ -12,13 +12,15 @@ import numpy as np
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.maps.alignment import Alignment
 from slam_backend.resampling import systematic
-from slam_backend.team.filter_merging._kernels.pairing import MIN_PAIRS, fit, unexplained
+from slam_backend.team.filter_merging._kernels.pairing import MIN_PAIRS, fit, reduced_chi2
 from slam_backend.team.filter_merging.landmarks import Landmarks
 
 CANDIDATES = 4  # pairs of particles weighed for each that is kept
 ITERATIONS = 3  # of Gauss and Newton for each pair
 ROUNDS = 8  # of looking for what two maps' covariances do not explain
-MOST_EXTRA = 0.05**2  # [m^2] two robots may place what they take for one corner so far apart; more is a contradiction
+MAX_BETWEEN_MAP_VARIANCE = (
+    0.05**2
+)  # [m^2] two robots may place what they take for one corner so far apart; more is a contradiction
 
 
 class Pairing(NamedTuple):
@@ -31,11 +33,11 @@ class Pairing(NamedTuple):
     from_b: IntArray
     motion: FloatArray
     evidence: FloatArray
-    extra: float
+    between_map_variance: float
     scale: float
 
 
-def pair_up(
+def pair_particles(
     weights_a: FloatArray, common_a: Landmarks, weights_b: FloatArray, common_b: Landmarks, alignment: Alignment,
     count: int, rng: np.random.Generator, known: bool = False,
 ) -> Pairing:  # fmt: skip
@@ -54,11 +56,11 @@ def pair_up(
     from_b = rng.permutation(systematic(weights_b, rng, CANDIDATES * count))
     common = common_a.values, common_a.counts > 0, common_b.values, common_b.counts > 0
     some_a, some_b = from_a[::CANDIDATES].copy(), from_b[::CANDIDATES].copy()
-    extra = _extra(*unexplained(*common, some_a, some_b, alignment.transform, ROUNDS))
+    extra = _between_map_variance(*reduced_chi2(*common, some_a, some_b, alignment.transform, ROUNDS))
     motions, informations, chi2, log_dets, shared = fit(
         *common, from_a, from_b, alignment.transform, extra, ITERATIONS
     )  # fmt: skip
-    scale = _contradiction(chi2, shared) if extra == MOST_EXTRA else 1.0
+    scale = _birge_ratio(chi2, shared) if extra == MAX_BETWEEN_MAP_VARIANCE else 1.0
     evidence, covariances = _weigh(motions, informations, chi2, log_dets, shared, scale, alignment, known)
     weights = np.exp(evidence - evidence.max())
     chosen = systematic(weights / weights.sum(), rng, count)
@@ -67,13 +69,13 @@ def pair_up(
     return Pairing(from_a[chosen], from_b[chosen], motion, evidence[chosen], extra, scale)
 
 
-def _extra(extra: FloatArray, shared: IntArray) -> float:
-    """Return tau^2 [m^2], the median over pairs of particles (c,): at most `MOST_EXTRA`, 0 where maps agree."""
+def _between_map_variance(extra: FloatArray, shared: IntArray) -> float:
+    """Return tau^2 [m^2], the median over pairs of particles (c,): at most `MAX_BETWEEN_MAP_VARIANCE`, 0 where maps agree."""
     enough = shared >= MIN_PAIRS
-    return min(float(np.median(extra[enough])), MOST_EXTRA) if enough.any() else 0.0
+    return min(float(np.median(extra[enough])), MAX_BETWEEN_MAP_VARIANCE) if enough.any() else 0.0
 
 
-def _contradiction(chi2: FloatArray, shared: IntArray) -> float:
+def _birge_ratio(chi2: FloatArray, shared: IntArray) -> float:
     """Return phi >= 1, by how much the widened covariances still understate the differences between maps."""
     enough = shared >= MIN_PAIRS
     if not enough.any():

@@ -26,10 +26,10 @@ from slam_backend.warm_up import warm_up
 
 def test_this_version_of_numba_can_leave_references_uncounted() -> None:
     """The option is numba's own: where it has gone, all works as before, but slower."""
-    assert _jit.CAN_LEAVE_UNCOUNTED
+    assert _jit.HAS_NRT_OPTION
 
 
-@pytest.mark.parametrize("compiled", [_jit.in_place, _jit.inlined, _jit.lanes, _jit.lanes_inlined, _jit.any_order])
+@pytest.mark.parametrize("compiled", [_jit.in_place, _jit.inline, _jit.simd, _jit.simd_inline, _jit.simd_sum])
 def test_kernels_that_work_in_place_can_make_no_array(compiled: Callable[[Any], Any]) -> None:
     """Its counter would be missing: numba refuses to compile them."""
 
@@ -65,7 +65,7 @@ def test_kernels_that_count_may_call_those_that_do_not_and_the_other_way_round()
 
 def test_references_are_counted_everywhere_where_numba_does_not_know_better(monkeypatch: pytest.MonkeyPatch) -> None:
     """Kernels then work as before, and may do more."""
-    monkeypatch.setattr(_jit, "CAN_LEAVE_UNCOUNTED", False)
+    monkeypatch.setattr(_jit, "HAS_NRT_OPTION", False)
 
     def makes_one(x: float) -> float:
         return float(np.full(3, x).sum())
@@ -77,7 +77,7 @@ def test_rooms_of_a_kernel_are_apart_and_stay_through_its_loops() -> None:
     """A loop does not take more room in each turn, and what it wrote last time is still there."""
 
     def fill(out: Any) -> None:
-        one, other = _jit.room(5), _jit.room(3)
+        one, other = _jit.stack_array(5), _jit.stack_array(3)
         for turn in range(4):
             if turn == 0:
                 one[:] = 0.0
@@ -97,7 +97,7 @@ def test_rooms_hold_numbers_of_any_type(dtype: Any) -> None:
     """They are laid out one behind the other, and wrap around as numbers of that type do."""
 
     def fill(out: Any) -> None:
-        row = _jit.room_of(7, dtype)
+        row = _jit.stack_array_of(7, dtype)
         for i in range(len(row)):
             row[i] = out[i]
         for i in range(len(row)):
@@ -113,7 +113,7 @@ def test_the_size_of_a_room_is_a_constant() -> None:
     """The stack has no room of a size that compilation does not know."""
 
     def fill(size: int) -> float:
-        return float(_jit.room(size)[0])
+        return float(_jit.stack_array(size)[0])
 
     with pytest.raises(NumbaError):
         _jit.in_place(fill)(3)
@@ -137,7 +137,7 @@ def _called_first_by_a_lane_kernel(strict: Any) -> bool:
     def lane(x: float) -> float:
         return strict(x, 2.0) * x
 
-    return bool(_jit.lanes(lane)(3.0) == 4.5)
+    return bool(_jit.simd(lane)(3.0) == 4.5)
 
 
 def test_a_device_kernel_refuses_a_call_from_python_and_serves_other_kernels() -> None:
@@ -174,7 +174,7 @@ def test_options_are_part_of_what_an_entry_of_the_cache_is_checked_for() -> None
     def double(x: float) -> float:
         return 2.0 * x
 
-    stamps = [kind(double)._cache._cache_file._source_stamp for kind in (_jit.jit, _jit.fused, _jit.in_place)]
+    stamps = [kind(double)._cache._cache_file._source_stamp for kind in (_jit.jit, _jit.jit_fma, _jit.in_place)]
     stamps.append(_jit.device(_jit.jit(double))._cache._cache_file._source_stamp)
     assert all(stamps.count(stamp) == 1 for stamp in stamps)
     assert stamps[0] == _jit.jit(double)._cache._cache_file._source_stamp
@@ -341,7 +341,7 @@ for size in (1, 3, 9, 30, 30, 30):
 team.step(np.zeros((2, 3)), TeamMeasurements(np.tile(points, (2, 1)), np.tile(looks, (2, 1)), np.array([30, 60])))
 assert len(team.groups) == 1
 team.standpoints(), team.outlines()
-slices = SmoothingOptions(slice_steps=20, rigid_within=0.01, max_keys=12, further_keys=4, fresh_keys=6)
+slices = SmoothingOptions(slice_steps=20, rigid_within=0.01, max_keys=12, further_keys=4, recent_keys=6)
 for smoothing in (slices, SmoothingOptions()):
     simulation = SimulatedTeam(2, seed=100)
     smoothed = simulation.build(
@@ -402,7 +402,7 @@ def test_kernels_work_where_no_cache_can_be_written(monkeypatch: pytest.MonkeyPa
     def double(x: float) -> float:
         return 2.0 * x
 
-    for kind in (_jit.jit, _jit.inlined, _jit.lanes, _jit.lanes_inlined):
+    for kind in (_jit.jit, _jit.inline, _jit.simd, _jit.simd_inline):
         assert python_entry(kind(double))(4.0) == 8.0
 
 

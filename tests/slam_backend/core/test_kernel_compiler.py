@@ -11,12 +11,12 @@ from numba import types
 from slam_backend.core.kernel_compiler import (
     Task,
     compile_kernels,
-    decoded,
-    encoded,
+    decode_signature,
+    divide_tasks,
+    encode_signature,
     find_kernel,
     missing_tasks,
     recorded_signatures,
-    shared_out,
 )
 
 ROOT = Path(__file__).parents[3]
@@ -51,7 +51,7 @@ def program(folder: Path, **variables: str) -> str:
 )
 def test_signatures_survive_their_notation(signature: tuple[types.Type, ...]) -> None:
     """Decoding what was encoded gives the same types."""
-    assert decoded(encoded(signature)) == signature
+    assert decode_signature(encode_signature(signature)) == signature
 
 
 @pytest.mark.parametrize("package", ["slam_backend", "vslam_env"])
@@ -59,14 +59,14 @@ def test_recorded_kernels_exist(package: str) -> None:
     """Each recorded name is a kernel, and each signature can be read."""
     for name, signatures in recorded_signatures(package).items():
         assert find_kernel(name) is not None
-        assert [encoded(decoded(words)) for words in signatures] == signatures
+        assert [encode_signature(decode_signature(words)) for words in signatures] == signatures
 
 
 @pytest.mark.parametrize("workers", [1, 2, 3, 8])
 def test_each_kernel_is_given_to_one_worker(workers: int) -> None:
     """All tasks are shared out once, and the workers' loads differ by no more than one task."""
     tasks = [Task(f"k{i}", "int64", {f"k{i}": 10 + i, "common": 5}, "") for i in range(20)]
-    shares = shared_out(tasks, workers)
+    shares = divide_tasks(tasks, workers)
     assert sorted(task.name for share in shares for task in share) == sorted(task.name for task in tasks)
     loads = [5 + sum(10 + int(task.name[1:]) for task in share) for share in shares]
     assert len(shares) == workers

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from slam_backend.core.state_codec import SEEDS, ForeignObjectError, Kinds, decoded, encoded, read_file
+from slam_backend.core.state_codec import SEEDS, ForeignObjectError, StateTypes, decode, encode, read_file
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.state_kinds import BACKEND_KINDS
 from slam_backend.team.team import TeamSlam
@@ -32,7 +32,7 @@ class Point:
     y: Any
 
 
-KINDS = Kinds((Colour, Point)).with_others(SEEDS)
+KINDS = StateTypes((Colour, Point)).with_others(SEEDS)
 FLOATS = [np.float64(2.5), float("nan"), -float("inf"), -0.0, 5e-324, struct.unpack("<d", b"\1\0\0\0\0\0\xf0\x7f")[0]]
 ARRAYS = [
     np.arange(6.0).reshape(2, 3),
@@ -86,25 +86,25 @@ def plain_values() -> st.SearchStrategy[Any]:
 @given(plain_values())
 def test_trees_come_back_bit_for_bit(tree: Any) -> None:
     """Whatever a tree is made of comes back with its types, its order and all bits of its numbers."""
-    same(decoded(encoded(tree, KINDS), KINDS), tree)
+    same(decode(encode(tree, KINDS), KINDS), tree)
 
 
 def test_what_is_shared_stays_shared() -> None:
     """A part that stands in two places is one part afterwards; a tree that doubles at each level stays small."""
     shared = np.arange(3.0)
-    first, second = decoded(encoded([shared, Point(shared, None)], KINDS), KINDS)
+    first, second = decode(encode([shared, Point(shared, None)], KINDS), KINDS)
     assert second.x is first
     tree: Any = [1]
     for _ in range(60):
         tree = (tree, tree)
-    assert len(encoded(tree, KINDS)) < 5000
+    assert len(encode(tree, KINDS)) < 5000
 
 
 def test_arrays_keep_their_layout_and_whether_they_can_be_written() -> None:
     """Kernels are compiled for either, and numpy gives other bytes for sums in another order."""
     fixed = np.arange(4.0)
     fixed.setflags(write=False)
-    columns, back = decoded(encoded([np.asfortranarray(np.ones((2, 3))), fixed], KINDS), KINDS)
+    columns, back = decode(encode([np.asfortranarray(np.ones((2, 3))), fixed], KINDS), KINDS)
     assert columns.flags.f_contiguous
     assert columns.flags.writeable
     assert not back.flags.writeable
@@ -114,7 +114,7 @@ def test_seed_sequences_go_on() -> None:
     """A seed sequence spawns the same children afterwards, those that it has spawned before included."""
     sequence = np.random.SeedSequence(10**50, spawn_key=(1, 2))
     sequence.spawn(3)
-    other = decoded(encoded(sequence, KINDS), KINDS)
+    other = decode(encode(sequence, KINDS), KINDS)
     assert other.spawn(1)[0].generate_state(4).tolist() == sequence.spawn(1)[0].generate_state(4).tolist()
 
 
@@ -135,7 +135,7 @@ class Stranger:
 def test_what_is_no_data_is_not_written(tree: Any, says: str) -> None:
     """An object of another class is refused when it is written, with its place."""
     with pytest.raises(ForeignObjectError, match=says):
-        encoded(tree, KINDS)
+        encode(tree, KINDS)
 
 
 def test_a_part_that_holds_itself_is_not_written() -> None:
@@ -143,7 +143,7 @@ def test_a_part_that_holds_itself_is_not_written() -> None:
     loop: list[Any] = []
     loop.append(loop)
     with pytest.raises(ForeignObjectError, match="a part that holds itself"):
-        encoded(loop, KINDS)
+        encode(loop, KINDS)
 
 
 def body(rows: Any, root: Any = None, blobs: bytes = b"") -> bytes:
@@ -189,33 +189,33 @@ def test_forged_bytes_are_refused(forged: bytes) -> None:
     """Whatever somebody made up is a ValueError, without code that runs and without much memory."""
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     with pytest.raises(ValueError, match=r"."):
-        decoded(forged, KINDS)
+        decode(forged, KINDS)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 300_000  # kB
 
 
 def test_flipped_bytes_are_refused_or_read() -> None:
     """Of the bytes of a filter's state each flip is a ValueError, or a tree that the filter refuses or goes on from."""
-    content = encoded(FastSlam(1, num_particles=4).get_state(), BACKEND_KINDS)
+    content = encode(FastSlam(1, num_particles=4).get_state(), BACKEND_KINDS)
     rng = np.random.default_rng(0)
     for _ in range(300):
         changed = bytearray(content)
         changed[int(rng.integers(len(content)))] ^= 1 << int(rng.integers(8))
         try:
-            FastSlam(1, num_particles=4).set_state(decoded(bytes(changed), BACKEND_KINDS))
+            FastSlam(1, num_particles=4).set_state(decode(bytes(changed), BACKEND_KINDS))
         except ValueError:
             continue
     for cut in range(0, len(content), 97):
         with pytest.raises(ValueError, match=r"."):
-            decoded(content[:cut], BACKEND_KINDS)
+            decode(content[:cut], BACKEND_KINDS)
 
 
 def test_states_of_teams_go_on_from_bytes() -> None:
     """A team that is set to what bytes hold gives the same state again."""
     team = TeamSlam(2, num_particles=4)
-    content = encoded(team.get_state(), BACKEND_KINDS)
+    content = encode(team.get_state(), BACKEND_KINDS)
     other = TeamSlam(2, num_particles=4, seed=7)
-    other.set_state(decoded(content, BACKEND_KINDS))
-    assert encoded(other.get_state(), BACKEND_KINDS) == content
+    other.set_state(decode(content, BACKEND_KINDS))
+    assert encode(other.get_state(), BACKEND_KINDS) == content
 
 
 def test_only_bounded_regular_files_are_read(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import pytest
 from builders.teams import MOTION, NEVER, SimulatedTeam, links, merged_team
 
 from slam_backend.core.validation import FloatArray
-from slam_backend.fastslam.consistency import FALSE_ALARMS, LOW_ESS, NIS_BOUNDS, USUAL, ConsistencyTest
+from slam_backend.fastslam.consistency import FALSE_ALARM_RATE, LOW_ESS, NIS_BOUNDS, USUAL, ConsistencyTest
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.models.odometry import OdometryModel
 
@@ -18,7 +18,7 @@ def tell(answers: Any, share: FloatArray) -> bool:
     test = ConsistencyTest()
     for step, (near, far, low, rejected) in enumerate(answers.random(share.shape) < share):
         nis = NIS_BOUNDS[1] + 1.0 if far else NIS_BOUNDS[0] + 1.0 if near else 1.0
-        test.note(step, nis, 0.5 * LOW_ESS if low else 1.0, 4, 3 if rejected else 1)
+        test.update(step, nis, 0.5 * LOW_ESS if low else 1.0, 4, 3 if rejected else 1)
     return bool(test.report().warnings)
 
 
@@ -32,7 +32,7 @@ def test_honest_filters_are_warned_of_no_more_often_than_stated() -> None:
     share[:, 0] -= USUAL[1]  # beyond the farther bound is beyond the nearer one, too
     alarms = sum(tell(rng, share) for _ in range(400))
     assert alarms <= 10
-    assert pytest.approx(0.01) == FALSE_ALARMS
+    assert pytest.approx(0.01) == FALSE_ALARM_RATE
 
 
 @pytest.mark.parametrize("sign", [0, 2, 3])

@@ -8,7 +8,7 @@ from builders.linear_world import CAMERA, turn
 from builders.worlds import StereoWorld
 
 from slam_backend.core.validation import FloatArray
-from slam_backend.fastslam._kernels import YOUNG
+from slam_backend.fastslam._kernels import RELINEARISE_BELOW
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.options import CALIBRATED_NOISE
 from slam_backend.geometry import compose
@@ -68,7 +68,7 @@ def test_stereo_on_a_known_path_makes_it_independent_ekfs(proposal: Any) -> None
         for pose, some, frame in zip(poses, names, frames, strict=True):
             for name, point in zip(some.tolist(), frame.points, strict=True):
                 if name in filters:
-                    young = proposal == "fastslam2" and filters[name].sightings <= YOUNG
+                    young = proposal == "fastslam2" and filters[name].sightings <= RELINEARISE_BELOW
                     filters[name].update(pose, point, young)
                 else:
                     filters[name] = StereoEkf(world, pose, point)

@@ -70,7 +70,9 @@ def test_no_noise_no_error(proposal: Any, num_robots: int, sigma: float | None) 
         return Measurements(exact.points, exact.descriptors, claimed.covariances)
 
     starts = np.array([[0.0, 0.0, 0.0], [0.4, -0.3, 2.0]])[:num_robots]
-    slam = FastSlam(num_robots, 5, world.camera, EXACT_MOTION, proposal, seed=0, initial_poses=starts, dead_zone=11.34)
+    slam = FastSlam(
+        num_robots, 5, world.camera, EXACT_MOTION, proposal, seed=0, initial_poses=starts, new_landmark_gate=11.34
+    )
     poses = starts.copy()
     for _ in range(60):
         poses = compose(poses, MOVE)
@@ -231,7 +233,7 @@ def test_covariances_stay_positive_definite_where_depth_is_all_but_unknown(propo
     """Landmarks seen from all sides by a very poor camera, and predicted far beyond its range, stay definite."""
     camera = StereoCamera(sigma_px=0.4, sigma_disparity_px=50.0)
     rng = np.random.default_rng(5)
-    slam = FastSlam(1, 1, camera, proposal=proposal, position_gate=1e12, dead_zone=1e12)
+    slam = FastSlam(1, 1, camera, proposal=proposal, position_gate=1e12, new_landmark_gate=1e12)
     for step in range(200):
         bearing, away = rng.uniform(-np.pi, np.pi), 10.0 ** rng.uniform(0.0, 2.7) if step else 3.0
         pose = np.array([-away * np.cos(bearing), -away * np.sin(bearing), bearing + rng.uniform(-0.3, 0.3)])

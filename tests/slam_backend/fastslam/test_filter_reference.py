@@ -17,7 +17,7 @@ from slam_backend.geometry import wrap_angle
 from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.models.measurements import Measurements
 from slam_backend.models.odometry import OdometryModel
-from slam_backend.reference import PlainFastSlam, fastslam2
+from slam_backend.reference import ReferenceFastSlam, fastslam2
 from slam_backend.reference import filter as plain_filter
 from slam_backend.resampling import RESAMPLING
 
@@ -31,7 +31,7 @@ def assert_same_pose(found: FloatArray, expected: FloatArray, close: dict[str, f
     np.testing.assert_allclose(wrap_angle(found[..., 2] - expected[..., 2]), 0.0, atol=close["atol"])
 
 
-class WatchedPlainFastSlam(PlainFastSlam):
+class WatchedPlainFastSlam(ReferenceFastSlam):
     """A plain filter that knows what it would report if any of the equally probable particles were the best.
 
     Where several are the most probable up to rounding, it looks for landmarks from the one that `preferred` says.
@@ -76,7 +76,7 @@ def assert_same_report(found: StepReport, plain: WatchedPlainFastSlam) -> None:
     assert any(found.nis == pytest.approx(r.nis, rel=1e-6, nan_ok=True) for r in same)
 
 
-def assert_same_particles(slam: FastSlam, plain: PlainFastSlam) -> None:
+def assert_same_particles(slam: FastSlam, plain: ReferenceFastSlam) -> None:
     """Compare each landmark of each particle: which decided alike if and only if they hold the same."""
     ids, means, covariances, counts = dense(slam)
     expected_counts = np.zeros_like(counts)
@@ -100,7 +100,7 @@ def assert_same_particles(slam: FastSlam, plain: PlainFastSlam) -> None:
                 assert log_odds[rows[name], m] == pytest.approx(landmark.log_odds, abs=1e-9)
 
 
-def assert_same(slam: FastSlam, plain: PlainFastSlam) -> None:
+def assert_same(slam: FastSlam, plain: ReferenceFastSlam) -> None:
     """Compare every number that the two filters hold.
 
     Log-weights are differences of log-likelihoods, whose rounding is relative to their own size: after a false match
@@ -132,7 +132,7 @@ def both(num_robots: int, seed: int, starts: Any = None, **choices: Any) -> tupl
 def happened(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
     """Count what the plain filter goes through, of what its answers do not show."""
     counts: Counter[str] = Counter()
-    is_lost, refine, weigh_existence = fastslam2.is_lost, fastslam2.refine, plain_filter.weigh_existence
+    is_lost, refine, update_existence = fastslam2.is_lost, fastslam2.refine, plain_filter.update_existence
 
     def counted_is_lost(*args: Any) -> bool:
         answer = is_lost(*args)
@@ -145,10 +145,10 @@ def happened(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
 
     def counted_weigh_existence(particles: Any, *args: Any) -> None:
         before = sum(len(particle.landmarks) for particle in particles)
-        weigh_existence(particles, *args)
+        update_existence(particles, *args)
         counts["given up"] += before - sum(len(particle.landmarks) for particle in particles)
 
-    monkeypatch.setattr(plain_filter, "weigh_existence", counted_weigh_existence)
+    monkeypatch.setattr(plain_filter, "update_existence", counted_weigh_existence)
     monkeypatch.setattr(fastslam2, "is_lost", counted_is_lost)
     monkeypatch.setattr(fastslam2, "refine", counted_refine)
     return counts
@@ -188,8 +188,8 @@ def run_both(seed: int, num_particles: int, most: int, steps: int, proposal: str
         resampling=str(rng.choice(list(RESAMPLING))),
         resample_threshold=float(rng.choice([0.0, 0.5, 1.0])),
         ambiguity=float(rng.choice([0.0, 2.0, 6.0])),
-        dead_zone=float(rng.choice([11.34, 25.0])),
-        dead_radius=float(rng.choice([0.0, 0.4, 1.0])),
+        new_landmark_gate=float(rng.choice([11.34, 25.0])),
+        new_landmark_radius=float(rng.choice([0.0, 0.4, 1.0])),
         recovery_position=float(rng.choice([0.0, 0.5])),
         one_to_one=bool(rng.random() < 0.6),
         landmark_noise=(0.0, 0.03)[seed // 3 % 2],

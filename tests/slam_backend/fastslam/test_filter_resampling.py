@@ -237,7 +237,12 @@ def test_a_filter_goes_on_bit_for_bit_through_many_snapshots(proposal: Any) -> N
     Noise beyond the gates lets landmarks come and go in several blocks of particles, one robot is blind at times and
     names are given at times, so that places are freed and used again in another order.
     """
-    options: Any = {"proposal": proposal, "dead_zone": 11.34, "dead_radius": 0.0, "resample_threshold": 0.9}
+    options: Any = {
+        "proposal": proposal,
+        "new_landmark_gate": 11.34,
+        "new_landmark_radius": 0.0,
+        "resample_threshold": 0.9,
+    }
     slam, looks = FastSlam(2, 70, CAMERA, seed=3, **options), StereoWorld(np.random.default_rng(1)).descriptors
     restored = FastSlam()
     restored.set_state(slam.get_state())

@@ -17,7 +17,7 @@ from slam_backend.maps.alignment import Alignment, AlignmentOptions
 from slam_backend.models.camera import StereoCamera
 from slam_backend.models.measurements import Measurements
 from slam_backend.models.odometry import OdometryModel
-from slam_backend.reference import PlainFastSlam
+from slam_backend.reference import ReferenceFastSlam
 from slam_backend.team.options import MergeOptions
 from slam_backend.team.team import TeamSlam
 
@@ -52,7 +52,7 @@ class Hall:
 
     def alignment(self, team: TeamSlam, one: int, other: int, pairs: list[tuple[int, int]], off: float) -> Alignment:
         """Return the motion between the maps of two robots' groups, off by so much, with these rows in common."""
-        first, second = (self.starts[team.members(robot)[0]] for robot in (one, other))
+        first, second = (self.starts[team.known_robots(robot)[0]] for robot in (one, other))
         motion = compose(inverse(first), second) + np.array([off, 0.0, 0.0])
         return Alignment(True, "", *motion, 1e-2 * np.eye(3), np.array(pairs, np.int64).reshape(-1, 2), 0.0)
 
@@ -87,8 +87,8 @@ def test_a_name_is_held_once_after_every_merge_undo_and_return(
             moves, frames, names = hall.read()
             team.step(moves, frames, parted, identities=names)
         one, other = data.draw(st.permutations(range(3)))[:2]
-        alone = one in team.keepers(one) and other in team.keepers(other)
-        if alone and team.members(one) != team.members(other) and data.draw(st.booleans()):
+        alone = one in team.trunk_robots(one) and other in team.trunk_robots(other)
+        if alone and team.known_robots(one) != team.known_robots(other) and data.draw(st.booleans()):
             sizes = len(team.map(one)), len(team.map(other))
             some = data.draw(st.integers(0, min(sizes)))
             rows = [data.draw(st.permutations(range(size)))[:some] for size in sizes]
@@ -102,7 +102,7 @@ def test_a_name_is_held_once_after_every_merge_undo_and_return(
 def test_a_false_merge_of_named_landmarks_is_undone_with_all_names_unique() -> None:
     """Maps merged three metres off hold each name once, while the merge stands and when it is undone."""
     hall = Hall(2, 0)
-    undone_soon = MergeOptions(watch_every=5, max_moved=0.0)
+    undone_soon = MergeOptions(watch_every=5, max_deformed=0.0)
     team = build(2, 0, merging=undone_soon, alignment=AlignmentOptions(min_inliers=3))
     kinds: list[str] = []
     for step in range(80):
@@ -124,7 +124,7 @@ def filter_of(kind: Any, proposal: Any) -> Any:
 
 
 @pytest.mark.parametrize("proposal", ["fastslam1", "fastslam2"])
-@pytest.mark.parametrize("kind", [FastSlam, PlainFastSlam])
+@pytest.mark.parametrize("kind", [FastSlam, ReferenceFastSlam])
 def test_a_named_landmark_predicted_behind_the_camera_starts_no_second_one(kind: Any, proposal: str) -> None:
     """What a particle predicts where no camera sees is not matched; nor does its name begin another landmark."""
     slam = filter_of(kind, proposal)
@@ -135,7 +135,7 @@ def test_a_named_landmark_predicted_behind_the_camera_starts_no_second_one(kind:
 
 
 @pytest.mark.parametrize("proposal", ["fastslam1", "fastslam2"])
-@pytest.mark.parametrize("kind", [FastSlam, PlainFastSlam])
+@pytest.mark.parametrize("kind", [FastSlam, ReferenceFastSlam])
 def test_a_name_given_twice_in_a_frame_starts_one_landmark(kind: Any, proposal: str) -> None:
     """Of two measurements of one name that no landmark has yet, the first begins it and the other is rejected."""
     slam = filter_of(kind, proposal)

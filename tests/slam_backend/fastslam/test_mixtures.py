@@ -11,10 +11,10 @@ from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.fastslam._kernels import LANES
 from slam_backend.fastslam._kernels.layout import ROW_OF
 from slam_backend.fastslam.estimates import map_mixture
-from slam_backend.fastslam.particle_maps import ParticleMaps, best_map, write_outline
+from slam_backend.fastslam.particle_maps import ParticleMaps, best_map, write_summary
 from slam_backend.maps.fusion import fuse_landmarks
-from slam_backend.maps.landmark_map import LandmarkMap, OutlineRows
-from slam_backend.team.filter_merging._kernels.pairing import MIN_PAIRS, WIDTH, fit, unexplained
+from slam_backend.maps.landmark_map import LandmarkMap, MapSummaryRows
+from slam_backend.team.filter_merging._kernels.pairing import MIN_PAIRS, WIDTH, fit, reduced_chi2
 from slam_backend.team.filter_merging.landmarks import Landmarks, joint_counts, write_joint
 
 UNPACK = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
@@ -116,20 +116,20 @@ def test_an_outline_is_that_of_the_map() -> None:
     """It has the map's landmarks in the map's order, with the same bits, whatever the least count."""
     slam = _filter_after_some_steps()
     for least in (0, 1, 3, 9):
-        for got, expected in zip(slam.outline(least), slam.map(min_count=least).outline, strict=True):
+        for got, expected in zip(slam.map_summary(least), slam.map(min_count=least).summary, strict=True):
             np.testing.assert_array_equal(got, expected)
-    assert len(FastSlam(num_particles=3).outline().ids) == 0
+    assert len(FastSlam(num_particles=3).map_summary().ids) == 0
 
 
 @pytest.mark.parametrize("room", [0, 5, 9, 100])
 def test_an_outline_tells_how_much_room_it_takes(room: int) -> None:
     """Behind rows that are taken, and where there are too few: then none but those that there are is written."""
     slam = _filter_after_some_steps()
-    expected = slam.outline(2)
+    expected = slam.map_summary(2)
     size = len(expected.ids)
     assert 9 - 3 < size < 100 - 3
-    rows = OutlineRows(np.full((room, 4), -7.0), np.full((room, 2), -7))
-    assert write_outline(slam.state.maps, slam.best_particle, 2, rows, 3) == 3 + size
+    rows = MapSummaryRows(np.full((room, 4), -7.0), np.full((room, 2), -7))
+    assert write_summary(slam.state.maps, slam.best_particle, 2, rows, 3) == 3 + size
     for got in rows:
         assert (got[:3] == -7).all()
         assert (got[3 + size :] == -7).all()
@@ -283,7 +283,7 @@ def test_the_fit_agrees_with_matrices(count: int, pairs: int) -> None:
 def test_what_is_unexplained_agrees_with_newtons_method() -> None:
     """tau^2 of each pair is what the plain rounds come to; where it is not 0, chi^2 is its degrees of freedom then."""
     common = common_landmarks(3, 15, WIDTH + 5)
-    extra, shared = unexplained(*common, START, 8)
+    extra, shared = reduced_chi2(*common, START, 8)
     for pair in range(WIDTH + 5):
         motion, plain = START, 0.0
         for _ in range(8):
@@ -296,7 +296,7 @@ def test_what_is_unexplained_agrees_with_newtons_method() -> None:
         assert chi2 == pytest.approx(freedom, rel=1e-4) if plain > 0.0 else chi2 <= freedom
     assert np.count_nonzero(extra) > WIDTH / 2
     exact = (common[0], common[1], common[0], common[1], common[4], common[4])
-    assert not unexplained(*exact, np.zeros(3), 8)[0].any()  # a map agrees with itself
+    assert not reduced_chi2(*exact, np.zeros(3), 8)[0].any()  # a map agrees with itself
 
 
 def test_landmarks_at_one_place_turn_nothing() -> None:

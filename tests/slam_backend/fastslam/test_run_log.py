@@ -11,18 +11,18 @@ from builders.kernels import python_entry
 from hypothesis import given
 from hypothesis import strategies as st
 
-from slam_backend.fastslam._kernels import IDLE, MOVED, PLACED
-from slam_backend.fastslam._kernels import STOOD as STOOD_STILL
-from slam_backend.fastslam._kernels.layout import DID, LOGGED, MOTION, NAME, NUM_MEASURED, NUM_NOTED, THOUGHT
-from slam_backend.fastslam._kernels.run_log import write_guesses
-from slam_backend.fastslam._kernels.step import note_turns
+from slam_backend.fastslam._kernels import EXACT_POSE, MOVED, NO_READING
+from slam_backend.fastslam._kernels import STATIONARY as STOOD_STILL
+from slam_backend.fastslam._kernels.layout import ESTIMATE, LOGGED, LOGGED_KIND, MOTION, NAME, NUM_MEASURED, NUM_NOTED
+from slam_backend.fastslam._kernels.run_log import write_initial_poses
+from slam_backend.fastslam._kernels.step import log_step
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.run_log import MEASUREMENTS, ROWS, RobotLog
 from slam_backend.fastslam.state import LONGEST, ROOM
 from slam_backend.models.measurements import Measurements
-from slam_backend.smoother.log_arrays import EXACT, ODOMETRY, STOOD
+from slam_backend.smoother.log_arrays import EXACT, ODOMETRY, STATIONARY
 
-note_turns = python_entry(note_turns)
+log_step = python_entry(log_step)
 
 Step = dict[str, Any]
 
@@ -65,7 +65,7 @@ def test_what_is_logged_comes_back(count: int, most: int, optional: float) -> No
         if "pose" in step:
             kind, motion = EXACT, step["pose"]
         else:
-            kind, motion = (ODOMETRY, step["odometry"]) if "odometry" in step else (STOOD, np.zeros(3))
+            kind, motion = (ODOMETRY, step["odometry"]) if "odometry" in step else (STATIONARY, np.zeros(3))
         assert row.kind == kind
         np.testing.assert_array_equal(row.motion, motion)
         np.testing.assert_array_equal(row.points, step["points"])
@@ -206,16 +206,19 @@ def test_steps_of_a_journal_are_as_one_by_one(most: int, optional: float, togeth
         measured, noted = [np.empty((0, NUM_MEASURED))], np.zeros((together, count, NUM_NOTED))
         for k, step in enumerate(steps.tolist()):
             for robot in range(count):
-                n, act = int(rng.integers(0, most)) * int(rng.random() < 0.8), int(rng.choice([IDLE, MOVED, PLACED]))
+                n, act = (
+                    int(rng.integers(0, most)) * int(rng.random() < 0.8),
+                    int(rng.choice([NO_READING, MOVED, EXACT_POSE])),
+                )
                 covered = n > 0 and rng.random() < optional
-                act = STOOD_STILL if n and act == IDLE else act
-                motion, seen = rng.normal(size=3) * (act in (MOVED, PLACED)), rng.normal(size=(n, NUM_MEASURED))
+                act = STOOD_STILL if n and act == NO_READING else act
+                motion, seen = rng.normal(size=3) * (act in (MOVED, EXACT_POSE)), rng.normal(size=(n, NUM_MEASURED))
                 seen[:, NAME] = rng.integers(-1, 9, n)
-                noted[k, robot, :MOTION] = act != IDLE, act, covered, n
-                noted[k, robot, MOTION:THOUGHT] = motion
+                noted[k, robot, :MOTION] = act != NO_READING, act, covered, n
+                noted[k, robot, MOTION:ESTIMATE] = motion
                 measured.append(seen)
-                if robot == own and act != IDLE:
-                    move, pose = motion if act in (MOVED, PLACED) else None, motion if act == PLACED else None
+                if robot == own and act != NO_READING:
+                    move, pose = motion if act in (MOVED, EXACT_POSE) else None, motion if act == EXACT_POSE else None
                     spreads, ids = seen[:, 3:NAME] if covered else None, seen[:, NAME].astype(np.int64)
                     expected.append(step, move, pose, seen[:, :3], ids, spreads)
         log.extend(own, steps, noted, np.concatenate(measured))
@@ -238,14 +241,14 @@ def test_a_journal_holds_what_robots_of_a_filter_did_and_measured(steps: list[li
             end += max(count, 0)
         moves, sightings, told = rng.normal(size=(4, 3)), rng.normal(size=(end, 9)), rng.integers(-1, 50, (2, end))
         means, noted = rng.normal(size=(3, 3)), np.empty((3, NUM_NOTED))
-        note_turns(rows, turns, moves, sightings, told, means, noted, measured, first)
+        log_step(rows, turns, moves, sightings, told, means, noted, measured, first)
         assert not noted[1].any()
         for robot in (0, 2):
             act, begin, last, covered, _, count = turns[rows[robot]].tolist()
-            logged = act != IDLE or count > 0
+            logged = act != NO_READING or count > 0
             assert noted[robot, :MOTION].tolist() == [logged, act, covered and count > 0, last - begin]
-            np.testing.assert_array_equal(noted[robot, MOTION:THOUGHT], moves[rows[robot]])
-            np.testing.assert_array_equal(noted[robot, THOUGHT:], means[robot])
+            np.testing.assert_array_equal(noted[robot, MOTION:ESTIMATE], moves[rows[robot]])
+            np.testing.assert_array_equal(noted[robot, ESTIMATE:], means[robot])
             columns = NAME if covered else 3
             expected += [(*sightings[b, :columns], told[0, b]) for b in range(begin, last)]
             first += last - begin
@@ -273,16 +276,16 @@ def test_guesses_are_of_the_steps_in_which_a_robot_did_or_measured_anything() ->
     """One row for each of these, of one robot of the filter; and whether its pose was given."""
     num_steps, rng = 40, np.random.default_rng(8)
     numbers, noted = np.arange(7, 7 + num_steps), rng.normal(size=(num_steps, 3, NUM_NOTED))
-    for robot, acts in ((0, [IDLE, MOVED]), (2, [IDLE, STOOD_STILL, PLACED])):
-        did = noted[:, robot, DID] = rng.choice(acts, num_steps)
-        kept = did != IDLE
+    for robot, acts in ((0, [NO_READING, MOVED]), (2, [NO_READING, STOOD_STILL, EXACT_POSE])):
+        did = noted[:, robot, LOGGED_KIND] = rng.choice(acts, num_steps)
+        kept = did != NO_READING
         noted[:, robot, LOGGED] = kept
         steps, poses = np.empty(num_steps, np.int64), np.empty((num_steps, 3))
-        num, is_placed = write_guesses(robot, numbers, noted, steps, poses)
+        num, is_placed = write_initial_poses(robot, numbers, noted, steps, poses)
         np.testing.assert_array_equal(steps[:num], numbers[kept])
-        np.testing.assert_array_equal(poses[:num], noted[kept, robot, THOUGHT:])
+        np.testing.assert_array_equal(poses[:num], noted[kept, robot, ESTIMATE:])
         assert 0 < num < num_steps
-        assert is_placed == (PLACED in acts)
+        assert is_placed == (EXACT_POSE in acts)
 
 
 def test_memory_of_a_long_run() -> None:

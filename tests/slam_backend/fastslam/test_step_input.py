@@ -12,10 +12,10 @@ from builders.filters import contents
 from hypothesis import given
 from hypothesis import strategies as st
 
-from slam_backend.fastslam._kernels import IDLE, MOVED, PLACED, STOOD
+from slam_backend.fastslam._kernels import EXACT_POSE, MOVED, NO_READING, STATIONARY
 from slam_backend.fastslam.filter import FastSlam
-from slam_backend.fastslam.reports import Findings, StepReport
-from slam_backend.fastslam.step_input import StepInput, check_step, seats_of
+from slam_backend.fastslam.reports import Associations, StepReport
+from slam_backend.fastslam.step_input import StepInput, rows_of, validate_step
 from slam_backend.models.camera import ROBOT_FROM_CAMERA, StereoCamera
 from slam_backend.models.measurements import Measurements, TeamMeasurements
 from slam_backend.team.team import TeamSlam
@@ -44,12 +44,12 @@ def reading(seed: int) -> Reading:
 def checked(readings: list[Reading]) -> StepInput:
     """Return the readings of some robots in one piece."""
     moves, frames, names, poses = map(list, zip(*readings, strict=True))
-    return check_step(len(readings), SIZE, StereoCamera(), moves, frames, names, poses)
+    return validate_step(len(readings), SIZE, StereoCamera(), moves, frames, names, poses)
 
 
 def stepped(slam: FastSlam, inputs: StepInput, *rows: int) -> StepReport:
     """Let a filter take in what the robots in some rows have read."""
-    return slam.step_checked(inputs, seats_of(rows), *Findings.none_yet(inputs))
+    return slam.step_checked(inputs, rows_of(rows), *Associations.allocate(inputs))
 
 
 def said(report: StepReport) -> tuple[Any, ...]:
@@ -64,20 +64,22 @@ def test_each_robot_finds_what_it_read(seeds: list[int]) -> None:
     inputs = checked(readings)
     last = 0
     for robot, (move, frame, names, pose) in enumerate(readings):
-        act, begin, end, covered, named, count = inputs.turns[robot]
-        assert inputs.table[robot].tolist() == list(inputs.turns[robot])
+        act, begin, end, covered, named, count = inputs.inputs[robot]
+        assert inputs.inputs_table[robot].tolist() == list(inputs.inputs[robot])
         used = np.full(len(frame or ()), True) if names is None else names >= 0
         assert (begin, end, count) == (last, last + used.sum(), -1 if frame is None else len(frame))
-        assert act == (PLACED if pose is not None else MOVED if move is not None else STOOD if end > begin else IDLE)
+        assert act == (
+            EXACT_POSE if pose is not None else MOVED if move is not None else STATIONARY if end > begin else NO_READING
+        )
         assert (covered, named) == (frame is not None and frame.covariances is not None, names is not None)
-        assert (robot in inputs.silent) == (frame is None and act == IDLE)
+        assert (robot in inputs.inactive) == (frame is None and act == NO_READING)
         motion = move if pose is None else pose
         np.testing.assert_array_equal(inputs.moves[robot], 0.0 if motion is None else motion)
         assert (robot in inputs.masks) == (not used.all())
         last = end
         if frame is None or not len(frame):
             continue
-        sightings = inputs.sightings[begin:end]
+        sightings = inputs.measurements[begin:end]
         np.testing.assert_array_equal(sightings[:, :3], frame.points[used] @ ROBOT_FROM_CAMERA.T)
         np.testing.assert_array_equal(inputs.descriptors[begin:end], frame.descriptors[used])
         if covered:
@@ -85,7 +87,7 @@ def test_each_robot_finds_what_it_read(seeds: list[int]) -> None:
             np.testing.assert_array_equal(sightings[:, 3:], turned[:, *np.triu_indices(3)])
         if named:
             np.testing.assert_array_equal(inputs.names[begin:end], names[used])
-    assert last == len(inputs.sightings) == len(inputs.descriptors)
+    assert last == len(inputs.measurements) == len(inputs.descriptors)
 
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda inputs: pickle.loads(pickle.dumps(inputs))])
@@ -110,9 +112,9 @@ def test_frames_in_one_piece_are_as_cut_out(counts: list[int], spoilt: bool, see
     team = TeamMeasurements(points, rng.normal(size=(sum(counts), SIZE)).astype(np.float32), ends)
     moves = rng.normal(size=(len(counts), 3))
     told = []
-    for frames in (team, team.of_each()):
+    for frames in (team, team.per_robot()):
         try:
-            told.append(check_step(len(counts), SIZE, StereoCamera(), moves, frames, None, None))
+            told.append(validate_step(len(counts), SIZE, StereoCamera(), moves, frames, None, None))
         except ValueError as refusal:
             told.append(str(refusal))
     assert isinstance(told[0], str) == (spoilt and len(points) > 0)
@@ -162,33 +164,33 @@ rows_of_ids = st.lists(st.lists(st.integers(-1, 9), max_size=4), min_size=1, max
 def test_each_robot_finds_what_became_of_what_it_measured(ids: list[list[int]], offset: int) -> None:
     """What was gathered robot by robot is cut out as it was, or only the names in it; robot -1 has nothing."""
     found, made = ([np.array(row, np.int64) + k for row in ids] for k in (0, offset))
-    findings = Findings.gathered(found, made)
+    findings = Associations.from_arrays(found, made)
     rows = (-1, *reversed(range(len(ids))))
     report = StepReport(findings, rows, 0, 0, 0, 0, 1.0, 3.0, False)
     for row, associated, created in zip(rows, report.associations, report.created, strict=True):
         np.testing.assert_array_equal(associated, [] if row < 0 else found[row])
         np.testing.assert_array_equal(created, [] if row < 0 else made[row])
-        assert row < 0 or findings.num_given(row) == len(found[row])
+        assert row < 0 or findings.num_measurements(row) == len(found[row])
         associated[:], created[:] = 77, 77  # copies
     for row, (own, new) in enumerate(zip(found, made, strict=True)):
         np.testing.assert_array_equal(findings.associated(row), own)
-        assert findings.names_associated(row) == own[own >= 0].tolist()
-        assert findings.names_created(row) == new[new >= 0].tolist()
+        assert findings.associated_ids(row) == own[own >= 0].tolist()
+        assert findings.created_ids(row) == new[new >= 0].tolist()
 
 
 @given(seeds=st.lists(st.integers(0, 10_000), min_size=1, max_size=4))
 def test_measurements_that_were_not_used_are_rejected(seeds: list[int]) -> None:
     """Each robot has a finding for all that it was given: of the used ones what was written, of the others -1."""
     inputs = checked(list(map(reading, seeds)))
-    findings, told = Findings.none_yet(inputs)
-    assert (findings.told == -1).all()
-    told[:] = np.arange(2 * len(inputs.sightings)).reshape(2, -1)
-    for robot, turn in enumerate(inputs.turns):
+    findings, told = Associations.allocate(inputs)
+    assert (findings.ids == -1).all()
+    told[:] = np.arange(2 * len(inputs.measurements)).reshape(2, -1)
+    for robot, turn in enumerate(inputs.inputs):
         _, begin, end, _, _, count = turn
         mask = inputs.masks.get(robot, np.full(max(count, 0), True))
-        assert findings.num_given(robot) == len(mask)
+        assert findings.num_measurements(robot) == len(mask)
         for kind, cut in enumerate((findings.associated(robot), findings.created(robot))):
-            np.testing.assert_array_equal(cut[mask], findings.told[kind, begin:end])
+            np.testing.assert_array_equal(cut[mask], findings.ids[kind, begin:end])
             np.testing.assert_array_equal(cut[~mask], -1)
 
 
@@ -199,4 +201,4 @@ def test_what_reports_and_journals_share_is_read_only() -> None:
         report = slam.step([None], [frame])
         assert report.associations[0].tolist() == [0]
         with pytest.raises(ValueError, match="read-only"):
-            report.findings.told[:] = 77
+            report.all_associations.ids[:] = 77

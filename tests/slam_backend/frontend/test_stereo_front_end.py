@@ -12,12 +12,12 @@ from scipy.spatial.transform import Rotation
 
 from slam_backend.core.compilation import watch_compilation
 from slam_backend.frontend import (
-    KINDS,
+    DESCRIPTOR_TYPES,
     CornerOptions,
     FrontEndOptions,
     StereoFrontEnd,
+    grid_order,
     harris_corners,
-    spread_order,
     usurf_descriptors,
 )
 from slam_backend.frontend._matching_kernels import match_rows, refine
@@ -83,7 +83,7 @@ def test_any_descriptor_goes_through_the_same_pipeline(pair: tuple[np.ndarray, n
     frame = eye.measure(*pair)
     descriptors = frame.measurements.descriptors
     assert len(descriptors) > 40
-    assert descriptors.shape[1] == eye.descriptor_size == KINDS[kind].size
+    assert descriptors.shape[1] == eye.descriptor_size == DESCRIPTOR_TYPES[kind].size
     np.testing.assert_allclose(np.linalg.norm(descriptors, axis=1), 1.0, atol=1e-5)
     assert np.abs(frame.pixels[:, 2] - DISPARITY).max() < 0.2
 
@@ -258,14 +258,14 @@ def test_equal_neighbours_give_one_corner() -> None:
 
 
 def test_the_order_is_that_of_ranks_within_cells() -> None:
-    """`spread_order` sorts by rank within the own cell, then by quality; here checked the long way."""
+    """`grid_order` sorts by rank within the own cell, then by quality; here checked the long way."""
     rng = np.random.default_rng(4)
     points, quality = rng.uniform(-50.0, 200.0, (70, 2)), rng.permutation(70).astype(float)
-    order = spread_order(points, quality, 40.0)
+    order = grid_order(points, quality, 40.0)
     cells = [tuple(cell) for cell in np.floor(points / 40.0).astype(int)]
     ranks = [sum(cells[j] == cells[i] and quality[j] > quality[i] for j in range(70)) for i in range(70)]
     assert order.tolist() == sorted(range(70), key=lambda i: (ranks[i], -quality[i]))
-    assert spread_order(np.empty((0, 2)), np.empty(0), 40.0).tolist() == []
+    assert grid_order(np.empty((0, 2)), np.empty(0), 40.0).tolist() == []
 
 
 def _motion(seed: int) -> tuple[np.ndarray, np.ndarray]:

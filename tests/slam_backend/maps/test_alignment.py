@@ -9,16 +9,16 @@ from hypothesis import strategies as st
 
 from slam_backend.geometry import between, inverse, rotate_covariances, transform_points, wrap_angle
 from slam_backend.maps.alignment import (
+    DISTINCT_ROTATION,
+    DISTINCT_TRANSLATION,
     METHODS,
     REASONS,
-    RIVAL_ANGLE,
-    RIVAL_DISTANCE,
     Alignment,
     AlignmentOptions,
     align_maps,
     candidate_matches,
 )
-from slam_backend.maps.correspondences import may_suffice, mutual_nearest
+from slam_backend.maps.correspondences import has_enough_candidates, mutual_nearest
 from slam_backend.maps.fusion import alignment_jacobian
 from slam_backend.maps.landmark_map import LandmarkMap, unchecked_map
 
@@ -43,7 +43,7 @@ class Pair:
     def is_false(self, found: Alignment) -> bool:
         """Tell whether a merge by `found` would be a false one."""
         e = self.error(found)
-        return found.success and bool(np.hypot(e[0], e[1]) > RIVAL_DISTANCE or abs(e[2]) > RIVAL_ANGLE)
+        return found.success and bool(np.hypot(e[0], e[1]) > DISTINCT_TRANSLATION or abs(e[2]) > DISTINCT_ROTATION)
 
 
 def pair(
@@ -307,7 +307,7 @@ def test_duplicates_do_not_kill_a_match_but_look_alikes_elsewhere_do() -> None:
             np.vstack([RICH.descriptors, copied]),
         )
 
-    options = AlignmentOptions(descriptor_ratio=0.5, look_alikes=0)
+    options = AlignmentOptions(descriptor_ratio=0.5, max_similar=0)
     blurry = replace(RICH, descriptors=RICH.descriptors + np.float32(0.004))
     near, far = with_copy([0.3, 0.3, 0.0]), with_copy([5.0, 0.0, 0.0])
     assert 0 in candidate_matches(blurry, near, options)[:, 0]
@@ -327,8 +327,8 @@ def test_looks_show_which_maps_cannot_have_enough_candidates(
         LandmarkMap(rng.normal(size=(common + others, 3)), covariances(rng, common + others, 0.01, 0.1), looks)
         for looks in (np.vstack([shared, own[0]]), np.vstack([blurred(rng, shared), own[1]]))
     )
-    options = AlignmentOptions(look_alikes=look_alikes, appearance=appearance)
-    enough = may_suffice(a.descriptors, b.descriptors, options)
+    options = AlignmentOptions(max_similar=look_alikes, appearance=appearance)
+    enough = has_enough_candidates(a.descriptors, b.descriptors, options)
     assert enough or len(candidate_matches(a, b, options)) < options.min_inliers
     assert enough or common < options.min_inliers
 

@@ -21,9 +21,9 @@ from slam_backend.maps.alignment import (
     candidate_matches,
     propose_motion,
 )
-from slam_backend.maps.correspondences import look_alikes, num_alike
+from slam_backend.maps.correspondences import count_similar, similar_pairs
 from slam_backend.maps.landmark_map import LandmarkMap
-from slam_backend.maps.verification import recurs
+from slam_backend.maps.verification import has_perceptual_alias
 
 TURNED = np.array([4.0, -3.0, 2.0])
 
@@ -146,8 +146,8 @@ def test_closest_points_need_a_start_and_the_better_of_two_is_kept() -> None:
     rng = np.random.default_rng(7)
     a = landmark_map(rng, rng.uniform(0.0, [20.0, 15.0, 1.5], (80, 3)))
     b = seen_from(a, TURNED, 0, rng)
-    assert off(proposals.closest_points(a, b, np.add(TURNED, [0.3, -0.2, 0.02])), TURNED) < 0.02
-    assert off(proposals.closest_points(a, b, np.add(TURNED, [0.0, 0.0, 2.0])), TURNED) > 0.5
+    assert off(proposals.icp(a, b, np.add(TURNED, [0.3, -0.2, 0.02])), TURNED) < 0.02
+    assert off(proposals.icp(a, b, np.add(TURNED, [0.0, 0.0, 2.0])), TURNED) > 0.5
     met = dict.fromkeys(("icp", "impicp"), 0)
     for seed in range(20):
         rng = np.random.default_rng([7, seed])
@@ -170,7 +170,7 @@ def test_graduated_non_convexity_minimises_truncated_squares() -> None:
     table = np.zeros((60, 18))
     table[:, :3], table[:, 3:6] = a.means, b.means
     variance, gate = 8e-4, 11.34
-    found = proposals.graduated(table, variance, gate)
+    found = proposals.gnc_tls(table, variance, gate)
 
     def cost(pose: np.ndarray) -> float:
         squares = ((a_points - transform_points(pose, b_points)) ** 2).sum(axis=1) / variance
@@ -252,8 +252,8 @@ def test_what_no_variance_explains_widens_the_covariance() -> None:
     for factor, ratio in ((3.0, 9.0), (1.0, 1.0), (0.1, 1.0)):
         table[:, :3] = table[:, 3:6] + 0.1 * factor * rng.standard_normal((400, 3))
         # The median of 400 has a standard deviation of 6 %.
-        assert kernels.unexplained(table, everyone, np.zeros(3), 0.01) == pytest.approx(ratio, rel=0.25)
-    assert kernels.unexplained(table, nobody, np.zeros(3), 0.01) == 1.0
+        assert kernels.reduced_chi2(table, everyone, np.zeros(3), 0.01) == pytest.approx(ratio, rel=0.25)
+    assert kernels.reduced_chi2(table, nobody, np.zeros(3), 0.01) == 1.0
 
 
 def test_members_without_extent_are_left_alone() -> None:
@@ -316,9 +316,9 @@ def test_pairs_of_look_alikes_are_those_within_the_gate() -> None:
     within = distances <= 0.45
     for most in (2, 3):
         kept = within & (within.sum(axis=1) <= most)[:, None] & (within.sum(axis=0) <= most)
-        assert look_alikes(a.descriptors, b.descriptors, 0.45, most).tolist() == np.argwhere(kept).tolist()
+        assert similar_pairs(a.descriptors, b.descriptors, 0.45, most).tolist() == np.argwhere(kept).tolist()
         assert kept.sum() > 10
-    assert look_alikes(a.descriptors[:0], b.descriptors, 0.45, 3).shape == (0, 2)
+    assert similar_pairs(a.descriptors[:0], b.descriptors, 0.45, 3).shape == (0, 2)
 
 
 @pytest.mark.parametrize("size", [1, 6, 40, 46, 64])
@@ -332,7 +332,7 @@ def test_what_is_near_is_found_whatever_the_heads_say(size: int, length: float) 
     a, b = a.astype(np.float32), (a[rng.integers(0, 70, 300)] + shift).astype(np.float32)
     distances = np.linalg.norm(a[:, None].astype(float) - b[None].astype(float), axis=2)
     surely, maybe = (np.count_nonzero(distances <= 0.45 + off) for off in (-2e-5 * length**2, 2e-5 * length**2))
-    assert surely <= num_alike(a, b, 0.45) <= maybe
+    assert surely <= count_similar(a, b, 0.45) <= maybe
     assert surely > 100
 
 
@@ -340,7 +340,7 @@ def test_what_is_near_is_found_whatever_the_heads_say(size: int, length: float) 
 def test_geometry_tells_look_alikes_apart(method: str) -> None:
     """Where three of all landmarks look the same hardly any stands out, and yet nearly all common ones are found."""
     a, b = threefold(np.random.default_rng(17), 120, 50)
-    assert align_maps(a, b, method, options=AlignmentOptions(look_alikes=0)).reason == "too few candidates"
+    assert align_maps(a, b, method, options=AlignmentOptions(max_similar=0)).reason == "too few candidates"
     found = align_maps(a, b, method)
     assert found.success, found.reason
     assert off(found.transform, TURNED) < 0.05
@@ -497,9 +497,9 @@ def test_whether_a_constellation_recurs_is_the_same_in_any_frame() -> None:
     options, rows = AlignmentOptions(), np.arange(12)
     map_a, _ = maps_with_doubles(7, doubles=12)
     for landmarks in (map_a, map_a.moved(np.array([5.0, 2.0, -2.5]))):
-        assert recurs(landmarks, rows, SIGMA**2, options)
-        assert recurs(landmarks, rows + SHARED, SIGMA**2, options)
-        assert not recurs(landmarks, np.arange(12, SHARED), SIGMA**2, options)
+        assert has_perceptual_alias(landmarks, rows, SIGMA**2, options)
+        assert has_perceptual_alias(landmarks, rows + SHARED, SIGMA**2, options)
+        assert not has_perceptual_alias(landmarks, np.arange(12, SHARED), SIGMA**2, options)
 
 
 def test_a_map_in_which_all_looks_alike_tells_nothing() -> None:
@@ -509,4 +509,4 @@ def test_a_map_in_which_all_looks_alike_tells_nothing() -> None:
     same = np.repeat(unit(rng, 1), 100, axis=0)
     landmarks = LandmarkMap(points, np.tile(SIGMA**2 * np.eye(3), (100, 1, 1)), same)
     for _ in range(5):
-        assert not recurs(landmarks, rng.choice(100, 20, replace=False), SIGMA**2, AlignmentOptions())
+        assert not has_perceptual_alias(landmarks, rng.choice(100, 20, replace=False), SIGMA**2, AlignmentOptions())

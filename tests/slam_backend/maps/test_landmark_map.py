@@ -179,7 +179,7 @@ def test_copies_cannot_be_written_either() -> None:
     """Be they deep or from a file, of a frame or of one cut out of a team's: what was found of them stays so."""
     frame = Measurements(POINTS, LOOKS, np.tile(np.eye(3), (2, 1, 1)))
     team = TeamMeasurements(np.array(POINTS), LOOKS.copy(), np.array([1, 2]))
-    for one in (frame, team.of_each()[1]):
+    for one in (frame, team.per_robot()[1]):
         for other in (copy.copy(one), copy.deepcopy(one), pickle.loads(pickle.dumps(one))):
             assert getattr(other, "extent", None) == getattr(one, "extent", None)
             for name in ("points", "descriptors", "covariances"):
@@ -202,7 +202,7 @@ def test_an_extent_bounds_all_points() -> None:
     assert frame.extent == (points[:, 2].min(), np.abs(points).max())
     assert copy.deepcopy(frame).extent == frame.extent
     assert Measurements.empty().extent == (np.inf, 0.0)
-    for part in TeamMeasurements(points, looks, np.array([3, 3, 7])).of_each():
+    for part in TeamMeasurements(points, looks, np.array([3, 3, 7])).per_robot():
         assert part.extent == (part.points[:, 2].min(initial=np.inf), np.abs(part.points).max(initial=0.0))
 
 

@@ -11,7 +11,7 @@ from slam_backend.geometry import rotate_covariances, rotation, transform_points
 from slam_backend.maps.alignment import REASONS, Alignment, AlignmentOptions, align_maps
 from slam_backend.maps.alignment_types import BOUNDS, HINTS, count_attempts, refusals_of
 from slam_backend.maps.landmark_map import LandmarkMap
-from slam_backend.team.merge_monitor import Watch, moved_share
+from slam_backend.team.merge_monitor import MergeMonitor, deformed_fraction
 from slam_backend.team.merge_scheduler import AttemptOptions
 from slam_backend.team.options import MergeOptions
 
@@ -78,10 +78,10 @@ def test_an_alignment_that_is_too_uncertain_says_which_bound_it_misses(limits: d
 
 def test_a_team_says_that_paths_leave_a_merge_open() -> None:
     """Where the particles of a merge differ too much the refusal names the paths, and the event bears the doubt."""
-    _, team = driven(2, 112, 100, attempts=AttemptOptions(every=10), merging=MergeOptions(sure=1e4))
+    _, team = driven(2, 112, 100, attempts=AttemptOptions(every=10), merging=MergeOptions(min_sigmas=1e4))
     event = next(event for event in team.events if event.alignment.reason == "too uncertain")
     assert event.alignment.missed == "paths"
-    assert event.alignment.excess == event.doubt > 1.0
+    assert event.alignment.excess == event.uncertainty > 1.0
     pair = next(pair for pair in team.pair_attempts if "too uncertain" in pair.refusals)
     assert team.diagnostics[0]["refused_too_uncertain"] == pair.refusals["too uncertain"]
 
@@ -96,7 +96,7 @@ def joined_map(count: int, turned: int = 0) -> LandmarkMap:
     return LandmarkMap(means, np.tile(1e-3 * np.eye(3), (count, 1, 1)), names, ids=100 + np.arange(count))
 
 
-def watched(joined: int, turned: int = 0) -> tuple[Watch, LandmarkMap]:
+def watched(joined: int, turned: int = 0) -> tuple[MergeMonitor, LandmarkMap]:
     """Return the watch of a merge that joined so many pairs, and the joint map, which holds some landmarks twice."""
     rng = np.random.default_rng(3)
     places = np.column_stack([rng.uniform(0.0, 12.0, (TWICE, 2)), np.full(TWICE, 0.5)])
@@ -105,20 +105,20 @@ def watched(joined: int, turned: int = 0) -> tuple[Watch, LandmarkMap]:
     joint = LandmarkMap(means, np.tile(1e-3 * np.eye(3), (2 * TWICE, 1, 1)), names)
     alignment = Alignment(True, "", 0.0, 0.0, 0.0, 1e-4 * np.eye(3), np.empty((0, 2), np.int64), 0.0)
     own, before = (set(range(TWICE)), set(range(TWICE, 2 * TWICE))), (joined_map(joined), joined_map(joined, turned))
-    return Watch(2, alignment, (None, None), before, own), joint  # type: ignore[arg-type]
+    return MergeMonitor(2, alignment, (None, None), before, own), joint  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(("joined", "contradicted"), [(0, True), (7, True), (8, False), (60, False)])
 def test_a_merge_stands_that_rests_on_more_than_tells_against_it(joined: int, contradicted: bool) -> None:
     """Landmarks mapped twice undo a merge only if the pairs that it joined are no more than 0.6 times as many."""
     watch, joint = watched(joined)
-    assert watch.is_contradicted(joint, MergeOptions(), AlignmentOptions(max_ratio=0.6)) == contradicted
+    assert watch.is_inconsistent(joint, MergeOptions(), AlignmentOptions(max_ratio=0.6)) == contradicted
 
 
 def test_pairs_that_do_not_look_alike_are_no_evidence() -> None:
     """However many a merge joined by chance, landmarks mapped twice undo it."""
     watch, joint = watched(60, turned=1)
-    assert watch.is_contradicted(joint, MergeOptions(), AlignmentOptions())
+    assert watch.is_inconsistent(joint, MergeOptions(), AlignmentOptions())
 
 
 FITS = 10
@@ -170,5 +170,5 @@ def test_the_kernel_agrees_with_matrices() -> None:
         joint = LandmarkMap(bent[kept], covariances(rng, 40), np.eye(40, 5), None, old.ids[kept])
         for options in (AlignmentOptions(), AlignmentOptions(position_gate=3.0), AlignmentOptions(min_inliers=41)):
             shares.append(plain_share(old, joint, options))
-            assert moved_share(old, joint, options) == shares[-1]
+            assert deformed_fraction(old, joint, options) == shares[-1]
     assert len(set(shares)) > 8

@@ -22,10 +22,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from slam_backend.readers import range_bearing_steps, read_csv
-from slam_backend.readers.calibration import Eye, Rectifier, load_euroc_eye, load_kitti_calibration
+from slam_backend.readers.calibration import CameraCalibration, Rectifier, load_euroc_camera, load_kitti_calibration
 from slam_backend.readers.kitti import load_kitti
 from slam_backend.readers.mrclam import load_mrclam
-from slam_backend.readers.mrclam import steps as mrclam_steps
+from slam_backend.readers.mrclam import to_filter_steps as mrclam_steps
 from slam_backend.readers.victoria import load_victoria
 from slam_backend.trajectory import Trajectory
 
@@ -80,7 +80,7 @@ def within(name: str, load: Callable[..., Any], *arguments: Any) -> Read:
 
 def euroc(before: str, after: str) -> Read:
     """Return a reader of a calibration of EuRoC in which a text is another."""
-    return holding("sensor.yaml", EUROC.replace(before, after), load_euroc_eye)
+    return holding("sensor.yaml", EUROC.replace(before, after), load_euroc_camera)
 
 
 def table(**changes: Any) -> Read:
@@ -108,7 +108,7 @@ def poses_of(text: str) -> Read:
 
 ODOMETRY, SEEN, CODES = "Robot2_Odometry.dat", "Robot2_Measurement.dat", "Barcodes.dat"
 IMAGES = np.zeros((240, 320), np.uint8), np.zeros((100, 320), np.uint8)
-WIDE = Eye(640, 240, eye_at(0.1).matrix, np.zeros(4), eye_at(0.1).body_from_camera)
+WIDE = CameraCalibration(640, 240, eye_at(0.1).matrix, np.zeros(4), eye_at(0.1).body_from_camera)
 
 
 def csv(text: str | bytes, **more: Any) -> Read:

@@ -15,7 +15,7 @@ from slam_backend.readers.kitti import (
     make_camera,
     motion_noise,
     planar_motion,
-    steps,
+    to_filter_steps,
     track_descriptors,
 )
 from slam_backend.trajectory import Trajectory, dead_reckoning
@@ -67,7 +67,7 @@ def test_features_become_points_at_the_height_of_the_camera(tmp_path: Path) -> N
     """Column and disparity give the point in the plane, the row is not used, and far features are dropped."""
     log = load_kitti(write_kitti(tmp_path))
     camera = make_camera(log, 1.0, 0.5)
-    frames = steps(log, camera).measurements
+    frames = to_filter_steps(log, camera).measurements
     assert frames[0] is None
     assert frames[1] is not None
     np.testing.assert_allclose(frames[1].points, [[1.0, 0.0, 8.0], [-2.0, 0.0, 12.0]], atol=1e-9)

@@ -10,7 +10,7 @@ from slam_backend.geometry import between, compose
 from slam_backend.metrics import ate
 from slam_backend.models.camera import StereoCamera
 from slam_backend.readers.conversions import HOLD, integrate_commands
-from slam_backend.readers.mrclam import MrclamLog, RobotLog, SightingNoise, load_mrclam, steps
+from slam_backend.readers.mrclam import MrclamLog, MrclamRobot, SightingNoise, load_mrclam, to_filter_steps
 from slam_backend.trajectory import dead_reckoning
 
 
@@ -123,13 +123,15 @@ def test_arcs_are_those_of_many_small_steps(drawn: list[tuple[float, float, floa
 
 
 def _log(sightings: list[tuple[float, int, float, float]], commands: list[list[float]]) -> MrclamLog:
-    robot = RobotLog(3, np.array(commands), np.array(sightings).reshape(-1, 4), None)
+    robot = MrclamRobot(3, np.array(commands), np.array(sightings).reshape(-1, 4), None)
     return MrclamLog((robot,), np.array([6, 7, 9]), np.zeros((3, 2)))
 
 
 def test_sightings_become_points_of_the_camera() -> None:
     """Zc = r cos b, Xc = -r sin b, Yc = 0, so that the camera model puts the landmark where it stands."""
-    frame = steps(_log([(0.0, 7, 2.0, 0.5), (0.0, 9, 3.0, -0.25)], [[0.0, 0.0, 0.0]])).robots[0].measurements[0]
+    frame = (
+        to_filter_steps(_log([(0.0, 7, 2.0, 0.5), (0.0, 9, 3.0, -0.25)], [[0.0, 0.0, 0.0]])).robots[0].measurements[0]
+    )
     assert frame is not None
     np.testing.assert_allclose(frame.points[0], [-2.0 * np.sin(0.5), 0.0, 2.0 * np.cos(0.5)], atol=1e-12)
     robot = StereoCamera().robot_from_camera(frame.points)
@@ -140,7 +142,7 @@ def test_sightings_become_points_of_the_camera() -> None:
 def test_covariance_is_that_of_drawn_sightings() -> None:
     """The Jacobian carries range and bearing noise to the camera frame: 200,000 draws agree within 3 %."""
     noise = SightingNoise(range_floor=0.03, range_share=0.01, bearing=0.015, height=0.05)
-    frame = steps(_log([(0.0, 7, 4.0, 0.6)], [[0.0, 0.0, 0.0]]), noise=noise).robots[0].measurements[0]
+    frame = to_filter_steps(_log([(0.0, 7, 4.0, 0.6)], [[0.0, 0.0, 0.0]]), noise=noise).robots[0].measurements[0]
     assert frame is not None
     assert frame.covariances is not None
     rng = np.random.default_rng(5)
@@ -160,7 +162,7 @@ def test_a_sighting_is_moved_to_its_step_by_the_odometry() -> None:
         relative = between(pose, [*landmark, 0.0])[:2]
         seen.append((time, 7, float(np.hypot(*relative)), float(np.arctan2(relative[1], relative[0]))))
     log = _log(seen, commands)
-    readings = steps(log, dt=0.5)
+    readings = to_filter_steps(log, dt=0.5)
     found = [k for k, frame in enumerate(readings.robots[0].measurements) if frame is not None]
     assert found == [1, 3]  # the first two share a step, where one landmark counts once
     path = dead_reckoning(np.zeros(3), readings.robots[0].odometry[1:])
@@ -174,7 +176,7 @@ def test_a_sighting_is_moved_to_its_step_by_the_odometry() -> None:
 def test_of_two_sightings_of_one_landmark_in_a_step_the_first_counts() -> None:
     """Repeated sightings in a step are not independent: the earliest is kept, other landmarks stay."""
     log = _log([(0.0, 7, 2.0, 0.0), (0.05, 7, 2.5, 0.0), (0.05, 6, 1.0, 0.0)], [[0.0, 0.0, 0.0]])
-    frame = steps(log, dt=0.2).robots[0].measurements[0]
+    frame = to_filter_steps(log, dt=0.2).robots[0].measurements[0]
     assert frame is not None
     assert frame.points[:, 2].tolist() == [1.0, 2.0]
 
@@ -184,7 +186,7 @@ def test_dead_reckoning_of_the_real_log_is_off_by_what_is_known(data_dir: Path) 
     """From the true start poses the five robots' odometry is off by 4.0, 2.0, 2.9, 3.0 and 2.9 m RMS."""
     log = load_mrclam(data_dir / "mrclam" / "MRCLAM_Dataset7")
     assert [len(own.sightings) for own in log.robots] == [2578, 3818, 4425, 1822, 3424]
-    readings = steps(log)
+    readings = to_filter_steps(log)
     errors = []
     for own, stepped in zip(log.robots, readings.robots, strict=True):
         assert own.truth is not None

@@ -12,8 +12,16 @@ from slam_backend.frontend import StereoFrontEnd
 from slam_backend.geometry import compose, inverse, transform_points
 from slam_backend.models.camera import StereoCamera
 from slam_backend.readers import integrate_commands, range_bearing_steps, read_csv
-from slam_backend.readers.calibration import Rectifier, load_euroc_eye, load_kitti_calibration
-from slam_backend.readers.victoria import ENCODER, SENSOR, WHEELBASE, TreeNoise, axle_velocities, load_victoria, steps
+from slam_backend.readers.calibration import Rectifier, load_euroc_camera, load_kitti_calibration
+from slam_backend.readers.victoria import (
+    ENCODER,
+    SENSOR,
+    WHEELBASE,
+    TreeNoise,
+    axle_velocities,
+    load_victoria,
+    to_filter_steps,
+)
 from slam_backend.trajectory import dead_reckoning
 
 
@@ -77,7 +85,7 @@ def test_the_vehicle_turns_about_a_point_on_its_rear_axle(steering: float) -> No
 def test_trees_stand_where_the_laser_saw_them(tmp_path: Path) -> None:
     """A reading, put through the camera model at the laser's place, is at its range and bearing from the laser."""
     write_victoria(tmp_path)
-    readings = steps(load_victoria(tmp_path))
+    readings = to_filter_steps(load_victoria(tmp_path))
     assert readings.measurements[1] is None
     frame = readings.measurements[0]
     assert frame is not None
@@ -91,7 +99,7 @@ def test_trees_stand_where_the_laser_saw_them(tmp_path: Path) -> None:
 def test_noise_points_along_and_across_the_ray(tmp_path: Path) -> None:
     """Straight ahead, depth has the deviation of the range, and the side that of the bearing times the range."""
     write_victoria(tmp_path)
-    frame = steps(load_victoria(tmp_path), TreeNoise(range=0.3, bearing=0.02, height=0.5)).measurements[0]
+    frame = to_filter_steps(load_victoria(tmp_path), TreeNoise(range=0.3, bearing=0.02, height=0.5)).measurements[0]
     assert frame is not None
     assert frame.covariances is not None
     np.testing.assert_allclose(np.diag(frame.covariances[0]), [(4.0 * 0.02) ** 2, 0.5**2, 0.3**2], rtol=1e-9)
@@ -198,7 +206,7 @@ def test_kitti_files_give_focal_length_centre_and_baseline(tmp_path: Path) -> No
 def test_euroc_files_are_read_with_their_remarks(tmp_path: Path) -> None:
     """Lists may run over lines and have remarks between; all numbers are where they belong."""
     (tmp_path / "sensor.yaml").write_text(EUROC)
-    eye = load_euroc_eye(tmp_path / "sensor.yaml")
+    eye = load_euroc_camera(tmp_path / "sensor.yaml")
     assert (eye.width, eye.height) == (640, 400)
     assert eye.matrix.tolist() == [[400.5, 0.0, 320.25], [0.0, 401.0, 199.0], [0.0, 0.0, 1.0]]
     assert eye.distortion.tolist() == [-0.3, 0.07, 2e-4, 1.8e-5]

@@ -14,10 +14,10 @@ from slam_backend.geometry import compose, wrap_angle
 from slam_backend.models.camera import StereoCamera
 from slam_backend.models.measurements import Measurements
 from slam_backend.models.odometry import OdometryModel
-from slam_backend.reference import PlainFastSlam
+from slam_backend.reference import ReferenceFastSlam
 from slam_backend.reference.fastslam2 import pose_given, refine
 from slam_backend.reference.measurement_model import Frame, Landmark
-from slam_backend.reference.pose_gaussian import PoseBelief, WhitenedPose, lower_root, turn_about_vertical
+from slam_backend.reference.pose_gaussian import GaussianPose, WhitenedPose, lower_root, turn_about_vertical
 
 CAMERA = StereoCamera(mount=(0.3, -0.2, 0.5))
 MOVE = np.array([0.25, 0.02, 0.3])
@@ -60,7 +60,7 @@ def test_root_of_a_covariance_of_any_rank(factor: FloatArray) -> None:
 def test_motion_is_predicted_to_first_order(pose: FloatArray, move: FloatArray, factor: FloatArray) -> None:
     """Mean and covariance of a moved pose are those of the linearised motion, by finite differences."""
     covariance, sigmas = factor @ factor.T, np.array([0.3, 0.2, 0.1])
-    moved = PoseBelief(pose, covariance).moved(move, sigmas)
+    moved = GaussianPose(pose, covariance).moved(move, sigmas)
 
     def difference(a: FloatArray, b: FloatArray) -> FloatArray:
         return np.array([*(a - b)[:2], wrap_angle((a - b)[2])])
@@ -81,8 +81,8 @@ def test_samples_do_not_depend_on_how_the_map_is_turned(
     start = np.array([3.0, -7.0, 2.5])
     turn = turn_about_vertical(start[2])
     covariance = factor @ factor.T + 0.1 * np.eye(3)
-    here, information = WhitenedPose.of(PoseBelief(pose, covariance)), covariance
-    there = WhitenedPose.of(PoseBelief(compose(start, pose), turn @ covariance @ turn.T))
+    here, information = WhitenedPose.of(GaussianPose(pose, covariance)), covariance
+    there = WhitenedPose.of(GaussianPose(compose(start, pose), turn @ covariance @ turn.T))
     xi = np.array([0.3, -0.2, 0.1])
     np.testing.assert_allclose(here.covariance, covariance, atol=1e-9)
     a, b = here.at(xi, information).sample(normals), there.at(xi, information).sample(normals)
@@ -194,12 +194,12 @@ def test_an_update_adds_the_information_of_the_measurement(is_given: bool) -> No
         assert landmark.count == 3
 
 
-def blind_walk(seed: int, num_particles: int) -> tuple[PlainFastSlam, StereoWorld, FloatArray]:
+def blind_walk(seed: int, num_particles: int) -> tuple[ReferenceFastSlam, StereoWorld, FloatArray]:
     """Return a filter whose robot saw landmarks at the start and then walked a full circle blind; its true pose."""
     world = StereoWorld(np.random.default_rng(100))
     motion = OdometryModel(floor_position=0.01, floor_heading=0.005)
     options = FilterOptions(num_particles=num_particles, camera=world.camera, motion=motion)
-    slam, pose = PlainFastSlam(1, options, seed), np.zeros(3)
+    slam, pose = ReferenceFastSlam(1, options, seed), np.zeros(3)
     slam.step([None], [world.measure(pose, world.visible(pose))])
     for _ in range(21):
         pose = compose(pose, MOVE)
@@ -213,7 +213,7 @@ def test_what_a_robot_walks_blind_is_predicted_and_not_sampled() -> None:
     The sum of the particles' squared distances is chi-square; false alarm 1e-3.
     """
     slam, _, _ = blind_walk(100, 200)
-    belief = PoseBelief.known(np.zeros(3))
+    belief = GaussianPose.known(np.zeros(3))
     for _ in range(21):
         belief = belief.moved(MOVE, slam.options.motion.sigmas(MOVE))
     assert slam.is_blind == [True]
@@ -254,5 +254,5 @@ def test_a_given_pose_ends_blindness() -> None:
     np.testing.assert_allclose(slam.pose().covariance, 0.0, atol=1e-30)
     np.testing.assert_allclose(slam.pose().mean, pose, atol=1e-12)
     slam.step([MOVE], [None])
-    expected = PoseBelief.known(pose).moved(MOVE, slam.options.motion.sigmas(MOVE))
+    expected = GaussianPose.known(pose).moved(MOVE, slam.options.motion.sigmas(MOVE))
     np.testing.assert_allclose(slam.pose().covariance, expected.covariance, rtol=1e-9, atol=1e-15)

@@ -13,32 +13,39 @@ from hypothesis import strategies as st
 from slam_backend.fastslam.run_log import RobotLog
 from slam_backend.geometry import between, compose, transform_points, wrap_angle
 from slam_backend.models.odometry import OdometryModel
-from slam_backend.smoother._kernels.keyframes import choose, number, place, rename, start_anew, walk
-from slam_backend.smoother.graph import LEVER, PathGraph
-from slam_backend.smoother.graph_building import extended
-from slam_backend.smoother.graph_reduction import at_mode, coarsened
-from slam_backend.smoother.log_arrays import ODOMETRY, REJECTED, STOOD
-from slam_backend.smoother.optimizer import find_mode
+from slam_backend.smoother._kernels.keyframes import (
+    add_keyframes,
+    number,
+    place,
+    rename,
+    select_measurements,
+    start_keyframe,
+)
+from slam_backend.smoother.graph import LEVER_ARM, SlamGraph
+from slam_backend.smoother.graph_building import extend_graph
+from slam_backend.smoother.graph_reduction import reduce_keyframes, relinearise
+from slam_backend.smoother.log_arrays import ODOMETRY, REJECTED, STATIONARY
+from slam_backend.smoother.optimizer import optimize
 from slam_backend.smoother.options import SmoothingOptions
 from slam_backend.smoother.rejuvenation import rejuvenate
-from slam_backend.smoother.sampling import draw_paths, lane_rows, replay
+from slam_backend.smoother.sampling import lane_rows, replay, sample_paths
 from training.bench.accuracy.runs import RunSpec, simulate_run
 
 
-def limits(max_keys, fresh_keys):
+def limits(max_keys, recent_keys):
     """Return options under which so many keys are left."""
-    return SmoothingOptions(max_keys=max_keys, fresh_keys=fresh_keys, kernel=0.0)
+    return SmoothingOptions(max_keys=max_keys, recent_keys=recent_keys, kernel=0.0)
 
 
 def test_condensed_sightings_of_single_poses_change_nothing():
     """Frozen at the mode, all measurements give the same mode, the same information and the same map."""
     run = small_run(2)
     graph = graph_of(run)
-    mode = find_mode(graph, camera_of(run), TIGHT)
-    frozen = coarsened(at_mode(graph, mode, np.zeros(graph.num_keys)), camera_of(run), limits(1000, 2))
+    mode = optimize(graph, camera_of(run), TIGHT)
+    frozen = reduce_keyframes(relinearise(graph, mode, np.zeros(graph.num_keys)), camera_of(run), limits(1000, 2))
     assert len(frozen.points) < len(graph.points)
     assert frozen.num_keys == graph.num_keys
-    again = find_mode(frozen, camera_of(run), TIGHT)
+    again = optimize(frozen, camera_of(run), TIGHT)
     np.testing.assert_allclose(again.poses, mode.poses, atol=1e-8)
     np.testing.assert_allclose(again.landmarks, mode.landmarks, atol=1e-8)
     one, same = upper(again), upper(mode)
@@ -53,11 +60,11 @@ def test_frames_taken_while_standing_belong_to_one_key():
     log.append(0, points=points, ids=run.names[0][0])
     log.append(1, points=points, ids=run.names[0][0])
     log.append(2, np.array([0.2, 0.0, 0.0]), points=points - [0.2, 0.0, 0.0], ids=run.names[0][0])
-    start = PathGraph.at_starts(np.zeros((1, 3)))
-    graph = extended(start, [log.arrays()], run.spec.noise.motion, np.zeros(3))
+    start = SlamGraph.at_starts(np.zeros((1, 3)))
+    graph = extend_graph(start, [log.arrays()], run.spec.noise.motion, np.zeros(3))
     assert graph.num_keys == 2
     assert graph.frame_keys.tolist() == [0, 0, 1]
-    mode = find_mode(graph, camera_of(run), TIGHT)
+    mode = optimize(graph, camera_of(run), TIGHT)
     assert mode.sightings.counts.tolist() == [2, 1] * len(points)
 
 
@@ -65,31 +72,33 @@ def test_rigid_neighbours_keep_what_they_see():
     """Keys that are joined at the mode leave landmarks, newest pose and likelihood at the mode where they were."""
     run = small_run()
     graph = graph_of(run)
-    mode = find_mode(graph, camera_of(run), TIGHT)
-    spreads = draw_paths(graph, mode, 50, np.random.default_rng(1)).spreads
-    fewer = coarsened(at_mode(graph, mode, spreads), camera_of(run), limits(9, 3))
+    mode = optimize(graph, camera_of(run), TIGHT)
+    spreads = sample_paths(graph, mode, 50, np.random.default_rng(1)).spreads
+    fewer = reduce_keyframes(relinearise(graph, mode, spreads), camera_of(run), limits(9, 3))
     assert fewer.num_keys == 9
-    np.testing.assert_allclose(fewer.poses[fewer.tips], mode.poses[graph.tips])
-    again = find_mode(fewer, camera_of(run), TIGHT)
+    np.testing.assert_allclose(fewer.poses[fewer.last_keys], mode.poses[graph.last_keys])
+    again = optimize(fewer, camera_of(run), TIGHT)
     assert again.reason == ""
     tiles, _ = replay(again, lane_rows(fewer.poses[:, :, None]), 1)
     np.testing.assert_allclose(tiles[:, 0, :3, 0], mode.landmarks, atol=1e-7)  # the old poses ask for the old map
-    np.testing.assert_allclose(again.poses[fewer.tips][:, :2], mode.poses[graph.tips][:, :2], atol=0.01)
+    np.testing.assert_allclose(again.poses[fewer.last_keys][:, :2], mode.poses[graph.last_keys][:, :2], atol=0.01)
 
 
 def test_odometry_is_carried_to_the_joined_keys():
     """Composed with the links that are left, the start leads to the newest pose by measured and smoothed motion."""
     run = small_run()
     graph = graph_of(run)
-    mode = find_mode(graph, camera_of(run), TIGHT)
-    fewer = coarsened(at_mode(graph, mode, np.full(graph.num_keys, 1e-6)), camera_of(run), limits(5, 2))
-    for b in np.flatnonzero(fewer.previous >= 0):
+    mode = optimize(graph, camera_of(run), TIGHT)
+    fewer = reduce_keyframes(relinearise(graph, mode, np.full(graph.num_keys, 1e-6)), camera_of(run), limits(5, 2))
+    for b in np.flatnonzero(fewer.parents >= 0):
         old = np.flatnonzero((np.abs(mode.poses - fewer.poses[b]) < 1e-12).all(axis=1))[0]
-        before = compose(mode.poses[old - 1], graph.motions[old])
-        after = compose(fewer.poses[fewer.previous[b]], fewer.motions[b])
+        before = compose(mode.poses[old - 1], graph.odometry[old])
+        after = compose(fewer.poses[fewer.parents[b]], fewer.odometry[b])
         np.testing.assert_allclose(after[:2], before[:2], atol=1e-9)
-        assert np.linalg.det(fewer.noises[b]) > 0.0
-        np.testing.assert_allclose(np.linalg.eigvalsh(fewer.noises[b]), np.linalg.eigvalsh(graph.noises[old]))
+        assert np.linalg.det(fewer.odometry_covariances[b]) > 0.0
+        np.testing.assert_allclose(
+            np.linalg.eigvalsh(fewer.odometry_covariances[b]), np.linalg.eigvalsh(graph.odometry_covariances[old])
+        )
 
 
 def test_unseen_keys_vanish_without_loss():
@@ -99,12 +108,12 @@ def test_unseen_keys_vanish_without_loss():
     mount = np.array(run.spec.noise.camera.mount)
     first = logs[0].arrays()
     upto, rest = _until(first, 9), first.since(9)
-    grown = extended(PathGraph.at_starts(run.true_paths[:, 0]), [upto], run.spec.noise.motion, mount)
-    whole = extended(grown, [rest], run.spec.noise.motion, mount)
-    mode = find_mode(whole, camera_of(run), TIGHT)
-    fewer = coarsened(at_mode(whole, mode, np.zeros(whole.num_keys)), camera_of(run), limits(1000, 2))
+    grown = extend_graph(SlamGraph.at_starts(run.true_paths[:, 0]), [upto], run.spec.noise.motion, mount)
+    whole = extend_graph(grown, [rest], run.spec.noise.motion, mount)
+    mode = optimize(whole, camera_of(run), TIGHT)
+    fewer = reduce_keyframes(relinearise(whole, mode, np.zeros(whole.num_keys)), camera_of(run), limits(1000, 2))
     assert fewer.num_keys == whole.num_keys - 1
-    again = find_mode(fewer, camera_of(run), TIGHT)
+    again = optimize(fewer, camera_of(run), TIGHT)
     np.testing.assert_allclose(again.poses, np.delete(mode.poses, 7, axis=0), atol=1e-3)
 
 
@@ -121,8 +130,8 @@ def test_a_long_run_stays_bounded():
     """However long a run, keys stay at their limit and memory at what keys and landmarks in view ask for."""
     run = small_run(length=30.0)
     logs = logs_of(run)
-    graph, sizes = PathGraph.at_starts(run.true_paths[:, 0]), []
-    options = SmoothingOptions(max_keys=30, fresh_keys=12)
+    graph, sizes = SlamGraph.at_starts(run.true_paths[:, 0]), []
+    options = SmoothingOptions(max_keys=30, recent_keys=12)
     arrays = logs[0].arrays()
     for last in range(10, run.num_steps, 10):
         part = _until(arrays.since(int(graph.latest[0]) + 1), last)
@@ -141,11 +150,11 @@ def test_further_robots_have_further_keys():
     """Two robots may have more keys than one, and have them; without further ones they share those of one."""
     run = small_run(robots=2, length=10.0)
     for further, most in ((0, 20), (6, 26)):
-        options = SmoothingOptions(max_keys=20, further_keys=further, fresh_keys=8)
+        options = SmoothingOptions(max_keys=20, further_keys=further, recent_keys=8)
         assert options.most_keys(1) == 20
         assert options.most_keys(2) == most
         result = rejuvenate(
-            PathGraph.at_starts(run.true_paths[:, 0]), [log.arrays() for log in logs_of(run)], run.spec.noise.motion,
+            SlamGraph.at_starts(run.true_paths[:, 0]), [log.arrays() for log in logs_of(run)], run.spec.noise.motion,
             camera_of(run), 20, np.random.default_rng(3), options,
         )  # fmt: skip
         assert result.graph.num_keys == most
@@ -156,11 +165,13 @@ def test_a_graph_is_not_changed_by_what_is_made_of_it():
     run = small_run()
     graph = graph_of(run)
     before = {name: getattr(graph, name).copy() for name in graph.__dataclass_fields__}
-    mode = find_mode(graph, camera_of(run), TIGHT)
-    draws = draw_paths(graph, mode, 9, np.random.default_rng(1))
-    fewer = coarsened(at_mode(graph, mode, draws.spreads), camera_of(run), limits(7, 3))
+    mode = optimize(graph, camera_of(run), TIGHT)
+    draws = sample_paths(graph, mode, 9, np.random.default_rng(1))
+    fewer = reduce_keyframes(relinearise(graph, mode, draws.spreads), camera_of(run), limits(7, 3))
     kept = {name: getattr(fewer, name).copy() for name in fewer.__dataclass_fields__}
-    coarsened(at_mode(fewer, find_mode(fewer, camera_of(run), TIGHT), np.ones(7)), camera_of(run), limits(4, 2))
+    reduce_keyframes(
+        relinearise(fewer, optimize(fewer, camera_of(run), TIGHT), np.ones(7)), camera_of(run), limits(4, 2)
+    )
     replace(graph)
     for name, value in before.items():
         np.testing.assert_array_equal(getattr(graph, name), value)
@@ -173,15 +184,15 @@ def test_a_graph_is_not_changed_by_what_is_made_of_it():
 def test_keys_are_joined_as_by_the_plain_program(max_keys, kernel):
     """Kernels leave the same keys as numpy: blind ones, measurements that contradict, and joining twice included."""
     run = small_run(2, length=8.0)
-    options = SmoothingOptions(max_keys=max_keys, further_keys=0, fresh_keys=6, kernel=kernel)
+    options = SmoothingOptions(max_keys=max_keys, further_keys=0, recent_keys=6, kernel=kernel)
     graph = graph_of(run, skip=(3, 4, 7))
     blind = graph.point_frames == 5  # that a key measured nothing is the exception
     names = ("points", "point_noises", "given", "point_frames", "point_landmarks")
     graph = replace(graph, **{name: getattr(graph, name)[~blind] for name in names})
     for _ in range(2):
-        mode = find_mode(graph, camera_of(run), TIGHT)
-        graph = at_mode(graph, mode, mode.spreads())
-        found, expected = (how(graph, camera_of(run), options) for how in (coarsened, plainly_coarsened))
+        mode = optimize(graph, camera_of(run), TIGHT)
+        graph = relinearise(graph, mode, mode.spreads())
+        found, expected = (how(graph, camera_of(run), options) for how in (reduce_keyframes, plainly_coarsened))
         assert found.num_keys <= max(options.most_keys(2), 8)
         for name in graph.__dataclass_fields__:
             one, other = getattr(found, name), getattr(expected, name)
@@ -191,7 +202,9 @@ def test_keys_are_joined_as_by_the_plain_program(max_keys, kernel):
         graph = found
 
 
-choose, number, place, start_anew, walk = map(python_entry, (choose, number, place, start_anew, walk))
+select_measurements, number, place, start_keyframe, add_keyframes = map(
+    python_entry, (select_measurements, number, place, start_keyframe, add_keyframes)
+)
 
 OLD = 4  # keys and frames of others before
 TIP = 2
@@ -204,8 +217,8 @@ def walked(kinds, motions, variances, counts, guesses, start, rigid_within):
     poses, between_keys, offsets, noises = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3, 3))
     spreads, slack, tips = np.empty(n), np.zeros(n), np.array([0, TIP, 3])
     poses[TIP] = start
-    keys, frames = walk(
-        kinds, motions, variances, counts, guesses, 1, rigid_within, LEVER, OLD, OLD, tips, robots, poses, previous,
+    keys, frames = add_keyframes(
+        kinds, motions, variances, counts, guesses, 1, rigid_within, LEVER_ARM, OLD, OLD, tips, robots, poses, previous,
         between_keys, noises, spreads, slack, frame_keys, offsets,
     )  # fmt: skip
     new = np.arange(OLD, keys)
@@ -220,7 +233,7 @@ def walked(kinds, motions, variances, counts, guesses, start, rigid_within):
 
 def scatter(noises):
     """Return the mean squares (n,) [m^2] by which motions of covariances (n, 3, 3) scatter, headings at `LEVER`."""
-    return noises[:, 0, 0] + noises[:, 1, 1] + LEVER**2 * noises[:, 2, 2]
+    return noises[:, 0, 0] + noises[:, 1, 1] + LEVER_ARM**2 * noises[:, 2, 2]
 
 
 def plainly_walked(kinds, motions, variances, counts, guesses, start, rigid_within):
@@ -254,7 +267,7 @@ def plainly_walked(kinds, motions, variances, counts, guesses, start, rigid_with
 def test_the_compiled_walk_is_the_plain_one(steps, rigid_within, seed):
     """Keys, frames, odometry between keys, its noise and the slack are those of the walk with whole matrices."""
     rng = np.random.default_rng(seed)
-    kinds = rng.choice([STOOD, ODOMETRY], steps, p=[0.2, 0.8]).astype(np.int8)
+    kinds = rng.choice([STATIONARY, ODOMETRY], steps, p=[0.2, 0.8]).astype(np.int8)
     motions = np.where(kinds[:, None] == ODOMETRY, rng.normal(size=(steps, 3)) * [0.2, 0.05, 0.5], 0.0)
     guesses = np.where(rng.random((steps, 1)) < 0.3, rng.normal(size=(steps, 3)), np.nan)
     arguments = (
@@ -274,7 +287,9 @@ def test_measurements_with_names_are_taken(covered):
     given_steps = np.array([False, True, False, False, True]) & covered
     taken, noises, marks = np.full((8, 3), -7.0), np.full((8, 6), -7.0), np.zeros(8, dtype=np.bool_)
     names, frames, counts = np.full(8, -7), np.full(8, -7), np.empty(5, dtype=np.int64)
-    num = choose(ids, points, given_steps, covariances, starts, 2, 5, counts, taken, noises, marks, frames, names)
+    num = select_measurements(
+        ids, points, given_steps, covariances, starts, 2, 5, counts, taken, noises, marks, frames, names
+    )
     assert num == 6
     assert counts.tolist() == [0, 2, 0, 1, 1]
     assert names.tolist() == [-7, -7, 4, 9, 4, 2, -7, -7]
@@ -329,7 +344,7 @@ def test_landmarks_with_more_new_measurements_than_old_start_again():
     new = np.array([0, 1, 1, 1, 2, 3, 5])
     names, held = np.array([9, 3, 8, 7, 1, 6]), np.array([1, 3, 7, 8, 9])
     means, landmarks = np.arange(15.0).reshape(5, 3), np.full((6, 3), -1.0)
-    start_anew(frozen, counts, raw, new, names, held, means, landmarks)
+    start_keyframe(frozen, counts, raw, new, names, held, means, landmarks)
     assert landmarks[:, 0].tolist() == [-1.0, 3.0, -1.0, 6.0, -1.0, -1.0]  # 3 and 7 are held, and 6 is not
 
 
@@ -342,20 +357,20 @@ def test_variances_are_squared_sigmas():
 def test_frames_stand_where_odometry_says():
     """A frame seen from its key is where the odometry between puts it, and the newest pose is always a key."""
     run = small_run()
-    start, [log] = PathGraph.at_starts(run.true_paths[:, 0]), logs_of(run)
+    start, [log] = SlamGraph.at_starts(run.true_paths[:, 0]), logs_of(run)
     mount, motion = np.array(run.spec.noise.camera.mount), run.spec.noise.motion
-    shared = extended(start, [log.arrays()], motion, mount, rigid_within=0.06)
+    shared = extend_graph(start, [log.arrays()], motion, mount, rigid_within=0.06)
     each = graph_of(run)
     assert 2 < shared.num_keys < each.num_keys / 1.5
     assert len(shared.frame_keys) == len(each.frame_keys)
-    np.testing.assert_allclose(shared.poses[shared.tips], each.poses[each.tips], atol=1e-12)
+    np.testing.assert_allclose(shared.poses[shared.last_keys], each.poses[each.last_keys], atol=1e-12)
     stood = compose(shared.poses[shared.frame_keys], shared.frame_offsets)
     off = stood - compose(each.poses[each.frame_keys], each.frame_offsets)
     off[:, 2] = wrap_angle(off[:, 2])
     np.testing.assert_allclose(off, 0.0, atol=1e-12)
     np.testing.assert_allclose(shared.landmarks, each.landmarks, atol=1e-12)
-    assert shared.slack.max() < 0.06**2
-    assert (shared.slack > 0).any()
+    assert shared.rigid_variances.max() < 0.06**2
+    assert (shared.rigid_variances > 0).any()
 
 
 @pytest.mark.parametrize("rigid_within", [0.0, 0.02])
@@ -366,8 +381,8 @@ def test_steps_in_one_place_share_its_key(rigid_within):
     still = log.arrays()
     motions = np.where(still.kinds[:, None] == ODOMETRY, [0.0, 0.0, 1e-4], 0.0)
     still = type(still)(**{name: getattr(still, name) for name in still.__dataclass_fields__} | {"motions": motions})
-    graph = extended(
-        PathGraph.at_starts(np.zeros((1, 3))), [still], run.spec.noise.motion, np.zeros(3), rigid_within=rigid_within
+    graph = extend_graph(
+        SlamGraph.at_starts(np.zeros((1, 3))), [still], run.spec.noise.motion, np.zeros(3), rigid_within=rigid_within
     )
     assert graph.num_keys == (len(still) if rigid_within == 0.0 else 2)  # the start, and where it stands now
     assert len(graph.points) == len(still.ids)
@@ -378,10 +393,10 @@ def test_shared_keys_cost_little_truth(seed):
     """Where keys share less than measurements err, the newest pose agrees with that of a key at each step."""
     run = simulate_run(RunSpec(length=15.0, landmarks=120, measurements=7, preset="paper"), seed)
     log, motion, camera = logs_of(run)[0].arrays(), run.spec.noise.motion, camera_of(run)
-    start = PathGraph.at_starts(run.true_paths[:, 0])
+    start = SlamGraph.at_starts(run.true_paths[:, 0])
     results = []
     for rigid_within in (0.0, 0.02):
-        options = SmoothingOptions(max_keys=1000, fresh_keys=1000, rigid_within=rigid_within)
+        options = SmoothingOptions(max_keys=1000, recent_keys=1000, rigid_within=rigid_within)
         results.append(rejuvenate(start, [log], motion, camera, 50, np.random.default_rng(1), options))
     each, shared = results
     assert each.reason == shared.reason == ""

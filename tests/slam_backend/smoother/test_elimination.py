@@ -13,10 +13,10 @@ from slam_backend.geometry import between
 from slam_backend.models.odometry import OdometryModel
 from slam_backend.smoother import _kernels
 from slam_backend.smoother._kernels.sparse_cholesky import solve
-from slam_backend.smoother.graph import LEVER, PathGraph
-from slam_backend.smoother.graph_building import extended
-from slam_backend.smoother.graph_reduction import at_mode, coarsened
-from slam_backend.smoother.optimizer import Mode, Sightings, find_mode
+from slam_backend.smoother.graph import LEVER_ARM, SlamGraph
+from slam_backend.smoother.graph_building import extend_graph
+from slam_backend.smoother.graph_reduction import reduce_keyframes, relinearise
+from slam_backend.smoother.optimizer import LandmarkFactors, MapEstimate, optimize
 from slam_backend.smoother.options import SmoothingOptions
 
 solve = python_entry(solve)
@@ -25,8 +25,8 @@ solve = python_entry(solve)
 class Problem(NamedTuple):
     """A graph, its mode, and the dense information of its poses and landmarks, (N, 3, N, 3)."""
 
-    graph: PathGraph
-    mode: Mode
+    graph: SlamGraph
+    mode: MapEstimate
     dense: FloatArray
 
 
@@ -34,11 +34,11 @@ def problem(robots: int, max_keys: int) -> Problem:
     """Return one of each kind: raw and frozen sightings, poses that are given, landmarks that poses share."""
     run = small_run(robots)
     camera = camera_of(run)
-    options = SmoothingOptions(max_keys=max_keys, further_keys=0, fresh_keys=6, kernel=0.0)
+    options = SmoothingOptions(max_keys=max_keys, further_keys=0, recent_keys=6, kernel=0.0)
     graph = graph_of(run)
-    mode = find_mode(graph, camera, TIGHT)
-    graph = coarsened(at_mode(graph, mode, mode.spreads()), camera, options)
-    mode = find_mode(graph, camera, TIGHT)
+    mode = optimize(graph, camera, TIGHT)
+    graph = reduce_keyframes(relinearise(graph, mode, mode.spreads()), camera, options)
+    mode = optimize(graph, camera, TIGHT)
     system, seen = mode.system, mode.sightings
     assert system is not None
     n = system.num_poses
@@ -46,7 +46,7 @@ def problem(robots: int, max_keys: int) -> Problem:
     dense = np.zeros((size, 3, size, 3))
     for node, block in enumerate(system.blocks):
         dense[node, :, node] = block[[[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
-    for b, a in enumerate(graph.previous):
+    for b, a in enumerate(graph.parents):
         if a >= 0 and min(mode.columns[a], mode.columns[b]) >= 0:
             i, j = mode.columns[[b, a]] // 3
             dense[i, :, j], dense[j, :, i] = system.links[b], system.links[b].T
@@ -173,7 +173,7 @@ def test_spreads_are_those_of_the_dense_covariance(posed):
                 rows.append(mode.columns[key] + axis)
         by = np.array(columns).T
         scatter = np.diag(by @ covariance[np.ix_(rows, rows)] @ by.T)
-        assert found[b] == pytest.approx(scatter[0] + scatter[1] + LEVER**2 * scatter[2], rel=1e-5)
+        assert found[b] == pytest.approx(scatter[0] + scatter[1] + LEVER_ARM**2 * scatter[2], rel=1e-5)
 
 
 def test_a_graph_is_crowded_where_all_poses_see_all_landmarks(posed):
@@ -185,8 +185,8 @@ def test_a_graph_is_crowded_where_all_poses_see_all_landmarks(posed):
         log.append(
             step, np.zeros(3) if step else None, points=points + 0.01 * rng.normal(size=(40, 3)), ids=np.arange(40)
         )
-    graph = extended(PathGraph.at_starts(np.zeros((1, 3))), [log.arrays()], OdometryModel(), np.zeros(3))
-    mode = find_mode(graph, camera_of(small_run()), TIGHT)
+    graph = extend_graph(SlamGraph.at_starts(np.zeros((1, 3))), [log.arrays()], OdometryModel(), np.zeros(3))
+    mode = optimize(graph, camera_of(small_run()), TIGHT)
     assert mode.crowded
 
 
@@ -214,15 +214,15 @@ def test_sightings_are_gathered_as_by_sorting():
     rng = np.random.default_rng(4)
     keys, landmarks, frames = 5, 4, 9
     frozen = np.sort(rng.choice(keys * landmarks, 8, replace=False))
-    graph = PathGraph(
+    graph = SlamGraph(
         robots=np.zeros(keys, dtype=np.int64), poses=np.zeros((keys, 3)), landmarks=np.zeros((landmarks, 3)),
-        landmark_ids=np.arange(landmarks), heads=np.zeros(1, dtype=np.int64), tips=np.zeros(1, dtype=np.int64),
-        latest=np.zeros(1, dtype=np.int64), frozen_keys=frozen % keys, frozen_landmarks=frozen // keys,
-        centres=rng.normal(size=(8, 3)), infos=rng.normal(size=(8, 6)), slopes=rng.normal(size=(8, 3)),
+        landmark_ids=np.arange(landmarks), first_keys=np.zeros(1, dtype=np.int64), last_keys=np.zeros(1, dtype=np.int64),
+        latest=np.zeros(1, dtype=np.int64), condensed_keys=frozen % keys, condensed_landmarks=frozen // keys,
+        linearisation_points=rng.normal(size=(8, 3)), information=rng.normal(size=(8, 6)), gradients=rng.normal(size=(8, 3)),
         counts=rng.integers(1, 5, 8), frame_keys=rng.integers(0, keys, frames), points=np.zeros((60, 3)),
         point_frames=rng.integers(0, frames, 60), point_landmarks=rng.integers(0, landmarks, 60),
     )  # fmt: skip
-    seen = Sightings.of(graph)
+    seen = LandmarkFactors.of(graph)
     of_raw = graph.point_landmarks * keys + graph.frame_keys[graph.point_frames]
     raw, counts = np.unique(of_raw, return_counts=True)
     codes = seen.landmarks * keys + seen.keys

@@ -6,31 +6,48 @@ from builders.kernels import python_entry
 from builders.runs import small_run
 
 from slam_backend.core.validation import FloatArray
-from slam_backend.fastslam._kernels import add_share
-from slam_backend.fastslam.estimates import widen
+from slam_backend.fastslam._kernels import add_gauge_covariance
+from slam_backend.fastslam.estimates import add_gauge_covariance
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.options import FilterOptions
-from slam_backend.fastslam.rejuvenation import RejuvenationStep
+from slam_backend.fastslam.rejuvenation import RejuvenationScheduler
 from slam_backend.geometry import between, compose, inverse, rotation, transform_points, wrap_angle
 from slam_backend.smoother import rejuvenation
 from slam_backend.smoother._kernels import LANES
 from slam_backend.smoother.gauge import (
-    add_scatter,
-    bring_nearer,
-    fit,
-    hold_start,
-    holding,
-    look_at,
-    measure_off,
+    add_covariance,
+    apply_if_closer,
+    fit_rigid_2d,
+    fix_gauge,
+    fix_start,
+    gather_landmarks,
+    landmark_weights,
     move,
-    move_tiles,
-    share,
+    squared_error,
+    transform_tiles,
 )
-from slam_backend.smoother.graph import RIGID, PathGraph
+from slam_backend.smoother.graph import RIGID, SlamGraph
 from training.bench.accuracy.runs import RunSpec, simulate_run
 
-add_scatter, bring_nearer, fit, look_at, measure_off, share, widen = map(
-    python_entry, (add_scatter, bring_nearer, fit, look_at, measure_off, share, widen)
+(
+    add_covariance,
+    apply_if_closer,
+    fit_rigid_2d,
+    gather_landmarks,
+    squared_error,
+    landmark_weights,
+    add_gauge_covariance,
+) = map(
+    python_entry,
+    (
+        add_covariance,
+        apply_if_closer,
+        fit_rigid_2d,
+        gather_landmarks,
+        squared_error,
+        landmark_weights,
+        add_gauge_covariance,
+    ),
 )
 
 SCATTER = np.array([[0.04, 0.01, -0.02], [0.01, 0.09, 0.03], [-0.02, 0.03, 0.05]])
@@ -90,7 +107,7 @@ def test_landmarks_are_moved_as_one_by_one():
     values, motions = random_maps(5, 70, rng), rng.normal(size=(70, 3))
     tiles = laned(values)
     before = tiles.copy()
-    move_tiles(tiles, motions)
+    transform_tiles(tiles, motions)
     np.testing.assert_allclose(unlaned(tiles, 70), moved_plainly(values, motions), atol=1e-12)
     np.testing.assert_array_equal(tiles[:, 1, :, 70 - LANES :], before[:, 1, :, 70 - LANES :])
 
@@ -108,18 +125,18 @@ def test_what_holding_looks_at_is_as_by_arrays():
     count, seen = LANES + 9, np.array([4, 0, 3])
     values, motions, poses = random_maps(5, count, rng), rng.normal(size=(count, 3)), rng.normal(size=(2, 3, count))
     targets, means, points = rng.normal(size=(3, 2)), rng.normal(size=(2, 3)), np.empty((3, 2, count))
-    look_at(laned(values), seen, targets, points, found := np.empty((3, count)))
+    gather_landmarks(laned(values), seen, targets, points, found := np.empty((3, count)))
     np.testing.assert_array_equal(points, values[seen, :2])
     off = values[seen, :2] - targets[:, :, None]
     np.testing.assert_allclose(found, (off**2).sum(axis=1) + values[seen, 3] + values[seen, 6], rtol=1e-12)
     move(poses, motions, moved := np.empty_like(poses))
     np.testing.assert_allclose(moved, compose(motions, poses.transpose(0, 2, 1)).transpose(0, 2, 1), atol=1e-12)
-    measure_off(poses, means, 3.0, squares := np.empty(count))
+    squared_error(poses, means, 3.0, squares := np.empty(count))
     np.testing.assert_allclose(squares, off_by(poses, means), rtol=1e-12)
     weights, again = rng.random(count), np.empty_like(poses)
     for by, gained in ((motions, squares @ weights - off_by(moved, means) @ weights), (0.0 * motions, 0.0)):
-        assert bring_nearer(poses, by, means, 3.0, weights, again) == (gained > 0.0)
-    bring_nearer(poses, motions, means, 3.0, weights, again)
+        assert apply_if_closer(poses, by, means, 3.0, weights, again) == (gained > 0.0)
+    apply_if_closer(poses, motions, means, 3.0, weights, again)
     np.testing.assert_array_equal(again, moved)
     move(poses, motions, poses)
     np.testing.assert_array_equal(poses, moved)
@@ -129,16 +146,16 @@ def test_motions_are_fitted_as_by_arrays():
     """Least squares by the singular value decomposition, one particle at a time; weights and scatter by their sums."""
     rng = np.random.default_rng(7)
     points, targets, weights = rng.normal(size=(5, 2, 30)), rng.normal(size=(5, 2)), rng.dirichlet(np.ones(30))
-    share(squares := rng.uniform(0.1, 2.0, (5, 30)), weights, shares := np.empty(5))
+    landmark_weights(squares := rng.uniform(0.1, 2.0, (5, 30)), weights, shares := np.empty(5))
     np.testing.assert_allclose(shares, 1.0 / (squares @ weights) / (1.0 / (squares @ weights)).sum(), rtol=1e-12)
-    fit(points, targets, shares, motions := np.empty((30, 3)))
+    fit_rigid_2d(points, targets, shares, motions := np.empty((30, 3)))
     for m, motion in enumerate(motions):
         centre, target = shares @ points[:, :, m], shares @ targets
         u, _, v = np.linalg.svd((shares[:, None] * (targets - target)).T @ (points[:, :, m] - centre))
         turn = u @ np.diag([1.0, np.linalg.det(u @ v)]) @ v
         np.testing.assert_allclose(rotation(motion[2]), turn, atol=1e-12)
         np.testing.assert_allclose(motion[:2], target - turn @ centre, atol=1e-12)
-    add_scatter(motions, weights, scatter := np.zeros((3, 3)))
+    add_covariance(motions, weights, scatter := np.zeros((3, 3)))
     np.testing.assert_allclose(scatter, (weights * inverse(motions).T) @ inverse(motions), atol=1e-12)
 
 
@@ -146,7 +163,7 @@ def test_a_scattered_frame_scatters_poses_and_points():
     """To first order: J C J^T with the derivatives of a moved pose, and of a moved point, by the motion."""
     rng = np.random.default_rng(2)
     poses, covariances = rng.normal(size=(4, 3)), np.zeros((4, 3, 3))
-    add_share(SCATTER, poses, covariances)
+    add_gauge_covariance(SCATTER, poses, covariances)
     small = 1e-6 * np.eye(3)
     for pose, covariance in zip(poses, covariances, strict=True):
         slopes = np.array([(compose(by, pose) - compose(-by, pose)) / 2e-6 for by in small]).T
@@ -154,7 +171,7 @@ def test_a_scattered_frame_scatters_poses_and_points():
         point = np.array([*pose[:2], 0.7])
         slopes = np.array([(transform_points(by, point[:2]) - transform_points(-by, point[:2])) / 2e-6 for by in small])
         of_point = np.zeros((3, 3))
-        widen(SCATTER, point[0], point[1], of_point)
+        add_gauge_covariance(SCATTER, point[0], point[1], of_point)
         np.testing.assert_allclose(of_point[:2, :2], slopes.T @ SCATTER @ slopes, atol=1e-8)
         assert not of_point[2].any()
 
@@ -170,7 +187,7 @@ def test_particles_that_differ_by_a_motion_alone_are_brought_together():
     weights /= weights.sum()
     moved, seen = moved_plainly(values, motions), np.array([0, 1, 3, 5])
     moved[[2, 4], :3] += 7.0  # what is not seen has no say
-    held = holding(laned(moved), seen, landmarks, poses, pose[None], weights)
+    held = fix_gauge(laned(moved), seen, landmarks, poses, pose[None], weights)
     assert held is not None
     np.testing.assert_allclose(compose(held.motions, motions), 0.0, atol=1e-12)
     np.testing.assert_allclose(held.scatter, (weights * motions.T) @ motions, atol=1e-12)
@@ -188,7 +205,7 @@ def test_what_says_nothing_of_the_turn_holds_nothing(apart: float):
     weights = np.full(80, 1.0 / 80)
     for seen in ([0, 1], [0], []):
         rows = np.array(seen, dtype=np.int64)
-        assert holding(laned(values), rows, landmarks, poses, pose[None], weights) is None
+        assert fix_gauge(laned(values), rows, landmarks, poses, pose[None], weights) is None
 
 
 def test_a_start_is_held_where_the_pose_is_known_in_the_map():
@@ -197,7 +214,7 @@ def test_a_start_is_held_where_the_pose_is_known_in_the_map():
     start, pose, weights = np.array([2.0, -1.0, 2.5]), np.array([1.0, 2.0, 0.5]), rng.dirichlet(np.ones(40))
     apart = rng.normal(size=(40, 3)) * [0.3, 0.2, 0.1]
     starts, poses = compose(start, inverse(apart)).T, pose[:, None] + 0.01 * rng.standard_normal((3, 40))
-    scatter = hold_start(starts, poses, start, pose, weights)
+    scatter = fix_start(starts, poses, start, pose, weights)
     np.testing.assert_array_equal(starts, np.repeat(start[:, None], 40, axis=1))
     np.testing.assert_allclose(scatter, (weights * apart.T) @ apart, atol=1e-12)
 
@@ -208,7 +225,7 @@ def test_a_start_is_not_held_where_the_path_from_it_is_known_better_than_the_map
     start, way = np.array([2.0, -1.0, 2.5]), np.array([0.5, 0.1, 0.2])
     starts = compose(start, rng.normal(size=(40, 3)) * [0.3, 0.2, 0.1]).T
     poses, before = compose(starts.T, way + 0.01 * rng.standard_normal((40, 3))).T, starts.copy()
-    scatter = hold_start(starts, poses, start, compose(start, way), np.full(40, 1.0 / 40))
+    scatter = fix_start(starts, poses, start, compose(start, way), np.full(40, 1.0 / 40))
     np.testing.assert_array_equal(starts, before)
     assert not scatter.any()
 
@@ -225,7 +242,7 @@ def test_what_particles_no_longer_show_is_claimed_all_the_same():
     off[:, 2] = wrap_angle(off[:, 2])
     shown = np.asarray(slam.weights * off.T @ off)
     both = shown[None].copy()
-    add_share(slam.state.gauge_covariance, said.mean[None], both)
+    add_gauge_covariance(slam.state.gauge_covariance, said.mean[None], both)
     assert np.trace(shown[:2, :2]) < np.trace(said.covariance[:2, :2])
     np.testing.assert_allclose(np.sqrt(np.diag(both[0])), np.sqrt(np.diag(said.covariance)), rtol=0.25)
 
@@ -244,19 +261,19 @@ def test_starts_that_are_given_stay_and_an_exact_pose_needs_no_share():
 def test_groups_that_share_too_little_doubt_both_frames():
     """Where one group started in the other's map is as uncertain as both frames are, however alike the particles."""
     options = FilterOptions(rejuvenate_every=10)
-    a, b, joint = (RejuvenationStep(options, robots) for robots in (1, 1, 2))
+    a, b, joint = (RejuvenationScheduler(options, robots) for robots in (1, 1, 2))
     motion = np.array([2.0, -1.0, 0.7])
     starts = np.repeat([[np.zeros(3)], [motion]], 5, axis=1).transpose(0, 2, 1)
     no_names = np.zeros((0, 2), dtype=np.int64)
     given = np.zeros(1, dtype=np.bool_)
     joint.join(a, b, (starts[:1], starts[:1], starts), (given, given), (SCATTER, 0.5 * SCATTER), no_names, np.zeros(7))
-    graph = PathGraph(**joint.get_state()["graph"])
+    graph = SlamGraph(**joint.get_state()["graph"])
     slopes, turn = np.eye(3), np.eye(3)
     slopes[:2, 2] = -motion[1], motion[0]
     turn[:2, :2] = rotation(motion[2])
     expected = slopes @ SCATTER @ slopes.T + turn @ (0.5 * SCATTER) @ turn.T + RIGID**2 * np.eye(3)
-    np.testing.assert_allclose(graph.noises[graph.heads[1]], expected, atol=1e-12)
-    np.testing.assert_allclose(graph.poses[graph.heads[1]], motion, atol=1e-12)
+    np.testing.assert_allclose(graph.odometry_covariances[graph.first_keys[1]], expected, atol=1e-12)
+    np.testing.assert_allclose(graph.poses[graph.first_keys[1]], motion, atol=1e-12)
 
 
 def test_maps_of_all_particles_claim_their_share():

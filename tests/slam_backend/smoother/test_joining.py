@@ -10,9 +10,9 @@ from builders.teams import NEVER, SimulatedTeam, check_snapshot, false_alignment
 from slam_backend.geometry import between, compose
 from slam_backend.maps.alignment import AlignmentOptions
 from slam_backend.smoother import rejuvenation as slices
-from slam_backend.smoother.graph import NONE, PathGraph, scattered
-from slam_backend.smoother.graph_building import extended, joined
-from slam_backend.smoother.optimizer import find_mode
+from slam_backend.smoother.graph import NONE, SlamGraph, scattered
+from slam_backend.smoother.graph_building import extend_graph, merge_graphs
+from slam_backend.smoother.optimizer import optimize
 from slam_backend.smoother.options import SmoothingOptions
 from slam_backend.team.merge_scheduler import AttemptOptions
 
@@ -25,7 +25,9 @@ def group_graph(run, robots, offset=0):
     names = np.unique(np.concatenate([log.arrays().ids for log in logs]))
     arrays = [log.renamed(names, names + offset).arrays() for log in logs]
     starts = between(run.true_paths[robots[0], 0], run.true_paths[robots, 0])
-    graph = extended(PathGraph.at_starts(starts), arrays, run.spec.noise.motion, np.array(run.spec.noise.camera.mount))
+    graph = extend_graph(
+        SlamGraph.at_starts(starts), arrays, run.spec.noise.motion, np.array(run.spec.noise.camera.mount)
+    )
     return graph, np.column_stack([names + offset, names])
 
 
@@ -39,7 +41,7 @@ def from_the_start(run, groups, guess):
             starts[robot] = compose(frames, between(run.true_paths[robots[0], 0], run.true_paths[robot, 0])).T
     logs = [log.arrays() for log in logs_of(run)]
     mount = np.array(run.spec.noise.camera.mount)
-    return extended(PathGraph.at_uncertain_starts(starts), logs, run.spec.noise.motion, mount)
+    return extend_graph(SlamGraph.at_uncertain_starts(starts), logs, run.spec.noise.motion, mount)
 
 
 def in_order(graph):
@@ -57,7 +59,7 @@ def covariance(graph, mode):
 
 def assert_same_posterior(graph, other, run):
     """Both graphs have the same mode and the same covariance about it."""
-    one, two = find_mode(graph, camera_of(run), TIGHT), find_mode(other, camera_of(run), TIGHT)
+    one, two = optimize(graph, camera_of(run), TIGHT), optimize(other, camera_of(run), TIGHT)
     assert one.reason == two.reason == ""
     np.testing.assert_allclose(one.poses[in_order(graph), :2], two.poses[in_order(other), :2], atol=1e-5)
     names, same = np.argsort(graph.landmark_ids), np.argsort(other.landmark_ids)
@@ -73,8 +75,8 @@ def test_two_groups_joined_are_what_their_logs_give_from_the_start():
     a, _ = group_graph(run, [0])
     b, renamed = group_graph(run, [1, 2], OFFSET)
     motion = compose(guess, between(run.true_paths[0, 0], run.true_paths[1, 0]))
-    both = joined(a, b, motion, renamed)
-    assert both.previous[both.heads].tolist() == [NONE, a.num_keys, both.heads[1]]
+    both = merge_graphs(a, b, motion, renamed)
+    assert both.parents[both.first_keys].tolist() == [NONE, a.num_keys, both.first_keys[1]]
     assert_same_posterior(both, from_the_start(run, [[0], [1, 2]], guess), run)
 
 
@@ -89,12 +91,12 @@ def test_a_third_robot_joins_later():
     def motion(a, b):
         return compose(guess, between(starts[a], starts[b]))
 
-    first = joined(graphs[0][0], graphs[1][0], motion(0, 1), graphs[1][1])
-    assert_same_posterior(joined(first, graphs[2][0], motion(0, 2), graphs[2][1]), whole, run)
+    first = merge_graphs(graphs[0][0], graphs[1][0], motion(0, 1), graphs[1][1])
+    assert_same_posterior(merge_graphs(first, graphs[2][0], motion(0, 2), graphs[2][1]), whole, run)
     names = graphs[2][1] - [0, -OFFSET]
-    pair = joined(graphs[1][0], graphs[2][0], motion(1, 2), names)
+    pair = merge_graphs(graphs[1][0], graphs[2][0], motion(1, 2), names)
     names = np.column_stack([pair.landmark_ids, pair.landmark_ids - OFFSET])
-    assert_same_posterior(joined(graphs[0][0], pair, motion(0, 1), names), whole, run)
+    assert_same_posterior(merge_graphs(graphs[0][0], pair, motion(0, 1), names), whole, run)
 
 
 def test_landmarks_without_a_new_name_are_left_out():
@@ -102,7 +104,7 @@ def test_landmarks_without_a_new_name_are_left_out():
     run = small_run(2, seed=104)
     (a, _), (b, renamed) = group_graph(run, [0]), group_graph(run, [1], OFFSET)
     lost = b.landmark_ids[3]
-    both = joined(a, b, np.array([1.0, 2.0, 0.5]), renamed[renamed[:, 0] != lost])
+    both = merge_graphs(a, b, np.array([1.0, 2.0, 0.5]), renamed[renamed[:, 0] != lost])
     assert len(both.points) == len(a.points) + np.count_nonzero(b.landmark_ids[b.point_landmarks] != lost)
     np.testing.assert_array_equal(both.landmark_ids[both.point_landmarks[: len(a.points)]],
                                   a.landmark_ids[a.point_landmarks])  # fmt: skip
@@ -114,9 +116,9 @@ def test_words_for_one_landmark_follow_it():
     run = small_run(2, seed=104)
     (a, _), (b, renamed) = group_graph(run, [0]), group_graph(run, [1], OFFSET)
     old, kept = renamed[0], renamed[1]
-    b = PathGraph(**b.to_mapping() | {"aliases": np.array([[old[0], kept[0]]])})
-    both = joined(a, b, np.zeros(3), renamed)
-    assert both.known_as(np.array([old[1], kept[1]])).tolist() == [kept[1], kept[1]]
+    b = SlamGraph(**b.to_mapping() | {"aliases": np.array([[old[0], kept[0]]])})
+    both = merge_graphs(a, b, np.zeros(3), renamed)
+    assert both.resolve_ids(np.array([old[1], kept[1]])).tolist() == [kept[1], kept[1]]
 
 
 @pytest.mark.parametrize("common", [0, 2])
@@ -128,16 +130,16 @@ def test_groups_without_landmarks_that_fix_the_motion_lie_as_the_merge_said(comm
     own = renamed[~np.isin(renamed[:, 1], a.landmark_ids)]
     uncertainty = np.diag([0.03, 0.04, 0.01]) ** 2
     motion = between(run.true_paths[0, 0], run.true_paths[1, 0])
-    both = joined(a, b, motion, np.concatenate([shared, own]), uncertainty)
-    mode = find_mode(both, camera_of(run), TIGHT)
+    both = merge_graphs(a, b, motion, np.concatenate([shared, own]), uncertainty)
+    mode = optimize(both, camera_of(run), TIGHT)
     assert mode.reason == ""
     half = np.linalg.inv(upper(mode))
-    first = mode.columns[both.heads[1]] + np.arange(3)
+    first = mode.columns[both.first_keys[1]] + np.arange(3)
     claimed = (half @ half.T)[np.ix_(first, first)]
     if common:
         assert np.linalg.eigvalsh(uncertainty - claimed).min() > -1e-9
         return
-    np.testing.assert_allclose(mode.poses[both.heads[1]], motion, atol=1e-6)
+    np.testing.assert_allclose(mode.poses[both.first_keys[1]], motion, atol=1e-6)
     np.testing.assert_allclose(claimed, uncertainty, rtol=1e-3, atol=1e-9)
 
 
@@ -199,7 +201,7 @@ def test_a_snapshot_of_a_team_goes_on_through_merges_and_rejuvenations(every, sl
     team = build(simulation, every, slice_steps)
     simulation.run(team, 50)
     reports = check_snapshot(simulation, team, [None] * 40)
-    assert any(report.renamings for report in reports)
+    assert any(report.id_maps for report in reports)
 
 
 def test_a_merge_goes_on_from_what_both_groups_have_smoothed():
@@ -234,9 +236,9 @@ def test_no_two_filters_work_on_their_smoothers_in_one_step(monkeypatch):
 
     def noted(*arguments):
         worked.append(team._step)
-        return find_mode(*arguments)
+        return optimize(*arguments)
 
-    monkeypatch.setattr(slices, "find_mode", noted)
+    monkeypatch.setattr(slices, "optimize", noted)
     simulation.run(team, 60)
     assert len(worked) > 10
     assert len(set(worked)) == len(worked)

@@ -23,12 +23,12 @@ from slam_backend.geometry import between, compose
 from slam_backend.models.camera import StereoCamera
 from slam_backend.models.odometry import OdometryModel
 from slam_backend.smoother._kernels import FREE
-from slam_backend.smoother._kernels.factors import invert, seek, seek_poses
+from slam_backend.smoother._kernels.factors import invert, optimise_landmark, sum_pose_information
 from slam_backend.smoother._kernels.normal_equations import advance
-from slam_backend.smoother.graph import PathGraph
-from slam_backend.smoother.graph_building import Guesses, Places, extended, first_rows
-from slam_backend.smoother.graph_reduction import at_mode
-from slam_backend.smoother.optimizer import find_mode
+from slam_backend.smoother.graph import SlamGraph
+from slam_backend.smoother.graph_building import InitialPoses, LandmarkPositions, extend_graph, log_head
+from slam_backend.smoother.graph_reduction import relinearise
+from slam_backend.smoother.optimizer import optimize
 from slam_backend.smoother.options import SmoothingOptions
 from slam_backend.smoother.rejuvenation import rejuvenate
 from training.bench.accuracy.batch_ml import batch_ml
@@ -73,24 +73,24 @@ def test_a_landmark_with_mostly_new_sightings_starts_where_the_filter_has_it():
     log = misplaced(run, name, by=3.0)
     motion, camera, mount = run.spec.noise.motion, camera_of(run), np.array(run.spec.noise.camera.mount)
     options = SmoothingOptions()
-    start = extended(PathGraph.at_starts(run.true_paths[:, 0]), [first_rows(log, first + 1)], motion, mount)
-    start = at_mode(start, find_mode(start, camera, options))
+    start = extend_graph(SlamGraph.at_starts(run.true_paths[:, 0]), [log_head(log, first + 1)], motion, mount)
+    start = relinearise(start, optimize(start, camera, options))
     assert np.linalg.norm(start.landmarks[start.landmark_ids == name][0] - run.landmarks[name]) > 1.0
     rest = [log.since(first + 1)]
-    guesses = [Guesses(np.arange(len(run.true_paths[0])), run.true_paths[0])]
-    places = Places(np.arange(120), run.landmarks + 0.02)
+    guesses = [InitialPoses(np.arange(len(run.true_paths[0])), run.true_paths[0])]
+    places = LandmarkPositions(np.arange(120), run.landmarks + 0.02)
 
     def error(guesses, places):
-        graph = extended(start, rest, motion, mount, guesses, places=places)
-        mode = find_mode(graph, camera, options)
+        graph = extend_graph(start, rest, motion, mount, guesses, places=places)
+        mode = optimize(graph, camera, options)
         assert mode.reason == ""
         return np.linalg.norm(mode.landmarks[graph.landmark_ids == name][0] - run.landmarks[name])
 
     assert error(guesses, places) < 0.05
     assert error(guesses, None) > 2.0
-    assert error([Guesses.none()], places) == error([Guesses.none()], None)
-    few = [first_rows(rest[0], 1)]
-    grown = extended(start, few, motion, mount, guesses, places=places)
+    assert error([InitialPoses.empty()], places) == error([InitialPoses.empty()], None)
+    few = [log_head(rest[0], 1)]
+    grown = extend_graph(start, few, motion, mount, guesses, places=places)
     old = np.flatnonzero(np.isin(grown.landmark_ids, start.landmark_ids))
     np.testing.assert_array_equal(grown.landmarks[old], start.landmarks[old])
 
@@ -99,13 +99,13 @@ def test_a_long_log_taken_in_at_once_ends_where_short_ones_do():
     """Part by part inside one call, or in many calls: the newest poses agree to a part of their doubt."""
     run = small_run(length=15.0)
     log = logs_of(run)[0].arrays()
-    options = SmoothingOptions(max_keys=40, fresh_keys=20)
+    options = SmoothingOptions(max_keys=40, recent_keys=20)
     motion, camera = run.spec.noise.motion, camera_of(run)
-    start = PathGraph.at_starts(run.true_paths[:, 0])
+    start = SlamGraph.at_starts(run.true_paths[:, 0])
     whole = rejuvenate(start, [log], motion, camera, 50, np.random.default_rng(1), options)
     graph = start
     for upto in range(7, 62, 6):
-        part = first_rows(log, upto).since(int(graph.latest[0]) + 1)
+        part = log_head(log, upto).since(int(graph.latest[0]) + 1)
         result = rejuvenate(graph, [part], motion, camera, 50, np.random.default_rng(upto), options)
         graph = result.graph
     assert whole.reason == result.reason == ""
@@ -122,20 +122,20 @@ def test_starts_on_which_particles_agree_are_given():
     motions = rng.normal(size=(30, 3)) * [0.2, 0.2, 0.05] + [5.0, 1.0, 3.1]
     starts[1] = motions.T
     starts[2] = compose(motions, np.array([0.0, 2.0, 0.1])).T
-    graph = PathGraph.at_uncertain_starts(starts)
-    assert graph.previous.tolist() == [-1, 3, 1, -1]
+    graph = SlamGraph.at_uncertain_starts(starts)
+    assert graph.parents.tolist() == [-1, 3, 1, -1]
     assert graph.robots.tolist() == [0, 1, 2, -1]
-    np.testing.assert_allclose(graph.motions[2], [0.0, 2.0, 0.1], atol=1e-12)
-    assert graph.noises[1, 0, 0] > 1e3
-    assert graph.noises[2, 0, 0] < 1e-6
+    np.testing.assert_allclose(graph.odometry[2], [0.0, 2.0, 0.1], atol=1e-12)
+    assert graph.odometry_covariances[1, 0, 0] > 1e3
+    assert graph.odometry_covariances[2, 0, 0] < 1e-6
 
 
 def test_a_held_start_is_sought_though_particles_agree_on_it():
     """It hangs on the origin by a vague prior, and on no other start, though none of them changes against another."""
     starts = np.repeat(np.array([[0.0, 0.0, 0.0], [5.0, 1.0, 3.1], [2.0, -1.0, 0.4]])[:, :, None], 30, axis=2)
-    graph = PathGraph.at_uncertain_starts(starts, np.array([False, True, True]))
-    assert graph.previous.tolist() == [-1, 3, 3, -1]
-    assert (graph.noises[1:3, 0, 0] > 1e3).all()
+    graph = SlamGraph.at_uncertain_starts(starts, np.array([False, True, True]))
+    assert graph.parents.tolist() == [-1, 3, 3, -1]
+    assert (graph.odometry_covariances[1:3, 0, 0] > 1e3).all()
     np.testing.assert_allclose(graph.poses[:3], starts[:, :, 0], atol=1e-12)
 
 
@@ -149,9 +149,9 @@ def test_a_start_that_is_not_known_is_found_by_shared_landmarks():
     shared = np.intersect1d(*(np.concatenate([names[i] for names in run.names]) for i in range(2)))
     assert len(shared) >= 3
     logs = [log.arrays() for log in logs_of(run)]
-    options = SmoothingOptions(max_keys=200, fresh_keys=200, max_iterations=40)
+    options = SmoothingOptions(max_keys=200, recent_keys=200, max_iterations=40)
     result = rejuvenate(
-        PathGraph.at_uncertain_starts(starts), logs, run.spec.noise.motion, camera_of(run), 200,
+        SlamGraph.at_uncertain_starts(starts), logs, run.spec.noise.motion, camera_of(run), 200,
         np.random.default_rng(4), options,
     )  # fmt: skip
     assert result.reason == ""
@@ -169,7 +169,7 @@ def test_robots_are_renumbered_with_all_that_is_theirs():
     order = np.array([1, 0])
     other = graph.reordered(order)
     np.testing.assert_array_equal(other.poses[other.robots == 0], graph.poses[graph.robots == 1])
-    assert other.tips.tolist() == graph.tips[::-1].tolist()
+    assert other.last_keys.tolist() == graph.last_keys[::-1].tolist()
     np.testing.assert_array_equal(other.reordered(order).robots, graph.robots)
 
 
@@ -179,7 +179,7 @@ def test_a_graph_cannot_be_written():
         graph_of(small_run()).poses[0] = 0.0
 
 
-advance, invert, seek = map(python_entry, (advance, invert, seek))
+advance, invert, optimise_landmark = map(python_entry, (advance, invert, optimise_landmark))
 
 
 @pytest.mark.parametrize("robots", [1, 2])
@@ -187,7 +187,7 @@ def test_with_every_step_a_key_the_mode_is_batch_maximum_likelihood(robots):
     """Two programs that share no line find the same paths, landmarks and cost."""
     run = small_run(robots)
     graph = graph_of(run)
-    mode = find_mode(graph, camera_of(run), TIGHT)
+    mode = optimize(graph, camera_of(run), TIGHT)
     batch = batch_ml(problem_of(run))
     assert mode.reason == ""
     assert mode.cost == pytest.approx(0.5 * batch.cost, rel=1e-9)
@@ -202,7 +202,7 @@ def test_with_every_step_a_key_the_mode_is_batch_maximum_likelihood(robots):
 def test_the_information_of_the_paths_is_that_of_batch_maximum_likelihood():
     """The factor's inverse holds the covariances of all poses, landmarks integrated out."""
     run = small_run()
-    mode = find_mode(graph_of(run), camera_of(run), TIGHT)
+    mode = optimize(graph_of(run), camera_of(run), TIGHT)
     half = np.linalg.inv(upper(mode))
     covariance = (half @ half.T).reshape(-1, 3, len(half) // 3, 3)
     each = np.arange(len(covariance))
@@ -214,7 +214,7 @@ def test_at_the_mode_the_plain_cost_is_flat():
     """Moving any pose or landmark by a thousandth of a millimetre, either way, does not lower the cost."""
     run = small_run(length=1.0)
     graph = graph_of(run)
-    mode = find_mode(graph, camera_of(run), TIGHT)
+    mode = optimize(graph, camera_of(run), TIGHT)
     best = plain_cost(run, mode.poses[None], dict(zip(graph.landmark_ids.tolist(), mode.landmarks, strict=True)))
     assert best == pytest.approx(mode.cost, rel=1e-9)
     for i in range(len(mode.poses) - 1):
@@ -244,14 +244,14 @@ def test_without_noise_there_is_no_error():
     run = simulate_run(RunSpec(length=4.0, landmarks=120, measurements=6, preset=exact), 103)
     assumed = StereoCamera(mount=exact.camera.mount)
     camera = np.array([assumed.focal_px, assumed.baseline, 0.2, 0.1, *assumed.mount])
-    start = PathGraph.at_starts(run.true_paths[:, 0])
+    start = SlamGraph.at_starts(run.true_paths[:, 0])
     log = RobotLog()
     for step in range(run.num_steps):
         points = assumed.robot_from_camera(run.frames[step][0].points) - np.array(assumed.mount)
         move = None if step == 0 else run.odometry[step, 0]
         log.append(step, move, points=points, ids=run.names[step][0])
-    graph = extended(start, [log.arrays()], OdometryModel(), np.array(assumed.mount))
-    mode = find_mode(graph, camera, TIGHT)
+    graph = extend_graph(start, [log.arrays()], OdometryModel(), np.array(assumed.mount))
+    mode = optimize(graph, camera, TIGHT)
     np.testing.assert_allclose(mode.poses[:, :2], run.true_paths[0, :, :2], atol=1e-9)
     np.testing.assert_allclose(mode.landmarks, run.landmarks[graph.landmark_ids], atol=1e-8)
 
@@ -263,19 +263,19 @@ def test_a_descent_that_creeps_has_ended_in_the_last_iteration():
     """
     run = small_run()
     graph, camera = graph_of(run), camera_of(run)
-    after_two = find_mode(graph, camera, replace(TIGHT, max_iterations=2))
-    rough = find_mode(graph, camera, replace(TIGHT, tolerance=0.1))
+    after_two = optimize(graph, camera, replace(TIGHT, max_iterations=2))
+    rough = optimize(graph, camera, replace(TIGHT, tolerance=0.1))
     assert rough.iterations == 3
     promise = after_two.cost - rough.cost  # of the third step
     near = replace(TIGHT, max_iterations=3, tolerance=promise / 5.0)
-    mode = find_mode(graph, camera, near)
+    mode = optimize(graph, camera, near)
     assert mode.reason == ""
     np.testing.assert_array_equal(mode.poses, rough.poses)
-    loose = find_mode(graph, camera, replace(near, tolerance=promise / 50.0), looseness=10.0)
+    loose = optimize(graph, camera, replace(near, tolerance=promise / 50.0), looseness=10.0)
     assert loose.reason == ""
     np.testing.assert_array_equal(loose.poses, rough.poses)
-    assert find_mode(graph, camera, near, 3).reason == "no convergence in 3 iterations"
-    assert find_mode(graph, camera, replace(near, tolerance=promise / 20.0)).reason == "no convergence in 3 iterations"
+    assert optimize(graph, camera, near, 3).reason == "no convergence in 3 iterations"
+    assert optimize(graph, camera, replace(near, tolerance=promise / 20.0)).reason == "no convergence in 3 iterations"
 
 
 def test_a_kernel_ignores_a_wrong_match():
@@ -285,9 +285,9 @@ def test_a_kernel_ignores_a_wrong_match():
     wrong = graph.points.copy()
     wrong[60] += [0.0, 1.5, 0.0]
     swapped = type(graph)(**{name: getattr(graph, name) for name in graph.__dataclass_fields__} | {"points": wrong})
-    right = find_mode(graph, camera_of(run), TIGHT).poses
-    plain = find_mode(swapped, camera_of(run), TIGHT).poses
-    robust = find_mode(swapped, camera_of(run), SmoothingOptions(kernel=16.0, tolerance=1e-9, max_iterations=40)).poses
+    right = optimize(graph, camera_of(run), TIGHT).poses
+    plain = optimize(swapped, camera_of(run), TIGHT).poses
+    robust = optimize(swapped, camera_of(run), SmoothingOptions(kernel=16.0, tolerance=1e-9, max_iterations=40)).poses
     assert np.abs(plain - right)[:, :2].max() > 10.0 * np.abs(robust - right)[:, :2].max()
 
 
@@ -295,7 +295,7 @@ def test_steps_without_measurements_are_eliminated_exactly():
     """Odometry chained over steps in which nothing was seen gives the keys the same mode as keeping those steps."""
     run = small_run()
     skip = (3, 4, 5, 11)
-    chained = find_mode(graph_of(run, skip), camera_of(run), TIGHT)
+    chained = optimize(graph_of(run, skip), camera_of(run), TIGHT)
     kept = graph_of(run)
     points = ~np.isin(kept.point_frames, skip)
     seen = np.unique(kept.point_landmarks[points])
@@ -304,7 +304,7 @@ def test_steps_without_measurements_are_eliminated_exactly():
     fewer["point_landmarks"] = np.searchsorted(seen, fewer["point_landmarks"])
     fewer |= {"landmarks": kept.landmarks[seen], "landmark_ids": kept.landmark_ids[seen]}
     whole = type(kept)(**{name: getattr(kept, name) for name in kept.__dataclass_fields__} | fewer)
-    mode = find_mode(whole, camera_of(run), TIGHT)
+    mode = optimize(whole, camera_of(run), TIGHT)
     np.testing.assert_allclose(chained.poses, np.delete(mode.poses, skip, axis=0), atol=2e-4)
 
 
@@ -318,12 +318,14 @@ def moving_log(steps: int) -> RobotLog:
 
 def test_without_landmarks_the_mode_is_dead_reckoning():
     """Thousands of steps without a landmark are one link of odometry, and its covariance is that of the chain."""
-    graph = extended(PathGraph.at_starts(np.zeros((1, 3))), [moving_log(3000).arrays()], OdometryModel(), np.zeros(3))
+    graph = extend_graph(
+        SlamGraph.at_starts(np.zeros((1, 3))), [moving_log(3000).arrays()], OdometryModel(), np.zeros(3)
+    )
     assert graph.num_keys == 2
-    mode = find_mode(graph, camera_of(small_run()), TIGHT)
+    mode = optimize(graph, camera_of(small_run()), TIGHT)
     assert mode.reason == ""
     half = np.linalg.inv(upper(mode))
-    np.testing.assert_allclose(half @ half.T, graph.noises[1], rtol=1e-6)
+    np.testing.assert_allclose(half @ half.T, graph.odometry_covariances[1], rtol=1e-6)
 
 
 def test_small_matrices_are_inverted_as_by_lapack():
@@ -346,12 +348,12 @@ def test_small_matrices_are_inverted_as_by_lapack():
 def test_only_poses_with_odometry_from_another_are_sought():
     """They get three rows each, in their order; poses that are given get none."""
     columns = np.empty(5, dtype=np.int64)
-    assert seek(np.array([-1, 0, -1, 1, 2]), columns) == 3
+    assert optimise_landmark(np.array([-1, 0, -1, 1, 2]), columns) == 3
     assert columns.tolist() == [FREE, 0, FREE, 3, 6]
     noises, informations = np.zeros((5, 3, 3)), np.empty((5, 3, 3))
-    assert seek_poses(np.array([-1, 0, -1, 1, 2]), noises, columns, informations) == (3, False)
+    assert sum_pose_information(np.array([-1, 0, -1, 1, 2]), noises, columns, informations) == (3, False)
     noises[[1, 3, 4]] = 0.5 * np.eye(3)
-    assert seek_poses(np.array([-1, 0, -1, 1, 2]), noises, columns, informations) == (3, True)
+    assert sum_pose_information(np.array([-1, 0, -1, 1, 2]), noises, columns, informations) == (3, True)
     np.testing.assert_array_equal(informations, 4.0 * noises)
 
 
@@ -374,24 +376,24 @@ def test_a_change_leads_where_it_says():
 
 def test_exact_motions_and_poses_leave_nothing_to_smooth():
     """Exact odometry has no information matrix, and a pose that was given as exact is not sought."""
-    start = PathGraph.at_starts(np.zeros((1, 3)))
-    graph = extended(start, [moving_log(4).arrays()], EXACT_MOTION, np.zeros(3))
-    assert find_mode(graph, camera_of(small_run()), TIGHT).reason == "odometry without noise"
+    start = SlamGraph.at_starts(np.zeros((1, 3)))
+    graph = extend_graph(start, [moving_log(4).arrays()], EXACT_MOTION, np.zeros(3))
+    assert optimize(graph, camera_of(small_run()), TIGHT).reason == "odometry without noise"
     log = RobotLog()
     log.append(0, pose=np.zeros(3))
     with pytest.raises(ValueError, match="logs: expected odometry"):
-        extended(start, [log.arrays()], OdometryModel(), np.zeros(3))
+        extend_graph(start, [log.arrays()], OdometryModel(), np.zeros(3))
 
 
 def test_a_landmark_whose_sightings_say_nothing_stays_and_keeps_nobody():
     """Frozen sightings that have lost their weight hold no landmark: it stays where it is, and poses are as without."""
     run = small_run()
     graph = graph_of(run)
-    best = find_mode(graph, camera_of(run), TIGHT)
+    best = optimize(graph, camera_of(run), TIGHT)
     lost = np.array([3.0, -2.0, 0.5])
     ghost = {
-        "frozen_keys": np.array([2, 4]),
-        "frozen_landmarks": np.full(2, len(graph.landmarks)),
+        "condensed_keys": np.array([2, 4]),
+        "condensed_landmarks": np.full(2, len(graph.landmarks)),
         "centres": np.array([[1.0, 0.0, 0.0], [40.0, 0.0, 0.0]]),
         "infos": 1e-200 * np.array([[1.0, 0.0, 0.0, 1.0, 0.0, 1.0]] * 2),
         "slopes": np.zeros((2, 3)),
@@ -399,7 +401,7 @@ def test_a_landmark_whose_sightings_say_nothing_stays_and_keeps_nobody():
         "landmark_ids": np.append(graph.landmark_ids, 10_000),
         "landmarks": np.concatenate([graph.landmarks, lost[None]]),
     }
-    mode = find_mode(replace(graph, **ghost), camera_of(run), TIGHT)
+    mode = optimize(replace(graph, **ghost), camera_of(run), TIGHT)
     assert mode.reason == ""
     np.testing.assert_allclose(mode.landmarks[-1], lost, atol=1e-9)
     np.testing.assert_allclose(mode.poses, best.poses, atol=1e-9)

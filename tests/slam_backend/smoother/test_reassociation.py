@@ -13,13 +13,13 @@ from slam_backend.fastslam.run_log import RobotLog
 from slam_backend.geometry import inverse, transform_points
 from slam_backend.models.camera import StereoCamera
 from slam_backend.models.measurements import Measurements
-from slam_backend.smoother.duplicates import alike_pairs, find_duplicates, without_duplicates
-from slam_backend.smoother.graph import PathGraph
-from slam_backend.smoother.graph_building import Guesses, extended
+from slam_backend.smoother.duplicates import find_duplicates, similar_pairs, without_duplicates
+from slam_backend.smoother.graph import SlamGraph
+from slam_backend.smoother.graph_building import InitialPoses, extend_graph
 from slam_backend.smoother.log_arrays import REJECTED
-from slam_backend.smoother.optimizer import find_mode
-from slam_backend.smoother.reassociation import NO_ONE, Known, Refused, find_only, taken_up
-from slam_backend.smoother.sampling import draw_paths
+from slam_backend.smoother.optimizer import optimize
+from slam_backend.smoother.reassociation import NO_ONE, LandmarkTable, RejectedMeasurements, find_only, reassociate
+from slam_backend.smoother.sampling import sample_paths
 
 OPTIONS = FilterOptions(camera=StereoCamera(sigma_px=0.2, sigma_disparity_px=0.1, mount=(0.1, 0.0, 0.9)))
 POSES = {4: np.array([0.0, 0.0, 0.3]), 5: np.array([0.4, 0.1, 0.2]), 7: np.array([0.9, 0.1, -0.1])}
@@ -46,7 +46,7 @@ def seen_from(pose, place):
 
 def guesses_of(poses):
     """Return the robot's poses, by step, as the smoother takes them."""
-    return [Guesses(np.array(list(poses)), np.array(list(poses.values())))]
+    return [InitialPoses(np.array(list(poses)), np.array(list(poses.values())))]
 
 
 def logs_and_refused(places, looks=None, covariances=None):
@@ -56,14 +56,14 @@ def logs_and_refused(places, looks=None, covariances=None):
         points = np.array([seen_from(pose, np.array([6.0, -1.0, 0.5])), seen_from(pose, places[i])])
         log.append(step, None if i == 0 else np.array([0.4, 0.0, 0.0]), points=points, ids=np.array([3, REJECTED]),
                    covariances=covariances)  # fmt: skip
-        refused[step] = Refused(np.array([1]), (LOOK if looks is None else looks[i])[None])
+        refused[step] = RejectedMeasurements(np.array([1]), (LOOK if looks is None else looks[i])[None])
     return [log.arrays()], [refused]
 
 
 def known(off=(0.0, 0.5, 0.0), count=1, sigma=0.2, look=LOOK):
     """Return a map of landmark 9, off by so much from where it is seen [m], and of landmark 3."""
     variances = np.array([sigma**2, 0.0, 0.0, sigma**2, 0.0, sigma**2])
-    return Known(
+    return LandmarkTable(
         np.array([3, 9]), np.array([[6.0, -1.0, 0.5], PLACE + off]), np.array([0.01 * variances, variances]),
         np.array([9, count], dtype=np.int32), np.array([OTHER_LOOK, look]),
     )  # fmt: skip
@@ -72,7 +72,7 @@ def known(off=(0.0, 0.5, 0.0), count=1, sigma=0.2, look=LOOK):
 def names(places, held, looks=None, poses=POSES):
     """Return the names (3,) of what was refused, after all."""
     logs, refused = logs_and_refused(places, looks)
-    found = taken_up(logs, refused, guesses_of(poses), held, OPTIONS)[0]
+    found = reassociate(logs, refused, guesses_of(poses), held, OPTIONS)[0]
     assert found.ids[::2].tolist() == [3, 3, 3]
     assert logs[0].ids[1::2].tolist() == [REJECTED] * 3
     return found.ids[1::2].tolist()
@@ -114,15 +114,15 @@ def test_covariances_of_the_sensor_say_what_agrees():
     for sigma, found in ((0.2, [9, 9, 9]), (0.05, [REJECTED] * 3)):
         noise = np.tile(np.array([1.0, 0.0, 0.0, 1.0, 0.0, 1.0]) * sigma**2, (2, 1))
         logs, refused = logs_and_refused(apart, covariances=noise)
-        assert taken_up(logs, refused, guesses_of(POSES), known(), OPTIONS)[0].ids[1::2].tolist() == found
+        assert reassociate(logs, refused, guesses_of(POSES), known(), OPTIONS)[0].ids[1::2].tolist() == found
 
 
 def test_nothing_refused_changes_no_log():
     """Without anything refused, or without a map, the logs are the same arrays."""
     logs, refused = logs_and_refused([PLACE] * 3)
-    nothing = Known(*(array[:0] for array in known()))
+    nothing = LandmarkTable(*(array[:0] for array in known()))
     for missed, held in (([{}], known()), (refused, nothing)):
-        found = taken_up(logs, missed, guesses_of(POSES), held, OPTIONS)
+        found = reassociate(logs, missed, guesses_of(POSES), held, OPTIONS)
         assert found[0].ids is logs[0].ids
 
 
@@ -168,9 +168,9 @@ def renamed_run():
     for row in logs_of(run)[0]:
         ids = np.where((row.ids == often) & (row.step >= when[len(when) // 2]), NEW_NAME, row.ids)
         log.append(row.step, row.motion if row.kind else None, points=row.points, ids=ids)
-    start = PathGraph.at_starts(run.true_paths[:, 0])
+    start = SlamGraph.at_starts(run.true_paths[:, 0])
     mount = np.array(run.spec.noise.camera.mount)
-    return run, extended(start, [log.arrays()], run.spec.noise.motion, mount), often
+    return run, extend_graph(start, [log.arrays()], run.spec.noise.motion, mount), often
 
 
 def looks(graph, alike=()):
@@ -183,8 +183,8 @@ def looks(graph, alike=()):
 
 def found(run, graph, descriptors):
     """Return what is found to be double on a graph."""
-    mode = find_mode(graph, camera_of(run), TIGHT)
-    return find_duplicates(graph, mode, draw_paths(graph, mode, 40, np.random.default_rng(1)), descriptors, 0.45)
+    mode = optimize(graph, camera_of(run), TIGHT)
+    return find_duplicates(graph, mode, sample_paths(graph, mode, 40, np.random.default_rng(1)), descriptors, 0.45)
 
 
 def test_one_landmark_under_two_names_is_found():
@@ -203,7 +203,7 @@ def test_pairs_are_those_of_the_tree(num, seed):
     starts = np.cumsum([0, *map(len, seen)])
     keys = np.concatenate([np.empty(0, dtype=np.int64), *seen])
     order = np.argsort(landmarks[:, 0])
-    found = alike_pairs(order, landmarks, descriptors, keys, starts, 0.5, 1.2)
+    found = similar_pairs(order, landmarks, descriptors, keys, starts, 0.5, 1.2)
     expected = {
         (a, b)
         for a, b in cKDTree(landmarks).query_pairs(0.5)
@@ -218,6 +218,6 @@ def test_a_duplicate_given_up_leaves_one_landmark():
     """The mode is then that of the run without the duplicate, and one name stands for the other."""
     run, graph, often = renamed_run()
     healed = without_duplicates(graph, np.array([[NEW_NAME, often]]))
-    mode, right = find_mode(healed, camera_of(run), TIGHT), find_mode(graph_of(run), camera_of(run), TIGHT)
+    mode, right = optimize(healed, camera_of(run), TIGHT), optimize(graph_of(run), camera_of(run), TIGHT)
     np.testing.assert_allclose(mode.poses, right.poses, atol=1e-8)
-    assert healed.known_as(np.array([NEW_NAME, 3])).tolist() == [often, 3]
+    assert healed.resolve_ids(np.array([NEW_NAME, 3])).tolist() == [often, 3]

@@ -14,7 +14,7 @@ from slam_backend.models.measurements import Measurements
 from slam_backend.smoother import optimizer as solving
 from slam_backend.smoother import rejuvenation
 from slam_backend.smoother.options import SmoothingOptions
-from slam_backend.smoother.sampling import drawn_spreads
+from slam_backend.smoother.sampling import sample_transition_variances
 from training.bench.accuracy.runs import RunSpec, simulate_run
 from training.bench.accuracy.trials import follow, score
 
@@ -137,10 +137,14 @@ def test_a_snapshot_goes_on_bit_for_bit(robots, least, monkeypatch):
 
     What is rigid is seen from draws where the factor's columns are long, and only there; either is restored.
     """
-    drawn, options = [], {} if least is None else {"smoothing": SmoothingOptions(max_keys=3, fresh_keys=2)}
+    drawn, options = [], {} if least is None else {"smoothing": SmoothingOptions(max_keys=3, recent_keys=2)}
     if least is not None:
         monkeypatch.setattr(solving, "LONG_COLUMNS", least)
-    monkeypatch.setattr(rejuvenation, "drawn_spreads", lambda *args: drawn.append(args) or drawn_spreads(*args))
+    monkeypatch.setattr(
+        rejuvenation,
+        "sample_transition_variances",
+        lambda *args: drawn.append(args) or sample_transition_variances(*args),
+    )
     run = small_run(robots)
     readings = list(run.readings())
     slam = rejuvenated(run, **options)

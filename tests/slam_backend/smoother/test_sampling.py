@@ -12,18 +12,18 @@ from slam_backend.fastslam.run_log import RobotLog
 from slam_backend.geometry import between, compose
 from slam_backend.models.odometry import OdometryModel
 from slam_backend.smoother._kernels import LANES, normalise, weigh_deviations
-from slam_backend.smoother.graph import PathGraph
-from slam_backend.smoother.graph_building import extended
-from slam_backend.smoother.optimizer import Mode, find_mode
+from slam_backend.smoother.graph import SlamGraph
+from slam_backend.smoother.graph_building import extend_graph
+from slam_backend.smoother.optimizer import MapEstimate, optimize
 from slam_backend.smoother.sampling import (
-    Draws,
-    _weighed,
-    bend,
-    draw_paths,
-    drawn_spreads,
+    PathSamples,
+    _importance_weights,
     lane_rows,
+    odometry_log_density,
     replay,
-    weigh_odometry,
+    retract_on_se2,
+    sample_paths,
+    sample_transition_variances,
 )
 
 MOUNT = np.array([0.1, -0.05, 0.2])
@@ -39,7 +39,7 @@ def full(upper: FloatArray) -> FloatArray:
     return upper[..., [[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
 
 
-def linear_toy(steps: int = 6) -> tuple[PathGraph, Mode]:
+def linear_toy(steps: int = 6) -> tuple[SlamGraph, MapEstimate]:
     """Return a robot that turns among three landmarks, measures them with covariances of its own, and the mode."""
     rng = np.random.default_rng(5)
     log = RobotLog()
@@ -56,14 +56,14 @@ def linear_toy(steps: int = 6) -> tuple[PathGraph, Mode]:
         seen += np.einsum("nij,nj->ni", roots, rng.normal(size=(3, 3)))
         upper = (roots @ roots.transpose(0, 2, 1))[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
         log.append(step, move if step else None, points=seen, ids=np.arange(3), covariances=upper)
-    graph = extended(PathGraph.at_starts(np.zeros((1, 3))), [log.arrays()], LINEAR, MOUNT)
-    return graph, find_mode(graph, CAMERA, TIGHT)
+    graph = extend_graph(SlamGraph.at_starts(np.zeros((1, 3))), [log.arrays()], LINEAR, MOUNT)
+    return graph, optimize(graph, CAMERA, TIGHT)
 
 
 def test_paths_of_a_run_that_saw_nothing_can_be_chosen_from():
     """Draws without a landmark are taken as any others; they have none then, either."""
     tiles = np.empty((0, 1, 9, LANES))
-    draws = Draws.weighed(np.zeros((2, 3, 40)), tiles, np.zeros(40), np.zeros(2))
+    draws = PathSamples.weighed(np.zeros((2, 3, 40)), tiles, np.zeros(40), np.zeros(2))
     taken = draws.taken(np.arange(60) % 40)
     assert draws.landmarks.shape == (0, 9, 40)
     assert taken.tiles.shape == (0, 2, 9, LANES)
@@ -73,7 +73,7 @@ def test_paths_of_a_run_that_saw_nothing_can_be_chosen_from():
 def test_where_all_is_linear_the_weights_are_constant():
     """The Gaussian about the mode is then the posterior itself, and importance weights have nothing to correct."""
     graph, mode = linear_toy()
-    weights = draw_paths(graph, mode, 500, np.random.default_rng(1)).log_weights
+    weights = sample_paths(graph, mode, 500, np.random.default_rng(1)).log_weights
     assert np.ptp(weights) < 1e-3
 
 
@@ -81,7 +81,7 @@ def test_where_all_is_linear_the_paths_scatter_as_the_posterior():
     """The sample's mean and covariance agree with mode and information: chi-square at a false alarm rate of 1 %."""
     graph, mode = linear_toy()
     m = 4000
-    poses = draw_paths(graph, mode, m + 1, np.random.default_rng(2)).poses[1:, :, 1:]  # the first path is the mode
+    poses = sample_paths(graph, mode, m + 1, np.random.default_rng(2)).poses[1:, :, 1:]  # the first path is the mode
     off = (poses - mode.poses[1:, :, None]).reshape(-1, m)
     white = upper(mode) @ off
     n = len(white)
@@ -111,7 +111,7 @@ def test_weights_are_those_of_their_logarithms():
 def test_the_first_path_is_the_most_probable_one():
     """Of all paths drawn it alone is the mode, so that the best particle has the best map."""
     graph, mode = linear_toy()
-    draws = draw_paths(graph, mode, 3, np.random.default_rng(3))
+    draws = sample_paths(graph, mode, 3, np.random.default_rng(3))
     np.testing.assert_array_equal(draws.poses[:, :, 0], mode.poses)
     np.testing.assert_allclose(draws.landmarks[:, :3, 0], mode.landmarks, atol=1e-9)
 
@@ -119,7 +119,7 @@ def test_the_first_path_is_the_most_probable_one():
 def test_replayed_landmarks_are_those_of_kalman_filters_along_the_path():
     """Means, covariances and likelihood along a path are those of one Kalman filter per landmark, taken in turn."""
     graph, mode = linear_toy()
-    poses = draw_paths(graph, mode, 70, np.random.default_rng(4)).poses  # more than one block of lanes
+    poses = sample_paths(graph, mode, 70, np.random.default_rng(4)).poses  # more than one block of lanes
     tiles, log_likelihood = replay(mode, lane_rows(poses), 70)
     values = tiles.transpose(0, 2, 1, 3).reshape(3, 9, -1)
     expected = []
@@ -153,8 +153,8 @@ def test_stereo_paths_are_weighed_evenly():
     """With real headings and a stereo camera the Gaussian still fits: nine tenths of the paths count."""
     run = small_run()
     graph = graph_of(run)
-    mode = find_mode(graph, camera_of(run), TIGHT)
-    weights = draw_paths(graph, mode, 300, np.random.default_rng(6)).log_weights
+    mode = optimize(graph, camera_of(run), TIGHT)
+    weights = sample_paths(graph, mode, 300, np.random.default_rng(6)).log_weights
     weights = np.exp(weights - weights.max())
     assert weights.sum() ** 2 / (weights**2).sum() > 270.0
 
@@ -184,19 +184,19 @@ def test_odometry_of_paths_has_its_gaussian_density():
     """Compiled densities of odometry differ from path to path as the plain formula says."""
     run = small_run(2)
     graph = graph_of(run)
-    mode = find_mode(graph, camera_of(run), TIGHT)
-    poses = draw_paths(graph, mode, 65, np.random.default_rng(7)).poses
-    found, spreads = weigh_odometry(graph, mode, lane_rows(poses), 65)
-    linked = np.flatnonzero(graph.previous >= 0)
+    mode = optimize(graph, camera_of(run), TIGHT)
+    poses = sample_paths(graph, mode, 65, np.random.default_rng(7)).poses
+    found, spreads = odometry_log_density(graph, mode, lane_rows(poses), 65)
+    linked = np.flatnonzero(graph.parents >= 0)
     expected, motions = np.zeros(65), []
     for b in linked:
-        first, second = poses[graph.previous[b]], poses[b]
+        first, second = poses[graph.parents[b]], poses[b]
         c, s = np.cos(first[2]), np.sin(first[2])
         dx, dy = second[:2] - first[:2]
         turn = (second[2] - first[2] + np.pi) % (2.0 * np.pi) - np.pi
         motion = np.array([c * dx + s * dy, -s * dx + c * dy, turn])
-        off = motion - graph.motions[b][:, None]
-        expected -= 0.5 * (off * np.linalg.solve(graph.noises[b], off)).sum(axis=0)
+        off = motion - graph.odometry[b][:, None]
+        expected -= 0.5 * (off * np.linalg.solve(graph.odometry_covariances[b], off)).sum(axis=0)
         motions.append(motion)
     np.testing.assert_allclose(found - found[0], expected - expected[0], atol=1e-7)
     scatter = [((m - m[:, :1])[0] ** 2 + (m - m[:, :1])[1] ** 2 + 9.0 * (m - m[:, :1])[2] ** 2).mean() for m in motions]
@@ -207,10 +207,10 @@ def test_drawn_spreads_are_those_of_the_inverse():
     """What a motion scatters by over paths is, in the mean over draws, what blocks of the inverse say."""
     run = small_run(2)
     graph = graph_of(run)
-    mode = find_mode(graph, camera_of(run), TIGHT)
+    mode = optimize(graph, camera_of(run), TIGHT)
     rng = np.random.default_rng(8)
-    found = np.array([drawn_spreads(graph, mode, rng) for _ in range(60)])
-    linked = graph.previous >= 0
+    found = np.array([sample_transition_variances(graph, mode, rng) for _ in range(60)])
+    linked = graph.parents >= 0
     ratios = found[:, linked] / mode.spreads()[linked]
     assert not found[:, ~linked].any()
     np.testing.assert_allclose(ratios.mean(axis=0), 1.0, atol=0.12)
@@ -222,7 +222,7 @@ def test_drawn_spreads_are_those_of_the_inverse():
 def test_any_number_of_paths_can_be_drawn(m):
     """Blocks of lanes are filled up, and what fills them is not returned."""
     graph, mode = linear_toy()
-    draws = draw_paths(graph, mode, m, np.random.default_rng(8))
+    draws = sample_paths(graph, mode, m, np.random.default_rng(8))
     assert draws.poses.shape == (6, 3, m)
     assert draws.landmarks.shape == (3, 9, m)
     assert np.isfinite(draws.landmarks).all()
@@ -272,12 +272,12 @@ def reference(mode: FloatArray, offsets: FloatArray) -> FloatArray:
 def test_motions_change_as_the_offsets_say_to_first_order():
     """Compiled as in the plain reference, headings on the circle; nothing is moved by offsets of zero."""
     mode, offsets = tree(0.2)
-    paths = bend(mode, PREVIOUS, offsets)
+    paths = retract_on_se2(mode, PREVIOUS, offsets)
     for i in range(5):
         off = paths[:, :, i] - reference(mode, offsets[:, :, i])
         np.testing.assert_allclose(off[:, :2], 0.0, atol=1e-6)
         np.testing.assert_allclose(np.sin(0.5 * off[:, 2]), 0.0, atol=1e-6)
-    still = bend(mode, PREVIOUS, np.zeros((6, 3, 1)))[:, :, 0]
+    still = retract_on_se2(mode, PREVIOUS, np.zeros((6, 3, 1)))[:, :, 0]
     np.testing.assert_allclose(still, mode, atol=1e-12)
 
 
@@ -290,7 +290,7 @@ def test_volumes_stay_as_they_are():
         for c in range(3):
             nudged = np.repeat(offsets[:, :, :1], 2, axis=2)
             nudged[key, c] += [1e-5, -1e-5]
-            paths = bend(mode, PREVIOUS, nudged)[sought]
+            paths = retract_on_se2(mode, PREVIOUS, nudged)[sought]
             columns.append(((paths[:, :, 0] - paths[:, :, 1]) / 2e-5).reshape(-1))
     assert np.linalg.det(np.array(columns).T) == pytest.approx(1.0, abs=1e-6)
 
@@ -298,10 +298,10 @@ def test_volumes_stay_as_they_are():
 def test_small_offsets_are_taken_as_they_are():
     """Straight and bent paths differ to second order only."""
     mode, offsets = tree(1e-4)
-    np.testing.assert_allclose(bend(mode, PREVIOUS, offsets), mode[:, :, None] + offsets, atol=1e-6)
+    np.testing.assert_allclose(retract_on_se2(mode, PREVIOUS, offsets), mode[:, :, None] + offsets, atol=1e-6)
 
 
-def wandering(turn: float) -> tuple[PathGraph, Any]:
+def wandering(turn: float) -> tuple[SlamGraph, Any]:
     """Return a robot that sees a new landmark at each of 25 steps, so that odometry alone knows its path; the mode."""
     motion = OdometryModel(
         sigma_along=0.05, sigma_across=0.02, sigma_heading=0.0, sigma_turn=0.0, floor_position=0.01, floor_heading=turn
@@ -310,16 +310,16 @@ def wandering(turn: float) -> tuple[PathGraph, Any]:
     for step in range(25):
         move = np.array([1.0, 0.0, 0.05]) if step else None
         log.append(step, move, points=np.array([[3.0, 0.5, 0.1]]), ids=np.array([step]))
-    graph = extended(PathGraph.at_starts(np.zeros((1, 3))), [log.arrays()], motion, np.zeros(3))
-    return graph, find_mode(graph, FLAT_CAMERA, TIGHT)
+    graph = extend_graph(SlamGraph.at_starts(np.zeros((1, 3))), [log.arrays()], motion, np.zeros(3))
+    return graph, optimize(graph, FLAT_CAMERA, TIGHT)
 
 
 def test_where_only_odometry_knows_the_path_bent_paths_are_drawn_from_the_posterior_itself():
     """Headings uncertain by half a radian in the end: straight paths are nearly all refused, bent ones weigh alike."""
     graph, mode = wandering(turn=0.1)
     poses, log_proposals = mode.paths(200, np.random.default_rng(1))
-    assert _weighed(graph, mode, poses, log_proposals).sample_size < 20.0
-    draws = draw_paths(graph, mode, 200, np.random.default_rng(1))
+    assert _importance_weights(graph, mode, poses, log_proposals).sample_size < 20.0
+    draws = sample_paths(graph, mode, 200, np.random.default_rng(1))
     assert np.ptp(draws.log_weights) < 1e-3
     assert draws.sample_size == pytest.approx(200.0, rel=1e-5)
     np.testing.assert_allclose(draws.poses[:, :, 0], mode.poses, atol=1e-12)
@@ -329,7 +329,7 @@ def test_straight_paths_stay_where_they_serve():
     """With landmarks seen again and again the Gaussian of poses is good: it is drawn from, to the bit."""
     run = small_run()
     graph = graph_of(run)
-    mode = find_mode(graph, camera_of(run), TIGHT)
-    draws = draw_paths(graph, mode, 60, np.random.default_rng(2))
+    mode = optimize(graph, camera_of(run), TIGHT)
+    draws = sample_paths(graph, mode, 60, np.random.default_rng(2))
     assert draws.sample_size > 30.0
     np.testing.assert_array_equal(draws.poses, mode.paths(60, np.random.default_rng(2))[0])

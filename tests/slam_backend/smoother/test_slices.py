@@ -18,16 +18,16 @@ from slam_backend.geometry import wrap_angle
 from slam_backend.models.measurements import Measurements
 from slam_backend.models.odometry import OdometryModel
 from slam_backend.smoother import rejuvenation as slices
-from slam_backend.smoother.graph import PathGraph
-from slam_backend.smoother.graph_building import Guesses, Places, extended, first_rows
-from slam_backend.smoother.graph_reduction import MOST_FRAMES, at_mode, coarsened
-from slam_backend.smoother.optimizer import find_mode
+from slam_backend.smoother.graph import SlamGraph
+from slam_backend.smoother.graph_building import InitialPoses, LandmarkPositions, extend_graph, log_head
+from slam_backend.smoother.graph_reduction import MAX_FRAMES, reduce_keyframes, relinearise
+from slam_backend.smoother.optimizer import optimize
 from slam_backend.smoother.options import SmoothingOptions
 from slam_backend.smoother.rejuvenation import Draft, Smoother
 from training.bench.accuracy.runs import StereoRun
 
-NOWHERE = Places(np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
-IN_SLICES = SmoothingOptions(slice_steps=8, max_keys=20, fresh_keys=8)
+NOWHERE = LandmarkPositions(np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
+IN_SLICES = SmoothingOptions(slice_steps=8, max_keys=20, recent_keys=8)
 IN_MANY = replace(IN_SLICES, tolerance=1e-9)  # no descent ends in the slice in which it begins
 
 
@@ -35,18 +35,18 @@ def test_slices_end_where_all_at_once_does():
     """Taken in four keys at a time, one Gauss-Newton step a slice, a run has the mode of the whole graph."""
     run = small_run(2)
     smoother = Smoother(run.spec.noise.motion, camera_of(run), TIGHT, np.random.default_rng(1))
-    graph, steps = PathGraph.at_starts(run.true_paths[:, 0]), 0
+    graph, steps = SlamGraph.at_starts(run.true_paths[:, 0]), 0
     logs = [log.arrays() for log in logs_of(run)]
     for upto in range(4, run.num_steps + 4, 4):
-        part = [first_rows(log, upto).since(int(graph.latest[0]) + 1) for log in logs]
-        state = smoother.take_in(graph, part, 2 * [Guesses.none()], NOWHERE)
+        part = [log_head(log, upto).since(int(graph.latest[0]) + 1) for log in logs]
+        state = smoother.add_logs(graph, part, 2 * [InitialPoses.empty()], NOWHERE)
         while isinstance(state, Draft):
-            state = smoother.descend(state)
+            state = smoother.optimise_slice(state)
             steps += 1
-        assert isinstance(state, PathGraph)
+        assert isinstance(state, SlamGraph)
         graph = state
     whole = graph_of(run)
-    mode = find_mode(whole, camera_of(run), TIGHT)
+    mode = optimize(whole, camera_of(run), TIGHT)
     assert steps > 0
     for robot in range(2):
         apart = graph.poses[graph.robots == robot] - mode.poses[whole.robots == robot]
@@ -63,11 +63,11 @@ def test_no_step_does_more_than_its_slice(monkeypatch):
     solved = []
 
     def noted(graph, *arguments):
-        mode = find_mode(graph, *arguments)
+        mode = optimize(graph, *arguments)
         solved.append((graph.num_keys, mode.iterations))
         return mode
 
-    monkeypatch.setattr(slices, "find_mode", noted)
+    monkeypatch.setattr(slices, "optimize", noted)
     drawn = []
     for reading in run.readings():
         solved.clear()
@@ -146,7 +146,7 @@ def test_where_there_is_nothing_to_smooth_slices_wait():
 
 
 EVERY = 10
-FEW_KEYS = {"max_keys": 10, "fresh_keys": 5}  # so that a log is taken in 20 steps at a time
+FEW_KEYS = {"max_keys": 10, "recent_keys": 5}  # so that a log is taken in 20 steps at a time
 
 
 def at_rest(run: StereoRun, step: int, count: int, odometry: Any = None) -> list[dict[str, Any]]:
@@ -183,18 +183,18 @@ def test_a_robot_that_waits_is_rejuvenated_once_it_moves(slice_steps: int | None
 
 @pytest.mark.parametrize("before", [0, 8])
 def test_a_wait_of_any_length_needs_no_more_room(before: int) -> None:
-    """At the start or on the way, what is to be worked through never exceeds what `MOST_FRAMES` frames hold."""
+    """At the start or on the way, what is to be worked through never exceeds what `MAX_FRAMES` frames hold."""
     run = small_run()
     slam, held = filter_of(run), []
     for reading in list(run.readings())[: before + 1]:
         slam.step(**reading)
-    for reading in at_rest(run, before, 4 * MOST_FRAMES):
+    for reading in at_rest(run, before, 4 * MAX_FRAMES):
         if slam.step(**reading).rejuvenation is not None:
             state = slam.get_state()["rejuvenation"]
-            held.append(len(state["graph"]["points"]) + len(state["graph"]["frozen_keys"]))
+            held.append(len(state["graph"]["points"]) + len(state["graph"]["condensed_keys"]))
             assert len(state["guesses"][0][0]) < EVERY
-    assert len(held) >= 4 * MOST_FRAMES // EVERY
-    assert max(held) <= run.spec.measurements * (before + MOST_FRAMES + EVERY)
+    assert len(held) >= 4 * MAX_FRAMES // EVERY
+    assert max(held) <= run.spec.measurements * (before + MAX_FRAMES + EVERY)
 
 
 def test_many_frames_of_one_key_are_condensed_at_the_mode() -> None:
@@ -202,19 +202,19 @@ def test_many_frames_of_one_key_are_condensed_at_the_mode() -> None:
     run = small_run()
     log, moving = RobotLog(), logs_of(run)[0]
     camera = run.spec.noise.camera
-    for step, reading in enumerate(at_rest(run, 0, MOST_FRAMES + 1)):
+    for step, reading in enumerate(at_rest(run, 0, MAX_FRAMES + 1)):
         points = camera.robot_from_camera(reading["measurements"][0].points) - np.array(camera.mount)
         log.append(step, points=points, ids=run.names[0][0])
     for row in list(moving)[1:]:
-        log.append(MOST_FRAMES + row.step, row.motion, points=row.points, ids=row.ids)
-    start = PathGraph.at_starts(run.true_paths[:, 0])
-    graph = extended(start, [log.arrays()], run.spec.noise.motion, np.array(camera.mount))
-    mode = find_mode(graph, camera_of(run), TIGHT)
-    fewer = coarsened(at_mode(graph, mode), camera_of(run), TIGHT)
+        log.append(MAX_FRAMES + row.step, row.motion, points=row.points, ids=row.ids)
+    start = SlamGraph.at_starts(run.true_paths[:, 0])
+    graph = extend_graph(start, [log.arrays()], run.spec.noise.motion, np.array(camera.mount))
+    mode = optimize(graph, camera_of(run), TIGHT)
+    fewer = reduce_keyframes(relinearise(graph, mode), camera_of(run), TIGHT)
     assert fewer.num_keys == graph.num_keys
-    assert sorted(set(fewer.frozen_keys)) == [0]
+    assert sorted(set(fewer.condensed_keys)) == [0]
     assert not (fewer.frame_keys[fewer.point_frames] == 0).any()
-    again = find_mode(fewer, camera_of(run), TIGHT)
+    again = optimize(fewer, camera_of(run), TIGHT)
     np.testing.assert_allclose(again.poses, mode.poses, atol=1e-8)
     one, same = upper(again), upper(mode)
     np.testing.assert_allclose(one.T @ one, same.T @ same, rtol=1e-6, atol=1e-3)
@@ -261,7 +261,7 @@ STEPS = st.lists(st.integers(0, 30), unique=True).map(sorted)
 def test_guesses_are_looked_up_and_forgotten_by_step(known, asked, last):
     """What was said of a step comes back, NaN of any other; after a step only later ones are known."""
     by_step = {step: np.random.default_rng(step).normal(size=3) for step in known}
-    guesses, half = Guesses.none(), len(known) // 2
+    guesses, half = InitialPoses.empty(), len(known) // 2
     for part in (known[:half], known[half:]):
         poses = np.array([by_step[step] for step in part]).reshape(-1, 3)
         guesses = guesses.with_later(np.array(part, dtype=np.int64), poses)

@@ -5,11 +5,11 @@ import pytest
 from builders.filters import looks
 from builders.teams import SIZE, SimulatedTeam, driven
 
-from slam_backend.fastslam.reports import Findings, StepReport
+from slam_backend.fastslam.reports import Associations, StepReport
 from slam_backend.maps.alignment import Alignment, AlignmentOptions
 from slam_backend.maps.landmark_map import LandmarkMap
-from slam_backend.team.communication import LANDMARK_BYTES, POSE_BYTES, ExchangeLedger
-from slam_backend.team.merge_scheduler import AttemptOptions, AttemptSchedule, PairKey, Straightening
+from slam_backend.team.communication import LANDMARK_BYTES, POSE_BYTES, TrafficCounter
+from slam_backend.team.merge_scheduler import AttemptOptions, MergeScheduler, PairKey, PendingAttempt
 from slam_backend.team.options import MergeOptions
 
 FIRST: PairKey = ((0,), (1, 3))
@@ -23,10 +23,10 @@ def map_of(names: list[int]) -> LandmarkMap:
     return LandmarkMap(means, np.tile(0.01 * np.eye(3), (len(rows), 1, 1)), looks(rows), ids=rows)
 
 
-def schedule(every: int = 25, new_candidates: int = 3, longest_wait: int = 200) -> AttemptSchedule:
+def schedule(every: int = 25, new_candidates: int = 3, longest_wait: int = 200) -> MergeScheduler:
     """A schedule whose alignments need four candidates."""
     options = AttemptOptions(every=every, new_candidates=new_candidates, longest_wait=longest_wait)
-    return AttemptSchedule(options, AlignmentOptions(min_inliers=4))
+    return MergeScheduler(options, AlignmentOptions(min_inliers=4))
 
 
 def pair_of(names: list[int]) -> tuple[LandmarkMap, LandmarkMap]:
@@ -38,7 +38,7 @@ def test_one_step_in_so_many_is_due() -> None:
     """With every = 25, the last step of each 25 is due, and no other but while an attempt goes on."""
     plan = schedule()
     assert [step for step in range(100) if plan.is_due(step)] == [24, 49, 74, 99]
-    plan.straightening = Straightening(((0,), (1,)), (0, 1), Alignment.refused("too few inliers"), 24)
+    plan.straightening = PendingAttempt(((0,), (1,)), (0, 1), Alignment.refused("too few inliers"), 24)
     assert all(plan.is_due(step) for step in range(25, 49))
 
 
@@ -80,25 +80,25 @@ def test_smoothing_for_a_pair_that_is_always_refused_costs_a_multiple_of_the_log
 def test_a_doubtful_pair_waits_as_long_as_that_helps() -> None:
     """It waits where it is not sure enough, the first time and while the doubt falls by three tenths each time."""
     plan = schedule()
-    assert [plan.should_wait(FIRST, doubt) for doubt in (4.0, 2.7, 1.8, 1.3)] == [True, True, True, False]
-    assert [plan.should_wait(SECOND, doubt) for doubt in (4.0, 0.9, 4.0)] == [True, False, False]
+    assert [plan.should_defer(FIRST, doubt) for doubt in (4.0, 2.7, 1.8, 1.3)] == [True, True, True, False]
+    assert [plan.should_defer(SECOND, doubt) for doubt in (4.0, 0.9, 4.0)] == [True, False, False]
 
 
 def test_what_a_pair_has_waited_counts_in_larger_groups() -> None:
     """Robots that waited for each other go on waiting in other company, others begin; a snapshot knows it, too."""
     plan = schedule()
-    assert plan.should_wait(((0,), (2,)), 4.0)
+    assert plan.should_defer(((0,), (2,)), 4.0)
     other = schedule()
     other.set_state(plan.get_state())
     for known in (plan, other):
-        assert not known.should_wait(((0, 1), (2, 3)), 4.0)
-        assert known.should_wait(((0,), (4,)), 4.0)
+        assert not known.should_defer(((0, 1), (2, 3)), 4.0)
+        assert known.should_defer(((0,), (4,)), 4.0)
 
 
 def test_a_barred_pair_does_not_try_in_larger_groups_either() -> None:
     """Robots of the one side do not try with robots of the other until the bar ends; others do, and each side may."""
     plan = schedule()
-    plan.bar(((0,), (1, 3)), 60)
+    plan.block(((0,), (1, 3)), 60)
     barred: list[PairKey] = [((0,), (1, 3)), ((0, 2), (1, 3)), ((0,), (3,)), ((1,), (0, 2))]
     free: list[PairKey] = [((0,), (2,)), ((1, 3), (2,)), ((1,), (3,))]
     assert not any(plan.may_try(pair, 59) for pair in barred)
@@ -218,8 +218,8 @@ def test_one_contact_between_two_groups_is_enough() -> None:
 def test_a_pair_too_doubtful_to_take_waits_however_long() -> None:
     """Beyond the most that can be taken it waits though waiting does not help; below it only as long as that helps."""
     plan = schedule()
-    assert [plan.should_wait(FIRST, 4.0, most=1.25) for _ in range(5)] == [True] * 5
-    assert [plan.should_wait(FIRST, doubt, most=1.25) for doubt in (1.3, 1.25, 1.0)] == [True, False, False]
+    assert [plan.should_defer(FIRST, 4.0, most=1.25) for _ in range(5)] == [True] * 5
+    assert [plan.should_defer(FIRST, doubt, most=1.25) for doubt in (1.3, 1.25, 1.0)] == [True, False, False]
 
 
 def test_trials_of_two_frames_are_compared() -> None:
@@ -239,7 +239,7 @@ def test_trials_of_two_frames_are_compared() -> None:
 
 def test_maps_with_too_many_pairs_for_geometry_alone_do_not_try() -> None:
     """Without appearance, a pair of maps with more than 10,000 pairs of landmarks is passed over; others still try."""
-    plan = AttemptSchedule(AttemptOptions(), AlignmentOptions(min_inliers=4, appearance=False))
+    plan = MergeScheduler(AttemptOptions(), AlignmentOptions(min_inliers=4, appearance=False))
     means = np.column_stack([np.arange(101.0), np.zeros((101, 2))])
     huge = LandmarkMap(means, np.tile(0.01 * np.eye(3), (101, 1, 1)), np.ones((101, 4)) / 2.0)
     assert plan.choose({FIRST: (huge, huge)}, 24) is None
@@ -258,7 +258,9 @@ def counted_map(counts: dict[int, int]) -> LandmarkMap:
 
 def report_of(rows: tuple[int, ...], associations: list[list[int]], created: list[list[int]]) -> StepReport:
     """A report of a joint step of the robots in some rows; what each robot's measurements became, row by row."""
-    findings = Findings.gathered(*([np.array(ids, np.int64) for ids in each] for each in (associations, created)))
+    findings = Associations.from_arrays(
+        *([np.array(ids, np.int64) for ids in each] for each in (associations, created))
+    )
     named, made = (np.concatenate([each[row] for row in rows if row >= 0]) for each in (associations, created))
     counts = np.sum(made >= 0), 0, np.sum(named >= 0), np.sum(named < 0)
     return StepReport(findings, rows, *counts, ess=1.0, nis=3.0, resampled=False)
@@ -266,7 +268,7 @@ def report_of(rows: tuple[int, ...], associations: list[list[int]], created: lis
 
 def test_new_landmarks_are_sent_with_descriptors_and_changed_ones_without() -> None:
     """A first exchange costs whole landmarks; a second only what is new, and what changed without its descriptor."""
-    ledger = ExchangeLedger(3)
+    ledger = TrafficCounter(3)
     ledger.record_maps(0, 2, counted_map({1: 4, 5: 2}), counted_map({7: 1}))
     assert ledger.sent == [2 * (LANDMARK_BYTES + LOOK), 0, LANDMARK_BYTES + LOOK]
     ledger.record_maps(0, 2, counted_map({1: 4, 5: 3, 6: 1}), counted_map({7: 1}))
@@ -275,7 +277,7 @@ def test_new_landmarks_are_sent_with_descriptors_and_changed_ones_without() -> N
 
 def test_each_pair_of_robots_has_its_own_record_of_what_was_sent() -> None:
     """Each pair of robots has its own record of what was sent."""
-    ledger = ExchangeLedger(3)
+    ledger = TrafficCounter(3)
     ledger.record_maps(0, 1, counted_map({1: 4}), counted_map({2: 1}))
     ledger.record_maps(0, 2, counted_map({1: 4}), counted_map({2: 1}))
     assert ledger.sent == [2 * (LANDMARK_BYTES + LOOK), LANDMARK_BYTES + LOOK, LANDMARK_BYTES + LOOK]
@@ -283,7 +285,7 @@ def test_each_pair_of_robots_has_its_own_record_of_what_was_sent() -> None:
 
 def test_members_of_a_group_send_poses_and_the_landmarks_they_touched() -> None:
     """Per step a robot sends its pose, each landmark it matched or made, and descriptors of those it made."""
-    ledger = ExchangeLedger(4)
+    ledger = TrafficCounter(4)
     ledger.record_step(report_of((1, 3), [[8], [4, -1, 9], [], [2]], [[8], [-1, -1, 9], [], [-1]]), 13)
     sent = np.array([0, POSE_BYTES + 2 * LANDMARK_BYTES + LOOK, 0, POSE_BYTES + LANDMARK_BYTES])
     np.testing.assert_array_equal(ledger.sent, sent)
@@ -294,14 +296,14 @@ def test_members_of_a_group_send_poses_and_the_landmarks_they_touched() -> None:
 
 def test_a_robot_that_has_left_does_not_send() -> None:
     """The joint filter goes on with those that hear each other."""
-    ledger = ExchangeLedger(3)
+    ledger = TrafficCounter(3)
     ledger.record_step(report_of((0, -1, 2), [[4], [7], [2]], [[4], [-1], [-1]]), 13)
     assert ledger.sent == [POSE_BYTES + LANDMARK_BYTES + LOOK, 0, POSE_BYTES + LANDMARK_BYTES]
 
 
 def test_a_ledger_goes_on_from_its_state() -> None:
     """A restored ledger counts on as the first one did, and shares nothing with it."""
-    ledger, twin = ExchangeLedger(2), ExchangeLedger(2)
+    ledger, twin = TrafficCounter(2), TrafficCounter(2)
     ledger.record_maps(0, 1, counted_map({1: 4}), counted_map({2: 1}))
     twin.set_state(ledger.get_state())
     for one in (ledger, twin):
@@ -312,7 +314,7 @@ def test_a_ledger_goes_on_from_its_state() -> None:
 def test_robots_that_merge_send_maps_and_then_a_few_hundred_bytes_a_step() -> None:
     """The first attempt costs both whole maps; a step of the joint filter a pose and what was seen in it."""
     simulation = SimulatedTeam(num_robots=2, seed=1)
-    team = simulation.build(merging=MergeOptions(straighten=False))
+    team = simulation.build(merging=MergeOptions(smooth_first=False))
     for _ in range(110):
         if team.events:
             break

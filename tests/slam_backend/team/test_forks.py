@@ -13,8 +13,8 @@ from scipy import stats
 from slam_backend.fastslam.existence import ExistenceModel
 from slam_backend.fastslam.reports import LandmarksCreated
 from slam_backend.geometry import between, wrap_angle
-from slam_backend.team.branches import MOST_REPLAYED
-from slam_backend.team.communication import LANDMARK_BYTES, POINT_BYTES, POSE_BYTES, reach
+from slam_backend.team.branches import MAX_REPLAYED
+from slam_backend.team.communication import LANDMARK_BYTES, POINT_BYTES, POSE_BYTES, contact_components
 from slam_backend.team.options import MergeOptions
 from slam_backend.team.team import TeamSlam
 
@@ -39,7 +39,7 @@ def live(team: TeamSlam, readings: list[tuple[Any, Any]], contacts: Any = None) 
 
 def branches(team: TeamSlam) -> set[tuple[int, ...]]:
     """Return which robots go by one filter."""
-    return {team.mates(robot) for robot in range(team.num_robots)}
+    return {team.same_filter(robot) for robot in range(team.num_robots)}
 
 
 # ---------------------------------------------------------------------- who is in contact
@@ -48,10 +48,10 @@ def branches(team: TeamSlam) -> set[tuple[int, ...]]:
 def test_robots_pass_on_what_they_hear() -> None:
     """A chain a-b-c-d is one network; without its middle link it is two; the diagonal means nothing."""
     chain = links(4, (0, 1), (1, 2), (2, 3))
-    assert reach(chain, 4).tolist() == [0, 0, 0, 0]
-    assert len(set(reach(links(4, (0, 1), (2, 3)), 4).tolist())) == 2
-    np.testing.assert_array_equal(reach(chain & ~np.eye(4, dtype=bool), 4), reach(chain, 4))
-    assert reach(None, 3).tolist() == [0, 0, 0]
+    assert contact_components(chain, 4).tolist() == [0, 0, 0, 0]
+    assert len(set(contact_components(links(4, (0, 1), (2, 3)), 4).tolist())) == 2
+    np.testing.assert_array_equal(contact_components(chain & ~np.eye(4, dtype=bool), 4), contact_components(chain, 4))
+    assert contact_components(None, 3).tolist() == [0, 0, 0]
 
 
 def test_a_group_in_a_chain_goes_by_one_filter() -> None:
@@ -83,7 +83,7 @@ def test_a_replay_gives_what_unbroken_contact_would_have_given(gap: int, options
     team, twin = (merged_team(copy.deepcopy(simulation), merging=FINAL, **options) for _ in range(2))
     simulation.run(simulation.build(), 30)
     away = readings_of(simulation, gap, silent=(0,))
-    back = readings_of(simulation, 1 + gap // (MOST_REPLAYED - 1), silent=(0,))
+    back = readings_of(simulation, 1 + gap // (MAX_REPLAYED - 1), silent=(0,))
     live(team, away, links(2))
     assert branches(team) == {(0,), (1,)}
     live(team, back)
@@ -199,7 +199,7 @@ def test_the_larger_part_keeps_the_joint_filter() -> None:
     live(team, readings_of(simulation, 1), links(3, (1, 2)))
     assert branches(team) == {(0,), (1, 2)}
     assert team.maps[1] == team.maps[2] == number != team.maps[0]
-    assert team.keepers(0) == (1, 2)
+    assert team.trunk_robots(0) == (1, 2)
     assert team.groups == ((0, 1, 2),)
 
 
@@ -226,14 +226,14 @@ def test_a_robot_that_meets_another_group_can_merge_with_it() -> None:
     team.merge(1, 2, true_alignment(simulation, team, 1, 2))
     live(team, readings_of(simulation, 5), links(3))
     live(team, readings_of(simulation, 1), links(3, (0, 2)))
-    assert team.keepers(1) == (2,)
+    assert team.trunk_robots(1) == (2,)
     team.merge(0, 2, true_alignment(simulation, team, 0, 2))
     assert team.groups == ((0, 1, 2),)
     live(team, readings_of(simulation, 5), links(3, (0, 2)))
-    assert [team.members(robot) for robot in range(3)] == [(0, 1, 2), (1, 2), (0, 1, 2)]
+    assert [team.known_robots(robot) for robot in range(3)] == [(0, 1, 2), (1, 2), (0, 1, 2)]
     assert simulation.position_errors(team).max() < 0.3
     live(team, readings_of(simulation, 2))
-    assert [team.members(robot) for robot in range(3)] == [(0, 1, 2)] * 3
+    assert [team.known_robots(robot) for robot in range(3)] == [(0, 1, 2)] * 3
     assert branches(team) == {(0, 1, 2)}
     assert simulation.position_errors(team).max() < 0.3
 
@@ -243,7 +243,7 @@ def test_only_those_who_keep_the_joint_filter_merge() -> None:
     simulation, team = driven(3, 3, 10, num_particles=13)
     team.merge(0, 1, true_alignment(simulation, team, 0, 1))
     live(team, readings_of(simulation, 1), links(3))
-    assert team.keepers(1) == (0,)
+    assert team.trunk_robots(1) == (0,)
     with pytest.raises(ValueError, match=r"robot_a: expected one of \(0,\), got 1\. Merge through a robot that goes"):
         team.merge(1, 2, true_alignment(simulation, team, 1, 2))
 

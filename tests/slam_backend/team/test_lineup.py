@@ -9,34 +9,41 @@ import pytest
 from builders.kernels import python_entry
 from builders.teams import NEVER, SimulatedTeam, false_alignment, links, true_alignment
 
-from slam_backend.core.packed_symmetric import UNPACK
-from slam_backend.fastslam._kernels import LANES, add_share
-from slam_backend.fastslam._kernels.weights import AT_ORIGIN, KNOWN, SPREAD, see_from_starts, stand, start_kind
+from slam_backend.core.packed_symmetric import UNPACK_INDEX
+from slam_backend.fastslam._kernels import LANES, add_gauge_covariance
+from slam_backend.fastslam._kernels.weights import (
+    AT_ORIGIN,
+    KNOWN,
+    SPREAD,
+    relative_poses_from_starts,
+    start_kind,
+    write_team_poses,
+)
 from slam_backend.fastslam.estimates import pose_mixtures
 from slam_backend.fastslam.filter import FastSlam
-from slam_backend.fastslam.relative_poses import SIGMAS, Standpoints, members_of
+from slam_backend.fastslam.relative_poses import SIGMAS, TeamPoses, membership_table
 from slam_backend.fastslam.reports import TeamReport
 from slam_backend.geometry import between, compose, inverse, rotate_covariances, rotation, wrap_angle
 from slam_backend.models.measurements import Measurements
 from slam_backend.team.branches import Branch
-from slam_backend.team.groups import Lineup
+from slam_backend.team.groups import TeamTopology
 from slam_backend.team.options import MergeOptions
 from slam_backend.team.team import TeamSlam
 
 
 def oldest_unknown(branch: Branch, now: int) -> int:
     """Return the first step that a filter may still have to take in; the next one if there is none."""
-    held = [1 + last for robot, last in branch.known.items() if robot not in branch.live]
-    return min([now + 1, *held, *(side.oldest for watch in branch.watches for side in watch.sides)])
+    held = [1 + last for robot, last in branch.last_steps.items() if robot not in branch.active_robots]
+    return min([now + 1, *held, *(side.oldest for watch in branch.monitors for side in watch.sides)])
 
 
 def check(team: TeamSlam, report: TeamReport) -> None:
     """Check that a team's lineup, and what its report says of that, are as the groups have it now."""
-    assert team.lineup == Lineup.of(team._groups)
+    assert team.lineup == TeamTopology.of(team._groups)
     assert team.lineup is team.lineup
     branches = [branch for group in team._groups for branch in group.branches]
     for robot, (group, branch, place) in enumerate(team.lineup.places):
-        assert robot in branch.live
+        assert robot in branch.active_robots
         assert branch.robots[place] == robot
         assert branch in group.branches
     assert (report.groups, report.maps) == (team.groups, tuple(branch.number for _, branch, _ in team.lineup.places))
@@ -59,16 +66,16 @@ def test_it_follows_merges_forks_returns_undos_and_the_end_of_a_watch() -> None:
     run(simulation, team, 80)
     assert team.lineup is alone
     team.merge(0, 1, false_alignment(simulation, team, np.array([3.0, -2.0, 0.5])))
-    assert team.lineup == Lineup.of(team._groups)
+    assert team.lineup == TeamTopology.of(team._groups)
     assert any("undo" in run(simulation, team, 1) for _ in range(100))
-    assert team.lineup.mates == ((0,), (1,), (2,))
+    assert team.lineup.same_filter == ((0,), (1,), (2,))
     team.merge(0, 2, true_alignment(simulation, team, 0, 2))
     run(simulation, team, 10)
     run(simulation, team, 10, links(3, (0, 1)))
-    assert team.lineup.mates == ((0,), (1,), (2,))
-    assert team.lineup.members == ((0, 2), (1,), (0, 2))
+    assert team.lineup.same_filter == ((0,), (1,), (2,))
+    assert team.lineup.known_robots == ((0, 2), (1,), (0, 2))
     run(simulation, team, 10)
-    assert team.lineup.mates == ((0, 2), (1,), (0, 2))
+    assert team.lineup.same_filter == ((0, 2), (1,), (0, 2))
     watched = team.lineup
     assert watched.oldest is not None
     run(simulation, team, 80)
@@ -86,14 +93,14 @@ def test_the_lineup_of_a_restored_team_is_that_of_its_state() -> None:
     assert team.lineup.groups == ((0, 1), (2,))
     for one in (team, other):
         one.set_state(state)
-        assert one.lineup == Lineup.of(one._groups)
+        assert one.lineup == TeamTopology.of(one._groups)
         assert one.lineup.groups == ((0,), (1,), (2,))
 
 
 @pytest.mark.parametrize(("rows", "robots"), [(3, None), (1, 4)])
 def test_all_that_is_believed_lies_in_one_array(rows: int, robots: int | None) -> None:
     """What is written by name is in the rows that kernels take, once, and nothing else is."""
-    points = Standpoints(rows, robots)
+    points = TeamPoses(rows, robots)
     points.beliefs.fill(-1.0)
     named = points.own, points.starts, points.ess, points.covariances, points.sigmas
     known = rows if robots is None else robots
@@ -108,9 +115,9 @@ def test_all_that_is_believed_lies_in_one_array(rows: int, robots: int | None) -
 
 
 @pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, lambda points: pickle.loads(pickle.dumps(points))])
-def test_the_views_of_a_copy_are_of_its_own_beliefs(copied: Callable[[Standpoints], Standpoints]) -> None:
+def test_the_views_of_a_copy_are_of_its_own_beliefs(copied: Callable[[TeamPoses], TeamPoses]) -> None:
     """What kernels write into a copy is what it tells."""
-    points = Standpoints(2)
+    points = TeamPoses(2)
     points.beliefs[:], points.poses[:] = 1.0, 2.0
     other = copied(points)
     assert (other.beliefs.tobytes(), other.poses.tobytes()) == (points.beliefs.tobytes(), points.poses.tobytes())
@@ -121,10 +128,10 @@ def test_the_views_of_a_copy_are_of_its_own_beliefs(copied: Callable[[Standpoint
 
 def test_members_say_who_goes_by_a_filter() -> None:
     """The robots of the filter, and of each whether it does."""
-    assert members_of((1, 2, 4), (4, 1)).tolist() == [[1, 2, 4], [1, 0, 1]]
+    assert membership_table((1, 2, 4), (4, 1)).tolist() == [[1, 2, 4], [1, 0, 1]]
 
 
-see_from_starts, start_kind = map(python_entry, (see_from_starts, start_kind))
+relative_poses_from_starts, start_kind = map(python_entry, (relative_poses_from_starts, start_kind))
 
 STARTS = np.array([[1.0, -2.0, 0.7], [4.0, 3.0, -2.0]])
 
@@ -159,7 +166,7 @@ def test_unknown_starts_do_not_blur_the_pose() -> None:
         state[name][1, :, :13] = compose(motions, state[name][1, :, :13].T).T
     turn = np.tile(np.eye(3), (13, 1, 1))
     turn[:, :2, :2] = np.array([[[np.cos(t), -np.sin(t)], [np.sin(t), np.cos(t)]] for t in motions[:, 2]])
-    covariances = state["covariances"][1, :, :13].T[:, UNPACK]
+    covariances = state["covariances"][1, :, :13].T[:, UNPACK_INDEX]
     state["covariances"][1, :, :13] = (turn @ covariances @ turn.transpose(0, 2, 1))[:, *np.triu_indices(3)].T
     slam.set_state(state)
     after = slam.pose_from_start(1)
@@ -178,12 +185,12 @@ def test_the_change_of_frame_is_that_of_matrices() -> None:
     covariances = roots @ roots.transpose(0, 2, 1)
     packed = covariances[:, *np.triu_indices(3)].T
     seen, spread = np.zeros((3, 11)), np.zeros((6, 11))
-    see_from_starts(starts, means, np.ascontiguousarray(packed), 9, seen, spread)
+    relative_poses_from_starts(starts, means, np.ascontiguousarray(packed), 9, seen, spread)
     for m in range(9):
         np.testing.assert_allclose(seen[:, m], between(starts[:, m], means[:, m]), atol=1e-12)
         turn = np.eye(3)
         turn[:2, :2] = rotation(-starts[2, m])
-        np.testing.assert_allclose(spread[UNPACK, m], turn @ covariances[m] @ turn.T, atol=1e-12)
+        np.testing.assert_allclose(spread[UNPACK_INDEX, m], turn @ covariances[m] @ turn.T, atol=1e-12)
     assert not seen[:, 9:].any()
     assert not spread[:, 9:].any()
 
@@ -205,10 +212,10 @@ def test_own_frames_are_the_plain_definition() -> None:
     estimates = pose_mixtures(*of_four[1:], weights)
     robots = np.concatenate([rows.reshape(-1, 4, 3, LANES) for rows in (np.zeros((4, 3, LANES)), *of_four)])
     names, live = np.array([3, 0, 2, 4]), np.array([1, 1, 1, 0])
-    points = Standpoints(5)
+    points = TeamPoses(5)
     points.poses.fill(7.0)
     points.beliefs.fill(7.0)
-    stand(
+    write_team_poses(
         robots, np.zeros((4, 3, 3)), weights, best, False, *estimates, np.array([names, live]), 0.5, points.poses,
         points.beliefs,
     )  # fmt: skip
@@ -254,9 +261,9 @@ def test_a_held_start_widens_what_is_seen_from_it_and_the_frame_does_not() -> No
     estimates = shown.copy()
     estimates.covariances[:] += 7.0
     scatter = np.array([[0.04, 0.01, -0.02], [0.01, 0.09, 0.03], [-0.02, 0.03, 0.05]])
-    points, members = Standpoints(1), np.array([[0], [1]])
-    stand(robots, scatter[None], weights, 4, False, *estimates, members, 0.5, points.poses, points.beliefs)
+    points, members = TeamPoses(1), np.array([[0], [1]])
+    write_team_poses(robots, scatter[None], weights, 4, False, *estimates, members, 0.5, points.poses, points.beliefs)
     expected = rotate_covariances(-start[2], shown.covariances)
-    add_share(scatter, (own := between(start, shown.means)), expected)
+    add_gauge_covariance(scatter, (own := between(start, shown.means)), expected)
     np.testing.assert_allclose(points.own, own, atol=1e-12)
     np.testing.assert_allclose(points.covariances, expected, atol=1e-12)

@@ -24,7 +24,7 @@ from builders.filters import (
 from hypothesis import given
 from hypothesis import strategies as st
 
-from slam_backend.core.packed_symmetric import UNPACK
+from slam_backend.core.packed_symmetric import UNPACK_INDEX
 from slam_backend.core.validation import IntArray
 from slam_backend.fastslam import particle_maps as _map_store
 from slam_backend.fastslam.filter import FastSlam
@@ -167,7 +167,7 @@ def test_common_landmarks_are_fused_at_each_particle_s_own_motion() -> None:
             map_a.means[PAIRS[:, 0]], scale[m] * map_a.covariances[PAIRS[:, 0]], means_b, scale[m] * covariances_b
         )
         np.testing.assert_allclose(joint_means[:5, :, m], means, rtol=1e-10)
-        np.testing.assert_allclose(joint_covariances[:5, :, m][:, UNPACK], covariances, atol=1e-12)
+        np.testing.assert_allclose(joint_covariances[:5, :, m][:, UNPACK_INDEX], covariances, atol=1e-12)
 
 
 def test_descriptors_are_averaged_by_counts_and_keep_their_length() -> None:
@@ -227,7 +227,7 @@ def test_a_filter_without_landmarks_joins_by_the_alignment_alone(empty_first: bo
 
 def test_what_lay_in_the_memory_of_new_rows_is_never_read(monkeypatch: pytest.MonkeyPatch) -> None:
     """Rows are made without being written: whatever was there, a run and a merge come to the same bits."""
-    states, make = [], _map_store.aligned
+    states, make = [], _map_store.empty_aligned
     for byte in (0, 255):  # 0.0, or NaN and -1
 
         def filled(*kind: Any, byte: int = byte) -> Any:
@@ -243,7 +243,7 @@ def test_what_lay_in_the_memory_of_new_rows_is_never_read(monkeypatch: pytest.Mo
             joint.step([MOVE, MOVE], [new_frame(), new_frame()])
             joint.state.resample()
         joint.rejuvenate()
-        joint.state.maps.make_room(len(joint.state.maps.ids), joint.descriptor_size)
+        joint.state.maps.reserve(len(joint.state.maps.ids), joint.descriptor_size)
         joint.step([MOVE, None], [new_frame(), None])
         states.append([a.get_state(), b.get_state(), merged, joint.get_state()])
     assert_same(*states)

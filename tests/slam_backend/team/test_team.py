@@ -101,35 +101,35 @@ def test_standpoints_of_all_robots_are_those_of_each() -> None:
     simulation = SimulatedTeam(num_robots=3, seed=5)
     team = simulation.build(num_particles=20, attempts=AttemptOptions(enabled=False))
     apart = np.eye(3, dtype=bool)
-    points, outlines = team.standpoints(), team.outlines(2)
+    points, outlines = team.team_poses(), team.map_summaries(2)
     for stage in range(4):
         if stage:
             simulation.run(team, 30, apart if stage == 3 else None)
         if stage == 2:
             team.merge(0, 1, align_maps(team.map(0, "mixture"), team.map(1, "mixture")))
-        assert team.standpoints(points) is points
-        outlines = team.outlines(2, outlines)
-        assert team.outlines(2, outlines) is outlines
-        fresh = team.standpoints()
+        assert team.team_poses(points) is points
+        outlines = team.map_summaries(2, outlines)
+        assert team.map_summaries(2, outlines) is outlines
+        fresh = team.team_poses()
         assert_same((points.poses, points.beliefs), (fresh.poses, fresh.beliefs))
         for robot in range(3):
-            assert_same(team.lineup.members[robot], team.members(robot))
-            assert_same(team.lineup.mates[robot], team.mates(robot))
+            assert_same(team.lineup.known_robots[robot], team.known_robots(robot))
+            assert_same(team.lineup.same_filter[robot], team.same_filter(robot))
             assert_same(points.poses[robot, robot], points.own[robot])
             assert_same(PoseEstimate(points.own[robot], points.covariances[robot]), team.pose_from_start(robot))
             np.testing.assert_allclose(points.starts[robot], team.start_from_group(robot), atol=1e-15)
             assert points.ess[robot] == team.ess(robot) / 20
             known = np.flatnonzero(~np.isnan(points.poses[robot, :, 0]))
-            assert_same(tuple(known.tolist()), team.members(robot))
+            assert_same(tuple(known.tolist()), team.known_robots(robot))
             assert_same(np.flatnonzero(~np.isnan(points.sigmas[robot])), known)
             for mate in known:
                 seen = team.pose_from_start(robot) if mate == robot else team.pose(int(mate), robot)
                 np.testing.assert_allclose(points.sigmas[robot, mate], np.sqrt(np.trace(seen.covariance[:2, :2]) / 2.0))
                 if mate != robot:
                     np.testing.assert_array_equal(points.poses[robot, mate], compose(points.starts[robot], seen.mean))
-            for got, expected in zip(outlines.of(robot), team.map(robot, min_count=2).outline, strict=True):
+            for got, expected in zip(outlines.of(robot), team.map(robot, min_count=2).summary, strict=True):
                 np.testing.assert_array_equal(got, expected)
-    assert len(team.mates(0)) == 1 < len(team.members(0))
+    assert len(team.same_filter(0)) == 1 < len(team.known_robots(0))
 
 
 def test_own_start_frames_do_not_jump_at_a_merge() -> None:
@@ -288,7 +288,7 @@ def test_every_step_names_landmarks_that_exist(run: Run) -> None:
                 ids[mate] |= set(created[created >= 0].tolist())
         for robot, found in enumerate(report.associations):
             assert set(found[found >= 0].tolist()) <= ids[robot]
-        for renaming in report.renamings:
+        for renaming in report.id_maps:
             new_id = dict(renaming.ids_b.tolist())
             joint = ids[renaming.robots_a[0]] | {new_id[old] for old in ids[renaming.robots_b[0]] if old in new_id}
             for robot in renaming.robots_a + renaming.robots_b:
@@ -299,7 +299,7 @@ def test_every_step_names_landmarks_that_exist(run: Run) -> None:
 def before_merges(report: TeamReport) -> list[tuple[int, ...]]:
     """Return the groups as they were in the step, before its merge."""
     groups = list(report.groups)
-    for renaming in reversed(report.renamings):
+    for renaming in reversed(report.id_maps):
         groups.remove(tuple(sorted(renaming.robots_a + renaming.robots_b)))
         groups += [renaming.robots_a, renaming.robots_b]
     return groups

@@ -12,7 +12,7 @@ from builders.teams import NEVER, SimulatedTeam, check_snapshot, driven, false_a
 
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.geometry import between, compose
-from slam_backend.maps.alignment import RIVAL_ANGLE, RIVAL_DISTANCE, AlignmentOptions, align_maps
+from slam_backend.maps.alignment import DISTINCT_ROTATION, DISTINCT_TRANSLATION, AlignmentOptions, align_maps
 from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.smoother.graph import mean_pose
 from slam_backend.smoother.options import SmoothingOptions
@@ -20,8 +20,8 @@ from slam_backend.team import group_merging as group_changes
 from slam_backend.team import merge_attempt as trying
 from slam_backend.team.branches import restored_filter
 from slam_backend.team.communication import LANDMARK_BYTES
-from slam_backend.team.filter_merging.merging import merge_filters, motion_covariance, paired
-from slam_backend.team.group_merging import MergePlan, doubt_about
+from slam_backend.team.filter_merging.merging import merge_filters, pair_filters, transform_covariance
+from slam_backend.team.group_merging import MergePlan, transform_uncertainty
 from slam_backend.team.groups import Group
 from slam_backend.team.merge_attempt import MOST_STEPS
 from slam_backend.team.merge_scheduler import AttemptOptions
@@ -30,7 +30,7 @@ from slam_backend.team.team import TeamSlam
 
 STEPS = 80
 AT_LAST = AttemptOptions(every=STEPS)  # the only attempt comes with the last step
-AS_IT_IS = MergeOptions(straighten=False)
+AS_IT_IS = MergeOptions(smooth_first=False)
 
 
 def bent_team(seed: int, attempts: AttemptOptions, **options: object) -> tuple[SimulatedTeam, TeamSlam]:
@@ -75,11 +75,11 @@ def test_a_merge_is_that_of_straightened_maps() -> None:
     bent = align_maps(*both_maps(alone), rng=rng)
     found = align_maps(sides[0].map("mixture"), sides[1].map("mixture"), rng=rng)
     assert [event.kind for event in team.events] == ["attempt", "merge"]
-    assert_same(team.events[0].bent, bent)
+    assert_same(team.events[0].unsmoothed_alignment, bent)
     assert_same(team.events[1].alignment, found)
     assert_same(team.merged_maps(team.events[1]), tuple(side.map() for side in sides))
-    watch = team._find(0)[0].watches[0]
-    for side, of_side, before in zip(watch.sides, sides, watch.before, strict=True):
+    watch = team._find(0)[0].monitors[0]
+    for side, of_side, before in zip(watch.sides, sides, watch.pre_merge_maps, strict=True):
         assert_same(side.trunk["filter"]["poses"], of_side.get_state()["poses"])
         assert len(before) == len(of_side.map())
 
@@ -111,8 +111,8 @@ def test_maps_that_no_longer_fit_are_not_merged() -> None:
     _, team = bent_team(113, AT_LAST, alignment=strict)
     event = team.events[0]
     assert (event.kind, event.alignment.reason) == ("attempt", "too uncertain")
-    assert event.bent is not None
-    assert event.bent.success
+    assert event.unsmoothed_alignment is not None
+    assert event.unsmoothed_alignment.success
     assert len(team.events) == 1
     assert team.groups == ((0,), (1,))
     assert not team._schedule.may_try(((0,), (1,)), STEPS)
@@ -122,7 +122,7 @@ def test_maps_that_no_longer_fit_are_not_merged() -> None:
 def test_maps_that_agree_on_less_once_straight_are_not_merged(every: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """A smoother that has lost its way is not believed: the attempt is refused, and the filters are as they were."""
     _, alone = bent_team(112, NEVER)
-    original = trying.straightened
+    original = trying.smoothed_maps
 
     def lost(a: Group, b: Group) -> tuple[LandmarkMap, LandmarkMap]:
         maps = original(a, b)
@@ -133,7 +133,7 @@ def test_maps_that_agree_on_less_once_straight_are_not_merged(every: int, monkey
     _, team = bent_team(112, AT_LAST)
     event = team.events[0]
     assert (len(team.events), event.alignment.reason) == (1, "too few inliers")
-    assert event.bent is not None
+    assert event.unsmoothed_alignment is not None
     for robot in range(2):
         assert_same(contents(team._find(robot)[0].filter), contents(alone._find(robot)[0].filter))
 
@@ -149,7 +149,7 @@ def test_what_cannot_be_bent_is_merged_as_it_is() -> None:
             poses = [between(start, pose) for start, pose in zip(simulation.starts, simulation.poses, strict=True)]
             team.step(odometry, frames, poses=poses)
         assert len(team.groups) == 1
-        assert team.events[0].bent is None
+        assert team.events[0].unsmoothed_alignment is None
         states.append(team.get_state() | {"merging": None})
     assert_same(states[0], states[1])
 
@@ -160,7 +160,7 @@ def test_straightened_maps_are_sent_once_more() -> None:
     for merging in (AS_IT_IS, MergeOptions()):
         _, team = bent_team(112, AT_LAST, merging=merging)
         sent.append(team.bytes_sent)
-    again = [len(before) * LANDMARK_BYTES for before in team._find(0)[0].watches[0].before]
+    again = [len(before) * LANDMARK_BYTES for before in team._find(0)[0].monitors[0].pre_merge_maps]
     assert (sent[1] - sent[0]).tolist() == again
 
 
@@ -170,8 +170,8 @@ def test_the_spread_of_motions_is_that_of_the_particles_that_a_merge_makes() -> 
     a, b = (team._find(robot)[0].filter for robot in range(2))
     alignment = align_maps(*both_maps(team), rng=np.random.default_rng(1))
     pairs = np.column_stack([a.map().ids[alignment.inliers[:, 0]], b.map().ids[alignment.inliers[:, 1]]])
-    motion = paired(a, b, alignment, pairs, np.random.default_rng(2)).motion
-    foretold = motion_covariance(motion, alignment)
+    motion = pair_filters(a, b, alignment, pairs, np.random.default_rng(2)).motion
+    foretold = transform_covariance(motion, alignment)
     joint, _ = merge_filters(a, b, alignment, pairs, np.random.default_rng(2))
     starts = joint.state.starts[1, :, : joint.num_particles].T
     np.testing.assert_allclose(foretold, np.cov(starts.T, bias=True), atol=1e-12)
@@ -180,9 +180,9 @@ def test_the_spread_of_motions_is_that_of_the_particles_that_a_merge_makes() -> 
 def test_a_pair_too_uncertain_to_merge_waits_and_merges_later() -> None:
     """Where particles differ in the motion by more than is sure the attempt is refused, until waiting helps no more."""
     rhythm = AttemptOptions(every=20)
-    _, team = bent_team(112, rhythm, merging=MergeOptions(sure=0.0))
+    _, team = bent_team(112, rhythm, merging=MergeOptions(min_sigmas=0.0))
     assert [event.kind for event in team.events] == ["attempt", "merge"]
-    simulation, team = bent_team(112, rhythm, merging=MergeOptions(sure=1e4))  # 0.05 mm
+    simulation, team = bent_team(112, rhythm, merging=MergeOptions(min_sigmas=1e4))  # 0.05 mm
     assert team.events[0].alignment.reason == "too uncertain"
     simulation.run(team, STEPS)
     *attempts, merge = team.events
@@ -196,7 +196,9 @@ def test_a_pair_too_uncertain_to_merge_waits_and_merges_later() -> None:
 @pytest.mark.parametrize("how", [{}, {"merged_particles": 5}])
 def test_being_sure_leaves_no_trace(how: dict[str, Any]) -> None:
     """Whether particles agree is only looked at: the merge is bit for bit that of a team which does not ask."""
-    states = [bent_team(112, AT_LAST, merging=MergeOptions(sure=sure, **how))[1].get_state() for sure in (0.0, 1e-6)]
+    states = [
+        bent_team(112, AT_LAST, merging=MergeOptions(min_sigmas=sure, **how))[1].get_state() for sure in (0.0, 1e-6)
+    ]
     assert_same(*({"filter": state["groups"], "rng": state["rng"]} for state in states))
 
 
@@ -238,9 +240,9 @@ def test_an_attempt_goes_on_when_both_maps_are_straight() -> None:
     assert [attempt.kind, merge.kind] == ["attempt", "merge"]
     assert attempt.step == merge.step == 1 + max(drawn.values())
     assert sorted(drawn) == [0, 1]
-    assert_same(attempt.bent, bent.bent)
-    watch = team._find(0)[0].watches[0]
-    assert_same(align_maps(*watch.before, rng=rng), merge.alignment)
+    assert_same(attempt.unsmoothed_alignment, bent.alignment)
+    watch = team._find(0)[0].monitors[0]
+    assert_same(align_maps(*watch.pre_merge_maps, rng=rng), merge.alignment)
     assert team._schedule.straightening is None
 
 
@@ -273,8 +275,8 @@ def test_an_attempt_waits_for_straight_maps_no_longer_than_it_may() -> None:
         team.step([None, None], [None, None])
     attempt = team.events[0]
     assert attempt.step == STEPS - 1 + MOST_STEPS + 1
-    assert attempt.bent is not None
-    np.testing.assert_allclose(attempt.alignment.transform, attempt.bent.transform, atol=1e-9)
+    assert attempt.unsmoothed_alignment is not None
+    np.testing.assert_allclose(attempt.alignment.transform, attempt.unsmoothed_alignment.transform, atol=1e-9)
 
 
 @pytest.mark.parametrize(("every", "slices"), [(None, 20), (1000, None)])
@@ -283,7 +285,7 @@ def test_only_a_smoother_that_works_in_slices_can_be_waited_for(every: int | Non
     simulation = SimulatedTeam(num_robots=2, seed=112)
     smoothing = SmoothingOptions(slice_steps=slices)
     team = simulation.build(attempts=AT_LAST, num_particles=8, rejuvenate_every=every, smoothing=smoothing)
-    assert not team._find(0)[0].filter.smooths_in_slices
+    assert not team._find(0)[0].filter.smooths_incrementally
     simulation.run(team, STEPS)
     assert [event.step for event in team.events] == [STEPS - 1] * 2
 
@@ -296,7 +298,7 @@ def planned(team: TeamSlam) -> MergePlan:
     """Return the plan of a merge of both robots, with its particles paired."""
     first, second = team._groups
     found = align_maps(team.map(0, "mixture"), team.map(1, "mixture"))
-    return MergePlan.of(first, second, found).paired(MergeOptions(), np.random.default_rng(1))
+    return MergePlan.of(first, second, found).with_pairing(MergeOptions(), np.random.default_rng(1))
 
 
 def test_a_trial_leaves_both_filters_as_they_are() -> None:
@@ -321,7 +323,7 @@ def test_a_trial_whose_merge_would_be_undone_is_refused(monkeypatch: pytest.Monk
     _, team = driven(2, 112, FEW_STEPS, num_particles=8)
     plan = planned(team)
     for share, bounded in ((0.2, True), (0.21, False)):
-        monkeypatch.setattr(group_changes, "moved_share", lambda *_, share=share: share)
+        monkeypatch.setattr(group_changes, "deformed_fraction", lambda *_, share=share: share)
         trial = plan.on_trial(MergeOptions(), AlignmentOptions(), np.random.default_rng(2))
         assert trial is not None
         assert np.isfinite(trial[1]) == bounded
@@ -337,7 +339,7 @@ def test_a_refused_trial_leaves_no_trace() -> None:
             FEW_STEPS,
             attempts=at_last,
             num_particles=8,
-            merging=MergeOptions(sure=NEVER_SURE, least_sure=least),
+            merging=MergeOptions(min_sigmas=NEVER_SURE, min_sigmas_on_trial=least),
         )[1].get_state()
         for least in (0.0, NEVER_SURE)
     ]
@@ -349,7 +351,7 @@ def test_a_refused_trial_leaves_no_trace() -> None:
 def test_a_pair_merges_by_the_motion_of_its_trial_when_two_agree() -> None:
     """The first trial waits; a later one is taken as it is: where the joint filter lets b start is what is reported."""
     simulation = SimulatedTeam(num_robots=2, seed=112)
-    merging = MergeOptions(sure=NEVER_SURE, least_sure=1.0)
+    merging = MergeOptions(min_sigmas=NEVER_SURE, min_sigmas_on_trial=1.0)
     team = simulation.build(attempts=AttemptOptions(every=20), num_particles=8, merging=merging)
     while len(team.groups) > 1 and team._step < 400:
         simulation.run(team, 1)
@@ -368,10 +370,10 @@ def test_what_held_frames_leave_open_is_doubted_as_well() -> None:
     simulation, team = driven(2, 3, 60, num_particles=13)
     alignment = false_alignment(simulation, team, np.zeros(3))
     a, b = (group.trunk.filter for group in team._groups)
-    plan = MergePlan.of(*team._groups, alignment).paired(MergeOptions(), team._rng)
+    plan = MergePlan.of(*team._groups, alignment).with_pairing(MergeOptions(), team._rng)
     assert plan.pairing is not None
-    covariance = motion_covariance(plan.pairing.motion, alignment)
-    before = doubt_about(plan)
+    covariance = transform_covariance(plan.pairing.motion, alignment)
+    before = transform_uncertainty(plan)
 
     rng = np.random.default_rng(0)
     frames = [np.diag([3e-2, 1e-2, 9e-3]), np.diag([1e-2, 5e-2, 4e-3])]
@@ -381,6 +383,6 @@ def test_what_held_frames_leave_open_is_doubted_as_well() -> None:
 
     for slam, frame in zip((a, b), frames, strict=True):
         slam.state.gauge_covariance[:] = frame
-    after = doubt_about(plan)
-    np.testing.assert_allclose(after, max(position / RIVAL_DISTANCE, heading / RIVAL_ANGLE), rtol=0.03)
+    after = transform_uncertainty(plan)
+    np.testing.assert_allclose(after, max(position / DISTINCT_TRANSLATION, heading / DISTINCT_ROTATION), rtol=0.03)
     assert after > 1.5 * before

@@ -9,14 +9,14 @@ from builders.comparison import assert_same
 from builders.filters import contents
 from builders.teams import NEVER, SimulatedTeam, check_snapshot, driven, false_alignment, links, true_alignment
 
-from slam_backend.fastslam.reports import MapDropped, MergeUndone, TeamReport
+from slam_backend.fastslam.reports import MapReleased, MergeUndone, TeamReport
 from slam_backend.geometry import inverse
 from slam_backend.maps.alignment import AlignmentOptions, align_maps
 from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.team import merge_rollback as undoing
-from slam_backend.team.branches import MOST_REPLAYED
-from slam_backend.team.merge_monitor import moved_share
-from slam_backend.team.merge_rollback import Undoing
+from slam_backend.team.branches import MAX_REPLAYED
+from slam_backend.team.merge_monitor import deformed_fraction
+from slam_backend.team.merge_rollback import MergeRollback
 from slam_backend.team.merge_scheduler import AttemptOptions
 from slam_backend.team.options import MergeOptions
 from slam_backend.team.team import TeamSlam
@@ -71,10 +71,10 @@ def test_after_an_undo_it_is_as_if_the_merge_had_never_been() -> None:
             assert_same(team._find(robot)[0].filter.log().arrays(), twin._find(robot)[0].filter.log().arrays())
         simulation.run(team, 10)
         other.run(twin, 10)
-    undone = [entry for entry in last.entries if isinstance(entry, MergeUndone)]
+    undone = [entry for entry in last.map_changes if isinstance(entry, MergeUndone)]
     assert [entry.maps for entry in undone] == [(0, 1, 2)]
     assert last.maps == (0, 1)
-    assert MapDropped(2) in last.entries
+    assert MapReleased(2) in last.map_changes
 
 
 def test_a_merge_on_top_of_a_false_one_goes_with_it() -> None:
@@ -113,8 +113,8 @@ def test_a_false_merge_on_top_of_a_right_one_goes_alone() -> None:
 
 
 def test_a_pair_whose_merge_was_undone_is_barred_for_a_while() -> None:
-    """The two sides do not try again for `barred_steps`, then they do, and merge rightly."""
-    attempts, merging = AttemptOptions(every=5), MergeOptions(barred_steps=60)
+    """The two sides do not try again for `blocked_steps`, then they do, and merge rightly."""
+    attempts, merging = AttemptOptions(every=5), MergeOptions(blocked_steps=60)
     simulation = SimulatedTeam(num_robots=2, seed=105)
     team = simulation.build(attempts=attempts, merging=merging)
     simulation.run(team, 44, links(2))
@@ -152,9 +152,9 @@ def test_a_robot_that_was_away_hears_of_the_undo_on_its_return() -> None:
         simulation.run(team, 1, links(3, (0, 2)))
     assert kinds(team) == ["merge", "merge", "undo"]
     assert team.groups == ((0, 1), (2,))
-    assert [team.members(robot) for robot in range(3)] == [(0, 1), (0, 1, 2), (2,)]
+    assert [team.known_robots(robot) for robot in range(3)] == [(0, 1), (0, 1, 2), (2,)]
     simulation.run(team, 10)
-    assert [team.members(robot) for robot in range(3)] == [(0, 1), (0, 1), (2,)]
+    assert [team.known_robots(robot) for robot in range(3)] == [(0, 1), (0, 1), (2,)]
     simulation.run(team, 20)
     assert simulation.position_errors(team).max() < 0.4
 
@@ -174,11 +174,11 @@ def test_a_right_merge_is_never_in_doubt_and_then_forgotten() -> None:
     simulation, team = driven(2, 110, merging=MergeOptions(watch_steps=40))
     team.merge(0, 1, align_maps(team.map(0, "mixture"), team.map(1, "mixture")))
     reports = simulation.run(team, 39)
-    assert len(team._find(0)[0].watches) == 1
+    assert len(team._find(0)[0].monitors) == 1
     assert len(team._records.log) == 39
     reports = simulation.run(team, 1)
-    assert reports[-1].entries[-2:] == (MapDropped(0), MapDropped(1))
-    assert team._find(0)[0].watches == []
+    assert reports[-1].map_changes[-2:] == (MapReleased(0), MapReleased(1))
+    assert team._find(0)[0].monitors == []
     assert len(team._records.log) == 0
     assert kinds(team) == ["merge"]
 
@@ -216,12 +216,12 @@ def test_only_what_moves_among_the_others_has_moved() -> None:
     means = rng.uniform(-9.0, 9.0, (30, 3))
     old = LandmarkMap(means, np.tile(0.01 * np.eye(3), (30, 1, 1)), np.eye(30, 5))
     moved = old.moved(inverse(np.array([3.0, -2.0, 2.5])))
-    assert moved_share(old, moved, AlignmentOptions()) == 0.0
+    assert deformed_fraction(old, moved, AlignmentOptions()) == 0.0
     shifted = moved.means.copy()
     shifted[:10] += [0.7, 0.7, 0.0]
     bent = LandmarkMap(shifted, moved.covariances, moved.descriptors)
-    assert moved_share(old, bent, AlignmentOptions()) == pytest.approx(1 / 3)
-    assert moved_share(old.subset(np.arange(7)), bent, AlignmentOptions()) == 0.0  # too few to say
+    assert deformed_fraction(old, bent, AlignmentOptions()) == pytest.approx(1 / 3)
+    assert deformed_fraction(old.subset(np.arange(7)), bent, AlignmentOptions()) == 0.0  # too few to say
 
 
 # ---------------------------------------------------------------------- snapshots
@@ -248,7 +248,7 @@ UNWATCHED = MergeOptions(watch_every=10_000)  # only what a test doubts is undon
 def doubted(team: TeamSlam) -> None:
     """Begin to take back the oldest merge of the first group."""
     group = team._groups[0]
-    group.undoing = Undoing.of(group.trunk, group.trunk.watches[0].number)
+    group.undoing = MergeRollback.of(group.trunk, group.trunk.monitors[0].number)
 
 
 def taken_in(monkeypatch: pytest.MonkeyPatch) -> list[int]:
@@ -279,7 +279,7 @@ def test_an_undo_takes_in_few_steps_at_a_time(monkeypatch: pytest.MonkeyPatch) -
         simulation.run(team, 1)
         other.run(twin, 1)
         done = tick == 4  # of each side 30 + tick steps wait, of which ten are taken in
-        assert len(steps) - before == (8 if done else MOST_REPLAYED)
+        assert len(steps) - before == (8 if done else MAX_REPLAYED)
         assert team.groups == (((0,), (1,)) if done else ((0, 1),))
     assert kinds(team) == ["merge", "undo"]
     for robot in range(2):
@@ -323,7 +323,7 @@ def test_a_doubt_ends_with_the_watch_of_the_filter_that_goes_on() -> None:
     team.merge(0, 1, false_alignment(simulation, team, FAR))
     simulation.run(team, 30)
     doubted(team)
-    team._groups[0].trunk.watches.clear()
+    team._groups[0].trunk.monitors.clear()
     simulation.run(team, 1)
     assert team._groups[0].undoing is None
     assert kinds(team) == ["merge"]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from slam_backend.frontend import GUARDS, StereoFrontEnd
+from slam_backend.frontend import MATCH_CHECKS, StereoFrontEnd
 from training.bench.stereo.bench import camera_of, speed_row
 from training.bench.stereo.quality import guard_rows, quality_row, retrieval, second_looks
 from training.bench.stereo.real_images import aloe_rows, chessboard, find_parts, measure_parts, planar_rows, rig_rows
@@ -40,7 +40,7 @@ def test_guards_are_counted_one_after_the_other() -> None:
     passed = np.ones((5, 4), dtype=bool)
     passed[0, 0] = passed[3, 1] = False
     rows = guard_rows(np.array([5.0, 0.5, -0.5, 0.1]), np.array([0.0, 3.0, 0.2, -0.1]), passed)
-    assert [row["name"] for row in rows] == ["all matches", *(f"+ {name}" for name in GUARDS)]
+    assert [row["name"] for row in rows] == ["all matches", *(f"+ {name}" for name in MATCH_CHECKS)]
     assert [row["matches"] for row in rows] == [4, 3, 3, 3, 2, 2]
     assert rows[0]["outliers"] == 0.25
     assert rows[1]["outliers"] == 0.0

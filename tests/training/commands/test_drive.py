@@ -68,7 +68,7 @@ def test_the_driven_robot_obeys_and_tab_takes_the_next() -> None:
     assert infos["robot_0"]["distance"] > 0.0
     policies = {agent: make_policy("random_walk", "continuous") for agent in env.possible_agents}
     drive(env, _Script([(set(), [])] * 5), policies, 3, pace=0.0)
-    assert env.episode.standing().distances[1] > 0.0
+    assert env.episode.team_metrics().distances[1] > 0.0
 
 
 def test_escape_ends() -> None:

@@ -6,17 +6,17 @@ from typer.testing import CliRunner
 from slam_backend.models.camera import StereoCamera
 from training.cli import app
 from training.episodes.video import beside_the_map, draw_eye
-from vslam_env.sensors import EyeFrame, StereoSensor, StereoSensorConfig
+from vslam_env.sensors import RenderedFrame, StereoSensor, StereoSensorConfig
 from vslam_env.world import FreeSpace, World
 
 ROOM = World("room", [[0, 0, 6, 0], [6, 0, 6, 5], [6, 5, 0, 5], [0, 5, 0, 0]])
 
 
-def _frame() -> EyeFrame:
+def _frame() -> RenderedFrame:
     config = StereoSensorConfig(camera=StereoCamera(focal_px=160.0, width=160, height=120))
     sensor = StereoSensor(config, ROOM, FreeSpace(ROOM, 0.2), np.random.default_rng(1))
-    frame = sensor.measure(np.array([[1.5, 2.0, 0.2]]), np.random.default_rng(2)).of_each()[0]
-    assert isinstance(frame, EyeFrame)
+    frame = sensor.measure(np.array([[1.5, 2.0, 0.2]]), np.random.default_rng(2)).per_robot()[0]
+    assert isinstance(frame, RenderedFrame)
     return frame
 
 

@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from slam_backend.maps.landmark_map import LandmarkMap
-from slam_backend.readers.kitti_images import holds_images, load_kitti_images
+from slam_backend.readers.kitti_images import is_image_folder, load_kitti_images
 from slam_backend.readers.stereo_files import StereoFiles, load_stereo_images
 from slam_backend.trajectory import Trajectory
 from training.cli import app
@@ -144,14 +144,14 @@ def test_times_and_duration(drive: Path) -> None:
 
 def test_folders_that_are_no_drive_are_named(tmp_path: Path) -> None:
     """Missing eyes, different images in both, files that are no images, and a missing calibration are refused."""
-    assert not holds_images(tmp_path)
+    assert not is_image_folder(tmp_path)
     with pytest.raises(ValueError, match="path: expected a folder with image_0 and image_1 or image_l and image_r"):
         load_kitti_images(tmp_path)
     for eye, names in (("image_l", ("0", "1")), ("image_r", ("0", "2"))):
         (tmp_path / eye).mkdir()
         for name in names:
             (tmp_path / eye / f"{name}.png").write_bytes(b"none")
-    assert holds_images(tmp_path)
+    assert is_image_folder(tmp_path)
     with pytest.raises(ValueError, match="path: expected two or more images of the same names in both eyes"):
         load_kitti_images(tmp_path)
     (tmp_path / "image_r" / "2.png").rename(tmp_path / "image_r" / "1.png")

@@ -10,7 +10,7 @@ from slam_backend.geometry import compose, transform_points
 from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.readers.conversions import integrate_commands
 from slam_backend.readers.kitti import load_kitti
-from slam_backend.readers.victoria import axle_velocities, load_victoria, steps
+from slam_backend.readers.victoria import axle_velocities, load_victoria, to_filter_steps
 from slam_backend.trajectory import Trajectory
 from training.replay.config import KittiConfig, VictoriaConfig
 from training.replay.kitti import find_loop, mean_drift
@@ -54,7 +54,7 @@ def test_trees_are_described_by_where_they_stand(tmp_path: Path) -> None:
     """Seen from the true pose, descriptors are the trees' places."""
     write_park(tmp_path)
     log = load_victoria(tmp_path)
-    frame = steps(log).measurements[0]
+    frame = to_filter_steps(log).measurements[0]
     assert frame is not None
     pose = integrate_commands(axle_velocities(log.controls), log.scan_times[:1])[0]
     found = describe_by_place(frame, pose)

@@ -26,7 +26,7 @@ from sb3_contrib import MaskablePPO
 
 from agents.goal_network import logits
 from agents.trained import load_model
-from slam_backend.core.state_codec import decoded, encoded
+from slam_backend.core.state_codec import decode, encode
 from training.cli import app
 from training.rl.checkpoint import CHECKPOINT_FILE, FORMAT, MAGIC, read_checkpoint, write_checkpoint
 from training.rl.config import TrainConfig
@@ -216,7 +216,7 @@ def test_a_pickle_in_the_place_of_a_checkpoint_is_not_run(tmp_path: Path, monkey
         with pytest.raises(ValueError, match=f"resume: .*{says}"):
             kept_of(tmp_path, SMOKE)
     assert not proof.exists()
-    file.write_bytes(_marked(encoded([1, 2], ENV_KINDS), FORMAT))
+    file.write_bytes(_marked(encode([1, 2], ENV_KINDS), FORMAT))
     with pytest.raises(ValueError, match="resume: expected the checkpoint of a training, got a broken file"):
         kept_of(tmp_path, SMOKE)
 
@@ -229,8 +229,8 @@ def test_tensors_are_kept_as_arrays() -> None:
     optimizer.step()
     for state in (layer.state_dict(), optimizer.state_dict(), torch.get_rng_state(), None):
         arrays = as_arrays(state)
-        back = as_tensors(decoded(encoded(arrays, ENV_KINDS), ENV_KINDS))
-        assert encoded(as_arrays(back), ENV_KINDS) == encoded(arrays, ENV_KINDS)
+        back = as_tensors(decode(encode(arrays, ENV_KINDS), ENV_KINDS))
+        assert encode(as_arrays(back), ENV_KINDS) == encode(arrays, ENV_KINDS)
     optimizer.load_state_dict(as_tensors(as_arrays(optimizer.state_dict())))
 
 

@@ -63,7 +63,7 @@ def test_readings_of_a_team_are_those_of_its_robots() -> None:
     env = small_env(comm_loss=0.5, oracle_pose=True, oracle_association=True)
     readings, _ = _record(env, 3)
     for now in readings:
-        again = TeamReadings.gathered(now).of_each()
+        again = TeamReadings.stack(now).per_robot()
         for one, other in zip(now, again, strict=True):
             for field, value, same in zip(Readings._fields, one, other, strict=True):
                 np.testing.assert_array_equal(value, same, err_msg=field)

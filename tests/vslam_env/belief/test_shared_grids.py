@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from builders.environments import ANGLES, MAX_RANGE, MEETING, building, cast, small_env, turning
 
-from slam_backend.fastslam.relative_poses import Standpoints
-from slam_backend.fastslam.reports import Findings, MergeUndone, Renaming, TeamReport
+from slam_backend.fastslam.relative_poses import TeamPoses
+from slam_backend.fastslam.reports import Associations, LandmarkIdMap, MergeUndone, TeamReport
 from slam_backend.geometry import between, compose, inverse
-from vslam_env.belief.belief import Body
-from vslam_env.belief.shared_grids import LONGEST_ABSENCE, SharedGrids, Strokes, Telling, caught_up
+from vslam_env.belief.belief import RobotHardware
+from vslam_env.belief.shared_grids import MAX_ABSENCE, GridTransfer, GridUpdate, SharedGrids, plan_catch_up
 from vslam_env.navigation import OCCUPIED, UNKNOWN
 
-BODY = Body(radius=0.2, ray_angles=ANGLES, scan_range=MAX_RANGE)
+BODY = RobotHardware(radius=0.2, ray_angles=ANGLES, scan_range=MAX_RANGE)
 STARTS = np.array([[7.3, 2.5, 1.5], [8.6, 1.8, 2.1], [6.2, 2.9, -2.0]])  # of three robots, in one room of the building
 NEAR, FAR = [5.4, 0.4, -4.0], [9.6, 4.1, 4.0]  # corners of that room; headings as they come
 ALL, NONE = ((0, 1, 2),) * 3, ((0,), (1,), (2,))
@@ -19,9 +19,9 @@ NOTHING, NO_MOTION = np.empty(0, np.int64), np.zeros(3)
 Mates = tuple[tuple[int, ...], ...]
 
 
-def stand(path: np.ndarray) -> Standpoints:
+def stand(path: np.ndarray) -> TeamPoses:
     """Return where robots at true poses (3, 3) believe themselves and each other to be, who know it well."""
-    points = Standpoints(3)
+    points = TeamPoses(3)
     for own in range(3):
         points.poses[own] = between(STARTS[own], path)
         points.starts[own] = inverse(STARTS[own])  # the map frame is that of the building
@@ -40,14 +40,14 @@ class Drive:
         self.grids, self.tick = SharedGrids(3, BODY), 0
         self._rng, self._path = np.random.default_rng(seed), STARTS.copy()
 
-    def on(self, mates: Mates, *entries: Renaming | MergeUndone, off: np.ndarray = NO_MOTION) -> None:
+    def on(self, mates: Mates, *entries: LandmarkIdMap | MergeUndone, off: np.ndarray = NO_MOTION) -> None:
         """Drive on for a tick, with these in contact, after what became of maps; 0 and 1 see each other `off`."""
         way = self._rng.uniform([-0.05, -0.05, -0.2], [0.15, 0.05, 0.2], (3, 3))
         self._path = np.clip(compose(self._path, way), NEAR, FAR)
         scans = np.array([cast(building(), pose) for pose in self._path])
-        points, merges = stand(self._path), tuple(entry for entry in entries if isinstance(entry, Renaming))
+        points, merges = stand(self._path), tuple(entry for entry in entries if isinstance(entry, LandmarkIdMap))
         points.poses[0, 1], points.poses[1, 0] = compose(off, points.poses[0, 1]), compose(off, points.poses[1, 0])
-        told = Findings.gathered([NOTHING], [NOTHING])
+        told = Associations.from_arrays([NOTHING], [NOTHING])
         report = TeamReport(self.tick, told, mates, (), merges, (0, 0, 0), entries, self.tick + 1)
         self.grids.step(self.tick, report, mates, points, scans, np.zeros(3, np.bool_))
         self.tick += 1
@@ -83,8 +83,8 @@ def test_meeting_again_without_having_read_anything_new_changes_nothing() -> Non
     before = drive.cells()
     points = stand(STARTS)
     for tick in range(drive.tick, drive.tick + 50):
-        drive.grids.meet(tick, NONE, points.starts)
-        drive.grids.meet(tick, ALL, points.starts)
+        drive.grids.share_on_contact(tick, NONE, points.starts)
+        drive.grids.share_on_contact(tick, ALL, points.starts)
     assert (drive.cells() == before).all()
 
 
@@ -92,9 +92,9 @@ def test_a_robot_long_away_receives_one_piece_and_nothing_is_kept_for_longer() -
     """What is kept of the time apart is bounded; after it they absorb each other's grids."""
     drive = Drive(100)
     drive.on(ALL)
-    for _ in range(LONGEST_ABSENCE + 5):
+    for _ in range(MAX_ABSENCE + 5):
         drive.on(((0, 1), (0, 1), (2,)))
-        assert len(drive.grids.get_state()["strokes"]) <= LONGEST_ABSENCE + 1
+        assert len(drive.grids.get_state()["strokes"]) <= MAX_ABSENCE + 1
     assert not drive.grids.get_state()["strokes"]
     alone = drive.cells()
     drive.on(ALL)
@@ -110,7 +110,9 @@ def test_restored_grids_know_what_was_missed() -> None:
     other = SharedGrids(3, BODY)
     other.set_state(drive.grids.get_state())
     points, nothing = stand(STARTS), np.full((3, len(ANGLES)), MAX_RANGE)
-    report = TeamReport(drive.tick, Findings.gathered([NOTHING], [NOTHING]), ALL, (), (), (0, 0, 0), (), drive.tick + 1)
+    report = TeamReport(
+        drive.tick, Associations.from_arrays([NOTHING], [NOTHING]), ALL, (), (), (0, 0, 0), (), drive.tick + 1
+    )
     for grids in (drive.grids, other):
         grids.step(drive.tick, report, ALL, points, nothing, np.zeros(3, np.bool_))
     for robot in range(3):
@@ -120,22 +122,26 @@ def test_restored_grids_know_what_was_missed() -> None:
 def test_what_was_sent_is_not_sent_again() -> None:
     """Of two that hold the same, one sends it; what is known is noted, not sent; others hand on what they received."""
     shared = np.array([[1, 1, 0], [1, 1, 0], [0, 0, 1]])
-    strokes = Strokes(7, shared, np.zeros((3, 3, 3)), np.ones((3, 2)), np.zeros(3, np.bool_))
+    strokes = GridUpdate(7, shared, np.zeros((3, 3, 3)), np.ones((3, 2)), np.zeros(3, np.bool_))
     motion = np.array([1.0, 2.0, 0.5])
-    tellings = [Telling(0, 2, motion, 0, False), Telling(1, 2, motion, 0, False), Telling(2, 0, -motion, 0, True)]
-    (after,), (missed,) = caught_up([strokes], tellings)
+    tellings = [
+        GridTransfer(0, 2, motion, 0, False),
+        GridTransfer(1, 2, motion, 0, False),
+        GridTransfer(2, 0, -motion, 0, True),
+    ]
+    (after,), (missed,) = plan_catch_up([strokes], tellings)
     assert missed.shared.tolist() == [[0, 0, 0], [0, 0, 0], [1, 1, 0]]
     assert after.shared.tolist() == [[1, 1, 1], [1, 1, 0], [1, 1, 1]]
     np.testing.assert_array_equal(missed.poses[2, :2], [motion, motion])
-    (later,), (missed,) = caught_up([after], [Telling(0, 1, motion, 0, False)])
+    (later,), (missed,) = plan_catch_up([after], [GridTransfer(0, 1, motion, 0, False)])
     assert later.shared.all()
     assert missed.shared.tolist() == [[0, 0, 0], [0, 0, 1], [0, 0, 0]]
     assert strokes.shared is shared
     assert shared.sum() == 5
-    assert caught_up([], tellings) == ([], [])
+    assert plan_catch_up([], tellings) == ([], [])
 
 
-MERGED = Renaming((0, 2), (1,), np.empty((0, 2), np.int64), (0, 1, 3))
+MERGED = LandmarkIdMap((0, 2), (1,), np.empty((0, 2), np.int64), (0, 1, 3))
 UNDONE = MergeUndone(MERGED.maps)
 PAIR, WITHOUT = ((0, 2), (1,), (0, 2)), ((0, 1), (0, 1), (2,))
 

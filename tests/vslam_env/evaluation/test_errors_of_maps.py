@@ -7,28 +7,35 @@ import numpy as np
 from builders.environments import MEETING, scored, small_env, standing_at, turning
 
 from slam_backend.core.validation import IntArray
-from slam_backend.fastslam.reports import Findings, LandmarksCreated, MapCopied, MapDropped, Renaming, TeamReport
+from slam_backend.fastslam.reports import (
+    Associations,
+    LandmarkIdMap,
+    LandmarksCreated,
+    MapForked,
+    MapReleased,
+    TeamReport,
+)
 from slam_backend.geometry import compose, inverse, transform_points, wrap_angle
-from slam_backend.maps.landmark_map import LandmarkMap, TeamOutlines
+from slam_backend.maps.landmark_map import LandmarkMap, TeamMapSummaries
 from slam_backend.metrics import map_error, map_rmse
-from vslam_env.evaluation.coverage import SEERS, Coverage, CoverageMeter
-from vslam_env.evaluation.map_scores import ClaimLedger
+from vslam_env.evaluation.coverage import OBSERVER_COUNT, CoverageCells, CoverageTracker
+from vslam_env.evaluation.map_scores import GroundTruthAssociation
 from vslam_env.navigation import FREE, SeenGrid, TeamGrids, cell_of
 
 TRUTHS = np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 0.3], [0.0, 6.0, -0.2], [7.0, 7.0, 0.0], [9.0, 1.0, 0.0]])
 COUNTABLE = np.array([True, True, False, True, True])
 STAY = np.zeros(3)
-MAP_SCORES = ("map_errors", "map_rmses", "map_recalls", "map_precisions", "placed_recalls")
+MAP_SCORES = ("map_errors", "map_rmses", "map_recalls", "map_precisions", "accurate_recalls")
 
 
 def _ids(*values: int) -> IntArray:
     return np.array(values, dtype=np.int64)
 
 
-def _report(created: tuple[IntArray, ...], renamings: tuple[Renaming, ...] = ()) -> TeamReport:
+def _report(created: tuple[IntArray, ...], renamings: tuple[LandmarkIdMap, ...] = ()) -> TeamReport:
     robots = tuple(range(len(created)))
     entries = (*(LandmarksCreated(r, r, 0, ids) for r, ids in enumerate(created) if len(ids)), *renamings)
-    findings = Findings.gathered(created, created)
+    findings = Associations.from_arrays(created, created)
     return TeamReport(0, findings, tuple((r,) for r in robots), (), renamings, robots, entries, 1)
 
 
@@ -36,19 +43,21 @@ def _map(means: np.ndarray, ids: IntArray) -> LandmarkMap:
     return LandmarkMap(means, np.tile(np.eye(3), (len(means), 1, 1)), np.zeros((len(means), 2)), ids=ids)
 
 
-def _ledger() -> ClaimLedger:
+def _ledger() -> GroundTruthAssociation:
     """Return books of two robots: the first holds 0, 1 and a false point, the second 1, 3 and what does not count."""
-    ledger = ClaimLedger(2, TRUTHS, COUNTABLE, 1.0)
+    ledger = GroundTruthAssociation(2, TRUTHS, COUNTABLE, 1.0)
     ledger.record(_report((_ids(0, 1, -1, 2), _ids(0, 1, 2))), [_ids(0, 1, 3, -1), _ids(1, 3, 2)])
     return ledger
 
 
-def _score(ledger: ClaimLedger, robot: int, held: LandmarkMap, world_from_group: np.ndarray) -> SimpleNamespace:
+def _score(
+    ledger: GroundTruthAssociation, robot: int, held: LandmarkMap, world_from_group: np.ndarray
+) -> SimpleNamespace:
     """Score one robot's map, the others having none."""
     robots = len(ledger.get_state()["map_of"])
     maps, poses = [LandmarkMap.empty(2)] * robots, np.zeros((robots, 3))
     maps[robot], poses[robot] = held, world_from_group
-    outlines = TeamOutlines.joined([each.outline for each in maps])
+    outlines = TeamMapSummaries.from_maps([each.summary for each in maps])
     standing = scored(ledger, outlines, standing_at(poses), np.zeros((robots, 3)), np.zeros((robots, 3)))
     return SimpleNamespace(**{name: getattr(standing, name)[robot] for name in MAP_SCORES})
 
@@ -56,8 +65,8 @@ def _score(ledger: ClaimLedger, robot: int, held: LandmarkMap, world_from_group:
 def test_claims_follow_creation() -> None:
     """A landmark claims the true one whose measurement created it: -1 if that was false, -2 if it does not count."""
     ledger = _ledger()
-    assert ledger.claims(0, _ids(0, 1, 2)).tolist() == [0, 1, -1]
-    assert ledger.claims(1, _ids(2, 1, 0)).tolist() == [-2, 2, 1]  # of the four that count, 3 is the third
+    assert ledger.true_ids(0, _ids(0, 1, 2)).tolist() == [0, 1, -1]
+    assert ledger.true_ids(1, _ids(2, 1, 0)).tolist() == [-2, 2, 1]  # of the four that count, 3 is the third
 
 
 def test_maps_are_scored_where_robots_believe_them_to_be() -> None:
@@ -68,17 +77,17 @@ def test_maps_are_scored_where_robots_believe_them_to_be() -> None:
     held = [_map(rng.normal(TRUTHS[:3], 0.1), np.arange(3)), _map(rng.normal(TRUTHS[:2], 0.1), np.arange(2))]
     there = inverse(compose(true_starts, starts))
     outlines = [
-        each.outline._replace(means=transform_points(pose, each.means)) for each, pose in zip(held, there, strict=True)
+        each.summary._replace(means=transform_points(pose, each.means)) for each, pose in zip(held, there, strict=True)
     ]
-    rows, parts = TeamOutlines.joined(outlines[::-1])
+    rows, parts = TeamMapSummaries.from_maps(outlines[::-1])
     nowhere = np.zeros((2, 3))
-    scores = scored(ledger, TeamOutlines(rows, parts[::-1].copy()), standing_at(starts), true_starts, nowhere)
+    scores = scored(ledger, TeamMapSummaries(rows, parts[::-1].copy()), standing_at(starts), true_starts, nowhere)
     for robot in range(2):
         expected = vars(_score(ledger, robot, held[robot], np.zeros(3)))
         for name in MAP_SCORES:
             np.testing.assert_allclose(getattr(scores, name)[robot], expected[name], atol=1e-12)
-    ledger.rename(Renaming((0,), (1,), np.array([[0, 1], [1, 3], [2, 4]]), (0, 1, 2)))
-    joint = TeamOutlines(rows, np.array([parts[1], parts[1]]))
+    ledger.merge(LandmarkIdMap((0,), (1,), np.array([[0, 1], [1, 3], [2, 4]]), (0, 1, 2)))
+    joint = TeamMapSummaries(rows, np.array([parts[1], parts[1]]))
     scores = scored(ledger, joint, standing_at(starts[[0, 0]]), true_starts[[0, 0]], nowhere)
     expected = vars(_score(ledger, 0, held[0], np.zeros(3)))
     for robot in range(2):
@@ -89,14 +98,14 @@ def test_maps_are_scored_where_robots_believe_them_to_be() -> None:
 def test_claims_follow_a_merge() -> None:
     """At a merge landmarks of a keep their claims, fused ones too, and those of b bring theirs under their new ids."""
     ledger = _ledger()
-    ledger.rename(Renaming((0,), (1,), np.array([[0, 1], [1, 3], [2, 4]]), (0, 1, 2)))
-    assert ledger.claims(0, _ids(0, 1, 2, 3, 4)).tolist() == [0, 1, -1, 2, -2]
+    ledger.merge(LandmarkIdMap((0,), (1,), np.array([[0, 1], [1, 3], [2, 4]]), (0, 1, 2)))
+    assert ledger.true_ids(0, _ids(0, 1, 2, 3, 4)).tolist() == [0, 1, -1, 2, -2]
 
 
 def test_books_follow_their_maps() -> None:
     """Whatever is copied, dropped or filled, a map claims what its landmarks were created as; so from a snapshot on."""
     rng = np.random.default_rng(8)
-    ledger, numbers = ClaimLedger(2, TRUTHS, COUNTABLE, 1.0), [0, 1]
+    ledger, numbers = GroundTruthAssociation(2, TRUTHS, COUNTABLE, 1.0), [0, 1]
     plain: dict[int, dict[int, int]] = {0: {}, 1: {}}
     for turn in range(2, 200):
         into, step = int(rng.choice(numbers)), 2 * turn
@@ -106,28 +115,28 @@ def test_books_follow_their_maps() -> None:
         claims = [-1 if true < 0 else (0, 1, -2, 2, 3)[true] for true in true_ids]
         plain[into] |= dict(zip(ids.tolist(), claims, strict=True))
         if turn % 3 == 0:
-            entries.append(MapCopied(into, turn))
+            entries.append(MapForked(into, turn))
             plain[turn] = dict(plain[into])
             numbers.append(turn)
         if len(numbers) > 4:
-            entries.append(MapDropped(numbers.pop(0)))
+            entries.append(MapReleased(numbers.pop(0)))
         maps = tuple(rng.choice(numbers, 2).tolist())
-        findings = Findings.gathered([ids, _ids()], [ids, _ids()])
+        findings = Associations.from_arrays([ids, _ids()], [ids, _ids()])
         report = TeamReport(step, findings, ((0,), (1,)), (), (), maps, tuple(entries), step + 1)
         ledger.record(report, [true_ids, _ids()])
         if turn % 50 == 0:
-            state, ledger = ledger.get_state(), ClaimLedger(2, TRUTHS, COUNTABLE, 1.0)
+            state, ledger = ledger.get_state(), GroundTruthAssociation(2, TRUTHS, COUNTABLE, 1.0)
             ledger.set_state(state)
         for robot, number in enumerate(maps):
             expected = plain[number]
-            assert ledger.claims(robot, np.array([*expected], np.int64)).tolist() == [*expected.values()]
+            assert ledger.true_ids(robot, np.array([*expected], np.int64)).tolist() == [*expected.values()]
 
 
 def test_a_fused_false_landmark_stays_false() -> None:
     """What a false point created is false, even if the other map's landmark fused into it was a true one."""
     ledger = _ledger()
-    ledger.rename(Renaming((0,), (1,), np.array([[0, 2], [1, 3], [2, 4]]), (0, 1, 2)))
-    assert ledger.claims(0, _ids(2)).tolist() == [-1]
+    ledger.merge(LandmarkIdMap((0,), (1,), np.array([[0, 2], [1, 3], [2, 4]]), (0, 1, 2)))
+    assert ledger.true_ids(0, _ids(2)).tolist() == [-1]
 
 
 def test_scores_agree_with_the_metrics() -> None:
@@ -136,13 +145,13 @@ def test_scores_agree_with_the_metrics() -> None:
     for _ in range(50):
         truths, countable = rng.uniform(-5.0, 5.0, (9, 3)), rng.random(9) < 0.8
         countable[0] = True
-        ledger = ClaimLedger(1, truths, countable, 0.8)
+        ledger = GroundTruthAssociation(1, truths, countable, 0.8)
         held = rng.integers(-1, 9, 13)
         ids = np.arange(13)
         ledger.record(_report((ids,)), [held])
         pose = rng.uniform(-3.0, 3.0, 3)
         means = transform_points(pose, truths[held] + rng.normal(0.0, 0.4, (13, 3)))
-        claims = ledger.claims(0, ids)
+        claims = ledger.true_ids(0, ids)
         score = _score(ledger, 0, _map(means, ids), inverse(pose))
         placed = transform_points(inverse(pose), means)
         matched = map_rmse(placed, ledger.true_positions, claims=claims)
@@ -153,7 +162,7 @@ def test_scores_agree_with_the_metrics() -> None:
         assert np.isclose(nothing.map_errors, 0.8 * np.sqrt(0.5))
         assert (nothing.map_rmses, nothing.map_recalls, nothing.map_precisions) == (0.8, 0.0, 0.0)
         errors = np.linalg.norm(placed[matched.matched[:, 0]] - ledger.true_positions[matched.matched[:, 1]], axis=1)
-        assert np.isclose(score.placed_recalls, np.count_nonzero(errors < 0.5) / len(ledger.true_positions))
+        assert np.isclose(score.accurate_recalls, np.count_nonzero(errors < 0.5) / len(ledger.true_positions))
 
 
 def test_pose_errors_are_differences_of_placed_poses() -> None:
@@ -162,8 +171,8 @@ def test_pose_errors_are_differences_of_placed_poses() -> None:
     starts, estimated, true = rng.uniform(-4.0, 4.0, (3, 20, 3))
     points = standing_at(np.zeros((20, 3)))
     points.own[:], points.sigmas[:] = estimated, rng.random((20, 20))
-    ledger = ClaimLedger(20, TRUTHS, COUNTABLE, 1.0)
-    outlines = TeamOutlines.joined([LandmarkMap.empty(2).outline] * 20)
+    ledger = GroundTruthAssociation(20, TRUTHS, COUNTABLE, 1.0)
+    outlines = TeamMapSummaries.from_maps([LandmarkMap.empty(2).summary] * 20)
     scores = scored(ledger, outlines, points, starts, true)
     placed = compose(starts, estimated)
     np.testing.assert_allclose(scores.pose_errors, np.linalg.norm(placed[:, :2] - true[:, :2], axis=1))
@@ -203,8 +212,8 @@ def test_coverage_is_a_union() -> None:
     starts = rng.uniform(-3.0, 3.0, (3, 3))
     team = TeamGrids(3)
     grids = team.grids
-    meter = CoverageMeter(centres, starts)
-    coverage, shares = Coverage(meter), []
+    meter = CoverageCells(centres, starts)
+    coverage, shares = CoverageTracker(meter), []
     kept = grids[1].get_state()
     angles = np.linspace(-0.6, 0.6, 32)
     for turn in range(40):
@@ -213,16 +222,16 @@ def test_coverage_is_a_union() -> None:
             if turn % 2:
                 grid.clear_disc(pose, 2.0)
             else:
-                grid.paint_scan(pose, rng.uniform(2.0, 9.0, 32), angles)
+                grid.update_from_scan(pose, rng.uniform(2.0, 9.0, 32), angles)
         if turn % 7 == 3:
-            grids[0].absorb(grids[2], rng.uniform(-1.0, 1.0, 3))
+            grids[0].merge(grids[2], rng.uniform(-1.0, 1.0, 3))
         if turn in (20, 30):
             grids[1].set_state(kept)
         shares.append(coverage.update(team, starts, np.empty(len(starts))))
         assert shares[-1] == _plain_share(centres, starts, grids)
     assert shares[-1] > 0.1
     assert min(np.diff(shares)) < 0.0  # walls were seen where floor had been, and a grid was restored
-    assert Coverage(meter).update(team, starts, np.empty(3)) == shares[-1]
+    assert CoverageTracker(meter).update(team, starts, np.empty(3)) == shares[-1]
 
 
 SQUARES = np.stack(np.meshgrid(np.arange(0.1, 8.0, 0.2), np.arange(0.1, 4.0, 0.2)), -1).reshape(-1, 2)
@@ -232,23 +241,23 @@ def test_finds_are_those_of_a_plain_count() -> None:
     """However grids change, each cell counts once for the nearest robot, as a look at all cells every time says."""
     rng = np.random.default_rng(2)
     starts = rng.uniform(0.0, 6.0, (3, 3))
-    coverage, team = Coverage(CoverageMeter(SQUARES, starts)), TeamGrids(3)
+    coverage, team = CoverageTracker(CoverageCells(SQUARES, starts)), TeamGrids(3)
     ever, found, angles = np.zeros(len(SQUARES), np.bool_), np.zeros(3), np.linspace(-0.6, 0.6, 32)
     for turn in range(60):
         for grid in team.grids:
             pose = np.append(rng.uniform(-3.0, 3.0, 2), rng.uniform(-3.0, 3.0))
-            grid.paint_scan(pose, rng.uniform(0.5, 3.0, 32), angles)
+            grid.update_from_scan(pose, rng.uniform(0.5, 3.0, 32), angles)
         if turn == 30:
             coverage.set_state(coverage.get_state())
         positions = rng.uniform(0.0, 8.0, (3, 2))
         said = np.empty(3)
         share = coverage.update(team, positions, said)
-        fresh = (coverage._floor[SEERS] > 0) & ~ever
+        fresh = (coverage._floor[OBSERVER_COUNT] > 0) & ~ever
         nearest = np.hypot(*np.moveaxis(SQUARES[:, None] - positions, -1, 0)).argmin(axis=1)
         found += np.bincount(nearest[fresh], minlength=3) / len(SQUARES)
         ever |= fresh
         np.testing.assert_allclose(said, found)
-        assert share == np.mean(coverage._floor[SEERS] > 0)
+        assert share == np.mean(coverage._floor[OBSERVER_COUNT] > 0)
     assert ever.mean() > 0.3
 
 

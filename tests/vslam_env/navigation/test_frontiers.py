@@ -22,12 +22,12 @@ from vslam_env.navigation import (
     plan_path,
 )
 from vslam_env.navigation._grid_kernels import known_bounds
-from vslam_env.navigation._planning_kernels import SAME_GOAL, weigh_pairs
-from vslam_env.navigation._planning_kernels.costmap import OUTSIDE, PAD, known_box
+from vslam_env.navigation._planning_kernels import SAME_GOAL, pair_distances
+from vslam_env.navigation._planning_kernels.costmap import OUTSIDE, PAD, known_region
 from vslam_env.navigation._planning_kernels.frontiers import _unseen_edges
-from vslam_env.navigation.candidate_slots import NUM_SLOTS, _of_least_total
+from vslam_env.navigation.candidate_slots import NUM_SLOTS, _assign
 
-_unseen_edges, known_box = map(python_entry, (_unseen_edges, known_box))
+_unseen_edges, known_region = map(python_entry, (_unseen_edges, known_region))
 
 
 def room(doors: tuple[float, ...] = (), width: float = 1.2) -> np.ndarray:
@@ -208,7 +208,7 @@ def explore(seed: int, start: FloatArray, max_ticks: int = 2000) -> tuple[SeenGr
     track = [pose]
     for tick in range(max_ticks):
         est_pose = in_start_frame(start, pose)
-        grid.paint_scan(est_pose, scan(walls, pose, rng), ANGLES)
+        grid.update_from_scan(est_pose, scan(walls, pose, rng), ANGLES)
         grid.clear_disc(est_pose)
         if tick % 10 == 0:
             slots.update(grid.cells, est_pose)
@@ -254,12 +254,12 @@ def test_frontiers_are_made_of_unknown_cells_beside_free_ones(corner: tuple[int,
     padded = np.pad(cells, 1, constant_values=OUTSIDE) == FREE
     beside = padded[:-2, 1:-1] | padded[2:, 1:-1] | padded[1:-1, :-2] | padded[1:-1, 2:]
     bounds = known_bounds(cells)
-    edges = _unseen_edges(known_box(cells, bounds), ignored, bounds[0] - PAD, bounds[1] - PAD)
+    edges = _unseen_edges(known_region(cells, bounds), ignored, bounds[0] - PAD, bounds[1] - PAD)
     found = np.argwhere(edges) + bounds[:2] - PAD
     assert found.tolist() == np.argwhere((cells == UNKNOWN) & beside & ~ignored).tolist()
 
 
-weigh_pairs = python_entry(weigh_pairs)
+pair_distances = python_entry(pair_distances)
 
 
 def test_pairs_that_are_clear_are_those_of_the_least_total() -> None:
@@ -272,13 +272,13 @@ def test_pairs_that_are_clear_are_those_of_the_least_total() -> None:
         places[again, :2] = goals[rng.integers(0, NUM_SLOTS, again.sum()), :2] + rng.normal(0.0, 0.3, (again.sum(), 2))
         goals[rng.random(NUM_SLOTS) < 0.5] = np.nan
         costs = np.empty((NUM_SLOTS, len(places)))
-        is_clear = weigh_pairs(goals, places, costs)
+        is_clear = pair_distances(goals, places, costs)
         apart = np.linalg.norm(goals[:, None, :2] - places[None, :, :2], axis=2)
         expected = np.where(apart < SAME_GOAL, apart, SAME_GOAL)  # NaN is no less
         np.testing.assert_allclose(costs, expected, rtol=1e-15)
         slots, sources = linear_sum_assignment(expected)
         near = expected[slots, sources] < SAME_GOAL
-        chosen = costs if is_clear else _of_least_total(costs)
+        chosen = costs if is_clear else _assign(costs)
         kept = np.argwhere(chosen < SAME_GOAL)
         np.testing.assert_array_equal(kept, np.column_stack([slots, sources])[near])
         is_alone = [(expected < SAME_GOAL).sum(axis=axis).max(initial=0) <= 1 for axis in (0, 1)]

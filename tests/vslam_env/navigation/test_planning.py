@@ -24,10 +24,10 @@ from vslam_env.navigation import (
     plan_path,
 )
 from vslam_env.navigation._grid_kernels import known_bounds
-from vslam_env.navigation._planning_kernels.costmap import CLOSE, NEAR, OPEN, OUTSIDE, PAD, known_box, weigh
+from vslam_env.navigation._planning_kernels.costmap import CLOSE, NEAR, OPEN, OUTSIDE, PAD, inflate_costs, known_region
 from vslam_env.navigation._planning_kernels.dijkstra import UNREACHED, parents_of, wavefront
 
-known_box, wavefront, weigh = map(python_entry, (known_box, wavefront, weigh))
+known_region, wavefront, inflate_costs = map(python_entry, (known_region, wavefront, inflate_costs))
 
 
 def floor(low: tuple[float, float], high: tuple[float, float], walls: list[tuple[float, ...]]) -> np.ndarray:
@@ -89,7 +89,7 @@ def test_the_wavefront_agrees_with_scipys_dijkstra(inner: np.ndarray, data: st.D
 def test_weights_follow_the_distance_from_walls(box: np.ndarray, reach: float) -> None:
     """A cell is closed below the reach of a wall, dear within one cell more, less dear within two or at the unknown."""
     distance = distance_transform_edt(box != OCCUPIED) if (box == OCCUPIED).any() else np.full(box.shape, np.inf)
-    weights = weigh(box, reach)[1:-1, 1:-1]
+    weights = inflate_costs(box, reach)[1:-1, 1:-1]
     inner = (slice(1, -1), slice(1, -1))
     unknown = box == UNKNOWN
     edge = unknown[2:, 1:-1] | unknown[:-2, 1:-1] | unknown[1:-1, 2:] | unknown[1:-1, :-2]
@@ -255,5 +255,5 @@ def test_the_known_box_holds_all_known_cells_and_no_more(places: list[tuple[int,
     rows, cols = np.nonzero(cells)
     assert bounds.tolist() == ([rows.min(), cols.min(), rows.max() + 1, cols.max() + 1] if places else [0, 0, 0, 0])
     padded = np.pad(cells, PAD, constant_values=OUTSIDE)
-    box = known_box(cells, bounds)
+    box = known_region(cells, bounds)
     np.testing.assert_array_equal(box, padded[bounds[0] : bounds[2] + 2 * PAD, bounds[1] : bounds[3] + 2 * PAD])

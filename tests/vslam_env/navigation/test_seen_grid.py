@@ -49,7 +49,7 @@ def test_a_cell_holds_its_own_centre(row: int, col: int) -> None:
 def test_an_open_view_leaves_no_speckles(pose: tuple[float, float, float]) -> None:
     """All cells in view of a scan that hits nothing are free, and no other cell is touched."""
     grid = SeenGrid()
-    grid.paint_scan(pose, np.full(32, MAX_RANGE), ANGLES)
+    grid.update_from_scan(pose, np.full(32, MAX_RANGE), ANGLES)
     offset = ALL_CENTRES - np.array(pose[:2])
     bearing = (np.arctan2(offset[..., 1], offset[..., 0]) - pose[2] + np.pi) % (2 * np.pi) - np.pi
     distance = np.hypot(offset[..., 0], offset[..., 1])
@@ -64,7 +64,7 @@ def test_an_open_view_leaves_no_speckles(pose: tuple[float, float, float]) -> No
 def test_a_wall_is_marked_without_holes(distance: float) -> None:
     """Before a wall all is free, on it occupied, behind it unknown."""
     grid = SeenGrid()
-    grid.paint_scan((0.0, 0.0, 0.0), wall_ranges(distance), ANGLES)
+    grid.update_from_scan((0.0, 0.0, 0.0), wall_ranges(distance), ANGLES)
     across = np.linspace(-0.4, 0.4, 41) * distance
     before = np.stack([np.full(41, distance - 0.3), across * 0.8], axis=-1)
     behind = np.stack([np.full(41, distance + 0.4), across], axis=-1)
@@ -88,7 +88,7 @@ def test_a_scan_is_painted_as_it_is_defined(seed: int, fan: np.ndarray) -> None:
             np.where(rng.random(len(fan)) < rng.choice([0.0, 0.2]), rng.uniform(0.0, 9.0, len(fan)), ranges)
         )
         ranges[rng.random(len(fan)) < rng.choice([0.0, 0.5])] = MAX_RANGE
-        grid.paint_scan(pose, ranges, fan)
+        grid.update_from_scan(pose, ranges, fan)
         plain = painted_plainly(plain, pose, ranges, fan, MAX_RANGE)
         assert (grid.get_state()["evidence"] == plain).all()
         verdicts = np.where(plain == 0, UNKNOWN, np.where(plain > 0, OCCUPIED, FREE))
@@ -104,7 +104,7 @@ def test_a_grid_tells_which_verdicts_changed() -> None:
     for k in range(30):
         pose = np.append(rng.uniform(-9.0, 9.0, 2), rng.uniform(-3.0, 3.0))
         before, changes[0] = grid.cells.copy(), 0
-        grid.paint_scan(pose, rng.uniform(0.3, 9.0, 32), ANGLES)
+        grid.update_from_scan(pose, rng.uniform(0.3, 9.0, 32), ANGLES)
         grid.clear_disc(pose)
         if k % 3 == 0:
             grid.bump(pose)
@@ -120,15 +120,15 @@ def test_a_grid_keeps_the_bounds_of_what_it_knows() -> None:
     team, other = TeamGrids(1), SeenGrid()
     (grid,), (bounds,) = team.grids, team.bounds
     assert bounds.tolist() == [0, 0, 0, 0]
-    other.paint_scan((3.0, -2.0, 1.0), wall_ranges(4.0), ANGLES)
+    other.update_from_scan((3.0, -2.0, 1.0), wall_ranges(4.0), ANGLES)
     for k in range(30):
         before = grid.get_state()
         pose = np.append(rng.uniform(-31.0, 31.0, 2) if k % 3 == 0 else rng.uniform(-3.0, 3.0, 2), rng.uniform(-3, 3))
-        grid.paint_scan(pose, rng.uniform(0.3, 9.0, 32), ANGLES)
+        grid.update_from_scan(pose, rng.uniform(0.3, 9.0, 32), ANGLES)
         grid.clear_disc(pose)
         grid.bump(pose)
         if k % 5 == 0:
-            grid.absorb(other, pose)
+            grid.merge(other, pose)
         if k % 7 == 0:
             grid.set_state(before)
         rows, columns = np.nonzero(grid.cells)
@@ -142,7 +142,7 @@ def test_a_doorway_between_two_rays_is_not_walled_up() -> None:
     grid = SeenGrid()
     ranges = wall_ranges(3.0)
     ranges[12:20] = MAX_RANGE  # 0.8 m wide
-    grid.paint_scan((0.0, 0.0, 0.0), ranges, ANGLES)
+    grid.update_from_scan((0.0, 0.0, 0.0), ranges, ANGLES)
     inside = np.stack([np.full(9, 3.0), np.linspace(-0.2, 0.2, 9)], axis=-1)
     assert (cells_at(grid, inside) == FREE).all()
 
@@ -157,7 +157,7 @@ def test_grazing_rays_do_not_eat_thin_walls() -> None:
     grid = SeenGrid()
     for x in np.arange(-5.0, 5.0, 0.05):
         pose = np.array([x, 0.0, 0.0])
-        grid.paint_scan(pose, scan(walls, pose, rng), ANGLES)
+        grid.update_from_scan(pose, scan(walls, pose, rng), ANGLES)
         grid.clear_disc(pose)
     along = np.linspace(-2.3, 6.0, 400)  # farther on, single rays hit too far apart to tell
     for y in (0.35, -1.4):
@@ -170,11 +170,11 @@ def test_one_stray_reading_does_not_block_a_way() -> None:
     """A hit where ten scans passed changes nothing; a wall that stays is believed."""
     grid = SeenGrid()
     for _ in range(10):
-        grid.paint_scan((0.0, 0.0, 0.0), wall_ranges(6.0), ANGLES)
-    grid.paint_scan((0.0, 0.0, 0.0), wall_ranges(3.1), ANGLES)
+        grid.update_from_scan((0.0, 0.0, 0.0), wall_ranges(6.0), ANGLES)
+    grid.update_from_scan((0.0, 0.0, 0.0), wall_ranges(3.1), ANGLES)
     assert cells_at(grid, np.array([[3.1, 0.05]])) == [FREE]
     for _ in range(3):
-        grid.paint_scan((0.0, 0.0, 0.0), wall_ranges(3.1), ANGLES)
+        grid.update_from_scan((0.0, 0.0, 0.0), wall_ranges(3.1), ANGLES)
     assert cells_at(grid, np.array([[3.1, 0.05]])) == [OCCUPIED]
 
 
@@ -183,14 +183,14 @@ def test_what_has_gone_is_forgotten() -> None:
     grid = SeenGrid()
     for distance, ticks in ((3.1, 100), (6.0, 20)):
         for _ in range(ticks):
-            grid.paint_scan((0.0, 0.0, 0.0), wall_ranges(distance), ANGLES)
+            grid.update_from_scan((0.0, 0.0, 0.0), wall_ranges(distance), ANGLES)
     assert (cells_at(grid, np.stack([np.linspace(0.3, 5.5, 50), np.zeros(50)], axis=-1)) == FREE).all()
 
 
 def test_the_robots_place_is_free_but_the_wall_it_touches_stays() -> None:
     """A disc frees unknown cells and what lies wholly inside it, not the wall at its rim."""
     grid = SeenGrid()
-    grid.paint_scan((0.05, 0.1, 0.0), wall_ranges(0.95), ANGLES)
+    grid.update_from_scan((0.05, 0.1, 0.0), wall_ranges(0.95), ANGLES)
     assert cells_at(grid, np.array([[1.0, 0.1]])) == [OCCUPIED]
     grid.clear_disc((0.75, 0.1, 0.0), radius=0.3)
     assert cells_at(grid, np.array([[0.75, 0.1], [0.75, -0.1]])).tolist() == [FREE, FREE]
@@ -207,7 +207,7 @@ def test_a_bump_marks_what_is_ahead() -> None:
     grid.bump(pose)
     assert cells_at(grid, np.array([[1.01, -1.7]])) == [OCCUPIED]
     for _ in range(10):
-        grid.paint_scan((1.0, -2.5, np.pi / 2), wall_ranges(4.0), ANGLES)
+        grid.update_from_scan((1.0, -2.5, np.pi / 2), wall_ranges(4.0), ANGLES)
     assert cells_at(grid, np.array([[1.01, -1.7]])) == [FREE]
 
 
@@ -216,10 +216,10 @@ def test_what_lies_outside_the_grid_is_ignored(pose: tuple[float, float, float])
     """Near and beyond the edge, all ways of painting work and touch only the cells that exist."""
     grid, other = SeenGrid(), SeenGrid()
     other.clear_disc((0.0, 0.0, 0.0), radius=2.0)
-    grid.paint_scan(pose, wall_ranges(3.0), ANGLES)
+    grid.update_from_scan(pose, wall_ranges(3.0), ANGLES)
     grid.clear_disc(pose)
     grid.bump(pose)
-    grid.absorb(other, pose)
+    grid.merge(other, pose)
     assert grid.cells.shape == (GRID_SIZE, GRID_SIZE)
 
 
@@ -228,8 +228,8 @@ def test_absorbed_walls_stand_where_they_are_and_stay_closed(self_from_other: tu
     """What another robot saw appears at its place in the own frame, its walls without holes."""
     grid, other = SeenGrid(), SeenGrid()
     for _ in range(4):
-        other.paint_scan((0.0, 0.0, 0.0), wall_ranges(4.1), ANGLES)
-    grid.absorb(other, self_from_other)
+        other.update_from_scan((0.0, 0.0, 0.0), wall_ranges(4.1), ANGLES)
+    grid.merge(other, self_from_other)
     wall = np.stack([np.full(300, 4.1), np.linspace(-1.7, 1.7, 300)], axis=-1)
     found = []
     for d in (-0.1, 0.0, 0.1):
@@ -242,9 +242,9 @@ def test_absorbed_walls_stand_where_they_are_and_stay_closed(self_from_other: tu
 def test_absorbing_without_a_move_copies_and_keeps_the_other() -> None:
     """An empty grid that absorbs another one in the same frame knows the same floor, and the other stays as it was."""
     grid, other = SeenGrid(), SeenGrid()
-    other.paint_scan((1.0, 2.0, 0.4), wall_ranges(4.1), ANGLES)
+    other.update_from_scan((1.0, 2.0, 0.4), wall_ranges(4.1), ANGLES)
     before = other.cells.copy()
-    grid.absorb(other, (0.0, 0.0, 0.0))
+    grid.merge(other, (0.0, 0.0, 0.0))
     assert (grid.cells == before).all()
     assert (other.cells == before).all()
 
@@ -252,15 +252,15 @@ def test_absorbing_without_a_move_copies_and_keeps_the_other() -> None:
 def test_copies_are_independent_and_views_follow() -> None:
     """A copy keeps its content when the grid changes; a frozen view follows it and refuses changes."""
     grid = SeenGrid()
-    copy, view = grid.copy(), grid.frozen()
+    copy, view = grid.copy(), grid.read_only_view()
     grid.clear_disc((0.1, 0.1, 0.0))
     assert not copy.cells.any()
     assert (view.cells == grid.cells).all()
     for write in (
-        lambda: view.paint_scan((0, 0, 0), wall_ranges(2.0), ANGLES),
+        lambda: view.update_from_scan((0, 0, 0), wall_ranges(2.0), ANGLES),
         lambda: view.clear_disc((0, 0, 0)),
         lambda: view.bump((0, 0, 0)),
-        lambda: view.absorb(grid, (0, 0, 0)),
+        lambda: view.merge(grid, (0, 0, 0)),
         lambda: view.set_state(grid.get_state()),
     ):
         with pytest.raises(RuntimeError, match=r"read-only view. Make a copy\(\)"):
@@ -284,10 +284,10 @@ def test_readings_are_painted_as_their_parts() -> None:
         shared = rng.integers(0, 2, (3, 3))
         poses = rng.uniform(-1.0, 1.0, (3, 3, 3)) * [9.0, 9.0, 3.0]
         scans, bumps = rng.uniform(0.3, 9.0, (3, 32)), rng.random(3) < 0.4
-        team.paint_readings(shared, poses, scans, bumps, *HARDWARE)
+        team.update(shared, poses, scans, bumps, *HARDWARE)
         for owner, robot in np.argwhere(shared):
             pose = poses[owner, robot]
-            parts[owner].paint_scan(pose, scans[robot], ANGLES)
+            parts[owner].update_from_scan(pose, scans[robot], ANGLES)
             parts[owner].clear_disc(pose, RADIUS)
             if bumps[robot]:
                 parts[owner].bump(pose, RADIUS)

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from vslam_env.rendering import MergeFlash, RobotView, Scene, draw_frame
-from vslam_env.rendering.canvas import CHI_SQUARE_95, Viewport, dots, ellipse_outlines, veils
+from vslam_env.rendering.canvas import CHI_SQUARE_95, Viewport, dots, ellipse_outlines, translucent_fill
 from vslam_env.rendering.merge_effect import FLASH_TICKS
 from vslam_env.rendering.palette import robot_colour
 
@@ -151,7 +151,7 @@ def test_only_the_grouping_counts_not_its_labels() -> None:
 def test_a_veil_covers_its_area(x: float, y: float, radius: float, opacity: float) -> None:
     """A translucent disc takes away, summed over pixels, its area times its opacity, wherever it lies."""
     image = np.full((61, 67, 3), 200, np.uint8)
-    veils(image, np.array([[x, y]]), radius, (0, 0, 0), opacity)
+    translucent_fill(image, np.array([[x, y]]), radius, (0, 0, 0), opacity)
     taken = (200.0 - image[..., 0]).sum() / 200.0
     assert taken == pytest.approx(np.pi * radius**2 * opacity, rel=0.08, abs=1.5)
 
@@ -159,12 +159,12 @@ def test_a_veil_covers_its_area(x: float, y: float, radius: float, opacity: floa
 def test_veils_add_up_and_are_cut_off() -> None:
     """Two veils on one spot let through the square of what one does; those outside the image leave it alone."""
     once, twice, outside = (np.full((31, 37, 3), 250, np.uint8) for _ in range(3))
-    veils(once, np.array([[15.0, 15.0]]), 4.0, (0, 0, 0), 0.4)
-    veils(twice, np.array([[15.0, 15.0], [15.0, 15.0]]), 4.0, (0, 0, 0), 0.4)
-    veils(outside, np.array([[-9.0, 15.0], [15.0, 99.0], [1e9, -1e9]]), 4.0, (0, 0, 0), 0.4)
+    translucent_fill(once, np.array([[15.0, 15.0]]), 4.0, (0, 0, 0), 0.4)
+    translucent_fill(twice, np.array([[15.0, 15.0], [15.0, 15.0]]), 4.0, (0, 0, 0), 0.4)
+    translucent_fill(outside, np.array([[-9.0, 15.0], [15.0, 99.0], [1e9, -1e9]]), 4.0, (0, 0, 0), 0.4)
     assert (once[15, 15, 0], twice[15, 15, 0]) == (150, 90)
     assert (outside == 250).all()
-    veils(outside, np.array([[0.0, 15.0], [37.0, 31.0]]), 4.0, (0, 0, 0), 0.4)
+    translucent_fill(outside, np.array([[0.0, 15.0], [37.0, 31.0]]), 4.0, (0, 0, 0), 0.4)
     assert 0 < (outside[..., 0] < 250).sum() < 60
 
 

@@ -13,12 +13,12 @@ from slam_backend.fastslam._kernels import MIN_DEPTH
 from slam_backend.geometry import compose
 from slam_backend.models.camera import StereoCamera
 from vslam_env.sensors import LandmarkSensor, LandmarkSensorConfig
-from vslam_env.sensors._landmark_kernels import NEAREST, make_up, measure, mix_in
+from vslam_env.sensors._landmark_kernels import NEAREST, measure, sample_clutter, shuffle_clutter
 from vslam_env.world import FreeSpace, Landmarks, World, make_world, place_landmarks
-from vslam_env.world._kernels import choose, detect
-from vslam_env.world.visibility import marks_of, view_limits, visible_landmarks
+from vslam_env.world._kernels import choose_detected, detect
+from vslam_env.world.visibility import landmark_geometry, view_limits, visible_landmarks
 
-choose = python_entry(choose)
+choose_detected = python_entry(choose_detected)
 
 SHARP = StereoCamera(sigma_px=1e-9, sigma_disparity_px=1e-9)
 PERFECT = LandmarkSensorConfig(
@@ -50,7 +50,7 @@ def test_a_perfect_sensor_reports_the_truth() -> None:
     for _ in range(10):
         poses = free.draw_starts(3, rng, 1.0)
         visible = sensor.visible(poses)
-        for pose, seen, frame in zip(poses, visible, sensor.measure(poses, rng).of_each(), strict=True):
+        for pose, seen, frame in zip(poses, visible, sensor.measure(poses, rng).per_robot(), strict=True):
             assert sorted(frame.true_ids.tolist()) == np.flatnonzero(seen).tolist()
             local = camera.robot_from_camera(frame.measurements.points)
             c, s = np.cos(pose[2]), np.sin(pose[2])
@@ -101,7 +101,7 @@ def test_noise_is_the_cameras() -> None:
     camera = StereoCamera(sigma_px=0.3, sigma_disparity_px=0.15)
     sensor = LandmarkSensor(replace(PERFECT, camera=camera), WALL, on_wall([[0.7, 0.4]]))
     rng = np.random.default_rng(3)
-    frames = [sensor.measure(np.zeros((1, 3)), rng).of_each()[0] for _ in range(8000)]
+    frames = [sensor.measure(np.zeros((1, 3)), rng).per_robot()[0] for _ in range(8000)]
     pixels = np.array([camera.project(frame.measurements.points[0]) for frame in frames])
     true = camera.project(np.array([-0.7, -0.4, 4.0]))
     np.testing.assert_allclose(pixels.std(axis=0), [0.3, 0.3, 0.15], rtol=0.04)
@@ -159,7 +159,7 @@ def test_false_points_are_the_plain_definition() -> None:
     ahead = np.maximum(places[2] * 6.0 / np.linalg.norm(rays, axis=1), 0.5)
     looks = common + 0.8 * own / np.linalg.norm(own, axis=1, keepdims=True)
     points = np.empty((20, 11))
-    make_up(places, own, common, 0.8, view_limits(camera, 1.0), points)
+    sample_clutter(places, own, common, 0.8, view_limits(camera, 1.0), points)
     np.testing.assert_allclose(points[:, :3], rays * ahead[:, None], rtol=1e-12)
     np.testing.assert_allclose(points[:, 3:], looks / np.linalg.norm(looks, axis=1, keepdims=True), rtol=1e-12)
 
@@ -174,7 +174,7 @@ def test_false_points_are_mixed_in_by_their_keys() -> None:
     own = [np.concatenate([row[:n], made_up]) for row, n, made_up in zip(ids, num_true, false, strict=True)]
     expected = [points[np.argsort(share)].tolist() for points, share in zip(own, shares, strict=True)]
     counts, mixed = num_true.copy(), ids.copy()
-    mix_in(num_false, keys.copy(), mixed, counts)
+    shuffle_clutter(num_false, keys.copy(), mixed, counts)
     assert counts.tolist() == [3, 2, 3, 0, 5]
     assert [row[:n].tolist() for row, n in zip(mixed, counts, strict=True)] == expected
 
@@ -188,7 +188,7 @@ def test_the_choice_is_that_of_the_smallest_keys(seed: int) -> None:
         detected = visible[keys[visible] < 0.7]
         expected = detected[np.argsort(keys[detected])][:places]
         chosen = np.empty(max(places, 1), np.int64)
-        count = choose(visible, keys, 0.7, places, chosen)
+        count = choose_detected(visible, keys, 0.7, places, chosen)
         assert chosen[:count].tolist() == expected.tolist()
 
 
@@ -199,7 +199,7 @@ def test_each_robot_detects_what_it_sees_as_false_points_leave_places() -> None:
     poses, view = free.draw_starts(4, rng, 1.0), view_limits(camera, 1.0)
     keys, num_false = rng.random((4, len(marks))), np.array([0, 2, 4, 9])
     chosen, counts = np.empty((4, 4), np.int64), np.empty(4, np.int64)
-    sight = marks_of(marks), marks.walls.copy(), world.walls.T.copy(), 0.2, view
+    sight = landmark_geometry(marks), marks.walls.copy(), world.walls.T.copy(), 0.2, view
     total, extra = detect(poses, *sight, keys, 0.8, num_false, chosen, counts)
     assert num_false.tolist() == [0, 2, 4, 4]
     assert (total, extra) == (counts.sum(), 10)
@@ -230,7 +230,7 @@ def test_detection_and_choice_are_uniform() -> None:
     config = replace(PERFECT, detection_probability=0.6, max_measurements=3)
     sensor = LandmarkSensor(config, WALL, on_wall(rows))
     rng = np.random.default_rng(5)
-    frames = [sensor.measure(np.zeros((1, 3)), rng).of_each()[0].true_ids for _ in range(6000)]
+    frames = [sensor.measure(np.zeros((1, 3)), rng).per_robot()[0].true_ids for _ in range(6000)]
     sizes = np.bincount([len(ids) for ids in frames], minlength=4) / 6000
     few = [(1 - 0.6) ** 7, 7 * 0.6 * 0.4**6, 21 * 0.36 * 0.4**5]
     np.testing.assert_allclose(sizes[:3], few, atol=0.016)
@@ -247,7 +247,7 @@ def test_false_points_come_at_the_stated_rate_and_look_like_the_rest() -> None:
     sensor = LandmarkSensor(config, world.walls, marks)
     rng = np.random.default_rng(6)
     poses = free.draw_starts(3, rng, 2.0)
-    frames = [frame for _ in range(1000) for frame in sensor.measure(poses, rng).of_each()]
+    frames = [frame for _ in range(1000) for frame in sensor.measure(poses, rng).per_robot()]
     ids = [frame.true_ids for frame in frames]
     assert max(map(len, ids)) <= 5
     false = np.array([(i < 0).sum() for i in ids])
@@ -265,7 +265,7 @@ def test_false_points_come_at_the_stated_rate_and_look_like_the_rest() -> None:
 def test_an_empty_view_gives_an_empty_frame() -> None:
     """A robot that looks away reports no points, with descriptors of the usual size."""
     sensor = LandmarkSensor(PERFECT, WALL, on_wall([[0.0, 0.0]]))
-    frame = sensor.measure(np.array([[0, 0, 3.0]]), np.random.default_rng(0)).of_each()[0]
+    frame = sensor.measure(np.array([[0, 0, 3.0]]), np.random.default_rng(0)).per_robot()[0]
     assert frame.measurements.points.shape == (0, 3)
     assert frame.measurements.descriptors.shape == (0, 11)
 
@@ -277,7 +277,7 @@ def test_all_that_is_measured_can_be_taken_in() -> None:
     close = LandmarkSensor(replace(PERFECT, camera=camera), WALL, on_wall([[0.0, 0.0], [0.01, 0.0]]))
     slam, rng, told = FastSlam(num_particles=2, camera=camera, seed=0), np.random.default_rng(9), []
     for x in np.linspace(0.0, 3.99, 400):
-        (frame,) = close.measure(np.array([[x, 0.0, 0.0]]), rng).of_each()
+        (frame,) = close.measure(np.array([[x, 0.0, 0.0]]), rng).per_robot()
         slam.step([(0.0, 0.0, 0.0)], [frame.measurements])
         told.append(len(frame.true_ids))
     assert min(told) == 0
@@ -304,7 +304,7 @@ def test_no_camera_reports_what_a_filter_cannot_use(camera: StereoCamera, false_
     sensor = LandmarkSensor(config, WALL, on_wall([[0.2 * i - 0.6, 0.3 - 0.1 * i] for i in range(7)]))
     for x in (0.0, 2.0, 3.5):
         for _ in range(10):
-            (frame,) = sensor.measure(np.array([[x, 0.0, 0.0]]), rng).of_each()
+            (frame,) = sensor.measure(np.array([[x, 0.0, 0.0]]), rng).per_robot()
             points = frame.measurements.points
             assert frame.measurements.extent == (points[:, 2].min(initial=np.inf), np.abs(points).max(initial=0.0))
             assert np.all(points[:, 2] >= NEAREST)

@@ -16,8 +16,8 @@ from slam_backend.geometry import transform_points
 from slam_backend.models.camera import StereoCamera
 from vslam_env import ExplorationEnv
 from vslam_env.presets import preset_config, stereo_belief
-from vslam_env.sensors.stereo.cameras import ImagingConfig, StereoEye
-from vslam_env.sensors.stereo.sensor import EyeFrame, StereoSensor, StereoSensorConfig
+from vslam_env.sensors.stereo.cameras import ImagingConfig, StereoRenderer
+from vslam_env.sensors.stereo.sensor import RenderedFrame, StereoSensor, StereoSensorConfig
 from vslam_env.sensors.stereo.textures import STYLES, TextureConfig, draw_textures
 from vslam_env.world import FreeSpace, World
 
@@ -36,7 +36,7 @@ def test_measured_points_lie_at_their_true_landmarks(sensor: StereoSensor) -> No
     rng, away, claimed, total = np.random.default_rng(1), [], 0, 0
     for heading in np.arange(-3.0, 3.0, 0.4):
         poses = POSES + np.array([0.0, 0.0, heading])
-        for pose, frame in zip(poses, sensor.measure(poses, rng).of_each(), strict=True):
+        for pose, frame in zip(poses, sensor.measure(poses, rng).per_robot(), strict=True):
             points = sensor.config.camera.robot_from_camera(frame.measurements.points)
             world = np.column_stack([transform_points(pose, points[:, :2]), points[:, 2]])
             known = frame.true_ids >= 0
@@ -54,10 +54,10 @@ def test_measured_points_lie_at_their_true_landmarks(sensor: StereoSensor) -> No
 
 def test_frames_hold_what_was_seen(sensor: StereoSensor) -> None:
     """Frames carry both images and what the front end found; measurements are at most as many as asked for."""
-    frames = sensor.measure(POSES, np.random.default_rng(2)).of_each()
-    assert all(isinstance(frame, EyeFrame) for frame in frames)
+    frames = sensor.measure(POSES, np.random.default_rng(2)).per_robot()
+    assert all(isinstance(frame, RenderedFrame) for frame in frames)
     for frame in frames:
-        assert isinstance(frame, EyeFrame)
+        assert isinstance(frame, RenderedFrame)
         assert frame.left.shape == frame.right.shape == (240, 320)
         assert 5 < len(frame.measurements) <= 20
         assert len(frame.true_ids) == len(frame.measurements) == len(frame.seen.pixels)
@@ -66,7 +66,7 @@ def test_frames_hold_what_was_seen(sensor: StereoSensor) -> None:
 
 def test_visible_landmarks_are_those_that_are_measured(sensor: StereoSensor) -> None:
     """Of the measured landmarks nearly all are visible ones, and nothing behind a robot is."""
-    visible, frames = sensor.visible(POSES), sensor.measure(POSES, np.random.default_rng(8)).of_each()
+    visible, frames = sensor.visible(POSES), sensor.measure(POSES, np.random.default_rng(8)).per_robot()
     assert visible.shape == (2, len(sensor.landmarks))
     measured = np.concatenate([visible[robot, f.true_ids[f.true_ids >= 0]] for robot, f in enumerate(frames)])
     assert measured.mean() > 0.8
@@ -78,12 +78,12 @@ def test_visible_landmarks_are_those_that_are_measured(sensor: StereoSensor) -> 
 
 def test_the_same_draws_give_the_same_images(sensor: StereoSensor) -> None:
     """Images depend on the poses and the generator alone, not on what was taken before."""
-    one = sensor.measure(POSES, np.random.default_rng(3)).of_each()
+    one = sensor.measure(POSES, np.random.default_rng(3)).per_robot()
     sensor.measure(POSES[::-1], np.random.default_rng(4))
-    two = sensor.measure(POSES, np.random.default_rng(3)).of_each()
+    two = sensor.measure(POSES, np.random.default_rng(3)).per_robot()
     for first, second in zip(one, two, strict=True):
-        assert isinstance(first, EyeFrame)
-        assert isinstance(second, EyeFrame)
+        assert isinstance(first, RenderedFrame)
+        assert isinstance(second, RenderedFrame)
         np.testing.assert_array_equal(first.left, second.left)
         np.testing.assert_array_equal(first.measurements.points, second.measurements.points)
         np.testing.assert_array_equal(first.true_ids, second.true_ids)
@@ -108,7 +108,7 @@ def test_other_descriptors_and_sizes_can_be_had() -> None:
     camera = StereoCamera(focal_px=400.0, width=400, height=300)
     config = StereoSensorConfig(camera=camera, front_end=FrontEndOptions(descriptor="sift"))
     other = StereoSensor(config, ROOM, FreeSpace(ROOM, 0.2), np.random.default_rng(7))
-    frame = other.measure(POSES[:1], np.random.default_rng(1)).of_each()[0]
+    frame = other.measure(POSES[:1], np.random.default_rng(1)).per_robot()[0]
     assert frame.measurements.descriptors.shape[1] == 128
     assert len(frame.measurements) > 20
 
@@ -152,7 +152,7 @@ def test_robots_that_see_build_maps_of_the_walls() -> None:
     for _ in range(38):
         _, _, _, _, infos = env.step(turning(env.agents))
     for agent, frame in zip(env.agents, env.episode.frames, strict=True):
-        assert isinstance(frame, EyeFrame)
+        assert isinstance(frame, RenderedFrame)
         assert frame.left.shape == (120, 160)
         assert len(env.belief(agent).map) > 20
         assert infos[agent]["map_rmse"] < 0.25
@@ -184,7 +184,7 @@ def test_images_can_be_observed() -> None:
     observed, _ = seeing.reset(seed=6)
     for _ in range(3):
         for agent, frame, reading in zip(seeing.agents, seeing.episode.frames, seeing.readings, strict=True):
-            assert isinstance(frame, EyeFrame)
+            assert isinstance(frame, RenderedFrame)
             assert reading.image is not None
             assert seeing.observation_space(agent).contains(observed[agent])
             image = observed[agent]["image"]
@@ -220,12 +220,12 @@ VIEWS = np.array([[1.0, 1.2, 0.3], [2.6, 2.9, -1.0]])
 
 
 @pytest.fixture(scope="module")
-def eye() -> StereoEye:
+def eye() -> StereoRenderer:
     """An eye in a textured room with another robot."""
-    return StereoEye(CAMERA, ImagingConfig(), WALLS, draw_textures(WALLS, np.random.default_rng(3), COARSE))
+    return StereoRenderer(CAMERA, ImagingConfig(), WALLS, draw_textures(WALLS, np.random.default_rng(3), COARSE))
 
 
-def _plain(eye: StereoEye, poses: np.ndarray, robot: int, shift: float, fine: int) -> np.ndarray:
+def _plain(eye: StereoRenderer, poses: np.ndarray, robot: int, shift: float, fine: int) -> np.ndarray:
     """Return the image (H, W) as the mean over `fine` x `fine` rays a pixel, each followed by itself."""
     paint, camera = eye.textures.config, CAMERA
     pictures = [eye.textures.picture(face) for face in range(2 * len(WALLS))]
@@ -275,7 +275,7 @@ def _plain(eye: StereoEye, poses: np.ndarray, robot: int, shift: float, fine: in
 
 
 @pytest.mark.parametrize("shift", [0.0, CAMERA.baseline])
-def test_it_agrees_with_following_many_rays(eye: StereoEye, shift: float) -> None:
+def test_it_agrees_with_following_many_rays(eye: StereoRenderer, shift: float) -> None:
     """A rendered image is the mean over rays through each pixel, for both eyes, with walls and a robot in view."""
     plain = _plain(eye, VIEWS, 0, shift, 5)
     rendered = eye.radiance(VIEWS, 0, shift).T
@@ -286,7 +286,7 @@ def test_it_agrees_with_following_many_rays(eye: StereoEye, shift: float) -> Non
     assert abs((rendered - plain).mean()) < 0.3
 
 
-def test_columns_know_what_they_see(eye: StereoEye) -> None:
+def test_columns_know_what_they_see(eye: StereoRenderer) -> None:
     """Traced rays meet the wall, face and depth that a rendered column shows; a robot is distinguished from a wall."""
     columns = np.arange(0.0, 90.0, 0.5)
     traced = eye.trace(VIEWS, 0, columns)
@@ -311,7 +311,7 @@ def test_means_over_boxes_survive_distance() -> None:
     """The mean grey of a far wall is that of its texture: nothing is skipped, whatever the distance."""
     walls = np.array([[20.0, -8.0, 20.0, 8.0]])
     textures = draw_textures(walls, np.random.default_rng(1), TextureConfig(texel=0.005, polygons=20.0))
-    eye = StereoEye(CAMERA, ImagingConfig(), walls, textures)
+    eye = StereoRenderer(CAMERA, ImagingConfig(), walls, textures)
     image = eye.radiance(np.array([[5.0, 0.0, 0.0]]), 0)
     distance = 20.0 - 5.1
     top, bottom = (29.5 - (z - 0.2) / distance * 80.0 for z in (1.2, -0.9))
@@ -325,7 +325,7 @@ def test_means_over_boxes_survive_distance() -> None:
 def test_front_end_measures_what_was_rendered() -> None:
     """Disparities of rendered pairs are f b / Z to less than a tenth of a pixel, and hardly any is off by a pixel."""
     camera = StereoCamera(mount=(0.0, 0.0, 0.1))
-    eye = StereoEye(camera, ImagingConfig(), WALLS, draw_textures(WALLS, np.random.default_rng(5)))
+    eye = StereoRenderer(camera, ImagingConfig(), WALLS, draw_textures(WALLS, np.random.default_rng(5)))
     front_end, rng, errors = StereoFrontEnd(camera), np.random.default_rng(6), []
     for pose in ([1.0, 1.2, 0.3], [2.6, 2.9, -1.0], [4.4, 0.6, 2.5], [0.6, 3.3, -0.6]):
         poses = np.array([pose])
@@ -338,10 +338,10 @@ def test_front_end_measures_what_was_rendered() -> None:
     assert (together > 1.0).mean() < 0.04
 
 
-def test_noise_is_that_of_the_configuration(eye: StereoEye) -> None:
+def test_noise_is_that_of_the_configuration(eye: StereoRenderer) -> None:
     """Pixels scatter by the stated deviation, independently in both eyes, about the exposed grey levels."""
     imaging = ImagingConfig(noise=3.0, gain_sigma=0.0, eye_gain_sigma=0.0)
-    camera = StereoEye(CAMERA, imaging, WALLS, eye.textures)
+    camera = StereoRenderer(CAMERA, imaging, WALLS, eye.textures)
     rng = np.random.default_rng(4)
     clean = [camera.radiance(VIEWS, 0, shift).T for shift in (0.0, CAMERA.baseline)]
     pairs = [camera.take(VIEWS, 0, rng) for _ in range(30)]
@@ -350,20 +350,22 @@ def test_noise_is_that_of_the_configuration(eye: StereoEye) -> None:
     assert abs(noise.mean()) < 0.03
     assert abs(np.corrcoef(noise[:, 0].ravel(), noise[:, 1].ravel())[0, 1]) < 0.01
     assert np.abs(noise).max() < 3.46 * 3.0 + 0.6
-    quiet = StereoEye(CAMERA, ImagingConfig(noise=0.0, gain_sigma=0.0, eye_gain_sigma=0.0), WALLS, eye.textures)
+    quiet = StereoRenderer(CAMERA, ImagingConfig(noise=0.0, gain_sigma=0.0, eye_gain_sigma=0.0), WALLS, eye.textures)
     np.testing.assert_array_equal(quiet.take(VIEWS, 0, rng)[0], np.floor(clean[0] + 0.5).astype(np.uint8))
 
 
-def test_exposure_and_blur_do_what_they_say(eye: StereoEye) -> None:
+def test_exposure_and_blur_do_what_they_say(eye: StereoRenderer) -> None:
     """A gain scales the image, and blur makes it smoother without changing its mean."""
     still = {"noise": 0.0, "gain_sigma": 0.0, "eye_gain_sigma": 0.0}
     gains = []
     for seed in range(40):
-        varying = StereoEye(CAMERA, ImagingConfig(**(still | {"gain_sigma": 0.1})), WALLS, eye.textures)
+        varying = StereoRenderer(CAMERA, ImagingConfig(**(still | {"gain_sigma": 0.1})), WALLS, eye.textures)
         image = varying.take(VIEWS, 0, np.random.default_rng(seed))[0].astype(float)
         gains.append(np.median(image / eye.radiance(VIEWS, 0).T))
     assert np.std(gains) == pytest.approx(0.1, rel=0.35)
-    blurred = StereoEye(CAMERA, ImagingConfig(**(still | {"blur_px": 1.5})), WALLS, eye.textures).radiance(VIEWS, 0)
+    blurred = StereoRenderer(CAMERA, ImagingConfig(**(still | {"blur_px": 1.5})), WALLS, eye.textures).radiance(
+        VIEWS, 0
+    )
     sharp = eye.radiance(VIEWS, 0)
     assert np.abs(np.diff(blurred, axis=0)).mean() < 0.7 * np.abs(np.diff(sharp, axis=0)).mean()
     assert blurred.mean() == pytest.approx(sharp.mean(), abs=1.0)

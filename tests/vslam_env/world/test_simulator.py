@@ -6,7 +6,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from slam_backend.geometry import compose, wrap_angle
-from vslam_env.sensors import Scan, ScanConfig
+from vslam_env.sensors import RangeFinder, ScanConfig
 from vslam_env.world import FreeSpace, OdometryNoise, Simulator, World, draw_bias, make_world, read_odometry
 from vslam_env.world._kernels.clearance import distances_to_walls
 
@@ -203,7 +203,7 @@ def test_rays_agree_with_the_plain_form(seed: int) -> None:
     config = ScanConfig(sigma=0.0, num_rays=7, half_fov=(0.4636, 1.2, 2.0, np.pi)[seed])
     poses = np.column_stack([rng.uniform(1, 18, 9), rng.uniform(1, 12, 9), rng.uniform(-np.pi, np.pi, 9)])
     for pose in poses:
-        ranges = Scan(config, walls).measure(pose[None], rng)[0]
+        ranges = RangeFinder(config, walls).measure(pose[None], rng)[0]
         plain = [plain_range(pose[:2], pose[2] + a, walls, 8.0) for a in config.ray_angles]
         np.testing.assert_allclose(ranges, plain, atol=1e-9)
 
@@ -211,7 +211,7 @@ def test_rays_agree_with_the_plain_form(seed: int) -> None:
 def test_rays_see_the_other_robots() -> None:
     """A robot 2 m ahead stops the middle rays at its edge; no robot sees itself."""
     poses = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 1.0]])
-    scan = Scan(ScanConfig(sigma=0.0, num_rays=33), BOX, robot_radius=0.25)
+    scan = RangeFinder(ScanConfig(sigma=0.0, num_rays=33), BOX, robot_radius=0.25)
     ranges = scan.measure(poses, np.random.default_rng(0))
     assert ranges.shape == (2, 33)
     assert ranges[0, 16] == pytest.approx(1.75)
@@ -222,7 +222,7 @@ def test_rays_see_the_other_robots() -> None:
 def test_noise_grows_with_distance_and_spares_what_is_out_of_range() -> None:
     """Readings scatter by 1 % of the distance (within 5 %, 5 sigma); a ray into the void reads exactly 8 m."""
     rng = np.random.default_rng(1)
-    scan = Scan(ScanConfig(num_rays=3), np.array([[4.0, -0.5, 4.0, 0.5]]))
+    scan = RangeFinder(ScanConfig(num_rays=3), np.array([[4.0, -0.5, 4.0, 0.5]]))
     ranges = np.array([scan.measure(np.zeros((1, 3)), rng)[0] for _ in range(5000)])
     assert ranges[:, 1].std() == pytest.approx(0.04, rel=0.05)
     assert ranges[:, 1].mean() == pytest.approx(4.0, abs=5 * 0.04 / np.sqrt(5000))
@@ -231,7 +231,7 @@ def test_noise_grows_with_distance_and_spares_what_is_out_of_range() -> None:
 
 def test_readings_stay_in_their_interval() -> None:
     """Even absurd noise gives readings in [0, 8] m."""
-    scan = Scan(ScanConfig(sigma=3.0), BOX)
+    scan = RangeFinder(ScanConfig(sigma=3.0), BOX)
     ranges = scan.measure(np.zeros((1, 3)), np.random.default_rng(2))
     assert ranges.min() >= 0.0
     assert ranges.max() <= 8.0

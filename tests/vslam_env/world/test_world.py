@@ -15,7 +15,7 @@ from builders.environments import WALLS, room, small_env
 from slam_backend.models.camera import StereoCamera
 from vslam_env import EnvConfig, vslam_v0
 from vslam_env.sensors import LandmarkSensor, LandmarkSensorConfig
-from vslam_env.simulation.scenario import draw_setting
+from vslam_env.simulation.scenario import sample_scenario
 from vslam_env.world import (
     SPLITS,
     WORLD_FAMILIES,
@@ -146,7 +146,7 @@ def test_starts_are_free_reachable_and_apart(family: str) -> None:
     """Three robots start 5 m apart, or 7 m if that is asked, off the walls, in the same part, sharing no view."""
     for seed, apart in ((0, 5.0), (1, 7.0), (2, 5.0)):
         config = EnvConfig(world=family, min_start_distance=apart)
-        setting = draw_setting(config, family, np.random.SeedSequence(seed))
+        setting = sample_scenario(config, family, np.random.SeedSequence(seed))
         starts = setting.true_starts
         gaps = np.linalg.norm(starts[:, None, :2] - starts[:, :2], axis=2)[~np.eye(3, dtype=bool)]
         assert gaps.min() >= apart

@@ -15,7 +15,7 @@ import numpy as np
 import scipy.linalg
 import scipy.sparse
 
-from slam_backend.core.validation import FloatArray, IntArray, bad_argument, check_float
+from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_float
 from slam_backend.geometry import wrap_angle
 from training.bench.accuracy.batch_problem import BatchProblem, Estimate, Moves, Sights
 
@@ -56,7 +56,7 @@ def batch_ml(problem: BatchProblem, start: Estimate | None = None, robust: float
         ValueError: If there is nothing to estimate.
     """
     if problem.num_steps < 2 or not len(problem.points):
-        raise bad_argument("problem", "two steps and a measurement", "a run without them", "Give a longer run.")
+        raise argument_error("problem", "two steps and a measurement", "a run without them", "Give a longer run.")
     if robust is not None:
         check_float("robust", robust, "Give it in standard deviations.", above=0.0)
     iterations = 0

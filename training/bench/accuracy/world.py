@@ -5,7 +5,7 @@ from typing import Self
 
 import numpy as np
 
-from slam_backend.core.validation import BoolArray, FloatArray, bad_argument, check_float, check_int
+from slam_backend.core.validation import BoolArray, FloatArray, argument_error, check_float, check_int
 from slam_backend.geometry import compose, inverse, transform_points, wrap_angle
 from slam_backend.models.camera import StereoCamera
 
@@ -97,7 +97,7 @@ class Office:
 def check_crossings(robots: int) -> None:
     """Refuse more robots than there are crossings, as each starts at one of its own."""
     if check_int("robots", robots, 1, "Use at least one robot.") > len(CROSSINGS):
-        raise bad_argument("robots", f"at most {len(CROSSINGS)}", robots, "Each starts at a crossing of its own.")
+        raise argument_error("robots", f"at most {len(CROSSINGS)}", robots, "Each starts at a crossing of its own.")
 
 
 def start_crossings(robots: int, rng: np.random.Generator) -> list[tuple[int, int]]:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.maps.alignment import RIVAL_ANGLE, RIVAL_DISTANCE, AlignmentOptions, align_maps
+from slam_backend.maps.alignment import DISTINCT_ROTATION, DISTINCT_TRANSLATION, AlignmentOptions, align_maps
 from slam_backend.readers.mrclam import MrclamLog, load_mrclam
 from training.bench.config import MrclamPairsConfig
 from training.experiments.statistics import grouped
@@ -92,7 +92,9 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
             "accepted": sum(row["accepted"] for row in own), "false": 0,
         } | dict.fromkeys(("median_m", "worst_m", "median_deg", "worst_deg"))  # fmt: skip
         if len(apart):
-            line["false"] = int(((apart[:, 0] > RIVAL_DISTANCE) | (apart[:, 1] > np.rad2deg(RIVAL_ANGLE))).sum())
+            line["false"] = int(
+                ((apart[:, 0] > DISTINCT_TRANSLATION) | (apart[:, 1] > np.rad2deg(DISTINCT_ROTATION))).sum()
+            )
             for column, unit in enumerate(("m", "deg")):
                 line[f"median_{unit}"] = float(np.median(apart[:, column]))
                 line[f"worst_{unit}"] = float(apart[:, column].max())

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from slam_backend.geometry import wrap_angle
-from slam_backend.maps.alignment import RIVAL_ANGLE, RIVAL_DISTANCE, align_maps
+from slam_backend.maps.alignment import DISTINCT_ROTATION, DISTINCT_TRANSLATION, align_maps
 from training.bench.alignment.map_pairs import (
     IDENTIFIABLE,
     UNALIGNABLE,
@@ -76,7 +76,7 @@ def play(trial: Trial) -> dict[str, Any]:
         bound = pair.bound()
         row |= {
             "error_m": float(np.hypot(error[0], error[1])), "error_rad": abs(float(error[2])),
-            "false": bool(np.hypot(error[0], error[1]) > RIVAL_DISTANCE or abs(error[2]) > RIVAL_ANGLE),
+            "false": bool(np.hypot(error[0], error[1]) > DISTINCT_TRANSLATION or abs(error[2]) > DISTINCT_ROTATION),
             "nees": float(error @ np.linalg.solve(found.covariance, error)),
             "bound_m2": float(bound[0, 0] + bound[1, 1]), "bound_rad2": float(bound[2, 2]),
         }  # fmt: skip

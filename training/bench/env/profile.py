@@ -16,7 +16,7 @@ from vslam_env.belief import observation
 from vslam_env.belief.shared_grids import SharedGrids
 from vslam_env.belief.team_belief import TeamBelief
 from vslam_env.navigation import TeamSlots
-from vslam_env.sensors import LandmarkSensor, Scan
+from vslam_env.sensors import LandmarkSensor, RangeFinder
 from vslam_env.simulation.episode import Episode
 from vslam_env.world import Simulator
 
@@ -33,14 +33,14 @@ class Phase(NamedTuple):
 PHASES = (
     Phase("physics", ((Simulator, "step"),)),
     Phase("landmark sensor", ((LandmarkSensor, "measure"),)),
-    Phase("scans", ((Scan, "measure"),)),
+    Phase("scans", ((RangeFinder, "measure"),)),
     Phase("grid painting", ((SharedGrids, "step"),)),
     Phase("filters", ((FastSlam, "step_checked"),)),
     Phase("team, alignment", ((TeamSlam, "step"),)),
     Phase("errors", ((Episode, "standing"),)),
     Phase("observations", ((observation, "observe_team"),)),
     Phase("candidates", ((TeamSlots, "update"),)),
-    Phase("beliefs, dictionaries", ((TeamBelief, "step"), (environment, "observations_of"), (environment, "infos_of"))),
+    Phase("beliefs, dictionaries", ((TeamBelief, "step"), (environment, "build_observations"), (environment, "build_infos"))),
 )  # fmt: skip
 
 

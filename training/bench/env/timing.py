@@ -15,7 +15,7 @@ from training.experiments.timing import clock, no_garbage_collection
 from vslam_env import vslam_v0
 from vslam_env.config import TICK, EnvConfig
 from vslam_env.environment import ExplorationEnv
-from vslam_env.simulation.scenario import draw_setting
+from vslam_env.simulation.scenario import sample_scenario
 from vslam_env.world import Simulator, read_odometry
 
 PEER = "mpe2"  # the package whose simple_spread is timed beside
@@ -96,7 +96,7 @@ def play_env(env: ExplorationEnv, seed: int, steps: int) -> Play:
 
 def time_simulator(config: EnvConfig, seed: int, steps: int, warm_up: int) -> dict[str, float]:
     """Time ticks of the simulator alone: physics, odometry, landmark sensor and scans, no filter, no observation."""
-    setting = draw_setting(config, config.world, np.random.SeedSequence(seed).spawn(1)[0])
+    setting = sample_scenario(config, config.world, np.random.SeedSequence(seed).spawn(1)[0])
     simulator = Simulator(setting.world, setting.true_starts, config.robot_radius, TICK)
     odometry, sensor, scan = (np.random.default_rng(seed + i) for i in range(3))
     rng = np.random.default_rng(seed)

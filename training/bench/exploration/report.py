@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.console import Console
 
-from agents.own import is_own
+from agents.own import is_plugin
 from agents.trained import MODEL_FILE
 from training.bench.config import NO_ORACLE
 from training.bench.exploration.trials import CURVES, TEAM
@@ -151,7 +151,7 @@ def label(name: str) -> str:
     ('train-0-1', 'train-0-1/model.npz', 'random_goals')
     """
     path = Path(name)
-    if is_own(name):
+    if is_plugin(name):
         return name
     return f"{path.parent.name}/{path.name}" if path.name == MODEL_FILE else path.name
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.core.validation import FloatArray, IntArray, bad_argument, check_int
+from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_int
 from slam_backend.fastslam.options import FilterOptions
 from slam_backend.geometry import between, compose, inverse, transform_points
 from slam_backend.models.camera import ROBOT_FROM_CAMERA
@@ -115,7 +115,7 @@ class LoadWorld:
                 in_view = np.flatnonzero(self._camera.sees(self._seen_from(now)))
                 if len(in_view) < share:
                     cure = "Use more landmarks, or fewer measurements."
-                    raise bad_argument("landmarks", f"{share} in a robot's view", f"a view of {len(in_view)}", cure)
+                    raise argument_error("landmarks", f"{share} in a robot's view", f"a view of {len(in_view)}", cure)
                 names.append(self._rng.choice(in_view, share, replace=False))
                 frames.append(self._measure(now, names[-1]))
             self._time += 1

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from slam_backend.core.validation import FloatArray
-from slam_backend.frontend import GUARDS, KINDS, FrontEndOptions, StereoFrontEnd
+from slam_backend.frontend import DESCRIPTOR_TYPES, MATCH_CHECKS, FrontEndOptions, StereoFrontEnd
 from slam_backend.geometry import rotation
 from slam_backend.models.camera import StereoCamera
 from training.bench.stereo.scenes import WALL, Named, Scene, office_views, wall_pose
@@ -50,7 +50,7 @@ def guard_rows(by_corners: FloatArray, by_patches: FloatArray, passed: Any) -> l
     """
     kept = np.ones(passed.shape[1], dtype=np.bool_)
     rows = [_errors("all matches", by_corners)]
-    for name, fine in zip(GUARDS, passed, strict=True):
+    for name, fine in zip(MATCH_CHECKS, passed, strict=True):
         kept &= fine
         rows.append(_errors(f"+ {name}", (by_corners if name == "mutual" else by_patches)[kept]))
     return rows
@@ -90,7 +90,7 @@ def retrieval(descriptor: Any, window: float | None, style: str, seed: int) -> d
     names = np.concatenate([view.names for view in known])
     described = np.concatenate([view.frame.measurements.descriptors for view in known])[names >= 0]
     names = names[names >= 0]
-    gate = KINDS[descriptor].gate
+    gate = DESCRIPTOR_TYPES[descriptor].gate
 
     def score(distance: float, angle: float) -> dict[str, Any]:
         right, accepted, accepted_right, total = 0, 0, 0, 0

@@ -14,12 +14,19 @@ from typing import Any
 import cv2
 import numpy as np
 
-from slam_backend.core.validation import Float32Array, FloatArray, bad_argument
-from slam_backend.frontend import GUARDS, KINDS, CornerOptions, FrontEndOptions, StereoFrontEnd, harris_corners
+from slam_backend.core.validation import Float32Array, FloatArray, argument_error
+from slam_backend.frontend import (
+    DESCRIPTOR_TYPES,
+    MATCH_CHECKS,
+    CornerOptions,
+    FrontEndOptions,
+    StereoFrontEnd,
+    harris_corners,
+)
 from slam_backend.frontend.descriptors import describe_points, nearest
 from slam_backend.frontend.images import Image
 from slam_backend.models.camera import StereoCamera
-from slam_backend.readers.calibration import Eye, Rectifier
+from slam_backend.readers.calibration import CameraCalibration, Rectifier
 from slam_backend.readers.kitti_images import read_grey
 from slam_backend.readers.stereo_files import load_rig
 from training.bench.stereo.quality import guard_rows
@@ -152,7 +159,7 @@ def rig_rows(folder: Path, descriptors: Sequence[str]) -> list[dict[str, Any]]:
                 "descriptor": descriptor,
                 "pairs": len(frames),
                 "matches": float(np.mean([frame.matches.passed.shape[1] for frame in frames])),
-                "left": dict(zip(GUARDS, np.mean(kept, axis=0).tolist(), strict=True)),
+                "left": dict(zip(MATCH_CHECKS, np.mean(kept, axis=0).tolist(), strict=True)),
                 "points": float(np.mean([len(frame.measurements) for frame in frames])),
                 "depth_m": float(np.median(depths)) if len(depths) else None,
                 "ms": spent,
@@ -179,7 +186,7 @@ def _eyes(folder: Path) -> tuple[list[Path], list[Path]]:
             return left, right
     got = f"a folder with {_calibration(folder)} alone"
     expected = "as many left as right images, " + ", ".join(f"{one} and {other}" for one, other in LAYOUTS[:4])
-    raise bad_argument("real", expected, got, f"Check {str(folder)!r}.")
+    raise argument_error("real", expected, got, f"Check {str(folder)!r}.")
 
 
 def aloe_rows(folder: Path, descriptor: Any) -> list[dict[str, Any]]:
@@ -215,7 +222,7 @@ def chessboard(folder: Path) -> dict[str, Any]:
             left_points.append(found[0])
             right_points.append(found[1])
     if len(images) < 5:
-        raise bad_argument("path", "five or more pairs of a chessboard", f"a folder with {len(images)}", "Check it.")
+        raise argument_error("path", "five or more pairs of a chessboard", f"a folder with {len(images)}", "Check it.")
     grid = np.zeros((BOARD[0] * BOARD[1], 3), np.float32)
     grid[:, :2] = np.mgrid[: BOARD[0], : BOARD[1]].T.reshape(-1, 2)
     height, width = images[0][0].shape
@@ -229,8 +236,8 @@ def chessboard(folder: Path) -> dict[str, Any]:
     left_from_right = np.eye(4)
     left_from_right[:3, :3] = stereo[5].T
     left_from_right[:3, 3] = -stereo[5].T @ np.ravel(stereo[6])
-    left_eye = Eye(width, height, stereo[1], np.ravel(stereo[2])[:5], np.eye(4))
-    right_eye = Eye(width, height, stereo[3], np.ravel(stereo[4])[:5], left_from_right)
+    left_eye = CameraCalibration(width, height, stereo[1], np.ravel(stereo[2])[:5], np.eye(4))
+    right_eye = CameraCalibration(width, height, stereo[3], np.ravel(stereo[4])[:5], left_from_right)
     rectifier = Rectifier(left_eye, right_eye)
     camera = rectifier.pair.camera(width, height, max_range=FARTHEST_SQUARES)
     options = FrontEndOptions(nearest=5.0, corners=CornerOptions(most=600))
@@ -279,7 +286,7 @@ def planar_rows(file: Path) -> list[dict[str, Any]]:
     model = _homography(file)
     a, b = (read_grey(_image(file.parent, f"{name}{side}")) for side in "AB")
     rows = []
-    for way in (*KINDS, "sift_own", "orb_own"):
+    for way in (*DESCRIPTOR_TYPES, "sift_own", "orb_own"):
         (at_a, described_a), (at_b, described_b) = (_described(image, way) for image in (a, b))
         row = {"pair": name, "way": way, "matches": 0, "right": 0}
         rows.append(row)
@@ -301,7 +308,9 @@ def _homography(file: Path) -> FloatArray:
     except (OSError, ValueError):
         numbers = np.empty(0)
     if numbers.shape != (9,) or not np.isfinite(numbers).all() or abs(np.linalg.det(numbers.reshape(3, 3))) == 0.0:
-        raise bad_argument("real", f"{file.name} with a 3 x 3 homography", "a different one", f"Correct {str(file)!r}.")
+        raise argument_error(
+            "real", f"{file.name} with a 3 x 3 homography", "a different one", f"Correct {str(file)!r}."
+        )
     return numbers.reshape(3, 3)
 
 
@@ -309,13 +318,13 @@ def _image(folder: Path, stem: str) -> Path:
     """Return the image of a name, whatever its suffix."""
     found = [folder / f"{stem}{suffix}" for suffix in SUFFIXES if (folder / f"{stem}{suffix}").is_file()]
     if not found:
-        raise bad_argument("real", f"an image {stem}.png, .jpg, ...", "no such file", f"Add it to {str(folder)!r}.")
+        raise argument_error("real", f"an image {stem}.png, .jpg, ...", "no such file", f"Add it to {str(folder)!r}.")
     return found[0]
 
 
 def _described(image: Image, way: str) -> tuple[FloatArray, Float32Array]:
     """Return points (n, 2) [px] and unit descriptors of an image."""
-    if way in KINDS:
+    if way in DESCRIPTOR_TYPES:
         points = harris_corners(image, CornerOptions(most=PLANAR_CORNERS)).points
         described = describe_points(image, points, np.full(len(points), 2.3), way)
         known = described.any(axis=1)

@@ -9,7 +9,7 @@ from slam_backend.frontend import StereoFrame, StereoFrontEnd
 from slam_backend.frontend.images import Image
 from slam_backend.geometry import transform_points
 from slam_backend.models.camera import StereoCamera
-from vslam_env.sensors.stereo.cameras import ImagingConfig, StereoEye
+from vslam_env.sensors.stereo.cameras import ImagingConfig, StereoRenderer
 from vslam_env.sensors.stereo.ground_truth import TextureCorners
 from vslam_env.sensors.stereo.sensor import SPURIOUS_PX
 from vslam_env.sensors.stereo.textures import TextureConfig, WallTextures, draw_textures
@@ -57,7 +57,7 @@ class Scene:
     ) -> None:  # fmt: skip
         self.world, self.camera = world, camera
         self.textures: WallTextures = draw_textures(world.walls, np.random.default_rng(seed), textures)
-        self.eye = StereoEye(camera, ImagingConfig() if imaging is None else imaging, world.walls, self.textures)
+        self.eye = StereoRenderer(camera, ImagingConfig() if imaging is None else imaging, world.walls, self.textures)
 
     def look(self, pose: FloatArray, rng: np.random.Generator) -> View:
         """Take a pair at a pose (3,) [m, m, rad]."""
@@ -79,7 +79,7 @@ class Scene:
         robot = camera.robot_from_camera(frame.measurements.points)
         world = np.column_stack([transform_points(view.pose, robot[:, :2]), robot[:, 2]])
         disparities = camera.focal_px * camera.baseline / traced.depths
-        names = corners.claims(traced, heights)
+        names = corners.true_ids(traced, heights)
         names[np.abs(frame.pixels[:, 2] - disparities) > SPURIOUS_PX] = -1
         return Named(frame, world, names, disparities)
 

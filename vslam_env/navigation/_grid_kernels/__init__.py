@@ -14,19 +14,33 @@ from vslam_env.navigation._grid_kernels.occupancy import (
     OCCUPIED,
     UNKNOWN,
     known_bounds,
-    paint_grid,
+    merge_grid,
 )
 from vslam_env.navigation._grid_kernels.scan_update import (
     directions_of,
     good_angles,
     good_ranges,
-    paint_scan,
-    room_to_paint,
+    scan_workspace,
+    update_from_scan,
 )
-from vslam_env.navigation._grid_kernels.team_update import paint_bump, paint_disc, paint_readings
+from vslam_env.navigation._grid_kernels.team_update import clear_disc, mark_bump, update_grids
 
 __all__ = [
-    "CELL", "FREE", "GRID_SIZE", "HALF_WIDTH", "MOST_CHANGES", "OCCUPIED", "UNKNOWN", "directions_of", "good_angles",
-    "good_ranges", "known_bounds", "paint_bump", "paint_disc", "paint_grid", "paint_readings",
-    "paint_scan", "room_to_paint",
+    "CELL",
+    "FREE",
+    "GRID_SIZE",
+    "HALF_WIDTH",
+    "MOST_CHANGES",
+    "OCCUPIED",
+    "UNKNOWN",
+    "clear_disc",
+    "directions_of",
+    "good_angles",
+    "good_ranges",
+    "known_bounds",
+    "mark_bump",
+    "merge_grid",
+    "scan_workspace",
+    "update_from_scan",
+    "update_grids",
 ]  # fmt: skip

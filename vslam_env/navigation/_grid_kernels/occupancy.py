@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.core.jit import device, in_place, inlined, jit
+from slam_backend.core.jit import device, in_place, inline, jit
 
 GRID_SIZE = 300
 CELL = 0.2
@@ -21,8 +21,8 @@ MOST_FREE, MOST_OCCUPIED = -8, 12
 MOST_CHANGES = 4096  # that a grid keeps for whoever counts its free cells; a scan makes a hundred at most
 
 
-@inlined
-def bounded(evidence: int) -> int:
+@inline
+def clamp_evidence(evidence: int) -> int:
     """Keep the evidence of a cell within its bounds; 0 is kept for cells that were never touched."""
     evidence = min(max(evidence, MOST_FREE), MOST_OCCUPIED)
     return evidence if evidence != 0 else -1
@@ -30,7 +30,7 @@ def bounded(evidence: int) -> int:
 
 @device
 @in_place
-def judge(cells: Any, changes: Any, bounds: Any, row: int, col: int, verdict: int) -> None:
+def set_state(cells: Any, changes: Any, bounds: Any, row: int, col: int, verdict: int) -> None:
     """Set a cell's verdict, and note it if it changed or was not known before.
 
     Args:
@@ -44,7 +44,7 @@ def judge(cells: Any, changes: Any, bounds: Any, row: int, col: int, verdict: in
     """
     if cells[row, col] != verdict:
         if cells[row, col] == UNKNOWN:
-            widen(bounds, row, col)
+            extend_bounds(bounds, row, col)
         cells[row, col] = verdict
         if 0 <= changes[0] < len(changes) - 1:
             changes[0] += 1
@@ -53,7 +53,7 @@ def judge(cells: Any, changes: Any, bounds: Any, row: int, col: int, verdict: in
             changes[0] = -1
 
 
-@inlined
+@inline
 def cell_range(low: float, high: float) -> tuple[int, int]:
     """Return the first and the one-past-last index of the cells between two coordinates [m], inside the grid."""
     first = min(max((low + HALF_WIDTH) / CELL, 0.0), float(GRID_SIZE))
@@ -63,7 +63,7 @@ def cell_range(low: float, high: float) -> tuple[int, int]:
 
 @device
 @in_place
-def widen(bounds: Any, row: int, col: int) -> None:
+def extend_bounds(bounds: Any, row: int, col: int) -> None:
     """Move bounds (4,) int32 so that a cell is within."""
     if bounds[2] == 0:
         bounds[0], bounds[1], bounds[2], bounds[3] = row, col, row + 1, col + 1
@@ -113,7 +113,7 @@ def _bounds_in_frame(other: Any, x: float, y: float, c: float, s: float) -> tupl
 
 
 @in_place
-def paint_grid(
+def merge_grid(
     evidence: Any, cells: Any, changes: Any, bounds: Any, other: Any, x: float, y: float, theta: float
 ) -> None:
     """Add another grid's evidence, seen from pose (x, y, theta) of its frame in this one.
@@ -140,5 +140,5 @@ def paint_grid(
                     if point == 0 or value > max(found, 0):
                         found = value
             if found != 0:
-                evidence[row, col] = bounded(evidence[row, col] + found)
-                judge(cells, changes, bounds, row, col, OCCUPIED if evidence[row, col] > 0 else FREE)
+                evidence[row, col] = clamp_evidence(evidence[row, col] + found)
+                set_state(cells, changes, bounds, row, col, OCCUPIED if evidence[row, col] > 0 else FREE)

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.core.jit import device, in_place, inlined, jit, room_of
+from slam_backend.core.jit import device, in_place, inline, jit, stack_array_of
 from slam_backend.core.validation import FloatArray
 from vslam_env.navigation._grid_kernels.occupancy import (
     CELL,
@@ -14,9 +14,9 @@ from vslam_env.navigation._grid_kernels.occupancy import (
     HALF_WIDTH,
     HIT,
     OCCUPIED,
-    bounded,
     cell_range,
-    judge,
+    clamp_evidence,
+    set_state,
 )
 
 # Rays as they are seen in the frame of a grid: after the rows of a survey that turn, how far to the left a ray gets
@@ -59,11 +59,11 @@ def look_to_side(told: Any, side: float, seen: Any) -> None:
         up = seen[ALONG_Y, i]
         leads_there = side * up > 0.0
         seen[SLOPE, i] = -seen[ALONG_X, i] / (up if leads_there else 1.0) if leads_there else aside
-        seen[TOP, i] = side * told[TELLING, i] * up + 0.5 * CELL if leads_there else -1.0
+        seen[TOP, i] = side * told[OBSERVED, i] * up + 0.5 * CELL if leads_there else -1.0
         aside = ASIDE if leads_there else aside
 
 
-@inlined
+@inline
 def cross_row(seen: Any, begin: int, end: int, steps: float, beside: float, passed: Any) -> tuple[int, int]:
     """Tell which rays the cells of a row lie to the left of.
 
@@ -106,7 +106,7 @@ LEAST = 1e-9  # of what is divided by
 # than the root of FREE_BELOW; whether there is a jump in range; how far along both something may be told where they see
 # no surface [m].
 ALONG_X, ALONG_Y, NORMAL_X, NORMAL_Y = range(4)  # these turn with the robot
-REACH, END_X, END_Y, IS_HIT, IN_LINE, TELLING, OFFSET, WALL_ABOVE, FREE_BELOW, IS_JUMP, TELLING_FREE = range(4, 15)
+REACH, END_X, END_Y, IS_HIT, IN_LINE, OBSERVED, OFFSET, WALL_ABOVE, FREE_BELOW, IS_JUMP, OBSERVED_FREE = range(4, 15)
 NUM_ROWS = 15
 
 
@@ -121,7 +121,7 @@ def directions_of(angles: FloatArray) -> Any:
 
 @device
 @in_place
-def _survey_rays(ranges: FloatArray, directions: FloatArray, max_range: float, told: Any) -> None:
+def _ray_geometry(ranges: FloatArray, directions: FloatArray, max_range: float, told: Any) -> None:
     """Write what each ray tells by itself, and whether three hits lie on one line."""
     count = len(ranges)
     for i in range(count):
@@ -130,7 +130,7 @@ def _survey_rays(ranges: FloatArray, directions: FloatArray, max_range: float, t
         told[REACH, i], told[IS_HIT, i] = reach, ranges[i] < max_range
         told[END_X, i], told[END_Y, i] = reach * directions[0, i], reach * directions[1, i]
         told[IN_LINE, i] = 0.0
-    for row in (ALONG_X, ALONG_Y, REACH, IS_HIT, TELLING):
+    for row in (ALONG_X, ALONG_Y, REACH, IS_HIT, OBSERVED):
         told[row, count] = 0.0
     for i in range(1, count - 1):
         along_x, along_y = told[END_X, i + 1] - told[END_X, i - 1], told[END_Y, i + 1] - told[END_Y, i - 1]
@@ -141,7 +141,7 @@ def _survey_rays(ranges: FloatArray, directions: FloatArray, max_range: float, t
 
 @device
 @in_place
-def _survey_pairs(told: Any) -> None:
+def _pair_geometry(told: Any) -> None:
     """Write what neighbouring rays see between them: one surface, a jump in range, or nothing.
 
     It is one surface if there is no gap between the hits to drive through, or if they line up with a third one; where
@@ -150,7 +150,7 @@ def _survey_pairs(told: Any) -> None:
     count = told.shape[1] - 1
     for k in (0, count):
         told[NORMAL_X, k], told[NORMAL_Y, k], told[OFFSET, k], told[WALL_ABOVE, k] = 0.0, 0.0, np.inf, np.inf
-        told[FREE_BELOW, k], told[IS_JUMP, k], told[TELLING_FREE, k] = np.inf, 0.0, 0.0
+        told[FREE_BELOW, k], told[IS_JUMP, k], told[OBSERVED_FREE, k] = np.inf, 0.0, 0.0
     for k in range(1, count):  # hardly any branches, for none could be foreseen
         x, y, reach = told[END_X, k - 1], told[END_Y, k - 1], min(told[REACH, k - 1], told[REACH, k])
         along_x, along_y = told[END_X, k] - x, told[END_Y, k] - y
@@ -167,12 +167,12 @@ def _survey_pairs(told: Any) -> None:
         told[FREE_BELOW, k], told[IS_JUMP, k] = np.inf if is_surface else free_below, is_jump
         cosine = told[ALONG_X, k - 1] * told[ALONG_X, k] + told[ALONG_Y, k - 1] * told[ALONG_Y, k]
         end_of_tangent = reach / max(math.sqrt(0.5 * max(1.0 + cosine, 0.0)), LEAST)  # of the arc up to the reach
-        told[TELLING_FREE, k] = 0.0 if is_surface else end_of_tangent
+        told[OBSERVED_FREE, k] = 0.0 if is_surface else end_of_tangent
 
 
 @device
 @in_place
-def survey(ranges: FloatArray, directions: FloatArray, max_range: float, told: Any) -> None:
+def scan_geometry(ranges: FloatArray, directions: FloatArray, max_range: float, told: Any) -> None:
     """Find out what a scan of `good_ranges` tells.
 
     Args:
@@ -181,20 +181,20 @@ def survey(ranges: FloatArray, directions: FloatArray, max_range: float, told: A
         max_range: A reading as far as this saw nothing [m].
         told: (15, n + 1) float64, robot frame. Written to, as described above.
     """
-    _survey_rays(ranges, directions, max_range, told)
-    _survey_pairs(told)
+    _ray_geometry(ranges, directions, max_range, told)
+    _pair_geometry(told)
     for i in range(len(ranges)):
         telling = told[REACH, i]
         for k in (i, i + 1):
             across = -(told[NORMAL_X, k] * told[ALONG_X, i] + told[NORMAL_Y, k] * told[ALONG_Y, i])
             through_wall = told[REACH, i] + WALL_HALF_THICKNESS / max(across, LEAST)
-            telling = max(telling, through_wall if told[WALL_ABOVE, k] < np.inf else told[TELLING_FREE, k])
-        told[TELLING, i] = telling
+            telling = max(telling, through_wall if told[WALL_ABOVE, k] < np.inf else told[OBSERVED_FREE, k])
+        told[OBSERVED, i] = telling
 
 
 @device
 @in_place
-def turn(told: Any, theta: float, seen: Any) -> None:
+def rotate_geometry(told: Any, theta: float, seen: Any) -> None:
     """Write the rows (4, n + 1) of a survey that turn as they are seen at a heading theta [rad]."""
     c, s = math.cos(theta), math.sin(theta)
     for x, y in ((ALONG_X, ALONG_Y), (NORMAL_X, NORMAL_Y)):
@@ -208,7 +208,7 @@ MOST_PLACES = GRID_SIZE + 1  # before the cells of a row, and after the last one
 LEAST_HEIGHT = 1e-9  # [m] that a row is taken to be from the robot, so that no ray crosses it nowhere
 
 
-@inlined
+@inline
 def _before(told: Any, seen: Any, k: Any, u: float, v: float) -> float:
     """Return how far before the surface of a pair of rays a point lies [m]."""
     before: float = seen[NORMAL_X, k] * u + seen[NORMAL_Y, k] * v + told[OFFSET, k]
@@ -217,7 +217,7 @@ def _before(told: Any, seen: Any, k: Any, u: float, v: float) -> float:
 
 @device
 @in_place
-def _told_at_jump(told: Any, seen: Any, k: Any, u: float, v: float, change: int) -> int:
+def _free_range_at_jump(told: Any, seen: Any, k: Any, u: float, v: float, change: int) -> int:
     """Return the evidence for a cell between two rays at whose ends the range jumps; seen from the robot at (u, v) [m].
 
     What is free by its distance may be on a surface that goes on from beside; what is not may hold one of the hits.
@@ -235,14 +235,14 @@ def _told_at_jump(told: Any, seen: Any, k: Any, u: float, v: float, change: int)
 
 
 @jit
-def room_to_paint(num_rays: int) -> FloatArray:
-    """Return room (22, n + 1) for a survey of n rays, and below it for what `paint_survey` makes of it."""
+def scan_workspace(num_rays: int) -> FloatArray:
+    """Return room (22, n + 1) for a survey of n rays, and below it for what `update_from_geometry` makes of it."""
     return np.empty((NUM_ROWS + NUM_SEEN_ROWS, num_rays + 1))
 
 
 @device
 @in_place
-def paint_survey(
+def update_from_geometry(
     evidence: Any, cells: Any, changes: Any, bounds: Any, x: float, y: float, theta: float, room: FloatArray
 ) -> None:
     """Write what a scan tells into a grid, visiting each cell between rays that reach its row once.
@@ -263,11 +263,11 @@ def paint_survey(
         x: Where the robot was [m].
         y: Likewise.
         theta: Its heading [rad].
-        room: Of `room_to_paint`, holding a survey.
+        room: Of `scan_workspace`, holding a survey.
     """
     told, seen, count = room[:NUM_ROWS], room[NUM_ROWS:], room.shape[1] - 1
-    all_passed = room_of(MOST_PLACES, np.uint32)
-    turn(told, theta, seen)
+    all_passed = stack_array_of(MOST_PLACES, np.uint32)
+    rotate_geometry(told, theta, seen)
     low_x = high_x = low_y = high_y = 0.0
     for i in range(count):
         end_x, end_y = told[REACH, i] * seen[ALONG_X, i], told[REACH, i] * seen[ALONG_Y, i]
@@ -304,17 +304,17 @@ def paint_survey(
                 elif before > told[WALL_ABOVE, k]:
                     change = HIT
                 if told[IS_JUMP, k] > 0.0:
-                    change = _told_at_jump(told, seen, k, u, v, change)
+                    change = _free_range_at_jump(told, seen, k, u, v, change)
                 old = evidence_row[col]
-                new = bounded(old + change) if change != 0 else old
+                new = clamp_evidence(old + change) if change != 0 else old
                 if new != old:
                     evidence_row[col] = new
                     if old == 0 or (new > 0) != (old > 0):
-                        judge(cells, changes, bounds, row, col, OCCUPIED if new > 0 else FREE)
+                        set_state(cells, changes, bounds, row, col, OCCUPIED if new > 0 else FREE)
 
 
 @jit
-def paint_scan(
+def update_from_scan(
     evidence: Any,
     cells: Any,
     changes: Any,
@@ -326,7 +326,7 @@ def paint_scan(
     directions: FloatArray,
     max_range: float,
 ) -> None:
-    """Write one scan of `good_ranges` into a grid: `survey` and `paint_survey`."""
-    room = room_to_paint(len(ranges))
-    survey(ranges, directions, max_range, room[:NUM_ROWS])
-    paint_survey(evidence, cells, changes, bounds, x, y, theta, room)
+    """Write one scan of `good_ranges` into a grid: `survey` and `update_from_geometry`."""
+    room = scan_workspace(len(ranges))
+    scan_geometry(ranges, directions, max_range, room[:NUM_ROWS])
+    update_from_geometry(evidence, cells, changes, bounds, x, y, theta, room)

@@ -13,13 +13,13 @@ from vslam_env.navigation._grid_kernels.occupancy import (
     HIT,
     OCCUPIED,
     cell_range,
-    judge,
+    set_state,
 )
-from vslam_env.navigation._grid_kernels.scan_update import NUM_ROWS, good_ranges, paint_survey, survey
+from vslam_env.navigation._grid_kernels.scan_update import NUM_ROWS, good_ranges, scan_geometry, update_from_geometry
 
 
 @in_place
-def paint_disc(evidence: Any, cells: Any, changes: Any, bounds: Any, x: float, y: float, radius: float) -> None:
+def clear_disc(evidence: Any, cells: Any, changes: Any, bounds: Any, x: float, y: float, radius: float) -> None:
     """Free what a robot covers: unknown cells centred in its disc, and occupied ones that lie wholly inside."""
     first_row, last_row = cell_range(y - radius, y + radius)
     first_col, last_col = cell_range(x - radius, x + radius)
@@ -33,11 +33,11 @@ def paint_disc(evidence: Any, cells: Any, changes: Any, bounds: Any, x: float, y
             inside = distance <= max(radius - 0.5 * CELL, 0.0)
             if inside or (evidence[row, col] == 0 and distance <= radius):
                 evidence[row, col] = min(evidence[row, col], -1)
-                judge(cells, changes, bounds, row, col, FREE)
+                set_state(cells, changes, bounds, row, col, FREE)
 
 
 @in_place
-def paint_bump(
+def mark_bump(
     evidence: Any, cells: Any, changes: Any, bounds: Any, x: float, y: float, theta: float, radius: float
 ) -> None:
     """Mark the cell just ahead of a robot's rim as occupied, no firmer than two hits."""
@@ -46,7 +46,7 @@ def paint_bump(
     col = math.floor((x + ahead * math.cos(theta) + HALF_WIDTH) / CELL)
     if 0 <= row < GRID_SIZE and 0 <= col < GRID_SIZE:
         evidence[row, col] = max(evidence[row, col], 2 * HIT)
-        judge(cells, changes, bounds, row, col, OCCUPIED)
+        set_state(cells, changes, bounds, row, col, OCCUPIED)
 
 
 @device
@@ -64,7 +64,7 @@ def _find_bad(shared: Any, poses: FloatArray, scans: FloatArray) -> tuple[int, i
 
 
 @in_place
-def paint_readings(
+def update_grids(
     evidence: Any,
     cells: Any,
     changes: Any,
@@ -85,14 +85,14 @@ def paint_readings(
         cells: (K, 300, 300) uint8.
         changes: (K, 1 + n) int32.
         bounds: (K, 4) int32.
-        shared: See `TeamGrids.paint_readings`, also for the rest.
+        shared: See `TeamGrids.update`, also for the rest.
         poses: (K, K, 3) float64 [m, m, rad].
         scans: (K, R) float64 [m].
         bumps: (K,) bool.
         directions: (2, R) float64.
         max_range: [m].
         radius: [m].
-        room: Of `room_to_paint`.
+        room: Of `scan_workspace`.
 
     Returns:
         Whose grid and whose reading do not go together, as its pose or its ranges are bad; nothing was written then.
@@ -102,12 +102,12 @@ def paint_readings(
     if bad[0] >= 0:
         return bad
     for robot in range(len(scans)):
-        survey(scans[robot], directions, max_range, room[:NUM_ROWS])
+        scan_geometry(scans[robot], directions, max_range, room[:NUM_ROWS])
         for owner in range(len(shared)):
             if shared[owner, robot]:
                 x, y, theta = poses[owner, robot]
-                paint_survey(evidence[owner], cells[owner], changes[owner], bounds[owner], x, y, theta, room)
-                paint_disc(evidence[owner], cells[owner], changes[owner], bounds[owner], x, y, radius)
+                update_from_geometry(evidence[owner], cells[owner], changes[owner], bounds[owner], x, y, theta, room)
+                clear_disc(evidence[owner], cells[owner], changes[owner], bounds[owner], x, y, radius)
                 if bumps[robot]:
-                    paint_bump(evidence[owner], cells[owner], changes[owner], bounds[owner], x, y, theta, radius)
+                    mark_bump(evidence[owner], cells[owner], changes[owner], bounds[owner], x, y, theta, radius)
     return bad

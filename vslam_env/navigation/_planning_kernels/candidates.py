@@ -7,7 +7,7 @@ import numpy as np
 
 from slam_backend.core.jit import device, in_place, jit
 from vslam_env.navigation._grid_kernels import CELL, GRID_SIZE, HALF_WIDTH
-from vslam_env.navigation._planning_kernels.frontiers import HEADING, NUM_COLUMNS, frontiers_over
+from vslam_env.navigation._planning_kernels.frontiers import HEADING, NUM_COLUMNS, compute_frontiers
 
 SAME_GOAL = 1.0  # [m] between updates the goal of a living candidate moves less than this
 AT_GOAL = 0.5  # [m]
@@ -23,7 +23,7 @@ def _visit(rows: Any, poses: Any, robot: int, visits: Any, given_up: Any) -> Non
     """Add to the visits (m,) of candidates what a robot and its teammates count; where patience runs out, give up.
 
     Args:
-        rows: (m, 5) of the slots, as of `frontiers_over`; NaN in empty ones.
+        rows: (m, 5) of the slots, as of `compute_frontiers`; NaN in empty ones.
         poses: (n, 3) [m, m, rad] of the robot and of teammates; NaN: it does not know.
         robot: Its row of them.
         visits: (m,) counted so far; begun anew where it gives up.
@@ -53,7 +53,7 @@ def _give_up(goal_x: float, goal_y: float, given_up: Any) -> None:
 
 @device
 @in_place
-def weigh_pairs(goals: Any, places: Any, costs: Any) -> bool:
+def pair_distances(goals: Any, places: Any, costs: Any) -> bool:
     """Write the distances (m, n), at most `SAME_GOAL`, between goals (m, 2 or more) and places (n, 2 or more).
 
     They are `SAME_GOAL` for goals that are NaN, of empty slots.
@@ -75,7 +75,7 @@ def weigh_pairs(goals: Any, places: Any, costs: Any) -> bool:
 
 
 @jit
-def refill(costs: Any, found: Any, rows: Any, visits: Any) -> None:
+def fill_slots(costs: Any, found: Any, rows: Any, visits: Any) -> None:
     """Write the next rows (m, 5) and visits (m,) of slots: old candidates stay where they were, new ones fill the gaps.
 
     Costs (m, n) are below `SAME_GOAL` for what is the same, at most once per row and column; `found` (n, 5).
@@ -104,24 +104,24 @@ def refill(costs: Any, found: Any, rows: Any, visits: Any) -> None:
 
 
 @jit
-def renew(
+def update_slots(
     cells: Any, bounds: Any, row: int, col: int, reach: float, escape: int, poses: Any, robot: int,
     rows: Any, visits: Any, given_up: Any,
 ) -> tuple[Any, Any, bool]:  # fmt: skip
     """Bring a robot's candidates up to date, if it is clear which of them are found again.
 
     Args:
-        cells, bounds, row, col, reach, escape: As of `frontiers_over`.
+        cells, bounds, row, col, reach, escape: As of `compute_frontiers`.
         poses, robot, rows, visits, given_up: As of `_visit`; the last three are written.
 
     Returns:
-        The frontiers (n, 5); the distances (m, n), of `weigh_pairs`; and whether the slots are filled: if not, the
+        The frontiers (n, 5); the distances (m, n), of `pair_distances`; and whether the slots are filled: if not, the
         pairs are to be chosen, and `refill` called.
     """
     _visit(rows, poses, robot, visits, given_up)
-    found = frontiers_over(cells, bounds, row, col, reach, escape, given_up)
+    found = compute_frontiers(cells, bounds, row, col, reach, escape, given_up)
     costs = np.empty((len(rows), len(found)))
-    is_clear = weigh_pairs(rows, found, costs)
+    is_clear = pair_distances(rows, found, costs)
     if is_clear:
-        refill(costs, found, rows, visits)
+        fill_slots(costs, found, rows, visits)
     return found, costs, is_clear

@@ -24,7 +24,7 @@ def any_above_zero(numbers: Any) -> bool:
 
 @device
 @jit
-def known_box(cells: Any, bounds: Any) -> Any:
+def known_region(cells: Any, bounds: Any) -> Any:
     """Cut the known box out of a grid, and pad it with the cells around.
 
     Args:
@@ -96,7 +96,7 @@ def _squared_clearance(box: Any, span: int) -> Any:
 
 @device
 @jit
-def weigh(box: Any, reach: float) -> Any:
+def inflate_costs(box: Any, reach: float) -> Any:
     """Weigh the cells of a box by how near they are to walls.
 
     Args:

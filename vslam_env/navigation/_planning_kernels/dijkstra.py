@@ -7,7 +7,7 @@ import numpy as np
 
 from slam_backend.core.jit import device, in_place, jit
 from vslam_env.navigation._grid_kernels import OCCUPIED
-from vslam_env.navigation._planning_kernels.costmap import PAD, known_box, weigh
+from vslam_env.navigation._planning_kernels.costmap import PAD, inflate_costs, known_region
 
 
 @device
@@ -27,7 +27,7 @@ def _line_cost(weights: Any, row: float, col: float, to_row: float, to_col: floa
 
 
 @jit
-def straight_path(weights: Any, cost: Any, parent: Any, row: int, col: int) -> Any:
+def shorten_path(weights: Any, cost: Any, parent: Any, row: int, col: int) -> Any:
     """Follow the parents from a goal back to the start, and pull the way straight where that costs no more.
 
     Args:
@@ -120,7 +120,7 @@ def nearest_open(box: Any, weights: Any, row: int, col: int, reach: int) -> tupl
 
 @device
 @in_place
-def steps_over(width: int) -> tuple[int, ...]:
+def neighbour_offsets(width: int) -> tuple[int, ...]:
     """Return how far a step in each of the eight directions leads in a flat grid of rows as wide as this."""
     return 1, width, -1, -width, 1 + width, width - 1, -1 - width, 1 - width
 
@@ -128,7 +128,7 @@ def steps_over(width: int) -> tuple[int, ...]:
 @jit
 def parents_of(ways: Any) -> Any:
     """Return of each cell the flat index of the one before it on its way, (h, w) int32; -1 where `ways` has that."""
-    steps = steps_over(ways.shape[1])
+    steps = neighbour_offsets(ways.shape[1])
     parents = np.empty(ways.size, np.int32)
     for cell, direction in enumerate(ways.ravel()):
         parents[cell] = cell - steps[direction] if direction >= 0 else -1
@@ -152,7 +152,7 @@ def wavefront(weights: Any, row: int, col: int) -> tuple[Any, Any]:
 
     Returns:
         Of each cell (h, w): the cost, int32, `UNREACHED` if there is no way; and the direction of the last step to
-        it, int8 as in `steps_over`, -1 at the first cell and where there is no way.
+        it, int8 as in `neighbour_offsets`, -1 at the first cell and where there is no way.
     """
     width = weights.shape[1]
     weight = weights.ravel()
@@ -166,7 +166,7 @@ def wavefront(weights: Any, row: int, col: int) -> tuple[Any, Any]:
     # Cells, and which entry follows each; a cost falls at most once per neighbour.
     entries = np.empty((8 * num_open + 1, 2), np.int32)
     heads = np.full(NUM_BUCKETS, -1, np.int32)
-    steps = np.array(steps_over(width))
+    steps = np.array(neighbour_offsets(width))
 
     used, taken, current = 0, 0, 0
     if row >= 0:
@@ -199,7 +199,7 @@ def wavefront(weights: Any, row: int, col: int) -> tuple[Any, Any]:
 
 
 @jit
-def ways_over(
+def dijkstra(
     cells: Any, bounds: Any, row: int, col: int, reach: float, escape: int
 ) -> tuple[Any, Any, Any, Any, int, int]:
     """Find the cheapest ways over the known floor of a grid.
@@ -216,8 +216,8 @@ def ways_over(
         The known box, (h, w) uint8; its weights, of `weigh`; costs and last steps, of `wavefront`; and the grid's row
         and column of its first cell.
     """
-    box, first_row, first_col = known_box(cells, bounds), bounds[0] - PAD, bounds[1] - PAD
-    weights = weigh(box, reach)
+    box, first_row, first_col = known_region(cells, bounds), bounds[0] - PAD, bounds[1] - PAD
+    weights = inflate_costs(box, reach)
     start_row, start_col = nearest_open(box, weights, row - first_row, col - first_col, escape)
     cost, ways = wavefront(weights, start_row, start_col)
     return box, weights, cost, ways, first_row, first_col

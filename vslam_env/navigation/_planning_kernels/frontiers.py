@@ -8,7 +8,7 @@ import numpy as np
 from slam_backend.core.jit import device, in_place, jit
 from vslam_env.navigation._grid_kernels import CELL, FREE, GRID_SIZE, HALF_WIDTH, UNKNOWN
 from vslam_env.navigation._planning_kernels.costmap import any_above_zero
-from vslam_env.navigation._planning_kernels.dijkstra import NUM_STRAIGHT, UNREACHED, steps_over, ways_over
+from vslam_env.navigation._planning_kernels.dijkstra import NUM_STRAIGHT, UNREACHED, dijkstra, neighbour_offsets
 
 MIN_CELLS = 3  # a robot needs 0.4 m; what is smaller is a speck or the corner of a wall
 MAX_CELLS = 20  # longer frontiers are cut, as one goal cannot stand for them
@@ -87,7 +87,7 @@ def _goal_near(members: Any, box: Any, cost: Any, mark: Any) -> tuple[int, int]:
 def _path_length(ways: Any, row: int, col: int) -> float:
     """Measure the way to a reached cell [m]."""
     width = ways.shape[1]
-    directions, steps = ways.reshape(ways.size), steps_over(width)
+    directions, steps = ways.reshape(ways.size), neighbour_offsets(width)
     cell, length = row * width + col, 0.0
     while directions[cell] >= 0:
         direction = directions[cell]
@@ -132,7 +132,7 @@ def _frontier_rows(box: Any, cost: Any, ways: Any, ignored: Any, row: int, col: 
     """Collect the frontiers of a box.
 
     Args:
-        box: (h, w) uint8, of `known_box`.
+        box: (h, w) uint8, of `known_region`.
         cost: (h, w) int32, of `wavefront`.
         ways: (h, w) int8, likewise.
         ignored: (300, 300) bool. Unknown cells of the grid that do not count.
@@ -181,11 +181,11 @@ def _frontier_rows(box: Any, cost: Any, ways: Any, ignored: Any, row: int, col: 
 
 
 @jit
-def frontiers_over(cells: Any, bounds: Any, row: int, col: int, reach: float, escape: int, ignored: Any) -> Any:
+def compute_frontiers(cells: Any, bounds: Any, row: int, col: int, reach: float, escape: int, ignored: Any) -> Any:
     """Collect the frontiers to which a way is known.
 
     Args:
-        cells: (300, 300) uint8. The grid, and how ways over it are looked for: see `ways_over`.
+        cells: (300, 300) uint8. The grid, and how ways over it are looked for: see `dijkstra`.
         bounds: (4,) int32.
         row: Where the ways begin.
         col: Likewise.
@@ -196,5 +196,5 @@ def frontiers_over(cells: Any, bounds: Any, row: int, col: int, reach: float, es
     Returns:
         (n, 5) float64 rows (x, y, heading, size, length), by increasing length.
     """
-    box, _, cost, ways, first_row, first_col = ways_over(cells, bounds, row, col, reach, escape)
+    box, _, cost, ways, first_row, first_col = dijkstra(cells, bounds, row, col, reach, escape)
     return _frontier_rows(box, cost, ways, ignored, first_row, first_col)

@@ -8,7 +8,7 @@ sub-columns, each of which meets one wall.
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.core.jit import device, fused, jit, lanes
+from slam_backend.core.jit import device, jit, jit_fma, simd
 from slam_backend.core.validation import Float32Array, FloatArray, IntArray
 
 NOTHING, ROBOT = -1, -2  # instead of a wall
@@ -21,7 +21,7 @@ BYTES_MEAN, BYTES_SIGMA = 510.0, 147.8005  # of the sum of four uniform bytes
 
 
 @device
-@lanes
+@simd
 def _nearest(slope: float, local: FloatArray, robots: FloatArray, radius: float) -> tuple[int, float, float]:
     """Follow the ray (1, slope) from the origin of the camera's frame.
 
@@ -77,7 +77,7 @@ def trace(
 
 
 @device
-@lanes
+@simd
 def _fill_column(
     sums: NDArray[np.int32],
     begin: int,
@@ -125,7 +125,7 @@ def _fill_column(
 
 
 @device
-@lanes
+@simd
 def _up_to(y: float, rows: int, width: np.float32, cumulative: Float32Array) -> np.float32:
     """Return the sum of a strip of `width` texels from the ceiling down to `y`; ceiling and floor have no texture."""
     if y <= 0.0:
@@ -136,7 +136,7 @@ def _up_to(y: float, rows: int, width: np.float32, cumulative: Float32Array) -> 
     return np.float32(cumulative[k] + np.float32(y - k) * (cumulative[k + 1] - cumulative[k]))
 
 
-@fused
+@jit_fma
 def render(
     local: FloatArray,
     indices: IntArray,
@@ -216,7 +216,7 @@ def render(
             _fill_column(sums, starts[face], first, last, top, per_pixel, share, cumulative, out[column])
 
 
-@lanes
+@simd
 def expose(
     radiance: Float32Array, noise: NDArray[np.uint8], gain: float, offset: float, sigma: float, image: NDArray[np.uint8]
 ) -> None:

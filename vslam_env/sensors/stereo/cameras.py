@@ -1,4 +1,4 @@
-"""`StereoEye`: the images that a robot's two cameras take of a textured world."""
+"""`StereoRenderer`: the images that a robot's two cameras take of a textured world."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -13,7 +13,7 @@ from slam_backend.models.camera import StereoCamera
 from vslam_env.sensors.stereo._render_kernels import expose, render, trace
 from vslam_env.sensors.stereo.textures import WallTextures
 from vslam_env.world._kernels import walls_in_wedge
-from vslam_env.world.visibility import by_rows
+from vslam_env.world.visibility import as_coordinate_rows
 
 VIEW = 60.0  # [m] farther walls are not drawn
 
@@ -58,7 +58,7 @@ class Traced(NamedTuple):
     along: FloatArray
 
 
-class StereoEye:
+class StereoRenderer:
     """Takes pairs of images of one world.
 
     Both eyes look the same way; the right one stands `camera.baseline` to the right of the left one. Other robots block
@@ -81,7 +81,7 @@ class StereoEye:
         robot_radius: float = 0.2,
     ) -> None:
         self.camera, self.imaging, self.textures = camera, imaging, textures
-        self._walls, self._radius = by_rows(walls), robot_radius
+        self._walls, self._radius = as_coordinate_rows(walls), robot_radius
         self._optics = as_read_only(np.array([camera.focal_px, 0.5 * (camera.width - 1), 0.5 * (camera.height - 1)]))
         paint = textures.config
         self._span = as_read_only(np.array([paint.ceiling, (paint.ceiling - paint.floor) / textures.rows]))

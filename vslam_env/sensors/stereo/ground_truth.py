@@ -106,7 +106,7 @@ class TextureCorners:
         self._settle(walls, landmarks, faces, offsets, tolerance)
         return self
 
-    def claims(self, traced: Traced, heights: FloatArray) -> IntArray:
+    def true_ids(self, traced: Traced, heights: FloatArray) -> IntArray:
         """Return which landmark (n,) int64 each point on a wall is, -1: none.
 
         Args:

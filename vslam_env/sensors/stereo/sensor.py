@@ -6,12 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from slam_backend.core.validation import BoolArray, FloatArray, IntArray, bad_argument, check_float
+from slam_backend.core.validation import BoolArray, FloatArray, IntArray, argument_error, check_float
 from slam_backend.frontend import CornerOptions, FrontEndOptions, StereoFrame, StereoFrontEnd
 from slam_backend.frontend.images import LARGEST, SMALLEST, Image
 from slam_backend.models.camera import StereoCamera
 from slam_backend.models.measurements import Measurements
-from vslam_env.sensors.stereo.cameras import ImagingConfig, StereoEye
+from vslam_env.sensors.stereo.cameras import ImagingConfig, StereoRenderer
 from vslam_env.sensors.stereo.ground_truth import TextureCorners
 from vslam_env.sensors.stereo.textures import TextureConfig, WallTextures, draw_textures
 from vslam_env.world.freespace import FreeSpace
@@ -22,7 +22,7 @@ FINEST = 2e3  # [px/m]; walls are looked at as a whole
 SPURIOUS_PX = 1.0  # a point whose disparity is farther off than this is none of what its ray meets
 
 
-def few_spread() -> FrontEndOptions:
+def default_front_end() -> FrontEndOptions:
     """Return the default front end of a robot.
 
     At most 20 points a frame, spread over the image, each described by 0.6 m of wall around it: from twice as far 91 %
@@ -48,7 +48,7 @@ class StereoSensorConfig:
     camera: StereoCamera = field(default_factory=StereoCamera)
     textures: TextureConfig = field(default_factory=TextureConfig)
     imaging: ImagingConfig = field(default_factory=ImagingConfig)
-    front_end: FrontEndOptions = field(default_factory=few_spread)
+    front_end: FrontEndOptions = field(default_factory=default_front_end)
     working_distance: float = 3.0
     max_incidence: float = float(np.radians(60.0))
     tolerance: float = 0.08
@@ -58,17 +58,17 @@ class StereoSensorConfig:
         for name, kind in (parts | {"front_end": FrontEndOptions}).items():
             if not isinstance(getattr(self, name), kind):
                 cure = f"Build one: {kind.__name__}(...)."
-                raise bad_argument(f"stereo.{name}", f"a {kind.__name__}", getattr(self, name), cure)
+                raise argument_error(f"stereo.{name}", f"a {kind.__name__}", getattr(self, name), cure)
         check_float("stereo.max_incidence", self.max_incidence, "Give radians.", above=0.0, at_most=np.pi / 2)
         check_float("stereo.working_distance", self.working_distance, "Give metres.", at_least=0.1, at_most=1e3)
         check_float("stereo.tolerance", self.tolerance, "Give metres.", above=0.0, at_most=1e3)
         width, height = self.camera.width, self.camera.height
         if min(width, height) < SMALLEST or width * height > LARGEST:
             expected = f"images of at least {SMALLEST} rows and columns and at most {LARGEST} pixels"
-            raise bad_argument("stereo.camera", expected, f"a size of {width} x {height}", "Render other images.")
+            raise argument_error("stereo.camera", expected, f"a size of {width} x {height}", "Render other images.")
         if (resolution := self.camera.focal_px / self.working_distance) > FINEST:
             expected, cure = f"a view of walls in at most {FINEST:g} px/m", "Lower focal_px, or look from farther."
-            raise bad_argument("stereo.working_distance", expected, f"a view in {resolution:g} px/m", cure)
+            raise argument_error("stereo.working_distance", expected, f"a view in {resolution:g} px/m", cure)
 
     @property
     def farthest(self) -> float:
@@ -76,7 +76,7 @@ class StereoSensorConfig:
         return self.camera.max_range
 
 
-class EyeFrame(NamedTuple):
+class RenderedFrame(NamedTuple):
     """What one robot's eyes saw in one tick, and what was made of it.
 
     Attributes:
@@ -93,8 +93,8 @@ class EyeFrame(NamedTuple):
     seen: StereoFrame
 
 
-class EyeFrames(NamedTuple):
-    """The frames of all robots in one tick: per robot what its `EyeFrame` has by the same name."""
+class TeamRenderedFrames(NamedTuple):
+    """The frames of all robots in one tick: per robot what its `RenderedFrame` has by the same name."""
 
     measurements: Sequence[Measurements]
     true_ids: Sequence[IntArray]
@@ -107,9 +107,9 @@ class EyeFrames(NamedTuple):
         """The true ids, as those who ask any sensor's frames look for them."""
         return self.true_ids
 
-    def of_each(self) -> list[EyeFrame]:
+    def per_robot(self) -> list[RenderedFrame]:
         """Return the frame of each robot; its true ids are copies."""
-        return list(map(EyeFrame, *self._replace(true_ids=[own.copy() for own in self.true_ids])))
+        return list(map(RenderedFrame, *self._replace(true_ids=[own.copy() for own in self.true_ids])))
 
 
 class StereoSensor:
@@ -155,7 +155,7 @@ class StereoSensor:
         self.config, self.textures, self.corners = config, textures, corners
         self._walls, self.robot_radius = walls, robot_radius
         self._view = view_limits(config.camera, config.max_incidence)
-        self._eye = StereoEye(config.camera, config.imaging, walls, textures, robot_radius)
+        self._eye = StereoRenderer(config.camera, config.imaging, walls, textures, robot_radius)
         self._front_end = StereoFrontEnd(config.camera, config.front_end)
 
     @classmethod
@@ -181,7 +181,7 @@ class StereoSensor:
         """Tell which true landmarks (K, N) the robots at `poses` (K, 3) [m, m, rad], world frame, can see."""
         return visible_landmarks(poses, self.landmarks, self._walls, self.robot_radius, self._view)
 
-    def measure(self, poses: FloatArray, rng: np.random.Generator) -> EyeFrames:
+    def measure(self, poses: FloatArray, rng: np.random.Generator) -> TeamRenderedFrames:
         """Take and measure a pair of images with each robot's eyes.
 
         Args:
@@ -196,10 +196,10 @@ class StereoSensor:
         for robot in range(len(poses)):
             left, right = self._eye.take(poses, robot, rng)
             seen = self._front_end.measure(left, right)
-            frames.append(EyeFrame(seen.measurements, self._claims(poses, robot, seen), left, right, seen))
-        return EyeFrames(*zip(*frames, strict=True))
+            frames.append(RenderedFrame(seen.measurements, self._true_ids(poses, robot, seen), left, right, seen))
+        return TeamRenderedFrames(*zip(*frames, strict=True))
 
-    def _claims(self, poses: FloatArray, robot: int, frame: StereoFrame) -> IntArray:
+    def _true_ids(self, poses: FloatArray, robot: int, frame: StereoFrame) -> IntArray:
         """Return the true landmark (n,) int64 behind each measured point, -1 where there is none.
 
         It is the one where the point's ray meets a wall, if the measured disparity is that of the wall to a pixel:
@@ -210,7 +210,7 @@ class StereoSensor:
         with np.errstate(invalid="ignore"):
             rise = (0.5 * (camera.height - 1) - frame.pixels[:, 1]) / camera.focal_px * traced.depths
         heights = np.where(traced.walls >= 0, camera.mount[2] + rise, 0.0)
-        names = self.corners.claims(traced, heights)
+        names = self.corners.true_ids(traced, heights)
         spurious = np.abs(frame.pixels[:, 2] - camera.focal_px * camera.baseline / traced.depths) > SPURIOUS_PX
         names[spurious] = -1
         return names

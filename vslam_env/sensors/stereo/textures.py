@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.core.read_only import as_constant, as_read_only
-from slam_backend.core.validation import FloatArray, IntArray, bad_argument, check_array, check_choice, check_float
+from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_array, check_choice, check_float
 from slam_backend.frontend.images import Image
 
 STYLES = ("distinct", "bricks", "posters_alike", "bricks_alike")
@@ -54,7 +54,7 @@ class TextureConfig:
             cure = "Give a number per square metre."
             check_float(f"textures.{name}", getattr(self, name), cure, at_least=0.0, at_most=1e4)
         if self.images is not None and not isinstance(self.images, str):
-            raise bad_argument("textures.images", "a folder as a string, or None", self.images, "Give a path.")
+            raise argument_error("textures.images", "a folder as a string, or None", self.images, "Give a path.")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -147,7 +147,7 @@ def check_textures(textures: WallTextures, walls: FloatArray) -> None:
     kinds = [array.dtype.str for array in (textures.starts, textures.columns, sums)] == ["<i8", "<i8", "<i4"]
     rows = max(1, round((textures.config.ceiling - textures.config.floor) / textures.config.texel))
     if not kinds or sums.shape != (ends[-1], rows + 1) or starts[0] != 0 or (starts[1:] != ends[:-1]).any():
-        raise bad_argument("textures", "a picture for each face of each wall", f"shape {sums.shape}", cure)
+        raise argument_error("textures", "a picture for each face of each wall", f"shape {sums.shape}", cure)
 
 
 def load_photographs(folder: str | Path, rows: int) -> list[Image]:
@@ -164,7 +164,7 @@ def load_photographs(folder: str | Path, rows: int) -> list[Image]:
             size = max(1, image.shape[1] * rows // image.shape[0]), rows
             photographs.append(np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8))
     if not photographs:
-        raise bad_argument("textures.images", "a folder with images", Path(folder), "Give PNG or JPEG files.")
+        raise argument_error("textures.images", "a folder with images", Path(folder), "Give PNG or JPEG files.")
     return photographs
 
 

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from slam_backend.core.jit import inlined, jit
+from slam_backend.core.jit import inline, jit
 from slam_backend.core.validation import FloatArray
 
 
-@inlined
+@inline
 def _distance(px: float, py: float, ex: float, ey: float, square: float) -> float:
     """Return how far (px, py) is from the line from the origin to (ex, ey), whose squared length is `square`."""
     u = min(1.0, max(0.0, (px * ex + py * ey) / square))

@@ -7,7 +7,7 @@ import numpy as np
 
 from slam_backend.core.jit import device, in_place, jit
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
-from vslam_env.world._kernels.ray_casting import EPSILON, ray_to_disc, ray_to_wall, those, walls_in_wedge
+from vslam_env.world._kernels.ray_casting import EPSILON, indices_of_set, ray_to_disc, ray_to_wall, walls_in_wedge
 
 TOUCH = 1e-6  # [m] what a ray meets this close to its target does not hide the target
 
@@ -65,7 +65,7 @@ def _find_visible(
         ahead, left = c * dx + s * dy, c * dy - s * dx
         rows[n] = (ahead > TOUCH) & (abs(left) <= tan_half * ahead) & (abs(dz) <= tan_vertical * ahead)
     count = 0
-    for n in rows[: those(rows)]:
+    for n in rows[: indices_of_set(rows)]:
         dx, dy, dz = marks[0, n] - eye_x, marks[1, n] - eye_y, marks[2, n] - height
         ahead, left = c * dx + s * dy, c * dy - s * dx
         distance = np.sqrt(dx * dx + dy * dy + dz * dz)
@@ -88,13 +88,13 @@ def _find_visible(
 
 @device
 @jit
-def _room_to_look(num_walls: int, num_landmarks: int) -> tuple[FloatArray, IntArray, IntArray]:
+def _visibility_workspace(num_walls: int, num_landmarks: int) -> tuple[FloatArray, IntArray, IntArray]:
     """Return what `_find_visible` works in and writes to."""
     return np.empty((num_walls, 4)), np.empty(num_walls, np.int64), np.empty(num_landmarks, np.int64)
 
 
 @jit
-def see(
+def visible(
     poses: FloatArray,
     marks: FloatArray,
     own_walls: IntArray,
@@ -119,7 +119,7 @@ def see(
         seen: (K, N) bool. Written to.
     """
     seen[:] = False
-    near, near_rows, rows = _room_to_look(walls.shape[1], marks.shape[1])
+    near, near_rows, rows = _visibility_workspace(walls.shape[1], marks.shape[1])
     for k in range(len(poses)):
         count = _find_visible(k, poses, marks, own_walls, walls, robot_radius, view, near, near_rows, rows)
         for n in rows[:count]:
@@ -128,7 +128,9 @@ def see(
 
 @device
 @in_place
-def choose(visible: IntArray, keys: FloatArray, detection_probability: float, places: int, chosen: IntArray) -> int:
+def choose_detected(
+    visible: IntArray, keys: FloatArray, detection_probability: float, places: int, chosen: IntArray
+) -> int:
     """Detect landmarks and choose among the detected ones.
 
     A landmark with a uniform key in [0, 1) is detected if the key is below the probability. The detected ones with the
@@ -194,19 +196,19 @@ def detect(
     Returns:
         How many are chosen in all, and how many false points there are.
     """
-    near, near_rows, rows = _room_to_look(walls.shape[1], marks.shape[1])
+    near, near_rows, rows = _visibility_workspace(walls.shape[1], marks.shape[1])
     total = extra = 0
     for k in range(len(poses)):
         count = _find_visible(k, poses, marks, own_walls, walls, robot_radius, view, near, near_rows, rows)
         num_false[k] = min(num_false[k], chosen.shape[1])
         places = chosen.shape[1] - num_false[k]
-        counts[k] = choose(rows[:count], keys[k], detection_probability, places, chosen[k])
+        counts[k] = choose_detected(rows[:count], keys[k], detection_probability, places, chosen[k])
         total, extra = total + counts[k], extra + num_false[k]
     return total, extra
 
 
 @jit
-def seen_from_somewhere(
+def observable_anywhere(
     positions: FloatArray,
     normals: FloatArray,
     own_walls: IntArray,

@@ -10,7 +10,7 @@ EPSILON = 1e-9  # walls that share an end point leave no gap between them
 
 @device
 @in_place
-def those(rows: IntArray) -> int:
+def indices_of_set(rows: IntArray) -> int:
     """Write which of some flags (n,), 0 or 1, are up in their place, first of all, and return how many are.
 
     There are no branches, for none could be foreseen.
@@ -63,7 +63,7 @@ def walls_in_wedge(
         beyond |= (y1 > reach) & (y2 > reach) | (y1 < -reach) & (y2 < -reach)
         beside = (y1 > tan_half * x1) & (y2 > tan_half * x2) | (-y1 > tan_half * x1) & (-y2 > tan_half * x2)
         rows[i] = not (beyond | ((tan_half > 0.0) & beside))
-    count = those(rows)
+    count = indices_of_set(rows)
     for k in range(count):  # moving all of them before would take twice as long
         i = rows[k]
         for end in (0, 2):

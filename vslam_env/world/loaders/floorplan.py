@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from slam_backend.core.files import write_file
-from slam_backend.core.validation import FloatArray, bad_argument, check_float
+from slam_backend.core.validation import FloatArray, argument_error, check_float
 from vslam_env.world.spec import World
 
 BRIGHT_SHARE = 0.85  # light grey 195 over mid grey 128, white over black, 254 over the 205 of "unknown" in ROS maps
@@ -64,7 +64,7 @@ def trace(free: Any, metres_per_pixel: float, tolerance_px: float, robot_radius:
     cropped = np.pad(free[y : y + height, x : x + width], 1)
     widest = 2.0 * metres_per_pixel * float(cv2.distanceTransform(cropped, cv2.DIST_L2, 3).max())
     if widest < 2.5 * robot_radius:
-        raise bad_argument(
+        raise argument_error(
             "world",
             f"free space for robots of radius {robot_radius:g} m",
             f"a widest place of {widest:.2f} m in {path}",
@@ -75,7 +75,7 @@ def trace(free: Any, metres_per_pixel: float, tolerance_px: float, robot_radius:
     outlines = [(line + corner - (0, len(free))) * to_metres for line in _outlines(cropped, tolerance_px)]
     if not outlines:
         expected = f"less than the free part of {path} is wide"
-        raise bad_argument("tolerance_px", expected, tolerance_px, "Give a pixel or two.")
+        raise argument_error("tolerance_px", expected, tolerance_px, "Give a pixel or two.")
     return np.vstack([np.hstack([line, np.roll(line, -1, axis=0)]) for line in outlines])
 
 
@@ -94,16 +94,16 @@ def load_walls_json(path: str | Path) -> World:
     try:
         content: Any = json.loads(path.read_text(encoding="utf-8-sig"))
     except (ValueError, RecursionError) as error:
-        raise bad_argument("world", "a JSON file", f"a syntax error in {path}: {error}", cure) from error
+        raise argument_error("world", "a JSON file", f"a syntax error in {path}: {error}", cure) from error
     if not isinstance(content, dict) or "walls" not in content:
         got = sorted(content) if isinstance(content, dict) else content
-        raise bad_argument("world", f"an object with the key 'walls' in {path}", got, cure)
+        raise argument_error("world", f"an object with the key 'walls' in {path}", got, cure)
     if (found := content.get("format", FORMAT)) != FORMAT or type(found) is not int:
         cure = "Use the release that wrote it, or write the walls again."
-        raise bad_argument("world", f"one of format {FORMAT} in {path}", f"a world of format {found!r}", cure)
+        raise argument_error("world", f"one of format {FORMAT} in {path}", f"a world of format {found!r}", cure)
     unknown = sorted(set(content) - {"format", "walls", "start_poses", "name"})
     if unknown:
-        raise bad_argument("world", f"no other keys in {path}", unknown[0], cure)
+        raise argument_error("world", f"no other keys in {path}", unknown[0], cure)
     return World(content.get("name", path.stem), content["walls"], start_poses=content.get("start_poses"))
 
 
@@ -138,7 +138,7 @@ def read_image(path: Path, flags: int) -> Any:
     """
     image = cv2.imread(str(path), flags)
     if image is None:
-        raise bad_argument("world", "an image that OpenCV can read", Path(path), "Save the plan as PNG.")
+        raise argument_error("world", "an image that OpenCV can read", Path(path), "Save the plan as PNG.")
     return image
 
 
@@ -149,15 +149,15 @@ def existing(path: str | Path) -> Path:
         ValueError: If there is no such file.
     """
     if not isinstance(path, (str, PathLike)):
-        raise bad_argument("world", "a path", path, "Give a text or a Path.")
+        raise argument_error("world", "a path", path, "Give a text or a Path.")
     path = Path(path)
     try:
         is_there = path.is_file()
     except OSError as error:  # e.g. a name too long for the system
         cure = f"Check the path: {error.strerror}."
-        raise bad_argument("world", "a file", Path(path), cure) from error
+        raise argument_error("world", "a file", Path(path), cure) from error
     if not is_there:
-        raise bad_argument("world", "a file", Path(path), "Check the path: there is no such file.")
+        raise argument_error("world", "a file", Path(path), "Check the path: there is no such file.")
     return path
 
 
@@ -170,7 +170,7 @@ def _free_part(image: Any, path: str) -> Any:
     levels = grey[~coloured]
     brightest = float(levels.max()) if levels.size else 0.0
     if not levels.size or levels.min() >= BRIGHT_SHARE * brightest:
-        raise bad_argument(
+        raise argument_error(
             "world",
             "a plan with free space lighter than its walls",
             f"no free space to tell from walls in {path}",

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import yaml
 
-from slam_backend.core.validation import bad_argument, check_array, check_choice, check_float
+from slam_backend.core.validation import argument_error, check_array, check_choice, check_float
 from slam_backend.geometry import transform_points
 from vslam_env.world.loaders.floorplan import existing, largest_part, read_image, trace
 from vslam_env.world.spec import World
@@ -37,7 +37,7 @@ def load_ros_map(path: str | Path, tolerance_px: float = 1.0, robot_radius: floa
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise bad_argument("world", "a YAML file", f"a syntax error in {path}", CURE) from error
+        raise argument_error("world", "a YAML file", f"a syntax error in {path}", CURE) from error
     settings = _checked(content, str(path))
     image = read_image(existing(path.parent / settings["image"]), cv2.IMREAD_GRAYSCALE).astype(np.float64)
     levels = 255.0 - image if settings["negate"] else image
@@ -45,7 +45,7 @@ def load_ros_map(path: str | Path, tolerance_px: float = 1.0, robot_radius: floa
     free = occupied < settings["free_thresh"]
     if not free.any():
         cure = "Check mode, negate and free_thresh."
-        raise bad_argument("world", "a map with free space", f"no free space in {path}", cure)
+        raise argument_error("world", "a map with free space", f"no free space in {path}", cure)
     walls = trace(largest_part(free), settings["resolution"], tolerance_px, robot_radius, str(path))
     return World(path.stem, transform_points(settings["origin"], walls.reshape(-1, 2)).reshape(-1, 4))
 
@@ -55,13 +55,13 @@ def _checked(content: Any, path: str) -> dict[str, Any]:
     for key in ("image", "resolution"):
         if not isinstance(content, dict) or key not in content:
             got = sorted(map(str, content)) if isinstance(content, dict) else content
-            raise bad_argument("world", f"a mapping with the key {key!r} in {path}", got, CURE)
+            raise argument_error("world", f"a mapping with the key {key!r} in {path}", got, CURE)
     if not isinstance(content["image"], str):
-        raise bad_argument("world", f"a path as image in {path}", content["image"], CURE)
+        raise argument_error("world", f"a path as image in {path}", content["image"], CURE)
     name = "world: " + Path(path).name
     negate = content.get("negate", 0)
     if negate not in (0, 1):  # True and False are such numbers; a text is true whatever it says
-        raise bad_argument(f"{name} negate", "0 or 1", negate, CURE)
+        raise argument_error(f"{name} negate", "0 or 1", negate, CURE)
     free_thresh = check_float(
         f"{name} free_thresh", content.get("free_thresh", 0.196), "Give a probability.", above=0.0, at_most=1.0
     )

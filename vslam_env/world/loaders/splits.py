@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from slam_backend.core.validation import bad_argument, check_choice
+from slam_backend.core.validation import argument_error, check_choice
 
 # Seeds of layout and textures, from (included) to (excluded).
 SPLITS: dict[str, tuple[int, int]] = {
@@ -46,5 +46,5 @@ def files_of_split(files: Sequence[Path], split: str) -> list[Path]:
     if not chosen:
         cure = "Put three files or more there; ten give one each for test and validation, and eight for training."
         folder = files[0].parent
-        raise bad_argument("world_split", f"files for {split!r} in {folder}", f"a folder of {len(files)}", cure)
+        raise argument_error("world_split", f"files for {split!r} in {folder}", f"a folder of {len(files)}", cure)
     return chosen

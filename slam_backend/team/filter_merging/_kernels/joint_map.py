@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.core.jit import device, inlined, jit
+from slam_backend.core.jit import device, inline, jit
 from slam_backend.core.validation import FloatArray, IntArray
 
 
@@ -43,7 +43,7 @@ def read(values: Any, where: Any, lanes: int) -> FloatArray:
     return result
 
 
-@inlined
+@inline
 def _widened(values: Any, at: int, lanes: int, extra: float, scale: float, landmark: Any) -> None:
     """Write a landmark to `landmark` (9,) with `extra` [m^2] added to its variances, all then times `scale`."""
     for c in range(9):
@@ -54,7 +54,7 @@ def _widened(values: Any, at: int, lanes: int, extra: float, scale: float, landm
         landmark[c] *= scale
 
 
-@inlined
+@inline
 def _move(landmark: Any, x: float, y: float, c: float, s: float) -> None:
     """Move a landmark (9,) in place by a motion of which c, s are cosine and sine; its covariance by Eq. 16 *."""
     px, py = landmark[0], landmark[1]

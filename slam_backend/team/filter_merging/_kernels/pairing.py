@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from slam_backend.core.jit import device, in_place, jit, lanes
+from slam_backend.core.jit import device, in_place, jit, simd
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 
 WIDTH = 16  # pairs in a block
@@ -25,7 +25,7 @@ LOG_2PI = math.log(2.0 * math.pi)
 
 
 @device
-@lanes
+@simd
 def _add(records: FloatArray, at: int, state: FloatArray) -> None:
     """Add a landmark, whose record begins at `at`, to the sums of all pairs of a block."""
     for i in range(WIDTH):
@@ -164,7 +164,7 @@ def fit(
 
 
 @jit
-def unexplained(
+def reduced_chi2(
     landmarks_a: FloatArray, held_a: BoolArray, landmarks_b: FloatArray, held_b: BoolArray,
     from_a: IntArray, from_b: IntArray, start: FloatArray, rounds: int,
 ) -> tuple[FloatArray, IntArray]:  # fmt: skip
