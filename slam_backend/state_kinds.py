@@ -25,8 +25,8 @@ CONFIGURATIONS = (
     SmoothingOptions, StereoCamera,
 )  # fmt: skip
 RECORDS = (
-    Alignment, AttemptRecord, LogArrays, Measurements, RejectedMeasurements, ReplayedStep, PreMergeSnapshot, StepInput, PendingAttempt,
-    TeamMeasurements, MergeMonitor, reports.Associations, reports.LandmarksCreated, reports.MapForked, reports.MapReleased,
+    Alignment, AttemptRecord, LogArrays, Measurements, RejectedMeasurements, ReplayedStep, PreMergeSnapshot, StepInput,
+    PendingAttempt,     TeamMeasurements, MergeMonitor, reports.Associations, reports.LandmarksCreated, reports.MapForked, reports.MapReleased,
     reports.MergeEvent, reports.MergeUndone, reports.PoseEstimates, reports.RejuvenationReport, reports.LandmarkIdMap,
     reports.StepReport,
 )  # fmt: skip

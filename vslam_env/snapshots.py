@@ -23,7 +23,7 @@ from vslam_env.state_checks import EpisodeCheck, check_drivers, check_standing
 from vslam_env.state_kinds import ENV_KINDS
 from vslam_env.world import WorldSource
 
-STATE_FORMAT = 29  # raised when what a state holds changes; a state goes on bit by bit only with what made it
+STATE_FORMAT = 30  # raised when what a state holds changes; a state goes on bit by bit only with what made it
 MAGIC = b"vslam_env state "
 KEYS = ("version", "config", "objects", "root", "agents", "cycle", "episode", "drivers", "standing")
 
@@ -60,7 +60,7 @@ def check_state(state: Any, config: EnvConfig, objects: Mapping[str, str]) -> Ma
     found = _checked("state", state)
     theirs_own = found["objects"]
     if not isinstance(theirs_own, dict) or not all(isinstance(name, str) for name in theirs_own):
-        check.raise_refusal("state['objects']", "a word for each object of the caller's", theirs_own)
+        check.refuse("state['objects']", "a word for each object of the caller's", theirs_own)
     if found["config"] != config:
         name, ours, theirs = _difference(config, found["config"])
         cure = "Restore into an environment of the same configuration."
@@ -91,13 +91,13 @@ def check_parts(
         root = restored_sequence(state["root"])
     except Exception as error:  # whatever numpy says of what are no parts of one
         raise argument_error("state['root']", "a seed sequence", f"'{error}'", "Pass it unchanged.") from error
-    check.check_type("state['agents']", state["agents"], tuple)
+    check.instance("state['agents']", state["agents"], tuple)
     if state["agents"] not in ((), tuple(config.agents)):
-        check.raise_refusal("state['agents']", f"{tuple(config.agents)} or none", state["agents"])
-    check.check_int("state['cycle']", state["cycle"])
+        check.refuse("state['agents']", f"{tuple(config.agents)} or none", state["agents"])
+    check.integer("state['cycle']", state["cycle"])
     if state["episode"] is None:
         if state["agents"]:
-            check.raise_refusal("state['episode']", "a running episode", "none")
+            check.refuse("state['episode']", "a running episode", "none")
         return root, None
     episode = EpisodeCheck(config, own)
     episode.check("state['episode']", state["episode"])

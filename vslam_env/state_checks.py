@@ -58,112 +58,112 @@ class EpisodeCheck:
             ValueError: By name of the part that is wrong.
         """
         own, count = self._own, self._count
-        check.check_keys(name, state, EPISODE)
+        check.keys(name, state, EPISODE)
         setting = state["setting"]
         if own is not None and setting is own.given_scenario:
             setting = own.setting
         elif own is None or setting is not own.setting:
             self._check_setting(f"{name}['setting']", setting)
             try:
-                self.setting = setting = Scenario.from_parts(*setting.parts())
+                self.setting = setting = Scenario.from_parts(*setting.to_parts())
             except Exception as error:  # whatever constructors say of parts that do not fit together
-                check.raise_refusal(f"{name}['setting']", "parts that fit together", f"'{error}'")
-        check.check_int(f"{name}['tick']", state["tick"])
+                check.refuse(f"{name}['setting']", "parts that fit together", f"'{error}'")
+        check.integer(f"{name}['tick']", state["tick"])
         self._tick = tick = state["tick"]
-        check.check_keys(f"{name}['simulator']", state["simulator"], ("poses", "bumped"))
+        check.keys(f"{name}['simulator']", state["simulator"], ("poses", "bumped"))
         self._check_inside(f"{name}['simulator']['poses']", state["simulator"]["poses"], setting.world)
-        check.check_array(f"{name}['simulator']['bumped']", state["simulator"]["bumped"], check.BOOL, (count,))
+        check.array(f"{name}['simulator']['bumped']", state["simulator"]["bumped"], check.BOOL, (count,))
         check_streams(f"{name}['streams']", state["streams"])
         self._check_belief(f"{name}['belief']", state["belief"], setting)
         self._check_ledger(f"{name}['ledger']", state["ledger"], setting, state["belief"]["team"])
         cells = len(setting.coverage.cells)
-        check.check_keys(f"{name}['coverage']", state["coverage"], ("ever", "found"))
-        check.check_array(f"{name}['coverage']['ever']", state["coverage"]["ever"], check.BOOL, (cells,))
-        check.check_indices(f"{name}['coverage']['found']", state["coverage"]["found"], (count,), 0, cells)
+        check.keys(f"{name}['coverage']", state["coverage"], ("ever", "found"))
+        check.array(f"{name}['coverage']['ever']", state["coverage"]["ever"], check.BOOL, (cells,))
+        check.indices(f"{name}['coverage']['found']", state["coverage"]["found"], (count,), 0, cells)
         (of_collisions, collisions), *others = check.named_items(f"{name}['counts']", state["counts"], 3)
-        check.check_ints(of_collisions, collisions)
-        check.check_length(of_collisions, collisions, count)
+        check.integers(of_collisions, collisions)
+        check.sequence(of_collisions, collisions, count)
         for where, of_robots in others:
-            check.check_floats(where, of_robots, (count,), 0.0)
-        check.check_length(f"{name}['last']", state["last"], 2)
+            check.floats(where, of_robots, (count,), 0.0)
+        check.sequence(f"{name}['last']", state["last"], 2)
         self._check_readings(f"{name}['last'][0]", state["last"][0])
         self._check_frames(f"{name}['last'][1]", state["last"][1], setting)
         *paths, (of_merges, merges) = check.named_items(f"{name}['paths']", state["paths"], 3)
         known = ((), ()) if own is None else (own.true_path, own.estimated_path)
         for (where, path), mine in zip(paths, known, strict=True):
-            check.check_length(where, path, tick + 1)
+            check.sequence(where, path, tick + 1)
             for poses in path[num_shared(path, mine) :]:  # the episode holds the others itself
-                check.check_floats(where, poses, (count, 3), -1e9, 1e9)
+                check.floats(where, poses, (count, 3), -1e9, 1e9)
         for where, merge in check.named_items(of_merges, merges):
-            check.check_length(where, merge, 3)
-            check.check_int(where, merge[0], 0, tick)
-            check.check_robots(where, merge[1], count)
-            check.check_robots(where, merge[2], count)
+            check.sequence(where, merge, 3)
+            check.integer(where, merge[0], 0, tick)
+            check.robots(where, merge[1], count)
+            check.robots(where, merge[2], count)
 
     # ------------------------------------------------------------------ the world
 
     def _check_inside(self, name: str, poses: Any, world: World) -> None:
         """Refuse what are no poses (K, 3) in a world: far outside, physics would not come to an end."""
-        check.check_positions(name, poses, (self._count, 3))
+        check.positions(name, poses, (self._count, 3))
         x_min, y_min, x_max, y_max = world.bounds
         low, high = np.array([x_min, y_min]) - AROUND, np.array([x_max, y_max]) + AROUND
         if ((poses[:, :2] < low) | (poses[:, :2] > high)).any():
-            check.raise_refusal(name, "places in the world", "others")
+            check.refuse(name, "places in the world", "others")
 
     def _check_setting(self, name: str, setting: Any) -> None:
         """Refuse what is no setting of an environment of this configuration."""
         config, count = self._config, self._count
-        check.check_type(name, setting, Scenario)
-        check.check_type(f"{name}.world", setting.world, World)
+        check.instance(name, setting, Scenario)
+        check.instance(f"{name}.world", setting.world, World)
         landmarks = setting.world.landmarks
         if landmarks is None:
-            check.raise_refusal(f"{name}.world", "one with landmarks", "none")
-        check.check_floats(f"{name}.true_starts", setting.true_starts, (count, 3), -1e8, 1e8)
-        check.check_floats(f"{name}.bias", setting.bias, (count, 2))
-        check.check_type(f"{name}.belief_seed", setting.belief_seed, np.random.SeedSequence)
+            check.refuse(f"{name}.world", "one with landmarks", "none")
+        check.floats(f"{name}.true_starts", setting.true_starts, (count, 3), -1e8, 1e8)
+        check.floats(f"{name}.bias", setting.bias, (count, 2))
+        check.instance(f"{name}.belief_seed", setting.belief_seed, np.random.SeedSequence)
         check_streams(f"{name}.stream_states", setting.stream_states)
         sensor, scan, coverage = setting.sensor, setting.scan, setting.coverage
         kind, wanted = (StereoSensor, config.stereo) if config.sensor == "stereo" else (LandmarkSensor, None)
-        check.check_type(f"{name}.sensor", sensor, kind)
+        check.instance(f"{name}.sensor", sensor, kind)
         if sensor.config != (config.landmark_sensor if wanted is None else wanted):
-            check.raise_refusal(f"{name}.sensor", "one of the environment's configuration", "another")
+            check.refuse(f"{name}.sensor", "one of the environment's configuration", "another")
         if isinstance(sensor, StereoSensor):
             corners, faces = sensor.corners, 2 * len(setting.world.walls)
-            check.check_indices(f"{name}.sensor.corners.faces", corners.faces, (len(landmarks),), 0, faces - 1)
-            check.check_floats(f"{name}.sensor.corners.offsets", corners.offsets, (len(landmarks), 2))
+            check.indices(f"{name}.sensor.corners.faces", corners.faces, (len(landmarks),), 0, faces - 1)
+            check.floats(f"{name}.sensor.corners.offsets", corners.offsets, (len(landmarks), 2))
             if (np.diff(corners.faces) < 0).any():
-                check.raise_refusal(f"{name}.sensor.corners.faces", "faces in order", "others")
-        check.check_type(f"{name}.scan", scan, RangeFinder)
+                check.refuse(f"{name}.sensor.corners.faces", "faces in order", "others")
+        check.instance(f"{name}.scan", scan, RangeFinder)
         if scan.config != config.scan or sensor.robot_radius != config.robot_radius:
-            check.raise_refusal(f"{name}.scan", "one of the environment's configuration", "another")
-        check.check_type(f"{name}.coverage", coverage, CoverageCells)
-        check.check_floats(f"{name}.coverage.cells", coverage.cells, (None, 2), -1e9, 1e9)
-        check.check_array(f"{name}.countable", setting.countable, check.BOOL, (len(landmarks),))
-        if not setting.countable.any():
-            check.raise_refusal(f"{name}.countable", "some landmark that counts", "none")
+            check.refuse(f"{name}.scan", "one of the environment's configuration", "another")
+        check.instance(f"{name}.coverage", coverage, CoverageCells)
+        check.floats(f"{name}.coverage.cells", coverage.cells, (None, 2), -1e9, 1e9)
+        check.array(f"{name}.observable_landmarks", setting.observable_landmarks, check.BOOL, (len(landmarks),))
+        if not setting.observable_landmarks.any():
+            check.refuse(f"{name}.observable_landmarks", "some landmark that counts", "none")
 
     # ------------------------------------------------------------------ beliefs
 
     def _check_belief(self, name: str, belief: Any, setting: Scenario) -> None:
-        check.check_keys(name, belief, ("tick", "team", "grids", "slots"))
+        check.keys(name, belief, ("tick", "team", "grids", "slots"))
         if belief["tick"] != self._tick or type(belief["tick"]) is not int:
-            check.raise_refusal(f"{name}['tick']", f"{self._tick}, as the episode's", belief["tick"])
+            check.refuse(f"{name}['tick']", f"{self._tick}, as the episode's", belief["tick"])
         own = None if self._own is None else self._own.belief
         team = TeamCheck(self._count, {} if own is None else own.buffered_inputs, (self._config.belief.filter,))
         team.check(f"{name}['team']", belief["team"])
         if belief["team"]["step"] != self._tick + 1:
-            check.raise_refusal(f"{name}['team']['step']", f"{self._tick + 1}", belief["team"]["step"])
+            check.refuse(f"{name}['team']['step']", f"{self._tick + 1}", belief["team"]["step"])
         landmarks = setting.world.landmarks
         assert landmarks is not None
         if self._config.sensor == "landmark" and not team.descriptor_sizes <= {landmarks.descriptors.shape[1]}:
             sizes = sorted(team.descriptor_sizes)
-            check.raise_refusal(f"{name}['team']", f"descriptors of length {landmarks.descriptors.shape[1]}", sizes)
+            check.refuse(f"{name}['team']", f"descriptors of length {landmarks.descriptors.shape[1]}", sizes)
         config, given = self._config.belief, belief["team"]
         rhythm, merging = merge_options(config, not self._config.oracle_merge)
         found = [*team.options, given["alignment"], given["schedule"]["alignment"], given["schedule"]["options"]]
         wanted = [config.filter] * len(team.options) + [config.alignment, config.alignment, rhythm]
         if [*found, given["merging"]] != [*wanted, merging]:
-            check.raise_refusal(f"{name}['team']", "options of the environment's configuration", "others")
+            check.refuse(f"{name}['team']", "options of the environment's configuration", "others")
         strokes = {} if own is None else own.grid_updates
         self._check_grids(f"{name}['grids']", belief["grids"], strokes)
         for where, slots in check.named_items(f"{name}['slots']", belief["slots"], self._count):
@@ -171,66 +171,66 @@ class EpisodeCheck:
 
     def _check_grids(self, name: str, grids: Any, known: Mapping[int, GridUpdate]) -> None:
         count = self._count
-        check.check_keys(name, grids, ("grids", "mates", "parted", "kept", "strokes"))
+        check.keys(name, grids, ("grids", "mates", "parted", "kept", "strokes"))
         for where, grid in check.named_items(f"{name}['grids']", grids["grids"], count):
             check_grid(where, grid)
         mates = grids["mates"]
-        check.check_type(f"{name}['mates']", mates, tuple)
+        check.instance(f"{name}['mates']", mates, tuple)
         for robot, (where, group) in enumerate(check.named_items(f"{name}['mates']", mates, count)):
-            check.check_robots(where, group, count)
+            check.robots(where, group, count)
             if robot not in group or any(mates[mate] != group for mate in group):
-                check.raise_refusal(where, "robots that are together", group)
-        check.check_indices(f"{name}['parted']", grids["parted"], (count, count), NEVER_MET, self._tick + 1)
+                check.refuse(where, "robots that are together", group)
+        check.indices(f"{name}['parted']", grids["parted"], (count, count), NEVER_MET, self._tick + 1)
         for where, kept in check.named_items(f"{name}['kept']", grids["kept"]):
-            check.check_type(where, kept, GridSnapshot)
-            check.check_int(f"{where}.tick", kept.tick, 0, self._tick + 1)
+            check.instance(where, kept, GridSnapshot)
+            check.integer(f"{where}.tick", kept.tick, 0, self._tick + 1)
             for of_side, side in check.named_items(f"{where}.sides", kept.sides, 2):
-                check.check_robots(of_side, side, count)
-            check.check_ints(f"{where}.maps", kept.maps)
-            check.check_length(f"{where}.maps", kept.maps, 3)
-            check.check_type(f"{where}.grids", kept.grids, dict)
+                check.robots(of_side, side, count)
+            check.integers(f"{where}.maps", kept.maps)
+            check.sequence(f"{where}.maps", kept.maps, 3)
+            check.instance(f"{where}.grids", kept.grids, dict)
             robots = [*kept.sides[0], *kept.sides[1]]
             if set(kept.grids) != set(robots) or len(set(robots)) < len(robots):
-                check.raise_refusal(f"{where}.grids", f"the grid of each of {robots}", list(kept.grids))
+                check.refuse(f"{where}.grids", f"the grid of each of {robots}", list(kept.grids))
             for grid in kept.grids.values():
                 check_grid(f"{where}.grids", grid)
-            self._check_strokes(f"{where}.strokes", kept.strokes, known)
+            self._check_strokes(f"{where}.updates", kept.updates, known)
         self._check_strokes(f"{name}['strokes']", grids["strokes"], known)
 
     def _check_strokes(self, name: str, history: Any, known: Mapping[int, GridUpdate]) -> None:
         """Refuse what are no strokes of some ticks, in order."""
         count, scan = self._count, self._config.scan
-        check.check_type(name, history, tuple)
+        check.instance(name, history, tuple)
         last = -1
         for strokes in history:
             if known.get(id(strokes)) is not strokes:
-                check.check_type(name, strokes, GridUpdate)
-                check.check_int(f"{name}.tick", strokes.tick, 0, self._tick)
-                check.check_indices(f"{name}.shared", strokes.shared, (count, count), 0, 1)
-                check.check_array(f"{name}.poses", strokes.poses, check.FLOAT64, (count, count, 3))
+                check.instance(name, strokes, GridUpdate)
+                check.integer(f"{name}.tick", strokes.tick, 0, self._tick)
+                check.indices(f"{name}.shared", strokes.shared, (count, count), 0, 1)
+                check.array(f"{name}.poses", strokes.poses, check.FLOAT64, (count, count, 3))
                 near = (np.abs(strokes.poses) <= check.MAX_DISTANCE).all(axis=2)
                 if not (near | (np.isnan(strokes.poses).any(axis=2) & (strokes.shared == 0))).all():
-                    check.raise_refusal(f"{name}.poses", "poses of those who share what they scan", "others")
-                check.check_floats(f"{name}.scans", strokes.scans, (count, scan.num_rays), 0.0, scan.max_range)
-                check.check_array(f"{name}.bumps", strokes.bumps, check.BOOL, (count,))
+                    check.refuse(f"{name}.poses", "poses of those who share what they scan", "others")
+                check.floats(f"{name}.scans", strokes.scans, (count, scan.num_rays), 0.0, scan.max_range)
+                check.array(f"{name}.bumps", strokes.bumps, check.BOOL, (count,))
             if strokes.tick <= last:
-                check.raise_refusal(name, "strokes in order", "others")
+                check.refuse(name, "strokes in order", "others")
             last = strokes.tick
 
     # ------------------------------------------------------------------ the simulator's books
 
     def _check_ledger(self, name: str, ledger: Any, setting: Scenario, team: Mapping[str, Any]) -> None:
         """Refuse what are no books on the landmarks of a team's filters, of which the simulator's kernels read rows."""
-        check.check_keys(name, ledger, ("books", "row_of", "map_of", "seen"))
+        check.keys(name, ledger, ("books", "row_of", "map_of", "seen"))
         books, row_of, count = ledger["books"], ledger["row_of"], self._count
-        check.check_indices(
+        check.indices(
             f"{name}['books']", books, (None, None), UNUSED, int(np.count_nonzero(setting.observable_landmarks)) - 1
         )
-        check.check_int_dict(f"{name}['row_of']", row_of, check.LANDMARK, (0, len(books) - 1))
+        check.int_dict(f"{name}['row_of']", row_of, check.LANDMARK, (0, len(books) - 1))
         if len(set(row_of.values())) < len(row_of):
-            check.raise_refusal(f"{name}['row_of']", "a row for each map", row_of)
-        check.check_ints(f"{name}['map_of']", ledger["map_of"])
-        check.check_length(f"{name}['map_of']", ledger["map_of"], count)
+            check.refuse(f"{name}['row_of']", "a row for each map", row_of)
+        check.integers(f"{name}['map_of']", ledger["map_of"])
+        check.sequence(f"{name}['map_of']", ledger["map_of"], count)
         numbers: set[int] = set(team["numbers"])
         for branch in branches_of(team):
             numbers.add(branch["number"])
@@ -239,91 +239,91 @@ class EpisodeCheck:
             maps = branch["filter"]["maps"]
             needed = max(1 + maps["ids"].max(initial=-1), maps["next_id"] - MOST_MEASURED * self._tick)
             if needed > books.shape[1]:
-                check.raise_refusal(f"{name}['books']", f"entries for {needed} landmarks", f"shape {books.shape}")
+                check.refuse(f"{name}['books']", f"entries for {needed} landmarks", f"shape {books.shape}")
         if lacking := numbers.union(ledger["map_of"]) - set(row_of):
-            check.raise_refusal(f"{name}['row_of']", f"a row for map {min(lacking)}", "none")
+            check.refuse(f"{name}['row_of']", f"a row for map {min(lacking)}", "none")
         seen = ledger["seen"]
-        check.check_type(f"{name}['seen']", seen, dict)
-        check.check_ints(f"{name}['seen']", tuple(seen), 0, self._tick)
+        check.instance(f"{name}['seen']", seen, dict)
+        check.integers(f"{name}['seen']", tuple(seen), 0, self._tick)
         for names in seen.values():
             self._check_names(f"{name}['seen']", names, len(setting.observable_landmarks))
         for step, inputs in team["records"]["log"]["steps"].items():
             if step not in seen or any(
-                turn[COUNT] > len(names) for turn, names in zip(inputs.turns, seen[step], strict=True)
+                turn[COUNT] > len(names) for turn, names in zip(inputs.inputs, seen[step], strict=True)
             ):
-                check.raise_refusal(f"{name}['seen']", f"what was seen in step {step}", "less")
+                check.refuse(f"{name}['seen']", f"what was seen in step {step}", "less")
         for entry in team["records"]["entries"]:
             if isinstance(entry, LandmarksCreated) and (
                 entry.step not in seen or len(entry.ids) > len(seen[entry.step][entry.robot])
             ):
-                check.raise_refusal(f"{name}['seen']", f"what was seen in step {entry.step}", "less")
+                check.refuse(f"{name}['seen']", f"what was seen in step {entry.step}", "less")
             if isinstance(entry, LandmarkIdMap) and len(entry.ids_b) and entry.ids_b.max() >= books.shape[1]:
-                check.raise_refusal(f"{name}['books']", "an entry for each landmark", f"shape {books.shape}")
+                check.refuse(f"{name}['books']", "an entry for each landmark", f"shape {books.shape}")
 
     def _check_names(self, name: str, names: Any, landmarks: int) -> None:
         """Refuse what does not say of each robot which true landmarks it saw."""
         if isinstance(names, np.ndarray):
-            check.check_indices(name, names, (self._count, None), -1, landmarks - 1)
+            check.indices(name, names, (self._count, None), -1, landmarks - 1)
             return
         for where, each in check.named_items(name, names, self._count):
-            check.check_indices(where, each, (None,), -1, landmarks - 1)
+            check.indices(where, each, (None,), -1, landmarks - 1)
 
     # ------------------------------------------------------------------ the last tick
 
     def _check_readings(self, name: str, readings: Any) -> None:
         count, scan = self._count, self._config.scan
-        check.check_type(name, readings, TeamReadings)
+        check.instance(name, readings, TeamReadings)
         if readings.odometry is not None:
-            check.check_floats(f"{name}.odometry", readings.odometry, (count, 3))
+            check.floats(f"{name}.odometry", readings.odometry, (count, 3))
         self._check_measurements(f"{name}.measurements", readings.measurements)
-        check.check_floats(f"{name}.scans", readings.scans, (count, scan.num_rays), 0.0, scan.max_range)
-        check.check_array(f"{name}.bumps", readings.bumps, check.BOOL, (count,))
+        check.floats(f"{name}.scans", readings.scans, (count, scan.num_rays), 0.0, scan.max_range)
+        check.array(f"{name}.bumps", readings.bumps, check.BOOL, (count,))
         if readings.poses is not None:
-            check.check_floats(f"{name}.poses", readings.poses, (count, 3))
+            check.floats(f"{name}.poses", readings.poses, (count, 3))
         if readings.identities is not None:
             for where, names in check.named_items(f"{name}.identities", readings.identities, count):
-                check.check_indices(where, names, (None,), -1)
-        if readings.heard is not None:
-            check.check_array(f"{name}.heard", readings.heard, check.BOOL, (count, count))
+                check.indices(where, names, (None,), -1)
+        if readings.contacts is not None:
+            check.array(f"{name}.contacts", readings.contacts, check.BOOL, (count, count))
         if readings.images is not None:
             self._check_images(f"{name}.images", readings.images)
 
     def _check_measurements(self, name: str, frames: Any) -> None:
         if not isinstance(frames, TeamMeasurements):
             for where, frame in check.named_items(name, frames, self._count):
-                check.check_type(where, frame, Measurements)
+                check.instance(where, frame, Measurements)
             return
-        n = check.check_floats(f"{name}.points", frames.points, (None, 3))
+        n = check.floats(f"{name}.points", frames.points, (None, 3))
         check_descriptors(f"{name}.descriptors", frames.descriptors, n)
-        check.check_indices(f"{name}.ends", frames.offsets, (self._count,), 0, n)
+        check.indices(f"{name}.ends", frames.offsets, (self._count,), 0, n)
         if (np.diff(frames.offsets) < 0).any() or frames.offsets[-1] != n:
-            check.raise_refusal(f"{name}.ends", f"ends that rise to {n}", "others")
+            check.refuse(f"{name}.ends", f"ends that rise to {n}", "others")
 
     def _check_images(self, name: str, images: Any) -> None:
         camera = self._config.stereo.camera
         for where, image in check.named_items(name, images, self._count):
-            check.check_array(where, image, check.UINT8, (camera.height, camera.width))
+            check.array(where, image, check.UINT8, (camera.height, camera.width))
 
     def _check_frames(self, name: str, frames: Any, setting: Scenario) -> None:
         landmarks = setting.world.landmarks
         assert landmarks is not None
         if self._config.sensor == "stereo":
-            check.check_type(name, frames, TeamRenderedFrames)
+            check.instance(name, frames, TeamRenderedFrames)
             self._check_measurements(f"{name}.measurements", frames.measurements)
             self._check_names(f"{name}.true_ids", frames.true_ids, len(landmarks))
             self._check_images(f"{name}.left", frames.left)
             self._check_images(f"{name}.right", frames.right)
             for where, seen in check.named_items(f"{name}.seen", frames.seen, self._count):
-                check.check_type(where, seen, StereoFrame)
+                check.instance(where, seen, StereoFrame)
             return
-        check.check_type(name, frames, TeamSensorFrames)
+        check.instance(name, frames, TeamSensorFrames)
         self._check_measurements(f"{name}.measurements", frames.measurements)
         most = self._config.landmark_sensor.max_measurements
-        check.check_indices(f"{name}.names", frames.names, (self._count, most), -1, len(landmarks) - 1)
+        check.indices(f"{name}.names", frames.names, (self._count, most), -1, len(landmarks) - 1)
         if not isinstance(frames.measurements, TeamMeasurements):
-            check.raise_refusal(f"{name}.measurements", "those of the team in one piece", "others")
+            check.refuse(f"{name}.measurements", "those of the team in one piece", "others")
         if np.diff(frames.measurements.offsets, prepend=0).max() > most:
-            check.raise_refusal(f"{name}.measurements", f"at most {most} of each robot", "more")
+            check.refuse(f"{name}.measurements", f"at most {most} of each robot", "more")
 
 
 MOST_MEASURED = 1000  # landmarks that all robots may create in a tick
@@ -344,58 +344,58 @@ def branches_of(team: Mapping[str, Any]) -> Iterable[Mapping[str, Any]]:
 
 def check_streams(name: str, streams: Any) -> None:
     """Refuse what are no states of an episode's random streams."""
-    check.check_keys(name, streams, STREAMS)
+    check.keys(name, streams, STREAMS)
     if len(streams) != len(STREAMS):
-        check.raise_refusal(name, f"the streams {', '.join(STREAMS)}", list(streams))
+        check.refuse(name, f"the streams {', '.join(STREAMS)}", list(streams))
     for stream, state in streams.items():
-        check.check_generator(f"{name}[{stream!r}]", state)
+        check.generator(f"{name}[{stream!r}]", state)
         if state["bit_generator"] != "PCG64":
-            check.raise_refusal(f"{name}[{stream!r}]", "a stream of PCG64", state["bit_generator"])
+            check.refuse(f"{name}[{stream!r}]", "a stream of PCG64", state["bit_generator"])
 
 
 def check_grid(name: str, grid: Any) -> None:
     """Refuse what is no state of a `SeenGrid`."""
-    check.check_keys(name, grid, ("evidence",))
-    check.check_array(f"{name}['evidence']", grid["evidence"], check.INT8, GRID)
+    check.keys(name, grid, ("evidence",))
+    check.array(f"{name}['evidence']", grid["evidence"], check.INT8, GRID)
 
 
 def check_slots(name: str, slots: Any) -> None:
     """Refuse what is no state of `CandidateSlots`."""
-    check.check_keys(name, slots, ("rows", "visits", "given_up"))
+    check.keys(name, slots, ("rows", "visits", "given_up"))
     rows = slots["rows"]
-    check.check_array(f"{name}['rows']", rows, check.FLOAT64, (NUM_SLOTS, SLOT_COLUMNS))
+    check.array(f"{name}['rows']", rows, check.FLOAT64, (NUM_SLOTS, SLOT_COLUMNS))
     empty = np.isnan(rows)
     held = rows[~empty[:, 0]]
-    check.check_floats(f"{name}['rows']", held, (len(held), SLOT_COLUMNS))
+    check.floats(f"{name}['rows']", held, (len(held), SLOT_COLUMNS))
     if (empty != empty[:, :1]).any() or (held.size and np.abs(held[:, :2]).max() > HALF_WIDTH):
-        check.raise_refusal(f"{name}['rows']", "places in the grid, or NaN", "others")
-    check.check_indices(f"{name}['visits']", slots["visits"], (NUM_SLOTS,))
-    check.check_array(f"{name}['given_up']", slots["given_up"], check.BOOL, GRID)
+        check.refuse(f"{name}['rows']", "places in the grid, or NaN", "others")
+    check.indices(f"{name}['visits']", slots["visits"], (NUM_SLOTS,))
+    check.array(f"{name}['given_up']", slots["given_up"], check.BOOL, GRID)
 
 
 def check_standing(name: str, standing: Any, count: int) -> None:
     """Refuse what does not say how K robots stand."""
-    check.check_type(name, standing, TeamMetrics)
-    for where, row in check.named_items(f"{name}.figures", standing.figures, NUM_METRICS):
-        check.check_length(where, row, count)
+    check.instance(name, standing, TeamMetrics)
+    for where, row in check.named_items(f"{name}.table", standing.table, NUM_METRICS):
+        check.sequence(where, row, count)
         for figure in row:
-            check.check_float(where, figure)
+            check.number(where, figure)
     for where, numbers in check.named_items(f"{name}.counts", standing.counts, 2):
-        check.check_ints(where, numbers)
-        check.check_length(where, numbers, count)
-    check.check_float(f"{name}.coverage", standing.coverage, 0.0, 1.0)
-    check.check_int(f"{name}.merges", standing.merges)
-    check.check_float(f"{name}.time", standing.time, 0.0)
+        check.integers(where, numbers)
+        check.sequence(where, numbers, count)
+    check.number(f"{name}.coverage", standing.coverage, 0.0, 1.0)
+    check.integer(f"{name}.merges", standing.merges)
+    check.number(f"{name}.time", standing.time, 0.0)
 
 
 def check_drivers(name: str, drivers: Any, count: int) -> None:
     """Refuse what does not say where each robot is heading."""
     for where, driver in check.named_items(name, drivers, count):
-        check.check_keys(where, driver, ("goal", "heading", "path"))
+        check.keys(where, driver, ("goal", "heading", "path"))
         if driver["goal"] is not None:
-            check.check_floats(f"{where}['goal']", driver["goal"], (2,), -HALF_WIDTH, HALF_WIDTH)
-        check.check_float(f"{where}['heading']", driver["heading"])
+            check.floats(f"{where}['goal']", driver["goal"], (2,), -HALF_WIDTH, HALF_WIDTH)
+        check.number(f"{where}['heading']", driver["heading"])
         if driver["path"] is not None:
-            check.check_floats(f"{where}['path']", driver["path"], (None, 2), -2.0 * HALF_WIDTH, 2.0 * HALF_WIDTH)
+            check.floats(f"{where}['path']", driver["path"], (None, 2), -2.0 * HALF_WIDTH, 2.0 * HALF_WIDTH)
             if not len(driver["path"]):
-                check.raise_refusal(f"{where}['path']", "some points", "none")
+                check.refuse(f"{where}['path']", "some points", "none")

@@ -20,7 +20,8 @@ CONFIGURATIONS = (
     OdometryNoise, ScanConfig, StereoSensorConfig, TextureConfig,
 )  # fmt: skip
 RECORDS = (
-    TeamRenderedFrames, TeamSensorFrames, GridSnapshot, Landmarks, TeamMetrics, StereoFrame, StereoMatches, GridUpdate, TeamReadings, WallTextures,
+    TeamRenderedFrames, TeamSensorFrames, GridSnapshot, Landmarks, TeamMetrics, StereoFrame, StereoMatches, GridUpdate,
+    TeamReadings, WallTextures,
     World,
 )  # fmt: skip
 

@@ -53,7 +53,7 @@ def count_falls(values: Any) -> int:
     return falls
 
 
-def raise_refusal(name: str, expected: str, got: object) -> NoReturn:
+def refuse(name: str, expected: str, got: object) -> NoReturn:
     """Raise the error for a part of a state."""
     raise argument_error(name, expected, got, CURE)
 
@@ -70,68 +70,68 @@ def refuse_malformed(name: str) -> Iterator[None]:
         raise argument_error(name, "what get_state returned", got, CURE) from error
 
 
-def check_type(name: str, value: Any, *kinds: type) -> None:
+def instance(name: str, value: Any, *kinds: type) -> None:
     """Refuse what is of none of some types; subclasses are other types."""
     if type(value) not in kinds:
-        raise_refusal(name, f"a {' or '.join(kind.__name__ for kind in kinds)}", f"a {type(value).__name__}")
+        refuse(name, f"a {' or '.join(kind.__name__ for kind in kinds)}", f"a {type(value).__name__}")
 
 
-def check_keys(name: str, value: Any, keys: Iterable[str]) -> None:
+def keys(name: str, value: Any, keys: Iterable[str]) -> None:
     """Refuse what is no dict, or lacks a key."""
     if not isinstance(value, Mapping):
-        raise_refusal(name, "a dict from get_state", f"a {type(value).__name__}")
+        refuse(name, "a dict from get_state", f"a {type(value).__name__}")
     for key in keys:
         if key not in value:
-            raise_refusal(name, "a dict from get_state", f"no {key!r}")
+            refuse(name, "a dict from get_state", f"no {key!r}")
 
 
-def check_length(name: str, value: Any, length: int | None = None) -> None:
+def sequence(name: str, value: Any, length: int | None = None) -> None:
     """Refuse what is neither a tuple nor a list, or of another length."""
-    check_type(name, value, tuple, list)
+    instance(name, value, tuple, list)
     if length is not None and len(value) != length:
-        raise_refusal(name, f"{length} of them", len(value))
+        refuse(name, f"{length} of them", len(value))
 
 
-def check_int(name: str, value: Any, low: int = 0, high: int = MAX_INT) -> None:
+def integer(name: str, value: Any, low: int = 0, high: int = MAX_INT) -> None:
     """Refuse what is no int, or not within bounds."""
     if type(value) is not int or not low <= value <= high:
-        raise_refusal(name, f"an int from {low} to {high}", value)
+        refuse(name, f"an int from {low} to {high}", value)
 
 
-def check_float(name: str, value: Any, low: float = -LARGEST, high: float = LARGEST) -> None:
+def number(name: str, value: Any, low: float = -LARGEST, high: float = LARGEST) -> None:
     """Refuse what is no float, or not within bounds."""
     if not isinstance(value, float) or not low <= value <= high:
-        raise_refusal(name, f"a float from {low:g} to {high:g}", value)
+        refuse(name, f"a float from {low:g} to {high:g}", value)
 
 
-def check_bool(name: str, value: Any) -> None:
+def boolean(name: str, value: Any) -> None:
     """Refuse what is no bool."""
-    check_type(name, value, bool)
+    instance(name, value, bool)
 
 
-def check_ints(name: str, values: Any, low: int = 0, high: int = MAX_INT, kind: type = tuple) -> None:
+def integers(name: str, values: Any, low: int = 0, high: int = MAX_INT, kind: type = tuple) -> None:
     """Refuse what is no collection of a type, of ints within bounds."""
-    check_type(name, values, kind)
+    instance(name, values, kind)
     for value in values:
         if type(value) is not int or not low <= value <= high:
-            raise_refusal(name, f"ints from {low} to {high}", value)
+            refuse(name, f"ints from {low} to {high}", value)
 
 
-def check_int_dict(name: str, value: Any, of_keys: tuple[int, int], of_values: tuple[int, int] = (0, MAX_INT)) -> None:
+def int_dict(name: str, value: Any, of_keys: tuple[int, int], of_values: tuple[int, int] = (0, MAX_INT)) -> None:
     """Refuse what is no dict whose keys and values are ints within bounds."""
-    check_type(name, value, dict)
-    check_ints(name, tuple(value), *of_keys)
-    check_ints(name, tuple(value.values()), *of_values)
+    instance(name, value, dict)
+    integers(name, tuple(value), *of_keys)
+    integers(name, tuple(value.values()), *of_values)
 
 
-def check_robots(name: str, robots: Any, count: int) -> None:
+def robots(name: str, robots: Any, count: int) -> None:
     """Refuse what is no tuple of some of so many robots, at least one, in ascending order."""
-    check_ints(name, robots, 0, count - 1)
+    integers(name, robots, 0, count - 1)
     if not robots or list(robots) != sorted(set(robots)):
-        raise_refusal(name, "robots in ascending order", robots)
+        refuse(name, "robots in ascending order", robots)
 
 
-def check_array(
+def array(
     name: str, value: Any, dtype: np.dtype[Any], shape: tuple[int | None, ...], low: Any = None, high: Any = None,
     columns: int | None = None,
 ) -> int:  # fmt: skip
@@ -147,55 +147,55 @@ def check_array(
     """
     if type(value) is not np.ndarray or value.dtype != dtype:
         got = f"an array of {value.dtype}" if isinstance(value, np.ndarray) else f"a {type(value).__name__}"
-        raise_refusal(name, f"an array of {dtype}", got)
+        refuse(name, f"an array of {dtype}", got)
     found = value.shape
     if found != shape and (
         len(found) != len(shape) or found != tuple([m if n is None else n for n, m in zip(shape, found, strict=True)])
     ):
         wanted = tuple("n" if n is None else n for n in shape)
-        raise_refusal(name, f"an array of shape {wanted}".replace("'", ""), f"shape {found}")
+        refuse(name, f"an array of shape {wanted}".replace("'", ""), f"shape {found}")
     if low is not None and value.size:
         wide = value.reshape(-1, value.size if columns is None else found[-1])
         if count_outside(wide, wide.shape[1] if columns is None else columns, low, high):
             kind = "numbers from {:g} to {:g}" if dtype.kind == "f" else "integers from {} to {}"
-            raise_refusal(name, kind.format(low, high), "others, or NaN" if dtype.kind == "f" else "others")
+            refuse(name, kind.format(low, high), "others, or NaN" if dtype.kind == "f" else "others")
     return len(value)
 
 
-def check_floats(
+def floats(
     name: str, value: Any, shape: tuple[int | None, ...], low: float = -LARGEST, high: float = LARGEST,
     columns: int | None = None, dtype: np.dtype[Any] = FLOAT64,
 ) -> int:  # fmt: skip
     """Return the length of an array of floats within bounds, as `array`."""
-    return check_array(name, value, dtype, shape, float(low), float(high), columns)
+    return array(name, value, dtype, shape, float(low), float(high), columns)
 
 
-def check_positions(name: str, value: Any, shape: tuple[int | None, ...], columns: int | None = None) -> int:
+def positions(name: str, value: Any, shape: tuple[int | None, ...], columns: int | None = None) -> int:
     """Return the length of an array of poses or points, as `array`."""
-    return check_array(name, value, FLOAT64, shape, -MAX_DISTANCE, MAX_DISTANCE, columns)
+    return array(name, value, FLOAT64, shape, -MAX_DISTANCE, MAX_DISTANCE, columns)
 
 
-def check_indices(
+def indices(
     name: str, value: Any, shape: tuple[int | None, ...], low: int = 0, high: int = MAX_INT, columns: int | None = None,
     dtype: np.dtype[Any] = INT64,
 ) -> int:  # fmt: skip
     """Return the length of an array of integers within bounds, as `array`."""
-    return check_array(name, value, dtype, shape, low, high, columns)
+    return array(name, value, dtype, shape, low, high, columns)
 
 
-def check_ascending(name: str, values: NDArray[Any]) -> None:
+def ascending(name: str, values: NDArray[Any]) -> None:
     """Refuse values (n,) of which one is not above the one before."""
     if count_falls(values):
-        raise_refusal(name, "numbers in ascending order, each once", "others")
+        refuse(name, "numbers in ascending order, each once", "others")
 
 
-def check_unique(name: str, values: NDArray[Any]) -> None:
+def unique(name: str, values: NDArray[Any]) -> None:
     """Refuse values (n,) of which two are equal."""
     if len(np.unique(values)) < len(values):
-        raise_refusal(name, "each number once", "one that repeats")
+        refuse(name, "each number once", "one that repeats")
 
 
-def check_options(name: str, options: Any, kind: type, known: Iterable[Any] = ()) -> None:
+def options(name: str, options: Any, kind: type, known: Iterable[Any] = ()) -> None:
     """Refuse what are no options of a type, or such that its constructor refuses.
 
     Args:
@@ -204,7 +204,7 @@ def check_options(name: str, options: Any, kind: type, known: Iterable[Any] = ()
         kind: A frozen dataclass.
         known: Options that need not be looked at again.
     """
-    check_type(name, options, kind)
+    instance(name, options, kind)
     try:
         if not any(options is other or options == other for other in known):
             _rebuilt(options)
@@ -218,27 +218,27 @@ def _rebuilt(options: Any) -> Any:
     return type(options)(**{name: _rebuilt(part) if is_dataclass(part) else part for name, part in parts.items()})
 
 
-def check_generator(name: str, state: Any) -> None:
+def generator(name: str, state: Any) -> None:
     """Refuse what is no state of one of numpy's random streams; numpy itself would read beyond its buffers."""
-    check_keys(name, state, ("bit_generator", "state"))
+    keys(name, state, ("bit_generator", "state"))
     kind = state["bit_generator"]
     if type(kind) is not str or kind not in STREAMS:
-        raise_refusal(f"{name}['bit_generator']", "one of " + ", ".join(STREAMS), kind)
+        refuse(f"{name}['bit_generator']", "one of " + ", ".join(STREAMS), kind)
     inner = state["state"]
-    check_keys(f"{name}['state']", inner, STREAMS[kind])
+    keys(f"{name}['state']", inner, STREAMS[kind])
     for part, (dtype, shape) in STREAMS[kind].items():
-        check_array(f"{name}['state'][{part!r}]", inner[part], dtype, shape)
+        array(f"{name}['state'][{part!r}]", inner[part], dtype, shape)
     if kind == "MT19937":
-        check_int(f"{name}['state']['pos']", inner.get("pos"), 0, 624)
+        integer(f"{name}['state']['pos']", inner.get("pos"), 0, 624)
         return
-    check_int(f"{name}['has_uint32']", state.get("has_uint32"), 0, 1)
-    check_int(f"{name}['uinteger']", state.get("uinteger"), 0, 2**32 - 1)
+    integer(f"{name}['has_uint32']", state.get("has_uint32"), 0, 1)
+    integer(f"{name}['uinteger']", state.get("uinteger"), 0, 2**32 - 1)
     if kind in ("PCG64", "PCG64DXSM"):
         for part in ("state", "inc"):
-            check_int(f"{name}['state'][{part!r}]", inner.get(part), 0, 2**128 - 1)
+            integer(f"{name}['state'][{part!r}]", inner.get(part), 0, 2**128 - 1)
     elif kind == "Philox":
-        check_int(f"{name}['buffer_pos']", state.get("buffer_pos"), 0, 4)
-        check_array(f"{name}['buffer']", state.get("buffer"), np.dtype(np.uint64), (4,))
+        integer(f"{name}['buffer_pos']", state.get("buffer_pos"), 0, 4)
+        array(f"{name}['buffer']", state.get("buffer"), np.dtype(np.uint64), (4,))
 
 
 def restore_generator(state: Mapping[str, Any]) -> np.random.Generator:
@@ -251,7 +251,7 @@ def restore_generator(state: Mapping[str, Any]) -> np.random.Generator:
 
 def named_items(name: str, values: Sequence[Any], length: int | None = None) -> Iterable[tuple[str, Any]]:
     """Return each of so many parts with its name, or refuse what is no tuple or list of them."""
-    check_length(name, values, length)
+    sequence(name, values, length)
     return [(f"{name}[{i}]", value) for i, value in enumerate(values)]
 
 
@@ -261,8 +261,8 @@ def compile_checks() -> None:
         for dtype in (FLOAT64, FLOAT32, INT64, INT32):
             values = np.zeros((1, 1), dtype)
             values.setflags(write=is_open)
-            check = check_floats if dtype.kind == "f" else check_indices
+            check = floats if dtype.kind == "f" else indices
             check("warm", values, (1, 1), 0, 1, dtype=dtype)
         names = np.zeros(1, np.int64)
         names.setflags(write=is_open)
-        check_ascending("warm", names)
+        ascending("warm", names)

@@ -64,7 +64,7 @@ def _shared_spread(
 
 
 @simd_inline
-def add_gauge_covariance(scatter: FloatArray, x: float, y: float, covariance: FloatArray) -> None:
+def add_gauge_to_landmarks(scatter: FloatArray, x: float, y: float, covariance: FloatArray) -> None:
     """Add to the covariance (3, 3) of a point what a scattered motion of the whole map gives it, to first order.
 
     J C J^T with J = [[1, 0, -y], [0, 1, x]]: heights stay.
@@ -130,7 +130,7 @@ def _mix(
             covariance[0, 2] += scale * xz
             covariance[1, 2] += scale * yz
         covariance[1, 0], covariance[2, 0], covariance[2, 1] = covariance[0, 1], covariance[0, 2], covariance[1, 2]
-        add_gauge_covariance(scatter, x, y, covariance)
+        add_gauge_to_landmarks(scatter, x, y, covariance)
     return means, covariances, times, names
 
 

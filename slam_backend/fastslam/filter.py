@@ -216,7 +216,7 @@ class FastSlam:
         return self.state.rejuvenation is not None and self.options.smoothing.slice_steps is not None
 
     def request_rejuvenation(self) -> None:
-        """Request a rejuvenation as soon as possible, in slices if the smoother works so; see `rejuvenation_requested`."""
+        """Request a rejuvenation as soon as possible, in slices if the smoother works incrementally."""
         if self.state.rejuvenation is not None:
             self.state.rejuvenation.request()
 

@@ -41,9 +41,9 @@ class FilterOptions:
         resample_threshold: Resample when ESS / M falls below this; 1 = at every step with a measurement.
         position_gate: D0, largest squared Mahalanobis distance of a match [-] (11.34: 99 % at 3 degrees of freedom).
         descriptor_gate: Square root of E0, largest L2 distance between matched descriptors [-].
-        new_landmark_gate: Measurements whose nearest candidate lies between `position_gate` and this are neither matched nor
-            new (`fastslam2`) [-].
-        new_landmark_radius: Nor is a measurement new within this distance of a landmark that looks like it (`fastslam2`) [m].
+        new_landmark_gate: Measurements whose nearest candidate lies between `position_gate` and this are neither
+            matched nor new (`fastslam2`) [-].
+        new_landmark_radius: Distance from a similar landmark within which no measurement is new (`fastslam2`) [m].
         recovery_position: Where a pose this uncertain explains three or more measurements, and most of all that it can
             explain, which a particle's stated uncertainty does not, the particle is lost and corrected from there
             (`fastslam2`) [m]; 0: its own uncertainty is always believed.

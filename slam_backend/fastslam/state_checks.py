@@ -54,58 +54,56 @@ def check_filter(name: str, state: Any, known: Sequence[FilterOptions] = ()) -> 
     Raises:
         ValueError: By name of the part that is wrong.
     """
-    check.check_keys(name, state, (*KEPT, *OTHERS_KEPT))
+    check.keys(name, state, (*KEPT, *OTHERS_KEPT))
     options = state["options"]
-    check.check_options(f"{name}['options']", options, FilterOptions, known)
+    check.options(f"{name}['options']", options, FilterOptions, known)
     if not any(options is other or options == other for other in known):
         _check_fit(f"{name}['options']", options)
-    m = check.check_floats(f"{name}['weights']", state["weights"], (None,), 0.0, 1.0)
+    m = check.floats(f"{name}['weights']", state["weights"], (None,), 0.0, 1.0)
     padded = -(-m // LANES) * LANES
-    k = check.check_array(f"{name}['poses']", state["poses"], check.FLOAT64, (None, 3, padded))
+    k = check.array(f"{name}['poses']", state["poses"], check.FLOAT64, (None, 3, padded))
     if not 1 <= k <= MAX_ROBOTS or m < 1 or not abs(float(state["weights"].sum()) - 1.0) < 1e-6:
-        check.raise_refusal(
-            name, "robots, particles, and weights that sum to 1", f"{k} robots, weights of {m} particles"
-        )
+        check.refuse(name, "robots, particles, and weights that sum to 1", f"{k} robots, weights of {m} particles")
     for part in POSE_FIELDS[:3]:
-        check.check_positions(f"{name}[{part!r}]", state[part], (k, 3, padded), m)
-    check.check_floats(f"{name}['covariances']", state["covariances"], (k, 6, padded), columns=m)
-    check.check_floats(f"{name}['gauge_covariance']", state["gauge_covariance"], (3, 3))
-    check.check_floats(f"{name}['start_covariances']", state["start_covariances"], (k, 3, 3))
-    check.check_indices(f"{name}['propagated_only']", state["propagated_only"], (k,), 0, 1)
+        check.positions(f"{name}[{part!r}]", state[part], (k, 3, padded), m)
+    check.floats(f"{name}['covariances']", state["covariances"], (k, 6, padded), columns=m)
+    check.floats(f"{name}['gauge_covariance']", state["gauge_covariance"], (3, 3))
+    check.floats(f"{name}['start_covariances']", state["start_covariances"], (k, 3, 3))
+    check.indices(f"{name}['propagated_only']", state["propagated_only"], (k,), 0, 1)
     for part in ("log_weights", "path_log_weights"):
-        check.check_floats(f"{name}[{part!r}]", state[part], (m,), LEAST)
-    check.check_int(f"{name}['steps']", state["steps"])
+        check.floats(f"{name}[{part!r}]", state[part], (m,), LEAST)
+    check.integer(f"{name}['steps']", state["steps"])
     estimates = state["estimates"]
-    check.check_type(f"{name}['estimates']", estimates, PoseEstimates)
-    check.check_positions(f"{name}['estimates'].means", estimates.means, (k, 3))
-    check.check_floats(f"{name}['estimates'].covariances", estimates.covariances, (k, 3, 3))
+    check.instance(f"{name}['estimates']", estimates, PoseEstimates)
+    check.positions(f"{name}['estimates'].means", estimates.means, (k, 3))
+    check.floats(f"{name}['estimates'].covariances", estimates.covariances, (k, 3, 3))
     check_maps(f"{name}['maps']", state["maps"], m, options)
     for where, log in check.named_items(f"{name}['logs']", state["logs"], k):
         check_log(where, log)
     if options.rejuvenate_every is not None:
-        check.check_keys(name, state, ("rejuvenation",))
+        check.keys(name, state, ("rejuvenation",))
         size = state["maps"]["descriptors"].shape[1]
         check_rejuvenation(f"{name}['rejuvenation']", state["rejuvenation"], state["logs"], size)
     check_consistency(f"{name}['consistency']", state["consistency"])
-    check.check_generator(f"{name}['rng']", state["rng"])
+    check.generator(f"{name}['rng']", state["rng"])
 
 
 def check_consistency(name: str, state: Any) -> None:
     """Refuse what are not the running sums of a consistency test."""
-    check.check_keys(name, state, (*SUMS, *LISTS))
+    check.keys(name, state, (*SUMS, *LISTS))
     for sum_, most in (
         ("frames", check.MAX_INT),
         ("begun", state["frames"]),
         ("quiet", RENEWED),
         ("matched", check.MAX_INT),
     ):
-        check.check_int(f"{name}[{sum_!r}]", state[sum_], 0, most)
-    check.check_float(f"{name}['nis']", state["nis"], 0.0)
+        check.integer(f"{name}[{sum_!r}]", state[sum_], 0, most)
+    check.number(f"{name}['nis']", state["nis"], 0.0)
     for part, count in (("counts", len(SIGN_OF)), ("since", len(SIGNS))):
         for where, number in check.named_items(f"{name}[{part!r}]", state[part], count):
-            check.check_int(where, number, -1)
+            check.integer(where, number, -1)
     for where, number in check.named_items(f"{name}['evidence']", state["evidence"], len(WEIGHTS)):
-        check.check_float(where, number, 0.0)
+        check.number(where, number, 0.0)
 
 
 def _check_fit(name: str, options: FilterOptions) -> None:
@@ -150,51 +148,49 @@ def count_bad_values(values: FloatArray, counts: Any, num_particles: int, farthe
 
 def check_maps(name: str, maps: Any, m: int, options: FilterOptions) -> None:
     """Refuse what are no maps of m particles."""
-    check.check_keys(name, maps, MAPS_KEPT)
+    check.keys(name, maps, MAPS_KEPT)
     if maps["num_particles"] != m:
-        check.raise_refusal(f"{name}['num_particles']", f"{m}, the number of weights", maps["num_particles"])
-    check.check_int(f"{name}['num_particles']", maps["num_particles"])
+        check.refuse(f"{name}['num_particles']", f"{m}, the number of weights", maps["num_particles"])
+    check.integer(f"{name}['num_particles']", maps["num_particles"])
     padded = -(-m // LANES) * LANES
-    check.check_int(f"{name}['next_id']", maps["next_id"], *check.LANDMARK)
-    n = check.check_indices(f"{name}['ids']", maps["ids"], (None,), 0, maps["next_id"] - 1)
-    check.check_ascending(f"{name}['ids']", maps["ids"])
-    check.check_indices(f"{name}['counts']", maps["counts"], (n, padded), *check.LANDMARK, m, check.INT32)
-    check.check_array(f"{name}['values']", maps["values"], check.FLOAT64, (n, 9 * padded))
+    check.integer(f"{name}['next_id']", maps["next_id"], *check.LANDMARK)
+    n = check.indices(f"{name}['ids']", maps["ids"], (None,), 0, maps["next_id"] - 1)
+    check.ascending(f"{name}['ids']", maps["ids"])
+    check.indices(f"{name}['counts']", maps["counts"], (n, padded), *check.LANDMARK, m, check.INT32)
+    check.array(f"{name}['values']", maps["values"], check.FLOAT64, (n, 9 * padded))
     held = as_read_only(maps["values"]), as_read_only(maps["counts"])
     if n and count_bad_values(*held, m, check.MAX_DISTANCE, check.LARGEST):
-        check.raise_refusal(f"{name}['values']", "means and positive variances", "others")
-    check.check_indices(f"{name}['maps']", maps["maps"], (None, padded), 0, m - 1, m, check.INT32)
-    check.check_indices(
-        f"{name}['maps']", maps["maps"], (None, padded), 0, padded - 1, dtype=check.INT32
-    )  # of all lanes
-    check.check_indices(f"{name}['map_of']", maps["map_of"], (n,), 0, len(maps["maps"]))
-    check.check_indices(f"{name}['identities']", maps["identities"], (n,), -1)
-    check.check_indices(f"{name}['last_seen']", maps["last_seen"], (n,))
+        check.refuse(f"{name}['values']", "means and positive variances", "others")
+    check.indices(f"{name}['maps']", maps["maps"], (None, padded), 0, m - 1, m, check.INT32)
+    check.indices(f"{name}['maps']", maps["maps"], (None, padded), 0, padded - 1, dtype=check.INT32)  # of all lanes
+    check.indices(f"{name}['map_of']", maps["map_of"], (n,), 0, len(maps["maps"]))
+    check.indices(f"{name}['identities']", maps["identities"], (n,), -1)
+    check.indices(f"{name}['last_seen']", maps["last_seen"], (n,))
     check_descriptors(f"{name}['descriptors']", maps["descriptors"], n)
     if options.existence is None:
         if maps["odds"] is not None:
-            check.raise_refusal(f"{name}['odds']", "None where existence is not kept", "an array")
+            check.refuse(f"{name}['odds']", "None where existence is not kept", "an array")
     else:
-        check.check_floats(f"{name}['odds']", maps["odds"], (n, padded), columns=m)
+        check.floats(f"{name}['odds']", maps["odds"], (n, padded), columns=m)
 
 
 def check_landmarks(name: str, landmarks: Any) -> None:
     """Refuse what is no map of landmarks."""
-    check.check_type(name, landmarks, LandmarkMap)
-    n = check.check_positions(f"{name}.means", landmarks.means, (None, 3))
-    check.check_floats(f"{name}.covariances", landmarks.covariances, (n, 3, 3))
+    check.instance(name, landmarks, LandmarkMap)
+    n = check.positions(f"{name}.means", landmarks.means, (None, 3))
+    check.floats(f"{name}.covariances", landmarks.covariances, (n, 3, 3))
     check_descriptors(f"{name}.descriptors", landmarks.descriptors, n)
-    check.check_array(f"{name}.counts", landmarks.counts, landmarks.counts.dtype if n == 0 else check.INT64, (n,))
-    check.check_indices(f"{name}.ids", landmarks.ids, (n,), *check.LANDMARK)
-    check.check_unique(f"{name}.ids", landmarks.ids)
+    check.array(f"{name}.counts", landmarks.counts, landmarks.counts.dtype if n == 0 else check.INT64, (n,))
+    check.indices(f"{name}.ids", landmarks.ids, (n,), *check.LANDMARK)
+    check.unique(f"{name}.ids", landmarks.ids)
 
 
 def check_descriptors(name: str, value: Any, n: int, size: int | None = None) -> int:
     """Return the length d of n descriptors, or refuse what are none, or of another length."""
     largest = float(LARGEST_DESCRIPTOR)
-    check.check_floats(name, value, (n, size), -largest, largest, dtype=check.FLOAT32)
+    check.floats(name, value, (n, size), -largest, largest, dtype=check.FLOAT32)
     if value.shape[1] > LONGEST_DESCRIPTOR:
-        check.raise_refusal(name, f"at most {LONGEST_DESCRIPTOR} columns", value.shape[1])
+        check.refuse(name, f"at most {LONGEST_DESCRIPTOR} columns", value.shape[1])
     return int(value.shape[1])
 
 
@@ -203,22 +199,22 @@ def check_descriptors(name: str, value: Any, n: int, size: int | None = None) ->
 
 def check_log(name: str, log: Any) -> None:
     """Refuse what is no state of a `RobotLog`; chunks that never change are looked at once."""
-    check.check_keys(name, log, ("chunks", "unfinished"))
-    check.check_length(f"{name}['chunks']", log["chunks"])
+    check.keys(name, log, ("chunks", "unfinished"))
+    check.sequence(f"{name}['chunks']", log["chunks"])
     last = -1
     for chunk in log["chunks"]:
         if not has_been_checked(chunk):
             check_steps(f"{name}['chunks']", chunk)
             if not len(chunk):
-                check.raise_refusal(f"{name}['chunks']", "chunks of some steps", "none")
+                check.refuse(f"{name}['chunks']", "chunks of some steps", "none")
             note_checked(chunk)
         if chunk.steps[0] <= last:
-            check.raise_refusal(f"{name}['chunks']", "steps in order", "others")
+            check.refuse(f"{name}['chunks']", "steps in order", "others")
         last = chunk.steps[-1]
     unfinished = log["unfinished"]
     check_steps(f"{name}['unfinished']", unfinished)
     if len(unfinished) > ROWS or (len(unfinished) and unfinished.steps[0] <= last):
-        check.raise_refusal(f"{name}['unfinished']", f"at most {ROWS} steps after the others", len(unfinished))
+        check.refuse(f"{name}['unfinished']", f"at most {ROWS} steps after the others", len(unfinished))
 
 
 def last_step(log: Mapping[str, Any]) -> int:
@@ -231,25 +227,25 @@ def last_step(log: Mapping[str, Any]) -> int:
 
 def check_steps(name: str, rows: Any) -> None:
     """Refuse what are no `LogArrays`."""
-    check.check_type(name, rows, LogArrays)
-    starts, t = rows.starts, check.check_indices(f"{name}.steps", rows.steps, (None,))
-    check.check_ascending(f"{name}.steps", rows.steps)
-    check.check_array(f"{name}.kinds", rows.kinds, check.INT8, (t,))
+    check.instance(name, rows, LogArrays)
+    starts, t = rows.starts, check.indices(f"{name}.steps", rows.steps, (None,))
+    check.ascending(f"{name}.steps", rows.steps)
+    check.array(f"{name}.kinds", rows.kinds, check.INT8, (t,))
     if t and not STATIONARY <= rows.kinds.min() <= rows.kinds.max() <= EXACT:
-        check.raise_refusal(f"{name}.kinds", f"kinds from {STATIONARY} to {EXACT}", "others")
-    check.check_positions(f"{name}.motions", rows.motions, (t, 3))
-    check.check_array(f"{name}.given", rows.given, check.BOOL, (t,))
-    n = check.check_positions(f"{name}.points", rows.points, (None, 3))
-    check.check_array(f"{name}.starts", starts, check.INT64, (t + 1,))
+        check.refuse(f"{name}.kinds", f"kinds from {STATIONARY} to {EXACT}", "others")
+    check.positions(f"{name}.motions", rows.motions, (t, 3))
+    check.array(f"{name}.given", rows.given, check.BOOL, (t,))
+    n = check.positions(f"{name}.points", rows.points, (None, 3))
+    check.array(f"{name}.starts", starts, check.INT64, (t + 1,))
     if starts[0] != 0 or starts[-1] != n or (starts[1:] < starts[:-1]).any():
-        check.raise_refusal(f"{name}.starts", f"rows that rise from 0 to {n}", "others")
-    check.check_indices(f"{name}.ids", rows.ids, (n,), REJECTED, check.MAX_LANDMARKS)
+        check.refuse(f"{name}.starts", f"rows that rise from 0 to {n}", "others")
+    check.indices(f"{name}.ids", rows.ids, (n,), REJECTED, check.MAX_LANDMARKS)
     if rows.covariances is not None:
-        check.check_array(f"{name}.covariances", rows.covariances, check.FLOAT64, (n, 6))
+        check.array(f"{name}.covariances", rows.covariances, check.FLOAT64, (n, 6))
         own = rows.covariances[np.repeat(rows.given, np.diff(starts))]
-        check.check_floats(f"{name}.covariances", own, (len(own), 6))
+        check.floats(f"{name}.covariances", own, (len(own), 6))
     elif rows.given.any():
-        check.raise_refusal(f"{name}.given", "none without covariances", "some")
+        check.refuse(f"{name}.given", "none without covariances", "some")
 
 
 # ---------------------------------------------------------------------- the smoother
@@ -277,72 +273,72 @@ def are_linked(previous: IntArray, robots: IntArray) -> bool:
 
 def check_graph(name: str, graph: Any, k: int) -> None:
     """Refuse what are no columns of a `SlamGraph` of k robots."""
-    check.check_keys(name, graph, GRAPH_COLUMNS)
+    check.keys(name, graph, GRAPH_COLUMNS)
     if len(graph) != len(GRAPH_COLUMNS):
-        check.raise_refusal(name, "the columns of a graph", "others")
+        check.refuse(name, "the columns of a graph", "others")
     where = {column: f"{name}[{column!r}]" for column in graph}
 
     def indices(column: str, rows: int | None, last: int, low: int = 0) -> int:
-        return check.check_indices(where[column], graph[column], (rows,), low, last)
+        return check.indices(where[column], graph[column], (rows,), low, last)
 
     keys, robots = indices("robots", None, k - 1, NONE), graph["robots"]
     indices("previous", keys, keys - 1, NONE)
-    check.check_floats(where["noises"], graph["noises"], (keys, 3, 3))
+    check.floats(where["noises"], graph["noises"], (keys, 3, 3))
     for column in ("spreads", "slack"):
-        check.check_floats(where[column], graph[column], (keys,), 0.0)
+        check.floats(where[column], graph[column], (keys,), 0.0)
     frames, landmarks = indices("frame_keys", None, keys - 1), indices("landmark_ids", None, check.MAX_LANDMARKS)
-    check.check_unique(where["landmark_ids"], graph["landmark_ids"])
-    n = check.check_positions(where["points"], graph["points"], (None, 3))
+    check.unique(where["landmark_ids"], graph["landmark_ids"])
+    n = check.positions(where["points"], graph["points"], (None, 3))
     for column, rows in (("poses", keys), ("motions", keys), ("frame_offsets", frames), ("landmarks", landmarks)):
-        check.check_positions(where[column], graph[column], (rows, 3))
-    check.check_array(where["given"], graph["given"], check.BOOL, (n,))
-    check.check_array(where["point_noises"], graph["point_noises"], check.FLOAT64, (n, 6))
-    check.check_floats(where["point_noises"], graph["point_noises"][graph["given"]], (None, 6))
+        check.positions(where[column], graph[column], (rows, 3))
+    check.array(where["given"], graph["given"], check.BOOL, (n,))
+    check.array(where["point_noises"], graph["point_noises"], check.FLOAT64, (n, 6))
+    check.floats(where["point_noises"], graph["point_noises"][graph["given"]], (None, 6))
     indices("point_frames", n, frames - 1), indices("point_landmarks", n, landmarks - 1)
     frozen = indices("condensed_keys", None, keys - 1)
     indices("condensed_landmarks", frozen, landmarks - 1), indices("counts", frozen, check.MAX_LANDMARKS)
     for column, width in (("centres", 3), ("infos", 6), ("slopes", 3)):
-        check.check_floats(where[column], graph[column], (frozen, width))
-    check.check_indices(where["aliases"], graph["aliases"], (None, 2), *check.LANDMARK)
+        check.floats(where[column], graph[column], (frozen, width))
+    check.indices(where["aliases"], graph["aliases"], (None, 2), *check.LANDMARK)
     for column in ("heads", "tips"):
         indices(column, k, keys - 1)
         if (robots[graph[column]] != np.arange(k)).any():
-            check.raise_refusal(where[column], "a key of each robot", "others")
+            check.refuse(where[column], "a key of each robot", "others")
     indices("latest", k, check.MAX_INT, -1)
     if not are_linked(graph["previous"], robots):
-        check.raise_refusal(where["previous"], "keys that lead back to a start", "others")
+        check.refuse(where["previous"], "keys that lead back to a start", "others")
 
 
 def check_rejuvenation(name: str, state: Any, logs: Sequence[Mapping[str, Any]], size: int) -> None:
     """Refuse what is no state of the smoother of a filter with these logs, whose descriptors have this size."""
-    check.check_keys(name, state, ("graph", "draft", "schedule", "guesses", "refused"))
+    check.keys(name, state, ("graph", "draft", "schedule", "guesses", "refused"))
     k, schedule = len(logs), state["schedule"]
-    check.check_keys(f"{name}['schedule']", schedule, SCHEDULE)
+    check.keys(f"{name}['schedule']", schedule, SCHEDULE)
     for part in SCHEDULE:
         is_flag = part in ("_asked", "_closed", "_exact")
-        (check.check_bool if is_flag else check.check_int)(f"{name}['schedule'][{part!r}]", schedule[part])
+        (check.boolean if is_flag else check.integer)(f"{name}['schedule'][{part!r}]", schedule[part])
     if state["graph"] is not None:
         check_graph(f"{name}['graph']", state["graph"], k)
     if state["draft"] is not None:
-        check.check_length(f"{name}['draft']", state["draft"], 3)
+        check.sequence(f"{name}['draft']", state["draft"], 3)
         graph, damping, steps = state["draft"]
         if state["graph"] is None:
-            check.raise_refusal(f"{name}['draft']", "none without a graph", "one")
+            check.refuse(f"{name}['draft']", "none without a graph", "one")
         check_graph(f"{name}['draft'][0]", graph, k)
-        check.check_float(f"{name}['draft'][1]", damping, 0.0)
-        check.check_int(f"{name}['draft'][2]", steps)
+        check.number(f"{name}['draft'][1]", damping, 0.0)
+        check.integer(f"{name}['draft'][2]", steps)
     for where, guesses in check.named_items(f"{name}['guesses']", state["guesses"], k):
-        check.check_length(where, guesses, 2)
-        heard = check.check_indices(f"{where}[0]", guesses[0], (None,))
-        check.check_ascending(f"{where}[0]", guesses[0])
-        check.check_positions(f"{where}[1]", guesses[1], (heard, 3))
+        check.sequence(where, guesses, 2)
+        heard = check.indices(f"{where}[0]", guesses[0], (None,))
+        check.ascending(f"{where}[0]", guesses[0])
+        check.positions(f"{where}[1]", guesses[1], (heard, 3))
     for (where, refused), log in zip(check.named_items(f"{name}['refused']", state["refused"], k), logs, strict=True):
         _check_refused(where, refused, log, size)
 
 
 def _check_refused(name: str, refused: Any, log: Mapping[str, Any], size: int) -> None:
     """Refuse what are no refused measurements of a log, by step."""
-    check.check_type(name, refused, dict)
+    check.instance(name, refused, dict)
     if not refused:
         return
     counts: dict[int, int] = {}
@@ -352,8 +348,8 @@ def _check_refused(name: str, refused: Any, log: Mapping[str, Any], size: int) -
             if part.steps[0] <= min((step for step in refused if type(step) is int), default=0):
                 break
     for step, (rows, looks) in refused.items():
-        check.check_type(name, refused[step], RejectedMeasurements)
-        check.check_int(f"{name}: step", step)
-        n = check.check_indices(f"{name}[{step}].rows", rows, (None,), 0, counts.get(step, check.MAX_INT) - 1)
-        check.check_ascending(f"{name}[{step}].rows", rows)
+        check.instance(name, refused[step], RejectedMeasurements)
+        check.integer(f"{name}: step", step)
+        n = check.indices(f"{name}[{step}].rows", rows, (None,), 0, counts.get(step, check.MAX_INT) - 1)
+        check.ascending(f"{name}[{step}].rows", rows)
         check_descriptors(f"{name}[{step}].descriptors", looks, n, size)

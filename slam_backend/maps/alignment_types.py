@@ -43,7 +43,8 @@ HINTS: dict[str, str] = {  # what helps, by the reason of a refusal
     "mirrored": "The mirror image fits better: check the sign of the measured coordinates.",
     "poorly spread": "The shared landmarks stand too close together: let robots see more of the same places.",
     "too uncertain": "The way of a robot to what the maps share is too uncertain: close loops or set"
-    " `rejuvenate_every`; or accept it, by a lower `MergeOptions.min_sigmas_on_trial` where paths leave it open, by a higher"
+    " `rejuvenate_every`; or accept it, by a lower `MergeOptions.min_sigmas_on_trial` where paths leave it open, by a"
+    " higher"
     " `AlignmentOptions.max_sigma_position` or `max_sigma_heading` where landmarks do.",
 }
 BOUNDS = ("translation", "rotation", "one match", "paths", "repeat")  # that a refusal as "too uncertain" may miss

@@ -238,7 +238,7 @@ def squared_error(poses: FloatArray, means: FloatArray, lever: float, squares: F
 def apply_if_closer(
     poses: FloatArray, motions: FloatArray, means: FloatArray, lever: float, weights: FloatArray, moved: FloatArray
 ) -> bool:
-    """Move particles as `move` does; return whether they are then less far off, see `squared_error`, weighed by (M,)."""
+    """Move particles as `move` does; return whether this lowers their mean `squared_error`, weighted by (M,)."""
     before, after = np.empty(len(weights)), np.empty(len(weights))
     move(poses, motions, moved)
     squared_error(poses, means, lever, before)

@@ -46,7 +46,8 @@ def reduce_keyframes(
     centres, infos, slopes = np.empty((n, 3)), np.empty((n, 6)), np.empty((n, 3))
     left, num = _kernels.reduce_keyframes(
         share, MAX_FRAMES, options.most_keys(robots), graph.frame_keys, seen.keys, seen.landmarks, seen.frozen,
-        seen.centres, seen.infos, seen.slopes, seen.counts, raw, numbers, condensed_keys, condensed_landmarks, centres, infos,
+        seen.centres, seen.infos, seen.slopes, seen.counts, raw, numbers, condensed_keys, condensed_landmarks, centres,
+        infos,
         slopes, counts, *keys.values(),
     )  # fmt: skip
     fewer = {

@@ -43,7 +43,8 @@ class LandmarkFactors(NamedTuple):
         frozen = np.empty(most, dtype=np.bool_)
         centres, infos, slopes = np.empty((most, 3)), np.empty((most, 6)), np.empty((most, 3))
         num = _kernels.gather(
-            graph.condensed_keys, graph.condensed_landmarks, graph.linearisation_points, graph.information, graph.gradients, graph.counts,
+            graph.condensed_keys, graph.condensed_landmarks, graph.linearisation_points, graph.information,
+            graph.gradients, graph.counts,
             graph.point_frames, graph.point_landmarks, graph.frame_keys, graph.num_keys, keys, landmarks, starts,
             frozen, centres, infos, slopes, counts, of_points,
         )  # fmt: skip
@@ -70,7 +71,8 @@ class LandmarkFactors(NamedTuple):
             Half the sum of their (robust) squared distances.
         """
         return _kernels.condense(
-            graph.points, graph.point_noises, graph.has_covariance, graph.point_frames, self.of_points, graph.frame_keys,
+            graph.points, graph.point_noises, graph.has_covariance, graph.point_frames, self.of_points,
+            graph.frame_keys,
             graph.frame_offsets, poses, landmarks, self.keys, self.landmarks, self.frozen, camera, scale, kernel,
             self.centres, self.infos, self.slopes, self.squares,
         )  # fmt: skip

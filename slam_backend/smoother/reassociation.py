@@ -76,9 +76,9 @@ def reassociate(
 ) -> list[LogArrays]:
     """Return the logs in which refused measurements bear the name of the landmark that they must be of.
 
-    A refused measurement can be of the only landmark within `new_landmark_radius` that looks like it, if nothing else of its
-    frame is. Those of one landmark that agree on its place, within `position_gate` of one from another frame, are taken
-    up if they outnumber its own sightings, and their mean is within `new_landmark_gate` of it: farther off it is another one.
+    A rejected measurement can belong to the only similar landmark within `new_landmark_radius`, if nothing else of its
+    frame does. Measurements of one landmark that agree on its position, within `position_gate` of one from another
+    frame, are associated if they outnumber its own sightings and their mean is within `new_landmark_gate` of it.
 
     Args:
         logs: Per robot.
@@ -142,8 +142,8 @@ def _find_owners(points: _Points, logs: Sequence[LogArrays], known: LandmarkTabl
     """Return the row (n,) in `known` of the only landmark that each point can be of; `NO_ONE`: none, or several."""
     owners = np.empty(len(points.means), dtype=np.int64)
     find_only(
-        points.means, points.descriptors, np.ascontiguousarray(known.means), known.descriptors, options.new_landmark_radius,
-        options.descriptor_gate, owners,
+        points.means, points.descriptors, np.ascontiguousarray(known.means), known.descriptors,
+        options.new_landmark_radius, options.descriptor_gate, owners,
     )  # fmt: skip
     for n in np.flatnonzero(owners != NO_ONE):
         log = logs[points.robots[n]]

@@ -96,7 +96,7 @@ class MergePlan(NamedTuple):
         may know well how the groups began where neither map does.
 
         Returns:
-            The plan by the motion that the joint filter has, and the doubt about that, see `transform_uncertainty`: infinite
+            The plan by the motion that the joint filter has, and its uncertainty, see `transform_uncertainty`: infinite
             where the merge would be undone for the shape of the joint map. None if the smoother finds nothing.
         """
         a, b = self.filters

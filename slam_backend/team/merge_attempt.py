@@ -108,7 +108,8 @@ def _start(
 
 
 def _realign(
-    pair: Pair, bent: Alignment, maps: Maps, options: AlignmentOptions, records: SharedRecords, rng: np.random.Generator,
+    pair: Pair, bent: Alignment, maps: Maps, options: AlignmentOptions, records: SharedRecords,
+    rng: np.random.Generator,
     before: Sequence[Mapping[str, Any]] = (),
 ) -> Alignment:  # fmt: skip
     """Align straight maps, which must agree on most of what the bent ones did.

@@ -200,7 +200,7 @@ class MergeScheduler:
     def get_state(self) -> dict[str, Any]:
         """Return the options and a copy of the memory; arrays are read-only."""
         memory: dict[str, Any] = {"records": copy.deepcopy(self._records), "bars": tuple(self._bars)}
-        memory |= {"doubts": dict(self._uncertainties), "trials": dict(self._trials)}
+        memory |= {"uncertainties": dict(self._uncertainties), "trials": dict(self._trials)}
         fixed = {"options": self._options, "alignment": self._alignment, "straightening": self.straightening}
         return fixed | memory
 
@@ -210,7 +210,7 @@ class MergeScheduler:
         self.straightening = state["straightening"]
         self._records = copy.deepcopy(state["records"])
         self._bars = list(state["bars"])
-        self._uncertainties, self._trials = dict(state["doubts"]), dict(with_constants(state["trials"]))
+        self._uncertainties, self._trials = dict(state["uncertainties"]), dict(with_constants(state["trials"]))
 
 
 def _touches(pair: PairKey, barred: PairKey) -> bool:

@@ -19,8 +19,8 @@ class MergeOptions:
             more. False: maps are taken as the filters bent them.
         sure: An attempt is refused, as long as waiting helps, while so many standard deviations of the motion among the
             particles that the merge would make reach 0.5 m or 5 degrees; 0: never for that.
-        min_sigmas_on_trial: Above 0 a pair that is less than `sure` merges on trial: the joint filter is smoothed, and kept if
-            the motion that it has passes twice running; where waiting does not help, so many standard deviations of it
+        min_sigmas_on_trial: Above 0 a pair that is less than `min_sigmas` merges on trial: the joint filter is
+            smoothed, and kept if the motion that it has passes twice running; where waiting does not help, so many standard deviations of it
             suffice. 0: there are no trials, and where waiting does not help the pair merges however uncertain it is, as
             is right where nothing would ever tell more about the robots' starts.
         watch_steps: A merge is watched for so many steps in which robots of both sides are in contact, and can be
@@ -45,8 +45,10 @@ class MergeOptions:
             cure = "Use None for the larger of the two."
             check_int("merging.merged_particles", self.merged_particles, 1, cure, MAX_PARTICLES)
         if not isinstance(self.smooth_first, bool):
-            raise argument_error("merging.straighten", "True or False", self.straighten, "Give a bool.")
-        check_float("merging.sure", self.min_sigmas, "Use 5, or 0 to merge however uncertain it is.", at_least=0.0)
+            raise argument_error("merging.smooth_first", "True or False", self.smooth_first, "Give a bool.")
+        check_float(
+            "merging.min_sigmas", self.min_sigmas, "Use 5, or 0 to merge however uncertain it is.", at_least=0.0
+        )
         cure = "Use 5, or 0 to merge in the end however uncertain it is."
         check_float("merging.min_sigmas_on_trial", self.min_sigmas_on_trial, cure, at_least=0.0)
         check_int("merging.watch_steps", self.watch_steps, 0, "Use 0 to make merges final.", MOST)
@@ -56,5 +58,5 @@ class MergeOptions:
 
     @property
     def max_uncertainty(self) -> float:
-        """Doubt, 1 = `sure`, beyond which no pair merges; infinite if any merges in the end."""
+        """Uncertainty, 1 = `min_sigmas`, beyond which no pair merges; infinite if any merges in the end."""
         return self.min_sigmas / self.min_sigmas_on_trial if self.min_sigmas_on_trial else math.inf

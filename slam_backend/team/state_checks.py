@@ -20,7 +20,7 @@ from slam_backend.team.merge_monitor import MergeMonitor, PreMergeSnapshot
 from slam_backend.team.merge_scheduler import AttemptOptions, AttemptRecord, PendingAttempt
 from slam_backend.team.options import MergeOptions
 
-BY_ROBOTS = ("doubts", "trials")  # parts of the schedule with an entry for each pair of robots
+BY_ROBOTS = ("uncertainties", "trials")  # parts of the schedule with an entry for each pair of robots
 KEYS = ("step", "epoch", "rng", "events", "groups", "numbers", "alignment", "merging", "schedule", "records")
 BRANCH = ("robots", "live", "filter", "known", "number", "epoch", "report", "watches", "split_from", "split_counts")
 KINDS = ("attempt", "merge", "undo")
@@ -53,33 +53,33 @@ class TeamCheck:
         Raises:
             ValueError: By name of the part that is wrong.
         """
-        check.check_keys(name, state, KEYS)
+        check.keys(name, state, KEYS)
         for of_group, group in check.named_items(f"{name}['groups']", state["groups"]):
-            check.check_keys(of_group, group, ("branches", "undoing"))
+            check.keys(of_group, group, ("branches", "undoing"))
             for where, branch in check.named_items(f"{of_group}['branches']", group["branches"]):
-                check.check_keys(where, branch, BRANCH)
-                check.check_type(f"{where}['robots']", branch["robots"], tuple)
+                check.keys(where, branch, BRANCH)
+                check.instance(f"{where}['robots']", branch["robots"], tuple)
         found = sum(len(group["branches"][0]["robots"]) for group in state["groups"] if group["branches"])
         if found != self._count:
             raise argument_error(name, f"one of {self._count} robots", found, "Build a team of the same size.")
-        check.check_int(f"{name}['step']", state["step"])
-        check.check_int(f"{name}['epoch']", state["epoch"])
-        check.check_generator(f"{name}['rng']", state["rng"])
-        check.check_options(f"{name}['alignment']", state["alignment"], AlignmentOptions)
-        check.check_options(f"{name}['merging']", state["merging"], MergeOptions)
+        check.integer(f"{name}['step']", state["step"])
+        check.integer(f"{name}['epoch']", state["epoch"])
+        check.generator(f"{name}['rng']", state["rng"])
+        check.options(f"{name}['alignment']", state["alignment"], AlignmentOptions)
+        check.options(f"{name}['merging']", state["merging"], MergeOptions)
         self._step = state["step"]
         self._check_records(f"{name}['records']", state["records"])
         for where, event in check.named_items(f"{name}['events']", state["events"]):
             self._check_event(where, event)
-        check.check_ints(f"{name}['numbers']", state["numbers"], 0, self._next_number - 1, list)
+        check.integers(f"{name}['numbers']", state["numbers"], 0, self._next_number - 1, list)
         self._check_schedule(f"{name}['schedule']", state["schedule"])
         for where, group in check.named_items(f"{name}['groups']", state["groups"]):
             self._check_group(where, group)
         trunks = [group["branches"][0]["robots"] for group in state["groups"]]
         if sorted(sum(trunks, ())) != list(range(self._count)) or trunks != sorted(trunks):
-            check.raise_refusal(f"{name}['groups']", "groups of all robots, in the order of their first ones", trunks)
+            check.refuse(f"{name}['groups']", "groups of all robots, in the order of their first ones", trunks)
         if len(self.descriptor_sizes) > 1:
-            check.raise_refusal(name, "descriptors of one length", sorted(self.descriptor_sizes))
+            check.refuse(name, "descriptors of one length", sorted(self.descriptor_sizes))
 
     # ------------------------------------------------------------------ groups
 
@@ -88,25 +88,25 @@ class TeamCheck:
         for where, branch in check.named_items(f"{name}['branches']", group["branches"]):
             self._check_branch(where, branch)
             if not branch["live"]:
-                check.raise_refusal(f"{where}['live']", "some robots", "none")
+                check.refuse(f"{where}['live']", "some robots", "none")
             live += branch["live"]
             self._check_oldest(where, branch)
         trunk = group["branches"][0]
         if sorted(live) != list(trunk["robots"]):
-            check.raise_refusal(f"{name}['branches']", f"branches by which {trunk['robots']} go, each by one", live)
+            check.refuse(f"{name}['branches']", f"branches by which {trunk['robots']} go, each by one", live)
         if group["undoing"] is not None:
             self._check_undoing(f"{name}['undoing']", group["undoing"], trunk)
 
     def _check_undoing(self, name: str, undoing: Any, trunk: Mapping[str, Any]) -> None:
         """Refuse what is no undoing of a merge that the branch of the joint filter had."""
-        check.check_keys(name, undoing, ("number", "sides", "replayed"))
-        check.check_int(f"{name}['number']", undoing["number"], 0, self._next_number - 1)
+        check.keys(name, undoing, ("number", "sides", "replayed"))
+        check.integer(f"{name}['number']", undoing["number"], 0, self._next_number - 1)
         sides = check.named_items(f"{name}['sides']", undoing["sides"])
         for where, side in sides:
             self._check_branch(where, side)
         parts = [side["robots"] for _, side in sides]
         if sorted(sum(parts, ())) != list(trunk["robots"]):
-            check.raise_refusal(f"{name}['sides']", f"parts of {trunk['robots']}", parts)
+            check.refuse(f"{name}['sides']", f"parts of {trunk['robots']}", parts)
         for of_side, replayed in check.named_items(f"{name}['replayed']", undoing["replayed"], len(parts)):
             for where, done in check.named_items(of_side, replayed):
                 self._check_replayed(where, done)
@@ -116,29 +116,27 @@ class TeamCheck:
             for robot, last in side["known"].items():
                 self._need_from(where, last + 1)
                 if last > trunk["known"].get(robot, -1):
-                    check.raise_refusal(where, "sides that know no more than the joint filter", last)
+                    check.refuse(where, "sides that know no more than the joint filter", last)
 
     def _check_branch(self, name: str, branch: Any) -> None:
         """Refuse what is no branch, whose filter and watches are checked with it."""
-        check.check_keys(name, branch, BRANCH)
+        check.keys(name, branch, BRANCH)
         robots, live, known = branch["robots"], branch["live"], branch["known"]
-        check.check_robots(f"{name}['robots']", robots, self._count)
-        check.check_ints(f"{name}['live']", live, 0, self._count - 1)
+        check.robots(f"{name}['robots']", robots, self._count)
+        check.integers(f"{name}['live']", live, 0, self._count - 1)
         if list(live) != sorted(set(live)) or not set(live) <= set(robots):
-            check.raise_refusal(f"{name}['live']", f"some of {robots}, in ascending order", live)
-        check.check_int_dict(f"{name}['known']", known, (0, self._count), (-1, self._step - 1))
+            check.refuse(f"{name}['live']", f"some of {robots}, in ascending order", live)
+        check.int_dict(f"{name}['known']", known, (0, self._count), (-1, self._step - 1))
         if set(known) != set(robots):
-            check.raise_refusal(f"{name}['known']", f"the last step of each of {robots}", known)
-        check.check_int(f"{name}['number']", branch["number"], 0, self._next_number - 1)
-        check.check_int(f"{name}['epoch']", branch["epoch"])
+            check.refuse(f"{name}['known']", f"the last step of each of {robots}", known)
+        check.integer(f"{name}['number']", branch["number"], 0, self._next_number - 1)
+        check.integer(f"{name}['epoch']", branch["epoch"])
         check_filter(f"{name}['filter']", branch["filter"], self._known)
         if len(branch["filter"]["poses"]) != len(robots):
-            check.raise_refusal(f"{name}['filter']", f"one of {len(robots)} robots", len(branch["filter"]["poses"]))
+            check.refuse(f"{name}['filter']", f"one of {len(robots)} robots", len(branch["filter"]["poses"]))
         for robot, log in zip(robots, branch["filter"]["logs"], strict=True):
             if last_step(log) > known[robot]:
-                check.raise_refusal(
-                    f"{name}['known']", f"at least {last_step(log)}, the last step logged", known[robot]
-                )
+                check.refuse(f"{name}['known']", f"at least {last_step(log)}, the last step logged", known[robot])
         self.options.append(branch["filter"]["options"])
         looks = branch["filter"]["maps"]["descriptors"]
         if len(looks):
@@ -146,13 +144,13 @@ class TeamCheck:
         if branch["report"] is not None:
             self._check_report(f"{name}['report']", branch["report"], len(robots))
         if branch["split_from"] is not None:
-            check.check_int(f"{name}['split_from']", branch["split_from"], 0, self._next_number - 1)
-        check.check_int_dict(f"{name}['split_counts']", branch["split_counts"], check.LANDMARK)
+            check.integer(f"{name}['split_from']", branch["split_from"], 0, self._next_number - 1)
+        check.int_dict(f"{name}['split_counts']", branch["split_counts"], check.LANDMARK)
         for where, watch in check.named_items(f"{name}['watches']", branch["watches"]):
             self._check_watch(where, watch, robots)
         numbers = [watch.number for watch in branch["watches"]]
         if numbers != sorted(set(numbers)):
-            check.raise_refusal(f"{name}['watches']", "merges from the oldest to the newest", numbers)
+            check.refuse(f"{name}['watches']", "merges from the oldest to the newest", numbers)
 
     def _check_oldest(self, name: str, branch: Mapping[str, Any]) -> None:
         """Refuse a branch that may have to take in steps that are not kept."""
@@ -160,7 +158,7 @@ class TeamCheck:
             if robot not in branch["live"]:
                 self._need_from(name, last + 1)
             elif last != self._step - 1 and self._step:
-                check.raise_refusal(f"{name}['known']", f"{self._step - 1} of a robot that goes by it", last)
+                check.refuse(f"{name}['known']", f"{self._step - 1} of a robot that goes by it", last)
         for watch in branch["watches"]:
             for side in watch.sides:
                 self._need_from(name, side.oldest)
@@ -168,107 +166,107 @@ class TeamCheck:
     def _need_from(self, name: str, first: int) -> None:
         """Refuse a state in which a step from `first` on is not kept."""
         if first < self._step and (first not in self._inputs or len(self._inputs) < self._step - first):
-            check.raise_refusal(name, "steps whose readings are kept", f"one that knows nothing from step {first} on")
+            check.refuse(name, "steps whose readings are kept", f"one that knows nothing from step {first} on")
 
     def _check_watch(self, name: str, watch: Any, robots: Sequence[int]) -> None:
         """Refuse what is no watch of a merge of some of these robots."""
-        check.check_type(name, watch, MergeMonitor)
-        check.check_int(f"{name}.number", watch.number, 0, self._next_number - 1)
-        check.check_int(f"{name}.steps", watch.steps)
-        check.check_type(f"{name}.alignment", watch.alignment, Alignment)
-        for where, landmarks in check.named_items(f"{name}.before", watch.before, 2):
+        check.instance(name, watch, MergeMonitor)
+        check.integer(f"{name}.number", watch.number, 0, self._next_number - 1)
+        check.integer(f"{name}.steps", watch.steps)
+        check.instance(f"{name}.alignment", watch.alignment, Alignment)
+        for where, landmarks in check.named_items(f"{name}.pre_merge_maps", watch.pre_merge_maps, 2):
             check_landmarks(where, landmarks)
-        for where, own in check.named_items(f"{name}.own", watch.own, 2):
-            check.check_ints(where, own, *check.LANDMARK, set)
+        for where, own in check.named_items(f"{name}.exclusive_landmarks", watch.exclusive_landmarks, 2):
+            check.integers(where, own, *check.LANDMARK, set)
         for where, side in check.named_items(f"{name}.sides", watch.sides, 2):
-            check.check_type(where, side, PreMergeSnapshot)
+            check.instance(where, side, PreMergeSnapshot)
             if id(side) not in self._done:
                 self._done.add(id(side))
                 self._check_branch(f"{where}.trunk", side.trunk)
-            earliest = [1 + min(side.trunk["known"].values()), *(s.oldest for w in side.watches for s in w.sides)]
-            check.check_int(f"{where}.oldest", side.oldest, 0, min(earliest))
+            earliest = [1 + min(side.trunk["known"].values()), *(s.oldest for w in side.monitors for s in w.sides)]
+            check.integer(f"{where}.oldest", side.oldest, 0, min(earliest))
         one, two = (side.robots for side in watch.sides)
         if set(one) & set(two) or not {*one, *two} <= set(robots):
-            check.raise_refusal(f"{name}.sides", f"two parts of {robots}", (one, two))
+            check.refuse(f"{name}.sides", f"two parts of {robots}", (one, two))
 
     # ------------------------------------------------------------------ readings and reports
 
     def _check_inputs(self, name: str, inputs: Any) -> None:
         """Refuse what are no readings of K robots in one step."""
-        check.check_type(name, inputs, StepInput)
-        n, table = check.check_positions(f"{name}.sightings", inputs.sightings, (None, 9), 3), inputs.table
-        check.check_indices(f"{name}.table", table, (self._count, 6), -1)
-        check_turns(f"{name}.turns", inputs.turns, n, self._count)
-        if [list(turn) for turn in inputs.turns] != table.tolist():
-            check.raise_refusal(f"{name}.table", "the turns", "others")
-        check.check_positions(f"{name}.moves", inputs.moves, (self._count, 3))
+        check.instance(name, inputs, StepInput)
+        n, table = check.positions(f"{name}.measurements", inputs.measurements, (None, 9), 3), inputs.inputs_table
+        check.indices(f"{name}.table", table, (self._count, 6), -1)
+        check_turns(f"{name}.inputs", inputs.inputs, n, self._count)
+        if [list(turn) for turn in inputs.inputs] != table.tolist():
+            check.refuse(f"{name}.table", "the turns", "others")
+        check.positions(f"{name}.moves", inputs.moves, (self._count, 3))
         size = check_descriptors(f"{name}.descriptors", inputs.descriptors, n)
         if n:
             self.descriptor_sizes.add(size)
-        named = check.check_indices(f"{name}.names", inputs.names, (None,), -1)
+        named = check.indices(f"{name}.names", inputs.names, (None,), -1)
         if named != n and (named or table[:, HAS_IDS].any()):
-            check.raise_refusal(f"{name}.names", "one for each measurement, or none", named)
-        for _, begin, end, given, _, _ in inputs.turns:
+            check.refuse(f"{name}.names", "one for each measurement, or none", named)
+        for _, begin, end, given, _, _ in inputs.inputs:
             if given:
-                check.check_floats(f"{name}.sightings", inputs.sightings[begin:end], (None, 9))
-        check_masks(f"{name}.masks", inputs.masks, inputs.turns)
-        check.check_ints(f"{name}.silent", inputs.silent, 0, self._count - 1, frozenset)
+                check.floats(f"{name}.measurements", inputs.measurements[begin:end], (None, 9))
+        check_masks(f"{name}.masks", inputs.masks, inputs.inputs)
+        check.integers(f"{name}.inactive", inputs.inactive, 0, self._count - 1, frozenset)
 
     def _check_replayed(self, name: str, done: Any) -> None:
         """Refuse what is no step that was taken in late."""
-        check.check_type(name, done, ReplayedStep)
-        check.check_int(f"{name}.step", done.step, 0, self._step)
-        check.check_robots(f"{name}.robots", done.robots, self._count)
+        check.instance(name, done, ReplayedStep)
+        check.integer(f"{name}.step", done.step, 0, self._step)
+        check.robots(f"{name}.robots", done.robots, self._count)
         if self._inputs.get(done.step) is not done.inputs:
             self._check_inputs(f"{name}.inputs", done.inputs)
         self._check_report(f"{name}.report", done.report, None)
 
     def _check_report(self, name: str, report: Any, robots: int | None) -> None:
         """Refuse what is no report of a step of a filter of some robots; None: of any number."""
-        check.check_type(name, report, reports.StepReport)
-        found = report.findings
-        check.check_type(f"{name}.findings", found, reports.Associations)
-        check.check_indices(f"{name}.findings.told", found.told, (2, None), REJECTED, check.MAX_LANDMARKS)
-        check_turns(f"{name}.findings.turns", found.turns, found.told.shape[1], None)
-        check_masks(f"{name}.findings.masks", found.masks, found.turns)
-        check.check_ints(f"{name}.rows", report.rows, -1, min(len(found.turns), self._count) - 1)
+        check.instance(name, report, reports.StepReport)
+        found = report.all_associations
+        check.instance(f"{name}.findings", found, reports.Associations)
+        check.indices(f"{name}.all_associations.ids", found.ids, (2, None), REJECTED, check.MAX_LANDMARKS)
+        check_turns(f"{name}.all_associations.inputs", found.inputs, found.ids.shape[1], None)
+        check_masks(f"{name}.all_associations.masks", found.masks, found.inputs)
+        check.integers(f"{name}.rows", report.rows, -1, min(len(found.inputs), self._count) - 1)
         if robots is not None and len(report.rows) != robots:
-            check.raise_refusal(f"{name}.rows", f"a row for each of {robots} robots", report.rows)
+            check.refuse(f"{name}.rows", f"a row for each of {robots} robots", report.rows)
         for part in ("num_created", "num_new", "num_matched", "num_rejected"):
-            check.check_int(f"{name}.{part}", getattr(report, part))
-        check.check_float(f"{name}.ess", report.ess, 0.0)
+            check.integer(f"{name}.{part}", getattr(report, part))
+        check.number(f"{name}.ess", report.ess, 0.0)
         if not (isinstance(report.nis, float) and (report.nis >= 0.0 or report.nis != report.nis)):
-            check.raise_refusal(f"{name}.nis", "a float at least 0, or NaN", report.nis)
+            check.refuse(f"{name}.nis", "a float at least 0, or NaN", report.nis)
         if report.rejuvenation is not None:
-            check.check_type(f"{name}.rejuvenation", report.rejuvenation, reports.RejuvenationReport)
+            check.instance(f"{name}.rejuvenation", report.rejuvenation, reports.RejuvenationReport)
 
     # ------------------------------------------------------------------ what is written down
 
     def _check_records(self, name: str, records: Any) -> None:
-        check.check_keys(name, records, ("log", "exchange", "rng", "entries", "next_number"))
-        check.check_int(f"{name}['next_number']", records["next_number"], self._count, check.MAX_LANDMARKS)
+        check.keys(name, records, ("log", "exchange", "rng", "entries", "next_number"))
+        check.integer(f"{name}['next_number']", records["next_number"], self._count, check.MAX_LANDMARKS)
         self._next_number = records["next_number"]
-        check.check_keys(f"{name}['log']", records["log"], ("steps",))
+        check.keys(f"{name}['log']", records["log"], ("steps",))
         steps = records["log"]["steps"]
-        check.check_type(f"{name}['log']['steps']", steps, dict)
-        check.check_ints(f"{name}['log']['steps']", tuple(steps), 0, self._step - 1)
+        check.instance(f"{name}['log']['steps']", steps, dict)
+        check.integers(f"{name}['log']['steps']", tuple(steps), 0, self._step - 1)
         if list(steps) != list(range(self._step - len(steps), self._step)):
-            check.raise_refusal(f"{name}['log']['steps']", "the last steps, in order", "others")
+            check.refuse(f"{name}['log']['steps']", "the last steps, in order", "others")
         for step, inputs in steps.items():
             if self._kept.get(step) is not inputs:
                 self._check_inputs(f"{name}['log']['steps'][{step}]", inputs)
         self._inputs = steps
         exchange = records["exchange"]
-        check.check_keys(f"{name}['exchange']", exchange, ("bytes_sent", "known"))
+        check.keys(f"{name}['exchange']", exchange, ("bytes_sent", "known"))
         for where, number in check.named_items(
             f"{name}['exchange']['bytes_sent']", exchange["bytes_sent"], self._count
         ):
-            check.check_int(where, number)
-        check.check_type(f"{name}['exchange']['known']", exchange["known"], dict)
+            check.integer(where, number)
+        check.instance(f"{name}['exchange']['known']", exchange["known"], dict)
         for pair, counts in exchange["known"].items():
-            check.check_ints(f"{name}['exchange']['known']", pair, 0, self._count - 1)
-            check.check_int_dict(f"{name}['exchange']['known']", counts, check.LANDMARK)
-        check.check_generator(f"{name}['rng']", records["rng"])
+            check.integers(f"{name}['exchange']['known']", pair, 0, self._count - 1)
+            check.int_dict(f"{name}['exchange']['known']", counts, check.LANDMARK)
+        check.generator(f"{name}['rng']", records["rng"])
         for where, entry in check.named_items(f"{name}['entries']", records["entries"]):
             self._check_entry(where, entry)
 
@@ -277,105 +275,105 @@ class TeamCheck:
         kind = type(entry)
         if kind is reports.LandmarksCreated:
             numbers: tuple[Any, ...] = (entry.number,)
-            check.check_int(f"{name}.robot", entry.robot, 0, self._count - 1)
-            check.check_int(f"{name}.step", entry.step, 0, self._step)
-            check.check_indices(f"{name}.ids", entry.ids, (None,), REJECTED, check.MAX_LANDMARKS)
+            check.integer(f"{name}.robot", entry.robot, 0, self._count - 1)
+            check.integer(f"{name}.step", entry.step, 0, self._step)
+            check.indices(f"{name}.ids", entry.ids, (None,), REJECTED, check.MAX_LANDMARKS)
         elif kind is reports.LandmarkIdMap:
             numbers = entry.maps
-            check.check_indices(f"{name}.ids_b", entry.ids_b, (None, 2), *check.LANDMARK)
-            check.check_robots(f"{name}.robots_a", entry.robots_a, self._count)
-            check.check_robots(f"{name}.robots_b", entry.robots_b, self._count)
+            check.indices(f"{name}.ids_b", entry.ids_b, (None, 2), *check.LANDMARK)
+            check.robots(f"{name}.robots_a", entry.robots_a, self._count)
+            check.robots(f"{name}.robots_b", entry.robots_b, self._count)
         elif kind is reports.MapForked:
             numbers = entry.source, entry.copy
         elif kind is reports.MergeUndone:
             numbers = entry.maps
         else:
-            check.check_type(name, entry, reports.MapReleased)
+            check.instance(name, entry, reports.MapReleased)
             numbers = (entry.number,)
-        check.check_ints(name, numbers, 0, self._next_number - 1)
+        check.integers(name, numbers, 0, self._next_number - 1)
 
     def _check_event(self, name: str, event: Any) -> None:
-        check.check_type(name, event, reports.MergeEvent)
-        check.check_int(f"{name}.step", event.step, 0, self._step)
+        check.instance(name, event, reports.MergeEvent)
+        check.integer(f"{name}.step", event.step, 0, self._step)
         if event.kind not in KINDS:
-            check.raise_refusal(f"{name}.kind", f"one of {KINDS}", event.kind)
-        check.check_robots(f"{name}.robots_a", event.robots_a, self._count)
-        check.check_robots(f"{name}.robots_b", event.robots_b, self._count)
-        check.check_type(f"{name}.alignment", event.alignment, Alignment)
-        if event.bent is not None:
-            check.check_type(f"{name}.bent", event.bent, Alignment)
+            check.refuse(f"{name}.kind", f"one of {KINDS}", event.kind)
+        check.robots(f"{name}.robots_a", event.robots_a, self._count)
+        check.robots(f"{name}.robots_b", event.robots_b, self._count)
+        check.instance(f"{name}.alignment", event.alignment, Alignment)
+        if event.unsmoothed_alignment is not None:
+            check.instance(f"{name}.unsmoothed_alignment", event.unsmoothed_alignment, Alignment)
 
     def _check_schedule(self, name: str, schedule: Any) -> None:
-        check.check_keys(name, schedule, ("options", "alignment", "straightening", "records", "bars", *BY_ROBOTS))
-        check.check_options(f"{name}['options']", schedule["options"], AttemptOptions)
-        check.check_options(f"{name}['alignment']", schedule["alignment"], AlignmentOptions)
+        check.keys(name, schedule, ("options", "alignment", "straightening", "records", "bars", *BY_ROBOTS))
+        check.options(f"{name}['options']", schedule["options"], AttemptOptions)
+        check.options(f"{name}['alignment']", schedule["alignment"], AlignmentOptions)
         pending, where = schedule["straightening"], f"{name}['straightening']"
         if pending is not None:
-            check.check_type(where, pending, PendingAttempt)
+            check.instance(where, pending, PendingAttempt)
             self._check_pair(f"{where}.pair", pending.pair)
-            check.check_ints(f"{where}.numbers", pending.numbers)
-            check.check_length(f"{where}.numbers", pending.numbers, 2)
-            check.check_type(f"{where}.bent", pending.bent, Alignment)
-            check.check_int(f"{where}.since", pending.since, 0, self._step)
-            check.check_bool(f"{where}.ready", pending.ready)
-        check.check_type(f"{name}['records']", schedule["records"], dict)
+            check.integers(f"{where}.numbers", pending.numbers)
+            check.sequence(f"{where}.numbers", pending.numbers, 2)
+            check.instance(f"{where}.alignment", pending.alignment, Alignment)
+            check.integer(f"{where}.since", pending.since, 0, self._step)
+            check.boolean(f"{where}.ready", pending.ready)
+        check.instance(f"{name}['records']", schedule["records"], dict)
         for pair, record in schedule["records"].items():
             self._check_pair(f"{name}['records']", pair)
-            check.check_type(f"{name}['records']", record, AttemptRecord)
+            check.instance(f"{name}['records']", record, AttemptRecord)
             for part in ("wait", "last_step", "next_step"):
-                check.check_int(f"{name}['records'].{part}", getattr(record, part))
-            check.check_type(f"{name}['records'].tried", record.tried, set)
+                check.integer(f"{name}['records'].{part}", getattr(record, part))
+            check.instance(f"{name}['records'].tried", record.tried, set)
             for match in record.tried:
-                check.check_ints(f"{name}['records'].tried", match, *check.LANDMARK)
+                check.integers(f"{name}['records'].tried", match, *check.LANDMARK)
         for where, bar in check.named_items(f"{name}['bars']", schedule["bars"]):
-            check.check_length(where, bar, 2)
+            check.sequence(where, bar, 2)
             self._check_pair(where, bar[0])
-            check.check_int(where, bar[1])
+            check.integer(where, bar[1])
         for part in BY_ROBOTS:
             where = f"{name}[{part!r}]"
-            check.check_type(where, schedule[part], dict)
+            check.instance(where, schedule[part], dict)
             for robots in schedule[part]:
-                check.check_ints(where, robots, 0, self._count - 1)
-                check.check_length(where, robots, 2)
-        for doubt in schedule["doubts"].values():
-            if not (isinstance(doubt, float) and doubt >= 0.0):
-                check.raise_refusal(f"{name}['doubts']", "a float at least 0", doubt)
+                check.integers(where, robots, 0, self._count - 1)
+                check.sequence(where, robots, 2)
+        for uncertainty in schedule["uncertainties"].values():
+            if not (isinstance(uncertainty, float) and uncertainty >= 0.0):
+                check.refuse(f"{name}['uncertainties']", "a float at least 0", uncertainty)
         for motion in schedule["trials"].values():
-            check.check_floats(f"{name}['trials']", motion, (3,))
+            check.floats(f"{name}['trials']", motion, (3,))
 
     def _check_pair(self, name: str, pair: Any) -> None:
         """Refuse what are no two groups of robots."""
-        check.check_type(name, pair, tuple)
-        check.check_length(name, pair, 2)
+        check.instance(name, pair, tuple)
+        check.sequence(name, pair, 2)
         for robots in pair:
-            check.check_robots(name, robots, self._count)
+            check.robots(name, robots, self._count)
 
 
 def check_turns(name: str, turns: Any, n: int, robots: int | None) -> None:
     """Refuse what are no turns of robots whose measurements lie among n, one robot's after the other's."""
-    check.check_length(name, turns, robots)
+    check.sequence(name, turns, robots)
     last = 0
     for turn in turns:
-        check.check_length(name, turn, 6)
+        check.sequence(name, turn, 6)
         for number in turn:
             if type(number) is not int and type(number) is not bool:
-                check.raise_refusal(name, "ints", turn)
+                check.refuse(name, "ints", turn)
         fine = (0 <= turn[MOTION_KIND] <= EXACT_POSE and last <= turn[BEGIN] <= turn[END] <= n) or turn[BEGIN] == turn[
             END
         ] == 0
         if not fine or not (
             0 <= turn[COVARIANCES_GIVEN] <= 1 and 0 <= turn[HAS_IDS] <= 1 and -1 <= turn[COUNT] <= check.MAX_LANDMARKS
         ):
-            check.raise_refusal(name, f"measurements among {n}", turn)
+            check.refuse(name, f"measurements among {n}", turn)
         last = max(last, turn[END])
 
 
 def check_masks(name: str, masks: Any, turns: Sequence[Sequence[int]]) -> None:
     """Refuse what does not say which measurements of some robots are used."""
     if not isinstance(masks, Mapping):
-        check.raise_refusal(name, "a dict", f"a {type(masks).__name__}")
+        check.refuse(name, "a dict", f"a {type(masks).__name__}")
     for robot, mask in masks.items():
-        check.check_int(name, robot, 0, len(turns) - 1)
-        check.check_array(name, mask, check.BOOL, (max(turns[robot][COUNT], 0),))
+        check.integer(name, robot, 0, len(turns) - 1)
+        check.array(name, mask, check.BOOL, (max(turns[robot][COUNT], 0),))
         if np.count_nonzero(mask) != turns[robot][END] - turns[robot][BEGIN]:
-            check.raise_refusal(name, "as many as are used", int(np.count_nonzero(mask)))
+            check.refuse(name, "as many as are used", int(np.count_nonzero(mask)))

@@ -158,7 +158,7 @@ def map_of(slam: FastSlam, particle: int) -> FloatArray:
 
 
 def load_landmarks(maps: ParticleMaps, values: FloatArray, *names: Any) -> None:
-    """Replace all landmarks by these: `values` (n, 9, M) as `dense` gives them, the rest as `load_metadata` takes it."""
+    """Replace all landmarks by these: `values` (n, 9, M) as of `dense`, the rest as of `load_metadata`."""
     maps.load_metadata(*names)
     padded = np.zeros((len(values), 9, maps.padded))
     padded[:, :, : maps.num_particles] = values

@@ -482,7 +482,8 @@ PAINTED: dict[str, list[Callable[[SeenGrid], Any]]] = {
     ],
     "ranges: expected an array of shape (n,)": [lambda grid: grid.update_from_scan(POSE, RANGES[:5], ANGLES)],
     "ranges: expected distances >= 0": [
-        lambda grid: grid.update_from_scan(POSE, -RANGES, ANGLES), lambda grid: grid.update_from_scan(POSE, RANGES * NAN, ANGLES),
+        lambda grid: grid.update_from_scan(POSE, -RANGES, ANGLES),
+        lambda grid: grid.update_from_scan(POSE, RANGES * NAN, ANGLES),
     ],
     "angles: expected ascending": [
         lambda grid: grid.update_from_scan(POSE, RANGES, ANGLES[::-1]),

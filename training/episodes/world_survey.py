@@ -45,7 +45,8 @@ def survey(world: str, world_seed: int, robots: int = 3) -> WorldFigures:
     gaps = np.linalg.norm(starts[:, None] - starts, axis=2)[~np.eye(robots, dtype=bool)]
     squares = FreeSpace(setting.world, config.robot_radius).free_area_cells
     return WorldFigures(
-        name=setting.world.name, walls=len(setting.world.walls), landmarks=int(np.count_nonzero(setting.observable_landmarks)),
+        name=setting.world.name, walls=len(setting.world.walls),
+        landmarks=int(np.count_nonzero(setting.observable_landmarks)),
         floor_m2=0.04 * len(squares), width_m=x_max - x_min, height_m=y_max - y_min,
         start_gap_m=float(gaps.min(initial=np.inf)),
     )  # fmt: skip

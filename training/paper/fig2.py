@@ -105,7 +105,10 @@ def refusals(rows: Iterable[Mapping[str, Any]]) -> dict[str, int]:
     false = [
         stage for row in rows for stage in row["stages"]
         if stage[OURS] is not None
-        and (stage[OURS]["translation_m"] > DISTINCT_TRANSLATION or stage[OURS]["rotation_deg"] > np.rad2deg(DISTINCT_ROTATION))
+        and (
+            stage[OURS]["translation_m"] > DISTINCT_TRANSLATION
+            or stage[OURS]["rotation_deg"] > np.rad2deg(DISTINCT_ROTATION)
+        )
     ]  # fmt: skip
     return {"share_too_little": len(poor), "false": len(false)}
 

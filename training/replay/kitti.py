@@ -62,7 +62,8 @@ def replay(log: KittiLog, config: KittiConfig, on_step: Callable[[float], None] 
     readings = to_filter_steps(log, camera)
     options = FilterOptions(
         num_particles=config.particles, camera=camera, motion=motion_noise(log), proposal=config.estimator,
-        rejuvenate_every=config.rejuvenate_every or None, position_gate=PLANAR_GATE, new_landmark_gate=NEW_LANDMARK_GATE,
+        rejuvenate_every=config.rejuvenate_every or None, position_gate=PLANAR_GATE,
+        new_landmark_gate=NEW_LANDMARK_GATE,
         recovery_position=RECOVERY_POSITION, descriptor_gate=OWN_TRACK,
     )  # fmt: skip
     slam = FastSlam.from_options(1, options, config.seed)

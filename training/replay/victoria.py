@@ -48,7 +48,8 @@ def replay(log: VictoriaLog, config: VictoriaConfig, on_step: Callable[[float], 
     options = FilterOptions(
         num_particles=config.particles, camera=StereoCamera(mount=SENSOR), motion=config.motion,
         proposal=config.estimator, rejuvenate_every=config.rejuvenate_every or None, position_gate=PLANAR_GATE,
-        new_landmark_gate=NEW_LANDMARK_GATE, new_landmark_radius=NEW_LANDMARK_RADIUS, new_landmark_density=NEW_LANDMARK_DENSITY,
+        new_landmark_gate=NEW_LANDMARK_GATE, new_landmark_radius=NEW_LANDMARK_RADIUS,
+        new_landmark_density=NEW_LANDMARK_DENSITY,
         recovery_position=RECOVERY_POSITION, descriptor_gate=SEARCH_RADIUS, descriptor_sigma=NO_WEIGHT,
     )  # fmt: skip
     slam = FastSlam.from_options(1, options, config.seed)

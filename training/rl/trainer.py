@@ -11,7 +11,7 @@ from sb3_contrib import MaskablePPO
 from stable_baselines3.common.logger import configure
 
 from agents.trained import MODEL_FILE, save_model
-from slam_backend.core.state_checks import check_generator as check_generator
+from slam_backend.core.state_checks import generator as check_generator
 from slam_backend.core.validation import argument_error
 from training.experiments.run_folder import installed_versions
 from training.rl.callbacks import Row, TrainingWatch

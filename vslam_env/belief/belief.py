@@ -42,7 +42,8 @@ class BeliefConfig:
     """What the robots assume about their sensors, and how they align their maps.
 
     Attributes:
-        filter: Of each robot's FastSLAM; its camera and motion hold the assumed noise, by default `default_filter_options`.
+        filter: Options of each robot's FastSLAM, whose camera and motion hold the assumed noise; by default those of
+            `default_filter_options`.
         alignment: When two maps are believed to fit together.
         attempts: When a pair of groups tries.
         merging: How their filters are merged, and when a merge is undone. By default robots merge on trial where they

@@ -42,7 +42,7 @@ class TeamGrids:
         max_range: float,
         radius: float,
     ) -> None:
-        """Paint what robots read in a tick: what `update_from_scan`, `clear_disc` and, after a bump, `bump` paint in turn.
+        """Paint what robots read in a tick: by `update_from_scan`, `clear_disc` and, after a bump, `bump`.
 
         Args:
             shared: (K, K) int64. 1 where what robot j reads is painted into i's grid; of the robots in ascending order.

@@ -328,7 +328,8 @@ def associate_final(
     work: FloatArray, records: FloatArray, match: FloatArray, mask: FloatArray, values: FloatArray, counts: Int32Array,
     row_of: IntArray, block: int, points: FloatArray, noises: FloatArray, given: bool, camera: FloatArray,
     starts: IntArray, slots: IntArray, looks: FloatArray, owners: IntArray, same: IntArray, named: bool,
-    position_gate: float, new_landmark_gate: float, new_landmark_radius: float, ambiguity: float, log_p0: float, one_to_one: bool,
+    position_gate: float, new_landmark_gate: float, new_landmark_radius: float, ambiguity: float, log_p0: float,
+    one_to_one: bool,
 ) -> None:  # fmt: skip
     """Pass B for one block: decide on all measurements, and sum what they say of the pose and of its likelihood."""
     padded, first = counts.shape[1], block * LANES

@@ -57,8 +57,8 @@ ASSOCIATED, CREATED = range(2)  # what becomes of measurements, (2, n)
 # What a filter assumes: the first of six numbers, seven and three, and then one each.
 NOISE, CAMERA, RECOVERY = 0, 6, 13
 (
-    DESCRIPTOR_GATE, DESCRIPTOR_VARIANCE, POSITION_GATE, NEW_LANDMARK_GATE, NEW_LANDMARK_RADIUS, AMBIGUITY_MARGIN, LOG_P0, WALK,
-    IS_ONE_TO_ONE, LONG, RESAMPLE_THRESHOLD,
+    DESCRIPTOR_GATE, DESCRIPTOR_VARIANCE, POSITION_GATE, NEW_LANDMARK_GATE, NEW_LANDMARK_RADIUS, AMBIGUITY_MARGIN,
+    LOG_P0, WALK, IS_ONE_TO_ONE, LONG, RESAMPLE_THRESHOLD,
 ) = range(16, 27)  # fmt: skip
 
 TILE = 9 * LANES  # particle m is lane m % LANES of block m // LANES

@@ -186,8 +186,8 @@ def step_robots(
                 own_poses, own_means, own_covariances, was_blind, move, sigmas, normals[drawn],
                 values, counts, odds, row_of, map_of, maps, users, free_rows, free_slots, tops, ids, identities, stored,
                 heads, points[a:b], noises[a:b], given, camera, descriptors[a:b], names[a:b], named,
-                assumed[DESCRIPTOR_GATE], assumed[DESCRIPTOR_VARIANCE], assumed[POSITION_GATE], assumed[NEW_LANDMARK_GATE],
-                assumed[NEW_LANDMARK_RADIUS], assumed[AMBIGUITY_MARGIN], lost, assumed[LOG_P0],
+                assumed[DESCRIPTOR_GATE], assumed[DESCRIPTOR_VARIANCE], assumed[POSITION_GATE],
+                assumed[NEW_LANDMARK_GATE], assumed[NEW_LANDMARK_RADIUS], assumed[AMBIGUITY_MARGIN], lost, assumed[LOG_P0],
                 assumed[WALK], is_one_to_one,
                 work, found[a:b], distances[a:b], new_slots[a:b], log_likelihood,
             )  # fmt: skip

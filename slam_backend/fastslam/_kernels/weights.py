@@ -206,7 +206,7 @@ def finish_step(
     mean: FloatArray, covariance: FloatArray, rows: IntArray, turns: IntArray, found: Int32Array, distances: FloatArray,
     told: IntArray, ids: IntArray, last_seen: IntArray, now: int, long: float, threshold: float,
 ) -> tuple[int, int, int, int, int, int, float, float, bool]:  # fmt: skip
-    """Do what `weigh`, `mixture` and `add_gauge_covariance` for each of K robots and, for their measurements, `summarise` do.
+    """Weigh the particles, estimate the poses of K robots, and summarise their measurements.
 
     Args:
         weights: (4, P) log-weights, those along paths, weights, and a step's log-likelihood; the first three change.

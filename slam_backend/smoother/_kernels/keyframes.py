@@ -84,7 +84,8 @@ def place(
 @device
 @jit
 def start_keyframe(
-    condensed_landmarks: IntArray, counts: IntArray, point_landmarks: IntArray, new_landmarks: IntArray, names: IntArray,
+    condensed_landmarks: IntArray, counts: IntArray, point_landmarks: IntArray, new_landmarks: IntArray,
+    names: IntArray,
     held: IntArray, means: FloatArray, landmarks: FloatArray,
 ) -> None:  # fmt: skip
     """Put those landmarks where a filter holds them to be that have more new measurements than old ones.

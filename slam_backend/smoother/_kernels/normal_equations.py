@@ -40,7 +40,8 @@ def gather(
     """Write the sightings of a graph by landmark and key, frozen ones before the others of a pair.
 
     Args:
-        condensed_keys, condensed_landmarks, frozen_centres, frozen_infos, frozen_slopes, frozen_counts: Of f frozen ones.
+        condensed_keys, condensed_landmarks, frozen_centres, frozen_infos, frozen_slopes, frozen_counts: The f
+            condensed factors.
         point_frames, point_landmarks: (n,) of the raw measurements.
         frame_keys: (F,) key of each frame.
         num_keys: k.

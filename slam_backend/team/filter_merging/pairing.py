@@ -70,7 +70,7 @@ def pair_particles(
 
 
 def _between_map_variance(extra: FloatArray, shared: IntArray) -> float:
-    """Return tau^2 [m^2], the median over pairs of particles (c,): at most `MAX_BETWEEN_MAP_VARIANCE`, 0 where maps agree."""
+    """Return tau^2 [m^2], the median over pairs of particles (c,), at most `MAX_BETWEEN_MAP_VARIANCE`."""
     enough = shared >= MIN_PAIRS
     return min(float(np.median(extra[enough])), MAX_BETWEEN_MAP_VARIANCE) if enough.any() else 0.0
 

@@ -22,7 +22,7 @@ from slam_backend.team.team import TeamSlam
 
 SIZE = 3  # of descriptors
 Reading = tuple[Any, Any, Any, Any]  # odometry, frame, names, pose
-NO_READING: Reading = (None, None, None, None)
+NOTHING: Reading = (None, None, None, None)
 
 
 def reading(seed: int) -> Reading:
@@ -91,7 +91,7 @@ def test_each_robot_finds_what_it_read(seeds: list[int]) -> None:
 
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda inputs: pickle.loads(pickle.dumps(inputs))])
-@pytest.mark.parametrize("readings", [[NO_READING], [reading(0), reading(3), NO_READING, reading(8)]])
+@pytest.mark.parametrize("readings", [[NOTHING], [reading(0), reading(3), NOTHING, reading(8)]])
 def test_copies_are_as_kernels_take_them(readings: list[Reading], copied: Callable[[StepInput], StepInput]) -> None:
     """A copy holds the same, and all can be written to, as in the original: kernels are compiled for such arrays."""
     inputs = checked(readings)
@@ -129,7 +129,7 @@ def test_robots_beside_change_nothing(proposal: Any) -> None:
     for step in range(25):
         own, others = [reading(10 * step), reading(10 * step + 1)], [reading(10 * step + k) for k in range(2, 5)]
         if any(mine[3] is not None for mine in own):
-            own = [NO_READING, NO_READING]
+            own = [NOTHING, NOTHING]
         table = [others[0], own[0], others[1], own[1], others[2]]
         assert_same(said(stepped(alone, checked(own), 0, 1)), said(stepped(beside, checked(table), 1, 3)))
     assert_same(contents(alone), contents(beside))

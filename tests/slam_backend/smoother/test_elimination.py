@@ -216,9 +216,11 @@ def test_sightings_are_gathered_as_by_sorting():
     frozen = np.sort(rng.choice(keys * landmarks, 8, replace=False))
     graph = SlamGraph(
         robots=np.zeros(keys, dtype=np.int64), poses=np.zeros((keys, 3)), landmarks=np.zeros((landmarks, 3)),
-        landmark_ids=np.arange(landmarks), first_keys=np.zeros(1, dtype=np.int64), last_keys=np.zeros(1, dtype=np.int64),
+        landmark_ids=np.arange(landmarks), first_keys=np.zeros(1, dtype=np.int64),
+        last_keys=np.zeros(1, dtype=np.int64),
         latest=np.zeros(1, dtype=np.int64), condensed_keys=frozen % keys, condensed_landmarks=frozen // keys,
-        linearisation_points=rng.normal(size=(8, 3)), information=rng.normal(size=(8, 6)), gradients=rng.normal(size=(8, 3)),
+        linearisation_points=rng.normal(size=(8, 3)), information=rng.normal(size=(8, 6)),
+        gradients=rng.normal(size=(8, 3)),
         counts=rng.integers(1, 5, 8), frame_keys=rng.integers(0, keys, frames), points=np.zeros((60, 3)),
         point_frames=rng.integers(0, frames, 60), point_landmarks=rng.integers(0, landmarks, 60),
     )  # fmt: skip

@@ -7,7 +7,7 @@ from builders.runs import small_run
 
 from slam_backend.core.validation import FloatArray
 from slam_backend.fastslam._kernels import add_gauge_covariance
-from slam_backend.fastslam.estimates import add_gauge_covariance
+from slam_backend.fastslam.estimates import add_gauge_to_landmarks
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.options import FilterOptions
 from slam_backend.fastslam.rejuvenation import RejuvenationScheduler
@@ -36,7 +36,7 @@ from training.bench.accuracy.runs import RunSpec, simulate_run
     gather_landmarks,
     squared_error,
     landmark_weights,
-    add_gauge_covariance,
+    add_gauge_to_landmarks,
 ) = map(
     python_entry,
     (
@@ -46,7 +46,7 @@ from training.bench.accuracy.runs import RunSpec, simulate_run
         gather_landmarks,
         squared_error,
         landmark_weights,
-        add_gauge_covariance,
+        add_gauge_to_landmarks,
     ),
 )
 
@@ -171,7 +171,7 @@ def test_a_scattered_frame_scatters_poses_and_points():
         point = np.array([*pose[:2], 0.7])
         slopes = np.array([(transform_points(by, point[:2]) - transform_points(-by, point[:2])) / 2e-6 for by in small])
         of_point = np.zeros((3, 3))
-        add_gauge_covariance(SCATTER, point[0], point[1], of_point)
+        add_gauge_to_landmarks(SCATTER, point[0], point[1], of_point)
         np.testing.assert_allclose(of_point[:2, :2], slopes.T @ SCATTER @ slopes, atol=1e-8)
         assert not of_point[2].any()
 

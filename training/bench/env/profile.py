@@ -40,7 +40,10 @@ PHASES = (
     Phase("errors", ((Episode, "standing"),)),
     Phase("observations", ((observation, "observe_team"),)),
     Phase("candidates", ((TeamSlots, "update"),)),
-    Phase("beliefs, dictionaries", ((TeamBelief, "step"), (environment, "build_observations"), (environment, "build_infos"))),
+    Phase(
+        "beliefs, dictionaries",
+        ((TeamBelief, "step"), (environment, "build_observations"), (environment, "build_infos")),
+    ),
 )  # fmt: skip
 
 
