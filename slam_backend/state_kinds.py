@@ -26,7 +26,8 @@ CONFIGURATIONS = (
 )  # fmt: skip
 RECORDS = (
     Alignment, AttemptRecord, LogArrays, Measurements, RejectedMeasurements, ReplayedStep, PreMergeSnapshot, StepInput,
-    PendingAttempt,     TeamMeasurements, MergeMonitor, reports.Associations, reports.LandmarksCreated, reports.MapForked, reports.MapReleased,
+    PendingAttempt, TeamMeasurements, MergeMonitor, reports.Associations, reports.LandmarksCreated, reports.MapForked,
+    reports.MapReleased,
     reports.MergeEvent, reports.MergeUndone, reports.PoseEstimates, reports.RejuvenationReport, reports.LandmarkIdMap,
     reports.StepReport,
 )  # fmt: skip

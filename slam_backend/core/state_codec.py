@@ -1,7 +1,8 @@
 """State trees as bytes and back, by a format that holds data alone: to read it runs no code of the file's.
 
 A tree is made of None, bools, ints, floats, texts, bytes, dicts, lists, tuples, sets, arrays of plain numbers, numpy
-scalars, and objects of the classes that the caller lists (`Kinds`). What stands in several places stands in one place
+scalars, and objects of the classes that the caller lists (`StateTypes`). What stands in several places stands in one
+place
 afterwards, too. Floats keep every bit, arrays their layout and whether they can be written to.
 
 The bytes are the length of a table, the table as JSON, and the arrays' own bytes one after the other. Rows of the table

@@ -177,7 +177,8 @@ class FastSlam:
             inputs: What these robots, and perhaps others, read; it is not written to.
             seats: Rows of these robots there.
             findings: Of `inputs`.
-            told: Their buffer, see `Findings.allocate`; what becomes of these robots' measurements is written there.
+            told: Their buffer, see `Associations.allocate`; what becomes of these robots' measurements is written
+                there.
             step: Number of the step in the logs; None: the next one.
         """
         state = self.state

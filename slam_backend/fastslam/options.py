@@ -50,8 +50,8 @@ class FilterOptions:
         recovery_heading: Likewise its heading [rad].
         descriptor_sigma: L2 distance between descriptors that costs a match as much as one sigma of position
             (`fastslam2`) [-].
-        ambiguity: A runner-up whose cost (squared Mahalanobis + log-determinant + descriptor) is nearer than this
-            makes a measurement ambiguous, and it is held back (`fastslam2`) [-].
+        ambiguity_margin: A runner-up whose cost (squared Mahalanobis + log-determinant + descriptor) is nearer than
+            this makes a measurement ambiguous, and it is held back (`fastslam2`) [-].
         new_landmark_density: p0, density of measurements that match nothing [1/m^3].
         one_to_one: Match a landmark at most once in a frame; False: measurements choose independently, as in the paper.
         landmark_noise: Standard deviation q [m] along each axis by which a landmark may move between two sightings: a

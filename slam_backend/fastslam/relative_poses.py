@@ -1,4 +1,4 @@
-"""`Standpoints`: where the robots of a team believe themselves and each other to be, each in its own start frame."""
+"""`TeamPoses`: where the robots of a team believe themselves and each other to be, each in its own start frame."""
 
 from functools import lru_cache
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from slam_backend.core.validation import FloatArray, IntArray
 
-# Columns of `Standpoints.beliefs`: the first of three, three, one, nine, and of one for each robot of the team.
+# Columns of `TeamPoses.beliefs`: the first of three, three, one, nine, and of one for each robot of the team.
 OWN, START, ESS, COVARIANCE, SIGMAS = 0, 3, 6, 7, 16
 
 

@@ -17,9 +17,9 @@ class Associations(NamedTuple):
     """What became of N robots' measurements in one step; read-only.
 
     Attributes:
-        told: (2, n) int64. Of all measurements used, one robot's after the other's: the landmark that each was taken
+        ids: (2, n) int64. Of all measurements used, one robot's after the other's: the landmark that each was taken
             for, and that which it created, as in `StepReport`.
-        turns: Of each robot, as in `StepInput`.
+        inputs: Of each robot, as in `StepInput`.
         masks: By robot which of its measurements were used, as there.
     """
 
@@ -130,7 +130,7 @@ class StepReport(NamedTuple):
     """What one step of `FastSlam` did.
 
     Attributes:
-        findings: What became of the measurements; `associations` and `created` are cut out of it.
+        all_associations: What became of the measurements; `associations` and `created` are cut out of it.
         rows: Of each robot there, -1: none.
         num_created: Measurements that created a landmark in at least one particle.
         num_new: Landmarks created by the most probable particle.
@@ -198,10 +198,10 @@ class MergeEvent:
         robots_a: The group whose map frame stays.
         robots_b: The other group.
         alignment: `map` of group a from `map` of group b, as found; refused attempts carry the reason.
-        bent: Of an attempt: the alignment of the maps as the filters had bent them, where these were straightened then
-            and `alignment` is that of the straight ones; else None.
-        doubt: For an attempt whose maps align, the uncertainty of the motion between them over the particles of the
-            merge, relative to what a merge has to be sure of; beyond 1 it may wait. NaN if that was not asked.
+        unsmoothed_alignment: Of an attempt: the alignment of the maps as the filters had bent them, where these were
+            straightened then and `alignment` is that of the straight ones; else None.
+        uncertainty: For an attempt whose maps align, the uncertainty of the motion between them over the particles of
+            the merge, relative to what a merge has to be sure of; beyond 1 it may wait. NaN if that was not asked.
     """
 
     step: int
@@ -274,7 +274,7 @@ class MergeUndone:
     """A merge was taken back: two maps are taken up again as they were before it, and the joint one ends.
 
     Attributes:
-        maps: Numbers of a's map, of b's and of the joint one, as in its `Renaming`.
+        maps: Numbers of a's map, of b's and of the joint one, as in its `LandmarkIdMap`.
     """
 
     maps: tuple[int, int, int]
@@ -288,13 +288,13 @@ class TeamReport(NamedTuple):
 
     Attributes:
         step: Number of this step (the first is 0).
-        findings: What became of the measurements; `associations` and `created` are cut out of it.
+        all_associations: What became of the measurements; `associations` and `created` are cut out of it.
         groups: The groups after this step.
         events: This step's attempts, merges and undos, in order.
-        renamings: One for each merge of this step, in order; apply them after `created`.
+        id_maps: One for each merge of this step, in order; apply them after `created`.
         maps: Per robot the number of the map that it goes by after this step. Before the first step they are 0, 1, ...
-        entries: All that happened to maps in this step, in order, replays and `created` included: whoever keeps books
-            on landmarks goes by these.
+        map_changes: All that happened to maps in this step, in order, replays and `created` included: whoever keeps
+            books on landmarks goes by these.
         oldest_step: Steps from this one on may still be taken in again; 1 + `step` if none.
         rejuvenations: For each filter of which something is to be told the robots that go by it, and what came of
             drawing its particles anew in this step, or what its smoother could not make sense of.

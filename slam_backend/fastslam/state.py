@@ -267,7 +267,7 @@ class FilterState:
         Args:
             inputs: What these robots, and perhaps others, read.
             seats: Rows of these robots there.
-            told: (2, n) int64, written: what becomes of their measurements, see `Findings`.
+            told: (2, n) int64, written: what becomes of their measurements, see `Associations`.
         """
         maps, pending = self.maps, self._pending
         active = used = 0

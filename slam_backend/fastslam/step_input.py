@@ -29,18 +29,18 @@ class StepInput(NamedTuple):
     Kernels are compiled for arrays that can be written; those that are kept are read-only.
 
     Attributes:
-        turns: Of each robot.
-        table: (N, 6) int64. The same.
+        inputs: Of each robot.
+        inputs_table: (N, 6) int64. The same.
         moves: (N, 3) [m, m, rad] odometry of those that moved, poses in their own start frames of those that were told
             theirs.
         masks: By robot which of its measurements are used (n_i,) bool; only of robots that the caller gave some named
             -1, which are not.
-        sightings: (n, 9) [m, m^2] all robots' measurements, one robot's after the other's, in robot axes: points (3)
+        measurements: (n, 9) [m, m^2] all robots' measurements, one robot's after the other's, in robot axes: points (3)
             relative to the camera centre, and their covariances (6), upper triangles by rows, where they have any.
         descriptors: (n, d).
         names: (n,) the caller's names, or (0,) where no robot has any.
-        silent: Robots of which there is nothing to take in. An empty frame is something: it says that nothing was there
-            to see.
+        inactive: Robots of which there is nothing to take in. An empty frame is something: it says that nothing was
+            there to see.
     """
 
     inputs: Sequence[RobotInput]
@@ -68,7 +68,7 @@ class RobotRows(NamedTuple):
 
     Attributes:
         rows: Of each robot there; -1: it is not heard, and stands still, unseeing.
-        heard: Of each that is: which of the K robots it is, and its row.
+        active: Of each that is: which of the K robots it is, and its row.
         array: (K,) int64. `rows`, as kernels take them; not written to.
     """
 

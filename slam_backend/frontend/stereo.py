@@ -104,7 +104,7 @@ class StereoMatches(NamedTuple):
         corner_disparity: (n,) float64 [px]. Difference of the columns of both corners.
         disparity: (n,) float64 [px]. By patches; meaningless where the guard "patch" failed.
         descriptors: (n, d) float32. Of the left corners, at the scale by which they were matched.
-        passed: (5, n) bool. Whether a match passed the guard, for each of `GUARDS` and whatever the others said.
+        passed: (5, n) bool. Whether a match passed the guard, for each of `MATCH_CHECKS` and whatever the others said.
     """
 
     corners: FloatArray

@@ -65,7 +65,7 @@ class AlignmentOptions:
             all look the same; two maps then have at most 10,000 such pairs.
         descriptor_gate: Largest L2 distance between matched descriptors [-].
         descriptor_ratio: A match stands out if it is closer than this times the best landmark of another place [-].
-        look_alikes: Landmarks that have up to so many look-alikes within the gate in the other map may be any of them;
+        max_similar: Landmarks that have up to so many look-alikes within the gate in the other map may be any of them;
             with more they must stand out. 0: all must.
         same_place: Landmarks of one map within this distance may be duplicates, and do not compete [m].
         position_gate: Largest squared Mahalanobis residual of an inlier [-]; 11.34 is 99 % of 3 degrees of freedom.

@@ -40,8 +40,8 @@ class MapSummaryRows(NamedTuple):
     """Outlines of one map or several, one after the other, in as few arrays as can be: kernels pay for each.
 
     Attributes:
-        places: (N, 4) float64 [m, m, m, m^2]. `means` and `variances`.
-        names: (N, 2) int64. `counts` and `ids`.
+        positions: (N, 4) float64 [m, m, m, m^2]. `means` and `variances`.
+        counts_and_ids: (N, 2) int64. `counts` and `ids`.
     """
 
     positions: FloatArray

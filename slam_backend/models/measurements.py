@@ -76,7 +76,7 @@ class TeamMeasurements(NamedTuple):
     Attributes:
         points: (n, 3) float64 [m]. Each in the frame of its camera, robot by robot.
         descriptors: (n, d) float32. Likewise.
-        ends: (K,) int64. Per robot where its points end; they begin where those before it end.
+        offsets: (K,) int64. Per robot where its points end; they begin where those before it end.
     """
 
     points: FloatArray

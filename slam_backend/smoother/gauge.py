@@ -97,12 +97,12 @@ def compute_gauge_fix(
     tiles: FloatArray, seen: IntArray, landmarks: FloatArray, poses: FloatArray, means: FloatArray, lever: float,
     weights: FloatArray, moved: FloatArray, motions: FloatArray, scatter: FloatArray,
 ) -> bool:  # fmt: skip
-    """Write what `Held` holds, `scatter` from zeros on; return whether that helps.
+    """Write what `GaugeFix` holds, `scatter` from zeros on; return whether that helps.
 
     Args:
-        tiles, seen, landmarks, poses, means, weights: As of `holding`.
+        tiles, seen, landmarks, poses, means, weights: As of `fix_gauge`.
         lever: [m] At which headings are felt.
-        moved, motions, scatter: As of `Held`, results.
+        moved, motions, scatter: As of `GaugeFix`, results.
     """
     n, m = len(seen), len(weights)
     targets, points, squares = landmarks[seen], np.empty((n, 2, m)), np.empty((n, m))
@@ -178,7 +178,7 @@ def gather_landmarks(
     """Write where particles hold some landmarks to be in the plane, and how far off that may be.
 
     Args:
-        tiles, seen: As of `holding`.
+        tiles, seen: As of `fix_gauge`.
         targets: (n, 2 or 3) [m] where they are in the most probable path.
         points: (n, 2, M) [m], result.
         squares: (n, M) [m^2], result: squared distances from there, and the variances of the landmarks.

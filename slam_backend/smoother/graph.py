@@ -46,25 +46,27 @@ class SlamGraph:
     Attributes:
         robots: (k,) int64. Whose pose each key is, `NONE` for the origin; keys of a robot are in the order of time.
         poses: (k, 3) float64 [m, m, rad], map frame. The last mode.
-        previous: (k,) int64. The key before, `NONE` where the pose is given: the origin, or a robot's start. A start
+        parents: (k,) int64. The key before, `NONE` where the pose is given: the origin, or a robot's start. A start
             that is not known hangs on the origin, or on another robot's start.
-        motions: (k, 3) float64 [m, m, rad]. Odometry from the previous key, in its frame.
-        noises: (k, 3, 3) float64. Its covariance, likewise.
-        spreads: (k,) float64 [m^2]. How far the motion from the previous key scattered when that was last asked, or
-            as far as odometry says before that; see `LEVER`.
-        slack: (k,) float64 [m^2]. How much those poses may move against each other that stand rigidly to the key.
+        odometry: (k, 3) float64 [m, m, rad]. Odometry from the previous key, in its frame.
+        odometry_covariances: (k, 3, 3) float64. Its covariance, likewise.
+        transition_variances: (k,) float64 [m^2]. How far the motion from the previous key scattered when that was last
+            asked, or as far as odometry says before that; see `LEVER_ARM`.
+        rigid_variances: (k,) float64 [m^2]. How much those poses may move against each other that stand rigidly to the
+            key.
         frame_keys, frame_offsets: (f,) int64, (f, 3) float64. Key of each frame, and the frame's pose seen from it.
-        points, point_noises, given: (n, 3), (n, 6), (n,) raw measurements, robot axes from the camera centre; their
-            covariances where the sensor gave them.
+        points, point_noises, has_covariance: (n, 3), (n, 6), (n,) raw measurements, robot axes from the camera centre;
+            their covariances where the sensor gave them.
         point_frames, point_landmarks: (n,) int64. Frame of each, and its row of `landmark_ids`.
         condensed_keys, condensed_landmarks: (s,) int64. Of the frozen sightings.
-        centres, infos, slopes: (s, 3), (s, 6), (s, 3) float64. Their quadratic forms, see `_kernels`.
+        linearisation_points, information, gradients: (s, 3), (s, 6), (s, 3) float64. Their quadratic forms, see
+            `_kernels`.
         counts: (s,) int64. Measurements in each.
         landmark_ids: (l,) int64. Names of the landmarks.
         landmarks: (l, 3) float64 [m], map frame. The last mode.
-        aliases: (a, 2) int64. Rows (name, name it goes by): landmarks found to be one.
-        heads: (K,) int64. Key at the start of each robot.
-        tips: (K,) int64. Newest key of each robot.
+        merged_ids: (a, 2) int64. Rows (name, name it goes by): landmarks found to be one.
+        first_keys: (K,) int64. Key at the start of each robot.
+        last_keys: (K,) int64. Newest key of each robot.
         latest: (K,) int64. Newest step of each robot's log that is taken in, -1 before the first.
     """
 

@@ -135,7 +135,7 @@ def _add_keyframes(
     """Walk through the robots' new steps: which of them become keys, and what was measured.
 
     Args:
-        graph, logs, motion, guesses, rigid_within: As of `extended`.
+        graph, logs, motion, guesses, rigid_within: As of `extend_graph`.
         columns: Of the graph with room; those of keys, frames and measurements are written, with landmarks' names in
             place of their rows.
 

@@ -77,7 +77,7 @@ def without_unused_frames(graph: SlamGraph) -> SlamGraph:
 
 
 def _without_unused(graph: SlamGraph, changed: dict[str, NDArray[Any]], kept: BoolArray) -> SlamGraph:
-    """Return the graph with some columns in place of its own, but with what anything is left of; see `compacted`.
+    """Return the graph with some columns replaced, without frames and landmarks that have no measurements left.
 
     Args:
         graph: As it was.

@@ -148,7 +148,7 @@ class MapEstimate(NamedTuple):
         return pattern.squares > LONG_COLUMNS * len(pattern.rows)
 
     def spreads(self) -> FloatArray:
-        """Return how far the motions from the keys before scatter (k,) [m^2], headings felt at `LEVER`; if of use."""
+        """Return the variances (k,) [m^2] of the motions from the previous keys, headings at `LEVER_ARM`."""
         assert self.system is not None
         return self.system.spreads(self.poses)
 
@@ -161,7 +161,8 @@ def optimize(
 
     A step that does not lower the cost is tried again with more damping (Levenberg, Marquardt). Where measurements lie
     at the edge of the kernel a descent may creep, each step promising what the one before did. So it ends in the last
-    iteration of the options, too, if it can fall by no more than `CREEP` times the tolerance: by default half of a
+    iteration of the options, too, if it can fall by no more than `SLOW_PROGRESS` times the tolerance: by default half
+    of a
     squared distance of two, in a space of hundreds of dimensions.
 
     Args:
@@ -302,7 +303,7 @@ class NormalEquations:
         )  # fmt: skip
 
     def draw(self, poses: FloatArray, num_paths: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-        """Return paths about poses (k, 3) and their log densities, see `Mode.paths`."""
+        """Return paths about poses (k, 3) and their log densities, see `MapEstimate.paths`."""
         p, seen = self.pattern, self.sightings
         normals = rng.standard_normal((p.drawn, 3, num_paths))
         normals[:, :, 0] = 0.0
@@ -319,7 +320,7 @@ class NormalEquations:
         return _kernels.covariance(self.pivots, self.values, p.ranks, p.tops, p.rows, columns // 3)
 
     def spreads(self, poses: FloatArray) -> FloatArray:
-        """Return how far motions to each pose (k, 3) scatter, see `Mode.spreads`."""
+        """Return how far motions to each pose (k, 3) scatter, see `MapEstimate.spreads`."""
         p = self.pattern
         return _kernels.scatter_of_links(
             poses, self.columns, self.graph.parents, LEVER_ARM, self.pivots, self.values, p.order, p.ranks, p.tops,

@@ -49,7 +49,7 @@ class Particles(NamedTuple):
 
     Attributes:
         poses, starts: (K, 3, M) float64 [m, m, rad], map frame. Newest pose and start of each robot. A start that is
-            given stays where it is; all else is held, see `holding`.
+            given stays where it is; all else is held, see `fix_gauge`.
         log_weights: (M,) float64, normalised.
         log_densities: (M,) float64. Of the newest poses under the Gaussian about the mode, up to a constant: 0 for the
             first particle, whose path is the mode, unless more than M were drawn.
@@ -119,7 +119,7 @@ def rejuvenate(
         options: What decides the rest.
         guesses: Per robot where it may be after some of the new steps.
         looks: For landmarks that turn out to be one. None: all are what they are called.
-        places: Where the filter holds landmarks to be, see `extended`.
+        places: Where the filter holds landmarks to be, see `extend_graph`.
 
     Returns:
         The graph to go on with, and M particles, or why there are none.
@@ -296,10 +296,10 @@ class Smoother(NamedTuple):
             graph: At its mode.
             logs: Per robot, of the steps after `graph.latest`.
             guesses: Per robot where it may be after some of these steps.
-            places: Where the filter holds landmarks to be, see `extended`.
+            places: Where the filter holds landmarks to be, see `extend_graph`.
 
         Returns:
-            As of `descend`.
+            As of `optimise_slice`.
         """
         grown = extend_graph(graph, logs, self.motion, self.camera[4:], guesses, self.options.rigid_within, places)
         return self.optimise_slice(Draft(graph=grown))
@@ -333,7 +333,7 @@ class Smoother(NamedTuple):
             looks: For landmarks that turn out to be one.
 
         Returns:
-            What came of the draws, or else as of `descend`.
+            What came of the draws, or else as of `optimise_slice`.
         """
         grown = extend_graph(graph, logs, self.motion, self.camera[4:], guesses, self.options.rigid_within, places)
         draft = Draft(graph=grown)
@@ -350,7 +350,7 @@ class Smoother(NamedTuple):
         return extend_graph(graph, blind, self.motion, self.camera[4:], rigid_within=self.options.rigid_within)
 
     def _after(self, draft: Draft, mode: MapEstimate) -> SlamGraph | Draft | str:
-        """Return what a step came to, as of `descend`."""
+        """Return what a step came to, as of `optimise_slice`."""
         if not mode.reason:
             return relinearised_and_reduced(draft.graph, mode, self.camera, self.options, self.rng)
         if mode.reason == NO_POSE:

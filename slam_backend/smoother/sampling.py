@@ -77,7 +77,7 @@ class PathSamples(NamedTuple):
         log_weights: (M,) float64. Importance weights, not normalised.
         weights: (M,) float64. The same, summing to 1; NaN where one is not finite.
         sample_size: Effective sample size of the weights, likewise.
-        spreads: (k,) float64 [m^2]. How far the motions from the keys before scatter, headings felt at `LEVER`.
+        spreads: (k,) float64 [m^2]. How far the motions from the keys before scatter, headings felt at `LEVER_ARM`.
     """
 
     poses: FloatArray
@@ -206,7 +206,7 @@ def odometry_log_density(
 
     Returns:
         (M,) log p(path given odometry) up to a constant, and (k,) [m^2] how far the motions from the keys before
-        scatter, headings felt at `LEVER`.
+        scatter, headings felt at `LEVER_ARM`.
     """
     blocks, k = rows.shape[:2]
     log_density, spreads = np.empty(blocks * LANES), np.empty(k)

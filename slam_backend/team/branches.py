@@ -28,14 +28,14 @@ class Branch:
 
     Attributes:
         robots: Of the filter, ascending, in the filter's order.
-        live: Those of them that go by it now, ascending.
+        active_robots: Those of them that go by it now, ascending.
         filter: Of all `robots`.
-        known: Per robot of the filter the last step whose readings it has taken in, -1 = none.
+        last_steps: Per robot of the filter the last step whose readings it has taken in, -1 = none.
         number: Of its map; each filter that ever was has one of its own.
         epoch: How many merges and undos the team had seen when the filter was made: the higher the more it knows.
         report: Of its last step.
         split_from: Number of the map with which it had all in common at the split; None before any.
-        watches: Of its merges that can still be undone, oldest first.
+        monitors: Of its merges that can still be undone, oldest first.
         split_counts: The landmarks of that map whose descriptors its robots know, by id, and how often each had been
             measured when they were last told.
     """
@@ -131,8 +131,8 @@ class StepRouting(NamedTuple):
 
     Attributes:
         robots: Whose readings it takes in.
-        seats: Of its robots; the others stand still, unseeing.
-        turns: In which of `TURNS` steps it smooths.
+        rows: Of its robots; the others stand still, unseeing.
+        batches: In which of `TURNS` steps it smooths.
     """
 
     robots: tuple[int, ...]
@@ -160,7 +160,7 @@ def process_step(
         intake: Of the branch and these robots.
         inputs: Of all robots of the team, checked by `validate_step`.
         findings: Of `inputs`.
-        told: Their buffer, see `Findings.allocate`; what becomes of these robots' measurements is written there.
+        told: Their buffer, see `Associations.allocate`; what becomes of these robots' measurements is written there.
     """
     robots, seats, turns = intake
     for robot in robots:

@@ -147,10 +147,10 @@ class TeamTopology(NamedTuple):
     Attributes:
         groups: The robots of each group, by ascending first robot.
         branches: Of all groups.
-        intakes: Of each, how it takes in a step.
+        routings: Of each, how it takes in a step.
         places: Per robot its group, the branch that it goes by, and its place in that.
-        members: Per robot those whose places its filter knows, itself included, ascending.
-        mates: Per robot those that go by the same filter, itself included, ascending.
+        known_robots: Per robot those whose places its filter knows, itself included, ascending.
+        same_filter: Per robot those that go by the same filter, itself included, ascending.
         maps: Per robot the number of the map that it goes by.
         numbers: Of all maps that are in use or may be taken up again.
         oldest: The first step that some filter may have to take in yet; None: there is none.

@@ -1,4 +1,4 @@
-"""`Watch`: after a merge the team gathers evidence of whether it was right, and keeps what it takes to undo it.
+"""`MergeMonitor`: after a merge the team gathers evidence of whether it was right, and keeps what it takes to undo it.
 
 A false merge hardly shows in the innovations of single measurements: descriptors tell landmarks apart, so that a robot
 goes on matching its own, and a filter that has to make two maps agree bends both. So two things are watched.
@@ -78,9 +78,9 @@ class MergeMonitor:
         number: Of the joint map when it was made; it names the merge.
         alignment: By which the sides were merged.
         sides: As they were before.
-        before: Each side's map just before the merge, in its own frame, with mixture covariances.
-        own: Landmarks that each side found for itself, before the merge or since, without those that the merge took
-            for common.
+        pre_merge_maps: Each side's map just before the merge, in its own frame, with mixture covariances.
+        exclusive_landmarks: Landmarks that each side found for itself, before the merge or since, without those that
+            the merge took for common.
         steps: In which robots of both sides were in contact since.
     """
 

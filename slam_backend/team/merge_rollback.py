@@ -1,4 +1,4 @@
-"""`Undoing`: a false merge is taken back over some steps, so that no step has to take in all that was read since.
+"""`MergeRollback`: a false merge is taken back over some steps, so that no step has to take in all that was read since.
 
 The groups that there were are taken up again as they were and catch up, a few steps of readings at a time, while their
 robots still go by the joint filter. When they have caught up they take over, as if the merge had never been.

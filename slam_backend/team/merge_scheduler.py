@@ -68,7 +68,7 @@ class PendingAttempt:
     Attributes:
         pair: That tries.
         numbers: Of both joint filters' maps: with others it does not go on.
-        bent: How the maps fit.
+        alignment: How the maps fit.
         since: Step in which it began.
         ready: Whether both maps are straight; it goes on one step later.
     """

@@ -14,15 +14,15 @@ class MergeOptions:
 
     Attributes:
         merged_particles: Of the joint filter; None: as many as the larger of the two.
-        straighten: Before a merge both sides' particles are drawn anew from the posterior of whole paths
+        smooth_first: Before a merge both sides' particles are drawn anew from the posterior of whole paths
             (`FastSlam.rejuvenate`; over some steps, where smoothers work in slices), and their maps have to align once
             more. False: maps are taken as the filters bent them.
-        sure: An attempt is refused, as long as waiting helps, while so many standard deviations of the motion among the
-            particles that the merge would make reach 0.5 m or 5 degrees; 0: never for that.
+        min_sigmas: An attempt is refused, as long as waiting helps, while so many standard deviations of the motion
+            among the particles that the merge would make reach 0.5 m or 5 degrees; 0: never for that.
         min_sigmas_on_trial: Above 0 a pair that is less than `min_sigmas` merges on trial: the joint filter is
-            smoothed, and kept if the motion that it has passes twice running; where waiting does not help, so many standard deviations of it
-            suffice. 0: there are no trials, and where waiting does not help the pair merges however uncertain it is, as
-            is right where nothing would ever tell more about the robots' starts.
+            smoothed, and kept if the motion that it has passes twice running; where waiting does not help, so many
+            standard deviations of it suffice. 0: there are no trials, and where waiting does not help the pair merges
+            however uncertain it is, as is right where nothing would ever tell more about the robots' starts.
         watch_steps: A merge is watched for so many steps in which robots of both sides are in contact, and can be
             undone so long; then its snapshot is freed. 0: merges are final.
         watch_every: In so many steps the evidence is weighed once.

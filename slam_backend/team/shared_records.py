@@ -1,4 +1,4 @@
-"""`Records`: what the groups of a team write down in common: readings, bytes, and what becomes of their maps."""
+"""`SharedRecords`: what the groups of a team write down in common: readings, bytes, and what becomes of their maps."""
 
 import copy
 from collections.abc import Mapping, Sequence

@@ -25,7 +25,7 @@ def chained(
 
 
 def plainly_coarsened(graph: SlamGraph, camera: FloatArray, options: SmoothingOptions) -> SlamGraph:
-    """Return what `coarsened` does."""
+    """Return what `reduce_keyframes` does."""
     share = max(1, options.recent_keys // len(graph.last_keys))
     fresh = np.zeros(graph.num_keys, dtype=np.bool_)
     for robot in range(len(graph.last_keys)):
@@ -38,7 +38,7 @@ def plainly_coarsened(graph: SlamGraph, camera: FloatArray, options: SmoothingOp
 
 
 def plainly_compacted(graph: SlamGraph) -> SlamGraph:
-    """Return what `compacted` does."""
+    """Return what `without_unused_frames` does."""
     frames, of_frames = _used(len(graph.frame_keys), graph.point_frames)
     landmarks, of_landmarks = _used(len(graph.landmark_ids), graph.point_landmarks, graph.condensed_landmarks)
     return replace(

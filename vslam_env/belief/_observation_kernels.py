@@ -25,7 +25,7 @@ def _clip(value: float, low: float, high: float) -> np.float32:
 @device
 @in_place
 def write_pose(belief: Any, pose: Any, sigmas: Any) -> None:
-    """Write `pose` and `pose_std`, each (3,) float32, of a robot that believes this, see `Standpoints`."""
+    """Write `pose` and `pose_std`, each (3,) float32, of a robot that believes this, see `TeamPoses`."""
     for i in range(3):
         pose[i] = _clip(belief[OWN + i], -POSE_LIMIT[i], POSE_LIMIT[i])
         sigmas[i] = _clip(math.sqrt(belief[COVARIANCE + 4 * i]), 0.0, POSE_LIMIT[i])
@@ -114,7 +114,7 @@ def paint(cells: Any, belief: Any, places: Any, local: Any) -> None:
 
     Args:
         cells: (300, 300) uint8. Of the seen grid.
-        belief: (16 or more,). Of the robot, see `Standpoints`: where it is, and what moves landmarks to its frame.
+        belief: (16 or more,). Of the robot, see `TeamPoses`: where it is, and what moves landmarks to its frame.
         places: (n, 4). Of the landmarks, see `MapSummaryRows`.
         local: (3, 48, 48) uint8. Channels free, occupied, landmarks, of cells of 0.2 m, 0 or 255. Written to.
     """

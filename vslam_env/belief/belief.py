@@ -175,7 +175,7 @@ class BeliefBatch(NamedTuple):
     Attributes:
         robots: (n,) int64. Their indices.
         points: Where they stand: their rows, and columns for all robots of the team up to the last one known.
-        outlines: Of the confirmed landmarks in the map frames.
+        map_summaries: Of the confirmed landmarks in the map frames.
         cells: (n, 300, 300) uint8. Of the seen grids.
         features: (n, 16, 5) float32 [m], robot frames. Of the candidates; the reader's own.
     """

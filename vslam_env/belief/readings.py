@@ -21,7 +21,7 @@ class Readings(NamedTuple):
         pose: (3,) float64 [m, m, rad], own start frame. The true pose if `oracle_pose` is on, else None.
         identities: (n,) int64. The true landmark behind each measurement, -1 for a false point, if
             `oracle_association` is on, else None.
-        heard: (K,) bool. Which robots its radio hears, itself included; None: all, always.
+        contacts: (K,) bool. Which robots its radio hears, itself included; None: all, always.
         image: (H, W) uint8. The left image, if `observe_images` is on, else None.
     """
 
@@ -47,7 +47,7 @@ class TeamReadings(NamedTuple):
         bumps: (K,) bool.
         poses: (K, 3) float64 [m, m, rad], or None.
         identities: Per robot, or None.
-        heard: (K, K) bool, or None.
+        contacts: (K, K) bool, or None.
         images: Per robot, or None.
     """
 

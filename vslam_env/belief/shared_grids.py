@@ -38,7 +38,7 @@ class GridTransfer(NamedTuple):
     """That one robot's grid takes what another's has.
 
     Attributes:
-        giver, taker: These robots.
+        source, target: These robots.
         motion: (3,) [m, m, rad]. The giver's start pose in the taker's start frame.
         since: The taker may miss what was read from this tick on.
         is_whole: Whether the taker absorbs the whole of it, strokes that are forgotten included.
@@ -118,7 +118,7 @@ class GridSnapshot(NamedTuple):
         sides: The robots of either group.
         maps: Numbers of a's map, of b's and of the joint one.
         grids: State of each robot's grid.
-        strokes: What was known then of the ticks before, of which somebody may miss something.
+        updates: What was known then of the ticks before, of which somebody may miss something.
     """
 
     tick: int
@@ -185,7 +185,7 @@ class SharedGrids:
         Args:
             tick: Of the readings.
             report: Of the tick.
-            mates: As `meet` takes them.
+            mates: As `share_on_contact` takes them.
             points: Where the robots stand now.
             scans: (K, R) float64 [m]. Of this tick.
             bumps: (K,) bool. Who bumped into something.

@@ -95,7 +95,7 @@ def score_team(
         book_of: (K,) int64. Which book is that of each robot's map.
         truths: (N', 3) [m], world frame. The landmarks that count, N' >= 1.
         cutoff: c of the map error [m].
-        beliefs: (K, 16 + K). Of `Standpoints`.
+        beliefs: (K, 16 + K). Of `TeamPoses`.
         true_starts, true_poses: (K, 3) [m, m, rad], world frame.
         scores: (8 or more, K) float64. Written to: per robot the map error E of the contract [m]; the RMSE [m] of the
             matched landmarks, the cutoff where nothing is matched; matched landmarks over the true ones, and over
@@ -218,7 +218,7 @@ class GroundTruthAssociation:
             points: Where they believe to be.
             true_starts: (K, 3) [m, m, rad]. The true start poses, in the frame of the true positions.
             true_poses: (K, 3) [m, m, rad]. Likewise.
-            scores: (8 or more, K) float64. Written to: the first figures of `Standing`.
+            scores: (8 or more, K) float64. Written to: the first figures of `TeamMetrics`.
         """
         (places, names), parts = outlines
         score_team(

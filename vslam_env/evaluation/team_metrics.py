@@ -1,4 +1,4 @@
-"""`Standing`: how the team stands at one moment, as the simulator knows it."""
+"""`TeamMetrics`: how the team stands at one moment, as the simulator knows it."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -16,7 +16,7 @@ class TeamMetrics(NamedTuple):
     """How the team stands.
 
     Attributes:
-        figures: (11, K). What the first properties return, row by row in their order; first those of
+        table: (11, K). What the first properties return, row by row in their order; first those of
             `vslam_env.evaluation.map_scores.score_team`.
         counts: (2, K). What `collisions` and `bytes_sent` return.
         coverage: Share of the free floor that the team has seen.

@@ -128,7 +128,7 @@ class Episode:
 
         self.tick = 0
         self._collisions: tuple[int, ...] = (0,) * config.num_robots
-        self._figures = np.zeros((NUM_METRICS, config.num_robots))  # of `Standing`; ways are added up in their row
+        self._figures = np.zeros((NUM_METRICS, config.num_robots))  # of `TeamMetrics`; ways are added up in their row
         self._found, self._distances = self._figures[DISCOVERED], self._figures[DISTANCES]
         self._error_integrals = self._figures[ERROR_INTEGRALS]
         self._integrates = RUNNING_COST in config.reward  # scoring every tick costs time: only where it is asked for

@@ -1,4 +1,4 @@
-"""`Setting`: all of an episode that is drawn at its reset and never changes afterwards."""
+"""`Scenario`: all of an episode that is drawn at its reset and never changes afterwards."""
 
 from dataclasses import dataclass
 from typing import Any, Self
@@ -29,7 +29,7 @@ class Scenario:
         sensor: The cameras.
         scan: The range finders.
         coverage: Where the free floor lies in the robots' grids.
-        countable: (N',) bool. Landmarks that some robot could ever see: only they count.
+        observable_landmarks: (N',) bool. Landmarks that some robot could ever see: only they count.
     """
 
     world: World

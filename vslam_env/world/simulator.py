@@ -27,7 +27,7 @@ def _drive_freely(
     """Write down where robots end after a tick if nothing stops them; tell whether surely nothing can.
 
     A robot goes along the chord of its arc, so that it ends where the arc does. With a command beyond
-    `FASTEST` nothing is clear.
+    `MAX_SPEED` nothing is clear.
 
     Args:
         poses: (K, 3) float64 [m, m, rad], world frame.
@@ -111,7 +111,7 @@ class Simulator:
             Whether some robot was near enough to something that it may have bumped into it.
 
         Raises:
-            ValueError: If the shape is wrong, or a number is not finite or beyond `FASTEST`.
+            ValueError: If the shape is wrong, or a number is not finite or beyond `MAX_SPEED`.
         """
         is_array = type(commands) is np.ndarray and commands.dtype == np.float64 and commands.flags.carray
         if not (is_array and commands.shape == self._shape):

@@ -65,7 +65,7 @@ def log_step(
 
     Args:
         rows, turns, moves, sightings: As of `step_robots`.
-        told: (2, n) what became of the measurements, as in `Findings`.
+        told: (2, n) what became of the measurements, as in `Associations`.
         means: (K, 3) [m, m, rad] where the robots are thought to be now.
         noted: (K, 10) of the step, see `layout`; written.
         measured: (>= first + used, 10): sightings, and the landmarks that they were taken for; written from `first` on.
@@ -121,27 +121,28 @@ def step_robots(
         now: Number of the step, above 0 if anyone asks when landmarks were seen last.
         assumed: (27,) noise of the odometry, camera, and the rest, see `layout`.
         rows: (K,) which of the N robots that `turns` tells of each is; -1: none, it did nothing at all.
-        turns: (N, 6) int64. What each did: `IDLE`, `STOOD`, `MOVED`, or `PLACED`, with the pose already written; where
-            its measurements begin and end among all n; whether these come with covariances, and with names.
+        turns: (N, 6) int64. What each did: `NO_READING`, `STATIONARY`, `MOVED`, or `PLACED`, with the pose already
+            written; where its measurements begin and end among all n; whether these come with covariances, and with
+            names.
         moves: (N, 3) odometry [m, m, rad] of those that moved.
         normals: (k, M, 3) standard normal draws, for the k robots that are not idle.
         robots: (5, K, 3, P) samples, starts, and N(x^, P^) before sampling.
         blind: (K,) 1 where that was propagated since the last sighting, else 0.
         weights: (4, P), read and written up to M.
-        frame: (3, 3) as in `conclude`.
+        frame: (3, 3) as in `finish_step`.
         values, ..., heads: The store, see `ParticleMaps`. n + 1 rows and n slots are free.
         sightings: (n, 9) [m, m^2] points and, of the robots that have them, covariances, as in `to_robot_axes`.
         descriptors: (n, d).
         names: (n,) the caller's names, of the robots that have them; or (0,).
         found, distances: (n, P), written as in `update_fastslam2`.
         told: (2, n), written: the slots of the landmarks that were started, -1 = none; in the end as in `summarise`.
-        mean, covariance: (K, 3), (K, 3, 3), written in the end, as in `conclude`.
+        mean, covariance: (K, 3), (K, 3, 3), written in the end, as in `finish_step`.
         noted, measured, num_measured: Of a journal, likewise, see `log_step`.
         fastslam1: None: the proposal of FastSLAM 2.0; a filter that has it never compiles the other one. Any number:
             that of FastSLAM 1.0.
 
     Returns:
-        What `conclude` returns; zeros before that.
+        What `finish_step` returns; zeros before that.
     """
     num_robots, num_particles = len(rows), normals.shape[1]
     camera, recovery = assumed[CAMERA : CAMERA + 7], assumed[RECOVERY : RECOVERY + 3]
@@ -187,8 +188,8 @@ def step_robots(
                 values, counts, odds, row_of, map_of, maps, users, free_rows, free_slots, tops, ids, identities, stored,
                 heads, points[a:b], noises[a:b], given, camera, descriptors[a:b], names[a:b], named,
                 assumed[DESCRIPTOR_GATE], assumed[DESCRIPTOR_VARIANCE], assumed[POSITION_GATE],
-                assumed[NEW_LANDMARK_GATE], assumed[NEW_LANDMARK_RADIUS], assumed[AMBIGUITY_MARGIN], lost, assumed[LOG_P0],
-                assumed[WALK], is_one_to_one,
+                assumed[NEW_LANDMARK_GATE], assumed[NEW_LANDMARK_RADIUS], assumed[AMBIGUITY_MARGIN], lost,
+                assumed[LOG_P0], assumed[WALK], is_one_to_one,
                 work, found[a:b], distances[a:b], new_slots[a:b], log_likelihood,
             )  # fmt: skip
             was_blind = False

@@ -296,7 +296,7 @@ def _relative_pose_of_self(
     starts: FloatArray, means: FloatArray, covariances: FloatArray, weights: FloatArray, best: int, kind: int,
     pose: FloatArray, spread: FloatArray,
 ) -> None:  # fmt: skip
-    """Move a robot's estimate (3,), (3, 3), in place, from the map frame to its start frame; the rest as in `stand`."""
+    """Move a robot's estimate (3,), (3, 3), in place, from the map frame to its start frame; see `write_team_poses`."""
     if kind == SPREAD:
         padded = starts.shape[1]
         seen, seen_spread = np.zeros((3, padded)), np.zeros((6, padded))
@@ -338,7 +338,7 @@ def write_team_poses(
         members: (2, n) int64. Which robots of the team they are, and which of them go by this filter: only these are
             written of.
         ess: Effective sample size of the filter, as a share of M.
-        poses, beliefs: Of the `Standpoints` of all robots of the team; written.
+        poses, beliefs: Of the `TeamPoses` of all robots of the team; written.
     """
     count = members.shape[1]
     starts, means = robots[STARTS], robots[MEANS]

@@ -96,7 +96,7 @@ def sum_pose_information(
     """Say which poses are sought, and what the odometry that leads to these tells.
 
     Args:
-        previous, columns: As of `seek`.
+        previous, columns: As of `optimise_landmark`.
         noises: (k, 3, 3) of that odometry.
         informations: (k, 3, 3), result: their inverses, zeros where a pose is given.
 

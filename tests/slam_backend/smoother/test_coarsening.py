@@ -232,7 +232,7 @@ def walked(kinds, motions, variances, counts, guesses, start, rigid_within):
 
 
 def scatter(noises):
-    """Return the mean squares (n,) [m^2] by which motions of covariances (n, 3, 3) scatter, headings at `LEVER`."""
+    """Return the mean squares (n,) [m^2] by which motions of covariances (n, 3, 3) scatter, headings at `LEVER_ARM`."""
     return noises[:, 0, 0] + noises[:, 1, 1] + LEVER_ARM**2 * noises[:, 2, 2]
 
 

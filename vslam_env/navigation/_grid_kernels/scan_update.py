@@ -258,7 +258,7 @@ def update_from_geometry(
     Args:
         evidence: (300, 300) int8.
         cells: (300, 300) uint8.
-        changes: See `judge`, also for the bounds.
+        changes: See `set_state`, also for the bounds.
         bounds: (4,) int32.
         x: Where the robot was [m].
         y: Likewise.

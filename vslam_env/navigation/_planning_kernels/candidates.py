@@ -116,7 +116,7 @@ def update_slots(
 
     Returns:
         The frontiers (n, 5); the distances (m, n), of `pair_distances`; and whether the slots are filled: if not, the
-        pairs are to be chosen, and `refill` called.
+        pairs are to be chosen, and `fill_slots` called.
     """
     _visit(rows, poses, robot, visits, given_up)
     found = compute_frontiers(cells, bounds, row, col, reach, escape, given_up)

@@ -43,7 +43,7 @@ def _find_visible(
 
     Args:
         robot: Its row of the poses.
-        poses: As of `see`, as what follows.
+        poses: As of `visible`, as what follows.
         marks: (5, N) float64.
         own_walls: (N,) int64.
         walls: (4, S) float64.
@@ -181,7 +181,7 @@ def detect(
     """Choose among the landmarks that each camera sees and detects.
 
     Args:
-        poses: (K, 3) float64. As of `see`, as what follows.
+        poses: (K, 3) float64. As of `visible`, as what follows.
         marks: (5, N) float64.
         own_walls: (N,) int64.
         walls: (4, S) float64.
@@ -231,7 +231,7 @@ def observable_anywhere(
         reachable: (H, W) bool, row = y upwards. Cells in which a robot can stand.
         origin: (2,) float64 [m], world frame. Lower left corner of cell (0, 0).
         cell: Side of a cell [m].
-        view: As in `see`.
+        view: As in `visible`.
 
     Returns:
         (N,) bool.
