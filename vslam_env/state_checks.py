@@ -339,7 +339,7 @@ def branches_of(team: Mapping[str, Any]) -> Iterable[Mapping[str, Any]]:
         if id(branch) not in done:
             done.add(id(branch))
             yield branch
-            waiting += [side.trunk for watch in branch["watches"] for side in watch.sides]
+            waiting += [side.trunk for watch in branch["monitors"] for side in watch.sides]
 
 
 def check_streams(name: str, streams: Any) -> None:

@@ -112,7 +112,7 @@ class FilterOptions:
         if self.landmark_noise is not None:
             cure = "Use 0 for landmarks that stand still."
             check_float("landmark_noise", self.landmark_noise, cure, at_least=0.0, at_most=LARGEST_SIGMA)
-        check_float("ambiguity", self.ambiguity_margin, "Use 0 to hold nothing back.", at_least=0.0)
+        check_float("ambiguity_margin", self.ambiguity_margin, "Use 0 to hold nothing back.", at_least=0.0)
         existence: object = self.existence
         if not isinstance(existence, ExistenceModel | None):
             cure = "Build one: ExistenceModel()."

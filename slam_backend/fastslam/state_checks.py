@@ -282,31 +282,31 @@ def check_graph(name: str, graph: Any, k: int) -> None:
         return check.indices(where[column], graph[column], (rows,), low, last)
 
     keys, robots = indices("robots", None, k - 1, NONE), graph["robots"]
-    indices("previous", keys, keys - 1, NONE)
-    check.floats(where["noises"], graph["noises"], (keys, 3, 3))
-    for column in ("spreads", "slack"):
+    indices("parents", keys, keys - 1, NONE)
+    check.floats(where["odometry_covariances"], graph["odometry_covariances"], (keys, 3, 3))
+    for column in ("transition_variances", "rigid_variances"):
         check.floats(where[column], graph[column], (keys,), 0.0)
     frames, landmarks = indices("frame_keys", None, keys - 1), indices("landmark_ids", None, check.MAX_LANDMARKS)
     check.unique(where["landmark_ids"], graph["landmark_ids"])
     n = check.positions(where["points"], graph["points"], (None, 3))
-    for column, rows in (("poses", keys), ("motions", keys), ("frame_offsets", frames), ("landmarks", landmarks)):
+    for column, rows in (("poses", keys), ("odometry", keys), ("frame_offsets", frames), ("landmarks", landmarks)):
         check.positions(where[column], graph[column], (rows, 3))
-    check.array(where["given"], graph["given"], check.BOOL, (n,))
+    check.array(where["has_covariance"], graph["has_covariance"], check.BOOL, (n,))
     check.array(where["point_noises"], graph["point_noises"], check.FLOAT64, (n, 6))
-    check.floats(where["point_noises"], graph["point_noises"][graph["given"]], (None, 6))
+    check.floats(where["point_noises"], graph["point_noises"][graph["has_covariance"]], (None, 6))
     indices("point_frames", n, frames - 1), indices("point_landmarks", n, landmarks - 1)
     frozen = indices("condensed_keys", None, keys - 1)
     indices("condensed_landmarks", frozen, landmarks - 1), indices("counts", frozen, check.MAX_LANDMARKS)
-    for column, width in (("centres", 3), ("infos", 6), ("slopes", 3)):
+    for column, width in (("linearisation_points", 3), ("information", 6), ("gradients", 3)):
         check.floats(where[column], graph[column], (frozen, width))
-    check.indices(where["aliases"], graph["aliases"], (None, 2), *check.LANDMARK)
-    for column in ("heads", "tips"):
+    check.indices(where["merged_ids"], graph["merged_ids"], (None, 2), *check.LANDMARK)
+    for column in ("first_keys", "last_keys"):
         indices(column, k, keys - 1)
         if (robots[graph[column]] != np.arange(k)).any():
             check.refuse(where[column], "a key of each robot", "others")
     indices("latest", k, check.MAX_INT, -1)
-    if not are_linked(graph["previous"], robots):
-        check.refuse(where["previous"], "keys that lead back to a start", "others")
+    if not are_linked(graph["parents"], robots):
+        check.refuse(where["parents"], "keys that lead back to a start", "others")
 
 
 def check_rejuvenation(name: str, state: Any, logs: Sequence[Mapping[str, Any]], size: int) -> None:

@@ -19,10 +19,10 @@ RIGID = 1e-4  # [m, rad]; starts that scatter less against each other do not mov
 
 
 # The columns of a graph that go together, row by row.
-OF_KEYS = ("robots", "poses", "previous", "motions", "noises", "spreads", "slack")
+OF_KEYS = ("robots", "poses", "parents", "odometry", "odometry_covariances", "transition_variances", "rigid_variances")
 OF_FRAMES = ("frame_keys", "frame_offsets")
-OF_POINTS = ("points", "point_noises", "given", "point_frames", "point_landmarks")
-OF_FROZEN = ("condensed_keys", "condensed_landmarks", "centres", "infos", "slopes", "counts")
+OF_POINTS = ("points", "point_noises", "has_covariance", "point_frames", "point_landmarks")
+OF_FROZEN = ("condensed_keys", "condensed_landmarks", "linearisation_points", "information", "gradients", "counts")
 OF_LANDMARKS = ("landmark_ids", "landmarks")
 
 

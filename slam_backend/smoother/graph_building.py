@@ -217,14 +217,14 @@ def merge_graphs(
     landmarks[of_b], landmarks[rows[: len(a.landmark_ids)]] = b.landmarks, a.landmarks
     shifted = {
         "robots": b.robots + len(a.last_keys),
-        "previous": previous,
+        "parents": previous,
         "frame_keys": b.frame_keys + keys,
         "point_frames": b.point_frames + frames,
         "point_landmarks": of_b[b.point_landmarks],
         "condensed_keys": b.condensed_keys + keys,
         "condensed_landmarks": of_b[b.condensed_landmarks],
-        "heads": b.first_keys + keys,
-        "tips": b.last_keys + keys,
+        "first_keys": b.first_keys + keys,
+        "last_keys": b.last_keys + keys,
     }
     both = {
         name: np.concatenate([getattr(a, name), shifted.get(name, getattr(b, name))])
@@ -284,11 +284,11 @@ def _unpinned(graph: SlamGraph, prior: FloatArray) -> tuple[IntArray, SlamGraph]
         return free, graph
     kept = graph.robots >= 0
     number = np.cumsum(kept) - 1
-    per_key = ("robots", "poses", "motions", "noises", "spreads", "slack")
+    per_key = ("robots", "poses", "odometry", "odometry_covariances", "transition_variances", "rigid_variances")
     return number[free], graph.with_columns(
         **{name: getattr(graph, name)[kept] for name in per_key},
         parents=np.where(previous >= 0, number[previous], NONE)[kept],
-        **{name: number[getattr(graph, name)] for name in ("frame_keys", "condensed_keys", "heads", "tips")},
+        **{name: number[getattr(graph, name)] for name in ("frame_keys", "condensed_keys", "first_keys", "last_keys")},
     )
 
 

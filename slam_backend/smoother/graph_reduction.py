@@ -55,12 +55,12 @@ def reduce_keyframes(
         "frame_keys": numbers[graph.frame_keys],
         "condensed_keys": condensed_keys[:num],
         "condensed_landmarks": condensed_landmarks[:num],
-        "centres": centres[:num],
-        "infos": infos[:num],
-        "slopes": slopes[:num],
+        "linearisation_points": centres[:num],
+        "information": infos[:num],
+        "gradients": slopes[:num],
         "counts": counts[:num],
-        "heads": numbers[graph.first_keys],
-        "tips": numbers[graph.last_keys],
+        "first_keys": numbers[graph.first_keys],
+        "last_keys": numbers[graph.last_keys],
     }
     return _without_unused(graph, fewer, raw[graph.frame_keys[graph.point_frames]])
 

@@ -71,13 +71,13 @@ class Branch:
         """Return all that decides how the branch goes on."""
         return {
             "robots": self.robots,
-            "live": self.active_robots,
+            "active_robots": self.active_robots,
             "filter": self.filter.get_state(),
-            "known": dict(self.last_steps),
+            "last_steps": dict(self.last_steps),
             "number": self.number,
             "epoch": self.epoch,
             "report": self.report,
-            "watches": tuple(watch.copy() for watch in self.monitors),
+            "monitors": tuple(watch.copy() for watch in self.monitors),
             "split_from": self.split_from,
             "split_counts": dict(self.split_counts),
         }
@@ -86,11 +86,11 @@ class Branch:
     def from_state(cls, state: Mapping[str, Any], at_hand: FastSlam | None = None) -> "Branch":
         """Build a branch from `get_state`; a filter at hand is filled in place of a new one."""
         slam = restored_filter(state["filter"], at_hand)
-        rest = {name: state[name] for name in ("robots", "live", "number", "epoch", "split_from")}
+        rest = {name: state[name] for name in ("robots", "active_robots", "number", "epoch", "split_from")}
         return cls(
             filter=slam,
-            last_steps=dict(state["known"]),
-            monitors=[watch.copy() for watch in state["watches"]],
+            last_steps=dict(state["last_steps"]),
+            monitors=[watch.copy() for watch in state["monitors"]],
             split_counts=dict(state["split_counts"]),
             report=with_constants(state["report"]),
             **rest,

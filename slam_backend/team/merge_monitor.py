@@ -47,8 +47,8 @@ class PreMergeSnapshot:
     @classmethod
     def of(cls, trunk: Mapping[str, Any]) -> "PreMergeSnapshot":
         """Return a side with this trunk, whose arrays nobody is to write to afterwards."""
-        earlier = [side.oldest for watch in trunk["watches"] for side in watch.sides]
-        return cls(with_read_only(trunk), min([1 + min(trunk["known"].values()), *earlier]))
+        earlier = [side.oldest for watch in trunk["monitors"] for side in watch.sides]
+        return cls(with_read_only(trunk), min([1 + min(trunk["last_steps"].values()), *earlier]))
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "trunk", with_constants(self.trunk))
@@ -66,7 +66,7 @@ class PreMergeSnapshot:
     @property
     def watches(self) -> tuple["MergeMonitor", ...]:
         """Of earlier merges in it, as they stood."""
-        watches: tuple[MergeMonitor, ...] = self.trunk["watches"]
+        watches: tuple[MergeMonitor, ...] = self.trunk["monitors"]
         return watches
 
 

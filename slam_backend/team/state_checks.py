@@ -22,7 +22,18 @@ from slam_backend.team.options import MergeOptions
 
 BY_ROBOTS = ("uncertainties", "trials")  # parts of the schedule with an entry for each pair of robots
 KEYS = ("step", "epoch", "rng", "events", "groups", "numbers", "alignment", "merging", "schedule", "records")
-BRANCH = ("robots", "live", "filter", "known", "number", "epoch", "report", "watches", "split_from", "split_counts")
+BRANCH = (
+    "robots",
+    "active_robots",
+    "filter",
+    "last_steps",
+    "number",
+    "epoch",
+    "report",
+    "monitors",
+    "split_from",
+    "split_counts",
+)
 KINDS = ("attempt", "merge", "undo")
 
 
@@ -87,9 +98,9 @@ class TeamCheck:
         live: list[int] = []
         for where, branch in check.named_items(f"{name}['branches']", group["branches"]):
             self._check_branch(where, branch)
-            if not branch["live"]:
-                check.refuse(f"{where}['live']", "some robots", "none")
-            live += branch["live"]
+            if not branch["active_robots"]:
+                check.refuse(f"{where}['active_robots']", "some robots", "none")
+            live += branch["active_robots"]
             self._check_oldest(where, branch)
         trunk = group["branches"][0]
         if sorted(live) != list(trunk["robots"]):
@@ -110,25 +121,25 @@ class TeamCheck:
         for of_side, replayed in check.named_items(f"{name}['replayed']", undoing["replayed"], len(parts)):
             for where, done in check.named_items(of_side, replayed):
                 self._check_replayed(where, done)
-        if all(watch.number != undoing["number"] for watch in trunk["watches"]):
+        if all(watch.number != undoing["number"] for watch in trunk["monitors"]):
             return  # the joint filter is another one now
         for where, side in sides:
-            for robot, last in side["known"].items():
+            for robot, last in side["last_steps"].items():
                 self._need_from(where, last + 1)
-                if last > trunk["known"].get(robot, -1):
+                if last > trunk["last_steps"].get(robot, -1):
                     check.refuse(where, "sides that know no more than the joint filter", last)
 
     def _check_branch(self, name: str, branch: Any) -> None:
         """Refuse what is no branch, whose filter and watches are checked with it."""
         check.keys(name, branch, BRANCH)
-        robots, live, known = branch["robots"], branch["live"], branch["known"]
+        robots, live, known = branch["robots"], branch["active_robots"], branch["last_steps"]
         check.robots(f"{name}['robots']", robots, self._count)
-        check.integers(f"{name}['live']", live, 0, self._count - 1)
+        check.integers(f"{name}['active_robots']", live, 0, self._count - 1)
         if list(live) != sorted(set(live)) or not set(live) <= set(robots):
-            check.refuse(f"{name}['live']", f"some of {robots}, in ascending order", live)
-        check.int_dict(f"{name}['known']", known, (0, self._count), (-1, self._step - 1))
+            check.refuse(f"{name}['active_robots']", f"some of {robots}, in ascending order", live)
+        check.int_dict(f"{name}['last_steps']", known, (0, self._count), (-1, self._step - 1))
         if set(known) != set(robots):
-            check.refuse(f"{name}['known']", f"the last step of each of {robots}", known)
+            check.refuse(f"{name}['last_steps']", f"the last step of each of {robots}", known)
         check.integer(f"{name}['number']", branch["number"], 0, self._next_number - 1)
         check.integer(f"{name}['epoch']", branch["epoch"])
         check_filter(f"{name}['filter']", branch["filter"], self._known)
@@ -136,7 +147,7 @@ class TeamCheck:
             check.refuse(f"{name}['filter']", f"one of {len(robots)} robots", len(branch["filter"]["poses"]))
         for robot, log in zip(robots, branch["filter"]["logs"], strict=True):
             if last_step(log) > known[robot]:
-                check.refuse(f"{name}['known']", f"at least {last_step(log)}, the last step logged", known[robot])
+                check.refuse(f"{name}['last_steps']", f"at least {last_step(log)}, the last step logged", known[robot])
         self.options.append(branch["filter"]["options"])
         looks = branch["filter"]["maps"]["descriptors"]
         if len(looks):
@@ -146,20 +157,20 @@ class TeamCheck:
         if branch["split_from"] is not None:
             check.integer(f"{name}['split_from']", branch["split_from"], 0, self._next_number - 1)
         check.int_dict(f"{name}['split_counts']", branch["split_counts"], check.LANDMARK)
-        for where, watch in check.named_items(f"{name}['watches']", branch["watches"]):
+        for where, watch in check.named_items(f"{name}['monitors']", branch["monitors"]):
             self._check_watch(where, watch, robots)
-        numbers = [watch.number for watch in branch["watches"]]
+        numbers = [watch.number for watch in branch["monitors"]]
         if numbers != sorted(set(numbers)):
-            check.refuse(f"{name}['watches']", "merges from the oldest to the newest", numbers)
+            check.refuse(f"{name}['monitors']", "merges from the oldest to the newest", numbers)
 
     def _check_oldest(self, name: str, branch: Mapping[str, Any]) -> None:
         """Refuse a branch that may have to take in steps that are not kept."""
-        for robot, last in branch["known"].items():
-            if robot not in branch["live"]:
+        for robot, last in branch["last_steps"].items():
+            if robot not in branch["active_robots"]:
                 self._need_from(name, last + 1)
             elif last != self._step - 1 and self._step:
-                check.refuse(f"{name}['known']", f"{self._step - 1} of a robot that goes by it", last)
-        for watch in branch["watches"]:
+                check.refuse(f"{name}['last_steps']", f"{self._step - 1} of a robot that goes by it", last)
+        for watch in branch["monitors"]:
             for side in watch.sides:
                 self._need_from(name, side.oldest)
 
@@ -183,7 +194,7 @@ class TeamCheck:
             if id(side) not in self._done:
                 self._done.add(id(side))
                 self._check_branch(f"{where}.trunk", side.trunk)
-            earliest = [1 + min(side.trunk["known"].values()), *(s.oldest for w in side.monitors for s in w.sides)]
+            earliest = [1 + min(side.trunk["last_steps"].values()), *(s.oldest for w in side.monitors for s in w.sides)]
             check.integer(f"{where}.oldest", side.oldest, 0, min(earliest))
         one, two = (side.robots for side in watch.sides)
         if set(one) & set(two) or not {*one, *two} <= set(robots):

@@ -70,7 +70,8 @@ OPTIONS: dict[type[Any], tuple[str, dict[str, str | list[Any]]]] = {
         "cap": "(0.5, 1)", "margin_px": FROM_ZERO, "range_share": "(0, 1]", "nearest": FROM_ZERO, "frame_limit": COUNT,
     }),
     FilterOptions: ("", {
-        "num_particles": "1..1000000", "resample_threshold": SHARE, "position_gate": POSITIVE, "ambiguity": FROM_ZERO,
+        "num_particles": "1..1000000", "resample_threshold": SHARE, "position_gate": POSITIVE,
+        "ambiguity_margin": FROM_ZERO,
         "descriptor_gate": "[1e-9, 2e6]", "new_landmark_gate": "[11.34, inf)", "new_landmark_radius": FROM_ZERO,
         "recovery_position": SIGMA, "recovery_heading": SIGMA, "descriptor_sigma": "[1e-9, 2e6]",
         "new_landmark_density": POSITIVE, "landmark_noise": SIGMA, "rejuvenate_every": COUNT, "camera": [320.0],

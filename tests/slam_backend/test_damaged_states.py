@@ -129,9 +129,12 @@ def test_damaged_states_are_refused_or_harmless(kind: str, seeds: range) -> None
     [
         (("maps", "map_of"), r"state\['maps'\]\['map_of'\]: expected integers from 0 to \d+, got 'others'"),
         (("maps", "maps"), r"state\['maps'\]\['maps'\]: expected integers from 0 to 59"),
-        (("rejuvenation", "graph", "tips"), r"state\['rejuvenation'\]\['graph'\]\['tips'\]: expected integers from"),
+        (
+            ("rejuvenation", "graph", "last_keys"),
+            r"state\['rejuvenation'\]\['graph'\]\['last_keys'\]: expected integers from",
+        ),
         (("rejuvenation", "graph", "point_frames"), r"\['point_frames'\]: expected integers"),
-        (("rejuvenation", "graph", "previous"), r"\['previous'\]: expected integers|keys that lead back to a start"),
+        (("rejuvenation", "graph", "parents"), r"\['parents'\]: expected integers|keys that lead back to a start"),
     ],
 )
 def test_an_index_out_of_range_is_refused_by_name(way: tuple[str, ...], says: str) -> None:

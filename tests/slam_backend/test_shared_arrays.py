@@ -51,7 +51,7 @@ def test_what_is_written_into_a_state_changes_nothing(name: str) -> None:
 def test_what_is_replaced_in_a_state_from_before_a_merge_is_refused_at_its_undo() -> None:
     """Dicts of a side are shared as well: no kernel goes by what somebody put into them."""
     _, team = merged(merging=MergeOptions(watch_every=10_000))
-    maps = team.get_state()["groups"][0]["branches"][0]["watches"][0].sides[0].trunk["filter"]["maps"]
+    maps = team.get_state()["groups"][0]["branches"][0]["monitors"][0].sides[0].trunk["filter"]["maps"]
     maps["map_of"] = np.full_like(maps["map_of"], 2**31)
     trunk = team._groups[0].trunk
     with pytest.raises(ValueError, match=r"state\['filter'\]\['maps'\]\['map_of'\]: expected integers"):

@@ -418,7 +418,7 @@ def test_an_edit_of_a_kernel_is_noticed_by_kernels_of_its_folder_that_call_it(na
     answers = []
     for number in (1.0, 2.0):
         (folder / "callee.py").write_text(
-            f"from slam_backend.core.jit import inlined\n\n\n@inlined\ndef answer(x):\n    return x + {number}\n"
+            f"from slam_backend.core.jit import inline\n\n\n@inline\ndef answer(x):\n    return x + {number}\n"
         )
         code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); from {name}.caller import ask; print(ask(0.0))"
         answers.append(float(subprocess.run([sys.executable, "-c", code], capture_output=True, check=True).stdout))

@@ -187,7 +187,7 @@ def run_both(seed: int, num_particles: int, most: int, steps: int, proposal: str
         proposal=proposal,
         resampling=str(rng.choice(list(RESAMPLING))),
         resample_threshold=float(rng.choice([0.0, 0.5, 1.0])),
-        ambiguity=float(rng.choice([0.0, 2.0, 6.0])),
+        ambiguity_margin=float(rng.choice([0.0, 2.0, 6.0])),
         new_landmark_gate=float(rng.choice([11.34, 25.0])),
         new_landmark_radius=float(rng.choice([0.0, 0.4, 1.0])),
         recovery_position=float(rng.choice([0.0, 0.5])),

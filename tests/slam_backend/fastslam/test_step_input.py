@@ -98,7 +98,7 @@ def test_copies_are_as_kernels_take_them(readings: list[Reading], copied: Callab
     twin = copied(inputs)
     assert_same(tuple(twin), tuple(inputs))
     for each in (inputs, twin):
-        for name in ("table", "moves", "sightings", "descriptors", "names"):
+        for name in ("inputs_table", "moves", "measurements", "descriptors", "names"):
             assert getattr(each, name).flags.writeable, name
 
 

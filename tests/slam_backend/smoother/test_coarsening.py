@@ -187,7 +187,7 @@ def test_keys_are_joined_as_by_the_plain_program(max_keys, kernel):
     options = SmoothingOptions(max_keys=max_keys, further_keys=0, recent_keys=6, kernel=kernel)
     graph = graph_of(run, skip=(3, 4, 7))
     blind = graph.point_frames == 5  # that a key measured nothing is the exception
-    names = ("points", "point_noises", "given", "point_frames", "point_landmarks")
+    names = ("points", "point_noises", "has_covariance", "point_frames", "point_landmarks")
     graph = replace(graph, **{name: getattr(graph, name)[~blind] for name in names})
     for _ in range(2):
         mode = optimize(graph, camera_of(run), TIGHT)
@@ -380,7 +380,7 @@ def test_steps_in_one_place_share_its_key(rigid_within):
     [log] = logs_of(run)
     still = log.arrays()
     motions = np.where(still.kinds[:, None] == ODOMETRY, [0.0, 0.0, 1e-4], 0.0)
-    still = type(still)(**{name: getattr(still, name) for name in still.__dataclass_fields__} | {"motions": motions})
+    still = type(still)(**{name: getattr(still, name) for name in still.__dataclass_fields__} | {"odometry": motions})
     graph = extend_graph(
         SlamGraph.at_starts(np.zeros((1, 3))), [still], run.spec.noise.motion, np.zeros(3), rigid_within=rigid_within
     )

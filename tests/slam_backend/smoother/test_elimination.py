@@ -235,7 +235,7 @@ def test_sightings_are_gathered_as_by_sorting():
     np.testing.assert_array_equal(seen.counts[seen.frozen], graph.counts)
     np.testing.assert_array_equal(seen.counts[~seen.frozen], counts)
     np.testing.assert_array_equal(seen.starts, np.searchsorted(seen.landmarks, np.arange(landmarks + 1)))
-    for name in ("centres", "infos", "slopes"):
+    for name in ("linearisation_points", "information", "gradients"):
         np.testing.assert_array_equal(getattr(seen, name)[seen.frozen], getattr(graph, name))
         assert not getattr(seen, name)[~seen.frozen].any()
     totals, in_view = np.empty(landmarks + 1, dtype=np.int64), np.empty(landmarks + 1, dtype=np.bool_)

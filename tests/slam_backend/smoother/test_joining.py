@@ -116,7 +116,7 @@ def test_words_for_one_landmark_follow_it():
     run = small_run(2, seed=104)
     (a, _), (b, renamed) = group_graph(run, [0]), group_graph(run, [1], OFFSET)
     old, kept = renamed[0], renamed[1]
-    b = SlamGraph(**b.to_mapping() | {"aliases": np.array([[old[0], kept[0]]])})
+    b = SlamGraph(**b.to_mapping() | {"merged_ids": np.array([[old[0], kept[0]]])})
     both = merge_graphs(a, b, np.zeros(3), renamed)
     assert both.resolve_ids(np.array([old[1], kept[1]])).tolist() == [kept[1], kept[1]]
 
@@ -213,7 +213,7 @@ def test_a_merge_goes_on_from_what_both_groups_have_smoothed():
         known = {group: state["latest"] for group, state in before.items()}
         report = team.step(*simulation.read())
         before = {group.robots: smoother_of(group) for group in team._groups}
-        for renaming in report.renamings:
+        for renaming in report.id_maps:
             robots = renaming.robots_a + renaming.robots_b
             latest = before[tuple(sorted(robots))]["latest"][np.argsort(np.argsort(robots))]
             asked = np.concatenate([known[renaming.robots_a], known[renaming.robots_b]])

@@ -299,7 +299,7 @@ def test_steps_without_measurements_are_eliminated_exactly():
     kept = graph_of(run)
     points = ~np.isin(kept.point_frames, skip)
     seen = np.unique(kept.point_landmarks[points])
-    names = ("points", "point_noises", "given", "point_frames", "point_landmarks")
+    names = ("points", "point_noises", "has_covariance", "point_frames", "point_landmarks")
     fewer = {name: getattr(kept, name)[points] for name in names}
     fewer["point_landmarks"] = np.searchsorted(seen, fewer["point_landmarks"])
     fewer |= {"landmarks": kept.landmarks[seen], "landmark_ids": kept.landmark_ids[seen]}
@@ -394,9 +394,9 @@ def test_a_landmark_whose_sightings_say_nothing_stays_and_keeps_nobody():
     ghost = {
         "condensed_keys": np.array([2, 4]),
         "condensed_landmarks": np.full(2, len(graph.landmarks)),
-        "centres": np.array([[1.0, 0.0, 0.0], [40.0, 0.0, 0.0]]),
-        "infos": 1e-200 * np.array([[1.0, 0.0, 0.0, 1.0, 0.0, 1.0]] * 2),
-        "slopes": np.zeros((2, 3)),
+        "linearisation_points": np.array([[1.0, 0.0, 0.0], [40.0, 0.0, 0.0]]),
+        "information": 1e-200 * np.array([[1.0, 0.0, 0.0, 1.0, 0.0, 1.0]] * 2),
+        "gradients": np.zeros((2, 3)),
         "counts": np.ones(2, dtype=np.int64),
         "landmark_ids": np.append(graph.landmark_ids, 10_000),
         "landmarks": np.concatenate([graph.landmarks, lost[None]]),
