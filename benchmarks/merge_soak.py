@@ -84,7 +84,7 @@ class Setting:
     @property
     def merging(self) -> dict[str, Any]:
         """Options of merges."""
-        told = {"straighten": self.straighten, "sure": self.sure}
+        told = {"smooth_first": self.straighten, "min_sigmas": self.sure}
         return told if self.min_sigmas_on_trial is None else told | {"min_sigmas_on_trial": self.min_sigmas_on_trial}
 
     @property

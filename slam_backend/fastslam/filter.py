@@ -46,7 +46,7 @@ class FastSlam:
         seed: Of the filter's own random stream: an int, a `numpy.random.SeedSequence` or a Generator.
         initial_poses: (K, 3) [m, m, rad], map frame. None: all at the origin.
         num_particles, camera, motion, proposal, resampling, resample_threshold, position_gate, descriptor_gate,
-        new_landmark_gate, new_landmark_radius, recovery_position, recovery_heading, descriptor_sigma, ambiguity,
+        new_landmark_gate, new_landmark_radius, recovery_position, recovery_heading, descriptor_sigma, ambiguity_margin,
         new_landmark_density, one_to_one, landmark_noise, existence, rejuvenate_every, smoothing: See
         `FilterOptions`.
 
@@ -78,7 +78,7 @@ class FastSlam:
         recovery_position: float = 0.5,
         recovery_heading: float = 0.1,
         descriptor_sigma: float = 0.1,
-        ambiguity: float = 6.0,
+        ambiguity_margin: float = 6.0,
         new_landmark_density: float = 0.01,
         one_to_one: bool = True,
         landmark_noise: float | None = None,
@@ -102,7 +102,7 @@ class FastSlam:
             recovery_position=recovery_position,
             recovery_heading=recovery_heading,
             descriptor_sigma=descriptor_sigma,
-            ambiguity_margin=ambiguity,
+            ambiguity_margin=ambiguity_margin,
             new_landmark_density=new_landmark_density,
             one_to_one=one_to_one,
             landmark_noise=landmark_noise,

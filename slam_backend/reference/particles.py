@@ -128,7 +128,7 @@ def keep_survivors_in_place(ancestors: IntArray) -> IntArray:
 
     The surplus copies, by ascending parent, fill the places of those that were not drawn, in ascending order.
 
-    >>> settled(np.array([3, 3, 3, 1])).tolist()
+    >>> keep_survivors_in_place(np.array([3, 3, 3, 1])).tolist()
     [3, 1, 3, 3]
     """
     copies = np.bincount(ancestors, minlength=len(ancestors))

@@ -44,7 +44,7 @@ def contact_components(contacts: BoolArray | None, num_robots: int) -> IntArray:
         (K,) int64. Robots with the same number can exchange data.
 
     >>> chain = np.array([[0, 1, 0, 0], [1, 0, 1, 0], [0, 1, 0, 0], [0, 0, 0, 0]], dtype=bool)
-    >>> reach(chain, 4).tolist()
+    >>> contact_components(chain, 4).tolist()
     [0, 0, 0, 1]
     """
     if contacts is None or contacts.all():

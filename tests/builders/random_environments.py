@@ -105,7 +105,7 @@ def _moved(config: EnvConfig, rng: np.random.Generator) -> Iterator[tuple[tuple[
         yield ("belief", "attempts", "every"), int(rng.integers(1, 6))
         yield ("belief", "alignment", "max_sigma_position"), 5.0
         yield ("belief", "alignment", "max_sigma_heading"), 1.0
-        yield ("belief", "merging", "sure"), 0.0
+        yield ("belief", "merging", "min_sigmas"), 0.0
     numbers = list(_numbers(config))
     wild = rng.random() < 0.6
     for _ in range(int(rng.integers(0, 6))):

@@ -79,8 +79,9 @@ OPTIONS: dict[type[Any], tuple[str, dict[str, str | list[Any]]]] = {
         "existence": [0.5], "smoothing": [{"max_keys": 9}],
     }),
     MergeOptions: ("merging.", {
-        "merged_particles": "1..1000000", "sure": FROM_ZERO, "min_sigmas_on_trial": FROM_ZERO, "watch_steps": "0..1e9",
-        "watch_every": COUNT, "blocked_steps": "0..1e9", "max_deformed": SHARE, "straighten": [1],
+        "merged_particles": "1..1000000", "min_sigmas": FROM_ZERO,
+        "min_sigmas_on_trial": FROM_ZERO, "watch_steps": "0..1e9",
+        "watch_every": COUNT, "blocked_steps": "0..1e9", "max_deformed": SHARE, "smooth_first": [1],
     }),
     OdometryModel: ("motion.", dict.fromkeys(OdometryModel.__slots__, SIGMA)),
     SmoothingOptions: ("", {

@@ -98,7 +98,7 @@ class TrainConfig(ExperimentConfig):
             reward=dict(self.reward),
             belief={
                 "filter": {"num_particles": self.particles} | ({} if self.straighten else {"rejuvenate_every": None}),
-                "merging": {"straighten": self.straighten},
+                "merging": {"smooth_first": self.straighten},
             },
         )  # fmt: skip
 

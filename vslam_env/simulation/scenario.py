@@ -43,7 +43,7 @@ class Scenario:
     observable_landmarks: np.ndarray
 
     def __post_init__(self) -> None:
-        for name in ("true_starts", "bias", "countable"):
+        for name in ("true_starts", "bias", "observable_landmarks"):
             object.__setattr__(self, name, as_constant(getattr(self, name)))
 
     def to_parts(self) -> tuple[Any, ...]:

@@ -346,7 +346,7 @@ for smoothing in (slices, SmoothingOptions()):
     simulation = SimulatedTeam(2, seed=100)
     smoothed = simulation.build(
         rejuvenate_every=20, smoothing=smoothing, attempts=AttemptOptions(every=5),
-        merging=MergeOptions(watch_every=5, sure=0.0),
+        merging=MergeOptions(watch_every=5, min_sigmas=0.0),
     )
     told = simulation.run(smoothed, 100)
     assert len(smoothed.groups) == 1

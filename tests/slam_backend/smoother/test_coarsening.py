@@ -380,7 +380,7 @@ def test_steps_in_one_place_share_its_key(rigid_within):
     [log] = logs_of(run)
     still = log.arrays()
     motions = np.where(still.kinds[:, None] == ODOMETRY, [0.0, 0.0, 1e-4], 0.0)
-    still = type(still)(**{name: getattr(still, name) for name in still.__dataclass_fields__} | {"odometry": motions})
+    still = type(still)(**{name: getattr(still, name) for name in still.__dataclass_fields__} | {"motions": motions})
     graph = extend_graph(
         SlamGraph.at_starts(np.zeros((1, 3))), [still], run.spec.noise.motion, np.zeros(3), rigid_within=rigid_within
     )

@@ -303,5 +303,5 @@ def test_without_it_the_frame_wanders_between_two_draws(monkeypatch: pytest.Monk
         return float(np.sqrt(np.mean(squares)))
 
     held = thrown()
-    monkeypatch.setattr(rejuvenation, "holding", lambda *arguments: None)
+    monkeypatch.setattr(rejuvenation, "fix_gauge", lambda *arguments: None)
     assert held < 0.6 * thrown()

@@ -46,7 +46,7 @@ def from_the_start(run, groups, guess):
 
 def in_order(graph):
     """Return the keys of the robots, robot by robot, in the order of time."""
-    return np.concatenate([np.flatnonzero(graph.robots == robot) for robot in range(len(graph.tips))])
+    return np.concatenate([np.flatnonzero(graph.robots == robot) for robot in range(len(graph.last_keys))])
 
 
 def covariance(graph, mode):

@@ -139,7 +139,7 @@ def test_maps_that_agree_on_less_once_straight_are_not_merged(every: int, monkey
 
 
 def test_what_cannot_be_bent_is_merged_as_it_is() -> None:
-    """Poses that are given as exact leave nothing to smooth: the merge is that without `straighten`, bit for bit."""
+    """Poses that are given as exact leave nothing to smooth: the merge is that without `smooth_first`, bit for bit."""
     states = []
     for merging in (AS_IT_IS, MergeOptions()):
         simulation = SimulatedTeam(num_robots=2, seed=114)
