@@ -126,7 +126,7 @@ def play_environment(seed: int, cycles: int, setting: Setting) -> Fates:
             for agent, policy in zip(env.agents, policies, strict=True)
         }
         observations = env.step(actions)[0]
-        follower.update(env.episode.tick - 1)
+        follower.note(env.episode.tick - 1)
     alike = f"{env.config.landmarks.repeated:.0%} with a twin"
     return fates(env.events, env.true_start_poses, seed, env.config.world, alike, env.episode.tick, follower)
 
@@ -143,7 +143,7 @@ def play_world(world: str, seed: int, setting: Setting) -> Fates:
         if follower is None:
             follower = Follower(env.episode.belief._team, env.episode.ledger, env.true_start_poses)
         else:
-            follower.update(env.episode.tick - 1)
+            follower.note(env.episode.tick - 1)
 
     record = run_episode(env, run.make_policies(env), seed, note)
     assert follower is not None
@@ -208,7 +208,7 @@ def play_aisles(seed: int, cycles: int, setting: Setting) -> Fates:
         ledger.record(team.step(reading["odometry"], reading["measurements"], up), names)
         if setting.forced and not team.events and min(len(team.map(robot)) for robot in range(2)) >= ENOUGH:
             team.merge(0, 1, forced_alignment(starts, team.map(0), team.map(1), rng, setting.shift))
-        follower.update(step)
+        follower.note(step)
     return fates(team.events, starts, seed, "aisles", f"classes of {look_alikes}", run.num_steps, follower)
 
 
