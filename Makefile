@@ -6,31 +6,32 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constr
 
 .PHONY: demo test lint metrics clients compat clean
 
-demo: $(VENV)/.core  ## three robots explore an office, build maps and merge them; writes a folder under runs/
+demo: $(VENV)/.core  ## run three robots that explore an office, build maps and merge them; writes a folder under runs/
 	$(BIN)/vslam run --world office --robots 3 --policy frontier --seed 0
 
-test: lint  ## everything that must hold
+test: lint  ## linters and all tests
 	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist worksteal
 
-lint: $(VENV)/.dev  ## style, types, and the direction of imports
+lint: $(VENV)/.dev  ## style, types, the direction of imports, and prose
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python benchmarks/prose.py
 
-metrics: $(VENV)/.core  ## sizes of the code, folders, the road of a measurement, private accesses, import circles
+metrics: $(VENV)/.core  ## metrics of the code: sizes, folders, path of a measurement, private accesses, import cycles
 	$(BIN)/python benchmarks/code_metrics.py
 
 CLIENTS := torchrl rllib agilerl tianshou benchmarl
 
-clients: $(CLIENTS:%=client-%)  ## the page of each learner run as written, each in an environment of its own; gigabytes
+clients: $(CLIENTS:%=client-%)  ## run the page of each learner as written, in its own environment; needs gigabytes
 
 client-%: docs/how-to/learners/%.md docs/how-to/learners/%.txt
 	$(PYTHON) -m venv $(VENV)-clients/$*
 	$(VENV)-clients/$*/bin/python -m pip install --quiet --disable-pip-version-check --editable . --requirement docs/how-to/learners/$*.txt
 	$(VENV)-clients/$*/bin/python tests/docs/run_page.py docs/how-to/learners/$*.md
 
-compat: compat-opencv compat-pettingzoo  ## all tests with an older OpenCV, and with what RLlib and AgileRL pin
+compat: compat-opencv compat-pettingzoo  ## all tests with an older OpenCV, and with the versions pinned by RLlib and AgileRL
 
 compat-opencv: OTHER := opencv-python-headless==4.14.0.94
 compat-pettingzoo: OTHER := gymnasium==1.2.2 pettingzoo==1.26.1
@@ -42,7 +43,7 @@ compat-%: pyproject.toml constraints.txt
 	$(VENV)-compat/$*/bin/python -m pytest --numprocesses auto --maxprocesses 4 --dist worksteal
 
 $(VENV)/bin/python:
-	@$(PYTHON) -c 'import sys; sys.exit("vslam_env needs Python >= 3.11, but $(PYTHON) is " + sys.version.split()[0] + ": say make PYTHON=python3.11" if sys.version_info < (3, 11) else 0)'
+	@$(PYTHON) -c 'import sys; sys.exit("vslam_env needs Python >= 3.11, but $(PYTHON) is " + sys.version.split()[0] + ": use make PYTHON=python3.11" if sys.version_info < (3, 11) else 0)'
 	$(PYTHON) -m venv $(VENV)
 
 $(VENV)/.core: pyproject.toml constraints.txt | $(VENV)/bin/python

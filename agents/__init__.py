@@ -1,4 +1,4 @@
-"""Exploration policies that see only what a robot can know."""
+"""Exploration policies; they use only observations and beliefs of the robots."""
 
 from agents.policy import Policy
 from agents.registry import POLICIES, make_policy

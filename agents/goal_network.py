@@ -1,4 +1,4 @@
-"""The network of trained policies, computed by numpy: what it looks at, how that is scaled, and its logits."""
+"""Network of trained policies in numpy: its inputs, their scales and the action logits."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -21,7 +21,7 @@ SHAPES: dict[str, tuple[int, ...]] = {
     "action_mask": (17,),
 }
 NAMES = tuple(SHAPES)
-# The vectors are multiplied with these before they enter, so that all are of the order of one.
+# Factors that scale the input vectors to the order of one.
 VECTORS: dict[str, tuple[float, ...]] = {
     "pose_std": (2.0, 2.0, 10.0),
     "map_stats": (0.01, 5.0, 5.0, 0.1, 1.0, 0.25),
@@ -31,7 +31,7 @@ VECTORS: dict[str, tuple[float, ...]] = {
 }
 CANDIDATE_SCALE = (0.1, 0.1, 0.1, 0.25, 1.0 / 60.0)
 GRID_SCALE = 1.0 / 255.0
-PATCHES = (4, 3)  # each convolution looks at patches that do not overlap
+PATCHES = (4, 3)  # sides of the non-overlapping patches of each convolution
 CHANNELS = (16, 32)
 CONTEXT = 64  # width of all other layers
 VECTOR_SIZE = sum(int(np.prod(SHAPES[name])) for name in VECTORS)
@@ -39,14 +39,14 @@ PICTURE_SIZE = CHANNELS[1] * (48 // (PATCHES[0] * PATCHES[1])) ** 2
 
 
 def logits(weights: Weights, observations: Mapping[str, NDArray[Any]]) -> Float32Array:
-    """Return how good each action seems (n, 17) float32, valid or not, on the scale of a softmax.
+    """Return the logit of each action, (n, 17) float32, for valid and invalid actions.
 
-    A convolution of the local grid and the vectors make a context; one and the same small network looks at it beside
-    each candidate, so that slots are treated alike.
+    A convolution of the local grid and the vectors give a context. One small network with shared weights scores each
+    candidate from this context and the candidate's features, so that the result does not depend on the slot.
 
     Args:
-        weights: By the names of the learner's layers.
-        observations: (n, ...) by name, as the environment gives them.
+        weights: Weights by the layer names of the learner.
+        observations: (n, ...) arrays by name, as the environment returns them.
     """
     picture = observations["local_grid"] * np.float32(GRID_SCALE)
     for layer, patch in enumerate(PATCHES):
@@ -70,7 +70,7 @@ def _linear(weights: Weights, name: str, rows: NDArray[Any]) -> NDArray[Any]:
 
 
 def _convolve(picture: NDArray[Any], weights: Weights, name: str, patch: int) -> NDArray[Any]:
-    """Look at patches (patch x patch) side by side: (n, c, h, w) becomes (n, channels, h / patch, w / patch)."""
+    """Convolve without overlap (stride = patch): (n, c, h, w) becomes (n, channels, h / patch, w / patch)."""
     n, channels, height, width = picture.shape
     tiles = picture.reshape(n, channels, height // patch, patch, width // patch, patch).transpose(0, 2, 4, 1, 3, 5)
     kernel = weights[f"{name}.weight"]

@@ -1,4 +1,4 @@
-"""`NearestFrontier`: drives to the nearest place to explore that no teammate is nearer to."""
+"""`NearestFrontier`: policy that drives to the nearest frontier to which no teammate is nearer."""
 
 from typing import Any
 
@@ -9,24 +9,24 @@ from slam_backend.core.validation import FloatArray
 from vslam_env.belief.team_belief import Belief
 from vslam_env.navigation import centre_of, distance_map, follow_path, plan_path
 
-SWITCH_RATIO = 0.5  # leave a goal for one whose path is less than this share of the way that is left
+SWITCH_RATIO = 0.5  # switch goals if the path is shorter than this share of the remaining path
 REPLAN_TICKS = 10
-FAR_SHARE = 0.3  # patrols lead to one of the farthest places
+FAR_SHARE = 0.3  # share of the reachable cells, farthest first, from which patrol goals are drawn
 ARRIVED = 0.5  # [m]
-MAX_SPEED, MAX_TURN = 1.0, 1.5  # [m/s], [rad/s] where continuous actions are 1
-NO_WAY = np.iinfo(np.int32).max  # in `DistanceMap.cost`
+MAX_SPEED, MAX_TURN = 1.0, 1.5  # [m/s], [rad/s]: speeds of a continuous action of 1
+UNREACHABLE = np.iinfo(np.int32).max  # unreachable, in `DistanceMap.cost`
 STAY, AHEAD, LEFT, RIGHT = 0, 1, 2, 3  # discrete actions
-TURN_FIRST = 0.5  # [rad/s] a discrete action turns if the pursuit asks for at least this
+TURN_FIRST = 0.5  # [rad/s] desired turn rate from which a discrete action turns
 
 
 def choose_slot(belief: Belief, held: int | None = None) -> int | None:
     """Return the slot of the nearest candidate by path length, or None if there is none.
 
-    Candidates that a teammate is nearer to, even as the crow flies, are left to it unless there are no others.
+    Candidates to which a teammate is nearer, in a straight line, are left to the teammate unless there are no others.
 
     Args:
-        belief: Of the robot.
-        held: The slot chosen before; it is kept unless the candidate is gone or another is much nearer.
+        belief: Belief of the robot.
+        held: Slot of the previous goal; it is kept unless the candidate is gone or another is much nearer.
     """
     candidates = belief.candidates
     slots = np.flatnonzero(candidates.valid)
@@ -44,13 +44,13 @@ def choose_slot(belief: Belief, held: int | None = None) -> int | None:
 
 
 class NearestFrontierGoals:
-    """The policy for `goal` actions; stays where nothing is left to explore."""
+    """Nearest-frontier policy for `goal` actions; stays where nothing is left to explore."""
 
     def __init__(self) -> None:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the last episode."""
+        """Clear the state of the last episode."""
         self._held: int | None = None
 
     def act(self, observation: Any, belief: Belief, rng: np.random.Generator) -> int:
@@ -60,12 +60,12 @@ class NearestFrontierGoals:
 
 
 class NearestFrontier:
-    """The policy for `continuous` and `discrete` actions: plans on the robot's own grid and drives along.
+    """Nearest-frontier policy for `continuous` and `discrete` actions; plans on the robot's grid and follows the path.
 
-    Where nothing is left to explore it patrols to far places, so that groups meet whose maps could not be aligned yet.
+    If nothing is left to explore, the robot patrols to far places, so that groups whose maps are not aligned yet meet.
 
     Args:
-        discrete: Whether actions are `discrete` ones; else `continuous` ones.
+        discrete: Whether actions are `discrete`; otherwise they are `continuous`.
     """
 
     def __init__(self, discrete: bool = False) -> None:
@@ -73,7 +73,7 @@ class NearestFrontier:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the last episode."""
+        """Clear the state of the last episode."""
         self._held: int | None = None
         self._patrol: FloatArray | None = None
         self._path: FloatArray | None = None
@@ -81,12 +81,12 @@ class NearestFrontier:
         self._age = REPLAN_TICKS
 
     def act(self, observation: Any, belief: Belief, rng: np.random.Generator) -> int | NDArray[np.float32]:
-        """Return the action that drives towards the chosen place."""
+        """Return the action that drives towards the goal."""
         self._age += 1
         if self._path is None or self._age >= REPLAN_TICKS:
             self._plan(belief, rng)
         if self._path is None:
-            speed, turn = 0.0, MAX_TURN  # looks around until floor to drive on is seen
+            speed, turn = 0.0, MAX_TURN  # turn on the spot until free floor is seen
         else:
             speed, turn = follow_path(belief.pose, self._path, MAX_SPEED, MAX_TURN, self._heading)
         if self._discrete:
@@ -96,7 +96,7 @@ class NearestFrontier:
         return np.array([speed / MAX_SPEED, turn / MAX_TURN], dtype=np.float32)
 
     def _plan(self, belief: Belief, rng: np.random.Generator) -> None:
-        """Choose where to go, and a path to it."""
+        """Choose a goal and a path to it."""
         self._age = 0
         self._held = choose_slot(belief, self._held)
         if self._held is not None:
@@ -110,16 +110,16 @@ class NearestFrontier:
         if self._path is None:
             self._patrol = None
         elif self._held is None:
-            self._patrol = self._path[-1]  # as near as one gets to a place beside which a wall has come to be seen
+            self._patrol = self._path[-1]  # the nearest reachable point, if a wall was discovered at the goal
 
 
 def patrol_goal(belief: Belief, rng: np.random.Generator) -> FloatArray:
-    """Draw one of the farthest places (2,) [m], start frame, that the robot can reach over floor it has seen.
+    """Draw one of the farthest points (2,) [m], start frame, that the robot can reach over known floor.
 
-    Where it can reach nothing it is the robot's own place.
+    If nothing is reachable, return the robot's position.
     """
     ways = distance_map(belief.grid.cells, belief.pose[:2])
-    rows, cols = np.nonzero(ways.cost < NO_WAY)
+    rows, cols = np.nonzero(ways.cost < UNREACHABLE)
     if not len(rows):
         return np.array(belief.pose[:2])
     costs = ways.cost[rows, cols]

@@ -1,4 +1,4 @@
-"""Policies of the user, by the name of their module: `my_module:Careful`."""
+"""Custom policies, imported by module and name: `my_module:Careful`."""
 
 import sys
 from collections.abc import Iterator
@@ -15,36 +15,36 @@ ACTION_TYPES = ("continuous", "discrete", "goal")
 EXPECTED = "MODULE:NAME of a policy"
 METHODS = ("reset", "act")
 NEEDED = (
-    "A policy has the methods reset() and act(observation, belief, rng); name its class, or a function that makes it, "
-    "which take no arguments."
+    "A policy has the methods reset() and act(observation, belief, rng). Name its class or a factory function "
+    "without arguments."
 )
 
 
 def is_plugin(name: str) -> bool:
-    """Tell whether a name is meant as a module and what makes a policy in it, not as a path."""
+    """Return whether a name has the form `MODULE:NAME` rather than being a path."""
     module, colon, factory = name.partition(":")
     return bool(colon) and factory.isidentifier() and all(part.isidentifier() for part in module.split("."))
 
 
 def plugin_action_type(name: str) -> str:
-    """Return the type of action that a policy is for: its attribute `action_type`, or `"goal"` if it has none.
+    """Return the action type of a policy: its attribute `action_type`, or `"goal"` if it has none.
 
     Raises:
-        ValueError: If there is no such policy, or that attribute is no type of action.
+        ValueError: If there is no such policy, or the attribute is not an action type.
     """
     return check_choice(f"{name}.action_type", getattr(_find(name), "action_type", "goal"), ACTION_TYPES)
 
 
 def load_plugin(name: str) -> Policy:
-    """Make a policy for one robot by calling what the name stands for, without arguments.
+    """Make a policy for one robot by calling the named class or function without arguments.
 
-    Modules are looked for as usual, and first in the current folder.
+    The current folder is searched first, then Python's import path.
 
     Args:
-        name: Such as `"my_module:Careful"`.
+        name: Module and name, e.g. `"my_module:Careful"`.
 
     Raises:
-        ValueError: If the module or the name in it is not there, or what it makes is no policy.
+        ValueError: If the module or the name does not exist, or the result is not a policy.
     """
     policy = _find(name)()
     missing = [method for method in METHODS if not callable(getattr(policy, method, None))]
@@ -56,38 +56,38 @@ def load_plugin(name: str) -> Policy:
 
 
 def _find(name: str) -> Any:
-    """Return what makes the policy."""
+    """Return the class or function that makes the policy."""
     module, _, factory = name.partition(":")
     try:
         with _current_folder_first():
             found = import_module(module)
     except ModuleNotFoundError as error:
         if error.name is None or not f"{module}.".startswith(f"{error.name}."):
-            raise  # the module is there, and asks for one that is not
-        cure = "Name a module that is installed, or work in the folder that holds it."
-        raise argument_error("policy", EXPECTED, f"no module {module!r}", cure) from error
+            raise  # the module exists; one of its own imports is missing
+        hint = "Name an installed module, or change into the folder that contains it."
+        raise argument_error("policy", EXPECTED, f"no module {module!r}", hint) from error
     made = getattr(found, factory, None)
     if not callable(made):
         raise argument_error("policy", EXPECTED, f"no class or function {factory!r} in {module}", "Check the name.")
     if not _may_make_policies(made):
-        raise argument_error("policy", EXPECTED, f"no maker of policies: {name}", NEEDED)
+        raise argument_error("policy", EXPECTED, f"no policy factory: {name}", NEEDED)
     return made
 
 
 def _may_make_policies(maker: Any) -> bool:
-    """Tell whether it is safe to call it to see what it makes: it is written in Python and asks for no arguments."""
+    """Return whether it is safe to call it for inspection: it is written in Python and takes no arguments."""
     if is_built_in(maker):
         return False
     try:
         signature(maker).bind()
-    except (TypeError, ValueError):  # the latter: it does not tell
+    except (TypeError, ValueError):  # ValueError: no signature is available
         return False
     return True
 
 
 @contextmanager
 def _current_folder_first() -> Iterator[None]:
-    """Let imports look into the current folder, as `python -m` does and an installed command does not."""
+    """Put the current folder first on the import path, as `python -m` does and an installed command does not."""
     here = str(Path.cwd())
     sys.path.insert(0, here)
     try:

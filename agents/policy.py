@@ -1,4 +1,4 @@
-"""`Policy`: what decides for one robot, from what that robot can know."""
+"""`Policy`: the interface of a policy that controls one robot."""
 
 from typing import Any, Protocol
 
@@ -8,19 +8,19 @@ from vslam_env.belief.team_belief import Belief
 
 
 class Policy(Protocol):
-    """Decides for one robot. Each robot needs a policy object of its own."""
+    """Policy of one robot. Each robot needs a policy object of its own."""
 
     def reset(self) -> None:
-        """Forget the last episode."""
+        """Clear the state of the last episode."""
 
     def act(self, observation: Any, belief: Belief, rng: np.random.Generator) -> Any:
         """Choose an action.
 
         Args:
-            observation: What the environment gave this robot.
-            belief: What this robot believes.
-            rng: Source of all draws.
+            observation: Observation of this robot, as the environment returned it.
+            belief: Belief of this robot.
+            rng: Source of all random draws.
 
         Returns:
-            An action of the robot's space.
+            An action of the robot's action space.
         """

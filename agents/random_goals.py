@@ -1,4 +1,4 @@
-"""`RandomGoals`: drives to candidates drawn at random."""
+"""`RandomGoals`: policy that drives to random candidates."""
 
 from typing import Any
 
@@ -8,10 +8,10 @@ from vslam_env.belief.team_belief import Belief
 
 
 class RandomGoals:
-    """Draws one of the valid candidates at every decision; stays when there is none. For `goal` actions."""
+    """Policy for `goal` actions that draws a valid candidate at every decision and stays if there is none."""
 
     def reset(self) -> None:
-        """Nothing is remembered."""
+        """Do nothing; the policy has no state."""
 
     def act(self, observation: Any, belief: Belief, rng: np.random.Generator) -> int:
         """Return 1 + the slot of a candidate, uniformly among the valid ones, or 0 if there is none."""

@@ -1,4 +1,4 @@
-"""`RandomWalk`: straight ahead for a while, then another way; the weakest policy worth comparing with."""
+"""`RandomWalk`: policy that drives straight and turns for random times; the weakest baseline."""
 
 from typing import Any
 
@@ -12,10 +12,10 @@ AHEAD, LEFT, RIGHT = 1, 2, 3  # discrete actions
 
 
 class RandomWalk:
-    """Goes ahead and turns in phases of random length.
+    """Policy that alternates between driving straight and turning, in phases of random length.
 
     Args:
-        discrete: Whether actions are `discrete` ones; else `continuous` ones.
+        discrete: Whether actions are `discrete`; otherwise they are `continuous`.
     """
 
     def __init__(self, discrete: bool = False) -> None:
@@ -23,12 +23,12 @@ class RandomWalk:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the last episode."""
+        """Clear the state of the last episode."""
         self._left = 0
         self._action = LEFT
 
     def act(self, observation: Any, belief: Belief, rng: np.random.Generator) -> int | NDArray[np.float32]:
-        """Go on with the current phase, or begin the next: ahead and turns to either side alternate."""
+        """Continue the current phase, or start the next one; left and right turns alternate with straight phases."""
         if self._left == 0:
             turning = self._action != AHEAD
             self._left = 1 + int(rng.geometric(1.0 / (MEAN_STRAIGHT if turning else MEAN_TURN)))

@@ -1,4 +1,4 @@
-"""Policies by name, trained ones by their file, and those of the user by their module."""
+"""Registry of policies: built-in ones by name, trained ones by file, custom ones by module."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from agents.random_walk import RandomWalk
 from agents.trained import SUFFIX, TrainedGoalPolicy, load_model
 from slam_backend.core.validation import argument_error, check_choice
 
-POLICIES = {  # and the types of action that each knows, that with which policies are compared first
+POLICIES = {  # with the action types that each supports; comparisons of policies use the first one
     "frontier": ("goal", "continuous", "discrete"),
     "random_goals": ("goal",),
     "random_walk": ("continuous", "discrete"),
@@ -18,10 +18,10 @@ POLICIES = {  # and the types of action that each knows, that with which policie
 
 
 def action_types(name: str) -> tuple[str, ...]:
-    """Return the types of action that a policy knows, that with which policies are compared first.
+    """Return the action types that a policy supports; comparisons of policies use the first one.
 
     Args:
-        name: As in `make_policy`.
+        name: Name of the policy, see `make_policy`.
 
     Raises:
         ValueError: If there is no such policy.
@@ -30,22 +30,23 @@ def action_types(name: str) -> tuple[str, ...]:
         return ("goal",)
     if is_plugin(name):
         return (plugin_action_type(name),)
-    cure = "Choose one of these names, the path of a trained model, or MODULE:NAME of your own."
-    return POLICIES[check_choice("policy", name, tuple(POLICIES), cure)]
+    hint = "Choose one of these names, the path of a trained model, or MODULE:NAME of a custom policy."
+    return POLICIES[check_choice("policy", name, tuple(POLICIES), hint)]
 
 
 def make_policy(name: str, action_type: str) -> Policy:
     """Make a policy for one robot.
 
     Args:
-        name: `"frontier"`: nearest frontier, for all action types. `"random_goals"`: random candidates, for `goal`.
-            `"random_walk"`: for `continuous` and `discrete`. The path of a model that `vslam train` wrote, or of its
-            run folder: for `goal` actions and dict observations. `"module:Name"`: what that makes when called without
-            arguments, for the actions that its attribute `action_type` names, or else for `goal`.
-        action_type: Of the environment.
+        name: Name of the policy. `"frontier"`: nearest frontier, for all action types. `"random_goals"`: random
+            candidates, for `goal`. `"random_walk"`: random walk, for `continuous` and `discrete`. Path of a model of
+            `vslam train`, or of its run folder: trained policy, for `goal` actions and dict observations.
+            `"module:Name"`: custom policy, made by calling `Name` without arguments, for its attribute `action_type`,
+            or else for `goal`.
+        action_type: Action type of the environment.
 
     Raises:
-        ValueError: If there is no such policy, it does not know this type of action, or a model cannot be read.
+        ValueError: If there is no such policy, it does not support the action type, or a model cannot be read.
     """
     known = action_types(name)
     if check_choice("action_type", action_type, ACTION_TYPES) not in known:
@@ -62,5 +63,5 @@ def make_policy(name: str, action_type: str) -> Policy:
 
 
 def is_model(name: str) -> bool:
-    """Tell whether a name is meant as the path of a model or of its run folder."""
+    """Return whether a name is the path of a model or of its run folder."""
     return isinstance(name, str) and name not in POLICIES and (name.endswith(SUFFIX) or Path(name).is_dir())

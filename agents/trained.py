@@ -1,4 +1,4 @@
-"""`TrainedGoalPolicy`: plays a network that `vslam train` taught; numpy alone, so that no learner need be installed."""
+"""`TrainedGoalPolicy`: policy that evaluates a network of `vslam train` with numpy, without a learning library."""
 
 import hashlib
 import io
@@ -16,7 +16,7 @@ from slam_backend.core.files import write_file
 from slam_backend.core.validation import argument_error
 from vslam_env.belief.team_belief import Belief
 
-FORMAT = 1  # raised when the network, or what observations mean, changes
+FORMAT = 1  # incremented when the network or the meaning of observations changes
 SUFFIX = ".npz"
 MODEL_FILE = "model" + SUFFIX
 ABOUT = "about"
@@ -26,8 +26,8 @@ class TrainedGoalPolicy:
     """A trained policy for `goal` actions and dict observations.
 
     Args:
-        weights: Of the network, as `load_model` returns them.
-        greedy: Whether to take the action that the network holds for best; else one drawn from its distribution.
+        weights: Weights of the network, as `load_model` returns them.
+        greedy: Whether to take the best action of the network; otherwise one is drawn from its distribution.
     """
 
     def __init__(self, weights: Weights, greedy: bool = False) -> None:
@@ -35,13 +35,13 @@ class TrainedGoalPolicy:
         self._greedy = greedy
 
     def reset(self) -> None:
-        """Nothing is remembered."""
+        """Do nothing; the policy has no state."""
 
     def act(self, observation: Any, belief: Belief, rng: np.random.Generator) -> int:
         """Return 0 to stay, or 1 + the slot of a valid candidate.
 
         Raises:
-            ValueError: If the observation lacks what the network was trained on.
+            ValueError: If the observation lacks an input of the network.
         """
         check_observation({name: np.shape(observation[name]) for name in observation})
         scores = logits(self._weights, {name: np.asarray(observation[name])[None] for name in NAMES})[0]
@@ -53,50 +53,50 @@ class TrainedGoalPolicy:
 
 
 def check_observation(shapes: Mapping[str, tuple[int, ...]]) -> None:
-    """Refuse observations on which no trained network can have been trained.
+    """Refuse observations that do not fit the input of the network.
 
     Args:
-        shapes: Of the named arrays.
+        shapes: Shapes of the arrays in the observation, by name.
 
     Raises:
-        ValueError: If one is missing or has another shape; the text names it.
+        ValueError: If an array is missing or has another shape; the message names it.
     """
     for name, shape in SHAPES.items():
         if shapes.get(name) != shape:
-            cure = "Use goal actions, dict observations and the standard scan."
+            hint = "Use goal actions, dict observations and the standard scan."
             got = f"no {name!r}" if name not in shapes else f"shape {shapes[name]}"
-            raise argument_error("observation", f"{name!r} of shape {shape}, as the model was trained on", got, cure)
+            raise argument_error("observation", f"{name!r} of shape {shape}, as the model was trained on", got, hint)
 
 
 def save_model(file: Path, weights: Weights, about: Mapping[str, Any]) -> None:
-    """Write a model: its weights and what is to be known about it, as plain arrays and JSON.
+    """Write a model: its weights and its metadata, as plain arrays and JSON.
 
     Args:
-        file: Where to; it is replaced as a whole.
-        weights: Of the network.
-        about: Plain values.
+        file: Path of the model; the file is replaced atomically.
+        weights: Weights of the network.
+        about: Metadata as plain values.
 
     Raises:
-        ValueError: If the file cannot be written; an old one of that name is then unchanged.
+        ValueError: If the file cannot be written; an existing file is then unchanged.
     """
     arrays = {name: np.asarray(weights[name], np.float32) for name in sorted(weights)}
-    told = {"format": FORMAT, "weights": _digest(arrays)} | dict(about)
+    metadata = {"format": FORMAT, "weights": _digest(arrays)} | dict(about)
     packed = io.BytesIO()
-    np.savez(packed, allow_pickle=False, **{ABOUT: np.array(json.dumps(told))}, **arrays)
+    np.savez(packed, allow_pickle=False, **{ABOUT: np.array(json.dumps(metadata))}, **arrays)
     write_file(file, packed.getvalue(), "file")
 
 
 def load_model(path: str | Path) -> tuple[Weights, dict[str, Any]]:
-    """Read a model that `save_model` wrote; nothing of the file is run.
+    """Read a model that `save_model` wrote; no code from the file is run.
 
     Args:
-        path: The file, or the run folder that holds it.
+        path: Path of the model, or of the run folder that contains it.
 
     Returns:
-        The weights, and what was told about them.
+        The weights and the metadata.
 
     Raises:
-        ValueError: If the file is missing, damaged or of another version.
+        ValueError: If the file is missing, damaged or has another format.
     """
     file = Path(path) / MODEL_FILE if Path(path).is_dir() else Path(path)
     expected = "a model that vslam train wrote"
@@ -107,20 +107,22 @@ def load_model(path: str | Path) -> tuple[Weights, dict[str, Any]]:
         about = json.loads(str(arrays.pop(ABOUT)))
         version, digest = about["format"], about["weights"]
     except (ValueError, KeyError, TypeError, RecursionError) as error:
-        cure = f"{str(file)!r} cannot be read: copy or train it anew."
-        raise argument_error("model", expected, "a broken file", cure) from error
+        hint = f"{str(file)!r} cannot be read. Copy it again, or train again."
+        raise argument_error("model", expected, "a broken file", hint) from error
     if version != FORMAT:
-        cure = f"Train it anew, or use the release that made it, {about.get('version', 'unknown')}."
-        raise argument_error("model", f"one of format {FORMAT}", f"a model of format {version}", cure)
+        hint = f"Train again, or use the release that wrote it, {about.get('version', 'unknown')}."
+        raise argument_error("model", f"one of format {FORMAT}", f"a model of format {version}", hint)
     if _digest(arrays) != digest:
-        raise argument_error("model", expected, "a broken file", f"{str(file)!r} was changed: copy or train it anew.")
+        raise argument_error(
+            "model", expected, "a broken file", f"{str(file)!r} was changed. Copy it again, or train again."
+        )
     return arrays, about
 
 
 def _digest(weights: Mapping[str, NDArray[Any]]) -> str:
-    """Return what tells these weights from all others."""
-    told = hashlib.sha256()
+    """Return a digest that identifies these weights."""
+    digest = hashlib.sha256()
     for name in sorted(weights):
-        told.update(f"{name} {weights[name].shape} {weights[name].dtype}\n".encode())
-        told.update(np.ascontiguousarray(weights[name]).tobytes())
-    return told.hexdigest()
+        digest.update(f"{name} {weights[name].shape} {weights[name].dtype}\n".encode())
+        digest.update(np.ascontiguousarray(weights[name]).tobytes())
+    return digest.hexdigest()

@@ -1,11 +1,11 @@
-"""Simulated logs of robots among barriers, and what filters make of them with and without rejuvenation.
+"""Simulated logs of robots among barriers, and results of filters with and without rejuvenation.
 
     python benchmarks/barrier_logs.py              # one robot
-    python benchmarks/barrier_logs.py --team 3     # three that merge
+    python benchmarks/barrier_logs.py --team 3     # three robots that merge
 
-Robots drive at up to 0.3 m/s and 30 degrees/s in a hall of 15 x 8 m with 15 landmarks whose identities are known. Walls
-block the sight; one or two frames a second are read. Odometry and sightings err as those of MR.CLAM do, and filters
-assume what the replay of MR.CLAM assumes.
+Robots drive at up to 0.3 m/s and 30 degrees/s in a hall of 15 x 8 m with 15 landmarks of known identity. Walls block
+the line of sight; one or two measurements per second are read. Noise of odometry and measurements is like that of
+MR.CLAM, and filters make the assumptions of the replay of MR.CLAM.
 """
 
 import math
@@ -30,24 +30,24 @@ from training.replay.mrclam import GATES, MAX_SIGMA_HEADING, MOTION, PARTICLES_P
 DT = 0.25  # [s]
 HALL = np.array([15.0, 8.0])  # [m]
 NUM_LANDMARKS = 15
-NEAREST, FARTHEST = 0.5, 6.0  # ranges that are read [m]
-MISSING = 1  # landmarks that two maps that are merged need not share, as in the replay of MR.CLAM
-MARGIN = 0.3  # [m] that robots keep from walls
-TRUE_SHARE = 0.5  # of the assumed noise of sightings, as in MR.CLAM
-LASTING = 4.0  # [s] after which errors of sightings are others, to 1 / e
+NEAREST, FARTHEST = 0.5, 6.0  # limits of measured ranges [m]
+MISSING = 1  # landmarks that merged maps need not share, as in the replay of MR.CLAM
+MARGIN = 0.3  # distance that robots keep from walls [m]
+TRUE_SHARE = 0.5  # true over assumed noise of the measurements, as in MR.CLAM
+LASTING = 4.0  # correlation time of measurement errors (to 1 / e) [s]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BarrierLog:
-    """What one robot did and read, T steps.
+    """Motion and readings of one robot in T steps.
 
     Attributes:
-        landmarks: (15, 2) float64 [m].
-        walls: (w, 2, 2) float64 [m]. Ends.
-        truth: (T, 3) float64 [m, m, rad].
-        odometry: (T, 3) float64 [m, m, rad].
-        frames: T entries, None where nothing was seen.
-        identities: Names of the landmarks seen, one row each.
+        landmarks: (15, 2) float64 [m]. Positions of the landmarks.
+        walls: (w, 2, 2) float64 [m]. End points of the walls.
+        truth: (T, 3) float64 [m, m, rad]. True poses.
+        odometry: (T, 3) float64 [m, m, rad]. Odometry readings.
+        frames: Measurements of the T steps, None where nothing was seen.
+        identities: Names of the measured landmarks, one row each.
     """
 
     landmarks: FloatArray
@@ -59,7 +59,7 @@ class BarrierLog:
 
 
 def crosses(p: FloatArray, q: FloatArray, walls: FloatArray) -> BoolArray:
-    """Tell for points p (2,) and q (n, 2) whether a wall (w, 2, 2) lies between: (n,)."""
+    """Return whether a wall (w, 2, 2) lies between points p (2,) and q (n, 2): (n,)."""
     a, b = walls[:, 0], walls[:, 1]
     q = np.atleast_2d(q)[:, None]
 
@@ -72,14 +72,14 @@ def crosses(p: FloatArray, q: FloatArray, walls: FloatArray) -> BoolArray:
 
 
 def wall_distance(p: FloatArray, walls: FloatArray) -> float:
-    """Return how far the nearest wall (w, 2, 2) is from p (2,) [m]."""
+    """Return the distance of the nearest wall (w, 2, 2) from p (2,) [m]."""
     a, along = walls[:, 0], walls[:, 1] - walls[:, 0]
     t = np.clip(((p - a) * along).sum(axis=1) / (along**2).sum(axis=1), 0.0, 1.0)
     return float(np.hypot(*(p - a - t[:, None] * along).T).min())
 
 
 def make_hall(num_walls: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-    """Return landmarks (15, 2) and walls (w, 2, 2) [m]; what there is of walls when there are none lies far away."""
+    """Return landmarks (15, 2) and walls (w, 2, 2) [m]; without walls, a single distant one."""
     walls = np.full((max(num_walls, 1), 2, 2), [[-90.0, -90.0], [-91.0, -90.0]])
     for k in range(num_walls):
         middle, turn, half = rng.uniform([1.5, 1.5], HALL - 1.5), rng.uniform(0.0, math.pi), rng.uniform(0.8, 1.6)
@@ -93,7 +93,7 @@ def make_hall(num_walls: int, rng: np.random.Generator) -> tuple[FloatArray, Flo
 
 
 def drive(walls: FloatArray, steps: int, speed: float, turn: float, rng: np.random.Generator) -> FloatArray:
-    """Return the true poses (T, 3) of a robot that goes from one place in sight to the next."""
+    """Return the true poses (T, 3) of a robot that drives between random points in its line of sight."""
 
     def free() -> FloatArray:
         while True:
@@ -125,18 +125,18 @@ def simulate(
     seed: int, robots: int = 1, duration: float = 900.0, *, odometry_scale: float = 1.0, num_walls: int = 8,
     view: float = math.radians(30.0), rate: float = 1.5, speed: float = 0.3, turn: float = math.radians(30.0),
 ) -> list[BarrierLog]:  # fmt: skip
-    """Return the logs of some robots in one hall.
+    """Return the logs of several robots in one hall.
 
     Args:
         seed: Seed of the hall and all noise.
-        robots: How many.
+        robots: Number of robots.
         duration: Length of the logs [s].
         odometry_scale: Factor on the noise of the odometry that filters assume [-].
-        num_walls: How many.
+        num_walls: Number of walls.
         view: Half the field of view [rad].
-        rate: Frames a second.
-        speed: At most [m/s].
-        turn: At most [rad/s].
+        rate: Number of measurement steps per second.
+        speed: Maximum speed [m/s].
+        turn: Maximum turn rate [rad/s].
     """
     rng = np.random.default_rng(seed)
     landmarks, walls = make_hall(num_walls, rng)
@@ -149,7 +149,7 @@ def simulate(
         sigmas = np.array([MOTION.sigmas(move) for move in moves]) * odometry_scale
         odometry = moves + sigmas * rng.standard_normal((steps, 3))
         odometry[0] = 0.0
-        errors = rng.standard_normal((NUM_LANDMARKS, 2))  # of each landmark's range and bearing, in sigmas
+        errors = rng.standard_normal((NUM_LANDMARKS, 2))  # errors of each landmark's range and bearing, in sigmas
         keep = math.exp(-DT / LASTING)
         frames: list[Measurements | None] = []
         seen: list[IntArray | None] = []
@@ -174,28 +174,28 @@ def simulate(
 
 
 def live(log: BarrierLog, seed: int, **options: Any) -> dict[str, float]:
-    """Let a filter live through a log.
+    """Run a filter on a log.
 
     Returns:
-        How far the map is off after the best fit [m], how far its landmarks scatter over the particles [m], the mean
-        NIS, and whether the filter was warned of.
+        Map error after the best fit [m], spread of landmarks over the particles [m], mean NIS, and whether the filter
+        raised a warning.
     """
     slam = FastSlam(motion=MOTION, seed=seed, **(GATES["given"] | options))
     for step, (move, frame, names) in enumerate(zip(log.odometry, log.frames, log.identities, strict=True)):
         slam.step([move if step else None], [frame], [names])
-    told = slam.consistency
+    consistency = slam.consistency
     maps = slam.state.maps
     means = maps.dense(maps.used_slots())[0][:, :3]
     return {
         "map": map_error(log, slam),
         "spread": float(np.sqrt(means[:, :2].var(axis=2).sum(axis=1).mean())),
-        "nis": told.nis_mean,
-        "warned": float(bool(told.warnings)),
+        "nis": consistency.nis_mean,
+        "warned": float(bool(consistency.warnings)),
     }
 
 
 def map_error(log: BarrierLog, slam: FastSlam) -> float:
-    """Return the RMS error [m] of a filter's map after the best fit; each landmark is of the name it was given."""
+    """Return the RMS error [m] of a filter's map after the best fit; landmarks have known identities."""
     landmarks, maps = slam.map(), slam.state.maps
     slots = maps.used_slots()
     names = maps.identities[slots][np.searchsorted(maps.ids[slots], landmarks.ids)]
@@ -205,7 +205,7 @@ def map_error(log: BarrierLog, slam: FastSlam) -> float:
 
 
 def live_as_team(logs: list[BarrierLog], seed: int, rejuvenate_every: int | None) -> tuple[int, list[int], float]:
-    """Let a team live through the logs of its robots; return groups, landmarks of their maps, and the mean error."""
+    """Run a team on the logs of its robots; return number of groups, sizes of their maps, and the mean error."""
     team = TeamSlam(
         len(logs),
         alignment=AlignmentOptions(
@@ -229,10 +229,10 @@ def live_as_team(logs: list[BarrierLog], seed: int, rejuvenate_every: int | None
 
 CONDITIONS: dict[str, dict[str, Any]] = {
     "as assumed": {},
-    "odometry twice as bad as assumed": {"odometry_scale": 2.0},
-    "a view of 180 degrees": {"view": math.radians(90.0)},
+    "odometry noise twice the assumed one": {"odometry_scale": 2.0},
+    "field of view of 180 degrees": {"view": math.radians(90.0)},
     "no walls": {"num_walls": 0},
-    "4 frames a second": {"rate": 4.0},
+    "4 measurements per second": {"rate": 4.0},
     "0.1 m/s, 10 degrees/s": {"speed": 0.1, "turn": math.radians(10.0)},
 }
 FILTERS: dict[str, dict[str, Any]] = {
@@ -244,16 +244,18 @@ FILTERS: dict[str, dict[str, Any]] = {
 
 def main(
     seeds: Annotated[int, typer.Option(help="Halls.")] = 12,
-    team: Annotated[int, typer.Option(help="Robots of a team, in place of one alone; 0: none.")] = 0,
-    odometry_scale: Annotated[float, typer.Option(help="Of a team: times the noise that filters assume.")] = 1.0,
+    team: Annotated[int, typer.Option(help="Number of robots in a team; 0: a single robot.")] = 0,
+    odometry_scale: Annotated[
+        float, typer.Option(help="Odometry noise of a team, relative to the assumed noise.")
+    ] = 1.0,
 ) -> None:
-    """Print how far maps are off under some conditions, mean (least-most), and of how many filters is warned."""
+    """Print map errors under several conditions, as mean (min-max), and the share of filters with a warning."""
     if team:
         for seed in range(seeds):
             logs = simulate(seed, robots=team, odometry_scale=odometry_scale)
             for every in (None, 100):
                 groups, sizes, error = live_as_team(logs, seed, every)
-                print(f"hall {seed}, every {every}: {groups} groups, landmarks {sizes}, maps off by {error:.2f} m")
+                print(f"hall {seed}, every {every}: {groups} groups, landmarks {sizes}, map error {error:.2f} m")
         return
     for condition, changes in CONDITIONS.items():
         logs = [simulate(seed, **changes)[0] for seed in range(seeds)]

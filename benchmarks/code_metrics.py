@@ -1,4 +1,4 @@
-"""Figures of the code base itself: sizes, folders, how far a measurement travels, private accesses, import circles.
+"""Metrics of the code base: sizes, folders, files on the path of a measurement, private accesses, import cycles.
 
 make metrics
 """
@@ -26,7 +26,7 @@ ROOT = Path(__file__).parents[1]
 PACKAGES = ("slam_backend", "vslam_env", "agents", "training")
 NAMED_TUPLE = ("_replace", "_asdict", "_fields", "_make")
 PRIVATE = re.compile(r"_[a-z]\w*")
-MANY = 10  # arguments of a kernel
+MANY = 10  # limit for the number of kernel parameters
 
 
 def sources(*folders: str) -> list[Path]:
@@ -35,7 +35,7 @@ def sources(*folders: str) -> list[Path]:
 
 
 def lines_of(files: list[Path]) -> int:
-    """Return how many lines files have."""
+    """Return the number of lines in files."""
     return sum(file.read_text(encoding="utf-8").count("\n") for file in files)
 
 
@@ -44,11 +44,11 @@ def module_name(file: Path) -> str:
     return ".".join(file.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
 
 
-# ---------------------------------------------------------------------- what is written
+# ---------------------------------------------------------------------- static analysis
 
 
 def private_names(tree: ast.AST) -> set[str]:
-    """Return the private attributes that a class, or all classes of a module, give to their objects."""
+    """Return the private attributes defined by a class, or by all classes of a module."""
     found = {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
     for node in ast.walk(tree):
         if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store) and ast.unparse(node.value) == "self":
@@ -59,11 +59,11 @@ def private_names(tree: ast.AST) -> set[str]:
 
 
 def private_accesses(file: Path, ours: set[str]) -> Iterator[tuple[int, str]]:
-    """Yield line and text of each access to a private attribute of an object of another of the project's classes.
+    """Yield line and text of each access to a private attribute of another class of the project.
 
     Args:
-        file: A module.
-        ours: Private attributes of all classes of the project; others are those of libraries.
+        file: Python file.
+        ours: Private attributes of all classes of the project; all others belong to libraries.
     """
     tree = ast.parse(file.read_text(encoding="utf-8"))
     own: dict[ast.AST, set[str]] = {}
@@ -78,7 +78,7 @@ def private_accesses(file: Path, ours: set[str]) -> Iterator[tuple[int, str]]:
 
 
 def imports(file: Path, known: set[str]) -> set[str]:
-    """Return the project's modules that a module imports when it is loaded."""
+    """Return the project's modules that a module imports at load time."""
     found: set[str] = set()
 
     def visit(nodes: list[ast.stmt]) -> None:
@@ -97,7 +97,7 @@ def imports(file: Path, known: set[str]) -> set[str]:
 
 
 def import_circles(graph: dict[str, set[str]]) -> list[list[str]]:
-    """Return the groups of modules that import each other, directly or through others."""
+    """Return the groups of modules that import each other, directly or indirectly."""
     reach: dict[str, set[str]] = {}
     for start in graph:
         seen, todo = set(), [start]
@@ -110,11 +110,11 @@ def import_circles(graph: dict[str, set[str]]) -> list[list[str]]:
     return [sorted(circle) for circle in circles if circle]
 
 
-# ---------------------------------------------------------------------- what is run
+# ---------------------------------------------------------------------- call traces
 
 
 def files_run(call: Callable[[], Any]) -> set[str]:
-    """Return the project's files that a call runs through, those of kernels and of what they call included."""
+    """Return the project's files that a call executes, including those of kernels and their callees."""
     codes: dict[CodeType, dict[str, Any]] = {}
 
     def note(frame: FrameType, event: str, argument: Any) -> None:
@@ -126,7 +126,7 @@ def files_run(call: Callable[[], Any]) -> set[str]:
         call()
     finally:
         sys.setprofile(None)
-    own = {code: names for code, names in codes.items() if is_own(code.co_filename)}
+    own = {code: names for code, names in codes.items() if is_plugin(code.co_filename)}
     kernels: set[Dispatcher] = set()
     todo = [kernel for code, names in own.items() for kernel in kernels_named(code, names)]
     while todo:
@@ -135,11 +135,11 @@ def files_run(call: Callable[[], Any]) -> set[str]:
             kernels.add(kernel)
             todo += kernels_named(kernel.py_func.__code__, kernel.py_func.__globals__)
     files = {code.co_filename for code in own} | {kernel.py_func.__code__.co_filename for kernel in kernels}
-    return {file for file in files if is_own(file)}
+    return {file for file in files if is_plugin(file)}
 
 
 def kernels_named(code: CodeType, names: dict[str, Any]) -> Iterator[Dispatcher]:
-    """Yield the kernels that a function names: its own, and attributes of modules that it names."""
+    """Yield the kernels that a function refers to, directly or as attributes of modules."""
     previous: Any = None
     for instruction in dis.get_instructions(code):
         if instruction.opname in ("LOAD_GLOBAL", "LOAD_NAME"):
@@ -152,13 +152,13 @@ def kernels_named(code: CodeType, names: dict[str, Any]) -> Iterator[Dispatcher]
             yield previous
 
 
-def is_own(file: str) -> bool:
-    """Tell whether a file is one of the packages'."""
+def is_plugin(file: str) -> bool:
+    """Return whether a file belongs to one of the packages."""
     return any(file.startswith(str(ROOT / package) + os.sep) for package in PACKAGES)
 
 
 def step_of_filter() -> set[str]:
-    """Return the files between a measurement and its `StepReport`."""
+    """Return the files executed between a measurement and its `StepReport`."""
     points = np.array([[-0.5, 0.0, 3.0], [0.2, 0.1, 4.0], [0.8, -0.1, 3.5]])
     frame = Measurements(points, np.eye(3, 64, dtype=np.float32))
     slam = FastSlam(num_particles=100, seed=0)
@@ -167,7 +167,7 @@ def step_of_filter() -> set[str]:
 
 
 def step_of_environment() -> set[str]:
-    """Return the files of a whole step of the default environment without a merge."""
+    """Return the files executed by a step of the default environment without a merge."""
     env = vslam_v0.parallel_env()
     env.reset(seed=0)
     actions = {agent: np.array([0.5, 0.1], np.float32) for agent in env.agents}
@@ -176,13 +176,13 @@ def step_of_environment() -> set[str]:
 
 
 def all_kernels() -> set[Dispatcher]:
-    """Return the kernels of the modules that are loaded."""
+    """Return the kernels of all loaded modules."""
     modules = [module for name, module in sys.modules.items() if name.split(".")[0] in PACKAGES]
     return {value for module in modules for value in vars(module).values() if isinstance(value, Dispatcher)}
 
 
 def main() -> None:
-    """Print the figures."""
+    """Print the metrics."""
     files = [file for file in sources(*PACKAGES) if file.name != "__init__.py"]
     graph = {module_name(file): set[str]() for file in sources(*PACKAGES)}
     for file in sources(*PACKAGES):
@@ -193,7 +193,7 @@ def main() -> None:
     private = [(file, *access) for file in files for access in private_accesses(file, ours)]
     circles = import_circles(graph)
     env_files, filter_files = step_of_environment(), step_of_filter()
-    kernels = {kernel for kernel in all_kernels() if is_own(kernel.py_func.__code__.co_filename)}
+    kernels = {kernel for kernel in all_kernels() if is_plugin(kernel.py_func.__code__.co_filename)}
     long = sum(kernel.py_func.__code__.co_argcount >= MANY for kernel in kernels)
     rows = {
         "source lines of the four packages": lines_of(sources(*PACKAGES)),
@@ -203,8 +203,8 @@ def main() -> None:
         "files from a measurement to its StepReport": len(filter_files),
         "files of a whole env.step without a merge": len(env_files),
         "accesses to private attributes of objects of other classes": len(private),
-        "import circles between modules": len(circles),
-        "kernels that are loaded for these": len(kernels),
+        "import cycles between modules": len(circles),
+        "loaded kernels": len(kernels),
         f"kernels with {MANY} or more parameters": long,
     }
     for name, number in rows.items():

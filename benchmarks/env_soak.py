@@ -1,12 +1,12 @@
-"""Step environments of random configurations for long, and check at every step what must always hold.
+"""Soak test of environments with random configurations; invariants are checked at every step.
 
     python benchmarks/env_soak.py --steps 200000 --keep soak.state
 
-The same command goes on from the last snapshot after a kill. Checked at each step: no robot stands in a wall or in
-another robot; observations lie in their spaces; rewards, infos and `state()` are finite; shares lie in [0, 1]. Now and
-then an episode's beginning is played again in a fresh environment, with another one stepping beside, and in another
-process under another hash seed: all must return the same bytes. Memory is watched. The chain of hashes over all that
-was returned is printed; a run that was killed and resumed ends with the same.
+The same command resumes from the last snapshot after a kill. Checked at each step: no robot is inside a wall or another
+robot; observations are in their spaces; rewards, infos and `state()` are finite; shares are in [0, 1]. At intervals,
+the beginning of an episode is repeated in a new environment, with another environment stepping in between, and in
+another process with another hash seed: all must return the same bytes. Memory use is recorded. The chained hash of all
+returned values is printed; it is the same for a run that was killed and resumed.
 """
 
 import os
@@ -31,14 +31,14 @@ from vslam_env import EnvConfig, ExplorationEnv, load_state, preset_config, save
 from vslam_env.world import WORLD_FAMILIES
 from vslam_env.world._kernels.clearance import distances_to_walls
 
-SKIN = 0.005  # [m] by which a robot may press into what it touches
-AGAIN_STEPS = 40  # of an episode that is played again
-EVERY = 8  # episodes, of which one is played again
+SKIN = 0.005  # allowed penetration of a robot into walls and robots [m]
+AGAIN_STEPS = 40  # number of repeated steps of an episode
+EVERY = 8  # interval of repeated episodes
 ANSWER = "digest "
 
 
 def random_config(rng: np.random.Generator) -> EnvConfig:
-    """Draw a configuration; few particles, so that many steps are made."""
+    """Sample a configuration; few particles, for many steps."""
     robots = int(rng.integers(1, 6))
     action_type = str(rng.choice(["continuous", "discrete", "goal"]))
     return preset_config(str(rng.choice(["easy", "standard", "hard"]))).replace(
@@ -63,7 +63,7 @@ def random_config(rng: np.random.Generator) -> EnvConfig:
 
 
 def random_actions(env: ExplorationEnv, rng: np.random.Generator) -> dict[str, Any]:
-    """Draw an action for each robot: mostly ahead, so that they get somewhere, and into walls."""
+    """Sample an action for each robot, biased ahead, so that robots travel and hit walls."""
     if env.config.action_type == "continuous":
         return {a: np.array([rng.uniform(-0.2, 1.0), 0.5 * rng.uniform(-1, 1)], np.float32) for a in env.agents}
     count = 4 if env.config.action_type == "discrete" else 17
@@ -84,7 +84,7 @@ def digest(value: Any, into: "hashlib._Hash") -> None:
 
 
 def check(env: ExplorationEnv, returned: tuple[Any, ...]) -> None:
-    """Raise AssertionError if something that must hold does not."""
+    """Raise AssertionError if an invariant is violated."""
     observations, infos = returned[0], returned[-1]
     for agent, observation in observations.items():
         assert env.observation_space(agent).contains(observation), f"observation of {agent} outside its space"
@@ -95,13 +95,13 @@ def check(env: ExplorationEnv, returned: tuple[Any, ...]) -> None:
         assert all(np.isfinite(reward) for reward in returned[1].values()), "a reward is not finite"
     assert np.isfinite(env.state()).all(), "state() is not finite"
     places, radius = env.true_poses[:, :2], env.config.robot_radius
-    assert distances_to_walls(places, env.world.walls).min() >= radius - SKIN, "a robot stands in a wall"
+    assert distances_to_walls(places, env.world.walls).min() >= radius - SKIN, "a robot is inside a wall"
     gaps = [float(np.linalg.norm(places[i] - places[j])) for i, j in combinations(range(len(places)), 2)]
-    assert min(gaps, default=np.inf) >= 2.0 * radius - 2.0 * SKIN, "two robots stand in each other"
+    assert min(gaps, default=np.inf) >= 2.0 * radius - 2.0 * SKIN, "two robots overlap"
 
 
 def beginning(seed: int, steps: int, beside: bool) -> str:
-    """Return the hash of the first steps of the episode of a seed, in a fresh environment, perhaps beside another."""
+    """Return the hash of the first steps of an episode in a new environment, optionally with another in between."""
     rng = np.random.default_rng(seed)
     env = vslam_v0.parallel_env(config=random_config(rng))
     other, other_rng = vslam_v0.parallel_env(world="fig5", num_robots=2, num_particles=5), np.random.default_rng(1)
@@ -119,7 +119,7 @@ def beginning(seed: int, steps: int, beside: bool) -> str:
 
 
 def in_another_process(seed: int, steps: int, hash_seed: int) -> str:
-    """Return `beginning` as another process under another hash seed has it."""
+    """Return the result of `beginning` in another process with another hash seed."""
     done = subprocess.run(
         [sys.executable, __file__, "--beginning", str(seed), "--steps", str(steps)],
         env=os.environ | {"PYTHONHASHSEED": str(hash_seed)},
@@ -131,7 +131,7 @@ def in_another_process(seed: int, steps: int, hash_seed: int) -> str:
 
 
 def memory_mb() -> float:
-    """Return the resident memory of this process [MB], or NaN where the system does not tell."""
+    """Return the resident memory of this process [MB], or NaN if the system does not report it."""
     try:
         pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
     except OSError:
@@ -141,7 +141,7 @@ def memory_mb() -> float:
 
 @dataclass(slots=True)
 class Soak:
-    """How far a soak is: all that decides how it goes on, the environment apart."""
+    """Progress of a soak test: its complete state, except for the environment."""
 
     seed: int
     steps: int = 0
@@ -151,7 +151,7 @@ class Soak:
     rng_state: Any = None
 
     def run(self, until: int, keep: Path | None, keep_every: int = 2000, log: Any = lambda text: None) -> None:
-        """Step until so many steps are done, keeping a snapshot now and then, if there is a place for it."""
+        """Step until the given number of steps, with regular snapshots if a file is given."""
         env, rng = self._restored(keep) if self.rng_state is not None else self._begun()
         begin, first, memory = time.perf_counter(), self.steps, float("nan")
         while self.steps < until:
@@ -161,17 +161,17 @@ class Soak:
             self.steps += 1
             self._take(env, returned)
             if self.steps - first == max((until - first) // 4, 1):
-                memory = memory_mb()  # a quarter in: kernels are loaded and caches filled
+                memory = memory_mb()  # after a quarter kernels are loaded and caches are full
             if keep is not None and (self.steps % keep_every == 0 or self.steps == until):
                 self.rng_state = rng.bit_generator.state
                 save_state(env.get_state() | {"soak": self._numbers()}, keep)
                 rate = (self.steps - first) / (time.perf_counter() - begin)
-                log(f"{self.steps} steps, {self.episodes} episodes, {rate:.0f} a second, {memory_mb():.0f} MB")
+                log(f"{self.steps} steps, {self.episodes} episodes, {rate:.0f} per second, {memory_mb():.0f} MB")
         log(f"memory: {memory:.0f} MB after a quarter, {memory_mb():.0f} MB at the end")
 
     @classmethod
     def resumed(cls, keep: Path) -> "Soak":
-        """Return the soak whose snapshot is in a file."""
+        """Return the soak test from the snapshot in a file."""
         return cls(**load_state(keep)["soak"])
 
     def _numbers(self) -> dict[str, Any]:
@@ -186,12 +186,16 @@ class Soak:
         return env, rng
 
     def _begun(self) -> tuple[ExplorationEnv, np.random.Generator]:
-        """Begin the next episode; every eighth is first played twice, and in another process."""
+        """Start the next episode; every eighth is also repeated beside another environment and in another process."""
         seed = 1000 * self.seed + self.episodes
         if self.episodes % EVERY == 0:
             reference = beginning(seed, AGAIN_STEPS, False)
-            assert beginning(seed, AGAIN_STEPS, True) == reference, f"episode {seed} differs beside another"
-            assert in_another_process(seed, AGAIN_STEPS, 1 + seed) == reference, f"episode {seed} differs elsewhere"
+            assert beginning(seed, AGAIN_STEPS, True) == reference, (
+                f"episode {seed} differs with another environment in between"
+            )
+            assert in_another_process(seed, AGAIN_STEPS, 1 + seed) == reference, (
+                f"episode {seed} differs in another process"
+            )
             self.again += 1
         rng = np.random.default_rng(seed)
         env = vslam_v0.parallel_env(config=random_config(rng))
@@ -207,23 +211,25 @@ class Soak:
 
 
 def main(
-    steps: Annotated[int, typer.Option(help="Of environments, in all.")] = 200_000,
-    seed: Annotated[int, typer.Option(help="Of everything.")] = 0,
-    keep: Annotated[Path | None, typer.Option(help="File of snapshots; an old one is gone on from.")] = None,
+    steps: Annotated[int, typer.Option(help="Total number of environment steps.")] = 200_000,
+    seed: Annotated[int, typer.Option(help="Seed of configurations and actions.")] = 0,
+    keep: Annotated[Path | None, typer.Option(help="File of snapshots; an existing one is resumed.")] = None,
     beginning_of: Annotated[
         int | None, typer.Option("--beginning", help="Only print the hash of the first steps of this seed's episode.")
     ] = None,
 ) -> None:
-    """Run the soak; the first thing that does not hold ends it with an AssertionError."""
-    check_int("steps", steps, 1, "Make one step or more.")
+    """Run the soak test; the first violated invariant ends it with an AssertionError."""
+    check_int("steps", steps, 1, "Use at least one step.")
     if beginning_of is not None:
         typer.echo(ANSWER + beginning(check_int("beginning", beginning_of, 0, "Give a seed."), steps, False))
         return
     soak = Soak.resumed(keep) if keep is not None and keep.exists() else Soak(seed)
     if soak.steps:
-        typer.echo(f"Going on after {soak.steps} steps.")
+        typer.echo(f"Resuming after {soak.steps} steps.")
     soak.run(steps, keep, log=typer.echo)
-    typer.echo(f"{soak.steps} steps in {soak.episodes} episodes, {soak.again} played again: all held. {soak.chain}")
+    typer.echo(
+        f"{soak.steps} steps in {soak.episodes} episodes, {soak.again} repeated: all invariants hold. {soak.chain}"
+    )
 
 
 if __name__ == "__main__":

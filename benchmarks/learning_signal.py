@@ -1,19 +1,20 @@
-"""What a learner is paid for: how well random play tells good goals from bad, and what discounts make of the reward.
+"""Learning signal of rewards: correlation of advantages with choices of goals, and effect of discounts on returns.
 
     python benchmarks/learning_signal.py choices --episodes 60
     python benchmarks/learning_signal.py returns --seeds 20
 
-`choices` shows what random play says about the choices that `vslam train` makes. Robots drive to candidates drawn at
-random, in worlds of the training split. For several rewards and traces of the generalised advantage estimate (lambda;
-a linear value is fitted and subtracted) it prints how the advantage of a decision correlates with what was chosen,
-against what could have been: a shorter way, a longer frontier, one that no teammate is nearer to. Beside each
-correlation stands its t value over the episodes: the larger, the fewer decisions a policy gradient needs; twice the t
-value is a quarter of the decisions.
+`choices` measures the signal for the decisions of `vslam train`. Robots drive to random candidates in worlds of the
+training split. For several rewards and values of lambda of the generalised advantage estimate (with a fitted linear
+value as baseline) it prints the correlation between the advantage of a decision and features of the choice relative to
+the alternatives: a shorter path, a longer frontier, no nearer teammate. Each correlation comes with its t value over
+    the
+episodes: the larger the t value, the fewer decisions a policy gradient needs; twice the t value needs a quarter of the
+decisions.
 
-`returns` plays scripted policies in the environment as it is by default, and prints the return of each, undiscounted
-and discounted per tick: of the default reward, of the running cost, and of potential-based shaping with the potential
--E and nothing else. Beside each mean over the robots and the seeds stands by how much it is above that of the nearest
-frontier, paired over the seeds, with its 95 % bootstrap interval.
+`returns` runs scripted policies in the default environment, and prints the return of each, undiscounted and discounted
+per tick, for three rewards: the default reward, the running cost, and potential-based shaping with the potential -E
+only. Each mean over robots and seeds comes with its difference to the nearest frontier, paired over the seeds, with its
+95 % bootstrap interval.
 """
 
 import os
@@ -34,7 +35,7 @@ from agents import make_policy
 from agents.policy import Policy
 from slam_backend.core.validation import FloatArray, check_int
 from training.episodes.runner import Progress, run_episode
-from training.experiments.statistics import mean_of, shown
+from training.experiments.statistics import format_ci, mean_ci
 from training.experiments.tables import markdown_table
 from training.rl.config import SPLIT_TRAIN, TrainConfig
 from vslam_env import ExplorationEnv, vslam_v0
@@ -48,19 +49,19 @@ REWARDS: tuple[dict[str, float], ...] = (
     {"map_error": 3.0, "own_coverage": 10.0},
 )
 TRACES = (0.95, 0.9, 0.5, 0.0)
-CHOICES = ("shorter way", "longer frontier", "no teammate nearer")
+CHOICES = ("shorter path", "longer frontier", "no teammate nearer")
 RIDGE = 1e-2
 WIDTH = 120
-DISCOUNTS = (1.0, 0.999, 0.99)  # per tick
-TICKS_OF_A_TURN = 42  # at 1.5 rad/s: a turn and a little
-RETURNS = {"map_error": "default", RUNNING_COST: "running cost", "shaping": "shaping alone"}
+DISCOUNTS = (1.0, 0.999, 0.99)  # discounts per tick
+TICKS_OF_A_TURN = 42  # at 1.5 rad/s: slightly more than a full turn
+RETURNS = {"map_error": "default", RUNNING_COST: "running cost", "shaping": "shaping only"}
 
 
 class Spin:
-    """Turns on the spot, then stands still.
+    """Policy that turns on the spot, then stands still.
 
     Args:
-        ticks: Number of ticks that it turns.
+        ticks: Number of ticks of turning.
     """
 
     def __init__(self, ticks: int) -> None:
@@ -68,7 +69,7 @@ class Spin:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the last episode."""
+        """Clear the state of the last episode."""
         self._left = self._ticks
 
     def act(self, observation: Any, belief: Belief, rng: np.random.Generator) -> FloatArray:
@@ -86,15 +87,15 @@ PLAYERS: dict[str, Callable[[], Policy]] = {
     "idle": partial(Spin, 0),
 }
 
-app = typer.Typer(help="What a learner is paid for.", no_args_is_help=True, add_completion=False)
+app = typer.Typer(help="Learning signal of rewards.", no_args_is_help=True, add_completion=False)
 
 
 def play(env: ExplorationEnv, seed: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Play an episode of random goals.
+    """Run an episode of random goals.
 
     Returns:
-        By decision and robot: what each term paid (T, K, 3), the choice against what was valid, in standard deviations
-        (T, K, 3), zeros where there was no choice, and what a value is fitted to (T, K, V).
+        Arrays by decision and robot: reward terms (T, K, 3), the choice relative to the valid candidates, in standard
+        deviations (T, K, 3), zeros without a choice, and features of the value (T, K, V).
     """
     observations, _ = env.reset(seed=seed)
     rng, policy = np.random.default_rng(seed), make_policy("random_goals", "goal")
@@ -103,21 +104,21 @@ def play(env: ExplorationEnv, seed: int) -> tuple[FloatArray, FloatArray, FloatA
         agents = env.agents
         actions = {agent: policy.act(observations[agent], env.belief(agent), rng) for agent in agents}
         progress = len(paid) / env.max_cycles
-        chosen.append([choice_of(observations[agent], actions[agent]) for agent in agents])
-        seen.append([standing_of(observations[agent], progress) for agent in agents])
+        chosen.append([choice_features(observations[agent], actions[agent]) for agent in agents])
+        seen.append([value_features(observations[agent], progress) for agent in agents])
         observations, _, _, _, infos = env.step(actions)
         paid.append([[infos[agent][f"reward/{term}"] for term in TERMS] for agent in agents])
     return np.array(paid), np.array(chosen), np.array(seen)
 
 
 def described(observation: Mapping[str, Any]) -> FloatArray:
-    """Return what `CHOICES` names of each valid candidate (n, 3)."""
+    """Return the features `CHOICES` of each valid candidate (n, 3)."""
     _, _, length, size, mate = observation["candidates"][observation["action_mask"][1:] != 0].T.astype(np.float64)
     return np.column_stack([-np.log1p(length), np.log1p(size), mate >= length])
 
 
-def choice_of(observation: Mapping[str, Any], action: int) -> FloatArray:
-    """Return how the chosen candidate differs from the mean of the valid ones (3,), in their standard deviations."""
+def choice_features(observation: Mapping[str, Any], action: int) -> FloatArray:
+    """Return the chosen candidate minus the mean of the valid ones (3,), in their standard deviations."""
     valid = np.flatnonzero(observation["action_mask"][1:])
     rows = described(observation)
     if action == 0 or len(rows) < 2:
@@ -127,24 +128,24 @@ def choice_of(observation: Mapping[str, Any], action: int) -> FloatArray:
     return np.where(spread > 1e-6, differs, 0.0)
 
 
-def standing_of(observation: Mapping[str, Any], progress: float) -> FloatArray:
-    """Return what a value is fitted to (V,): time, map, pose, candidates, floor and walls around."""
+def value_features(observation: Mapping[str, Any], progress: float) -> FloatArray:
+    """Return the features of the value (V,): time, map, pose, candidates, free cells and walls nearby."""
     rows, (count, sigma, _, _, _, group) = described(observation), observation["map_stats"]
     best = rows.max(axis=0) if len(rows) else np.zeros(3)
     mean = rows.mean(axis=0) if len(rows) else np.zeros(3)
     around = observation["local_grid"].mean(axis=(1, 2)) / 255.0
-    told = (1.0, progress, progress**2, progress * group, count / 100, 5 * sigma, group, observation["pose_std"][0])
-    return np.array([*told, len(rows) / 16, *best, *mean, *around])
+    scalars = (1.0, progress, progress**2, progress * group, count / 100, 5 * sigma, group, observation["pose_std"][0])
+    return np.array([*scalars, len(rows) / 16, *best, *mean, *around])
 
 
 def advantages(rewards: FloatArray, seen: FloatArray, gamma: float, trace: float) -> tuple[FloatArray, float]:
-    """Return the advantages (E, T, K), mean 0 and standard deviation 1, and the share of the returns explained.
+    """Return the advantages (E, T, K), with mean 0 and standard deviation 1, and the explained share of the returns.
 
     Args:
-        rewards: (E, T, K).
-        seen: (E, T, K, V).
+        rewards: (E, T, K) float64. Rewards by episode, decision and robot.
+        seen: (E, T, K, V) float64. Features of the value.
         gamma: Discount per decision.
-        trace: lambda.
+        trace: Lambda of the generalised advantage estimate.
     """
     returns, ahead = np.zeros_like(rewards), np.zeros(rewards[:, 0].shape)
     for t in reversed(range(rewards.shape[1])):
@@ -162,11 +163,11 @@ def advantages(rewards: FloatArray, seen: FloatArray, gamma: float, trace: float
 
 
 def play_ticks(env: ExplorationEnv, make: Callable[[], Policy], seed: int) -> tuple[FloatArray, FloatArray]:
-    """Play an episode of one policy for all robots.
+    """Run an episode with one policy for all robots.
 
     Returns:
-        What the default reward and the running cost paid in each step, means over the robots (T, 2), and the mean map
-        error at the reset and after each step (T + 1,) [m].
+        Default reward and running cost of each step, means over the robots (T, 2), and the mean map error at the reset
+        and after each step (T + 1,) [m].
     """
     paid, errors = [], []
 
@@ -180,11 +181,11 @@ def play_ticks(env: ExplorationEnv, make: Callable[[], Policy], seed: int) -> tu
 
 
 def returns_of(paid: FloatArray, errors: FloatArray, gamma: float) -> dict[str, float]:
-    """Return the discounted return of an episode by the names of `RETURNS`.
+    """Return the discounted return of an episode by the names in `RETURNS`.
 
     Args:
-        paid: (T, 2). What the default reward and the running cost paid in each step.
-        errors: (T + 1,) [m]. The map error at the reset and after each step.
+        paid: (T, 2) float64. Default reward and running cost of each step.
+        errors: (T + 1,) float64 [m]. Map error at the reset and after each step.
         gamma: Discount per step.
     """
     discounts = gamma ** np.arange(len(paid))
@@ -201,20 +202,20 @@ def table_of(found: Mapping[tuple[str, float, str], FloatArray]) -> str:
             cells = []
             for gamma in DISCOUNTS:
                 own = found[reward, gamma, policy]
-                more = mean_of("more", own - found[reward, gamma, FRONTIER])
-                cells += [f"{own.mean():z.3f}", "" if policy == FRONTIER else shown(more, "more")]
+                more = mean_ci("more", own - found[reward, gamma, FRONTIER])
+                cells += [f"{own.mean():z.3f}", "" if policy == FRONTIER else format_ci(more, "more")]
             rows.append([title, policy, *cells])
-    headings = [text for gamma in DISCOUNTS for text in (f"gamma {gamma:g}", "less the frontier's")]
+    headings = [text for gamma in DISCOUNTS for text in (f"gamma {gamma:g}", "minus frontier")]
     return markdown_table(["reward", "policy", *headings], rows)
 
 
 @app.command()
 def returns(
-    seeds: Annotated[int, typer.Option(help="Episodes of each policy, 100 s long.")] = 20,
-    first_seed: Annotated[int, typer.Option(help="Seed of the first episode; the others follow.")] = 0,
+    seeds: Annotated[int, typer.Option(help="Number of episodes of each policy, 100 s long.")] = 20,
+    first_seed: Annotated[int, typer.Option(help="Seed of the first episode; later ones count up.")] = 0,
 ) -> None:
-    """Play scripted policies, and print what discounts make of their returns."""
-    check_int("seeds", seeds, 2, "An interval needs two or more.")
+    """Run scripted policies, and print their returns by discount."""
+    check_int("seeds", seeds, 2, "A confidence interval needs two or more.")
     check_int("first_seed", first_seed, 0, "Use 0 or a positive number.")
     env = vslam_v0.parallel_env(reward={"map_error": 1.0, RUNNING_COST: 1.0})
     every = [(policy, seed) for seed in range(first_seed, first_seed + seeds) for policy in PLAYERS]
@@ -229,11 +230,11 @@ def returns(
 
 @app.command()
 def choices(
-    episodes: Annotated[int, typer.Option(help="Of three robots and 90 s; a second or two each.")] = 60,
-    first_seed: Annotated[int, typer.Option(help="Of the first of them.")] = 2000,
+    episodes: Annotated[int, typer.Option(help="Number of episodes of three robots and 90 s.")] = 60,
+    first_seed: Annotated[int, typer.Option(help="Seed of the first episode.")] = 2000,
     gamma: Annotated[float, typer.Option(help="Discount per decision.")] = TrainConfig().gamma,
 ) -> None:
-    """Play random goals, and print how the advantage of a decision correlates with what was chosen."""
+    """Run random goals, and print the correlation of advantages with choices."""
     chosen_config = TrainConfig(reward=dict.fromkeys(TERMS, 1.0))
     env = vslam_v0.parallel_env(config=chosen_config.make_env_config(SPLIT_TRAIN))
     played = [play(env, seed) for seed in range(first_seed, first_seed + episodes)]

@@ -1,8 +1,8 @@
-"""What became of the merges of a run: how far off they were made and left, what they joined, whether they were undone.
+"""Outcomes of the merges of a run: errors at the merge and later, wrong pairs, and undoing.
 
-Two things can be wrong with a merge. It may join landmarks that are not the same. And the motion between the groups'
-start frames may be off, though all pairs are right, where a robot's own way from its start to what is joined is: that
-was so before the merge, and is seen by it.
+A merge can be wrong in two ways. Its pairs may not be the same landmarks. And the transform between the groups' start
+frames may have an error although all pairs are right, if the path from a start to the shared landmarks has an error:
+this error exists before the merge, which reveals it.
 """
 
 from collections.abc import Iterable, Sequence
@@ -19,31 +19,31 @@ from slam_backend.team.team import TeamSlam
 from training.episodes.runner import is_false_merge
 from vslam_env.evaluation.map_scores import FALSE, GroundTruthAssociation
 
-WINDOW = 200  # [steps] after which a false merge counts
+WINDOW = 200  # steps after which a false merge counts
 
 
 @dataclass(slots=True)
 class MergeFate:
-    """What became of a merge.
+    """Outcome of a merge.
 
     Attributes:
-        seed: Of its run.
-        world: Family of worlds.
-        alike: How much landmarks look alike.
-        step: When it was made.
-        robots_a, robots_b: Which groups.
-        error_m, error_deg: Of its motion.
-        bent_m, bent_deg: Of the motion by which the maps would have merged had they not been straightened; NaN if none.
-        wrong_pairs: Share of the pairs it joined that are truly two landmarks; NaN if it was forced without pairs.
-        undone_after: Steps until it was undone; None: it was not.
-        ended_after: Steps until the run ended.
-        later_m, later_deg: Of one group's frame in the other's as the team has it `WINDOW` steps later, or at the end
-            of the run if that is earlier; NaN if undone by then.
-        end_m, end_deg: The same at the end; NaN if undone.
-        moved: Largest share of a side's landmarks that was seen out of place while the merge was watched; beyond
-            `MergeOptions.max_deformed` it is undone. NaN if it was not watched.
-        doubt: Doubt of the attempt that led to it, see `MergeEvent`; NaN if it was forced.
-        undone_m, undone_deg: How far off the merge was, as the team had it, just before it was undone; NaN if it was
+        seed: Seed of the run.
+        world: World family.
+        alike: Description of the similarity of landmarks.
+        step: Step of the merge.
+        robots_a, robots_b: Robots of the two groups.
+        error_m, error_deg: Error of the transform of the merge.
+        bent_m, bent_deg: Error of the transform from the unsmoothed maps; NaN if there is none.
+        wrong_pairs: Share of the merged pairs that are two landmarks in truth; NaN for a forced merge without pairs.
+        undone_after: Steps until the merge was undone; None: it was not.
+        ended_after: Steps until the end of the run.
+        later_m, later_deg: Error of the transform between the groups' frames, as estimated by the team `WINDOW` steps
+            later, or at the end of the run if earlier; NaN if undone by then.
+        end_m, end_deg: Error of the same transform at the end; NaN if undone.
+        moved: Largest share of a side's landmarks that was out of place while the merge was monitored; above
+            `MergeOptions.max_deformed` the merge is undone. NaN if it was not monitored.
+        doubt: Uncertainty of the attempt that led to the merge, see `MergeEvent`; NaN for a forced merge.
+        undone_m, undone_deg: Error of the merge, as estimated by the team, just before it was undone; NaN if it was
             not.
     """
 
@@ -71,31 +71,31 @@ class MergeFate:
 
     @property
     def is_false(self) -> bool:
-        """Whether its motion was plainly wrong."""
+        """Whether the error of the transform exceeds the thresholds of a false merge."""
         return is_false_merge(self.error_m, self.error_deg)
 
     @property
     def is_rightly_undone(self) -> bool | None:
-        """Whether it was off, when made or when undone, by what counts as false; None if it was not undone."""
+        """Whether the error at the merge or at its undo exceeded the thresholds; None if it was not undone."""
         if self.undone_after is None:
             return None
         return self.is_false or is_false_merge(self.undone_m, self.undone_deg)
 
     @property
     def counts(self) -> bool:
-        """Whether it was in force after the window, or at the end."""
+        """Whether the merge persisted for the window, or until the end."""
         return self.undone_after is None or self.undone_after > WINDOW
 
 
 @dataclass(slots=True)
 class Delay:
-    """An attempt whose maps aligned as they were, but not once they were straight, or not surely enough then.
+    """Attempt with an alignment of the unsmoothed maps, but not of the smoothed ones, or with too large uncertainty.
 
     Attributes:
-        seed: Of its run.
-        step: When it was made.
-        reason: Why it was refused.
-        merged_after: Steps until the two groups' first robots shared a map; None: they never did.
+        seed: Seed of the run.
+        step: Step of the attempt.
+        reason: Reason of the refusal.
+        merged_after: Steps until the two groups' first robots shared a map; None: never.
     """
 
     seed: int
@@ -106,14 +106,14 @@ class Delay:
 
 @dataclass(slots=True)
 class RunEnd:
-    """How a run ended.
+    """State at the end of a run.
 
     Attributes:
-        seed: Its seed.
-        world: Family of worlds, or floor plan.
-        groups: The robots that share a map at the end.
-        last_merge: The step of the last merge that is in force; None without one.
-        ate_m: RMS error of each robot's path after the best SE(2) fit, mean over the robots; NaN where not asked.
+        seed: Seed of the run.
+        world: World family, or floor plan.
+        groups: Robots that share a map at the end.
+        last_merge: Step of the last merge that was not undone; None without one.
+        ate_m: RMS error of each robot's path after the best SE(2) fit, mean over the robots; NaN if not computed.
     """
 
     seed: int
@@ -127,18 +127,18 @@ Fates = tuple[list[MergeFate], list[Delay], RunEnd]
 
 
 class Follower:
-    """Follows the merges of a run, step by step.
+    """Observer of the merges of a run, step by step.
 
     Args:
-        team: That merges.
-        ledger: Which true landmark each landmark of its maps is.
+        team: Team whose merges are observed.
+        ledger: True landmark of each landmark in the maps.
         starts: (K, 3) true start poses, world frame.
 
     Attributes:
-        wrong_pairs: By number of the event the share of the pairs joined that are truly two landmarks.
-        later: How far off each merge is [m, degrees], as the team has it at most `WINDOW` steps later.
-        last: How far off each merge is [m, degrees], as the team had it last.
-        moved: Largest share of a side's landmarks that was seen out of place while the merge was watched.
+        wrong_pairs: Share of merged pairs that are two landmarks in truth, by number of the event.
+        later: Error of each merge [m, degrees], as estimated by the team at most `WINDOW` steps later.
+        last: Latest error of each merge [m, degrees], as estimated by the team.
+        moved: Largest share of a side's landmarks that was out of place while the merge was monitored.
     """
 
     def __init__(self, team: TeamSlam, ledger: GroundTruthAssociation, starts: FloatArray) -> None:
@@ -150,11 +150,11 @@ class Follower:
 
     @property
     def groups(self) -> tuple[tuple[int, ...], ...]:
-        """Of the team, as it is now."""
+        """Current groups of the team."""
         return self._team.groups
 
     def note(self, step: int) -> None:
-        """Look at the merges there are after a step."""
+        """Update the records after a step."""
         if step % self._team._merging.watch_every == 0:
             self._weigh()
         for i, event in enumerate(self._team.events):
@@ -162,12 +162,12 @@ class Follower:
                 if i not in self.wrong_pairs:
                     self.wrong_pairs[i] = self._share_of_wrong_pairs(event)
                 if undone_in(self._team.events, event) is None:
-                    self.later[i] = self.off_now(event)
+                    self.later[i] = self.current_error(event)
             if event.kind == "merge" and undone_in(self._team.events, event) is None:
-                self.last[i] = self.off_now(event)
+                self.last[i] = self.current_error(event)
 
     def _weigh(self) -> None:
-        """Note which shares of the maps of watched merges are out of place."""
+        """Record the shares of landmarks out of place in the maps of monitored merges."""
         numbers = {id(event.alignment): i for i, event in enumerate(self._team.events) if event.kind == "merge"}
         for group in self._team._groups:
             if not group.trunk.monitors:
@@ -178,15 +178,15 @@ class Follower:
                 share = max(deformed_fraction(old, joint, self._team._alignment) for old in watch.pre_merge_maps)
                 self.moved[i] = max(share, self.moved.get(i, 0.0))
 
-    def off_now(self, merge: MergeEvent) -> tuple[float, float]:
-        """Return by how much [m, degrees] one group's frame is off in the other's as their joint filter has it now."""
+    def current_error(self, merge: MergeEvent) -> tuple[float, float]:
+        """Return the error [m, degrees] of the transform between the groups' frames in their joint filter."""
         trunk = self._team._group_of(merge.robots_a[0]).trunk
         robots = (group[0] for group in (merge.robots_a, merge.robots_b))
         starts = [trunk.filter.start_pose(trunk.robots.index(robot)) for robot in robots]
-        return off_by(self._starts, merge, between(*starts))
+        return transform_error(self._starts, merge, between(*starts))
 
     def _share_of_wrong_pairs(self, merge: MergeEvent) -> float:
-        """Return it for a merge just made; false points are no landmarks, and a pair with one is wrong."""
+        """Return the share of wrong pairs of a new merge; pairs with false points are wrong."""
         watches = (watch for group in self._team._groups for watch in group.trunk.monitors)
         sides = next(watch.sides for watch in watches if watch.alignment is merge.alignment)
         claims = []
@@ -196,8 +196,8 @@ class Follower:
         return float(np.mean((claims[0] != claims[1]) | (claims[0] == FALSE))) if len(claims[0]) else float("nan")
 
 
-def off_by(starts: FloatArray, event: MergeEvent, motion: FloatArray) -> tuple[float, float]:
-    """Return by how much [m, degrees] a motion between two groups' frames is wrong."""
+def transform_error(starts: FloatArray, event: MergeEvent, motion: FloatArray) -> tuple[float, float]:
+    """Return the error [m, degrees] of a transform between two groups' frames."""
     error = between(between(starts[event.robots_a[0]], starts[event.robots_b[0]]), motion)
     return float(np.hypot(*error[:2])), float(abs(np.degrees(error[2])))
 
@@ -205,14 +205,14 @@ def off_by(starts: FloatArray, event: MergeEvent, motion: FloatArray) -> tuple[f
 def fates(
     events: Sequence[MergeEvent], starts: FloatArray, seed: int, world: str, alike: str, steps: int, follower: Follower
 ) -> Fates:
-    """Return what became of the merges of a run that has ended after so many steps, and which came later.
+    """Return the outcomes of the merges of a finished run, its late merges and its final state.
 
     Args:
-        events: Of the run.
+        events: Events of the run.
         starts: (K, 3) true start poses, world frame.
-        seed, world, alike: Of the run.
-        steps: Of the run.
-        follower: That was there in all of them.
+        seed, world, alike: Description of the run.
+        steps: Number of steps of the run.
+        follower: Observer of all steps.
     """
     found, nothing = [], (float("nan"), float("nan"))
     for i, event in enumerate(events):
@@ -222,11 +222,12 @@ def fates(
             found.append(
                 MergeFate(
                     seed, world, alike, event.step, event.robots_a, event.robots_b,
-                    *off_by(starts, event, event.alignment.transform), *off_if_bent(starts, events[:i], event),
+                    *transform_error(starts, event, event.alignment.transform),
+                    *unsmoothed_error(starts, events[:i], event),
                     follower.wrong_pairs[i], None if undone is None else undone - event.step, steps - event.step,
                     *(nothing if soon else follower.later[i]),
-                    *(nothing if undone is not None else follower.off_now(event)),
-                    follower.moved.get(i, float("nan")), doubt_of(events[:i], event),
+                    *(nothing if undone is not None else follower.current_error(event)),
+                    follower.moved.get(i, float("nan")), attempt_uncertainty(events[:i], event),
                     *(nothing if undone is None else follower.last[i]),
                 )
             )  # fmt: skip
@@ -235,34 +236,34 @@ def fates(
 
 
 def undone_in(events: Sequence[MergeEvent], merge: MergeEvent) -> int | None:
-    """Return the step in which a merge was undone; None: it was not."""
+    """Return the step in which a merge was undone; None if it was not."""
     return next((e.step for e in events if e.kind == "undo" and e.alignment is merge.alignment), None)
 
 
-def doubt_of(before: Sequence[MergeEvent], merge: MergeEvent) -> float:
-    """Return the doubt of the attempt that led to a merge; NaN if it was forced."""
+def attempt_uncertainty(before: Sequence[MergeEvent], merge: MergeEvent) -> float:
+    """Return the uncertainty of the attempt that led to a merge; NaN if it was forced."""
     return next((event.uncertainty for event in before if event.alignment is merge.alignment), float("nan"))
 
 
-def off_if_bent(starts: FloatArray, before: Sequence[MergeEvent], merge: MergeEvent) -> tuple[float, float]:
-    """Return by how much [m, degrees] the maps of a merge were off before they were straightened; NaN if they were not.
+def unsmoothed_error(starts: FloatArray, before: Sequence[MergeEvent], merge: MergeEvent) -> tuple[float, float]:
+    """Return the error [m, degrees] of the transform from the unsmoothed maps of a merge; NaN if there is none.
 
     Args:
-        starts: As in `fates`.
-        before: The events before the merge, the attempt that led to it among them.
-        merge: The merge.
+        starts: (K, 3) true start poses, world frame.
+        before: Events before the merge, including the attempt that led to it.
+        merge: Event of the merge.
     """
     attempt = next((event for event in before if event.alignment is merge.alignment), None)
     nothing = float("nan"), float("nan")
     return (
         nothing
         if attempt is None or attempt.unsmoothed_alignment is None
-        else off_by(starts, attempt, attempt.unsmoothed_alignment.transform)
+        else transform_error(starts, attempt, attempt.unsmoothed_alignment.transform)
     )
 
 
 def delays(events: Sequence[MergeEvent], seed: int) -> list[Delay]:
-    """Return the attempts of a run that were refused only because maps were straightened."""
+    """Return the attempts of a run that were refused only because maps were smoothed."""
     found = []
     for i, event in enumerate(events):
         if event.unsmoothed_alignment is not None and not event.alignment.success:
@@ -274,7 +275,7 @@ def delays(events: Sequence[MergeEvent], seed: int) -> list[Delay]:
 
 
 def summarise(merges: list[MergeFate], late: list[Delay], ends: list[RunEnd], steps: int) -> dict[str, Any]:
-    """Return the figures of all runs together."""
+    """Return the summary of all runs."""
     whole = [end.last_merge for end in ends if len(end.groups) == 1 and end.last_merge is not None]
     false = [merge for merge in merges if merge.is_false]
     right = [merge for merge in merges if not merge.is_false]
@@ -311,12 +312,12 @@ def summarise(merges: list[MergeFate], late: list[Delay], ends: list[RunEnd], st
 
 
 def mean(values: Iterable[float]) -> float:
-    """Return the mean of those that are not NaN; NaN if all are."""
+    """Return the mean of the values that are not NaN; NaN if there are none."""
     known = [value for value in values if np.isfinite(value)]
     return float(np.mean(known)) if known else float("nan")
 
 
 def rms(values: Iterable[float]) -> float:
-    """Return the root mean square of those that are not NaN; NaN if all are."""
+    """Return the root mean square of the values that are not NaN; NaN if there are none."""
     squares = np.square([value for value in values if np.isfinite(value)])
     return float(np.sqrt(squares.mean())) if len(squares) else float("nan")

@@ -1,4 +1,4 @@
-"""Are wrong merges avoided, or found and undone? Runs in random worlds whose landmarks look alike, back to back.
+"""Soak test of merges in random worlds with similar landmarks: are false merges avoided, or detected and undone?
 
     python benchmarks/merge_soak.py --minutes 10 --json merge_soak.json
     python benchmarks/merge_soak.py --minutes 10 --forced
@@ -7,15 +7,15 @@
     python benchmarks/merge_soak.py --minutes 60 --world FOLDER_OF_PLANS --seeds 3
     python benchmarks/merge_soak.py --minutes 60 --world maze --world loops --seeds 10
 
-Runs are stereo runs through offices of aisles, 100 m per robot, with look-alikes in classes of one to three, false
-points and wrong descriptors; or episodes of the environment in all its families of worlds, up to all landmarks with a
-twin. Numbers of robots and contacts change from run to run. A merge is false if it is more than 0.5 m or 5 degrees off;
-it counts if it is in force 200 steps later or at the end. How far off the team is by then, and whether what it joined
-are the same landmarks, is told beside it, see `merge_fates`. With `--forced` robots do not merge by themselves: once
-two maps are large enough they are merged by that wrong motion which fits them best, and the question is how many of
-these the team undoes, and when; `--shift 0.6` takes the true motion shifted by so many metres instead.
-With `--world` the runs are those of `vslam run --world WORLD --seed SEED`: all worlds that are named, a folder standing
-for the floor plans in it, with `--seeds` seeds each, from `--first-seed` on; `--minutes` ends them early.
+Runs are stereo runs through offices of aisles, 100 m per robot, with classes of one to three similar landmarks, false
+points and wrong descriptors; or episodes of the environment in all world families, in which up to all landmarks have a
+twin. Numbers of robots and contacts vary between runs. A merge is false if its error exceeds 0.5 m or 5 degrees; it
+counts if it persists for 200 steps or until the end. The error of the team's estimate at that time, and the share of
+wrong pairs, are reported as well, see `merge_fates`. With `--forced` robots do not merge by themselves: once two maps
+are large enough they are merged with the wrong transform that fits them best, and the question is how many of these
+merges the team undoes, and when; `--shift 0.6` instead shifts the true transform by this distance in metres.
+With `--world` the runs are those of `vslam run --world WORLD --seed SEED`, for all given worlds, where a folder stands
+for the floor plans in it, with `--seeds` seeds each, starting at `--first-seed`; `--minutes` ends them early.
 """
 
 import os
@@ -54,24 +54,24 @@ from vslam_env.evaluation.map_scores import GroundTruthAssociation
 
 KINDS = ("aisles", "environment", "both")
 WORLDS = ("office", "loops", "maze", "hall", "fig5")
-REPEATED = (0.0, 0.5, 1.0)  # shares of landmarks that look like another one
+REPEATED = (0.0, 0.5, 1.0)  # shares of landmarks with a twin
 RADIOS: tuple[dict[str, Any], ...] = ({}, {"comm_range": 8.0}, {"comm_line_of_sight": True}, {"comm_loss": 0.2})
-LOSES, FINDS = 0.02, 0.05  # probability per step that a link is lost, and found again
-ENOUGH = 20  # landmarks of either map before a merge is forced
-HYPOTHESES, COINCIDENCE = 2000, 0.25  # [-, m]: how a forced merge is found
-Runs = tuple[Fates, int]  # what became of a run, and its steps
+LOSES, FINDS = 0.02, 0.05  # probabilities per step that a link is lost, and restored
+ENOUGH = 20  # minimum landmarks of each map for a forced merge
+HYPOTHESES, COINCIDENCE = 2000, 0.25  # number of hypotheses and inlier distance of forced merges [-, m]
+Runs = tuple[Fates, int]  # outcomes of a run, and its number of steps
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Setting:
-    """What the command line decides about each run.
+    """Options of all runs, from the command line.
 
     Attributes:
-        forced: Merge wrongly on purpose.
-        shift: How [m]; None: by the motion that fits best.
-        rejuvenate_every: Of the filters; None: their default.
-        straighten: Maps before a merge.
-        sure, min_sigmas_on_trial: Of the motion a merge has to be, see `MergeOptions`; None: as it is by default.
+        forced: Whether wrong merges are forced.
+        shift: Shift of forced merges [m]; None: the wrong transform with the best fit.
+        rejuvenate_every: Interval of rejuvenations; None: the filters' default.
+        straighten: Whether maps are smoothed before a merge.
+        sure, min_sigmas_on_trial: Required certainty of a transform, see `MergeOptions`; None: the default.
     """
 
     forced: bool = False
@@ -83,18 +83,20 @@ class Setting:
 
     @property
     def merging(self) -> dict[str, Any]:
-        """Options of merges."""
-        told = {"smooth_first": self.straighten, "min_sigmas": self.sure}
-        return told if self.min_sigmas_on_trial is None else told | {"min_sigmas_on_trial": self.min_sigmas_on_trial}
+        """Merge options."""
+        options = {"smooth_first": self.straighten, "min_sigmas": self.sure}
+        return (
+            options if self.min_sigmas_on_trial is None else options | {"min_sigmas_on_trial": self.min_sigmas_on_trial}
+        )
 
     @property
     def filter(self) -> dict[str, Any]:
-        """Options of the filters that are not their defaults."""
+        """Filter options that differ from the defaults."""
         return {} if self.rejuvenate_every is None else {"rejuvenate_every": self.rejuvenate_every}
 
 
 def make_env(seed: int, cycles: int, setting: Setting) -> ExplorationEnv:
-    """Return the environment of an episode: the seed decides about everything."""
+    """Return the environment of an episode, which the seed determines completely."""
     rng = np.random.default_rng([seed, 17])
     config = preset_config("standard").replace(
         world=str(rng.choice(WORLDS)),
@@ -112,7 +114,7 @@ def make_env(seed: int, cycles: int, setting: Setting) -> ExplorationEnv:
 
 
 def play_environment(seed: int, cycles: int, setting: Setting) -> Fates:
-    """Run one episode and return what became of its merges."""
+    """Run one episode and return the outcomes of its merges."""
     env = make_env(seed, cycles, setting)
     rng = np.random.default_rng([seed, 18])
     policies = [make_policy("frontier", env.config.action_type) for _ in env.possible_agents]
@@ -132,7 +134,7 @@ def play_environment(seed: int, cycles: int, setting: Setting) -> Fates:
 
 
 def play_world(world: str, seed: int, setting: Setting) -> Fates:
-    """Play the episode of `vslam run` in one world and return what became of its merges."""
+    """Run the episode of `vslam run` in one world and return the outcomes of its merges."""
     run = RunConfig(world=world, seed=seed)
     belief = {"merging": setting.merging, "filter": setting.filter}
     env = ExplorationEnv(run.environment().replace(belief=belief))
@@ -153,7 +155,7 @@ def play_world(world: str, seed: int, setting: Setting) -> Fates:
 
 
 def named_worlds(worlds: Sequence[str]) -> list[str]:
-    """Return families and floor plans, those of a folder by their names."""
+    """Return world families and floor plans, with folders replaced by the sorted plans in them."""
     found = []
     for world in worlds:
         folder = Path(world)
@@ -162,7 +164,7 @@ def named_worlds(worlds: Sequence[str]) -> list[str]:
 
 
 def play_random(minutes: float, first_seed: int, cycles: int | None, kind: str, setting: Setting) -> Iterator[Runs]:
-    """Play random runs until so many minutes are over."""
+    """Run random runs until the time is over."""
     begin = time.monotonic()
     for seed in count(first_seed):
         if time.monotonic() - begin > 60.0 * minutes:
@@ -173,7 +175,7 @@ def play_random(minutes: float, first_seed: int, cycles: int | None, kind: str, 
 
 
 def play_named(minutes: float, first_seed: int, worlds: Sequence[str], seeds: int, setting: Setting) -> Iterator[Runs]:
-    """Play so many seeds in each of some worlds, or until so many minutes are over."""
+    """Run all seeds in each of some worlds, or until the time is over."""
     begin = time.monotonic()
     for world in named_worlds(worlds):
         for seed in range(first_seed, first_seed + seeds):
@@ -182,7 +184,7 @@ def play_named(minutes: float, first_seed: int, worlds: Sequence[str], seeds: in
 
 
 def play_aisles(seed: int, cycles: int, setting: Setting) -> Fates:
-    """Let a team live through one stereo run of `cycles` steps and return what became of its merges."""
+    """Run a team on one stereo run of `cycles` steps and return the outcomes of its merges."""
     rng = np.random.default_rng([seed, 17])
     robots, look_alikes = int(rng.integers(2, 5)), int(rng.integers(1, 4))
     spec = RunSpec(
@@ -213,7 +215,7 @@ def play_aisles(seed: int, cycles: int, setting: Setting) -> Fates:
 
 
 def force(env: ExplorationEnv, rng: np.random.Generator, shift: float | None) -> None:
-    """Merge robots 0 and 1 wrongly, if their maps are large enough."""
+    """Force a wrong merge of robots 0 and 1, if their maps are large enough."""
     belief, ledger = env.episode.belief, env.episode.ledger
     map_a, map_b = belief.filter_map(0), belief.filter_map(1)
     if min(len(map_a), len(map_b)) < ENOUGH:
@@ -224,17 +226,17 @@ def force(env: ExplorationEnv, rng: np.random.Generator, shift: float | None) ->
 def forced_alignment(
     starts: FloatArray, map_a: LandmarkMap, map_b: LandmarkMap, rng: np.random.Generator, shift: float | None
 ) -> Alignment:
-    """Return a wrong alignment of the maps of robots 0 and 1: off by `shift` [m], or else the one that fits best."""
+    """Return a wrong alignment of the maps of robots 0 and 1: shifted by `shift` [m], or the one with the best fit."""
     if shift is not None:
         return shifted_alignment(starts, map_a, map_b, rng, shift)
     return wrong_alignment(starts, map_a, map_b, rng)
 
 
 def wrong_alignment(starts: FloatArray, map_a: LandmarkMap, map_b: LandmarkMap, rng: np.random.Generator) -> Alignment:
-    """Return the plainly wrong motion between the maps of robots 0 and 1 that fits them best, whatever they look like.
+    """Return the false transform between the maps of robots 0 and 1 with the best fit, ignoring descriptors.
 
-    Of many motions that lay two landmarks of b on two of a, that one is taken which brings most one-to-one pairs within
-    `COINCIDENCE`; the pairs are its inliers.
+    Among many transforms that map two landmarks of b to two of a, it is the one with the most one-to-one pairs within
+    `COINCIDENCE`; these pairs are its inliers.
     """
     truth = between(*starts[:2])
     points_a, points_b = map_a.means[:, :2], map_b.means[:, :2]
@@ -258,19 +260,19 @@ def wrong_alignment(starts: FloatArray, map_a: LandmarkMap, map_b: LandmarkMap, 
 def shifted_alignment(
     starts: FloatArray, map_a: LandmarkMap, map_b: LandmarkMap, rng: np.random.Generator, metres: float
 ) -> Alignment:
-    """Return the true motion shifted by so many metres in any direction, with the pairs that this lays together."""
+    """Return the true transform shifted in a random direction, with the pairs that then coincide."""
     angle = rng.uniform(-np.pi, np.pi)
     motion = between(*starts[:2]) + metres * np.array([np.cos(angle), np.sin(angle), 0.0])
     return claimed(motion, coinciding(map_a.means[:, :2], map_b.means[:, :2], motion))
 
 
 def claimed(motion: FloatArray, pairs: IntArray) -> Alignment:
-    """Return an alignment that is sure of its motion (3,) and pairs (k, 2)."""
+    """Return an alignment that claims a certain transform (3,) and pairs (k, 2)."""
     return Alignment(True, "", *motion.tolist(), np.diag([1e-3, 1e-3, 1e-4]), pairs, 0.0)
 
 
 def coinciding(points_a: FloatArray, points_b: FloatArray, motion: FloatArray) -> IntArray:
-    """Return the rows (a, b) of points that, b's moved, are each other's nearest and lie within `COINCIDENCE`."""
+    """Return the rows (a, b) of points that, after moving b, are mutual nearest neighbours within `COINCIDENCE`."""
     moved = points_b @ rotation(motion[2]).T + motion[:2]
     distances = np.linalg.norm(points_a[:, None] - moved, axis=2)
     nearest = distances.argmin(axis=1)
@@ -279,58 +281,60 @@ def coinciding(points_a: FloatArray, points_b: FloatArray, motion: FloatArray) -
     return np.column_stack([rows, nearest])[mutual]
 
 
-def told(merge: MergeFate) -> str:
+def described(merge: MergeFate) -> str:
     """Return a line about a merge."""
     if merge.undone_after is None:
         fate = (
-            f"in force, {merge.later_m:.2f} m {merge.later_deg:.1f} deg off later, {merge.end_m:.2f} m "
+            f"in force, error {merge.later_m:.2f} m {merge.later_deg:.1f} deg later, {merge.end_m:.2f} m "
             f"{merge.end_deg:.1f} deg at the end"
         )
     else:
         fate = (
-            f"undone after {merge.undone_after} steps, {'rightly' if merge.is_rightly_undone else 'WRONGLY'}, "
-            f"{merge.undone_m:.2f} m {merge.undone_deg:.1f} deg off then"
+            f"undone after {merge.undone_after} steps, {'correctly' if merge.is_rightly_undone else 'WRONGLY'}, "
+            f"error {merge.undone_m:.2f} m {merge.undone_deg:.1f} deg then"
         )
     return (
         f"seed {merge.seed} {merge.world} ({merge.alike}): {merge.robots_a} + {merge.robots_b} at "
-        f"{merge.step}, {merge.error_m:.2f} m {merge.error_deg:.1f} deg off"
-        f"{', FALSE' if merge.is_false else ''}, doubt {merge.doubt:.2f}, {merge.moved:.0%} moved, {fate}"
+        f"{merge.step}, error {merge.error_m:.2f} m {merge.error_deg:.1f} deg"
+        f"{', FALSE' if merge.is_false else ''}, uncertainty {merge.doubt:.2f}, {merge.moved:.0%} moved, {fate}"
     )
 
 
 def main(
-    minutes: Annotated[float, typer.Option(help="How long; the last run is played to its end.")] = 10.0,
-    first_seed: Annotated[int, typer.Option(help="Of the first run.")] = 100,
-    cycles: Annotated[int | None, typer.Option(help="Steps of a run.", show_default="400, episodes 1500")] = None,
-    kind: Annotated[str, typer.Option(help="aisles, environment or both.")] = "aisles",
-    forced: Annotated[bool, typer.Option(help="Merge wrongly on purpose.")] = False,
-    shift: Annotated[float | None, typer.Option(help="Forced merges are off by these metres and not turned.")] = None,
-    rejuvenate_every: Annotated[
-        int | None, typer.Option(help="Steps of a filter between its rejuvenations.", show_default="the default")
+    minutes: Annotated[float, typer.Option(help="Duration in minutes; the last run is finished.")] = 10.0,
+    first_seed: Annotated[int, typer.Option(help="Seed of the first run.")] = 100,
+    cycles: Annotated[
+        int | None, typer.Option(help="Number of steps of a run.", show_default="400, episodes 1500")
     ] = None,
-    straighten: Annotated[bool, typer.Option(help="Straighten maps before they merge.")] = True,
+    kind: Annotated[str, typer.Option(help="Kind of runs: aisles, environment or both.")] = "aisles",
+    forced: Annotated[bool, typer.Option(help="Force wrong merges.")] = False,
+    shift: Annotated[float | None, typer.Option(help="Shift of forced merges in metres, without rotation.")] = None,
+    rejuvenate_every: Annotated[
+        int | None, typer.Option(help="Steps between rejuvenations of a filter.", show_default="the default")
+    ] = None,
+    straighten: Annotated[bool, typer.Option(help="Smooth maps before a merge.")] = True,
     sure: Annotated[
-        float, typer.Option(help="Deviations a merge has to be sure by; 0: none.")
+        float, typer.Option(help="Required certainty of a merge in standard deviations; 0: none.")
     ] = MergeOptions().min_sigmas,
     min_sigmas_on_trial: Annotated[
-        float | None, typer.Option(help="As MergeOptions has it; 0: no trials.", show_default="the default")
+        float | None, typer.Option(help="Value for MergeOptions; 0: no trials.", show_default="the default")
     ] = None,
-    world: Annotated[list[str] | None, typer.Option(help="A family, a floor plan or a folder of these.")] = None,
-    seeds: Annotated[int, typer.Option(help="Of each world that is named.")] = 3,
-    json_file: Annotated[Path | None, typer.Option("--json", help="Write all figures to this file.")] = None,
+    world: Annotated[list[str] | None, typer.Option(help="World family, floor plan, or folder of floor plans.")] = None,
+    seeds: Annotated[int, typer.Option(help="Number of seeds of each given world.")] = 3,
+    json_file: Annotated[Path | None, typer.Option("--json", help="Write all results to this file.")] = None,
 ) -> None:
-    """Run the soak and print it."""
+    """Run the soak test and print its results."""
     if not minutes > 0.0:
-        raise argument_error("minutes", "a number above 0", minutes, "Run for some time.")
+        raise argument_error("minutes", "a number above 0", minutes, "Give minutes.")
     check_choice("kind", kind, KINDS)
     if shift is not None and not (forced and shift >= 0.0):
-        raise argument_error("shift", "metres, with --forced", shift, "Add --forced, or leave it out.")
+        raise argument_error("shift", "metres, with --forced", shift, "Add --forced, or omit it.")
     if cycles is not None:
         check_int("cycles", cycles, 2, "Give a number of steps.")
     check_int("first_seed", first_seed, 0, "Seeds are not negative.")
-    check_int("seeds", seeds, 1, "Play at least one seed.")
+    check_int("seeds", seeds, 1, "Use at least one seed.")
     if world and (forced or cycles is not None):
-        raise argument_error("world", "no --forced and no --cycles with it", world, "Leave them out.")
+        raise argument_error("world", "no --forced and no --cycles with it", world, "Omit them.")
     if json_file is not None:
         check_writable(json_file, "json")
     setting = Setting(
@@ -349,7 +353,7 @@ def main(
     for (found, delayed, end), length in runs:
         merges, late, ends, steps = merges + found, late + delayed, [*ends, end], steps + length
         for merge in found:
-            console.print(told(merge))
+            console.print(described(merge))
         if len(end.groups) > 1:
             console.print(f"seed {end.seed} {end.world}: groups {end.groups} at the end")
     summary = summarise(merges, late, ends, steps)

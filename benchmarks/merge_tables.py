@@ -1,10 +1,10 @@
-"""The tables of `docs/explanation/merging.md`, from soaks that `merge_soak.py --json` has written.
+"""Tables of `docs/explanation/merging.md` from results of `merge_soak.py --json`.
 
     python benchmarks/merge_tables.py benchmarks/merge_soak/*.json
     python benchmarks/merge_tables.py benchmarks/merge_soak/both_9000.json --worst 6
 
-The first tells of each soak what became of its merges; the second, over all merges that were not forced, what
-straightening the maps was worth; the third which of them were farthest off, and whether what they joined was wrong.
+The first table has the outcomes of the merges of each soak; the second, over all merges that were not forced, compares
+smoothed with unsmoothed maps; the third lists the merges with the largest errors and their shares of wrong pairs.
 """
 
 import json
@@ -18,11 +18,11 @@ import typer
 from slam_backend.core.validation import FloatArray, argument_error, check_int
 from training.episodes.runner import is_false_merge
 
-FAR = 0.3  # [m]
+FAR = 0.3  # error from which a merge counts as inaccurate [m]
 
 
 def read_soaks(files: Sequence[Path]) -> list[dict[str, Any]]:
-    """Return what soaks have written, each with its own name."""
+    """Return the results of soaks with their names."""
     soaks = []
     for file in files:
         try:
@@ -30,21 +30,21 @@ def read_soaks(files: Sequence[Path]) -> list[dict[str, Any]]:
         except (OSError, ValueError) as error:
             raise argument_error("files", "soaks of merge_soak.py --json", str(file), str(error)) from error
         if not isinstance(soak, dict) or not {"setting", "summary", "merges", "delays"} <= set(soak):
-            raise argument_error("files", "soaks of merge_soak.py --json", str(file), "Give files that it has written.")
+            raise argument_error("files", "soaks of merge_soak.py --json", str(file), "Give files of this command.")
         soaks.append(soak | {"name": file.stem})
     return soaks
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    """Return a table in Markdown."""
+    """Return a Markdown table."""
     lines = [head, ["---"] * len(head), *rows]
     return "\n".join("| " + " | ".join(str(cell) for cell in line) + " |" for line in lines)
 
 
 def fates_table(soaks: Sequence[dict[str, Any]]) -> str:
-    """Return what became of the merges of each soak."""
+    """Return the outcomes of the merges of each soak."""
     head = (
-        "soak", "runs", "in one group", "merges", "false", "in force 200 steps later", "off by as much at the end",
+        "soak", "runs", "in one group", "merges", "false", "in force 200 steps later", "still off at the end",
         "right ones undone", "false ones undone, after", "RMS, then 200 steps later [m]", "put off",
     )  # fmt: skip
     rows = []
@@ -71,10 +71,10 @@ def own_merges(soaks: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def straight_table(merges: Sequence[dict[str, Any]]) -> str:
-    """Return how far off the merges are, and would have been as the filters had bent the maps: those that say both."""
+    """Return the errors of merges of smoothed and of unsmoothed maps, for merges with both values."""
     both = [merge for merge in merges if merge["bent_m"] is not None]
     rows = []
-    for name, prefix in (("as the filters bent them", "bent"), ("straightened", "error")):
+    for name, prefix in (("unsmoothed", "bent"), ("smoothed", "error")):
         metres, degrees = (np.array([merge[f"{prefix}_{unit}"] for merge in both]) for unit in ("m", "deg"))
         rows.append((name, *_spread(metres), sum(map(is_false_merge, metres.tolist(), degrees.tolist()))))
     head = (f"maps of {len(both)} merges", "RMS [m]", "95 %", "worst", f"beyond {FAR} m", "false")
@@ -82,7 +82,7 @@ def straight_table(merges: Sequence[dict[str, Any]]) -> str:
 
 
 def worst_table(merges: Sequence[dict[str, Any]], count: int) -> str:
-    """Return so many merges, the farthest off first."""
+    """Return the given number of merges with the largest errors."""
     rows = []
     for merge in sorted(merges, key=lambda merge: -float(merge["error_m"]))[:count]:
         later = "undone" if merge["later_m"] is None else f"{merge['later_m']:.2f} m, {merge['later_deg']:.1f}°"
@@ -90,12 +90,12 @@ def worst_table(merges: Sequence[dict[str, Any]], count: int) -> str:
         wrong = "-" if merge["wrong_pairs"] is None else f"{merge['wrong_pairs']:.0%}"
         made = f"{merge['step']}: {merge['error_m']:.2f} m, {merge['error_deg']:.1f}°"
         rows.append((merge["seed"], merge["world"], groups, made, later, wrong))
-    head = ("seed", "world", "robots", "made at step, off by", "200 steps later, or at the end", "wrong pairs")
+    head = ("seed", "world", "robots", "step, error", "200 steps later, or at the end", "wrong pairs")
     return table(head, rows)
 
 
 def _spread(metres: FloatArray) -> tuple[str, str, str, int]:
-    """Return root mean square, 95 %, maximum, and how many are far off."""
+    """Return root mean square, 95 % quantile, maximum, and the number of large errors."""
     if not len(metres):
         return "-", "-", "-", 0
     squared = float(np.sqrt(np.mean(metres**2)))
@@ -104,13 +104,13 @@ def _spread(metres: FloatArray) -> tuple[str, str, str, int]:
 
 
 def _number(value: float | None) -> float:
-    """Return NaN for what JSON has none for."""
+    """Return NaN for a JSON null."""
     return float("nan") if value is None else value
 
 
 def main(
-    files: Annotated[list[Path], typer.Argument(help="What merge_soak.py --json has written.")],
-    worst: Annotated[int, typer.Option(help="How many of the farthest.")] = 6,
+    files: Annotated[list[Path], typer.Argument(help="Files of merge_soak.py --json.")],
+    worst: Annotated[int, typer.Option(help="Number of merges with the largest errors.")] = 6,
 ) -> None:
     """Print the tables."""
     check_int("worst", worst, 0, "Use 0 for none.")

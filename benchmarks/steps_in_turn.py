@@ -1,11 +1,11 @@
-"""How long `env.step` takes in two or more checkouts of this repository, timed in turn: what a change gained.
+"""Time of `env.step` in several checkouts of this repository, measured in alternation.
 
     python benchmarks/steps_in_turn.py ../before . --config '{"num_robots": 6}'
 
-Only public names are used, so that trees with different modules can be compared. Each checkout plays the same episode
-with the same actions in a process of its own, and only one of them runs at a time, in bursts of 20 steps. So a machine
-whose speed changes from one second to the next changes it for all of them. Two checkouts of the same arithmetic play
-the same episode; others drift apart by what rounding grows to.
+Only public names are used, so that trees with different modules can be compared. Each checkout runs the same episode
+with the same actions in its own process, and only one process runs at a time, in bursts of 20 steps. Variations of the
+machine's speed therefore affect all checkouts equally. Two checkouts with the same arithmetic run the same episode;
+otherwise rounding differences grow and the episodes diverge.
 """
 
 import json
@@ -21,8 +21,8 @@ import typer
 
 from slam_backend.core.validation import FloatArray, argument_error, check_int
 
-BURST = 20  # steps
-WARM_UP = 60  # steps of each episode that do not count
+BURST = 20  # steps per burst
+WARM_UP = 60  # steps of each episode that are not counted
 PLAYER = """
 import json, os, sys, time
 root, overrides, path, count = sys.argv[1], json.loads(sys.argv[2]), sys.argv[3], int(sys.argv[4])
@@ -34,7 +34,7 @@ from agents import make_policy
 from vslam_env import EnvConfig, vslam_v0
 env = vslam_v0.parallel_env(config=EnvConfig().replace(**overrides))
 env.max_cycles = count + 1
-if not os.path.exists(path):  # the first tree's nearest frontier drives, the others play its actions again
+if not os.path.exists(path):  # the policy runs in the first tree, the others repeat its actions
     policies = {agent: make_policy("frontier", env.config.action_type) for agent in env.possible_agents}
     rng = np.random.default_rng(100)
     observations, actions = env.reset(seed=100)[0], []
@@ -62,7 +62,7 @@ for line in sys.stdin:
 
 
 class Player:
-    """A process that plays episodes of one checkout.
+    """Process that runs episodes of one checkout.
 
     Args:
         root: Folder of the checkout.
@@ -79,7 +79,7 @@ class Player:
         )
 
     def play(self, first: int, last: int) -> list[float]:
-        """Play steps `first` to `last` - 1 of the episode, from its reset if `first` is 0; return their times [us]."""
+        """Run steps `first` to `last` - 1 of the episode, after a reset if `first` is 0; return their times [us]."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._process.stdin.write(json.dumps([first, last]) + "\n")
@@ -97,7 +97,7 @@ class Player:
 
 
 def times_in_turn(players: list[Player], steps: int, plays: int) -> FloatArray:
-    """Return the times (players, plays, steps) [us] of all steps after the warm-up; one more play is thrown away."""
+    """Return the times (players, plays, steps) [us] of all steps after the warm-up; the first play is discarded."""
     times: list[Any] = []
     for play in range(plays + 1):
         rows: list[list[float]] = [[] for _ in players]
@@ -110,14 +110,16 @@ def times_in_turn(players: list[Player], steps: int, plays: int) -> FloatArray:
 
 
 def main(
-    roots: Annotated[list[Path], typer.Argument(help="Checkouts; the first is what the others are compared with.")],
-    config: Annotated[str, typer.Option(help="JSON: what EnvConfig is changed by.")] = "{}",
-    plays: Annotated[int, typer.Option(help="Of the episode; of each step the best counts.")] = 4,
-    steps: Annotated[int, typer.Option(help="That are timed.")] = 600,
+    roots: Annotated[list[Path], typer.Argument(help="Checkouts; the first is the reference.")],
+    config: Annotated[str, typer.Option(help="Changes of EnvConfig as JSON.")] = "{}",
+    plays: Annotated[
+        int, typer.Option(help="Number of repeats of the episode; the best time of each step counts.")
+    ] = 4,
+    steps: Annotated[int, typer.Option(help="Number of timed steps.")] = 600,
 ) -> None:
-    """Print medians, means and 99th percentiles of each checkout, and their ratios to the first."""
-    check_int("plays", plays, 1, "Play at least once.")
-    check_int("steps", steps, 1, "Time at least one.")
+    """Print median, mean and 99 % quantile of each checkout, and their ratios to the first."""
+    check_int("plays", plays, 1, "Use at least one repeat.")
+    check_int("steps", steps, 1, "Use at least one step.")
     for root in roots:
         if not (root / "vslam_env").is_dir():
             raise argument_error("roots", "checkouts of this repository", str(root), "Name folders with vslam_env.")

@@ -1,11 +1,11 @@
-"""A robot's own range-bearing log, CSV files in a folder, becomes a path and a map, scored and drawn.
+"""Path and map from a range-bearing log in CSV files, with errors and a plot.
 
     python examples/own_log.py FOLDER
 
-The folder holds `odometry.csv` (time, v, omega), `sightings.csv` (time, landmark, range, bearing) and, where the truth
+The folder contains `odometry.csv` (time, v, omega), `sightings.csv` (time, landmark, range, bearing) and, if the truth
 is known, `truth.csv` (time, x, y, theta) and `landmarks.csv` (landmark, x, y): seconds, metres, radians, bearings
-positive to the left. The robot moves in the plane. Without a folder the example makes up a log of its own.
-The page docs/how-to/own_log.md says what to change for another robot.
+positive to the left. The robot moves in the plane. Without a folder the example simulates a log.
+The page docs/how-to/own_log.md explains the changes for another robot.
 """
 
 import sys
@@ -24,13 +24,13 @@ from slam_backend.metrics import AteResult, ate
 from slam_backend.readers import integrate_commands, range_bearing_steps, read_csv
 from slam_backend.trajectory import dead_reckoning
 
-# What is assumed of this robot: errors of its odometry, of a range [m] and of a bearing [rad].
+# Assumed noise of this robot: errors of its odometry, of a range [m] and of a bearing [rad].
 MOTION = OdometryModel(sigma_along=0.1, sigma_across=0.05, sigma_heading=0.2, sigma_turn=0.1, floor_heading=0.003)
 SIGMA_RANGE, SIGMA_BEARING = 0.1, 0.02
 
 
 def run(folder: Path, picture: Path) -> dict[str, AteResult]:
-    """Map the log of a folder and draw it; return the errors of path, odometry and map, as far as they are known."""
+    """Map the log of a folder and plot it; return the errors of path, odometry and map, if the truth is known."""
     driven = read_csv(folder / "odometry.csv", ("time", "v", "omega")).numbers
     seen = read_csv(folder / "sightings.csv", ("time", "range", "bearing"), labels=("landmark",))
     steps = range_bearing_steps(
@@ -39,7 +39,7 @@ def run(folder: Path, picture: Path) -> dict[str, AteResult]:
     for note in steps.notes:
         print(note)
 
-    # Gates for identities that are sure: no position is so unlikely that a name would not be believed.
+    # Gates for known identities: no position is unlikely enough to reject an identity.
     slam = FastSlam(
         num_particles=100, motion=MOTION, position_gate=1e4, new_landmark_gate=1e6, rejuvenate_every=50, seed=0
     )
@@ -53,7 +53,7 @@ def run(folder: Path, picture: Path) -> dict[str, AteResult]:
     errors = {}
     if (folder / "truth.csv").is_file():
         rows = read_csv(folder / "truth.csv", ("time", "x", "y", "theta")).numbers
-        rows = rows[np.unique(rows[:, 0], return_index=True)[1]]  # in order, and one row for each time
+        rows = rows[np.unique(rows[:, 0], return_index=True)[1]]  # sorted, with one row per time
         known = (steps.times >= rows[0, 0]) & (steps.times <= rows[-1, 0])
         if not known.any():
             sys.exit(f"truth.csv and the log do not overlap: {rows[0, 0]:.1f} to {rows[-1, 0]:.1f} s in truth.csv.")
@@ -81,14 +81,14 @@ def run(folder: Path, picture: Path) -> dict[str, AteResult]:
 
 
 def make_log(folder: Path) -> None:
-    """Write the log of a robot that drives a figure of eight among ten landmarks; its odometry is 5 % off."""
+    """Simulate the log of a robot that drives a figure of eight among ten landmarks; its odometry has a 5 % error."""
     rng = np.random.default_rng(7)
     times = np.arange(0.0, 120.0, 0.1)
     driven = np.column_stack([times, np.full_like(times, 0.4), 0.35 * np.where(times % 36.0 < 18.0, 1.0, -1.0)])
     poses = compose([2.0, 1.0, 0.8], integrate_commands(driven, times))
     angles = np.linspace(0.0, 2.0 * np.pi, 10, endpoint=False)
     stand = poses[:, :2].mean(axis=0) + 4.0 * np.column_stack([np.cos(angles), np.sin(angles)])
-    told = driven * [1.0, 1.05, 0.95] + rng.normal(0.0, [0.0, 0.02, 0.02], driven.shape)
+    noisy = driven * [1.0, 1.05, 0.95] + rng.normal(0.0, [0.0, 0.02, 0.02], driven.shape)
     rows = []
     for time, pose in zip(times[::5], poses[::5], strict=True):
         for name, (x, y) in zip("ABCDEFGHIJ", transform_points(inverse(pose), stand), strict=True):
@@ -98,7 +98,7 @@ def make_log(folder: Path) -> None:
     (folder / "sightings.csv").write_text("\n".join(["time,landmark,range,bearing", *rows]) + "\n")
     lines = [f"{name},{x},{y}" for name, (x, y) in zip("ABCDEFGHIJ", stand, strict=True)]
     (folder / "landmarks.csv").write_text("\n".join(["landmark,x,y", *lines]) + "\n")
-    _write(folder / "odometry.csv", "time,v,omega", told)
+    _write(folder / "odometry.csv", "time,v,omega", noisy)
     _write(folder / "truth.csv", "time,x,y,theta", np.column_stack([times, poses]))
 
 
@@ -107,20 +107,20 @@ def _write(file: Path, names: str, rows: FloatArray) -> None:
 
 
 def main(
-    folder: Annotated[Path | None, typer.Argument(help="Of the log.", show_default="one that is made up")] = None,
+    folder: Annotated[Path | None, typer.Argument(help="Folder of the log.", show_default="a simulated log")] = None,
     picture: Annotated[Path, typer.Option(help="PNG file to draw.")] = Path("own_log.png"),
 ) -> None:
-    """Map a log, and print how far path and map are off."""
+    """Map a log, and print the errors of path and map."""
     if folder is None:
         folder = Path(tempfile.mkdtemp(prefix="own_log-"))
         make_log(folder)
-        print(f"Made up a log in {folder}")
+        print(f"Simulated a log in {folder}")
     try:
         errors = run(folder, picture)
     except ValueError as error:
         sys.exit(f"error {error}")
-    told = ", ".join(f"{name} {error.aligned:.3f} m" for name, error in errors.items())
-    print(f"RMS errors after the best rigid fit: {told}." if told else "Errors: no ground truth in this folder.")
+    summary = ", ".join(f"{name} {error.aligned:.3f} m" for name, error in errors.items())
+    print(f"RMS errors after the best rigid fit: {summary}." if summary else "Errors: no ground truth in this folder.")
     print(f"Picture: {picture}")
 
 

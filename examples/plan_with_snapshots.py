@@ -1,11 +1,11 @@
-"""Look ahead with snapshots: random shooting over a few decisions, beside the policy that it starts from.
+"""Planning with snapshots: random shooting over several decisions, compared with its base policy.
 
     python examples/plan_with_snapshots.py --seeds 5
 
-Every few decisions the planner tries some plans in a twin of the environment and follows the best. A plan sends each
-robot to one of its candidates and then goes on with the base policy (nearest frontier); one plan is the base policy
-alone. The twin earns true rewards and meets the very noise that will come: this is what an oracle could reach by
-choosing goals, a bound for learned policies and no policy for robots.
+Every few decisions the planner evaluates plans in a twin of the environment and executes the best. A plan sends each
+robot to one of its candidates and then continues with the base policy (nearest frontier); one plan is the base policy
+only. The twin returns true rewards and has the same future noise: the result is an upper bound for learned policies
+that choose goals, not a policy for robots.
 """
 
 from collections.abc import Mapping
@@ -17,30 +17,30 @@ import typer
 from agents import make_policy
 from vslam_env import ExplorationEnv, vslam_v0
 
-Plan = dict[str, int]  # the candidate's slot that each robot heads for first; 0: as the base policy says
+Plan = dict[str, int]  # slot of each robot's first goal; 0: base policy
 
 
 class Base:
-    """The nearest-frontier policy for all robots."""
+    """Nearest-frontier policy for all robots."""
 
     def __init__(self, env: ExplorationEnv) -> None:
         self.policies = {agent: make_policy("frontier", "goal") for agent in env.possible_agents}
 
     def act(self, env: ExplorationEnv, plan: Plan) -> dict[str, Any]:
-        """Return an action for each robot: the planned one while its slot is filled, else that of the policy."""
+        """Return an action for each robot: the planned one while its slot is filled, otherwise the policy's."""
         actions = {}
         for agent in env.agents:
             belief, slot = env.belief(agent), plan.get(agent, 0)
             if slot and belief.candidates.valid[slot - 1]:
                 actions[agent] = slot
             else:
-                # Nearest frontier draws nothing; a policy that does would get a generator of its own here.
+                # Nearest frontier uses no randomness; other policies would get their own generator here.
                 actions[agent] = self.policies[agent].act(None, belief, np.random.default_rng(0))
         return actions
 
 
 def draw_plan(env: ExplorationEnv, rng: np.random.Generator) -> Plan:
-    """Send each robot to a candidate drawn at random, or leave it to the base policy."""
+    """Send each robot to a random candidate, or leave it to the base policy."""
     plan = {}
     for agent in env.agents:
         filled = 1 + np.flatnonzero(env.belief(agent).candidates.valid)
@@ -49,12 +49,12 @@ def draw_plan(env: ExplorationEnv, rng: np.random.Generator) -> Plan:
 
 
 def earned(rewards: Mapping[str, float]) -> float:
-    """Return what a step paid, averaged over the robots."""
+    """Return the reward of a step, averaged over the robots."""
     return float(np.mean(list(rewards.values())))
 
 
 def follow(env: ExplorationEnv, plan: Plan, decisions: int) -> float:
-    """Carry out a plan for some decisions; return what it earned."""
+    """Execute a plan for some decisions; return its reward."""
     base, total = Base(env), 0.0
     for _ in range(decisions):
         if env.agents:
@@ -63,7 +63,7 @@ def follow(env: ExplorationEnv, plan: Plan, decisions: int) -> float:
 
 
 def best_plan(env: ExplorationEnv, twin: ExplorationEnv, rollouts: int, horizon: int, rng: np.random.Generator) -> Plan:
-    """Try plans in the twin, from where the environment stands, and return the one that earned most."""
+    """Evaluate plans in the twin from the current state, and return the one with the highest reward."""
     state = env.get_state()
     plans: list[Plan] = [{}] + [draw_plan(env, rng) for _ in range(rollouts)]
     gains = []
@@ -74,7 +74,7 @@ def best_plan(env: ExplorationEnv, twin: ExplorationEnv, rollouts: int, horizon:
 
 
 def play(seed: int, decisions: int, rollouts: int, horizon: int) -> float:
-    """Play an episode, planning anew every `horizon` decisions; without rollouts it is the base policy's."""
+    """Run an episode with a new plan every `horizon` decisions; without rollouts the base policy decides."""
     env = vslam_v0.parallel_env(action_type="goal", num_robots=2, max_cycles=decisions)
     env.reset(seed=seed)
     twin, rng, total = env.clone(), np.random.default_rng(seed), 0.0
@@ -86,17 +86,19 @@ def play(seed: int, decisions: int, rollouts: int, horizon: int) -> float:
 
 def main(
     seeds: Annotated[int, typer.Option(help="Episodes.")] = 5,
-    first_seed: Annotated[int, typer.Option(help="Of the first.")] = 100,
-    decisions: Annotated[int, typer.Option(help="Of each episode, a second each.")] = 40,
-    rollouts: Annotated[int, typer.Option(help="Plans that are tried beside the base policy's.")] = 12,
-    horizon: Annotated[int, typer.Option(help="Decisions that a plan looks ahead.")] = 5,
+    first_seed: Annotated[int, typer.Option(help="Seed of the first episode.")] = 100,
+    decisions: Annotated[int, typer.Option(help="Number of decisions per episode, of 1 s each.")] = 40,
+    rollouts: Annotated[int, typer.Option(help="Number of plans in addition to the base policy.")] = 12,
+    horizon: Annotated[int, typer.Option(help="Planning horizon in decisions.")] = 5,
 ) -> None:
     """Compare the planner with its base policy."""
     gains = []
     for seed in range(first_seed, first_seed + seeds):
         alone, planned = play(seed, decisions, 0, horizon), play(seed, decisions, rollouts, horizon)
         gains.append((alone, planned))
-        typer.echo(f"seed {seed}: nearest frontier {alone:.3f} m, with snapshots {planned:.3f} m of map error removed")
+        typer.echo(
+            f"seed {seed}: nearest frontier {alone:.3f} m, with snapshots {planned:.3f} m reduction of the map error"
+        )
     alone, planned = np.mean(gains, axis=0)
     typer.echo(f"mean: nearest frontier {alone:.3f} m, with snapshots {planned:.3f} m")
 

@@ -1,1 +1,1 @@
-"""The command line, runs and replays, and the training of exploration policies."""
+"""Command line, episodes, replays, benchmarks and training of exploration policies."""

@@ -1,4 +1,4 @@
-"""`python -m training` is the command `vslam`."""
+"""Entry point of `python -m training`, which is the command `vslam`."""
 
 from training.cli import main
 

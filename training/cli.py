@@ -1,4 +1,4 @@
-"""The command line `vslam`: it only registers commands; each lives in a module of its own."""
+"""Command line `vslam`: registers the commands, each of which has its own module."""
 
 import errno
 import os
@@ -41,9 +41,9 @@ app.add_typer(worlds, name="worlds")
 
 
 def main() -> None:
-    """Run the command line; bad input becomes one line on stderr and exit status 2.
+    """Run the command line; bad input gives one line on stderr and exit status 2.
 
-    A command that SIGINT or SIGTERM has stopped, at once or after what was under way, ends with 128 and its number.
+    A command stopped by SIGINT or SIGTERM, at once or after finishing its current work, exits with 128 + signal number.
     """
     with signals_answered() as handler:
         try:
@@ -55,29 +55,29 @@ def main() -> None:
                 Console(stderr=True).print(f"Stopped by {Signals(handler.number).name}.", highlight=False)
             sys.exit(128 + handler.number)
         except ValueError as error:
-            # Only errors in the project's own form explain themselves; others are faults and keep their traceback.
+            # Errors in the project's format are meant for the user; all others are faults and keep their traceback.
             if ": expected " not in str(error):
                 raise
             _refuse(str(error))
         except OSError as error:
             if _has_no_folder():
                 _refuse("folder: expected a current folder, got a deleted one. Change into one that exists.")
-            # Of stdout, or of a library that writes: our own writers have made theirs a ValueError.
+            # stdout or a library failed to write: the project's own writers raise ValueError.
             if error.errno not in NO_ROOM:
                 raise
             _abandon_stdout()
             where = "stdout" if error.filename is None else repr(error.filename)
-            _refuse(f"output: expected a place with room, got {where}. The system says: {error.strerror}.")
+            _refuse(f"output: expected a disk with free space, got {where}. The system says: {error.strerror}.")
 
 
 def _refuse(text: str) -> NoReturn:
-    """End with one line on stderr."""
+    """Exit with one line on stderr."""
     Console(stderr=True, soft_wrap=True, highlight=False).print(f"[red]error[/] {escape(text)}")
     sys.exit(BAD_INPUT)
 
 
 def _has_no_folder() -> bool:
-    """Tell whether the folder in which the command was called is gone."""
+    """Return whether the folder in which the command was called was deleted."""
     try:
         os.getcwd()
     except FileNotFoundError:
@@ -86,11 +86,11 @@ def _has_no_folder() -> bool:
 
 
 def _abandon_stdout() -> None:
-    """Drop what cannot be printed on stdout: Python would try once more at its end, and complain."""
+    """Discard buffered output that cannot be printed: Python would try again at exit and complain."""
     try:
         sys.stdout.flush()
     except OSError:
-        sys.stdout = open(os.devnull, "w")  # noqa: SIM115   # until the end
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115   # until exit
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Policies that come with the project, and those of users."""
+"""Built-in and custom policies."""
 
 import sys
 from collections.abc import Iterator
@@ -49,7 +49,7 @@ def _run(env: ExplorationEnv, name: str, seed: int) -> tuple[list[Any], float]:
 
 @pytest.mark.parametrize(("name", "action_type"), MATCHES)
 def test_policies_act_within_the_rules(name: str, action_type: str) -> None:
-    """Every policy's actions are in the space and unmasked, and the same seed gives the same actions."""
+    """Actions of every policy are in the space and valid, and the same seed gives the same actions."""
     first, _ = _run(_env(action_type), name, 3)
     second, _ = _run(_env(action_type), name, 3)
     for one, other in zip(first, second, strict=True):
@@ -80,7 +80,7 @@ def _candidates(env: ExplorationEnv, goals: dict[int, tuple[float, float, float]
 
 
 def test_the_nearest_slot_is_chosen_and_kept() -> None:
-    """The shortest path wins; a slot that was chosen is kept unless it is gone or another is less than half as far."""
+    """The shortest path wins; a chosen slot is kept unless it is gone or another path is less than half as long."""
     env = _env("goal")
     env.reset(seed=0)
     both = _belief(env, candidates=_candidates(env, {2: (1.0, 0.0, 4.0), 9: (0.0, 2.0, 3.0)}))
@@ -92,8 +92,8 @@ def test_the_nearest_slot_is_chosen_and_kept() -> None:
     assert choose_slot(_belief(env, candidates=_candidates(env, {}))) is None
 
 
-def test_what_a_teammate_is_nearer_to_is_left_to_it() -> None:
-    """A candidate beside a teammate is avoided, unless there is no other."""
+def test_candidates_with_a_nearer_teammate_are_left_to_it() -> None:
+    """A candidate next to a teammate is avoided, unless there is no other."""
     env = _env("goal")
     env.reset(seed=0)
     mates = (Teammate(1, np.array([-1.5, 2.0, 0.0]), np.eye(3)),)
@@ -103,8 +103,8 @@ def test_what_a_teammate_is_nearer_to_is_left_to_it() -> None:
     assert choose_slot(_belief(env, candidates=one, teammates=mates)) == 9
 
 
-def test_patrols_lead_far_over_seen_floor() -> None:
-    """A far place can be reached over floor that has been seen, and lies far off."""
+def test_patrol_goals_are_far_and_reachable() -> None:
+    """A patrol goal is far away and reachable over known floor."""
     env = _env("continuous", max_cycles=100, num_robots=1)
     env.reset(seed=1, options={"start_poses": [[8.0, 2.0, 1.0]]})
     while env.agents:
@@ -117,15 +117,15 @@ def test_patrols_lead_far_over_seen_floor() -> None:
     assert len(np.unique(places, axis=0)) > 1
 
 
-def test_a_patrol_goes_on_where_a_wall_is_seen_at_its_place() -> None:
-    """Who gets no nearer to the place of a patrol, for a wall that came to be seen there, is sent to another one."""
+def test_blocked_patrol_goals_are_replaced() -> None:
+    """A robot that cannot come closer to a patrol goal because of a newly seen wall gets another goal."""
     env = _env("continuous")
     env.reset(seed=0)
     grid = SeenGrid()
     grid.clear_disc([0.0, 0.0, 0.0], 4.0)
     policy, pose, way = make_policy("frontier", "continuous"), np.zeros(3), []
     belief = _belief(env, pose=pose, candidates=_candidates(env, {}), grid=grid.read_only_view())
-    row, col = cell_of(patrol_goal(belief, np.random.default_rng(0)))  # which the policy draws as well
+    row, col = cell_of(patrol_goal(belief, np.random.default_rng(0)))  # the same goal as the policy's
     assert row > 150 < col
     rng = np.random.default_rng(0)
     for tick in range(400):
@@ -133,7 +133,7 @@ def test_a_patrol_goes_on_where_a_wall_is_seen_at_its_place() -> None:
         speed, turn = policy.act(None, belief, rng)
         if tick == 0:
             state = grid.get_state()
-            state["evidence"][row + np.arange(-4, 5), col - np.arange(-4, 5)] = 1  # across the way to it
+            state["evidence"][row + np.arange(-4, 5), col - np.arange(-4, 5)] = 1  # across the path to it
             grid.set_state(state)
         pose = compose(pose, [0.1 * speed, 0.0, 0.15 * turn])
         way.append(pose[:2])
@@ -141,7 +141,7 @@ def test_a_patrol_goes_on_where_a_wall_is_seen_at_its_place() -> None:
 
 
 def test_unknown_names_and_mismatches() -> None:
-    """An unknown policy, and one that does not know the type of action, are refused with the names that would do."""
+    """Unknown policies and unsupported action types are refused, with the supported names."""
     with pytest.raises(ValueError, match=r"policy: expected one of 'frontier', 'random_.*, got 'best'"):
         make_policy("best", "goal")
     with pytest.raises(ValueError, match="action_type: expected one of 'continuous', 'discrete', 'goal', got 'jump'"):
@@ -184,10 +184,10 @@ NUMBER = 3
 
 @pytest.fixture
 def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """A module in the current folder, which is not among those that Python looks into by itself."""
+    """A module in the current folder, which is not on Python's import path."""
     name = "policies_of_a_user"
     (tmp_path / f"{name}.py").write_text(MODULE)
-    (tmp_path / "asks_for_more.py").write_text("import a_module_that_nobody_has\n")
+    (tmp_path / "asks_for_more.py").write_text("import a_missing_module\n")
     monkeypatch.chdir(tmp_path)
     path = list(sys.path)
     yield name
@@ -197,7 +197,7 @@ def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
 
 
 def test_a_policy_is_found_in_the_current_folder(module: str) -> None:
-    """A class or a function is called for each robot; it says for which actions it is, or is for goals."""
+    """A class or function is called for each robot; its attribute gives the action type, `goal` by default."""
     one, other = (make_policy(f"{module}:Still", "continuous") for _ in range(2))
     assert type(one).__name__ == "Still"
     assert one is not other
@@ -217,37 +217,37 @@ def test_a_policy_is_found_in_the_current_folder(module: str) -> None:
         (
             "os:system",
             "goal",
-            "policy: expected MODULE:NAME of a policy, got no maker of policies: os:system. A policy has",
+            "policy: expected MODULE:NAME of a policy, got no policy factory: os:system. A policy has",
         ),
         (
             "os:abort",
             "goal",
-            "policy: expected MODULE:NAME of a policy, got no maker of policies: os:abort. A policy has",
+            "policy: expected MODULE:NAME of a policy, got no policy factory: os:abort. A policy has",
         ),
         (
             "builtins:int",
             "goal",
-            "policy: expected MODULE:NAME .* got no maker of policies: builtins:int. A policy has",
+            "policy: expected MODULE:NAME .* got no policy factory: builtins:int. A policy has",
         ),
-        ("numpy:sin", "goal", "policy: expected MODULE:NAME of a policy, got no maker of policies: numpy:sin"),
-        ("shutil:rmtree", "goal", "policy: expected MODULE:NAME of a policy, got no maker of policies: shutil:rmtree"),
+        ("numpy:sin", "goal", "policy: expected MODULE:NAME of a policy, got no policy factory: numpy:sin"),
+        ("shutil:rmtree", "goal", "policy: expected MODULE:NAME of a policy, got no policy factory: shutil:rmtree"),
         ("{}:Odd", "goal", "policies_of_a_user:Odd.action_type: expected one of 'continuous', .* got 'flight'"),
         ("{}:Still", "goal", "action_type: expected 'continuous' for policy 'policies_of_a_user:Still', got 'goal'"),
     ],
 )
-def test_what_is_no_policy_is_named(module: str, name: str, action_type: str, says: str) -> None:
-    """Missing modules and names, what lacks a method, and actions that it is not for: each is named as such."""
+def test_invalid_policies_have_specific_errors(module: str, name: str, action_type: str, says: str) -> None:
+    """Missing modules and names, missing methods, and unsupported action types have specific errors."""
     with pytest.raises(ValueError, match=says):
         make_policy(name.format(module), action_type)
 
 
-def test_a_module_that_fails_tells_why_itself(module: str) -> None:
-    """A module that is there but asks for one that is not keeps its own error."""
-    with pytest.raises(ModuleNotFoundError, match="a_module_that_nobody_has"):
+def test_a_failing_module_keeps_its_own_error(module: str) -> None:
+    """A module with a failing import of its own keeps its own error."""
+    with pytest.raises(ModuleNotFoundError, match="a_missing_module"):
         make_policy("asks_for_more:Still", "goal")
 
 
 def test_paths_are_not_taken_for_modules() -> None:
-    """Drives, names with slashes and plain names are left to the registry."""
+    """Drive letters, names with slashes and plain names are left to the registry."""
     assert is_plugin("package.module:Name")
     assert not any(map(is_plugin, ("C:\\models\\best.npz", "runs/train-0-1", "frontier", "module:", ":Name", "a:b.c")))

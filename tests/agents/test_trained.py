@@ -1,4 +1,4 @@
-"""Trained policies: the network in numpy, the file that holds it, and what is refused."""
+"""Trained policies: the numpy network, the model file, and refusals."""
 
 import json
 import subprocess
@@ -48,8 +48,8 @@ def _observation(seed: int = 0) -> dict[str, Any]:
     return observation
 
 
-def test_slots_are_treated_alike() -> None:
-    """Candidates in other slots get the same logits there, and the logit of staying is as before."""
+def test_logits_do_not_depend_on_slots() -> None:
+    """Permuting candidates permutes their logits, and keeps the logit of staying."""
     observation, order = _observation(), np.random.default_rng(5).permutation(16)
     moved = observation | {"candidates": observation["candidates"][order]}
     before, after = (logits(_weights(), {k: v[None] for k, v in o.items()})[0] for o in (observation, moved))
@@ -58,8 +58,8 @@ def test_slots_are_treated_alike() -> None:
     assert np.ptp(before) > 0.1
 
 
-def test_rows_do_not_meet() -> None:
-    """Several observations at once get the logits that each gets alone."""
+def test_batched_observations_are_independent() -> None:
+    """Each observation of a batch has the same logits as alone."""
     some = [_observation(seed) for seed in range(3)]
     together = logits(_weights(), {name: np.stack([o[name] for o in some]) for name in SHAPES})
     for row, observation in zip(together, some, strict=True):
@@ -68,14 +68,14 @@ def test_rows_do_not_meet() -> None:
 
 
 def test_actions_are_drawn_from_the_softmax_of_the_valid_ones() -> None:
-    """Masked actions never come; the others come as often as the softmax says; greedy takes the best of them."""
+    """Invalid actions never occur; valid ones have the frequencies of the softmax; greedy takes the best."""
     observation, weights = _observation(3), _weights()
     scores = logits(weights, {name: observation[name][None] for name in SHAPES})[0].astype(np.float64)
     valid = observation["action_mask"] != 0
     chances = np.where(valid, np.exp(scores), 0.0) / np.exp(scores[valid]).sum()
     policy, rng = TrainedGoalPolicy(weights), np.random.default_rng(0)
     policy.reset()
-    belief: Any = None  # it decides by the observation alone
+    belief: Any = None  # only the observation matters
     counts = np.bincount([policy.act(observation, belief, rng) for _ in range(2000)], minlength=17)
     assert (counts[~valid] == 0).all()
     spread = np.sqrt(2000.0 * chances * (1.0 - chances))
@@ -84,8 +84,8 @@ def test_actions_are_drawn_from_the_softmax_of_the_valid_ones() -> None:
     assert greedy.act(observation, belief, rng) == int(np.where(valid, scores, -np.inf).argmax())
 
 
-def test_a_model_plays_as_any_policy(tmp_path: Path) -> None:
-    """`make_policy` takes the path of a model or of its folder, and the policy drives robots of every team size."""
+def test_models_work_like_other_policies(tmp_path: Path) -> None:
+    """`make_policy` accepts the path of a model or of its folder, and the policy drives teams of any size."""
     save_model(tmp_path / "model.npz", _weights(), ABOUT)
     for name in (str(tmp_path / "model.npz"), str(tmp_path)):
         env = vslam_v0.parallel_env(world="fig5", num_robots=2, num_particles=5, action_type="goal", max_cycles=3)
@@ -100,7 +100,7 @@ def test_a_model_plays_as_any_policy(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_fresh_process_plays_it_without_a_learner(tmp_path: Path) -> None:
+def test_models_need_no_learning_library(tmp_path: Path) -> None:
     """A saved model gives the same logits in another process, which imports neither torch nor Stable-Baselines3."""
     save_model(tmp_path / "model.npz", _weights(), ABOUT)
     np.savez(tmp_path / "seen.npz", **_observation())
@@ -118,8 +118,8 @@ def test_a_fresh_process_plays_it_without_a_learner(tmp_path: Path) -> None:
     )
 
 
-def test_files_keep_everything(tmp_path: Path) -> None:
-    """Weights and what is said of them come back as they were."""
+def test_models_are_restored_exactly(tmp_path: Path) -> None:
+    """Weights and metadata are restored exactly."""
     weights = _weights(4)
     save_model(tmp_path / "a.npz", weights, {"steps": 7, **ABOUT})
     kept, about = load_model(tmp_path / "a.npz")
@@ -132,7 +132,7 @@ def test_files_keep_everything(tmp_path: Path) -> None:
 
 
 def test_damaged_models_are_refused(tmp_path: Path) -> None:
-    """A missing, cut, changed or foreign file, or one of another version, is refused by name with its cure."""
+    """A missing, truncated, changed or foreign file, or one of another version, is refused with a hint."""
     file = tmp_path / "model.npz"
     with pytest.raises(ValueError, match=r"model: expected a model that vslam train wrote, got no such file. Check"):
         load_model(file)
@@ -151,7 +151,7 @@ def test_damaged_models_are_refused(tmp_path: Path) -> None:
         load_model(file)
     about = json.loads(str(arrays["about"])) | {"format": FORMAT + 1, "version": "9.9"}
     np.savez(file, **arrays | {"about": np.array(json.dumps(about))})
-    with pytest.raises(ValueError, match=r"expected one of format 1, got a model of format 2. .* made it, 9.9"):
+    with pytest.raises(ValueError, match=r"expected one of format 1, got a model of format 2. .* wrote it, 9.9"):
         load_model(file)
 
 

@@ -13,21 +13,21 @@ SPEC = importlib.util.spec_from_file_location("env_soak", PATH)
 assert SPEC is not None
 assert SPEC.loader is not None
 env_soak = importlib.util.module_from_spec(SPEC)
-sys.modules["env_soak"] = env_soak  # dataclasses look their module up
+sys.modules["env_soak"] = env_soak  # dataclasses look up their module
 SPEC.loader.exec_module(env_soak)
 
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No episode is played again: that takes other processes."""
+    """No episode is repeated, because that takes other processes."""
     monkeypatch.setattr(env_soak, "beginning", lambda *_: "")
     monkeypatch.setattr(env_soak, "in_another_process", lambda *_: "")
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("quick")
-def test_a_resumed_soak_ends_like_an_unbroken_one(tmp_path: Path) -> None:
-    """A soak that ends at a snapshot and goes on in a new object returns the same bytes as one in a single piece."""
+def test_a_resumed_soak_equals_an_uninterrupted_one(tmp_path: Path) -> None:
+    """A soak test that stops at a snapshot and resumes in a new object returns the same bytes as an unbroken one."""
     whole = env_soak.Soak(3)
     whole.run(120, None)
     keep = tmp_path / "soak.state"
@@ -42,7 +42,7 @@ def test_a_resumed_soak_ends_like_an_unbroken_one(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
 def test_a_stopped_soak_leaves_a_whole_snapshot(tmp_path: Path, how: signal.Signals) -> None:
-    """A soak that is killed, or stopped by Ctrl-C, while it writes snapshots leaves one from which it goes on."""
+    """A soak test that is killed, or stopped by Ctrl-C, while it writes snapshots leaves a valid one."""
     keep = tmp_path / "soak.state"
     code = (
         "import signal, sys; sys.path.insert(0, sys.argv[1]); import env_soak, pathlib\n"
@@ -67,8 +67,8 @@ def test_a_stopped_soak_leaves_a_whole_snapshot(tmp_path: Path, how: signal.Sign
 
 
 @pytest.mark.usefixtures("quick")
-def test_what_does_not_hold_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A robot in a wall, an observation outside its space and an info that is no number each end the soak."""
+def test_violated_invariants_are_detected(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A robot in a wall, an observation outside its space and a non-numeric info each end the soak test."""
     env = env_soak.vslam_v0.parallel_env(world="fig5", num_robots=2, num_particles=3)
     returned: tuple[Any, ...] = env.reset(seed=1)
     env_soak.check(env, returned)
@@ -83,13 +83,13 @@ def test_what_does_not_hold_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     x1, y1, x2, y2 = env.world.walls[0]
     stuck = np.array([[0.5 * (x1 + x2), 0.5 * (y1 + y2) + 0.1, 0.0], env.true_poses[1]])
     monkeypatch.setattr(type(env), "true_poses", property(lambda self: stuck))
-    with pytest.raises(AssertionError, match="a robot stands in a wall"):
+    with pytest.raises(AssertionError, match="a robot is inside a wall"):
         env_soak.check(env, returned)
 
 
 @pytest.mark.slow
 def test_beginnings_do_not_depend_on_the_process() -> None:
-    """The first steps of an episode are the same bytes beside another environment and under another hash seed."""
+    """The first steps of an episode have the same bytes beside another environment and with another hash seed."""
     reference = env_soak.beginning(5, 6, False)
     assert env_soak.beginning(5, 6, True) == reference
     assert env_soak.in_another_process(5, 6, 99) == reference

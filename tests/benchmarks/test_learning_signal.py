@@ -1,4 +1,4 @@
-"""What a learner is paid for: advantages by hand, choices against what was valid, discounted returns, the tables."""
+"""Learning signal of rewards: advantages by hand, relative choices, discounted returns, tables."""
 
 import importlib.util
 from pathlib import Path
@@ -19,24 +19,24 @@ SPEC.loader.exec_module(learning_signal)
 
 
 def _seen(candidates: list[list[float]]) -> dict[str, Any]:
-    """Return an observation with candidates (length, size, distance of a teammate) in the first slots but one."""
+    """Return an observation with candidates (length, size, distance of a teammate) in all first slots but one."""
     rows, mask = np.zeros((16, 5), np.float32), np.zeros(17, np.int8)
     rows[1 : 1 + len(candidates), 2:] = candidates
     mask[[0, *range(2, 2 + len(candidates))]] = 1
     return {"candidates": rows, "action_mask": mask}
 
 
-def test_choices_are_told_against_what_was_valid() -> None:
-    """The shorter, longer, unclaimed one of two lies one standard deviation above their mean in each."""
+def test_choices_are_relative_to_valid_candidates() -> None:
+    """Of two candidates, the shorter, longer, unclaimed one is one standard deviation above their mean in each."""
     two = _seen([[2.0, 3.0, 9.0], [8.0, 1.0, 4.0]])
-    np.testing.assert_allclose(learning_signal.choice_of(two, 2), [1.0, 1.0, 1.0])
-    np.testing.assert_allclose(learning_signal.choice_of(two, 3), [-1.0, -1.0, -1.0])
-    assert not learning_signal.choice_of(two, 0).any()
-    assert not learning_signal.choice_of(_seen([[2.0, 3.0, 9.0]]), 2).any()
+    np.testing.assert_allclose(learning_signal.choice_features(two, 2), [1.0, 1.0, 1.0])
+    np.testing.assert_allclose(learning_signal.choice_features(two, 3), [-1.0, -1.0, -1.0])
+    assert not learning_signal.choice_features(two, 0).any()
+    assert not learning_signal.choice_features(_seen([[2.0, 3.0, 9.0]]), 2).any()
 
 
-def test_advantages_are_those_of_the_definition() -> None:
-    """They are the discounted sums of surprises about a value that is fitted to the returns, scaled."""
+def test_advantages_match_the_definition() -> None:
+    """Advantages are the scaled discounted sums of temporal differences to a fitted value."""
     rng = np.random.default_rng(1)
     rewards, seen = rng.standard_normal((6, 5, 2)), rng.standard_normal((6, 5, 2, 3))
     scaled, explained = learning_signal.advantages(rewards, seen, 0.9, 0.7)
@@ -51,7 +51,7 @@ def test_advantages_are_those_of_the_definition() -> None:
 
 
 @pytest.mark.parametrize("gamma", [1.0, 0.999, 0.99])
-def test_returns_are_those_of_the_definition(gamma: float) -> None:
+def test_returns_match_the_definition(gamma: float) -> None:
     """Discounts weigh the map error of early steps; shaping alone pays the first error, whatever comes after it."""
     errors = np.random.default_rng(2).uniform(0.2, 0.7, 301)
     paid = np.column_stack([errors[:-1] - errors[1:], -TICK * errors[1:]])
@@ -61,12 +61,12 @@ def test_returns_are_those_of_the_definition(gamma: float) -> None:
     last = gamma**299 * errors[300]
     assert found["map_error"] == pytest.approx(errors[0] - (1.0 - gamma) * later - last)
     assert found["running_cost"] == pytest.approx(-TICK * (later + last))
-    value_of_the_end = errors[300]  # what shaping alone pays from there on
+    value_of_the_end = errors[300]  # return of shaping only from there on
     assert found["shaping"] + gamma**300 * value_of_the_end == pytest.approx(errors[0])
 
 
-def test_players_turn_and_stand() -> None:
-    """A turn takes 4.2 s; who spins never stops, and who idles never begins."""
+def test_spinning_and_idle_policies() -> None:
+    """A full turn takes 4.2 s; the spinning policy never stops, and the idle one never starts."""
 
     def turned(name: str, ticks: int) -> Any:
         policy = learning_signal.PLAYERS[name]()
@@ -80,8 +80,8 @@ def test_players_turn_and_stand() -> None:
     assert turned("idle", 200) == 0.0
 
 
-def test_an_episode_is_paid_as_its_errors_fall() -> None:
-    """What is noted of an episode are the rewards that the environment paid, and the errors between them."""
+def test_episode_records_have_rewards_and_errors() -> None:
+    """The record of an episode has the rewards of the environment, and the errors between them."""
     weights = {"map_error": 1.0, "running_cost": 1.0}
     env = vslam_v0.parallel_env(world="fig5", num_robots=2, num_particles=5, max_cycles=12, reward=weights)
     paid, errors = learning_signal.play_ticks(env, learning_signal.PLAYERS["spin"], 0)
@@ -91,7 +91,7 @@ def test_an_episode_is_paid_as_its_errors_fall() -> None:
 
 
 def test_the_table_compares_with_the_frontier() -> None:
-    """Each row shows means, and beside them what others have more than the frontier on the same seeds."""
+    """Each row shows means, and the differences to the frontier on the same seeds."""
     found = {
         (reward, gamma, policy): np.array([0.5, 1.0]) - (policy != learning_signal.FRONTIER) * np.array([0.25, 0.5])
         for reward in learning_signal.RETURNS
@@ -106,7 +106,7 @@ def test_the_table_compares_with_the_frontier() -> None:
 
 @pytest.mark.slow
 def test_returns_are_printed(capsys: pytest.CaptureFixture[str]) -> None:
-    """In two episodes each the frontier earns most in each line of the default reward."""
+    """In two episodes each the frontier has the largest default reward in each line."""
     learning_signal.returns(seeds=2)
     lines = [line.split(" | ") for line in capsys.readouterr().out.splitlines() if line.startswith("| default")]
     assert len(lines) == len(learning_signal.PLAYERS)
@@ -116,8 +116,8 @@ def test_returns_are_printed(capsys: pytest.CaptureFixture[str]) -> None:
 
 @pytest.mark.slow
 def test_the_table_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
-    """Two episodes give a line for each reward and trace."""
+    """Two episodes give a line for each reward and lambda."""
     learning_signal.choices(episodes=2)
-    told = capsys.readouterr().out
-    assert told.count("own_coverage") == len(learning_signal.TRACES)
-    assert "shorter way" in told
+    output = capsys.readouterr().out
+    assert output.count("own_coverage") == len(learning_signal.TRACES)
+    assert "shorter path" in output

@@ -1,4 +1,4 @@
-"""The soak of merges runs, and says what became of each merge."""
+"""The soak test of merges runs, and reports the outcome of each merge."""
 
 import importlib.util
 import math
@@ -13,8 +13,8 @@ FOLDER = Path(__file__).parents[2] / "benchmarks"
 
 @pytest.fixture(scope="module")
 def soak() -> Any:
-    """The script as a module."""
-    sys.path.insert(0, str(FOLDER))  # it imports one beside it
+    """Script as a module."""
+    sys.path.insert(0, str(FOLDER))  # it imports a script in its folder
     spec = importlib.util.spec_from_file_location("merge_soak", FOLDER / "merge_soak.py")
     assert spec is not None
     assert spec.loader is not None
@@ -25,15 +25,15 @@ def soak() -> Any:
     sys.path.remove(str(FOLDER))
 
 
-def test_a_folder_stands_for_its_floor_plans(soak: Any, tmp_path: Path) -> None:
-    """Families keep their names; the plans of a folder come in the order of theirs."""
+def test_folders_are_replaced_by_their_floor_plans(soak: Any, tmp_path: Path) -> None:
+    """Families keep their names; the plans of a folder are sorted by name."""
     for name in ("b.png", "a.png", "notes.txt"):
         (tmp_path / name).touch()
     assert soak.named_worlds(["maze", str(tmp_path)]) == ["maze", str(tmp_path / "a.png"), str(tmp_path / "b.png")]
 
 
-def test_a_forced_merge_is_followed_to_its_undo(soak: Any) -> None:
-    """Merged by the wrong motion that fits best, two robots are counted as falsely merged, and as rightly parted."""
+def test_a_forced_false_merge_is_undone(soak: Any) -> None:
+    """Two robots merged by the wrong transform with the best fit count as a false merge that is correctly undone."""
     merges, late, end = soak.play_aisles(9000, 120, soak.Setting(forced=True))
     (merge,) = merges
     assert merge.is_false
@@ -41,7 +41,7 @@ def test_a_forced_merge_is_followed_to_its_undo(soak: Any) -> None:
     assert math.isnan(merge.doubt)
     assert merge.undone_after is not None
     assert merge.is_rightly_undone
-    assert "rightly" in soak.told(merge)
+    assert "correctly" in soak.described(merge)
     assert (end.seed, end.world, end.last_merge, late) == (9000, "aisles", None, [])
     assert len(end.groups) > 1
     summary = soak.summarise(merges, late, [end], 120)

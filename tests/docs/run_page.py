@@ -1,4 +1,4 @@
-"""Run the programs of a page as written, where its learner is installed: `python run_page.py PAGE`."""
+"""Run the programs of a page as written, with its learner installed: `python run_page.py PAGE`."""
 
 import re
 import subprocess
@@ -13,7 +13,7 @@ if __name__ == "__main__":
     if not programs:
         sys.exit(f"{sys.argv[1]}: expected programs, got none.")
     for program in programs:
-        with tempfile.TemporaryDirectory() as folder:  # what a program leaves behind goes with it
+        with tempfile.TemporaryDirectory() as folder:  # removes the output of a program
             (Path(folder) / "page.py").write_text(program, encoding="utf-8")
             subprocess.run([sys.executable, "page.py"], cwd=folder, check=True)
     print(f"{sys.argv[1]}: its programs ran to their ends.")

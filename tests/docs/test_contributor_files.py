@@ -1,4 +1,4 @@
-"""The files for contributors agree with the Makefile, the package and each other."""
+"""Files for contributors agree with the Makefile, the package and each other."""
 
 import re
 import tomllib
@@ -20,7 +20,7 @@ def _yaml(path: str) -> Any:
 
 
 def test_workflow_jobs_run_existing_make_targets_only() -> None:
-    """A job prepares Python and calls make; the same can be run by hand."""
+    """A job prepares Python and calls make, so that everything can be run by hand."""
     targets = set(re.findall(r"^([\w-]+):", MAKEFILE, re.MULTILINE))
     for workflow in (ROOT / ".github" / "workflows").glob("*.yml"):
         for job in yaml.safe_load(workflow.read_text(encoding="utf-8"))["jobs"].values():
@@ -29,15 +29,15 @@ def test_workflow_jobs_run_existing_make_targets_only() -> None:
             assert all(words[0] == "make" and words[1] in targets for words in commands)
 
 
-def test_the_workflow_tests_the_oldest_python_that_the_package_supports() -> None:
-    """Linux jobs must pass, and begin at `requires-python`."""
+def test_the_workflow_tests_the_oldest_supported_python() -> None:
+    """Linux jobs must pass, and start at `requires-python`."""
     job = _yaml(".github/workflows/test.yml")["jobs"]["linux"]
     assert "continue-on-error" not in job
     assert f">={job['strategy']['matrix']['python'][0]}" == PROJECT["requires-python"]
 
 
-def test_hooks_before_a_commit_run_the_tools_of_make_lint() -> None:
-    """Each line of `make lint` has its hook; hooks format where `make lint` checks the format."""
+def test_hooks_run_the_tools_of_make_lint() -> None:
+    """Each line of `make lint` has a hook; hooks format where `make lint` checks the format."""
     recipe = re.search(r"^lint:.*\n((?:\t.*\n)+)", MAKEFILE, re.MULTILINE)
     assert recipe is not None
     lint = [line.split()[0].removeprefix("$(BIN)/") for line in recipe.group(1).splitlines()]
@@ -46,13 +46,13 @@ def test_hooks_before_a_commit_run_the_tools_of_make_lint() -> None:
 
 
 def test_the_citation_names_the_version_and_licence_of_the_package() -> None:
-    """A citation names what is installed."""
+    """The citation gives the installed version."""
     citation = _yaml("CITATION.cff")
     assert (citation["version"], citation["license"]) == (PROJECT["version"], PROJECT["license"])
 
 
-def test_the_guide_explains_every_way_to_compile_a_kernel() -> None:
-    """The table of decorators in CONTRIBUTING.md has all that take a function or a kernel, and no others."""
+def test_the_guide_lists_all_kernel_decorators() -> None:
+    """The table of decorators in CONTRIBUTING.md lists exactly those that take a function or a kernel."""
     guide = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
     table = guide[guide.index("| decorator |") : guide.index("- Kernels that call each other")]
     explained = {name for row in table.split("\n|")[2:] for name in re.findall(r"`(\w+)`", row.split("|")[0])}

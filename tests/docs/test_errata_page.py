@@ -1,4 +1,4 @@
-"""The ledger of equations, and every other page, names what is there."""
+"""The ledger of equations, and every other page, name existing code and tests."""
 
 import re
 from importlib import import_module
@@ -22,7 +22,7 @@ NAMED_TEST = re.compile(r"`(?:[\w/]*/)?(\w+\.py|)::(\w+)`")
 
 
 def _assert_there(text: str) -> int:
-    """Return how many tests a text names, all of which exist; `::test` is one of the file named before."""
+    """Check that all tests named in a text exist, and return their number; `::test` refers to the file before it."""
     file, named = "", NAMED_TEST.findall(text)
     for given, test in named:
         file = given or file
@@ -32,19 +32,19 @@ def _assert_there(text: str) -> int:
 
 @pytest.mark.parametrize(("functions", "tests"), [row[1:3] for row in LEDGER], ids=[row[0] for row in LEDGER])
 def test_the_ledger_names_functions_and_tests_that_exist(functions: str, tests: str) -> None:
-    """Every row names at least one function of the package and one test, and all of them are there."""
+    """Every row names at least one existing function of the package and one existing test."""
     paths = re.findall(r"`([^`]+)`", functions)
     assert paths
     for path in paths:
         found: Any = import_module("slam_backend")
         for name in path.split("."):
-            if not hasattr(found, name):  # a module that nobody has imported yet
+            if not hasattr(found, name):  # a module that is not imported yet
                 import_module(f"{found.__name__}.{name}")
             found = getattr(found, name)
     assert _assert_there(tests)
 
 
 @pytest.mark.parametrize("page", [name for name, text in PAGES.items() if NAMED_TEST.search(text)])
-def test_tests_that_pages_name_exist(page: str) -> None:
-    """A page that calls a test as its witness names one that is there."""
+def test_tests_named_on_pages_exist(page: str) -> None:
+    """A test that a page cites as evidence exists."""
     assert _assert_there(PAGES[page])

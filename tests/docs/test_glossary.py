@@ -1,4 +1,4 @@
-"""The glossary explains each term once and says where it lives in the code."""
+"""The glossary defines each term once and gives its place in the code."""
 
 import re
 from importlib import import_module
@@ -41,7 +41,7 @@ def test_each_term_has_a_definition_and_names_code_that_exists(row: list[str]) -
 
 
 def test_no_term_is_explained_twice() -> None:
-    """One word for one thing."""
+    """Each term is defined once."""
     terms = [term for row in ROWS for term in row[0].split(", ")]
     assert len(terms) > 60
     assert len(set(terms)) == len(terms)

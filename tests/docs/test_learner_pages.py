@@ -1,4 +1,4 @@
-"""Pages of learners: each has what `make clients` needs, and the one whose learner is installed here runs."""
+"""Pages of learners have the files for `make clients`, and the page of the installed learner runs."""
 
 import re
 from pathlib import Path
@@ -14,7 +14,7 @@ def _programs(page: Path) -> list[str]:
 
 
 def test_each_learner_has_what_its_target_needs() -> None:
-    """The Makefile, the page on training and the folder name the same learners; each page has a program."""
+    """The Makefile, the page on training and the folder list the same learners; each page has a program."""
     named = re.search(r"^CLIENTS := (.*)$", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
     assert named is not None
     clients = set(named.group(1).split())

@@ -1,4 +1,4 @@
-"""What the pages say is there: files and headings that they link to, commands and options that they show."""
+"""References on pages exist: linked files and headings, commands and options."""
 
 import doctest
 import re
@@ -15,7 +15,7 @@ from training.cli import app
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / ".github").rglob("*.md"), *(ROOT / "docs").rglob("*.md")])
-DATED = [ROOT / "CHANGELOG.md", *(ROOT / "docs" / "lab").glob("*.md")]  # they speak of the code of their day
+DATED = [ROOT / "CHANGELOG.md", *(ROOT / "docs" / "lab").glob("*.md")]  # dated pages refer to the code of that time
 MODULES = [
     file.relative_to(ROOT).with_suffix("")
     for package in ("slam_backend", "vslam_env", "agents", "training")
@@ -43,15 +43,15 @@ def _name(page: Path) -> str:
 
 
 def _anchors(page: Path) -> set[str]:
-    """Return the anchors that a page's headings have where it is shown."""
+    """Return the anchors of a page's headings."""
     text = FENCED.sub("", page.read_text(encoding="utf-8"))
     headings = re.findall(r"^#+ (.+)$", text, re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-") for heading in headings}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=_name)
-def test_links_lead_somewhere(page: Path) -> None:
-    """Every file that a page links to is there, and every heading within one."""
+def test_linked_files_and_headings_exist(page: Path) -> None:
+    """Every linked file exists, and every linked heading in it."""
     for target in LINK.findall(FENCED.sub("", page.read_text(encoding="utf-8"))):
         if re.match(r"[a-z]+:", target):
             continue
@@ -62,15 +62,15 @@ def test_links_lead_somewhere(page: Path) -> None:
 
 
 @pytest.mark.parametrize("source", SOURCES, ids=_name)
-def test_pages_that_sources_name_exist(source: Path) -> None:
-    """A docstring or comment that refers to a page names one that exists."""
+def test_pages_named_in_sources_exist(source: Path) -> None:
+    """Pages named in docstrings and comments exist."""
     for page in PAGE_NAME.findall(source.read_text(encoding="utf-8")):
         assert (ROOT / page).exists(), f"{page} does not exist"
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if page not in DATED], ids=_name)
-def test_files_that_pages_name_exist(page: Path) -> None:
-    """A file or folder of the repository that a page names in code style, or gives to Python, exists."""
+def test_files_named_on_pages_exist(page: Path) -> None:
+    """Files and folders of the repository exist if a page names them in code style, or runs them with Python."""
     text = page.read_text(encoding="utf-8")
     for path in FILE_NAME.findall(text):
         if not re.search(r"NAME|\*|-v\d+$", path):  # placeholders, and names of environments
@@ -78,14 +78,14 @@ def test_files_that_pages_name_exist(page: Path) -> None:
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if page not in DATED], ids=_name)
-def test_make_targets_that_pages_show_exist(page: Path) -> None:
-    """Every `make` target that a page shows is one of the Makefile."""
+def test_make_targets_on_pages_exist(page: Path) -> None:
+    """Every `make` target on a page is in the Makefile."""
     targets = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
     assert set(MAKE.findall(page.read_text(encoding="utf-8"))) <= targets
 
 
 def _lines() -> Iterator[tuple[str, str]]:
-    """Yield page and text of each command line that the pages show, `vslam` first."""
+    """Yield page and text of each command line on the pages, starting with `vslam`."""
     for page in PAGES:
         text = page.read_text(encoding="utf-8").replace("\\\n", " ")
         shown = [line.split("#")[0] for block in FENCED.findall(text) for line in block.splitlines()]
@@ -95,7 +95,7 @@ def _lines() -> Iterator[tuple[str, str]]:
 
 @pytest.mark.parametrize(("page", "line"), sorted(set(_lines())))
 def test_commands_on_the_pages_exist(page: str, line: str) -> None:
-    """Every command that a page shows is one, and has the options shown with it."""
+    """Every command on a page exists, with the options shown."""
     command: Any = typer.main.get_command(app)
     words = shlex.split(line.replace("[", " ").replace("]", " "))[1:]
     while hasattr(command, "commands") and words and words[0].isidentifier():
@@ -109,7 +109,7 @@ def test_commands_on_the_pages_exist(page: str, line: str) -> None:
 
 @pytest.mark.parametrize("module", MODULES, ids=lambda path: ".".join(path.parts))
 def test_examples_in_docstrings_hold(module: Path) -> None:
-    """What a docstring shows is what comes out."""
+    """Examples in docstrings give the documented results."""
     results = doctest.testmod(import_module(".".join(module.parts)), verbose=False)
     assert results.attempted
     assert not results.failed

@@ -14,14 +14,14 @@ SPEC.loader.exec_module(example)
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The log that the example makes up."""
+    """Simulated log of the example."""
     folder = tmp_path_factory.mktemp("log")
     example.make_log(folder)
     return folder
 
 
-def test_a_log_becomes_a_map(log: Path, tmp_path: Path) -> None:
-    """Path and map are right to a decimetre, where dead reckoning is off by most of a metre; a picture is drawn."""
+def test_a_log_gives_an_accurate_map(log: Path, tmp_path: Path) -> None:
+    """Path and map are accurate to a decimetre, dead reckoning to most of a metre; a picture is drawn."""
     errors = example.run(log, tmp_path / "own.png")
     assert errors["path"].aligned < 0.1
     assert errors["map"].aligned < 0.05
@@ -32,15 +32,15 @@ def test_a_log_becomes_a_map(log: Path, tmp_path: Path) -> None:
 
 
 def test_without_truth_nothing_is_scored(log: Path, tmp_path: Path) -> None:
-    """Odometry and sightings are enough for a map and a picture."""
+    """Odometry and measurements suffice for a map and a picture."""
     for name in ("odometry.csv", "sightings.csv"):
         (tmp_path / name).write_text((log / name).read_text())
     assert example.run(tmp_path, tmp_path / "own.png") == {}
     assert (tmp_path / "own.png").stat().st_size > 1000
 
 
-def test_the_program_says_what_is_wrong_in_one_line(log: Path, tmp_path: Path) -> None:
-    """Bad input ends the program with one line that names file, line and column."""
+def test_bad_input_gives_a_one_line_error(log: Path, tmp_path: Path) -> None:
+    """Bad input ends the program with one line that gives file, line and column."""
     (tmp_path / "odometry.csv").write_text("time,v,omega\n0.0,0.1,fast\n")
     message = (
         r"^error path: expected a finite number in column 'omega', got 'fast'\. Correct line 2 of .*odometry\.csv\.$"
@@ -54,9 +54,9 @@ def test_the_program_says_what_is_wrong_in_one_line(log: Path, tmp_path: Path) -
         example.main(tmp_path, tmp_path / "own.png")
 
 
-def test_the_program_makes_up_a_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Without a folder it makes up a log, and prints three errors."""
+def test_the_program_simulates_a_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Without a folder the program simulates a log, and prints three errors."""
     example.main(None, tmp_path / "own.png")
     printed = capsys.readouterr().out
-    assert "Made up a log in " in printed
+    assert "Simulated a log in " in printed
     assert "RMS errors after the best rigid fit: path 0.0" in printed

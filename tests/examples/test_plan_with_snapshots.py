@@ -20,8 +20,8 @@ def test_planning_beats_its_base_policy() -> None:
     assert np.mean(planned) > 1.05 * np.mean(alone)
 
 
-def test_trying_plans_leaves_the_environment_alone() -> None:
-    """After plans were tried in a twin, the environment goes on as if nobody had looked ahead."""
+def test_planning_does_not_change_the_environment() -> None:
+    """Evaluating plans in a twin does not change later steps of the environment."""
     envs = [example.vslam_v0.parallel_env(action_type="goal", num_robots=2, world="fig5") for _ in range(2)]
     for env in envs:
         env.reset(seed=5)

@@ -1,4 +1,4 @@
-"""The command line `vslam`, called in this process as a user calls it."""
+"""Fixtures that call the command line `vslam` in this process."""
 
 import sys
 from collections.abc import Callable
@@ -11,7 +11,7 @@ from training import cli
 
 
 class Said(NamedTuple):
-    """How a command ended: its exit status, and what it printed."""
+    """Result of a command: its exit status, and its output."""
 
     status: int
     out: str
@@ -20,10 +20,10 @@ class Said(NamedTuple):
 
 @pytest.fixture
 def vslam(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Said]:
-    """Call the command line with arguments, and tell how it ended."""
+    """Call the command line with arguments, and return its result."""
 
     def call(*arguments: str) -> Said:
-        capsys.readouterr()  # what was printed before is of no concern
+        capsys.readouterr()  # discards earlier output
         monkeypatch.setattr(sys, "argv", ["vslam", *arguments])
         with pytest.raises(SystemExit) as end:
             cli.main()
@@ -34,9 +34,9 @@ def vslam(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -
 
 @pytest.fixture
 def refusal(vslam: Callable[..., Said], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., str]:
-    """Call the command line in a folder of its own; it must end with status 2 and one line, which comes back.
+    """Call the command line in its own folder; it must end with status 2 and one line, which is returned.
 
-    Whoever comes first with an empty cache has waited for the compiler before, and was told so on lines of its own.
+    With an empty cache, messages of the compiler come on separate lines before it.
     """
     monkeypatch.chdir(tmp_path)
 
@@ -44,9 +44,9 @@ def refusal(vslam: Callable[..., Said], monkeypatch: pytest.MonkeyPatch, tmp_pat
         said = vslam(*arguments)
         assert said.status == 2
         assert not said.out
-        told = [line for line in said.err.splitlines(True) if not line.startswith(("Compiling the", "Compiled in"))]
-        assert len(told) == 1
+        lines = [line for line in said.err.splitlines(True) if not line.startswith(("Compiling the", "Compiled in"))]
+        assert len(lines) == 1
         assert not Path("runs").exists()
-        return told[0]
+        return lines[0]
 
     return call

@@ -1,4 +1,4 @@
-"""Small logs in the three formats that can be replayed, made of exact or noisy readings of a known world."""
+"""Small logs in three replayable formats, with exact or noisy readings of a known world."""
 
 from pathlib import Path
 
@@ -20,7 +20,7 @@ TREE_ANGLES = np.linspace(0.0, 2.0 * np.pi, 17, endpoint=False)
 RING = np.array([0.0, 14.0])  # middle of the vehicle's circle
 TREES = np.vstack([RING + 8.0 * np.column_stack([np.cos(TREE_ANGLES[::2]), np.sin(TREE_ANGLES[::2])]),
                    RING + 24.0 * np.column_stack([np.cos(TREE_ANGLES), np.sin(TREE_ANGLES)])])  # fmt: skip
-EAST = np.array([100.0, -50.0, 0.8])  # the start, as the GPS sees it
+EAST = np.array([100.0, -50.0, 0.8])  # start pose in the GPS frame
 
 
 def write_log(folder: Path, noise: float, seed: int = 3) -> None:
@@ -33,8 +33,8 @@ def write_log(folder: Path, noise: float, seed: int = 3) -> None:
     for robot, start in STARTS.items():
         times = 1000.0 + 0.1 * np.arange(round(SECONDS / 0.1))
         driven = np.column_stack([times, np.full_like(times, 0.5), np.full_like(times, 0.6 if robot == 2 else -0.5)])
-        told = driven * [1.0, 1.0 + 0.2 * noise, 1.0 - 0.15 * noise]
-        np.savetxt(folder / f"Robot{robot}_Odometry.dat", told, fmt="%.6f")
+        readings = driven * [1.0, 1.0 + 0.2 * noise, 1.0 - 0.15 * noise]
+        np.savetxt(folder / f"Robot{robot}_Odometry.dat", readings, fmt="%.6f")
         poses = compose(start, integrate_commands(driven, times))
         np.savetxt(folder / f"Robot{robot}_Groundtruth.dat", np.column_stack([times, poses]), fmt="%.9f")
         rows = []
@@ -48,7 +48,7 @@ def write_log(folder: Path, noise: float, seed: int = 3) -> None:
 
 
 def write_park(folder: Path, skew: float = 0.0) -> None:
-    """Write a log of a vehicle that drives two rounds among trees; its steering is told with an error `skew` [rad]."""
+    """Write a log of a vehicle that drives two rounds among trees; its steering has an error `skew` [rad]."""
     times = np.arange(0.0, 60.0, 0.025)
     steering = np.full_like(times, np.arctan(2.83 / 14.0))
     driven = axle_velocities(np.column_stack([times, np.full_like(times, 3.0), steering]))
@@ -63,14 +63,14 @@ def write_park(folder: Path, skew: float = 0.0) -> None:
         cells[k] = np.array(polar)
     stamps = np.arange(500, 58000, 200)
     fixes = transform_points(EAST, compose(integrate_commands(driven, stamps / 1000.0), laser)[:, :2])
-    told = {"time": times * 1000, "speed": np.full_like(times, 3.0), "steering": steering + skew}
-    savemat(folder / "aa3_dr.mat", told)
+    readings = {"time": times * 1000, "speed": np.full_like(times, 3.0), "steering": steering + skew}
+    savemat(folder / "aa3_dr.mat", readings)
     savemat(folder / "VictoriaParkSinSincronizar.mat", {"TLsr": scan_times, "zt": cells[None]})
     savemat(folder / "aa3_gpsx.mat", {"timeGps": stamps, "Lo_m": fixes[:, 0], "La_m": fixes[:, 1]})
 
 
 def write_drive(folder: Path, bias: float = 0.0, bus: bool = False) -> None:
-    """Write a drive along a bend; the turn rate is told with an error `bias` [rad/s], a bus drives ahead if asked."""
+    """Write a drive along a bend; the turn rate has an error `bias` [rad/s], optionally with a bus driving ahead."""
     rng = np.random.default_rng(5)
     times = 0.1 * np.arange(120)
     mount = np.array([1.1, -0.3, 0.0])

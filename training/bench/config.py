@@ -1,4 +1,4 @@
-"""The configurations of all benches: what each tries, and the range of every value."""
+"""Configurations of all benchmarks: trials, and the range of every value."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ from training.experiments.config import (
 )
 from training.replay.config import MRCLAM, log_path
 
-if TYPE_CHECKING:  # what computes is imported when a command runs, so that --help answers at once
+if TYPE_CHECKING:  # numerical modules are imported when a command runs, so that --help is fast
     from training.bench.accuracy.trials import Trial as AccuracyTrial
     from training.bench.alignment.trials import Trial as AlignmentTrial
     from training.bench.env.bench import EnvLoad
@@ -36,7 +36,7 @@ if TYPE_CHECKING:  # what computes is imported when a command runs, so that --he
 Method = Literal["dead_reckoning", "batch_ml", "ideal_online", "fastslam1", "fastslam2", "fastslam2+existence",
                  "fastslam2+rejuvenation"]  # fmt: skip
 AlignmentMethod = Literal["ransac", "svd", "icp", "impicp", "gnc", "clique"]
-# (overlap, outliers): with 200 landmarks of each map, 20 true pairs leave room for 180 wrong ones, 200 for none.
+# (overlap, outliers): of 200 landmarks in each map, 20 true pairs allow up to 180 wrong ones, 200 allow none.
 GRID = (
     (1.0, 0.0), (0.5, 0.0), (0.5, 0.5), (0.25, 0.0), (0.25, 0.5), (0.25, 0.75), (0.1, 0.0), (0.1, 0.5), (0.1, 0.8),
     (0.1, 0.9),
@@ -47,38 +47,41 @@ ANY_SPLIT = "any"
 
 
 class AccuracyConfig(ExperimentConfig):
-    """The accuracy bench: each combination of the lists is tried on each seed."""
+    """Accuracy benchmark: all combinations of the lists, for each seed."""
 
-    seeds: int = option(16, "Number of seeds.", ge=1, hint="Run at least one seed.")
+    seeds: int = option(16, "Number of seeds.", ge=1, hint="Use at least one seed.")
     seed: int = first_seed()
     presets: tuple[Literal["good", "coarse", "paper"], ...] = option(
-        ("good",), "Noise: good, coarse or paper.", name="preset"
+        ("good",), "Noise presets: good, coarse, paper.", name="preset"
     )
     associations: tuple[Literal["known", "unknown"], ...] = option(
         ("known",), "Data association: known or unknown.", name="association"
     )
     robots: tuple[Positive, ...] = option((1,), "Numbers of robots that share a map.")
-    lengths: tuple[float, ...] = option((100.0,), "Length of each robot's path [m].", name="length")
+    lengths: tuple[float, ...] = option((100.0,), "Lengths of each robot's path [m].", name="length")
     methods: tuple[Method, ...] = option(
         ("dead_reckoning", "batch_ml", "ideal_online", "fastslam1", "fastslam2"),
-        "dead_reckoning, batch_ml, ideal_online, fastslam1, fastslam2, fastslam2+existence, fastslam2+rejuvenation.",
+        "Methods: dead_reckoning, batch_ml, ideal_online, fastslam1, fastslam2, fastslam2+existence, "
+        "fastslam2+rejuvenation.",
         shown="all but the last two",
     )
-    particles: tuple[Positive, ...] = option((10, 30, 100, 300, 1000), "Particles per filter.", hint=ONE_PARTICLE)
+    particles: tuple[Positive, ...] = option(
+        (10, 30, 100, 300, 1000), "Numbers of particles per filter.", hint=ONE_PARTICLE
+    )
     noise_factor: float = option(
-        1.0, "Factor by which filters scale the true variance of the measurements.", gt=0.0,
-        hint="Use 1 for the noise as it is.",
+        1.0, "Factor of the assumed measurement variance over the true one.", gt=0.0,
+        hint="Use 1 for the true noise.",
     )  # fmt: skip
     landmark_noise: float | None = option(
-        None, "Standard deviation of the landmarks' random walk [m].", shown="0, if rejuvenated 0.005", ge=0.0
+        None, "Standard deviation of the landmarks' random walk [m].", shown="0; 0.005 with rejuvenation", ge=0.0
     )
 
     def check(self) -> None:
-        """Refuse combinations that no trial can be."""
+        """Refuse combinations without a valid trial."""
         self.trials()
 
     def trials(self) -> list["AccuracyTrial"]:
-        """Return all trials, those on the same run in a row."""
+        """Return all trials, with trials of the same run in succession."""
         from training.bench.accuracy.trials import FILTERS, Trial
 
         seeds = range(self.seed, self.seed + self.seeds)
@@ -95,17 +98,19 @@ class AccuracyConfig(ExperimentConfig):
 
 
 class AlignmentBenchConfig(ExperimentConfig):
-    """The alignment bench: a grid of cells, and the hard sets U and I, whose trials are spread over their cases."""
+    """Alignment benchmark: a grid of cells, and the hard sets U and I, whose trials are divided among their cases."""
 
     methods: tuple[AlignmentMethod, ...] = option(
-        ("ransac", "svd", "icp", "impicp", "gnc", "clique"), "ransac, svd, icp, impicp, gnc, clique.", shown="all"
+        ("ransac", "svd", "icp", "impicp", "gnc", "clique"),
+        "Methods: ransac, svd, icp, impicp, gnc, clique.",
+        shown="all",
     )
-    seeds: int = option(500, "Trials of each cell of the grid and method.", ge=1, hint="Try each cell at least once.")
-    hard: int = option(1000, "Trials of each hard set and method.", ge=0, hint="Use 0 to leave the hard sets out.")
+    seeds: int = option(500, "Number of trials of each grid cell and method.", ge=1, hint="Use at least one trial.")
+    hard: int = option(1000, "Number of trials of each hard set and method.", ge=0, hint="Use 0 to omit the hard sets.")
     seed: int = first_seed()
 
     def trials(self) -> list["AlignmentTrial"]:
-        """Return all trials, those on the same maps in a row."""
+        """Return all trials, with trials on the same maps in succession."""
         from training.bench.alignment.trials import Trial, cases
 
         grid = [
@@ -127,31 +132,31 @@ class MrclamPairsConfig(ExperimentConfig):
 
     path: str = log_path(MRCLAM)
     durations: tuple[Annotated[float, Field(ge=0.0)], ...] = option(
-        (100.0, 200.0, 400.0, 0.0), "Seconds after which maps are aligned; 0: at the end.",
+        (100.0, 200.0, 400.0, 0.0), "Times at which maps are aligned [s]; 0: at the end.",
         hint="Give seconds; 0 means all.",
     )  # fmt: skip
-    particles: int = option(100, "Particles of each robot's filter.", ge=1, hint="Use at least one particle.")
+    particles: int = option(100, "Number of particles per filter.", ge=1, hint="Use at least one particle.")
 
 
 class EnvBenchConfig(ExperimentConfig):
-    """The environment bench. One number at a time differs from the base, the first of each list."""
+    """Environment benchmark. Each row changes one number of the base, which has the first entry of each list."""
 
     robots: tuple[RobotCount, ...] = option(
-        (3, 1, 2, 4, 6, 8), "Numbers of robots K, the base first.", hint="Use 1 to 8 robots."
+        (3, 1, 2, 4, 6, 8), "Numbers of robots K, starting with the base.", hint="Use 1 to 8 robots."
     )
     particles: tuple[Positive, ...] = option((100, 30, 300, 1000), "Numbers of particles M.", hint=ONE_PARTICLE)
-    worlds: tuple[str, ...] = option(("office", "fig5", "maze", "hall", "loops"), "Families or paths of worlds.")
+    worlds: tuple[str, ...] = option(("office", "fig5", "maze", "hall", "loops"), "World families or paths.")
     modes: tuple[Literal["dict", "flat", "goal"], ...] = option(
-        ("dict", "flat", "goal"), "Observations and actions: dict, flat, goal, which decides at every tick.",
+        ("dict", "flat", "goal"), "Observations and actions: dict, flat, or goal with a decision at every tick.",
         shown="all",
     )  # fmt: skip
-    steps: int = option(600, "Timed steps per row.", ge=2, hint="Time a few steps.")
-    plays: int = setting(5, "Repeats of a row's episode, for the times that other programs do not disturb.", ge=1)
+    steps: int = option(600, "Number of timed steps per row.", ge=2, hint="Use at least two steps.")
+    plays: int = setting(5, "Number of repeats of each episode, to reduce the influence of other load.", ge=1)
     seed: int = option(100, "Seed of the episodes.", ge=0, hint="Use 0 or a positive number.")
-    peer: bool = option(True, "Time simple_spread of MPE2 in turn with the first row.")
+    peer: bool = option(True, "Time simple_spread of MPE2 interleaved with the first row.")
 
     def loads(self) -> list["EnvLoad"]:
-        """Return what is timed, row by row, the base first."""
+        """Return the timed loads, row by row, starting with the base."""
         from training.bench.env.bench import EnvLoad
 
         base = EnvLoad(self.robots[0], self.particles[0], self.worlds[0], self.modes[0])
@@ -164,7 +169,7 @@ class EnvBenchConfig(ExperimentConfig):
 
 @dataclass(frozen=True, slots=True)
 class ExplorationTrial:
-    """One policy in one episode: name, path or `module:name`, perhaps with `@` and the type of action."""
+    """One episode of one policy: name, path or `module:name`, optionally with `@` and the action type."""
 
     policy: str
     world: str
@@ -174,33 +179,33 @@ class ExplorationTrial:
 
 
 class ExplorationBenchConfig(ExperimentConfig):
-    """The exploration bench. Worlds, numbers of robots and oracles are combined; policies meet in each."""
+    """Exploration benchmark: all combinations of worlds, numbers of robots and oracles, with each policy."""
 
     policies: tuple[str, ...] = option(
         ("frontier", "random_goals", "random_walk"),
-        "Names, models' paths, MODULE:NAME of your own; NAME@discrete chooses the type of action. The others are "
+        "Policies by name, path of a model, or MODULE:NAME; NAME@discrete selects the action type. The others are "
         "compared with the first.",
     )
-    worlds: tuple[str, ...] = option(("office", "maze", "loops", "hall"), "Families or paths of worlds.")
+    worlds: tuple[str, ...] = option(("office", "maze", "loops", "hall"), "World families or paths.")
     split: Literal["train", "validation", "test", "any"] = option(
-        "validation", "train, validation or test worlds, or any."
+        "validation", "Split of the worlds: train, validation, test, or any."
     )
-    robots: tuple[RobotCount, ...] = option((3,), "Numbers of robots that explore together.", hint="Use 1 to 8 robots.")
+    robots: tuple[RobotCount, ...] = option((3,), "Numbers of robots in a team.", hint="Use 1 to 8 robots.")
     oracles: tuple[Literal["none", "pose", "association", "merge", "all"], ...] = option(
-        (NO_ORACLE, ALL_ORACLES), "What robots know from the truth: none, pose, association, merge, all."
+        (NO_ORACLE, ALL_ORACLES), "Ground truth given to robots: none, pose, association, merge, all."
     )
-    duration: float = option(120.0, "Seconds of an episode.", ge=1.0, hint="Give seconds.")
-    particles: int = option(100, "Particles per filter.", ge=1, hint=ONE_PARTICLE)
+    duration: float = option(120.0, "Duration of an episode [s].", ge=1.0, hint="Give seconds.")
+    particles: int = option(100, "Number of particles per filter.", ge=1, hint=ONE_PARTICLE)
     rejuvenate_every: int | None = option(
         None, "Ticks between rejuvenations of the particles; 0: never.", shown="100", ge=0
     )
-    preset: NoisePreset = option("standard", "easy, standard or hard noise.")
-    sensor: Sensor = option("landmark", "landmark, or stereo: rendered images.")
-    seeds: int = option(10, "Episodes of each policy.", ge=1, hint="Play one episode or more.")
+    preset: NoisePreset = option("standard", "Noise preset: easy, standard or hard.")
+    sensor: Sensor = option("landmark", "Sensor: landmark, or stereo (rendered images).")
+    seeds: int = option(10, "Number of episodes of each policy.", ge=1, hint="Use at least one episode.")
     seed: int = first_seed()
 
     def check(self) -> None:
-        """Refuse policies and worlds that are not there."""
+        """Refuse policies and worlds that do not exist."""
         from training.bench.exploration.trials import parted
 
         for policy in self.policies:
@@ -210,7 +215,7 @@ class ExplorationBenchConfig(ExperimentConfig):
 
     @classmethod
     def completed(cls, values: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Make paths absolute, so that a configuration and its trials repeat from anywhere."""
+        """Make paths absolute, so that a configuration and its trials can be repeated from any folder."""
         from agents.registry import is_model
         from vslam_env.world import WORLD_FAMILIES
 
@@ -222,13 +227,13 @@ class ExplorationBenchConfig(ExperimentConfig):
         return found
 
     def trials(self) -> list[ExplorationTrial]:
-        """Return all trials: seed by seed, and in a seed combination by combination."""
+        """Return all trials, ordered by seed, then by combination."""
         seeds = range(self.seed, self.seed + self.seeds)
         combined = product(seeds, self.worlds, self.robots, self.oracles, self.policies)
         return [ExplorationTrial(policy, world, k, oracle, seed) for seed, world, k, oracle, policy in combined]
 
     def run(self, trial: ExplorationTrial) -> "RunConfig":
-        """Return the trial as a run."""
+        """Return the configuration of a trial's run."""
         from training.bench.exploration.trials import parted
         from training.episodes.config import RunConfig
 
@@ -241,7 +246,7 @@ class ExplorationBenchConfig(ExperimentConfig):
         return RunConfig(**shared, max_cycles=max(1, round(self.duration / RunConfig(**shared).step_s)))
 
     def environment(self, trial: ExplorationTrial) -> "EnvConfig":
-        """Return the environment of a trial: of all policies with one seed in one combination the same world."""
+        """Return the environment of a trial: all policies have the same world for one seed and combination."""
         from vslam_env.world import is_single_layout
 
         split = None if self.split == ANY_SPLIT or is_single_layout(trial.world) else self.split
@@ -250,26 +255,26 @@ class ExplorationBenchConfig(ExperimentConfig):
 
 
 class FilterBenchConfig(ExperimentConfig):
-    """The filter bench; rows are all combinations of the numbers given."""
+    """Filter benchmark; rows are all combinations of the given numbers."""
 
     particles: tuple[Positive, ...] = option((100, 1000), "Numbers of particles M.", hint=ONE_PARTICLE)
-    landmarks: tuple[int, ...] = option((100, 300, 1000), "Numbers of landmarks N, in the maps of all particles.")
-    measurements: tuple[int, ...] = option((5, 15), "Numbers of measurements B, of all robots together.")
+    landmarks: tuple[int, ...] = option((100, 300, 1000), "Numbers of landmarks N in the map of each particle.")
+    measurements: tuple[int, ...] = option((5, 15), "Numbers of measurements B per step, of all robots together.")
     robots: tuple[Positive, ...] = option((1, 2, 3), "Numbers of robots K.", hint="Use 1 to 8 robots.")
     proposals: tuple[Proposal, ...] = ("fastslam1", "fastslam2")
     lookalikes: int = option(
-        1, "Number of landmarks that share one descriptor.", ge=1, hint="Use 1 for landmarks that all look different."
+        1, "Number of landmarks that share one descriptor.", ge=1, hint="Use 1 for distinct descriptors."
     )
-    steps: int = option(300, "Timed steps per row.", ge=1, hint="Time at least one step.")
-    large: bool = option(False, "Also 10,000 particles with 300 and 1,000 landmarks.")
-    compile: bool = option(False, "Also time the compilation of all kernels into an empty cache.")
+    steps: int = option(300, "Number of timed steps per row.", ge=1, hint="Use at least one step.")
+    large: bool = option(False, "Include 10,000 particles with 300 and 1,000 landmarks.")
+    compile: bool = option(False, "Include the compilation time of all kernels with an empty cache.")
 
     def check(self) -> None:
         """Refuse combinations that cannot be timed."""
         self.loads()
 
     def loads(self) -> list["FilterLoad"]:
-        """Return what is timed, row by row."""
+        """Return the timed loads, row by row."""
         from training.bench.filter.workload import LARGE_LOADS, FilterLoad
 
         numbers = product(self.proposals, self.particles, self.landmarks, self.measurements, self.robots)
@@ -289,42 +294,46 @@ class FilterBenchConfig(ExperimentConfig):
 
 
 class StereoBenchConfig(ExperimentConfig):
-    """The stereo bench. Images are three quarters as high as wide, with the same field of view."""
+    """Stereo benchmark. The height of images is three quarters of their width, with a constant field of view."""
 
     sizes: tuple[Annotated[int, Field(ge=64)], ...] = setting((320, 640), "Widths of the images [px].")
-    landmarks: tuple[Positive, ...] = setting((50, 100, 200), "Numbers of landmarks in a frame.")
+    landmarks: tuple[Positive, ...] = setting((50, 100, 200), "Numbers of landmarks per frame.")
     walls: tuple[Annotated[int, Field(ge=4)], ...] = setting((10, 40, 120), "Numbers of walls.")
-    steps: int = option(100, "Timed pairs per row.", ge=1, hint="Time at least one pair.")
-    views: int = option(60, "Rendered pairs per descriptor for quality.", ge=1, hint="Look at least once.")
+    steps: int = option(100, "Number of timed pairs per row.", ge=1, hint="Use at least one pair.")
+    views: int = option(
+        60, "Number of rendered pairs per descriptor for the quality.", ge=1, hint="Use at least one pair."
+    )
     descriptors: tuple[Descriptor, ...] = option(("usurf", "sift", "orb"), "Descriptors to compare.")
 
 
 class TrainBenchConfig(ExperimentConfig):
-    """The training bench; the environments are those of `vslam train`'s preset `quick`."""
+    """Training benchmark; its environments are those of the preset `quick` of `vslam train`."""
 
-    world: str = option("office", "A family or a path.")
+    world: str = option("office", "World family or path.")
     robots: int = option(3, "Number of robots, 1 to 8.", ge=1, le=8, hint="Use 1 to 8 robots.")
-    envs: int = option(16, "Environments side by side.", ge=1, hint="Use at least one environment.")
-    workers: tuple[NonNegative, ...] = option((0, 1, 2), "Numbers of processes, 0: this one.", hint="Use 0 for none.")
-    steps: int = option(40, "Steps timed per number of workers.", ge=2, hint="Time a few steps.")
+    envs: int = option(16, "Number of parallel environments.", ge=1, hint="Use at least one environment.")
+    workers: tuple[NonNegative, ...] = option(
+        (0, 1, 2), "Numbers of worker processes, 0: this process.", hint="Use 0 for this process."
+    )
+    steps: int = option(40, "Number of timed steps per number of workers.", ge=2, hint="Use at least two steps.")
     seed: int = option(100, "Seed of the episodes.", ge=0, hint="Use 0 or a positive number.")
 
     def check(self) -> None:
-        """Refuse more workers than environments, and worlds that are not there."""
+        """Refuse more workers than environments, and worlds that do not exist."""
         from slam_backend.core.validation import argument_error
 
         if (most := max(self.workers)) > self.envs:
-            raise argument_error("workers", f"at most one per environment, {self.envs}", most, "Use fewer.")
+            raise argument_error("workers", f"at most one per environment, {self.envs}", most, "Use fewer workers.")
         self.environment()
 
     def training(self) -> "TrainConfig":
-        """Return the training that is timed."""
+        """Return the timed training."""
         from training.rl.config import TrainConfig
 
         return TrainConfig(world=self.world, robots=self.robots, envs=self.envs)
 
     def environment(self) -> "EnvConfig":
-        """Return the environments' configuration."""
+        """Return the configuration of the environments."""
         from training.rl.config import SPLIT_TRAIN
 
         return self.training().make_env_config(SPLIT_TRAIN)

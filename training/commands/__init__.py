@@ -1,1 +1,1 @@
-"""Commands of `vslam`: options, progress and run folders; the work is done elsewhere."""
+"""Commands of `vslam`: options, progress displays and run folders; other packages do the work."""

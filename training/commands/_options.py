@@ -1,4 +1,4 @@
-"""Options of commands, generated from the class of their configuration."""
+"""Command-line options, generated from the class of a command's configuration."""
 
 from collections.abc import Callable, Iterator, Mapping
 from functools import wraps
@@ -9,9 +9,10 @@ from typing import Annotated, Any
 import typer
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
+from rich.markup import escape
 
 from training.commands._run_folder import Call, ConfigT, claim_stdout
-from training.experiments.config import about_option, kind_of
+from training.experiments.config import option_arguments, value_type
 
 NEXT_FREE = "the next free one in runs"
 
@@ -19,7 +20,7 @@ Check = Annotated[bool, typer.Option("--check", help="Exit with status 1 unless 
 Json = Annotated[
     Path | None,
     typer.Option(
-        help="Write the metrics to this file too; - is stdout, and all else goes to stderr then.",
+        help="Also write the metrics to this file; - is stdout, with all other output on stderr.",
         show_default=False,
         callback=claim_stdout,
     ),
@@ -28,47 +29,47 @@ Config = Annotated[
     Path | None,
     typer.Option(help="config.toml of an earlier run to repeat; other options override it.", show_default=False),
 ]
-OUT = {False: "New run folder.", True: "Run folder: a new one, or that of a run to go on with."}
+OUT = {False: "New run folder.", True: "Run folder: a new one, or the one of a stopped run to resume."}
 
 
 def _check_processes(number: int) -> int:
     if number < 1:
         from slam_backend.core.validation import argument_error
 
-        raise argument_error("processes", "an int >= 1", number, "Use one process or more.")
+        raise argument_error("processes", "an int >= 1", number, "Use at least one process.")
     return number
 
 
-Processes = Annotated[int, typer.Option(help="Trials at a time.", callback=_check_processes)]
+Processes = Annotated[int, typer.Option(help="Number of trials that run in parallel.", callback=_check_processes)]
 
 
 def options(
     kind: type[ConfigT], command: str, *, quick: Mapping[str, Any] | None = None, quick_help: str = "",
     log: tuple[Path, str] | None = None, continues: bool = False,
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:  # fmt: skip
-    """Give a command the options of its configuration, and --quick, --out, --json and --config.
+    """Give a command the options of its configuration, plus --quick, --out, --json and --config.
 
-    The command is called with a `Call`; its other parameters are options of its own.
+    The command is called with a `Call`; its other parameters are additional options.
 
     Args:
-        quick: Values that --quick stands for; None: there is no such option.
-        log: As `Call` has it.
-        continues: As `Call` has it.
+        quick: Values set by --quick; None: there is no such option.
+        log: Folder of the log, see `Call`.
+        continues: Whether stopped runs can be resumed, see `Call`.
     """
-    fields = {_name(name, field): (name, field) for name, field in kind.model_fields.items() if about_option(field)}
+    fields = {_name(name, field): (name, field) for name, field in kind.model_fields.items() if option_arguments(field)}
 
     def decorate(work: Callable[..., None]) -> Callable[..., None]:
         own = list(signature(work).parameters.values())[1:]
 
         @wraps(work)
-        def run(**told: Any) -> None:
-            given = {field: _parsed(name, *fields[name], told[name]) for name, (field, _) in fields.items()}
+        def run(**passed: Any) -> None:
+            given = {field: _parsed(name, *fields[name], passed[name]) for name, (field, _) in fields.items()}
             call = Call(
                 kind=kind, command=command, given={name: v for name, v in given.items() if v is not None},
-                out=told["out"], json=told["json"], file=told["config"], log=log, continues=continues,
-                quick=quick if quick is not None and told["quick"] else {},
+                out=passed["out"], json=passed["json"], file=passed["config"], log=log, continues=continues,
+                quick=quick if quick is not None and passed["quick"] else {},
             )  # fmt: skip
-            work(call, **{parameter.name: told[parameter.name] for parameter in own})
+            work(call, **{parameter.name: passed[parameter.name] for parameter in own})
 
         parameters = [_parameter(name, *fields[name]) for name in fields if fields[name][0] != "seed"] + own
         parameters += [_parameter(name, *fields[name]) for name in fields if fields[name][0] == "seed"]
@@ -85,28 +86,28 @@ def options(
 
 
 def words(text: str) -> tuple[str, ...]:
-    """Return the words of a text with commas between."""
+    """Return the words of a comma-separated text."""
     return tuple(word.strip() for word in text.split(","))
 
 
 def numbers(name: str, text: str, kind: Callable[[str], Any] = int) -> tuple[Any, ...]:
-    """Return the numbers of a text such as `10, 100`.
+    """Return the numbers of a comma-separated text such as `10, 100`.
 
     Raises:
-        ValueError: If one is no number; the message names the option.
+        ValueError: If an entry is not a number; the message gives the option.
     """
     from slam_backend.core.validation import argument_error
 
     try:
         return tuple(kind(word) for word in text.split(","))
     except ValueError as error:
-        raise argument_error(name, "numbers with commas between", repr(text), "Write them like 10,100.") from error
+        raise argument_error(name, "comma-separated numbers", repr(text), "Write them like 10,100.") from error
 
 
 def _name(name: str, field: FieldInfo) -> str:
-    """Return the name of a field's parameter."""
-    told = str((about_option(field) or {})["option"])
-    return name if not told or told.startswith("--") else told
+    """Return the parameter name of a field."""
+    option = str((option_arguments(field) or {})["option"])
+    return name if not option or option.startswith("--") else option
 
 
 def _is_list(field: FieldInfo) -> bool:
@@ -114,34 +115,35 @@ def _is_list(field: FieldInfo) -> bool:
 
 
 def _parsed(option: str, name: str, field: FieldInfo, value: Any) -> Any:
-    """Return the value of an option as the configuration takes it; None: it was not given."""
+    """Return the value of an option as the configuration takes it; None if it was not given."""
     if value is None:
         return None
     if isinstance(value, Path):
         return str(value.resolve())
-    kind, _ = kind_of(field.annotation)
+    kind, _ = value_type(field.annotation)
     if not _is_list(field):
         return value
     return numbers(option, value, kind) if kind in (int, float) else words(value)
 
 
 def _parameter(option: str, name: str, field: FieldInfo) -> Parameter:
-    """Return the parameter from which typer makes an option, None by default: what is not given is left open."""
-    about = about_option(field) or {}
-    kind, _ = kind_of(field.annotation)
+    """Return the parameter from which typer makes an option; its default is None, which means not given."""
+    about = option_arguments(field) or {}
+    kind, _ = value_type(field.annotation)
+    text = escape(field.description or "")  # units in brackets are not markup
     if about["is_path"]:
         kind = Path
     elif _is_list(field) or kind not in (int, float, bool):
         kind = str
     shown = about["shown"] or _shown(option, field.default)
     if about["is_argument"]:
-        return _keyword(option, Annotated[kind | None, typer.Argument(help=field.description, show_default=False)])
+        return _keyword(option, Annotated[kind | None, typer.Argument(help=text, show_default=False)])
     flags = [about["option"]] if about["option"].startswith("--") else []
-    return _keyword(option, Annotated[kind | None, typer.Option(*flags, help=field.description, show_default=shown)])
+    return _keyword(option, Annotated[kind | None, typer.Option(*flags, help=text, show_default=shown)])
 
 
 def _shown(option: str, default: Any) -> str | bool:
-    """Return the default that `--help` shows."""
+    """Return the default shown by `--help`."""
     if default is None or default is PydanticUndefined:
         return False
     if isinstance(default, bool):

@@ -1,4 +1,4 @@
-"""What commands show while they work: a bar over trials, or over a share of the whole; Ctrl-C ends after the trial."""
+"""Progress displays of commands: a bar over trials or over a fraction of the work; Ctrl-C stops after the trial."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -9,25 +9,25 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-if TYPE_CHECKING:  # what computes is imported when a command runs, so that --help answers at once
+if TYPE_CHECKING:  # numerical modules are imported when a command runs, so that --help is fast
     from training.experiments.run_folder import RunFolder
 
-REDRAW_S = 0.1  # between two pictures of a bar over trials
+REDRAW_S = 0.1  # interval between redraws of the bar over trials
 
 
 @contextmanager
-def trials_shown(
+def trial_progress(
     console: Console, total: int | None, completed: int = 0, timed: bool = True
 ) -> Iterator[tuple[Callable[..., None], Callable[[], bool]]]:
-    """Show a bar over trials; all libraries work on one thread, and Ctrl-C becomes a question.
+    """Show a bar over trials; all libraries use one thread, and Ctrl-C sets a flag.
 
     Args:
-        timed: Whether something is timed: the bar is then drawn between trials only, so that no other thread of this
-            process works meanwhile.
+        timed: Whether trials are timed: the bar is then drawn between trials only, so that no other thread of this
+            process runs during a trial.
 
     Yields:
-        A function that counts one trial, by its name and its share of `total`, and one that tells whether Ctrl-C was
-        pressed.
+        A function that counts a trial by its name and its share of `total`, and a function that returns whether Ctrl-C
+        was pressed.
     """
     from threadpoolctl import threadpool_limits
 
@@ -56,36 +56,36 @@ def trials_shown(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class KeptPart:
-    """Trials of one kind that a run folder keeps."""
+class TrialSet:
+    """Trials of one kind that a run folder stores."""
 
-    file: str  # In which their rows are kept
-    kind: type[Any]  # The dataclass of a trial
-    # Runs a trial and returns its row; a function of a module, so that other processes find it
+    file: str  # File with the rows of finished trials
+    kind: type[Any]  # Dataclass of a trial
+    # Function that runs a trial and returns its row; importable by other processes
     play: Callable[[Any], dict[str, Any]]
-    trials: Sequence[Any]  # All, in order
-    tell: Callable[[dict[str, Any]], str]  # Describes a row in a few words
-    cost: Callable[[Any], int] = lambda trial: 1  # About how long a trial takes, in an arbitrary unit
-    processes: int = 1  # How many run at a time; 1: in this process
+    trials: Sequence[Any]  # All trials, in order
+    tell: Callable[[dict[str, Any]], str]  # Short description of a row
+    cost: Callable[[Any], int] = lambda trial: 1  # Approximate cost of a trial, in an arbitrary unit
+    processes: int = 1  # Number of parallel processes; 1: this process
 
 
-def play_kept(
-    console: Console, folder: "RunFolder", *parts: KeptPart, timed: bool = False
+def run_trial_sets(
+    console: Console, folder: "RunFolder", *parts: TrialSet, timed: bool = False
 ) -> list[list[dict[str, Any]]]:
-    """Play what a folder does not hold yet under a bar, part after part; say how to go on if Ctrl-C ended it.
+    """Run the trials that a folder does not contain yet, under a bar; after Ctrl-C, print how to resume.
 
     Returns:
-        Per part the rows of all finished trials, in the order of the trials.
+        Rows of all finished trials of each part, in the order of the trials.
     """
     from training.experiments.trial_store import finished_trials, run_trials, trial_of
 
     kept = [finished_trials(folder, part.file, part.kind) for part in parts]
     total = sum(part.cost(trial) for part in parts for trial in part.trials)
     done = sum(part.cost(t) for part, found in zip(parts, kept, strict=True) for t in part.trials if t in found)
-    with trials_shown(console, total, done, timed) as (advance, interrupted):
+    with trial_progress(console, total, done, timed) as (advance, interrupted):
         for part, found in zip(parts, kept, strict=True):
 
-            def on_trial(row: dict[str, Any], part: KeptPart = part, found: dict[Any, Any] = found) -> None:
+            def on_trial(row: dict[str, Any], part: TrialSet = part, found: dict[Any, Any] = found) -> None:
                 trial = trial_of(row, part.kind)
                 found[trial] = row
                 advance(part.tell(row), part.cost(trial))
@@ -95,21 +95,21 @@ def play_kept(
     rows = [[found[t] for t in part.trials if t in found] for part, found in zip(parts, kept, strict=True)]
     finished, wanted = sum(map(len, rows)), sum(len(part.trials) for part in parts)
     if finished < wanted:
-        text = f"Stopped after {finished} of {wanted} trials; go on with --out {folder.path}."
+        text = f"Stopped after {finished} of {wanted} trials; resume with --out {folder.path}."
         console.print(text, soft_wrap=True)
     return rows
 
 
 @contextmanager
-def share_shown(console: Console, text: str, *more: str, **fields: Any) -> Iterator[Callable[..., None]]:
-    """Show a bar over the share of the work that is done.
+def share_progress(console: Console, text: str, *more: str, **fields: Any) -> Iterator[Callable[..., None]]:
+    """Show a bar over the completed fraction of the work.
 
     Args:
-        more: Templates of further columns.
-        fields: What these begin with, as `task.fields`.
+        more: Templates of additional columns.
+        fields: Initial values of the fields in these templates, as `task.fields`.
 
     Yields:
-        A function of the share, in [0, 1], and of fields that have changed.
+        A function of the completed fraction, in [0, 1], and of changed fields.
     """
     columns = (
         TextColumn(text), BarColumn(), TextColumn("{task.percentage:>3.0f} %"), *map(TextColumn, more),

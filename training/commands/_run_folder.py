@@ -1,4 +1,4 @@
-"""How commands that leave a run folder begin and end, and where they write their metrics."""
+"""Start and end of commands with a run folder, and output of their metrics."""
 
 import os
 import sys
@@ -17,7 +17,7 @@ from training.experiments.compilation import prepare
 from training.experiments.config import ExperimentConfig
 from training.replay.config import find_log
 
-if TYPE_CHECKING:  # what computes is imported when a command runs, so that --help answers at once
+if TYPE_CHECKING:  # numerical modules are imported when a command runs, so that --help is fast
     from training.experiments.run_folder import RunFolder
 
 STDOUT = Path("-")
@@ -28,34 +28,34 @@ _STREAM: ContextVar[TextIO | None] = ContextVar("stream", default=None)
 
 @dataclass(eq=False)
 class Call(Generic[ConfigT]):
-    """A call of a command that leaves a run folder."""
+    """Call of a command with a run folder."""
 
-    kind: type[ConfigT]  # Class of its configuration
-    command: str  # The command, without the leading `vslam`
-    given: dict[str, Any]  # Options that were given, by the names of the configuration's fields; paths are absolute
+    kind: type[ConfigT]  # Class of the configuration
+    command: str  # Name of the command, without the leading `vslam`
+    given: dict[str, Any]  # Given options, by field of the configuration; paths are absolute
     out: Path | None = None  # Run folder
-    json: Path | None = None  # File that gets the metrics, too
+    json: Path | None = None  # Additional file for the metrics
     file: Path | None = None  # Configuration of an earlier run
-    quick: Mapping[str, Any] = field(default_factory=dict)  # What --quick stands for, if it was given
-    # Where `path` is if it is not given: below the folder of data, and what must be there, as an error says it
+    quick: Mapping[str, Any] = field(default_factory=dict)  # Values set by --quick, if it was given
+    # Default of `path` below the data folder, and the expected content, worded for an error
     log: tuple[Path, str] | None = None
-    continues: bool = False  # Whether `out` may be the folder of the same run, stopped half-way
-    console: Console = field(default_factory=partial(Console, highlight=False))  # Where the command prints
-    folder: "RunFolder" = field(init=False)  # Run folder; there after `begin`
-    metrics: dict[str, Any] = field(init=False)  # As they were written
+    continues: bool = False  # Whether `out` may be the folder of the same run, stopped early
+    console: Console = field(default_factory=partial(Console, highlight=False))  # Console for the output
+    folder: "RunFolder" = field(init=False)  # Run folder; set by `begin`
+    metrics: dict[str, Any] = field(init=False)  # Metrics as written; set by `write`
 
     @cached_property
     def values(self) -> dict[str, Any]:
-        """What is given, above what --quick says, above the configuration of an earlier run.
+        """Given options, over values of --quick, over the configuration of an earlier run.
 
         Raises:
-            ValueError: If `json` cannot be written, the file cannot be read or is of another command, or there is no
-                such log.
+            ValueError: If `json` cannot be written, the file cannot be read or belongs to another command, or the log
+                is missing.
         """
         from slam_backend.core.files import check_writable
         from training.experiments.run_folder import read_config
 
-        if self.json not in (None, STDOUT) and self.json.parent != self.out:  # the run's own folder is made later
+        if self.json not in (None, STDOUT) and self.json.parent != self.out:  # the run folder is created later
             check_writable(self.json, "json")
         values: dict[str, Any] = {}
         if self.file is not None:
@@ -67,26 +67,26 @@ class Call(Generic[ConfigT]):
 
     @cached_property
     def config(self) -> ConfigT:
-        """The configuration; a value out of its range is refused by name."""
+        """Validated configuration."""
         return self.kind.from_mapping(self.values)
 
     def begin(
         self, *first_steps: Callable[[], object], config: ExperimentConfig | None = None
     ) -> tuple[Console, "RunFolder"]:
-        """Make the run folder, and compile or load all kernels before anything is shown.
+        """Create the run folder, and compile or load all kernels before any output.
 
         Args:
-            first_steps: First steps of the work, done before there is a folder: they may show that the input is bad.
+            first_steps: First steps of the work, run before the folder is created to detect bad input.
 
         Raises:
-            ValueError: If the folder is not free or cannot be made; nothing has been compiled then.
+            ValueError: If the folder is not free or cannot be created; nothing has been compiled then.
         """
         from training.experiments.run_folder import CONFIG_FILE, RunFolder, check_free
         from training.experiments.trial_store import open_folder
 
         chosen, out = config or self.config, self.out
         if out is not None and not (self.continues and (out / CONFIG_FILE).is_file()):
-            check_free(out)  # at once: the compiler may take a minute
+            check_free(out)  # before the kernels are compiled, which may take minutes
         make = open_folder if self.continues else RunFolder.create
         folders: list[RunFolder] = []
         prepare(*first_steps, lambda: folders.append(make(out, self.command, chosen.to_mapping(), chosen.seed)))
@@ -94,14 +94,14 @@ class Call(Generic[ConfigT]):
         return self.console, self.folder
 
     def write(self, metrics: Mapping[str, Any]) -> None:
-        """Write `metrics.json`, before pictures for which there may be no room."""
+        """Write `metrics.json`, before any pictures, which may fill the disk."""
         self.metrics = self.folder.write_metrics(metrics)
 
     def finish(self, check: bool = False, held: Iterable[bool] = ()) -> None:
-        """Write the metrics where --json says, say where the folder is, and check the claims if asked to.
+        """Write the metrics for --json, print the run folder, and check the claims if requested.
 
         Raises:
-            typer.Exit: With status 1, if `check` and a claim does not hold or none was checked.
+            typer.Exit: With status 1, if `check` is set and a claim does not hold or none was checked.
         """
         from training.experiments.run_folder import to_json
 
@@ -114,14 +114,14 @@ class Call(Generic[ConfigT]):
 
 
 def claim_stdout(context: typer.Context, json: Path | None) -> Path | None:
-    """Return the option --json; if it names stdout, all other output of the command goes to stderr from now on."""
+    """Return the option --json; if it is stdout, redirect all other output of the command to stderr."""
     if json == STDOUT:
         context.with_resource(_others_on_stderr())
     return json
 
 
 def write_json(json: Path, text: str) -> None:
-    """Write a text to the file, or the stdout, that the option --json names.
+    """Write a text to the file, or the stdout, given by the option --json.
 
     Raises:
         ValueError: If it cannot be written.
@@ -139,7 +139,7 @@ def write_json(json: Path, text: str) -> None:
 
 @contextmanager
 def _others_on_stderr() -> Iterator[None]:
-    """Send to stderr what this process and those that it starts print; only `write_json` reaches stdout."""
+    """Redirect output of this process and its children to stderr; only `write_json` writes to stdout."""
     with ExitStack() as stack:
         others = sys.stderr or stack.enter_context(open(os.devnull, "w", encoding="utf-8"))
         stream = sys.stdout
@@ -155,12 +155,12 @@ def _others_on_stderr() -> Iterator[None]:
 
 
 def _close(stream: TextIO) -> None:
-    with suppress(OSError):  # `write_json` has told of it
+    with suppress(OSError):  # `write_json` has reported it
         stream.close()
 
 
 def _descriptor(stream: TextIO) -> int | None:
-    """Return the descriptor below a stream; None: it has none."""
+    """Return the file descriptor of a stream, or None if it has none."""
     try:
         return stream.fileno()
     except (OSError, ValueError):

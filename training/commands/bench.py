@@ -1,4 +1,4 @@
-"""The commands `vslam bench ...`: how good and how fast filters, environments and trainings are."""
+"""Commands `vslam bench ...`: accuracy and speed of filters, environments and training."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -21,24 +21,24 @@ from training.bench.config import (
     TrainBenchConfig,
 )
 from training.commands._options import Processes, options
-from training.commands._progress import KeptPart, play_kept, share_shown, trials_shown
+from training.commands._progress import TrialSet, run_trial_sets, share_progress, trial_progress
 from training.commands._run_folder import Call
 from training.commands.replay import MRCLAM_LOG
 from training.rl.config import require_extra
 
-if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
+if TYPE_CHECKING:  # numerical modules are imported when the command runs, so that --help is fast
     from training.bench.stereo.real_images import RealPart
 
-bench = typer.Typer(help="Measure how good and how fast filters, environments and trainings are.", no_args_is_help=True)
+bench = typer.Typer(help="Measure accuracy and speed of filters, environments and training.", no_args_is_help=True)
 
 
 @bench.command("accuracy")
 @options(AccuracyConfig, "bench accuracy", continues=True)
 def bench_accuracy(call: Call[AccuracyConfig], processes: Processes = 1) -> None:
-    """How far filters are from the truth on simulated stereo runs, beside dead reckoning and what could be reached.
+    """Measure filter accuracy on simulated stereo runs, against dead reckoning and lower bounds of the error.
 
-    Options in the singular take several values with commas between; all combinations are tried. Ctrl-C finishes the
-    trial under way and sums up what there is; the same command with --out FOLDER goes on from there.
+    Options that accept several values take them comma-separated; all combinations are run. Ctrl-C finishes the
+    current trial and summarises the finished ones; the same command with --out FOLDER resumes the run.
     """
     from training.bench.accuracy.report import draw_accuracy, markdown, print_tables, summarise
     from training.bench.accuracy.trials import TRIALS_FILE, Trial, play
@@ -50,8 +50,8 @@ def bench_accuracy(call: Call[AccuracyConfig], processes: Processes = 1) -> None
         return f"seed {row['seed']}, {row['method']}" + (f" {row['particles']}" if row["particles"] else "")
 
     trials = call.config.trials()
-    part = KeptPart(file=TRIALS_FILE, kind=Trial, play=play, trials=trials, tell=tell, processes=processes)
-    (rows,) = play_kept(console, folder, part)
+    part = TrialSet(file=TRIALS_FILE, kind=Trial, play=play, trials=trials, tell=tell, processes=processes)
+    (rows,) = run_trial_sets(console, folder, part)
     lines = plain(summarise(rows))
     print_tables(console, lines)
     call.write({"summary": lines, "trials": rows})
@@ -64,7 +64,7 @@ def bench_accuracy(call: Call[AccuracyConfig], processes: Processes = 1) -> None
 @bench.command("filter")
 @options(
     FilterBenchConfig, "bench filter", quick={"measurements": (15,), "robots": (1,), "steps": 100},
-    quick_help="B=15, K=1, 100 steps.",
+    quick_help="15 measurements, 1 robot, 100 steps.",
 )  # fmt: skip
 def bench_filter(call: Call[FilterBenchConfig]) -> None:
     """Time steps of the filter over particles, landmarks, measurements and robots, on one thread."""
@@ -72,7 +72,7 @@ def bench_filter(call: Call[FilterBenchConfig]) -> None:
     from training.bench.filter.report import draw_speed, print_result
 
     console, folder = call.begin()
-    with trials_shown(console, count_trials(call.config)) as (on_trial, interrupted):
+    with trial_progress(console, count_trials(call.config)) as (on_trial, interrupted):
         result = run_bench(call.config, on_trial, interrupted)
     print_result(console, result)
     call.write(result)
@@ -91,13 +91,13 @@ def bench_stereo(
     real: Annotated[
         Path | None,
         typer.Option(
-            help="Folder of pairs with a model file: NAMEA, NAMEB, NAME_model.txt (homography), or left and right "
-            "images with calib.txt or two sensor.yaml; folders in it, too.",
+            help="Folder with image pairs: NAMEA, NAMEB, NAME_model.txt (homography), or left and right "
+            "images with calib.txt or two sensor.yaml; subfolders are included.",
             show_default="$VSLAM_DATA, if set",
         ),
     ] = None,
 ) -> None:
-    """Time rendering and front end, and measure disparities, guards and descriptors on rendered and real pairs."""
+    """Time rendering and the front end, and evaluate disparities, match checks and descriptors on image pairs."""
     import os
 
     from rich.markdown import Markdown
@@ -109,7 +109,7 @@ def bench_stereo(
     descriptors = call.config.descriptors
     parts = [] if data is None or (real is None and not data.is_dir()) else _parts(data, descriptors, real)
     console, folder = call.begin()
-    with trials_shown(console, None) as (on_part, interrupted):
+    with trial_progress(console, None) as (on_part, interrupted):
         result = run_stereo_bench(call.config, parts, on_part, interrupted)
     tables = markdown(result)
     console.print(Markdown(tables))
@@ -126,7 +126,7 @@ def bench_stereo(
 
 
 def _parts(data: Path, descriptors: Sequence[str], real: Path | None) -> "list[RealPart]":
-    """Return what is to be measured of real images, and refuse a folder that was named and holds none."""
+    """Return the real images to measure, and refuse a folder without any if it was given explicitly."""
     from slam_backend.core.validation import argument_error
     from training.bench.stereo.real_images import EXPECTED, find_parts
 
@@ -145,14 +145,14 @@ def _parts(data: Path, descriptors: Sequence[str], real: Path | None) -> "list[R
     quick_help="Base configuration only, 300 steps.",
 )  # fmt: skip
 def bench_env(call: Call[EnvBenchConfig]) -> None:
-    """Time steps of environments with the filter in the loop, on one thread, and tell where the time goes."""
+    """Time steps of environments with the filter in the loop, on one thread, with a breakdown by part."""
     from training.bench.env.bench import count_trials, print_env_result, run_bench
     from vslam_env import vslam_v0
 
-    for load in call.config.loads():  # what cannot be built shows before there is a folder
+    for load in call.config.loads():  # detects configurations that cannot be built before the folder is created
         vslam_v0.parallel_env(config=load.config())
     console, _ = call.begin()
-    with trials_shown(console, count_trials(call.config)) as (on_trial, interrupted):
+    with trial_progress(console, count_trials(call.config)) as (on_trial, interrupted):
         result = run_bench(call.config, on_trial, interrupted)
     print_env_result(console, result, call.config.peer)
     call.write(result)
@@ -162,14 +162,14 @@ def bench_env(call: Call[EnvBenchConfig]) -> None:
 @bench.command("exploration")
 @options(
     ExplorationBenchConfig, "bench exploration", continues=True,
-    quick={"worlds": ("office",), "duration": 60.0, "seeds": 3}, quick_help="Offices alone, 60 s, 3 seeds.",
+    quick={"worlds": ("office",), "duration": 60.0, "seeds": 3}, quick_help="Office worlds only, 60 s, 3 seeds.",
 )  # fmt: skip
 def bench_exploration(call: Call[ExplorationBenchConfig], processes: Processes = 1) -> None:
-    """Compare scripted policies, and your own, over worlds: floor seen, maps, poses, merges, with intervals.
+    """Compare policies over worlds: coverage, map errors, pose errors and merges, with confidence intervals.
 
-    All policies of a seed meet the same worlds, starts and noise. Plurals take several values with commas between; all
-    combinations are played. Robots that are told poses, names of landmarks and merges show what estimation costs.
-    Ctrl-C finishes the episode under way; the same command with --out FOLDER goes on from there.
+    All policies of a seed have the same worlds, starts and noise. Options in the plural take comma-separated values;
+    all combinations are run. Robots with known poses, landmark names and merges show the cost of estimation.
+    Ctrl-C finishes the current episode; the same command with --out FOLDER resumes the run.
     """
     from training.bench.exploration import report
     from training.bench.exploration.trials import TRIALS_FILE, play
@@ -178,11 +178,11 @@ def bench_exploration(call: Call[ExplorationBenchConfig], processes: Processes =
     trials = call.config.trials()
     firsts = {(t.policy, t.world, t.robots): t for t in reversed(trials)}.values()
     console, folder = call.begin(*(partial(_first_steps, call.config, trial) for trial in firsts))
-    part = KeptPart(
+    part = TrialSet(
         file=TRIALS_FILE, kind=ExplorationTrial, play=partial(play, call.config), trials=trials, processes=processes,
         tell=lambda row: f"{row['world']}, {row['policy']}, seed {row['seed']}: {row['coverage']:.0%} seen",
     )  # fmt: skip
-    (rows,) = play_kept(console, folder, part)
+    (rows,) = run_trial_sets(console, folder, part)
     lines, over_time = plain(report.summarise(rows)), plain(report.curves(rows))
     policies_differ, oracles_differ = plain(report.compare_policies(rows)), plain(report.compare_oracles(rows))
     report.print_tables(console, lines, policies_differ, oracles_differ)
@@ -197,7 +197,7 @@ def bench_exploration(call: Call[ExplorationBenchConfig], processes: Processes =
 
 
 def _first_steps(config: ExplorationBenchConfig, trial: ExplorationTrial) -> None:
-    """Play the first two steps of a trial: a world that cannot be had, or a policy that fails, shows at once."""
+    """Run the first two steps of a trial, to detect worlds that cannot be built and policies that fail."""
     from training.episodes.runner import run_episode
     from vslam_env import vslam_v0
 
@@ -210,12 +210,12 @@ def _first_steps(config: ExplorationBenchConfig, trial: ExplorationTrial) -> Non
 @bench.command("train")
 @options(TrainBenchConfig, "bench train")
 def bench_train(call: Call[TrainBenchConfig]) -> None:
-    """Time environment, adapter, network and update per decision of a robot, and the environments over workers."""
+    """Time environment, adapter, network and update per decision of a robot, and environments by worker count."""
     require_extra()
     from training.bench.train.bench import TRIALS, print_result, run_bench
 
     console, _ = call.begin()
-    with trials_shown(console, TRIALS) as (on_trial, interrupted):
+    with trial_progress(console, TRIALS) as (on_trial, interrupted):
         result = run_bench(call.config, on_trial, interrupted)
     print_result(console, result)
     call.write(result)
@@ -225,25 +225,25 @@ def bench_train(call: Call[TrainBenchConfig]) -> None:
 @bench.command("alignment")
 @options(
     AlignmentBenchConfig, "bench alignment", continues=True, quick={"seeds": 10, "hard": 45},
-    quick_help="10 trials of each cell, 45 of each hard set.",
+    quick_help="10 trials of each grid cell, 45 of each hard set.",
 )  # fmt: skip
 def bench_alignment(call: Call[AlignmentBenchConfig]) -> None:
-    """Success, error over the Cramer-Rao bound and time of all alignment methods, on pairs of simulated maps.
+    """Compare alignment methods on simulated maps: success rate, error over the Cramer-Rao bound, and time.
 
-    A grid over the share of common landmarks and of wrong look-alikes; U: maps that must not be aligned; I: maps that
-    just can be. One process, one thread, so that times count. Ctrl-C ends the bench after the trial under way and sums
-    up what there is; the same command with --out FOLDER goes on from there.
+    The grid varies the share of common landmarks and of wrong similar pairs; U: maps that must not be aligned; I: maps
+    that can barely be aligned. One process with one thread, for comparable times. Ctrl-C finishes the current trial
+    and summarises the finished ones; the same command with --out FOLDER resumes the run.
     """
     from training.bench.alignment.report import draw_alignment, markdown, print_tables, summarise
     from training.bench.alignment.trials import TRIALS_FILE, Trial, play
     from training.experiments.run_folder import plain
 
     console, folder = call.begin()
-    part = KeptPart(
+    part = TrialSet(
         file=TRIALS_FILE, kind=Trial, play=play, trials=call.config.trials(),
         tell=lambda row: f"{row['kind']} {row['case']}".strip(),
     )  # fmt: skip
-    (rows,) = play_kept(console, folder, part, timed=True)
+    (rows,) = run_trial_sets(console, folder, part, timed=True)
     lines = plain(summarise(rows))
     print_tables(console, lines)
     call.write({"summary": lines})
@@ -255,20 +255,20 @@ def bench_alignment(call: Call[AlignmentBenchConfig]) -> None:
 @bench.command("mrclam")
 @options(MrclamPairsConfig, "bench mrclam", log=MRCLAM_LOG)
 def bench_mrclam(call: Call[MrclamPairsConfig]) -> None:
-    """Five real robots map alone from their own starts; all pairs of maps are aligned, barcodes seen and hidden.
+    """Align maps of five real robots that mapped alone, for all pairs, with known and unknown barcodes.
 
-    Errors are against the motion between the fits of both maps to the true landmarks. The odometry noise was calibrated
-    on data sets 7 and 4 of MR.CLAM.
+    Errors are relative to the transform between the fits of both maps to the true landmarks. The odometry noise was
+    calibrated on data sets 7 and 4 of MR.CLAM.
     """
     from training.bench.alignment.mrclam import HEADINGS, align_log, cells, summarise
     from training.experiments.tables import console_table, markdown_table
 
     console, folder = call.begin()
-    with share_shown(console, "robots map alone") as update:
+    with share_progress(console, "single-robot mapping") as update:
         rows = align_log(call.config, update)
     lines = summarise(rows)
     shown = [cells(line) for line in lines]
-    console.print(console_table("Maps of real robots, aligned pairwise", HEADINGS, shown))
+    console.print(console_table("Pairwise alignment of maps of real robots", HEADINGS, shown))
     folder.write_text("table.md", markdown_table(HEADINGS, shown))
     call.write({"summary": lines, "pairs": rows})
     call.finish()

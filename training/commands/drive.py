@@ -1,4 +1,4 @@
-"""The command `vslam drive`: explore by hand, in a window, beside robots that explore by themselves."""
+"""Command `vslam drive`: drive one robot by keyboard while the others follow a policy."""
 
 from pathlib import Path
 from typing import Annotated
@@ -10,15 +10,15 @@ from training.experiments.compilation import prepare
 
 
 def drive_by_hand(
-    world: Annotated[str, typer.Option(help="A family or a path; see vslam worlds list.")] = "office",
-    robots: Annotated[int, typer.Option(help="How many, 1 to 8.")] = 3,
-    policy: Annotated[str, typer.Option(help="Of the robots that nobody drives, or none.")] = "frontier",
-    seed: Annotated[int, typer.Option(help="Of the episode.")] = 0,
-    preset: Annotated[str, typer.Option(help="easy, standard or hard noise.")] = "standard",
-    max_cycles: Annotated[int, typer.Option(help="Ticks of 0.1 s until the end.")] = 6000,
-    record: Annotated[Path | None, typer.Option(help="Film it into this .mp4 file.", show_default=False)] = None,
+    world: Annotated[str, typer.Option(help="World family or path; see vslam worlds list.")] = "office",
+    robots: Annotated[int, typer.Option(help="Number of robots, 1 to 8.")] = 3,
+    policy: Annotated[str, typer.Option(help="Policy of the other robots, or none.")] = "frontier",
+    seed: Annotated[int, typer.Option(help="Seed of the episode.")] = 0,
+    preset: Annotated[str, typer.Option(help="Noise preset: easy, standard or hard.")] = "standard",
+    max_cycles: Annotated[int, typer.Option(help="Length of the episode in ticks of 0.1 s.")] = 6000,
+    record: Annotated[Path | None, typer.Option(help="Record a video to this .mp4 file.", show_default=False)] = None,
 ) -> None:
-    """Drive a robot with the keys: arrows or WASD; Tab takes the next robot, Escape or Q ends."""
+    """Drive a robot with the arrow keys or WASD; Tab selects the next robot, Escape or Q quits."""
     from contextlib import ExitStack
 
     from agents import make_policy
@@ -31,10 +31,10 @@ def drive_by_hand(
 
     env = vslam_v0.parallel_env(world=world, num_robots=robots, preset=preset, max_cycles=max_cycles)
     policies = {} if policy == "none" else {a: make_policy(policy, "continuous") for a in env.possible_agents}
-    env.reset(seed=seed)  # a world that cannot be built shows first
+    env.reset(seed=seed)  # detects a world that cannot be built first
     reason = display_unavailable_reason()
     if reason:
-        raise argument_error("drive", "a screen for a window", reason.split(".")[0], reason.split(". ", 1)[1] + ".")
+        raise argument_error("drive", "a display for a window", reason.split(".")[0], reason.split(". ", 1)[1] + ".")
     prepare()
     console = Console(highlight=False)
     console.print(KEYS)

@@ -1,18 +1,18 @@
-"""The commands `vslam paper ...`: figures of the paper, computed from simulation."""
+"""Commands `vslam paper ...`: figures of the paper, reproduced in simulation."""
 
 from typing import TYPE_CHECKING, Any
 
 import typer
 
 from training.commands._options import Check, Processes, options
-from training.commands._progress import KeptPart, play_kept
+from training.commands._progress import TrialSet, run_trial_sets
 from training.commands._run_folder import Call
 from training.paper.config import Fig1Config, Fig2Config, Fig5Config, Fig6Config, PairConfig
 
-if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
+if TYPE_CHECKING:  # numerical modules are imported when the command runs, so that --help is fast
     from training.paper.fig3 import AlignedPair
 
-paper = typer.Typer(help="Compute figures of the paper anew.", no_args_is_help=True)
+paper = typer.Typer(help="Reproduce figures of the paper.", no_args_is_help=True)
 
 
 @paper.command("fig6")
@@ -21,13 +21,13 @@ paper = typer.Typer(help="Compute figures of the paper anew.", no_args_is_help=T
     quick_help="3 seeds, M = 1, 10, 100, and 25 m.",
 )  # fmt: skip
 def fig6(call: Call[Fig6Config], processes: Processes = 1, check: Check = False) -> None:
-    """Fig. 6: time of a step, and map error, of one to three robots that share B measurements.
+    """Reproduce Fig. 6: step time and map error of one to three robots that share B measurements.
 
-    The filter is the paper's (`fastslam1`, unknown association, resampling at random at every step), the noise large
-    against the odometry; beside it look-alikes with false points, and good stereo with both proposals and with
-    rejuvenation, for M = 10, 100, 1000. Map errors come from --processes at a time, times from one alone. The paper's
-    claims are asked of the data. Ctrl-C finishes the trial under way and sums up what there is; the same command with
-    --out FOLDER goes on from there.
+    The filter is the paper's (`fastslam1`, unknown association, random resampling at every step), with large noise
+    relative to the odometry. Further regimes: similar landmarks with false points, and good stereo with both proposals
+    and with rejuvenation, for M = 10, 100, 1000. Map errors run in --processes at a time, times in one process. The
+    paper's claims are checked. Ctrl-C finishes the current trial and summarises the finished ones; the same command
+    with --out FOLDER resumes the run.
     """
     from training.experiments.run_folder import plain
     from training.paper.fig6.claims import check_claims, robots_ratios, summarise, to_csv
@@ -36,16 +36,16 @@ def fig6(call: Call[Fig6Config], processes: Processes = 1, check: Check = False)
 
     console, folder = call.begin()
     parts = (
-        KeptPart(
+        TrialSet(
             file=ERRORS_FILE, kind=ErrorTrial, play=play_error, trials=call.config.error_trials(), processes=processes,
             tell=lambda row: f"map errors: seed {row['seed']}, M={row['particles']}", cost=cost,
         ),
-        KeptPart(
+        TrialSet(
             file=TIMES_FILE, kind=TimeTrial, play=play_time, trials=call.config.time_trials(),
             tell=lambda row: f"times: seed {row['seed']}, M={row['particles']}", cost=cost,
         ),
     )  # fmt: skip
-    errors, times = play_kept(console, folder, *parts, timed=True)
+    errors, times = run_trial_sets(console, folder, *parts, timed=True)
     lines, ratios, claims = plain(summarise(errors, times)), plain(robots_ratios(errors)), check_claims(errors, times)
     print_result(console, lines, ratios, claims)
     call.write({"summary": lines, "robots_ratios": ratios, "claims": [claim.to_mapping() for claim in claims]})
@@ -58,19 +58,19 @@ def fig6(call: Call[Fig6Config], processes: Processes = 1, check: Check = False)
 @paper.command("fig1")
 @options(Fig1Config, "paper fig1")
 def fig1(call: Call[Fig1Config]) -> None:
-    """Fig. 1: clouds of particles along the paths of three robots, by odometry alone and with what they see."""
-    from training.paper.fig1 import draw_clouds, draw_fig1, figures_of, simulate_fig1
+    """Reproduce Fig. 1: particles along the paths of three robots, with odometry only and with measurements."""
+    from training.paper.fig1 import draw_clouds, draw_fig1, path_errors, simulate_fig1
 
     console, folder = call.begin()
     run = simulate_fig1(call.config)
     moved, measured = (draw_clouds(run, call.config, with_measurements) for with_measurements in (False, True))
     panels = [("motion model alone (Eq. 4)", "odometry", moved), ("with measurements", "estimate", measured)]
     draw_fig1(folder.path / "fig1.png", run, panels)
-    found = {"odometry": figures_of(run, moved), "measurements": figures_of(run, measured)}
+    found = {"odometry": path_errors(run, moved), "measurements": path_errors(run, measured)}
     for name, rows in found.items():
         for robot, row in enumerate(rows, 1):
-            text = f"robot {robot}, {name}: path RMS {row['path_rms_m']:.2f} m, at the end off by"
-            console.print(f"{text} {row['end_error_m']:.2f} m, spread {row['end_spread_m']:.2f} m")
+            text = f"robot {robot}, {name}: path RMS {row['path_rms_m']:.2f} m, final error"
+            console.print(f"{text} {row['end_error_m']:.2f} m, final spread {row['end_spread_m']:.2f} m")
     call.write(found)
     call.finish()
 
@@ -78,29 +78,29 @@ def fig1(call: Call[Fig1Config]) -> None:
 @paper.command("fig2")
 @options(Fig2Config, "paper fig2", continues=True, quick={"seeds": 3, "length": 40.0}, quick_help="3 runs of 40 m.")
 def fig2(call: Call[Fig2Config], check: Check = False) -> None:
-    """Fig. 2: error of SVD, ICP, ImpICP, RANSAC and ours against the size of two robots' own maps.
+    """Reproduce Fig. 2: error of SVD, ICP, ImpICP, RANSAC and our method over the size of two robots' maps.
 
-    The paper's four are shown as they come, without refinement or refusal. Its statement, RANSAC is best and
-    practically zero whatever the size, is asked of the data. The same command with --out FOLDER goes on with a run
-    that Ctrl-C has stopped.
+    The paper's four methods run without refinement and refusal. The paper's claim, that RANSAC is best with practically
+    zero error for any size, is checked. The same command with --out FOLDER resumes a run that Ctrl-C has
+    stopped.
     """
     from training.experiments.run_folder import plain
     from training.experiments.tables import number
     from training.paper import fig2 as figure
 
     console, folder = call.begin()
-    part = KeptPart(
+    part = TrialSet(
         file=figure.TRIALS_FILE, kind=figure.Fig2Trial, play=figure.play, trials=call.config.trials(),
         tell=lambda row: f"seed {row['seed']}",
     )  # fmt: skip
-    (rows,) = play_kept(console, folder, part)
+    (rows,) = run_trial_sets(console, folder, part)
     lines, poor = figure.summarise(rows), figure.refusals(rows)
     claims = plain(figure.check_claims(lines))
     for claim in claims:
         held = "holds" if claim["holds"] else "does not hold"
         shown = f"{number(claim['measured'])}, at most {claim['at_most']:g}: {held}"
         console.print(f"{claim['claim']}: {shown}", highlight=False, markup=False)
-    text = f"At {poor['share_too_little']} stages maps share too little; ours was false {poor['false']} times."
+    text = f"At {poor['share_too_little']} stages the maps share too little; false alignments of ours: {poor['false']}."
     console.print(text)
     call.write({"summary": lines, "claims": claims} | poor)
     folder.write_text("fig2.csv", figure.to_csv(rows))
@@ -111,13 +111,13 @@ def fig2(call: Call[Fig2Config], check: Check = False) -> None:
 @paper.command("fig3")
 @options(PairConfig, "paper fig3")
 def fig3(call: Call[PairConfig]) -> None:
-    """Fig. 3: two robots' own maps, what matches between them, and the motion found."""
+    """Reproduce Fig. 3: maps of two robots, the matches between them, and the estimated transform."""
     from training.paper.fig3 import draw_fig3, matches_csv
 
     pair = _align(call)
     figures = pair.figures()
     call.console.print(
-        f"{figures['inliers']} matches, {figures['true_inliers']} of them true; motion off by "
+        f"{figures['inliers']} matches, {figures['true_inliers']} of them true; transform error "
         f"{figures['translation_error_m']:.3f} m and {figures['rotation_error_deg']:.2f} degrees"
     )
     call.folder.write_text("fig3.csv", matches_csv(pair))
@@ -129,7 +129,7 @@ def fig3(call: Call[PairConfig]) -> None:
 @paper.command("fig4")
 @options(PairConfig, "paper fig4")
 def fig4(call: Call[PairConfig]) -> None:
-    """Fig. 4: ellipses of a few landmarks of two aligned maps, before and after fusion."""
+    """Reproduce Fig. 4: covariance ellipses of landmarks of two aligned maps, before and after fusion."""
     import numpy as np
 
     from training.paper.fig3 import draw_fig4, ellipses_csv, fuse_pair
@@ -137,7 +137,7 @@ def fig4(call: Call[PairConfig]) -> None:
     fused = fuse_pair(_align(call))
     areas = 1e4 * np.sqrt(np.linalg.det(fused.covariances[..., :2, :2]))
     for name, one, two, both in zip(fused.names.tolist(), *areas, strict=True):
-        text = f"landmark {name}: {one:.2f} and {two:.2f} square centimetres become {both:.2f}"
+        text = f"landmark {name}: {one:.2f} and {two:.2f} square centimetres before, {both:.2f} after fusion"
         call.console.print(text)
     call.folder.write_text("fig4.csv", ellipses_csv(fused))
     draw_fig4(call.folder.path / "fig4.png", fused)
@@ -147,7 +147,7 @@ def fig4(call: Call[PairConfig]) -> None:
 
 
 def _align(call: Call[PairConfig]) -> "AlignedPair":
-    """Begin fig3 or fig4: return two maps with the motion between them, which are refused before there is a folder."""
+    """Start fig3 or fig4: return two maps and the transform between them, computed before the folder is created."""
     from training.paper.fig3 import align_pair
 
     found: list[AlignedPair] = []
@@ -158,7 +158,7 @@ def _align(call: Call[PairConfig]) -> "AlignedPair":
 @paper.command("fig5")
 @options(Fig5Config, "paper fig5")
 def fig5(call: Call[Fig5Config]) -> None:
-    """Fig. 5: robots in a room with landmarks on its walls; what they see, and what walls hide from them."""
+    """Reproduce Fig. 5: robots in a room with landmarks on its walls, which landmarks they see and which are hidden."""
     from training.paper.fig5 import draw_fig5, simulate_fig5
 
     console, folder = call.begin()
@@ -169,7 +169,7 @@ def fig5(call: Call[Fig5Config]) -> None:
     for robot, row in enumerate(rows):
         console.print(
             f"robot {robot}: {row['in_view']} landmarks in view, {row['hidden']} of them hidden; "
-            f"{row['measured']} of {row['seen']} measured in this tick"
+            f"{row['measured']} of {row['seen']} visible measured in this tick"
         )
     hidden, in_view = sum(row["hidden"] for row in rows), sum(row["in_view"] for row in rows)
     console.print(f"Walls and robots hide {hidden} of {in_view} landmarks in view.")

@@ -1,4 +1,4 @@
-"""The commands `vslam replay ...`: the backend on logs of real robots."""
+"""Commands `vslam replay ...`: the backend on logs of real robots."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -8,7 +8,7 @@ import typer
 from rich.console import Console
 
 from training.commands._options import options
-from training.commands._progress import share_shown
+from training.commands._progress import share_progress
 from training.commands._run_folder import Call
 from training.episodes.tables import print_consistency, print_refusals, write_maps
 from training.experiments.tables import console_table, number
@@ -24,7 +24,7 @@ from training.replay.config import (
     VictoriaConfig,
 )
 
-if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
+if TYPE_CHECKING:  # numerical modules are imported when the command runs, so that --help is fast
     from slam_backend.core.validation import FloatArray
     from slam_backend.readers.mrclam import MrclamLog
     from slam_backend.trajectory import Trajectory
@@ -33,25 +33,25 @@ if TYPE_CHECKING:  # what computes is imported when the command runs, so that --
     from training.replay.single_robot import OneReplay
     from training.replay.victoria import VictoriaScore
 
-replay = typer.Typer(help="Run the backend on the log of real robots.", no_args_is_help=True)
+replay = typer.Typer(help="Run the backend on logs of real robots.", no_args_is_help=True)
 
 NO_TRUTH = "Errors: no ground truth in this folder."
 MRCLAM_LOG = (MRCLAM, "a folder of the MR.CLAM log, with Barcodes.dat, Landmark_Groundtruth.dat and Robot*.dat")
 VICTORIA_LOG = (
     VICTORIA, "a folder of the Victoria Park log, with aa3_dr.mat, VictoriaParkSinSincronizar.mat and aa3_gpsx.mat",
 )  # fmt: skip
-KITTI_LOG = (KITTI, "an archive (.npz) of KITTI features, a folder with one, or one of images (image_0, ...)")
+KITTI_LOG = (KITTI, "an archive (.npz) of KITTI features, a folder with one, or a folder of images (image_0, ...)")
 STEREO_LOG = (
     PAIRS,
     "a folder with two stereo pairs (left_img_0.png, right_img_0.png, left_img_1.png, ...) and their calibration",
 )
-DRIVE_ALONE = ("times", "duration", "particles")  # options of drives, which two pairs do not have
+DRIVE_ALONE = ("times", "duration", "particles")  # options for drives only, not for two pairs
 
 
 @replay.command("mrclam")
 @options(MrclamConfig, "replay mrclam", log=MRCLAM_LOG)
 def replay_mrclam(call: Call[MrclamConfig]) -> None:
-    """Five real robots with unknown starts: a filter each, maps aligned and merged, one team in the end.
+    """Replay five real robots with unknown starts: separate filters, whose maps are aligned and merged into one team.
 
     The odometry noise was calibrated on data sets 7 and 4 of MR.CLAM.
     """
@@ -74,7 +74,7 @@ def replay_mrclam(call: Call[MrclamConfig]) -> None:
     if counts := _rejuvenations(scores["rejuvenations"]):
         console.print(counts)
     speed = float(result.times[-1] - result.times[0]) / result.seconds
-    console.print(f"The filters took {result.seconds:.1f} s: {speed:.0f} times real time.")
+    console.print(f"Filter time: {result.seconds:.1f} s, {speed:.0f} times real time.")
     for robot, own in enumerate(log.robots):
         for kind, poses in (("estimate", result.paths[robot]), ("dead_reckoning", result.reckoned[robot])):
             folder.write_trajectory(f"robot{own.robot}_{kind}", Trajectory(result.times, poses))
@@ -93,11 +93,11 @@ def replay_mrclam(call: Call[MrclamConfig]) -> None:
 
 
 def _replay_live(console: Console, log: "MrclamLog", config: MrclamConfig) -> "Replay":
-    """Run the replay under a progress bar, and tell of each merge as it comes."""
+    """Run the replay under a progress bar, and print each merge when it happens."""
     from training.replay.mrclam import replay_team
 
     names = [own.robot for own in log.robots]
-    with share_shown(console, f"{len(names)} robots", "{task.fields[groups]} groups", groups=len(names)) as update:
+    with share_progress(console, f"{len(names)} robots", "{task.fields[groups]} groups", groups=len(names)) as update:
 
         def on_step(done: float, report: Any) -> None:
             update(done, groups=len(report.groups))
@@ -111,7 +111,7 @@ def _replay_live(console: Console, log: "MrclamLog", config: MrclamConfig) -> "R
 
 
 def _print_tables(console: Console, metrics: dict[str, Any], with_poses: set[int]) -> None:
-    """Print scores of paths, maps and merges, as far as they are known."""
+    """Print the available errors of paths, maps and merges."""
     aligned, start = "after the best rigid fit", "from the true start, no fit"
     paths = {
         f"path (m),\n{aligned}": "ate_aligned_m", "odometry,\nfitted too": "dead_reckoning_ate_aligned_m",
@@ -135,7 +135,7 @@ def _print_tables(console: Console, metrics: dict[str, Any], with_poses: set[int
         ):
             if robots:
                 console.print(f"{title} of robots {', '.join(map(str, robots))}: {why}.")
-    errors = {"off by (m)": "error_m", "off by (°)": "error_deg"}
+    errors = {"error (m)": "error_m", "error (°)": "error_deg"}
     errors = {name: key for name, key in errors.items() if any(row[key] is not None for row in metrics["merges"])}
     merges = []
     for row in metrics["merges"]:
@@ -151,21 +151,21 @@ def _print_tables(console: Console, metrics: dict[str, Any], with_poses: set[int
 @replay.command("victoria")
 @options(VictoriaConfig, "replay victoria", log=VICTORIA_LOG)
 def replay_victoria(call: Call[VictoriaConfig]) -> None:
-    """A car among the trees of a park: trees without names, matched by where they stand, GPS as the truth."""
+    """Replay a car among the trees of a park: unlabelled trees, matched by position, with GPS as ground truth."""
     from slam_backend.readers.victoria import load_victoria
     from training.replay.victoria import replay, score, summarise
 
     log = load_victoria(call.config.path, call.config.duration)
     console, _ = call.begin()
-    with share_shown(console, "replay") as on_step:
+    with share_progress(console, "replay") as on_step:
         result = replay(log, call.config, on_step)
     scored = score(result, log)
     metrics = summarise(result, scored)
-    told = [f"Trees seen ten times or more: {metrics['landmarks_seen_ten_times']}.", *log.notes]
+    notes = [f"Trees seen at least ten times: {metrics['landmarks_seen_ten_times']}.", *log.notes]
     unknown = NO_TRUTH
     if scored is not None:
         gps = metrics["gps"]
-        told.insert(
+        notes.insert(
             0,
             f"At {gps['fixes']} GPS fixes: median {gps['median_m']:.2f} m, 95 % within {gps['percentile_95_m']:.2f} m, "
             f"worst {gps['worst_m']:.1f} m.",
@@ -178,13 +178,13 @@ def replay_victoria(call: Call[VictoriaConfig]) -> None:
         )
     known = scored.fixes if scored else None
     metrics |= {"notes": log.notes}
-    _finish_one(call, result, metrics, told, "Victoria Park", scored, known, known_as="GPS", unknown=unknown)
+    _finish_one(call, result, metrics, notes, "Victoria Park", scored, known, known_as="GPS", unknown=unknown)
 
 
 @replay.command("kitti")
 @options(KittiConfig, "replay kitti", log=KITTI_LOG)
 def replay_kitti(call: Call[KittiConfig]) -> None:
-    """A car in a town: stereo images, or stereo features whose tracks are the landmarks; motion taken to be planar."""
+    """Replay a car in a town: stereo images, or tracked stereo features as landmarks, assuming planar motion."""
     from slam_backend.readers.kitti import load_kitti
     from slam_backend.readers.kitti_images import is_image_folder
     from training.replay.kitti import replay, score, summarise
@@ -194,27 +194,27 @@ def replay_kitti(call: Call[KittiConfig]) -> None:
         return
     log = load_kitti(call.config.path, call.config.truth, call.config.duration)
     console, _ = call.begin()
-    with share_shown(console, "replay") as on_step:
+    with share_progress(console, "replay") as on_step:
         result = replay(log, call.config, on_step)
     scored = score(result, log)
-    told = _drive_told(scored, "odometry")
+    notes = _drift_lines(scored, "odometry")
     if scored is not None and scored.loop is not None:
         seconds = [float(result.times[step] - result.times[0]) for step in scored.loop]
-        told.append(
-            f"The place of {seconds[0]:.0f} s was seen again at {seconds[1]:.0f} s; the motion between is off by "
-            f"{scored.loop_error:.2f} m. Tracks that ended never come back, so nothing closes this loop."
+        notes.append(
+            f"The robot returned at {seconds[1]:.0f} s to its place of {seconds[0]:.0f} s; relative error: "
+            f"{scored.loop_error:.2f} m. Ended tracks are not matched again, so there is no loop closure."
         )
     title = "KITTI, tracked stereo features in the plane"
     known = scored.truth if scored else None
-    _finish_one(call, result, summarise(result, scored), told, title, scored, known, truth=log.truth)
+    _finish_one(call, result, summarise(result, scored), notes, title, scored, known, truth=log.truth)
 
 
 @replay.command("stereo")
 @options(ImagesConfig, "replay stereo", log=STEREO_LOG)
 def replay_stereo(call: Call[ImagesConfig]) -> None:
-    """Two stereo pairs of one room: the motion between the two places. Three pairs or more: a drive in the plane.
+    """Replay stereo images: two pairs give the motion between their places, three or more a drive in the plane.
 
-    File names are looked up in the folder, unless they are whole paths.
+    File names are relative to the folder, unless they are absolute paths.
     """
     from slam_backend.core.validation import argument_error
     from slam_backend.readers.stereo_files import StereoFiles, find_pairs
@@ -226,13 +226,13 @@ def replay_stereo(call: Call[ImagesConfig]) -> None:
         return
     for name in DRIVE_ALONE:
         if name in values:
-            cure = "Leave it away: two pairs are aligned in space."
-            raise argument_error(name, "a drive of three pairs or more", "a folder with two pairs", cure)
+            hint = "Omit it: two pairs are aligned in space."
+            raise argument_error(name, "a drive of three pairs or more", "a folder with two pairs", hint)
     _align_pairs(call, PairsConfig.from_mapping(values))
 
 
 def _align_pairs(call: Call[ImagesConfig], chosen: PairsConfig) -> None:
-    """Align two pairs by each descriptor, print how well, and write the run folder."""
+    """Align two pairs with each descriptor, print the result, and write the run folder."""
     import numpy as np
 
     from slam_backend.frontend import DESCRIPTORS
@@ -270,21 +270,21 @@ def _align_pairs(call: Call[ImagesConfig], chosen: PairsConfig) -> None:
 
 
 def _replay_images(call: Call[Any], chosen: ImagesConfig) -> None:
-    """Replay a folder of stereo images, print how far off it ended, and write the run folder."""
+    """Replay a folder of stereo images, print the errors, and write the run folder."""
     from training.replay.image_figures import draw_frame, expected_pixels
     from training.replay.stereo_images import load_images, replay_images, score_images, summarise_images
 
     log = load_images(chosen)
     console, folder = call.begin(config=chosen)
-    with share_shown(console, "replay") as on_step:
+    with share_progress(console, "replay") as on_step:
         result = replay_images(log, chosen, on_step)
     one, scored = result.replay, score_images(result.replay, log)
     metrics = summarise_images(result, scored)
-    told = [
-        f"Odometry: visual, from every second of {metrics['features_per_frame']:.0f} features a frame "
-        f"({metrics['odometry_inliers_per_frame']:.0f} agreed); the filter got the others. Motion is taken to be in "
-        f"the plane. Front end and odometry took {1e3 * result.front_end_seconds / len(log.times):.0f} ms a frame.",
-        *_drive_told(scored, "visual odometry alone"),
+    notes = [
+        f"Odometry: visual, from half of the {metrics['features_per_frame']:.0f} features per frame "
+        f"({metrics['odometry_inliers_per_frame']:.0f} inliers); the filter uses the other half. Motion is assumed "
+        f"planar. Front end and odometry took {1e3 * result.front_end_seconds / len(log.times):.0f} ms per frame.",
+        *_drift_lines(scored, "visual odometry alone"),
     ]
     landmarks = one.landmarks
     counts = dict(zip(landmarks.ids.tolist(), landmarks.counts.tolist(), strict=True))
@@ -295,38 +295,38 @@ def _replay_images(call: Call[Any], chosen: ImagesConfig) -> None:
     image = log.images(len(log.times) - 1)[0]
     draw_frame(folder.path / "frame.png", image, result.last.pixels[::2], result.last_ids, counts, expected)
     known = scored.truth if scored else None
-    _finish_one(call, one, metrics, told, "stereo images in the plane", scored, known, truth=log.truth)
+    _finish_one(call, one, metrics, notes, "stereo images in the plane", scored, known, truth=log.truth)
 
 
-def _drive_told(scored: "DriveScore | None", other: str) -> list[str]:
-    """Return lines about KITTI's drift and the errors at the end, of the estimate and of the `other`."""
+def _drift_lines(scored: "DriveScore | None", other: str) -> list[str]:
+    """Return lines about the KITTI drift and the final errors of the estimate and of the `other` path."""
     if scored is None:
         return []
-    told, drifts, ends, length = [], scored.drifts, scored.ends, scored.length
+    notes, drifts, ends, length = [], scored.drifts, scored.ends, scored.length
     if all(map(math.isfinite, drifts)):  # the true path is long enough
-        told.append(
-            f"Drift (KITTI's: mean error of the motion over 100, 200, ... 800 m): {100.0 * drifts[0]:.2f} % "
+        notes.append(
+            f"Drift (KITTI metric: mean error over segments of 100, 200, ... 800 m): {100.0 * drifts[0]:.2f} % "
             f"(odometry {100.0 * drifts[1]:.2f} %)."
         )
     shares = [100.0 * error / length for error in ends]
-    told.append(
-        f"End of {length:.1f} m, from the start, no fit: off by {ends[0]:.2f} m, {shares[0]:.2f} % of the path "
+    notes.append(
+        f"Final error after {length:.1f} m, from the start, no fit: {ends[0]:.2f} m, {shares[0]:.2f} % of the path "
         f"({other} {ends[1]:.2f} m, {shares[1]:.2f} %)."
     )
-    return told
+    return notes
 
 
 def _finish_one(
-    call: Call[Any], result: "OneReplay", metrics: Mapping[str, Any], told: Sequence[str], title: str,
+    call: Call[Any], result: "OneReplay", metrics: Mapping[str, Any], notes: Sequence[str], title: str,
     scored: "DriveScore | VictoriaScore | None", known: "FloatArray | None", *, known_as: str = "true path",
     truth: "Trajectory | None" = None, unknown: str = NO_TRUTH,
 ) -> None:  # fmt: skip
-    """Show and keep the replay of one robot's log.
+    """Print and store the replay of a log of one robot.
 
     Args:
         known: Known positions (n, 2 or 3) [m], world frame; None without truth.
-        known_as: Their label in the picture.
-        unknown: Line in place of the table where there are no scores.
+        known_as: Label of the known positions in the picture.
+        unknown: Text in place of the table if there are no errors.
     """
     from slam_backend.trajectory import Trajectory
     from training.experiments.run_folder import plain, to_json
@@ -336,7 +336,7 @@ def _finish_one(
     shown = plain(metrics)
     _print_one(console, shown, result, unknown)
     print_consistency(console, shown["consistency"])
-    lines = [*told, _rejuvenations(metrics["rejuvenations"]), write_maps(folder, {"1": result.landmarks})]
+    lines = [*notes, _rejuvenations(metrics["rejuvenations"]), write_maps(folder, {"1": result.landmarks})]
     for line in filter(None, lines):
         console.print(line, soft_wrap=True)
     estimate, reckoned = scored.paths if scored else (result.path, result.reckoned)
@@ -354,7 +354,7 @@ def _finish_one(
 
 
 def _print_one(console: Console, metrics: dict[str, Any], result: "OneReplay", unknown: str) -> None:
-    """Print how far path and dead reckoning are off or that it is `unknown`, what became of the measurements, speed."""
+    """Print errors of path and dead reckoning, or `unknown`, then the use of the measurements and the speed."""
     row = metrics["robots"][0]
     if row["ate_aligned_m"] is None:
         console.print(unknown, soft_wrap=True)
@@ -365,15 +365,15 @@ def _print_one(console: Console, metrics: dict[str, Any], result: "OneReplay", u
         console.print(console_table("RMS distance to the truth [m]", headings, rows))
     made = metrics["measurements"]
     console.print(
-        f"{metrics['landmarks']} landmarks; of the measurements {made['matched']} matched, {made['created']} began "
-        f"landmarks, {made['rejected']} were refused. {row['path_m']:.0f} m in {metrics['duration_s']:.0f} s; "
-        f"the filter took {result.seconds:.1f} s: {result.speed:.0f} times real time."
+        f"{metrics['landmarks']} landmarks; {made['matched']} measurements matched, {made['created']} created "
+        f"landmarks, {made['rejected']} rejected. {row['path_m']:.0f} m in {metrics['duration_s']:.0f} s; "
+        f"filter time {result.seconds:.1f} s, {result.speed:.0f} times real time."
     )
 
 
 def _rejuvenations(counts: Mapping[str, Any]) -> str:
-    """Return a line that tells how often particles were drawn again, and why not; "" if nothing was attempted."""
+    """Return a line with the number of rejuvenations and the reasons for refusals; "" if nothing was attempted."""
     refused = "; ".join(f"{reason} ({count})" for reason, count in counts["refused"].items())
     if not counts["drawn"] and not refused:
         return ""
-    return f"Particles were drawn anew {counts['drawn']} times" + (f", and not, for: {refused}." if refused else ".")
+    return f"Rejuvenated {counts['drawn']} times" + (f". Refused: {refused}." if refused else ".")

@@ -1,4 +1,4 @@
-"""The command `vslam run`: robots explore a building, live progress, tables, and the run folder."""
+"""Command `vslam run`: an exploration episode with live progress, tables, and the run folder."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -14,17 +14,17 @@ from training.commands._options import options
 from training.commands._run_folder import Call
 from training.episodes.config import RunConfig
 
-if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
+if TYPE_CHECKING:  # numerical modules are imported when the command runs, so that --help is fast
     from training.episodes.runner import EpisodeRecord, MergeRecord, Progress
 
 VIDEO_SIZE = (960, 720)
 REFRESH_STEPS = 5
-IMAGE_WIDTH = 480  # of what one robot sees, beside the map [px]
+IMAGE_WIDTH = 480  # width of a robot's camera images, beside the map [px]
 
 
 @options(RunConfig, "run")
-def run(call: Call[RunConfig], video: Annotated[bool, typer.Option(help="Whether to film the run.")] = True) -> None:
-    """Robots that do not know where they start explore a building, map it, and join their maps."""
+def run(call: Call[RunConfig], video: Annotated[bool, typer.Option(help="Whether to record a video.")] = True) -> None:
+    """Let robots with unknown starts explore a building, map it, and merge their maps."""
     from agents.registry import action_types
     from slam_backend.trajectory import Trajectory
     from training.episodes.figures import draw_errors, draw_maps
@@ -38,7 +38,7 @@ def run(call: Call[RunConfig], video: Annotated[bool, typer.Option(help="Whether
     chosen = call.config
     env = chosen.make_env()
     policies = chosen.make_policies(env)
-    # A bad world shows before there is a folder.
+    # Detect a world that cannot be built before the folder is created.
     console, folder = call.begin(lambda: _first_steps(env, policies, chosen.seed))
     folder.write_text("environment.toml", env.config.replace(world=folder.config["world"]).to_toml())
     record = _run_live(console, env, policies, chosen, folder.path / "video.mp4" if video else None)
@@ -46,7 +46,7 @@ def run(call: Call[RunConfig], video: Annotated[bool, typer.Option(help="Whether
     print_tables(console, scores)
     print_consistency(console, scores["consistency"])
     call.write(scores)
-    for robot in range(len(record.infos)):  # paths of robots are in their own start frames, the true ones in the world
+    for robot in range(len(record.infos)):  # estimated paths are in start frames, true paths in the world frame
         for kind, paths in (
             ("estimate", record.estimated), ("dead_reckoning", record.reckoned), ("truth", record.true_poses)
         ):  # fmt: skip
@@ -59,7 +59,7 @@ def run(call: Call[RunConfig], video: Annotated[bool, typer.Option(help="Whether
 
 
 def _first_steps(env: Any, policies: Any, seed: int) -> None:
-    """Run the first two steps of the episode, which need all kernels but those of a merge."""
+    """Run the first two steps of the episode, which use all kernels except those of merging."""
     from training.episodes.runner import run_episode
 
     steps = iter(range(2))
@@ -67,9 +67,9 @@ def _first_steps(env: Any, policies: Any, seed: int) -> None:
 
 
 def _run_live(console: Console, env: Any, policies: Any, config: RunConfig, video: Path | None) -> "EpisodeRecord":
-    """Run the episode with live figures, filming it if there is a path for the video; Ctrl-C ends it early."""
+    """Run the episode with live metrics, recording it if there is a path for the video; Ctrl-C stops it."""
     from training.episodes.runner import run_episode
-    from training.episodes.video import VideoWriter, beside_the_map, choose_pace, with_slow_flashes
+    from training.episodes.video import VideoWriter, choose_pace, with_camera_images, with_video_time_merges
     from training.experiments.interrupt import interrupt_flag
     from vslam_env.rendering import draw_frame
 
@@ -84,18 +84,18 @@ def _run_live(console: Console, env: Any, policies: Any, config: RunConfig, vide
         def on_step(progress: "Progress") -> None:
             show(progress)
             if writer is not None and progress.step % pace.stride == 0:
-                picture = draw_frame(with_slow_flashes(env.scene(), env.events, pace.speedup), VIDEO_SIZE)
-                writer.add(beside_the_map(picture, env.episode.frames[0], IMAGE_WIDTH) if eyes else picture)
+                picture = draw_frame(with_video_time_merges(env.scene(), env.events, pace.speedup), VIDEO_SIZE)
+                writer.add(with_camera_images(picture, env.episode.frames[0], IMAGE_WIDTH) if eyes else picture)
 
         record = run_episode(env, policies, config.seed, on_step, interrupted)
     if not record.complete:
-        console.print(f"Stopped at {record.times[-1]:.1f} s; what follows is about the run until then.")
+        console.print(f"Stopped at {record.times[-1]:.1f} s; the results cover the run until then.")
     return record
 
 
 @contextmanager
 def live_progress(console: Console, num_steps: int, agents: Sequence[str]) -> Iterator[Callable[["Progress"], None]]:
-    """Show a bar with the figures of a running episode, and a line for each merge; yields what takes in a step."""
+    """Show a bar with the metrics of a running episode, and a line for each merge; yield the callback for a step."""
     columns = (
         TextColumn("{task.fields[time]:6.1f} s"), BarColumn(20), TextColumn("E {task.fields[errors]} m"),
         TextColumn("{task.fields[coverage]:2.0f} % seen"), TextColumn("{task.fields[groups]} maps"),
@@ -121,5 +121,5 @@ def live_progress(console: Console, num_steps: int, agents: Sequence[str]) -> It
 def describe(merge: "MergeRecord") -> str:
     """Describe a merge in one line."""
     sides = [", ".join(map(str, side)) for side in (merge.robots_a, merge.robots_b)]
-    off = f"off by {merge.error_m:.2f} m, {merge.error_deg:.1f} deg"
+    off = f"error {merge.error_m:.2f} m, {merge.error_deg:.1f} deg"
     return f"{merge.time:6.1f} s  maps of {sides[0]} and {sides[1]} merged on {merge.landmarks} landmarks, {off}"

@@ -1,4 +1,4 @@
-"""The command `vslam train`: one network learns to choose goals for all robots; curves, checkpoints, a model."""
+"""Command `vslam train`: training of one goal-selection network for all robots; curves, checkpoints, model."""
 
 import os
 from functools import partial
@@ -13,7 +13,7 @@ from training.commands._run_folder import Call
 from training.experiments.compilation import prepare
 from training.rl.config import SPLIT_TRAIN, TrainConfig, require_extra
 
-if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
+if TYPE_CHECKING:  # numerical modules are imported when the command runs, so that --help is fast
     from training.rl.callbacks import Row
     from training.rl.trainer import Training
 
@@ -23,46 +23,48 @@ def train(
     call: Call[TrainConfig],
     workers: Annotated[
         int | None,
-        typer.Option(help="Processes that step them; 0: this one. Weights do not depend on it.", show_default="cores"),
+        typer.Option(
+            help="Number of environment processes; 0: this one. Weights do not depend on it.", show_default="cores"
+        ),
     ] = None,
-    device: Annotated[str, typer.Option(help="cpu, or cuda for the updates of the network.")] = "cpu",
+    device: Annotated[str, typer.Option(help="Device of the network updates: cpu or cuda.")] = "cpu",
     resume: Annotated[
         Path | None,
-        typer.Option(help="Run folder of a training that stopped: go on as if it had not.", show_default=False),
+        typer.Option(help="Run folder of a stopped training to resume.", show_default=False),
     ] = None,
 ) -> None:
-    """Train one network for all robots by PPO with masked goal actions; play it with vslam run --policy FOLDER.
+    """Train one network for all robots by PPO with masked goal actions; use it with vslam run --policy FOLDER.
 
-    A config.toml decides all else. Its gamma is the discount of a decision:
-    that of a tick, at least 0.999, to the power of decision_ticks.
+    A config.toml sets all other values. Its gamma is the discount per decision:
+    the discount per tick, at least 0.999, to the power of decision_ticks.
 
-    Ctrl-C ends it after the running rollout and saves; pressed again, it ends
-    at once. --resume FOLDER then goes on from the last checkpoint and ends with
-    the same weights as a training that never stopped, even if it was killed.
+    Ctrl-C stops after the current rollout and saves; a second Ctrl-C stops at
+    once. --resume FOLDER continues from the last checkpoint and gives the same
+    weights as an uninterrupted training, even if the process was killed.
     """
     from slam_backend.core.validation import argument_error, check_int
     from training.experiments.run_folder import RunFolder, installed_versions, read_config
 
     require_extra()
-    from training.rl.trainer import Training, check_device, kept_of
+    from training.rl.trainer import Training, check_device, stored_checkpoint
     from training.vec_env import load_kernels
 
     if workers is not None:
-        check_int("workers", workers, 0, "Use 0 for none, or a number of processes.")
+        check_int("workers", workers, 0, "Use 0 for this process, or a number of processes.")
     check_device(device)
     if resume is None:
         chosen = call.config
     else:
         others = [*call.given, *(name for name, value in (("out", call.out), ("config", call.file)) if value)]
         if others:
-            cure = "A training goes on with its own; --workers, --device and --json may be given."
-            raise argument_error("resume", "no other options that decide the training", others, cure)
+            hint = "A resumed training keeps its configuration; only --workers, --device and --json may be given."
+            raise argument_error("resume", "no options that change the training", others, hint)
         values, seed = read_config(resume, call.command, "resume")
         chosen = TrainConfig.from_mapping(values | {"seed": seed})
-        kept = kept_of(resume, chosen)  # what is wrong with it shows before anything is compiled
+        kept = stored_checkpoint(resume, chosen)  # detects a bad checkpoint before kernels are compiled
     crew = default_workers(chosen) if workers is None else workers
     if resume is None:
-        # A bad world shows before there is a folder.
+        # Detect a world that cannot be built before the folder is created.
         call.begin(lambda: load_kernels(chosen.make_env_config(SPLIT_TRAIN)))
     else:
         prepare()
@@ -74,23 +76,23 @@ def train(
         complete, seconds = _run_live(call.console, training)
         _finish(call, training, complete, seconds)
     except KeyboardInterrupt:
-        _tell_how_to_go_on(call.console, call.folder.path)
+        _print_resume_command(call.console, call.folder.path)
         raise
     finally:
         training.close()
 
 
 def default_workers(config: TrainConfig) -> int:
-    """Return how many processes step the environments if nobody says it: the cores, at most one per environment."""
+    """Return the default number of environment processes: the cores, at most one per environment."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return 0 if cores == 1 else min(cores, config.envs)
 
 
 def _run_live(console: Console, training: "Training") -> tuple[bool, float]:
-    """Train under a progress bar with the time left; Ctrl-C ends it after the running rollout.
+    """Train under a progress bar with the time left; Ctrl-C stops after the current rollout.
 
     Returns:
-        Whether it is complete, and how long it took [s].
+        Whether the training is complete, and its duration [s].
     """
     import time
     from contextlib import ExitStack
@@ -100,7 +102,7 @@ def _run_live(console: Console, training: "Training") -> tuple[bool, float]:
     from training.experiments.interrupt import interrupt_flag
 
     columns = (
-        TextColumn("{task.completed:,.0f} of {task.total:,.0f}"), BarColumn(None), TextColumn("{task.fields[told]}"),
+        TextColumn("{task.completed:,.0f} of {task.total:,.0f}"), BarColumn(None), TextColumn("{task.fields[status]}"),
         TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(),
     )  # fmt: skip
     config, begin = training.config, time.perf_counter()
@@ -110,38 +112,38 @@ def _run_live(console: Console, training: "Training") -> tuple[bool, float]:
         return True, 0.0
     with ExitStack() as stack:
         bar = stack.enter_context(Progress(*columns, console=console, expand=True, speed_estimate_period=300.0))
-        told = _told(training.rows[-1]) if done else "first rollout"
-        task = bar.add_task("", total=total, completed=done, told=told)
-        on_press = partial(bar.update, task, told="stopping: saves after this rollout")
+        status = _rollout_text(training.rows[-1]) if done else "first rollout"
+        task = bar.add_task("", total=total, completed=done, status=status)
+        on_press = partial(bar.update, task, status="stopping after this rollout")
         interrupted = stack.enter_context(interrupt_flag(on_press))
 
         def on_update(row: "Row") -> None:
             if not interrupted():
-                bar.update(task, told=_told(row))
+                bar.update(task, status=_rollout_text(row))
 
         training.watch.listen(on_update, interrupted, lambda decisions: bar.update(task, completed=decisions))
         complete = training.run()
     if not complete:
-        console.print("Stopped; the checkpoint holds all until here.")
+        console.print("Stopped; the checkpoint contains all finished rollouts.")
     return complete, time.perf_counter() - begin
 
 
-def _told(row: "Row") -> str:
-    """Return what the bar says of a rollout."""
+def _rollout_text(row: "Row") -> str:
+    """Return the text of the bar about a rollout."""
     return f"return {row['return']:.2f}, E {row['map_error']:.2f} m, recall {row['map_recall']:.2f}"
 
 
 def _finish(call: Call[TrainConfig], training: "Training", complete: bool, seconds: float) -> None:
-    """Write and show what the training led to."""
-    from training.rl.curves import draw_learning, ends_of, to_csv
+    """Write and print the results of the training."""
+    from training.rl.curves import draw_learning, first_and_last_tenth, to_csv
 
     rows, console, folder = training.rows, call.console, call.folder
     folder.write_text("curves.csv", to_csv(rows))
     draw_learning(folder.path / "learning.png", rows)
-    ends: dict[str, Any] = ends_of(rows)
+    ends: dict[str, Any] = first_and_last_tenth(rows)
     first, last = ends["first"], ends["last"]
     console.print(
-        f"Return of the first tenth {first['return']:.3f}, of the last {last['return']:.3f}; "
+        f"Return in the first tenth {first['return']:.3f}, in the last {last['return']:.3f}; "
         f"map error {first['map_error']:.3f} m, {last['map_error']:.3f} m."
     )
     call.write({"complete": complete, "decisions": int(rows[-1]["steps"]), "seconds_this_time": seconds, **ends})
@@ -149,14 +151,14 @@ def _finish(call: Call[TrainConfig], training: "Training", complete: bool, secon
     if complete:
         console.print(f"Next: vslam evaluate {folder.path}", soft_wrap=True)
     else:
-        _tell_how_to_go_on(console, folder.path)
+        _print_resume_command(console, folder.path)
 
 
-def _tell_how_to_go_on(console: Console, folder: Path) -> None:
-    """Say how a training that was stopped goes on, if it can."""
+def _print_resume_command(console: Console, folder: Path) -> None:
+    """Print how to resume a stopped training, if possible."""
     from training.rl.checkpoint import CHECKPOINT_FILE
 
     text = "Stopped before the first checkpoint: nothing was saved."
     if (folder / CHECKPOINT_FILE).is_file():
-        text = f"Go on: vslam train --resume {folder}"
+        text = f"Resume: vslam train --resume {folder}"
     console.print(text, soft_wrap=True)

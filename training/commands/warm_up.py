@@ -1,4 +1,4 @@
-"""`vslam warm-up`: compile all kernels now, so that nothing has to wait for them later."""
+"""Command `vslam warm-up`: compile all kernels in advance."""
 
 from typing import Annotated
 
@@ -7,14 +7,16 @@ from rich.console import Console
 
 
 def warm_up(
-    everything: Annotated[bool, typer.Option("--all", help="Also what the default environment does not need.")] = False,
-    workers: Annotated[int | None, typer.Option(help="Processes that compile; one for each core if left out.")] = None,
+    everything: Annotated[
+        bool, typer.Option("--all", help="Include kernels that the default environment does not need.")
+    ] = False,
+    workers: Annotated[int | None, typer.Option(help="Number of compiling processes; default: one per core.")] = None,
 ) -> None:
-    """Compile the kernels into the cache on disk; takes seconds if they are there already."""
+    """Compile the kernels into the disk cache; takes seconds if they are cached already."""
     import vslam_env
-    from training.experiments.compilation import compilation_shown
+    from training.experiments.compilation import compilation_progress
 
-    with compilation_shown(Console(stderr=True)) as progress:
+    with compilation_progress(Console(stderr=True)) as progress:
         seconds = vslam_env.warm_up(everything=everything, workers=workers, progress=progress)
     if not seconds:
-        Console().print("The kernels are in the cache.")
+        Console().print("All kernels are in the cache.")

@@ -1,4 +1,4 @@
-"""The commands `vslam worlds ...`: which there are, what they look like, and whether a map of your own is one."""
+"""Commands `vslam worlds ...`: list, preview, check and import worlds."""
 
 import sys
 from pathlib import Path
@@ -9,22 +9,22 @@ from rich.console import Console
 
 worlds = typer.Typer(help="List, preview, check and import worlds.", no_args_is_help=True)
 
-Source = Annotated[str, typer.Argument(help="A family, or the path of a floor plan, ROS map, .json file or folder.")]
-FirstSeed = Annotated[int, typer.Option(help="The first world seed.")]
-Seeds = Annotated[int, typer.Option(help="How many world seeds.")]
-Robots = Annotated[int, typer.Option(help="How many robots start.")]
+Source = Annotated[str, typer.Argument(help="World family, or path of a floor plan, ROS map, .json file or folder.")]
+FirstSeed = Annotated[int, typer.Option(help="First world seed.")]
+Seeds = Annotated[int, typer.Option(help="Number of world seeds.")]
+Robots = Annotated[int, typer.Option(help="Number of robots to place.")]
 
 
 @worlds.command("list")
-def list_worlds(seeds: Annotated[int, typer.Option(help="Worlds of each family that are measured.")] = 5) -> None:
-    """Name the families of worlds with their usual size."""
+def list_worlds(seeds: Annotated[int, typer.Option(help="Number of worlds measured per family.")] = 5) -> None:
+    """List the world families with their typical size."""
     from rich.table import Table
 
     from slam_backend.core.validation import check_int
     from training.episodes.world_survey import survey
     from vslam_env.world import SPLITS, WORLD_FAMILIES
 
-    check_int("seeds", seeds, 1, "Measure one world or more.")
+    check_int("seeds", seeds, 1, "Use at least one world.")
     table = Table("family", "what", "walls", "landmarks", "floor", "size")
     for name, maker in WORLD_FAMILIES.items():
         found = [survey(name, seed) for seed in range(seeds)]
@@ -38,7 +38,7 @@ def list_worlds(seeds: Annotated[int, typer.Option(help="Worlds of each family t
     console.print(table)
     for split, (first, end) in SPLITS.items():
         console.print(f"{split}: world seeds {first} to {end - 1}")
-    console.print("Also paths: .png .jpg .pgm .yaml (ROS) .json, or a folder of these.")
+    console.print("Paths work too: .png .jpg .pgm .yaml (ROS) .json, or a folder of these.")
 
 
 @worlds.command("preview")
@@ -46,18 +46,18 @@ def preview(
     world: Source, out: Annotated[Path, typer.Option(help="PNG file to write.")] = Path("worlds.png"),
     first_seed: FirstSeed = 0, seeds: Seeds = 4, robots: Robots = 3,
 ) -> None:  # fmt: skip
-    """Draw worlds of some seeds, with landmarks and start poses, into one picture."""
+    """Draw the worlds of some seeds, with landmarks and start poses, into one picture."""
     import imageio.v3 as imageio
 
     from slam_backend.core.files import check_writable, write_file
     from slam_backend.core.validation import argument_error
     from training.episodes.world_survey import contact_sheet
-    from training.experiments.compilation import compilation_shown
+    from training.experiments.compilation import compilation_progress
 
     if out.suffix.lower() != ".png":
         raise argument_error("out", "a name that ends in .png", out, "Pictures are written as PNG.")
     check_writable(out, "out")
-    with compilation_shown(Console(stderr=True)):
+    with compilation_progress(Console(stderr=True)):
         picture = contact_sheet(world, first_seed, seeds, robots)
     write_file(out, imageio.imwrite("<bytes>", picture, extension=".png"), "out")
     Console(highlight=False).print(f"Picture: {out}", soft_wrap=True)
@@ -65,23 +65,23 @@ def preview(
 
 @worlds.command("validate")
 def validate(world: Source, first_seed: FirstSeed = 0, seeds: Seeds = 20, robots: Robots = 3) -> None:
-    """Build worlds of some seeds and start robots in them; a world in which that fails ends with exit status 2."""
+    """Build the worlds of some seeds and place robots in them; a failure gives exit status 2."""
     from rich.table import Table
 
     from slam_backend.core.validation import check_int
     from training.episodes.world_survey import survey_all
 
-    check_int("seeds", seeds, 1, "Check one world or more.")
+    check_int("seeds", seeds, 1, "Use at least one world.")
     check_int("first_seed", first_seed, 0, "Use 0 or a positive number.")
     found = survey_all(world, range(first_seed, first_seed + seeds), robots)
-    table = Table("figure", "least", "most", title=f"{found[0].name}: {seeds} of {seeds} worlds are sound")
+    table = Table("figure", "least", "most", title=f"{found[0].name}: {seeds} of {seeds} worlds are valid")
     for title, values in (
         ("walls", [float(each.walls) for each in found]),
-        ("landmarks that can be seen", [float(each.landmarks) for each in found]),
+        ("observable landmarks", [float(each.landmarks) for each in found]),
         ("floor, m²", [each.floor_m2 for each in found]),
         ("width, m", [each.width_m for each in found]),
         ("height, m", [each.height_m for each in found]),
-        ("least distance between starts, m", [each.start_gap_m for each in found]),
+        ("smallest distance between starts, m", [each.start_gap_m for each in found]),
     ):
         table.add_row(title, f"{min(values):.4g}", f"{max(values):.4g}")
     Console().print(table)
@@ -92,9 +92,11 @@ def import_world(
     plan: Annotated[Path, typer.Argument(help="Floor plan (.png, .jpg, .pgm) or ROS map (.yaml).")],
     out: Annotated[Path, typer.Argument(help=".json file to write.")],
     metres_per_pixel: Annotated[
-        float | None, typer.Option(help="Of a floor plan; a ROS map says it itself.", show_default="0.045")
+        float | None, typer.Option(help="Resolution of a floor plan; ROS maps contain theirs.", show_default="0.045")
     ] = None,
-    tolerance_px: Annotated[float, typer.Option(help="Outlines are straightened by less than this.")] = 1.0,
+    tolerance_px: Annotated[
+        float, typer.Option(help="Tolerance of the polygon approximation of outlines in pixels.")
+    ] = 1.0,
 ) -> None:
     """Trace the walls of a map and write them as .json, which can be edited."""
     from slam_backend.core.validation import argument_error
@@ -102,14 +104,14 @@ def import_world(
 
     if plan.suffix.lower() in (".yaml", ".yml"):
         if metres_per_pixel is not None:
-            cure = "Change resolution in the file instead."
-            raise argument_error("metres_per_pixel", "none beside a ROS map", metres_per_pixel, cure)
+            hint = "Change resolution in the file instead."
+            raise argument_error("metres_per_pixel", "no value for a ROS map", metres_per_pixel, hint)
         traced = load_ros_map(plan, tolerance_px)
     else:
         traced = load_floorplan(plan, 0.045 if metres_per_pixel is None else metres_per_pixel, tolerance_px)
-    FreeSpace(traced)  # what no robot fits in is refused
+    FreeSpace(traced)  # refuses a world without room for a robot
     if out.suffix.lower() != ".json":
-        raise argument_error("out", "a name that ends in .json", out, "Worlds are known by the ends of their names.")
+        raise argument_error("out", "a name that ends in .json", out, "The suffix determines the format.")
     save_walls_json(traced, out)
     x_min, y_min, x_max, y_max = traced.bounds
     size = f"{x_max - x_min:.1f} x {y_max - y_min:.1f} m"
@@ -117,5 +119,5 @@ def import_world(
 
 
 def _span(values: list[int]) -> str:
-    """Write the least and the greatest of some numbers."""
+    """Format the range of some numbers."""
     return str(min(values)) if min(values) == max(values) else f"{min(values)}-{max(values)}"

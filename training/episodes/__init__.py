@@ -1,1 +1,1 @@
-"""Episodes of scripted policies: runner, metrics, tables, figures and videos."""
+"""Exploration episodes with given policies: runner, metrics, tables, figures and videos."""

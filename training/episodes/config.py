@@ -1,42 +1,42 @@
-"""`RunConfig`: everything that decides a run, and the environment and policies that it stands for."""
+"""`RunConfig`: configuration of a run, with its environment and policies."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from training.experiments.config import ONE_PARTICLE, ActionType, ExperimentConfig, NoisePreset, Sensor, option
 
-if TYPE_CHECKING:  # what computes is imported when a command runs, so that --help answers at once
+if TYPE_CHECKING:  # numerical modules are imported when a command runs, so that --help is fast
     from agents.policy import Policy
     from vslam_env.config import EnvConfig
     from vslam_env.environment import ExplorationEnv
 
-EPISODE_S = 180.0  # time for three robots to see the office and to meet each other's traces there [s]
+EPISODE_S = 180.0  # enough for three robots to explore the office and to overlap their maps [s]
 
 
 class RunConfig(ExperimentConfig):
-    """A run, as its command line says it; all robots have the same policy."""
+    """Configuration of a run; all robots have the same policy."""
 
-    world: str = option("office", "A family or a path; see vslam worlds list.")
+    world: str = option("office", "World family or path; see vslam worlds list.")
     robots: int = option(3, "Number of robots, 1 to 8.", ge=1, le=8, hint="Use 1 to 8 robots.")
     policy: str = option(
-        "frontier", "frontier, random_goals, random_walk, a trained model's path, or MODULE:NAME of your own."
+        "frontier", "Policy: frontier, random_goals, random_walk, path of a trained model, or MODULE:NAME."
     )
     action_type: ActionType = option(
-        "continuous", "continuous, discrete or goal.", shown="continuous, if the policy knows it"
+        "continuous", "Action type: continuous, discrete or goal.", shown="continuous, if the policy supports it"
     )
     max_cycles: int | None = option(
-        None, "Steps of the episode.", shown="180 s worth", ge=1, hint="Give a number of steps."
+        None, "Number of steps of the episode.", shown="180 s", ge=1, hint="Give a number of steps."
     )
-    particles: int = option(100, "Particles per filter.", ge=1, hint=ONE_PARTICLE)
+    particles: int = option(100, "Number of particles per filter.", ge=1, hint=ONE_PARTICLE)
     rejuvenate_every: int | None = option(
         None, "Ticks between rejuvenations of the particles; 0: never.", shown="100", ge=0,
         hint="Give a number of ticks, or 0 for never.",
     )  # fmt: skip
-    preset: NoisePreset = option("standard", "easy, standard or hard noise.")
-    sensor: Sensor = option("landmark", "landmark, or stereo: rendered images.")
+    preset: NoisePreset = option("standard", "Noise preset: easy, standard or hard.")
+    sensor: Sensor = option("landmark", "Sensor: landmark, or stereo (rendered images).")
 
     def to_mapping(self) -> dict[str, Any]:
-        """Return the plain values that repeat this run from any folder, the seed apart."""
+        """Return plain values that repeat this run from any folder, except the seed."""
         from agents.registry import is_model
         from vslam_env.world import WORLD_FAMILIES
 
@@ -58,7 +58,7 @@ class RunConfig(ExperimentConfig):
 
     @property
     def decision_ticks(self) -> int | None:
-        """Ticks between decisions: as many as a trained policy was trained with; None for others: the usual ones."""
+        """Ticks between decisions of a trained policy, as in its training; None for other policies: the default."""
         from agents.registry import is_model
         from agents.trained import load_model
         from vslam_env.config import EnvConfig
@@ -70,11 +70,11 @@ class RunConfig(ExperimentConfig):
 
     @property
     def num_steps(self) -> int:
-        """Steps of the episode."""
+        """Number of steps of the episode."""
         return round(EPISODE_S / self.step_s) if self.max_cycles is None else self.max_cycles
 
     def environment(self) -> "EnvConfig":
-        """Return the environment's configuration."""
+        """Return the configuration of the environment."""
         from vslam_env.presets import preset_config
 
         assumed: dict[str, Any] = {"num_particles": self.particles}

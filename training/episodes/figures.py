@@ -1,4 +1,4 @@
-"""The two figures of a run: the maps beside the truth, and the map errors over time."""
+"""Two plots of a run: the maps over the true world, and the map errors over time."""
 
 from pathlib import Path
 from typing import Any
@@ -17,15 +17,15 @@ from vslam_env.rendering.canvas import CHI_SQUARE_95
 from vslam_env.rendering.palette import FAINT_INK, INK, PAPER, TRUE_LANDMARK, WALL, Colour, robot_colour
 
 MARGIN_M = 0.8
-COLUMNS = 4  # of small panels
-LEGEND = "broad and faint: true path   ·   line: estimated path   ·   dotted: odometry alone   ·   ellipses: 95 %"
+COLUMNS = 4  # number of columns of small panels
+LEGEND = "wide, faint: true path   ·   line: estimated path   ·   dotted: odometry only   ·   ellipses: 95 %"
 
 
 def draw_maps(record: EpisodeRecord, path: Path) -> None:
-    """Save a picture of what each robot had before its first merge, and of all maps at the end.
+    """Save a plot of the map of each robot before its first merge, and of all maps at the end.
 
-    Every map is in its robot's own start frame, put on the world by the robot's true start pose alone: what does not
-    lie on the walls is error.
+    Each map is placed by the true start pose of its robot, without any fit, so that deviations from the walls are
+    estimation errors.
     """
     robots = range(len(record.infos))
     columns = min(len(robots), COLUMNS)
@@ -67,7 +67,7 @@ def draw_maps(record: EpisodeRecord, path: Path) -> None:
 
 
 def draw_errors(record: EpisodeRecord, path: Path) -> None:
-    """Save a picture of each robot's map error and of the coverage over time, merges as vertical lines."""
+    """Save a plot of the map error of each robot and of the coverage over time, with merges as vertical lines."""
     figure = Figure(figsize=(9.3, 5.6), layout="constrained", facecolor=rgb(PAPER))
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=[3, 1])
     for robot, errors in enumerate(record.map_errors):
@@ -96,13 +96,13 @@ def draw_errors(record: EpisodeRecord, path: Path) -> None:
 
 
 def _extent(scene: Scene) -> tuple[FloatArray, FloatArray]:
-    """Return the corners (2,) of the box to show."""
+    """Return the corners (2,) of the visible box."""
     ends = scene.walls.reshape(-1, 2)
     return ends.min(axis=0) - MARGIN_M, ends.max(axis=0) + MARGIN_M
 
 
 def _draw_truth(axes: Axes, scene: Scene, width: float) -> None:
-    """Draw walls and true landmarks, and frame the world."""
+    """Draw walls and true landmarks, and set the limits of the axes."""
     axes.add_collection(LineCollection(list(scene.walls.reshape(-1, 2, 2)), colors=[rgb(WALL)], linewidths=width))
     axes.scatter(scene.landmarks[:, 0], scene.landmarks[:, 1], s=2.2 * width, color=rgb(TRUE_LANDMARK), linewidths=0)
     low, high = _extent(scene)
@@ -125,7 +125,7 @@ def _draw_landmarks(axes: Axes, means: FloatArray, covariances: FloatArray, colo
 
 
 def _draw_paths(axes: Axes, record: EpisodeRecord, robot: int, until: float) -> None:
-    """Draw the true path faintly, the estimated one, and dotted that of the odometry alone, up to a time."""
+    """Draw the true path faint, the estimated path, and the odometry path dotted, up to a given time."""
     shown = record.times <= until
     truth, colour = record.true_poses[robot], rgb(robot_colour(robot))
     axes.plot(truth[shown, 0], truth[shown, 1], color=colour, alpha=0.25, linewidth=3.0)

@@ -1,4 +1,4 @@
-"""The figures of an episode, by the names that `metrics.json` uses."""
+"""Metrics of an episode, with the names used in `metrics.json`."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -14,14 +14,14 @@ from training.episodes.tables import consistency_rows, pair_rows
 def score_episode(record: EpisodeRecord) -> dict[str, Any]:
     """Return the metrics of an episode.
 
-    Per robot: `ate_aligned_m`, `ate_start_m` and the same of dead reckoning; `dead_reckoning_end_percent`, the error of
-    its last position over the length of the path; `path_m`; the map's `map_error`, `map_rmse_m`, `map_recall`,
-    `map_precision`, as the environment's infos give them; `map_rmse_start_m`, which is `map_rmse_m` again, and
-    `map_rmse_aligned_m`, that after the best SE(2) fit of the matched landmarks, NaN if these are fewer than two.
-    `team` holds the means over robots that have the figure.
+    Per robot: `ate_aligned_m`, `ate_start_m` and the same for dead reckoning; `dead_reckoning_end_percent`, its final
+    position error relative to the path length; `path_m`; the `map_error`, `map_rmse_m`, `map_recall` and
+    `map_precision` of the map, as in the environment's infos; `map_rmse_start_m`, equal to `map_rmse_m`; and
+    `map_rmse_aligned_m`, the RMSE after the best SE(2) fit of the matched landmarks, NaN if there are fewer than two.
+    `team` has the means over the robots for which a metric is known.
 
-    All but the aligned figures are of each robot's own start frame, moved by its true start pose without any fitting.
-    (In a replay, `map_rmse_m`, `map_recall` and `map_precision` are those after the fit.) Robots count from 0.
+    All metrics except the aligned ones use each robot's start frame, placed by its true start pose without fitting.
+    (In a replay, `map_rmse_m`, `map_recall` and `map_precision` are after the fit.) Robots count from 0.
     """
     robots = [_score_robot(record, robot) for robot in range(len(record.infos))]
     return {
@@ -45,8 +45,8 @@ def merge_row(
 ) -> dict[str, Any]:  # fmt: skip
     """Return one entry of `merges`, the same for runs and replays.
 
-    `step` counts the steps of the filters, which are the ticks of a run; `landmarks` is how many were shared; `false`
-    is None where the errors are NaN, `undone_s` where the merge is in force.
+    `step` counts filter steps, which are the ticks of a run; `landmarks` is the number of shared landmarks; `false` is
+    None if the errors are NaN, `undone_s` is None if the merge was not undone.
     """
     return {
         "step": step, "time_s": round(time, 3), "robots_a": list(robots_a), "robots_b": list(robots_b),
@@ -57,13 +57,13 @@ def merge_row(
 
 
 def _mean(values: list[float]) -> float:
-    """Return the mean of those that are finite, NaN if none is."""
+    """Return the mean of the finite values, NaN if there are none."""
     known = [value for value in values if np.isfinite(value)]
     return float(np.mean(known)) if known else float("nan")
 
 
 def _aligned_rmse(record: EpisodeRecord, robot: int) -> float:
-    """Return the RMS error [m] of a map's matched landmarks after the best SE(2) fit of these."""
+    """Return the RMS error [m] of the matched landmarks of a map after their best SE(2) fit."""
     means, truths = record.maps[robot].moved(record.true_poses[robot, 0]).means, record.true_landmarks
     claims = record.map_claims[robot]
     estimates, matches = map_rmse(means, truths, claims=claims).matched.T
@@ -74,7 +74,7 @@ def _aligned_rmse(record: EpisodeRecord, robot: int) -> float:
 
 
 def _score_robot(record: EpisodeRecord, robot: int) -> dict[str, float]:
-    """Return the figures of one robot."""
+    """Return the metrics of one robot."""
     truth, info = record.true_poses[robot], record.infos[robot]
     estimated, reckoned = (compose(truth[0], path[robot]) for path in (record.estimated, record.reckoned))
     own, odometry = ate(estimated, truth), ate(reckoned, truth)

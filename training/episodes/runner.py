@@ -1,4 +1,4 @@
-"""One episode of an environment under given policies, and the record of it that tables and figures are made of."""
+"""Runner for one episode of an environment with given policies, and its record for tables and figures."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -22,65 +22,65 @@ FALSE_MERGE_M, FALSE_MERGE_DEG = 0.5, 5.0
 
 
 def is_false_merge(error_m: float, error_deg: float) -> bool:
-    """Return whether maps were joined in a way that is plainly wrong."""
+    """Return whether the errors of a merge exceed the thresholds of a false merge."""
     return error_m > FALSE_MERGE_M or error_deg > FALSE_MERGE_DEG
 
 
 @dataclass(frozen=True, slots=True)
 class MergeRecord:
-    """One merge, compared with the truth."""
+    """One merge, compared with the ground truth."""
 
     tick: int  # Ticks since the reset
-    time: float  # Since the reset [s]
-    robots_a: tuple[int, ...]  # The group whose map frame stayed
-    robots_b: tuple[int, ...]  # The other group
-    landmarks: int  # How many landmarks of either map were believed to be the same
-    error_m: float  # Of the translation between the two map frames [m]
-    error_deg: float  # Of the rotation between them, >= 0 [degrees]
-    undone: float | None = None  # When the team took it back [s]; None: it is in force
+    time: float  # Time since the reset [s]
+    robots_a: tuple[int, ...]  # Group whose map frame is kept
+    robots_b: tuple[int, ...]  # Other group
+    landmarks: int  # Number of matched landmarks of the two maps
+    error_m: float  # Error of the translation between the two map frames [m]
+    error_deg: float  # Error of the rotation between them, >= 0 [degrees]
+    undone: float | None = None  # Time at which the merge was undone [s]; None: it was not
 
     @property
     def is_false(self) -> bool:
-        """Whether the maps were joined in a way that is plainly wrong."""
+        """Whether the errors exceed the thresholds of a false merge."""
         return is_false_merge(self.error_m, self.error_deg)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EpisodeRecord:
-    """What happened in an episode of K robots and T steps."""
+    """Record of an episode of K robots and T steps."""
 
-    times: FloatArray  # (T + 1,) float64 [s]. Of the reset and of each step.
+    times: FloatArray  # (T + 1,) float64 [s]. Times of the reset and of each step.
     true_poses: FloatArray  # (K, T + 1, 3) float64 [m, m, rad], world frame
-    estimated: FloatArray  # (K, T + 1, 3) float64 [m, m, rad]. What each robot believed at the time, own start frames.
-    reckoned: FloatArray  # (K, T + 1, 3) float64 [m, m, rad]. Its odometry alone, own start frames.
+    estimated: FloatArray  # (K, T + 1, 3) float64 [m, m, rad]. Pose estimates at the time, start frames.
+    reckoned: FloatArray  # (K, T + 1, 3) float64 [m, m, rad]. Dead reckoning, start frames.
     map_errors: FloatArray  # (K, T + 1) float64 [m]
     coverage: FloatArray  # (T + 1,) float64 [-]
-    merges: tuple[MergeRecord, ...]  # In order
-    attempts: int  # How often two maps were compared
-    pairs: tuple[PairAttempts, ...]  # Outcome of these attempts, by pairs of groups
-    groups: tuple[tuple[int, ...], ...]  # The robots that share a map at the end
-    infos: tuple[Mapping[str, Any], ...]  # Per robot its last info
-    # Per robot its map just before its first merge, own start frame; the last map if it never merged
+    merges: tuple[MergeRecord, ...]  # Merges in order
+    attempts: int  # Number of alignment attempts
+    pairs: tuple[PairAttempts, ...]  # Outcomes of these attempts, by pairs of groups
+    groups: tuple[tuple[int, ...], ...]  # Robots that share a map at the end
+    infos: tuple[Mapping[str, Any], ...]  # Last info of each robot
+    # Map of each robot just before its first merge, start frame; the final map if it never merged
     own_maps: tuple[LandmarkMap, ...]
-    alone_until: tuple[float | None, ...]  # Per robot the time of that merge [s], or None
-    # Per robot the true landmark (n,) int64 behind each one of its map, as `map_rmse` reads claims
+    alone_until: tuple[float | None, ...]  # Time of each robot's first merge [s], or None
+    # True landmarks (n,) int64 of the landmarks in each robot's map, the claims of `map_rmse`
     map_claims: tuple[IntArray, ...]
-    maps: tuple[LandmarkMap, ...]  # Per robot its map at the end, own start frame
+    maps: tuple[LandmarkMap, ...]  # Final map of each robot, start frame
     true_landmarks: FloatArray  # (N, 3) float64 [m], world frame
-    consistency: tuple[Consistency, ...]  # Per robot whether its filter at the end errs as little as it claims
-    scene: Scene  # The last picture: truth and maps in the world frame
+    consistency: tuple[Consistency, ...]  # Consistency of each robot's filter at the end
+    scene: Scene  # Last scene: truth and maps in the world frame
     complete: bool  # Whether the episode ran to its end
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Progress:
-    """How far an episode is."""
+    """Progress of an episode."""
 
-    step: int  # Steps done; 0 after the reset
-    time: float  # Since the reset [s]
-    infos: Mapping[str, Mapping[str, Any]]  # Of all agents, as the environment gave them
+    step: int  # Completed steps; 0 after the reset
+    time: float  # Time since the reset [s]
+    infos: Mapping[str, Mapping[str, Any]]  # Infos of all agents, as the environment returned them
     new_merges: tuple[MergeRecord, ...]  # Merges of this step
-    rewards: Mapping[str, float] = field(default_factory=dict)  # Of all agents for this step; none after the reset
+    rewards: Mapping[str, float] = field(default_factory=dict)  # Rewards of all agents; none after the reset
 
 
 def run_episode(
@@ -90,9 +90,9 @@ def run_episode(
     """Run one episode to its end, or until `should_stop`.
 
     Args:
-        policies: One for each agent; they see observations and beliefs, never infos.
-        seed: Of the environment's reset and of the policies' draws, which are independent streams.
-        on_step: Called after the reset and after each step; the environment may be looked at.
+        policies: Policy of each agent; policies see observations and beliefs, never infos.
+        seed: Seed of the reset and of the policies' random draws, which are independent streams.
+        on_step: Function called after the reset and after each step; it may inspect the environment.
 
     Raises:
         ValueError: If an agent has no policy.
@@ -121,7 +121,7 @@ def run_episode(
 
 
 class _Log:
-    """Collects the record step by step."""
+    """Collector of the record, step by step."""
 
     def __init__(self, env: ExplorationEnv, infos: Mapping[str, Mapping[str, Any]]) -> None:
         self._env, self._agents = env, list(env.possible_agents)
@@ -139,31 +139,31 @@ class _Log:
         self._enter(infos, 0)
 
     def before_step(self) -> None:
-        """Keep the maps of the robots that are still alone."""
+        """Store the maps of the robots that have not merged yet."""
         for robot, agent in enumerate(self._agents):
             if robot not in self._alone_until:
                 self._maps[robot] = self._env.belief(agent).map
 
     def after_step(self, infos: Mapping[str, Mapping[str, Any]], tick: int) -> Progress:
-        """Take in one step that ended at `tick`."""
+        """Record a step that ended at `tick`."""
         self._enter(infos, tick)
         events = self._env.events[self._events :]
         self._events += len(events)
-        merges = tuple(self._compared(event) for event in events if event.kind == "merge")
+        merges = tuple(self._merge_record(event) for event in events if event.kind == "merge")
         for merge in merges:
             for robot in merge.robots_a + merge.robots_b:
                 self._alone_until.setdefault(robot, merge.time)
         self._merges.extend(merges)
         for event in events:
             if event.kind == "undo":
-                self._take_back(event)
+                self._record_undo(event)
         return Progress(len(self._ticks) - 1, tick * TICK, infos, merges)
 
     def finish(self, odometry: FloatArray) -> EpisodeRecord:
         """Return the record.
 
         Args:
-            odometry: (ticks + 1, K, 3) float64 [m, m, rad]. Readings of all ticks; that of the reset is zero.
+            odometry: (ticks + 1, K, 3) float64 [m, m, rad]. Odometry readings of all ticks; zero for the reset.
         """
         ticks = np.array(self._ticks)
         reckoned = [dead_reckoning(np.zeros(3), odometry[1:, robot])[ticks] for robot in range(len(self._agents))]
@@ -191,14 +191,14 @@ class _Log:
         self._errors.append([float(infos[agent]["map_error"]) for agent in self._agents])
         self._coverage.append(float(infos[self._agents[0]]["coverage"]))
 
-    def _take_back(self, event: MergeEvent) -> None:
-        """Note the undo of a merge: of the last one between these groups."""
+    def _record_undo(self, event: MergeEvent) -> None:
+        """Record the undo of the last merge between two groups."""
         pair = event.robots_a, event.robots_b
         last = max(i for i, merge in enumerate(self._merges) if (merge.robots_a, merge.robots_b) == pair)
         self._merges[last] = replace(self._merges[last], undone=event.step * TICK)
 
-    def _compared(self, event: MergeEvent) -> MergeRecord:
-        """Compare a merge with the true motion between the start poses that the two map frames stand for."""
+    def _merge_record(self, event: MergeEvent) -> MergeRecord:
+        """Compare a merge with the true transform between the start poses of the two map frames."""
         truth = between(self._starts[min(event.robots_a)], self._starts[min(event.robots_b)])
         error = between(truth, event.alignment.transform)
         return MergeRecord(

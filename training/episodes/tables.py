@@ -1,4 +1,4 @@
-"""What runs and replays end with: rows of `metrics.json` about merges and consistency, tables, and maps as data."""
+"""Final output of runs and replays: rows of `metrics.json` on merges and consistency, tables, and map files."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -8,7 +8,7 @@ from rich.table import Table
 
 from training.experiments.tables import console_table, number
 
-if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
+if TYPE_CHECKING:  # numerical modules are imported when the command runs, so that --help is fast
     from slam_backend.fastslam.consistency import Consistency
     from slam_backend.maps.alignment_types import PairAttempts
     from slam_backend.maps.landmark_map import LandmarkMap
@@ -20,24 +20,24 @@ ROWS = (
     ("precision [%]", "map_precision", 1, 100.0), ("ATE, aligned [m]", "ate_aligned_m", 3, 1.0),
     ("   odometry's [m]", "dead_reckoning_ate_aligned_m", 3, 1.0), ("ATE, start frame [m]", "ate_start_m", 3, 1.0),
     ("   odometry's [m]", "dead_reckoning_ate_start_m", 3, 1.0), ("path [m]", "path_m", 1, 1.0),
-    ("odometry's last error [% of path]", "dead_reckoning_end_percent", 1, 1.0),
+    ("odometry's final error [% of path]", "dead_reckoning_end_percent", 1, 1.0),
 )  # fmt: skip
 
 MISSED = {
-    "translation": "The standard deviation of the translation was beyond its bound.",
-    "rotation": "The standard deviation of the rotation was beyond its bound.",
-    "one match": "Leaving one match out would have moved the result by more than its bound.",
-    "paths": "The robots' paths from their starts left the motion between these open by more than its bound.",
-    "repeat": "Two trials in a row found motions that differ by more than their bound.",
+    "translation": "The standard deviation of the translation exceeded its bound.",
+    "rotation": "The standard deviation of the rotation exceeded its bound.",
+    "one match": "Removing one match would have changed the result by more than the bound.",
+    "paths": "The uncertainty of the paths left the transform between the starts uncertain beyond the bound.",
+    "repeat": "Two consecutive attempts gave transforms that differ by more than the bound.",
 }
 COLUMNS = ("robot", "mean NIS", "NIS beyond 95 %", "few particles", "mostly rejected", "verdict")
-CAUTIOUS = 1.0  # mean NIS below which covariances are at least twice as large as they need be, even in the plane
+CAUTIOUS = 1.0  # mean NIS below which covariances are at least twice too large, even in the plane
 UPPER = ("xx", "xy", "xz", "yy", "yz", "zz")
 MAP_COLUMNS = ("id", "count", "x_m", "y_m", "z_m", *(f"cov_{pair}_m2" for pair in UPPER))
 
 
 def print_tables(console: Console, metrics: Mapping[str, Any]) -> None:
-    """Print robots and team, then the merges."""
+    """Print the metrics of robots and team, then the merges."""
     columns = {f"robot {robot}": row for robot, row in enumerate(metrics["robots"])} | {"team": metrics["team"]}
     rows = [
         [label, *(number(row[key], digits, factor) for row in columns.values())] for label, key, digits, factor in ROWS
@@ -50,14 +50,14 @@ def print_tables(console: Console, metrics: Mapping[str, Any]) -> None:
     print_refusals(console, metrics["refusals"])
     groups = "; ".join(", ".join(map(str, group)) for group in metrics["groups"])
     console.print(
-        f"Groups at the end: {groups}.  Floor seen: {metrics['coverage']:.1%} in {metrics['duration_s']:.0f} s.  "
-        f"Alignments tried: {metrics['attempts']}."
+        f"Groups at the end: {groups}.  Coverage: {metrics['coverage']:.1%} in {metrics['duration_s']:.0f} s.  "
+        f"Alignment attempts: {metrics['attempts']}."
     )
 
 
 def _merges(rows: list[Mapping[str, Any]]) -> Table:
     """Return the table of merges."""
-    headings = ("time [s]", "robots", "with", "landmarks", "off by [m]", "off by [deg]", "verdict")
+    headings = ("time [s]", "robots", "with", "landmarks", "error [m]", "error [deg]", "verdict")
     cells = []
     for row in rows:
         sides = [", ".join(map(str, row[side])) for side in ("robots_a", "robots_b")]
@@ -66,15 +66,15 @@ def _merges(rows: list[Mapping[str, Any]]) -> Table:
         if row["undone_s"] is not None:
             verdict += f"{', ' if verdict else ''}undone at {row['undone_s']:.1f} s"
         cells.append([f"{row['time_s']:.1f}", *sides, str(row["landmarks"]), *errors, verdict])
-    return console_table("Merges, against the true motion between the start poses", headings, cells)
+    return console_table("Merges, compared with the true transform between the start poses", headings, cells)
 
 
 def pair_rows(
     pairs: "Sequence[PairAttempts] | None", groups: Sequence[Sequence[int]], names: Sequence[int] | None = None
 ) -> list[dict[str, Any]]:
-    """Return one row for each pair of groups that tried, and for each pair of groups at the end that never did.
+    """Return one row for each pair of groups that attempted a merge, and for each final pair that never did.
 
-    `apart` says whether the two share no map at the end; `last_step` counts the steps of the filters.
+    `apart` is whether the two share no map at the end; `last_step` counts filter steps.
 
     Args:
         names: Number of each robot; None: its index.
@@ -104,41 +104,41 @@ def pair_rows(
 
 
 def print_refusals(console: Console, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Print how often each pair tried and why it was refused, and what helps those that are apart at the end."""
+    """Print the attempts and refusals of each pair, and hints for pairs without a common map at the end."""
     from slam_backend.maps.alignment_types import HINTS
 
-    told = [row for row in rows if row["refused"] or not row["attempts"]]
-    if not told:
+    shown = [row for row in rows if row["refused"] or not row["attempts"]]
+    if not shown:
         return
     cells = []
-    for row in told:
+    for row in shown:
         sides = [", ".join(map(str, row[side])) for side in ("robots_a", "robots_b")]
         reasons = ", ".join(f"{reason} ({count})" for reason, count in row["refused"].items())
         cells.append([*sides, str(row["attempts"]), reasons, _last(row), "apart" if row["apart"] else "one map"])
-    title = "Refused attempts to merge maps (and by what factor a bound was missed)"
-    headings = ("robots", "with", "attempts", "refused as", "last", "at the end")
+    title = "Refused merge attempts (with the factor by which a bound was missed)"
+    headings = ("robots", "with", "attempts", "reason", "last", "at the end")
     console.print(console_table(title, headings, cells))
-    for reason in dict.fromkeys(row["last_reason"] for row in told if row["apart"] and row["last_reason"]):
+    for reason in dict.fromkeys(row["last_reason"] for row in shown if row["apart"] and row["last_reason"]):
         console.print(f"{reason}: {HINTS[reason]}")
-    for missed in dict.fromkeys(row["missed"] for row in told if row["apart"] and row["missed"]):
+    for missed in dict.fromkeys(row["missed"] for row in shown if row["apart"] and row["missed"]):
         console.print(f"{missed}: {MISSED[missed]}")
-    if any(not row["attempts"] for row in told):
-        console.print(f"never tried: The robots were out of contact, or: {HINTS['too few candidates']}")
+    if any(not row["attempts"] for row in shown):
+        console.print(f"not attempted: The robots were out of contact, or: {HINTS['too few candidates']}")
 
 
 def _last(row: Mapping[str, Any]) -> str:
-    """Tell of the last refusal of a pair."""
+    """Describe the last refusal of a pair."""
     if row["last_step"] is None:
-        return "never tried"
-    told = f"{row['last_reason']} at step {row['last_step']}"
+        return "not attempted"
+    text = f"{row['last_reason']} at step {row['last_step']}"
     if row["missed"]:
         factor = "" if row["excess"] is None else f" {row['excess']:.1f}"
-        told += f" ({row['missed']}{factor})"
-    return told
+        text += f" ({row['missed']}{factor})"
+    return text
 
 
 def _never_tried(robots_a: list[int], robots_b: list[int]) -> dict[str, Any]:
-    """Return the row of two groups that are apart and were never compared."""
+    """Return the row of two groups without a common map that were never compared."""
     return {
         "robots_a": robots_a, "robots_b": robots_b, "attempts": 0, "refused": {}, "last_reason": "", "last_step": None,
         "missed": "", "excess": float("nan"), "apart": True,
@@ -146,17 +146,17 @@ def _never_tried(robots_a: list[int], robots_b: list[int]) -> dict[str, Any]:
 
 
 def consistency_rows(robots: Iterable[int], reports: Iterable["Consistency"]) -> list[dict[str, Any]]:
-    """Return the entry `consistency` of `metrics.json`, one row for each robot, under these numbers."""
+    """Return the entry `consistency` of `metrics.json`, one row for each robot, with the given numbers."""
     return [{"robot": robot} | report.to_mapping() for robot, report in zip(robots, reports, strict=True)]
 
 
 def print_consistency(console: Console, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Print what `consistency_rows` gave, NaN as None; each warning in words, once."""
+    """Print the result of `consistency_rows`, with NaN as None, and each warning once."""
     cells = []
     for row in rows:
         shares = (f"{100.0 * row[key]:.1f} %" for key in ("nis_share", "ess_share", "rejected_share"))
         cells.append([str(row["robot"]), number(row["nis_mean"]), *shares, _verdict(row)])
-    title = "Consistency: do filters err as little as they claim? (shares of frames)"
+    title = "Consistency: errors relative to the estimated covariances (shares of frames)"
     console.print(console_table(title, COLUMNS, cells))
     texts: dict[str, list[str]] = {}
     for row in rows:
@@ -167,15 +167,15 @@ def print_consistency(console: Console, rows: Sequence[Mapping[str, Any]]) -> No
 
 
 def _verdict(row: Mapping[str, Any]) -> str:
-    """Return what the row comes to, in a word or two."""
+    """Return the verdict of a row, in one or two words."""
     if row["warnings"]:
         return "inconsistent"
     is_cautious = row["nis_mean"] is not None and row["nis_mean"] < CAUTIOUS
-    return "cautious" if is_cautious else "no objection"
+    return "cautious" if is_cautious else "consistent"
 
 
 def group_name(robots: Sequence[int]) -> str:
-    """Return the name of a group in file names.
+    """Return the name of a group for file names.
 
     >>> group_name((2, 5))
     '2-5'
@@ -184,10 +184,10 @@ def group_name(robots: Sequence[int]) -> str:
 
 
 def write_maps(folder: "RunFolder", maps: "Mapping[str, LandmarkMap]") -> str:
-    """Write each map as `map_<group>.npz` and `map_<group>.csv`, and return a line that says so.
+    """Write each map as `map_<group>.npz` and `map_<group>.csv`, and return a line that lists them.
 
     Args:
-        maps: By the name of the group, each in the start frame of the group's first robot.
+        maps: Maps by the name of the group, each in the start frame of the group's first robot.
     """
     for name, landmarks in maps.items():
         landmarks.save(folder.path / f"map_{name}.npz")
@@ -197,7 +197,7 @@ def write_maps(folder: "RunFolder", maps: "Mapping[str, LandmarkMap]") -> str:
 
 
 def to_csv(landmarks: "LandmarkMap") -> str:
-    """Return a map as CSV text, every number in the shortest form that reads back bit for bit; no descriptors."""
+    """Return a map as CSV, without descriptors; numbers have the shortest form that is exact."""
     import numpy as np
 
     upper = landmarks.covariances[:, *np.triu_indices(3)]

@@ -1,4 +1,4 @@
-"""Driving a robot by hand: keys become actions, the other robots follow a policy."""
+"""Teleoperation: keys control one robot, the others follow a policy."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -13,13 +13,13 @@ from vslam_env.config import TICK
 from vslam_env.environment import ExplorationEnv
 from vslam_env.rendering import draw_frame
 
-KEYS = "arrows or WASD drive, Tab takes the next robot, Escape or Q ends"
+KEYS = "arrows or WASD: drive, Tab: next robot, Escape or Q: quit"
 AHEAD, BACK, LEFT, RIGHT = ({"up", "w"}, {"down", "s"}, {"left", "a"}, {"right", "d"})
 NEXT, END = {"tab"}, {"escape", "q"}
 
 
 class Screen(Protocol):
-    """What shows frames and knows the keys: `vslam_env.rendering.window.Window`, or a test's own."""
+    """Display of frames and source of key presses: `vslam_env.rendering.window.Window`, or a test double."""
 
     held: set[str]
     typed: list[str]
@@ -30,7 +30,7 @@ class Screen(Protocol):
 
 
 def action_of(held: set[str]) -> FloatArray:
-    """Return the action (2,), speed and turn in [-1, 1], of the keys that are held down."""
+    """Return the action (2,), speed and turn in [-1, 1], of the pressed keys."""
     speed = float(bool(held & AHEAD)) - float(bool(held & BACK))
     turn = float(bool(held & LEFT)) - float(bool(held & RIGHT))
     return np.array([speed, turn])
@@ -41,11 +41,11 @@ def drive(
     on_frame: Callable[[NDArray[np.uint8]], None] = lambda frame: None, should_stop: Callable[[], bool] = lambda: False,
     pace: float = TICK,
 ) -> Mapping[str, Mapping[str, Any]]:  # fmt: skip
-    """Run an episode in which one robot at a time goes by the keys.
+    """Run an episode in which the keys control one robot at a time.
 
     Args:
-        policies: For the robots that nobody drives; agents without one stand still.
-        pace: A step takes at least this long [s].
+        policies: Policies of the other robots; agents without a policy stand still.
+        pace: Minimum duration of a step [s].
 
     Returns:
         The last infos.
@@ -71,7 +71,7 @@ def _actions(
     env: ExplorationEnv, observations: Mapping[str, Any], policies: Mapping[str, Policy],
     rngs: Mapping[str, np.random.Generator], driven: int, action: FloatArray,
 ) -> dict[str, Any]:  # fmt: skip
-    """Return the actions of all robots: of the keys, of a policy, or none."""
+    """Return the actions of all robots: from the keys, from a policy, or zero."""
     agents: Sequence[str] = env.agents
     still = np.zeros(2)
     actions: dict[str, Any] = {

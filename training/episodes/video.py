@@ -1,4 +1,4 @@
-"""Writing an episode as a video that every browser plays: H.264, 4:2:0 colour, its index at the front."""
+"""Video of an episode that plays in every browser: H.264, 4:2:0 colour, index at the front."""
 
 import math
 from collections.abc import Iterable
@@ -22,17 +22,17 @@ from vslam_env.sensors import RenderedFrame
 FPS = 25
 SLOWEST_FPS = 5
 LONGEST_S = 20.0
-SHORTEST_S = 12.0  # few frames are shown more slowly, so that an episode lasts about this long
-# Constant quality; larger is smaller and worse. 23 is x264's own middle, 26 still shows single dots.
+SHORTEST_S = 12.0  # minimum duration; short episodes are slowed down
+# Constant rate factor; larger values give smaller files. 23 is the default of x264, 26 still shows single dots.
 QUALITY = 26
 
-NEAR, FAR = (213, 94, 0), (0, 114, 178)  # RGB, of points 1 m and 8 m away
+NEAR, FAR = (213, 94, 0), (0, 114, 178)  # RGB colours of points at 1 m and 8 m
 DEPTHS = (1.0, 8.0)  # [m]
 
 
 @dataclass(frozen=True, slots=True)
 class Pace:
-    """Which steps of an episode become frames, and how fast these are shown."""
+    """Frame rate of a video relative to the steps of an episode."""
 
     stride: int  # Every `stride`-th step is a frame
     fps: int  # Frames per second of video
@@ -40,7 +40,7 @@ class Pace:
 
 
 def choose_pace(num_steps: int, step_s: float) -> Pace:
-    """Choose a pace at which an episode of `num_steps` steps of `step_s` [s] takes at most `LONGEST_S`.
+    """Choose a pace for which an episode of `num_steps` steps of `step_s` [s] takes at most `LONGEST_S`.
 
     >>> choose_pace(2000, 0.1)
     Pace(stride=4, fps=25, speedup=10.0)
@@ -52,11 +52,11 @@ def choose_pace(num_steps: int, step_s: float) -> Pace:
     return Pace(stride, fps, stride * step_s * fps)
 
 
-def with_slow_flashes(scene: Scene, events: Iterable[MergeEvent], speedup: float) -> Scene:
-    """Let merges flash for as long as a viewer, not a robot, needs: ages run in the time of the video.
+def with_video_time_merges(scene: Scene, events: Iterable[MergeEvent], speedup: float) -> Scene:
+    """Scale the ages of merge effects to video time, so that they last equally long for the viewer.
 
     Args:
-        events: The team's events; their `step` counts ticks as `scene.tick` does.
+        events: Events of the team; their `step` counts ticks, as `scene.tick` does.
         speedup: Simulated seconds per second of video.
     """
     ages = [(math.floor((scene.tick - event.step) / speedup), event) for event in events if event.kind == "merge"]
@@ -65,23 +65,25 @@ def with_slow_flashes(scene: Scene, events: Iterable[MergeEvent], speedup: float
 
 
 class VideoWriter:
-    """A video file that appears under its name only when it is complete; use it in a `with` block.
+    """Video file that appears under its name only when complete; a context manager.
 
-    It is completed also when the block is left by an exception, with the frames until then; a video without frames
-    leaves no file, and neither does one that its encoder could not write.
+    The file is also completed if the block raises, with the frames until then. A video without frames, or one that the
+    encoder could not write, leaves no file.
 
     Raises:
-        ValueError: If the path ends otherwise, its folder is missing, it cannot be written, or a number is out of
+        ValueError: If the suffix is wrong, the folder is missing, the file cannot be written, or a number is out of
             range.
     """
 
     def __init__(self, path: Path, size: tuple[int, int], fps: int = FPS) -> None:
         if path.suffix != ".mp4" or not path.parent.is_dir():
-            raise argument_error("path", "a file name ending in .mp4 in a folder that exists", Path(path), "Change it.")
+            raise argument_error(
+                "path", "a file name ending in .mp4 in a folder that exists", Path(path), "Change the path."
+            )
         for name, length in zip(("size[0]", "size[1]"), size, strict=True):
-            if check_int(name, length, 2, "Give the picture's size in pixels.") % 2:
+            if check_int(name, length, 2, "Give the size of the picture in pixels.") % 2:
                 raise argument_error(name, "an even number", length, "Add one pixel.")
-        check_int("fps", fps, 1, "Show at least one frame a second.")
+        check_int("fps", fps, 1, "Use at least one frame per second.")
         check_writable(path, "path")
         self._path, self._size = path, size
         self._partial = resolved(path).with_name(f".{path.stem}.partial.mp4")
@@ -95,7 +97,7 @@ class VideoWriter:
             pix_fmt_out="yuv420p",
             macro_block_size=2,
             quality=None,
-            ffmpeg_log_level="quiet",  # what it cannot write is found when the video is closed
+            ffmpeg_log_level="quiet",  # write errors are detected when the video is closed
             output_params=["-crf", str(QUALITY), "-preset", "veryfast", "-movflags", "+faststart"],
         )
         self._sink.send(None)
@@ -106,7 +108,7 @@ class VideoWriter:
         if frame.shape != (height, width, 3) or frame.dtype != np.uint8:
             got = f"shape {frame.shape} of {frame.dtype}"
             raise argument_error(
-                "frame", f"an array of shape ({height}, {width}, 3) of uint8", got, "Draw it so large."
+                "frame", f"an array of shape ({height}, {width}, 3) of uint8", got, "Draw frames of this size."
             )
         try:
             self._sink.send(np.ascontiguousarray(frame))
@@ -129,7 +131,7 @@ class VideoWriter:
             self._partial.unlink(missing_ok=True)
 
     def _check_whole(self) -> None:
-        """Refuse a file that lacks frames: the encoder does not report that it could not write."""
+        """Refuse an incomplete file: the encoder does not report write errors."""
         try:
             count, _ = imageio_ffmpeg.count_frames_and_secs(self._partial)
         except (OSError, RuntimeError) as error:
@@ -138,28 +140,28 @@ class VideoWriter:
             raise self._unwritten()
 
     def _unwritten(self) -> ValueError:
-        """Return the error of a video that its encoder could not write."""
-        text = "The encoder stopped: make room on the disk, or go without a video."
+        """Return the error for a video that the encoder could not write."""
+        text = "The encoder stopped. Free disk space, or run without a video."
         return argument_error("path", "a file that can be written", Path(self._path), text)
 
 
-def beside_the_map(picture: NDArray[np.uint8], frame: Any, width: int) -> NDArray[np.uint8]:
-    """Return a picture (H, W + width, 3) with a robot's two images at its right.
+def with_camera_images(picture: NDArray[np.uint8], frame: Any, width: int) -> NDArray[np.uint8]:
+    """Return a picture (H, W + width, 3) with the two camera images of a robot on the right.
 
     Args:
-        frame: An `RenderedFrame`; where it is none, the room stays empty.
+        frame: Image pair, an `RenderedFrame`; for other values the area stays empty.
     """
     height = picture.shape[0]
     panel = np.full((height, width, 3), 24, dtype=np.uint8)
     if isinstance(frame, RenderedFrame):
         tall = min(height // 2, round(width * frame.left.shape[0] / frame.left.shape[1]))
         wide = round(tall * frame.left.shape[1] / frame.left.shape[0])
-        for row, image in enumerate((draw_eye(frame, (wide, tall)), _large(frame.right, (wide, tall)))):
+        for row, image in enumerate((draw_camera_image(frame, (wide, tall)), _large(frame.right, (wide, tall)))):
             panel[row * tall : (row + 1) * tall, :wide] = image
     return np.concatenate([picture, panel], axis=1)
 
 
-def draw_eye(frame: RenderedFrame, size: tuple[int, int]) -> NDArray[np.uint8]:
+def draw_camera_image(frame: RenderedFrame, size: tuple[int, int]) -> NDArray[np.uint8]:
     """Return the left image (h, w, 3) with circles at measured corners, coloured by depth, and their disparities."""
     picture = _large(frame.left, size)
     scale = size[0] / frame.left.shape[1]
@@ -174,6 +176,6 @@ def draw_eye(frame: RenderedFrame, size: tuple[int, int]) -> NDArray[np.uint8]:
 
 
 def _large(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
-    """Return a grey image in RGB at another size."""
+    """Return a grey image as RGB at another size."""
     larger = cv2.resize(image, size, interpolation=cv2.INTER_LINEAR)
     return np.asarray(cv2.cvtColor(larger, cv2.COLOR_GRAY2RGB), dtype=np.uint8)

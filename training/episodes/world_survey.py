@@ -1,4 +1,4 @@
-"""What worlds are like: their figures, and pictures of several side by side."""
+"""Survey of worlds: sizes and counts, and pictures of several worlds side by side."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -20,22 +20,22 @@ TILE = (640, 480)  # [px]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WorldFigures:
-    """One world."""
+    """Sizes and counts of one world."""
 
-    name: str  # Of the world
-    walls: int  # Its walls
-    landmarks: int  # Those that robots could ever see
-    floor_m2: float  # Floor that robots can explore [m²]
+    name: str  # Name of the world
+    walls: int  # Number of walls
+    landmarks: int  # Number of observable landmarks
+    floor_m2: float  # Area that robots can explore [m²]
     width_m: float  # Extent along x [m]
     height_m: float  # Extent along y [m]
-    start_gap_m: float  # Least distance between two drawn start poses [m]; infinity for a single robot
+    start_gap_m: float  # Smallest distance between two start poses [m]; infinity for one robot
 
 
 def survey(world: str, world_seed: int, robots: int = 3) -> WorldFigures:
-    """Build a world and start robots in it.
+    """Build a world and place robots in it.
 
     Raises:
-        ValueError: If that is not possible; the text says why and what to do.
+        ValueError: If that is impossible; the message gives the reason and a hint.
     """
     check_int("seed", world_seed, 0, "Use 0 or a positive number.")
     config = EnvConfig(world=world, num_robots=robots)
@@ -53,17 +53,17 @@ def survey(world: str, world_seed: int, robots: int = 3) -> WorldFigures:
 
 
 def survey_all(world: str, world_seeds: Iterable[int], robots: int) -> list[WorldFigures]:
-    """Build the worlds of some seeds and start robots in each.
+    """Build the worlds of some seeds and place robots in each.
 
     Raises:
-        ValueError: If that is not possible; the text says why, what to do, and for which seed.
+        ValueError: If that is impossible; the message gives the reason, a hint, and the seed.
     """
     found = []
     for seed in world_seeds:
         try:
             found.append(survey(world, seed, robots))
         except ValueError as error:
-            raise ValueError(f"{error} That was world seed {seed}, after {len(found)} sound ones.") from error
+            raise ValueError(f"{error} That was world seed {seed}, after {len(found)} valid ones.") from error
     return found
 
 
@@ -71,9 +71,9 @@ def contact_sheet(world: str, first_seed: int, count: int, robots: int) -> NDArr
     """Draw worlds of `count` seeds side by side, with landmarks and start poses, (H, W, 3) uint8 RGB.
 
     Raises:
-        ValueError: If an argument is bad or a world cannot be built.
+        ValueError: If an argument is invalid or a world cannot be built.
     """
-    check_int("seeds", count, 1, "Draw one world or more.")
+    check_int("seeds", count, 1, "Use at least one world.")
     check_int("first_seed", first_seed, 0, "Use 0 or a positive number.")
     env = vslam_v0.parallel_env(world=world, num_robots=robots)
     tiles: list[Any] = []

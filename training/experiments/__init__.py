@@ -1,1 +1,1 @@
-"""Tools that all experiments share: configuration, run folders, kept trials, statistics, tables, plots."""
+"""Common tools of all experiments: configuration, run folders, stored trials, statistics, tables, plots."""

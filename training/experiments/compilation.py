@@ -1,4 +1,4 @@
-"""What a command shows while kernels are compiled, which happens once; later it shows nothing."""
+"""Progress display of commands while kernels are compiled; nothing is shown if all are cached."""
 
 import math
 import time
@@ -11,14 +11,14 @@ from rich.spinner import Spinner
 
 
 @contextmanager
-def compilation_shown(console: Console) -> Iterator[Callable[[int, int, float], None]]:
-    """Show, from the first compilation in the block on, that the user waits for the compiler, and afterwards how long.
+def compilation_progress(console: Console) -> Iterator[Callable[[int, int, float], None]]:
+    """Show that the compiler runs, from the first compilation in the block on, and its total time afterwards.
 
-    A terminal shows a spinner, anything else one line. Nothing is shown where all kernels come from the cache. The
-    block must not print to a live display of its own.
+    A terminal shows a spinner, other outputs one line. Nothing is shown if all kernels come from the cache. The
+    block must not use a live display of its own.
 
     Yields:
-        The `progress` of `warm_up`.
+        Progress callback for `warm_up`.
     """
     from slam_backend.core.compilation import MESSAGE, watch_compilation
 
@@ -47,16 +47,16 @@ def compilation_shown(console: Console) -> Iterator[Callable[[int, int, float], 
 
 
 def prepare(*first_steps: Callable[[], object]) -> None:
-    """Compile or load all kernels before a command's own displays begin; who has to wait is told so on stderr.
+    """Compile or load all kernels before a command shows its own output; report compilation on stderr.
 
     Args:
-        first_steps: Of the command, called in turn; what is wrong with its input shows before the long wait.
+        first_steps: Functions called in order before all kernels are compiled, so that bad input is reported early.
     """
     from slam_backend.core.compilation import log_compilation
     from vslam_env.warm_up import warm_up
 
-    with compilation_shown(Console(stderr=True)) as progress:
+    with compilation_progress(Console(stderr=True)) as progress:
         for step in first_steps:
             step()
         warm_up(progress=progress)
-    log_compilation(lambda text: Console(stderr=True).print(text, highlight=False))  # of what only some runs need
+    log_compilation(lambda text: Console(stderr=True).print(text, highlight=False))  # kernels that only some runs need

@@ -1,6 +1,6 @@
-"""`ExperimentConfig`: everything that decides a command's results; its fields are the command's options.
+"""`ExperimentConfig`: complete configuration of a command; its fields are the options of the command.
 
-The modules that define configurations import no numerical library, so that `--help` answers at once.
+The modules that define configurations import no numerical library, so that `--help` is fast.
 """
 
 from collections.abc import Mapping
@@ -37,14 +37,14 @@ def option(
     default: Any, help: str, *, name: str | None = None, shown: str | None = None, hint: str = "",
     is_path: bool = False, is_argument: bool = False, **constraints: Any,
 ) -> Any:  # fmt: skip
-    """Return a field that is an option on the command line, too.
+    """Return a field that is also an option on the command line.
 
     Args:
-        name: Name of the option, or two with a slash for a flag; None: that of the field.
-        shown: Default that `--help` shows; None: the value.
-        hint: Advice in the error for a bad value, a full sentence.
-        is_path: Whether it is a path, which is kept absolute.
-        constraints: Bounds as `pydantic.Field` takes them.
+        name: Name of the option, or two names with a slash for a flag; None: the name of the field.
+        shown: Default as `--help` shows it; None: the value.
+        hint: Advice in the error for a bad value; a full sentence.
+        is_path: Whether the value is a path, which is made absolute.
+        constraints: Bounds, as for `pydantic.Field`.
     """
     about: JsonDict = {
         "option": name or "", "shown": shown, "hint": hint, "is_path": is_path, "is_argument": is_argument,
@@ -53,17 +53,17 @@ def option(
 
 
 def setting(default: Any, description: str = "", **constraints: Any) -> Any:
-    """Return a field that is no option: earlier runs' `config.toml` and programs set it."""
+    """Return a field without a command-line option; programs and the `config.toml` of earlier runs set it."""
     return Field(default, description=description, **constraints)
 
 
 def first_seed() -> Any:
-    """Return the field of a seed from which on several are counted."""
-    return option(0, "First seed.", name="first_seed", ge=0, hint="Use 0 or a positive number.")
+    """Return the field of the first of several consecutive seeds."""
+    return option(0, "First of the consecutive seeds.", name="first_seed", ge=0, hint="Use 0 or a positive number.")
 
 
 def table(path: str) -> Any:
-    """Return the type of a field that is a dataclass of another package, imported when a configuration is made."""
+    """Return the type of a field that is a dataclass of another package, imported when a configuration is created."""
 
     def build(value: Any, info: ValidationInfo) -> Any:
         module, name = path.split(":")
@@ -82,33 +82,33 @@ def table(path: str) -> Any:
 
 
 class Checked(BaseModel):
-    """Values that are frozen, and checked when they are made."""
+    """Frozen values, validated at creation."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
     def __init__(self, **values: Any) -> None:
-        """Check all values.
+        """Validate all values.
 
         Raises:
-            ValueError: If a name is unknown or a value is out of its range; the message names it.
+            ValueError: If a name is unknown or a value is out of range; the message gives the name.
         """
         try:
             super().__init__(**{name: tuple(v) if isinstance(v, list) else v for name, v in values.items()})
         except ValidationError as error:
-            raise _in_one_line(type(self), error) from None
+            raise _one_line_error(type(self), error) from None
 
     def replace(self, **changes: Any) -> Self:
-        """Return a copy with some values changed, all of them checked again."""
+        """Return a copy with some values changed, validated again."""
         return type(self)(**{**dict(self), **changes})
 
     def check(self) -> None:
-        """Refuse values that do not go together; each alone is in its range."""
+        """Refuse combinations of values that are not allowed; each value alone is in range."""
 
     @field_validator("*")
     @classmethod
     def _check_list(cls, value: Any) -> Any:
         if isinstance(value, tuple) and (not value or len(set(value)) < len(value)):
-            raise ValueError  # `_in_one_line` knows the name
+            raise ValueError  # `_one_line_error` adds the name
         return value
 
     @model_validator(mode="after")
@@ -118,63 +118,63 @@ class Checked(BaseModel):
 
 
 class ExperimentConfig(Checked):
-    """Base of the configurations, which are written to `config.toml`; run folders keep the seed beside the others."""
+    """Base of all configurations, which are stored in `config.toml`; run folders store the seed separately."""
 
     seed: int = option(0, "Seed of all random draws.", ge=0, hint="Use 0 or a positive number.")
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any]) -> Self:
-        """Build a configuration from plain values, as `to_mapping` gives them; what is left out has its default."""
+        """Build a configuration from the plain values of `to_mapping`; omitted values have their defaults."""
         return cls(**cls.completed(values))
 
     @classmethod
     def completed(cls, values: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Return plain values with what they leave out, where that depends on the others."""
+        """Return plain values with omitted values filled in, where these depend on other values."""
         return values
 
     def to_mapping(self) -> dict[str, Any]:
-        """Return the plain values that repeat the command, the seed apart."""
+        """Return plain values that repeat the command, except the seed."""
         return self.model_dump(exclude={"seed"})
 
 
-def about_option(field: FieldInfo) -> dict[str, Any] | None:
-    """Return what `option` was told about a field; None: the field is no option."""
+def option_arguments(field: FieldInfo) -> dict[str, Any] | None:
+    """Return the arguments of `option` for a field; None if the field is not an option."""
     extra = field.json_schema_extra
     return dict(extra) if isinstance(extra, Mapping) and "option" in extra else None
 
 
-def kind_of(annotation: Any) -> tuple[Any, list[Any]]:
-    """Return the type of a value, or of the entries of a list, and its constraints; None beside it does not count.
+def value_type(annotation: Any) -> tuple[Any, list[Any]]:
+    """Return the type and constraints of a value, or of the entries of a list; an alternative None is ignored.
 
-    >>> kind_of(tuple[Positive, ...] | None)
+    >>> value_type(tuple[Positive, ...] | None)
     (<class 'int'>, [Ge(ge=1)])
     """
     if get_origin(annotation) is Annotated:
         inner, *more = get_args(annotation)
-        kind, constraints = kind_of(inner)
+        kind, constraints = value_type(inner)
         return kind, [*constraints, *(c for each in more for c in getattr(each, "metadata", [each]))]
     if get_origin(annotation) in (Union, UnionType, tuple):
-        return kind_of(next(each for each in get_args(annotation) if each is not NoneType))
+        return value_type(next(each for each in get_args(annotation) if each is not NoneType))
     return annotation, []
 
 
-def _in_one_line(kind: type[Checked], error: ValidationError) -> ValueError:
-    """Return the first thing that is wrong in the form that all errors of the project have."""
+def _one_line_error(kind: type[Checked], error: ValidationError) -> ValueError:
+    """Return the first validation error in the error format of the project."""
     found = error.errors()
     for each in found:
         if each["type"] == "extra_forbidden":
             names = ", ".join(kind.model_fields)
             return _error("config", f"names among {names}", str(each["loc"][0]), "Correct the name.")
     first, value = found[0], found[0]["input"]
-    told = first.get("ctx", {}).get("error")
-    if told is not None and str(told):
-        return ValueError(str(told))
+    cause = first.get("ctx", {}).get("error")
+    if cause is not None and str(cause):
+        return ValueError(str(cause))
     field = kind.model_fields[str(first["loc"][0])]
-    about = about_option(field) or {"option": "", "hint": ""}
+    about = option_arguments(field) or {"option": "", "hint": ""}
     name = str(about["option"] or first["loc"][0]).split("/")[0].removeprefix("--")
-    if told is not None:
+    if cause is not None:
         return _error(name, "at least one value, each once", list(value), "Correct the list.")
-    leaf, constraints = kind_of(field.annotation)
+    leaf, constraints = value_type(field.annotation)
     hint = str(about["hint"]) or HINTS.get(leaf, HINTS[int])
     if first["type"] == "missing":
         return _error(name, "a value", "none", hint)
@@ -186,7 +186,7 @@ def _in_one_line(kind: type[Checked], error: ValidationError) -> ValueError:
 
 
 def _range(kind: Any, constraints: list[Any]) -> str:
-    """Say what a number may be."""
+    """Describe the values that a number may have."""
     if kind not in (int, float):
         return {bool: "a bool", str: "a text"}.get(kind, "a table")
     bounds = {name: getattr(each, name) for each in constraints for name in ("gt", "ge", "le") if hasattr(each, name)}

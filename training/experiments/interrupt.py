@@ -1,4 +1,4 @@
-"""SIGINT (Ctrl-C) and SIGTERM: a question that a loop asks, or the end of what runs; also if ignored at the start."""
+"""Handling of SIGINT (Ctrl-C) and SIGTERM: a flag for loops, or immediate termination."""
 
 import os
 import signal
@@ -13,30 +13,30 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class AtOnce:
-    """A handler that ends what runs by `KeyboardInterrupt`.
+    """Signal handler that raises `KeyboardInterrupt`.
 
     Attributes:
-        number: The last signal that came, within `interrupt_flag` too; None: there was none.
+        number: Number of the last signal, including signals within `interrupt_flag`; None: none was received.
     """
 
     def __init__(self) -> None:
         self.number: int | None = None
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
-        """Take in a signal."""
+        """Record a signal and interrupt."""
         self.number = number
         raise KeyboardInterrupt
 
 
 @contextmanager
 def signals_answered() -> Iterator[AtOnce]:
-    """Let both signals end a block by `KeyboardInterrupt`, even in a process that was started with them ignored.
+    """Let both signals end a block by `KeyboardInterrupt`, even if the process was started with the signals ignored.
 
-    A shell does that to its background jobs, and some runners do it to all they start. Outside the main thread, where
-    Python delivers no signals, nothing is changed.
+    Shells ignore SIGINT for background jobs, and some runners for all their children. Outside the main thread, where
+    Python delivers no signals, nothing changes.
 
     Yields:
-        The handler.
+        The signal handler.
     """
     handler = AtOnce()
     usual = _handlers()
@@ -51,13 +51,13 @@ def signals_answered() -> Iterator[AtOnce]:
 
 @contextmanager
 def interrupt_flag(on_press: Callable[[], None] = lambda: None) -> Iterator[Callable[[], bool]]:
-    """Give a function that tells whether SIGINT or SIGTERM came; the second one interrupts.
+    """Yield a function that returns whether SIGINT or SIGTERM was received; a second signal interrupts.
 
-    The second one does what the first would have done without this block, or raises `KeyboardInterrupt` where that is
-    nothing. Outside the main thread, where Python delivers no signals, nothing is changed.
+    The second signal does what the first one would have done without this block, or raises `KeyboardInterrupt` if it
+    was ignored. Outside the main thread, where Python delivers no signals, nothing changes.
 
     Args:
-        on_press: Called when the first one comes, between two operations of the main thread, to tell the user so.
+        on_press: Function called at the first signal, between two operations of the main thread, to notify the user.
     """
     pressed = threading.Event()
     usual = _handlers()
@@ -81,14 +81,14 @@ def interrupt_flag(on_press: Callable[[], None] = lambda: None) -> Iterator[Call
 
 @contextmanager
 def signals_held() -> Iterator[None]:
-    """Hold both signals back from processes that are started in a block; this one gets them at its end, or before.
+    """Block both signals in processes started within the block; this process receives them at its end or earlier.
 
-    Ctrl-C, and often SIGTERM, go to a whole group of processes. Workers leave them to the process that started them.
+    Ctrl-C, and often SIGTERM, reach a whole process group. Workers leave them to the process that started them.
     """
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
         return
-    resource_tracker.ensure_running()  # the first process of a kind starts it, and it lets signals through again
+    resource_tracker.ensure_running()  # otherwise the first worker starts it, and its start unblocks signals
     former = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
     try:
         yield
@@ -97,7 +97,7 @@ def signals_held() -> Iterator[None]:
 
 
 def begin_worker() -> None:
-    """Let a worker process ignore both signals, and end when the process that started it has ended in any way."""
+    """Make a worker process ignore both signals, and exit when its parent process has ended for any reason."""
     for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)
     parent = parent_process()
@@ -111,7 +111,7 @@ def _end_with(sentinel: int) -> None:
 
 
 def _handlers() -> dict[signal.Signals, Any]:
-    """Return how both signals are handled; those that were set up outside Python, and other threads', are left out."""
+    """Return the handlers of both signals, except in other threads and for handlers set outside Python."""
     if threading.current_thread() is not threading.main_thread():
         return {}
     handlers = {number: signal.getsignal(number) for number in SIGNALS}

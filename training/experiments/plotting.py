@@ -1,4 +1,4 @@
-"""Figures as small PNG files."""
+"""Plots as small PNG files, and common plot elements."""
 
 from io import BytesIO
 from pathlib import Path
@@ -14,11 +14,11 @@ from slam_backend.core.files import write_file
 from slam_backend.core.validation import FloatArray
 
 CHI_SQUARE_95 = 5.991  # two degrees of freedom
-COLOURS = 256  # lines, points and edges of letters need no more; a file is then a quarter as large
+COLOURS = 256  # enough for lines, points and text edges; reduces files to a quarter
 
 
 def save_png(figure: Figure, file: Path, dpi: int) -> None:
-    """Write a figure with a palette of its own.
+    """Write a figure with an adaptive colour palette.
 
     Raises:
         ValueError: If the file cannot be written; the message names `out`.
@@ -32,7 +32,7 @@ def save_png(figure: Figure, file: Path, dpi: int) -> None:
 
 
 def rgb(colour: tuple[int, int, int]) -> tuple[float, float, float]:
-    """Return a colour of bytes as matplotlib wants it."""
+    """Return an RGB colour of bytes as floats for matplotlib."""
     r, g, b = colour
     return r / 255.0, g / 255.0, b / 255.0
 
@@ -46,6 +46,6 @@ def ellipse_95(mean: FloatArray, covariance: FloatArray, **style: Any) -> Ellips
 
 
 def add_legend(figure: Figure, axes: Axes, **style: Any) -> None:
-    """Add a legend of what is drawn in some axes above a figure, in one row."""
+    """Add a legend for the content of some axes above a figure, in one row."""
     handles, labels = axes.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), frameon=False, **style)

@@ -1,4 +1,4 @@
-"""Tables of text, on the console, as Markdown and as CSV: the first column to the left, numbers to the right."""
+"""Text tables for the console, Markdown and CSV: first column left-aligned, numbers right-aligned."""
 
 import csv
 import io
@@ -9,11 +9,11 @@ from rich.box import SIMPLE_HEAD
 from rich.markup import escape
 from rich.table import Table
 
-LARGE = 1e5  # numbers from here on are shown with an exponent
+LARGE = 1e5  # numbers from here on have an exponent
 
 
 def number(value: float | None, digits: int = 2, factor: float = 1.0) -> str:
-    """Show a number, times a factor, with fixed digits; a dash where it is None or NaN.
+    """Format a number, times a factor, with fixed digits; None and NaN give a dash.
 
     >>> number(0.1234, 1, 100.0), number(-1e-9), number(3.2e7), number(None)
     ('12.3', '0.00', '3e+07', '-')
@@ -25,7 +25,7 @@ def number(value: float | None, digits: int = 2, factor: float = 1.0) -> str:
 
 
 def console_table(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]] = ()) -> Table:
-    """Return a table for the console; title, headings and rows are shown as they are, markup and all."""
+    """Return a table for the console; title, headings and rows are shown verbatim, without markup."""
     table = Table(title=escape(title), box=SIMPLE_HEAD, title_justify="left", padding=(0, 1), collapse_padding=True)
     for column, heading in enumerate(headings):
         table.add_column(escape(heading), justify="left" if column == 0 else "right", overflow="fold")
@@ -35,7 +35,7 @@ def console_table(title: str, headings: Sequence[str], rows: Sequence[Sequence[s
 
 
 def markdown_table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    r"""Return a Markdown table that ends with a line break.
+    r"""Return a Markdown table with a final line break.
 
     >>> markdown_table(("method", "error [m]"), [("svd", "0.12")])
     '| method | error [m] |\n| --- | ---: |\n| svd | 0.12 |\n'
@@ -45,12 +45,12 @@ def markdown_table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> st
 
 
 def titled_markdown(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a Markdown table under a bold title; nothing if it has no rows."""
+    """Return a Markdown table under a bold title, or nothing if it has no rows."""
     return f"**{title}**\n\n{markdown_table(headings, rows)}" if rows else ""
 
 
 def csv_text(headings: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    r"""Return rows as CSV under a heading: floats have six significant digits, None is empty.
+    r"""Return rows as CSV with a header: floats have six significant digits, None is empty.
 
     >>> csv_text(("robot", "error_m"), [(0, 1 / 3), (1, None)])
     'robot,error_m\n0,0.333333\n1,\n'

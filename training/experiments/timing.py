@@ -1,4 +1,4 @@
-"""Calls timed one by one, the garbage collector off, and what the benches of times have in common."""
+"""Timing of single calls without garbage collection, and common parts of the timing benchmarks."""
 
 import gc
 import os
@@ -14,11 +14,11 @@ from rich.console import Console
 
 from slam_backend.core.validation import FloatArray
 
-BUSY = 1.2  # load of the last minute above which another process was running
+BUSY = 1.2  # one-minute load above which another process was running
 
 
 def timing_ms(seconds: FloatArray) -> dict[str, float]:
-    """Summarise durations (n,) [s] of `calls`: their median, least, and the ends of the middle 80 % [ms]."""
+    """Summarise durations (n,) [s] of `calls`: median, minimum, and the ends of the middle 80 % [ms]."""
     low, median, high = (float(q) for q in np.quantile(1e3 * seconds, (0.1, 0.5, 0.9)))
     least = float(1e3 * seconds.min())
     return {"median_ms": median, "low_ms": low, "high_ms": high, "min_ms": least, "calls": len(seconds)}
@@ -26,7 +26,7 @@ def timing_ms(seconds: FloatArray) -> dict[str, float]:
 
 @contextmanager
 def no_garbage_collection() -> Iterator[None]:
-    """Collect once, then not again until the block ends: a collection falls on one call and belongs to many."""
+    """Collect garbage once, then not until the block ends: a collection would be charged to a single call."""
     was_on = gc.isenabled()
     gc.collect()
     gc.disable()
@@ -38,10 +38,10 @@ def no_garbage_collection() -> Iterator[None]:
 
 
 def time_calls(call: Callable[[Any], Any], arguments: Sequence[Any], warm_up: int = 0) -> tuple[FloatArray, list[Any]]:
-    """Time `call(argument)` for each argument in turn, the first `warm_up` of which are not counted.
+    """Time `call(argument)` for each argument in order, not counting the first `warm_up` calls.
 
     Returns:
-        Durations (n - warm_up,) [s], and what these calls returned.
+        Durations (n - warm_up,) [s] and results of the timed calls.
     """
     results: list[Any] = [None] * len(arguments)
 
@@ -54,7 +54,7 @@ def time_calls(call: Callable[[Any], Any], arguments: Sequence[Any], warm_up: in
 
 
 def clock(call: Callable[[Any], Any], arguments: Sequence[Any]) -> FloatArray:
-    """Return how long each call took (n,) [s]; nothing of the results is kept."""
+    """Return the duration of each call (n,) [s]; results are discarded."""
     durations = np.empty(len(arguments), np.int64)
     for i, argument in enumerate(arguments):
         begin = time.perf_counter_ns()
@@ -63,14 +63,14 @@ def clock(call: Callable[[Any], Any], arguments: Sequence[Any]) -> FloatArray:
     return durations / 1e9
 
 
-def run_in_turn(
+def run_named_trials(
     trials: Sequence[tuple[str, Callable[[], object]]],
     on_trial: Callable[[str], None],
     should_stop: Callable[[], bool],
 ) -> bool:
     """Run named trials until all are done or the user stops; return whether all are done.
 
-    `on_trial` is called with the name of each trial before it begins, `should_stop` is asked before that.
+    `on_trial` is called with the name of each trial before it starts, and `should_stop` before that.
     """
     for name, trial in trials:
         if should_stop():
@@ -81,13 +81,13 @@ def run_in_turn(
 
 
 def describe_machine() -> dict[str, Any]:
-    """Return the processor, its number of cores, and the load of the last minute."""
+    """Return the processor, its number of cores, and the one-minute load."""
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
     return {"processor": processor(), "cores": os.cpu_count(), "load_before": load}
 
 
 def processor() -> str:
-    """Return the processor's name, as far as the system reports it."""
+    """Return the name of the processor, if the system reports it."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:
@@ -97,9 +97,9 @@ def processor() -> str:
 
 
 def print_caveats(console: Console, result: Mapping[str, Any]) -> None:
-    """Say if the machine was busy, and if the user stopped the bench."""
+    """Print a warning if the machine was busy or the user stopped the benchmark."""
     load = result["machine"]["load_before"]
     if load is not None and load > BUSY:
         console.print(f"The machine was busy (load {load:.1f}): times may be too long.")
     if not result["complete"]:
-        console.print("Stopped early: the tables hold what was timed until then.")
+        console.print("Stopped early: the tables contain only the trials up to then.")

@@ -1,4 +1,4 @@
-"""Trials that are kept as soon as they are finished, so that a stopped run goes on where it stopped."""
+"""Storage of finished trials, so that a stopped run can be resumed."""
 
 import json
 import os
@@ -20,33 +20,33 @@ TrialT = TypeVar("TrialT")
 
 
 def open_folder(out: Path | None, command: str, config: Mapping[str, Any], seed: int) -> RunFolder:
-    """Make the run folder, or go on with the one in which the same run was begun.
+    """Create the run folder, or resume the folder of the same run.
 
     Args:
-        out: The folder. None: the next free one.
+        out: Run folder. None: the next free one.
 
     Raises:
-        ValueError: If `out` holds another run, or cannot be written.
+        ValueError: If `out` belongs to another run, or cannot be written.
     """
     if out is None or not (out / CONFIG_FILE).is_file():
         return RunFolder.create(out, command, config, seed)
     values, kept_seed = read_config(out, command)
-    asked = {name: value for name, value in plain(config).items() if value is not None}  # TOML knows no None
+    asked = {name: value for name, value in plain(config).items() if value is not None}  # TOML has no None
     if (values, kept_seed) != (asked, seed):
-        cure = f"Repeat the options in {str(out / CONFIG_FILE)!r}, or choose another folder."
-        expected = f"a folder of this very {command.split()[0]}"
-        raise argument_error("out", expected, "a folder of one with other options", cure)
+        hint = f"Repeat the options in {str(out / CONFIG_FILE)!r}, or choose another folder."
+        expected = f"a folder of the same {command.split()[0]} run"
+        raise argument_error("out", expected, "a folder of a run with other options", hint)
     return RunFolder(out, command, values, seed, installed_versions())
 
 
 def finished_trials(folder: RunFolder, name: str, kind: type[TrialT]) -> dict[TrialT, dict[str, Any]]:
-    """Read the trials that a folder holds; a last line that was cut off is dropped, from the file too.
+    """Read the trials in a folder; a truncated last line is dropped, and removed from the file.
 
     Args:
-        kind: A frozen dataclass, whose fields a row holds beside the figures.
+        kind: Frozen dataclass of the trials; a row contains its fields and the metrics.
 
     Raises:
-        ValueError: If a line is no such row.
+        ValueError: If a line is not such a row.
     """
     file = folder.path / name
     if not file.is_file():
@@ -62,14 +62,14 @@ def finished_trials(folder: RunFolder, name: str, kind: type[TrialT]) -> dict[Tr
     try:
         trials = {trial_of(row, kind): row for row in rows}
     except (KeyError, TypeError, ValueError) as error:
-        cure = f"Take {str(file)!r} away, or choose another folder: {error}."
-        raise argument_error("out", "trials that a run kept", "others", cure) from error
+        hint = f"Remove {str(file)!r}, or choose another folder. Error: {error}."
+        raise argument_error("out", "trials of an earlier run", "a file with other content", hint) from error
     folder.write_text(name, "".join(json.dumps(row) + "\n" for row in rows))
     return trials
 
 
 def trial_of(row: Mapping[str, Any], kind: type[TrialT]) -> TrialT:
-    """Return the trial, a dataclass, whose row this is."""
+    """Return the trial of a row, as a dataclass."""
     fields: Mapping[str, Any] = kind.__dataclass_fields__  # type: ignore[attr-defined]
     return kind(**{name: row[name] for name in fields})
 
@@ -78,14 +78,14 @@ def run_trials(
     folder: RunFolder, name: str, play: Callable[[TrialT], dict[str, Any]], trials: Iterable[TrialT], processes: int,
     interrupted: Callable[[], bool], on_trial: Callable[[dict[str, Any]], None],
 ) -> None:  # fmt: skip
-    """Run trials and append each to the folder as it ends; on an interrupt those under way are finished.
+    """Run trials and append each to the folder as it ends; after an interrupt, running trials are finished.
 
     Args:
-        play: Runs a trial and returns its row; a function of a module, so that other processes find it.
-        processes: How many run at a time; 1: in this process.
+        play: Function that runs a trial and returns its row; importable by other processes.
+        processes: Number of parallel processes; 1: this process.
 
     Raises:
-        ValueError: If a row cannot be written; those before it are kept.
+        ValueError: If a row cannot be written; earlier rows are kept.
     """
     going = _until(interrupted, trials)
     with closing(_in_turn(play, going) if processes == 1 else _spread(play, going, processes)) as rows:
@@ -96,7 +96,7 @@ def run_trials(
 
 
 def _until(interrupted: Callable[[], bool], trials: Iterable[TrialT]) -> Iterator[TrialT]:
-    """Hand out trials until Ctrl-C."""
+    """Yield trials until the user interrupts."""
     for trial in trials:
         if interrupted():
             return
@@ -114,9 +114,9 @@ def _in_turn(
 def _spread(
     play: Callable[[TrialT], dict[str, Any]], trials: Iterable[TrialT], processes: int
 ) -> Generator[dict[str, Any], None, None]:
-    """Run trials in several processes, each with one thread, and give their rows as they end.
+    """Run trials in several processes with one thread each, and yield their rows as they end.
 
-    Where the rows are not wanted to the end, the processes are killed, whatever they do.
+    If the consumer stops early, the processes are killed.
     """
     context = get_context("spawn")
     others = set(active_children())
@@ -125,7 +125,7 @@ def _spread(
             running: set[Future[dict[str, Any]]] = set()
             for trial in trials:
                 with signals_held():
-                    running.add(pool.submit(play, trial))  # starts a process, if there are too few
+                    running.add(pool.submit(play, trial))  # starts a process if there are fewer than the maximum
                 while len(running) >= processes:
                     done, running = wait(running, return_when=FIRST_COMPLETED)
                     yield from (future.result() for future in done)
@@ -139,7 +139,7 @@ def _spread(
 
 @contextmanager
 def one_thread_each() -> Iterator[None]:
-    """Start processes whose libraries use one thread each: more would only get in the others' way."""
+    """Limit the libraries of started processes to one thread each, because processes already use all cores."""
     before = {name: os.environ.get(name) for name in SINGLE_THREAD}
     os.environ |= dict.fromkeys(SINGLE_THREAD, "1")
     try:

@@ -1,1 +1,1 @@
-"""Figures of the paper, computed from simulation."""
+"""Figures of the paper, reproduced in simulation."""

@@ -1,25 +1,27 @@
-"""The configurations of the paper's figures."""
+"""Configurations of the paper's figures."""
 
 from itertools import product
 from typing import TYPE_CHECKING, Literal
 
 from training.experiments.config import ONE_PARTICLE, ExperimentConfig, Positive, first_seed, option
 
-if TYPE_CHECKING:  # what computes is imported when a command runs, so that --help answers at once
+if TYPE_CHECKING:  # numerical modules are imported when a command runs, so that --help is fast
     from training.paper.fig2 import Fig2Trial
     from training.paper.fig6.trials import ErrorTrial, TimeTrial
 
 STEP = 0.25  # distance between frames along the path [m]
-SEEN = "An office without landmarks shows nothing."
+SEEN = "Use at least one landmark."
 
 
 class Fig1Config(ExperimentConfig):
-    """Fig. 1: clouds of particles along the paths of a few robots."""
+    """Fig. 1: particles along the paths of several robots."""
 
     robots: int = option(3, "Number of robots.", ge=1)
-    particles: int = option(400, "Particles of each cloud.", ge=1, hint="Use at least one particle; 400 make a cloud.")
+    particles: int = option(400, "Number of particles per robot.", ge=1, hint="Use at least one particle, e.g. 400.")
     length: float = option(30.0, "Length of each robot's path [m].")
-    every: float = option(5.0, "Metres between two clouds.", ge=STEP, hint="A cloud can be drawn after each step.")
+    every: float = option(
+        5.0, "Distance between two plotted sets of particles [m].", ge=STEP, hint="Use at least the length of a step."
+    )
 
     def check(self) -> None:
         """Refuse runs that cannot be simulated."""
@@ -31,20 +33,22 @@ class Fig1Config(ExperimentConfig):
 
 
 class Fig2Config(ExperimentConfig):
-    """Fig. 2: errors of alignment methods against the size of two robots' maps."""
+    """Fig. 2: errors of alignment methods over the size of two robots' maps."""
 
-    seeds: int = option(20, "Number of runs.", ge=1, hint="Run at least one seed.")
+    seeds: int = option(20, "Number of runs.", ge=1, hint="Use at least one seed.")
     seed: int = first_seed()
     length: float = option(80.0, "Length of each robot's path [m].")
-    every: float = option(5.0, "Metres between two alignments.", ge=STEP, hint="Maps can be aligned after each step.")
-    landmarks: int = option(300, "Landmarks of the office.", ge=1, hint=SEEN)
-    particles: int = option(100, "Particles of each robot's filter.", ge=1, hint="Use at least one particle.")
+    every: float = option(
+        5.0, "Distance between two alignments [m].", ge=STEP, hint="Use at least the length of a step."
+    )
+    landmarks: int = option(300, "Number of landmarks in the office.", ge=1, hint=SEEN)
+    particles: int = option(100, "Number of particles per filter.", ge=1, hint="Use at least one particle.")
 
     def check(self) -> None:
-        """Refuse a path without a stage."""
+        """Refuse a path shorter than one stage."""
         from slam_backend.core.validation import check_float
 
-        check_float("length", self.length, "Give metres, at least one stage of them.", at_least=self.every)
+        check_float("length", self.length, "Give metres, at least one stage.", at_least=self.every)
 
     def trials(self) -> list["Fig2Trial"]:
         """Return one trial for each seed."""
@@ -57,44 +61,46 @@ class Fig2Config(ExperimentConfig):
 
 
 class PairConfig(ExperimentConfig):
-    """Figs. 3 and 4: two robots' maps, aligned and fused."""
+    """Figs. 3 and 4: aligned and fused maps of two robots."""
 
     length: float = option(30.0, "Length of each robot's path [m].", ge=STEP, hint="Give metres.")
-    landmarks: int = option(300, "Landmarks of the office.", ge=1, hint=SEEN)
-    particles: int = option(100, "Particles of each robot's filter.", ge=1, hint="Use at least one particle.")
+    landmarks: int = option(300, "Number of landmarks in the office.", ge=1, hint=SEEN)
+    particles: int = option(100, "Number of particles per filter.", ge=1, hint="Use at least one particle.")
 
 
 class Fig5Config(ExperimentConfig):
-    """Fig. 5: robots in a room, what they see, and what walls hide from them."""
+    """Fig. 5: robots in a room, with visible and hidden landmarks."""
 
     robots: int = option(3, "Number of robots.", ge=1, le=8, hint="Use 1 to 8 robots.")
     decisions: int = option(
-        30, "Seconds of exploration before the figure.", ge=1, hint="Let them move for a second or more."
+        30, "Duration of the exploration before the figure [s].", ge=1, hint="Give at least one second."
     )
     measurements: int = option(
-        5, "Number of measurements B of each robot in a tick, at most.", ge=1,
-        hint="Let each measure a landmark or more.",
+        5, "Maximum number of measurements B per robot and tick.", ge=1,
+        hint="Use at least one measurement.",
     )  # fmt: skip
 
 
 class Fig6Config(ExperimentConfig):
-    """Fig. 6: time of a step and map error against particles and robots."""
+    """Fig. 6: time of a step and map error over numbers of particles and robots."""
 
-    seeds: int = option(20, "Number of runs of each kind.", ge=1, hint="Run at least one seed.")
+    seeds: int = option(20, "Number of runs of each kind.", ge=1, hint="Use at least one seed.")
     seed: int = first_seed()
     particles: tuple[Positive, ...] = option(
-        (1, 10, 50, 100, 200, 300, 400, 500, 1000, 1500, 2000), "Numbers of particles M with commas between.",
-        shown="the paper's eleven, 1 to 2000", hint=ONE_PARTICLE,
+        (1, 10, 50, 100, 200, 300, 400, 500, 1000, 1500, 2000), "Numbers of particles M, comma-separated.",
+        shown="11 values of the paper, 1 to 2000", hint=ONE_PARTICLE,
     )  # fmt: skip
-    robots: tuple[Positive, ...] = option((1, 2, 3), "Numbers of robots K.", hint="Use at least one robot.")
-    regimes: tuple[Literal["paper", "look_alikes", "good"], ...] = option(
-        ("paper", "look_alikes", "good"), "paper, look_alikes, good.", shown="all"
+    robots: tuple[Positive, ...] = option(
+        (1, 2, 3), "Numbers of robots K, comma-separated.", hint="Use at least one robot."
     )
-    measurements: int = option(15, "Number of measurements B in a step, of all robots together.")
+    regimes: tuple[Literal["paper", "look_alikes", "good"], ...] = option(
+        ("paper", "look_alikes", "good"), "Noise regimes: paper, look_alikes, good.", shown="all"
+    )
+    measurements: int = option(15, "Number of measurements B per step, of all robots together.")
     length: float = option(100.0, "Length of each robot's path [m].")
 
     def check(self) -> None:
-        """Refuse what no trial can be."""
+        """Refuse combinations without a valid trial."""
         from training.bench.accuracy.world import check_crossings
 
         self.error_trials()
@@ -102,7 +108,7 @@ class Fig6Config(ExperimentConfig):
         check_crossings(max(self.robots))
 
     def error_trials(self) -> list["ErrorTrial"]:
-        """Return the trials of the map error, those on the same run in a row, seed by seed."""
+        """Return the trials of the map error, ordered by seed, with the trials of one run in succession."""
         from training.paper.fig6.trials import BOUND, FEW, REGIMES, ErrorTrial
 
         return [
@@ -114,7 +120,7 @@ class Fig6Config(ExperimentConfig):
         ]
 
     def time_trials(self) -> list["TimeTrial"]:
-        """Return the trials of the time per step, seed by seed; none without the paper's regime."""
+        """Return the trials of the step time, ordered by seed; none without the paper's regime."""
         from training.paper.fig6.trials import TimeTrial
 
         seeds = range(self.seed, self.seed + self.seeds) if "paper" in self.regimes else ()

@@ -1,4 +1,4 @@
-"""The paper's Fig. 1: clouds of particles along the paths of a few robots, by odometry alone and with what they see."""
+"""Fig. 1 of the paper: particles along the paths of several robots, with odometry only and with measurements."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,39 +22,39 @@ from training.paper.config import Fig1Config
 from training.paper.fig6.trials import FILTER_OPTIONS, REGIMES
 from vslam_env.rendering.palette import FAINT_INK, TRUE_LANDMARK, WALL, robot_colour
 
-WIDTH = 3.5  # of a column of text [in]
-SMALL = 0.1  # [m]; clouds whose RMS spread is below this are shown enlarged too
+WIDTH = 3.5  # width of a text column [in]
+SMALL = 0.1  # [m]; clouds with a smaller RMS spread are also shown enlarged
 ENLARGED = 6.0
 INK = "0.25"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Clouds:
-    """Particles along the paths of K robots."""
+    """Sets of particles along the paths of K robots."""
 
-    steps: IntArray  # (n,) int64. When they were taken, the start first.
+    steps: IntArray  # (n,) int64. Steps of the sets, starting with the start.
     poses: FloatArray  # (n, K, M, 3) float64 [m, m, rad], world frame. All particles, after resampling.
-    # (K, T, 3) float64 [m, m, rad], world frame. Without measurements: of the odometry as it was read; with them: the
-    # filter's estimate of each pose at its own step.
+    # (K, T, 3) float64 [m, m, rad], world frame. Without measurements: the measured odometry; with measurements: the
+    # filter's pose estimates at their own steps.
     paths: FloatArray
-    landmarks: FloatArray  # (N, 3) float64 [m], world frame. The map at the end, empty without measurements.
+    landmarks: FloatArray  # (N, 3) float64 [m], world frame. Final map, empty without measurements.
 
     def spreads(self) -> FloatArray:
-        """Return the RMS distance (n, K) [m] of the particles of each cloud from its mean."""
+        """Return the RMS distance (n, K) [m] of the particles of each set from their mean."""
         apart = self.poses[..., :2] - self.poses[..., :2].mean(axis=2, keepdims=True)
         return np.asarray(np.sqrt((apart**2).sum(axis=3).mean(axis=2)))
 
 
 def simulate_fig1(config: Fig1Config) -> StereoRun:
-    """Return the run that the figure shows: the robots of Fig. 6's own regime."""
+    """Return the run of the figure, with the robots of Fig. 6 in the paper's regime."""
     return simulate_run(REGIMES["paper"].spec(config.robots, config.length), config.seed)
 
 
 def draw_clouds(run: StereoRun, config: Fig1Config, measured: bool) -> Clouds:
-    """Let the particles of `fastslam1` follow the robots.
+    """Run `fastslam1` for the robots, and return its particles.
 
     Args:
-        measured: Whether they weigh and learn from what the robots see; otherwise the motion model alone moves them
+        measured: Whether the filter uses measurements; otherwise only the motion model moves the particles
             (Eq. 4).
     """
     slam = run.build_filter(config.particles, "fastslam1", seed=config.seed, **FILTER_OPTIONS["fastslam1"])
@@ -75,11 +75,11 @@ def draw_clouds(run: StereoRun, config: Fig1Config, measured: bool) -> Clouds:
     )  # fmt: skip
 
 
-def figures_of(run: StereoRun, clouds: Clouds) -> list[dict[str, float]]:
-    """Return for each robot how far path and last cloud are off.
+def path_errors(run: StereoRun, clouds: Clouds) -> list[dict[str, float]]:
+    """Return the errors of path and last particles for each robot.
 
     Returns:
-        `path_rms_m` of the dashed path, `end_error_m` of it at the last cloud, and `end_spread_m` of that cloud.
+        `path_rms_m` of the dashed path, `end_error_m` at the last set of particles, and `end_spread_m` of that set.
     """
     errors = np.linalg.norm((clouds.paths - run.true_paths)[..., :2], axis=2)
     spreads = clouds.spreads()[-1]
@@ -94,10 +94,10 @@ def figures_of(run: StereoRun, clouds: Clouds) -> list[dict[str, float]]:
 
 
 def draw_fig1(file: Path, run: StereoRun, panels: Sequence[tuple[str, str, Clouds]]) -> None:
-    """Draw the panels below each other, to be read at the width of a column, into a PNG file.
+    """Draw the panels one below the other, for the width of a text column, into a PNG file.
 
     Args:
-        panels: Title, name of the dashed line, and clouds of each.
+        panels: Title, name of the dashed line, and particles of each panel.
     """
     ratio = run.office.size[1] / run.office.size[0]
     with mpl.rc_context({"font.size": 7, "axes.titlesize": 7.5, "axes.linewidth": 0.6}):
@@ -120,7 +120,7 @@ def draw_fig1(file: Path, run: StereoRun, panels: Sequence[tuple[str, str, Cloud
 
 
 def _draw_office(ax: Axes, office: Office) -> None:
-    """Draw the blocks of rooms, the outer walls and the true landmarks; metres are equally long along both axes."""
+    """Draw the blocks of rooms, the outer walls and the true landmarks, with equal axes."""
     for x1, y1, x2, y2 in office.blocks:
         ax.add_patch(Rectangle((x1, y1), x2 - x1, y2 - y1, fc="0.96", ec=rgb(WALL), lw=0.8))
     ax.add_patch(Rectangle((0.0, 0.0), *office.size, fc="none", ec=rgb(WALL), lw=0.8))
@@ -134,7 +134,7 @@ def _draw_office(ax: Axes, office: Office) -> None:
 
 
 def _draw_clouds(ax: Axes, run: StereoRun, clouds: Clouds) -> None:
-    """Draw the map, and each robot's true path, dashed path and clouds; a particle is a dash along its heading."""
+    """Draw the map, and each robot's true path, dashed path and particles as dashes along their headings."""
     ax.plot(*clouds.landmarks[:, :2].T, ls="", marker="+", ms=2.2, mew=0.45, color=INK, zorder=2)
     for robot, true in enumerate(run.true_paths):
         colour = rgb(robot_colour(robot))
@@ -151,14 +151,14 @@ def _draw_clouds(ax: Axes, run: StereoRun, clouds: Clouds) -> None:
 
 
 def _draw_particles(ax: Axes, poses: FloatArray, length: float, colour: tuple[float, float, float]) -> None:
-    """Draw poses (n, 3) as dashes of this length [m] along their headings."""
+    """Draw poses (n, 3) as dashes of the given length [m] along their headings."""
     half = 0.5 * length * np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])])
     dashes = np.stack([poses[:, :2] - half, poses[:, :2] + half], axis=1)
     ax.add_collection(LineCollection(list(dashes), colors=[colour], linewidths=0.35, alpha=0.4, zorder=5))
 
 
 def _enlarge_ends(ax: Axes, run: StereoRun, clouds: Clouds) -> None:
-    """Show the last clouds enlarged inside the blocks of rooms, as far as there are blocks."""
+    """Draw the last sets of particles enlarged inside the blocks of rooms, as far as there are blocks."""
     for robot, (x1, y1, x2, y2) in zip(range(len(run.true_paths)), run.office.blocks, strict=False):
         colour, width, height = rgb(robot_colour(robot)), 0.9 * (x2 - x1), 0.9 * (y2 - y1)
         box = (x1 + 0.05 * (x2 - x1), y1 + 0.05 * (y2 - y1), width, height)
@@ -176,7 +176,7 @@ def _enlarge_ends(ax: Axes, run: StereoRun, clouds: Clouds) -> None:
 
 
 def _legend(robots: int) -> list[Line2D]:
-    """Return what the strokes mean."""
+    """Return the entries of the legend."""
     colours = [Line2D([], [], color=rgb(robot_colour(k)), lw=1.6, label=f"robot {k + 1}") for k in range(robots)]
     return [
         *colours, Line2D([], [], color=rgb(FAINT_INK), lw=0.9, label="true path"),

@@ -1,4 +1,4 @@
-"""The paper's Fig. 2: how far off each method's motion between two maps is, against the size of the maps."""
+"""Fig. 2 of the paper: errors of alignment methods over the size of the two maps."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -20,9 +20,9 @@ TRIALS_FILE = "runs.jsonl"
 PAPER_METHODS = ("svd", "icp", "impicp", "ransac")
 OURS = "ours"  # ransac with refinement and refusals
 METHODS = (*PAPER_METHODS, OURS)
-ENOUGH_SHARED = 12  # landmarks that both maps hold; with fewer there is nothing to align
-BIN = 50  # landmarks
-# What "practically zero" is taken for: medians over the runs, in each bin.
+ENOUGH_SHARED = 12  # shared landmarks below which maps need not be alignable
+BIN = 50  # width of a bin [landmarks]
+# Thresholds of "practically zero", for medians over the runs in each bin.
 PRACTICALLY_ZERO = {"translation_m": 0.2, "rotation_deg": 1.0}
 LABELS = {"translation_m": "translation [m]", "rotation_deg": "rotation [°]"}
 
@@ -43,11 +43,11 @@ class Fig2Trial:
 
 
 def play(trial: Fig2Trial) -> dict[str, Any]:
-    """Let two robots map, and align their maps along the way.
+    """Let two robots map, and align their maps at each stage of the path.
 
     Returns:
-        The trial's fields and `stages`: rows of `length`, `size` (mean number of landmarks of both maps), `shared` true
-        landmarks, and for each method `translation_m` and `rotation_deg`, None where it finds or accepts none.
+        Fields of the trial and `stages`: rows of `length`, `size` (mean number of landmarks of the two maps), `shared`
+        true landmarks, and `translation_m` and `rotation_deg` of each method, None where it gives no alignment.
     """
     run = simulate_pair(trial.seed, trial.length, trial.landmarks)
     truth = true_motion(run)
@@ -65,7 +65,7 @@ def play(trial: Fig2Trial) -> dict[str, Any]:
 
 
 def _error(motion: FloatArray | None, truth: FloatArray) -> dict[str, float] | None:
-    """Return how far off a motion is."""
+    """Return the errors of a transform."""
     if motion is None:
         return None
     turned = abs(float(np.rad2deg(wrap_angle(motion[2] - truth[2]))))
@@ -73,11 +73,11 @@ def _error(motion: FloatArray | None, truth: FloatArray) -> dict[str, float] | N
 
 
 def summarise(rows: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return a line for each bin of map sizes and each method, over the stages at which maps share enough.
+    """Return one line for each bin of map sizes and each method, over the stages with enough shared landmarks.
 
     Returns:
-        Lines of `size` (middle of the bin), `method`, `stages`, `found` (share of them), and `_median`, `_mean` and
-        `_p90` of `translation_m` and `rotation_deg` where a motion was found; None where none was.
+        Lines of `size` (middle of the bin), `method`, `stages`, `found` (share of stages with a result), and `_median`,
+        `_mean` and `_p90` of `translation_m` and `rotation_deg` over these; None without a result.
     """
     bins: dict[int, list[Mapping[str, Any]]] = {}
     for row in rows:
@@ -100,7 +100,7 @@ def summarise(rows: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def refusals(rows: Iterable[Mapping[str, Any]]) -> dict[str, int]:
-    """Return at how many stages maps that share too little were met, and how many of them ours accepted wrongly."""
+    """Return the number of stages with too few shared landmarks, and of false alignments of ours among them."""
     poor = [stage for row in rows for stage in row["stages"] if stage["shared"] < ENOUGH_SHARED]
     false = [
         stage for row in rows for stage in row["stages"]
@@ -114,10 +114,10 @@ def refusals(rows: Iterable[Mapping[str, Any]]) -> dict[str, int]:
 
 
 def check_claims(lines: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Ask the paper's statement of the data: RANSAC is best, and practically zero whatever the size of the maps.
+    """Check the paper's claim: RANSAC is best, with practically zero error for any size of the maps.
 
     Returns:
-        Rows of `claim`, `measured`, `at_most` and `holds`; means are over all sizes alike.
+        Rows of `claim`, `measured`, `at_most` and `holds`; means weigh all sizes equally.
     """
     claims: list[dict[str, Any]] = []
     sizes = sorted({line["size"] for line in lines})
@@ -138,7 +138,7 @@ def check_claims(lines: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def to_csv(rows: Iterable[Mapping[str, Any]]) -> str:
-    """Return every stage and method as text with commas between."""
+    """Return every stage and method as CSV."""
     headings = ["seed", "length_m", "size", "shared", "method", *PRACTICALLY_ZERO]
     lines = []
     for row in rows:
@@ -150,7 +150,7 @@ def to_csv(rows: Iterable[Mapping[str, Any]]) -> str:
 
 
 def draw_fig2(file: Path, lines: Sequence[Mapping[str, Any]]) -> None:
-    """Draw medians as lines and the middle 10 to 90 % up to its upper end as bars, on a log scale, into a PNG file."""
+    """Draw medians as lines and 90 % quantiles as error bars, on a log scale, into a PNG file."""
     with mpl.rc_context({"font.size": 9}):
         figure = Figure(figsize=(10.0, 4.0), layout="constrained")
         panels = figure.subplots(1, 2)

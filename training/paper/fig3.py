@@ -1,4 +1,4 @@
-"""The paper's Figs. 3 and 4: two maps, what matches, the motion found; and what fusing does to the ellipses."""
+"""Figs. 3 and 4 of the paper: matches and transform of two maps; covariance ellipses before and after fusion."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,28 +21,28 @@ from training.experiments.tables import csv_text
 from training.paper.config import PairConfig
 from training.paper.map_pairs import Stage, map_alone, simulate_pair, true_motion
 
-SHOWN = 3  # landmarks of Fig. 4
+SHOWN = 3  # number of landmarks in Fig. 4
 
 COLOURS = {"map 1": "#0072B2", "map 2": "#D55E00", "fused": "#009E73"}
-APART = 3.0  # between the two maps in the left panel [m]
+APART = 3.0  # gap between the two maps in the left panel [m]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AlignedPair:
-    """Two robots' own maps and the motion found between them."""
+    """Maps of two robots and the estimated transform between them."""
 
-    stage: Stage  # What they hold
-    candidates: IntArray  # (k, 2) rows (a, b) of landmarks that look alike
-    alignment: Alignment  # Successful
-    truth: FloatArray  # (3,) True motion between the start frames [m, m, rad]
+    stage: Stage  # Both maps
+    candidates: IntArray  # (k, 2) rows (a, b) of landmarks with similar descriptors
+    alignment: Alignment  # Successful alignment
+    truth: FloatArray  # (3,) True transform between the start frames [m, m, rad]
 
     @property
     def maps(self) -> tuple[LandmarkMap, LandmarkMap]:
-        """Both maps, own start frames."""
+        """Both maps, in their start frames."""
         return self.stage.maps
 
     def figures(self) -> dict[str, Any]:
-        """Return how many landmarks match, how many of these truly, and how far the motion is off."""
+        """Return the number of matches, the number of true ones among them, and the errors of the transform."""
         names_a, names_b = (own[rows] for own, rows in zip(self.stage.names, self.alignment.inliers.T, strict=True))
         error = self.alignment.transform - self.truth
         return {
@@ -57,31 +57,31 @@ class AlignedPair:
 
 
 def align_pair(config: PairConfig) -> AlignedPair:
-    """Let two robots map alone for a while, and align their maps.
+    """Let two robots map separately, and align their maps.
 
     Raises:
-        ValueError: If these maps cannot be aligned.
+        ValueError: If the maps cannot be aligned.
     """
     run = simulate_pair(config.seed, config.length, config.landmarks)
     *_, stage = map_alone(run, config.particles, config.seed, config.length)
     found = align_maps(*stage.maps, rng=np.random.default_rng(config.seed))
     if not found.success:
-        cure = "Let the robots drive farther, or take another seed."
-        raise argument_error("length", "maps that can be aligned", f"a refusal: {found.reason}", cure)
+        hint = "Let the robots drive farther, or take another seed."
+        raise argument_error("length", "maps that can be aligned", f"a refusal: {found.reason}", hint)
     return AlignedPair(stage, candidate_matches(*stage.maps, AlignmentOptions()), found, true_motion(run))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FusedLandmarks:
-    """A few landmarks before and after fusion, frame of the first map."""
+    """Several landmarks before and after fusion, frame of the first map."""
 
-    names: IntArray  # (n,) true landmarks
-    means: FloatArray  # (3, n, 3) float64 [m]. Of the first map, of the second one moved, and fused.
-    covariances: FloatArray  # (3, n, 3, 3) float64 [m^2]. Likewise; those moved hold the alignment's uncertainty, too.
+    names: IntArray  # (n,) Numbers of the true landmarks
+    means: FloatArray  # (3, n, 3) float64 [m]. Means in the first map, the second map after alignment, the fused map.
+    covariances: FloatArray  # (3, n, 3, 3) float64 [m^2]. Covariances; aligned ones include the transform's.
 
 
 def fuse_pair(pair: AlignedPair, shown: int = SHOWN) -> FusedLandmarks:
-    """Fuse both maps, and return the shared landmarks of which both together know least in the plane."""
+    """Fuse both maps, and return the shared landmarks with the largest fused uncertainty in the plane."""
     (map_a, map_b), found = pair.maps, pair.alignment
     rows_a, rows_b = found.inliers.T
     fused = fuse_maps(map_a, map_b, found)
@@ -98,7 +98,7 @@ def fuse_pair(pair: AlignedPair, shown: int = SHOWN) -> FusedLandmarks:
 
 
 def matches_csv(pair: AlignedPair) -> str:
-    """Return every inlier: where either map has it, and where the motion found puts that of the second."""
+    """Return every inlier as CSV: its position in both maps, and the aligned position of the second."""
     headings = ["true_a", "true_b", "ax", "ay", "az", "bx", "by", "bz", "moved_x", "moved_y"]
     map_a, map_b = pair.maps
     rows = []
@@ -110,7 +110,7 @@ def matches_csv(pair: AlignedPair) -> str:
 
 
 def ellipses_csv(fused: FusedLandmarks) -> str:
-    """Return means and covariances before and after fusion."""
+    """Return means and covariances before and after fusion as CSV."""
     headings = ["landmark", "which", "x", "y", "z", "xx", "xy", "xz", "yy", "yz", "zz"]
     upper = np.triu_indices(3)
     rows = []
@@ -121,7 +121,7 @@ def ellipses_csv(fused: FusedLandmarks) -> str:
 
 
 def draw_fig3(file: Path, pair: AlignedPair) -> None:
-    """Draw both maps in their own frames with lines between what matches, and one over the other, into a PNG file."""
+    """Draw both maps in their own frames with lines between matches, and the aligned maps, into a PNG file."""
     map_a, map_b = pair.maps
     offset = np.array([0.0, map_a.means[:, 1].min() - map_b.means[:, 1].max() - APART])
     rows_a, rows_b = pair.alignment.inliers.T
@@ -134,7 +134,7 @@ def draw_fig3(file: Path, pair: AlignedPair) -> None:
         _dots(left, map_b.means[:, :2] + offset, "map 2")
         left.plot(*np.zeros(2), marker="+", ms=10, color=COLOURS["map 1"])
         left.plot(*offset, marker="+", ms=10, color=COLOURS["map 2"])
-        left.set_title(f"(a) own frames; {len(rows_a)} matches\nof {len(pair.candidates)} look-alikes", loc="left")
+        left.set_title(f"(a) own frames; {len(rows_a)} matches\nof {len(pair.candidates)} candidates", loc="left")
         moved = transform_points(pair.alignment.transform, map_b.means)
         right.scatter(
             *map_a.means[rows_a, :2].T, s=60, marker="o", facecolor="none", edgecolor="0.6", lw=0.7, label="matched"
@@ -143,7 +143,7 @@ def draw_fig3(file: Path, pair: AlignedPair) -> None:
         _dots(right, moved[:, :2], "map 2")
         figures = pair.figures()
         right.set_title(
-            f"(b) map 2 moved into the frame of map 1,\noff by {100 * figures['translation_error_m']:.0f} cm and "
+            f"(b) map 2 moved into the frame of map 1,\nerror {100 * figures['translation_error_m']:.0f} cm and "
             f"{figures['rotation_error_deg']:.1f}°",
             loc="left",
         )
@@ -157,7 +157,7 @@ def draw_fig3(file: Path, pair: AlignedPair) -> None:
 
 
 def draw_fig4(file: Path, fused: FusedLandmarks) -> None:
-    """Draw the 95 % ellipses of a few landmarks before and after fusion, a column for each, into a PNG file."""
+    """Draw the 95 % ellipses of several landmarks before and after fusion, one per column, into a PNG file."""
     count = len(fused.names)
     with mpl.rc_context({"font.size": 9}):
         figure = Figure(figsize=(3.6 * count, 7.2), layout="constrained")

@@ -1,4 +1,4 @@
-"""Fig. 5 of the paper: three robots in a room, the landmarks that they see, and those that walls hide from them."""
+"""Fig. 5 of the paper: three robots in a room, the landmarks that they see, and those hidden by walls."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,28 +23,28 @@ from vslam_env.world.visibility import view_limits, visible_landmarks
 STATES = ("hidden", "seen", "measured")
 
 WIDTH = 7.0  # [in]
-BODY = 0.35  # [m] drawn larger than it is
+BODY = 0.35  # radius of drawn robots [m], larger than the true one
 INK = "0.15"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fig5:
-    """What the figure shows, world frame."""
+    """Content of the figure, world frame."""
 
     walls: FloatArray  # (S, 4) float64 [m]
     landmarks: FloatArray  # (N, 3) float64 [m]
     poses: FloatArray  # (K, 3) float64 [m, m, rad]. True poses.
     paths: FloatArray  # (K, T, 2) float64 [m]. True paths.
-    half_fov: float  # Of the cameras [rad]
+    half_fov: float  # Half the field of view of the cameras [rad]
     max_range: float  # [m]
-    # (K, N) bool. In range and in the image, looked at from their wall's face: what a robot would see in a room whose
-    # walls were glass.
+    # (K, N) bool. Landmarks in range and in the image that face the robot: what a robot would see in a room with glass
+    # walls.
     in_view: BoolArray
-    seen: BoolArray  # (K, N) bool. What it does see.
-    measured: BoolArray  # (K, N) bool. What it integrates in this tick.
+    seen: BoolArray  # (K, N) bool. Visible landmarks.
+    measured: BoolArray  # (K, N) bool. Landmarks measured in this tick.
 
     def figures(self) -> list[dict[str, int]]:
-        """Return per robot how many landmarks are in view, hidden, seen and measured."""
+        """Return the numbers of landmarks in view, hidden, seen and measured of each robot."""
         return [
             {
                 "in_view": int(view.sum()), "hidden": int((view & ~seen).sum()), "seen": int(seen.sum()),
@@ -54,7 +54,7 @@ class Fig5:
         ]  # fmt: skip
 
     def to_csv(self) -> str:
-        """Return a row for each robot and landmark in its view: where both are, and what became of the landmark."""
+        """Return a CSV row for each robot and landmark in its view: positions, and whether it is seen and measured."""
         headings = ["robot", "x", "y", "theta", "landmark", "landmark_x", "landmark_y", "landmark_z", "state"]
         rows = []
         for robot, pose in enumerate(self.poses):
@@ -66,17 +66,17 @@ class Fig5:
 
 
 def simulate_fig5(config: Fig5Config) -> Fig5:
-    """Let robots explore the room for a while, and tell what each sees at the end."""
+    """Let robots explore the room for a while, and return what each sees at the end."""
     chosen = EnvConfig().replace(landmark_sensor={"max_measurements": config.measurements})
     env = vslam_v0.parallel_env(
         world="fig5", num_robots=config.robots, action_type="goal", max_cycles=config.decisions, config=chosen
     )
     _explore(env, config.seed)
-    return _as_seen(env)
+    return _visibility(env)
 
 
 def _explore(env: ExplorationEnv, seed: int) -> None:
-    """Play an episode of nearest-frontier explorers."""
+    """Run an episode of nearest-frontier exploration."""
     policies = {agent: make_policy("frontier", "goal") for agent in env.possible_agents}
     rng = np.random.default_rng(seed)
     observations, _ = env.reset(seed=seed)
@@ -85,8 +85,8 @@ def _explore(env: ExplorationEnv, seed: int) -> None:
         observations = env.step(actions)[0]
 
 
-def _as_seen(env: ExplorationEnv) -> Fig5:
-    """Return what the robots see now, and what they would see without walls and each other."""
+def _visibility(env: ExplorationEnv) -> Fig5:
+    """Return what the robots see now, and what they would see without walls and other robots."""
     episode, sight = env.episode, env.config.landmark_sensor
     marks, poses = env.world.landmarks, env.true_poses
     assert marks is not None

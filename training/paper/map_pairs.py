@@ -1,4 +1,4 @@
-"""Two robots that do not know of each other map one office: what they hold along the way, and what is true of it."""
+"""Maps of two independent robots in one office at several stages, with the true data associations."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,30 +12,30 @@ from slam_backend.maps.landmark_map import LandmarkMap
 from training.bench.accuracy.runs import FALSE_POINT, STEP, RunSpec, StereoRun, simulate_run
 
 ROBOTS = 2
-MEASUREMENTS = 16  # in a step, of both together
-# As in the simulation's unknown association: landmarks that look alike in threes, false points, wrong descriptors.
+MEASUREMENTS = 16  # per step, of both robots together
+# As in the simulation's unknown association: groups of three similar landmarks, false points, wrong descriptors.
 LOOK_ALIKES = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stage:
-    """What both robots hold after some way."""
+    """Maps of both robots after a certain path length."""
 
-    length: float  # That each has driven [m]
-    # Of either robot, own start frame; covariances of the mixture, the path's uncertainty included
+    length: float  # Path length of each robot [m]
+    # Map of each robot, start frame; mixture covariances, which include the uncertainty of the path
     maps: tuple[LandmarkMap, LandmarkMap]
-    # Per robot (N,) int64. The true landmark behind each of its map; `FALSE_POINT`: none.
+    # True landmark of each landmark in each map, (N,) int64; `FALSE_POINT`: none
     names: tuple[IntArray, IntArray]
 
     @property
     def shared(self) -> int:
-        """How many true landmarks both maps hold."""
+        """Number of true landmarks that both maps contain."""
         held = [set(own[own != FALSE_POINT].tolist()) for own in self.names]
         return len(held[0] & held[1])
 
 
 def simulate_pair(seed: int, length: float, landmarks: int) -> StereoRun:
-    """Draw an office and two robots' ways through it, from crossings of their own."""
+    """Sample an office and the paths of two robots through it, from different crossings."""
     return simulate_run(
         RunSpec(
             robots=ROBOTS, length=length, measurements=MEASUREMENTS, landmarks=landmarks, association="unknown",
@@ -46,15 +46,15 @@ def simulate_pair(seed: int, length: float, landmarks: int) -> StereoRun:
 
 
 def true_motion(run: StereoRun) -> FloatArray:
-    """Return the motion (3,) from the second robot's start frame to the first one's [m, m, rad]."""
+    """Return the transform (3,) from the second robot's start frame to the first one's [m, m, rad]."""
     return between(run.true_paths[0, 0], run.true_paths[1, 0])
 
 
 def map_alone(run: StereoRun, particles: int, seed: int, every: float) -> Iterator[Stage]:
-    """Let each robot map by itself, from a start that it takes for the origin.
+    """Let each robot map on its own, with its start as the origin.
 
     Yields:
-        Stages, the last at the end of the run.
+        Stages; the last one is at the end of the run.
     """
     noise = run.spec.noise
     streams = np.random.SeedSequence(seed).spawn(ROBOTS)

@@ -1,4 +1,4 @@
-"""Pictures of replays: paths and maps against the truth, a panel per robot and joint map, and one filter's replay."""
+"""Plots of replays: paths and maps against the ground truth, for a team or a single robot."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,21 +17,21 @@ from training.replay.metrics import AlignedMap, PathScore, align_to_truth
 from training.replay.mrclam import Replay
 from training.replay.single_robot import OneReplay, PositionScore
 
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#B8860B")  # told apart by colour-blind eyes too
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#B8860B")  # safe for colour-blind readers
 TRUTH = "#9a9a9a"
 COLUMNS = 3
 
-MARGIN = 0.06  # of the larger extent, around what the picture must show
-STRAY = 0.001  # share of the known positions at each edge that it need not show: a fix may jump by 100 m
+MARGIN = 0.06  # margin around the content, relative to the larger extent
+STRAY = 0.001  # share of outliers ignored at each edge: a GPS fix may jump by 100 m
 WIDTH = 8.0  # [in]
-OFTEN = 10  # measurements that make a landmark a sure one
+OFTEN = 10  # measurements from which a landmark is drawn opaque
 
 
 def draw_replay(file: Path, log: MrclamLog, replay: Replay, paths: Sequence[PathScore | None]) -> None:
     """Draw the replay into a PNG file.
 
     Args:
-        paths: Scores of `score_path`, per robot; None where the truth is not known.
+        paths: Path scores of `score_path` for each robot; None without ground truth.
     """
     joint = [group for group in replay.groups if len(group) > 1]
     panels = len(log.robots) + len(joint)
@@ -51,10 +51,10 @@ def draw_replay(file: Path, log: MrclamLog, replay: Replay, paths: Sequence[Path
 def draw_joint_map(
     file: Path, log: MrclamLog, replay: Replay, paths: Sequence[PathScore | None], group: tuple[int, ...]
 ) -> None:
-    """Draw the map that a group of robots shares at the end, with their paths, alone into a PNG file.
+    """Draw the final map of a group of robots, with their paths, into a PNG file of its own.
 
     Args:
-        paths: Scores of `score_path`, per robot; None where the truth is not known.
+        paths: Path scores of `score_path` for each robot; None without ground truth.
     """
     with mpl.rc_context({"font.size": 9, "axes.titlesize": 10}):
         figure = Figure(figsize=(5.2, 7.4), layout="constrained")
@@ -63,7 +63,7 @@ def draw_joint_map(
 
 
 def _draw_robot(ax: Axes, log: MrclamLog, replay: Replay, path: PathScore | None, robot: int) -> None:
-    """Draw one robot's path and dead reckoning, each fitted to the true path, and its map, fitted to the landmarks."""
+    """Draw one robot's path and dead reckoning, aligned to the true path, and its map, aligned to the landmarks."""
     colour = COLOURS[robot % len(COLOURS)]
     title = f"robot {log.robots[robot].robot}"
     fitted = align_to_truth(replay.maps[robot], replay.claims[robot], log)
@@ -87,14 +87,14 @@ def _draw_robot(ax: Axes, log: MrclamLog, replay: Replay, path: PathScore | None
 def _draw_group(
     ax: Axes, log: MrclamLog, replay: Replay, paths: Sequence[PathScore | None], group: tuple[int, ...]
 ) -> None:
-    """Draw the map of several robots and their paths, all moved by one fit of the map to the true landmarks."""
+    """Draw the map of several robots and their paths, all aligned by one fit of the map to the true landmarks."""
     names = ", ".join(str(log.robots[robot].robot) for robot in group)
     first = group[0]
     fitted = align_to_truth(replay.maps[first], replay.claims[first], log)
     own = _own_frame(fitted, paths[first])
     in_world = fitted is not None or paths[first] is not None
     for robot in group:
-        # The map hangs in the first robot's start frame; the others' start frames follow through the group's.
+        # The map is in the first robot's start frame; the group relates it to the other start frames.
         first_from_own = compose(replay.start_from_group[first], inverse(replay.start_from_group[robot]))
         points = transform_points(compose(own, first_from_own), replay.paths[robot][:, :2])
         score = paths[robot]
@@ -108,7 +108,7 @@ def _draw_group(
 
 
 def _own_frame(fitted: AlignedMap | None, path: PathScore | None) -> FloatArray:
-    """Return where a picture puts a robot's start frame (3,): by its map, else by its path, else at the origin."""
+    """Return the start frame (3,) of a robot in the plot: aligned by its map, else by its path, else the identity."""
     if fitted is not None:
         return fitted.world_from_map
     return np.zeros(3) if path is None else path.world_from_path
@@ -122,7 +122,7 @@ def _draw_landmarks(ax: Axes, landmarks: LandmarkMap, colour: str) -> None:
 
 
 def _finish(ax: Axes, log: MrclamLog, title: str) -> None:
-    """Add what all panels share: true landmarks, equal axes, a legend."""
+    """Add the common elements of all panels: true landmarks, equal axes, a legend."""
     if log.positions is not None:
         ax.plot(*log.positions.T, ls="", marker="+", ms=8, mew=1.1, color="#404040", zorder=3, label="true landmarks")
     ax.set_aspect("equal", adjustable="datalim")
@@ -138,14 +138,14 @@ def draw_one(
     scores: tuple[PositionScore, PositionScore] | None = None, truth: FloatArray | None = None,
     truth_label: str = "true path",
 ) -> None:  # fmt: skip
-    """Draw a replay into a PNG file, all fitted to the truth, each path by its own SE(2) alignment.
+    """Draw a replay into a PNG file, with each path aligned to the ground truth by its own SE(2) transform.
 
-    Dead reckoning may leave the picture, which shows estimate and truth, stray known positions apart; the legend says
-    how many of these lie outside.
+    The plot is limited to the estimate and the ground truth, except outliers, and may cut off dead reckoning; the
+    legend gives the number of known positions outside.
 
     Args:
         paths: Positions (T, 2) [m], start frame, of the estimate and of dead reckoning.
-        scores: Of both; None without truth: all is then drawn in the start frame.
+        scores: Scores of estimate and dead reckoning; None without ground truth: the plot then uses the start frame.
     """
     origin = np.zeros(3)
     fits = (origin, origin) if scores is None else (scores[0].world_from_path, scores[1].world_from_path)
@@ -176,7 +176,7 @@ def draw_one(
 
 
 def _window(estimate: FloatArray, truth: FloatArray | None) -> tuple[FloatArray, FloatArray]:
-    """Return the lower and upper corner (2,) [m] of what the picture shows."""
+    """Return the lower and upper corner (2,) [m] of the plot."""
     low, high = estimate.min(axis=0), estimate.max(axis=0)
     if truth is not None:
         few, most = np.quantile(truth, [STRAY, 1.0 - STRAY], axis=0)
@@ -186,7 +186,7 @@ def _window(estimate: FloatArray, truth: FloatArray | None) -> tuple[FloatArray,
 
 
 def _draw_counted(ax: Axes, landmarks: FloatArray, counts: IntArray) -> None:
-    """Draw landmarks (N, 2): those measured often full, the others pale."""
+    """Draw landmarks (N, 2): opaque if measured often, otherwise transparent."""
     often = counts >= OFTEN
     for chosen, alpha, label in ((~often, 0.35, f"seen less than {OFTEN} times"), (often, 1.0, "landmarks")):
         if chosen.any():

@@ -1,4 +1,4 @@
-"""Pictures of what a camera saw: corners and landmarks drawn over images, and two images with what they share."""
+"""Camera images with corners and landmarks, and image pairs with their matches."""
 
 from pathlib import Path
 
@@ -16,12 +16,12 @@ KNOWN, NEW, REFUSED, EXPECTED = (90, 200, 90), (60, 170, 250), (70, 70, 230), (2
 def draw_frame(
     file: Path, image: Image, pixels: FloatArray, ids: IntArray, counts: dict[int, int], expected: FloatArray
 ) -> None:
-    """Draw what a filter made of a frame into a PNG file.
+    """Draw a stereo frame and its data associations into a PNG file.
 
     Args:
-        pixels: (n, 3) float64 [px]. Column, row and disparity of the points that the filter got.
-        ids: (n,) int64. Their landmarks, -1 = refused.
-        expected: (m, 2) float64 [px]. Where landmarks that stand in view are expected.
+        pixels: (n, 3) float64 [px]. Column, row and disparity of the measured points.
+        ids: (n,) int64. Landmark ids of the points, -1 for rejected ones.
+        expected: (m, 2) float64 [px]. Predicted positions of the landmarks in view.
     """
     canvas = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
     for column, row in expected:
@@ -34,10 +34,10 @@ def draw_frame(
 
 
 def draw_matches(file: Path, left: Image, right: Image, a: FloatArray, b: FloatArray, right_ones: IntArray) -> None:
-    """Draw two images one above the other with lines between points (n, 2) [px] that were matched.
+    """Draw two images, one above the other, with lines between matched points (n, 2) [px].
 
     Args:
-        right_ones: Rows of the matches that are right; the others are drawn in red.
+        right_ones: Rows of the correct matches; the others are drawn in red.
     """
     width = max(left.shape[1], right.shape[1])
     canvas = np.zeros((left.shape[0] + right.shape[0], width), np.uint8)
@@ -55,11 +55,11 @@ def draw_matches(file: Path, left: Image, right: Image, a: FloatArray, b: FloatA
 def expected_pixels(
     landmarks: FloatArray, pose: FloatArray, focal_px: float, centre_px: FloatArray, reach: float
 ) -> FloatArray:
-    """Return where landmarks appear to a level camera, (m, 2) [px]; those behind it or beyond `reach` [m] are not.
+    """Return the image positions (m, 2) [px] of landmarks in front of a level camera within `reach` [m].
 
     Args:
         landmarks: (N, 3) [m], start frame: x ahead, y left, z above the camera.
-        pose: (3,) [m, m, rad], start frame. Of the camera.
+        pose: (3,) [m, m, rad], start frame. Pose of the camera.
     """
     local = transform_points(inverse(pose), landmarks)
     local = local[(local[:, 0] > 1.0) & (local[:, 0] < reach)]
@@ -67,7 +67,7 @@ def expected_pixels(
 
 
 def _fine(column: float, row: float) -> tuple[int, int]:
-    """Return a point in sixteenths of a pixel, as OpenCV draws it."""
+    """Return a point in sixteenths of a pixel, the unit of OpenCV's drawing functions."""
     return round(16.0 * float(column)), round(16.0 * float(row))
 
 

@@ -1,4 +1,4 @@
-"""The replay of a KITTI drive: tracked stereo features, whose tracks are the landmarks, in the plane."""
+"""Replay of a KITTI drive in the plane, with tracked stereo features as landmarks."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,27 +24,27 @@ from training.replay.single_robot import (
     score_paths,
 )
 
-# A track has its number for a descriptor, so that none is taken for another, and unlike a given identity leaves the
-# gate in force: tracks on other cars are refused, and a refused track never starts a second landmark.
+# The number of a track is its descriptor, so that tracks are never confused. Unlike given identities, this keeps the
+# gate active: tracks on other cars are rejected, and a rejected track never creates a second landmark.
 OWN_TRACK = 0.5
 NEW_LANDMARK_GATE = 1e9
-# Other cars can outvote what stands: the pose is not widened because most tracks contradict it.
+# Points on other cars can outnumber static ones: contradicting tracks do not widen the pose.
 RECOVERY_POSITION = 0.0
-LOOP_AFTER = 100.0  # [m] driven before a place counts as seen again
-LOOP_WITHIN = 10.0  # [m] between two poses of one place
-SEGMENTS = range(100, 801, 100)  # [m] over which KITTI compares motions, from every `SEGMENT_EVERY`th pose
+LOOP_AFTER = 100.0  # path length before a place counts as revisited [m]
+LOOP_WITHIN = 10.0  # maximum distance between two poses at one place [m]
+SEGMENTS = range(100, 801, 100)  # lengths of KITTI's segments [m], from every `SEGMENT_EVERY`th pose
 SEGMENT_EVERY = 10
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DriveScore:
-    """Paths of the left camera against the true one, in the plane; pairs are of the estimate and of odometry alone."""
+    """Paths of the left camera against the true path, in the plane; pairs are (estimate, odometry)."""
 
-    truth: FloatArray  # (n, 3) float64 [m, m, rad]. At the first n steps.
-    # Twice (T, 3) float64 [m, m, rad], start frame. Where the camera is at each step.
+    truth: FloatArray  # (n, 3) float64 [m, m, rad]. True poses at the first n steps.
+    # Twice (T, 3) float64 [m, m, rad], start frame. Camera poses at each step.
     paths: tuple[FloatArray, FloatArray]
     scores: tuple[PositionScore, PositionScore]  # Scores of both
-    # Steps (earlier, later) at which the car was at one place again, nearest of all; None if it never was
+    # Steps (earlier, later) at which the car was nearest to an earlier place; None if it never returned
     loop: tuple[int, int] | None
     loop_error: float  # Error [m] of the estimated motion between these two steps; NaN if there are none
     drifts: tuple[float, float]  # Mean errors of the motions over segments; see `mean_drift`
@@ -57,7 +57,7 @@ class DriveScore:
 
 
 def replay(log: KittiLog, config: KittiConfig, on_step: Callable[[float], None] = lambda done: None) -> OneReplay:
-    """Let a filter live through a drive; poses are those of the inertial unit."""
+    """Run a filter on a drive; poses are of the inertial unit."""
     camera = make_camera(log, config.sigma_px, config.sigma_disparity_px)
     readings = to_filter_steps(log, camera)
     options = FilterOptions(
@@ -72,14 +72,14 @@ def replay(log: KittiLog, config: KittiConfig, on_step: Callable[[float], None] 
 
 
 def score(result: OneReplay, log: KittiLog) -> DriveScore | None:
-    """Score a replay against the true path of the camera; None if that is not known."""
+    """Score a replay against the true path of the camera; None without ground truth."""
     mount = np.array([*log.mount[:2], 0.0])
     paths = compose(result.path, mount), compose(result.reckoned, mount)
     return None if log.truth is None else score_drive(paths, log.truth)
 
 
 def score_drive(paths: tuple[FloatArray, FloatArray], trajectory: Trajectory) -> DriveScore:
-    """Score the camera's paths (T, 3) [m, m, rad], start frame, by estimate and odometry, against the true one."""
+    """Score the camera's paths (T, 3) [m, m, rad], start frame, of estimate and odometry, against the true path."""
     truth = trajectory.poses[: len(paths[0])]
     one, other = score_paths(paths, truth)
     loop, error = find_loop(truth), float("nan")
@@ -91,7 +91,7 @@ def score_drive(paths: tuple[FloatArray, FloatArray], trajectory: Trajectory) ->
 
 
 def drive_metrics(scored: DriveScore | None, odometry: str) -> dict[str, float]:
-    """Return the metrics of a drive under the names of `metrics.json`, NaN where the truth is not known."""
+    """Return the metrics of a drive by their names in `metrics.json`, NaN without ground truth."""
     length, ends, drifts = (
         (scored.length, scored.ends, scored.drifts) if scored else (np.nan, (np.nan,) * 2, (np.nan,) * 2)
     )
@@ -102,15 +102,15 @@ def drive_metrics(scored: DriveScore | None, odometry: str) -> dict[str, float]:
 
 
 def mean_drift(path: FloatArray, truth: FloatArray) -> float:
-    """Return the mean error of the estimated motion over segments of the true path, as a share of their lengths.
+    """Return the mean error of the estimated motion over segments of the true path, relative to their lengths.
 
-    Segments are of 100, 200, ..., 800 m, and weigh alike (Geiger, Lenz, Urtasun, CVPR 2012).
+    Segments have 100, 200, ..., 800 m, with equal weights (Geiger, Lenz, Urtasun, CVPR 2012).
 
     Args:
-        truth: (n, 3) float64 [m, m, rad]. At the first n <= T steps, any frame.
+        truth: (n, 3) float64 [m, m, rad]. True poses at the first n <= T steps, any frame.
 
     Returns:
-        The share; NaN if the true path is shorter than 100 m.
+        The relative error; NaN if the true path is shorter than 100 m.
     """
     driven = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(truth[:, :2], axis=0).T))])
     errors = [np.empty(0)]
@@ -125,7 +125,7 @@ def mean_drift(path: FloatArray, truth: FloatArray) -> float:
 
 
 def find_loop(truth: FloatArray) -> tuple[int, int] | None:
-    """Return the two nearest poses among (n, 3), a way apart, as (earlier, later); None if the car never came back."""
+    """Return the steps (earlier, later) of the closest revisit in (n, 3) poses; None if the car never returned."""
     driven = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(truth[:, :2], axis=0).T))])
     apart = np.hypot(*(truth[:, None, :2] - truth[None, :, :2]).transpose(2, 0, 1))
     apart[driven[None, :] - driven[:, None] < LOOP_AFTER] = np.inf
@@ -134,6 +134,6 @@ def find_loop(truth: FloatArray) -> tuple[int, int] | None:
 
 
 def summarise(result: OneReplay, scored: DriveScore | None) -> dict[str, Any]:
-    """Return the content of `metrics.json`; what cannot be known is NaN, as are errors of the map."""
+    """Return the content of `metrics.json`; unknown values are NaN, including errors of the map."""
     own = drive_metrics(scored, "dead_reckoning") | {"loop_error_m": scored.loop_error if scored else float("nan")}
     return metrics_of(result, scored.scores if scored else None, own)

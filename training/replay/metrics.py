@@ -1,4 +1,4 @@
-"""A replay is scored against the true paths and landmarks of its log."""
+"""Metrics of a replay against the true paths and landmarks of its log."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,31 +19,31 @@ from training.replay.mrclam import Replay
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PathScore:
-    """One robot's path against the truth, where there is one."""
+    """Path of one robot against the true path, where it is known."""
 
     known: BoolArray  # (T,) bool. Steps at which the true pose is known.
     truth: FloatArray  # (known steps, 3) float64 [m, m, rad], world frame
-    world_from_start: FloatArray  # (3,) The start frame put at the true start pose
-    ate_start: float  # [m] With that pose, without fitting
-    ate_aligned: float  # [m] After SE(2) alignment of the whole path
-    world_from_path: FloatArray  # (3,) That alignment
-    reckoned_start: float  # [m] As `ate_start`, of dead reckoning
-    reckoned_aligned: float  # [m] As `ate_aligned`, of dead reckoning
-    world_from_reckoned: FloatArray  # (3,) Its alignment
+    world_from_start: FloatArray  # (3,) True start pose
+    ate_start: float  # ATE from the true start pose, without fitting [m]
+    ate_aligned: float  # ATE after SE(2) alignment of the whole path [m]
+    world_from_path: FloatArray  # (3,) Alignment of the path
+    reckoned_start: float  # `ate_start` of dead reckoning [m]
+    reckoned_aligned: float  # `ate_aligned` of dead reckoning [m]
+    world_from_reckoned: FloatArray  # (3,) Alignment of dead reckoning
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AlignedMap:
-    """A map fitted to the true landmarks that its own claim to be."""
+    """Map aligned to the true landmarks by its claims."""
 
-    world_from_map: FloatArray  # (3,) float64 [m, m, rad]. The fit, over one landmark per true one: the one seen most.
+    world_from_map: FloatArray  # (3,) float64 [m, m, rad]. Fit over the most-seen landmark of each true one.
     landmarks: LandmarkMap  # The map in the world frame
     claims: IntArray  # (N,) int64. Row in `MrclamLog.positions` of each landmark.
     score: MapScore  # RMS error, recall and precision after the fit, in the plane
 
 
 def score_path(replay: Replay, robot: int, truth: Trajectory | None) -> PathScore | None:
-    """Score the path of a robot, counted from 0; None if fewer than two of its steps have a true pose."""
+    """Score the path of a robot, counted from 0; None if fewer than two steps have a true pose."""
     if truth is None:
         return None
     known = (replay.times >= truth.times[0]) & (replay.times <= truth.times[-1])
@@ -62,10 +62,10 @@ def score_path(replay: Replay, robot: int, truth: Trajectory | None) -> PathScor
 
 
 def align_to_truth(landmarks: LandmarkMap, claims: IntArray, log: MrclamLog) -> AlignedMap | None:
-    """Fit a map with claims (N,), rows of `MrclamLog.positions`, to the true landmarks.
+    """Align a map with claims (N,), rows of `MrclamLog.positions`, to the true landmarks.
 
     Returns:
-        The fitted map; None if it claims fewer than two different landmarks, or the log has no true ones.
+        The aligned map; None if it claims fewer than two different landmarks, or the log has no true ones.
     """
     if log.positions is None:
         return None
@@ -82,29 +82,29 @@ def align_to_truth(landmarks: LandmarkMap, claims: IntArray, log: MrclamLog) -> 
 def motion_error(
     motion: FloatArray, maps: Sequence[LandmarkMap], claims: Sequence[IntArray], log: MrclamLog
 ) -> tuple[float, float] | None:
-    """Return how far the motion between two maps is off [m, rad]; None if one of them cannot be fitted to the truth.
+    """Return the errors of the transform between two maps [m, rad]; None if a map cannot be aligned to the truth.
 
-    The true motion between two maps is that between their fits to the true landmarks. The true start poses do not
-    give it, because each map is turned about its start by what its first steps got wrong.
+    The true transform relates the fits of the two maps to the true landmarks. The true start poses do not define it,
+    because errors of the first steps rotate each map about its start.
     """
     fits = [align_to_truth(own, named, log) for own, named in zip(maps, claims, strict=True)]
     if fits[0] is None or fits[1] is None:
         return None
     true = between(fits[0].world_from_map, fits[1].world_from_map)
-    middle = maps[1].means[:, :2].mean(axis=0)  # where the landmarks lie matters, not a far origin
+    middle = maps[1].means[:, :2].mean(axis=0)  # the error is measured at the landmarks, not at a distant origin
     offset = transform_points(motion, middle) - transform_points(true, middle)
     return float(np.hypot(*offset)), abs(float(wrap_angle(motion[2] - true[2])))
 
 
 def summarise(replay: Replay, log: MrclamLog, paths: Sequence[PathScore | None]) -> dict[str, Any]:
-    """Return the content of `metrics.json`; what cannot be known is NaN.
+    """Return the content of `metrics.json`; unknown values are NaN.
 
-    Robots carry the numbers of the log, in `robot`, `groups` and `merges` alike. `map_rmse_m` = `map_rmse_aligned_m`,
-    `map_recall` and `map_precision` are after the best SE(2) fit of the map; `map_rmse_start_m` and `map_error` put the
-    start frame at the true start pose, without any fitting.
+    Robots have the numbers of the log in `robot`, `groups` and `merges`. `map_rmse_m` = `map_rmse_aligned_m`,
+    `map_recall` and `map_precision` are after the best SE(2) fit of the map; `map_rmse_start_m` and `map_error` use the
+    true start pose, without fitting.
     """
     numbers = [robot.robot for robot in log.robots]
-    none = float("nan") if log.positions is None else 0.0  # share of the true landmarks that a map without a fit holds
+    none = float("nan") if log.positions is None else 0.0  # recall of a map that cannot be aligned
     named = [[numbers[robot] for robot in group] for group in replay.groups]
     nan = float("nan")
     robots = []
@@ -144,7 +144,7 @@ def summarise(replay: Replay, log: MrclamLog, paths: Sequence[PathScore | None])
 def _start_frame_errors(
     landmarks: LandmarkMap, claims: IntArray, path: PathScore, log: MrclamLog
 ) -> tuple[float, float]:
-    """Return map error and RMSE [m] with the start frame at the true start pose, without fitting; NaN if unknown."""
+    """Return map error and RMSE [m] with the true start pose, without fitting; NaN if unknown."""
     if log.positions is None:
         return float("nan"), float("nan")
     means, truths = _flat(landmarks.moved(path.world_from_start).means), _flat(log.positions)
@@ -152,5 +152,5 @@ def _start_frame_errors(
 
 
 def _flat(points: FloatArray) -> FloatArray:
-    """Return points (n, 2) or (n, 3) as (n, 3) at height 0: the log knows no heights."""
+    """Return points (n, 2) or (n, 3) as (n, 3) with height 0: the log has no heights."""
     return np.column_stack([points[:, :2], np.zeros(len(points))])

@@ -1,6 +1,6 @@
-"""The replay of a MR.CLAM log: robots, each with its own filter from its own unknown start, alone or as a team.
+"""Replay of an MR.CLAM log: robots with separate filters and unknown starts, alone or as a team.
 
-The default odometry noise was calibrated on data sets 7 and 4: their figures are not those of unseen logs.
+The default odometry noise was calibrated on data sets 7 and 4: their results are not those of unseen logs.
 """
 
 import time
@@ -25,21 +25,22 @@ from training.replay.config import MRCLAM_MOTION, MrclamConfig
 from training.replay.single_robot import PLANAR_GATE, RejuvenationCount
 from vslam_env.evaluation.map_scores import GroundTruthAssociation
 
-# A joint filter's particles are weighed by what all its robots see, and die out so much faster: with the starts known,
-# five robots in 100 particles were 13 % farther from their paths than in 500.
+# The weights of a joint filter's particles combine the measurements of all its robots, so that depletion is faster:
+# with known starts, the path errors of five robots were 13 % larger with 100 particles than with 500.
 PARTICLES_PER_ROBOT = 100
 
 MOTION = OdometryModel(**MRCLAM_MOTION)
-# Identities given: a barcode cannot be taken for another, so position need not tell landmarks apart and the gate only
-# stops nonsense; nor does a barcode ever start a second landmark. Identities hidden: all landmarks look alike, and the
-# gate is that of two degrees of freedom, as all is seen in one plane; one landmark is new only far beyond it. With one
-# to three look-alikes in view, most of them contradict a right pose too easily to widen it.
+# Given identities: barcodes cannot be confused, so that the gate only rejects gross errors; a barcode never creates a
+# second landmark. Hidden identities: all landmarks have the same descriptor, and the gate has two degrees of freedom,
+# since all measurements are planar; only measurements far beyond it create landmarks. With one to three similar
+# landmarks in view, most of them contradict a correct pose too easily to widen it.
 GATES: dict[str, dict[str, Any]] = {
     "given": {"position_gate": 1e4, "new_landmark_gate": 1e6},
     "hidden": {"position_gate": PLANAR_GATE, "new_landmark_gate": 40.0, "recovery_position": 0.0},
 }
-# Young maps of these robots are bent by tenths of a metre: landmarks need not fit closely, but nearly all have to. On
-# two logs and four seeds, merges on 12 of the 15 landmarks were up to 24 degrees off, on 14 never more than 4.
+# Early maps of these robots are deformed by tenths of a metre: inliers need not fit closely, but almost all landmarks
+# must be inliers. On two logs and four seeds, merges with 12 of the 15 landmarks had errors up to 24 degrees, with 14
+# at most 4.
 POSITION_FLOOR = 0.3
 LANDMARKS_NOT_SHARED = 1
 MAX_SIGMA_HEADING = 0.05
@@ -47,49 +48,49 @@ MAX_SIGMA_HEADING = 0.05
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Merge:
-    """One merge, with the maps as they were just before it, straightened, without landmarks first seen in that step."""
+    """One merge, with the smoothed maps just before it, without landmarks first seen in that step."""
 
-    time: float  # Seconds since the first step [s]
-    event: MergeEvent  # The merge; its robots count from 0
-    map_a: LandmarkMap  # Of the group whose frame stays
-    map_b: LandmarkMap  # Of the other group
-    # (N,) int64. Row in `MrclamLog.positions` of the landmark whose sighting began each one of `map_a`.
+    time: float  # Time since the first step [s]
+    event: MergeEvent  # Merge event; robots count from 0
+    map_a: LandmarkMap  # Map of the group whose frame is kept
+    map_b: LandmarkMap  # Map of the other group
+    # (N,) int64. Row in `MrclamLog.positions` of the measurement that created each landmark of `map_a`.
     claims_a: IntArray
-    claims_b: IntArray  # Likewise of `map_b`
-    undone: float | None = None  # When the team took it back, seconds since the first step [s]; None: it is in force
+    claims_b: IntArray  # The same for `map_b`
+    undone: float | None = None  # Time of the undo since the first step [s]; None: not undone
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Replay:
-    """What the team estimated. K robots, T steps."""
+    """Estimates of the team, for K robots and T steps."""
 
-    times: FloatArray  # (T,) float64 [s]. Of the log's clock.
-    # (K, T, 3) float64 [m, m, rad]. Estimated at each step from what was known then, own start frames.
+    times: FloatArray  # (T,) float64 [s]. Times of the steps by the log's clock.
+    # (K, T, 3) float64 [m, m, rad]. Pose estimates at the time of each step, start frames.
     paths: FloatArray
-    reckoned: FloatArray  # (K, T, 3) float64 [m, m, rad]. Dead reckoning of the commands, own start frames.
-    maps: tuple[LandmarkMap, ...]  # Of each robot's group at the end, moved to the robot's own start frame
-    # Per robot (N,) int64. Row in `MrclamLog.positions` of the landmark whose sighting began each one of its map; kept
-    # beside the filters, which need not know it.
+    reckoned: FloatArray  # (K, T, 3) float64 [m, m, rad]. Dead reckoning of the commands, start frames.
+    maps: tuple[LandmarkMap, ...]  # Final map of each robot's group, in the robot's start frame
+    # Row in `MrclamLog.positions` of the measurement that created each landmark of each robot's map, (N,) int64;
+    # recorded outside the filters, which do not use it.
     claims: tuple[IntArray, ...]
-    start_from_group: FloatArray  # (K, 3) float64 [m, m, rad]. From its group's map frame to each robot's start frame.
+    start_from_group: FloatArray  # (K, 3) float64 [m, m, rad]. Group's map frame in each start frame.
     groups: tuple[tuple[int, ...], ...]  # Robots, counted from 0, that share a map at the end
-    merges: tuple[Merge, ...]  # In order
-    attempts: int  # How often two maps were compared
-    # Outcome of these attempts, by pairs of groups; None: each robot stays by itself
+    merges: tuple[Merge, ...]  # Merges in order
+    attempts: int  # Number of alignment attempts
+    # Outcomes of these attempts, by pairs of groups; None: robots do not merge
     pairs: tuple[PairAttempts, ...] | None
-    # What came of drawing particles anew, all filters together, see `RejuvenationCount.to_mapping`
+    # Rejuvenations of all filters, see `RejuvenationCount.to_mapping`
     rejuvenations: dict[str, Any]
-    consistency: tuple[Consistency, ...]  # Per robot whether its filter at the end errs as little as it claims
-    seconds: float  # What the filters took to live through the log [s]
+    consistency: tuple[Consistency, ...]  # Consistency of each robot's filter at the end
+    seconds: float  # Computing time of the filters [s]
 
 
 def replay_team(
     log: MrclamLog, config: MrclamConfig, on_step: Callable[[float, TeamReport], None] = lambda progress, report: None
 ) -> Replay:
-    """Let a team of filters live through a log.
+    """Run a team of filters on a log.
 
     Returns:
-        Paths as they were known at each step, maps and merges as they came.
+        Paths as estimated at each step, and maps and merges.
     """
     readings = to_filter_steps(log, config.dt, config.sensor, config.drive)
     robots, num_steps = range(len(log.robots)), len(readings.times)
@@ -104,22 +105,24 @@ def replay_team(
     attempts, seconds, rejuvenations = 0, 0.0, RejuvenationCount()
     for step in range(num_steps):
         seen = [own.measurements[step] for own in readings.robots]
-        rows = [_true_rows(frame) for frame in seen]
+        rows = [_true_landmark_rows(frame) for frame in seen]
         names = rows if config.identities == "given" else None
-        told = seen if config.identities == "given" else [_alike(frame) for frame in seen]
+        given = seen if config.identities == "given" else [_alike(frame) for frame in seen]
         groups = {robot: group for group in team.groups for robot in group}
         maps = {group: team.map(group[0]) for group in team.groups}
         started = time.perf_counter()
-        report = team.step([own.odometry[step] if step else None for own in readings.robots], told, contacts, names)
+        report = team.step([own.odometry[step] if step else None for own in readings.robots], given, contacts, names)
         seconds += time.perf_counter() - started
-        for _, told_of in report.rejuvenations:
-            rejuvenations.add(told_of)
+        for _, attempt in report.rejuvenations:
+            rejuvenations.add(attempt)
         for event in report.events:
             attempts += event.kind == "attempt"
             if event.kind == "merge":
                 since = float(readings.times[step] - readings.times[0])
                 sides = [groups[side[0]] for side in (event.robots_a, event.robots_b)]
-                joined = [_those_of(new, maps[side]) for side, new in zip(sides, team.merged_maps(event), strict=True)]
+                joined = [
+                    _common_landmarks(new, maps[side]) for side, new in zip(sides, team.merged_maps(event), strict=True)
+                ]
                 claims = [ledger.true_ids(side[0], own.ids) for side, own in zip(sides, joined, strict=True)]
                 merges.append(Merge(since, event, joined[0], joined[1], claims[0], claims[1]))
             if event.kind == "undo":
@@ -156,18 +159,18 @@ def _make_team(log: MrclamLog, config: MrclamConfig) -> TeamSlam:
     )  # fmt: skip
 
 
-def _those_of(landmarks: LandmarkMap, known: LandmarkMap) -> LandmarkMap:
-    """Return the landmarks that another map holds, too."""
+def _common_landmarks(landmarks: LandmarkMap, known: LandmarkMap) -> LandmarkMap:
+    """Return the landmarks that are also in another map."""
     return landmarks.subset(np.flatnonzero(np.isin(landmarks.ids, known.ids)))
 
 
 def _alike(frame: Measurements | None) -> Measurements | None:
-    """Return the frame with one descriptor for all: what is seen says where it is, not what it is."""
+    """Return the measurements with the same descriptor for all: only positions identify landmarks."""
     if frame is None:
         return None
     return Measurements(frame.points, np.ones((len(frame), 1), dtype=np.float32), frame.covariances)
 
 
-def _true_rows(frame: Measurements | None) -> IntArray:
-    """Return the row in `MrclamLog.positions` (n,) of what was seen."""
+def _true_landmark_rows(frame: Measurements | None) -> IntArray:
+    """Return the row in `MrclamLog.positions` (n,) of each measured landmark."""
     return np.empty(0, dtype=np.int64) if frame is None else frame.descriptors.argmax(axis=1).astype(np.int64)

@@ -1,4 +1,4 @@
-"""One filter lives through the log of one robot, and its path is scored against known positions."""
+"""Replay of the log of one robot with one filter, and scores of its path at known positions."""
 
 import re
 import time
@@ -20,62 +20,62 @@ from slam_backend.models.measurements import Measurements
 from slam_backend.trajectory import dead_reckoning
 from training.episodes.tables import consistency_rows
 
-if TYPE_CHECKING:  # what computes is imported when the command runs, so that --help answers at once
+if TYPE_CHECKING:  # numerical modules are imported when the command runs, so that --help is fast
     from slam_backend.fastslam.reports import RejuvenationReport
 
 NUMBER = re.compile(r"\d+(\.\d+)?")
 
-# Of what moves in the plane a measurement fixes two coordinates: 99.9 % of right matches have a smaller squared
-# Mahalanobis distance.
+# A planar measurement has two degrees of freedom: 99.9 % of correct matches have a smaller squared Mahalanobis
+# distance.
 PLANAR_GATE = 13.8
 
 
 class RejuvenationCount:
-    """Attempts by what came of them."""
+    """Counts of rejuvenation attempts by outcome."""
 
     def __init__(self) -> None:
         self._reasons: Counter[str] = Counter()
 
     def add(self, report: "RejuvenationReport | None") -> None:
-        """Count an attempt; None: there was none. Reasons that differ in their numbers alone are one."""
+        """Count an attempt; None: there was none. Reasons that differ only in numbers are counted together."""
         if report is not None:
             self._reasons[NUMBER.sub("n", report.reason)] += 1
 
     def to_mapping(self) -> dict[str, Any]:
-        """Return how often particles were `drawn`, and `refused`: by reason how often they were not."""
+        """Return the number of rejuvenations, `drawn`, and the numbers of refusals by reason, `refused`."""
         refused = {reason: count for reason, count in sorted(self._reasons.items()) if reason}
         return {"drawn": self._reasons[""], "refused": refused}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OneReplay:
-    """What one filter estimated. T steps."""
+    """Estimates of one filter over T steps."""
 
-    times: FloatArray  # (T,) float64 [s]. Of the log's clock.
-    path: FloatArray  # (T, 3) float64 [m, m, rad]. Estimated at each step from what was known then, start frame.
+    times: FloatArray  # (T,) float64 [s]. Times of the steps by the log's clock.
+    path: FloatArray  # (T, 3) float64 [m, m, rad]. Pose estimates at the time of each step, start frame.
     reckoned: FloatArray  # (T, 3) float64 [m, m, rad]. Dead reckoning, start frame.
-    landmarks: LandmarkMap  # The map at the end, start frame
-    matched: int  # Measurements that the most probable particle matched
-    created: int  # Landmarks that it made
-    rejected: int  # Measurements of which it made nothing
-    rejuvenations: Mapping[str, Any]  # What came of drawing particles anew, see `RejuvenationCount.to_mapping`
-    consistency: Consistency  # Whether the filter errs as little as it claims
-    seconds: float  # What the filter took to live through the log [s]
+    landmarks: LandmarkMap  # Final map, start frame
+    matched: int  # Number of measurements matched by the most probable particle
+    created: int  # Number of landmarks created by it
+    rejected: int  # Number of measurements rejected by it
+    rejuvenations: Mapping[str, Any]  # Rejuvenations, see `RejuvenationCount.to_mapping`
+    consistency: Consistency  # Consistency of the filter
+    seconds: float  # Computing time of the filter [s]
 
     @property
     def speed(self) -> float:
-        """Seconds of log in a second of computing."""
+        """Seconds of log per second of computing."""
         return float(self.times[-1] - self.times[0]) / self.seconds
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PositionScore:
-    """A path against n known positions."""
+    """Errors of a path at n known positions."""
 
-    start: float  # RMS distance [m] with the start frame put where it is known to be
+    start: float  # RMS distance from the known start pose, without fitting [m]
     aligned: float  # RMS distance [m] after the SE(2) alignment of the whole path
-    world_from_path: FloatArray  # (3,) float64 [m, m, rad]. That alignment.
-    errors: FloatArray  # (n,) float64 [m]. Distances after it.
+    world_from_path: FloatArray  # (3,) float64 [m, m, rad]. Alignment of the path.
+    errors: FloatArray  # (n,) float64 [m]. Distances after alignment.
 
 
 def replay_one(
@@ -86,12 +86,12 @@ def replay_one(
     describe: Callable[[Measurements, FloatArray], Measurements] = lambda frame, pose: frame,
     on_report: Callable[[StepReport], None] = lambda report: None,
 ) -> OneReplay:
-    """Let a filter of one robot live through a log.
+    """Run a filter of one robot on a log.
 
     Args:
-        steps: T pairs: the motion since the step before (3,) [m, m, rad], of which the first is not used, and the
-            frame. What makes them, as they are asked for, is not timed.
-        describe: Makes of a frame and the predicted pose (3,), start frame, the frame that the filter is given.
+        steps: T pairs: motion since the previous step (3,) [m, m, rad], unused in the first pair, and measurements.
+            The time that this iterator takes is not counted.
+        describe: Function that adapts measurements for the filter, given the predicted pose (3,), start frame.
     """
     path, odometry = np.zeros((len(times), 3)), np.zeros((len(times), 3))
     matched, created, rejected, seconds = 0, 0, 0, 0.0
@@ -99,8 +99,8 @@ def replay_one(
     for step, (move, frame) in enumerate(steps):
         odometry[step] = move if step else 0.0
         started = time.perf_counter()
-        told = None if frame is None else describe(frame, compose(slam.pose().mean, odometry[step]))
-        report = slam.step([odometry[step] if step else None], [told])
+        adapted = None if frame is None else describe(frame, compose(slam.pose().mean, odometry[step]))
+        report = slam.step([odometry[step] if step else None], [adapted])
         path[step] = slam.pose().mean
         seconds += time.perf_counter() - started
         matched += report.num_matched
@@ -120,7 +120,7 @@ def score_positions(points: FloatArray, truth: FloatArray, world_from_start: Flo
     """Score estimated positions (n, 2) [m], start frame, against true ones (n, 2) [m], world frame.
 
     Args:
-        world_from_start: (3,) float64 [m, m, rad]. Where the start frame is known to be.
+        world_from_start: (3,) float64 [m, m, rad]. Known pose of the start frame.
     """
     fit = align_se2(truth, points)
     raw, fitted = (np.hypot(*(transform_points(pose, points) - truth).T) for pose in (world_from_start, fit))
@@ -128,14 +128,14 @@ def score_positions(points: FloatArray, truth: FloatArray, world_from_start: Flo
 
 
 def score_paths(paths: Iterable[FloatArray], truth: FloatArray) -> list[PositionScore]:
-    """Score paths (T, 3), each in a frame of its own, against the true poses (n, 3) of the first n steps."""
+    """Score paths (T, 3), each in its own frame, against the true poses (n, 3) of the first n steps."""
     return [
         score_positions(path[: len(truth), :2], truth[:, :2], compose(truth[0], inverse(path[0]))) for path in paths
     ]
 
 
 def end_errors(paths: Iterable[FloatArray], truth: FloatArray) -> list[float]:
-    """Return how far paths (T, 3) are off [m] at the last of n true poses (n, 3), from the true start, no fit."""
+    """Return the errors [m] of paths (T, 3) at the last of n true poses (n, 3), from the true start, not fitted."""
     last = len(truth) - 1
     ends = [compose(compose(truth[0], inverse(path[0])), path[last]) - truth[last] for path in paths]
     return [float(np.hypot(end[0], end[1])) for end in ends]
@@ -149,7 +149,7 @@ def path_length(path: FloatArray) -> float:
 def metrics_of(
     result: OneReplay, scores: tuple[PositionScore, PositionScore] | None, own: Mapping[str, Any], **more: Any
 ) -> dict[str, Any]:
-    """Return the content of `metrics.json`; what cannot be known is NaN, as are errors of the map."""
+    """Return the content of `metrics.json`; unknown values are NaN, including errors of the map."""
     nan = float("nan")
     estimate, reckoned = ((nan, nan), (nan, nan)) if scores is None else ((s.aligned, s.start) for s in scores)
     return {

@@ -1,7 +1,7 @@
-"""The replay of stereo images of a drive: front end, visual odometry and filter, in the plane.
+"""Replay of stereo images of a drive in the plane: front end, visual odometry and filter.
 
-Odometry and filter must not use the same noise twice: the features of a frame are dealt out in turn, one to the visual
-odometry, one to the filter.
+Odometry and filter must not use the same noise twice: the features of a frame alternate between the visual odometry
+and the filter.
 """
 
 import time
@@ -27,28 +27,28 @@ from training.replay.config import NEAREST, ImagesConfig
 from training.replay.kitti import DriveScore, drive_metrics, score_drive
 from training.replay.single_robot import PLANAR_GATE, OneReplay, metrics_of, replay_one
 
-CORNERS = 2500  # of an image of KITTI's size, spread over it
-# What a visual odometry of half of the features was off by, per metre and per frame, on the drive that came with the
-# first 51 frames of KITTI 06: 1.6 cm along, 0.9 cm across, 0.0009 rad at 1.2 m a frame.
+CORNERS = 2500  # number of corners in an image of KITTI's size
+# Errors of a visual odometry from half of the features, per metre and per frame, on the drive of the first 51 frames
+# of KITTI 06: 1.6 cm along, 0.9 cm across, 0.0009 rad at 1.2 m per frame.
 ODOMETRY = OdometryModel(
     sigma_along=0.01, sigma_across=0.005, sigma_heading=0.001, sigma_turn=0.02, floor_position=0.005, floor_heading=5e-4
 )
-ODOMETRY_SIGMA, ODOMETRY_SIGMA_DISPARITY = 0.5, 0.3  # [px] of features within two frames
+ODOMETRY_SIGMA, ODOMETRY_SIGMA_DISPARITY = 0.5, 0.3  # noise of features between two frames [px]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImagesReplay:
-    """What came of a drive's images."""
+    """Results of a drive with images."""
 
-    replay: OneReplay  # What the filter estimated; poses are those of the left camera
-    # (T,) int64. Pairs of features that agreed with each motion; 0 for the first, and where the motion before was taken
-    # to go on.
+    replay: OneReplay  # Estimates of the filter; poses are of the left camera
+    # (T,) int64. Inlier features of each motion; 0 for the first frame, and where the motion was extrapolated from the
+    # previous one.
     odometry_inliers: IntArray
-    features: IntArray  # (T,) int64. Points that the front end measured.
-    front_end_seconds: float  # What front end and visual odometry took for all frames [s]
-    last: StereoFrame  # What the front end made of the last frame
-    last_ids: IntArray  # (n,) int64. Landmarks behind those of its points that the filter got; -1 = refused.
-    # How far above the camera each landmark was last seen, by its id [m]; the filter knows none
+    features: IntArray  # (T,) int64. Numbers of points measured by the front end.
+    front_end_seconds: float  # Computing time of front end and visual odometry [s]
+    last: StereoFrame  # Last frame, as measured by the front end
+    last_ids: IntArray  # (n,) int64. Landmark ids of its points that the filter used; -1 = rejected.
+    # Last measured height of each landmark above the camera, by id [m]; the filter has no heights
     heights: dict[int, float]
 
 
@@ -66,7 +66,7 @@ def load_images(config: ImagesConfig) -> KittiImages:
 
 
 def make_camera(log: KittiImages, max_range: float, sigma_px: float, sigma_disparity_px: float) -> StereoCamera:
-    """Return a drive's camera with a range [m] and standard deviations [px]."""
+    """Return the camera of a drive with a range [m] and standard deviations [px]."""
     sigmas = {"sigma_px": sigma_px, "sigma_disparity_px": sigma_disparity_px}
     return log.pair.camera(log.width, log.height, max_range=max_range, **sigmas)
 
@@ -74,7 +74,7 @@ def make_camera(log: KittiImages, max_range: float, sigma_px: float, sigma_dispa
 def replay_images(
     log: KittiImages, config: ImagesConfig, on_step: Callable[[float], None] = lambda done: None
 ) -> ImagesReplay:
-    """Let front end, visual odometry and filter live through a drive."""
+    """Run front end, visual odometry and filter on a drive."""
     options = FilterOptions(
         num_particles=config.particles,
         camera=make_camera(log, config.max_range, config.sigma_px, config.sigma_disparity_px),
@@ -83,13 +83,13 @@ def replay_images(
         rejuvenate_every=config.rejuvenate_every or None,
         position_gate=PLANAR_GATE,
         descriptor_gate=DESCRIPTOR_TYPES[config.descriptor].gate,
-        # A street repeats itself: many look-alikes at once would be taken for a lost pose.
+        # Streets are repetitive: many similar points at once would be mistaken for a lost pose.
         recovery_position=0.0,
         existence=ExistenceModel(detection=0.6),
     )
     filter_seed, sample_seed = np.random.SeedSequence(config.seed).spawn(2)
     slam = FastSlam.from_options(1, options, filter_seed)
-    eye = _Eye(log, config, np.random.default_rng(sample_seed))
+    eye = _StereoFrontEnd(log, config, np.random.default_rng(sample_seed))
     steps = map(eye.look, range(len(log.times)))
     replay = replay_one(slam, log.times, steps, on_step, on_report=eye.remember)
     return ImagesReplay(
@@ -98,7 +98,7 @@ def replay_images(
     )  # fmt: skip
 
 
-class _Eye:
+class _StereoFrontEnd:
     """Front end and visual odometry of a drive, frame by frame; attributes as in `ImagesReplay`."""
 
     frame: StereoFrame
@@ -116,7 +116,7 @@ class _Eye:
         self.heights: dict[int, float] = {}
 
     def look(self, step: int) -> tuple[FloatArray, Measurements]:
-        """Return the motion since the frame before (3,) [m, m, rad], and what the filter is given of this one."""
+        """Return the motion since the previous frame (3,) [m, m, rad], and this frame's measurements for the filter."""
         images = self._log.images(step)
         begin = time.perf_counter()
         self.frame = self._front_end.measure(*images)
@@ -129,22 +129,22 @@ class _Eye:
         self._before, self.features[step] = own, len(points)
         self.seconds += time.perf_counter() - begin
         level = points[::2].copy()
-        level[:, 1] = 0.0  # a plane knows no rows; see `slam_backend.readers.kitti`
+        level[:, 1] = 0.0  # a planar model has no rows; see `slam_backend.readers.kitti`
         return self._motion, Measurements(level, descriptors[::2])
 
     def remember(self, report: StepReport) -> None:
-        """Keep which landmarks the frame's points are of, and how high these are."""
+        """Record the landmarks of the frame's points, and their heights."""
         self.ids = report.associations[0]
         self.heights |= zip(self.ids.tolist(), (-self.frame.measurements.points[::2, 1]).tolist(), strict=True)
 
 
 def score_images(result: OneReplay, log: KittiImages) -> DriveScore | None:
-    """Score a replay against the true path; None if that is not known."""
+    """Score a replay against the true path; None without ground truth."""
     return None if log.truth is None else score_drive((result.path, result.reckoned), log.truth)
 
 
 def summarise_images(result: ImagesReplay, scored: DriveScore | None) -> dict[str, Any]:
-    """Return the content of `metrics.json`; what cannot be known is NaN, as are errors of the map."""
+    """Return the content of `metrics.json`; unknown values are NaN, including errors of the map."""
     return metrics_of(
         result.replay, scored.scores if scored else None, drive_metrics(scored, "visual_odometry"),
         landmarks_seen_three_times=int((result.replay.landmarks.counts >= 3).sum()),

@@ -1,4 +1,4 @@
-"""Two local visual maps of one room, each of a single stereo pair, are aligned in space: the EuRoC pairs."""
+"""Spatial alignment of two local visual maps of one room, each from a single stereo pair (EuRoC)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -32,36 +32,36 @@ ITERATIONS = 2000
 class RoomPairs:
     """Two stereo pairs of one room."""
 
-    images: tuple[tuple[Image, Image], tuple[Image, Image]]  # Per place the left and right image, as they were taken
-    rectifier: Rectifier | Rectified  # Of the rig
-    # Per place (4, 4) float64 [m], the body in the world; None where not known
+    images: tuple[tuple[Image, Image], tuple[Image, Image]]  # Raw left and right image of each place
+    rectifier: Rectifier | Rectified  # Rectification of the stereo rig
+    # Body pose in the world at each place, (4, 4) float64 [m]; None if unknown
     poses: tuple[FloatArray, FloatArray] | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PairsResult:
-    """How two local maps fit together."""
+    """Alignment of two local maps."""
 
-    images: tuple[Image, Image]  # Per place the rectified left image
-    frames: tuple[StereoFrame, StereoFrame]  # Per place its points
-    motion: CameraMotion | None  # From the second camera to the first; None if no motion was found
-    error_m: float  # Of the translation [m]; NaN where not known
-    error_deg: float  # Of the rotation [degrees]; likewise
-    true_m: float  # Distance between the places [m]; likewise
-    true_deg: float  # Angle between them [degrees]; likewise
-    # Per place the map of its points: x ahead of the left camera, y to the left, z up
+    images: tuple[Image, Image]  # Rectified left image of each place
+    frames: tuple[StereoFrame, StereoFrame]  # Points of each place
+    motion: CameraMotion | None  # Transform from the second camera to the first; None if not found
+    error_m: float  # Error of the translation [m]; NaN if unknown
+    error_deg: float  # Error of the rotation [degrees]; NaN if unknown
+    true_m: float  # Distance between the places [m]; NaN if unknown
+    true_deg: float  # Angle between them [degrees]; NaN if unknown
+    # Map of the points of each place: x ahead of the left camera, y to the left, z up
     maps: tuple[LandmarkMap, LandmarkMap]
 
 
 def load_pairs(path: str | Path, files: StereoFiles = FILES) -> RoomPairs:
-    """Read two pairs, their calibration and, if they are there, their poses.
+    """Read two pairs, their calibration and, if present, their poses.
 
     Args:
-        files: Names within it. `truth` has two rows of an image, a quaternion w x y z and a position, or of a 3 x 4
-            matrix; None: `poses_dev.txt`, if it is there.
+        files: File names within the folder. `truth` has two rows of an image, a quaternion w x y z and a position, or
+            of a 3 x 4 matrix; None: `poses_dev.txt`, if present.
 
     Raises:
-        ValueError: If a file is missing or ill-formed, or there are other than two pairs; the text names it.
+        ValueError: If a file is missing or malformed, or there are not exactly two pairs; the message names it.
     """
     left, right = find_pairs(path, files)
     if len(left) != PAIRS:
@@ -78,7 +78,7 @@ def load_pairs(path: str | Path, files: StereoFiles = FILES) -> RoomPairs:
 
 
 def align_pairs(log: RoomPairs, config: PairsConfig) -> PairsResult:
-    """Measure both pairs, match their points by appearance, and find the motion between the cameras."""
+    """Measure both pairs, match their points by appearance, and estimate the motion between the cameras."""
     rectifier = log.rectifier
     size = rectifier.camera
     camera = rectifier.pair.camera(
@@ -89,7 +89,9 @@ def align_pairs(log: RoomPairs, config: PairsConfig) -> PairsResult:
     rectified = [rectifier.rectify(*pair) for pair in log.images]
     first, second = (eye.measure(*pair) for pair in rectified)
     rng = np.random.default_rng(config.seed)
-    gate = 2.0 * DESCRIPTOR_TYPES[config.descriptor].gate  # places far apart look less alike; RANSAC tells
+    gate = (
+        2.0 * DESCRIPTOR_TYPES[config.descriptor].gate
+    )  # distant views have less similar descriptors; RANSAC rejects wrong matches
     motion = camera_motion(first.measurements, second.measurements, camera, gate, rng, ITERATIONS)
     nan = float("nan")
     error_m, error_deg, true_m, true_deg = nan, nan, nan, nan
@@ -106,7 +108,7 @@ def align_pairs(log: RoomPairs, config: PairsConfig) -> PairsResult:
 
 
 def _map_of(frame: StereoFrame, camera: StereoCamera) -> LandmarkMap:
-    """Return the points of a pair as a map in the axes of a robot at the left camera."""
+    """Return the points of a pair as a map in robot axes at the left camera."""
     points, turn = frame.measurements.points, ROBOT_FROM_CAMERA
     return LandmarkMap(points @ turn.T, turn @ camera.covariance(points) @ turn.T, frame.measurements.descriptors)
 
@@ -126,14 +128,14 @@ def summarise_pairs(results: Mapping[str, PairsResult]) -> dict[str, Any]:
 
 
 def _read_poses(file: Path) -> tuple[FloatArray, FloatArray]:
-    """Read two poses: image, quaternion w x y z, position x y z; or a 3 x 4 matrix, perhaps after a time."""
+    """Read two poses: image, quaternion w x y z, position x y z; or a 3 x 4 matrix, optionally after a time."""
     rows = [line.split() for line in file.read_text("utf-8").splitlines() if line and not line.startswith("#")]
     try:
         values = np.array(rows, dtype=np.float64)
     except ValueError:
         values = np.empty(0)
     if values.shape not in ((2, 8), (2, 12), (2, 13)) or not np.isfinite(values).all():
-        expected = f"{file.name} with two rows of 8 numbers, or of 12"
+        expected = f"{file.name} with two rows of 8 or 12 numbers"
         raise argument_error("path", expected, "a different one", f"Correct {str(file)!r}.")
     poses = []
     for row in values:

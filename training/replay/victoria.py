@@ -1,4 +1,4 @@
-"""The replay of a log of Victoria Park: trees without names, matched by where they stand, and GPS as the truth."""
+"""Replay of the Victoria Park log: unlabelled trees, matched by position, with GPS as ground truth."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,32 +18,32 @@ from slam_backend.trajectory import Trajectory
 from training.replay.config import VictoriaConfig
 from training.replay.single_robot import PLANAR_GATE, OneReplay, PositionScore, metrics_of, replay_one, score_positions
 
-# Trees stand metres apart: what lies within 1.5 m of a known one, or is not far beyond its gate, is no new one.
+# Trees are metres apart: a measurement within 1.5 m of a known tree, or not far beyond its gate, is not a new one.
 NEW_LANDMARK_GATE = 40.0
 NEW_LANDMARK_RADIUS = 1.5
-# One thing in 10 m x 10 m x the 1 m that a planar sensor does not resolve is not in the map.
+# Density of clutter: one unmapped object in 10 m x 10 m x the 1 m that a planar sensor does not resolve.
 NEW_LANDMARK_DENSITY = 0.01
-# A filter lets most contradicting trees widen its pose at once. Here a bush and a passer-by outvote the map now and
-# then, while the odometry is good: it is believed.
+# By default, contradicting trees widen the pose at once. Here bushes and pedestrians contradict the map now and then,
+# while the odometry is good: the pose is not widened.
 RECOVERY_POSITION = 0.0
-# Only trees that were first seen within this distance of a reading, as far as is known, are compared with it [m].
+# Distance from a measurement within which a tree, as first measured, is a candidate for data association [m].
 SEARCH_RADIUS = 25.0
-NO_WEIGHT = 1e6  # [m]; as the deviation of what tells trees apart
-KNOWN_START = 30.0  # [m] of the path that show where it starts: a GPS fix has no heading
+NO_WEIGHT = 1e6  # standard deviation of the descriptors [m]: they do not affect weights
+KNOWN_START = 30.0  # path length that determines the start heading [m]: a GPS fix has no heading
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VictoriaScore:
     """Paths of the antenna against the GPS fixes during the replay."""
 
-    fixes: FloatArray  # (g, 2) float64 [m]. East and north.
-    # Twice (T, 2) float64 [m], start frame. Where estimate and dead reckoning put the antenna at each step.
+    fixes: FloatArray  # (g, 2) float64 [m]. Positions, east and north.
+    # Twice (T, 2) float64 [m], start frame. Antenna positions of estimate and dead reckoning at each step.
     paths: tuple[FloatArray, FloatArray]
     scores: tuple[PositionScore, PositionScore]  # Scores of both at the fixes
 
 
 def replay(log: VictoriaLog, config: VictoriaConfig, on_step: Callable[[float], None] = lambda done: None) -> OneReplay:
-    """Let a filter live through a log; poses are those of the rear axle."""
+    """Run a filter on a log; poses are of the rear axle."""
     readings = to_filter_steps(log, config.sensor)
     options = FilterOptions(
         num_particles=config.particles, camera=StereoCamera(mount=SENSOR), motion=config.motion,
@@ -58,17 +58,17 @@ def replay(log: VictoriaLog, config: VictoriaConfig, on_step: Callable[[float], 
 
 
 def describe_by_place(frame: Measurements, pose: FloatArray) -> Measurements:
-    """Return the frame with each tree's place as its descriptor, seen from the predicted pose (3,) of the rear axle.
+    """Return the measurements with each tree's position as its descriptor, given the predicted rear-axle pose (3,).
 
-    Trees look alike. But the filter compares a reading with whatever looks like it, and a park full of trees is much
-    to compare; so it is told to compare those of one neighbourhood, and to give the place no weight.
+    All trees have the same appearance. A filter compares a measurement with all landmarks of similar descriptors, which
+    is expensive in a park full of trees; positions as descriptors limit this to the neighbourhood, without any weight.
     """
     ahead = frame.points @ ROBOT_FROM_CAMERA.T + np.array(SENSOR)
     return Measurements(frame.points, transform_points(pose, ahead)[:, :2].astype(np.float32), frame.covariances)
 
 
 def score(result: OneReplay, log: VictoriaLog) -> VictoriaScore | None:
-    """Score a replay at the GPS fixes, which are of the antenna, beside the laser; None if there are fewer than two."""
+    """Score a replay at the GPS fixes, which are of the antenna beside the laser; None if there are fewer than two."""
     if log.gps is None:
         return None
     during = (log.gps[:, 0] >= result.times[0]) & (log.gps[:, 0] <= result.times[-1])
@@ -87,11 +87,11 @@ def score(result: OneReplay, log: VictoriaLog) -> VictoriaScore | None:
 
 
 def summarise(result: OneReplay, scored: VictoriaScore | None) -> dict[str, Any]:
-    """Return the content of `metrics.json`; where the trees really stand is not known, so errors of maps are NaN.
+    """Return the content of `metrics.json`; true positions of the trees are unknown, so that errors of the map are NaN.
 
-    `ate_start_m` puts the start frame where the first 30 m of the path fit the fixes. `gps` tells of the distances to
-    the fixes after the SE(2) alignment of the whole path: among the fixes are some that jumped. Without fixes it is
-    None.
+    `ate_start_m` uses the start pose from a fit of the first 30 m of the path to the fixes. `gps` has the distances to
+    the fixes after the SE(2) alignment of the whole path; some fixes are outliers. It is None without
+    fixes.
     """
     often = int(np.count_nonzero(result.landmarks.counts >= 10))
     if scored is None:

@@ -1,4 +1,4 @@
-"""`TrainingWatch`: what a training tells between its steps: episodes, checkpoints, progress, and when to stop."""
+"""`TrainingCallback`: training callback for episode statistics, checkpoints, progress and stopping."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -8,18 +8,18 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from training.vec_env import ExplorationVecEnv
 
-LAST = ("map_error", "map_recall", "map_precision", "coverage", "merges", "collisions")  # at an episode's end
+LAST = ("map_error", "map_recall", "map_precision", "coverage", "merges", "collisions")  # final values of an episode
 
 Row = dict[str, float]
 
 
-class TrainingWatch(BaseCallback):  # type: ignore[misc]   # its types are not looked at
-    """Sums up the episodes of each rollout, and saves and stops between rollouts only.
+class TrainingCallback(BaseCallback):  # type: ignore[misc]   # its types are not checked
+    """Callback that summarises the episodes of each rollout, and saves and stops between rollouts only.
 
     Attributes:
-        rows: Of all rollouts so far: `steps`, means over the episodes that ended of `return`, of `LAST` at their end,
-            of `invalid_actions` and of each reward term's sum.
-        stopped: Whether it was stopped early.
+        rows: One row per rollout: `steps`, and means over its finished episodes of `return`, the final values `LAST`,
+            `invalid_actions` and the sum of each reward term.
+        stopped: Whether the training was stopped early.
     """
 
     def __init__(self, env: ExplorationVecEnv, save: Callable[[], None], every: int) -> None:
@@ -40,19 +40,20 @@ class TrainingWatch(BaseCallback):  # type: ignore[misc]   # its types are not l
         should_stop: Callable[[], bool],
         on_step: Callable[[int], None] = lambda decisions: None,
     ) -> None:
-        """Be told of rollouts, and be asked whether to stop.
+        """Set the functions called between rollouts: to report a rollout, and to ask whether to stop.
 
         Args:
-            should_stop: Asked between two rollouts; then a checkpoint is saved and the training ends.
+            should_stop: Function called between two rollouts; if it returns true, a checkpoint is saved and the
+                training ends.
         """
         self._tell, self._should_stop, self._count = on_update, should_stop, on_step
 
     def get_state(self) -> dict[str, Any]:
-        """Return what it has summed up."""
+        """Return the state of the callback."""
         return {"rows": [dict(row) for row in self.rows], "sums": [dict(sums) for sums in self._sums]}
 
     def set_state(self, state: Mapping[str, Any]) -> None:
-        """Go on from what `get_state` gave."""
+        """Restore a state of `get_state`."""
         self.rows, self._sums = [dict(row) for row in state["rows"]], [dict(sums) for sums in state["sums"]]
         self._begun = len(self.rows)
 
@@ -66,7 +67,7 @@ class TrainingWatch(BaseCallback):  # type: ignore[misc]   # its types are not l
 
     def _on_step(self) -> bool:
         if self.stopped:
-            return False  # what this step did is forgotten: the checkpoint was saved before it
+            return False  # this step is discarded: the checkpoint was saved before it
         for slot, (info, done) in enumerate(zip(self.locals["infos"], self.locals["dones"], strict=True)):
             sums = self._sums[slot]
             for name, value in info.items():
@@ -88,7 +89,7 @@ class TrainingWatch(BaseCallback):  # type: ignore[misc]   # its types are not l
 
 
 def _finished(sums: Mapping[str, float], info: Mapping[str, Any]) -> Row:
-    """Return the figures of an episode that ended: its return, its end, and the sum of each reward term."""
+    """Return the metrics of a finished episode: return, final values, and the sum of each reward term."""
     terms = {name: value for name, value in sums.items() if name.startswith("reward/")}
     last = {name: float(info[name]) for name in LAST}
     return {"return": sum(terms.values()), **last, "invalid_actions": sums["invalid_action"], **terms}

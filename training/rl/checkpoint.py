@@ -1,4 +1,4 @@
-"""Checkpoints of a training: one file that is whole or not there, marked with what made it."""
+"""Checkpoints of a training: single files, written atomically and tagged with package versions."""
 
 import hashlib
 import json
@@ -12,16 +12,17 @@ from slam_backend.core.validation import argument_error
 from training.experiments.run_folder import installed_versions
 from vslam_env.state_kinds import ENV_KINDS
 
-FORMAT = 2  # raised when what a checkpoint holds changes
+FORMAT = 2  # incremented when the content of checkpoints changes
 MAGIC = b"vslam train checkpoint "
 CHECKPOINT_FILE = "checkpoint.bin"
-DECISIVE = ("vslam-env", "torch", "stable-baselines3", "sb3-contrib", "numpy")  # a training goes on exactly with these
+# Packages whose versions must match for an exact resume
+DECISIVE = ("vslam-env", "torch", "stable-baselines3", "sb3-contrib", "numpy")
 
 
 def write_checkpoint(file: Path, content: Mapping[str, Any]) -> None:
-    """Write a checkpoint; an interrupted write leaves the one before.
+    """Write a checkpoint atomically: an interrupted write keeps the previous one.
 
-    The file holds data alone: to read it runs no code of the file's.
+    The file contains data only; reading it runs no code.
 
     Raises:
         ValueError: If it cannot be written.
@@ -34,43 +35,45 @@ def write_checkpoint(file: Path, content: Mapping[str, Any]) -> None:
 
 
 def read_checkpoint(file: Path) -> dict[str, Any]:
-    """Read a checkpoint that `write_checkpoint` wrote.
+    """Read a checkpoint of `write_checkpoint`.
 
     Raises:
-        ValueError: If it is missing, cut off, changed, or of other versions with which it would not go on exactly.
+        ValueError: If it is missing, truncated, changed, or written with package versions that prevent an exact resume.
     """
     expected = "the checkpoint of a training"
     if not file.is_file():
-        cure = f"There is no {str(file)!r}: the run ended before its first checkpoint. Train anew."
-        raise argument_error("resume", expected, "no such file", cure)
+        hint = f"There is no {str(file)!r}: the run ended before its first checkpoint. Train again."
+        raise argument_error("resume", expected, "no such file", hint)
     try:
         head, _, packed = read_file(file).partition(b"\n")
     except OSError as error:
-        cure = f"{str(file)!r} cannot be read: {error}."
-        raise argument_error("resume", f"{expected} of at most {MAX_BYTES >> 20} MiB", "another file", cure) from error
+        hint = f"{str(file)!r} cannot be read: {error}."
+        raise argument_error("resume", f"{expected} of at most {MAX_BYTES >> 20} MiB", "another file", hint) from error
     try:
         if not head.startswith(MAGIC):
             raise ValueError("another kind of file")
         mark = json.loads(head[len(MAGIC) :])
         size, digest, version, versions = (mark[name] for name in ("bytes", "sha256", "format", "versions"))
     except (ValueError, KeyError, TypeError) as error:
-        raise argument_error("resume", expected, "a broken file", f"{str(file)!r} is none: train anew.") from error
+        raise argument_error(
+            "resume", expected, "a broken file", f"{str(file)!r} is not a checkpoint. Train again."
+        ) from error
     if version != FORMAT:
         raise argument_error("resume", f"one of format {FORMAT}", f"a checkpoint of format {version}", "Train again.")
     if len(packed) != size or hashlib.sha256(packed).hexdigest() != digest:
-        cure = f"{str(file)!r} was cut off or changed: copy it again, or train anew."
-        raise argument_error("resume", f"{expected}, {size} bytes", f"a broken file of {len(packed)}", cure)
+        hint = f"{str(file)!r} was truncated or changed. Copy it again, or train again."
+        raise argument_error("resume", f"{expected}, {size} bytes", f"a broken file of {len(packed)}", hint)
     for package, here in _versions().items():
         if versions.get(package) != here:
-            cure = f"Install {package}=={versions.get(package)}, or train anew."
-            raise argument_error("resume", f"a checkpoint made with {package} {here}", versions.get(package), cure)
+            hint = f"Install {package}=={versions.get(package)}, or train again."
+            raise argument_error("resume", f"a checkpoint made with {package} {here}", versions.get(package), hint)
     try:
         content = decode(packed, ENV_KINDS)
         if not isinstance(content, dict) or not all(isinstance(name, str) for name in content):
-            raise ValueError("it holds no parts by name")
+            raise ValueError("it has no named parts")
     except ValueError as error:
-        cure = f"{str(file)!r} was made by something else: train again. Reading says: {error}."
-        raise argument_error("resume", expected, "a broken file", cure) from error
+        hint = f"{str(file)!r} was made by another program. Train again. Error: {error}."
+        raise argument_error("resume", expected, "a broken file", hint) from error
     return content
 
 

@@ -1,4 +1,4 @@
-"""`TrainConfig` and `EvaluateConfig`: everything that decides a training and its evaluation, and their environments."""
+"""`TrainConfig` and `EvaluateConfig`: configuration of training and evaluation, and their environments."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,17 +10,17 @@ from pydantic import Field
 
 from training.experiments.config import ExperimentConfig, NoisePreset, Positive, first_seed, option, setting
 
-if TYPE_CHECKING:  # what computes is imported when a command runs, so that --help answers at once
+if TYPE_CHECKING:  # numerical modules are imported when a command runs, so that --help is fast
     from vslam_env.config import EnvConfig
 
 SPLIT_TRAIN, SPLIT_TRY = "train", "validation"
 NEEDED = ("torch", "stable_baselines3", "sb3_contrib", "tensorboard")
 MODEL = "model"
-ONE = "Give a number of at least one."
+ONE = "Give a number >= 1."
 Share = Annotated[float, Field(gt=0.0, le=1.0)]
 TRAIN_PRESETS: dict[str, dict[str, Any]] = {
     "quick": {},
-    # Seconds only: to see that everything works.
+    # Takes seconds; checks that everything works.
     "smoke": {"world": "fig5", "robots": 2, "particles": 5, "max_cycles": 4, "envs": 2, "steps": 48, "batch": 16,
               "epochs": 2, "checkpoint_updates": 1},
 }  # fmt: skip
@@ -29,37 +29,37 @@ TRAIN_PRESETS: dict[str, dict[str, Any]] = {
 class TrainConfig(ExperimentConfig):
     """MaskablePPO with one network for all robots and `goal` actions.
 
-    A rollout is one episode of every robot. What is left out has the value of the preset `quick`.
+    A rollout is one episode of every robot. Omitted values come from the preset `quick`.
     """
 
-    preset: Literal["quick", "smoke"] = option("quick", "quick or smoke.")
-    world: str = option("office", "A family or a path; see vslam worlds list.")
+    preset: Literal["quick", "smoke"] = option("quick", "Preset: quick or smoke.")
+    world: str = option("office", "World family or path; see vslam worlds list.")
     robots: int = option(3, "Number of robots, 1 to 8.", ge=1, le=8, hint="Use 1 to 8 robots.")
-    noise: NoisePreset = setting("standard", "Preset of the environment.")
-    particles: Positive = setting(30, "Particles of each filter.")
+    noise: NoisePreset = setting("standard", "Noise preset of the environment.")
+    particles: Positive = setting(30, "Number of particles of each filter.")
     straighten: bool = setting(
         False,
-        "Rejuvenate filters, and straighten maps before they are merged, as in the environment by default: "
-        "it makes maps truer and keeps wrong merges out, and here takes most of the time.",
+        "Rejuvenate filters, and smooth maps before merging, as the environment does by default. "
+        "This makes maps more accurate and avoids false merges, but takes most of the time of a training.",
     )
-    decision_ticks: Positive = setting(20, "Ticks of 0.1 s from a decision to the next.")
-    max_cycles: Positive = setting(45, "Decisions of an episode.")
-    reward: Mapping[str, float] = setting({"map_error": 3.0, "own_coverage": 10.0}, "Weights of the terms.")
-    envs: int = option(16, "Environments side by side.", ge=1, hint=ONE)
-    steps: int = option(64_800, "Decisions of all robots together, rounded up to whole rollouts.", ge=1, hint=ONE)
-    batch: int = setting(360, "Decisions per step of the optimiser, whose advantages are compared.", ge=2)
-    epochs: Positive = setting(10, "Passes over each rollout.")
-    learning_rate: float = setting(1.5e-3, "At the start; it falls linearly to zero.", gt=0.0)
+    decision_ticks: Positive = setting(20, "Number of ticks of 0.1 s between decisions.")
+    max_cycles: Positive = setting(45, "Number of decisions per episode.")
+    reward: Mapping[str, float] = setting({"map_error": 3.0, "own_coverage": 10.0}, "Weights of the reward terms.")
+    envs: int = option(16, "Number of parallel environments.", ge=1, hint=ONE)
+    steps: int = option(64_800, "Decisions of all robots in total, rounded up to whole rollouts.", ge=1, hint=ONE)
+    batch: int = setting(360, "Minibatch size of the optimiser; advantages are normalised per minibatch.", ge=2)
+    epochs: Positive = setting(10, "Number of passes over each rollout.")
+    learning_rate: float = setting(1.5e-3, "Initial learning rate; it decays linearly to zero.", gt=0.0)
     gamma: Share = setting(
-        0.95, "Discount per decision: one per tick, to the power of `decision_ticks`. 0.999 per tick: 0.98."
+        0.95, "Discount per decision, the discount per tick to the power of `decision_ticks`: 0.999 per tick is 0.98."
     )
-    gae_lambda: Share = setting(0.5, "Of the generalised advantage estimate.")
-    clip: float = setting(0.2, "Clip range of PPO's ratio.", gt=0.0)
+    gae_lambda: Share = setting(0.5, "Lambda of the generalised advantage estimate.")
+    clip: float = setting(0.2, "Clip range of PPO's probability ratio.", gt=0.0)
     entropy: float = setting(0.002, "Weight of the entropy bonus.", ge=0.0)
-    checkpoint_updates: Positive = setting(5, "Rollouts between checkpoints.")
+    checkpoint_updates: Positive = setting(5, "Number of rollouts between checkpoints.")
 
     def check(self) -> None:
-        """Refuse what the environment refuses."""
+        """Refuse values that the environment refuses."""
         from vslam_env.world import check_source
 
         check_source(self.world)
@@ -67,11 +67,11 @@ class TrainConfig(ExperimentConfig):
 
     @classmethod
     def completed(cls, values: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Take what is left out from the preset."""
+        """Fill in omitted values from the preset."""
         return {**TRAIN_PRESETS.get(str(values.get("preset", "quick")), {}), **values}
 
     def to_mapping(self) -> dict[str, Any]:
-        """Return the plain values that repeat this training from any folder, the seed apart."""
+        """Return plain values that repeat this training from any folder, except the seed."""
         from vslam_env.world import WORLD_FAMILIES
 
         world = self.world if self.world in WORLD_FAMILIES else str(Path(self.world).resolve())
@@ -79,16 +79,16 @@ class TrainConfig(ExperimentConfig):
 
     @property
     def rollout(self) -> int:
-        """Decisions of all robots in a rollout."""
+        """Number of decisions of all robots in a rollout."""
         return self.envs * self.robots * self.max_cycles
 
     @property
     def updates(self) -> int:
-        """Rollouts, each followed by an update of the network."""
+        """Number of rollouts, each followed by an update of the network."""
         return -(-self.steps // self.rollout)
 
     def make_env_config(self, split: str | None) -> "EnvConfig":
-        """Return the environment for worlds of a split; files of one building have none."""
+        """Return the environment for worlds of a split; a world with a single layout has no splits."""
         from vslam_env.presets import preset_config
         from vslam_env.world import is_single_layout
 
@@ -105,27 +105,27 @@ class TrainConfig(ExperimentConfig):
 
 @dataclass(frozen=True, slots=True)
 class EvaluateTrial:
-    """One policy in one episode."""
+    """One episode of one policy."""
 
     policy: str
     seed: int
 
 
 class EvaluateConfig(ExperimentConfig):
-    """A trained model beside scripted policies; all decide as often as the model was trained to."""
+    """Evaluation of a trained model and baseline policies; all decide at the interval of the training."""
 
-    model: str = option(..., "A model that vslam train wrote, or its run folder.", is_path=True, is_argument=True)
-    policies: tuple[str, ...] = option(("random_goals", "frontier"), "Policies to compare with, with commas between.")
-    split: Literal["validation", "test"] = option("validation", "validation or test worlds.")
-    world: str | None = option(None, "A family or a path.", shown="that of the training")
-    robots: int | None = option(None, "Number of robots, 1 to 8.", shown="those of the training")
-    max_cycles: int | None = option(None, "Decisions of an episode.", shown="as in the training")
-    greedy: bool = option(False, "Take the model's best action, rather than one drawn from its distribution.")
-    seeds: int = option(20, "Episodes of each policy.", ge=2, hint="An interval needs two or more.")
+    model: str = option(..., "Model of vslam train, or its run folder.", is_path=True, is_argument=True)
+    policies: tuple[str, ...] = option(("random_goals", "frontier"), "Baseline policies, comma-separated.")
+    split: Literal["validation", "test"] = option("validation", "Split of the worlds: validation or test.")
+    world: str | None = option(None, "World family or path.", shown="as in the training")
+    robots: int | None = option(None, "Number of robots, 1 to 8.", shown="as in the training")
+    max_cycles: int | None = option(None, "Number of decisions per episode.", shown="as in the training")
+    greedy: bool = option(False, "Take the model's best action instead of sampling from its distribution.")
+    seeds: int = option(20, "Number of episodes of each policy.", ge=2, hint="A confidence interval needs two or more.")
     seed: int = first_seed()
 
     def check(self) -> None:
-        """Refuse policies that are not there, or cannot choose goals."""
+        """Refuse policies that do not exist or do not support `goal` actions."""
         from agents.registry import make_policy
 
         for name in self.policies:
@@ -133,7 +133,7 @@ class EvaluateConfig(ExperimentConfig):
 
     @classmethod
     def completed(cls, values: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Refuse an evaluation of no model."""
+        """Refuse a configuration without a model."""
         from slam_backend.core.validation import argument_error
 
         if "model" not in values:
@@ -141,14 +141,14 @@ class EvaluateConfig(ExperimentConfig):
         return values
 
     def to_mapping(self) -> dict[str, Any]:
-        """Return the plain values that repeat this evaluation from any folder, the seed apart."""
+        """Return plain values that repeat this evaluation from any folder, except the seed."""
         return super().to_mapping() | {"model": str(Path(self.model).resolve())}
 
     def environment(self) -> "EnvConfig":
-        """Return the environment; its return is the fall of the map error, whatever the model was paid for.
+        """Return the environment. Its reward is the decrease of the map error, whatever the reward of the training.
 
         Raises:
-            ValueError: If the model cannot be read, or knows another kind of environment.
+            ValueError: If the model cannot be read, or its environment is not supported.
         """
         from agents.trained import load_model
         from vslam_env.config import EnvConfig
@@ -161,20 +161,20 @@ class EvaluateConfig(ExperimentConfig):
         return config.replace(**changes, reward={"map_error": 1.0}, shared_reward=False)
 
     def trials(self) -> list[EvaluateTrial]:
-        """Return all trials, seed by seed."""
+        """Return all trials, ordered by seed."""
         names = (MODEL, *self.policies)
         return [EvaluateTrial(name, seed) for seed in range(self.seed, self.seed + self.seeds) for name in names]
 
 
 def require_extra() -> None:
-    """Refuse to go on without the packages of the extra `train`.
+    """Refuse to continue without the packages of the extra `train`.
 
     Raises:
-        ValueError: If one is missing.
+        ValueError: If a package is missing.
     """
     from slam_backend.core.validation import argument_error
 
     missing = [name for name in NEEDED if find_spec(name) is None]
     if missing:
-        cure = "Install them: pip install torch==2.13.0, which is small, then pip install '.[train]' in a checkout."
-        raise argument_error("train", "the packages of the extra 'train'", f"no {', '.join(missing)}", cure)
+        hint = "Install them: pip install torch==2.13.0, then pip install '.[train]' in a checkout."
+        raise argument_error("train", "the packages of the extra 'train'", f"no {', '.join(missing)}", hint)

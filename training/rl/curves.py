@@ -1,4 +1,4 @@
-"""The rows of a training as CSV and as a picture, and their first and last tenth."""
+"""Training curves: rows as CSV and as a plot, and the means of the first and last tenth."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -22,13 +22,13 @@ COLOUR = "#0072B2"
 
 
 def to_csv(rows: Sequence[Row]) -> str:
-    """Return one line per rollout under a heading; numbers have six digits."""
+    """Return the rows as CSV with a header, one line per rollout; numbers have six digits."""
     names = list(rows[0]) if rows else []
     return csv_text(names, ([row[name] for name in names] for row in rows))
 
 
-def ends_of(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
-    """Return the means over the first and over the last tenth of the rollouts, at least one each."""
+def first_and_last_tenth(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
+    """Return the means over the first and over the last tenth of the rollouts, at least one rollout each."""
     tenth = max(1, len(rows) // 10)
     return {"first": _mean(rows[:tenth]), "last": _mean(rows[-tenth:])}
 
@@ -38,7 +38,7 @@ def _mean(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def draw_learning(file: Path, rows: Sequence[Mapping[str, float]]) -> None:
-    """Draw each figure of the rollouts, and its running mean over a tenth of them, into a PNG file."""
+    """Plot each metric by rollout, with its running mean over a tenth of the rollouts, into a PNG file."""
     steps = np.array([row["steps"] for row in rows])
     with mpl.rc_context({"font.size": 9}):
         figure = Figure(figsize=(10.0, 5.6), layout="constrained")
@@ -56,7 +56,7 @@ def draw_learning(file: Path, rows: Sequence[Mapping[str, float]]) -> None:
 
 
 def running_mean(values: FloatArray, window: int) -> FloatArray:
-    """Return the mean of the last `window` values (n,) at each place; of fewer at the beginning.
+    """Return the mean of the last `window` values (n,) at each index; the first means are over fewer values.
 
     >>> running_mean(np.array([1.0, 3.0, 5.0]), 2)
     array([1., 2., 4.])

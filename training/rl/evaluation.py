@@ -1,4 +1,4 @@
-"""A trained model beside scripted policies, each on the same worlds it has never seen: one trial, and all summed up."""
+"""Evaluation of a trained model against baseline policies on the same unseen worlds."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -12,7 +12,7 @@ from agents.policy import Policy
 from agents.registry import make_policy
 from agents.trained import TrainedGoalPolicy, load_model
 from training.episodes.runner import run_episode
-from training.experiments.statistics import ahead_by, mean_of, shown, summarise_means
+from training.experiments.statistics import format_ci, mean_ci, paired_difference, summarise_means
 from training.experiments.tables import console_table
 from training.rl.config import MODEL, EvaluateConfig, EvaluateTrial
 from vslam_env import vslam_v0
@@ -24,13 +24,13 @@ FIGURES = ("return", *LAST)
 Rows = Sequence[Mapping[str, Any]]
 SHOWN = {
     "return": "return [m]", "map_error": "map error [m]", "map_recall": "recall", "coverage": "floor",
-    "merges": "merges", "distance": "way [m]",
+    "merges": "merges", "distance": "path [m]",
 }  # fmt: skip
-WITH_INTERVAL = ("return", "map_error")  # the others have theirs in metrics.json
+WITH_INTERVAL = ("return", "map_error")  # metrics.json has the intervals of all metrics
 
 
 def play(config: EvaluateConfig, trial: EvaluateTrial) -> dict[str, Any]:
-    """Play an episode; return the trial and its figures, means over the robots."""
+    """Run an episode; return the trial and its metrics as means over the robots."""
     env = _environment(config)
     policies = {agent: _policy(config, trial.policy) for agent in env.possible_agents}
     rewards: list[float] = []
@@ -49,15 +49,15 @@ def _policy(config: EvaluateConfig, name: str) -> Policy:
 
 
 def summarise(rows: Rows) -> list[dict[str, Any]]:
-    """Return a line per policy: its seeds, and of each figure the mean and its interval."""
+    """Return one line per policy: its number of seeds, and mean and confidence interval of each metric."""
     return summarise_means(rows, ("policy",), FIGURES)
 
 
 def leads(rows: Rows) -> list[dict[str, Any]]:
-    """Return per other policy by how much the model's return is higher on the same seeds.
+    """Return the lead of the model's return over each other policy on common seeds.
 
-    Fields: `over`, `seeds` (those that both have played), `lead` with `lead_low` and `lead_high` (95 %, bootstrap),
-    `won`: the share of seeds in which the model's is higher.
+    Fields: `over`, `seeds` (number of common seeds), `lead` with `lead_low` and `lead_high` (95 %, bootstrap), `won`:
+    share of the seeds in which the model's return is higher.
     """
     returns: dict[str, dict[int, float]] = {}
     for row in rows:
@@ -65,25 +65,25 @@ def leads(rows: Rows) -> list[dict[str, Any]]:
     own = returns.pop(MODEL, {})
     found = []
     for name, theirs in returns.items():
-        ahead = ahead_by(own, theirs)
+        ahead = paired_difference(own, theirs)
         if len(ahead):
-            told = {"over": name, "seeds": len(ahead), "won": float((ahead > 0.0).mean())}
-            found.append(told | mean_of("lead", ahead))
+            lead = {"over": name, "seeds": len(ahead), "won": float((ahead > 0.0).mean())}
+            found.append(lead | mean_ci("lead", ahead))
     return found
 
 
 def print_evaluation(console: Console, lines: Rows, ahead: Rows, split: str | None) -> None:
-    """Print a table, which 80 columns hold, and a line for each lead.
+    """Print a table that fits into 80 columns, and one line for each lead.
 
     Args:
-        split: Of the worlds; None where all episodes are in the same building.
+        split: Split of the worlds; None for a world with a single layout.
     """
     played = sorted({line["seeds"] for line in lines})
     episodes = "-".join(str(n) for n in (played if len(played) < 2 else (played[0], played[-1])))
     rows = [
         [
             line["policy"],
-            *(shown(line, name, stacked=True) if name in WITH_INTERVAL else f"{line[name]:.2f}" for name in SHOWN),
+            *(format_ci(line, name, stacked=True) if name in WITH_INTERVAL else f"{line[name]:.2f}" for name in SHOWN),
         ]
         for line in lines
     ]
@@ -92,7 +92,7 @@ def print_evaluation(console: Console, lines: Rows, ahead: Rows, split: str | No
     console.print(console_table(title, ["policy", *SHOWN.values()], rows))
     for lead in ahead:
         console.print(
-            f"model - {lead['over']}: {shown(lead, 'lead')} m of return, ahead in {100.0 * lead['won']:.0f} % "
+            f"model - {lead['over']}: {format_ci(lead, 'lead')} m of return, ahead in {100.0 * lead['won']:.0f} % "
             f"of {lead['seeds']} seeds",
             soft_wrap=True,
         )

@@ -1,4 +1,4 @@
-"""`GoalPolicy`: the network of `agents.goal_network` in torch, with a value head, as MaskablePPO trains it."""
+"""`GoalPolicy`: torch version of `agents.goal_network` with a value head, for MaskablePPO."""
 
 from typing import Any
 
@@ -14,8 +14,8 @@ from agents.goal_network import CANDIDATE_SCALE, CHANNELS, CONTEXT, PATCHES, PIC
 NUM_SLOTS = SHAPES["candidates"][0]
 
 
-class GoalFeatures(BaseFeaturesExtractor):  # type: ignore[misc]   # its types are not looked at
-    """Context of the robot, beside the scaled candidates and which of them there are."""
+class GoalFeatures(BaseFeaturesExtractor):  # type: ignore[misc]   # its types are not checked
+    """Context of the robot, scaled candidates, and the mask of valid candidates."""
 
     def __init__(self, observation_space: Any) -> None:
         super().__init__(observation_space, CONTEXT + 6 * NUM_SLOTS)
@@ -30,7 +30,7 @@ class GoalFeatures(BaseFeaturesExtractor):  # type: ignore[misc]   # its types a
             self.register_buffer(f"{name}_scale", torch.tensor(scale), persistent=False)
 
     def forward(self, observations: dict[str, Any]) -> Any:
-        """Return (n, 64 + 16 x 5 + 16): context, candidates row by row, which are valid."""
+        """Return (n, 64 + 16 x 5 + 16): context, candidates row by row, mask of valid candidates."""
         seen = torch.relu(self.picture_out(self.picture(observations["local_grid"]).flatten(1)))
         vectors = [(observations[name] * getattr(self, f"{name}_scale")).flatten(1) for name in VECTORS]
         context = torch.tanh(self.context(torch.cat([seen, *vectors], dim=1)))
@@ -39,7 +39,7 @@ class GoalFeatures(BaseFeaturesExtractor):  # type: ignore[misc]   # its types a
 
 
 class SlotScorer(nn.Module):  # type: ignore[misc]
-    """One small network looks at each candidate; the mean of what it sees in the valid ones goes to the value."""
+    """Scores of the candidates by one shared network; the value uses its mean features over valid candidates."""
 
     latent_dim_pi = 1 + NUM_SLOTS
     latent_dim_vf = CONTEXT
@@ -54,17 +54,17 @@ class SlotScorer(nn.Module):  # type: ignore[misc]
         self.value_hidden = nn.Linear(2 * CONTEXT, CONTEXT)
 
     def forward(self, features: Any) -> tuple[Any, Any]:
-        """Return logits (n, 17) and what the value is read from (n, 64)."""
+        """Return logits (n, 17) and features of the value head (n, 64)."""
         context, hidden, valid = self._look(features)
         return self._logits(context, hidden), self._value(context, hidden, valid)
 
     def forward_actor(self, features: Any) -> Any:
-        """Return the logits alone."""
+        """Return the logits only."""
         context, hidden, _ = self._look(features)
         return self._logits(context, hidden)
 
     def forward_critic(self, features: Any) -> Any:
-        """Return what the value is read from alone."""
+        """Return the features of the value head only."""
         return self._value(*self._look(features))
 
     def _look(self, features: Any) -> tuple[Any, Any, Any]:
@@ -81,13 +81,13 @@ class SlotScorer(nn.Module):  # type: ignore[misc]
 
 
 class GoalPolicy(MaskableMultiInputActorCriticPolicy):  # type: ignore[misc]
-    """The actor and critic over it, for `goal` actions and dict observations."""
+    """Actor and critic for `goal` actions and dict observations."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs | {"features_extractor_class": GoalFeatures})
 
     def _build(self, lr_schedule: Any) -> None:
-        """Make the layers and the optimiser; the scorer's outputs are the logits already."""
+        """Make the layers and the optimiser; the scorer's outputs already are the logits."""
         self.mlp_extractor = SlotScorer()
         self.action_net = nn.Identity()
         self.value_net = nn.Linear(CONTEXT, 1)
@@ -99,7 +99,7 @@ class GoalPolicy(MaskableMultiInputActorCriticPolicy):  # type: ignore[misc]
         self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)
 
     def actor_weights(self) -> dict[str, NDArray[np.float32]]:
-        """Return copies of the weights that `agents.goal_network` needs, by its names."""
+        """Return copies of the weights that `agents.goal_network` needs, by layer name."""
         layers = {**self.features_extractor.state_dict(), **self.mlp_extractor.state_dict()}
         return {
             name: tensor.detach().cpu().numpy().copy()

@@ -1,4 +1,4 @@
-"""`SlotBatch`: several environments side by side, each robot of each in a slot of its own, stepped one by one."""
+"""`SyncEnvs`: several environments in one process, one slot per robot, stepped in sequence."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -14,27 +14,27 @@ from slam_backend.core.validation import BoolArray, Float32Array, FloatArray, ar
 
 MakeEnv = Callable[[], ParallelEnv[str, Any, Any]]
 Infos = list[dict[str, Any]]
-WHOLE = ""  # names the one array of observations that are not dicts
+WHOLE = ""  # name of the array of a plain box observation
 MASK = "action_mask"
-NOTHING_SENT = "step_wait: expected actions that were sent, got none. Call step_async() first."
+NOTHING_SENT = "step_wait: expected actions, got none. Call step_async() first."
 Layout = tuple[tuple[str, tuple[int, ...], np.dtype[Any]], ...]  # names, shapes and types of observations
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Stepped:
-    """What all slots saw in a step."""
+class StepResult:
+    """Result of a step for all slots."""
 
-    observations: dict[str, NDArray[Any]]  # Arrays (S, ...) by name, as `stacked` makes them; nobody else holds them
+    observations: dict[str, NDArray[Any]]  # Arrays (S, ...) by name; not shared
     rewards: Float32Array  # (S,) float32
-    dones: BoolArray  # (S,) bool. The slot's episode has ended and its observation is the first of the next one.
+    dones: BoolArray  # (S,) bool. Whether the episode ended; the observation is then the first of the next.
     infos: Infos  # One dict per slot
-    # (P, 2) float64 [s]. What the environments of each process took: on the clock, and of its processor.
+    # (P, 2) float64 [s]. Wall-clock time and processor time that the environments of each process took.
     spent: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
 class Slot:
-    """One robot of one environment; what it lacks itself is its environment's."""
+    """One robot of one environment; missing attributes are looked up in the environment."""
 
     env: Any
     agent: str
@@ -44,14 +44,14 @@ class Slot:
 
 
 def row_layout(space: spaces.Space[Any]) -> Layout:
-    """Return names, shapes and types of the observations of a space; a plain box has the name `""`.
+    """Return names, shapes and dtypes of the observations of a space; a plain box has the name `""`.
 
     Raises:
         ValueError: If the space is neither a box nor a dict of boxes.
     """
     boxes = dict(space.spaces) if isinstance(space, spaces.Dict) else {WHOLE: space}
     if not all(isinstance(box, spaces.Box) for box in boxes.values()):
-        raise argument_error("observation_space", "a Box or a Dict of these", space, "Flatten what is nested.")
+        raise argument_error("observation_space", "a Box or a Dict of boxes", space, "Flatten nested spaces.")
     return tuple((name, box.shape or (), np.dtype(box.dtype)) for name, box in boxes.items())
 
 
@@ -61,9 +61,9 @@ def buffers(layout: Layout, slots: int) -> dict[str, NDArray[Any]]:
 
 
 def stacked(layout: Layout, observations: Sequence[Any]) -> dict[str, NDArray[Any]]:
-    """Return new arrays (S, ...) by name, a row for each of S observations; they share no memory with these.
+    """Return new arrays (S, ...) by name, with one row for each of S observations; no memory is shared.
 
-    Each name's rows are joined by one call: one assignment per row takes twice as long.
+    One call joins the rows of each name: one assignment per row takes twice as long.
     """
     found = {}
     for name, rows in buffers(layout, len(observations)).items():
@@ -76,20 +76,20 @@ def stacked(layout: Layout, observations: Sequence[Any]) -> dict[str, NDArray[An
     return found
 
 
-class SlotBatch:
-    """Environments in this process. Slots are ordered by environment, then by agent.
+class SyncEnvs:
+    """Environments in this process, with slots ordered by environment, then by agent.
 
-    An environment whose episode ends is reset at once. What each environment returns is what it would return alone.
+    An environment whose episode ends is reset at once. Each environment gives the same results as it would alone.
 
     Args:
-        makers: Each makes an environment; all agents of all of them have the same spaces.
+        makers: Functions that each make an environment; all agents of all environments have the same spaces.
 
     Attributes:
-        observation_space: Of a slot.
-        action_space: Of a slot.
-        render_mode: Of the environments.
-        counts: How many slots each environment has.
-        layout: Of the observations of a slot.
+        observation_space: Observation space of a slot.
+        action_space: Action space of a slot.
+        render_mode: Render mode of the environments.
+        counts: Number of slots of each environment.
+        layout: Layout of the observations of a slot.
 
     Raises:
         ValueError: If there is no environment, or spaces or render modes differ.
@@ -110,11 +110,11 @@ class SlotBatch:
             for kind in ("observation_space", "action_space"):
                 theirs = getattr(slot.env, kind)(slot.agent)
                 if theirs != getattr(self, kind):
-                    raise argument_error(kind, "the same for all agents", theirs, "Give robots of one kind.")
+                    raise argument_error(kind, "the same for all agents", theirs, "Use one configuration.")
             if slot.env.render_mode != self.render_mode:
-                raise argument_error("render_mode", "the same for all", slot.env.render_mode, "Make all alike.")
+                raise argument_error("render_mode", "the same for all", slot.env.render_mode, "Use one configuration.")
         self.layout = row_layout(self.observation_space)
-        self._results: Stepped | None = None
+        self._results: StepResult | None = None
 
     @property
     def num_slots(self) -> int:
@@ -129,39 +129,39 @@ class SlotBatch:
         Returns:
             Observations (S, ...) by name, and infos.
         """
-        told = [
+        results = [
             env.reset(seed=seed, options=dict(option))
             for env, seed, option in zip(self.envs, seeds, options, strict=True)
         ]
-        observations, infos = map(self._by_slot, zip(*told, strict=True))
+        observations, infos = map(self._by_slot, zip(*results, strict=True))
         return stacked(self.layout, observations), infos
 
-    def step(self, actions: NDArray[Any]) -> Stepped:
+    def step(self, actions: NDArray[Any]) -> StepResult:
         """Step all environments with actions (S, ...)."""
-        chosen = iter(actions)  # each environment takes as many as it has agents
+        chosen = iter(actions)  # each environment takes one action per agent
         wanted = [dict(zip(agents, chosen, strict=False)) for agents in self._agents]
         begin = time.perf_counter(), time.process_time()
-        # Nothing else is done between the steps: they take the caches, and what runs after each of them is slow.
-        told = [env.step(each) for env, each in zip(self.envs, wanted, strict=True)]
-        begun = [each[0] if env.agents else env.reset()[0] for env, each in zip(self.envs, told, strict=True)]
+        # No other work is done between the steps: they evict the caches, so that work after each step is slow.
+        results = [env.step(each) for env, each in zip(self.envs, wanted, strict=True)]
+        begun = [each[0] if env.agents else env.reset()[0] for env, each in zip(self.envs, results, strict=True)]
         spent = np.array([[time.perf_counter() - begin[0], time.process_time() - begin[1]]])
-        last, rewards, over, cut, infos = map(self._by_slot, zip(*told, strict=True))
+        last, rewards, over, cut, infos = map(self._by_slot, zip(*results, strict=True))
         for info, terminated, truncated, observation in zip(infos, over, cut, last, strict=True):
             info["TimeLimit.truncated"] = truncated and not terminated
             if terminated or truncated:
                 info["terminal_observation"] = observation
         observations = stacked(self.layout, self._by_slot(begun))
-        return Stepped(observations, np.array(rewards, np.float32), np.logical_or(over, cut), infos, spent)
+        return StepResult(observations, np.array(rewards, np.float32), np.logical_or(over, cut), infos, spent)
 
-    def send(self, actions: NDArray[Any]) -> None:
-        """Step with actions (S, ...); `receive` hands out what came of it."""
+    def step_async(self, actions: NDArray[Any]) -> None:
+        """Step with actions (S, ...); `step_wait` returns the result."""
         self._results = self.step(actions)
 
-    def receive(self) -> Stepped:
-        """Return what the last `send` led to.
+    def step_wait(self) -> StepResult:
+        """Return the result of the last `step_async`.
 
         Raises:
-            RuntimeError: If nothing was sent.
+            RuntimeError: If no actions were sent.
         """
         if self._results is None:
             raise RuntimeError(NOTHING_SENT)
@@ -169,12 +169,12 @@ class SlotBatch:
         return results
 
     def ask(self, command: str, slots: Sequence[int], name: str, *rest: Any) -> list[Any]:
-        """Get, set, look for or call an attribute of some slots, once per slot.
+        """Get, set, test for or call an attribute of some slots, once per slot.
 
         Args:
             command: `"get"`, `"set"`, `"has"` or `"call"`.
-            name: The attribute; one that a slot lacks is its environment's.
-            rest: Value to set, or arguments and keyword arguments of the call.
+            name: Name of the attribute; if a slot lacks it, the environment's attribute is used.
+            rest: Value to set, or positional and keyword arguments of the call.
         """
         chosen = [self.slots[slot] for slot in slots]
         if command == "has":
@@ -192,5 +192,5 @@ class SlotBatch:
             env.close()
 
     def _by_slot(self, by_env: Sequence[Mapping[str, Any]]) -> list[Any]:
-        """Return what each environment tells of each of its agents, slot by slot."""
+        """Return the values of all agents, slot by slot."""
         return [of[agent] for of, agents in zip(by_env, self._agents, strict=True) for agent in agents]

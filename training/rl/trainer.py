@@ -1,4 +1,4 @@
-"""A training: MaskablePPO built from a configuration, run, saved, and gone on with as if it had never stopped."""
+"""`Training`: MaskablePPO built from a configuration; runs, saves checkpoints and resumes exactly."""
 
 import random
 from collections.abc import Mapping
@@ -14,7 +14,7 @@ from agents.trained import MODEL_FILE, save_model
 from slam_backend.core.state_checks import generator as check_generator
 from slam_backend.core.validation import argument_error
 from training.experiments.run_folder import installed_versions
-from training.rl.callbacks import Row, TrainingWatch
+from training.rl.callbacks import Row, TrainingCallback
 from training.rl.checkpoint import CHECKPOINT_FILE, read_checkpoint, write_checkpoint
 from training.rl.config import SPLIT_TRAIN, SPLIT_TRY, TrainConfig
 from training.rl.network import GoalPolicy
@@ -24,22 +24,22 @@ BOARD = "tensorboard"
 
 
 class Training:
-    """A training in a folder of its own.
+    """Training in its own folder.
 
-    All sums run on one thread: two trainings of one configuration give the same weights, be they interrupted or not,
-    in one process or several, as long as machine and packages are the same.
+    All sums run on one thread: two trainings of one configuration give the same weights, whether interrupted or not and
+    for any number of processes, on the same machine with the same packages.
 
     Args:
-        folder: Where checkpoint, model and TensorBoard curves go.
-        workers: Processes that step the environments; 0: this one.
-        device: `"cpu"`, `"cuda"` or one of several, as torch names them.
+        folder: Folder of checkpoint, model and TensorBoard curves.
+        workers: Number of processes that step the environments; 0: this process.
+        device: Torch device: `"cpu"`, `"cuda"` or one of several GPUs.
 
     Attributes:
         model: The learner.
-        watch: What tells of it, and stops it.
+        watch: Callback that reports progress and stops the training.
 
     Raises:
-        ValueError: If there is no such device, or the environment cannot be built.
+        ValueError: If the device does not exist, or the environment cannot be built.
     """
 
     def __init__(self, config: TrainConfig, folder: Path, workers: int = 0, device: str = "cpu") -> None:
@@ -52,7 +52,7 @@ class Training:
             batch_size=config.batch, n_epochs=config.epochs, gamma=config.gamma, gae_lambda=config.gae_lambda,
             clip_range=config.clip, ent_coef=config.entropy, seed=config.seed, device=device,
         )  # fmt: skip
-        self.watch = TrainingWatch(self.env, self.save, config.checkpoint_updates)
+        self.watch = TrainingCallback(self.env, self.save, config.checkpoint_updates)
 
     @property
     def rows(self) -> list[Row]:
@@ -60,7 +60,7 @@ class Training:
         return self.watch.rows
 
     def run(self) -> bool:
-        """Train to the end, or until `watch` is told to stop; save a checkpoint and the model.
+        """Train to the end, or until the callback stops the training; save a checkpoint and the model.
 
         Returns:
             Whether the training is complete.
@@ -75,7 +75,7 @@ class Training:
         return not self.watch.stopped
 
     def save(self) -> None:
-        """Write the checkpoint, and the model as it is now."""
+        """Write the checkpoint and the current model."""
         model = self.model
         content = {
             "config": self.config.to_mapping(),
@@ -88,7 +88,7 @@ class Training:
             "watch": self.watch.get_state(),
             "draws": {
                 "python": random.getstate(),
-                "numpy": np.random.get_state(legacy=False),  # noqa: NPY002   # the learner draws from the global one
+                "numpy": np.random.get_state(legacy=False),  # noqa: NPY002   # the learner uses the global generator
                 "torch": as_arrays(torch.get_rng_state()),
                 "cuda": as_arrays(_cuda_state()),
             },
@@ -97,7 +97,7 @@ class Training:
         self.save_model(self._folder / MODEL_FILE)
 
     def save_model(self, file: Path) -> None:
-        """Write the model that `agents.trained` plays."""
+        """Write the model for `agents.trained`."""
         about = {
             "version": installed_versions()["vslam-env"],
             "environment": self.config.make_env_config(SPLIT_TRY).to_toml(), "steps": int(self.model.num_timesteps),
@@ -106,19 +106,19 @@ class Training:
         save_model(file, self.model.policy.actor_weights(), about)
 
     def restore(self, kept: Mapping[str, Any]) -> None:
-        """Go on from what `kept_of` read.
+        """Resume from a checkpoint of `stored_checkpoint`.
 
         Raises:
-            ValueError: If a part of it is none that `save` wrote; train again, or read another.
+            ValueError: If a part does not fit this training.
         """
         try:
             self._go_on_from(kept)
-        except Exception as error:  # whatever torch says of parts that are none of this model's
-            cure = f"Copy the checkpoint again, or train again. It says: {error}."
-            raise argument_error("resume", "the parts that a training saved", "'others'", cure) from error
+        except Exception as error:  # torch raises various errors for parts of another model
+            hint = f"Copy the checkpoint again, or train again. Error: {error}."
+            raise argument_error("resume", "a checkpoint of this model", "a different one", hint) from error
 
     def _go_on_from(self, kept: Mapping[str, Any]) -> None:
-        """Take over the parts of a checkpoint."""
+        """Load the parts of a checkpoint."""
         model, draws = self.model, kept["draws"]
         model.policy.load_state_dict(as_tensors(kept["policy"]))
         model.policy.optimizer.load_state_dict(as_tensors(kept["optimizer"]))
@@ -138,41 +138,41 @@ class Training:
         self.env.close()
 
 
-def kept_of(folder: Path, config: TrainConfig) -> dict[str, Any]:
-    """Return the checkpoint of a training's folder.
+def stored_checkpoint(folder: Path, config: TrainConfig) -> dict[str, Any]:
+    """Return the checkpoint in the folder of a training.
 
     Raises:
-        ValueError: If there is none, it is damaged, or of another configuration or version.
+        ValueError: If it is missing or damaged, or has another configuration or version.
     """
     kept = read_checkpoint(folder / CHECKPOINT_FILE)
     if (kept["config"], kept["seed"]) != (config.to_mapping(), config.seed):
-        cure = "Give back the folder its own config.toml, or train anew."
-        raise argument_error("resume", "a checkpoint of the folder's configuration", "a checkpoint of another", cure)
+        hint = "Restore the config.toml of the folder, or train again."
+        raise argument_error("resume", "a checkpoint of the folder's configuration", "a checkpoint of another", hint)
     return kept
 
 
 def check_device(device: str) -> str:
-    """Return a device that torch has here.
+    """Return a device that torch can use.
 
     Raises:
-        ValueError: If it is no device, or this machine has none of its kind.
+        ValueError: If it is not a device, or this machine has no such device.
     """
     try:
         kind = torch.device(device).type
     except RuntimeError as error:
-        raise argument_error("device", "cpu, cuda or cuda:0", device, "Leave it out to use the processor.") from error
+        raise argument_error("device", "cpu, cuda or cuda:0", device, "Omit it to use the processor.") from error
     if kind not in ("cpu", "cuda"):
-        raise argument_error("device", "cpu, cuda or cuda:0", device, "Leave it out to use the processor.")
+        raise argument_error("device", "cpu, cuda or cuda:0", device, "Omit it to use the processor.")
     if kind == "cuda":
         found = torch.cuda.device_count() if torch.cuda.is_available() else 0
         if (torch.device(device).index or 0) >= found:
-            cure = "Leave --device out to use the processor, or install a torch that finds the GPU."
-            raise argument_error("device", "a GPU that torch can use", f"a machine with {found} of them", cure)
+            hint = "Omit --device to use the processor, or install a torch build that supports the GPU."
+            raise argument_error("device", "a GPU that torch can use", f"a machine with {found} of them", hint)
     return device
 
 
 def as_arrays(value: Any) -> Any:
-    """Return nested dicts, lists and tuples with arrays in place of tensors, as checkpoints hold them."""
+    """Return nested dicts, lists and tuples with arrays in place of tensors, for a checkpoint."""
     if isinstance(value, torch.Tensor):
         return value.detach().cpu().numpy().copy()
     if isinstance(value, Mapping):
@@ -181,7 +181,7 @@ def as_arrays(value: Any) -> Any:
 
 
 def as_tensors(value: Any) -> Any:
-    """Return what `as_arrays` was given, on the processor."""
+    """Return the inverse of `as_arrays`, with tensors on the CPU."""
     if isinstance(value, np.ndarray):
         return torch.from_numpy(value.copy())
     if isinstance(value, Mapping):

@@ -1,4 +1,4 @@
-"""`SlotWorkers`: the environments of a `SlotBatch` divided among processes; observations come by shared memory."""
+"""`ProcessEnvs`: environments of `SyncEnvs` in worker processes; observations use shared memory."""
 
 import atexit
 import time
@@ -18,40 +18,41 @@ from numpy.typing import NDArray
 from slam_backend.core.validation import argument_error
 from training.experiments.interrupt import begin_worker, signals_held
 from training.experiments.trial_store import one_thread_each
-from training.rl.slots import NOTHING_SENT, Infos, Layout, MakeEnv, SlotBatch, Stepped, buffers
+from training.rl.slots import NOTHING_SENT, Infos, Layout, MakeEnv, StepResult, SyncEnvs, buffers
 
-CLOSE_S = 5.0  # workers that have not ended by then are killed
+CLOSE_S = 5.0  # time after which running workers are killed
 
 
-class SlotWorkers:
-    """Environments in other processes, with the methods and the results of a `SlotBatch`.
+class ProcessEnvs:
+    """Environments in worker processes, with the methods and the results of `SyncEnvs`.
 
-    Each worker takes a run of consecutive environments, as equal in number as can be. It writes observations into
-    memory that it shares with this process, which copies them out before the next step; all else goes through a pipe.
-    Workers use one thread each, leave SIGINT and SIGTERM to this process, and end when it does. An error in a worker is
-    raised here, and ends all of them.
+    Each worker runs consecutive environments, as equal in number as possible. It writes observations into shared
+    memory, which this process copies before the next step; everything else goes through a pipe. Workers use one thread
+    each, leave SIGINT and SIGTERM to this process, and end when it ends. An error in a worker is raised here and ends
+    all workers.
 
     Args:
-        makers: Each makes an environment; what cloudpickle can pickle. This process makes each once, to see its spaces.
-        workers: How many processes, at least 1.
-        prepare: Called once in each of them, in all at a time, before environments are made: what it loads keeps no
-            step waiting later. Picklable likewise.
+        makers: Functions that each make an environment; cloudpickle must support them. This process calls each once, to
+            read its spaces.
+        workers: Number of processes, at least 1.
+        prepare: Function called once in each process, in all at the same time, before environments are made, e.g. to
+            load kernels. Picklable by cloudpickle.
 
     Attributes:
-        observation_space: Of a slot.
-        action_space: Of a slot.
-        render_mode: Of the environments.
-        counts: How many slots each environment has.
+        observation_space: Observation space of a slot.
+        action_space: Action space of a slot.
+        render_mode: Render mode of the environments.
+        counts: Number of slots of each environment.
 
     Raises:
         ValueError: If there are more workers than environments, or their spaces differ.
     """
 
     def __init__(self, makers: Sequence[MakeEnv], workers: int, prepare: Callable[[], object] = lambda: None) -> None:
-        sample = SlotBatch(makers)
+        sample = SyncEnvs(makers)
         if workers > len(makers):
-            cure = "Use fewer workers, or more environments."
-            raise argument_error("workers", f"at most one per environment, {len(makers)}", workers, cure)
+            hint = "Use fewer workers, or more environments."
+            raise argument_error("workers", f"at most one per environment, {len(makers)}", workers, hint)
         self.observation_space: spaces.Space[Any] = sample.observation_space
         self.action_space: spaces.Space[Any] = sample.action_space
         self.render_mode, self.counts = sample.render_mode, sample.counts
@@ -69,14 +70,16 @@ class SlotWorkers:
         self._sent = False
         ends = [0, *np.cumsum(self.counts).tolist()]
         self._kill = partial(_kill, self._processes)
-        atexit.register(self._kill)  # comes before multiprocessing's own, which sends SIGTERM and waits
+        atexit.register(self._kill)  # runs before multiprocessing's handler, which sends SIGTERM and waits
         with one_thread_each(), signals_held():
             for share in np.array_split(np.arange(len(makers)), workers):
                 envs = slice(int(share[0]), int(share[-1]) + 1)
                 slots = slice(ends[envs.start], ends[envs.stop])
                 ours, theirs = context.Pipe()
                 packed = cloudpickle.dumps((prepare, list(makers[envs])))
-                process = context.Process(target=_serve, args=(theirs, packed, memory, slots, ends[-1]), daemon=True)
+                process = context.Process(
+                    target=_worker_loop, args=(theirs, packed, memory, slots, ends[-1]), daemon=True
+                )
                 process.start()
                 theirs.close()
                 self._envs.append(envs)
@@ -92,34 +95,36 @@ class SlotWorkers:
     def reset(
         self, seeds: Sequence[int | None], options: Sequence[Mapping[str, Any]]
     ) -> tuple[dict[str, NDArray[Any]], Infos]:
-        """Reset all environments; as of `SlotBatch`."""
-        self._settle()
-        told = self._ask_all([("reset", list(seeds[envs]), list(options[envs])) for envs in self._envs])
-        return self._copied(), [info for infos in told for info in infos]
+        """Reset all environments; see `SyncEnvs.reset`."""
+        self._discard_pending()
+        answers = self._ask_all([("reset", list(seeds[envs]), list(options[envs])) for envs in self._envs])
+        return self._copy_observations(), [info for infos in answers for info in infos]
 
-    def send(self, actions: NDArray[Any]) -> None:
-        """Let all environments begin a step with actions (S, ...)."""
-        self._settle()
+    def step_async(self, actions: NDArray[Any]) -> None:
+        """Start a step of all environments with actions (S, ...)."""
+        self._discard_pending()
         for pipe, slots in zip(self._pipes, self._slots, strict=True):
             self._send(pipe, ("step", actions[slots]))
         self._sent = True
 
-    def receive(self) -> Stepped:
-        """Wait for the step to end, and return what it led to.
+    def step_wait(self) -> StepResult:
+        """Wait for the end of the step, and return its result.
 
         Raises:
-            RuntimeError: If nothing was sent.
+            RuntimeError: If no actions were sent.
         """
         if not self._sent:
             raise RuntimeError(NOTHING_SENT)
         self._sent = False
-        told = self._answers()
-        rewards, dones, spent = (np.concatenate([each[part] for each in told]) for part in (0, 1, 2))
-        return Stepped(self._copied(), rewards, dones, [info for each in told for info in each[3]], spent)
+        answers = self._answers()
+        rewards, dones, spent = (np.concatenate([each[part] for each in answers]) for part in (0, 1, 2))
+        return StepResult(
+            self._copy_observations(), rewards, dones, [info for each in answers for info in each[3]], spent
+        )
 
     def ask(self, command: str, slots: Sequence[int], name: str, *rest: Any) -> list[Any]:
-        """Get, set, look for or call an attribute of some slots, as `SlotBatch` does; what comes back is pickled."""
-        self._settle()
+        """Get, set, test for or call an attribute of some slots, as `SyncEnvs.ask`; answers are pickled."""
+        self._discard_pending()
         asked: dict[int, list[int]] = {}
         for slot in slots:
             worker = next(w for w, part in enumerate(self._slots) if part.start <= slot < part.stop)
@@ -150,12 +155,12 @@ class SlotWorkers:
 
     # ------------------------------------------------------------------ within
 
-    def _settle(self) -> None:
-        """Take back a step that nobody waited for, and refuse to go on after the end."""
+    def _discard_pending(self) -> None:
+        """Discard the result of a pending step, and refuse closed environments."""
         if not self._pipes:
             raise RuntimeError("environments: expected running workers, got closed ones. Make new ones.")
         if self._sent:
-            self.receive()
+            self.step_wait()
 
     def _ask_all(self, messages: Sequence[tuple[Any, ...]]) -> list[Any]:
         for pipe, message in zip(self._pipes, messages, strict=True):
@@ -163,14 +168,14 @@ class SlotWorkers:
         return self._answers()
 
     def _send(self, pipe: Connection, message: tuple[Any, ...]) -> None:
-        with suppress(BrokenPipeError):  # a worker that died is found out when its answer is missed
+        with suppress(BrokenPipeError):  # a dead worker is detected when its answer is missing
             pipe.send(message)
 
     def _answers(self) -> list[Any]:
         return [self._answer(worker) for worker in range(len(self._pipes))]
 
     def _answer(self, worker: int) -> Any:
-        """Return what a worker answers; its error, or its death, ends all workers."""
+        """Return the answer of a worker; an error or the death of a worker ends all workers."""
         try:
             failed, answer = self._pipes[worker].recv()
         except (EOFError, ConnectionResetError):
@@ -178,19 +183,19 @@ class SlotWorkers:
             code = self._processes[worker].exitcode
             self.close()
             envs = self._envs[worker]
-            text = f"worker {worker}: expected an answer of environments {envs.start} to {envs.stop - 1}, got its end"
+            text = f"worker {worker}: expected an answer of environments {envs.start} to {envs.stop - 1}, got an exit"
             raise RuntimeError(f"{text} with status {code}. Make new environments.") from None
         if failed:
             self.close()
             raise answer
         return answer
 
-    def _copied(self) -> dict[str, NDArray[Any]]:
+    def _copy_observations(self) -> dict[str, NDArray[Any]]:
         return {name: view.copy() for name, view in self._seen.items()}
 
 
 def _kill(processes: Sequence[Any]) -> None:
-    """End the workers of environments that were never closed."""
+    """Kill the workers of environments that were not closed."""
     for process in processes:
         process.kill()
 
@@ -203,18 +208,18 @@ def _views(memory: Mapping[str, Any], layout: Layout, slots: int) -> dict[str, N
     }
 
 
-def _serve(pipe: Connection, packed: bytes, memory: Mapping[str, Any], part: slice, slots: int) -> None:
-    """Run a worker: answer commands until told to close, or until the other process is gone."""
+def _worker_loop(pipe: Connection, packed: bytes, memory: Mapping[str, Any], part: slice, slots: int) -> None:
+    """Run a worker: answer commands until it is closed or the parent process is gone."""
     begin_worker()
-    batch: SlotBatch | None = None
+    batch: SyncEnvs | None = None
     failure: Exception | None = None
     try:
         prepare, makers = cloudpickle.loads(packed)
         prepare()
-        batch = SlotBatch(makers)
+        batch = SyncEnvs(makers)
         rows = {name: view[part] for name, view in _views(memory, batch.layout, slots).items()}
-    except Exception as error:  # told when something is asked for
-        failure = _noted(error)
+    except Exception as error:  # reported in the answer to the next command
+        failure = _with_traceback(error)
     while True:
         try:
             command, *rest = pipe.recv()
@@ -225,43 +230,43 @@ def _serve(pipe: Connection, packed: bytes, memory: Mapping[str, Any], part: sli
                 batch.close()
             return
         try:
-            answer = (True, failure) if batch is None or failure else (False, _obey(batch, rows, command, rest))
+            answer = (True, failure) if batch is None or failure else (False, _execute(batch, rows, command, rest))
         except Exception as error:
-            answer = (True, _noted(error))
-        if not _answered(pipe, answer):
+            answer = (True, _with_traceback(error))
+        if not _send_answer(pipe, answer):
             return
 
 
-def _answered(pipe: Connection, answer: tuple[bool, Any]) -> bool:
-    """Send an answer, or the error of one that cannot be pickled; return whether the other process is still there."""
+def _send_answer(pipe: Connection, answer: tuple[bool, Any]) -> bool:
+    """Send an answer, or the error if it cannot be pickled; return whether the parent process still exists."""
     try:
         pipe.send(answer)
     except OSError:
         return False
     except Exception as error:
-        return _answered(pipe, (True, _noted(error)))
+        return _send_answer(pipe, (True, _with_traceback(error)))
     return True
 
 
-def _noted(error: Exception) -> Exception:
-    """Return an error that is being handled, with its traceback as a note, which other processes get to see."""
+def _with_traceback(error: Exception) -> Exception:
+    """Return the current error with its traceback as a note, which survives pickling."""
     error.add_note(f"In a worker:\n{traceback.format_exc()}")
     return error
 
 
-def _obey(batch: SlotBatch, rows: Mapping[str, NDArray[Any]], command: str, rest: Sequence[Any]) -> Any:
-    """Carry out a command; observations go to the shared rows, the answer is what else there is to tell."""
+def _execute(batch: SyncEnvs, rows: Mapping[str, NDArray[Any]], command: str, rest: Sequence[Any]) -> Any:
+    """Execute a command; observations go to the shared rows, all other results into the answer."""
     if command == "step":
         stepped = batch.step(rest[0])
-        _show(rows, stepped.observations)
+        _write_rows(rows, stepped.observations)
         return stepped.rewards, stepped.dones, stepped.spent, stepped.infos
     if command == "reset":
         observations, infos = batch.reset(*rest)
-        _show(rows, observations)
+        _write_rows(rows, observations)
         return infos
     return getattr(batch, command)(*rest)
 
 
-def _show(rows: Mapping[str, NDArray[Any]], observations: Mapping[str, NDArray[Any]]) -> None:
+def _write_rows(rows: Mapping[str, NDArray[Any]], observations: Mapping[str, NDArray[Any]]) -> None:
     for name, array in observations.items():
         rows[name][...] = array

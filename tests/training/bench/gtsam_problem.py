@@ -1,4 +1,4 @@
-"""The batch problem once more, in the words of gtsam: an independent peer with its own factors and optimiser."""
+"""Batch problem in gtsam: an independent implementation with its own factors and optimiser."""
 
 from types import ModuleType
 from typing import Any
@@ -12,8 +12,8 @@ from training.bench.accuracy.batch_problem import BatchProblem, Estimate
 def solve_with_gtsam(gtsam: ModuleType, problem: BatchProblem, start: Estimate) -> tuple[Estimate, list[FloatArray]]:
     """Return gtsam's estimate, and its marginal covariances of the last pose of each robot.
 
-    Poses are `Pose2`, landmarks `Point3`; residuals are computed here from gtsam's own pose algebra and camera
-    parameters, their derivatives numerically, so that nothing of `batch_problem` but the data is used.
+    Poses are `Pose2`, landmarks `Point3`; residuals use gtsam's own pose algebra and camera parameters, with numerical
+    derivatives, so that only the data of `batch_problem` is used.
     """
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
 

@@ -1,4 +1,4 @@
-"""Batch maximum likelihood and the ideal online estimate: laws, statistics, and an independent peer."""
+"""Batch maximum likelihood and the ideal online estimate: laws, statistics, and an independent implementation."""
 
 from dataclasses import replace
 
@@ -27,13 +27,13 @@ def run() -> StereoRun:
 
 @pytest.fixture(scope="module")
 def problem(run: StereoRun) -> BatchProblem:
-    """What they read."""
+    """Least-squares problem of the run."""
     return BatchProblem.of_run(run)
 
 
 @pytest.fixture(scope="module")
 def batch(problem: BatchProblem) -> BatchEstimate:
-    """What that says."""
+    """Batch estimate of the problem."""
     return batch_ml(problem)
 
 
@@ -65,8 +65,8 @@ def squares(errors: FloatArray, covariances: FloatArray) -> FloatArray:
 
 
 @pytest.mark.parametrize("metric", [False, True])
-def test_derivatives_of_sights_are_those_of_their_residuals(problem: BatchProblem, metric: bool) -> None:
-    """Moving one pose or landmark changes its residuals as the Jacobians say (central differences)."""
+def test_jacobians_of_measurements_match_central_differences(problem: BatchProblem, metric: bool) -> None:
+    """Moving one pose or landmark changes its residuals as the Jacobians predict (central differences)."""
     at = problem.dead_reckoning()
     sights = problem.sights(at, metric)
     for axis in range(3):
@@ -78,8 +78,8 @@ def test_derivatives_of_sights_are_those_of_their_residuals(problem: BatchProble
         np.testing.assert_allclose((ahead - behind) / 2e-6, sights.by_landmark[..., axis], rtol=1e-4, atol=1e-3)
 
 
-def test_derivatives_of_moves_are_those_of_their_residuals(problem: BatchProblem) -> None:
-    """Moving every second pose changes the residuals before and after it as the Jacobians say."""
+def test_jacobians_of_odometry_match_central_differences(problem: BatchProblem) -> None:
+    """Moving every second pose changes the residuals before and after it as the Jacobians predict."""
     at = problem.dead_reckoning()
     moves = problem.moves(at)
     for axis in range(3):
@@ -102,7 +102,7 @@ def test_residuals_are_standard_normal_at_the_truth(run: StereoRun, problem: Bat
 
 
 def test_exact_readings_give_the_truth(run: StereoRun) -> None:
-    """Without noise the estimate is the truth, even from far away, and no residual is left."""
+    """Without noise the estimate equals the truth, even from a distant start, with zero residuals."""
     problem = BatchProblem.of_run(noiseless(run))
     rng = np.random.default_rng(0)
     away = problem.dead_reckoning()
@@ -114,8 +114,8 @@ def test_exact_readings_give_the_truth(run: StereoRun) -> None:
         assert estimate.cost < 1e-9
 
 
-def test_it_is_a_minimum_and_the_only_one_near(run: StereoRun, problem: BatchProblem, batch: BatchEstimate) -> None:
-    """No slope is left; descent from the truth ends at the same place; the cost there is chi-square (1e-3)."""
+def test_the_estimate_is_the_local_minimum(run: StereoRun, problem: BatchProblem, batch: BatchEstimate) -> None:
+    """The gradient is zero; descent from the truth ends at the same point; the cost there is chi-square (1e-3)."""
     assert batch.gradient < 1e-5
     again = batch_ml(problem, Estimate(run.true_paths, run.landmarks[problem.names]))
     np.testing.assert_allclose(again.paths, batch.paths, atol=1e-7)
@@ -125,8 +125,8 @@ def test_it_is_a_minimum_and_the_only_one_near(run: StereoRun, problem: BatchPro
     np.testing.assert_array_equal(batch.paths[:, 0], run.true_paths[:, 0])
 
 
-def test_covariances_are_the_inverse_of_all_information(problem: BatchProblem, batch: BatchEstimate) -> None:
-    """The blocks by elimination equal those of the dense inverse of J^T J over all unknowns at once."""
+def test_covariances_match_the_dense_inverse(problem: BatchProblem, batch: BatchEstimate) -> None:
+    """The blocks by elimination equal those of the dense inverse of J^T J over all unknowns."""
     at = Estimate(batch.paths, batch.landmarks)
     sights, moves = problem.sights(at), problem.moves(at)
     robots, steps, _ = batch.paths.shape
@@ -150,7 +150,7 @@ def test_covariances_are_the_inverse_of_all_information(problem: BatchProblem, b
     np.testing.assert_allclose(batch.landmark_covariances, blocks[split:], rtol=1e-5, atol=1e-12)
 
 
-def test_errors_are_as_large_as_the_covariances_say() -> None:
+def test_errors_agree_with_the_covariances() -> None:
     """Over 50 independent runs the last pose and a landmark have chi-square errors, batch and online; 1e-3 each."""
     spec = RunSpec(length=3.0, measurements=7, landmarks=170)
     found: dict[str, list[float]] = {"pose": [], "landmark": [], "online": []}
@@ -169,7 +169,7 @@ def test_errors_are_as_large_as_the_covariances_say() -> None:
 
 
 def test_after_the_last_step_online_and_batch_agree(problem: BatchProblem, batch: BatchEstimate) -> None:
-    """The Kalman filter ends with the map, the last poses and the covariances that elimination gives."""
+    """The Kalman filter ends with the map, the last poses and the covariances of the elimination."""
     online = ideal_online(problem, batch)
     np.testing.assert_allclose(online.landmarks, batch.landmarks, atol=1e-6)
     np.testing.assert_allclose(online.landmark_covariances, batch.landmark_covariances, rtol=1e-6, atol=1e-12)
@@ -177,8 +177,8 @@ def test_after_the_last_step_online_and_batch_agree(problem: BatchProblem, batch
     np.testing.assert_allclose(online.covariances[:, -1], batch.path_covariances[:, -1], rtol=1e-6, atol=1e-12)
 
 
-def test_later_readings_only_add_knowledge(problem: BatchProblem, batch: BatchEstimate) -> None:
-    """At every step the online covariance exceeds that of the batch: their difference is positive semi-definite."""
+def test_later_readings_reduce_covariances(problem: BatchProblem, batch: BatchEstimate) -> None:
+    """At every step the online covariance minus the batch covariance is positive semi-definite."""
     online = ideal_online(problem, batch)
     difference = online.covariances - batch.path_covariances
     assert np.linalg.eigvalsh(difference).min() > -1e-11
@@ -201,7 +201,7 @@ def test_a_robust_kernel_withstands_false_points(run: StereoRun) -> None:
     assert (apart[1] > 5.0 * spread).all()
 
 
-def test_names_come_back(run: StereoRun, problem: BatchProblem, batch: BatchEstimate) -> None:
+def test_measured_landmarks_are_estimated_once(run: StereoRun, problem: BatchProblem, batch: BatchEstimate) -> None:
     """Every measured landmark is estimated once, under its own index; false points are left out."""
     np.testing.assert_array_equal(np.sort(batch.names), run.measured_landmarks())
     np.testing.assert_allclose(batch.landmarks, run.landmarks[batch.names], atol=0.5)
@@ -213,7 +213,7 @@ def test_names_come_back(run: StereoRun, problem: BatchProblem, batch: BatchEsti
 
 
 def test_nothing_to_estimate_is_refused(problem: BatchProblem) -> None:
-    """A run without measurements, and a scale that is not positive."""
+    """A run without measurements and a scale that is not positive are refused."""
     none = np.zeros(0, dtype=np.int64)
     empty = replace(problem, points=np.zeros((0, 3)), robots=none, steps=none, landmarks=none, names=none)
     with pytest.raises(ValueError, match="problem: expected two steps and a measurement, got a run without them"):
@@ -224,8 +224,8 @@ def test_nothing_to_estimate_is_refused(problem: BatchProblem) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("preset", sorted(PRESETS))
-def test_gtsam_finds_the_same(preset: str) -> None:
-    """An independent library, with factors of its own, finds the same paths, landmarks and covariances."""
+def test_gtsam_gives_the_same_estimate(preset: str) -> None:
+    """An independent library with its own factors gives the same paths, landmarks and covariances."""
     gtsam = pytest.importorskip("gtsam", reason="gtsam, an optional peer, is not installed: pip install gtsam")
     noise: NoisePreset = PRESETS[preset]
     run = simulate_run(RunSpec(robots=2, length=5.0, measurements=8, preset=noise), seed=6)

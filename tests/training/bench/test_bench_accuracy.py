@@ -1,4 +1,4 @@
-"""The accuracy bench: what it scores, how it sums up, and that nothing finished is lost."""
+"""Accuracy benchmark: metrics, summary, and stored trials."""
 
 import io
 import json
@@ -31,7 +31,7 @@ def run() -> StereoRun:
 
 @pytest.fixture(scope="module")
 def rows() -> list[dict[str, Any]]:
-    """All trials of a small bench."""
+    """All trials of a small benchmark."""
     return [plain(play(trial)) for trial in SMALL.trials()]
 
 
@@ -47,8 +47,8 @@ def test_the_truth_scores_zero(run: StereoRun) -> None:
     assert row["map_recall"] == row["map_precision"] == row["confirmed_precision"] == 1.0
 
 
-def test_a_moved_answer_is_wrong_by_the_motion_and_right_once_aligned(run: StereoRun) -> None:
-    """A rigid motion of path and map shows in the raw figures, and NEES, but not in the aligned ones."""
+def test_a_rigid_motion_changes_only_unaligned_metrics(run: StereoRun) -> None:
+    """A rigid motion of path and map changes the raw metrics and NEES, but not the aligned ones."""
     motion = np.array([0.3, -0.4, 0.02])
     paths = compose(motion, run.true_paths)
     measured = run.measured_landmarks()
@@ -66,8 +66,8 @@ def test_a_moved_answer_is_wrong_by_the_motion_and_right_once_aligned(run: Stere
     assert row["anees"] == pytest.approx(row["nees_mean"] / 3.0)
 
 
-def test_maps_are_scored_by_the_landmarks_behind_them(run: StereoRun) -> None:
-    """Duplicates and false landmarks cost precision, missing ones recall; those seen once count as not confirmed."""
+def test_maps_are_scored_by_true_landmarks(run: StereoRun) -> None:
+    """Duplicates and false landmarks reduce precision, missing ones recall; landmarks seen once are not confirmed."""
     measured = run.measured_landmarks()
     true = run.landmarks[measured]
     half = len(measured) // 2
@@ -82,8 +82,8 @@ def test_maps_are_scored_by_the_landmarks_behind_them(run: StereoRun) -> None:
     assert np.isnan(row["nees_mean"])
 
 
-def test_methods_come_in_their_order(rows: list[dict[str, Any]]) -> None:
-    """Batch ML is nearest to the truth, dead reckoning farthest; all figures that a method can have are there."""
+def test_methods_are_ordered_by_accuracy(rows: list[dict[str, Any]]) -> None:
+    """Batch ML has the smallest errors, dead reckoning the largest; each method has all its metrics."""
     mean = {method: np.mean([row["pose_rms_m"] for row in rows if row["method"] == method]) for method in SMALL.methods}
     assert mean["batch_ml"] <= mean["ideal_online"] < mean["fastslam2"] < mean["dead_reckoning"]
     for row in rows:
@@ -93,12 +93,12 @@ def test_methods_come_in_their_order(rows: list[dict[str, Any]]) -> None:
             assert row["map_recall"] == row["map_precision"] == 1.0
             assert 0.0 < row["anees"] < 10.0
         if row["method"] == "fastslam2":
-            assert row["wrong_match_share"] == 0.0  # names are known
+            assert row["wrong_match_share"] == 0.0  # associations are known
             assert 0.2 < row["ess_share"] <= 1.0
 
 
 def test_trials_repeat(rows: list[dict[str, Any]]) -> None:
-    """The same trial gives the same figures, time apart, whatever ran before it."""
+    """The same trial gives the same metrics, except times, whatever ran before it."""
     accuracy_trials._run_of.cache_clear()
     for row in (rows[-1], rows[1]):
         again = plain(play(Trial(**{name: row[name] for name in Trial.__dataclass_fields__})))
@@ -107,7 +107,7 @@ def test_trials_repeat(rows: list[dict[str, Any]]) -> None:
 
 
 def test_unknown_association_is_scored_with_its_errors() -> None:
-    """False points become landmarks, which precision counts, and which a model of existence gives up in part."""
+    """False points become landmarks, which reduce precision, and which an existence model deletes in part."""
     trial = Trial(
         preset="coarse", association="unknown", robots=1, length=12.0, method="fastslam2", particles=20, seed=30
     )
@@ -118,8 +118,8 @@ def test_unknown_association_is_scored_with_its_errors() -> None:
     assert play(replace(trial, method="fastslam2+existence"))["map_precision"] > row["map_precision"]
 
 
-def test_rejuvenation_is_a_method_of_its_own() -> None:
-    """It is tried every 25 steps, its time and refusals are told, and the rest of the row is as of any filter."""
+def test_rejuvenation_is_a_separate_method() -> None:
+    """Rejuvenation is attempted every 25 steps, with its time and refusals reported; other metrics are as usual."""
     trial = Trial(
         preset="good", association="known", robots=1, length=12.0, method="fastslam2+rejuvenation", particles=20,
         seed=30,
@@ -132,8 +132,8 @@ def test_rejuvenation_is_a_method_of_its_own() -> None:
     assert row["pose_rms_m"] != plain_row["pose_rms_m"]
 
 
-def test_filters_that_assume_more_noise_claim_less() -> None:
-    """More noise of the measurements, or landmarks that walk, make them less sure; the run and the peers stay."""
+def test_more_assumed_noise_raises_covariances() -> None:
+    """More assumed noise of measurements or landmarks raises covariances; the run and other methods are the same."""
     trial = Trial(preset="good", association="known", robots=1, length=12.0, method="fastslam2", particles=20, seed=30)
     as_it_is = play(trial)["nees_median"]
     assert play(replace(trial, noise_factor=9.0))["nees_median"] < 0.5 * as_it_is
@@ -143,7 +143,7 @@ def test_filters_that_assume_more_noise_claim_less() -> None:
 
 
 def test_summary_and_intervals(rows: list[dict[str, Any]]) -> None:
-    """One line per condition, method and M; the mean is that of the rows and lies in its interval."""
+    """There is one line per condition, method and M; the mean is the mean of the rows and is in its interval."""
     lines = summarise(rows)
     assert [(line["method"], line["particles"]) for line in lines] == [
         ("dead_reckoning", 0), ("batch_ml", 0), ("ideal_online", 0),
@@ -163,9 +163,9 @@ def test_summary_and_intervals(rows: list[dict[str, Any]]) -> None:
 
 
 def test_intervals_cover_what_they_should() -> None:
-    """Of 300 intervals of the mean of 16 normal values about 95 % hold the truth: 86 to 98 % with false alarm 1e-3.
+    """Of 300 intervals of the mean of 16 normal values about 95 % contain the truth: 86 to 98 % with false alarm 1e-3.
 
-    The percentile bootstrap of 16 values is known to cover some 92 %.
+    The percentile bootstrap of 16 values is known to cover about 92 %.
     """
     rng = np.random.default_rng(8)
     held = 0
@@ -181,8 +181,8 @@ def _open(out: Path, config: AccuracyConfig) -> RunFolder:
     return open_folder(out, "bench accuracy", config.to_mapping(), config.seed)
 
 
-def test_what_is_finished_is_kept(tmp_path: Path, rows: list[dict[str, Any]]) -> None:
-    """Stopped after three trials and begun again, a bench plays the rest only; a line cut off is played again."""
+def test_finished_trials_are_kept(tmp_path: Path, rows: list[dict[str, Any]]) -> None:
+    """A benchmark stopped after three trials runs only the rest when resumed; a truncated line is run again."""
     folder = _open(tmp_path / "bench", SMALL)
     done: list[dict[str, Any]] = []
     run_trials(folder, TRIALS_FILE, play, SMALL.trials(), 1, lambda: len(done) >= 3, done.append)
@@ -201,20 +201,22 @@ def test_what_is_finished_is_kept(tmp_path: Path, rows: list[dict[str, Any]]) ->
         assert json.loads(line)["pose_rms_m"] == row["pose_rms_m"]
 
 
-def test_a_folder_belongs_to_one_bench(tmp_path: Path) -> None:
-    """Another choice of options is refused in the folder of a bench."""
+def test_a_folder_accepts_one_configuration(tmp_path: Path) -> None:
+    """Other options are refused in the folder of a benchmark."""
     _open(tmp_path / "bench", SMALL)
-    with pytest.raises(ValueError, match="out: expected a folder of this very bench, got a folder of one with other"):
+    with pytest.raises(
+        ValueError, match="out: expected a folder of the same bench run, got a folder of a run with other"
+    ):
         _open(tmp_path / "bench", SMALL.replace(seeds=3))
 
 
 @pytest.mark.slow
-def test_processes_change_nothing(tmp_path: Path, rows: list[dict[str, Any]]) -> None:
-    """Two processes give the figures of one: exactly for the filter, to 1e-9 for batch maximum likelihood.
+def test_results_do_not_depend_on_processes(tmp_path: Path, rows: list[dict[str, Any]]) -> None:
+    """Two processes give the results of one: exactly for the filter, to 1e-9 for batch maximum likelihood.
 
-    The latter's linear algebra is done by a BLAS, whose sums depend on how many threads it has, and the processes of a
-    bench have one each. In a run of the filter the one matrix product is that with the camera's axes, a permutation
-    with signs, which is exact in any order.
+    The linear algebra of the latter uses a BLAS, whose sums depend on its number of threads, and the processes of a
+    benchmark have one thread each. The only matrix product in a run of the filter is with the camera's axes, a signed
+    permutation, which is exact in any order.
     """
     few = [trial for trial in SMALL.trials() if trial.method in ("batch_ml", "fastslam2")]
     done: list[dict[str, Any]] = []
@@ -227,7 +229,7 @@ def test_processes_change_nothing(tmp_path: Path, rows: list[dict[str, Any]]) ->
 
 
 def test_tables_and_figure(tmp_path: Path, rows: list[dict[str, Any]]) -> None:
-    """Tables name each method with its error, on 80 columns and as Markdown; the figure is a PNG file."""
+    """Tables list each method with its error, on 80 columns and as Markdown; the figure is a PNG file."""
     lines = plain(summarise(rows))
     console = Console(width=80, record=True, file=io.StringIO())
     print_tables(console, lines)
@@ -241,7 +243,7 @@ def test_tables_and_figure(tmp_path: Path, rows: list[dict[str, Any]]) -> None:
 
 
 def test_the_command_from_end_to_end(vslam: Any, tmp_path: Path) -> None:
-    """The command prints its tables, writes JSON, Markdown and figure, and goes on where it is called again."""
+    """The command prints its tables, writes JSON, Markdown and figure, and resumes when called again."""
     out = tmp_path / "bench"
     arguments = ["bench", "accuracy", "--seeds", "1", "--first-seed", "40", "--length", "3,5", "--methods"]
     arguments += ["dead_reckoning,fastslam2", "--particles", "7", "--out", str(out), "--json", str(out / "copy.json")]

@@ -23,8 +23,8 @@ from training.bench.config import GRID, AlignmentBenchConfig
 
 
 @pytest.mark.parametrize(("overlap", "outliers"), GRID)
-def test_pairs_have_the_shares_that_were_asked_for(overlap: float, outliers: float) -> None:
-    """So many landmarks are common, to their noise; so many of the candidates are wrong; heights never tell which."""
+def test_pairs_have_the_requested_shares(overlap: float, outliers: float) -> None:
+    """The shares of common landmarks, up to noise, and of wrong candidates are as requested; heights never differ."""
     pair = draw_pair(overlap, outliers, np.random.default_rng(100))
     right = round(overlap * LANDMARKS)
     assert len(pair.pairs) == right
@@ -39,7 +39,7 @@ def test_pairs_have_the_shares_that_were_asked_for(overlap: float, outliers: flo
 
 
 def test_the_bound_is_reached_by_least_squares_on_true_pairs() -> None:
-    """With nothing wrong the motion's squared error over many draws is the Cramer-Rao bound."""
+    """With true pairs only, the mean squared error of the transform is the Cramer-Rao bound."""
     squares, bounds = [], []
     for seed in range(100, 250):
         pair = draw_pair(0.1, 0.0, np.random.default_rng(seed))
@@ -50,8 +50,8 @@ def test_the_bound_is_reached_by_least_squares_on_true_pairs() -> None:
 
 
 @pytest.mark.parametrize("kind", IDENTIFIABLE)
-def test_identifiable_maps_are_what_they_claim(kind: str) -> None:
-    """At least 12 true pairs, spread over 2 m or more."""
+def test_identifiable_maps_have_enough_spread_pairs(kind: str) -> None:
+    """There are at least 12 true pairs, spread over at least 2 m."""
     for seed in range(100, 120):
         pair = draw_identifiable(kind, np.random.default_rng(seed))
         assert len(pair.pairs) >= 12
@@ -61,7 +61,7 @@ def test_identifiable_maps_are_what_they_claim(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", UNALIGNABLE)
 def test_unalignable_maps_have_no_true_motion_and_are_refused(kind: str) -> None:
-    """There is nothing to find, and nothing is found, though most pairs of maps have candidates enough."""
+    """Maps without a true transform are refused, though most pairs of maps have enough candidates."""
     for seed in range(100, 108):
         pair = draw_unalignable(kind, np.random.default_rng(seed))
         assert np.isnan(pair.pose).all()
@@ -71,7 +71,7 @@ def test_unalignable_maps_have_no_true_motion_and_are_refused(kind: str) -> None
 
 
 def test_pairs_that_cannot_be_drawn_are_refused() -> None:
-    """With half of the landmarks common there is room for as many wrong pairs, and no more."""
+    """With half of the landmarks common, at most as many wrong pairs are possible."""
     with pytest.raises(ValueError, match=r"outliers: expected a finite number >= 0 and <= 0.5.* got 0.9"):
         draw_pair(0.5, 0.9, np.random.default_rng(0))
     with pytest.raises(ValueError, match="kind: expected one of 'no overlap'"):
@@ -79,7 +79,7 @@ def test_pairs_that_cannot_be_drawn_are_refused() -> None:
 
 
 def row(**changed: Any) -> dict[str, Any]:
-    """Return the row of a trial on the grid that succeeded."""
+    """Return the row of a successful trial on the grid."""
     return {
         "kind": "grid", "case": "", "overlap": 0.5, "outliers": 0.0, "method": "ransac", "success": True, "reason": "",
         "false": False, "seconds": 0.002, "cpu_seconds": 0.001, "error_m": 0.02, "error_rad": 0.001, "nees": 3.0,
@@ -88,14 +88,14 @@ def row(**changed: Any) -> dict[str, Any]:
 
 
 def refusal(reason: str, **changed: Any) -> dict[str, Any]:
-    """Return the row of a trial that was refused."""
+    """Return the row of a refused trial."""
     found = ("error_m", "error_rad", "nees", "bound_m2", "bound_rad2")
     whole = row(success=False, reason=reason, **changed)
     return {name: value for name, value in whole.items() if name not in found}
 
 
-def test_errors_are_told_over_the_bound_and_refusals_count_as_failures() -> None:
-    """RMS error over the root of the mean bound; a refused trial is no success and has no error."""
+def test_errors_are_relative_to_the_bound_and_refusals_are_failures() -> None:
+    """Errors are RMS over the root of the mean bound; a refused trial is a failure without error."""
     rows = [row(), row(error_m=0.04, error_rad=0.003), refusal("ambiguous")]
     line = summarise(rows)[0]
     assert line["right"] == pytest.approx(2 / 3)
@@ -107,7 +107,7 @@ def test_errors_are_told_over_the_bound_and_refusals_count_as_failures() -> None
 
 
 def test_a_trial_repeats() -> None:
-    """The same trial gives the same figures, time apart, whatever was played before."""
+    """The same trial gives the same results, except times, whatever ran before it."""
     trial = Trial(kind="I", case="area", overlap=0.0, outliers=0.0, method="clique", seed=103)
     first = play(trial)
     play(Trial(kind="U", case="half alike", overlap=0.0, outliers=0.0, method="svd", seed=9))
@@ -116,8 +116,8 @@ def test_a_trial_repeats() -> None:
     assert all(first[name] == again[name] for name in first if "seconds" not in name)
 
 
-def test_every_method_meets_the_same_trials() -> None:
-    """Trials come cell by cell and seed by seed, each once for each method; U and I never share a seed's maps."""
+def test_all_methods_have_the_same_trials() -> None:
+    """Trials are ordered by cell and seed, each once for each method; U and I never share the maps of a seed."""
     config = AlignmentBenchConfig(methods=("ransac", "gnc"), seeds=3, hard=10, seed=100)
     trials = config.trials()
     assert len(trials) == len(set(trials)) == 2 * (3 * len(GRID) + 20)
@@ -125,13 +125,13 @@ def test_every_method_meets_the_same_trials() -> None:
     assert AlignmentBenchConfig.from_mapping(config.to_mapping() | {"seed": 100}) == config
 
 
-def test_the_command_leaves_tables_a_figure_and_every_trial(vslam: Any, tmp_path: Path) -> None:
-    """A small bench leaves its tables; begun again in the same folder, nothing is run twice."""
+def test_the_command_writes_tables_figure_and_trials(vslam: Any, tmp_path: Path) -> None:
+    """A small benchmark writes its tables; when resumed in the same folder, no trial runs twice."""
     out, copy = tmp_path / "bench", tmp_path / "copy.json"
     options = ("--methods", "ransac,gnc", "--seeds", "1", "--hard", "9", "--first-seed", "100", "--out", str(out))
     said = vslam("bench", "alignment", *options, "--json", str(copy))
     assert said.status == 0
-    assert "Maps that just can be aligned" in said.out
+    assert "Maps that can barely be aligned" in said.out
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics == json.loads(copy.read_text())
     assert (out / "alignment.png").stat().st_size > 10_000

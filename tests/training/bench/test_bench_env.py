@@ -1,4 +1,4 @@
-"""`vslam bench env`: its rows, the budget of a step, and what it says where something is missing."""
+"""`vslam bench env`: rows, budget of a step, and missing packages."""
 
 import json
 from pathlib import Path
@@ -15,7 +15,7 @@ from training.bench.env.bench import run_bench
 from training.bench.env.timing import (
     BURST,
     Play,
-    play_in_turn,
+    play_alternating,
     play_peer,
     ratio_of_bursts,
     record_actions,
@@ -28,12 +28,12 @@ runner = CliRunner()
 
 
 class _Nested:
-    """A class with a slow method that calls another slow one, by a clock of its own [ns]."""
+    """Class with a slow method that calls another slow one, with its own clock [ns]."""
 
     now = 0
 
     def outer(self) -> None:
-        """Take 2 us, and what `inner` takes."""
+        """Take 2 us plus the time of `inner`."""
         _Nested.now += 2000
         self.inner()
 
@@ -43,7 +43,7 @@ class _Nested:
 
 
 def test_nested_phases_are_not_counted_twice(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What an inner phase takes is taken off the outer one; the rest is what is in no phase."""
+    """The time of an inner phase is subtracted from the outer one; the rest belongs to no phase."""
     phases = tuple(env_budget.Phase(name, ((_Nested, name),)) for name in ("outer", "inner"))
     monkeypatch.setattr(env_budget, "PHASES", phases)
     monkeypatch.setattr(env_budget.time, "perf_counter_ns", lambda: _Nested.now)
@@ -60,8 +60,8 @@ def test_nested_phases_are_not_counted_twice(monkeypatch: pytest.MonkeyPatch) ->
     assert [_Nested.outer, _Nested.inner] == untouched
 
 
-def test_all_phases_take_part_in_a_step() -> None:
-    """Over 25 ticks each phase is called, and afterwards nothing of the package is changed."""
+def test_a_step_calls_all_phases() -> None:
+    """Over 25 ticks each phase is called, and afterwards the package is unchanged."""
     before = [owner.__dict__[name] for phase in env_budget.PHASES for owner, name in phase.calls]
     env = vslam_v0.parallel_env(world="fig5", num_robots=2, num_particles=10)
     env.reset(seed=3)
@@ -71,8 +71,8 @@ def test_all_phases_take_part_in_a_step() -> None:
     assert [owner.__dict__[name] for phase in env_budget.PHASES for owner, name in phase.calls] == before
 
 
-def test_recorded_actions_play_again() -> None:
-    """Actions that a policy took lead a fresh environment along the same way."""
+def test_recorded_actions_repeat_the_path() -> None:
+    """Recorded actions of a policy lead a new environment along the same path."""
     env = vslam_v0.parallel_env(world="fig5", num_robots=2, num_particles=10)
     actions = record_actions(env, 7, 12)
     poses = env.true_poses
@@ -83,7 +83,7 @@ def test_recorded_actions_play_again() -> None:
 
 
 def test_times_are_summed_up() -> None:
-    """Median, mean, 99th percentile, least and rates are of all durations, the undisturbed time of best repeats."""
+    """Median, mean, 99 % quantile, minimum and rates use all durations, the undisturbed time the best repeats."""
     times = summarise_us(np.array([1.0, 2.0, 3.0, 4.0, 100.0]) * 1e-6)
     assert [times[name] for name in ("median_us", "mean_us", "min_us", "calls")] == pytest.approx([3.0, 22.0, 1.0, 5])
     assert (times["per_second"], times["per_second_mean"]) == pytest.approx((1e6 / 3.0, 1e6 / 22.0))
@@ -93,21 +93,21 @@ def test_times_are_summed_up() -> None:
     assert times["median_us"] == pytest.approx(38.5)
 
 
-def test_a_missing_peer_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where the peer package is not installed, nothing is timed in its place."""
-    monkeypatch.setattr(env_timing, "PEER", "a_package_that_nobody_has")
+def test_without_the_peer_package_there_is_no_comparison(monkeypatch: pytest.MonkeyPatch) -> None:
+    """If the package of the comparison is not installed, nothing is timed instead."""
+    monkeypatch.setattr(env_timing, "PEER", "a_missing_package")
     assert play_peer(3, 0, 2) is None
 
 
-def test_plays_take_turns() -> None:
-    """Each play begins anew and makes all its calls in order, burst by burst beside the other."""
+def test_plays_alternate_in_bursts() -> None:
+    """Each play starts over and makes all its calls in order, in alternating bursts."""
     heard: list[tuple[str, int]] = []
     count = 2 * BURST + 3
 
     def play(name: str) -> Play:
         return Play(lambda: heard.append((name, -1)), lambda i: heard.append((name, i)), range(count))
 
-    assert play_in_turn([play("a"), play("b")], 5, 2).shape == (2, 2, count - 5)
+    assert play_alternating([play("a"), play("b")], 5, 2).shape == (2, 2, count - 5)
     for name in "ab":
         assert [i for each, i in heard if each == name] == [-1, *range(count)] * 2
     first, second, third = range(BURST), range(BURST, 2 * BURST), range(2 * BURST, count)
@@ -115,14 +115,14 @@ def test_plays_take_turns() -> None:
     assert heard[2 : 2 + 2 * count] == [(name, i) for name, calls in turns for i in calls]
 
 
-def test_what_slows_both_plays_leaves_their_ratio() -> None:
-    """Calls that take three times as long as those beside them do so whatever the machine does from burst to burst."""
+def test_ratios_do_not_depend_on_machine_speed() -> None:
+    """The ratio of two alternating plays does not depend on variations of the machine's speed between bursts."""
     slowed = np.repeat([1.0, 7.0, 2.0], BURST) * np.array([[1.0], [4.0]])
     assert ratio_of_bursts(3e-6 * slowed, 1e-6 * slowed) == pytest.approx(3.0)
 
 
-def test_loads_differ_from_the_base_one_by_one() -> None:
-    """The first numbers make the base; every other row differs from it in one of them."""
+def test_each_load_changes_one_number_of_the_base() -> None:
+    """The first numbers are the base; every other row changes one of them."""
     loads = EnvBenchConfig(robots=(2, 1), particles=(10, 20), worlds=("fig5", "hall"), modes=("dict", "goal")).loads()
     assert len(loads) == 5
     base = loads[0]
@@ -130,8 +130,8 @@ def test_loads_differ_from_the_base_one_by_one() -> None:
         assert sum(getattr(load, name) != getattr(base, name) for name in ("robots", "particles", "world", "mode")) == 1
 
 
-def test_stopping_early_leaves_what_there_is() -> None:
-    """A bench that is stopped after two trials is incomplete and says no more than it measured."""
+def test_stopping_early_keeps_finished_results() -> None:
+    """A benchmark stopped after two trials is incomplete and contains only its measurements."""
     config = EnvBenchConfig(robots=(1,), particles=(5,), worlds=("fig5",), modes=("dict",), steps=3, peer=False)
     asked: list[bool] = []
 
@@ -147,8 +147,8 @@ def test_stopping_early_leaves_what_there_is() -> None:
     assert not result["snapshots"]
 
 
-def test_the_command_writes_its_figures(tmp_path: Path) -> None:
-    """The run folder and the JSON hold rows, budget, snapshots and resets; the config repeats the run."""
+def test_the_command_writes_its_results(tmp_path: Path) -> None:
+    """The run folder and the JSON have rows, budget, snapshots and resets; the config repeats the run."""
     out, file = tmp_path / "run", tmp_path / "figures.json"
     arguments = ["bench", "env", "--robots", "1", "--particles", "5", "--worlds", "fig5", "--modes", "flat,goal",
                  "--steps", "4", "--no-peer"]  # fmt: skip

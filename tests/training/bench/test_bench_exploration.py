@@ -1,4 +1,4 @@
-"""The bench of exploration: who meets which worlds, how an episode is scored, summed up and gone on with."""
+"""Exploration benchmark: common worlds, metrics, summary and resuming."""
 
 import csv
 import io
@@ -33,7 +33,7 @@ SMALL = ExplorationBenchConfig(
     policies=("frontier", "random_walk", "frontier@continuous"), worlds=("fig5",), robots=(2,), duration=8.0,
     particles=20, seeds=2, seed=200,
 )  # fmt: skip
-TOLD_M = 1e-3  # an oracle's merge is sure to a tenth of a millimetre
+TOLD_M = 1e-3  # merges of an oracle are accurate to a tenth of a millimetre
 OWN = """
 class Stubborn:
     def reset(self):
@@ -46,7 +46,7 @@ class Stubborn:
 
 @pytest.fixture
 def own_policy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """A user's policy in the current folder: it always chooses an action that is not there."""
+    """Custom policy in the current folder that always chooses an invalid action."""
     (tmp_path / "a_users_policies.py").write_text(OWN)
     monkeypatch.chdir(tmp_path)
     yield "a_users_policies:Stubborn"
@@ -55,12 +55,12 @@ def own_policy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]
 
 @pytest.fixture(scope="module")
 def rows() -> list[dict[str, Any]]:
-    """One seed of a small bench: three policies, told nothing and all."""
+    """One seed of a small benchmark: three policies, without and with all oracles."""
     return [play(SMALL, trial) for trial in SMALL.trials() if trial.seed == SMALL.seed]
 
 
 def _row(policy: str, seed: int, oracle: str = "none", **figures: Any) -> dict[str, Any]:
-    """Return a row in which all figures that are not given are one half."""
+    """Return a row in which all other metrics are one half."""
     values = dict.fromkeys(FIGURES, 0.5) | {"right_merges": 2, "false_merges": 0} | figures
     line = {"time_s": [0.0, 1.0]} | {name: [0.0, 0.1 * seed] for name in CURVES}
     return (
@@ -68,8 +68,8 @@ def _row(policy: str, seed: int, oracle: str = "none", **figures: Any) -> dict[s
     )
 
 
-def test_all_policies_of_a_seed_meet_the_same_world() -> None:
-    """Walls, landmarks and starts depend on the seed and the split alone, not on policy, kind of action or oracle."""
+def test_all_policies_of_a_seed_have_the_same_world() -> None:
+    """Walls, landmarks and starts depend only on the seed and the split, not on policy, action type or oracle."""
 
     def met(config: ExplorationBenchConfig, trial: ExplorationTrial) -> tuple[bytes, ...]:
         env = vslam_v0.parallel_env(config=config.environment(trial))
@@ -82,12 +82,12 @@ def test_all_policies_of_a_seed_meet_the_same_world() -> None:
     assert len({*places[200], *places[201], met(other, other.trials()[0])}) == 3
 
 
-def test_robots_that_are_told_all_know_where_they_are(rows: list[dict[str, Any]]) -> None:
-    """With all oracles poses have no error; without, they have; both play as long as was asked."""
+def test_oracles_remove_pose_errors(rows: list[dict[str, Any]]) -> None:
+    """With all oracles poses have no error; without, they have; both run for the requested time."""
     for row in rows:
-        told = row["oracle"] == "all"
-        assert (row["pose_error"] < TOLD_M) is told
-        assert (row["ate_start_m"] < TOLD_M) is told
+        has_oracle = row["oracle"] == "all"
+        assert (row["pose_error"] < TOLD_M) is has_oracle
+        assert (row["ate_start_m"] < TOLD_M) is has_oracle
         assert row["curves"]["time_s"][-1] == pytest.approx(8.0)
         assert len(row["curves"]["coverage"]) == CURVE_POINTS
         assert row["curves"]["coverage"][-1] == row["coverage"] > row["curves"]["coverage"][0]
@@ -96,18 +96,18 @@ def test_robots_that_are_told_all_know_where_they_are(rows: list[dict[str, Any]]
 
 
 def test_a_trial_repeats_itself(rows: list[dict[str, Any]]) -> None:
-    """Played again a trial has the same figures; the time that a decision takes is not one of them."""
+    """A repeated trial has the same metrics, except decision times."""
     again = play(SMALL, SMALL.trials()[0])
     assert {**again, "decision_ms": 0.0, "curves": 0} == {**rows[0], "decision_ms": 0.0, "curves": 0}
     for name in ("time_s", *CURVES):
         np.testing.assert_array_equal(again["curves"][name], rows[0]["curves"][name])
 
 
-def test_a_users_own_policy_takes_part(own_policy: str) -> None:
-    """A policy is named by its module; each of its actions that was not there is counted."""
+def test_custom_policies_can_be_compared(own_policy: str) -> None:
+    """A policy can be given by its module; each of its invalid actions is counted."""
     config = ExplorationBenchConfig(policies=(own_policy,), worlds=("fig5",), robots=(2,), duration=4.0, particles=10)
     row = play(config, config.trials()[0])
-    assert row["invalid_actions"] == 2 * 4  # two robots, a decision each second
+    assert row["invalid_actions"] == 2 * 4  # two robots, one decision per second
     assert row["way_m"] == 0.0
 
 
@@ -116,7 +116,7 @@ def _merge(time: float, error_m: float, undone: float | None = None) -> MergeRec
 
 
 def test_merges_are_right_false_or_undone() -> None:
-    """False is what was wrong for 20 s or at the end; one that is undone sooner is not, nor a right one."""
+    """A merge is false if wrong for 20 s or at the end; one that is undone earlier is neither false nor right."""
     merges = [_merge(5.0, 0.1), _merge(9.0, 0.2), _merge(11.0, 0.7), _merge(12.0, 0.9, 31.0), _merge(13.0, 0.9, 33.0)]
     assert count_merges([*merges, _merge(2.0, 0.1, 3.0)]) == {
         "right_merges": 2, "false_merges": 2, "undone_merges": 3, "first_merge_s": 5.0, "last_merge_s": 9.0,
@@ -125,7 +125,7 @@ def test_merges_are_right_false_or_undone() -> None:
 
 
 def test_policies_are_compared_with_the_first_on_common_seeds() -> None:
-    """Differences are the other's less the first's; the share of seeds in which it is better knows which way."""
+    """Differences are relative to the first policy; the share of better seeds accounts for the sign of the metric."""
     rows = [_row("a", seed, mean_coverage=0.1 * seed, map_error=0.3) for seed in (1, 2, 3, 4)]
     rows += [_row("b", seed, mean_coverage=0.1 * seed + 0.2, map_error=0.1 * seed) for seed in (1, 2, 4, 9)]
     found = {line["figure"]: line for line in compare_policies(rows)}
@@ -136,12 +136,12 @@ def test_policies_are_compared_with_the_first_on_common_seeds() -> None:
     assert compare_oracles(rows) == []
 
 
-def test_what_an_oracle_is_worth_is_paired_too() -> None:
+def test_oracles_are_compared_in_pairs() -> None:
     """Each policy is compared with itself without the oracle."""
     rows = [
-        _row("a", seed, told, map_rmse_m=0.1 * seed - 0.05 * (told == "all"))
+        _row("a", seed, oracle, map_rmse_m=0.1 * seed - 0.05 * (oracle == "all"))
         for seed in (1, 2)
-        for told in ("none", "all")
+        for oracle in ("none", "all")
     ]
     found = {line["figure"]: line for line in compare_oracles(rows)}
     assert found["map_rmse_m"]["more"] == pytest.approx(-0.05)
@@ -150,8 +150,8 @@ def test_what_an_oracle_is_worth_is_paired_too() -> None:
     assert compare_policies(rows) == []
 
 
-def test_times_that_were_never_reached_do_not_count() -> None:
-    """Without a merge there is no time of the first one: the mean is over the seeds that have one."""
+def test_means_skip_seeds_without_a_merge() -> None:
+    """The mean time of the first merge is over the seeds with a merge."""
     (line,) = summarise([_row("a", 1, first_merge_s=None), _row("a", 2, first_merge_s=30.0)])
     assert line["seeds"] == 2
     assert line["first_merge_s"] == 30.0
@@ -160,18 +160,18 @@ def test_times_that_were_never_reached_do_not_count() -> None:
 
 
 def test_tables_fit_into_80_columns(rows: list[dict[str, Any]]) -> None:
-    """Nothing is cut on a terminal of 80 columns; the Markdown has all policies, told and not."""
+    """Tables are not cut on a terminal of 80 columns; the Markdown has all policies, with and without oracles."""
     lines = summarise(rows)
     console = Console(file=io.StringIO(), width=80)
     print_tables(console, lines, compare_policies(rows), compare_oracles(rows))
     text = console.file.getvalue()  # type: ignore[attr-defined]
     assert "…" not in text
-    assert text.count("told all\n") + text.count("told all ") >= 6
-    assert "random_walk, told all" in markdown(lines, compare_policies(rows), compare_oracles(rows))
+    assert text.count("oracle all\n") + text.count("oracle all ") >= 6
+    assert "random_walk, oracle all" in markdown(lines, compare_policies(rows), compare_oracles(rows))
 
 
 def test_curves_are_drawn_and_written(rows: list[dict[str, Any]], tmp_path: Path) -> None:
-    """The CSV has a line per policy, oracle and time; the picture is one."""
+    """The CSV has a line per policy, oracle and time; the figure is a PNG file."""
     found = list(csv.DictReader(io.StringIO(to_csv(curves(rows)))))
     assert len(found) == 3 * 2 * CURVE_POINTS
     last = [line for line in found if (line["policy"], line["oracle"]) == ("frontier", "none")][-1]
@@ -180,10 +180,10 @@ def test_curves_are_drawn_and_written(rows: list[dict[str, Any]], tmp_path: Path
     assert (tmp_path / "exploration.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_the_command_keeps_what_was_played(
+def test_stored_trials_are_not_run_again(
     vslam: Any, own_policy: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A trial that is kept is not played again; one that was cut off is, to the same figures."""
+    """A stored trial is not run again; a truncated one is, with the same results."""
     out = tmp_path / "run"
     command = (
         "bench", "exploration", "--policies", f"frontier,{own_policy}", "--worlds", "fig5", "--robots", "2",
@@ -213,14 +213,14 @@ def test_the_command_keeps_what_was_played(
     assert [row | {"decision_ms": 0} for row in again] == [row | {"decision_ms": 0} for row in first["trials"]]
 
 
-def test_paths_are_kept_absolute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A bench can be gone on with from another folder: worlds that are files have their full path."""
+def test_paths_are_stored_absolute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A benchmark can be resumed from another folder: worlds in files have absolute paths."""
     (tmp_path / "room.json").write_text(
         '{"name": "room", "walls": [[0, 0, 9, 0], [9, 0, 9, 7], [9, 7, 0, 7], [0, 7, 0, 0]]}'
     )
     monkeypatch.chdir(tmp_path)
     config = ExplorationBenchConfig.from_mapping({"worlds": ["office", "room.json"]})
     assert config.worlds == ("office", str(tmp_path / "room.json"))
-    assert config.environment(config.trials()[-1]).world_split is None  # one building is not split
+    assert config.environment(config.trials()[-1]).world_split is None  # a single layout has no splits
     assert config.environment(config.trials()[0]).world_split == "validation"
     assert ExplorationBenchConfig.from_mapping(config.to_mapping() | {"seed": 0}) == config

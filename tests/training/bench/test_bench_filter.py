@@ -20,7 +20,7 @@ TINY = ("--particles", "5,9", "--landmarks", "40", "--measurements", "3", "--rob
 
 
 def _result(milliseconds: Any, loads: list[FilterLoad]) -> dict[str, Any]:
-    """A result in which the median of each load is given by a function of it."""
+    """Result in which the median of each load is a function of the load."""
     timing = {"low_ms": 0.1, "high_ms": 9.0, "min_ms": 0.1, "calls": 3}
     rows = [
         load.model_dump() | timing | {
@@ -34,8 +34,8 @@ def _result(milliseconds: Any, loads: list[FilterLoad]) -> dict[str, Any]:
     return {"machine": machine, "rows": rows, "state": state, "compilation": None, "complete": False}
 
 
-def test_a_bench_leaves_a_folder_that_repeats_it(vslam: Any, tmp_path: Path) -> None:
-    """One row for each combination, in table, metrics.json and the copy; the config repeats them, as far as asked."""
+def test_a_run_folder_repeats_the_benchmark(vslam: Any, tmp_path: Path) -> None:
+    """There is one row per combination, in table, metrics.json and its copy; the config repeats them."""
     first, second, copy = tmp_path / "first", tmp_path / "second", tmp_path / "copy.json"
     status, shown, _ = vslam("bench", "filter", *TINY, "--out", str(first), "--json", str(copy))
     assert status == 0
@@ -49,7 +49,7 @@ def test_a_bench_leaves_a_folder_that_repeats_it(vslam: Any, tmp_path: Path) -> 
         assert 0.0 < row["min_ms"] <= row["low_ms"] <= row["median_ms"] <= row["high_ms"]
         assert row["calls"] == 4
         assert row["resampled"] == 1.0
-        assert row["right"] >= 0.5  # of twelve
+        assert row["right"] >= 0.5  # twelve measurements
         assert row["bytes_per_landmark"] >= 76.0
     assert metrics["machine"]["processor"] == processor()
     assert (first / "speed.png").read_bytes().startswith(b"\x89PNG")
@@ -60,8 +60,8 @@ def test_a_bench_leaves_a_folder_that_repeats_it(vslam: Any, tmp_path: Path) -> 
     assert configs[0]["steps"] == 4
 
 
-def test_who_stops_keeps_what_is_done() -> None:
-    """After Ctrl-C no trial begins; finished rows are there, and the result says that it is not all."""
+def test_stopping_keeps_finished_rows() -> None:
+    """After Ctrl-C no trial starts; finished rows are kept, and the result is marked incomplete."""
     config = FilterBenchConfig(particles=(3,), landmarks=(30,), measurements=(2,), robots=(1, 2), steps=2)
     begun: list[str] = []
     result = run_bench(config, begun.append, should_stop=lambda: len(begun) > 1)
@@ -70,7 +70,7 @@ def test_who_stops_keeps_what_is_done() -> None:
     assert (result["state"], result["complete"]) == ({}, False)
 
 
-def test_every_trial_is_announced() -> None:
+def test_every_trial_advances_the_bar() -> None:
     """The progress bar ends at its end."""
     config = FilterBenchConfig(particles=(3,), landmarks=(30,), measurements=(2,), robots=(1,), steps=2)
     begun: list[str] = []
@@ -78,8 +78,8 @@ def test_every_trial_is_announced() -> None:
     assert len(begun) == count_trials(config)
 
 
-def test_the_table_tells_all() -> None:
-    """On 80 columns: robots side by side, a busy machine, an early stop."""
+def test_the_table_shows_load_and_early_stop() -> None:
+    """On 80 columns the table shows robots side by side, a busy machine and an early stop."""
     load = FilterLoad(particles=1000)
     result = _result(lambda load: 0.5 * load.robots, [load, load.replace(robots=3)])
     shown = StringIO()
@@ -99,7 +99,7 @@ def test_the_table_tells_all() -> None:
 
 
 def test_the_widest_rows_fit_on_80_columns() -> None:
-    """No row of a table of three numbers of robots and ten thousand particles is cut off or broken."""
+    """No row of a table with three numbers of robots and ten thousand particles is cut or wrapped."""
     loads = FilterBenchConfig(robots=(1, 2, 3), large=True).loads()
     shown = StringIO()
     result = _result(lambda load: 64.2e-4 * load.particles, loads)
@@ -109,14 +109,14 @@ def test_the_widest_rows_fit_on_80_columns() -> None:
 
 
 def test_timing_is_by_quantiles_of_single_calls() -> None:
-    """Ten per cent are below the low and above the high figure, half are below the median."""
+    """Ten per cent are below the low and above the high quantile, half are below the median."""
     timing = timing_ms(np.linspace(0.0, 1.0, 101))
     assert [timing[name] for name in ("low_ms", "median_ms", "high_ms")] == pytest.approx([100.0, 500.0, 900.0])
     assert (timing["min_ms"], timing["calls"]) == (0.0, 101)
 
 
 def test_calls_are_timed_without_the_garbage_collector() -> None:
-    """It is off during the calls and as before afterwards, errors included; the first calls warm up."""
+    """The collector is off during the calls and restored afterwards, errors included; the first calls warm up."""
     seconds, results = time_calls(lambda number: (number, gc.isenabled()), range(5), warm_up=2)
     assert results == [(2, False), (3, False), (4, False)]
     assert (len(seconds), bool((seconds > 0.0).all())) == (3, True)
@@ -125,7 +125,7 @@ def test_calls_are_timed_without_the_garbage_collector() -> None:
     assert gc.isenabled()
 
 
-# What a new process does in place of warming up: it leaves a file in the cache and tells how many there were.
+# Program of a new process instead of the warm-up: writes a file into the cache and prints the number of files.
 FAKE_WARM_UP = """
 import json, os, pathlib
 folder = pathlib.Path(os.environ["NUMBA_CACHE_DIR"])
@@ -136,8 +136,8 @@ print(json.dumps(seconds | {"found": found, "folder": str(folder)}))
 """
 
 
-def test_compilation_is_timed_in_a_cache_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two new processes share a cache that begins empty; its size is told, and it is gone afterwards."""
+def test_compilation_is_timed_with_a_new_cache(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two new processes share a cache that is empty at first; its size is reported, and it is deleted afterwards."""
     monkeypatch.setattr(compile_timing, "WARM_UP_SCRIPT", FAKE_WARM_UP)
     times = compile_timing.time_compilation()
     assert (times["cold"]["found"], times["cached"]["found"]) == (0, 1)
@@ -145,14 +145,14 @@ def test_compilation_is_timed_in_a_cache_of_its_own(monkeypatch: pytest.MonkeyPa
     assert not Path(times["cold"]["folder"]).exists()
 
 
-def test_a_bench_tells_what_compiling_costs(monkeypatch: pytest.MonkeyPatch, vslam: Any, tmp_path: Path) -> None:
-    """With --compile one line says how long compiling takes, and the cache after it; the JSON holds both processes."""
+def test_compilation_times_are_printed(monkeypatch: pytest.MonkeyPatch, vslam: Any, tmp_path: Path) -> None:
+    """With --compile one line gives the times of compilation and of loading; the JSON has both processes."""
     monkeypatch.setattr(compile_timing, "WARM_UP_SCRIPT", FAKE_WARM_UP)
     least = ("--particles", "3", "--landmarks", "30", "--measurements", "2", "--robots", "1", "--steps", "2")
     said = vslam("bench", "filter", *least, "--compile", "--out", str(tmp_path / "bench"))
     assert said.status == 0
-    shown = " ".join(said.out.split())  # lines may be broken anywhere
-    assert "Kernels: compiled in 41 s, once; taken from the cache (0.3 MB) in 0.3 s; import 1.2 s." in shown
-    told = json.loads((tmp_path / "bench" / "metrics.json").read_text())["compilation"]
-    assert (told["cold"]["compile_s"], told["cached"]["compile_s"]) == (41.0, 0.0)
-    assert (told["cache_files"], told["cache_bytes"]) == (2, 300_000)
+    shown = " ".join(said.out.split())  # lines may be wrapped anywhere
+    assert "Kernels: compiled in 41 s, once; loaded from the cache (0.3 MB) in 0.3 s; import 1.2 s." in shown
+    compilation = json.loads((tmp_path / "bench" / "metrics.json").read_text())["compilation"]
+    assert (compilation["cold"]["compile_s"], compilation["cached"]["compile_s"]) == (41.0, 0.0)
+    assert (compilation["cache_files"], compilation["cache_bytes"]) == (2, 300_000)

@@ -16,8 +16,8 @@ from training.bench.stereo.scenes import WALL, Scene, panel_hall, wall_pose
 from training.cli import app
 
 
-def test_a_speed_row_times_what_it_says() -> None:
-    """At 320 x 240 px with 40 walls there are 100 landmarks in the frame, and both parts of a pair are timed."""
+def test_speed_rows_have_the_requested_load() -> None:
+    """At 320 x 240 px with 40 walls there are 100 landmarks in the image, and both parts of a pair are timed."""
     row = speed_row(320, 100, 40, "usurf", 2, 3)
     assert row["landmarks"] == row["wanted"] == 100
     assert (row["width"], row["height"], row["walls"]) == (320, 240, 40)
@@ -27,16 +27,16 @@ def test_a_speed_row_times_what_it_says() -> None:
         assert row[part]["processor_ms"] > 0.0
 
 
-def test_halls_have_their_number_of_walls() -> None:
-    """Four walls make the hall, the others are panels inside it."""
+def test_halls_have_the_requested_walls() -> None:
+    """Four walls are the hall, the others are panels inside it."""
     for count in (4, 10, 40):
         world = panel_hall(count)
         assert len(world.walls) == count
         assert world.bounds == (0.0, 0.0, 8.0, 6.0)
 
 
-def test_guards_are_counted_one_after_the_other() -> None:
-    """Each row keeps what all guards so far let pass; patches count from the second guard on."""
+def test_match_checks_are_counted_cumulatively() -> None:
+    """Each row has the matches that pass all checks so far; patches are used from the second check on."""
     passed = np.ones((5, 4), dtype=bool)
     passed[0, 0] = passed[3, 1] = False
     rows = guard_rows(np.array([5.0, 0.5, -0.5, 0.1]), np.array([0.0, 3.0, 0.2, -0.1]), passed)
@@ -50,7 +50,7 @@ def test_guards_are_counted_one_after_the_other() -> None:
 
 
 def test_rendered_pairs_have_few_outliers() -> None:
-    """In an office patches measure disparities to a tenth of a pixel, and guards throw most outliers away."""
+    """In an office patches measure disparities to a tenth of a pixel, and checks reject most outliers."""
     row = quality_row("usurf", 12, 101)
     first, last = row["guards"][0], row["guards"][-1]
     assert last["matches"] > 150
@@ -61,22 +61,22 @@ def test_rendered_pairs_have_few_outliers() -> None:
     assert last["rms_px"] < first["rms_px"]
 
 
-def test_places_that_look_alike_are_not_told_apart() -> None:
-    """Head-on nearly all landmarks are found again; from an angle fewer; among equal bricks next to none."""
+def test_repetitive_walls_are_not_retrieved() -> None:
+    """Frontally nearly all landmarks are retrieved; at an angle fewer; among equal bricks almost none."""
     distinct, alike = (retrieval("usurf", None, style, 101) for style in ("distinct", "bricks_alike"))
     assert distinct["angles"]["0"]["recall"] > 0.95
     assert distinct["angles"]["0"]["recall"] > distinct["angles"]["30"]["recall"] > distinct["angles"]["60"]["recall"]
     assert alike["angles"]["15"]["precision"] < 0.1
 
 
-def test_a_window_of_constant_size_is_found_again_from_afar() -> None:
-    """From twice as far, windows in metres find at least twice as many landmarks as windows in pixels."""
+def test_metric_windows_are_retrieved_from_afar() -> None:
+    """From twice the distance, windows in metres retrieve at least twice as many landmarks as windows in pixels."""
     fixed, sized = (retrieval("usurf", window, "distinct", 101)["ratios"]["2"]["recall"] for window in (None, 0.6))
     assert sized > 2.0 * fixed
 
 
-def test_second_looks_are_as_far_apart_as_the_camera_model_says() -> None:
-    """NEES of two looks at a landmark is near 1 with the default noise, and smaller with twice of it."""
+def test_repeated_views_agree_with_the_camera_model() -> None:
+    """NEES of two views of a landmark is near 1 with the default noise, and smaller with twice this noise."""
     rows = second_looks(101)
     assert rows["1"]["pairs"] > 500
     assert 0.6 < rows["1"]["anees"] < 1.6
@@ -84,8 +84,8 @@ def test_second_looks_are_as_far_apart_as_the_camera_model_says() -> None:
     assert rows["2"]["anees"] < rows["1"]["anees"]
 
 
-def test_a_wall_is_looked_at_from_where_it_was_asked() -> None:
-    """The optical axis meets the wall at the place, the distance and the angle that were asked for."""
+def test_wall_poses_have_the_requested_geometry() -> None:
+    """The optical axis meets the wall at the requested position, distance and angle."""
     scene = Scene(WALL, camera_of(320), 1)
     for distance, angle in ((2.5, 0.0), (3.0, 0.7), (2.0, -0.5)):
         traced = scene.eye.trace(wall_pose(6.0, distance, angle)[None], 0, np.array([159.5]))
@@ -94,8 +94,8 @@ def test_a_wall_is_looked_at_from_where_it_was_asked() -> None:
         assert traced.depths[0] == pytest.approx(distance)
 
 
-def test_points_of_a_view_are_named(tmp_path: Path) -> None:
-    """Points with a name lie near their landmark, and true disparities are those of their rays."""
+def test_points_have_true_landmarks_and_disparities(tmp_path: Path) -> None:
+    """Points with a true landmark are near it, and true disparities agree with ray casting."""
     scene = Scene(WALL, camera_of(320), 2)
     front_end = StereoFrontEnd(scene.camera)
     corners = scene.corners(front_end)
@@ -121,7 +121,7 @@ def _photograph(shape: tuple[int, int] = (240, 320)) -> np.ndarray:
 
 
 def _write_pairs(folder: Path) -> None:
-    """Write a planar pair of any name, and below it a rectified stereo pair of a wall 3 m ahead."""
+    """Write a planar pair with an arbitrary name, and in a subfolder a rectified stereo pair of a wall 3 m ahead."""
     photograph = _photograph()
     warp = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     cv2.imwrite(str(folder / "houseA.jpg"), photograph)
@@ -156,17 +156,17 @@ def test_any_pairs_with_a_model_file_are_measured(tmp_path: Path) -> None:
     assert "| rig | ORB | 1 | " in text
 
 
-def test_what_fails_is_noted_and_the_rest_goes_on(tmp_path: Path) -> None:
-    """A broken model file, a missing image and a rig without images each fail by themselves."""
+def test_failed_parts_are_recorded_and_others_continue(tmp_path: Path) -> None:
+    """A broken model file, a missing image and a rig without images each fail separately."""
     _write_pairs(tmp_path)
     (tmp_path / "a_model.txt").write_text("1 2 three")
     (tmp_path / "b_model.txt").write_text("1 0 0 0 1 0 0 0 1")
     (tmp_path / "empty").mkdir()
     (tmp_path / "empty" / "calib.txt").write_text("")
     result: dict[str, Any] = {"speed": [], "quality": [], "retrieval": []}
-    told: list[str] = []
-    measure_parts(find_parts(tmp_path, ("usurf",)), result, told.append)
-    assert told == [
+    names: list[str] = []
+    measure_parts(find_parts(tmp_path, ("usurf",)), result, names.append)
+    assert names == [
         "planar pair a",
         "planar pair b",
         "planar pair house",
@@ -185,8 +185,8 @@ def test_what_fails_is_noted_and_the_rest_goes_on(tmp_path: Path) -> None:
         rig_rows(tmp_path / "empty", ("usurf",))
 
 
-def test_the_command_keeps_what_it_has(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, vslam: Any) -> None:
-    """A real part that fails costs the exit status 2 and one line, not the results of the others."""
+def test_the_command_keeps_results_beside_failures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, vslam: Any) -> None:
+    """A real part that fails gives exit status 2 and one line, and keeps the results of the others."""
     rendered: dict[str, Any] = {"speed": [], "quality": [], "retrieval": []}
     monkeypatch.setattr("training.bench.stereo.bench._run_rendered", lambda *arguments: dict(rendered))
     _write_pairs(tmp_path)
@@ -204,14 +204,14 @@ def test_the_command_keeps_what_it_has(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 @pytest.mark.slow
-def test_the_command_leaves_its_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """`vslam bench stereo --quick` writes tables, a picture and metrics; without real data it says nothing of them."""
+def test_the_command_writes_its_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`vslam bench stereo --quick` writes tables, a picture and metrics; without real data it has no real part."""
     monkeypatch.delenv("VSLAM_DATA", raising=False)
     arguments = ["bench", "stereo", "--quick", "--steps", "2", "--views", "3", "--descriptors", "usurf"]
     done = CliRunner().invoke(app, [*arguments, "--out", str(tmp_path / "run")])
     assert done.exit_code == 0, done.output
     tables = (tmp_path / "run" / "tables.md").read_text()
-    for title in ("Time on one thread", "Rendered pairs", "Found again by descriptor", "Second looks"):
+    for title in ("Time on one thread", "Rendered pairs", "Retrieval by descriptor", "Repeated views"):
         assert title in tables
     assert "Aloe" not in tables
     assert (tmp_path / "run" / "stereo.png").stat().st_size > 10_000
@@ -220,7 +220,7 @@ def test_the_command_leaves_its_tables(tmp_path: Path, monkeypatch: pytest.Monke
 
 @pytest.mark.slow
 def test_real_images(data_dir: Path) -> None:
-    """On real pairs guards leave 2 % of outliers at most; boards are flat; planar pairs are matched."""
+    """On real pairs checks leave at most 2 % outliers; boards are flat; planar pairs are matched."""
     rows = aloe_rows(data_dir / "opencv_samples", "usurf")
     assert rows[-1]["outliers"] < 0.02
     assert rows[0]["outliers"] > 5.0 * rows[-1]["outliers"]

@@ -1,4 +1,4 @@
-"""`vslam bench train`: what it times, what it says, and what it refuses."""
+"""`vslam bench train`: timed parts, output, and refusals."""
 
 import json
 from pathlib import Path
@@ -21,20 +21,20 @@ runner = CliRunner()
 SMALL = TrainBenchConfig(world="fig5", robots=1, envs=1, workers=(0,), steps=2)
 
 
-def test_a_replay_gives_what_was_recorded() -> None:
-    """The same steps come round again, with the spaces of the environment, and are inside them."""
+def test_a_replay_repeats_the_recording() -> None:
+    """The recorded steps repeat in a cycle, with the spaces of the environment, and are inside them."""
     replay = Replay(record(SMALL.environment(), 3))
     replay.reset()
-    told = [replay.step(None) for _ in range(2 * RECORDED)]
-    for first, second in zip(told, told[RECORDED:], strict=False):
+    results = [replay.step(None) for _ in range(2 * RECORDED)]
+    for first, second in zip(results, results[RECORDED:], strict=False):
         assert first is second
-    for step in told[:RECORDED]:
+    for step in results[:RECORDED]:
         assert replay.observation_space("robot_0").contains(step[0]["robot_0"])
-    assert not np.array_equal(told[0][0]["robot_0"]["local_grid"], told[-1][0]["robot_0"]["local_grid"])
+    assert not np.array_equal(results[0][0]["robot_0"]["local_grid"], results[-1][0]["robot_0"]["local_grid"])
 
 
-def test_times_of_workers_are_summed_up() -> None:
-    """Gain and work are medians of what each step took beside one worker; balance is mean over slowest."""
+def test_worker_times_are_summarised() -> None:
+    """Gain and work are medians of each step relative to one worker; balance is mean over slowest."""
     alone = WorkerTimes(
         workers=1, masks=np.array([0.0, 0.0, 1.0]), steps=np.array([4.0, 6.0, 3.0]),
         spent=np.array([[[4.0, 3.0]], [[5.0, 4.0]], [[3.0, 2.0]]]),
@@ -56,8 +56,8 @@ def test_times_of_workers_are_summed_up() -> None:
     assert summarise_workers((two,), slots=12)[0]["gain"] is None
 
 
-def test_stopping_early_leaves_what_there_is() -> None:
-    """A bench that is stopped before its third trial says what the second one measured, and that it is incomplete."""
+def test_stopping_early_keeps_finished_results() -> None:
+    """A benchmark stopped before its third trial has the results of the second, and is marked incomplete."""
     asked: list[bool] = []
 
     def should_stop() -> bool:
@@ -71,15 +71,15 @@ def test_stopping_early_leaves_what_there_is() -> None:
 
 
 @pytest.mark.slow
-def test_the_command_writes_its_figures(tmp_path: Path) -> None:
-    """The run folder and the JSON hold all parts of a decision, and the rates over workers."""
+def test_the_command_writes_its_results(tmp_path: Path) -> None:
+    """The run folder and the JSON have all parts of a decision, and the rates over workers."""
     out, file = tmp_path / "run", tmp_path / "figures.json"
     arguments = ["bench", "train", "--world", "fig5", "--robots", "1", "--envs", "1", "--workers", "0", "--steps", "3"]
     result = runner.invoke(app, [*arguments, "--out", str(out), "--json", str(file)])
     assert result.exit_code == 0, result.output
     figures = json.loads(file.read_text())
     assert figures == json.loads((out / "metrics.json").read_text())
-    names = ["environment", "adapter, between steps", ADAPTER_ALONE, "masks", "network, drawing", "network, updating"]
+    names = ["environment", "adapter, between steps", ADAPTER_ALONE, "masks", "network, sampling", "network, update"]
     assert [part["name"] for part in figures["parts"]] == names
     assert [row["workers"] for row in figures["workers"]] == [0]
     assert figures["complete"]

@@ -1,4 +1,4 @@
-"""The load on which the filter is timed is what it says: full maps, random measurements, robots at equal shares."""
+"""Workload of the filter benchmark: full maps, random measurements, equal shares of the robots."""
 
 from typing import Any
 
@@ -13,8 +13,8 @@ SMALL: dict[str, Any] = {"particles": 7, "landmarks": 60, "measurements": 11}
 
 
 @pytest.mark.parametrize("proposal", ["fastslam1", "fastslam2"])
-def test_every_particle_holds_every_landmark_where_it_is(proposal: str) -> None:
-    """After the mapping all particles hold all landmarks, three sightings each, within a few standard deviations."""
+def test_every_particle_has_an_accurate_full_map(proposal: str) -> None:
+    """After the mapping all particles have all landmarks, measured three times, within a few standard deviations."""
     world = LoadWorld(FilterLoad(proposal=proposal, robots=2, **SMALL))  # type: ignore[arg-type]
     slam, ids = filled_filter(world)
     held = slam.map()
@@ -29,7 +29,7 @@ def test_every_particle_holds_every_landmark_where_it_is(proposal: str) -> None:
 
 @pytest.mark.parametrize("robots", [1, 2, 3])
 def test_robots_share_the_measurements(robots: int) -> None:
-    """B measurements in each step whatever K is, the robots' shares equal up to one, no landmark twice in a frame."""
+    """There are B measurements in each step for any K, with shares equal up to one, and no landmark twice."""
     world = LoadWorld(FilterLoad(robots=robots, **SMALL))
     for step in world.course(20):
         shares = [len(frame) for frame in step.frames if frame is not None]
@@ -38,7 +38,7 @@ def test_robots_share_the_measurements(robots: int) -> None:
         assert all(len(set(names)) == len(names) for names in step.names)
 
 
-def test_what_is_measured_next_cannot_be_foretold() -> None:
+def test_measured_landmarks_are_uniformly_random() -> None:
     """Over many steps all landmarks in view are measured about equally often."""
     world = LoadWorld(FilterLoad(**SMALL))
     names = np.concatenate([step.names[0] for step in world.course(600)])
@@ -48,7 +48,7 @@ def test_what_is_measured_next_cannot_be_foretold() -> None:
 
 
 def test_true_noise_is_the_assumed_one() -> None:
-    """Odometry and pixels scatter as the filter's own models say."""
+    """Odometry and pixels have the noise of the filter's models."""
     world = LoadWorld(FilterLoad(**SMALL))
     camera = world.load.options.camera
     pose, moves, pixels = np.zeros(3), [], []
@@ -68,8 +68,8 @@ def test_true_noise_is_the_assumed_one() -> None:
 
 
 @pytest.mark.parametrize("lookalikes", [1, 3])
-def test_so_many_landmarks_look_alike(lookalikes: int) -> None:
-    """Within the descriptor gate of a landmark lie its look-alikes and no others, noise included."""
+def test_classes_of_similar_landmarks_have_the_requested_size(lookalikes: int) -> None:
+    """The descriptor gate of a landmark contains exactly its similar landmarks, noise included."""
     load = FilterLoad(lookalikes=lookalikes, **SMALL)
     world = LoadWorld(load)
     (step,) = world.course(1)
@@ -80,7 +80,7 @@ def test_so_many_landmarks_look_alike(lookalikes: int) -> None:
 
 
 def test_same_seed_same_load() -> None:
-    """A load repeats bit for bit, and another seed gives another one."""
+    """A load repeats bit by bit, and another seed gives another load."""
     first, second, other = ([*LoadWorld(FilterLoad(seed=seed, **SMALL)).course(3)] for seed in (5, 5, 6))
     for one, two, three in zip(first, second, other, strict=True):
         assert one.frames[0] is not None

@@ -1,4 +1,4 @@
-"""Pairs of real maps: how they are aligned and scored."""
+"""Alignment and scores of pairs of real maps."""
 
 import json
 from pathlib import Path
@@ -16,7 +16,7 @@ from training.replay.mrclam import replay_team
 
 
 def test_exact_maps_are_aligned_exactly(tmp_path: Path) -> None:
-    """Without noise both robots' own maps are aligned to centimetres, by barcodes and by geometry alone."""
+    """Without noise the maps of both robots are aligned to centimetres, by barcodes and by geometry only."""
     write_log(tmp_path, noise=0.0)
     log = load_mrclam(tmp_path)
     rows = align_pairs(replay_team(log, MrclamConfig(path=str(tmp_path), alone=True, particles=20)), log)
@@ -34,15 +34,15 @@ def test_exact_maps_are_aligned_exactly(tmp_path: Path) -> None:
 
 
 def row(**changed: Any) -> dict[str, Any]:
-    """Return the row of a pair that was aligned."""
+    """Return the row of an aligned pair."""
     return {
         "duration_s": None, "robots": [1, 2], "shared": 15, "barcodes": "given", "method": "ransac", "accepted": True,
         "reason": "", "inliers": 15, "error_m": 0.1, "error_deg": 1.0,
     } | changed  # fmt: skip
 
 
-def test_sums_count_what_is_false() -> None:
-    """Large errors count as false, refusals do not; pairs that share little are not counted."""
+def test_large_errors_count_as_false() -> None:
+    """Large errors count as false, refusals do not; pairs with few shared landmarks are not counted."""
     refused = {"accepted": False, "reason": "ambiguous", "error_m": None, "error_deg": None}
     rows = [row(), row(error_m=0.6), row(error_deg=7.0), row(**refused), row(shared=3, **refused)]
     line = summarise(rows)[0]
@@ -53,13 +53,13 @@ def test_sums_count_what_is_false() -> None:
 
 
 def test_the_command_leaves_a_table(vslam: Any, tmp_path: Path) -> None:
-    """One line per duration, barcodes and method, on the console, as Markdown and in metrics.json."""
+    """There is one line per duration, barcodes and method, on the console, as Markdown and in metrics.json."""
     write_log(tmp_path, noise=1.0)
     out = tmp_path / "run"
     options = ("--path", str(tmp_path), "--durations", "30,0", "--particles", "10", "--out", str(out))
     said = vslam("bench", "mrclam", *options)
     assert said.status == 0
-    assert "aligned pairwise" in said.out
+    assert "Pairwise alignment" in said.out
     assert len((out / "table.md").read_text().splitlines()) == 2 + 8
     metrics = json.loads((out / "metrics.json").read_text())
     assert [line["duration_s"] for line in metrics["summary"]] == [30.0] * 4 + [None] * 4

@@ -1,4 +1,4 @@
-"""Simulated stereo runs: physically possible, repeatable, and as noisy as they say."""
+"""Simulated stereo runs: physically possible, repeatable, and with the stated noise."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ FALSE_ALARM = 1e-3
 
 @pytest.fixture(scope="module")
 def run() -> StereoRun:
-    """Two robots for 30 m, landmarks of unknown association."""
+    """Two robots for 30 m, with unknown association."""
     return simulate_run(RunSpec(robots=2, length=30.0, measurements=11, association="unknown"), seed=3)
 
 
@@ -31,7 +31,7 @@ def test_a_path_keeps_its_length_and_never_jumps(run: StereoRun) -> None:
 
 
 def test_robots_keep_clear_of_walls_and_blocks(run: StereoRun) -> None:
-    """Every pose lies inside the building, a metre and more from each wall and block."""
+    """Every pose is inside the building, at least a metre from each wall and block."""
     for x, y, _ in run.true_paths.reshape(-1, 3):
         assert 1.0 < x < run.office.size[0] - 1.0
         assert 1.0 < y < run.office.size[1] - 1.0
@@ -40,7 +40,7 @@ def test_robots_keep_clear_of_walls_and_blocks(run: StereoRun) -> None:
 
 
 def test_paths_close_loops() -> None:
-    """On 100 m a robot comes back to places it has left long ago, heading the same way."""
+    """On 100 m a robot returns to places that it left long ago, with the same heading."""
     path = simulate_run(RunSpec(length=100.0), seed=1).true_paths[0]
     gaps = np.hypot(*(path[:, None, :2] - path[None, :, :2]).transpose(2, 0, 1))
     turned = np.cos(path[:, None, 2] - path[None, :, 2])
@@ -48,7 +48,7 @@ def test_paths_close_loops() -> None:
     assert np.count_nonzero((gaps < 0.3) & (turned > 0.9) & later) > 50
 
 
-def test_what_is_seen_can_be_seen(run: StereoRun) -> None:
+def test_visible_landmarks_satisfy_all_conditions(run: StereoRun) -> None:
     """No line of sight crosses a block (sampled densely), each meets its wall from the front, in image and range."""
     camera = run.spec.noise.camera
     shares = np.linspace(0.0, 1.0, 400)[:, None]
@@ -70,7 +70,7 @@ def test_what_is_seen_can_be_seen(run: StereoRun) -> None:
 
 
 def test_a_block_hides_what_is_behind_it() -> None:
-    """From an aisle along x, a landmark across a block is invisible though in the image and in range."""
+    """From an aisle along x, a landmark behind a block is invisible though in the image and in range."""
     office = Office.draw(2000, np.random.default_rng(0))
     camera = PRESETS["good"].camera
     x1, y1, x2, y2 = office.blocks[0]
@@ -82,8 +82,8 @@ def test_a_block_hides_what_is_behind_it() -> None:
     assert office.visible(pose, camera).any()
 
 
-def test_measurements_are_shared_out(run: StereoRun) -> None:
-    """Of B = 11 the first robot takes up to 6, the second up to 5; in open view they take them all."""
+def test_measurements_are_divided_among_robots(run: StereoRun) -> None:
+    """Of B = 11 the first robot has up to 6, the second up to 5; in open view they use all of them."""
     sizes = np.array([[len(frame) for frame in frames] for frames in run.frames])
     assert sizes.max(axis=0).tolist() == [6, 5]
     assert (sizes[:, 0] == 6).mean() > 0.6
@@ -116,8 +116,8 @@ def test_noise_is_as_stated(preset: str) -> None:
     assert not run.odometry[0].any()
 
 
-def test_unknown_association_has_its_share_of_everything_wrong() -> None:
-    """2 % false points and 3 % wrong descriptors (binomial, false alarm 1e-3 each); three landmarks of each look."""
+def test_unknown_association_has_the_stated_errors() -> None:
+    """2 % false points and 3 % wrong descriptors (binomial, false alarm 1e-3 each); classes of three landmarks."""
     run = simulate_run(RunSpec(association="unknown", length=100.0), seed=7)
     names = np.concatenate([name for step in run.names for name in step])
     looks = np.concatenate([frame.descriptors for step in run.frames for frame in step])
@@ -130,7 +130,7 @@ def test_unknown_association_has_its_share_of_everything_wrong() -> None:
 
 
 def test_the_first_frame_is_at_the_start(run: StereoRun) -> None:
-    """Readings begin with a frame and no odometry; names are handed out only where the association is known."""
+    """Readings start with measurements without odometry; identities are given only if the association is known."""
     first, second, *_ = run.readings()
     assert first["odometry"] == [None, None]
     assert len(first["measurements"][0]) > 0
@@ -140,8 +140,8 @@ def test_the_first_frame_is_at_the_start(run: StereoRun) -> None:
     assert next(known.readings())["identities"][0] is known.names[0][0]
 
 
-def test_runs_repeat_and_more_robots_change_nothing_of_the_first() -> None:
-    """The same seed gives the same bytes, another seed another run; robot 0 drives and reads alike with K = 1 and 3."""
+def test_runs_repeat_and_do_not_depend_on_added_robots() -> None:
+    """The same seed gives the same bytes, another seed another run; robot 0 is equal for K = 1 and 3."""
     first, again = (simulate_run(RunSpec(length=5.0), seed=2) for _ in range(2))
     np.testing.assert_array_equal(first.odometry, again.odometry)
     for a, b in zip(first.frames, again.frames, strict=True):
@@ -155,8 +155,8 @@ def test_runs_repeat_and_more_robots_change_nothing_of_the_first() -> None:
     assert len(np.unique(three.true_paths[:, 0, :2], axis=0)) == 3
 
 
-def test_a_filter_of_the_run_starts_where_the_robots_do(run: StereoRun) -> None:
-    """The filter's map frame is the world frame, and it takes every reading as it comes."""
+def test_filters_of_a_run_start_at_the_true_poses(run: StereoRun) -> None:
+    """The filter's map frame is the world frame, and it accepts all readings."""
     slam = run.build_filter(7, seed=1)
     for reading in run.readings():
         slam.step(**reading)
@@ -178,12 +178,12 @@ def test_a_filter_of_the_run_starts_where_the_robots_do(run: StereoRun) -> None:
     ],
 )
 def test_impossible_runs_are_refused(arguments: dict[str, Any], message: str) -> None:
-    """Argument, what was expected, and what came."""
+    """The error has the argument, the expected and the actual value."""
     with pytest.raises(ValueError, match=message):
         RunSpec(**arguments)
 
 
-def test_no_crossing_is_shared() -> None:
-    """More robots than crossings cannot start apart."""
+def test_starts_are_at_different_crossings() -> None:
+    """More robots than crossings cannot have different starts."""
     with pytest.raises(ValueError, match="robots: expected at most 9, got 10"):
         start_crossings(10, np.random.default_rng(0))

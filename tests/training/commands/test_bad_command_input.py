@@ -1,4 +1,4 @@
-"""Bad input of every command is one line of stderr and exit status 2, before anything is computed or written."""
+"""Bad input of every command gives one line on stderr and exit status 2, before any computation or output."""
 
 from pathlib import Path
 from typing import Any
@@ -10,13 +10,13 @@ from training.cli import app
 
 MRCLAM = "path: expected a folder of the MR.CLAM log, with Barcodes.dat, Landmark_Groundtruth.dat and Robot*.dat"
 ROBOTS = "robots: expected an int from 1 to 8, got"
-LIST = "expected numbers with commas between, got"
-# Per command its bad arguments, each with how the line begins. Ranges: tests/training/experiments/test_configs.py.
+LIST = "expected comma-separated numbers, got"
+# Bad arguments of each command, with the beginning of the error. Ranges: tests/training/experiments/test_configs.py.
 BAD: dict[str, dict[str, str]] = {
     "run": {
         "--world nowhere": "world: expected one of 'office', 'maze', 'loops', 'hall', 'fig5', or a path",
         "--world broken.json": "world: expected",
-        "--policy nobody": "policy: expected one of 'frontier', 'random_goals', 'random_walk', got 'nobody'.",
+        "--policy unknown": "policy: expected one of 'frontier', 'random_goals', 'random_walk', got 'unknown'.",
         "--policy random_walk --action-type goal": "action_type: expected 'continuous' or 'discrete'",
         "--robots 9": f"{ROBOTS} 9. Use 1 to 8 robots.", "--robots 0 --json -": f"{ROBOTS} 0.",
         "--action-type fly": "action_type: expected one of 'continuous', 'discrete', 'goal', got 'fly'.",
@@ -34,8 +34,8 @@ BAD: dict[str, dict[str, str]] = {
     },
     "warm-up": {"--workers 0": "workers: expected an int >= 1, got 0."},
     "replay mrclam": {
-        "--path /nowhere": MRCLAM + ", got no such path. Check '/nowhere'; if --path is left away, it is ",
-        "": MRCLAM + ", got no --path. Name it, or set VSLAM_DATA.",
+        "--path /nowhere": MRCLAM + ", got no such path. Check '/nowhere'; without --path it is ",
+        "": MRCLAM + ", got no --path. Give --path, or set VSLAM_DATA.",
         "--path . --robots 1;2": f"robots: {LIST} '1;2'.",
         "--path . --robots 7": "robots: expected different numbers from 1 to 5, got (7,).",
         "--path . --duration -1": "duration: expected a finite number > 0, got -1.0.",
@@ -74,8 +74,8 @@ BAD: dict[str, dict[str, str]] = {
         "--envs 1 --workers 2": "workers: expected at most one per environment, 1, got 2",
     },
     "bench exploration": {
-        "--policies nobody": "policy: expected one of 'frontier', 'random_goals', 'random_walk', got 'nobody'.",
-        "--policies no_module:Nobody": "policy: expected MODULE:NAME of a policy, got no module 'no_module'.",
+        "--policies unknown": "policy: expected one of 'frontier', 'random_goals', 'random_walk', got 'unknown'.",
+        "--policies no_module:Missing": "policy: expected MODULE:NAME of a policy, got no module 'no_module'.",
         "--policies random_walk@goal": "random_walk@: expected one of 'continuous', 'discrete', got 'goal'.",
         "--policies none.npz": "model: expected a model that vslam train wrote, got no such file.",
         "--worlds nowhere": "world: expected",
@@ -96,14 +96,14 @@ BAD: dict[str, dict[str, str]] = {
     "worlds preview": {"fig5 --out worlds.txt": "out: expected a name that ends in .png, got 'worlds.txt'"},
     "worlds import": {
         "gone.png plan.json": "world: expected a file",
-        "gone.yaml plan.json --metres-per-pixel 0.1": "metres_per_pixel: expected none beside",
+        "gone.yaml plan.json --metres-per-pixel 0.1": "metres_per_pixel: expected no value for a ROS map",
     },
 }  # fmt: skip
 ROWS = [(command, arguments, begins) for command, rows in BAD.items() for arguments, begins in rows.items()]
 
 
 def _commands(command: Any, path: str = "") -> dict[str, Any]:
-    """Return all commands of the command line by their words."""
+    """Return all commands by their words."""
     inner = getattr(command, "commands", None)
     if inner is None:
         return {path: command}
@@ -125,7 +125,7 @@ def _need_learner(command: str) -> None:
 def test_bad_input_is_one_line_and_status_2(
     command: str, arguments: str, begins: str, refusal: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """Name, what was expected, what came and a hint on one line of stderr; nothing is written."""
+    """One line on stderr has name, expected and actual value and a hint; nothing is written."""
     _need_learner(command)
     monkeypatch.delenv("VSLAM_DATA", raising=False)
     (tmp_path / "full").mkdir()
@@ -136,8 +136,8 @@ def test_bad_input_is_one_line_and_status_2(
 
 
 @pytest.mark.parametrize("command", WITH_FOLDER)
-def test_files_that_cannot_be_had_are_refused_by_every_command(command: str, refusal: Any) -> None:
-    """A missing configuration, and a place where the metrics cannot be written, are found before any work."""
+def test_bad_files_are_refused_by_every_command(command: str, refusal: Any) -> None:
+    """A missing configuration, and a path at which metrics cannot be written, are detected before any work."""
     _need_learner(command)
     missing = refusal(*command.split(), "--config", "/nowhere")
     assert missing.startswith("error config: expected the config.toml of an earlier run, got no such file.")
@@ -145,6 +145,6 @@ def test_files_that_cannot_be_had_are_refused_by_every_command(command: str, ref
     assert unwritable.startswith("error json: expected a file that can be written, got 'none/copy.json'. The system")
 
 
-def test_every_command_is_among_them() -> None:
-    """Each command has bad arguments above, but for the one that needs a screen."""
+def test_every_command_has_bad_arguments() -> None:
+    """Each command has bad arguments above, except the one that needs a display."""
     assert BAD.keys() == COMMANDS.keys() - {"drive"}

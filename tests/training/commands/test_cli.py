@@ -9,7 +9,7 @@ from training import cli
 
 
 def test_a_fault_of_the_program_keeps_its_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A ValueError that is not in the project's form is no bad input."""
+    """A ValueError without the project's format is not bad input."""
 
     def broken(prog_name: str) -> None:
         raise ValueError("operands could not be broadcast together")
@@ -20,8 +20,8 @@ def test_a_fault_of_the_program_keeps_its_traceback(monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.parametrize("module", ["training", "training.cli"])
-def test_modules_are_the_command(module: str) -> None:
-    """`python -m training` and `python -m training.cli` say what `vslam` says, with its exit status."""
+def test_modules_run_the_command(module: str) -> None:
+    """`python -m training` and `python -m training.cli` have the output and exit status of `vslam`."""
     for arguments, status, says in ((["--help"], 0, "Usage: vslam"), (["run", "--robots", "0"], 2, "robots: expected")):
         done = subprocess.run([sys.executable, "-m", module, *arguments], capture_output=True, text=True)
         assert done.returncode == status
@@ -29,7 +29,7 @@ def test_modules_are_the_command(module: str) -> None:
 
 
 def test_help_needs_no_heavy_import() -> None:
-    """The command line is built without numba, OpenCV, matplotlib or torch, so that --help answers at once."""
+    """The command line is built without numba, OpenCV, matplotlib or torch, so that --help is fast."""
     heavy = "{'numba', 'cv2', 'matplotlib', 'torch', 'scipy'}"
     code = f"import sys, training.cli; print(sorted({heavy} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -37,15 +37,15 @@ def test_help_needs_no_heavy_import() -> None:
 
 
 @pytest.mark.parametrize("arguments", [("run", "--max-cycles", "3"), ("worlds", "preview", "fig5")])
-def test_a_deleted_folder_is_one_line(arguments: tuple[str, ...], tmp_path: Path) -> None:
-    """A command that is called in a folder that is gone says so; --help works there."""
+def test_a_deleted_folder_gives_a_one_line_error(arguments: tuple[str, ...], tmp_path: Path) -> None:
+    """A command called in a deleted folder has a clear error; --help works there."""
     gone = tmp_path / "gone"
     gone.mkdir()
     shell = ["sh", "-c", 'rmdir "$0"; exec "$@"', str(gone), sys.executable, "-m", "training"]
     environment = os.environ | {"PYTHONPATH": str(Path(cli.__file__).parents[1])}
     done = subprocess.run([*shell, *arguments], cwd=gone, env=environment, capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (2, "")
-    told = "error folder: expected a current folder, got a deleted one. Change into one that exists."
-    assert done.stderr.splitlines() == [told]
+    expected = "error folder: expected a current folder, got a deleted one. Change into one that exists."
+    assert done.stderr.splitlines() == [expected]
     gone.mkdir()
     assert subprocess.run([*shell, "--help"], cwd=gone, env=environment, capture_output=True).returncode == 0

@@ -1,4 +1,4 @@
-"""A disk that is full ends a command with one line and status 2, and what was finished before stays."""
+"""A full disk ends a command with one line and status 2, and finished results are kept."""
 
 import errno
 import json
@@ -24,7 +24,7 @@ FULL = Path("/dev/full")
 
 @contextmanager
 def _files_up_to(size: int) -> Iterator[None]:
-    """Let no file grow beyond a number of bytes, as on a disk that is nearly full."""
+    """Limit the size of files, as on a nearly full disk."""
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
     try:
@@ -46,7 +46,7 @@ def _files_up_to(size: int) -> Iterator[None]:
         ((), 4_000, "video.mp4", {"config.toml", "environment.toml"}),
     ],
 )
-def test_a_run_that_finds_no_room_is_one_line(
+def test_a_full_disk_gives_a_one_line_error(
     options: tuple[str, ...],
     size: int,
     file: str,
@@ -55,7 +55,7 @@ def test_a_run_that_finds_no_room_is_one_line(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The line names the file and the reason; files before it are whole, and nothing half-written is left."""
+    """The line gives the file and the reason; earlier files are complete, and no partial file is left."""
     monkeypatch.chdir(tmp_path)
     with _files_up_to(size):
         said = vslam("run", *SHORT, *options)
@@ -71,7 +71,7 @@ def test_a_run_that_finds_no_room_is_one_line(
 
 
 def test_a_video_that_cannot_be_written_leaves_no_file(tmp_path: Path) -> None:
-    """A film that lacks frames, as its encoder found no room, is refused when it is closed; an older one stays."""
+    """A video with missing frames is refused when it is closed; an older file is kept."""
     path = tmp_path / "film.mp4"
     path.write_bytes(b"older")
     frames = np.random.default_rng(0).integers(0, 256, (20, 64, 64, 3), dtype=np.uint8)
@@ -90,8 +90,8 @@ def _row(trial: Any) -> dict[str, Any]:
     return {"seed": trial, "text": "x" * 400}
 
 
-def test_finished_trials_stay(tmp_path: Path) -> None:
-    """Trials that found room are kept as whole lines."""
+def test_finished_trials_survive_a_full_disk(tmp_path: Path) -> None:
+    """Trials written before the disk was full are kept as complete lines."""
     folder = open_folder(tmp_path / "run", "count", {}, 0)
     with _files_up_to(1_000), pytest.raises(ValueError, match=r"out: expected a file .* says: File too large\."):
         run_trials(folder, "trials.jsonl", _row, range(9), 1, lambda: False, lambda row: None)
@@ -100,8 +100,8 @@ def test_finished_trials_stay(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])
-def test_what_a_library_cannot_write_is_one_line(number: int, refusal: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An error of the system about room, from wherever it comes, is reported; any other keeps its traceback."""
+def test_write_errors_of_libraries_are_one_line(number: int, refusal: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A system error about space, from any library, is reported; any other error keeps its traceback."""
 
     def app(raised: OSError) -> Callable[[str], None]:
         def fail(prog_name: str) -> None:
@@ -110,7 +110,7 @@ def test_what_a_library_cannot_write_is_one_line(number: int, refusal: Any, monk
         return fail
 
     monkeypatch.setattr(cli, "app", app(OSError(number, os.strerror(number), "events")))
-    text = f"output: expected a place with room, got 'events'. The system says: {os.strerror(number)}."
+    text = f"output: expected a disk with free space, got 'events'. The system says: {os.strerror(number)}."
     assert refusal("anything") == f"error {text}\n"
     monkeypatch.setattr(cli, "app", app(ConnectionError("another")))
     with pytest.raises(ConnectionError, match="another"):
@@ -119,11 +119,11 @@ def test_what_a_library_cannot_write_is_one_line(number: int, refusal: Any, monk
 
 @pytest.mark.skipif(not FULL.is_char_device(), reason="there is no device that is always full")
 def test_a_full_stdout_is_one_line() -> None:
-    """Tables that cannot be printed end the command with one line, without a word more when Python ends."""
+    """Tables that cannot be printed end the command with one line, without further output at exit."""
     environment = os.environ | {"PYTHONPATH": str(Path(cli.__file__).parents[1])}
     with FULL.open("w") as full:
         command = [sys.executable, "-m", "training", "worlds", "list", "--seeds", "1"]
         done = subprocess.run(command, env=environment, stdout=full, stderr=subprocess.PIPE, text=True)
     assert done.returncode == 2
-    told = "error output: expected a place with room, got stdout. The system says: No space left on device.\n"
-    assert done.stderr == told
+    expected = "error output: expected a disk with free space, got stdout. The system says: No space left on device.\n"
+    assert done.stderr == expected

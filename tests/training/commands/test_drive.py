@@ -1,4 +1,4 @@
-"""`vslam drive`: keys become actions, in a window of a screen that is none."""
+"""`vslam drive`: keys become actions, in a window of a dummy display."""
 
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ runner = CliRunner()
 
 
 class _Script:
-    """A screen whose user holds and types given keys, frame by frame, and then closes it."""
+    """Display whose user holds and types given keys, frame by frame, and then closes it."""
 
     def __init__(self, frames: list[tuple[set[str], list[str]]]) -> None:
         self.frames = list(frames)
@@ -47,13 +47,13 @@ class _Script:
         ({"x"}, [0, 0]),
     ],
 )
-def test_keys_are_actions(held: set[str], action: list[float]) -> None:
+def test_keys_are_mapped_to_actions(held: set[str], action: list[float]) -> None:
     """Arrows and WASD are speed and turn; opposite keys cancel; other keys do nothing."""
     assert action_of(held).tolist() == action
 
 
-def test_the_driven_robot_obeys_and_tab_takes_the_next() -> None:
-    """The robot at the keys drives ahead, the others stand or follow their policy; Tab hands the keys on."""
+def test_keys_drive_one_robot_and_tab_selects_the_next() -> None:
+    """The selected robot drives ahead, the others stand or follow their policy; Tab selects the next robot."""
     env = vslam_v0.parallel_env(world="fig5", num_robots=2, num_particles=5)
     screen = _Script([({"up"}, [])] * 5 + [(set(), ["tab"])] + [({"up"}, [])] * 4)
     infos = drive(env, screen, {}, 3, pace=0.0)
@@ -78,8 +78,8 @@ def test_escape_ends() -> None:
     assert env.episode.tick == 1
 
 
-def test_a_window_reads_keys_and_its_cross(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Keys that go down are held until they go up; the cross closes the window for good."""
+def test_a_window_reads_keys_and_close_events(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pressed keys are held until released; the close button closes the window for good."""
     pygame = pytest.importorskip("pygame")
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     window, frame = Window("test"), np.zeros((120, 160, 3), np.uint8)
@@ -99,21 +99,21 @@ def test_a_window_reads_keys_and_its_cross(monkeypatch: pytest.MonkeyPatch) -> N
     post((pygame.QUIT, None))
     window.show(frame)
     assert window.closed
-    window.show(frame)  # nothing opens again
+    window.show(frame)  # the window stays closed
     window.close()
 
 
 def test_the_command_needs_a_screen(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without a screen or pygame the command says what is missing, before it compiles anything."""
+    """Without a display or pygame the command reports what is missing, before it compiles anything."""
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"):
         monkeypatch.delenv(name, raising=False)
     result = runner.invoke(app, ["drive", "--world", "fig5"])
     assert isinstance(result.exception, ValueError)
-    assert "drive: expected a screen for a window" in str(result.exception)
+    assert "drive: expected a display for a window" in str(result.exception)
 
 
-def test_the_command_films(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """On a dummy screen the command drives to the end, sums up, and leaves a video."""
+def test_the_command_records_a_video(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """With a dummy display the command runs to the end, prints a summary, and writes a video."""
     pytest.importorskip("pygame")
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     film = tmp_path / "drive.mp4"

@@ -1,4 +1,4 @@
-"""With `--json -` the metrics stand alone on stdout, whatever a command and its processes print besides."""
+"""With `--json -` only the metrics are on stdout, whatever a command and its processes print."""
 
 import json
 import os
@@ -15,7 +15,7 @@ from small_logs import write_drive, write_log, write_park
 from training import cli
 
 SEED = ("--first-seed", "100")
-# Of each command with --json: arguments that let it do as little as possible, in a folder with logs and a model.
+# Minimal arguments of each command with --json, in a folder with logs and a model.
 LEAST = {
     "run": ("--world", "fig5", "--robots", "1", "--max-cycles", "3", "--particles", "5", "--no-video"),
     "train": ("--preset", "smoke", "--robots", "1", "--workers", "0", "--steps", "24"),
@@ -50,7 +50,7 @@ LEARNING = ("train", "evaluate", "bench train")
 
 
 def _commands(group: Any, name: str = "") -> Iterator[str]:
-    """Return the names of all commands that have the option --json."""
+    """Return the names of all commands with the option --json."""
     for part, command in group.commands.items():
         path = f"{name} {part}".strip()
         if hasattr(command, "commands"):
@@ -61,7 +61,7 @@ def _commands(group: Any, name: str = "") -> Iterator[str]:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a log of each kind."""
+    """Folder with a log of each kind."""
     made: Path = tmp_path_factory.mktemp("logs")
     for name in ("robots", "park", "drive"):
         (made / name).mkdir()
@@ -71,8 +71,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made
 
 
-def test_all_commands_are_looked_at() -> None:
-    """The table holds each command that has the option."""
+def test_all_commands_with_json_are_covered() -> None:
+    """The table has each command with the option."""
     assert set(_commands(typer.main.get_command(cli.app))) == set(LEAST)
 
 
@@ -86,12 +86,12 @@ def test_stdout_is_json(
     monkeypatch: pytest.MonkeyPatch,
     request: pytest.FixtureRequest,
 ) -> None:
-    """What each command prints on stdout is the content of its `metrics.json`, and what people read is on stderr."""
+    """The stdout of each command is the content of its `metrics.json`; other output is on stderr."""
     if command in LEARNING:
         pytest.importorskip("sb3_contrib")
     arguments = LEAST[command]
     if command == "bench stereo":
-        monkeypatch.delenv("VSLAM_DATA", raising=False)  # no real images, which take long
+        monkeypatch.delenv("VSLAM_DATA", raising=False)  # no real images, which are slow
     if command == "replay stereo":
         arguments = ("--path", str(request.getfixturevalue("data_dir") / "euroc_pairs"))
     monkeypatch.chdir(folder)
@@ -119,8 +119,8 @@ class Loud:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("closed", [False, True])
-def test_loud_policies_in_other_processes_do_not_disturb(closed: bool, tmp_path: Path) -> None:
-    """What a policy prints, or writes to the descriptor of stdout, in a worker process ends on stderr."""
+def test_output_of_workers_goes_to_stderr(closed: bool, tmp_path: Path) -> None:
+    """Output of a policy in a worker process, by print or to the descriptor of stdout, goes to stderr."""
     (tmp_path / "loud.py").write_text(LOUD)
     arguments = ["--policies", "frontier,loud:Loud", "--processes", "2", "--json", "-", "--out", str(tmp_path / "run")]
     few = [
@@ -137,8 +137,8 @@ def test_loud_policies_in_other_processes_do_not_disturb(closed: bool, tmp_path:
         assert "written" in done.stderr
 
 
-def test_a_reader_that_is_gone_is_one_line(tmp_path: Path) -> None:
-    """If nothing reads the JSON any more, the command says so in one line, and its folder is whole."""
+def test_a_closed_stdout_gives_a_one_line_error(tmp_path: Path) -> None:
+    """If stdout is closed, the command has a one-line error, and its folder is complete."""
     few = "--world fig5 --robots 1 --max-cycles 3 --particles 5 --no-video --out run --json -"
     shell = f"{sys.executable} -m training run {few} 2>err | true; echo ${{PIPESTATUS[0]}}"
     environment = os.environ | {"PYTHONPATH": str(Path(cli.__file__).parents[1])}

@@ -1,4 +1,4 @@
-"""What holds for every command that leaves a run folder: its options, how it begins, shows its work, and ends."""
+"""Common behaviour of commands with a run folder: options, start, progress and end."""
 
 import io
 import json
@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 from training.commands import _progress
 from training.commands._options import numbers, options, words
-from training.commands._progress import KeptPart, play_kept, share_shown, trials_shown
+from training.commands._progress import TrialSet, run_trial_sets, share_progress, trial_progress
 from training.commands._run_folder import Call
 from training.experiments.config import ExperimentConfig, Positive, option, setting
 from training.experiments.run_folder import RunFolder
@@ -26,7 +26,7 @@ from training.experiments.trial_store import open_folder
 class Numbers(ExperimentConfig):
     """Configuration of the command `count`."""
 
-    few: int = option(1, "A few.")
+    few: int = option(1, "A few [m].")
     many: int = option(10, "Many.", ge=1)
     sizes: tuple[Positive, ...] = option((3, 4), "Sizes.", name="size")
     fine: bool = option(False, "Fine or not.")
@@ -36,18 +36,18 @@ class Numbers(ExperimentConfig):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trial:
-    """A trial."""
+    """Trial with a seed."""
 
     seed: int
 
 
 def play(trial: Trial) -> dict[str, Any]:
-    """Square its seed."""
+    """Square the seed."""
     return asdict(trial) | {"square": trial.seed**2}
 
 
-def _part(seeds: range, play: Callable[[Trial], dict[str, Any]], file: str = "trials.jsonl") -> KeptPart:
-    return KeptPart(
+def _part(seeds: range, play: Callable[[Trial], dict[str, Any]], file: str = "trials.jsonl") -> TrialSet:
+    return TrialSet(
         file=file, kind=Trial, play=play, trials=[Trial(seed=seed) for seed in seeds],
         tell=lambda row: f"seed {row['seed']}", cost=lambda trial: 1 + trial.seed,
     )  # fmt: skip
@@ -57,12 +57,12 @@ def _console() -> Console:
     return Console(file=io.StringIO(), width=200, record=True)
 
 
-def _call(given: dict[str, Any] | None = None, command: str = "count", **told: Any) -> Call[Numbers]:
-    return Call(kind=Numbers, command=command, given=given or {}, **told)
+def _call(given: dict[str, Any] | None = None, command: str = "count", **options: Any) -> Call[Numbers]:
+    return Call(kind=Numbers, command=command, given=given or {}, **options)
 
 
 def test_options_are_those_of_the_configuration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each `option` is one, with help and default; texts become lists, paths absolute; what is not given is open."""
+    """Each `option` becomes one, with help and default; texts become lists, paths absolute; others stay unset."""
     calls: list[Call[Numbers]] = []
     app = typer.Typer()
 
@@ -74,7 +74,7 @@ def test_options_are_those_of_the_configuration(tmp_path: Path, monkeypatch: pyt
         calls.append(call)
 
     shown = CliRunner().invoke(app, ["--help"], env={"COLUMNS": "200"}).output
-    for text in ("Count.", "--few", "(1)", "--size", "(3,4)", "--fine", "--no-fine", "(no-fine)",
+    for text in ("Count.", "--few", "A few [m].", "(1)", "--size", "(3,4)", "--fine", "--no-fine", "(no-fine)",
                  "(here)", "--quick", "--out", "--json", "--config", "--seed"):  # fmt: skip
         assert text in shown
     assert "hidden" not in shown
@@ -86,17 +86,17 @@ def test_options_are_those_of_the_configuration(tmp_path: Path, monkeypatch: pyt
     assert calls[1].config == Numbers()
 
 
-def test_numbers_with_commas() -> None:
-    """Blanks do not matter; what is no number is refused by the option's name."""
+def test_comma_separated_numbers() -> None:
+    """Blanks are allowed; entries that are not numbers are refused by the name of the option."""
     assert numbers("robots", "1, 4,2") == (1, 4, 2)
     assert numbers("length", "1, 2.5", float) == (1.0, 2.5)
     assert words("a, b") == ("a", "b")
-    with pytest.raises(ValueError, match="robots: expected numbers with commas between, got '1-3'"):
+    with pytest.raises(ValueError, match="robots: expected comma-separated numbers, got '1-3'"):
         numbers("robots", "1-3")
 
 
-def test_what_is_given_goes_above_quick_and_quick_above_a_file(tmp_path: Path) -> None:
-    """Each value comes from the option, else from what --quick says, else from the earlier run, else from the class."""
+def test_options_override_quick_and_quick_overrides_a_file(tmp_path: Path) -> None:
+    """Each value comes from the option, else from --quick, else from the earlier run, else from the class."""
     RunFolder.create(tmp_path / "run", "count", {"few": 2, "many": 20}, 5)
     chosen = _call({}, file=tmp_path / "run", quick={"many": 3}).config
     assert (chosen.few, chosen.many, chosen.seed) == (2, 3, 5)
@@ -107,10 +107,12 @@ def test_what_is_given_goes_above_quick_and_quick_above_a_file(tmp_path: Path) -
 
 
 def test_logs_are_looked_for_below_the_folder_of_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A log that is not named is where VSLAM_DATA says; without that variable, or a log there, the error says so."""
+    """A log without --path is below VSLAM_DATA; without that variable, or without a log there, there is an error."""
     log = (Path("park"), "a park's log")
     monkeypatch.setenv("VSLAM_DATA", str(tmp_path))
-    with pytest.raises(ValueError, match=r"path: expected a park's log, got no such path\. Check '.*park'; if --path"):
+    with pytest.raises(
+        ValueError, match=r"path: expected a park's log, got no such path\. Check '.*park'; without --path"
+    ):
         _ = _call(log=log).config
     for name in ("park", "mine"):
         (tmp_path / name).mkdir()
@@ -122,7 +124,7 @@ def test_logs_are_looked_for_below_the_folder_of_data(tmp_path: Path, monkeypatc
 
 
 def test_first_steps_come_before_the_folder(tmp_path: Path) -> None:
-    """Work that shows bad input leaves no folder; a folder of the same run is taken up only where that is asked for."""
+    """First steps with bad input leave no folder; a folder of the same run is reused only where allowed."""
     out = tmp_path / "run"
 
     def refuse() -> None:
@@ -139,8 +141,8 @@ def test_first_steps_come_before_the_folder(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("below", [False, True])
-def test_a_folder_that_cannot_be_had_is_refused_before_any_work(below: bool, tmp_path: Path) -> None:
-    """Nobody waits for the compiler to read that the folder is a file, or is to stand where a file is."""
+def test_a_bad_folder_is_refused_before_any_work(below: bool, tmp_path: Path) -> None:
+    """A folder that is a file, or is below a file, is refused before anything is compiled."""
     (tmp_path / "file").write_text("x")
     out, done = tmp_path / "file" / "run" if below else tmp_path / "file", []
     with pytest.raises(ValueError, match=r"out: expected a (new or empty folder|folder that can be written), got"):
@@ -150,7 +152,7 @@ def test_a_folder_that_cannot_be_had_is_refused_before_any_work(below: bool, tmp
 
 @pytest.mark.parametrize(("held", "status"), [([True, True], 0), ([True, False], 1), ([], 1)])
 def test_check_turns_claims_that_fail_into_status_1(held: list[bool], status: int, tmp_path: Path) -> None:
-    """With --check a claim that does not hold, or none at all, is status 1; the metrics are written either way."""
+    """With --check a claim that fails, or the lack of claims, is status 1; the metrics are written in any case."""
     copy = tmp_path / "copy.json"
     call = _call(out=tmp_path / "run", json=copy, console=_console())
     call.begin()
@@ -165,8 +167,8 @@ def test_check_turns_claims_that_fail_into_status_1(held: list[bool], status: in
     assert json.loads(copy.read_text()) == json.loads((tmp_path / "run" / "metrics.json").read_text())
 
 
-def test_a_stopped_command_says_how_to_go_on_and_does(tmp_path: Path) -> None:
-    """Ctrl-C ends after the trial under way; called again only the rest is played, and rows come in order of trials."""
+def test_a_stopped_command_can_be_resumed(tmp_path: Path) -> None:
+    """Ctrl-C ends after the current trial; called again, only the rest is run, and rows keep the order of trials."""
     folder, shown = open_folder(tmp_path / "run", "count", {}, 0), _console()
     played: list[int] = []
 
@@ -177,23 +179,23 @@ def test_a_stopped_command_says_how_to_go_on_and_does(tmp_path: Path) -> None:
         return play(trial)
 
     parts = (_part(range(3), stopping), _part(range(5, 7), play, "others.jsonl"))
-    rows = play_kept(shown, folder, *parts)
+    rows = run_trial_sets(shown, folder, *parts)
     assert [[row["seed"] for row in own] for own in rows] == [[0, 1], []]
-    assert f"Stopped after 2 of 5 trials; go on with --out {folder.path}." in shown.export_text()
-    rows = play_kept(shown, folder, *parts)
+    assert f"Stopped after 2 of 5 trials; resume with --out {folder.path}." in shown.export_text()
+    rows = run_trial_sets(shown, folder, *parts)
     assert played == [0, 1, 2]
     assert [[row["square"] for row in own] for own in rows] == [[0, 1, 4], [25, 36]]
     assert "Stopped" not in shown.export_text()
 
 
 def test_a_bar_counts_what_trials_cost(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each trial is shown with its name, and what it costs is counted; libraries have one thread meanwhile."""
+    """Each trial is shown with its name, and its cost is counted; libraries have one thread meanwhile."""
     import numpy as np  # noqa: F401   # a library with threads
     from threadpoolctl import threadpool_info
 
     monkeypatch.setattr(_progress, "REDRAW_S", 0.0)
     shown = Console(file=io.StringIO(), width=100, force_terminal=True)
-    with trials_shown(shown, 10, 4) as (advance, interrupted):
+    with trial_progress(shown, 10, 4) as (advance, interrupted):
         advance("the third", 3)
         assert not interrupted()
         assert {pool["num_threads"] for pool in threadpool_info()} <= {1}
@@ -203,9 +205,9 @@ def test_a_bar_counts_what_trials_cost(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_lines_go_above_a_bar_of_shares() -> None:
-    """What is printed while a bar runs stays, and changed fields are shown."""
+    """Output printed while a bar runs is kept, and changed fields are shown."""
     shown = _console()
-    with share_shown(shown, "work", "{task.fields[left]} left", left=3) as update:
+    with share_progress(shown, "work", "{task.fields[left]} left", left=3) as update:
         update(0.5, left=2)
         shown.print("half of it")
     assert "half of it" in shown.export_text(clear=False)

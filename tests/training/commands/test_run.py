@@ -24,7 +24,7 @@ from vslam_env import vslam_v0
 from vslam_env.config import EnvConfig
 from vslam_env.world import World
 
-# A room of 7 x 5 m in which two robots look at the same wall from places that are not the same.
+# A room of 7 x 5 m in which two robots see the same wall from different places.
 ROOM = World(
     "room",
     np.array([[0.0, 0.0, 7.0, 0.0], [7.0, 0.0, 7.0, 5.0], [7.0, 5.0, 0.0, 5.0], [0.0, 5.0, 0.0, 0.0]]),
@@ -48,7 +48,7 @@ def record() -> EpisodeRecord:
 
 
 def test_a_record_has_a_row_for_the_reset_and_for_each_step(record: EpisodeRecord) -> None:
-    """Times, poses, errors and coverage have one entry more than there are steps, and begin at the reset."""
+    """Times, poses, errors and coverage have one entry more than there are steps, and start at the reset."""
     assert record.complete
     np.testing.assert_allclose(record.times, 0.1 * np.arange(STEPS + 1))
     for poses in (record.true_poses, record.estimated, record.reckoned):
@@ -81,14 +81,14 @@ def test_an_episode_repeats_from_its_seed() -> None:
     env = vslam_v0.parallel_env(world=ROOM, num_robots=2, action_type="goal", max_cycles=3, num_particles=13)
     goal = run_episode(env, config.make_policies(env), config.seed)
     np.testing.assert_allclose(goal.times, [0.0, 1.0, 2.0, 3.0])
-    # Thirty readings are chained to three rows: noisy, but no further off than odometry can be after three metres.
+    # Thirty readings are chained to three rows: noisy, but within the error of odometry after three metres.
     for robot in range(2):
         truth = between(goal.true_poses[robot, 0], goal.true_poses[robot])
         assert np.abs(goal.reckoned[robot] - truth).max() < 0.5
 
 
 def test_an_episode_can_be_stopped() -> None:
-    """`should_stop` ends the episode after the current step, and the record says so."""
+    """`should_stop` ends the episode after the current step, and the record is marked incomplete."""
     config = RunConfig(robots=2, policy="random_walk", seed=3)
     env = vslam_v0.parallel_env(world=ROOM, num_robots=2, max_cycles=STEPS, num_particles=13)
     seen: list[int] = []
@@ -99,14 +99,14 @@ def test_an_episode_can_be_stopped() -> None:
 
 
 def test_every_agent_needs_a_policy() -> None:
-    """A missing policy is named before anything runs."""
+    """A missing policy is reported before anything runs."""
     env = vslam_v0.parallel_env(world=ROOM, num_robots=2)
     with pytest.raises(ValueError, match=r"policies: expected a policy for each agent, got no policy for \['robot_0'"):
         run_episode(env, {}, 0)
 
 
-def test_scores_of_a_perfect_path_are_zero_and_dead_reckoning_is_scored_beside_it(record: EpisodeRecord) -> None:
-    """The true path scores 0; one that ends 0.6 m off after 12 m is 5 % off; turning it alone is aligned away."""
+def test_a_perfect_path_scores_zero_and_dead_reckoning_is_scored(record: EpisodeRecord) -> None:
+    """The true path scores 0; one that ends 0.6 m off after 12 m is 5 % off; a pure rotation is aligned away."""
     own = between(record.true_poses[:, :1], record.true_poses)
     off = own.copy()
     off[:, -1, 0] += 0.6
@@ -124,7 +124,7 @@ def test_scores_of_a_perfect_path_are_zero_and_dead_reckoning_is_scored_beside_i
 
 
 def test_metrics_have_the_promised_names(record: EpisodeRecord) -> None:
-    """Independent checks rely on these keys."""
+    """External checks rely on these keys."""
     metrics = score_episode(record)
     assert {"robots", "merges", "groups", "coverage", "attempts", "refusals"} <= set(metrics)
     assert sum(row["attempts"] for row in metrics["refusals"]) == metrics["attempts"]
@@ -140,14 +140,14 @@ def test_metrics_have_the_promised_names(record: EpisodeRecord) -> None:
 
 @pytest.mark.parametrize(("error_m", "error_deg", "false"), [(0.5, 5.0, False), (0.51, 0.0, True), (0.0, 5.1, True)])
 def test_a_merge_is_false_beyond_half_a_metre_or_five_degrees(error_m: float, error_deg: float, false: bool) -> None:
-    """The limits of the definition, either of which suffices."""
+    """Each limit of the definition suffices."""
     merge = MergeRecord(12, 1.2, (0,), (1, 2), 9, error_m, error_deg)
     assert merge.is_false is false
-    assert describe(merge).startswith("   1.2 s  maps of 0 and 1, 2 merged on 9 landmarks, off by")
+    assert describe(merge).startswith("   1.2 s  maps of 0 and 1, 2 merged on 9 landmarks, error")
 
 
 def test_figures_are_drawn_for_any_team(record: EpisodeRecord, tmp_path: Path) -> None:
-    """One robot or five, merged or not, and a run that was stopped at once: all give two pictures."""
+    """One robot or five, merged or not, and a run stopped at once: all give two plots."""
 
     def cut(robots: int, rows: int) -> EpisodeRecord:
         chosen = [k % 2 for k in range(robots)]
@@ -168,8 +168,8 @@ def test_figures_are_drawn_for_any_team(record: EpisodeRecord, tmp_path: Path) -
             assert file.read_bytes().startswith(b"\x89PNG")
 
 
-def test_tables_show_what_is_not_known_as_a_dash(record: EpisodeRecord) -> None:
-    """A missing figure is a dash, units in brackets survive, and a false merge is called so."""
+def test_tables_show_unknown_values_as_a_dash(record: EpisodeRecord) -> None:
+    """A missing value is a dash, units in brackets are kept, and a false merge is marked."""
     metrics = score_episode(record)
     metrics["robots"][1]["map_rmse_m"] = None
     metrics["merges"][0]["false"] = True
@@ -177,12 +177,12 @@ def test_tables_show_what_is_not_known_as_a_dash(record: EpisodeRecord) -> None:
     print_tables(console, metrics)
     console.file.close()
     text = console.export_text()
-    for word in ("map error E [m], errors cut at 1 m", "off by [deg]", "false", " - ", "robot 1", "team"):
+    for word in ("map error E [m], errors cut at 1 m", "error [deg]", "false", " - ", "robot 1", "team"):
         assert word in text
 
 
-def test_live_figures_tell_of_merges(record: EpisodeRecord) -> None:
-    """Each merge is printed as it comes, beside the bar."""
+def test_merges_are_printed_live(record: EpisodeRecord) -> None:
+    """Each merge is printed when it happens, beside the bar."""
     with open("/dev/null", "w") as nowhere:
         console = Console(width=120, record=True, file=nowhere)
         infos = {f"robot_{k}": info for k, info in enumerate(record.infos)}
@@ -196,7 +196,7 @@ SHORT = ("--robots", "2", "--particles", "11", "--max-cycles", "23", "--world", 
 
 @pytest.mark.slow
 def test_a_run_folder_repeats_itself(vslam: Any, tmp_path: Path) -> None:
-    """A run leaves all promised files, and its own config repeats its paths byte by byte and its metrics exactly."""
+    """A run writes all documented files, and its config repeats its paths and metrics exactly."""
     one, two, copy = tmp_path / "one", tmp_path / "two", tmp_path / "copy.json"
     assert vslam("run", *SHORT, "--seed", "5", "--out", str(one), "--json", str(copy)).status == 0
     assert vslam("run", "--config", str(one / "config.toml"), "--no-video", "--out", str(two)).status == 0
@@ -220,10 +220,10 @@ def test_a_run_folder_repeats_itself(vslam: Any, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("policy", "action_type"), [("a_policy_of_mine:Still", "discrete"), ("random_goals", "goal")])
-def test_a_policy_brings_its_kind_of_action(
+def test_policies_determine_the_default_action_type(
     policy: str, action_type: str, vslam: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Who names a policy that knows no continuous actions, one of his own as well, need not say which it knows."""
+    """The action type need not be given for a policy without continuous actions, built-in or custom."""
     lines = ("class Still:", "    action_type = 'discrete'", "    def reset(self): pass", "    def act(*_): return 0")
     (tmp_path / "a_policy_of_mine.py").write_text("\n".join(lines))
     monkeypatch.chdir(tmp_path)
@@ -236,10 +236,10 @@ def test_a_policy_brings_its_kind_of_action(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupted_run_writes_what_it_has(
+def test_an_interrupted_run_writes_partial_results(
     number: signal.Signals, monkeypatch: pytest.MonkeyPatch, vslam: Any, tmp_path: Path
 ) -> None:
-    """A signal after seven steps leaves a whole folder about these seven steps, and its usual exit status."""
+    """A signal after seven steps leaves a complete folder of these seven steps, and the exit status of the signal."""
 
     @contextmanager
     def stopping(*arguments: Any) -> Iterator[Callable[[Progress], None]]:
@@ -263,8 +263,8 @@ def test_an_interrupted_run_writes_what_it_has(
 
 
 @pytest.mark.parametrize(("action_type", "step_s"), [("continuous", 0.1), ("discrete", 0.1), ("goal", 1.0)])
-def test_an_episode_lasts_as_long_with_any_actions(action_type: str, step_s: float) -> None:
-    """By default the simulated time is the same, whatever a step is."""
+def test_episode_duration_does_not_depend_on_the_action_type(action_type: str, step_s: float) -> None:
+    """By default the simulated time does not depend on the duration of a step."""
     config = RunConfig(action_type=action_type)
     assert config.step_s == pytest.approx(step_s)
     assert config.num_steps * config.step_s == pytest.approx(EPISODE_S)
@@ -272,7 +272,7 @@ def test_an_episode_lasts_as_long_with_any_actions(action_type: str, step_s: flo
 
 
 def test_a_config_repeats_a_run_from_any_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """The path of a world is stored whole; the name of a family stays a name."""
+    """The path of a world is stored as absolute path; the name of a family stays a name."""
     monkeypatch.chdir(tmp_path)
     assert RunConfig(world="plan.png").to_mapping()["world"] == str(tmp_path.resolve() / "plan.png")
     assert RunConfig(world="fig5").to_mapping()["world"] == "fig5"

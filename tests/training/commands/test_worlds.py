@@ -1,4 +1,4 @@
-"""The commands `vslam worlds`: what they print and write, and how they refuse."""
+"""Commands `vslam worlds`: output, files, and refusals."""
 
 import json
 from pathlib import Path
@@ -31,8 +31,8 @@ def test_list_names_all_families() -> None:
     assert "test: world seeds 0 to 9999" in result.output
 
 
-def test_preview_draws_one_tile_a_seed(tmp_path: Path) -> None:
-    """Three worlds make two by two tiles, the last one blank; the same seeds give the same picture."""
+def test_preview_draws_one_tile_per_seed(tmp_path: Path) -> None:
+    """Three worlds give two by two tiles, the last one blank; the same seeds give the same picture."""
     sheet = contact_sheet("fig5", 3, 3, 2)
     assert sheet.shape == (960, 1280, 3)
     assert (sheet[480:, 640:] == 255).all()
@@ -45,7 +45,7 @@ def test_preview_draws_one_tile_a_seed(tmp_path: Path) -> None:
 
 
 def test_import_and_validate(tmp_path: Path) -> None:
-    """A plan becomes a .json of the same walls in metres, which validates; starts are as far apart as asked."""
+    """A plan becomes a valid .json of the same walls in metres; start distances are as requested."""
     out = tmp_path / "plan.json"
     result = runner.invoke(app, ["worlds", "import", str(_plan(tmp_path)), str(out), "--metres-per-pixel", "0.1"])
     assert result.exit_code == 0
@@ -57,19 +57,19 @@ def test_import_and_validate(tmp_path: Path) -> None:
     assert found.floor_m2 == pytest.approx(16.0 * 12.0, rel=0.05)
     result = runner.invoke(app, ["worlds", "validate", str(out), "--seeds", "2", "--robots", "2"])
     assert result.exit_code == 0
-    assert "2 of 2 worlds are sound" in result.output
+    assert "2 of 2 worlds are valid" in result.output
 
 
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
         (["validate", "fig5", "--robots", "40"], "num_robots"),
-        (["validate", "fig5", "--robots", "40", "--first-seed", "4"], "world seed 4, after 0 sound ones"),
+        (["validate", "fig5", "--robots", "40", "--first-seed", "4"], "world seed 4, after 0 valid ones"),
         (["import", "PLAN", "plan.txt"], "out: expected a name that ends in .json"),
     ],
 )
-def test_what_cannot_be_built_is_refused(arguments: list[str], says: str, tmp_path: Path) -> None:
-    """Too many robots for a world, and names that no world has, are refused; see test_bad_input for the others."""
+def test_impossible_worlds_are_refused(arguments: list[str], says: str, tmp_path: Path) -> None:
+    """Too many robots for a world, and unknown worlds, are refused; see test_bad_input for other errors."""
     plan = str(_plan(tmp_path))
     result = runner.invoke(app, ["worlds", *(plan if word == "PLAN" else word for word in arguments)])
     assert isinstance(result.exception, ValueError)

@@ -5,7 +5,7 @@ from typer.testing import CliRunner
 
 from slam_backend.models.camera import StereoCamera
 from training.cli import app
-from training.episodes.video import beside_the_map, draw_eye
+from training.episodes.video import draw_camera_image, with_camera_images
 from vslam_env.sensors import RenderedFrame, StereoSensor, StereoSensorConfig
 from vslam_env.world import FreeSpace, World
 
@@ -20,21 +20,21 @@ def _frame() -> RenderedFrame:
     return frame
 
 
-def test_the_eye_stands_beside_the_map() -> None:
-    """The map stays as it is; at its right are the left image above and the right one below."""
+def test_camera_images_are_beside_the_map() -> None:
+    """The map is unchanged; on its right are the left image above and the right image below."""
     frame, picture = _frame(), np.full((300, 400, 3), 200, np.uint8)
-    together = beside_the_map(picture, frame, 160)
+    together = with_camera_images(picture, frame, 160)
     assert together.shape == (300, 560, 3)
     np.testing.assert_array_equal(together[:, :400], picture)
     np.testing.assert_array_equal(together[120:240, 400:, 0], frame.right)
     assert (together[240:, 400:] == 24).all()
-    assert (beside_the_map(picture, None, 160)[:, 400:] == 24).all()
+    assert (with_camera_images(picture, None, 160)[:, 400:] == 24).all()
 
 
 def test_corners_are_drawn_where_they_were_measured() -> None:
-    """Colour appears at the measured corners, and nowhere else but along their disparities."""
+    """Colour appears at the measured corners and along their disparities only."""
     frame = _frame()
-    drawn = draw_eye(frame, (320, 240))
+    drawn = draw_camera_image(frame, (320, 240))
     coloured = np.abs(drawn[:, :, 0].astype(int) - drawn[:, :, 2]) > 10
     assert len(frame.seen.pixels) > 5
     near = np.zeros_like(coloured)
@@ -50,8 +50,8 @@ def test_corners_are_drawn_where_they_were_measured() -> None:
     assert not coloured[~near].any()
 
 
-def test_a_run_with_rendered_eyes(tmp_path: Path) -> None:
-    """`vslam run --sensor stereo` leaves a folder with a video that is wider than that of a run without."""
+def test_a_run_with_rendered_cameras(tmp_path: Path) -> None:
+    """`vslam run --sensor stereo` leaves a folder with a wider video than a run without."""
     arguments = ["run", "--sensor", "stereo", "--world", "fig5", "--robots", "1", "--max-cycles", "6"]
     done = CliRunner().invoke(app, [*arguments, "--particles", "10", "--out", str(tmp_path / "run")])
     assert done.exit_code == 0, done.output

@@ -1,4 +1,4 @@
-"""Why maps were not merged, as `metrics.json` has it and as it is printed."""
+"""Refusals of merges in `metrics.json` and on the console."""
 
 from typing import Any
 
@@ -12,8 +12,8 @@ from training.experiments.run_folder import plain
 
 def tried(a: tuple[int, ...], b: tuple[int, ...], attempts: int, **refused: Any) -> PairAttempts:
     """Return the attempts of a pair; `refused` are the other fields."""
-    told = {"refusals": {}, "last_reason": "", "last_step": None, "missed": "", "excess": float("nan")} | refused
-    return PairAttempts(robots_a=a, robots_b=b, attempts=attempts, **told)
+    fields = {"refusals": {}, "last_reason": "", "last_step": None, "missed": "", "excess": float("nan")} | refused
+    return PairAttempts(robots_a=a, robots_b=b, attempts=attempts, **fields)
 
 
 PAIRS = (
@@ -28,12 +28,12 @@ GROUPS = ((0, 1), (2,), (3,))
 
 @pytest.fixture
 def console() -> Console:
-    """A console that keeps what is printed."""
+    """Console that records its output."""
     return Console(width=140, record=True, quiet=False, file=None, force_terminal=False)
 
 
-def test_each_pair_has_a_row_and_so_have_groups_that_never_tried() -> None:
-    """Robots bear their names; a pair is apart where the two share no map at the end."""
+def test_each_pair_of_groups_has_a_row() -> None:
+    """Robots have their numbers; a pair is apart if the two share no map at the end."""
     rows = plain(pair_rows(PAIRS, GROUPS, names=[4, 5, 6, 7]))
     assert rows[0] == {
         "robots_a": [4], "robots_b": [5], "attempts": 3, "refused": {"too uncertain": 2},
@@ -45,22 +45,22 @@ def test_each_pair_has_a_row_and_so_have_groups_that_never_tried() -> None:
     assert pair_rows(None, GROUPS) == []
 
 
-def test_the_table_says_why_and_what_helps(console: Console, capsys: pytest.CaptureFixture[str]) -> None:
-    """Counts of each reason, the last refusal with its step, and hints for the pairs that are apart alone."""
+def test_the_table_has_reasons_and_hints(console: Console, capsys: pytest.CaptureFixture[str]) -> None:
+    """The table has counts of each reason and the last refusal with its step; hints are for pairs still apart."""
     print_refusals(console, plain(pair_rows(PAIRS, GROUPS)))
     text = console.export_text()
     for words in (
         "too uncertain (2)", "too uncertain at step 74 (paths 2.5)",
         "ambiguous (2)", "ambiguous at step 149", "ambiguous: The shared landmarks fit at several places",
-        "never tried: The robots were out of contact",
+        "not attempted: The robots were out of contact",
     ):  # fmt: skip
         assert words in " ".join(text.split())
     assert "too uncertain: The way" not in text
     assert capsys.readouterr().out
 
 
-def test_nothing_is_printed_where_nothing_was_refused(console: Console) -> None:
-    """A team that merged at the first attempts, and one robot alone, have no table."""
+def test_without_refusals_there_is_no_table(console: Console) -> None:
+    """A team that merged at its first attempts, and a single robot, have no table."""
     for pairs, groups in (((tried((0,), (1,), 1),), ((0, 1),)), ((), ((0,),))):
         print_refusals(console, pair_rows(pairs, groups))
     assert console.export_text() == ""

@@ -7,14 +7,14 @@ import pytest
 
 from slam_backend.fastslam.reports import MergeEvent
 from slam_backend.maps.alignment import Alignment
-from training.episodes.video import LONGEST_S, VideoWriter, choose_pace, with_slow_flashes
+from training.episodes.video import LONGEST_S, VideoWriter, choose_pace, with_video_time_merges
 from vslam_env.rendering import Scene
 
 SIZE = (98, 62)
 
 
 def frames(count: int) -> list[np.ndarray]:
-    """Return grey frames that get brighter."""
+    """Return grey frames of increasing brightness."""
     return [np.full((SIZE[1], SIZE[0], 3), 10 + 20 * k, np.uint8) for k in range(count)]
 
 
@@ -25,8 +25,8 @@ def read_back(path: Path) -> tuple[str, np.ndarray]:
     return done.stderr.decode(), np.frombuffer(done.stdout, np.uint8).reshape(-1, SIZE[1], SIZE[0], 3)
 
 
-def test_a_video_holds_the_frames_in_a_form_that_browsers_play(tmp_path: Path) -> None:
-    """What is written is H.264 in 4:2:0 colour with its index in front, and reads back as nearly the same frames."""
+def test_videos_play_in_browsers_and_have_all_frames(tmp_path: Path) -> None:
+    """The file is H.264 in 4:2:0 colour with its index in front, and decodes to nearly the same frames."""
     path = tmp_path / "video.mp4"
     with VideoWriter(path, SIZE, fps=5) as video:
         for frame in frames(7):
@@ -41,8 +41,8 @@ def test_a_video_holds_the_frames_in_a_form_that_browsers_play(tmp_path: Path) -
         assert np.abs(frame.astype(int) - wanted).mean() < 3.0
 
 
-def test_an_interrupted_video_holds_what_came_before(tmp_path: Path) -> None:
-    """An exception in the block leaves a whole, shorter video and nothing else."""
+def test_an_interrupted_video_has_the_earlier_frames(tmp_path: Path) -> None:
+    """An exception in the block leaves a valid, shorter video and no other file."""
     path = tmp_path / "video.mp4"
 
     def interrupted() -> None:
@@ -58,7 +58,7 @@ def test_an_interrupted_video_holds_what_came_before(tmp_path: Path) -> None:
 
 
 def test_a_video_without_frames_leaves_no_file(tmp_path: Path) -> None:
-    """Nothing drawn, nothing left behind."""
+    """Without frames no file is left behind."""
     with VideoWriter(tmp_path / "video.mp4", SIZE):
         pass
     assert list(tmp_path.iterdir()) == []
@@ -81,21 +81,21 @@ def test_bad_arguments_are_named(tmp_path: Path, name: str, size: tuple[int, int
 
 
 def test_a_frame_of_another_size_is_refused(tmp_path: Path) -> None:
-    """A frame must be as large as the video."""
+    """A frame must have the size of the video."""
     with VideoWriter(tmp_path / "video.mp4", SIZE) as video, pytest.raises(ValueError, match="frame: expected"):
         video.add(np.zeros((SIZE[0], SIZE[1], 3), np.uint8))
 
 
 @pytest.mark.parametrize("num_steps", [1, 7, 240, 499, 501, 2500, 12345])
-def test_no_episode_makes_a_long_video(num_steps: int) -> None:
-    """Whatever an episode's length, its video stays below the limit, and its speed-up says how fast it runs."""
+def test_videos_have_a_maximum_duration(num_steps: int) -> None:
+    """For any length of an episode, the video is below the limit, with the stated speed-up."""
     pace = choose_pace(num_steps, 0.1)
     shown = -(-num_steps // pace.stride)
     assert shown / pace.fps <= LONGEST_S
     assert pace.speedup == pytest.approx(num_steps * 0.1 / (num_steps / pace.stride / pace.fps))
 
 
-def test_flashes_last_in_the_time_of_the_viewer() -> None:
+def test_merge_effects_last_in_video_time() -> None:
     """A merge 100 ticks ago is 10 ticks old at ten-fold speed; attempts, future and faded merges do not flash."""
     nothing = np.zeros((0, 4))
     scene = Scene(nothing, np.zeros((0, 3)), (), 300, 30.0, 0.2, (), (), 0.0)
@@ -104,5 +104,5 @@ def test_flashes_last_in_the_time_of_the_viewer() -> None:
         MergeEvent(step, kind, (0,), (1, 2), refused)
         for step, kind in ((10, "merge"), (200, "merge"), (250, "attempt"), (301, "merge"))
     ]
-    (flash,) = with_slow_flashes(scene, events, 10.0).merges
+    (flash,) = with_video_time_merges(scene, events, 10.0).merges
     assert (flash.age_ticks, flash.robots_a, flash.robots_b) == (10, (0,), (1, 2))

@@ -6,11 +6,11 @@ import pytest
 from rich.console import Console
 
 from slam_backend.core.compilation import MESSAGE
-from training.experiments.compilation import compilation_shown, prepare
+from training.experiments.compilation import compilation_progress, prepare
 
 
 def _compile_two() -> None:
-    """Compile two kernels as if they were the project's own."""
+    """Compile two kernels like those of the project."""
     for module in ("slam_backend.a", "vslam_env.b"):
 
         def kernel(x: float) -> float:
@@ -21,10 +21,10 @@ def _compile_two() -> None:
 
 
 @pytest.mark.parametrize("is_terminal", [False, True])
-def test_who_waits_for_the_compiler_is_told_once(is_terminal: bool) -> None:
-    """However many kernels: one message when the first begins, and one with the time when the block is over."""
+def test_compilation_is_reported_once(is_terminal: bool) -> None:
+    """For any number of kernels there is one message at the first, and one with the time at the end of the block."""
     console = Console(file=StringIO(), force_terminal=is_terminal, width=120)
-    with compilation_shown(console):
+    with compilation_progress(console):
         _compile_two()
         during = console.file.getvalue()  # type: ignore[attr-defined]
     after = console.file.getvalue()  # type: ignore[attr-defined]
@@ -35,8 +35,8 @@ def test_who_waits_for_the_compiler_is_told_once(is_terminal: bool) -> None:
         assert after.count("\n") == 2
 
 
-def test_nothing_is_shown_where_nothing_is_compiled(capsys: pytest.CaptureFixture[str]) -> None:
-    """Once the kernels are there, a command begins in silence."""
+def test_cached_kernels_are_not_reported(capsys: pytest.CaptureFixture[str]) -> None:
+    """With all kernels loaded, a command starts without messages."""
     prepare()
     capsys.readouterr()
     called = []

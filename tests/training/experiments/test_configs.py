@@ -1,4 +1,4 @@
-"""What holds for the configurations of all commands: they come back from a `config.toml`, and bad values do not."""
+"""Common behaviour of all configurations: restored from a `config.toml`, with bad values refused."""
 
 from pathlib import Path
 from typing import Any, get_args
@@ -23,7 +23,7 @@ from vslam_env.config import ACTION_TYPES, MAX_ROBOTS, SENSORS
 from vslam_env.presets import PRESETS
 from vslam_env.world import SPLITS
 
-# Per class what it cannot do without, and a value that is not its default.
+# Required values of each class, and a value that differs from its default.
 CASES: dict[type[ExperimentConfig], dict[str, Any]] = {
     bench.AccuracyConfig: {"lengths": (5.0, 7.5)}, bench.AlignmentBenchConfig: {"methods": ("icp", "svd")},
     bench.EnvBenchConfig: {"worlds": ("fig5",)},
@@ -45,7 +45,7 @@ AT_LEAST_0 = "an int >= 0"
 AT_LEAST_1 = "an int >= 1"
 ROBOTS = "an int from 1 to 8"
 ABOVE_0 = "a finite number > 0"
-# Per class bad values, each with what was expected of it.
+# Bad values of each class, with the expected part of the error.
 BAD: dict[type[ExperimentConfig], dict[str, dict[Any, str]]] = {
     bench.AccuracyConfig: {
         "seeds": {0: AT_LEAST_1}, "particles": {(0,): AT_LEAST_1, (): "at least one value, each once"},
@@ -111,7 +111,7 @@ BAD: dict[type[ExperimentConfig], dict[str, dict[Any, str]]] = {
         "rejuvenate_every": {-1: AT_LEAST_0},
     },
 }  # fmt: skip
-# Fields whose options have other names, by which they are refused.
+# Fields whose options have other names, which errors use.
 OPTIONS = {"seed": "first_seed", "presets": "preset", "associations": "association", "lengths": "length"}
 BAD_VALUES = [
     pytest.param(kind, name, value, expected, id=f"{kind.__name__}-{name}-{value}")
@@ -121,8 +121,8 @@ BAD_VALUES = [
 ]
 
 
-def test_every_configuration_is_among_them() -> None:
-    """The laws below are asked of all classes that the commands use."""
+def test_every_configuration_is_covered() -> None:
+    """The tests below cover all classes of the commands."""
 
     def below(kind: type[ExperimentConfig]) -> set[str]:
         subclasses = [each for each in kind.__subclasses__() if each.__module__.startswith("training.")]
@@ -133,8 +133,8 @@ def test_every_configuration_is_among_them() -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_run_folder_brings_the_same_configuration_back(kind: type[ExperimentConfig], tmp_path: Path) -> None:
-    """Values written to `config.toml` and read again make an equal configuration, tables and lists included."""
+def test_run_folders_restore_the_configuration(kind: type[ExperimentConfig], tmp_path: Path) -> None:
+    """Values written to `config.toml` and read again give an equal configuration, tables and lists included."""
     config = kind.from_mapping(CASES[kind] | {"seed": 7})
     RunFolder.create(tmp_path / "run", "some command", config.to_mapping(), config.seed)
     values, seed = read_config(tmp_path / "run", "some command")
@@ -144,15 +144,15 @@ def test_a_run_folder_brings_the_same_configuration_back(kind: type[ExperimentCo
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_misspelt_name_is_told_with_those_that_there_are(kind: type[ExperimentConfig]) -> None:
-    """What the configuration does not know is named, and not taken for nothing."""
+def test_misspelt_names_are_reported_with_the_valid_ones(kind: type[ExperimentConfig]) -> None:
+    """Unknown names are reported, not ignored."""
     with pytest.raises(ValueError, match=r"^config: expected names among .*seed.*, got 'sede'\. Correct the name\."):
         kind.from_mapping(CASES[kind] | {"sede": 1})
 
 
 @pytest.mark.parametrize(("kind", "name", "value", "expected"), BAD_VALUES)
 def test_bad_values_are_refused_by_name(kind: type[ExperimentConfig], name: str, value: Any, expected: str) -> None:
-    """One line: the name, what was expected, what came, and a hint."""
+    """One line has the name, the expected and the actual value, and a hint."""
     with pytest.raises(ValueError, match="expected") as refusal:
         kind.from_mapping(CASES[kind] | {name: value})
     text = str(refusal.value)
@@ -171,8 +171,8 @@ def test_a_table_of_another_package_is_checked_there() -> None:
         replay.VictoriaConfig(path="log", motion={"sigma_along": -1.0})
 
 
-def test_choices_are_those_of_the_packages() -> None:
-    """Configurations name the choices, so that `--help` imports none of the packages that have them."""
+def test_choices_match_the_packages() -> None:
+    """Configurations repeat the choices, so that `--help` imports none of the packages that define them."""
     assert get_args(experiments.Proposal) == PROPOSALS
     assert get_args(experiments.Descriptor) == DESCRIPTORS
     assert get_args(experiments.ActionType) == ACTION_TYPES

@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM end what runs in order, and at once if they come again, also where they were ignored at first."""
+"""SIGINT and SIGTERM stop a command in order, and at once if repeated, even if they were ignored at first."""
 
 import json
 import os
@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from training import cli
-from training.commands._progress import trials_shown
+from training.commands._progress import trial_progress
 from training.experiments.interrupt import SIGNALS, interrupt_flag, signals_answered, signals_held
 from training.experiments.trial_store import open_folder, run_trials
 
@@ -41,12 +41,12 @@ def disposition(request: pytest.FixtureRequest) -> Iterator[str]:
 
 @BOTH
 @pytest.mark.usefixtures("disposition")
-def test_the_first_signal_is_told_once_and_the_second_insists(number: int) -> None:
-    """The first one calls what tells of it and raises the flag; the second one interrupts; then all is as before."""
-    told: list[str] = []
+def test_the_first_signal_sets_the_flag_and_the_second_interrupts(number: int) -> None:
+    """The first signal calls the callback and sets the flag; the second interrupts; then handlers are restored."""
+    calls: list[str] = []
 
     def insist() -> None:
-        with signals_answered(), interrupt_flag(lambda: told.append("pressed")) as pressed:
+        with signals_answered(), interrupt_flag(lambda: calls.append("pressed")) as pressed:
             assert not pressed()
             signal.raise_signal(number)
             assert pressed()
@@ -54,12 +54,12 @@ def test_the_first_signal_is_told_once_and_the_second_insists(number: int) -> No
 
     with pytest.raises(KeyboardInterrupt, match=r"^$"):
         insist()
-    assert told == ["pressed"]
+    assert calls == ["pressed"]
 
 
 @pytest.mark.usefixtures("disposition")
-def test_a_flag_alone_answers_ctrl_c() -> None:
-    """A loop that is not part of a command is interrupted by the second Ctrl-C too."""
+def test_a_flag_works_outside_commands() -> None:
+    """A loop outside a command is also interrupted by the second Ctrl-C."""
 
     def insist() -> None:
         with interrupt_flag() as pressed:
@@ -72,7 +72,7 @@ def test_a_flag_alone_answers_ctrl_c() -> None:
 
 
 def test_other_threads_change_nothing() -> None:
-    """Outside the main thread both blocks leave the handlers alone."""
+    """Outside the main thread both blocks keep the handlers unchanged."""
     before = [signal.getsignal(number) for number in SIGNALS]
     within: list[Any] = []
 
@@ -92,13 +92,13 @@ def test_other_threads_change_nothing() -> None:
 def test_a_stopped_command_has_the_status_of_its_signal(
     presses: int, number: int, vslam: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Stopped in order or at once, a command exits with 128 and the signal's number."""
+    """Stopped in order or at once, a command exits with 128 + signal number."""
     summed_up: list[bool] = []
 
     def app(prog_name: str) -> None:
         from rich.console import Console
 
-        with trials_shown(Console(stderr=True), 1) as (_, interrupted):
+        with trial_progress(Console(stderr=True), 1) as (_, interrupted):
             for _ in range(presses):
                 signal.raise_signal(number)
             assert interrupted()
@@ -119,7 +119,7 @@ def test_a_stopped_command_has_the_status_of_its_signal(
 
 
 def test_bad_input_keeps_its_status_after_a_signal(vslam: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What could not be written after a stop is not hidden behind the signal."""
+    """A write error after a stop is not hidden by the signal."""
 
     def app(prog_name: str) -> None:
         with interrupt_flag():
@@ -132,8 +132,8 @@ def test_bad_input_keeps_its_status_after_a_signal(vslam: Any, monkeypatch: pyte
 
 @pytest.mark.skipif(not hasattr(signal, "pthread_sigmask"), reason="signals cannot be held back here")
 @pytest.mark.usefixtures("disposition")
-def test_held_signals_come_afterwards() -> None:
-    """A signal within the block is not lost, and a process that is started there never gets any."""
+def test_blocked_signals_are_delivered_later() -> None:
+    """A signal within the block is not lost, and a process started there never receives any."""
     with interrupt_flag() as pressed:
         with signals_held():
             os.kill(os.getpid(), signal.SIGTERM)
@@ -144,12 +144,12 @@ def test_held_signals_come_afterwards() -> None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sleep:
-    """A trial.
+    """Slow trial.
 
     Attributes:
-        seed: Which.
-        seconds: How long it takes.
-        folder: Where it says that it has begun, and by which process.
+        seed: Seed of the trial.
+        seconds: Duration of the trial.
+        folder: Folder in which it records its start and its process.
     """
 
     seed: int
@@ -158,7 +158,7 @@ class Sleep:
 
 
 def sleep(trial: Sleep) -> dict[str, Any]:
-    """Say which process this is, and take a while."""
+    """Record the process, and sleep."""
     part = Path(trial.folder) / f"part-{trial.seed}"
     part.write_text(str(os.getpid()))
     part.rename(Path(trial.folder) / f"begun-{trial.seed}")
@@ -167,7 +167,7 @@ def sleep(trial: Sleep) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Play slow trials in two processes, as a bench does: the command of the test below."""
+    """Run slow trials in two processes, like a benchmark; the command of the test below."""
     folder, seconds = sys.argv[1:]
 
     def app(prog_name: str) -> None:
@@ -175,7 +175,7 @@ def main() -> None:
 
         trials = [Sleep(seed=seed, seconds=float(seconds), folder=folder) for seed in range(99)]
         try:
-            with trials_shown(Console(stderr=True), 99) as (_, interrupted):
+            with trial_progress(Console(stderr=True), 99) as (_, interrupted):
                 kept = open_folder(Path(folder) / "run", "sleep", {}, 0)
                 run_trials(kept, "trials.jsonl", sleep, trials, 2, interrupted, lambda row: None)
             sys.exit(0)
@@ -199,10 +199,10 @@ def main() -> None:
         ([signal.SIGKILL], False, -9, 600.0),
     ],
 )
-def test_no_worker_is_left_behind(
+def test_no_worker_survives_a_signal(
     signals: list[signal.Signals], to_group: bool, status: int, seconds: float, tmp_path: Path
 ) -> None:
-    """One signal lets workers finish their trials, which are kept; two stop at once; in no way a worker lives on."""
+    """One signal lets workers finish their trials, which are kept; two stop at once; no worker survives."""
     code = "import sys; sys.path.insert(0, sys.argv.pop(1)); import test_interrupt; test_interrupt.main()"
     command = [sys.executable, "-c", code, str(Path(__file__).parent), str(tmp_path), str(seconds)]
     shielded = ["sh", "-c", 'trap "" INT; exec "$@"', "sh", *command]
@@ -231,7 +231,7 @@ def _alive(process: int) -> bool:
         state = Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()[0]
     except OSError:
         return False
-    return state != "Z"  # ended, though nothing has asked for its status
+    return state != "Z"  # ended, but its status was not collected
 
 
 def _wait(until: Callable[[], bool]) -> None:

@@ -1,4 +1,4 @@
-"""Figures are written small, and look as they would without that."""
+"""Plots are written with a palette, and look the same as without."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from training.experiments.plotting import save_png
 
 
 def _figure() -> Figure:
-    """A plot with lines of ten colours, error bars, a shaded band and text."""
+    """Plot with lines of ten colours, error bars, a shaded band and text."""
     rng = np.random.default_rng(3)
     figure = Figure(figsize=(6.0, 4.0), layout="constrained")
     axes = figure.subplots()
@@ -23,7 +23,7 @@ def _figure() -> Figure:
 
 
 def test_a_small_file_shows_the_same_figure(tmp_path: Path) -> None:
-    """The picture has the size asked for, no pixel is far from that of a file with all colours, which is larger."""
+    """The picture has the requested size, and no pixel is far from that of the larger file with all colours."""
     small, whole = tmp_path / "small.png", tmp_path / "whole.png"
     save_png(_figure(), small, 120)
     figure = _figure()
@@ -38,7 +38,7 @@ def test_a_small_file_shows_the_same_figure(tmp_path: Path) -> None:
 
 
 def test_the_same_figure_is_the_same_file(tmp_path: Path) -> None:
-    """A picture made twice is the same to the byte."""
+    """A plot made twice gives identical files."""
     for name in ("one.png", "two.png"):
         save_png(_figure(), tmp_path / name, 80)
     assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()

@@ -16,13 +16,13 @@ from training.experiments.trial_store import finished_trials
 
 @dataclass(frozen=True)
 class Trial:
-    """A trial that is known by its seed."""
+    """Trial identified by its seed."""
 
     seed: int
 
 
 def test_a_run_can_be_read_back(tmp_path: Path) -> None:
-    """Config and seed come back as they were given; None means not given; versions are noted."""
+    """Config and seed are restored; None means not given; versions are recorded."""
     config = {"path": tmp_path, "robots": (1, 3), "duration": None, "motion": {"sigma_along": np.float64(0.25)}}
     folder = RunFolder.create(tmp_path / "new" / "run", "replay mrclam", config, seed=7)
     expected = {"path": str(tmp_path), "robots": [1, 3], "motion": {"sigma_along": 0.25}}
@@ -39,8 +39,8 @@ def test_folders_without_a_name_never_collide(tmp_path: Path, monkeypatch: pytes
     assert names == [f"runs/replay-mrclam-2-{n}" for n in (1, 2, 3)]
 
 
-def test_an_empty_folder_is_taken_and_a_full_one_refused(tmp_path: Path) -> None:
-    """Nothing is ever overwritten."""
+def test_only_empty_folders_are_accepted(tmp_path: Path) -> None:
+    """No file is ever overwritten."""
     (tmp_path / "empty").mkdir()
     RunFolder.create(tmp_path / "empty", "run", {}, seed=0)
     with pytest.raises(ValueError, match=r"out: expected a new or empty folder, got a folder with files\."):
@@ -57,8 +57,8 @@ def test_an_empty_folder_is_taken_and_a_full_one_refused(tmp_path: Path) -> None
     assert not (tmp_path / "other").exists()
 
 
-def test_metrics_are_whole_and_json(tmp_path: Path) -> None:
-    """What is not a number becomes null, and no half-written file ever stands there."""
+def test_metrics_are_valid_json(tmp_path: Path) -> None:
+    """Values that are not finite become null, and no partial file exists at any time."""
     folder = RunFolder.create(tmp_path / "run", "run", {"world": "office"}, seed=3)
     folder.write_metrics({"coverage": float("nan"), "robots": [{"ate_aligned_m": np.float64(0.5)}]})
     written = folder.write_metrics({"coverage": np.inf, "matrix": np.arange(2)})
@@ -72,7 +72,7 @@ def test_metrics_are_whole_and_json(tmp_path: Path) -> None:
 
 
 def test_paths_are_written_as_tum(tmp_path: Path) -> None:
-    """A path comes back bit for bit."""
+    """A path is restored bit by bit."""
     path = Trajectory([1.0, 2.5], [[0.1, 0.2, 0.0], [0.3, 0.4, 0.0]])
     file = RunFolder.create(tmp_path / "run", "run", {}, seed=0).write_trajectory("robot1_estimate", path)
     assert file.name == "robot1_estimate.tum"
@@ -85,11 +85,11 @@ def test_paths_are_written_as_tum(tmp_path: Path) -> None:
         (None, r"config: expected the config\.toml of an earlier run, got no such file\. Check '.*config\.toml'"),
         ("seed = = 1", r"got a broken file\. Correct '.*config\.toml'"),
         ('command = "run"', r"config: expected a run of 'replay mrclam', got 'run'"),
-        ('command = "replay mrclam"', r"config: expected a table \[config\] and a whole number seed"),
+        ('command = "replay mrclam"', r"config: expected a table \[config\] and an int seed"),
     ],
 )
-def test_a_config_that_cannot_be_repeated_is_refused(tmp_path: Path, text: str | None, message: str) -> None:
-    """A missing, broken or foreign config gets one clear error."""
+def test_invalid_configs_are_refused(tmp_path: Path, text: str | None, message: str) -> None:
+    """A missing, broken or foreign config has one clear error."""
     file = tmp_path / "config.toml"
     if text is not None:
         file.write_text(text)
@@ -97,8 +97,8 @@ def test_a_config_that_cannot_be_repeated_is_refused(tmp_path: Path, text: str |
         read_config(file, "replay mrclam")
 
 
-def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
-    """A file in a folder that is gone is refused as `out`, with the reason."""
+def test_write_errors_name_the_option(tmp_path: Path) -> None:
+    """A file in a deleted folder is refused as `out`, with the reason."""
     folder = RunFolder.create(tmp_path / "run", "run", {}, seed=0)
     shutil.rmtree(folder.path)
     with pytest.raises(
@@ -115,15 +115,15 @@ values = st.recursive(
 
 
 @given(values)
-def test_plain_values_are_json_and_stay_themselves(value: object) -> None:
-    """Everything plain survives JSON unchanged, and making it plain again changes nothing."""
+def test_plain_values_survive_json(value: object) -> None:
+    """Plain values survive JSON unchanged, and conversion is idempotent."""
     once = plain(value)
     assert json.loads(json.dumps(once, allow_nan=False)) == once
     assert plain(once) == once
 
 
 def test_a_folder_of_another_format_is_refused(tmp_path: Path) -> None:
-    """A configuration says of which format the folder is; one that says nothing is of the present one."""
+    """A configuration states the format of the folder; without one it is the current format."""
     folder = RunFolder.create(tmp_path / "run", "run", {"many": 3}, 1)
     file = folder.path / "config.toml"
     text = file.read_text()
@@ -135,14 +135,14 @@ def test_a_folder_of_another_format_is_refused(tmp_path: Path) -> None:
         read_config(folder.path, "run")
 
 
-def test_kept_trials_that_are_none_are_refused(tmp_path: Path) -> None:
-    """A line that is cut off is dropped; one that is no trial is reported, and the file stays as it is."""
+def test_invalid_stored_trials_are_refused(tmp_path: Path) -> None:
+    """A truncated line is dropped; a line that is not a trial is reported, and the file is unchanged."""
     folder = RunFolder.create(tmp_path / "run", "run", {}, 1)
     file = folder.path / "trials.jsonl"
     file.write_text('{"seed": 1, "figure": 2}\n{"seed": 2, "fig')
     assert finished_trials(folder, file.name, Trial) == {Trial(1): {"seed": 1, "figure": 2}}
     for line in ("[]", "3", '{"figure": 2}', "[" * 100_000, '{"seed": [1]}'):
         file.write_text(line + "\n")
-        with pytest.raises(ValueError, match="out: expected trials that a run kept"):
+        with pytest.raises(ValueError, match="out: expected trials of an earlier run"):
             finished_trials(folder, file.name, Trial)
         assert file.read_text() == line + "\n"

@@ -1,4 +1,4 @@
-"""Figs. 2 to 4 of the paper: two robots' own maps, aligned and fused."""
+"""Figs. 2 to 4 of the paper: aligned and fused maps of two robots."""
 
 import csv
 import json
@@ -30,8 +30,8 @@ def pair() -> AlignedPair:
     return align_pair(PairConfig(length=25.0, particles=30, seed=100))
 
 
-def test_names_tell_the_true_landmark_behind_each_of_a_map() -> None:
-    """Moved by the true motion, landmarks of both robots' own maps that bear one name lie at one place."""
+def test_stages_have_true_associations() -> None:
+    """After the true transform, landmarks of both maps with the same number have the same position."""
     run_of_two = simulate_pair(100, 20.0, 300)
     *_, stage = map_alone(run_of_two, 30, 100, 20.0)
     truth = true_motion(run_of_two)
@@ -47,8 +47,8 @@ def test_names_tell_the_true_landmark_behind_each_of_a_map() -> None:
     assert len(apart) >= stage.shared
 
 
-def test_stages_hold_the_errors_of_all_methods(rows: list[dict[str, Any]]) -> None:
-    """Maps grow along the way, and where they share enough RANSAC and ours are near the truth, others need not be."""
+def test_stages_have_errors_of_all_methods(rows: list[dict[str, Any]]) -> None:
+    """Maps grow along the path, and with enough shared landmarks RANSAC and our method are near the truth."""
     for row in rows:
         sizes = [stage["size"] for stage in row["stages"]]
         assert len(sizes) == 3
@@ -71,13 +71,13 @@ def test_a_run_repeats() -> None:
 
 
 def stage(size: float, errors: dict[str, float | None], shared: int = 50) -> dict[str, Any]:
-    """Return a stage at which each method errs by so much, in metres and degrees alike."""
-    told = {m: None if e is None else {"translation_m": e, "rotation_deg": e} for m, e in errors.items()}
-    return {"length": 5.0, "size": size, "shared": shared, **dict.fromkeys(METHODS), **told}
+    """Return a stage with the given error of each method, in metres and in degrees."""
+    rows_of_methods = {m: None if e is None else {"translation_m": e, "rotation_deg": e} for m, e in errors.items()}
+    return {"length": 5.0, "size": size, "shared": shared, **dict.fromkeys(METHODS), **rows_of_methods}
 
 
-def test_the_papers_statement_is_asked_of_the_data() -> None:
-    """It holds where RANSAC is best and near zero at every size, and fails where it is not at one of them."""
+def test_the_papers_claim_is_checked() -> None:
+    """The claim holds if RANSAC is best and near zero for every size, and fails if it is not for one size."""
     good = {"svd": 2.0, "icp": 1.0, "impicp": 0.5, "ransac": 0.1, OURS: 0.1}
     fine = [{"stages": [stage(60.0, good), stage(160.0, good), stage(160.0, good, shared=3)]}]
     lines = summarise(fine)
@@ -92,13 +92,13 @@ def test_the_papers_statement_is_asked_of_the_data() -> None:
 
 
 def test_false_alignments_are_counted() -> None:
-    """Ours is false where it accepts and is off by more than 0.5 m or 5 degrees, whatever the maps share."""
+    """Our method is false if it accepts with an error above 0.5 m or 5 degrees, whatever the maps share."""
     stages = [stage(60.0, {OURS: 0.6}), stage(60.0, {OURS: 0.4}), stage(60.0, {OURS: 4.0}, shared=2), stage(60.0, {})]
     assert refusals([{"stages": stages}]) == {"share_too_little": 1, "false": 2}
 
 
-def test_the_motion_found_lays_one_map_on_the_other(pair: AlignedPair) -> None:
-    """Nearly all inliers are true, and the error is of the size that the covariance says and the maps' own bend."""
+def test_the_estimated_transform_aligns_the_maps(pair: AlignedPair) -> None:
+    """Nearly all inliers are true, and the error agrees with the covariance and the deformation of the maps."""
     figures = pair.figures()
     assert figures["inliers"] >= 20
     assert figures["true_inliers"] >= 0.95 * figures["inliers"]
@@ -106,7 +106,7 @@ def test_the_motion_found_lays_one_map_on_the_other(pair: AlignedPair) -> None:
     assert figures["rotation_error_deg"] < 2.0
 
 
-def test_fused_ellipses_are_smaller_than_both(pair: AlignedPair) -> None:
+def test_fusion_reduces_covariances(pair: AlignedPair) -> None:
     """Fusion never adds uncertainty, and the fused mean lies between both in Mahalanobis terms."""
     fused = fuse_pair(pair)
     assert len(fused.names) == 3
@@ -117,7 +117,7 @@ def test_fused_ellipses_are_smaller_than_both(pair: AlignedPair) -> None:
 
 
 def test_the_commands_write_pictures_and_tables(vslam: Any, tmp_path: Path) -> None:
-    """Each figure ends as PNG, CSV and metrics.json; fig2 begun again in its folder runs nothing twice."""
+    """Each figure gives PNG, CSV and metrics.json; fig2 resumed in its folder runs no stage twice."""
     options = ("--seeds", "1", "--first-seed", "100", "--length", "10", "--every", "10", "--particles", "20")
     for _ in range(2):
         said = vslam("paper", "fig2", *options, "--out", str(tmp_path / "fig2"))

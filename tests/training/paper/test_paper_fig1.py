@@ -1,4 +1,4 @@
-"""Fig. 1: clouds start as points, spread as the motion model says, and shrink where landmarks are seen."""
+"""Fig. 1: particles start at a point, spread by the motion model, and converge with measurements."""
 
 import json
 from pathlib import Path
@@ -9,7 +9,7 @@ import pytest
 
 from training.bench.accuracy.runs import PRESETS, STEP, StereoRun
 from training.paper.config import Fig1Config
-from training.paper.fig1 import Clouds, draw_clouds, figures_of, simulate_fig1
+from training.paper.fig1 import Clouds, draw_clouds, path_errors, simulate_fig1
 from training.paper.fig6.trials import FILTER_OPTIONS
 
 SMALL = Fig1Config(robots=2, particles=50, length=12.0, every=3.0, seed=60)
@@ -23,20 +23,18 @@ def run() -> StereoRun:
 
 @pytest.fixture(scope="module")
 def moved(run: StereoRun) -> Clouds:
-    """Their clouds by odometry alone."""
+    """Particles with odometry only."""
     return draw_clouds(run, SMALL, measured=False)
 
 
 @pytest.fixture(scope="module")
 def measured(run: StereoRun) -> Clouds:
-    """Their clouds with what they see."""
+    """Particles with measurements."""
     return draw_clouds(run, SMALL, measured=True)
 
 
-def test_clouds_start_as_points_and_measurements_hold_them_together(
-    run: StereoRun, moved: Clouds, measured: Clouds
-) -> None:
-    """All particles start at the true pose; by odometry alone they spread on and on, with measurements far less."""
+def test_measurements_limit_the_spread_of_particles(run: StereoRun, moved: Clouds, measured: Clouds) -> None:
+    """All particles start at the true pose; with odometry only they keep spreading, with measurements far less."""
     assert moved.steps.tolist() == [0, 12, 24, 36, 48]
     assert moved.poses.shape == measured.poses.shape == (5, 2, 50, 3)
     for robot in range(2):
@@ -48,7 +46,7 @@ def test_clouds_start_as_points_and_measurements_hold_them_together(
 
 
 def test_paths_are_of_odometry_and_of_the_filter(run: StereoRun, moved: Clouds, measured: Clouds) -> None:
-    """Without measurements the dashed path is the odometry as it was read; with them it is the filter's estimate."""
+    """Without measurements the dashed path is the measured odometry; with them it is the filter's estimate."""
     last, step = moved.paths[1, -2], run.odometry[-1, 1]
     c, s = np.cos(last[2]), np.sin(last[2])
     expected = last[0] + c * step[0] - s * step[1], last[1] + s * step[0] + c * step[1]
@@ -58,13 +56,13 @@ def test_paths_are_of_odometry_and_of_the_filter(run: StereoRun, moved: Clouds, 
         slam.step(**reading)
     np.testing.assert_array_equal(measured.paths[1, -1], slam.pose(1).mean)
     for clouds in (moved, measured):
-        own = figures_of(run, clouds)
+        own = path_errors(run, clouds)
         apart = np.linalg.norm((clouds.paths[0, -1] - run.true_paths[0, -1])[:2])
         assert own[0]["end_error_m"] == pytest.approx(apart)
         assert own[0]["end_spread_m"] == clouds.spreads()[-1, 0]
 
 
-def test_one_step_spreads_as_the_motion_model_says() -> None:
+def test_one_step_spreads_by_the_motion_model() -> None:
     """Eq. 4: the variance after one step is that of the odometry along and across, to 4 sigma of 4000 draws."""
     config = Fig1Config(robots=1, particles=4000, length=STEP, every=STEP, seed=61)
     run = simulate_fig1(config)
@@ -73,8 +71,8 @@ def test_one_step_spreads_as_the_motion_model_says() -> None:
     assert spread**2 == pytest.approx(along**2 + across**2, rel=4.0 * np.sqrt(2.0 / 4000))
 
 
-def test_the_command_leaves_picture_and_figures(vslam: Any, tmp_path: Path) -> None:
-    """A PNG file, the figures of each robot as JSON, and the same again from the config."""
+def test_the_command_writes_figure_and_errors(vslam: Any, tmp_path: Path) -> None:
+    """The command writes a PNG file and the errors of each robot as JSON, and its config repeats them."""
     first, again = tmp_path / "first", tmp_path / "again"
     arguments = ["paper", "fig1", "--length", "6", "--particles", "30", "--every", "2", "--seed", "62"]
     for rest in ([*arguments, "--out", str(first)], ["paper", "fig1", "--config", str(first), "--out", str(again)]):

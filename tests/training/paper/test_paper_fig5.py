@@ -1,4 +1,4 @@
-"""`vslam paper fig5`: walls restrict what robots see, in the data as in the picture."""
+"""`vslam paper fig5`: walls restrict the view, in the data and in the picture."""
 
 import csv
 import io
@@ -19,12 +19,12 @@ runner = CliRunner()
 
 @pytest.fixture(scope="module")
 def found() -> Fig5:
-    """Return a figure in which something is hidden."""
+    """Return a figure in which some landmarks are hidden."""
     return simulate_fig5(Fig5Config(seed=1, decisions=6))
 
 
 def _crossed(found: Fig5, robot: int, mark: int) -> bool:
-    """Tell whether a wall, shrunk at the landmark, or another robot stands between a robot and a landmark."""
+    """Return whether a wall, shortened at the landmark, or another robot stands between a robot and a landmark."""
     eye, target = found.poses[robot, :2], found.landmarks[mark, :2]
     sight = 0.999 * (target - eye)
     for wall in found.walls:
@@ -44,7 +44,7 @@ def _crossed(found: Fig5, robot: int, mark: int) -> bool:
 
 
 def test_walls_restrict_the_view(found: Fig5) -> None:
-    """The paper's statement: of the landmarks in view exactly those behind walls or robots are not seen."""
+    """The paper's claim: of the landmarks in view exactly those behind walls or robots are not seen."""
     hidden = found.in_view & ~found.seen
     assert hidden.sum() >= 5
     assert not (found.seen & ~found.in_view).any()
@@ -52,14 +52,14 @@ def test_walls_restrict_the_view(found: Fig5) -> None:
         assert _crossed(found, robot, mark) == hidden[robot, mark]
 
 
-def test_what_is_measured_is_seen(found: Fig5) -> None:
-    """Each robot integrates at most B landmarks, all of which it sees."""
+def test_measured_landmarks_are_visible(found: Fig5) -> None:
+    """Each robot measures at most B landmarks, all of which it sees."""
     assert not (found.measured & ~found.seen).any()
     assert (found.measured.sum(axis=1) <= 5).all()
     assert found.paths.shape == (3, 61, 2)
 
 
-def test_the_table_says_what_the_picture_shows(found: Fig5) -> None:
+def test_the_table_matches_the_figure(found: Fig5) -> None:
     """The CSV has a row for each landmark in a robot's view, with its state."""
     rows = list(csv.DictReader(io.StringIO(found.to_csv())))
     assert len(rows) == found.in_view.sum()
@@ -71,7 +71,7 @@ def test_the_table_says_what_the_picture_shows(found: Fig5) -> None:
 
 
 def test_the_command_writes_picture_and_table(tmp_path: Path) -> None:
-    """The run folder holds a PNG with the robots' colours, the CSV, and figures per robot."""
+    """The run folder has a PNG with the robots' colours, the CSV, and numbers per robot."""
     out = tmp_path / "run"
     arguments = ["--robots", "2", "--decisions", "2", "--seed", "3", "--out", str(out)]
     result = runner.invoke(app, ["paper", "fig5", *arguments])

@@ -1,4 +1,4 @@
-"""Fig. 6: what is run, how it is summed up, which claims hold, and that nothing finished is lost."""
+"""Fig. 6: trials, summary, claims, and stored trials."""
 
 import csv
 import json
@@ -57,7 +57,7 @@ def run() -> StereoRun:
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a small run of the command."""
+    """Folder of a small run of the command."""
     out = tmp_path_factory.mktemp("fig6") / "run"
     assert _call([*ARGUMENTS, "--out", str(out), "--json", str(out / "copy.json")]) == 0
     return out
@@ -80,13 +80,13 @@ def _error(seed: int, robots: int, particles: int, value: float) -> dict[str, An
 
 
 def _time(seed: int, particles: int, ratio: float) -> dict[str, Any]:
-    """Return a row of `play_time`: three robots take `ratio` times as long as one."""
+    """Return a row of `play_time` in which three robots take `ratio` times as long as one."""
     values: dict[str, Any] = {name: [1.0, ratio] for name in TIMES}
     return {"robots": [1, 3], "particles": particles, "measurements": 15, "length": 100.0, "seed": seed} | values
 
 
-def test_the_figure_is_the_papers() -> None:
-    """By default: M and K of the paper's caption, 20 seeds, B = 15 for all robots together, nobody told any names."""
+def test_defaults_match_the_paper() -> None:
+    """Defaults are M and K of the paper's caption, 20 seeds, B = 15 for all robots, and unknown association."""
     config = Fig6Config()
     assert config.particles == (1, 10, 50, 100, 200, 300, 400, 500, 1000, 1500, 2000)
     assert config.robots == (1, 2, 3)
@@ -107,21 +107,21 @@ def test_the_figure_is_the_papers() -> None:
 
 
 def test_the_papers_filter_resamples_at_every_step(run: StereoRun) -> None:
-    """After each step with a measurement, whatever the effective sample size (Algorithm 1, l. 10)."""
+    """The filter resamples after each step with a measurement, for any effective sample size (Algorithm 1, l. 10)."""
     slam = run.build_filter(7, "fastslam1", **FILTER_OPTIONS["fastslam1"])
     assert all(slam.step(**reading).resampled for reading in run.readings())
 
 
 def test_trials_repeat() -> None:
-    """The same trial gives the same figures, and others for another seed."""
+    """The same trial gives the same results, and another seed gives other ones."""
     trial = ErrorTrial(regime="good", proposal="fastslam1", robots=2, particles=5, measurements=8, length=3.0, seed=42)
     other = replace(trial, seed=43)
     assert play_error(trial) == play_error(trial)
     assert play_error(trial)["map_rmse_m"] != play_error(other)["map_rmse_m"]
 
 
-def test_nothing_is_nearer_than_the_bound() -> None:
-    """Batch maximum likelihood, which has no particles, maps a run better than a filter of few particles does."""
+def test_the_bound_is_below_filter_errors() -> None:
+    """Batch maximum likelihood, which has no particles, is more accurate than a filter with few particles."""
     trial = ErrorTrial(regime="good", proposal=BOUND, robots=2, particles=0, measurements=15, length=25.0, seed=42)
     bound, own = play_error(trial), play_error(replace(trial, proposal="fastslam1", particles=3))
     assert 0.0 < bound["map_rmse_m"] < 0.5 * own["map_rmse_m"]
@@ -134,7 +134,7 @@ def test_nothing_is_nearer_than_the_bound() -> None:
 
 
 def test_the_error_of_all_landmarks_counts_duplicates(run: StereoRun) -> None:
-    """Each landmark of the map counts by its distance from what caused it; what nothing caused does not."""
+    """Each landmark of the map counts with the distance from its true landmark; false points do not count."""
     means = np.vstack([run.landmarks[:2], run.landmarks[1] + [0.0, 0.0, 3.0], [[50.0, 0.0, 0.0]]])
     claims = np.array([0, 1, 1, FALSE_POINT])
     answer = Answer(run.true_paths, None, means, claims, np.ones(4, dtype=bool))
@@ -142,8 +142,8 @@ def test_the_error_of_all_landmarks_counts_duplicates(run: StereoRun) -> None:
     assert np.isnan(rms_of_all(run, Answer(run.true_paths, None, means[3:], claims[3:], np.ones(1, dtype=bool))))
 
 
-def test_taking_turns_changes_no_filter(run: StereoRun) -> None:
-    """Filters that are timed in turns end where each ends alone, and each step of each is timed."""
+def test_alternating_timing_does_not_change_filters(run: StereoRun) -> None:
+    """Filters timed in alternation end in the same states as alone, and each step of each filter is timed."""
     other = simulate_run(REGIMES["paper"].spec(1, 6.0), seed=41)
     runs = [run, other]
     filters = [each.build_filter(5, "fastslam1", seed=3) for each in runs]
@@ -157,7 +157,7 @@ def test_taking_turns_changes_no_filter(run: StereoRun) -> None:
         assert (taken > 0.0).all()
 
 
-def test_times_are_of_full_steps() -> None:
+def test_times_use_full_steps() -> None:
     """A row has one time for each K; full steps are those with B measurements, of which two robots have more."""
     row = play_time(TimeTrial(robots=(2, 1), particles=3, measurements=15, length=20.0, seed=44))
     runs = [simulate_run(REGIMES["paper"].spec(k, 20.0), seed=44) for k in (2, 1)]
@@ -170,7 +170,7 @@ def test_times_are_of_full_steps() -> None:
 
 
 def test_paired_ratios_are_geometric_means() -> None:
-    """A constant factor is found exactly; seeds that one side lacks do not count; one seed has no interval."""
+    """A constant factor is found exactly; only common seeds count; one seed has no interval."""
     values = {seed: 0.1 + seed for seed in range(6)}
     found = paired_ratio({seed: 0.7 * value for seed, value in values.items()}, values)
     assert found["ratio"] == pytest.approx(0.7)
@@ -182,9 +182,9 @@ def test_paired_ratios_are_geometric_means() -> None:
 
 
 def test_paired_intervals_cover_what_they_should() -> None:
-    """Of 400 intervals of 20 log-normal pairs 95 % hold the true ratio: 91 to 98 % with a false alarm below 1e-3.
+    """Of 400 intervals of 20 log-normal pairs 95 % contain the true ratio: 91 to 98 % with a false alarm below 1e-3.
 
-    What both values of a pair share, however large, does not widen the interval.
+    A common factor of a pair, however large, does not widen the interval.
     """
     rng = np.random.default_rng(5)
     held, widths = 0, []
@@ -198,8 +198,8 @@ def test_paired_intervals_cover_what_they_should() -> None:
     assert np.mean(widths) == pytest.approx(2.0 * 2.09 * 0.3 / np.sqrt(20), rel=0.1)
 
 
-def test_claims_hold_where_the_data_say_so() -> None:
-    """Each claim holds on data made for it, falls with the data made against it, and is open with a single seed."""
+def test_claims_follow_the_data() -> None:
+    """Each claim holds on data made for it, fails on data against it, and is open with a single seed."""
     rng = np.random.default_rng(6)
     spread = {seed: float(np.exp(rng.normal(scale=0.05))) for seed in range(8)}
     value = {(1, 1): 1.0, (3, 1): 0.9, (1, 100): 0.5, (3, 100): 0.35, (1, 2000): 0.4, (3, 2000): 0.3}
@@ -211,8 +211,8 @@ def test_claims_hold_where_the_data_say_so() -> None:
         "map error, K=3: M=2000 below M=1",
         "map error, M=100: K=3 below K=1, at most 0.85 of it",
         "map error, M=2000: K=3 below K=1",
-        "time, M=100: K=3 and K=1 alike, within a factor of 2",
-        "time, M=1000: K=3 and K=1 alike, within a factor of 1.5",
+        "time, M=100: K=3 and K=1 equal within a factor of 2",
+        "time, M=1000: K=3 and K=1 equal within a factor of 1.5",
     ]
     assert all(claim.holds for claim in claims.values())
     assert claims["map error, K=1: M=2000 below M=1"].ratio == pytest.approx(0.4, rel=0.2)
@@ -228,7 +228,7 @@ def test_claims_hold_where_the_data_say_so() -> None:
 
 
 def rejuvenated_errors(three: float) -> list[dict[str, Any]]:
-    """Return maps off by 6 cm with `fastslam2`; rejuvenated by 3 cm of one robot and by `three` [m] of three.
+    """Return map errors of 6 cm with `fastslam2`; with rejuvenation 3 cm for one robot and `three` [m] for three.
 
     Batch maximum likelihood has 2.5 and 1.5 cm.
     """
@@ -240,10 +240,10 @@ def rejuvenated_errors(three: float) -> list[dict[str, Any]]:
     ]  # fmt: skip
 
 
-def test_rejuvenation_is_asked_to_be_worth_it() -> None:
-    """Its map is below that of `fastslam2`, near the bound, and better with more robots by what the bound gains.
+def test_rejuvenation_claims_follow_the_data() -> None:
+    """Rejuvenated errors are below those of `fastslam2`, near the bound, and gain from robots as the bound does.
 
-    Without it nothing is asked; without the bound what is asked of both is open.
+    Without rejuvenation there is no claim; without the bound claims about both are open.
     """
     errors = rejuvenated_errors(three=0.018)
     claims = check_claims(errors, [])
@@ -269,8 +269,8 @@ def test_rejuvenation_is_asked_to_be_worth_it() -> None:
     assert [claim.holds for claim in unbound] == [True, True, False, False, True, False]
 
 
-def test_a_share_is_asked_of_the_ratio_itself() -> None:
-    """At M = 100 the interval must lie below 1 and the ratio at its limit; nor may times be too short."""
+def test_limits_apply_to_the_ratio_itself() -> None:
+    """At M = 100 the interval must be below 1 and the ratio at most its limit; nor may times be too short."""
     base: dict[str, Any] = {"claim": "", "seeds": 20, "below": 1.0, "ratio_at_most": 0.85}
     assert Claim(**base, ratio=0.80, low=0.66, high=0.97).holds
     assert not Claim(**base, ratio=0.87, low=0.80, high=0.95).holds
@@ -280,7 +280,7 @@ def test_a_share_is_asked_of_the_ratio_itself() -> None:
 
 
 def test_ratios_of_robots_are_shown_for_every_regime() -> None:
-    """Most robots over fewest, raw and aligned, for each regime, proposal and M."""
+    """There is a ratio of most over fewest robots, raw and aligned, for each regime, proposal and M."""
     errors = [_error(s, k, m, 1.0 / k) for s in range(3) for k in (1, 2, 3) for m in (10, 100)]
     errors += [row | {"regime": "good", "proposal": "fastslam2"} for row in errors]
     found = robots_ratios(errors)
@@ -295,7 +295,7 @@ def test_ratios_of_robots_are_shown_for_every_regime() -> None:
 
 
 def test_a_line_for_each_point(tmp_path: Path) -> None:
-    """Errors and times of one point meet in one line, with intervals; what was not measured is None, empty in CSV."""
+    """Errors and times of one point share a line, with intervals; unknown values are None, empty in CSV."""
     errors = [_error(s, k, 10, 0.1 * (s + 1)) for s in range(4) for k in (1, 3)]
     errors += [row | {"regime": "good"} for row in errors]
     lines = summarise(errors, [_time(s, 10, 2.0) for s in range(2)])
@@ -318,8 +318,8 @@ def test_a_line_for_each_point(tmp_path: Path) -> None:
     assert (tmp_path / "fig6.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_the_command_leaves_figure_table_and_trials(finished: Path) -> None:
-    """PNG, CSV with a line for each regime, proposal, K and M, the trials one by one, and all of it as JSON."""
+def test_the_command_writes_figure_table_and_trials(finished: Path) -> None:
+    """The command writes PNG, CSV with a line for each regime, proposal, K and M, the trials, and all as JSON."""
     assert (finished / "fig6.png").is_file()
     table = list(csv.DictReader((finished / "fig6.csv").read_text().splitlines()))
     points = {(row["regime"], row["proposal"], int(row["robots"]), int(row["particles"])) for row in table}
@@ -338,8 +338,8 @@ def test_the_command_leaves_figure_table_and_trials(finished: Path) -> None:
     assert len((finished / TIMES_FILE).read_text().splitlines()) == 2 * 2
 
 
-def test_a_stopped_run_goes_on(finished: Path, tmp_path: Path) -> None:
-    """With half of its trials lost, and one cut off, the same command computes these again, and the same errors."""
+def test_a_stopped_run_is_resumed(finished: Path, tmp_path: Path) -> None:
+    """With half of its trials removed and one truncated, the same command computes them again, with equal errors."""
     out = tmp_path / "run"
     out.mkdir()
     for name in ("config.toml", TIMES_FILE):
@@ -353,8 +353,8 @@ def test_a_stopped_run_goes_on(finished: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("factor", "status"), [(0.5, 0), (1.5, 1)])
-def test_check_tells_by_the_exit_status(tmp_path: Path, factor: float, status: int) -> None:
-    """0 where all claims hold, 1 where one does not: three robots half, or one and a half times, as wrong as one."""
+def test_check_sets_the_exit_status(tmp_path: Path, factor: float, status: int) -> None:
+    """The status is 0 if all claims hold, 1 otherwise: errors of three robots are 0.5 or 1.5 times those of one."""
     out = tmp_path / "run"
     arguments = ["paper", "fig6", "--seeds", "3", "--particles", "1,100", "--robots", "1,3", "--regimes", "paper"]
     assert _call([*arguments, "--length", "0.25", "--out", str(out)]) == 0

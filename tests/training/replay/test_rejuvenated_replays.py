@@ -1,4 +1,4 @@
-"""`--rejuvenate-every`: it reaches the filters of each command, and config.toml repeats it."""
+"""`--rejuvenate-every` is passed to the filters of each command, and config.toml repeats it."""
 
 import json
 import tomllib
@@ -28,13 +28,13 @@ PARTICLES = 20
 
 
 def estimates(folder: Path) -> list[bytes]:
-    """Return the estimated paths of a run folder, as they were written."""
+    """Return the estimated paths in a run folder, as text."""
     return [file.read_bytes() for file in sorted(folder.glob("*estimate.tum"))]
 
 
 @pytest.fixture
 def reasons(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Return the list to which attempts add why they were refused, "" if not; those that warm up are left out."""
+    """Return the list of refusals of attempts, "" for success; attempts of the warm-up are left out."""
     said: list[str] = []
     usual = _rejuvenation_step.rejuvenate
 
@@ -52,7 +52,7 @@ def reasons(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def test_a_replay_is_rejuvenated_and_repeats_itself(
     command: str, vslam: Any, tmp_path: Path, reasons: list[str]
 ) -> None:
-    """Most attempts succeed, the estimates change, the option stands in config.toml, which repeats the paths."""
+    """Most attempts succeed, the estimates change, and config.toml has the option and repeats the paths."""
     log, plain, one, two = (tmp_path / name for name in ("log", "plain", "one", "two"))
     log.mkdir()
     WRITERS[command](log)
@@ -64,7 +64,7 @@ def test_a_replay_is_rejuvenated_and_repeats_itself(
     assert reasons.count("") > 0.5 * len(reasons) > 0.0
     assert vslam("replay", command, "--config", str(one), "--out", str(two)).status == 0
     counts = json.loads((one / "metrics.json").read_text())["rejuvenations"]
-    assert counts["drawn"] == reasons.count("") // 2  # of two runs
+    assert counts["drawn"] == reasons.count("") // 2  # two runs
     assert sum(counts["refused"].values()) == (len(reasons) - reasons.count("")) // 2
     off = tmp_path / "off"
     never = ("--config", str(one), "--rejuvenate-every", "0", "--out", str(off))
@@ -79,16 +79,16 @@ def test_a_replay_is_rejuvenated_and_repeats_itself(
     assert first == second
 
 
-def test_all_replays_are_rejuvenated_as_often_as_environments_unless_told_otherwise() -> None:
-    """The default is one interval, that of the environments' filters."""
+def test_replays_and_environments_have_the_same_default_interval() -> None:
+    """The default is the interval of the environments' filters."""
     usual = preset_config("standard").belief.filter.rejuvenate_every
     for config in (MrclamConfig, VictoriaConfig, KittiConfig, ImagesConfig):
         assert config(path="log").rejuvenate_every == usual
 
 
 @pytest.mark.parametrize("command", WRITERS)
-def test_a_replay_tells_whether_its_filters_are_consistent(command: str, vslam: Any, tmp_path: Path) -> None:
-    """The table and metrics.json have a row for each robot, with a warning in words where there is one."""
+def test_replays_report_consistency(command: str, vslam: Any, tmp_path: Path) -> None:
+    """The table and metrics.json have a row for each robot, with a warning where needed."""
     log, run = tmp_path / "log", tmp_path / "run"
     log.mkdir()
     WRITERS[command](log)
@@ -103,8 +103,8 @@ def test_a_replay_tells_whether_its_filters_are_consistent(command: str, vslam: 
 
 
 @pytest.mark.parametrize("sensor", ["landmark", "stereo"])
-def test_the_filters_of_a_run_are_told(sensor: str) -> None:
-    """The environment's filters get the particles and the interval of the run; all else is that of the preset."""
+def test_options_of_a_run_reach_its_filters(sensor: str) -> None:
+    """The environment's filters have the particles and the interval of the run; other options are the preset's."""
     config = RunConfig(world="fig5", particles=17, rejuvenate_every=9, preset="hard", sensor=sensor)
     chosen = config.make_env().config
     assert (chosen.belief.filter.num_particles, chosen.belief.filter.rejuvenate_every) == (17, 9)
@@ -113,8 +113,8 @@ def test_the_filters_of_a_run_are_told(sensor: str) -> None:
     assert chosen.replace(belief=usual) == expected
 
 
-def test_a_run_is_rejuvenated_as_the_environment_has_it_unless_told_otherwise() -> None:
-    """Without a word the environment's interval holds; 0 is never."""
+def test_runs_have_the_environments_default_interval() -> None:
+    """By default the environment's interval is used; 0 disables rejuvenation."""
     assert RunConfig().make_env().config.belief == preset_config("standard").belief
     assert preset_config("standard").belief.filter.rejuvenate_every is not None
     assert RunConfig(rejuvenate_every=0).make_env().config.belief.filter.rejuvenate_every is None
@@ -122,7 +122,7 @@ def test_a_run_is_rejuvenated_as_the_environment_has_it_unless_told_otherwise() 
 
 @pytest.mark.slow
 def test_a_run_is_rejuvenated_and_repeats_itself(vslam: Any, tmp_path: Path) -> None:
-    """Of three runs of the command, that without differs from that with, and that from its config does not."""
+    """Of three runs of the command, the one without differs from the one with, which its config repeats."""
     plain, one, two = (tmp_path / name for name in ("plain", "one", "two"))
     options = ("--robots", "2", "--particles", "11", "--max-cycles", "40", "--world", "fig5", "--seed", "104")
     with_it, without = (*options, "--rejuvenate-every", "10"), (*options, "--rejuvenate-every", "0")
@@ -135,23 +135,23 @@ def test_a_run_is_rejuvenated_and_repeats_itself(vslam: Any, tmp_path: Path) -> 
 
 
 def _count_of(*reasons: str | None) -> dict[str, Any]:
-    """Return the count of attempts with these reasons; None: a step without any."""
+    """Return the count of attempts with these reasons; None: a step without an attempt."""
     count = RejuvenationCount()
     for reason in reasons:
         count.add(None if reason is None else RejuvenationReport(reason, 1.0, 1, 1))
     return count.to_mapping()
 
 
-def test_refusals_are_told_apart_by_their_words() -> None:
-    """Numbers within a reason do not make it another one, and steps without an attempt do not count."""
+def test_refusals_are_counted_by_reason() -> None:
+    """Numbers within a reason are ignored, and steps without an attempt do not count."""
     sizes = [f"an effective sample size of {size}" for size in ("1.5", "29.9")]
     refused = {"an effective sample size of n": 2, "no convergence in n iterations": 1}
     assert _count_of("", *sizes, None, "", "no convergence in 15 iterations") == {"drawn": 2, "refused": refused}
 
 
-def test_the_sentence_tells_all_there_is() -> None:
-    """Draws alone, draws and refusals, and nothing where nothing was attempted."""
+def test_rejuvenations_are_summarised_in_a_line() -> None:
+    """Successes only, successes and refusals, and no text without attempts."""
     assert _rejuvenations(_count_of(None)) == ""
-    assert _rejuvenations(_count_of("", "")) == "Particles were drawn anew 2 times."
-    told = _rejuvenations(_count_of("no pose to seek", ""))
-    assert told == "Particles were drawn anew 1 times, and not, for: no pose to seek (1)."
+    assert _rejuvenations(_count_of("", "")) == "Rejuvenated 2 times."
+    line = _rejuvenations(_count_of("no pose to seek", ""))
+    assert line == "Rejuvenated 1 times. Refused: no pose to seek (1)."

@@ -23,8 +23,8 @@ EXACT = MrclamConfig(
 )  # fmt: skip
 
 
-def test_without_noise_the_team_is_right(tmp_path: Path) -> None:
-    """Exact readings that are believed give one group, and paths, maps and the merge exact to centimetres."""
+def test_exact_readings_give_exact_results(tmp_path: Path) -> None:
+    """Exact readings give one group, and paths, maps and the merge accurate to centimetres."""
     write_log(tmp_path, noise=0.0)
     log = load_mrclam(tmp_path)
     result = replay_team(log, EXACT)
@@ -45,8 +45,8 @@ def test_without_noise_the_team_is_right(tmp_path: Path) -> None:
         assert row["map_rmse_m"] - 1e-3 < row["map_rmse_start_m"] < 0.1
 
 
-def test_noise_is_removed_that_dead_reckoning_keeps(tmp_path: Path) -> None:
-    """With biased odometry each path is at most a third as wrong as dead reckoning, in both kinds of score."""
+def test_the_filter_reduces_the_error_of_dead_reckoning(tmp_path: Path) -> None:
+    """With biased odometry each path error is at most a third of dead reckoning's, in both kinds of score."""
     write_log(tmp_path, noise=1.0)
     log = load_mrclam(tmp_path)
     result = replay_team(log, MrclamConfig(path=str(tmp_path), particles=25, seed=4))
@@ -58,7 +58,7 @@ def test_noise_is_removed_that_dead_reckoning_keeps(tmp_path: Path) -> None:
 
 
 def test_a_run_is_written_and_repeats_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, vslam: Any) -> None:
-    """The command leaves a complete folder, and run again from its config the same metrics to the last digit."""
+    """The command writes a complete folder, and repeated from its config exactly the same metrics."""
     log, first, second = (tmp_path / name for name in ("log", "first", "second"))
     log.mkdir()
     write_log(log, noise=1.0)
@@ -82,7 +82,7 @@ def test_a_run_is_written_and_repeats_itself(tmp_path: Path, monkeypatch: pytest
     for file in first.glob("*.png"):
         assert file.read_bytes()[:4] == b"\x89PNG"
     metrics = json.loads((first / "metrics.json").read_text())
-    assert metrics["groups"] == [[2, 5]]  # whose map is drawn alone
+    assert metrics["groups"] == [[2, 5]]  # its map has a figure of its own
     assert metrics == json.loads((tmp_path / "copy.json").read_text())
     assert metrics == json.loads((second / "metrics.json").read_text())
     assert metrics["seed"] == 5
@@ -93,8 +93,8 @@ def test_a_run_is_written_and_repeats_itself(tmp_path: Path, monkeypatch: pytest
     assert np.array_equal(estimate.poses, Trajectory.load_tum(second / "robot5_estimate.tum").poses)
 
 
-def test_maps_are_left_as_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, vslam: Any) -> None:
-    """Each group's map is an archive that `LandmarkMap.load` reads, in its first robot's start frame, and a CSV."""
+def test_maps_are_written_as_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, vslam: Any) -> None:
+    """Each group's map is an archive for `LandmarkMap.load`, in its first robot's start frame, and a CSV."""
     write_log(tmp_path, noise=0.0)
     monkeypatch.chdir(tmp_path)
     options = ("--duration", "20", "--particles", "7", "--alone", "--out", "run")
@@ -113,8 +113,8 @@ def test_maps_are_left_as_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, 
             assert np.array_equal(table[f"cov_{pair}_m2"], own.covariances[:, i, j])
 
 
-def test_a_folder_without_truth_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, vslam: Any) -> None:
-    """Where nothing is known, the command says so in place of tables of dashes; what was sorted is one line."""
+def test_missing_ground_truth_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, vslam: Any) -> None:
+    """Without ground truth, a line replaces the tables; sorting of the log is reported in one line."""
     write_log(tmp_path, noise=1.0)
     for file in tmp_path.glob("*Groundtruth.dat"):
         file.unlink()
@@ -127,7 +127,7 @@ def test_a_folder_without_truth_says_so(tmp_path: Path, monkeypatch: pytest.Monk
     assert "Paths of robots 2, 5: no ground truth in this folder." in said.out
     assert "Maps of robots 2, 5: no ground truth in this folder." in said.out
     assert "│" not in said.out.split("Merges")[0]
-    assert "off by" not in said.out
+    assert "error (m)" not in said.out
     assert "Sorted by time: Robot5_Odometry.dat (1 row, up to 0.100 s back)." in said.out.splitlines()
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert metrics["notes"] == ["Sorted by time: Robot5_Odometry.dat (1 row, up to 0.100 s back)."]
@@ -136,8 +136,8 @@ def test_a_folder_without_truth_says_so(tmp_path: Path, monkeypatch: pytest.Monk
     assert metrics["groups"] == [[2, 5]]
 
 
-def test_the_map_error_says_that_errors_are_cut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, vslam: Any) -> None:
-    """The column of E says at which distance each error is cut."""
+def test_the_map_error_states_its_cutoff(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, vslam: Any) -> None:
+    """The column of E gives the distance at which errors are cut."""
     write_log(tmp_path, noise=0.0)
     monkeypatch.chdir(tmp_path)
     said = vslam("replay", "mrclam", "--path", ".", "--duration", "5", "--particles", "2", "--out", "run")
@@ -146,7 +146,7 @@ def test_the_map_error_says_that_errors_are_cut(tmp_path: Path, monkeypatch: pyt
 
 
 def test_a_log_without_truth_has_no_path_scores(tmp_path: Path) -> None:
-    """Where the true path is not known its errors are NaN, while the map is scored."""
+    """Without true paths their errors are NaN, while the map is scored."""
     write_log(tmp_path, noise=1.0)
     (tmp_path / "Robot5_Groundtruth.dat").unlink()
     log = load_mrclam(tmp_path, robots=(5,), duration=10.0)
@@ -157,7 +157,7 @@ def test_a_log_without_truth_has_no_path_scores(tmp_path: Path) -> None:
 
 
 def test_map_is_aligned_by_its_most_seen_landmarks(tmp_path: Path) -> None:
-    """A duplicate seen once does not turn the map; it lowers the precision."""
+    """A duplicate seen once does not rotate the map, but lowers the precision."""
     write_log(tmp_path, noise=0.0)
     log = load_mrclam(tmp_path)
     world_from_map = np.array([1.0, -2.0, 0.7])
@@ -174,7 +174,7 @@ def test_map_is_aligned_by_its_most_seen_landmarks(tmp_path: Path) -> None:
 
 
 def test_robots_that_stay_alone_never_merge(tmp_path: Path) -> None:
-    """Alone, each robot ends with its own map, and what it estimates does not depend on which others are replayed."""
+    """Each single robot ends with its own map, and its estimates do not depend on the other robots."""
     write_log(tmp_path, noise=1.0)
     config = MrclamConfig(path=str(tmp_path), particles=7, alone=True, seed=4)
     both, first = load_mrclam(tmp_path, duration=20.0), load_mrclam(tmp_path, (2,), duration=20.0)
@@ -185,8 +185,8 @@ def test_robots_that_stay_alone_never_merge(tmp_path: Path) -> None:
     np.testing.assert_array_equal(result.paths[0][:80], replay_team(first, config).paths[0][:80])
 
 
-def test_hidden_identities_are_found_by_position(tmp_path: Path) -> None:
-    """Without barcodes exact readings of landmarks that stand apart still give each of them once."""
+def test_hidden_identities_are_associated_by_position(tmp_path: Path) -> None:
+    """Without barcodes exact readings of distant landmarks still give each of them once."""
     write_log(tmp_path, noise=0.0)
     apart: list[int] = []
     for row, place in enumerate(LANDMARKS):
@@ -206,9 +206,9 @@ def test_hidden_identities_are_found_by_position(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_five_real_robots_become_one_team(data_dir: Path) -> None:
-    """On the real log all five end in one group by right merges, paths a tenth as wrong as dead reckoning.
+    """On the real log all five end in one group by right merges, with path errors a tenth of dead reckoning's.
 
-    That of robot 1, whose first headings are hardly known, turns with what merges tell of them: a fifth.
+    The path of robot 1, whose first headings are uncertain, rotates with the merges: a fifth.
     """
     log = load_mrclam(data_dir / "mrclam" / "MRCLAM_Dataset7")
     result = replay_team(log, MrclamConfig(path="MRCLAM_Dataset7", particles=100))
@@ -225,8 +225,8 @@ def test_five_real_robots_become_one_team(data_dir: Path) -> None:
 
 
 @pytest.mark.slow
-def test_real_robots_alone_are_as_good_as_a_careful_filter(data_dir: Path) -> None:
-    """Each by itself, the five robots reach on average a path of 0.33 m and a map of 0.13 m."""
+def test_single_real_robots_reach_the_recorded_accuracy(data_dir: Path) -> None:
+    """The five single robots have on average a path error of 0.33 m and a map error of 0.13 m."""
     log = load_mrclam(data_dir / "mrclam" / "MRCLAM_Dataset7")
     result = replay_team(log, MrclamConfig(path="MRCLAM_Dataset7", alone=True))
     rows = summarise(result, log, [score_path(result, r, own.truth) for r, own in enumerate(log.robots)])["robots"]
@@ -235,8 +235,8 @@ def test_real_robots_alone_are_as_good_as_a_careful_filter(data_dir: Path) -> No
 
 
 @pytest.mark.slow
-def test_the_same_assumptions_hold_on_another_log(data_dir: Path) -> None:
-    """On data set 4, robot 3, with true poses from a file of their own, reaches a path of 0.15 m, a map of 0.1 m.
+def test_another_log_is_replayed_with_the_same_noise(data_dir: Path) -> None:
+    """Robot 3 of data set 4, with true poses from a separate file, has a path error of 0.15 m, a map error of 0.1 m.
 
     The odometry noise was calibrated on it, and on data set 7.
     """
@@ -249,7 +249,7 @@ def test_the_same_assumptions_hold_on_another_log(data_dir: Path) -> None:
 
 
 def test_paths_in_start_frames_and_group_frames_agree(tmp_path: Path) -> None:
-    """Late poses, moved into the group's frame, fit the true poses by the same motion as the group's map."""
+    """Late poses in the group's frame fit the true poses by the same transform as the group's map."""
     write_log(tmp_path, noise=0.0)
     log = load_mrclam(tmp_path)
     result = replay_team(log, EXACT)

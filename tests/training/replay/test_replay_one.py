@@ -24,8 +24,8 @@ from training.replay.victoria import score as score_victoria
 from training.replay.victoria import summarise as summarise_victoria
 
 
-def test_a_park_is_mapped_by_position_alone(tmp_path: Path) -> None:
-    """With steering told wrong by half a degree, nameless trees keep the path right, and each is in the map once."""
+def test_a_park_is_mapped_by_position_only(tmp_path: Path) -> None:
+    """With a steering error of half a degree, unlabelled trees keep the path right, and each is in the map once."""
     write_park(tmp_path, skew=0.01)
     log = load_victoria(tmp_path)
     result = replay_victoria(log, VictoriaConfig(path="log", particles=10, seed=3))
@@ -41,17 +41,17 @@ def test_a_park_is_mapped_by_position_alone(tmp_path: Path) -> None:
 
 
 def test_exact_dead_reckoning_needs_no_fit(tmp_path: Path) -> None:
-    """Controls that are followed lead the antenna through all fixes; start and fit then agree."""
+    """Exact controls lead the antenna through all fixes; errors from the start and after the fit then agree."""
     write_park(tmp_path)
     log = load_victoria(tmp_path)
     scored = score_victoria(replay_victoria(log, VictoriaConfig(path="log", particles=2)), log)
     assert scored.scores[1].start < 0.01
-    start = integrate_commands(axle_velocities(log.controls), log.scan_times[:1])[0]  # of the first scan
+    start = integrate_commands(axle_velocities(log.controls), log.scan_times[:1])[0]  # at the first scan
     np.testing.assert_allclose(scored.scores[1].world_from_path, compose(EAST, start), atol=1e-3)
 
 
-def test_trees_are_described_by_where_they_stand(tmp_path: Path) -> None:
-    """Seen from the true pose, descriptors are the trees' places."""
+def test_descriptors_of_trees_are_positions(tmp_path: Path) -> None:
+    """From the true pose, descriptors are the trees' positions."""
     write_park(tmp_path)
     log = load_victoria(tmp_path)
     frame = to_filter_steps(log).measurements[0]
@@ -73,7 +73,7 @@ def test_a_stretch_with_fewer_than_two_fixes_has_no_scores(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("command", ["victoria", "kitti"])
-def test_a_folder_without_truth_says_so(
+def test_missing_ground_truth_is_reported(
     command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, vslam: Any
 ) -> None:
     """Without GPS or true poses there is a line in place of the table, and no dash."""
@@ -88,8 +88,8 @@ def test_a_folder_without_truth_says_so(
     assert json.loads((tmp_path / "run" / "metrics.json").read_text())["robots"][0]["ate_aligned_m"] is None
 
 
-def test_the_command_tells_drift_and_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, vslam: Any) -> None:
-    """Over 100 m KITTI's drift is printed as a share, and the error at the end, of the estimate and of odometry."""
+def test_the_command_prints_drift_and_final_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, vslam: Any) -> None:
+    """KITTI's drift over 100 m and the final error are printed for the estimate and for odometry."""
     write_drive(tmp_path, bias=0.05)
     monkeypatch.chdir(tmp_path)
     said = vslam("replay", "kitti", "--path", ".", "--particles", "2", "--out", "run")
@@ -97,14 +97,14 @@ def test_the_command_tells_drift_and_end(tmp_path: Path, monkeypatch: pytest.Mon
     assert row["end_error_percent"] == pytest.approx(100.0 * row["end_error_m"] / row["true_path_m"])
     assert row["dead_reckoning_end_error_m"] > 5.0 * row["end_error_m"] > 0.0
     assert (
-        f"End of {row['true_path_m']:.1f} m, from the start, no fit: off by {row['end_error_m']:.2f} m, "
+        f"Final error after {row['true_path_m']:.1f} m, from the start, no fit: {row['end_error_m']:.2f} m, "
         f"{row['end_error_percent']:.2f} % of the path (odometry {row['dead_reckoning_end_error_m']:.2f} m, "
     ) in said.out
     assert ("Drift" in said.out) == (row["mean_drift"] is not None)
 
 
-def test_tracks_correct_the_turn_of_a_drive(tmp_path: Path) -> None:
-    """With the turn rate told wrong, tracked features leave a tenth of dead reckoning's error."""
+def test_tracks_correct_a_wrong_turn_rate(tmp_path: Path) -> None:
+    """With a wrong turn rate, tracked features reduce the error to a tenth of dead reckoning's."""
     write_drive(tmp_path, bias=0.05)
     log = load_kitti(tmp_path)
     result = replay_kitti(log, KittiConfig(path="log", particles=10, seed=3))
@@ -117,7 +117,7 @@ def test_tracks_correct_the_turn_of_a_drive(tmp_path: Path) -> None:
 
 
 def test_tracks_on_a_bus_are_refused(tmp_path: Path) -> None:
-    """Eight tracks that move with a bus are refused once they move, and the path stays right to a decimetre."""
+    """Eight tracks on a bus are rejected once it moves, and the path stays right to a decimetre."""
     write_drive(tmp_path, bus=True)
     log = load_kitti(tmp_path)
     result = replay_kitti(log, KittiConfig(path="log", particles=10, seed=3))
@@ -128,7 +128,7 @@ def test_tracks_on_a_bus_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_drive_without_truth_has_no_scores(tmp_path: Path) -> None:
-    """Where the true path is not known, errors are NaN."""
+    """Without a true path, errors are NaN."""
     write_drive(tmp_path)
     (tmp_path / "poses" / "00.txt").unlink()
     log = load_kitti(tmp_path, duration=1.0)
@@ -137,8 +137,8 @@ def test_a_drive_without_truth_has_no_scores(tmp_path: Path) -> None:
     assert np.isnan(summarise_kitti(result, None)["robots"][0]["ate_aligned_m"])
 
 
-def test_a_loop_is_the_place_that_is_passed_twice() -> None:
-    """On a circle of 160 m that is driven one and a quarter times, the loop's ends are one round apart."""
+def test_loops_are_found_at_revisited_places() -> None:
+    """On a circle of 160 m driven one and a quarter times, the ends of the loop are one round apart."""
     angles = np.linspace(0.0, 2.5 * np.pi, 126)
     radius = 80.0 / np.pi
     circle = np.column_stack([radius * np.cos(angles), radius * np.sin(angles), angles])
@@ -149,12 +149,12 @@ def test_a_loop_is_the_place_that_is_passed_twice() -> None:
     assert find_loop(circle[:80]) is None
 
 
-def test_drift_is_a_share_of_the_way_in_any_frame() -> None:
-    """A path 3 % too long drifts by that, wherever it starts; one that turns, by the chord; a short one has none."""
+def test_drift_is_relative_and_frame_independent() -> None:
+    """The drift of a path 3 % too long is 3 % in any frame; a turn drifts by the chord; a short path has none."""
     along = np.arange(0.0, 351.0)
     truth = np.column_stack([along, np.zeros_like(along), np.zeros_like(along)])
     assert mean_drift(compose(np.array([5.0, -2.0, 0.7]), truth * [1.03, 1.0, 1.0]), truth) == pytest.approx(0.03)
-    turned = np.where(along < 120.0, 0.0, 0.1)  # after 120 m all goes aside
+    turned = np.where(along < 120.0, 0.0, 0.1)  # the path turns after 120 m
     bent = np.column_stack([np.cumsum(np.cos(turned)), np.cumsum(np.sin(turned)), turned])
     starts, lengths = np.arange(0.0, 351.0, 10.0), np.array([100.0, 200.0, 300.0])
     aside = np.clip(starts + lengths[:, None] - 119.0, 0.0, lengths[:, None]) * (starts < 120.0)
@@ -164,7 +164,7 @@ def test_drift_is_a_share_of_the_way_in_any_frame() -> None:
 
 
 def test_positions_are_scored_before_and_after_the_fit() -> None:
-    """A path that is only moved has no error after the fit, and before it as much as it was moved."""
+    """A rigidly moved path has no error after the fit, and the distance of the motion before it."""
     points = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 2.0], [4.0, 3.0]])
     score = score_positions(points, transform_points([3.0, 4.0, 0.0], points), np.zeros(3))
     assert score.start == pytest.approx(5.0)
@@ -176,7 +176,7 @@ def test_positions_are_scored_before_and_after_the_fit() -> None:
 def test_a_run_is_written_and_repeats_itself(
     command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, vslam: Any
 ) -> None:
-    """The command leaves a complete folder, and run again from its config the same metrics to the last digit."""
+    """The command writes a complete folder, and repeated from its config exactly the same metrics."""
     log, first, second = (tmp_path / name for name in ("log", "first", "second"))
     log.mkdir()
     (write_park if command == "victoria" else write_drive)(log)
@@ -209,8 +209,8 @@ def test_a_run_is_written_and_repeats_itself(
 
 
 @pytest.mark.slow
-def test_victoria_park_is_followed_to_five_metres(data_dir: Path) -> None:
-    """Over the whole real log dead reckoning is off by 149 m, the estimate, fitted to all fixes, by less than 5 m."""
+def test_victoria_park_has_an_error_below_five_metres(data_dir: Path) -> None:
+    """On the whole real log the error of dead reckoning is 149 m, that of the fitted estimate below 5 m."""
     log = load_victoria(data_dir / "victoria_park")
     assert sum(len(scan) for scan in log.scans) == 52_974
     scored = score_victoria(replay_victoria(log, VictoriaConfig(path="log", particles=30)), log)
@@ -220,8 +220,8 @@ def test_victoria_park_is_followed_to_five_metres(data_dir: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_real_drive_is_followed_to_one_per_cent(data_dir: Path) -> None:
-    """Over 694 m of KITTI, smoothed tracks leave less than 1 % of the way, and its length is right to 2 %."""
+def test_a_real_drive_has_an_error_below_one_per_cent(data_dir: Path) -> None:
+    """Over 694 m of KITTI, smoothed tracks give an error below 1 % of the path, and its length to 2 %."""
     log = load_kitti(data_dir / "kitti_landmarks")
     result = replay_kitti(log, KittiConfig(path="log", rejuvenate_every=50))
     scored = score_kitti(result, log)

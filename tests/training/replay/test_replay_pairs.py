@@ -29,7 +29,7 @@ distortion_coefficients: [0.0, 0.0, 0.0, 0.0]
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two rendered pairs of a wall from places 0.6 m and 17 degrees apart, written as EuRoC's are."""
+    """Two rendered pairs of a wall from places 0.6 m and 17 degrees apart, in EuRoC's format."""
     folder, rng = tmp_path_factory.mktemp("room"), np.random.default_rng(1)
     scene = Scene(WALL, CAMERA, 3)
     rows = ["# image qw qx qy qz px py pz"]
@@ -48,7 +48,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("descriptor", ["usurf", "sift", "orb"])
 def test_two_places_are_aligned(room: Path, descriptor: str) -> None:
-    """With any descriptor the motion between two rendered places is found to 3 cm and half a degree."""
+    """With any descriptor the transform between two rendered places is accurate to 3 cm and half a degree."""
     result = align_pairs(load_pairs(room), PairsConfig.from_mapping({"path": str(room), "descriptor": descriptor}))
     assert result.true_deg == pytest.approx(np.degrees(0.3), abs=1e-6)
     assert 0.5 < result.true_m < 1.0
@@ -70,7 +70,7 @@ def test_the_command_compares_descriptors(room: Path, tmp_path: Path) -> None:
 
 
 def test_without_poses_there_are_no_errors(room: Path) -> None:
-    """Where no poses are known a motion is found all the same, and its error is not."""
+    """Without true poses there is a transform, but no error."""
     poses = (room / "poses_dev.txt").read_text()
     (room / "poses_dev.txt").unlink()
     try:
@@ -78,7 +78,7 @@ def test_without_poses_there_are_no_errors(room: Path) -> None:
         assert result.motion is not None
         assert np.isnan(result.error_m)
         (room / "poses_dev.txt").write_text("0 1 0 0 0 1 2\n")
-        with pytest.raises(ValueError, match=r"path: expected poses_dev\.txt with two rows of 8 numbers"):
+        with pytest.raises(ValueError, match=r"path: expected poses_dev\.txt with two rows of 8 or 12 numbers"):
             load_pairs(room)
     finally:
         (room / "poses_dev.txt").write_text(poses)
@@ -95,7 +95,7 @@ def test_missing_files_are_named(room: Path, tmp_path: Path) -> None:
 
 
 def test_other_file_names_are_options(room: Path, tmp_path: Path) -> None:
-    """The same images under other names, in other folders, give the same alignment; the run repeats from its config."""
+    """The same images with other names and folders give the same alignment; the run repeats from its config."""
     names = {"left_img_0.png": "cam0/2.png", "left_img_1.png": "cam0/10.png", "right_img_0.png": "cam1/a.png"}
     names |= {"right_img_1.png": "cam1/b.png", "sensorLeft.yaml": "l.yaml", "sensorRight.yaml": "r.yaml"}
     other = tmp_path / "other"
@@ -117,11 +117,11 @@ def test_other_file_names_are_options(room: Path, tmp_path: Path) -> None:
     for place in (0, 1):
         landmarks = LandmarkMap.load(tmp_path / "run-other" / f"map_{place}.npz")
         assert len(landmarks) == found[0]["alignments"]["usurf"]["points"][place]
-        assert landmarks.means[:, 0].min() > 1.0  # ahead of the camera
+        assert landmarks.means[:, 0].min() > 1.0  # in front of the camera
 
 
 def test_rectified_pairs_need_one_file(room: Path, tmp_path: Path) -> None:
-    """KITTI's calibration and poses serve two pairs, too: the left camera is the body then."""
+    """KITTI's calibration and poses work for two pairs, too, with the left camera as the body."""
     focal, middle = CAMERA.focal_px, f"{0.5 * (CAMERA.width - 1)} {{}} 0 {CAMERA.focal_px} {0.5 * (CAMERA.height - 1)}"
     rows = [f"{focal} 0 {middle.format(shift)} 0 0 0 1 0\n" for shift in (0.0, -focal * CAMERA.baseline)]
     (tmp_path / "calib.txt").write_text("".join(rows))
@@ -137,7 +137,7 @@ def test_rectified_pairs_need_one_file(room: Path, tmp_path: Path) -> None:
     assert result.error_deg < 0.5
 
 
-def test_the_command_says_that_no_truth_is_known(room: Path, tmp_path: Path) -> None:
+def test_missing_poses_are_reported(room: Path, tmp_path: Path) -> None:
     """Without poses there are no columns of errors."""
     for file in room.iterdir():
         if file.name != "poses_dev.txt":
@@ -159,6 +159,8 @@ def test_the_command_says_that_no_truth_is_known(room: Path, tmp_path: Path) -> 
         (("--times", "times.txt"), "times: expected a drive of three pairs or more, got a folder with two pairs"),
     ],
 )
-def test_bad_names_are_refused(options: tuple[str, ...], message: str, room: Path, refusal: Any) -> None:
-    """What is missing is named, and the option with which to name another."""
+def test_missing_files_and_their_options_are_named(
+    options: tuple[str, ...], message: str, room: Path, refusal: Any
+) -> None:
+    """The error gives the missing file, and the option for another name."""
     assert message in refusal("replay", "stereo", "--path", str(room), *options)

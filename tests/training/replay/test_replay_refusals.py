@@ -1,4 +1,4 @@
-"""What `vslam replay` says of logs that are not there, damaged, or whose times go back."""
+"""Refusals of `vslam replay` for logs that are missing, damaged, or with times that go back."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -42,10 +42,10 @@ def _turn_back(command: str, log: Path) -> None:
         ("kitti", "drive.npz", "path: expected a numpy archive, got a broken file. Get"),
     ],
 )
-def test_a_file_that_was_cut_is_named(
+def test_truncated_files_are_refused(
     command: str, file: str, message: str, refusal: Any, tmp_path: Path,
 ) -> None:  # fmt: skip
-    """Half of a download is refused with the name of the file, before anything is computed."""
+    """A truncated file is refused by name, before anything is computed."""
     log = tmp_path / "log"
     log.mkdir()
     WRITERS[command](log)
@@ -71,7 +71,7 @@ def test_a_file_that_was_cut_is_named(
     ],
 )
 def test_time_that_goes_back_is_refused(command: str, message: str, refusal: Any, tmp_path: Path) -> None:
-    """Two readings far in the wrong order end the replay before it begins; frames of KITTI any two."""
+    """Two readings far out of order are refused before the replay starts, and any two frames of KITTI."""
     log = tmp_path / "log"
     log.mkdir()
     WRITERS[command](log)

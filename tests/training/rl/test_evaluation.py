@@ -1,4 +1,4 @@
-"""What trainings and evaluations say, without a learner: sums over seeds, curves, refusals."""
+"""Training and evaluation without a learner: sums over seeds, curves, refusals."""
 
 import io
 from pathlib import Path
@@ -12,7 +12,7 @@ from rich.console import Console
 from agents import POLICIES
 from training.rl import config as learn_extra
 from training.rl.config import TrainConfig
-from training.rl.curves import ends_of, running_mean, to_csv
+from training.rl.curves import first_and_last_tenth, running_mean, to_csv
 from training.rl.evaluation import FIGURES, leads, print_evaluation, summarise
 
 
@@ -21,7 +21,7 @@ def _row(policy: str, seed: int, gained: float) -> dict[str, Any]:
 
 
 def test_leads_are_paired_over_the_seeds_that_both_played() -> None:
-    """The lead is the mean of the differences on common seeds; seeds that one lacks do not count."""
+    """The lead is the mean of the differences on common seeds; other seeds do not count."""
     rows = [_row("model", seed, gained) for seed, gained in ((1, 0.4), (2, 0.1), (3, 9.0))]
     rows += [_row("frontier", seed, gained) for seed, gained in ((1, 0.2), (2, 0.3), (4, -9.0))]
     (lead,) = leads(rows)
@@ -34,7 +34,7 @@ def test_leads_are_paired_over_the_seeds_that_both_played() -> None:
 
 
 def test_equal_differences_have_an_interval_of_no_width() -> None:
-    """Where the model is ahead by the same on all seeds, however these differ, both ends are that lead."""
+    """If the lead is the same on all seeds, whatever the returns, both ends of the interval are this lead."""
     rows = [_row(name, seed, seed + ahead) for seed in range(5) for name, ahead in (("model", 0.25), ("other", 0.0))]
     (lead,) = leads(rows)
     np.testing.assert_allclose([lead["lead"], lead["lead_low"], lead["lead_high"]], 0.25)
@@ -47,7 +47,7 @@ def test_equal_differences_have_an_interval_of_no_width() -> None:
 
 @pytest.mark.parametrize(("split", "worlds"), [("test", "Worlds of the test split"), (None, "One building")])
 def test_the_table_fits_into_80_columns(split: str | None, worlds: str) -> None:
-    """No figure is folded or cut on a terminal of 80 columns, long names of policies, signs and hundreds among them."""
+    """Nothing is wrapped or cut on a terminal of 80 columns, with long names of policies, signs and hundreds."""
     rows = [_row(name, seed, 0.01 * (seed - 9)) | {"distance": 123.45} for seed in range(20) for name in POLICIES]
     rows += [_row("model", seed, -0.25) for seed in range(20)]
     console = Console(file=io.StringIO(), width=80)
@@ -55,29 +55,29 @@ def test_the_table_fits_into_80_columns(split: str | None, worlds: str) -> None:
     text = console.file.getvalue()  # type: ignore[attr-defined]
     assert "…" not in text
     assert all(line.count("..") in (0, 2) for line in text.splitlines())  # both intervals of a policy side by side
-    for told in ("random_goals", "-0.250..-0.250", "123.45", f"{worlds}, 20 episodes of each policy"):
-        assert told in text
+    for part in ("random_goals", "-0.250..-0.250", "123.45", f"{worlds}, 20 episodes of each policy"):
+        assert part in text
 
 
-def test_nobody_leads_without_a_model() -> None:
+def test_without_a_model_there_is_no_lead() -> None:
     """Without an episode of the model there is no lead."""
     assert leads([_row("frontier", 1, 0.2)]) == []
 
 
 def test_curves_have_a_line_per_rollout() -> None:
-    """The CSV has a heading and a line per rollout; the ends are means over a tenth, at least one."""
+    """The CSV has a header and a line per rollout; the ends are means over a tenth, at least one rollout."""
     rows = [{"steps": float(step), "return": 1.0 / (1 + step)} for step in range(20)]
     lines = to_csv(rows).splitlines()
     assert lines[0] == "steps,return"
     assert lines[3] == "2,0.333333"
     assert len(lines) == 21
-    assert ends_of(rows)["first"] == {"steps": 0.5, "return": 0.75}
-    assert ends_of(rows[:3])["last"]["steps"] == 2.0
+    assert first_and_last_tenth(rows)["first"] == {"steps": 0.5, "return": 0.75}
+    assert first_and_last_tenth(rows[:3])["last"]["steps"] == 2.0
     assert to_csv([]) == "\n"
 
 
 def test_running_means_look_back_only() -> None:
-    """Each is the mean of the last ones, of fewer at the beginning."""
+    """Each mean is over the last values, over fewer at the beginning."""
     values = np.arange(1.0, 8.0)
     np.testing.assert_allclose(running_mean(values, 3), [1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0])
 
@@ -90,16 +90,18 @@ def test_rollouts_fill_the_steps() -> None:
     assert TrainConfig.from_mapping(config.to_mapping() | {"seed": 0}) == config
 
 
-def test_splits_are_those_of_many_worlds(tmp_path: Path) -> None:
-    """Families have a split for training and one to try; one building has neither."""
+def test_only_families_have_splits(tmp_path: Path) -> None:
+    """Families have a split for training and one for tests; a single layout has neither."""
     assert TrainConfig().make_env_config("train").world_split == "train"
     plan = tmp_path / "plan.png"
     cv2.imwrite(str(plan), np.pad(np.full((200, 300), 255, np.uint8), 5))
     assert TrainConfig(world=str(plan)).make_env_config("train").world_split is None
 
 
-def test_missing_packages_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without the extra, training says what to install."""
-    monkeypatch.setattr(learn_extra, "NEEDED", ("numpy", "a_package_that_nobody_has"))
-    with pytest.raises(ValueError, match=r"train: expected the packages of the extra 'train', got no a_package"):
+def test_missing_packages_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without the extra, training names the packages to install."""
+    monkeypatch.setattr(learn_extra, "NEEDED", ("numpy", "a_missing_package"))
+    with pytest.raises(
+        ValueError, match=r"train: expected the packages of the extra 'train', got no a_missing_package"
+    ):
         learn_extra.require_extra()

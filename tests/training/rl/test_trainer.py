@@ -1,4 +1,4 @@
-"""Trainings: they learn, repeat, go on where they stopped, and refuse what is damaged or not there."""
+"""Training: learning, repeatability, resuming, and refusal of damaged or missing files."""
 
 import hashlib
 import json
@@ -31,7 +31,7 @@ from training.cli import app
 from training.rl.checkpoint import CHECKPOINT_FILE, FORMAT, MAGIC, read_checkpoint, write_checkpoint
 from training.rl.config import TrainConfig
 from training.rl.network import GoalPolicy
-from training.rl.trainer import Training, as_arrays, as_tensors, check_device, kept_of
+from training.rl.trainer import Training, as_arrays, as_tensors, check_device, stored_checkpoint
 from training.vec_env import ExplorationVecEnv
 from vslam_env.belief.observation import observation_space
 from vslam_env.state_kinds import ENV_KINDS
@@ -42,7 +42,7 @@ runner = CliRunner()
 
 
 class _NearIsGood(ParallelEnv):  # type: ignore[misc]
-    """One robot in fresh surroundings at each step is paid the more, the shorter the path to what it chose."""
+    """Environment of one robot with new candidates at each step; the reward is larger for shorter paths."""
 
     possible_agents = ("robot_0",)
     render_mode = None
@@ -82,11 +82,11 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any
 def _trained(folder: Path, stop_after: int | None = None, resume: bool = False) -> dict[str, Any]:
     training = Training(SMOKE, folder)
     if resume:
-        training.restore(kept_of(folder, SMOKE))
+        training.restore(stored_checkpoint(folder, SMOKE))
     counted: list[int] = []
     training.watch.listen(lambda row: None, lambda: len(training.rows) == stop_after, counted.append)
     assert training.run() == (stop_after is None)
-    assert counted == list(range(20 if resume else 4, 20 if stop_after else 52, 4))  # told of each step, and no other
+    assert counted == list(range(20 if resume else 4, 20 if stop_after else 52, 4))  # each step once
     training.close()
     weights: dict[str, Any] = training.model.policy.actor_weights()
     return weights
@@ -104,7 +104,7 @@ def test_both_forms_of_the_network_agree() -> None:
     policy = GoalPolicy(SPACE, spaces.Discrete(17), lambda left: 1e-3)
     with torch.no_grad():
         for tensor in policy.parameters():
-            tensor.add_(0.1 * torch.randn_like(tensor))  # biases that begin as zeros count too
+            tensor.add_(0.1 * torch.randn_like(tensor))  # biases, initially zero, matter too
     SPACE.seed(1)
     some = [SPACE.sample() for _ in range(4)]
     for observation in some:
@@ -120,8 +120,8 @@ def test_both_forms_of_the_network_agree() -> None:
 
 
 @pytest.mark.slow
-def test_it_learns_what_is_good() -> None:
-    """Where short paths pay, a few updates make the network choose much shorter ones than chance does."""
+def test_training_improves_the_policy() -> None:
+    """If short paths pay, after a few updates the network chooses much shorter ones than chance does."""
     torch.set_num_threads(1)
     env = ExplorationVecEnv([_NearIsGood] * 12)
     model = MaskablePPO(
@@ -138,7 +138,7 @@ def test_it_learns_what_is_good() -> None:
 
 @pytest.mark.slow
 def test_one_seed_gives_the_same_weights(whole: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
-    """A second training equals the first to the byte, and what it saved; another seed does not."""
+    """A second training equals the first to the byte, and so do its files; another seed does not."""
     again = _trained(tmp_path)
     _assert_same(again, whole[1])
     _assert_same(dict(load_model(tmp_path)[0]), whole[1])
@@ -148,15 +148,15 @@ def test_one_seed_gives_the_same_weights(whole: tuple[Path, dict[str, Any]], tmp
 
 @pytest.mark.slow
 def test_resumed_equals_uninterrupted(whole: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
-    """A training that was stopped after its first rollout and resumed in a new object ends with the same weights."""
+    """A training stopped after its first rollout and resumed in a new object ends with the same weights."""
     stopped = _trained(tmp_path, stop_after=1)
     assert not np.array_equal(stopped["slot.weight"], whole[1]["slot.weight"])
     _assert_same(_trained(tmp_path, resume=True), whole[1])
     assert read_checkpoint(tmp_path / CHECKPOINT_FILE)["watch"] == read_checkpoint(whole[0] / CHECKPOINT_FILE)["watch"]
 
 
-def test_rows_tell_of_episodes(whole: tuple[Path, dict[str, Any]]) -> None:
-    """Each rollout has a row: a return that is the sum of its terms, and TensorBoard gets the same numbers."""
+def test_rows_summarise_episodes(whole: tuple[Path, dict[str, Any]]) -> None:
+    """Each rollout has a row, with a return that is the sum of its terms; TensorBoard has the same numbers."""
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     rows = read_checkpoint(whole[0] / CHECKPOINT_FILE)["watch"]["rows"]
@@ -171,27 +171,27 @@ def test_rows_tell_of_episodes(whole: tuple[Path, dict[str, Any]]) -> None:
 
 
 def test_damaged_checkpoints_are_refused(whole: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
-    """A missing, cut, foreign or changed checkpoint, one of another configuration or version, is told with its cure."""
+    """A missing, truncated, foreign or changed checkpoint, or one of another configuration or version, is refused."""
     file = tmp_path / CHECKPOINT_FILE
     with pytest.raises(ValueError, match="resume: expected the checkpoint of a training, got no such file"):
-        kept_of(tmp_path, SMOKE)
+        stored_checkpoint(tmp_path, SMOKE)
     bytes_whole = (whole[0] / CHECKPOINT_FILE).read_bytes()
     file.write_bytes(bytes_whole[: len(bytes_whole) // 2])
-    with pytest.raises(ValueError, match=r"resume: .* got a broken file of \d+. .* was cut off or changed"):
-        kept_of(tmp_path, SMOKE)
+    with pytest.raises(ValueError, match=r"resume: .* got a broken file of \d+. .* was truncated or changed"):
+        stored_checkpoint(tmp_path, SMOKE)
     file.write_bytes(b"something else")
-    with pytest.raises(ValueError, match=r"resume: .* got a broken file. .* is none: train anew"):
-        kept_of(tmp_path, SMOKE)
+    with pytest.raises(ValueError, match=r"resume: .* got a broken file. .* is not a checkpoint"):
+        stored_checkpoint(tmp_path, SMOKE)
     file.write_bytes(bytes_whole.replace(b'"torch": "', b'"torch": "0', 1))
     with pytest.raises(ValueError, match=r"resume: expected a checkpoint made with torch .* Install torch==0"):
-        kept_of(tmp_path, SMOKE)
+        stored_checkpoint(tmp_path, SMOKE)
     write_checkpoint(file, {"config": {**SMOKE.to_mapping(), "gamma": 0.5}, "seed": 5})
     with pytest.raises(ValueError, match="resume: expected a checkpoint of the folder's configuration"):
-        kept_of(tmp_path, SMOKE)
+        stored_checkpoint(tmp_path, SMOKE)
 
 
 class Trap:
-    """What a pickle of makes a file when it is read."""
+    """Object whose pickle creates a file when it is read."""
 
     def __init__(self, file: Path) -> None:
         self.file = file
@@ -201,28 +201,28 @@ class Trap:
 
 
 def _marked(body: bytes, number: int) -> bytes:
-    """Return a checkpoint of a format with another body, as if it had been written so."""
+    """Return a checkpoint of a given format with another body and a valid checksum."""
     mark = {"format": number, "versions": {}, "bytes": len(body), "sha256": hashlib.sha256(body).hexdigest()}
     return MAGIC + json.dumps(mark).encode() + b"\n" + body
 
 
-def test_a_pickle_in_the_place_of_a_checkpoint_is_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever its format and checksum say, it runs nothing; checkpoints of other formats are refused by number."""
+def test_pickles_are_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No code from the file is run, whatever its format; checkpoints of other formats are refused by number."""
     monkeypatch.setattr("training.rl.checkpoint._versions", dict)
     file, proof = tmp_path / CHECKPOINT_FILE, tmp_path / "proof"
     body = pickle.dumps({"config": Trap(proof)})
     for number, says in ((FORMAT, "got a broken file"), (1, "expected one of format 2, got a checkpoint of format 1")):
         file.write_bytes(_marked(body, number))
         with pytest.raises(ValueError, match=f"resume: .*{says}"):
-            kept_of(tmp_path, SMOKE)
+            stored_checkpoint(tmp_path, SMOKE)
     assert not proof.exists()
     file.write_bytes(_marked(encode([1, 2], ENV_KINDS), FORMAT))
     with pytest.raises(ValueError, match="resume: expected the checkpoint of a training, got a broken file"):
-        kept_of(tmp_path, SMOKE)
+        stored_checkpoint(tmp_path, SMOKE)
 
 
 def test_tensors_are_kept_as_arrays() -> None:
-    """The states of networks and optimizers come back as they were, moments and step counts included."""
+    """The states of networks and optimizers are restored, moments and step counts included."""
     layer = torch.nn.Linear(3, 2)
     optimizer = torch.optim.Adam(layer.parameters())
     layer(torch.ones(3)).sum().backward()
@@ -236,7 +236,7 @@ def test_tensors_are_kept_as_arrays() -> None:
 
 @pytest.mark.slow
 def test_a_checkpoint_with_other_parts_is_refused(whole: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
-    """A checkpoint that is whole, but of which a part is none of this training's, is refused with its cure."""
+    """A valid checkpoint with a part that does not fit this training is refused with a hint."""
     kept = read_checkpoint(whole[0] / CHECKPOINT_FILE)
     training = Training(SMOKE, tmp_path)
     streams = kept["draws"]["numpy"]
@@ -248,13 +248,13 @@ def test_a_checkpoint_with_other_parts_is_refused(whole: tuple[Path, dict[str, A
         {"draws": kept["draws"] | {"numpy": beyond}},
         {"draws": kept["draws"] | {"torch": np.zeros(3, np.uint8)}},
     ):
-        with pytest.raises(ValueError, match="resume: expected the parts that a training saved, got 'others'"):
+        with pytest.raises(ValueError, match="resume: expected a checkpoint of this model, got a different one"):
             training.restore(kept | part)
     training.close()
 
 
-def test_a_missing_gpu_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A GPU is refused where torch finds none; so are devices that are none."""
+def test_a_missing_gpu_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A GPU is refused if torch finds none; so are invalid devices."""
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(ValueError, match="device: expected a GPU that torch can use, got a machine with 0 of them"):
         check_device("cuda")
@@ -264,8 +264,8 @@ def test_a_missing_gpu_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.slow
-def test_a_second_ctrl_c_tells_how_to_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is interrupted at once says whether a checkpoint is there, and with which command it goes on."""
+def test_a_second_ctrl_c_prints_how_to_resume(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After an immediate interrupt, the output says whether there is a checkpoint, and how to resume."""
     out = tmp_path / "run"
 
     def interrupted(training: Training) -> bool:
@@ -284,12 +284,12 @@ def test_a_second_ctrl_c_tells_how_to_go_on(tmp_path: Path, monkeypatch: pytest.
     training.run()
     monkeypatch.setattr(Training, "run", interrupted)
     result = runner.invoke(app, ["train", "--resume", str(out), "--workers", "0"])
-    assert f"Go on: vslam train --resume {out}" in result.output.replace("\n", "")
+    assert f"Resume: vslam train --resume {out}" in result.output.replace("\n", "")
 
 
 @pytest.mark.slow
-def test_the_commands_train_go_on_evaluate_and_play(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ctrl-C saves, `--resume` ends the training, `evaluate` compares with paired seeds, `run` plays the model."""
+def test_commands_train_resume_evaluate_and_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ctrl-C saves, `--resume` finishes the training, `evaluate` compares on paired seeds, `run` uses the model."""
     out = tmp_path / "run"
     begin = ["train", "--preset", "smoke", "--seed", "5", "--workers", "0", "--out", str(out)]
     kept_run = Training.run
@@ -303,7 +303,7 @@ def test_the_commands_train_go_on_evaluate_and_play(tmp_path: Path, monkeypatch:
         patch.setattr(Training, "run", interrupted)
         result = runner.invoke(app, begin)
     assert result.exit_code == 0, result.output
-    assert "Stopped; the checkpoint holds all until here." in result.output
+    assert "Stopped; the checkpoint contains all finished rollouts." in result.output
     assert json.loads((out / "metrics.json").read_text())["complete"] is False
     result = runner.invoke(app, ["train", "--resume", str(out), "--workers", "0"])
     assert result.exit_code == 0, result.output
@@ -316,7 +316,7 @@ def test_the_commands_train_go_on_evaluate_and_play(tmp_path: Path, monkeypatch:
     assert "This training is complete already." in result.output
     assert json.loads((out / "metrics.json").read_text())["decisions"] == 48
     result = runner.invoke(app, ["train", "--resume", str(out), "--steps", "96"])
-    assert "resume: expected no other options that decide the training, got ['steps']" in str(result.exception)
+    assert "resume: expected no options that change the training, got ['steps']" in str(result.exception)
 
     tried = tmp_path / "tried"
     result = runner.invoke(app, ["evaluate", str(out), "--seeds", "2", "--first-seed", "100", "--out", str(tried)])
@@ -332,7 +332,7 @@ def test_the_commands_train_go_on_evaluate_and_play(tmp_path: Path, monkeypatch:
     plan = tmp_path / "plan.png"
     cv2.imwrite(str(plan), np.pad(np.full((200, 300), 255, np.uint8), 5))
     result = runner.invoke(app, ["evaluate", str(out), "--world", str(plan), "--split", "test"])
-    assert "split: expected worlds of which there are many" in str(result.exception)
+    assert "split: expected a world family or folder" in str(result.exception)
 
     played = tmp_path / "played"
     arguments = ["run", "--policy", str(out), "--world", "fig5", "--robots", "2", "--particles", "5", "--max-cycles"]

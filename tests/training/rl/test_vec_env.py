@@ -1,4 +1,4 @@
-"""`ExplorationVecEnv`: what Stable-Baselines3 gets is what each environment gives by itself."""
+"""`ExplorationVecEnv` returns the same results as each environment alone."""
 
 import os
 import time
@@ -41,7 +41,7 @@ def _assert_equal(ours: Any, theirs: Any) -> None:
 
 
 def _toy(fails_at: int) -> Any:
-    """Return a maker of a tiny environment of one agent that fails in some step; cloudpickle takes it whole."""
+    """Return a maker of a tiny environment of one agent that fails in some step; cloudpickle can serialise it."""
 
     class Toy(ParallelEnv):  # type: ignore[misc]
         possible_agents, render_mode = ("only",), None
@@ -75,8 +75,8 @@ def workers() -> Iterator[ExplorationVecEnv]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("where", ["here", "workers"])
-def test_slots_hold_what_each_environment_gives_alone(where: str, request: pytest.FixtureRequest) -> None:
-    """Observations, rewards, ends and infos of two episodes are those of a plain loop, in this process or others."""
+def test_slots_equal_separate_environments(where: str, request: pytest.FixtureRequest) -> None:
+    """Observations, rewards, ends and infos of two episodes equal those of a plain loop, with and without workers."""
     env = make_vec_env(GOALS, 3) if where == "here" else request.getfixturevalue("workers")
     env.seed(5)
     observations = env.reset()
@@ -90,24 +90,24 @@ def test_slots_hold_what_each_environment_gives_alone(where: str, request: pytes
     for step in range(6):
         actions = _goals(env.env_method("action_masks"), rng)
         observations, rewards, dones, infos = env.step(actions)
-        told = [
+        results = [
             one.step(dict(zip(GOALS.agents, actions[2 * e : 2 * e + 2], strict=True))) for e, one in enumerate(alone)
         ]
         ended = step == GOALS.max_cycles - 1
-        seen = [one.reset()[0] if ended else told[e][0] for e, one in enumerate(alone)]
+        seen = [one.reset()[0] if ended else results[e][0] for e, one in enumerate(alone)]
         for slot, (e, agent) in enumerate(slots):
             _assert_equal({name: rows[slot] for name, rows in observations.items()}, seen[e][agent])
-            assert rewards[slot] == np.float32(told[e][1][agent])
+            assert rewards[slot] == np.float32(results[e][1][agent])
             assert dones[slot] == ended
             info = dict(infos[slot])
             assert info.pop("TimeLimit.truncated") is ended
             if ended:
-                _assert_equal(info.pop("terminal_observation"), told[e][0][agent])
-            _assert_equal(info, told[e][4][agent])
+                _assert_equal(info.pop("terminal_observation"), results[e][0][agent])
+            _assert_equal(info, results[e][4][agent])
 
 
 def test_rollouts_equal_a_loop() -> None:
-    """PPO's buffer holds the observations and rewards of a loop; at the time limit the value of the end is added."""
+    """PPO's buffer has the observations and rewards of a loop; at the time limit the final value is added."""
     config = GOALS.replace(action_type="continuous", observation_type="flat", max_cycles=5)
     model = PPO("MlpPolicy", make_vec_env(config, 2), n_steps=8, batch_size=8, n_epochs=1, seed=3, device="cpu")
     _, callback = model._setup_learn(32, None)
@@ -135,8 +135,8 @@ def test_rollouts_equal_a_loop() -> None:
                 observations, _ = env.reset()
 
 
-def test_a_goal_reached_is_no_time_limit() -> None:
-    """Where episodes terminate, the slots are done and `TimeLimit.truncated` is false."""
+def test_termination_is_not_truncation() -> None:
+    """If episodes terminate, the slots are done and `TimeLimit.truncated` is false."""
     env = make_vec_env(GOALS.replace(stop_at_recall=1e-9, max_cycles=50), 1, seed=1)
     env.reset()
     rng = np.random.default_rng(0)
@@ -151,7 +151,7 @@ def test_a_goal_reached_is_no_time_limit() -> None:
 
 @pytest.mark.parametrize("where", ["here", "workers"])
 def test_results_are_copies(where: str, request: pytest.FixtureRequest) -> None:
-    """What one step returned changes by no later step, and changing it changes no later mask."""
+    """Results of a step are not changed by later steps, and changing them changes no later mask."""
     env = make_vec_env(GOALS, 1) if where == "here" else request.getfixturevalue("workers")
     env.seed(2)
     first = env.reset()
@@ -167,15 +167,15 @@ def test_results_are_copies(where: str, request: pytest.FixtureRequest) -> None:
 
 
 @pytest.mark.parametrize("where", ["here", "workers"])
-def test_nobody_shares_what_was_handed_out(where: str, request: pytest.FixtureRequest) -> None:
-    """What a step returned shares memory with no other step's; writing into it changes neither these nor what comes."""
+def test_results_share_no_memory(where: str, request: pytest.FixtureRequest) -> None:
+    """Results of a step share no memory with other steps; writing to them changes neither other nor later ones."""
     env = make_vec_env(GOALS, 3) if where == "here" else request.getfixturevalue("workers")
     twin = make_vec_env(GOALS, 3)
     rng = np.random.default_rng(6)
     for each in (env, twin):
         each.seed(8)
     handed, expected = [env.reset()], [twin.reset()]
-    for _ in range(6):  # over the end of an episode
+    for _ in range(6):  # beyond the end of an episode
         actions = _goals(twin.env_method("action_masks"), rng)
         (observations, rewards, dones, infos), (theirs, *_) = env.step(actions), twin.step(actions)
         handed += [observations, {"rewards": rewards, "dones": dones}]
@@ -193,8 +193,8 @@ def test_nobody_shares_what_was_handed_out(where: str, request: pytest.FixtureRe
 
 
 @pytest.mark.parametrize("where", ["here", "workers"])
-def test_time_in_environments_is_told(where: str, request: pytest.FixtureRequest) -> None:
-    """Per process there are the seconds that the last step's environments took, which are not more than it took."""
+def test_time_in_environments_is_recorded(where: str, request: pytest.FixtureRequest) -> None:
+    """There are the seconds of the last step's environments for each process, at most the time of the step."""
     env = make_vec_env(GOALS, 3) if where == "here" else request.getfixturevalue("workers")
     env.seed(3)
     env.reset()
@@ -207,7 +207,7 @@ def test_time_in_environments_is_told(where: str, request: pytest.FixtureRequest
 
 
 def test_seeds_repeat_and_differ() -> None:
-    """A seed gives the same episodes again; neighbours share no environment's seed; None comes from anywhere."""
+    """A seed repeats its episodes; neighbouring seeds share no seed of an environment; None is random."""
     env = make_vec_env(GOALS, 2)
     states = []
     for seed in (7, 7, 8, None):
@@ -223,7 +223,7 @@ def test_seeds_repeat_and_differ() -> None:
 
 
 def test_options_reach_the_next_reset_only() -> None:
-    """A list of options goes slot by slot; the first slot of an environment speaks for it."""
+    """A list of options is by slot; the first slot of an environment decides."""
     env = make_vec_env(GOALS.replace(world="office", min_start_distance=2.0), 2, seed=0)
     env.set_options([{"world_seed": 3}, {}, {"world_seed": 4}, {}])
     env.reset()
@@ -257,14 +257,14 @@ def test_attributes_and_methods(where: str, request: pytest.FixtureRequest) -> N
     assert env.env_is_wrapped(object, indices=[0, 1]) == [False, False]
 
 
-def test_masks_are_there_with_goal_actions_only() -> None:
-    """MaskablePPO asks `has_attr("action_masks")`; flat observations carry the mask too."""
+def test_only_goal_actions_have_masks() -> None:
+    """MaskablePPO calls `has_attr("action_masks")`; flat observations have the mask too."""
     assert make_vec_env(GOALS.replace(observation_type="flat"), 1).has_attr("action_masks")
     assert not make_vec_env(GOALS.replace(action_type="discrete"), 1).has_attr("action_masks")
 
 
 def test_pictures() -> None:
-    """`render` tiles one picture per environment, as SB3's recorders want it."""
+    """`render` tiles one image per environment, as SB3's recorders expect."""
     env = make_vec_env(GOALS, 2, seed=0, render_mode="rgb_array")
     env.reset()
     assert env.render_mode == "rgb_array"
@@ -275,7 +275,7 @@ def test_pictures() -> None:
 
 
 def test_differing_robots_are_refused() -> None:
-    """All slots have one space of observations, one of actions and one way of rendering."""
+    """All slots have the same observation space, action space and render mode."""
     other = GOALS.replace(action_type="discrete")
     makers = [partial(vslam_v0.parallel_env, config=config) for config in (GOALS, other)]
     with pytest.raises(ValueError, match="observation_space: expected the same for all agents"):
@@ -288,7 +288,7 @@ def test_differing_robots_are_refused() -> None:
 
 
 def test_bad_numbers_are_refused() -> None:
-    """Numbers of environments, workers and actions, and seeds, are checked; the cure is told."""
+    """Numbers of environments, workers and actions, and seeds, are checked, with hints."""
     with pytest.raises(ValueError, match="num_envs: expected an int >= 1, got 0"):
         make_vec_env(GOALS, 0)
     with pytest.raises(ValueError, match="workers: expected an int >= 0, got -1"):
@@ -299,7 +299,7 @@ def test_bad_numbers_are_refused() -> None:
     with pytest.raises(ValueError, match="seed: expected an int >= 0, got -3"):
         env.seed(-3)
     env.reset()
-    with pytest.raises(ValueError, match="actions: expected 2 of them, got 3"):
+    with pytest.raises(ValueError, match="actions: expected 2 actions, got 3"):
         env.step(np.zeros(3, np.int64))
     with pytest.raises(RuntimeError, match=r"step_wait: .* Call step_async\(\) first"):
         env.step_wait()
@@ -307,7 +307,7 @@ def test_bad_numbers_are_refused() -> None:
 
 @pytest.mark.slow
 def test_workers_prepare_before_anything_else(tmp_path: Path) -> None:
-    """Each worker calls `prepare` once before its environments are made; what fails there is raised here."""
+    """Each worker calls `prepare` once before its environments are made; errors in it are raised here."""
 
     def prepare() -> None:
         (tmp_path / str(os.getpid())).touch(exist_ok=False)
@@ -328,8 +328,8 @@ def test_workers_prepare_before_anything_else(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_errors_of_workers_arrive() -> None:
-    """An error in a worker is raised here, says where it was, and ends the workers; so does the death of one."""
+def test_errors_of_workers_are_raised() -> None:
+    """An error in a worker is raised here with its location and ends the workers; so does the death of a worker."""
     env = ExplorationVecEnv([_toy(fails_at=2)], workers=1)
     env.reset()
     env.step(np.zeros(1, np.int64))
@@ -341,5 +341,5 @@ def test_errors_of_workers_arrive() -> None:
     env = ExplorationVecEnv([_toy(fails_at=9)], workers=1)
     env.reset()
     env._slots._processes[0].kill()
-    with pytest.raises(RuntimeError, match="worker 0: expected an answer of environments 0 to 0, got its end"):
+    with pytest.raises(RuntimeError, match="worker 0: expected an answer of environments 0 to 0, got an exit"):
         env.step(np.zeros(1, np.int64))

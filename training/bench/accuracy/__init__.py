@@ -1,1 +1,1 @@
-"""Errors and consistency of the filter beside batch maximum likelihood."""
+"""Accuracy benchmark: errors and consistency of filters, against batch maximum likelihood."""

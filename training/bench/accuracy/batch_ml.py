@@ -1,12 +1,12 @@
-"""Batch maximum likelihood: the paths and landmarks that explain a whole run best, and how well they are known.
+"""Batch maximum likelihood (bundle adjustment with odometry): paths, landmarks and their covariances.
 
 Levenberg-Marquardt on the sum of squared whitened residuals. In the normal equations
 
     [ A   B  ] [dp]   [a]        A: poses, block-tridiagonal by odometry, one chain per robot
     [ B^T C  ] [dl] = [c]        C: landmarks, block-diagonal; B: one block per measurement
 
-the poses are eliminated by a banded Cholesky factor: (C - B^T A^-1 B) dl = c - B^T A^-1 a is dense, but only as large
-as the map, so that the effort grows linearly with the length of the run.
+the poses are eliminated by a banded Cholesky factor: (C - B^T A^-1 B) dl = c - B^T A^-1 a is dense, but its size is
+that of the map, so that the cost grows linearly with the length of the run.
 """
 
 from dataclasses import dataclass
@@ -23,34 +23,34 @@ BAND = 5  # super-diagonals of a block-tridiagonal matrix with blocks of 3
 MAX_ITERATIONS = 100
 FIRST_DAMPING = 1e-3
 MAX_DAMPING = 1e12
-LEAST_DECREASE = 1e-12  # of the cost, relative: converged
+LEAST_DECREASE = 1e-12  # relative decrease of the cost at convergence
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BatchEstimate:
-    """The estimate of maximum likelihood, and its covariance to first order."""
+    """Maximum likelihood estimate with its first-order covariance."""
 
-    paths: FloatArray  # (K, T, 3) float64 [m, m, rad], world frame; the first poses are given
+    paths: FloatArray  # (K, T, 3) float64 [m, m, rad], world frame; the first poses are known
     landmarks: FloatArray  # (L, 3) float64 [m], world frame
-    names: IntArray  # (L,) int64. The run's own indices of the landmarks.
+    names: IntArray  # (L,) int64. Indices of the landmarks in the run.
     path_covariances: FloatArray  # (K, T, 3, 3) float64; 0 at the first poses
     landmark_covariances: FloatArray  # (L, 3, 3) float64 [m^2]
-    cost: float  # Sum of squared whitened residuals (of their robust loss, with a kernel); chi-square without
-    freedom: int  # Its degrees of freedom, residuals less unknowns
-    # Largest slope of the cost that is left, in units of the unknown's own curvature: how many standard deviations a
-    # single unknown would still move
+    cost: float  # Sum of squared whitened residuals (chi-square), or of the robust loss with a kernel
+    freedom: int  # Degrees of freedom: residuals minus unknowns
+    # Largest remaining gradient of the cost in units of the unknown's own curvature: the number of standard deviations
+    # that a single unknown would still move
     gradient: float
-    iterations: int  # Steps of the descent
+    iterations: int  # Number of iterations
 
 
 def batch_ml(problem: BatchProblem, start: Estimate | None = None, robust: float | None = None) -> BatchEstimate:
-    """Find the paths and landmarks of maximum likelihood.
+    """Compute the maximum likelihood paths and landmarks.
 
     Args:
         problem: Odometry and measurements; K >= 1, T >= 2.
-        start: Where the descent begins. None: at dead reckoning, first with errors in metres, then in pixels.
+        start: Initial estimate. None: dead reckoning, optimised first with errors in metres, then in pixels.
         robust: Scale c of a Cauchy kernel on the measurements, c^2 log(1 + d^2 / c^2) for a squared distance d^2; None:
-            plain squares.
+            least squares.
 
     Raises:
         ValueError: If there is nothing to estimate.
@@ -75,7 +75,7 @@ def batch_ml(problem: BatchProblem, start: Estimate | None = None, robust: float
 
 
 def _descend(problem: BatchProblem, at: Estimate, robust: float | None, metric: bool) -> tuple[Estimate, int]:
-    """Return the nearest minimum and the number of steps to it (Levenberg-Marquardt, Nocedal and Wright, ch. 10)."""
+    """Return the nearest minimum and the number of iterations (Levenberg-Marquardt, Nocedal and Wright, ch. 10)."""
     damping = FIRST_DAMPING
     system = _System(problem, problem.sights(at, metric), problem.moves(at), robust)
     for iteration in range(MAX_ITERATIONS):
@@ -95,7 +95,7 @@ def _descend(problem: BatchProblem, at: Estimate, robust: float | None, metric: 
 
 
 def _moved(at: Estimate, poses: FloatArray, landmarks: FloatArray) -> Estimate:
-    """Add changes of the poses after the first (K, T - 1, 3) and of the landmarks (L, 3)."""
+    """Add changes to the poses after the first (K, T - 1, 3) and to the landmarks (L, 3)."""
     paths = at.paths.copy()
     paths[:, 1:] += poses
     paths[..., 2] = wrap_angle(paths[..., 2])
@@ -103,7 +103,7 @@ def _moved(at: Estimate, poses: FloatArray, landmarks: FloatArray) -> Estimate:
 
 
 class _System:
-    """The normal equations at one estimate."""
+    """Normal equations at one estimate."""
 
     def __init__(self, problem: BatchProblem, sights: Sights, moves: Moves, robust: float | None) -> None:
         squares = np.einsum("ni,ni->n", sights.residuals, sights.residuals)
@@ -112,7 +112,7 @@ class _System:
         self.cost = float(loss.sum() + np.einsum("kti,kti->", moves.residuals, moves.residuals))
         self.shape = problem.odometry.shape
         num_poses, num_landmarks = self.shape[0] * self.shape[1], len(problem.names)
-        # First poses are known: what is measured from them says nothing about a pose that is sought.
+        # First poses are known: measurements from them give no information on unknown poses.
         pose = problem.robots * self.shape[1] + problem.steps - 1
         later = problem.steps > 0
         by_pose = sights.by_pose * weights[:, None, None]
@@ -143,7 +143,7 @@ class _System:
         self.upper[:, :-1] = first.swapaxes(2, 3) @ second[:, 1:]
 
     def _banded(self, damping: float) -> FloatArray:
-        """Return the Cholesky factor of A, its diagonal enlarged, as `scipy.linalg.cholesky_banded` stores it."""
+        """Return the Cholesky factor of A with enlarged diagonal, in the format of `scipy.linalg.cholesky_banded`."""
         size = 3 * len(self.diagonal)
         bands = np.zeros((BAND + 1, size))
         upper = self.upper.reshape(-1, 3, 3)
@@ -156,7 +156,7 @@ class _System:
         return np.asarray(scipy.linalg.cholesky_banded(bands))
 
     def _reduced(self, factor: FloatArray, damping: float) -> tuple[FloatArray, FloatArray]:
-        """Return A^-1 B and the Cholesky factor of C - B^T A^-1 B, lower."""
+        """Return A^-1 B and the lower Cholesky factor of the Schur complement C - B^T A^-1 B."""
         solved = np.asarray(scipy.linalg.cho_solve_banded((factor, False), self.cross.toarray()))
         schur = -(self.cross.T @ solved)
         size = len(self.landmarks)
@@ -167,7 +167,7 @@ class _System:
         return solved, np.linalg.cholesky(0.5 * (schur + schur.T))
 
     def solve(self, damping: float) -> tuple[FloatArray, FloatArray]:
-        """Return the changes of poses (K, T - 1, 3) and landmarks (L, 3) that the equations ask for."""
+        """Return the solution: changes of the poses (K, T - 1, 3) and landmarks (L, 3)."""
         factor = self._banded(damping)
         solved, lower = self._reduced(factor, damping)
         slope = self.slope_poses.ravel()
@@ -176,9 +176,10 @@ class _System:
         return poses.reshape(self.shape), landmarks.reshape(-1, 3)
 
     def covariances(self) -> tuple[FloatArray, FloatArray]:
-        """Return the diagonal blocks of the inverse: of all poses (K, T, 3, 3), and of the landmarks (L, 3, 3).
+        """Return the marginal covariances of all poses (K, T, 3, 3) and of the landmarks (L, 3, 3).
 
-        Those of the poses are those of A^-1 + (A^-1 B) S^-1 (A^-1 B)^T, S = C - B^T A^-1 B.
+        They are the diagonal blocks of the inverse; those of the poses are of A^-1 + (A^-1 B) S^-1 (A^-1 B)^T with the
+        Schur complement S = C - B^T A^-1 B.
         """
         factor = self._banded(0.0)
         solved, lower = self._reduced(factor, 0.0)
@@ -194,7 +195,7 @@ class _System:
         return paths, np.einsum("kli,klj->lij", halves, halves)
 
     def largest_slope(self) -> float:
-        """Return the largest slope of half the cost over the square root of the unknown's own curvature."""
+        """Return the largest gradient of half the cost over the square root of the unknown's own curvature."""
         poses = np.abs(self.slope_poses) / np.sqrt(np.diagonal(self.diagonal, axis1=1, axis2=2))
         landmarks = np.abs(self.slope_landmarks) / np.sqrt(np.diagonal(self.landmarks, axis1=1, axis2=2))
         return float(max(poses.max(), landmarks.max()))
@@ -203,7 +204,7 @@ class _System:
 def _block_matrix(
     blocks: FloatArray, rows: IntArray, columns: IntArray, size: tuple[int, int]
 ) -> scipy.sparse.csr_array:
-    """Return the sparse matrix of `size` blocks that holds the sum of `blocks` (n, 3, 3) at block rows and columns."""
+    """Return the sparse block matrix of `size` blocks with the sums of `blocks` (n, 3, 3) at block rows and columns."""
     inner = np.arange(3)
     i = np.broadcast_to((3 * rows)[:, None, None] + inner[:, None], blocks.shape)
     j = np.broadcast_to((3 * columns)[:, None, None] + inner, blocks.shape)

@@ -1,4 +1,4 @@
-"""What a run says about paths and landmarks: whitened residuals of odometry and measurements, and their Jacobians."""
+"""Least-squares problem of a run: whitened residuals of odometry and measurements, with their Jacobians."""
 
 from dataclasses import dataclass
 from typing import Self
@@ -21,13 +21,13 @@ class Estimate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sights:
-    """Whitened residuals of n measurements, standard normal at the truth."""
+    """Whitened residuals of n measurements, standard normal at the true values."""
 
     residuals: FloatArray  # (n, 3) float64 [-]
-    # (n, 3, 3) float64. Derivative with respect to the pose (x, y, theta) of the robot that measured.
+    # (n, 3, 3) float64. Derivatives with respect to the pose (x, y, theta) of the measuring robot.
     by_pose: FloatArray
-    by_landmark: FloatArray  # (n, 3, 3) float64. With respect to the landmark.
-    in_front: bool  # Whether all landmarks lie ahead of the cameras that measured them, as they must
+    by_landmark: FloatArray  # (n, 3, 3) float64. Derivatives with respect to the landmark.
+    in_front: bool  # Whether all landmarks are in front of their cameras
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,27 +35,27 @@ class Moves:
     """Whitened residuals of the odometry from each pose to the next."""
 
     residuals: FloatArray  # (K, T - 1, 3) float64 [-]
-    by_first: FloatArray  # (K, T - 1, 3, 3) float64. Derivative with respect to the earlier pose.
-    by_second: FloatArray  # (K, T - 1, 3, 3) float64. With respect to the later one.
+    by_first: FloatArray  # (K, T - 1, 3, 3) float64. Derivatives with respect to the earlier pose.
+    by_second: FloatArray  # (K, T - 1, 3, 3) float64. Derivatives with respect to the later pose.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BatchProblem:
-    """All readings of a run in flat arrays, each measurement with the name of its landmark."""
+    """All readings of a run in flat arrays, with the true landmark of each measurement."""
 
     starts: FloatArray  # (K, 3) float64 [m, m, rad], world frame, known exactly
     odometry: FloatArray  # (K, T - 1, 3) float64 [m, m, rad], each in the frame of the earlier pose
     odometry_sigmas: FloatArray  # (K, T - 1, 3) float64 [m, m, rad]
-    camera: StereoCamera  # With its noise
-    points: FloatArray  # (n, 3) float64 [m], camera frame. The measurements, by rising step, then robot.
-    robots: IntArray  # (n,) int64, who measured
-    steps: IntArray  # (n,) int64, when
-    landmarks: IntArray  # (n,) int64, which: a row of `names`
-    names: IntArray  # (L,) int64. The run's own indices of the landmarks, in the order of their first sighting.
+    camera: StereoCamera  # Camera and its noise
+    points: FloatArray  # (n, 3) float64 [m], camera frame. Measurements, sorted by step, then robot.
+    robots: IntArray  # (n,) int64. Robot of each measurement.
+    steps: IntArray  # (n,) int64. Step of each measurement.
+    landmarks: IntArray  # (n,) int64. Landmark of each measurement, as a row of `names`.
+    names: IntArray  # (L,) int64. Landmark indices in the run, by first measurement.
 
     @classmethod
     def of_run(cls, run: StereoRun) -> Self:
-        """Gather a run's readings with their true names; false points are left out."""
+        """Collect the readings of a run with their true landmarks, without false points."""
         noise = run.spec.noise
         points, robots, steps, named = [], [], [], []
         for step, (frames, names) in enumerate(zip(run.frames, run.names, strict=True)):
@@ -84,7 +84,7 @@ class BatchProblem:
         return int(self.odometry.shape[1]) + 1
 
     def dead_reckoning(self) -> Estimate:
-        """Return paths by odometry alone, and each landmark where its first sighting puts it."""
+        """Return paths from odometry only, with each landmark at the position of its first measurement."""
         paths = np.empty((len(self.starts), self.num_steps, 3))
         paths[:, 0] = self.starts
         for step in range(1, self.num_steps):
@@ -99,9 +99,9 @@ class BatchProblem:
         """Return the residuals of all measurements.
 
         Args:
-            metric: False: predicted minus measured (u, v, disparity), the exact model of the noise. True: predicted
-                minus measured point, its covariance taken at the measurement; less exact, but nearly linear, and
-                defined behind the camera too, so that descent may start far away.
+            metric: False: residual of the predicted (u, v, disparity), the exact noise model. True: residual of the
+                predicted point, with its covariance at the measurement; less exact, but almost linear and defined
+                behind the camera, so that the optimisation may start far away.
         """
         poses = at.paths[self.robots, self.steps]
         turn = np.zeros((len(poses), 3, 3))
@@ -134,7 +134,7 @@ class BatchProblem:
         return Sights(residuals, scale @ by_pose, scale @ turn, bool((depth > 0.0).all()))
 
     def moves(self, at: Estimate) -> Moves:
-        """Return the residuals of all odometry: the motion between the poses minus what was read."""
+        """Return the residuals of all odometry: the motion between poses minus the reading."""
         first, second = at.paths[:, :-1], at.paths[:, 1:]
         motion = between(first, second)
         residuals = motion - self.odometry

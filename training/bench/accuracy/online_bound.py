@@ -1,8 +1,8 @@
-"""The ideal online estimate: what each pose would be known as at its own time, by a filter without any approximation.
+"""Ideal online estimate: each pose at its own time, from a filter without approximations.
 
-The readings are linearised at the batch estimate, which knows the whole run, and are then taken one step after the
-other by a Kalman filter over the latest poses and all landmarks (EKF-SLAM with perfect linearisation points). After the
-last step its map is that of the batch estimate, to first order. No online filter can do better in the mean.
+The readings are linearised at the batch estimate, which uses the whole run, and then processed step by step by a
+Kalman filter over the latest poses and all landmarks (EKF-SLAM with perfect linearisation points). After the last step
+its map equals the batch estimate, to first order. No online filter can have a smaller mean error.
 """
 
 from dataclasses import dataclass
@@ -18,23 +18,23 @@ from training.bench.accuracy.batch_problem import BatchProblem, Estimate
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OnlineEstimate:
-    """Each pose by the readings up to its own step."""
+    """Estimate of each pose from the readings up to its own step."""
 
-    paths: FloatArray  # (K, T, 3) float64 [m, m, rad], world frame; the first poses are given
+    paths: FloatArray  # (K, T, 3) float64 [m, m, rad], world frame; the first poses are known
     covariances: FloatArray  # (K, T, 3, 3) float64; 0 at the first poses
-    landmarks: FloatArray  # (L, 3) float64 [m], world frame, by all readings; in the order of `BatchProblem.names`
+    landmarks: FloatArray  # (L, 3) float64 [m], world frame, from all readings, ordered as `BatchProblem.names`
     landmark_covariances: FloatArray  # (L, 3, 3) float64 [m^2]
 
 
 def ideal_online(problem: BatchProblem, batch: BatchEstimate) -> OnlineEstimate:
-    """Filter a run whose readings are linearised at its batch estimate."""
+    """Filter a run with its readings linearised at the batch estimate."""
     at = Estimate(batch.paths, batch.landmarks)
     sights, moves = problem.sights(at), problem.moves(at)
     num_robots, num_steps = len(problem.starts), problem.num_steps
-    # Unknowns are the deviations from `at`: poses of all robots first, then landmarks in the order of first sighting.
+    # The state holds deviations from `at`: poses of all robots, then landmarks in the order of first measurement.
     size = 3 * (num_robots + len(problem.names))
     mean, covariance = np.zeros(size), np.zeros((size, size))
-    known = 3 * num_robots  # unknowns met so far
+    known = 3 * num_robots  # size of the state so far
     deviations = np.zeros((num_robots, num_steps, 3))
     spreads = np.zeros((num_robots, num_steps, 3, 3))
     ends = np.searchsorted(problem.steps, np.arange(num_steps), side="right")
@@ -50,7 +50,7 @@ def ideal_online(problem: BatchProblem, batch: BatchEstimate) -> OnlineEstimate:
         columns = 3 * (num_robots + problem.landmarks[rows])
         _, first = np.unique(columns, return_index=True)
         new = np.isin(np.arange(len(rows)), first) & (columns >= known)
-        for row in rows[new]:  # in the order of first sighting, which is that of the unknowns
+        for row in rows[new]:  # by first measurement, as in the state
             pose = slice(3 * problem.robots[row], 3 * problem.robots[row] + 3)
             _append(mean, covariance, pose, known, sights.residuals[row], sights.by_pose[row], sights.by_landmark[row])
             known += 3
@@ -76,7 +76,7 @@ def _predict(
     mean: FloatArray, covariance: FloatArray, own: slice, known: int, residual: FloatArray, by_first: FloatArray,
     by_second: FloatArray,
 ) -> None:  # fmt: skip
-    """Move one pose in place: residual + F d_before + G d_after is standard normal, hence d_after = -G^-1 (...)."""
+    """Propagate one pose in place: residual + F d_before + G d_after is standard normal, so d_after = -G^-1 (...)."""
     mean[own] = -np.linalg.solve(by_second, residual + by_first @ mean[own])
     change = -np.linalg.solve(by_second, by_first)
     noise = np.linalg.inv(by_second)
@@ -90,7 +90,7 @@ def _append(
     mean: FloatArray, covariance: FloatArray, pose: slice, known: int, residual: FloatArray, by_pose: FloatArray,
     by_landmark: FloatArray,
 ) -> None:  # fmt: skip
-    """Add a landmark in place, of which nothing is known but its first sighting."""
+    """Add a landmark in place, with its first measurement as the only information."""
     new = slice(known, known + 3)
     mean[new] = -np.linalg.solve(by_landmark, residual + by_pose @ mean[pose])
     change = -np.linalg.solve(by_landmark, by_pose)
@@ -101,7 +101,7 @@ def _append(
 
 
 def _update(mean: FloatArray, covariance: FloatArray, residuals: FloatArray, jacobian: FloatArray) -> None:
-    """Take whitened residuals (n, 3) with Jacobian (3 n, size) into mean and covariance, in place."""
+    """Update mean and covariance in place with whitened residuals (n, 3) and Jacobian (3 n, size)."""
     gain = covariance @ jacobian.T
     innovation = jacobian @ gain
     innovation[np.diag_indices(len(innovation))] += 1.0

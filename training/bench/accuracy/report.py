@@ -1,4 +1,4 @@
-"""Trials of the accuracy bench summed up, in tables, Markdown and a figure."""
+"""Report of the accuracy benchmark: summary, tables, Markdown and a figure."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -31,7 +31,7 @@ NAMES = {
     "fastslam1": "fastslam1", "fastslam2": "fastslam2", "fastslam2+existence": "with existence",
     "fastslam2+rejuvenation": "with rejuvenation",
 }  # fmt: skip
-# Per table its columns: heading, figure, statistic over seeds, factor, digits, whether with its interval.
+# Columns of each table: heading, metric, statistic over seeds, factor, digits, whether its interval is shown.
 PARTS: dict[str, tuple[tuple[str, str, str, float, int, bool], ...]] = {
     "paths": (
         ("pose [m]", "pose_rms_m", "mean", 1.0, 3, True), ("median", "pose_rms_m", "median", 1.0, 3, False),
@@ -63,16 +63,16 @@ COLOURS = {
     "fastslam1": "#D55E00", "fastslam2": "#0072B2", "batch_ml": "#009E73", "ideal_online": "#CC79A7",
     "dead_reckoning": "#7f7f7f", "fastslam2+existence": "#56B4E9",
     "fastslam2+rejuvenation": "#E69F00",
-}  # fmt: skip  # told apart by colour-blind eyes too
+}  # fmt: skip  # safe for colour-blind readers
 
 
 def summarise(rows: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return one line per condition, method and M, in the order in which they first come.
+    """Return one line per condition, method and M, in the order of first occurrence.
 
     Returns:
         The fields of `GROUP`, `seeds`, and for each of `FIGURES` a table with `mean`, `median` and their intervals
         `mean_low`, `mean_high`, `median_low`, `median_high` (95 %, percentile bootstrap over seeds; None for a single
-        seed) and `worst`; or None where no seed has the figure.
+        seed) and `worst`; or None if no seed has the metric.
     """
     lines = []
     for key, members in grouped(rows, GROUP).items():
@@ -85,7 +85,7 @@ def summarise(rows: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def describe(values: FloatArray) -> dict[str, float | None] | None:
-    """Return mean, median, their bootstrap intervals and the largest of values (n,); None if there are none.
+    """Return mean, median, their bootstrap intervals and the maximum of values (n,); None if there are none.
 
     >>> describe(np.array([2.0]))["mean_low"] is None
     True
@@ -100,7 +100,7 @@ def describe(values: FloatArray) -> dict[str, float | None] | None:
 
 
 def table_rows(lines: Sequence[Mapping[str, Any]], columns: Sequence[Any]) -> tuple[list[str], list[list[str]]]:
-    """Return headings and rows of text for the lines of one condition; columns that nobody fills are left out."""
+    """Return headings and text rows for the lines of one condition, without empty columns."""
     shown = [column for column in columns if any(line[column[1]] is not None for line in lines)]
     rows = []
     for line in lines:
@@ -111,7 +111,7 @@ def table_rows(lines: Sequence[Mapping[str, Any]], columns: Sequence[Any]) -> tu
 
 
 def conditions(lines: Sequence[Mapping[str, Any]]) -> dict[str, list[Mapping[str, Any]]]:
-    """Return the lines of each condition under its name, in the order in which they come."""
+    """Return the lines of each condition by its name, in the order of first occurrence."""
     groups: dict[str, list[Mapping[str, Any]]] = {}
     for line in lines:
         preset, association, robots, length = (line[name] for name in CONDITION)
@@ -145,7 +145,7 @@ def markdown(lines: Sequence[Mapping[str, Any]]) -> str:
 def _cell(
     found: Mapping[str, float | None] | None, statistic: str, factor: float, digits: int, with_interval: bool
 ) -> str:
-    """Show a statistic, with its interval if asked for, and what is not known as a dash."""
+    """Format a statistic, with its interval if requested; unknown values give a dash."""
     value = None if found is None else found[statistic]
     if found is None or value is None:
         return "-"
@@ -170,7 +170,7 @@ def draw_accuracy(file: Path, lines: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _draw_panel(ax: Axes, lines: Sequence[Mapping[str, Any]], key: str, label: str) -> None:
-    """Draw the filters as curves over M, what has no particles as level lines with their intervals."""
+    """Draw filters as curves over M, and methods without particles as level lines with their intervals."""
     for method in dict.fromkeys(line["method"] for line in lines):
         own = [line for line in lines if line["method"] == method and line[key] is not None]
         if not own:
@@ -195,7 +195,7 @@ def _draw_panel(ax: Axes, lines: Sequence[Mapping[str, Any]], key: str, label: s
     ax.xaxis.set_minor_locator(NullLocator())
     ax.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     bottom, top = ax.get_ylim()
-    if top < 1e3 * bottom:  # else powers of ten are easier to read
+    if top < 1e3 * bottom:  # otherwise powers of ten are easier to read
         ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         ax.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
         ax.yaxis.set_minor_formatter(NullFormatter())

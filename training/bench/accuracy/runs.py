@@ -1,4 +1,4 @@
-"""Seeded stereo runs of one or several robots through an office, with the truth: what accuracy is measured on."""
+"""Seeded stereo runs of one or several robots through an office, with ground truth, for the accuracy benchmark."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -17,11 +17,11 @@ from training.bench.accuracy.world import Office, start_crossings
 from training.experiments.config import Checked, Positive, setting
 
 STEP = 0.25  # distance between frames along the path [m]
-EYE = (0.0, 0.0, 0.9)  # of the left camera on the robot [m]
-LEAST_DISPARITY = 0.5  # px; noise never brings a measured disparity below this
-NEAREST_OUTLIER = 1.0  # [m]
+EYE = (0.0, 0.0, 0.9)  # left camera in the robot frame [m]
+LEAST_DISPARITY = 0.5  # lower limit of noisy disparities [px]
+NEAREST_OUTLIER = 1.0  # smallest depth of false points [m]
 Preset = Literal["good", "coarse", "paper"]
-FALSE_POINT = -1  # name of a measurement that no landmark caused
+FALSE_POINT = -1  # landmark index of a false measurement
 
 PRECISE_WHEELS = OdometryModel(
     sigma_along=0.02, sigma_across=0.01, sigma_heading=0.0, sigma_turn=0.03, floor_position=0.0, floor_heading=0.0015
@@ -30,7 +30,7 @@ PRECISE_WHEELS = OdometryModel(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NoisePreset:
-    """True noise of a run, which the filters assume too."""
+    """True noise of a run, which the filters also assume."""
 
     sigma_px: float  # Standard deviation of the image coordinates u and v [px]
     sigma_disparity_px: float  # Standard deviation of the disparity [px]
@@ -38,13 +38,13 @@ class NoisePreset:
 
     @property
     def camera(self) -> StereoCamera:
-        """The camera of all runs (f 320 px, b 0.12 m, 320 x 240 px, range 8 m) with this noise."""
+        """Camera of all runs (f 320 px, b 0.12 m, 320 x 240 px, range 8 m) with this noise."""
         return StereoCamera(sigma_px=self.sigma_px, sigma_disparity_px=self.sigma_disparity_px, mount=EYE)
 
 
-# good: features located to a fifth of a pixel, disparities to a tenth; common wheels (5 % along, 2 degrees per metre).
-# coarse: to a pixel and half a pixel, as without refinement. paper: measurements that say little against the odometry
-# (2 % along, 1 % across, .0015 rad per step and 3 % of the turn), the regime in which the paper's Fig. 6 holds.
+# good: features located to 0.2 px, disparities to 0.1 px; ordinary wheels (5 % along, 2 degrees per metre). coarse: 1
+# px and 0.5 px, as without refinement. paper: measurements that are uninformative relative to the odometry (2 % along,
+# 1 % across, .0015 rad per step and 3 % of the turn), the regime of the paper's Fig. 6.
 PRESETS: dict[str, NoisePreset] = {
     "good": NoisePreset(sigma_px=0.2, sigma_disparity_px=0.1),
     "coarse": NoisePreset(sigma_px=1.0, sigma_disparity_px=0.5),
@@ -53,50 +53,50 @@ PRESETS: dict[str, NoisePreset] = {
 
 
 class RunSpec(Checked):
-    """What decides a simulated run, its seed apart."""
+    """Parameters of a simulated run, except its seed."""
 
     robots: Positive = 1  # K
-    length: float = setting(100.0, ge=STEP)  # Of each robot's path [m]
-    measurements: int = 15  # B, of all robots together in a step; robot i gets B // K, and one more if i < B mod K
+    length: float = setting(100.0, ge=STEP)  # Path length of each robot [m]
+    measurements: int = 15  # B per step, of all robots together; robot i has B // K, plus one if i < B mod K
     landmarks: Positive = 300  # N
-    preset: Preset | NoisePreset = "good"  # Key of `PRESETS`, or a preset of one's own
-    # "known": each measurement comes with the name of its landmark, and none is false. "unknown": by appearance and
-    # position alone, with look-alikes, false points and wrong descriptors as below.
+    preset: Preset | NoisePreset = "good"  # Key of `PRESETS`, or a custom preset
+    # "known": each measurement has the index of its landmark, and none is false. "unknown": data association uses
+    # descriptors and positions only, with similar landmarks, false points and wrong descriptors as below.
     association: Literal["known", "unknown"] = "known"
-    look_alikes: Positive = 3  # Landmarks of a class, which all have one descriptor ("unknown" only)
-    # Shares of the measurements whose point lies anywhere in view, and of those that look like another class ("unknown"
-    # only)
+    look_alikes: Positive = 3  # Number of landmarks that share a descriptor ("unknown" only)
+    # Shares of the measurements whose point lies anywhere in view, and of those with the descriptor of another class
+    # ("unknown" only)
     outliers: float = setting(0.02, ge=0.0, le=1.0)
     wrong_descriptors: float = setting(0.03, ge=0.0, le=1.0)
     descriptor_size: int = setting(64, ge=2)  # d
-    # Root mean square length of the noise added to a descriptor before it is normalised again
+    # RMS norm of the noise added to a descriptor before it is normalised
     descriptor_noise: float = setting(0.17, ge=0.0)
 
     def check(self) -> None:
-        """Refuse robots that see nothing."""
-        check_int("measurements", self.measurements, self.robots, "Each robot needs at least one measurement a step.")
+        """Refuse robots without measurements."""
+        check_int("measurements", self.measurements, self.robots, "Each robot needs at least one measurement per step.")
 
     @property
     def noise(self) -> NoisePreset:
-        """The preset itself."""
+        """Noise preset."""
         return self.preset if isinstance(self.preset, NoisePreset) else PRESETS[self.preset]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StereoRun:
-    """What K robots did and read in T steps, and the truth. The world frame is the map frame of `build_filter`."""
+    """Motion and readings of K robots in T steps, with truth. The world frame is the map frame of `build_filter`."""
 
-    spec: RunSpec  # What was asked for
+    spec: RunSpec  # Parameters of the run
     office: Office  # Walls and landmarks
     true_paths: FloatArray  # (K, T, 3) float64 [m, m, rad], world frame
-    # (T, K, 3) float64 [m, m, rad]. Noisy motion from step t - 1 to t in the frame of t - 1; at t = 0 the robots stand,
-    # and the entry is 0.
+    # (T, K, 3) float64 [m, m, rad]. Noisy motion from step t - 1 to t in the frame of t - 1; zero at t = 0, where the
+    # robots do not move.
     odometry: FloatArray
-    # Per step and robot its measurements, in random order; the first is taken at the start pose
+    # Measurements by step and robot, in random order; the first are taken at the start poses
     frames: tuple[tuple[Measurements, ...], ...]
-    # Per step and robot (n,) int64, the landmark behind each measurement; `FALSE_POINT`: none
+    # True landmarks (n,) int64 of the measurements, by step and robot; `FALSE_POINT`: none
     names: tuple[tuple[IntArray, ...], ...]
-    descriptors: NDArray[np.float32]  # (N, d) float32, what each landmark looks like
+    descriptors: NDArray[np.float32]  # (N, d) float32. Descriptor of each landmark.
 
     @property
     def landmarks(self) -> FloatArray:
@@ -105,7 +105,7 @@ class StereoRun:
 
     @property
     def num_steps(self) -> int:
-        """T, the frame at the start included."""
+        """T, including the frame at the start."""
         return len(self.frames)
 
     def measured_landmarks(self) -> IntArray:
@@ -114,9 +114,9 @@ class StereoRun:
         return np.unique(named[named != FALSE_POINT])
 
     def readings(self) -> Iterator[dict[str, Any]]:
-        """Give the arguments of `FastSlam.step`, step by step: `slam.step(**reading)`.
+        """Yield the arguments of `FastSlam.step` for each step: `slam.step(**reading)`.
 
-        The first step has no odometry; the names of landmarks are given if the association is known.
+        The first step has no odometry; landmark identities are included if the association is known.
         """
         known = self.spec.association == "known"
         for step, (frames, names) in enumerate(zip(self.frames, self.names, strict=True)):
@@ -145,10 +145,10 @@ class _Looks:
 
 
 def simulate_run(spec: RunSpec, seed: int) -> StereoRun:
-    """Draw an office, the robots' paths through it, and what they read.
+    """Sample an office, the robots' paths through it, and their readings.
 
-    A robot's path and odometry depend on the seed and its number alone: with more robots, or another camera noise, the
-    first ones drive the same ways.
+    The path and odometry of a robot depend only on the seed and its number: with more robots or another camera noise,
+    the first robots drive the same paths.
     """
     check_int("seed", seed, 0, "Use 0 or a positive number.")
     layout, looks_seed, starts, *own = np.random.SeedSequence(seed).spawn(3 + 3 * spec.robots)
@@ -173,7 +173,7 @@ def simulate_run(spec: RunSpec, seed: int) -> StereoRun:
 
 
 def _draw_looks(spec: RunSpec, rng: np.random.Generator) -> _Looks:
-    """Draw unit descriptors, one for each class of look-alikes; where landmarks are known, each is its own class."""
+    """Sample unit descriptors, one for each class of similar landmarks; known landmarks have one class each."""
     size = spec.look_alikes if spec.association == "unknown" else 1
     classes = rng.normal(size=(-(-spec.landmarks // size), spec.descriptor_size))
     of_landmark = rng.permutation(spec.landmarks) // size
@@ -192,7 +192,7 @@ def _read_odometry(path: FloatArray, motion: OdometryModel, rng: np.random.Gener
 def _look(
     office: Office, looks: _Looks, pose: FloatArray, spec: RunSpec, most: int, rng: np.random.Generator
 ) -> tuple[Measurements, IntArray]:
-    """Measure at most `most` of the visible landmarks, chosen at random; return the frame and their names."""
+    """Measure at most `most` of the visible landmarks, chosen at random; return measurements and landmark indices."""
     camera = spec.noise.camera
     names = rng.permutation(np.flatnonzero(office.visible(pose, camera)))[:most]
     num = len(names)
@@ -213,7 +213,7 @@ def _look(
 
 
 def _anywhere(camera: StereoCamera, num: int, rng: np.random.Generator) -> FloatArray:
-    """Draw (num, 3) pixels u, v, disparity of points anywhere in the image, at any depth up to the camera's range."""
+    """Sample pixels u, v, disparity (num, 3) of points anywhere in the image, at any depth up to the camera's range."""
     u = rng.uniform(-0.5 * camera.width, 0.5 * camera.width, num)
     v = rng.uniform(-0.5 * camera.height, 0.5 * camera.height, num)
     depth = rng.uniform(NEAREST_OUTLIER, camera.max_range, num)

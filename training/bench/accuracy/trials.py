@@ -1,4 +1,4 @@
-"""One trial of the accuracy bench: a simulated run, one method, and how far its answer is from the truth."""
+"""Trial of the accuracy benchmark: errors of one method on a simulated run."""
 
 import time
 from dataclasses import asdict, dataclass, replace
@@ -22,58 +22,58 @@ PEERS = ("dead_reckoning", "batch_ml", "ideal_online")
 FILTERS = ("fastslam1", "fastslam2", "fastslam2+existence", "fastslam2+rejuvenation")
 METHODS = (*PEERS, *FILTERS)
 REJUVENATE_EVERY = 25  # steps
-CONFIRMED = 2  # sightings that confirm a landmark
-LEAST_SIGMA = 1e-5  # [m, rad]; a collapsed set of particles claims no error at all, which has no NEES
+CONFIRMED = 2  # measurements that confirm a landmark
+LEAST_SIGMA = 1e-5  # [m, rad]; lower limit, because a collapsed particle set has no NEES
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trial:
-    """What decides a trial."""
+    """Parameters of a trial."""
 
-    preset: Preset  # Of the noise
-    association: Literal["known", "unknown"]  # "known" or "unknown"; what uses no filter is told the names in any case
+    preset: Preset  # Noise preset
+    association: Literal["known", "unknown"]  # Methods without a filter always know it
     robots: int  # K
-    length: float  # Of each robot's path [m]
+    length: float  # Path length of each robot [m]
     method: str  # One of `METHODS`
-    particles: int  # M of a filter, 0 of the others
-    seed: int  # Of the run, and of the filter's draws
-    noise_factor: float = 1.0  # What a filter multiplies the true variance of the measurements by
-    landmark_noise: float | None = None  # Of a filter [m], see `FilterOptions`
+    particles: int  # M of a filter, 0 for other methods
+    seed: int  # Seed of the run and of the filter
+    noise_factor: float = 1.0  # Assumed measurement variance of a filter over the true one
+    landmark_noise: float | None = None  # Landmark noise of a filter [m], see `FilterOptions`
 
     def __post_init__(self) -> None:
-        _ = self.spec  # refuses the rest
+        _ = self.spec  # validates the other fields
 
     @property
     def spec(self) -> RunSpec:
-        """The run that is simulated."""
+        """Simulated run."""
         return RunSpec(robots=self.robots, length=self.length, preset=self.preset, association=self.association)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Answer:
-    """What a method says about a run; None where it says nothing."""
+    """Estimates of a method for a run; None for quantities that it does not estimate."""
 
-    paths: FloatArray  # (K, T, 3) float64 [m, m, rad], world frame. Online methods: each pose as known at its own step.
-    covariances: FloatArray | None = None  # (K, T, 3, 3) float64, of these poses
-    means: FloatArray | None = None  # (n, 3) float64 [m], world frame. The map at the end.
-    # (n,) int64. The true landmark behind each, by the run's own index; `FALSE_POINT`: none.
+    paths: FloatArray  # (K, T, 3) float64 [m, m, rad], world frame. Online methods: estimates at the time of each step.
+    covariances: FloatArray | None = None  # (K, T, 3, 3) float64. Covariances of these poses.
+    means: FloatArray | None = None  # (n, 3) float64 [m], world frame. Final map.
+    # (n,) int64. True landmark of each landmark of the map, by its index in the run; `FALSE_POINT`: none.
     claims: IntArray | None = None
-    confirmed: Any = None  # (n,) bool. Whether it was seen at least `CONFIRMED` times.
-    extra: dict[str, float] | None = None  # Further figures of a filter
+    confirmed: Any = None  # (n,) bool. Whether it was measured at least `CONFIRMED` times.
+    extra: dict[str, float] | None = None  # Additional metrics of a filter
 
 
 def play(trial: Trial) -> dict[str, Any]:
     """Run a trial.
 
     Returns:
-        The trial's own fields, and: `pose_rms_m` (all robots and steps, as it is), `pose_aligned_rms_m` (after the one
-        SE(2) motion that fits all paths best), `heading_rms_deg`; `map_rmse_m`, `map_aligned_rmse_m`, `map_recall` (of
-        the landmarks that were measured), `map_precision`, `confirmed_recall`, `confirmed_precision` (of landmarks seen
-        twice and more); `nees_median`, `nees_mean` (3-D, ideal 3), `anees` (the mean over the dimension, ideal 1); of
+        Fields of the trial, and: `pose_rms_m` (all robots and steps, not aligned), `pose_aligned_rms_m` (after the
+        SE(2) fit of all paths), `heading_rms_deg`; `map_rmse_m`, `map_aligned_rmse_m`, `map_recall` (of measured
+        landmarks), `map_precision`, `confirmed_recall`, `confirmed_precision` (of landmarks measured at least twice);
+        `nees_median`, `nees_mean` (3-D, ideal 3), `anees` (mean over the dimension, ideal 1); for
         filters `ess_share` (mean of ESS / M), `nis` (mean, ideal 3), `wrong_match_share` (of all matches of the most
         probable particle), `held_back_share` (of all measurements, neither matched nor new), `step_ms` (median),
-        `rejuvenation_ms` (median of the steps in which it was tried), `refused_share` (of these attempts); and
-        `seconds`. NaN stands for what is not known.
+        `rejuvenation_ms` (median of the steps with an attempt), `refused_share` (of these attempts); and
+        `seconds`. NaN means unknown.
     """
     begin = time.perf_counter()
     run = _run_of(trial.spec, trial.seed)
@@ -88,9 +88,9 @@ def play(trial: Trial) -> dict[str, Any]:
 
 
 def _build_filter(run: StereoRun, trial: Trial) -> FastSlam:
-    """Return the filter that a trial's method names, fresh.
+    """Return a new filter for the method of a trial.
 
-    "+existence": with the default model of existence; "+rejuvenation": every `REJUVENATE_EVERY` steps.
+    "+existence": with the default existence model; "+rejuvenation": every `REJUVENATE_EVERY` steps.
     """
     proposal, _, extra = trial.method.partition("+")
     camera, factor = run.spec.noise.camera, float(np.sqrt(trial.noise_factor))
@@ -106,7 +106,7 @@ def _build_filter(run: StereoRun, trial: Trial) -> FastSlam:
 
 
 def score(run: StereoRun, answer: Answer) -> dict[str, float]:
-    """Compare an answer with the truth; see `play` for the figures."""
+    """Return the errors of an answer; see `play` for the metrics."""
     errors = answer.paths - run.true_paths
     errors[..., 2] = wrap_angle(errors[..., 2])
     fitted = ate(answer.paths.reshape(-1, 3), run.true_paths.reshape(-1, 3))
@@ -121,7 +121,7 @@ def score(run: StereoRun, answer: Answer) -> dict[str, float]:
         float("nan"),
     )  # fmt: skip
     if answer.covariances is not None:
-        claimed = answer.covariances[:, 1:].reshape(-1, 3, 3) + LEAST_SIGMA**2 * np.eye(3)  # the start is given
+        claimed = answer.covariances[:, 1:].reshape(-1, 3, 3) + LEAST_SIGMA**2 * np.eye(3)  # the start is known
         values = nees(errors[:, 1:].reshape(-1, 3), claimed)
         row |= {"nees_median": float(np.median(values)), "nees_mean": float(values.mean())}
         row["anees"] = row["nees_mean"] / 3.0
@@ -131,7 +131,7 @@ def score(run: StereoRun, answer: Answer) -> dict[str, float]:
 
 
 def _score_map(run: StereoRun, means: FloatArray, claims: IntArray, confirmed: Any) -> dict[str, float]:
-    """Return the figures of a map; only landmarks that were measured can be missed."""
+    """Return the metrics of a map; recall counts only measured landmarks."""
     measured = run.measured_landmarks()
     rows = np.full(len(run.landmarks), FALSE_POINT)
     rows[measured] = np.arange(len(measured))
@@ -152,7 +152,7 @@ def _score_map(run: StereoRun, means: FloatArray, claims: IntArray, confirmed: A
 
 
 def follow(run: StereoRun, slam: FastSlam) -> Answer:
-    """Let a filter, fresh from `run.build_filter`, take the run step by step; note each pose when it is estimated."""
+    """Run a new filter of `run.build_filter` on a run; record each pose estimate at its own step."""
     robots = range(slam.num_robots)
     claims: dict[int, int] = {}  # id of a landmark -> true landmark behind the measurement that created it
     paths, covariances, ess, nis, times = [], [], [], [], []
@@ -197,7 +197,7 @@ def follow(run: StereoRun, slam: FastSlam) -> Answer:
 
 
 def optimal(run: StereoRun, method: str) -> Answer:
-    """Return the batch or the ideal online estimate; both know which landmark is behind each measurement."""
+    """Return the batch estimate or the ideal online estimate, both with true data associations."""
     problem, batch = _batch_of(run)
     if method == "ideal_online":
         online = ideal_online(problem, batch)
@@ -210,12 +210,12 @@ def optimal(run: StereoRun, method: str) -> Answer:
 
 @lru_cache(maxsize=1)
 def _run_of(spec: RunSpec, seed: int) -> StereoRun:
-    """Simulate a run once for the trials on it that follow each other."""
+    """Simulate a run once for consecutive trials."""
     return simulate_run(spec, seed)
 
 
 @lru_cache(maxsize=1)
 def _batch_of(run: StereoRun) -> tuple[BatchProblem, BatchEstimate]:
-    """Optimise a run once for the two methods that need it."""
+    """Optimise a run once for the two methods that use it."""
     problem = BatchProblem.of_run(run)
     return problem, batch_ml(problem)

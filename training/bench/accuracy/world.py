@@ -1,4 +1,4 @@
-"""An office of aisles around blocks of rooms: landmarks on its walls, smooth paths through it, and who sees what."""
+"""Office of aisles around blocks of rooms, with landmarks on its walls, smooth paths, and visibility."""
 
 from dataclasses import dataclass
 from typing import Self
@@ -13,27 +13,27 @@ AISLE = 3.0  # width [m]
 BLOCK = (4.5, 2.5)  # size of a block of rooms [m]
 BLOCKS = (2, 2)  # along x and y
 CROSSINGS = [(i, j) for i in range(BLOCKS[0] + 1) for j in range(BLOCKS[1] + 1)]  # of the aisles, along x and y
-HEIGHTS = (0.1, 1.9)  # of landmarks above the floor [m]
-OFF_WALL = 0.01  # landmarks stand out from their wall by this much [m]
-MAX_INCIDENCE = np.radians(80.0)  # a wall seen at a larger angle to its normal shows no landmarks [rad]
-CORNER_RADIUS = 1.0  # of a robot's way round a corner [m]
+HEIGHTS = (0.1, 1.9)  # range of landmark heights above the floor [m]
+OFF_WALL = 0.01  # distance of landmarks from their wall [m]
+MAX_INCIDENCE = np.radians(80.0)  # largest angle to the normal at which landmarks are visible [rad]
+CORNER_RADIUS = 1.0  # radius of paths around corners [m]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Office:
-    """Walls of a rectangular building with free-standing blocks, and the landmarks on them."""
+    """Rectangular building with free-standing blocks, and the landmarks on their walls."""
 
-    size: FloatArray  # (2,) float64 [m]. The building spans from the origin of the world frame to here.
-    # (S, 4) float64 [m], world frame. Rows x1 y1 x2 y2, x1 < x2 and y1 < y2: nobody looks through them.
+    size: FloatArray  # (2,) float64 [m]. Corner of the building opposite the origin of the world frame.
+    # (S, 4) float64 [m], world frame. Rows x1 y1 x2 y2, x1 < x2 and y1 < y2: opaque blocks.
     blocks: FloatArray
     crossings: tuple[FloatArray, FloatArray]  # Centre lines of the aisles: (x of those along y, y of those along x) [m]
     landmarks: FloatArray  # (N, 3) float64 [m], world frame
-    normals: FloatArray  # (N, 2) float64 [-], world frame. Out of the wall that bears the landmark.
+    normals: FloatArray  # (N, 2) float64 [-], world frame. Outward normal of each landmark's wall.
 
     @classmethod
     def draw(cls, num_landmarks: int, rng: np.random.Generator) -> Self:
-        """Spread landmarks evenly at random over all walls, the building's own and those of the blocks."""
-        check_int("num_landmarks", num_landmarks, 1, "An office without landmarks shows nothing.")
+        """Distribute landmarks uniformly over the walls of the building and of the blocks."""
+        check_int("num_landmarks", num_landmarks, 1, "Use at least one landmark.")
         starts = [AISLE + np.arange(count) * (side + AISLE) for count, side in zip(BLOCKS, BLOCK, strict=True)]
         size = np.array([count * (side + AISLE) + AISLE for count, side in zip(BLOCKS, BLOCK, strict=True)])
         blocks = np.array([[x, y, x + BLOCK[0], y + BLOCK[1]] for x in starts[0] for y in starts[1]])
@@ -46,10 +46,10 @@ class Office:
         return cls(size, blocks, (crossings[0], crossings[1]), np.column_stack([planar, height]), normals[face])
 
     def visible(self, pose: FloatArray, camera: StereoCamera) -> BoolArray:
-        """Tell which landmarks (N,) a robot sees.
+        """Return which landmarks (N,) a robot sees.
 
-        A landmark is visible if it lies in the image and within the camera's range, if the line of sight meets its wall
-        from the front at no more than `MAX_INCIDENCE` to the normal, and if no block stands in between.
+        A landmark is visible if it is in the image and within the camera's range, if the line of sight meets the front
+        of its wall at no more than `MAX_INCIDENCE` to the normal, and if no block is in between.
         """
         eye = compose(pose, np.array([*camera.mount[:2], 0.0]))[:2]
         seen = camera.sees(camera.camera_from_robot(transform_points(inverse(pose), self.landmarks)))
@@ -61,23 +61,23 @@ class Office:
         return seen
 
     def walk(self, node: tuple[int, int], length: float, step: float, rng: np.random.Generator) -> FloatArray:
-        """Drive along the aisles at random, never turning back, with corners rounded to arcs.
+        """Drive along random aisles without turning back, with corners rounded to arcs.
 
         Args:
-            node: Crossing at which the path starts, (index along x, index along y).
+            node: Crossing at the start of the path, (index along x, index along y).
 
         Returns:
-            (T, 3) poses [m, m, rad], world frame, T = floor(length / step) + 1, headed along the path.
+            (T, 3) poses [m, m, rad], world frame, T = floor(length / step) + 1, with headings along the path.
         """
         check_float("length", length, "Give metres.", above=0.0)
-        check_float("step", step, "Give metres between poses.", above=0.0)
+        check_float("step", step, "Give the distance between poses in metres.", above=0.0)
         wanted: FloatArray = np.arange(int(length / step + 1e-9) + 1, dtype=np.float64) * step
         heading = _directions(self.crossings, node)
         ahead = heading[rng.integers(len(heading))]
         x, y = self.crossings[0][node[0]], self.crossings[1][node[1]]
         pose = np.array([x, y, np.arctan2(ahead[1], ahead[0])])
         pieces: list[tuple[float, float]] = []  # (length, curvature)
-        total, entered = 0.0, 0.0  # length so far, part of the next straight that the last corner has covered
+        total, entered = 0.0, 0.0  # length so far, part of the next straight covered by the last corner
         while total <= wanted[-1]:
             node = (node[0] + ahead[0], node[1] + ahead[1])
             spacing = self.crossings[0] if ahead[0] else self.crossings[1]
@@ -95,13 +95,15 @@ class Office:
 
 
 def check_crossings(robots: int) -> None:
-    """Refuse more robots than there are crossings, as each starts at one of its own."""
+    """Refuse more robots than crossings, because each starts at a different one."""
     if check_int("robots", robots, 1, "Use at least one robot.") > len(CROSSINGS):
-        raise argument_error("robots", f"at most {len(CROSSINGS)}", robots, "Each starts at a crossing of its own.")
+        raise argument_error(
+            "robots", f"at most {len(CROSSINGS)}", robots, "Each robot starts at a different crossing."
+        )
 
 
 def start_crossings(robots: int, rng: np.random.Generator) -> list[tuple[int, int]]:
-    """Draw a different crossing for each robot."""
+    """Sample a different crossing for each robot."""
     check_crossings(robots)
     return [CROSSINGS[i] for i in rng.permutation(len(CROSSINGS))[:robots]]
 
@@ -121,17 +123,17 @@ def _faces(size: FloatArray, blocks: FloatArray) -> tuple[FloatArray, FloatArray
 
 
 def _hidden(eye: FloatArray, points: FloatArray, blocks: FloatArray) -> BoolArray:
-    """Tell for which points (n, 2) the segment from `eye` (2,) passes through a block (S, 4): the slab method."""
+    """Return for which points (n, 2) the segment from `eye` (2,) passes through a block (S, 4), by the slab method."""
     with np.errstate(divide="ignore"):
         inverse_sight = 1.0 / (points - eye)[:, None, :]
-    with np.errstate(invalid="ignore"):  # 0 * inf where a sight runs along a slab's edge: then it is not hidden by it
+    with np.errstate(invalid="ignore"):  # 0 * inf where a line of sight runs along the edge of a slab: not hidden
         low, high = (blocks[None, :, :2] - eye) * inverse_sight, (blocks[None, :, 2:] - eye) * inverse_sight
     enter, leave = np.minimum(low, high).max(axis=2), np.maximum(low, high).min(axis=2)
     return np.asarray(((enter < leave) & (enter < 1.0) & (leave > 0.0)).any(axis=1))
 
 
 def _directions(crossings: tuple[FloatArray, FloatArray], node: tuple[int, int]) -> list[tuple[int, int]]:
-    """Return the unit steps of the grid of crossings that stay inside it."""
+    """Return the unit steps from a crossing that stay inside the grid."""
     last = len(crossings[0]) - 1, len(crossings[1]) - 1
     ways = ((1, 0), (-1, 0), (0, 1), (0, -1))
     return [(i, j) for i, j in ways if 0 <= node[0] + i <= last[0] and 0 <= node[1] + j <= last[1]]

@@ -1,1 +1,1 @@
-"""Map alignment on simulated and real pairs of maps."""
+"""Alignment benchmarks on simulated and real pairs of maps."""

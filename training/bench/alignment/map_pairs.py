@@ -1,4 +1,4 @@
-"""Pairs of maps with the true motion between them, drawn: alignable ones, and ones that nobody can align."""
+"""Simulated pairs of maps with their true transforms: alignable pairs, and pairs that cannot be aligned."""
 
 from dataclasses import dataclass
 
@@ -11,35 +11,35 @@ from slam_backend.maps.fusion import alignment_jacobian
 from slam_backend.maps.landmark_map import LandmarkMap
 
 NOISE = 0.05  # standard deviation of each landmark in each map and axis [m]
-LANDMARKS = 200  # of each map
-SQUARE = 30.0  # side of the area that they are spread over [m]
-HEIGHT = 1.5  # they hang up to here [m]
+LANDMARKS = 200  # number of landmarks in each map
+SQUARE = 30.0  # side of the mapped area [m]
+HEIGHT = 1.5  # largest height of landmarks [m]
 DESCRIPTOR_SIZE = 64
-DESCRIPTOR_NOISE = 0.17  # root mean square length
+DESCRIPTOR_NOISE = 0.17  # RMS norm of the descriptor noise
 
-FEWEST_TRUE = 12  # true pairs of an identifiable pair of maps
-LEAST_SPREAD = 2.0  # they extend over this at least [m]
+FEWEST_TRUE = 12  # smallest number of true pairs of identifiable maps
+LEAST_SPREAD = 2.0  # smallest extent of the true pairs [m]
 UNALIGNABLE = (
     "no overlap", "no overlap, corridors", "no overlap, look-alikes", "no overlap, look-alikes in corridors",
     "mirrored corridor", "mirrored map", "shifted corridor", "twin rooms", "half alike",
 )  # fmt: skip
 IDENTIFIABLE = ("area", "corridor", "area, rival", "corridor, rival", "area, look-alikes")
-CLASS = 3  # so many of all landmarks look the same where there are look-alikes
+CLASS = 3  # number of landmarks with the same descriptor, in kinds with look-alikes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapPair:
-    """Two maps, and what is true of them."""
+    """Two maps with their true transform and matches."""
 
-    a: LandmarkMap  # The map whose frame an alignment leads to
-    b: LandmarkMap  # The other
-    pose: FloatArray  # (3,) float64 [m, m, rad]. True motion a_from_b; NaN where there is none.
-    pairs: IntArray  # (n, 2) int64 rows (a, b) of the landmarks that are truly the same
+    a: LandmarkMap  # Map whose frame is the target of the alignment
+    b: LandmarkMap  # Other map
+    pose: FloatArray  # (3,) float64 [m, m, rad]. True transform a_from_b; NaN if there is none.
+    pairs: IntArray  # (n, 2) int64. Rows (a, b) of the true matches.
 
     def bound(self) -> FloatArray:
-        """Return the Cramer-Rao bound (3, 3) [m, m, rad] of (tx, ty, theta), were the true pairs known.
+        """Return the Cramer-Rao bound (3, 3) [m, m, rad] of (tx, ty, theta) for known true pairs.
 
-        The inverse of the sum of J^T (Sigma_a + R Sigma_b R^T)^-1 J, for the equal, round covariances that are drawn.
+        It is the inverse of the sum of J^T (Sigma_a + R Sigma_b R^T)^-1 J, for equal isotropic covariances.
         """
         jacobian = alignment_jacobian(self.pose[2], self.b.means[self.pairs[:, 1]])
         fisher = np.einsum("nij,nik->jk", jacobian, jacobian) / (2.0 * NOISE**2)
@@ -47,26 +47,26 @@ class MapPair:
 
 
 def draw_pair(overlap: float, outliers: float, rng: np.random.Generator) -> MapPair:
-    """Draw two maps of 200 landmarks of which some are common, and some others look alike.
+    """Sample two maps of 200 landmarks with some common and some wrong, similar landmarks.
 
     Raises:
-        ValueError: If there are not enough landmarks for so many wrong pairs.
+        ValueError: If there are not enough landmarks for the wrong pairs.
     """
-    check_float("overlap", overlap, "Give a share.", at_least=0.0, at_most=1.0)
+    check_float("overlap", overlap, "Give a share from 0 to 1.", at_least=0.0, at_most=1.0)
     right = round(overlap * LANDMARKS)
     most = 1.0 - right / LANDMARKS
-    check_float("outliers", outliers, f"At most {most:g} with this overlap.", at_least=0.0, at_most=most)
+    check_float("outliers", outliers, f"Use at most {most:g} with this overlap.", at_least=0.0, at_most=most)
     wrong = round(right * outliers / (1.0 - outliers)) if right else round(LANDMARKS * outliers)
     points_a, points_b = _spread(LANDMARKS, (SQUARE, SQUARE), rng), _spread(LANDMARKS, (SQUARE, SQUARE), rng)
     return _pair(points_a, _common(points_a, points_b, right, wrong), right, right + wrong, rng)
 
 
 def draw_identifiable(kind: str, rng: np.random.Generator) -> MapPair:
-    """Draw maps that can be aligned, but only just: 12 to 40 true pairs, spread over 2 m to 15 m, among 200.
+    """Sample maps that can barely be aligned: 12 to 40 true pairs, spread over 2 m to 15 m, among 200.
 
     Args:
-        kind: "area" or "corridor": where the true pairs lie; "..., rival": up to half as many wrong ones agree on
-            another motion; "..., look-alikes": three of all landmarks always look the same.
+        kind: Distribution of the true pairs, "area" or "corridor"; "..., rival": up to half as many wrong pairs agree
+            on another transform; "..., look-alikes": three landmarks each share a descriptor.
     """
     check_choice("kind", kind, IDENTIFIABLE)
     right = int(rng.integers(FEWEST_TRUE, 41))
@@ -75,7 +75,7 @@ def draw_identifiable(kind: str, rng: np.random.Generator) -> MapPair:
     strip = (extent, min(2.5, extent)) if kind.startswith("corridor") else (extent, extent)
     points_a, points_b = _spread(LANDMARKS, (SQUARE, SQUARE), rng), _spread(LANDMARKS, (SQUARE, SQUARE), rng)
     patch = _spread(right, strip, rng)
-    patch[:2, 0] = [0.0, extent]  # so that they do reach so far
+    patch[:2, 0] = [0.0, extent]  # ensures the extent
     turned = transform_points([*rng.uniform(0.0, SQUARE - extent, 2), rng.uniform(-np.pi, np.pi)], patch)
     points_a[:right] = turned
     points_b = _common(points_a, points_b, right, alike - right)
@@ -89,15 +89,15 @@ def draw_identifiable(kind: str, rng: np.random.Generator) -> MapPair:
 
 
 def draw_unalignable(kind: str, rng: np.random.Generator) -> MapPair:
-    """Draw maps that must not be aligned: nothing tells where one lies in the other, or two places say so alike.
+    """Sample maps that must not be aligned: without information on the transform, or with two equal hypotheses.
 
     Args:
-        kind: "no overlap": other places, where all landmarks look alike pairwise by chance. "..., corridors": likewise,
-            but thin. "..., look-alikes": three of all landmarks always look the same. "mirrored corridor": its two
-            walls are swapped. "mirrored map": the mirror image of an area. "shifted corridor": doors that repeat, so
-            that two shifts are supported almost alike. "twin rooms": two rooms that look the same, of which b has seen
-            one. "half alike": half of all landmarks look like wrong ones that agree on another place, about as many as
-            agree on a first.
+        kind: "no overlap": different places, with all landmarks similar in pairs by chance. "..., corridors": the same
+            for thin areas. "..., look-alikes": three landmarks each share a descriptor. "mirrored corridor": its two
+            walls are swapped. "mirrored map": the mirror image of an area. "shifted corridor": repeated doors, so
+            that two shifts have almost the same support. "twin rooms": two identical rooms, of which b contains
+            one. "half alike": half of all landmarks have wrong matches that agree on a second transform, almost as
+            well as the right ones on the first.
     """
     check_choice("kind", kind, UNALIGNABLE)
     count = int(rng.integers(40, LANDMARKS + 1))
@@ -116,7 +116,7 @@ def draw_unalignable(kind: str, rng: np.random.Generator) -> MapPair:
     if kind == "twin rooms":
         return _twin_rooms(count, rng)
     points = _spread(count, corridor if kind == "shifted corridor" else area, rng)
-    agreeing = int(count * rng.uniform(0.25, 0.4))  # on the second place; the other has at most 1.4 times as many
+    agreeing = int(count * rng.uniform(0.25, 0.4))  # for the second transform; the first has at most 1.4 times as many
     first = int(agreeing * rng.uniform(1.0, 1.4))
     moved = np.array(points)
     elsewhere = _other_motion(rng) if kind == "half alike" else np.array([rng.uniform(2.0, 8.0), 0.0, 0.0])
@@ -127,7 +127,7 @@ def draw_unalignable(kind: str, rng: np.random.Generator) -> MapPair:
 
 
 def _twin_rooms(count: int, rng: np.random.Generator) -> MapPair:
-    """Draw a map with the same room twice, and one with it once: each of b's landmarks fits in both places."""
+    """Sample a map with two copies of a room, and a map with one copy: b's landmarks fit both places."""
     half = count // 2
     room = _spread(half, (8.0, 6.0), rng)
     a = np.concatenate([room, transform_points([14.0, *rng.uniform(-3.0, 3.0, 2)], room)])
@@ -136,7 +136,7 @@ def _twin_rooms(count: int, rng: np.random.Generator) -> MapPair:
 
 
 def _look_alikes(points_a: FloatArray, points_b: FloatArray, right: int, rng: np.random.Generator) -> MapPair:
-    """Return maps with the first `right` rows in common, in which three of all landmarks always look the same."""
+    """Return maps with the first `right` rows in common, in which groups of three landmarks share a descriptor."""
     count = len(points_a) + len(points_b) - right
     classes = rng.permutation(count) // CLASS
     looks = _unit(-(-count // CLASS), rng)[classes]
@@ -149,7 +149,7 @@ def _spread(count: int, size: tuple[float, float], rng: np.random.Generator) -> 
 
 
 def _common(points_a: FloatArray, points_b: FloatArray, right: int, wrong: int) -> FloatArray:
-    """Return b's points with the first `right` put where a's are; heights never tell the `wrong` ones after them."""
+    """Return b's points with the first `right` equal to a's; the heights of the `wrong` ones after them match too."""
     points = np.array(points_b)
     points[:right] = points_a[:right]
     points[right : right + wrong, 2] = points_a[right : right + wrong, 2]
@@ -157,13 +157,13 @@ def _common(points_a: FloatArray, points_b: FloatArray, right: int, wrong: int) 
 
 
 def _other_motion(rng: np.random.Generator) -> FloatArray:
-    """Draw a motion that differs clearly from none."""
+    """Sample a transform that differs clearly from the identity."""
     angle = rng.uniform(0.0, 2.0 * np.pi)
     return np.array([*(rng.uniform(3.0, 10.0) * np.array([np.cos(angle), np.sin(angle)])), rng.uniform(-np.pi, np.pi)])
 
 
 def _pair(points_a: FloatArray, points_b: FloatArray, right: int, alike: int, rng: np.random.Generator) -> MapPair:
-    """Return maps whose first `alike` rows look alike pairwise, and the first `right` of these truly are the same."""
+    """Return maps whose first `alike` rows are similar in pairs, and the first `right` of these are true matches."""
     looks = _unit(len(points_a), rng)
     looks_b = np.concatenate([looks[:alike], _unit(len(points_b) - alike, rng)])
     points = np.array(points_b)
@@ -175,7 +175,7 @@ def _pair_of(
     points_a: FloatArray, looks_a: FloatArray, points_b: FloatArray, looks_b: FloatArray, right: int,
     rng: np.random.Generator,
 ) -> MapPair:  # fmt: skip
-    """Return noisy maps of points in one frame, b in a frame of its own that lies among its landmarks, shuffled."""
+    """Return noisy maps of points in one frame, with b in a frame of its own amid its landmarks, shuffled."""
     centre = points_b[:, :2].mean(axis=0) + rng.uniform(-5.0, 5.0, 2)
     pose = np.array([*centre, rng.uniform(-np.pi, np.pi)])
     order = rng.permutation(len(points_b))
@@ -192,12 +192,12 @@ def _pair_of(
 
 
 def _unit(count: int, rng: np.random.Generator) -> FloatArray:
-    """Draw unit descriptors (count, d)."""
+    """Sample unit descriptors (count, d)."""
     looks = rng.standard_normal((count, DESCRIPTOR_SIZE))
     return np.asarray(looks / np.linalg.norm(looks, axis=1, keepdims=True))
 
 
 def _blurred(looks: FloatArray, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Return descriptors with noise, of unit length again."""
+    """Return normalised descriptors with noise."""
     noisy = looks + DESCRIPTOR_NOISE / np.sqrt(DESCRIPTOR_SIZE) * rng.standard_normal(looks.shape)
     return np.asarray(noisy / np.linalg.norm(noisy, axis=1, keepdims=True), dtype=np.float32)

@@ -1,4 +1,4 @@
-"""Real maps aligned pairwise: each robot of a MR.CLAM log maps alone from its own start; barcodes seen, then hidden."""
+"""Pairwise alignment of real maps: robots of an MR.CLAM log map alone; barcodes are known, then unknown."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -21,8 +21,8 @@ HEADINGS = (
     "worst [°]",
 )  # fmt: skip
 METHODS = ("ransac", "clique")
-ENOUGH_SHARED = 5  # landmarks from which on maps are to be aligned by their barcodes
-# Maps are bent by tenths of a metre, by more the younger they are.
+ENOUGH_SHARED = 5  # shared landmarks from which maps should be alignable by barcodes
+# Maps are deformed by tenths of a metre, early ones more.
 OPTIONS = AlignmentOptions(position_floor=0.3, min_inliers=ENOUGH_SHARED, max_sigma_heading=0.05)
 BARCODES: dict[str, AlignmentOptions] = {"given": OPTIONS, "hidden": replace(OPTIONS, appearance=False)}
 
@@ -31,7 +31,7 @@ def align_log(config: MrclamPairsConfig, on_part: Callable[[float], None] = lamb
     """Let each robot map alone for each duration, and align all pairs of maps.
 
     Returns:
-        Rows as `align_pairs` gives them, with `duration_s` (None: the whole log).
+        Rows of `align_pairs` with `duration_s` (None: the whole log).
     """
     rows = []
     for place, duration in enumerate(config.durations):
@@ -49,12 +49,12 @@ def align_log(config: MrclamPairsConfig, on_part: Callable[[float], None] = lamb
 
 
 def align_pairs(result: Replay, log: MrclamLog) -> list[dict[str, Any]]:
-    """Align the maps of all pairs of robots, barcodes given and hidden, by all methods.
+    """Align the maps of all pairs of robots, with known and unknown barcodes, by all methods.
 
     Returns:
-        Rows of `robots` (as the log numbers them), `shared` landmarks, `barcodes`, `method`, `accepted`, `reason`,
-        `inliers`; `error_m` where b's landmarks lie and `error_deg`, against the motion between both maps' fits to the
-        true landmarks, None where refused.
+        Rows of `robots` (numbers of the log), `shared` landmarks, `barcodes`, `method`, `accepted`, `reason`,
+        `inliers`; `error_m` at b's landmarks and `error_deg`, relative to the transform between the fits of both maps
+        to the true landmarks, None if refused.
     """
     numbers = [robot.robot for robot in log.robots]
     rows = []
@@ -77,11 +77,11 @@ def align_pairs(result: Replay, log: MrclamLog) -> list[dict[str, Any]]:
 
 
 def summarise(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return a line per duration, barcodes and method.
+    """Return one line per duration, barcodes and method.
 
     Returns:
-        Lines of `duration_s`, `barcodes`, `method`, `pairs` that share enough landmarks, `accepted` of these, `false`
-        (off by more than 0.5 m or 5 degrees), `median_m`, `worst_m`, `median_deg`, `worst_deg` of what was accepted.
+        Lines of `duration_s`, `barcodes`, `method`, `pairs` with enough shared landmarks, `accepted` of these, `false`
+        (error above 0.5 m or 5 degrees), `median_m`, `worst_m`, `median_deg`, `worst_deg` of the accepted ones.
     """
     lines = []
     for (duration, barcodes, method), own in grouped(rows, ("duration_s", "barcodes", "method")).items():
@@ -103,7 +103,7 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def cells(line: Mapping[str, Any]) -> list[str]:
-    """Return one line of the table as text."""
+    """Return one row of the table as text."""
     after = "all" if line["duration_s"] is None else f"{line['duration_s']:g}"
     counts = [str(line[name]) for name in ("pairs", "accepted", "false")]
     errors = [number(line[name]) for name in ("median_m", "worst_m", "median_deg", "worst_deg")]

@@ -1,4 +1,4 @@
-"""Trials of `vslam bench alignment` summed up, in tables, Markdown and a figure."""
+"""Report of `vslam bench alignment`: summary, tables, Markdown and a figure."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -20,16 +20,16 @@ from training.experiments.tables import console_table, number, titled_markdown
 CELL = ("kind", "case", "overlap", "outliers", "method")
 
 TITLES = {
-    "grid": "200 landmarks in each map, 5 cm noise, by share in common and share of wrong look-alikes",
+    "grid": "200 landmarks in each map, 5 cm noise, by share of common landmarks and of wrong similar pairs",
     "U": "Maps that must not be aligned",
-    "I": "Maps that just can be aligned: 12 to 40 true pairs, spread over 2 m to 15 m",
+    "I": "Maps that can barely be aligned: 12 to 40 true pairs, spread over 2 m to 15 m",
 }
 HEADINGS = {
     "grid": ("common", "wrong", "method", "right [%]", "translation/bound", "rotation/bound", "ANEES", "ms", "95 %"),
-    "U": ("case", "method", "accepted", "refused as", "ms", "95 %"),
-    "I": ("case", "method", "accepted [%]", "false", "worst [m]", "worst [°]", "ANEES", "refused as", "ms"),
+    "U": ("case", "method", "accepted", "refused for", "ms", "95 %"),
+    "I": ("case", "method", "accepted [%]", "false", "worst [m]", "worst [°]", "ANEES", "refused for", "ms"),
 }
-# Told apart by colour-blind eyes too.
+# Safe for colour-blind readers
 COLOURS = {
     "ransac": "#0072B2", "clique": "#009E73", "gnc": "#CC79A7", "impicp": "#E69F00", "icp": "#D55E00", "svd": "#7f7f7f",
 }  # fmt: skip
@@ -41,14 +41,14 @@ PANELS = (
 
 
 def summarise(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return a line for each cell and method, in order of appearance, and for each kind and method as a whole.
+    """Return a line for each cell and method, in the order of first occurrence, and for each kind and method in total.
 
     Returns:
-        Lines of `CELL` (None where they are pooled), `trials`, `accepted`, `right` (accepted and not false), `false`,
-        `reasons` (how often each), `translation` and `rotation` (RMS error over the root of the mean Cramer-Rao bound,
-        accepted trials), `anees` with `anees_low` and `anees_high`, between which it lies with 95 % if covariances are
-        honest, `worst_m`, `worst_deg`; computing time `median_ms`, `p95_ms`, `max_ms`, and `passed_ms`, the median of
-        what passed, which other processes lengthen.
+        Lines of `CELL` (None if pooled), `trials`, `accepted`, `right` (accepted and not false), `false`,
+        `reasons` (counts), `translation` and `rotation` (RMS error over the root of the mean Cramer-Rao bound,
+        accepted trials), `anees` with its 95 % range `anees_low` to `anees_high` for consistent covariances,
+        `worst_m`, `worst_deg`; processor times `median_ms`, `p95_ms`, `max_ms`, and `passed_ms`, the median
+        wall-clock time, which other processes lengthen.
     """
     cells = grouped(rows, CELL)
     for (kind, method), own in grouped(rows, ("kind", "method")).items():
@@ -57,7 +57,7 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _describe(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the figures of one line."""
+    """Return the metrics of one line."""
     found = [row for row in rows if "error_m" in row]
     milliseconds = 1e3 * np.array([row["cpu_seconds"] for row in rows])
     line: dict[str, Any] = {
@@ -89,12 +89,12 @@ def _over_bound(errors: Any, bounds: Sequence[float]) -> float:
 
 
 def table_rows(kind: str, lines: Sequence[Mapping[str, Any]]) -> list[list[str]]:
-    """Return the rows of text of one kind's table."""
+    """Return the text rows of the table of one kind."""
     return [_cells(kind, line) for line in lines if line["kind"] == kind]
 
 
 def print_tables(console: Console, lines: Sequence[Mapping[str, Any]]) -> None:
-    """Print what each kind of trial came to."""
+    """Print the results of each kind of trial."""
     for kind, title in TITLES.items():
         if rows := table_rows(kind, lines):
             console.print(console_table(title, HEADINGS[kind], rows))
@@ -107,7 +107,7 @@ def markdown(lines: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _cells(kind: str, line: Mapping[str, Any]) -> list[str]:
-    """Return one line as text."""
+    """Return one row as text."""
     refused = ", ".join(f"{reason} {count}" for reason, count in line["reasons"].items())
     anees = number(line["anees"], 2)
     if kind == "grid":
@@ -125,7 +125,7 @@ def _cells(kind: str, line: Mapping[str, Any]) -> list[str]:
 
 
 def _times(line: Mapping[str, Any]) -> list[str]:
-    """Return median and 95 % quantile of the time."""
+    """Return the median and the 95 % quantile of the time."""
     return [f"{line['median_ms']:.1f}", f"{line['p95_ms']:.1f}"]
 
 
@@ -144,13 +144,13 @@ def draw_alignment(file: Path, lines: Sequence[Mapping[str, Any]]) -> None:
                 panel.set_ylabel(label)
             row[0].set_title(f"{200 * overlap:.0f} of 200 landmarks in common", loc="left")
         for panel in axes[-1]:
-            panel.set_xlabel("wrong look-alikes [%]")
+            panel.set_xlabel("wrong similar pairs [%]")
         add_legend(figure, axes[0][0])
         save_png(figure, file, 110)
 
 
 def _draw_panel(ax: Axes, lines: Sequence[Mapping[str, Any]], key: str) -> None:
-    """Draw one figure of all methods against the share of outliers; where a method never succeeds, nothing."""
+    """Draw one metric of all methods over the share of outliers; a method without success has no curve."""
     for method in dict.fromkeys(line["method"] for line in lines):
         own = [line for line in lines if line["method"] == method and line[key] is not None]
         factor = 100.0 if key == "right" else 1.0

@@ -1,4 +1,4 @@
-"""The trials of `vslam bench alignment`: one pair of maps, one method, and how far the motion found is off."""
+"""Trials of `vslam bench alignment`: alignment error of one method on one pair of maps."""
 
 import time
 from dataclasses import dataclass
@@ -27,14 +27,14 @@ KINDS: tuple[Kind, ...] = ("grid", "U", "I")
 class Trial:
     """One alignment."""
 
-    # "grid": 200 landmarks each, of which a share is common, and of the look-alikes a share is wrong. "U": maps that
-    # must not be aligned. "I": maps that just can be.
+    # "grid": 200 landmarks each, with a given share of common landmarks and of wrong similar pairs. "U": maps that must
+    # not be aligned. "I": maps that can barely be aligned.
     kind: Kind
-    case: str  # Of the hard kinds, which of `UNALIGNABLE` or `IDENTIFIABLE`; empty for the grid
-    overlap: float  # Of the grid, share of the landmarks that are common; 0 for the hard kinds
-    outliers: float  # Of the grid, share of the look-alike pairs that are wrong; 0 for the hard kinds
-    method: str  # Of `align_maps`
-    seed: int  # Of maps and search
+    case: str  # Entry of `UNALIGNABLE` or `IDENTIFIABLE`; empty for the grid
+    overlap: float  # Share of common landmarks in the grid; 0 for the hard kinds
+    outliers: float  # Share of wrong pairs among the similar ones in the grid; 0 for the hard kinds
+    method: str  # Method of `align_maps`
+    seed: int  # Seed of maps and search
 
 
 def cases(kind: Kind) -> tuple[str, ...]:
@@ -44,9 +44,9 @@ def cases(kind: Kind) -> tuple[str, ...]:
 
 @lru_cache(maxsize=1)
 def maps_of(kind: Kind, case: str, overlap: float, outliers: float, seed: int) -> MapPair:
-    """Return the maps of a trial; all methods are tried on the same."""
+    """Return the maps of a trial, which are the same for all methods."""
     cell = KINDS.index(kind), cases(kind).index(case), round(1000 * overlap), round(1000 * outliers)
-    rng = np.random.default_rng([seed, *cell])  # cells share no draws, so that their errors are independent
+    rng = np.random.default_rng([seed, *cell])  # cells share no random draws, so that their errors are independent
     if kind == "grid":
         return draw_pair(overlap, outliers, rng)
     return draw_unalignable(case, rng) if kind == "U" else draw_identifiable(case, rng)
@@ -56,10 +56,10 @@ def play(trial: Trial) -> dict[str, Any]:
     """Align the maps of a trial.
 
     Returns:
-        The trial's fields; `success`, `reason`, `ratio`, `inliers`; `seconds` as they passed, `cpu_seconds` of
-        computing. Where there is a true motion and one was found: `error_m` and `error_rad`, `false` if they are above
-        0.5 m or 5 degrees, `nees`, and the Cramer-Rao variances `bound_m2` and `bound_rad2`. Whatever is found where
-        there is none is false.
+        Fields of the trial; `success`, `reason`, `ratio`, `inliers`; wall-clock time `seconds`, processor time
+        `cpu_seconds`. If there is a true transform and an estimate: `error_m` and `error_rad`, `false` if above
+        0.5 m or 5 degrees, `nees`, and the Cramer-Rao variances `bound_m2` and `bound_rad2`. Without a true transform
+        any estimate is false.
     """
     pair = maps_of(trial.kind, trial.case, trial.overlap, trial.outliers, trial.seed)
     rng = np.random.default_rng(trial.seed)

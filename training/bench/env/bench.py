@@ -1,4 +1,4 @@
-"""`vslam bench env`: what is timed, trial after trial, and the tables."""
+"""Benchmark `vslam bench env`: trials and tables."""
 
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -10,8 +10,8 @@ from training.bench.config import EnvBenchConfig
 from training.bench.env.profile import measure_budget
 from training.bench.env.timing import (
     PEER,
+    play_alternating,
     play_env,
-    play_in_turn,
     play_peer,
     ratio_of_bursts,
     record_actions,
@@ -21,21 +21,21 @@ from training.bench.env.timing import (
     time_snapshots,
 )
 from training.experiments.tables import console_table
-from training.experiments.timing import describe_machine, print_caveats, run_in_turn
+from training.experiments.timing import describe_machine, print_caveats, run_named_trials
 from vslam_env import vslam_v0
 from vslam_env.config import EnvConfig
 
-WARM_UP = 60  # steps: the maps have landmarks then
+WARM_UP = 60  # number of steps after which maps contain landmarks
 MODES: dict[str, dict[str, Any]] = {
     "dict": {}, "flat": {"observation_type": "flat"}, "goal": {"action_type": "goal", "decision_ticks": 1},
 }  # fmt: skip
-# "Undisturbed": the median over each call's best repeat. "Per s": by the median, then by the mean.
+# "Undisturbed": median over the best repeat of each call. "Per s": by the median, then by the mean.
 TIMES = ("median", "mean", "99 %", "least", "undis-\nturbed", "per s", "by mean")
 MICROS = ("median_us", "mean_us", "p99_us", "min_us", "undisturbed_us")
 
 
 class EnvLoad(NamedTuple):
-    """An environment to time: robots, particles, world, and mode of observations and actions."""
+    """Environment to be timed: robots, particles, world, and mode of observations and actions."""
 
     robots: int
     particles: int
@@ -43,15 +43,15 @@ class EnvLoad(NamedTuple):
     mode: str
 
     def config(self) -> EnvConfig:
-        """Return the environment's configuration."""
-        # Eight robots find no starts 5 m apart in every building.
+        """Return the configuration of the environment."""
+        # Not every building has eight starts 5 m apart.
         apart = {"min_start_distance": 2.0, "shared_start_view": True} if self.robots > 4 else {}
         belief = {"filter": {"num_particles": self.particles}}
         return EnvConfig().replace(world=self.world, num_robots=self.robots, belief=belief, **MODES[self.mode], **apart)
 
     @property
     def title(self) -> str:
-        """The load in words."""
+        """Description of the load."""
         return f"{self.robots} robots, {self.particles} particles, {self.world}, {self.mode}"
 
 
@@ -60,12 +60,12 @@ def run_bench(
     on_trial: Callable[[str], None] = lambda name: None,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> dict[str, Any]:
-    """Time all loads, and the base load in parts; what was not reached is empty or None.
+    """Time all loads, and the base load by part; unfinished results are empty or None.
 
     Returns:
-        `rows`, each a load with the `walls` of its world and its times; of the base load `simulator`, `budget`, `reset`
-        and `snapshots`; `peer`, simple_spread with as many agents, and `ratio_to_peer`, how many times as long a step
-        of the first row takes, burst by burst beside it; `machine`, and `complete`.
+        `rows`, one per load with the number of `walls` of its world and its times; for the base load `simulator`,
+        `budget`, `reset` and `snapshots`; `peer`, simple_spread with the same number of agents, and `ratio_to_peer`,
+        the ratio of the first row's step time to the peer's, measured in alternating bursts; `machine`, and `complete`.
     """
     seed, steps, loads = config.seed, config.steps, config.loads()
     base = loads[0].config()
@@ -79,7 +79,7 @@ def run_bench(
         plays = [play_env(env, seed, WARM_UP + steps)]
         if with_peer and (peer := play_peer(load.robots, seed, WARM_UP + steps)) is not None:
             plays.append(peer)
-        own, *beside = play_in_turn(plays, WARM_UP, config.plays)
+        own, *beside = play_alternating(plays, WARM_UP, config.plays)
         result["rows"].append({**load._asdict(), "walls": len(env.world.walls), **summarise_us(own)})
         if beside:
             result.update(peer=summarise_us(beside[0]), ratio_to_peer=ratio_of_bursts(own, beside[0]))
@@ -105,17 +105,17 @@ def run_bench(
         ("reset", partial(time_others, "reset")), ("snapshots", partial(time_others, "snapshots")),
         *((load.title, partial(time_row, load)) for load in loads[1:]),
     ]  # fmt: skip
-    result["complete"] = run_in_turn(trials, on_trial, should_stop)
+    result["complete"] = run_named_trials(trials, on_trial, should_stop)
     return result
 
 
 def count_trials(config: EnvBenchConfig) -> int:
-    """Return how often `run_bench` calls `on_trial`."""
+    """Return the number of calls of `on_trial` by `run_bench`."""
     return len(config.loads()) + 4
 
 
 def print_env_result(console: Console, result: Mapping[str, Any], asked_peer: bool) -> None:
-    """Print rows, the budget of a step, and what else was measured."""
+    """Print the rows, the budget of a step, and the other results."""
     rows, peer = result["rows"], result["peer"]
     if rows:
         keys = ("robots", "particles", "world", "walls", "mode")
@@ -130,11 +130,13 @@ def print_env_result(console: Console, result: Mapping[str, Any], asked_peer: bo
     others = {"simulator only": result["simulator"], "reset": result["reset"], **result["snapshots"]}
     others[f"{PEER} simple_spread"] = peer
     beside = [(name, *_times(times)) for name, times in others.items() if times is not None]
-    console.print(console_table(f"Beside [us]; {PEER} has neither walls nor SLAM", ("", *TIMES), beside))
+    console.print(console_table(f"Comparison [us]; {PEER} has neither walls nor SLAM", ("", *TIMES), beside))
     if peer is not None:
         ratio = rows[0]["undisturbed_us"] / peer["undisturbed_us"]
-        told = f"{result['ratio_to_peer']:.2f} times as long as one of simple_spread beside it, {ratio:.2f} times"
-        console.print(f"A step of the first row takes {told} undisturbed.")
+        ratios = (
+            f"{result['ratio_to_peer']:.2f} times as long as one of simple_spread in alternation, {ratio:.2f} times"
+        )
+        console.print(f"A step of the first row takes {ratios} undisturbed.")
     if asked_peer and peer is None and result["complete"]:
         console.print(f"{PEER} is not installed: no peer was timed (pip install {PEER}).")
     print_caveats(console, result)

@@ -1,4 +1,4 @@
-"""Where the time of `env.step` goes: each phase timed without what it calls of the others."""
+"""Profile of `env.step`: time of each phase, without the time of nested phases."""
 
 import time
 from collections import defaultdict
@@ -20,11 +20,11 @@ from vslam_env.sensors import LandmarkSensor, RangeFinder
 from vslam_env.simulation.episode import Episode
 from vslam_env.world import Simulator
 
-REST = "all else"
+REST = "other"
 
 
 class Phase(NamedTuple):
-    """A part of a step: its name, and the owners and names of the functions that count to it."""
+    """Part of a step: its name, and the owners and names of its functions."""
 
     name: str
     calls: tuple[tuple[Any, str], ...]
@@ -48,9 +48,9 @@ PHASES = (
 
 
 def measure_budget(step: Callable[[Any], Any], arguments: list[Any]) -> list[dict[str, Any]]:
-    """Call `step` with each argument in turn and tell where the time went.
+    """Call `step` with each argument in order and return the time of each phase.
 
-    The clock itself costs about a microsecond for each timed call. What happens now and then shows in the mean alone.
+    The clock takes about a microsecond per timed call. Rare events show only in the mean.
     """
     totals: list[dict[str, int]] = []
     with _timed(PHASES) as spent:
@@ -69,9 +69,9 @@ def measure_budget(step: Callable[[Any], Any], arguments: list[Any]) -> list[dic
 
 @contextmanager
 def _timed(phases: tuple[Phase, ...]) -> Iterator[dict[str, int]]:
-    """Time the calls of phases while the block runs; yields nanoseconds by phase, nested phases taken off."""
+    """Time the calls of phases while the block runs; yield nanoseconds by phase, without nested phases."""
     spent: dict[str, int] = defaultdict(int)
-    stack: list[list[int]] = []  # of nested calls: nanoseconds that inner ones took
+    stack: list[list[int]] = []  # nanoseconds of inner calls, for each nested call
 
     def timed(function: Callable[..., Any], name: str) -> Callable[..., Any]:
         @wraps(function)

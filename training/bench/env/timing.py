@@ -1,4 +1,4 @@
-"""Environments timed step by step on actions that were recorded beforehand, so that no policy is timed with them."""
+"""Timing of environments step by step with recorded actions, so that no policy is timed."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -18,15 +18,15 @@ from vslam_env.environment import ExplorationEnv
 from vslam_env.simulation.scenario import sample_scenario
 from vslam_env.world import Simulator, read_odometry
 
-PEER = "mpe2"  # the package whose simple_spread is timed beside
-BURST = 50  # calls in a row, of plays that take turns
+PEER = "mpe2"  # package of simple_spread, the comparison
+BURST = 50  # consecutive calls of one play before the next
 
 
 def summarise_us(seconds: FloatArray) -> dict[str, float]:
     """Summarise durations (n,) or (repeats, n) [s] of n `calls`.
 
-    `undisturbed_us` is the median of the calls, each at the best of its repeats; `mean_us` shows what happens now and
-    then, and what other programs take; rates are by the median and by the mean.
+    `undisturbed_us` is the median over calls of their best repeat; `mean_us` includes rare events and the load of
+    other programs; rates are from the median and from the mean.
     """
     micros = 1e6 * np.atleast_2d(seconds)
     median, high = (float(q) for q in np.quantile(micros, (0.5, 0.99)))
@@ -39,14 +39,14 @@ def summarise_us(seconds: FloatArray) -> dict[str, float]:
 
 
 def record_actions(env: ExplorationEnv, seed: int, steps: int) -> list[dict[str, Any]]:
-    """Let the nearest-frontier policy drive an episode; return its actions, which can be played again."""
+    """Run an episode with the nearest-frontier policy; return its actions for later plays."""
     env.max_cycles = max(env.max_cycles, steps + 1)
     policies = {agent: make_policy("frontier", env.config.action_type) for agent in env.possible_agents}
     rng = np.random.default_rng(seed)
     observations, _ = env.reset(seed=seed)
     actions = []
     for _ in range(steps):
-        # A flat vector is no dict of arrays: the policy goes by the belief alone.
+        # The policy uses only the belief, so that a flat observation works too.
         actions.append({a: policies[a].act(observations[a], env.belief(a), rng) for a in env.agents})
         observations = env.step(actions[-1])[0]
     return actions
@@ -54,18 +54,18 @@ def record_actions(env: ExplorationEnv, seed: int, steps: int) -> list[dict[str,
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Play:
-    """What is played again and again, the same each time."""
+    """Sequence of calls that can be repeated exactly."""
 
-    begin: Callable[[], object]  # Called before each play
-    call: Callable[[Any], Any]  # What is timed
-    arguments: Sequence[Any]  # Of its calls, in order
+    begin: Callable[[], object]  # Function called before each play
+    call: Callable[[Any], Any]  # Timed function
+    arguments: Sequence[Any]  # Arguments of its calls, in order
 
 
-def play_in_turn(plays: Sequence[Play], warm_up: int, repeats: int) -> FloatArray:
-    """Return how long the calls of each play took (plays, repeats, n - warm_up) [s], if all have n of them.
+def play_alternating(plays: Sequence[Play], warm_up: int, repeats: int) -> FloatArray:
+    """Return the durations of the calls of each play (plays, repeats, n - warm_up) [s]; all plays have n calls.
 
-    The plays take turns in bursts of calls, each with its own order, so that a machine whose speed changes from one
-    second to the next changes it for all of them.
+    Plays alternate in bursts of calls, each with its own order, so that variations of the machine's speed affect all
+    of them equally.
     """
     count = len(plays[0].arguments)
     durations = np.empty((len(plays), repeats, count))
@@ -81,7 +81,7 @@ def play_in_turn(plays: Sequence[Play], warm_up: int, repeats: int) -> FloatArra
 
 
 def ratio_of_bursts(ours: FloatArray, others: FloatArray) -> float:
-    """Return how many times as long calls (repeats, n) [s] took as others beside them: the median over all bursts."""
+    """Return the ratio of durations (repeats, n) [s] of calls to others run in alternation: the median over bursts."""
     firsts = range(0, ours.shape[1], BURST)
     own, beside = (
         np.array([np.median(each[:, first : first + BURST], axis=1) for first in firsts]) for each in (ours, others)
@@ -90,12 +90,12 @@ def ratio_of_bursts(ours: FloatArray, others: FloatArray) -> float:
 
 
 def play_env(env: ExplorationEnv, seed: int, steps: int) -> Play:
-    """Return an episode of the nearest-frontier policy."""
+    """Return an episode of the nearest-frontier policy as a play."""
     return Play(partial(env.reset, seed=seed), env.step, record_actions(env, seed, steps))
 
 
 def time_simulator(config: EnvConfig, seed: int, steps: int, warm_up: int) -> dict[str, float]:
-    """Time ticks of the simulator alone: physics, odometry, landmark sensor and scans, no filter, no observation."""
+    """Time ticks of the simulator: physics, odometry, landmark sensor and scans, without filter and observations."""
     setting = sample_scenario(config, config.world, np.random.SeedSequence(seed).spawn(1)[0])
     simulator = Simulator(setting.world, setting.true_starts, config.robot_radius, TICK)
     odometry, sensor, scan = (np.random.default_rng(seed + i) for i in range(3))
@@ -110,25 +110,25 @@ def time_simulator(config: EnvConfig, seed: int, steps: int, warm_up: int) -> di
         setting.scan.measure(after, scan)
 
     commands, turn = [], np.zeros(config.num_robots)
-    for _ in range(warm_up + steps):  # they wander, and meet walls now and then
+    for _ in range(warm_up + steps):  # random drives with occasional wall contacts
         turn = np.clip(0.9 * turn + 0.4 * rng.standard_normal(config.num_robots), -1.5, 1.5)
         commands.append(np.column_stack([np.full(config.num_robots, 0.5), turn]))
     return _timed(tick, commands, warm_up)
 
 
 def _timed(call: Callable[[Any], Any], arguments: Sequence[Any], warm_up: int) -> dict[str, float]:
-    """Time calls, nothing of whose results is kept."""
+    """Time calls and discard their results."""
     with no_garbage_collection():
         return summarise_us(clock(call, arguments)[warm_up:])
 
 
 def time_resets(env: ExplorationEnv, first_seed: int, resets: int) -> dict[str, float]:
-    """Time resets, each of another seed; the first is not counted."""
+    """Time resets with different seeds, not counting the first."""
     return _timed(lambda seed: env.reset(seed=seed), range(first_seed, first_seed + resets + 1), 1)
 
 
 def time_snapshots(env: ExplorationEnv, seed: int, steps: int, repeats: int) -> dict[str, dict[str, float]]:
-    """Time taking and restoring states after `steps` steps of the nearest-frontier policy, and clones."""
+    """Time get_state, set_state and clones after `steps` steps of the nearest-frontier policy."""
     record_actions(env, seed, steps)
     state = env.get_state()
     other = vslam_v0.parallel_env(config=env.config)
@@ -144,7 +144,7 @@ def time_snapshots(env: ExplorationEnv, seed: int, steps: int, repeats: int) -> 
 
 
 def play_peer(agents: int, seed: int, steps: int) -> Play | None:
-    """Return an episode of MPE2's simple_spread under random actions, or None where it is not installed."""
+    """Return an episode of MPE2's simple_spread with random actions as a play, or None if it is not installed."""
     if find_spec(PEER) is None:
         return None
     peer = import_module(f"{PEER}.simple_spread_v3").parallel_env(N=agents, max_cycles=steps + 1)

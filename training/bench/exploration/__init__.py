@@ -1,1 +1,1 @@
-"""Exploration policies compared over worlds."""
+"""Exploration benchmark: comparison of policies over worlds."""

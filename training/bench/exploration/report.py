@@ -1,4 +1,4 @@
-"""Trials of `vslam bench exploration` summed up: means, paired differences and curves, in tables, CSV and a figure."""
+"""Report of `vslam bench exploration`: means, paired differences and curves, as tables, CSV and a figure."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -14,7 +14,7 @@ from agents.trained import MODEL_FILE
 from training.bench.config import NO_ORACLE
 from training.bench.exploration.trials import CURVES, TEAM
 from training.experiments.plotting import save_png
-from training.experiments.statistics import ahead_by, grouped, mean_of, shown, summarise_means
+from training.experiments.statistics import format_ci, grouped, mean_ci, paired_difference, summarise_means
 from training.experiments.tables import console_table, csv_text, markdown_table
 
 Rows = Sequence[Mapping[str, Any]]
@@ -25,23 +25,23 @@ FIGURES = (
     "false_merges", "undone_merges", "first_merge_s", "last_merge_s", "one_group", "attempts", "collisions",
     "invalid_actions", "decision_ms",
 )  # fmt: skip
-# Figures by which policies are compared: whether more of it is better, heading, and factor.
+# Metrics for the comparison of policies: whether larger is better, heading, and factor.
 COMPARED = {
     "mean_coverage": (True, "over time [%]", 100.0), "below_90_s": (False, "below 90 % [s]", 1.0),
     "map_error": (False, "E [cm]", 100.0), "map_rmse_m": (False, "RMSE [cm]", 100.0),
     "pose_error": (False, "pose [cm]", 100.0),
 }  # fmt: skip
 COMPARED_HEADINGS = [heading for _, heading, _ in COMPARED.values()]
-BELOW = "\n  "  # what a policy is told, on a line of its own
+BELOW = "\n  "  # separator that puts the oracle on its own line
 CURVE_PANELS = {
     "coverage": ("floor seen [%]", 100.0), "map_error": ("map error E [m]", 1.0), "pose_error": ("pose error [m]", 1.0),
 }  # fmt: skip
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7f7f7f")  # for colour-blind eyes too
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7f7f7f")  # safe for colour-blind readers
 STYLES = ("-", "--", ":", "-.")
 
 
 class Column(NamedTuple):
-    """A column of a table: its heading, the figure, digits and factor, and whether its interval is shown."""
+    """Column of a table: heading, metric, digits, factor, and whether its interval is shown."""
 
     heading: str
     figure: str
@@ -50,9 +50,9 @@ class Column(NamedTuple):
     interval: bool = False
 
     def cell(self, line: Mapping[str, Any], stacked: bool = False) -> str:
-        """Return the text for a line; `stacked` puts the interval below the mean."""
+        """Return the text for a line; with `stacked` the interval is below the mean."""
         ends = {} if self.interval else {f"{self.figure}_low": None, f"{self.figure}_high": None}
-        return shown({**line, **ends}, self.figure, self.digits, self.factor, stacked)
+        return format_ci({**line, **ends}, self.figure, self.digits, self.factor, stacked)
 
 
 OVER_TIME = Column("over time [%]", "mean_coverage", 1, 100.0, True)
@@ -63,37 +63,37 @@ IN_SHORT = (
     Column("false", "false_merges", 1),
 )  # fmt: skip
 PARTS: dict[str, tuple[Column, ...]] = {
-    "what was seen": (
+    "coverage": (
         Column("floor seen [%]", "coverage", 1, 100.0, True), OVER_TIME, BELOW_90,
-        Column("90 % reached [%]", "reached_90", 0, 100.0), Column("way [m]", "way_m", 0),
+        Column("90 % reached [%]", "reached_90", 0, 100.0), Column("distance [m]", "way_m", 0),
     ),
     "maps and poses": (
         Column("E [m]", "map_error", 3, 1.0, True), Column("RMSE [m]", "map_rmse_m", 3, 1.0, True),
         Column("recall [%]", "map_recall", 1, 100.0), Column("precision [%]", "map_precision", 1, 100.0),
-        Column("pose [m]", "pose_error", 3, 1.0, True), Column("path [m]", "ate_start_m", 3, 1.0, True),
+        Column("pose [m]", "pose_error", 3, 1.0, True), Column("ATE [m]", "ate_start_m", 3, 1.0, True),
     ),
     "merges and driving": (
         Column("right", "right_merges", 2), Column("false", "false_merges", 2), Column("undone", "undone_merges", 2),
         Column("first [s]", "first_merge_s", 0), Column("last [s]", "last_merge_s", 0),
-        Column("all in one group [%]", "one_group", 0, 100.0), Column("pushing [s]", "collisions", 1, 0.1),
+        Column("all in one group [%]", "one_group", 0, 100.0), Column("collisions [s]", "collisions", 1, 0.1),
         Column("decision [ms]", "decision_ms", 2),
     ),
 }  # fmt: skip
 
 
 def summarise(rows: Rows) -> list[dict[str, Any]]:
-    """Return a line for each of `CONDITION`: its seeds and the means of `FIGURES` over the seeds that have them.
+    """Return a line for each of `CONDITION`: its number of seeds and the means of `FIGURES` over seeds with a value.
 
-    Where 90 % of the floor are not always reached, the mean of `below_90_s` is a restricted one: of the time below.
+    If 90 % of the floor are not always reached, the mean of `below_90_s` is a restricted mean, of the time below 90 %.
     """
     return summarise_means(rows, CONDITION, FIGURES)
 
 
 def compare_policies(rows: Rows) -> list[dict[str, Any]]:
-    """Return how each policy differs from the first, in each place and by each figure, on common seeds.
+    """Return the paired differences of each policy to the first, for each place and metric, on common seeds.
 
     Fields: those of `PLACE`, `policy`, `than`, `figure`, `seeds`, `more` with `more_low` and `more_high` (95 %,
-    bootstrap over the seeds), `better`: the share of seeds in which the policy is the better one.
+    bootstrap over the seeds), `better`: the share of seeds in which the policy is better.
     """
     found = []
     for place, own in grouped(rows, PLACE).items():
@@ -106,7 +106,7 @@ def compare_policies(rows: Rows) -> list[dict[str, Any]]:
 
 
 def compare_oracles(rows: Rows) -> list[dict[str, Any]]:
-    """Return how each policy with an oracle differs from itself without, in the same form; `than` is `"none"`."""
+    """Return the paired differences of each policy with and without an oracle, in the same form; `than` is `"none"`."""
     found = []
     for (world, robots, policy), own in grouped(rows, ("world", "robots", "policy")).items():
         by_oracle = grouped(own, ("oracle",))
@@ -120,14 +120,14 @@ def compare_oracles(rows: Rows) -> list[dict[str, Any]]:
 def curves(rows: Rows) -> list[dict[str, Any]]:
     """Return a row for each of `CONDITION` and time: means of `CURVES` over seeds, with intervals.
 
-    Policies that decide at other times may have other times.
+    Policies with other decision intervals may have other times.
     """
     found = []
     for key, own in grouped(rows, CONDITION).items():
         for point, when in enumerate(own[0]["curves"]["time_s"]):
             line: dict[str, Any] = dict(zip(CONDITION, key, strict=True)) | {"time_s": when}
             for name in CURVES:
-                line |= mean_of(name, [row["curves"][name][point] for row in own])
+                line |= mean_ci(name, [row["curves"][name][point] for row in own])
             found.append(line)
     return found
 
@@ -137,15 +137,15 @@ def _differences(line: Mapping[str, Any], own: Rows, other: Rows) -> list[dict[s
     found = []
     for figure, (more_is_better, _, _) in COMPARED.items():
         sides = [{row["seed"]: row[figure] for row in side if row[figure] is not None} for side in (own, other)]
-        more = ahead_by(*sides)
+        more = paired_difference(*sides)
         if len(more):
             better = float(((more > 0.0) if more_is_better else (more < 0.0)).mean())
-            found.append({**line, "figure": figure, "seeds": len(more), **mean_of("more", more), "better": better})
+            found.append({**line, "figure": figure, "seeds": len(more), **mean_ci("more", more), "better": better})
     return found
 
 
 def label(name: str) -> str:
-    """Return a policy or a world as tables and figures call it: without folders, if it is a path.
+    """Return the label of a policy or a world for tables and figures: a path is given without its folders.
 
     >>> label("runs/train-0-1"), label("runs/train-0-1/model.npz"), label("random_goals")
     ('train-0-1', 'train-0-1/model.npz', 'random_goals')
@@ -157,7 +157,7 @@ def label(name: str) -> str:
 
 
 def print_tables(console: Console, lines: Rows, policies: Rows, oracles: Rows) -> None:
-    """Print, for each world and number of robots, the figures in short and the differences, in 80 columns."""
+    """Print the main metrics and the differences for each world and number of robots, within 80 columns."""
     for title, own, comparisons in _places(lines, policies, oracles):
         rows = [[who, *(column.cell(line, True) for column in IN_SHORT)] for who, line in _named(own, BELOW)]
         console.print(console_table(title, _stacked(column.heading for column in IN_SHORT), rows))
@@ -167,7 +167,7 @@ def print_tables(console: Console, lines: Rows, policies: Rows, oracles: Rows) -
 
 
 def markdown(lines: Rows, policies: Rows, oracles: Rows) -> str:
-    """Return all figures and differences as Markdown."""
+    """Return all metrics and differences as Markdown."""
     parts = []
     for place, own, comparisons in _places(lines, policies, oracles):
         parts.append(f"### {place}\n")
@@ -180,52 +180,55 @@ def markdown(lines: Rows, policies: Rows, oracles: Rows) -> str:
 
 
 def to_csv(rows: Rows) -> str:
-    """Return rows as CSV under a heading; numbers have six digits, lists and tables are left out."""
+    """Return rows as CSV with a header; numbers have six digits, lists and tables are omitted."""
     names = [name for name, value in rows[0].items() if not isinstance(value, Mapping | list)] if rows else []
     return csv_text(names, ([row[name] for name in names] for row in rows))
 
 
-def who_is(line: Mapping[str, Any], between: str = ", ") -> str:
-    """Return the name of a policy and what it is told; with `BELOW` between them, for narrow columns, line by line."""
-    told = "" if line["oracle"] == NO_ORACLE else f"{between}told {line['oracle']}"
+def policy_label(line: Mapping[str, Any], between: str = ", ") -> str:
+    """Return the label of a policy and its oracle; the separator `BELOW` puts the oracle on its own line."""
+    oracle = "" if line["oracle"] == NO_ORACLE else f"{between}oracle {line['oracle']}"
     name = label(line["policy"])
-    return (name.replace("@", f"{BELOW}@") if between == BELOW else name) + told
+    return (name.replace("@", f"{BELOW}@") if between == BELOW else name) + oracle
 
 
 def _stacked(headings: Iterable[str]) -> list[str]:
-    """Return the headings of a narrow table, units on a second line, after that of the names."""
+    """Return the headings of a narrow table, with an empty first one and units on a second line."""
     return ["", *(heading.replace(" [", "\n[") for heading in headings)]
 
 
 def _named(lines: Rows, between: str = ", ") -> list[tuple[str, Mapping[str, Any]]]:
-    """Return the lines under their names, policy by policy."""
+    """Return the lines by label, policy by policy."""
     order = list(dict.fromkeys(line["policy"] for line in lines))
-    return [(who_is(line, between), line) for line in sorted(lines, key=lambda line: order.index(line["policy"]))]
+    return [(policy_label(line, between), line) for line in sorted(lines, key=lambda line: order.index(line["policy"]))]
 
 
 def _places(lines: Rows, policies: Rows, oracles: Rows) -> Iterator[tuple[str, Rows, list[tuple[str, Rows]]]]:
-    """Yield for each world and number of robots a title, the lines, and the differences under their headings."""
+    """Yield for each world and number of robots a title, the lines, and the differences by heading."""
     place = ("world", "robots")
     for (world, robots), own in grouped(lines, place).items():
         seeds = sorted({line["seeds"] for line in own})
         count = f"{seeds[0]}-{seeds[-1]} seeds" if len(seeds) > 1 else f"{seeds[0]} seed{'s' if seeds[0] > 1 else ''}"
         comparisons: list[tuple[str, Rows]] = []
         if by_policy := grouped(policies, place).get((world, robots)):
-            comparisons.append((f"less {label(by_policy[0]['than'])}, paired", by_policy))
+            comparisons.append((f"minus {label(by_policy[0]['than'])}, paired", by_policy))
         if by_oracle := grouped(oracles, place).get((world, robots)):
-            comparisons.append(("told less not told, paired", by_oracle))
+            comparisons.append(("with minus without oracle, paired", by_oracle))
         yield f"{label(world)}, K={robots}, {count}", own, comparisons
 
 
 def _difference_rows(differences: Rows, stacked: bool) -> list[list[str]]:
-    """Return the differences of each policy and oracle as texts, after their names."""
+    """Return the differences of each policy and oracle as text, after their labels."""
     by_name: dict[str, dict[str, Mapping[str, Any]]] = {}
     for line in differences:
-        by_name.setdefault(who_is(line, BELOW if stacked else ", "), {})[line["figure"]] = line
+        by_name.setdefault(policy_label(line, BELOW if stacked else ", "), {})[line["figure"]] = line
     return [
         [
             who,
-            *(shown(own[n], "more", 1, factor, stacked) if n in own else "-" for n, (_, _, factor) in COMPARED.items()),
+            *(
+                format_ci(own[n], "more", 1, factor, stacked) if n in own else "-"
+                for n, (_, _, factor) in COMPARED.items()
+            ),
         ]
         for who, own in by_name.items()
     ]
@@ -235,7 +238,7 @@ def draw_exploration(file: Path, curves: Rows) -> None:
     """Draw a row of panels for each world and number of robots into a PNG file: means over seeds, 95 % intervals."""
     places = grouped(curves, ("world", "robots"))
     colours = _each(COLOURS, (line["policy"] for line in curves))
-    policy_of = {who_is(line): line["policy"] for line in curves}
+    policy_of = {policy_label(line): line["policy"] for line in curves}
     styles = _each(STYLES, (NO_ORACLE, *(line["oracle"] for line in curves)))
     figure = Figure(figsize=(12.0, 2.7 * len(places) + 0.5), layout="constrained")
     axes = figure.subplots(len(places), len(CURVE_PANELS), squeeze=False, sharex=True)
@@ -252,22 +255,22 @@ def draw_exploration(file: Path, curves: Rows) -> None:
         panel.set_xlabel("time [s]")
     handles, names = axes[0][0].get_legend_handles_labels()
     entries = dict(sorted(zip(names, handles, strict=True), key=lambda e: list(colours).index(policy_of[e[0]])))
-    columns = min(len(colours), 6)  # a policy, and below it what it does when it is told more
+    columns = min(len(colours), 6)  # a policy, and below it the same policy with an oracle
     figure.legend(entries.values(), entries, loc="outside upper center", ncols=columns, frameon=False, fontsize=9)
     save_png(figure, file, 100)
 
 
 def _draw_mean(axes: Axes, lines: Rows, name: str, factor: float, colour: str, style: str) -> None:
-    """Draw one policy's mean over time with its interval, faint and without interval where it is told something."""
+    """Draw the mean of one policy over time with its interval, or faint and without interval for an oracle."""
     times = [line["time_s"] for line in lines]
     mean = factor * np.array([line[name] for line in lines])
     alone = lines[0]["oracle"] == NO_ORACLE
-    axes.plot(times, mean, color=colour, linestyle=style, linewidth=1.6 if alone else 1.1, label=who_is(lines[0]))
+    axes.plot(times, mean, color=colour, linestyle=style, linewidth=1.6 if alone else 1.1, label=policy_label(lines[0]))
     if alone and lines[0][f"{name}_low"] is not None:
         low, high = (factor * np.array([line[f"{name}_{end}"] for line in lines]) for end in ("low", "high"))
         axes.fill_between(times, low, high, color=colour, alpha=0.15, linewidth=0)
 
 
 def _each(choices: Sequence[str], names: Iterable[str]) -> dict[str, str]:
-    """Give each name a choice of its own, as long as there are enough."""
+    """Return a different choice for each name, as long as there are enough."""
     return {name: choices[i % len(choices)] for i, name in enumerate(dict.fromkeys(names))}

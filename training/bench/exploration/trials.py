@@ -1,4 +1,4 @@
-"""One trial of `vslam bench exploration`: an episode, and the figures by which policies are compared."""
+"""Trial of `vslam bench exploration`: an episode, and its metrics for the comparison of policies."""
 
 import time
 from collections.abc import Sequence
@@ -18,23 +18,24 @@ from vslam_env import vslam_v0
 from vslam_env.belief.team_belief import Belief
 
 TRIALS_FILE = "trials.jsonl"
-NEARLY_ALL = 0.9  # of the floor
-WATCHED_S = 20.0  # a wrong merge that lasted so long, or to the end, is a false one
+NEARLY_ALL = 0.9  # share of the floor
+WATCHED_S = 20.0  # a wrong merge that persists for this long, or to the end, is false
 CURVE_POINTS = 25
 TEAM = ("map_error", "map_rmse_m", "map_recall", "map_precision", "ate_start_m", "ate_aligned_m")
 CURVES = ("coverage", "map_error", "pose_error")
 
 
 def play(config: ExplorationBenchConfig, trial: ExplorationTrial) -> dict[str, Any]:
-    """Play an episode and return the trial with its figures, means over the robots unless said otherwise.
+    """Run an episode and return the trial with its metrics, means over the robots unless noted otherwise.
 
-    - `coverage`: share of the reachable floor that is seen at the end; `mean_coverage`: its mean over time;
-      `reached_90`: whether 90 % are ever seen; `below_90_s`: whole seconds until then, or of the whole episode.
-    - At the end, in the robots' own start frames: `TEAM`, as `score_episode` has them, `pose_error`, and `way_m`.
-    - Of the team: `right_merges`, `false_merges`, `undone_merges`, `first_merge_s`, `last_merge_s`, as `count_merges`
-      has them; `one_group`: whether all share a map at the end; `attempts`, `collisions` (ticks), `invalid_actions`.
-    - `decision_ms`: median of the processor's time that a policy takes for one decision.
-    - `curves`: `time_s` and, at these times, `CURVES`.
+    - `coverage`: share of the reachable floor seen at the end; `mean_coverage`: its mean over time;
+      `reached_90`: whether 90 % are reached; `below_90_s`: whole seconds until then, or of the whole episode.
+    - At the end, in start frames: `TEAM`, as in `score_episode`, `pose_error`, and `way_m`, the distance driven.
+    - For the team: `right_merges`, `false_merges`, `undone_merges`, `first_merge_s`, `last_merge_s`, see
+      `count_merges`; `one_group`: whether all share a map at the end; `attempts`, `collisions` (ticks),
+      `invalid_actions`.
+    - `decision_ms`: median processor time of a decision of the policy.
+    - `curves`: `time_s` and the values of `CURVES` at these times.
     """
     env = vslam_v0.parallel_env(config=config.environment(trial))
     timed = {agent: _Timed(policy) for agent, policy in config.run(trial).make_policies(env).items()}
@@ -67,20 +68,22 @@ def play(config: ExplorationBenchConfig, trial: ExplorationTrial) -> dict[str, A
 
 
 def parted(policy: str) -> tuple[str, str]:
-    """Return a policy's name and its type of action: a goal if it knows how to set one, unless `@` says otherwise.
+    """Return the name and action type of a policy: `goal` if the policy supports it, unless `@` selects another.
 
     Raises:
-        ValueError: If there is no such policy, or it does not know this type of action.
+        ValueError: If there is no such policy, or it does not support the action type.
     """
     name, at, wanted = policy.rpartition("@") if "@" in policy else (policy, "", "")
     known = action_types(name)
-    return name, check_choice(f"{name}@", wanted, known, "These are the actions that it knows.") if at else known[0]
+    return name, check_choice(
+        f"{name}@", wanted, known, "Choose an action type that the policy supports."
+    ) if at else known[0]
 
 
 def count_merges(merges: Sequence[MergeRecord]) -> dict[str, Any]:
-    """Return how many merges were right, false or undone, and when the first and the last right one came.
+    """Return the numbers of right, false and undone merges, and the times of the first and last right merge.
 
-    False ones are off by more than 0.5 m or 5 degrees and were in force 20 s later, or at the end. Without a right one
+    A false merge has an error above 0.5 m or 5 degrees and persists for 20 s, or until the end. Without right merges
     `first_merge_s` and `last_merge_s` are None.
     """
     false = [m for m in merges if m.is_false and (m.undone is None or m.undone - m.time >= WATCHED_S)]
@@ -93,7 +96,7 @@ def count_merges(merges: Sequence[MergeRecord]) -> dict[str, Any]:
 
 
 class _Timed:
-    """A policy, and the processor's time [s] of each of its decisions."""
+    """Policy with a record of the processor time [s] of each decision."""
 
     def __init__(self, policy: Policy) -> None:
         self._policy = policy
@@ -115,7 +118,7 @@ def _at(times: FloatArray, values: FloatArray, when: FloatArray) -> FloatArray:
 
 
 def _pose_errors(record: EpisodeRecord) -> FloatArray:
-    """Return the mean over robots (T + 1,) [m] of the distance from pose to estimate, own start at its true pose."""
+    """Return the mean over robots (T + 1,) [m] of the position error, with start frames at the true start poses."""
     believed = np.stack([
         compose(truth[0], path) for truth, path in zip(record.true_poses, record.estimated, strict=True)
     ])  # fmt: skip

@@ -1,1 +1,1 @@
-"""Speed of a filter step."""
+"""Filter benchmark: speed of a filter step."""

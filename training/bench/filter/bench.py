@@ -1,4 +1,4 @@
-"""`vslam bench filter`: filters that hold a map, timed step by step; and the compilation of all kernels."""
+"""Benchmark `vslam bench filter`: steps of filters with a full map, and compilation of all kernels."""
 
 import json
 import os
@@ -17,12 +17,12 @@ from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.reports import StepReport
 from training.bench.config import FilterBenchConfig
 from training.bench.filter.workload import LARGE_LOADS, FilterLoad, LoadStep, LoadWorld
-from training.experiments.timing import describe_machine, run_in_turn, time_calls, timing_ms
+from training.experiments.timing import describe_machine, run_named_trials, time_calls, timing_ms
 
 LARGE_STEPS = 60
 STATE_LOAD = FilterLoad(particles=100, landmarks=300, measurements=15)
-SWEEPS = 3  # how often each landmark was measured before
-WARM_UP = 30  # steps that are not counted
+SWEEPS = 3  # number of previous measurements of each landmark
+WARM_UP = 30  # number of steps that are not counted
 STATE_CALLS = 200
 WARM_UP_SCRIPT = """
 import json, time
@@ -35,12 +35,12 @@ print(json.dumps({"import_s": ready - begin, "compile_s": compiling, "warm_up_s"
 
 
 def time_row(load: FilterLoad, steps: int) -> dict[str, Any]:
-    """Fill a `FastSlam` and time `steps` steps of it.
+    """Fill a `FastSlam` and time `steps` steps.
 
     Returns:
-        The load, its times, and: `right`, the share of the measurements that the most probable particle gave to the
-        landmark they are of; `landmarks_held` by that particle at the end; `ess`, the mean effective sample size over M
-        before resampling; `resampled`, the share of the steps that resampled; `nbytes` that the particles hold.
+        The load, its times, and: `right`, the share of the measurements that the most probable particle associates
+        correctly; `landmarks_held`, its final number of landmarks; `ess`, the mean effective sample size over M
+        before resampling; `resampled`, the share of steps with resampling; `nbytes`, the memory of the particles.
     """
     world = LoadWorld(load)
     slam, ids = filled_filter(world)
@@ -55,19 +55,19 @@ def time_row(load: FilterLoad, steps: int) -> dict[str, Any]:
 
 
 def time_state(load: FilterLoad) -> dict[str, Any]:
-    """Time `get_state` and `set_state` of a filter that has run for a while."""
+    """Time `get_state` and `set_state` of a filter after a number of steps."""
     world = LoadWorld(load)
     slam, _ = filled_filter(world)
     for step in world.course(WARM_UP):
         slam.step(step.odometry, step.frames)
     state = slam.get_state()
-    taken, _ = time_calls(lambda _: len(slam.get_state()), range(STATE_CALLS), WARM_UP)  # each freed before the next
+    taken, _ = time_calls(lambda _: len(slam.get_state()), range(STATE_CALLS), WARM_UP)  # each is freed before the next
     given, _ = time_calls(slam.set_state, [state] * STATE_CALLS, WARM_UP)
     return {"get_state": timing_ms(taken), "set_state": timing_ms(given)}
 
 
 def filled_filter(world: LoadWorld) -> tuple[FastSlam, IntArray]:
-    """Return a filter whose particles all hold all landmarks, and the landmarks' ids in it (N,)."""
+    """Return a filter whose particles contain all landmarks, and the landmark ids in the filter (N,)."""
     load = world.load
     options = load.options
     slam = FastSlam(
@@ -82,18 +82,18 @@ def filled_filter(world: LoadWorld) -> tuple[FastSlam, IntArray]:
 
 
 def _share_right(course: list[LoadStep], reports: list[StepReport], ids: IntArray) -> float:
-    """Return the share of all measurements that were given to the landmark they are of."""
+    """Return the share of all measurements with a correct association."""
     found = np.concatenate([np.concatenate(report.associations) for report in reports])
     true = np.concatenate([np.concatenate(step.names) for step in course])
     return float(np.mean(found == ids[true]))
 
 
 def time_compilation() -> dict[str, Any]:
-    """Warm the backend up in two processes that share a cache of their own, empty at first.
+    """Warm the backend up in two processes that share a new, empty cache.
 
     Returns:
-        `"cold"` and `"cached"`, each with the seconds that the import, the compiler and the whole warm-up took, and the
-        size of the cache in files and bytes.
+        `"cold"` and `"cached"`, each with the times of import, compiler and whole warm-up [s], and the size of the
+        cache in files and bytes.
     """
     with tempfile.TemporaryDirectory() as folder:
         cold, cached = _warm_up(folder), _warm_up(folder)
@@ -118,8 +118,8 @@ def run_bench(
     """Run all trials, or those until `should_stop`; there are `count_trials(config)`.
 
     Returns:
-        `rows` in the order of the loads, the times of the `state`, of the `compilation` if asked for; `machine`, and
-        whether the bench is `complete`.
+        `rows` in the order of the loads, the times of the `state`, of the `compilation` if requested; `machine`, and
+        whether the benchmark is `complete`.
     """
     result: dict[str, Any] = {"machine": describe_machine(), "rows": [], "state": {}, "compilation": None}
 
@@ -133,15 +133,15 @@ def run_bench(
     trials.append(("get_state, set_state", lambda: result.update(state=time_state(STATE_LOAD))))
     if config.compile:
         trials.append(("compilation", lambda: result.update(compilation=time_compilation())))
-    result["complete"] = run_in_turn(trials, on_trial, should_stop)
+    result["complete"] = run_named_trials(trials, on_trial, should_stop)
     return result
 
 
 def count_trials(config: FilterBenchConfig) -> int:
-    """Return how often `run_bench` calls `on_trial`."""
+    """Return the number of calls of `on_trial` by `run_bench`."""
     return 1 + len(config.loads()) + config.compile
 
 
 def _name(load: FilterLoad) -> str:
-    """Name a load for the progress bar."""
+    """Return the name of a load for the progress bar."""
     return f"{load.proposal} M={load.particles} N={load.landmarks} B={load.measurements} K={load.robots}"

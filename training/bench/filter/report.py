@@ -33,14 +33,14 @@ LEGEND = [
 
 
 def print_result(console: Console, result: Mapping[str, Any]) -> None:
-    """Print rows and what else was measured."""
+    """Print the rows and the other results."""
     rows, machine, compilation = result["rows"], result["machine"], result["compilation"]
     for proposal in dict.fromkeys(row["proposal"] for row in rows):
         console.print(_table(rows, proposal))
     if rows:
         console.print(
-            "Unknown association, resampling at every step, one thread. right: measurements given to the landmark they "
-            "are of."
+            "Unknown association, resampling at every step, one thread. right: share of correctly "
+            "associated measurements."
         )
     console.print(f"{machine['processor']}.")
     if rows:
@@ -55,7 +55,7 @@ def print_result(console: Console, result: Mapping[str, Any]) -> None:
     if compilation is not None:
         cold, cached = compilation["cold"], compilation["cached"]
         console.print(
-            f"Kernels: compiled in {cold['compile_s']:.0f} s, once; taken from the cache "
+            f"Kernels: compiled in {cold['compile_s']:.0f} s, once; loaded from the cache "
             f"({compilation['cache_bytes'] / 1e6:.1f} MB) in {cached['warm_up_s']:.1f} s; "
             f"import {cached['import_s']:.1f} s."
         )
@@ -63,9 +63,9 @@ def print_result(console: Console, result: Mapping[str, Any]) -> None:
 
 
 def _table(rows: Sequence[Row], proposal: str) -> Table:
-    """Return the table of one proposal's times: a line for each number of particles, landmarks and measurements."""
+    """Return the table of one proposal's times, with a row for each number of particles, landmarks and measurements."""
     first, *more = sorted({row["robots"] for row in rows})
-    headings = ("M", "N", "B", f"K={first}", "10-90 %", "least", *(f"K={k}" for k in more), "right")
+    headings = ("M", "N", "B", f"K={first}", "10-90 %", "min", *(f"K={k}" for k in more), "right")
     lines: dict[Any, dict[int, Row]] = {}
     for row in rows:
         if row["proposal"] == proposal:
@@ -83,12 +83,12 @@ def _table(rows: Sequence[Row], proposal: str) -> Table:
 
 
 def _ms(value: float) -> str:
-    """Show milliseconds with three digits that count."""
+    """Format milliseconds with three significant digits."""
     return f"{value:.3f}" if value < 1.0 else f"{value:.2f}" if value < 10.0 else f"{value:.1f}"
 
 
 def draw_speed(file: Path, result: Mapping[str, Any]) -> None:
-    """Draw the time of a step against N, M and K into a PNG file."""
+    """Draw the time of a step over N, M and K into a PNG file."""
     figure = Figure(figsize=(12.0, 5.0), layout="constrained")
     panels = figure.subplots(1, 3, sharey=True)
     for ax, (name, label, title) in zip(panels, AXES, strict=True):
@@ -108,20 +108,20 @@ def draw_speed(file: Path, result: Mapping[str, Any]) -> None:
 
 
 def _draw_panel(ax: Axes, rows: Sequence[Row], name: str) -> None:
-    """Draw one line for each proposal, and for each number of particles unless these are the abscissa."""
+    """Draw one line for each proposal, and for each number of particles unless it is the abscissa."""
     ways = sorted({(row["proposal"], 0 if name == "particles" else row["particles"]) for row in rows})
     longest = len({row[name] for row in rows})
     for proposal, particles in ways:
         line = [row for row in rows if row["proposal"] == proposal and particles in (0, row["particles"])]
         line.sort(key=lambda row: int(row[name]))
-        if len(line) < longest:  # rows that were timed for another panel
+        if len(line) < longest:  # rows for another panel
             continue
         x, low, median, high = _columns(line, name)
         colour = COLOURS[proposal]
         ax.plot(x, median, color=colour, marker="o", ms=4)
         ax.fill_between(x, low, high, color=colour, alpha=0.15, lw=0)
         if particles:
-            above = proposal == "fastslam2"  # the slower one, so that labels keep apart
+            above = proposal == "fastslam2"  # slower, so that labels do not overlap
             ax.annotate(
                 f"M={particles:,}", (x[-1], median[-1]), xytext=(5, 2 if above else -2), textcoords="offset points",
                 fontsize=7, color=colour, va="bottom" if above else "top",
@@ -129,5 +129,5 @@ def _draw_panel(ax: Axes, rows: Sequence[Row], name: str) -> None:
 
 
 def _columns(line: Sequence[Row], name: str) -> FloatArray:
-    """Return the abscissa and the low, median and high time [ms] of a line, (4, n)."""
+    """Return the abscissa and the low, median and high times [ms] of a line, (4, n)."""
     return np.transpose([(row[name], row["low_ms"], row["median_ms"], row["high_ms"]) for row in line])

@@ -1,4 +1,4 @@
-"""What the filter is timed on: robots in front of a cloud of landmarks, of which they measure any at random."""
+"""Workload of the filter benchmark: robots in front of a cloud of landmarks, measured at random."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -18,53 +18,53 @@ LARGE_LOADS: list[dict[str, Any]] = [
     {"particles": 10_000, "landmarks": landmarks, "measurements": 15} for landmarks in (300, 1000)
 ]
 DESCRIPTOR_SIZE = 64
-DESCRIPTOR_NOISE = 0.1  # root mean square L2 length of what is added to a descriptor before it is normalised again
-DEPTHS = (2.0, 7.0)  # [m]
-IMAGE_SHARE = 0.8  # of the image in which the first robot sees the landmarks; the rest is room to move
-MAPPED_AT_ONCE = 50  # measurements in a frame while the map is built
-GAP = 0.1  # between robots, side by side [m]
+DESCRIPTOR_NOISE = 0.1  # RMS norm of the noise added to a descriptor before normalisation
+DEPTHS = (2.0, 7.0)  # range of depths [m]
+IMAGE_SHARE = 0.8  # share of the image used by landmarks; the margin allows motion
+MAPPED_AT_ONCE = 50  # measurements per frame while the map is built
+GAP = 0.1  # distance between neighbouring robots [m]
 SWAY_POSITION, SWAY_HEADING = 0.1, 0.03  # amplitudes of the robots' motion [m], [rad]
-SWAY_PER_STEP = np.array([0.11, 0.19])  # their phases' steps [rad]
+SWAY_PER_STEP = np.array([0.11, 0.19])  # phase increments [rad]
 
 
 class FilterLoad(Checked):
     """One row of the table."""
 
-    proposal: Proposal = "fastslam2"  # Of the filter
+    proposal: Proposal = "fastslam2"  # Proposal of the filter
     particles: Positive = 100  # M
-    landmarks: int = 300  # N; all particles hold all of them
-    measurements: int = 15  # B, of all robots together in a step
+    landmarks: int = 300  # N, in each particle's map
+    measurements: int = 15  # B per step, of all robots together
     robots: Positive = 1  # K
-    lookalikes: Positive = 1  # So many landmarks share one descriptor; 1: all differ
-    seed: NonNegative = 0  # Of all random draws
+    lookalikes: Positive = 1  # Number of landmarks that share a descriptor; 1: all differ
+    seed: NonNegative = 0  # Seed of all random draws
 
     def check(self) -> None:
-        """Refuse more measurements than there can be."""
-        check_int("measurements", self.measurements, self.robots, "Give each robot at least one.")
-        cure = "A robot's measurements are of different landmarks, and it sees nearly all of them."
-        check_int("landmarks", self.landmarks, 2 * self.measurements, cure)
+        """Refuse more measurements than possible."""
+        check_int("measurements", self.measurements, self.robots, "Give each robot at least one measurement.")
+        hint = "Each robot measures different landmarks, and sees nearly all of them."
+        check_int("landmarks", self.landmarks, 2 * self.measurements, hint)
 
     @property
     def options(self) -> FilterOptions:
-        """Of the filter: the noise that it assumes is the true one, and it resamples at every step."""
+        """Options of the filter: it assumes the true noise, and resamples at every step."""
         return FilterOptions(num_particles=self.particles, proposal=self.proposal, resample_threshold=1.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadStep:
-    """The readings of one step."""
+    """Readings of one step."""
 
-    odometry: tuple[FloatArray | None, ...]  # Per robot (3,) [m, m, rad], or None
-    frames: tuple[Measurements | None, ...]  # Per robot its measurements, or None
-    names: tuple[IntArray, ...]  # Per robot (n_i,) int64, the true names of what it measured
+    odometry: tuple[FloatArray | None, ...]  # Odometry of each robot, (3,) [m, m, rad], or None
+    frames: tuple[Measurements | None, ...]  # Measurements of each robot, or None
+    names: tuple[IntArray, ...]  # True landmarks of each robot's measurements, (n_i,) int64
 
 
 class LoadWorld:
-    """Landmarks, and robots that sway in front of them.
+    """Landmarks, and robots that oscillate in front of them.
 
-    Landmarks fill the first robot's view between two depths, evenly over the image. Robots stand side by side at known
-    poses and sway by decimetres, so that each sees nearly all of them at all times. Measurements in a step are drawn at
-    random from what is in view, so that two steps have little in common.
+    Landmarks fill the first robot's view between two depths, uniformly over the image. Robots are side by side at known
+    poses and oscillate by decimetres, so that each sees nearly all landmarks at all times. Measurements of a step are a
+    random choice of the landmarks in view, so that two steps have little in common.
     """
 
     def __init__(self, load: FilterLoad) -> None:
@@ -76,7 +76,7 @@ class LoadWorld:
         half_image = [0.5 * self._camera.width, 0.5 * self._camera.height]
         image = IMAGE_SHARE * self._rng.uniform(-1.0, 1.0, (load.landmarks, 2)) * half_image
         seen = np.column_stack([image * (depth / self._camera.focal_px)[:, None], depth])
-        self.landmarks: FloatArray = seen @ ROBOT_FROM_CAMERA.T  # (N, 3), map frame: the first robot starts near 0
+        self.landmarks: FloatArray = seen @ ROBOT_FROM_CAMERA.T  # (N, 3), map frame; the first robot starts near 0
         kinds = self._rng.standard_normal((-(-load.landmarks // load.lookalikes), DESCRIPTOR_SIZE))
         self.descriptors = _unit(kinds)[np.arange(load.landmarks) // load.lookalikes]
         self.starts = np.zeros((load.robots, 3))
@@ -85,13 +85,13 @@ class LoadWorld:
         self._time = 0
 
     def true_pose(self, robot: int, time: int) -> FloatArray:
-        """Return a robot's true pose (3,), map frame; at time 0 it is at its start."""
+        """Return the true pose (3,) of a robot, map frame; its start pose at time 0."""
         phases = self._phases[robot]
         ahead, turn = np.sin(SWAY_PER_STEP * time + phases) - np.sin(phases)
         return compose(self.starts[robot], [SWAY_POSITION * ahead, 0.0, SWAY_HEADING * turn])
 
     def mapping(self, sweeps: int) -> Iterator[LoadStep]:
-        """Yield steps in which the first robot, at its start, measures all landmarks `sweeps` times, by name."""
+        """Yield steps in which the first robot, at its start, measures all landmarks `sweeps` times, identified."""
         rest = (None,) * (self.load.robots - 1)
         for _ in range(sweeps):
             order = self._rng.permutation(self.load.landmarks)
@@ -101,7 +101,7 @@ class LoadWorld:
                 yield LoadStep((None, *rest), (self._measure(self.starts[0], names), *rest), (names, *none))
 
     def course(self, num: int) -> Iterator[LoadStep]:
-        """Yield `num` steps in which all robots move and measure, B in all, their shares as equal as can be."""
+        """Yield `num` steps in which all robots move and make B measurements in total, divided evenly."""
         load = self.load
         shares = load.measurements // load.robots + (np.arange(load.robots) < load.measurements % load.robots)
         for _ in range(num):
@@ -114,15 +114,15 @@ class LoadWorld:
                 odometry.append(move + self._rng.standard_normal(3) * self._motion.sigmas(move))
                 in_view = np.flatnonzero(self._camera.sees(self._seen_from(now)))
                 if len(in_view) < share:
-                    cure = "Use more landmarks, or fewer measurements."
-                    raise argument_error("landmarks", f"{share} in a robot's view", f"a view of {len(in_view)}", cure)
+                    hint = "Use more landmarks, or fewer measurements."
+                    raise argument_error("landmarks", f"{share} in a robot's view", f"a view of {len(in_view)}", hint)
                 names.append(self._rng.choice(in_view, share, replace=False))
                 frames.append(self._measure(now, names[-1]))
             self._time += 1
             yield LoadStep(tuple(odometry), tuple(frames), tuple(names))
 
     def _seen_from(self, pose: FloatArray) -> FloatArray:
-        """Return the landmarks (N, 3) [m] in the frame of the camera of a robot at `pose`."""
+        """Return the landmarks (N, 3) [m] in the camera frame of a robot at `pose`."""
         return self._camera.camera_from_robot(transform_points(inverse(pose), self.landmarks))
 
     def _measure(self, pose: FloatArray, names: IntArray) -> Measurements:
@@ -135,6 +135,6 @@ class LoadWorld:
 
 
 def _unit(vectors: FloatArray) -> NDArray[np.float32]:
-    """Return the vectors (n, d) at length 1."""
+    """Return the normalised vectors (n, d)."""
     unit: NDArray[np.float32] = (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
     return unit

@@ -1,1 +1,1 @@
-"""Speed and quality of the stereo front end."""
+"""Stereo benchmark: speed and quality of the front end."""

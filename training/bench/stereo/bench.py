@@ -1,4 +1,4 @@
-"""`vslam bench stereo`: how fast the stereo eye is, and how good, on rendered pairs."""
+"""Benchmark `vslam bench stereo`: speed and quality of stereo measurements on rendered pairs."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -17,13 +17,13 @@ from training.experiments.timing import describe_machine, time_calls, timing_ms
 from vslam_env.sensors.stereo.textures import STYLES, TextureConfig
 
 BUSY = TextureConfig(polygons=20.0, posters=0.6)  # enough corners for 100 landmarks in an image
-CROWDED = 2  # [px] between corners where more than 100 landmarks are wanted: 4 px leave 270 corners in an image
-WARM_UP = 5  # pairs that are not timed
-WINDOW = 0.6  # [m] of the descriptor window of constant physical size
+CROWDED = 2  # spacing of corners for more than 100 landmarks [px]; 4 px leave 270 corners per image
+WARM_UP = 5  # number of pairs that are not timed
+WINDOW = 0.6  # descriptor window of constant physical size [m]
 
 
 def camera_of(width: int) -> StereoCamera:
-    """Return the default camera with images of another width and the same field of view."""
+    """Return the default camera with another image width and the same field of view."""
     return StereoCamera(focal_px=float(width), width=width, height=3 * width // 4)
 
 
@@ -47,7 +47,7 @@ def speed_row(width: int, landmarks: int, walls: int, descriptor: Any, steps: in
 
 
 def _timed(call: Callable[[Any], Any], steps: int) -> dict[str, float]:
-    """Time a call [ms]: by the clock, and by the processor, which counts the same on a busy machine."""
+    """Time a call [ms]: wall-clock time, and processor time, which other load does not affect."""
     time_calls(call, range(WARM_UP))
     begin = time.process_time()
     timing = timing_ms(time_calls(call, range(steps))[0])
@@ -60,7 +60,7 @@ def run_stereo_bench(
     on_part: Callable[[str], None] = lambda name: None,
     interrupted: Callable[[], bool] = lambda: False,
 ) -> dict[str, Any]:
-    """Run all parts, on one thread of OpenCV; `interrupted` is asked between them."""
+    """Run all parts, with one OpenCV thread; `interrupted` is checked between them."""
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     result = _run_rendered(config, on_part, interrupted)

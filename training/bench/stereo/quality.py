@@ -1,4 +1,4 @@
-"""How good the stereo eye is on rendered pairs: disparities, guards, second looks, and what descriptors find again."""
+"""Quality of stereo measurements on rendered pairs: disparities, match checks, repeated views, and retrieval."""
 
 from typing import Any
 
@@ -14,13 +14,13 @@ from vslam_env.world import make_world
 
 ANGLES_DEG = (0.0, 15.0, 30.0, 45.0, 60.0)
 RATIOS = (1.0, 1.25, 1.5, 2.0)
-DISTANCE = 2.5  # [m] of the reference views
-PLACES = tuple(np.arange(2.5, 12.0, 1.0).tolist())  # along the wall [m]
+DISTANCE = 2.5  # distance of the reference views [m]
+PLACES = tuple(np.arange(2.5, 12.0, 1.0).tolist())  # positions along the wall [m]
 OUTLIER_PX = 1.0
 
 
 def quality_row(descriptor: Any, views: int, seed: int) -> dict[str, Any]:
-    """Measure rendered pairs from anywhere in an office: disparities before and after each guard, second looks."""
+    """Measure rendered pairs at random poses in an office: disparities before and after each match check."""
     rng, camera = np.random.default_rng(seed), StereoCamera()
     scene = Scene(make_world("office", np.random.default_rng(seed)), camera, seed)
     front_end = StereoFrontEnd(camera, FrontEndOptions(descriptor=descriptor))
@@ -41,12 +41,13 @@ def quality_row(descriptor: Any, views: int, seed: int) -> dict[str, Any]:
 
 
 def guard_rows(by_corners: FloatArray, by_patches: FloatArray, passed: Any) -> list[dict[str, Any]]:
-    """Return how many matches are left after each guard and how good they are.
+    """Return the number and the quality of the matches that remain after each match check.
 
     Args:
-        by_corners: (n,) float64 [px]. Errors of the differences of corners' columns.
-        by_patches: (n,) float64 [px]. Errors of the disparities by patches, known once the patch guard has passed.
-        passed: (5, n) bool. Of `StereoMatches`.
+        by_corners: (n,) float64 [px]. Errors of the disparities from corner columns.
+        by_patches: (n,) float64 [px]. Errors of the disparities from patches, defined for matches that pass the patch
+            check.
+        passed: (5, n) bool. Results of the checks, as in `StereoMatches`.
     """
     kept = np.ones(passed.shape[1], dtype=np.bool_)
     rows = [_errors("all matches", by_corners)]
@@ -68,14 +69,14 @@ def _errors(name: str, errors: FloatArray) -> dict[str, Any]:
 
 
 def retrieval(descriptor: Any, window: float | None, style: str, seed: int) -> dict[str, Any]:
-    """Measure how well landmarks of a wall are found again by descriptor from other angles and distances.
+    """Measure how well landmarks of a wall are retrieved by descriptor from other angles and distances.
 
-    The map is what the cameras at ten places see head-on from 2.5 m. A query's true landmark counts if it is in the
-    map. Recall: nearest descriptor in the map is the right landmark. Precision: of the nearest ones within the gate,
-    those that are right.
+    The map contains the points that cameras at ten places see frontally from 2.5 m. Queries count if their true
+    landmark is in the map. Recall: the nearest descriptor in the map is of the right landmark. Precision: share of
+    right landmarks among the nearest ones within the gate.
 
     Args:
-        window: Of constant physical size [m]; None: of constant size in the image.
+        window: Constant physical size of the descriptor window [m]; None: constant size in the image.
     """
     rng, camera = np.random.default_rng(seed), StereoCamera()
     scene = Scene(WALL, camera, seed, TextureConfig(style=style))
@@ -119,11 +120,11 @@ def retrieval(descriptor: Any, window: float | None, style: str, seed: int) -> d
 
 
 def second_looks(seed: int) -> dict[str, Any]:
-    """Measure landmarks of the wall from several places; return how their differences compare with the camera model.
+    """Measure landmarks of the wall from several places; return the consistency of their differences.
 
     Returns:
-        Number of pairs of looks; ANEES (divided by 3, ideal 1) over the pairs whose difference lies within the 99.9 %
-        gate, and the share of these, for the default camera noise and for twice of it.
+        Number of pairs of views; ANEES (divided by 3, ideal 1) over the pairs whose difference is within the 99.9 %
+        gate, and the share of these, for the default camera noise and for twice this noise.
     """
     rng, camera = np.random.default_rng(seed), StereoCamera()
     scene = Scene(WALL, camera, seed)
@@ -152,7 +153,7 @@ def second_looks(seed: int) -> dict[str, Any]:
 
 
 def _world_covariances(view: Named, pose: FloatArray, camera: StereoCamera) -> FloatArray:
-    """Return (n, 3, 3) [m^2], world frame, of a view's points by the camera model."""
+    """Return the covariances (n, 3, 3) [m^2], world frame, of a view's points by the camera model."""
     axes = np.zeros((3, 3))  # robot axes from camera axes, then the heading
     axes[:2, :2] = rotation(pose[2])
     axes[2, 2] = 1.0

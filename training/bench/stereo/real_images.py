@@ -1,7 +1,7 @@
-"""The front end on real images, whatever a folder holds of them.
+"""Evaluation of the front end on the real images in a folder.
 
-A pair with known disparities and a chessboard rig (OpenCV's samples), planar pairs with homographies, and stereo pairs
-with the calibration of their rig.
+Supported are a pair with known disparities and a chessboard rig (OpenCV's samples), planar pairs with homographies,
+and stereo pairs with the calibration of their rig.
 """
 
 import time
@@ -34,38 +34,38 @@ from training.bench.stereo.quality import guard_rows
 ALOE_SPAN = 3740.0 * 0.16  # focal length [px] times baseline [m] of the Middlebury rig of 2006
 ALOE_DISPARITIES = (15.0, 260.0)
 BOARD = (9, 6)  # inner corners of the chessboard
-MODEL = "_model.txt"  # ends the name of a planar pair's homography
+MODEL = "_model.txt"  # suffix of the homography of a planar pair
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".tif", ".tiff")
 LAYOUTS = (
     ("left*", "right*"), ("image_0/*", "image_1/*"), ("image_l/*", "image_r/*"), ("cam0/*", "cam1/*"),
     ("cam0/data/*", "cam1/data/*"), ("*_l.*", "*_r.*"), ("*L.*", "*R.*"),
 )  # fmt: skip
 CALIBRATIONS = ("calib.txt", "sensorLeft.yaml,sensorRight.yaml", "cam0/sensor.yaml,cam1/sensor.yaml")
-MOST_PAIRS = 10  # of a rig are measured
-LEAST_DISPARITY, LARGEST_DISPARITY = 1.0, 0.25  # px; share of the width
+MOST_PAIRS = 10  # maximum number of measured pairs of a rig
+LEAST_DISPARITY, LARGEST_DISPARITY = 1.0, 0.25  # [px]; share of the width
 EXPECTED = (
     "pairs with a model file: NAMEA, NAMEB and NAME_model.txt (a homography), or left and right images with calib.txt "
     "or two sensor.yaml"
 )
-PLANAR_CORNERS, PLANAR_TOLERANCE = 1000, 4.0  # px in the first image
-FARTHEST_SQUARES = 60.0  # points farther than this are dropped [squares]
+PLANAR_CORNERS, PLANAR_TOLERANCE = 1000, 4.0  # tolerance in the first image [px]
+FARTHEST_SQUARES = 60.0  # maximum distance of points [squares]
 
 
 @dataclass(frozen=True, slots=True)
 class RealPart:
-    """Something that a folder of real images lets be measured."""
+    """Measurable part of a folder of real images."""
 
-    key: str  # Under which the bench keeps it
-    name: str  # Name of the part, for people
-    measure: Callable[[], Any]  # Returns rows, or one row
+    key: str  # Key in the result of the benchmark
+    name: str  # Displayed name of the part
+    measure: Callable[[], Any]  # Function that returns rows, or one row
 
 
 def find_parts(folder: Path, descriptors: Sequence[str]) -> list[RealPart]:
-    """Return what there is to be measured in a folder and in those within it.
+    """Return the measurable parts of a folder and of its subfolders.
 
     Args:
-        folder: With any of OpenCV's samples; planar pairs `NAMEA`, `NAMEB` with their homography `NAME_model.txt`;
-            stereo pairs in one of `LAYOUTS` with one of `CALIBRATIONS`.
+        folder: Folder with some of OpenCV's samples, planar pairs `NAMEA`, `NAMEB` with their homography
+            `NAME_model.txt`, or stereo pairs in one of `LAYOUTS` with one of `CALIBRATIONS`.
     """
     parts: list[RealPart] = []
     for place in (folder, *_folders_in(folder)):
@@ -89,10 +89,10 @@ def measure_parts(
     on_part: Callable[[str], None] = lambda name: None,
     interrupted: Callable[[], bool] = lambda: False,
 ) -> None:
-    """Measure parts one after the other, and add each to a result; one that fails is noted, and the others go on.
+    """Measure parts in order, and add each to a result; a part that fails is recorded, and the others continue.
 
     Args:
-        result: Result of the bench; changed. `failed` holds what was wrong, by the names of the parts.
+        result: Result of the benchmark; changed. `failed` contains errors by the name of the part.
     """
     for part in parts:
         if interrupted():
@@ -100,7 +100,7 @@ def measure_parts(
         on_part(part.name)
         try:
             found = part.measure()
-        except Exception as error:  # of any kind: OpenCV's, numpy's or ours, on images of anyone
+        except Exception as error:  # any error of OpenCV, numpy or this package, since images are arbitrary
             result.setdefault("failed", {})[part.name] = str(error) or type(error).__name__
             continue
         if isinstance(found, list):
@@ -110,28 +110,29 @@ def measure_parts(
 
 
 def _folders_in(folder: Path) -> list[Path]:
-    """Return the folders within one, in order."""
+    """Return the subfolders of a folder, sorted."""
     return sorted(below for below in folder.iterdir() if below.is_dir())
 
 
 def _aloe(folder: Path, descriptor: str) -> dict[str, Any]:
-    """Return `aloe_rows` under the name of the descriptor."""
+    """Return `aloe_rows` by the name of the descriptor."""
     return {descriptor: aloe_rows(folder, descriptor)}
 
 
 def rig_rows(folder: Path, descriptors: Sequence[str]) -> list[dict[str, Any]]:
-    """Measure stereo pairs of a calibrated rig: how many matches each guard leaves, how far points are, and the time.
+    """Measure stereo pairs of a calibrated rig: matches after each match check, depths, and times.
 
     Args:
-        folder: In one of `LAYOUTS`, with one of `CALIBRATIONS`; at most `MOST_PAIRS` of its pairs are measured, evenly
-            chosen.
+        folder: Folder in one of `LAYOUTS`, with one of `CALIBRATIONS`; at most `MOST_PAIRS` of its pairs are measured,
+            evenly chosen.
 
     Returns:
-        Per descriptor: `rig`, `descriptor`, `pairs`; means over the pairs of `matches`, of those left after each guard
-        (`left`), of `points`, of the median depth `depth_m` (None without points), and the time of a pair `ms`.
+        One row per descriptor: `rig`, `descriptor`, `pairs`; means over the pairs of `matches`, of the matches after
+        each check (`left`), of `points`, of the median depth `depth_m` (None without points), and the time of a pair
+        `ms`.
 
     Raises:
-        ValueError: If there are no such images, or the calibration cannot be used.
+        ValueError: If there are no such images, or the calibration is invalid.
     """
     left, right = _eyes(folder)
     chosen = np.unique(np.linspace(0, len(left) - 1, min(len(left), MOST_PAIRS)).round().astype(int))
@@ -147,7 +148,7 @@ def rig_rows(folder: Path, descriptors: Sequence[str]) -> list[dict[str, Any]]:
         kind: Any = descriptor
         options = FrontEndOptions(descriptor=kind, nearest=nearest_m, corners=CornerOptions(most=1500))
         eye = StereoFrontEnd(camera, options, rig.pair.centre_px)
-        eye.measure(*rectified[0])  # nothing is loaded or compiled any more when it is timed
+        eye.measure(*rectified[0])  # loads and compiles before the timing
         began = time.perf_counter()
         frames = [eye.measure(*pair) for pair in rectified]
         spent = 1e3 * (time.perf_counter() - began) / len(frames)
@@ -169,7 +170,7 @@ def rig_rows(folder: Path, descriptors: Sequence[str]) -> list[dict[str, Any]]:
 
 
 def _calibration(folder: Path) -> str:
-    """Return the calibration of a rig that a folder holds, "" if there is none."""
+    """Return the calibration of the rig in a folder, "" if there is none."""
     for names in CALIBRATIONS:
         if all((folder / name).is_file() for name in names.split(",")):
             return names
@@ -177,7 +178,7 @@ def _calibration(folder: Path) -> str:
 
 
 def _eyes(folder: Path) -> tuple[list[Path], list[Path]]:
-    """Return the images of the left and of the right eye."""
+    """Return the images of the left and of the right camera."""
     for layout in LAYOUTS:
         left, right = (
             sorted(file for file in folder.glob(names) if file.suffix.lower() in SUFFIXES) for names in layout
@@ -190,7 +191,7 @@ def _eyes(folder: Path) -> tuple[list[Path], list[Path]]:
 
 
 def aloe_rows(folder: Path, descriptor: Any) -> list[dict[str, Any]]:
-    """Return errors before and after each guard on the aloe pair, whose disparities are known to whole pixels."""
+    """Return errors before and after each match check on the aloe pair, whose true disparities are whole pixels."""
     left, right = (read_grey(folder / f"aloe{eye}.jpg") for eye in "LR")
     true = read_grey(folder / "aloeGT.png").astype(np.float64)
     height, width = left.shape
@@ -209,9 +210,9 @@ def chessboard(folder: Path) -> dict[str, Any]:
     """Calibrate the chessboard rig, rectify its pairs, and measure the board.
 
     Returns:
-        Pairs; the reprojection error of the calibration [px]; points of the front end on the board; their distance
-        from the plane of the board's corners, as OpenCV's search for a chessboard finds them in both images: median in
-        squares and as a share of the depth, and the share of the points within a twentieth of a square.
+        Number of pairs; reprojection error of the calibration [px]; points of the front end on the board; their median
+        distance, in squares and as a share of the depth, from the plane of the board's corners, which OpenCV detects in
+        both images; and the share of points within a twentieth of a square.
     """
     images, left_points, right_points = [], [], []
     for number in (1, 2, 3, 4, 5, 6, 7, 8, 9, 11, 12, 13, 14):
@@ -222,7 +223,9 @@ def chessboard(folder: Path) -> dict[str, Any]:
             left_points.append(found[0])
             right_points.append(found[1])
     if len(images) < 5:
-        raise argument_error("path", "five or more pairs of a chessboard", f"a folder with {len(images)}", "Check it.")
+        raise argument_error(
+            "path", "five or more pairs of a chessboard", f"a folder with {len(images)}", "Check the folder."
+        )
     grid = np.zeros((BOARD[0] * BOARD[1], 3), np.float32)
     grid[:, :2] = np.mgrid[: BOARD[0], : BOARD[1]].T.reshape(-1, 2)
     height, width = images[0][0].shape
@@ -272,15 +275,15 @@ def chessboard(folder: Path) -> dict[str, Any]:
 def planar_rows(file: Path) -> list[dict[str, Any]]:
     """Return matching scores on one planar pair.
 
-    Descriptors of Harris corners, upright, by u-SURF, SIFT and ORB; and OpenCV's SIFT and ORB with their own keypoints
-    and rotations beside them. A match is a mutual nearest descriptor; it is right if the homography takes it within
-    4 px. Score: right ones among the matches.
+    Upright descriptors of Harris corners by u-SURF, SIFT and ORB; and OpenCV's SIFT and ORB with their own keypoints
+    and rotations for comparison. A match is a mutual nearest descriptor; it is right if the homography maps it within
+    4 px. Score: share of right matches.
 
     Args:
-        file: `NAME_model.txt`, the homography from image `NAMEB` to `NAMEA` beside it.
+        file: `NAME_model.txt`, the homography from image `NAMEB` to the `NAMEA` in the same folder.
 
     Raises:
-        ValueError: If it holds no 3 x 3 homography, or an image is missing.
+        ValueError: If the file has no 3 x 3 homography, or an image is missing.
     """
     name = file.name.removesuffix(MODEL)
     model = _homography(file)
@@ -302,7 +305,7 @@ def planar_rows(file: Path) -> list[dict[str, Any]]:
 
 
 def _homography(file: Path) -> FloatArray:
-    """Return the homography (3, 3) that a file of nine numbers holds."""
+    """Return the homography (3, 3) from a file of nine numbers."""
     try:
         numbers = np.array(file.read_text(encoding="utf-8").replace(",", " ").split(), dtype=np.float64)
     except (OSError, ValueError):
@@ -315,7 +318,7 @@ def _homography(file: Path) -> FloatArray:
 
 
 def _image(folder: Path, stem: str) -> Path:
-    """Return the image of a name, whatever its suffix."""
+    """Return the image with a given name and any supported suffix."""
     found = [folder / f"{stem}{suffix}" for suffix in SUFFIXES if (folder / f"{stem}{suffix}").is_file()]
     if not found:
         raise argument_error("real", f"an image {stem}.png, .jpg, ...", "no such file", f"Add it to {str(folder)!r}.")
@@ -338,7 +341,7 @@ def _described(image: Image, way: str) -> tuple[FloatArray, Float32Array]:
 
 
 def _board(image: Image) -> Float32Array | None:
-    """Return the inner corners (54, 1, 2) [px] of the chessboard, to a fraction of a pixel; None if it is not found."""
+    """Return the inner corners (54, 1, 2) [px] of the chessboard at subpixel accuracy; None if it is not found."""
     found, corners = cv2.findChessboardCorners(image, BOARD)
     if not found:
         return None

@@ -18,10 +18,10 @@ COLOURS = {"usurf": "#0072B2", "sift": "#D55E00", "orb": "#009E73"}
 
 
 def markdown(result: dict[str, Any]) -> str:
-    """Return all tables, those that have content."""
+    """Return all tables with content, as Markdown."""
     parts = [_speed(result["speed"])]
     for row in result["quality"]:
-        per_frame = f"{row['landmarks_per_frame']:.1f} landmarks a frame"
+        per_frame = f"{row['landmarks_per_frame']:.1f} landmarks per frame"
         parts.append(_guards(f"Rendered pairs from an office, {NAMES[row['descriptor']]}: {per_frame}", row["guards"]))
     parts.append(_retrieval(result["retrieval"]))
     if "second_looks" in result:
@@ -29,8 +29,8 @@ def markdown(result: dict[str, Any]) -> str:
             [f"{scale} x", f"{row['pairs']}", f"{100 * row['within']:.1f} %", f"{row['anees']:.2f}"]
             for scale, row in result["second_looks"].items()
         ]
-        title = "Second looks at a landmark: NEES by the default camera noise, and by twice of it"
-        headings = ["noise", "pairs of looks", "within the 99.9 % gate", "ANEES of these"]
+        title = "Repeated views of a landmark: NEES with the default camera noise, and with twice this noise"
+        headings = ["noise", "pairs of views", "within the 99.9 % gate", "ANEES of these"]
         parts.append(titled_markdown(title, headings, lines))
     for descriptor, rows in result.get("aloe", {}).items():
         parts.append(_guards(f"Aloe, {NAMES[descriptor]} (true disparities are whole pixels)", rows))
@@ -60,11 +60,11 @@ def _speed(rows: Sequence[dict[str, Any]]) -> str:
         times = [" / ".join(f"{value:.2f}" for value in part) for part in parts]
         size, name = f"{row['width']} x {row['height']}", NAMES[row["descriptor"]]
         lines.append([size, str(row["walls"]), f"{row['landmarks']} of {row['wanted']}", name, *times])
-    return titled_markdown("Time on one thread: least / median by the clock / mean of the processor", columns, lines)
+    return titled_markdown("Time on one thread: minimum / median wall-clock time / mean processor time", columns, lines)
 
 
 def _guards(title: str, rows: Sequence[dict[str, Any]]) -> str:
-    columns = ["guard", "matches", "outliers > 1 px", "median error, px", "RMS of inliers, px", "bias, px"]
+    columns = ["check", "matches", "outliers > 1 px", "median error, px", "RMS of inliers, px", "bias, px"]
     lines = [
         [
             row["name"], str(row["matches"]), f"{100 * row['outliers']:.2f} %", f"{row['median_px']:.3f}",
@@ -87,7 +87,7 @@ def _retrieval(rows: Sequence[dict[str, Any]]) -> str:
         lines.append(
             [row["style"], name, *(number(cell["recall"]) + " / " + number(cell["precision"]) for cell in cells)]
         )
-    title = "Found again by descriptor: recall / precision, by viewing angle and distance"
+    title = "Retrieval by descriptor: recall / precision, by viewing angle and distance"
     return titled_markdown(title, columns, lines)
 
 
@@ -111,11 +111,11 @@ def _rigs(rows: Sequence[dict[str, Any]]) -> str:
         counts = [f"{count:.0f}" for count in (row["matches"], *row["left"].values(), row["points"])]
         means = [number(row["depth_m"]), number(row["ms"], 1)]
         lines.append([row["rig"], NAMES[row["descriptor"]], str(row["pairs"]), *counts, *means])
-    return titled_markdown("Stereo pairs with a calibration: matches left after each guard, means", columns, lines)
+    return titled_markdown("Stereo pairs with a calibration: mean number of matches after each check", columns, lines)
 
 
 def draw_stereo(file: Path, result: dict[str, Any]) -> None:
-    """Draw outliers after each guard, and recall by angle and by distance, into a PNG file."""
+    """Draw outliers after each match check, and recall by angle and by distance, into a PNG file."""
     figure = Figure(figsize=(13.0, 4.2), layout="constrained")
     guards, angles, ratios = figure.subplots(1, 3)
     for row in result["quality"]:
@@ -124,8 +124,8 @@ def draw_stereo(file: Path, result: dict[str, Any]) -> None:
         name = row["descriptor"]
         guards.plot(range(len(names)), shares, marker="o", color=COLOURS[name], label=NAMES[name])
     guards.set_xticks(range(len(names)), names, rotation=25)
-    guards.set_ylabel("matches off by more than 1 px [%]")
-    guards.set_title("Guards, one after the other")
+    guards.set_ylabel("matches with an error above 1 px [%]")
+    guards.set_title("Successive match checks")
     for axes, key, label in (
         (angles, "angles", "viewing angle [degrees]"),
         (ratios, "ratios", "distance, times 2.5 m"),
@@ -139,9 +139,9 @@ def draw_stereo(file: Path, result: dict[str, Any]) -> None:
             axes.plot(numbers, [cell["recall"] for cell in row[key].values()], label=name, **style)
         axes.set_ylim(0.0, 1.02)
         axes.set_xlabel(label)
-        axes.set_ylabel("nearest descriptor is the right landmark")
-    angles.set_title("Found again from another angle")
-    ratios.set_title("Found again from another distance")
+        axes.set_ylabel("recall (nearest descriptor)")
+    angles.set_title("Retrieval from another angle")
+    ratios.set_title("Retrieval from another distance")
     for axes in (guards, angles, ratios):
         axes.grid(alpha=0.2)
         axes.spines[["top", "right"]].set_visible(False)

@@ -1,4 +1,4 @@
-"""Scenes for measuring the stereo eye: a hall of panels for its speed, one long wall for how views change."""
+"""Scenes of the stereo benchmark: a hall of panels for speed, a long wall for changes of viewpoint."""
 
 from dataclasses import dataclass
 
@@ -16,11 +16,11 @@ from vslam_env.sensors.stereo.textures import TextureConfig, WallTextures, draw_
 from vslam_env.world import FreeSpace, World
 
 WALL = World("wall", np.array([[0, 0, 14, 0], [14, 0, 14, 9], [14, 9, 0, 9], [0, 9, 0, 0]], dtype=float))
-WORKING_DISTANCE = 3.0  # [m] from which the wall's true corners are seen
+WORKING_DISTANCE = 3.0  # distance at which true corners are detected [m]
 
 
 def panel_hall(walls: int) -> World:
-    """Return a hall of 8 x 6 m whose other walls are short panels in two rows before its far side."""
+    """Return a hall of 8 x 6 m whose additional walls are short panels in two rows before its far side."""
     shell = [[0, 0, 8, 0], [8, 0, 8, 6], [8, 6, 0, 6], [0, 6, 0, 0]]
     panels = []
     for n in range(max(0, walls - len(shell))):
@@ -31,7 +31,7 @@ def panel_hall(walls: int) -> World:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """What a camera saw of a world from a known place."""
+    """Image pair of a world from a known pose."""
 
     pose: FloatArray  # (3,) float64 [m, m, rad], world frame
     left: Image  # (H, W) uint8
@@ -40,16 +40,16 @@ class View:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Named:
-    """A view's points with their true landmarks."""
+    """Points of a view with their true landmarks."""
 
-    frame: StereoFrame  # What the front end made of the view
-    world: FloatArray  # (n, 3) float64 [m], world frame, by the true pose
+    frame: StereoFrame  # Measurements of the front end
+    world: FloatArray  # (n, 3) float64 [m], world frame, from the true pose
     names: IntArray  # (n,) int64. True landmarks, -1: none.
-    true_disparities: FloatArray  # (n,) float64 [px]. Of what the points' rays meet.
+    true_disparities: FloatArray  # (n,) float64 [px]. True disparities, by ray casting.
 
 
 class Scene:
-    """A textured world, its eyes, and its true corners."""
+    """Textured world with cameras and true corners."""
 
     def __init__(
         self, world: World, camera: StereoCamera, seed: int, textures: TextureConfig | None = None,
@@ -60,17 +60,17 @@ class Scene:
         self.eye = StereoRenderer(camera, ImagingConfig() if imaging is None else imaging, world.walls, self.textures)
 
     def look(self, pose: FloatArray, rng: np.random.Generator) -> View:
-        """Take a pair at a pose (3,) [m, m, rad]."""
+        """Render a pair at a pose (3,) [m, m, rad]."""
         return View(pose, *self.eye.take(pose[None], 0, rng))
 
     def corners(self, front_end: StereoFrontEnd) -> TextureCorners:
-        """Return the true corners, as this front end's detector finds them."""
+        """Return the true corners, as detected by this front end."""
         resolution = self.camera.focal_px / WORKING_DISTANCE
         free = FreeSpace(self.world, 0.2)
         return TextureCorners(self.world, self.textures, free, resolution, front_end.options.corners)
 
     def named(self, view: View, front_end: StereoFrontEnd, corners: TextureCorners) -> Named:
-        """Measure a view and find out what its points are in truth."""
+        """Measure a view and find the true landmarks of its points."""
         camera = self.camera
         frame = front_end.measure(view.left, view.right)
         traced = self.eye.trace(view.pose[None], 0, frame.pixels[:, 0])
@@ -85,7 +85,7 @@ class Scene:
 
 
 def office_views(scene: Scene, count: int, rng: np.random.Generator) -> list[View]:
-    """Take pairs from places anywhere in a world's free space, in any direction."""
+    """Render pairs at random free positions of a world, in random directions."""
     free = FreeSpace(scene.world, 0.2)
     x0, y0, x1, y1 = scene.world.bounds
     views: list[View] = []
@@ -97,6 +97,6 @@ def office_views(scene: Scene, count: int, rng: np.random.Generator) -> list[Vie
 
 
 def wall_pose(along: float, distance: float, angle: float) -> FloatArray:
-    """Return the pose (3,) of a camera that looks at a point of the long wall from a distance under an angle."""
+    """Return the pose (3,) of a camera that looks at a point of the long wall from a given distance and angle."""
     heading = -0.5 * np.pi + angle
     return np.array([along - distance * np.cos(heading), -distance * np.sin(heading), heading])

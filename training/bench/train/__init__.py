@@ -1,1 +1,1 @@
-"""Speed of training."""
+"""Training benchmark: time of a decision by part, and speed over worker processes."""

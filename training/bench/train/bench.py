@@ -1,4 +1,4 @@
-"""`vslam bench train`: where the time of a training goes, and what workers gain."""
+"""Benchmark `vslam bench train`: time of a training by part, and speedup by workers."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -18,15 +18,15 @@ from training.bench.train.timing import (
     time_learner,
     time_workers,
 )
-from training.experiments.statistics import shown
+from training.experiments.statistics import format_ci
 from training.experiments.tables import console_table, number
-from training.experiments.timing import describe_machine, print_caveats, run_in_turn
+from training.experiments.timing import describe_machine, print_caveats, run_named_trials
 
 TRIALS = 4
-WORKER_HEADINGS = ("workers", "median", "fastest", "mean", "times one", "balance", "work", "beside us")
+WORKER_HEADINGS = ("workers", "median", "fastest", "mean", "speedup", "balance", "work", "overhead us")
 LEGEND = (
-    "By the processors' own time: balance is the mean worker's over the slowest one's, work that of all beside one "
-    "worker. A step that nobody interrupts gains workers x balance / work. Beside us: what else a decision takes."
+    "In processor time: balance is the mean over the slowest worker, work is the total relative to one worker. "
+    "An undisturbed step gains workers x balance / work. Overhead us: time of a decision outside the environments."
 )
 
 
@@ -35,10 +35,10 @@ def run_bench(
     on_trial: Callable[[str], None] = lambda name: None,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> dict[str, Any]:
-    """Time the parts of a training, then the environments alone over workers.
+    """Time the parts of a training, then the environments by number of workers.
 
     Returns:
-        `parts` of a training in one process, `workers` in the order asked for, `machine`, and `complete`.
+        `parts` of a training in one process, `workers` in the given order, `machine`, and `complete`.
     """
     result: dict[str, Any] = {"machine": describe_machine()}
     recordings: list[Recording] = []
@@ -52,7 +52,7 @@ def run_bench(
         ("learner", lambda: parts.extend(time_learner(recordings[0], config.training()))),
         ("workers", lambda: times.extend(time_workers(*asked))),
     ]
-    result["complete"] = run_in_turn(trials, on_trial, should_stop)
+    result["complete"] = run_named_trials(trials, on_trial, should_stop)
     for each in times:
         if each.workers == 0:
             environment = Part.of("environment", each.spent[:, 0, CLOCK], slots)
@@ -67,14 +67,14 @@ def print_result(console: Console, result: Mapping[str, Any]) -> None:
     for part in result["parts"]:
         share = "" if part["name"] == ADAPTER_ALONE else f"{100.0 * part['median_us'] / total:.1f} %"
         rows.append((part["name"], f"{part['median_us']:.1f}", f"{part['min_us']:.1f}", share))
-    headings = ("part", "median us", "least us", "share")
-    console.print(console_table("A decision of a robot, in one process", headings, rows))
+    headings = ("part", "median us", "min us", "share")
+    console.print(console_table("Time of one robot's decision, in one process", headings, rows))
     if result["workers"]:
         cells = []
         for row in result["workers"]:
             rates = (f"{row[name]:,.0f}" for name in ("per_second", "best_per_second", "mean_per_second"))
-            shares = shown(row, "gain", 2), f"{row['balance']:.2f}", number(row["work"])
+            shares = format_ci(row, "gain", 2), f"{row['balance']:.2f}", number(row["work"])
             cells.append((str(row["workers"]), *rates, *shares, f"{row['beside_us']:.0f}"))
-        console.print(console_table("Environments alone, decisions per second", WORKER_HEADINGS, cells))
+        console.print(console_table("Environments only, decisions per second", WORKER_HEADINGS, cells))
         console.print(LEGEND)
     print_caveats(console, result)

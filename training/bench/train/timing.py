@@ -1,4 +1,4 @@
-"""Cost of a decision of a training beside its environment, and environments timed over worker processes."""
+"""Time of a decision outside the environments, and of environments in worker processes."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -23,15 +23,15 @@ from vslam_env.config import EnvConfig
 
 ADAPTER_STEPS = 400
 WARM_UP = 20
-RECORDED = 20  # steps of an environment that are played again and again
+RECORDED = 20  # number of steps that are replayed repeatedly
 ADAPTER_ALONE = "adapter alone"
 
 WORKERS_WARM_UP = 3
-CLOCK, PROCESSOR = 0, 1  # columns of what the environments of each process took
+CLOCK, PROCESSOR = 0, 1  # columns of the times of each process
 
 
 class Part(NamedTuple):
-    """One part of a training's time, per decision of a robot [us]."""
+    """Part of the time of a training, per decision of a robot [us]."""
 
     name: str
     median_us: float
@@ -39,39 +39,39 @@ class Part(NamedTuple):
 
     @classmethod
     def of(cls, name: str, seconds: FloatArray, decisions: int) -> "Part":
-        """Sum up durations (n,) [s], each of so many decisions."""
+        """Summarise durations (n,) [s] of calls with `decisions` decisions each."""
         return cls(name, 1e6 / decisions * float(np.median(seconds)), 1e6 / decisions * float(seconds.min()))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recording:
-    """What an environment returned under random valid goals: spaces, its reset, and `RECORDED` steps."""
+    """Spaces, reset and `RECORDED` steps of an environment with random valid goals."""
 
     agents: Sequence[str]
     spaces: tuple[Any, Any]
     first: Any
-    told: Sequence[Any]
+    steps: Sequence[Any]
 
 
 def record(config: EnvConfig, seed: int) -> Recording:
-    """Play some steps of an environment with `goal` actions."""
+    """Record some steps of an environment with `goal` actions."""
     env = vslam_v0.parallel_env(config=config.replace(max_cycles=RECORDED + 1))
     spaces = env.observation_space(env.possible_agents[0]), env.action_space(env.possible_agents[0])
     rng = np.random.default_rng(seed)
-    first, told = env.reset(seed=seed), []
+    first, steps = env.reset(seed=seed), []
     seen = first[0]
     for _ in range(RECORDED):
         actions = {agent: int(rng.choice(np.flatnonzero(seen[agent]["action_mask"]))) for agent in env.agents}
-        told.append(env.step(actions))
-        seen = told[-1][0]
-    return Recording(tuple(env.possible_agents), spaces, first, told)
+        steps.append(env.step(actions))
+        seen = steps[-1][0]
+    return Recording(tuple(env.possible_agents), spaces, first, steps)
 
 
 class Replay(ParallelEnv[str, Any, Any]):  # type: ignore[misc]   # PettingZoo has no type information
-    """Gives back what an environment once returned, so that nothing but the adapter around it takes time.
+    """Environment that returns recorded values, so that only the adapter around it takes time.
 
-    All replays of a recording hand out the same few arrays, which stay near the processor, as those do that an
-    environment has just made.
+    All replays of a recording return the same few arrays, which stay in the cache, like arrays that an environment
+    has just written.
     """
 
     render_mode = None
@@ -81,36 +81,36 @@ class Replay(ParallelEnv[str, Any, Any]):  # type: ignore[misc]   # PettingZoo h
         self.possible_agents = self.agents = list(recording.agents)
 
     def observation_space(self, agent: str) -> Any:
-        """Return that of the environment."""
+        """Return the observation space of the environment."""
         return self._recording.spaces[0]
 
     def action_space(self, agent: str) -> Any:
-        """Return that of the environment."""
+        """Return the action space of the environment."""
         return self._recording.spaces[1]
 
     def reset(self, seed: int | None = None, options: Any = None) -> Any:
-        """Return what the environment's reset returned."""
+        """Return the result of the recorded reset."""
         return self._recording.first
 
     def step(self, actions: Any) -> Any:
-        """Return what its next step returned, from the beginning again after the last."""
+        """Return the result of the next recorded step, starting over after the last."""
         self._next = (self._next + 1) % RECORDED
-        return self._recording.told[self._next]
+        return self._recording.steps[self._next]
 
 
 def _seconds(call: Callable[[Any], Any], arguments: Sequence[Any], warm_up: int) -> FloatArray:
-    """Return how long calls took (n - warm_up,) [s], nothing of their results kept."""
+    """Return the durations of calls (n - warm_up,) [s] and discard their results."""
     with no_garbage_collection():
         return clock(call, arguments)[warm_up:]
 
 
 def time_adapter(recording: Recording, num_envs: int) -> list[Part]:
-    """Return what the adapter adds to a decision, and what the masks cost, over environments that take no time."""
+    """Return the time that the adapter and the masks add to a decision, with replayed environments."""
     env = ExplorationVecEnv([lambda: Replay(recording)] * num_envs)
     env.reset()
     actions = [np.zeros(env.num_envs, np.int64)] * (ADAPTER_STEPS + WARM_UP)
     alone = [Replay(recording) for _ in range(num_envs)]
-    # Reads what the steps return, in turn and once a step: the replay's own time, which is no adapter's.
+    # Accesses the results once per step: the time of the replay itself, not of the adapter.
     bare = _seconds(lambda _: [one.step(None) for one in alone], actions, WARM_UP)
     stepped = _seconds(env.step, actions, WARM_UP)
     masks = _seconds(lambda _: np.stack(env.env_method("action_masks")), actions, WARM_UP)
@@ -123,7 +123,7 @@ def time_adapter(recording: Recording, num_envs: int) -> list[Part]:
 
 
 def time_learner(recording: Recording, config: TrainConfig) -> list[Part]:
-    """Return what drawing actions from the network and updating it cost per decision, on one thread."""
+    """Return the time per decision of sampling actions from the network and of updating it, on one thread."""
     torch.set_num_threads(1)
     env = ExplorationVecEnv([lambda: Replay(recording)] * config.envs)
     model = MaskablePPO(
@@ -138,36 +138,36 @@ def time_learner(recording: Recording, config: TrainConfig) -> list[Part]:
             model.policy(model.policy.obs_to_tensor(seen)[0], action_masks=masks)
 
     drawn = _seconds(act, [None] * 60, 10)
-    model.learn(config.rollout)  # fills the buffer, and warms the update up
+    model.learn(config.rollout)  # fills the buffer and warms up the update
     updates = []
     for _ in range(3):
         begin = time.perf_counter()
         model.train()
         updates.append(time.perf_counter() - begin)
     return [
-        Part.of("network, drawing", drawn, env.num_envs),
-        Part.of("network, updating", np.array(updates), config.rollout),
+        Part.of("network, sampling", drawn, env.num_envs),
+        Part.of("network, update", np.array(updates), config.rollout),
     ]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WorkerTimes:
-    """Durations of N steps with a number of workers, each step with the same actions as with the other numbers [s]."""
+    """Durations [s] of N steps with a number of workers; all numbers of workers use the same actions."""
 
-    workers: int  # Processes; 0: the measuring one alone
-    masks: FloatArray  # (N,) on the clock. Asking for the masks.
-    steps: FloatArray  # (N,) on the clock. The steps.
-    # (N, P, 2). What the environments of each process took of them: on the clock, and of its processor.
+    workers: int  # Number of worker processes; 0: this process
+    masks: FloatArray  # (N,) Wall-clock time of requesting the masks
+    steps: FloatArray  # (N,) Wall-clock time of the steps
+    # (N, P, 2) Wall-clock time and processor time of the environments of each process
     spent: FloatArray
 
     @property
     def whole(self) -> FloatArray:
-        """(N,) on the clock. Masks and steps."""
+        """(N,) Wall-clock time of masks and steps."""
         return self.masks + self.steps
 
     @property
     def beside(self) -> FloatArray:
-        """(N,) on the clock. What steps took beside the environments of the slowest process: adapter and pipes."""
+        """(N,) Wall-clock time of steps outside the environments of the slowest process: adapter and pipes."""
         beside: FloatArray = self.steps - self.spent[:, :, CLOCK].max(axis=1)
         return beside
 
@@ -175,12 +175,12 @@ class WorkerTimes:
 def time_workers(
     config: EnvConfig, num_envs: int, workers: Sequence[int], steps: int, seed: int
 ) -> tuple[WorkerTimes, ...]:
-    """Time environments under random valid goals, in this process or over workers.
+    """Time environments with random valid goals, in this process or in workers.
 
-    All of them play the same episodes, and take turns at each step: what else the machine does meets them all alike.
+    All numbers of workers run the same episodes and alternate at each step, so that other load affects all equally.
 
     Args:
-        workers: Numbers of processes; 0: this one alone.
+        workers: Numbers of worker processes; 0: this process.
     """
     with ExitStack() as open_now:
         envs = []
@@ -211,14 +211,14 @@ def time_workers(
 
 
 def summarise_workers(times: Sequence[WorkerTimes], slots: int) -> list[dict[str, Any]]:
-    """Return a row for each number of workers; medians over the steps where nothing else is said.
+    """Return a row for each number of workers; medians over the steps unless noted otherwise.
 
     Returns:
         Rows of `workers`; decisions of robots `per_second` by the median step, `best_per_second` by the fastest,
-        `mean_per_second` by all; `beside_us`, what a decision takes beside the environments of the slowest process;
-        `balance`, the mean over the maximum of the processes' processor times. Beside one worker, else None: `work`,
-        the processor time of all environments as a multiple of that in one worker, above 1 where processes get into
-        each other's way; `gain` in decisions per second, step by step, with its 95 % bootstrap interval.
+        `mean_per_second` by all; `beside_us`, the time of a decision outside the environments of the slowest process;
+        `balance`, the mean over the maximum of the processes' processor times. Relative to one worker, else None:
+        `work`, the total processor time of the environments, above 1 if processes slow each other down; `gain` in
+        decisions per second, step by step, with its 95 % bootstrap interval.
     """
     alone = {each.workers: each for each in times}.get(1)
     rows = []

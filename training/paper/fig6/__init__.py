@@ -1,1 +1,1 @@
-"""Figure 6 of the paper: map error against particles and robots."""
+"""Figure 6 of the paper: map error and step time over numbers of particles and robots."""

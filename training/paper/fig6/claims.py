@@ -1,4 +1,4 @@
-"""Trials of Fig. 6 summed up, and what the paper says of it, asked of the data by 95 % intervals paired over seeds."""
+"""Summary of Fig. 6, and checks of the paper's claims by 95 % intervals paired over seeds."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -8,35 +8,35 @@ import numpy as np
 from scipy import stats
 
 from slam_backend.core.validation import FloatArray
-from training.experiments.statistics import CONFIDENCE, grouped, mean_of
+from training.experiments.statistics import CONFIDENCE, grouped, mean_ci
 from training.experiments.tables import csv_text
 from training.paper.fig6.trials import BOUND, FIGURES
 
 POINT = ("regime", "proposal", "robots", "particles")
 TIMES = ("median_ms", "all_median_ms", "all_mean_ms", "measured")
-LEAST = 1e-12  # [m, ms]; the logarithm of 0 is none
+LEAST = 1e-12  # [m, ms]; lower limit, because the logarithm of 0 is undefined
 
 Rows = Iterable[Mapping[str, Any]]
 
-ENOUGH = 100  # particles from which on the paper's claims about robots are asked
+ENOUGH = 100  # smallest number of particles for the paper's claims about robots
 PAPER = {"regime": "paper", "proposal": "fastslam1"}
-# Beyond what the paper says: with three robots the error is at most this share of a single robot's, at M = 100.
+# Stronger than the paper's claim: the error of three robots relative to a single robot's, at M = 100.
 LARGEST_SHARE, AT = 0.85, 100
-# Nor does the paper know of rejuvenation. Under good stereo a map is then nearly that of batch maximum likelihood, to
-# which names and the whole run are known, and three robots that share the measurements gain nearly what can be had: the
-# share of the error that is left is at most so many times the share that is left with batch maximum likelihood.
+# The paper has no rejuvenation. With good stereo its map error should be near that of batch maximum likelihood, which
+# uses true associations and the whole run, and three robots that share the measurements should gain nearly as much: the
+# ratio of their errors to a single robot's is at most this multiple of the same ratio for batch maximum likelihood.
 REJUVENATED, NEAR_BOUND, NEAR_ITS_GAIN = "fastslam2+rejuvenation", 1.3, 1.15
 
 
 def summarise(errors: Rows, times: Rows) -> list[dict[str, Any]]:
-    """Return one line per regime, proposal, K and M, in the order in which they first come.
+    """Return one line per regime, proposal, K and M, in the order of first occurrence.
 
     Args:
-        times: As `play_time` returns them; they belong to the paper's regime.
+        times: Results of `play_time`, which belong to the paper's regime.
 
     Returns:
-        The fields of `POINT`, `seeds`, `timed_seeds`, and for each of `FIGURES` and `TIMES` its mean over the seeds,
-        with `_low` and `_high` appended the ends of its 95 % bootstrap interval; None where it is not known.
+        The fields of `POINT`, `seeds`, `timed_seeds`, and the mean of each of `FIGURES` and `TIMES` over the seeds,
+        with the ends of its 95 % bootstrap interval as `_low` and `_high`; None if unknown.
     """
     groups = grouped(errors, POINT)
     clocked: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
@@ -50,13 +50,13 @@ def summarise(errors: Rows, times: Rows) -> list[dict[str, Any]]:
         line = dict(zip(POINT, point, strict=True)) | {"seeds": len(own), "timed_seeds": len(timed)}
         for names, rows in ((FIGURES, own), (TIMES, timed)):
             for name in names:
-                line |= mean_of(name, [row[name] for row in rows])
+                line |= mean_ci(name, [row[name] for row in rows])
         lines.append(line)
     return lines
 
 
 def to_csv(lines: Sequence[Mapping[str, Any]]) -> str:
-    """Return the lines of `summarise` as CSV with a heading; what is not known is empty, numbers have six digits."""
+    """Return the lines of `summarise` as CSV with a header; unknown values are empty, numbers have six digits."""
     figures = (f"{name}{end}" for name in (*FIGURES, *TIMES) for end in ("", "_low", "_high"))
     names = [*POINT, "seeds", "timed_seeds", *figures]
     return csv_text(names, ([line[name] for name in names] for line in lines))
@@ -66,7 +66,7 @@ def paired_ratio(above: Mapping[int, float], below: Mapping[int, float]) -> dict
     """Return the geometric mean over seeds of `above / below`, with its 95 % interval by Student's t on the logarithms.
 
     Returns:
-        `ratio`, `low`, `high` and `seeds`; None for what so few seeds do not tell.
+        `ratio`, `low`, `high` and `seeds`; None for values that need more seeds.
 
     >>> paired_ratio({0: 2.0, 1: 8.0, 2: 5.0}, {0: 1.0, 1: 2.0})["ratio"]
     2.82842712474619
@@ -83,12 +83,12 @@ def paired_ratio(above: Mapping[int, float], below: Mapping[int, float]) -> dict
 
 
 def error_by_seed(errors: Rows, figure: str = "map_rmse_m", **point: Any) -> dict[int, float]:
-    """Return a figure by seed of the error trials with these fields."""
+    """Return a metric of the error trials with the given fields, by seed."""
     return _by_seed(errors, point, lambda row: row[figure])
 
 
 def time_by_seed(times: Rows, robots: int, particles: int) -> dict[int, float]:
-    """Return by seed the median time [ms] of the steps with all measurements, for K robots and M particles."""
+    """Return the median time [ms] of the steps with all measurements for K robots and M particles, by seed."""
     return _by_seed(
         (row for row in times if robots in row["robots"]), {"particles": particles},
         lambda row: row["median_ms"][row["robots"].index(robots)],
@@ -96,36 +96,36 @@ def time_by_seed(times: Rows, robots: int, particles: int) -> dict[int, float]:
 
 
 def _by_seed(rows: Rows, point: Mapping[str, Any], read: Callable[[Mapping[str, Any]], Any]) -> dict[int, float]:
-    """Return what is read from the rows with these fields, by seed; what is not known is left out."""
+    """Return values of the rows with the given fields, by seed, without unknown ones."""
     chosen = (row for row in rows if all(row[name] == value for name, value in point.items()))
     return {row["seed"]: float(value) for row in chosen if (value := read(row)) is not None}
 
 
 def flat_within(particles: int) -> float:
-    """Return within what factor the time per step may depend on K and still be called flat: 2, from M = 1000 on 1.5.
+    """Return the factor within which the step time counts as independent of K: 2, or 1.5 for M >= 1000.
 
-    These are the factors within which the time is to be flat in the number of landmarks too. Without the division of
-    the measurements, three robots would cost three times as much as one.
+    The same factors apply to the dependence on the number of landmarks. Without division of the measurements, three
+    robots would take three times as long as one.
     """
     return 1.5 if particles >= 1000 else 2.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Claim:
-    """One statement about a ratio."""
+    """Statement about a ratio."""
 
-    claim: str  # In words
+    claim: str  # Text of the claim
     ratio: float | None  # Geometric mean over seeds; None without data
     low: float | None  # Lower end of its 95 % interval, paired over seeds; None for a single seed
-    high: float | None  # Its upper end
-    seeds: int  # How many
-    above: float | None = None  # What the interval's lower end must be above; None: no such limit
-    below: float | None = None  # What the interval's upper end must be below; None: no such limit
-    ratio_at_most: float | None = None  # What the ratio itself may not be above; None: no such limit
+    high: float | None  # Upper end of the interval
+    seeds: int  # Number of seeds
+    above: float | None = None  # Limit below the interval; None: no such limit
+    below: float | None = None  # Limit above the interval; None: no such limit
+    ratio_at_most: float | None = None  # Maximum of the ratio itself; None: no such limit
 
     @property
     def holds(self) -> bool:
-        """Whether the data show it; what they leave open does not hold."""
+        """Whether the data show the claim; an inconclusive claim does not hold."""
         if self.ratio is None or self.low is None or self.high is None:
             return False
         return (
@@ -135,12 +135,12 @@ class Claim:
         )
 
     def to_mapping(self) -> dict[str, Any]:
-        """Return it as plain values."""
+        """Return the claim as plain values."""
         return asdict(self) | {"holds": self.holds}
 
 
 def check_claims(errors: Sequence[Mapping[str, Any]], times: Sequence[Mapping[str, Any]]) -> list[Claim]:
-    """Ask the paper's claims of the trials in its regime, as far as there are any."""
+    """Check the paper's claims on the trials of its regime, as far as there are any."""
     own = [row for row in errors if all(row[name] == value for name, value in PAPER.items())]
     numbers = sorted({row["particles"] for row in own})
     robots = sorted({row["robots"] for row in own})
@@ -160,7 +160,7 @@ def check_claims(errors: Sequence[Mapping[str, Any]], times: Sequence[Mapping[st
 
 
 def _rejuvenation_claims(errors: Iterable[Mapping[str, Any]]) -> list[Claim]:
-    """Return the claims about the map of rejuvenated filters: over others', over the bound, and over robots."""
+    """Return the claims about rejuvenated filters: against other filters, against the bound, and over robots."""
     good = [row for row in errors if row["regime"] == "good"]
     robots = sorted({row["robots"] for row in good if row["proposal"] == REJUVENATED and row["particles"] == AT})
     own, plain, bound = (
@@ -185,12 +185,12 @@ def _rejuvenation_claims(errors: Iterable[Mapping[str, Any]]) -> list[Claim]:
 
 
 def _product(a: Mapping[int, float], b: Mapping[int, float]) -> dict[int, float]:
-    """Return the products of what both have for a seed."""
+    """Return the products of two values with a common seed."""
     return {seed: a[seed] * b[seed] for seed in a.keys() & b.keys()}
 
 
 def _time_claims(times: Sequence[Mapping[str, Any]]) -> list[Claim]:
-    """Return the claims about the time per step."""
+    """Return the claims about the step time."""
     robots = sorted({k for row in times for k in row["robots"]})
     if len(robots) < 2:
         return []
@@ -198,17 +198,17 @@ def _time_claims(times: Sequence[Mapping[str, Any]]) -> list[Claim]:
     claims = []
     for m in sorted({row["particles"] for row in times if row["particles"] >= ENOUGH}):
         found, factor = paired_ratio(*(time_by_seed(times, k, m) for k in (most, one))), flat_within(m)
-        name = f"time, M={m}: K={most} and K={one} alike, within a factor of {factor:g}"
+        name = f"time, M={m}: K={most} and K={one} equal within a factor of {factor:g}"
         claims.append(Claim(claim=name, above=1.0 / factor, below=factor, **found))
     return claims
 
 
 def robots_ratios(errors: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return, for each regime, proposal and M, the map error of most robots over that of fewest, as it is and aligned.
+    """Return the ratio of map errors, largest over smallest number of robots, for each regime, proposal and M.
 
     Returns:
-        Rows of `regime`, `proposal`, `particles`, `robots` (the two numbers, fewest first), `raw` and `aligned`, the
-        last two as `paired_ratio` gives them.
+        Rows of `regime`, `proposal`, `particles`, `robots` (the two numbers, smallest first), `raw` and `aligned`, the
+        last two as results of `paired_ratio`.
     """
     rows = list(errors)
     robots = sorted({row["robots"] for row in rows})

@@ -1,4 +1,4 @@
-"""Tables and picture of `vslam paper fig6`."""
+"""Tables and figure of `vslam paper fig6`."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -20,7 +20,7 @@ from training.paper.fig6.claims import Claim
 from training.paper.fig6.trials import BOUND, REGIMES
 from vslam_env.rendering.palette import robot_colour
 
-MARKERS = ("o", "s", "^")  # of one, two and three robots, as in the paper
+MARKERS = ("o", "s", "^")  # markers of one, two and three robots, as in the paper
 STYLES = {"fastslam1": "-", "fastslam2": "--", "fastslam2+rejuvenation": ":", BOUND: (0, (6, 1.5, 1, 1.5))}
 Lines = Sequence[Mapping[str, Any]]
 
@@ -28,13 +28,13 @@ Lines = Sequence[Mapping[str, Any]]
 def print_result(
     console: Console, lines: Sequence[Mapping[str, Any]], ratios: Sequence[Mapping[str, Any]], claims: Sequence[Claim]
 ) -> None:
-    """Print a table of each regime and proposal, one of the ratios, and which claims hold."""
+    """Print a table for each regime and proposal, one of the ratios, and the results of the claims."""
     for regime, proposal in dict.fromkeys((line["regime"], line["proposal"]) for line in lines):
         own = [line for line in lines if (line["regime"], line["proposal"]) == (regime, proposal)]
         _print_points(console, f"{REGIMES[regime].title}, {proposal}", own)
     if ratios:
         few, many = ratios[0]["robots"]
-        table = console_table(f"Map error, K={many} over K={few} (95 %)", ("regime", "M", "as it is", "aligned"))
+        table = console_table(f"Map error, K={many} over K={few} (95 %)", ("regime", "M", "not aligned", "aligned"))
         for row in ratios:
             name = f"{REGIMES[row['regime']].title}, {row['proposal']}"
             table.add_row(
@@ -50,7 +50,7 @@ def print_result(
 
 
 def _print_points(console: Console, title: str, lines: Sequence[Mapping[str, Any]]) -> None:
-    """Print map error and time, a row for each M and a column for each K."""
+    """Print map error and time, with a row for each M and a column for each K."""
     robots = sorted({line["robots"] for line in lines})
     parts = [("map error [m]", "map_rmse_m", 3, 1)] + [("step [ms]", "median_ms", 3, 0)] * any(
         line["median_ms"] is not None for line in lines
@@ -67,7 +67,7 @@ def _print_points(console: Console, title: str, lines: Sequence[Mapping[str, Any
 
 
 def _cell(line: Mapping[str, Any] | None, figure: str, digits: int, with_interval: bool) -> str:
-    """Show a mean, with its interval if asked for, and what is not known as a dash."""
+    """Format a mean, with its interval if requested; unknown values give a dash."""
     if line is None:
         return "-"
     low, high = line[f"{figure}_low"], line[f"{figure}_high"]
@@ -76,7 +76,7 @@ def _cell(line: Mapping[str, Any] | None, figure: str, digits: int, with_interva
 
 
 def _interval(found: Mapping[str, Any]) -> str:
-    """Show a ratio with its interval."""
+    """Format a ratio with its interval."""
     ends = "" if found["low"] is None else f" ({number(found['low'])}-{number(found['high'])})"
     return number(found["ratio"]) + ends
 
@@ -109,7 +109,7 @@ def draw_fig6(file: Path, lines: Lines) -> None:
 
 
 def _draw_panel(ax: Axes, lines: Lines, key: str) -> None:
-    """Draw a curve for each proposal and number of robots over M; the bound, which has no M, as a level."""
+    """Draw a curve over M for each proposal and number of robots, and the bound, which has no M, as a level line."""
     robots = sorted({line["robots"] for line in lines})
     for line in lines:
         if line["proposal"] == BOUND and line[key] is not None:
@@ -117,7 +117,7 @@ def _draw_panel(ax: Axes, lines: Lines, key: str) -> None:
     for proposal, k in sorted({(line["proposal"], line["robots"]) for line in lines if line["proposal"] != BOUND}):
         own = [line for line in lines if (line["proposal"], line["robots"]) == (proposal, k) and line[key] is not None]
         x, mean, low, high = _columns(own, key)
-        x = x * 1.03 ** (robots.index(k) - 0.5 * (len(robots) - 1))  # so that intervals stand side by side
+        x = x * 1.03 ** (robots.index(k) - 0.5 * (len(robots) - 1))  # shifts the intervals side by side
         ax.errorbar(
             x, mean, yerr=[np.maximum(mean - low, 0.0), np.maximum(high - mean, 0.0)], lw=1.1,
             color=rgb(robot_colour(k - 1)), marker=_marker(k), mfc="white", ms=4.5, capsize=1.5, elinewidth=0.8,
@@ -133,7 +133,7 @@ def _draw_panel(ax: Axes, lines: Lines, key: str) -> None:
 
 
 def _columns(lines: Lines, key: str) -> FloatArray:
-    """Return M, the mean and the ends of its interval, (4, n) in the order of M; a missing interval is the mean."""
+    """Return M, the mean and the ends of its interval, (4, n), sorted by M; a missing interval equals the mean."""
     rows = []
     for line in sorted(lines, key=lambda line: int(line["particles"])):
         ends = (line[f"{key}_low"], line[f"{key}_high"])
@@ -142,7 +142,7 @@ def _columns(lines: Lines, key: str) -> FloatArray:
 
 
 def _legend(robots: Sequence[int], proposals: Sequence[str]) -> list[Line2D]:
-    """Return what the curves mean."""
+    """Return the entries of the legend."""
     handles = [
         Line2D([], [], color=rgb(robot_colour(k - 1)), marker=_marker(k), mfc="white", ms=4.5, label=f"K = {k}")
         for k in robots
@@ -153,5 +153,5 @@ def _legend(robots: Sequence[int], proposals: Sequence[str]) -> list[Line2D]:
 
 
 def _marker(robots: int) -> str:
-    """Return the marker of K robots."""
+    """Return the marker for K robots."""
     return MARKERS[(robots - 1) % len(MARKERS)]

@@ -1,4 +1,4 @@
-"""Trials of the paper's Fig. 6 under three noise regimes: the error of a filter's map, and the time of a step."""
+"""Trials of the paper's Fig. 6 in three noise regimes: map error and step time of a filter."""
 
 import time
 from dataclasses import asdict, dataclass
@@ -15,22 +15,22 @@ from training.experiments.timing import no_garbage_collection
 
 Proposal = Literal["fastslam1", "fastslam2", "fastslam2+rejuvenation", "batch_ml"]
 
-BOUND: Proposal = "batch_ml"  # no filter: maximum likelihood over the whole run, told all names; it has no particles
+BOUND: Proposal = "batch_ml"  # no filter, no particles: maximum likelihood with true associations
 
-FEW = (10, 100, 1000)  # particles, beside the paper's eleven numbers
-# Algorithm 1, l. 10: drawn at random in proportion to the weights, at every step. fastslam2 keeps the defaults, and
-# "+rejuvenation" draws all particles anew from smoothed paths every so many steps.
+FEW = (10, 100, 1000)  # numbers of particles, instead of the paper's eleven
+# Algorithm 1, l. 10: random draws in proportion to the weights, at every step. fastslam2 has the defaults, and
+# "+rejuvenation" samples all particles from smoothed paths at regular intervals.
 FILTER_OPTIONS: dict[Proposal, dict[str, Any]] = {
     "fastslam1": {"resample_threshold": 1.0, "resampling": "multinomial"}, "fastslam2": {},
     "fastslam2+rejuvenation": {"rejuvenate_every": REJUVENATE_EVERY},
 }  # fmt: skip
 
-# Sec. 5 speaks neither of look-alikes nor of false points.
+# Sec. 5 mentions neither similar landmarks nor false points.
 DISTINCT = {"look_alikes": 1, "outliers": 0.0, "wrong_descriptors": 0.0}
 ERRORS_FILE, TIMES_FILE = "errors.jsonl", "times.jsonl"
-FIXED_COST = 200  # a step costs about as much as that of so many particles, however few there are
-BOUND_COST = 4000  # in the same unit, of batch maximum likelihood
-BLOCK = 20  # steps that one filter takes before the next has its turn
+FIXED_COST = 200  # fixed cost of a step, in particles
+BOUND_COST = 4000  # cost of batch maximum likelihood, in the same unit
+BLOCK = 20  # steps of one filter before the next filter runs
 FIGURES = (
     "map_rmse_m", "map_aligned_rmse_m", "map_all_rmse_m", "map_recall", "map_precision", "pose_rms_m",
     "pose_aligned_rms_m", "heading_rms_deg", "ess_share", "wrong_match_share",
@@ -39,16 +39,16 @@ FIGURES = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Regime:
-    """Noise, looks of the landmarks, and the filters that are tried. Association is always unknown."""
+    """Noise, descriptors and filters of a set of trials. Association is always unknown."""
 
-    title: str  # For tables and figures
-    preset: Preset  # Of the noise
-    looks: dict[str, Any]  # Fields of `RunSpec` that say how landmarks are confused
-    proposals: tuple[Proposal, ...]  # Of the filters; with `BOUND`, what nothing can beat stands beside them
-    few: bool  # Whether the numbers of particles in `FEW` are enough
+    title: str  # Title in tables and figures
+    preset: Preset  # Noise preset
+    looks: dict[str, Any]  # Fields of `RunSpec` for similar landmarks and outliers
+    proposals: tuple[Proposal, ...]  # Proposals of the filters; `BOUND` adds the lower bound
+    few: bool  # Whether only the numbers of particles in `FEW` are run
 
     def spec(self, robots: int, length: float, measurements: int = 15) -> RunSpec:
-        """Return the run of K robots, each driving `length` [m]; all together measure at most B landmarks in a step."""
+        """Return the run of K robots that drive `length` [m] each and measure at most B landmarks per step in total."""
         return RunSpec(
             preset=self.preset, association="unknown", robots=robots, length=length, measurements=measurements,
             **self.looks,
@@ -60,7 +60,7 @@ REGIMES = {
         title="as in the paper", preset="paper", looks=DISTINCT, proposals=("fastslam1",), few=False
     ),
     "look_alikes": Regime(
-        title="with look-alikes and false points", preset="paper", looks={}, proposals=("fastslam1",),
+        title="with similar landmarks and false points", preset="paper", looks={}, proposals=("fastslam1",),
         few=True,
     ),
     "good": Regime(
@@ -72,15 +72,15 @@ REGIMES = {
 
 @dataclass(frozen=True, slots=True)
 class ErrorTrial:
-    """What decides how wrong a map is."""
+    """Parameters of a map error trial."""
 
     regime: str  # Key of `REGIMES`
-    proposal: Proposal  # Of the filter, or `BOUND`
+    proposal: Proposal  # Proposal of the filter, or `BOUND`
     robots: int  # K
-    particles: int  # M; 0 of the bound
-    measurements: int  # B, of all robots together
-    length: float  # Of each robot's path [m]
-    seed: int  # Of the run, and of the filter's draws
+    particles: int  # M; 0 for the bound
+    measurements: int  # B, for all robots together
+    length: float  # Path length of each robot [m]
+    seed: int  # Seed of the run and of the filter
 
     def __post_init__(self) -> None:
         check_choice("regime", self.regime, tuple(REGIMES))
@@ -88,23 +88,23 @@ class ErrorTrial:
         least = 0 if self.proposal == BOUND else 1
         check_int("particles", self.particles, least, "Use at least one particle; 100 is a good start.")
         check_int("seed", self.seed, 0, "Use 0 or a positive number.")
-        _ = self.spec  # refuses the rest
+        _ = self.spec  # validates the other fields
 
     @property
     def spec(self) -> RunSpec:
-        """The run that is simulated."""
+        """Simulated run."""
         return REGIMES[self.regime].spec(self.robots, self.length, self.measurements)
 
 
 @dataclass(frozen=True, slots=True)
 class TimeTrial:
-    """What decides how long steps take; all numbers of robots are timed together."""
+    """Parameters of a step time trial; all numbers of robots are timed together."""
 
     robots: tuple[int, ...]  # Numbers K
     particles: int  # M
-    measurements: int  # B, of all robots together
-    length: float  # Of each robot's path [m]
-    seed: int  # Of the runs, and of the filters' draws
+    measurements: int  # B, for all robots together
+    length: float  # Path length of each robot [m]
+    seed: int  # Seed of the runs and of the filters
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "robots", tuple(self.robots))
@@ -113,12 +113,12 @@ class TimeTrial:
 
     @property
     def specs(self) -> list[RunSpec]:
-        """The runs that are simulated, one for each number of robots."""
+        """Simulated runs, one for each number of robots."""
         return [REGIMES["paper"].spec(robots, self.length, self.measurements) for robots in self.robots]
 
 
 def cost(trial: ErrorTrial | TimeTrial) -> int:
-    """Return about how long a trial takes, in an arbitrary unit: what a progress bar counts."""
+    """Return the approximate cost of a trial in an arbitrary unit, for a progress bar."""
     if isinstance(trial, TimeTrial):
         return (trial.particles + FIXED_COST) * len(trial.robots)
     return BOUND_COST if trial.proposal == BOUND else trial.particles + FIXED_COST
@@ -128,9 +128,9 @@ def play_error(trial: ErrorTrial) -> dict[str, Any]:
     """Run a trial.
 
     Returns:
-        The trial's own fields, the figures that `accuracy_trials.play` explains, and `map_all_rmse_m`: that of all
-        landmarks of the map which a true landmark caused, duplicates included, where `map_rmse_m` takes the nearest.
-        What only filters have is NaN of the bound.
+        Fields of the trial, the metrics of `accuracy.trials.play`, and `map_all_rmse_m`: the RMSE over all landmarks of
+        the map that have a true landmark, duplicates included, while `map_rmse_m` uses the nearest one.
+        Metrics that only filters have are NaN for the bound.
     """
     run = _run_of(trial.spec, trial.seed)
     if trial.proposal == BOUND:
@@ -142,7 +142,7 @@ def play_error(trial: ErrorTrial) -> dict[str, Any]:
 
 
 def rms_of_all(run: StereoRun, answer: Answer) -> float:
-    """Return the RMS distance [m] of all landmarks of a map from the true ones that caused them; NaN if none did."""
+    """Return the RMS distance [m] of all landmarks of a map from their true landmarks; NaN if there are none."""
     if answer.means is None or answer.claims is None:
         return float("nan")
     caused = answer.claims != FALSE_POINT
@@ -151,13 +151,13 @@ def rms_of_all(run: StereoRun, answer: Answer) -> float:
 
 
 def play_time(trial: TimeTrial) -> dict[str, Any]:
-    """Time the filters of all numbers of robots in the paper's regime, in turns, so that what else is running hits all.
+    """Time the filters of all numbers of robots in the paper's regime, interleaved so that other load affects all.
 
     Returns:
-        The trial's own fields, and per number of robots: `median_ms`, of the steps with as many measurements as were
-        asked for, `all_median_ms` and `all_mean_ms`, of all steps, and `measured`, the mean number in a step.
-        Times are processor time of the one thread that a filter uses, which what else is running does not prolong
-        but by the caches it takes.
+        Fields of the trial, and for each number of robots: `median_ms` over the steps with the full number of
+        measurements, `all_median_ms` and `all_mean_ms` over all steps, and `measured`, the mean number per step.
+        Times are processor times of the single thread of a filter; other processes affect them only through shared
+        caches.
     """
     runs = [_run_of(spec, trial.seed) for spec in trial.specs]
     filters = [_build(run, "fastslam1", trial.particles, trial.seed) for run in runs]
@@ -173,7 +173,7 @@ def play_time(trial: TimeTrial) -> dict[str, Any]:
 
 
 def time_in_turns(filters: list[FastSlam], runs: list[StereoRun]) -> list[FloatArray]:
-    """Let each filter take its run, `BLOCK` steps at a time; return each one's times (T,) [ms]."""
+    """Run each filter on its run, `BLOCK` steps at a time; return the times (T,) [ms] of each."""
     times = [np.zeros(run.num_steps) for run in runs]
     readings = [list(run.readings()) for run in runs]
     with no_garbage_collection():
@@ -187,22 +187,22 @@ def time_in_turns(filters: list[FastSlam], runs: list[StereoRun]) -> list[FloatA
 
 
 def full_steps(run: StereoRun) -> BoolArray:
-    """Tell at which steps (T,) the robots measured all B landmarks that they may; fewer are in view now and then."""
+    """Return at which steps (T,) the robots measured B landmarks; sometimes fewer are in view."""
     return np.asarray(_measured(run) == run.spec.measurements)
 
 
 def _measured(run: StereoRun) -> FloatArray:
-    """Return the measurements of all robots in each step (T,)."""
+    """Return the number of measurements of all robots in each step (T,)."""
     return np.array([sum(map(len, frames)) for frames in run.frames], dtype=np.float64)
 
 
 def _build(run: StereoRun, proposal: Proposal, particles: int, seed: int) -> FastSlam:
-    """Return a filter of this figure."""
+    """Return a filter for this figure."""
     options = FILTER_OPTIONS[proposal]
     return run.build_filter(particles, "fastslam1" if proposal == "fastslam1" else "fastslam2", seed=seed, **options)
 
 
 @lru_cache(maxsize=3)
 def _run_of(spec: RunSpec, seed: int) -> StereoRun:
-    """Simulate a run once for the trials on it that follow each other."""
+    """Simulate a run once for consecutive trials."""
     return simulate_run(spec, seed)
