@@ -4,13 +4,18 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: demo test lint metrics clients compat clean
+.PHONY: demo test test-all lint metrics kernels-wheel clients compat clean
 
 demo: $(VENV)/.core  ## run three robots that explore an office, build maps and merge them; writes a folder under runs/
 	$(BIN)/vslam run --world office --robots 3 --policy frontier --seed 0
 
-test: lint  ## linters and all tests
-	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist worksteal
+PYTEST := -m pytest --numprocesses auto --maxprocesses 4 --dist worksteal
+
+test: lint  ## linters, and all tests that are not marked slow
+	$(BIN)/python $(PYTEST) -m "not slow"
+
+test-all: lint  ## linters and all tests
+	$(BIN)/python $(PYTEST)
 
 lint: $(VENV)/.dev  ## style, types, the direction of imports, and prose
 	$(BIN)/ruff check .
@@ -21,6 +26,9 @@ lint: $(VENV)/.dev  ## style, types, the direction of imports, and prose
 
 metrics: $(VENV)/.core  ## metrics of the code: sizes, folders, path of a measurement, private accesses, import cycles
 	$(BIN)/python benchmarks/code_metrics.py
+
+kernels-wheel: $(VENV)/.core  ## build a wheel of kernels compiled for x86-64-v3 and v4 in dist/; takes minutes
+	$(BIN)/python -m slam_backend.core.kernel_wheel dist slam_backend vslam_env
 
 CLIENTS := torchrl rllib agilerl tianshou benchmarl
 
@@ -40,7 +48,7 @@ compat-%: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)-compat/$*
 	$(VENV)-compat/$*/bin/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable ".[dev]"
 	$(VENV)-compat/$*/bin/python -m pip install --quiet --disable-pip-version-check $(OTHER)
-	$(VENV)-compat/$*/bin/python -m pytest --numprocesses auto --maxprocesses 4 --dist worksteal
+	$(VENV)-compat/$*/bin/python $(PYTEST)
 
 $(VENV)/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit("vslam_env needs Python >= 3.11, but $(PYTHON) is " + sys.version.split()[0] + ": use make PYTHON=python3.11" if sys.version_info < (3, 11) else 0)'
@@ -55,5 +63,5 @@ $(VENV)/.dev: pyproject.toml constraints.txt | $(VENV)/bin/python
 	touch $@ $(VENV)/.core
 
 clean:
-	rm -rf $(VENV) $(VENV)-clients $(VENV)-compat build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) $(VENV)-clients $(VENV)-compat build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
 	find . -name __pycache__ -prune -exec rm -rf {} +

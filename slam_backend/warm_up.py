@@ -51,9 +51,9 @@ def warm_up(
 ) -> float:
     """Compile the kernels that a filter or a team needs, or load them from the cache.
 
-    Kernels are kept in numba's cache: beside the package if its folder can be written, else in the user's own cache
-    folder, or where the variable NUMBA_CACHE_DIR says. A new version of the package, of numba or another processor
-    starts with an empty one. While one process fills it others wait.
+    Kernels are kept beside the package if its folder can be written, else in the user's own cache folder, or where the
+    variable NUMBA_CACHE_DIR says. What is missing there comes from the package `vslam-env-kernels`, if it is installed
+    and fits, and is compiled else. While one process fills the cache others wait.
 
     Args:
         options: Of the filters; None: the default ones.

@@ -3,8 +3,9 @@
 import errno
 import os
 import sys
+from importlib.metadata import version
 from signal import Signals
-from typing import NoReturn
+from typing import Annotated, NoReturn
 
 import typer
 from rich.console import Console
@@ -25,10 +26,28 @@ BAD_INPUT = 2
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 INTERRUPTED = 130  # typer's status after a KeyboardInterrupt
 
+
+def _print_version(is_wanted: bool) -> None:
+    if is_wanted:
+        typer.echo(f"vslam-env {version('vslam-env')}")
+        raise typer.Exit
+
+
 app = typer.Typer(
     name="vslam", help="Robots that do not know where they start explore, map and merge: runs, replays and figures.",
     no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
 )  # fmt: skip
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool, typer.Option("--version", help="Print the version and exit.", callback=_print_version, is_eager=True)
+    ] = False,
+) -> None:
+    """Take the options that come before a command."""
+
+
 app.command("run")(run)
 app.command("drive")(drive_by_hand)
 app.command("train")(train)

@@ -10,7 +10,6 @@ from typing import Any, Literal, Self, TypeVar
 
 import numpy as np
 import tomli_w
-from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from slam_backend.core.validation import argument_error, check_choice, check_float, check_int
 from vslam_env.belief.belief import BeliefConfig
@@ -29,6 +28,8 @@ def validate(cls: type[T], values: Mapping[str, Any]) -> T:
         text = json.dumps(to_plain(values), default=str)
     except (ValueError, RecursionError) as error:  # an int of 5000 digits, or a part that holds itself
         raise argument_error("config", "values that JSON can hold", "no such values", f"It says: {error}.") from error
+    from pydantic import TypeAdapter, ValidationError  # slow to import, and not always needed
+
     try:
         # Strict on JSON refuses 2.0, "2" and True as ints, but takes dicts for parts, lists for tuples, int for float.
         return TypeAdapter(cls).validate_json(text, strict=True)
@@ -142,7 +143,7 @@ class EnvConfig:
         belief: What the robots assume, and how they align their maps.
     """
 
-    __pydantic_config__ = ConfigDict(extra="forbid")
+    __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012
 
     world: str = "office"
     world_split: Literal["train", "validation", "test"] | None = None

@@ -1,9 +1,7 @@
 """The few ways in which this project compiles a kernel: serial, cached on disk, without the interpreter lock."""
 
+import logging
 from collections.abc import Callable
-from functools import lru_cache
-from hashlib import sha256
-from pathlib import Path
 from typing import Any, ParamSpec, TypeVar, cast
 
 import numba
@@ -17,16 +15,16 @@ from numba.np import arrayobj
 from numpy.typing import NDArray
 
 from slam_backend.core.kernel_cache import KernelCache
+from slam_backend.core.shipped_kernels import CONFIG
 from slam_backend.core.validation import FloatArray
 
+LOGGER = logging.getLogger("slam_backend")
 P = ParamSpec("P")
 T = TypeVar("T")
 Scalar = TypeVar("Scalar", bound=np.generic)
 
+IS_PLAIN = bool(CONFIG.DISABLE_JIT)  # whether kernels are plain functions
 LINE = 64  # bytes of a line of the cache
-KERNELS = "_kernels"  # ends the name of a folder whose modules hold kernels that call each other
-SIMD_MATH = Path(__file__).with_name("simd_math.py")  # which those of other folders call, too
-
 
 # numba counts the references to each array: it makes a counter for each one that Python hands over, and each slice in a
 # kernel costs two atomic instructions. A kernel that only works in arrays which it is given can do without. numba
@@ -39,10 +37,10 @@ HAS_NRT_OPTION = hasattr(CPUTargetOptions, "_nrt")
 _STRICT: dict[str, Any] = {"fastmath": False, "error_model": "python"}
 
 # Lane kernels run the same arithmetic over a fixed number of particles, so that the compiler turns it into vector
-# instructions. Two things it needs: a product and a sum may be fused into one instruction (`contract`; sums are not
-# reordered, so the same machine gives the same bytes), and a division by zero gives inf instead of an exception.
+# instructions. Two things it needs: a product and a sum may be fused into one instruction (`contract`), and a division
+# by zero gives inf instead of an exception. Sums are never reordered: their last bits would depend on how many numbers
+# a processor adds at a time, and kernels compiled for another one would give other bytes.
 _LANES: dict[str, Any] = {"fastmath": {"contract"}, "error_model": "numpy"}
-_ANY_ORDER: dict[str, Any] = {"fastmath": {"contract", "reassoc", "nsz"}, "error_model": "numpy"}
 
 
 class DeviceKernel(CPUDispatcher):
@@ -60,10 +58,7 @@ class DeviceKernel(CPUDispatcher):
 def jit(function: Callable[P, T]) -> Callable[P, T]:
     """Compile a kernel that may make arrays, and keep its signature for the type checker.
 
-    numba's disk cache notices edits of the file that holds `function`, not of other files whose kernels it calls:
-    kernels that call each other therefore live in one module, or in one folder whose name ends in `_kernels`, of which
-    an edit of any file is noticed, as is one of `SIMD_MATH`. `parallel=True` is left out on purpose, because it breaks
-    forked workers.
+    `parallel=True` is left out on purpose, because it breaks forked workers.
     """
     return _compiled(function, counted=True, forceinline=False, **_STRICT)
 
@@ -96,54 +91,26 @@ def simd_inline(function: Callable[P, T]) -> Callable[P, T]:
     return device(_compiled(function, counted=False, forceinline=True, **_LANES))
 
 
-def simd_sum(function: Callable[P, T]) -> Callable[P, T]:
-    """Compile a sum over an array that may be taken in any order, the same one each time, so that it is vectorised."""
-    return device(_compiled(function, counted=False, forceinline=True, **_ANY_ORDER))
-
-
 def device(kernel: Callable[P, T]) -> Callable[P, T]:
     """Leave out the Python wrapper of a kernel that only other kernels call; stands above the kernel's own decorator.
 
     The wrapper takes as long to compile as a small kernel. A call from Python raises TypeError.
     """
-    if isinstance(kernel, CPUDispatcher):  # a plain function where NUMBA_DISABLE_JIT is set
+    if isinstance(kernel, CPUDispatcher):
         kernel.targetoptions["no_cpython_wrapper"] = True
         kernel.__class__ = DeviceKernel
-        _stamp(kernel)
     return kernel
 
 
 def _compiled(function: Callable[P, T], counted: bool, **options: Any) -> Callable[P, T]:
-    """Compile without the interpreter lock and with the cache on disk, if there is a place for it."""
+    """Compile without the interpreter lock and with the cache on disk."""
     if HAS_NRT_OPTION:
         options["_nrt"] = counted
     options |= {"nogil": True, "no_cfunc_wrapper": True}  # no C code calls a kernel
-    try:
-        kernel = numba.njit(cache=True, **options)(function)
-    except RuntimeError:  # neither the package's folder nor the user's can be written: each process compiles anew
-        kernel = numba.njit(**options)(function)
-    _stamp(kernel)
+    kernel: Any = numba.njit(**options)(function)
+    if not IS_PLAIN:
+        kernel._cache = KernelCache(kernel)
     return cast(Callable[P, T], kernel)
-
-
-def _stamp(kernel: Any) -> None:
-    """Let entries of the disk cache be stale once the options or the files that a kernel was compiled from change."""
-    cache: Any = getattr(kernel, "_cache", None)
-    if not hasattr(cache, "_impl"):  # compilation, or its cache, is switched off
-        return
-    folder = Path(kernel.py_func.__code__.co_filename).parent
-    callees = _contents(folder) if folder.name.endswith(KERNELS) else b""
-    options = sorted((name, sorted(x) if isinstance(x, set) else x) for name, x in kernel.targetoptions.items())
-    kernel._cache = KernelCache(cache, (cache._impl.locator.get_source_stamp(), callees, options))
-
-
-@lru_cache
-def _contents(folder: Path) -> bytes:
-    """Return a digest of all modules of a folder, and of those which any folder's may call."""
-    digest = sha256()
-    for file in sorted({*folder.glob("*.py"), SIMD_MATH}):
-        digest.update(file.read_bytes())
-    return digest.digest()
 
 
 def _float_bits(typing_context: Any, x: Any) -> Any:
@@ -162,10 +129,6 @@ def _bits_float(typing_context: Any, x: Any) -> Any:
         return builder.bitcast(args[0], ir.DoubleType())
 
     return types.float64(types.int64), code
-
-
-float_bits = cast(Callable[[float], int], intrinsic(_float_bits))
-bits_float = cast(Callable[[int], float], intrinsic(_bits_float))
 
 
 # numba declares no types for these.
@@ -200,7 +163,19 @@ def _room_of(typing_context: Any, size: Any, dtype: Any) -> Any:
     return _unset(dtype.dtype, size, dtype)
 
 
+# numba refuses calls of intrinsics from Python, which kernels are where compilation is switched off.
+if IS_PLAIN:
+    LOGGER.warning("NUMBA_DISABLE_JIT is set: kernels run as plain Python, some hundred times as slow.")
+float_bits = cast(
+    Callable[[float], int], (lambda x: np.float64(x).view(np.int64)) if IS_PLAIN else intrinsic(_float_bits)
+)
+bits_float = cast(
+    Callable[[int], float], (lambda x: np.int64(x).view(np.float64)) if IS_PLAIN else intrinsic(_bits_float)
+)
 # An array of as many numbers as a constant says, unset, that lives as long as the call of a kernel: it costs nothing,
 # and even a kernel that works `in_place` may have it, but not return it.
-stack_array = cast(Callable[[int], FloatArray], intrinsic(prefer_literal=True)(_room))
-stack_array_of = cast(Callable[[int, type[Scalar]], NDArray[Scalar]], intrinsic(prefer_literal=True)(_room_of))
+stack_array = cast(Callable[[int], FloatArray], np.empty if IS_PLAIN else intrinsic(prefer_literal=True)(_room))
+stack_array_of = cast(
+    Callable[[int, type[Scalar]], NDArray[Scalar]],
+    np.empty if IS_PLAIN else intrinsic(prefer_literal=True)(_room_of),
+)

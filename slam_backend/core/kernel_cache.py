@@ -1,111 +1,207 @@
-"""Disk cache of compiled kernels: several processes may use it at a time, and damaged files are compiled again."""
+"""Disk cache of compiled kernels: several processes may use it at a time, and damaged files are compiled again.
 
-import logging
+A kernel is looked up in the user's own cache first, then among those that the package `vslam-env-kernels` ships. Files
+are named after all that decides what is in them, so that a stale one is never found.
+"""
+
+import os
 import pickle
+import stat
+import sys
+import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import suppress
+from functools import lru_cache
 from hashlib import sha256
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
-from numba.core.caching import FunctionCache, IndexDataCacheFile
+from numba.core import sigutils
+from numba.core.caching import NullCache
+from numba.core.compiler import CompileResult
+from numba.core.registry import CPUDispatcher
+from numba.core.serialize import dumps
+from numba.misc.appdirs import AppDirs
 
-LOGGER = logging.getLogger("slam_backend")
-DIGEST = sha256().digest_size  # bytes at the end of each file; numba alone would not look at them
+from slam_backend.core.kernel_stamp import stamp_of
+from slam_backend.core.shipped_kernels import CONFIG, shipped_kernels, warn_once
+
+DIGEST = sha256().digest_size  # bytes at the end of each file
+SUFFIX = ".nbc"
+NOT_KEPT = "Compiled kernels are not kept ({}): each process compiles them."
+NOT_PRIVATE = "it belongs to another user, or others may write to it"
+PYTHON = f"{sys.implementation.cache_tag}{getattr(sys, 'abiflags', '')}"
 
 
-class KernelCache(FunctionCache):
-    """The cache of one kernel: a place that cannot be written to costs time, and stops nothing.
+class KernelCache(NullCache):
+    """The cache of one kernel: a place that cannot be used costs time, and stops nothing.
 
     Args:
-        cache: The cache that numba made; it has not read its files yet.
-        stamp: Digest of what the kernel is compiled from; entries of another stamp are stale.
+        kernel: Kernel; what it calls need not be defined yet.
     """
 
-    def __init__(self, cache: FunctionCache, stamp: Any) -> None:
-        self.__dict__.update(cache.__dict__)
-        self._cache_file: CheckedFile = CheckedFile(cache._cache_path, cache._impl.filename_base, stamp)  # type: ignore[no-untyped-call]
+    def __init__(self, kernel: CPUDispatcher) -> None:
+        self._kernel = kernel
+        self._stamp = ""
 
     @property
-    def folder(self) -> str:
-        """Folder of the cache's files."""
-        return str(self._cache_path)
+    def cache_path(self) -> str | None:
+        """Folder of the user's cache for this kernel; None: there is none."""
+        folder = cache_folder(Path(self._kernel.py_func.__code__.co_filename).parent, CONFIG.CACHE_DIR)
+        return None if folder is None else str(folder)
+
+    def file_name(self, signature: Any, target: tuple[str, ...]) -> str:
+        """Return the name of the file that holds a kernel.
+
+        Args:
+            signature: Argument types.
+            target: Triple, processor and features, as the code generator names them.
+        """
+        return f"{self._start(signature, target)}{self.stamp[:32]}{SUFFIX}"
+
+    @property
+    def stamp(self) -> str:
+        """Digest of what the kernel is compiled from; it is taken when the kernel is first asked for."""
+        if not self._stamp:
+            self._stamp = stamp_of(self._kernel)
+        return self._stamp
 
     def holds(self, signature: Any, codegen: Any) -> bool:
-        """Return whether a kernel is kept for a signature; it is not read."""
-        key = self._index_key(signature, codegen)  # type: ignore[no-untyped-call]
-        return self._cache_file.holds(key)
+        """Return whether a kernel that can be used is kept or shipped for a signature; it is not unpickled."""
+        return any(_read(file) is not None for file in self._files(signature, codegen))
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Return the kernel of a signature; None: there is none that can be used."""
+        target_context.refresh()
+        for file in self._files(sig, target_context.codegen()):
+            content = _read(file)
+            if content is not None:
+                name, reduced = pickle.loads(content)
+                if name == file.name:
+                    return CompileResult._rebuild(target_context, *reduced)  # type: ignore[no-untyped-call]
+        return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Keep a kernel, if that can be: the disk may be full, or read-only by now."""
+        """Keep a kernel, if that can be: there may be no folder for it, or the disk may be full."""
+        folder = self.cache_path
+        if data.library.has_dynamic_globals:
+            return
+        if folder is None:
+            warn_once("not kept", NOT_KEPT.format("no folder can be written"))
+            return
+        target = data.codegen.magic_tuple()
+        name = self.file_name(sig, target)
         try:
-            super().save_overload(sig, data)  # type: ignore[no-untyped-call]
+            _write(Path(folder) / name, dumps((name, data._reduce())))  # type: ignore[no-untyped-call]
         except OSError as error:
-            LOGGER.debug("Not kept: %s: %s", self._name, error)
+            warn_once("not kept", NOT_KEPT.format(error))
+            return
+        for file in Path(folder).glob(f"{self._start(sig, target)}*{SUFFIX}"):  # of older sources
+            if file.name != name:
+                file.unlink(missing_ok=True)
+
+    def _files(self, signature: Any, codegen: Any) -> Iterator[Path]:
+        """Yield the files that would hold a kernel: the user's own, and the shipped one."""
+        folder = self.cache_path
+        if folder is not None:
+            yield Path(folder) / self.file_name(signature, codegen.magic_tuple())
+        shipped = shipped_kernels()
+        if shipped is not None:
+            yield shipped.folder / self.file_name(signature, shipped.target)
+
+    def _start(self, signature: Any, target: tuple[str, ...]) -> str:
+        """Return how the names of the files of a signature begin, whatever the kernel is compiled from."""
+        function = self._kernel.py_func
+        name = f"{function.__module__}.{function.__qualname__}"
+        types = str(sigutils.normalize_signature(signature))  # type: ignore[no-untyped-call]
+        digest = sha256(repr((name, types, *target, PYTHON)).encode()).hexdigest()
+        return f"{name.rpartition('.')[2].strip('<>')}-{digest[:32]}."
 
 
-class CheckedFile(IndexDataCacheFile):
-    """Index and data files of one kernel; a file that is not what was written counts as missing.
+# ---------------------------------------------------------------------- folders and files
 
-    Nothing of such a file is unpickled, let alone run. A data file is named after the stamp and the signature that it
-    was compiled for, and is complete before the index refers to it. numba numbers its data files and writes the index
-    first, so that one of two processes that save at the same time can find the other's machine code under its own
-    signature; here a race costs an entry at worst.
+
+@lru_cache
+def cache_folder(sources: Path, chosen: str = "") -> Path | None:
+    """Return the folder in which the kernels of a folder of sources are kept; None: there is none that can be used.
+
+    Kernels are code: the folder belongs to the user, and no other user may write to it.
+
+    Args:
+        sources: Folder of sources.
+        chosen: Folder that is tried first; empty: none.
     """
-
-    def save(self, key: Any, data: Any) -> None:
-        """Save the machine code of one signature."""
-        digest = sha256(repr((self._source_stamp, key)).encode()).hexdigest()
-        name = self._data_name_pattern.format(number=int(digest[:15], 16))
-        self._save_data(name, (key, data))  # type: ignore[no-untyped-call]
-        entries = self._load_index()
-        if not entries:  # data of older sources are never read again
-            for file in Path(self._cache_path).glob(f"{self._index_name.removesuffix('.nbi')}.*.nbc"):
-                if file.name != name:
-                    file.unlink(missing_ok=True)
-        entries[key] = name
-        self._save_index(entries)  # type: ignore[no-untyped-call]
-
-    def load(self, key: Any) -> Any:
-        """Return the kernel of a signature; None: there is none that can be used."""
-        found = super().load(key)  # type: ignore[no-untyped-call]
-        return found[1] if found is not None and found[0] == key else None
-
-    def holds(self, key: Any) -> bool:
-        """Return whether there is a file for a key."""
-        name = self._load_index().get(key)
-        return name is not None and Path(self._data_path(name)).exists()  # type: ignore[no-untyped-call]
-
-    def _load_index(self) -> dict[Any, str]:
-        content = _checked(self._index_path)
-        if content is None:
-            return {}
-        stream = BytesIO(content)
-        if pickle.load(stream) != self._version:
-            return {}
-        stamp, names = pickle.load(stream)
-        return dict(names) if stamp == self._source_stamp else {}
-
-    def _load_data(self, name: str) -> Any:
-        content = _checked(self._data_path(name))  # type: ignore[no-untyped-call]
-        if content is None:
-            raise OSError(f"{name} is damaged")  # numba takes that for a file that is gone
-        return pickle.loads(content)
-
-    @contextmanager
-    def _open_for_write(self, filepath: str) -> Iterator[BytesIO]:
-        with super()._open_for_write(filepath) as file:
-            content = BytesIO()
-            yield content
-            file.write(content.getvalue() + sha256(content.getvalue()).digest())
+    name = f"{sources.name}_{sha256(str(sources.absolute()).encode()).hexdigest()[:32]}"
+    places = [sources / "__pycache__", Path(_user_cache()) / name]
+    if chosen:
+        places.insert(0, Path(chosen) / name)
+    for place in places:
+        with suppress(OSError):
+            place.mkdir(mode=0o700, parents=True, exist_ok=True)
+            if not is_private(place.stat(), _is_own_group):
+                warn_once("refused", f"Kernels are not kept in {place}: {NOT_PRIVATE}.")
+            elif os.access(place, os.W_OK | os.X_OK):
+                return place
+    return None
 
 
-def _checked(path: str) -> bytes | None:
-    """Return the content of a file without the digest at its end; None: it cannot be read, or the two do not agree."""
+def _user_cache() -> str:
+    """Return the folder for numba's caches of all projects of the user."""
+    return str(AppDirs(appname="numba", appauthor=False).user_cache_dir)  # type: ignore[no-untyped-call]
+
+
+def is_private(status: os.stat_result, may_write: Any = lambda group, user: False) -> bool:
+    """Return whether a file or folder belongs to the user, and only the user may write to it.
+
+    Args:
+        may_write: Whether a group, by its number, that may write is the user's own.
+    """
+    if not hasattr(os, "geteuid"):  # Windows
+        return True
+    if status.st_uid != os.geteuid() or status.st_mode & stat.S_IWOTH:
+        return False
+    return not status.st_mode & stat.S_IWGRP or bool(may_write(status.st_gid, status.st_uid))
+
+
+def _is_own_group(group: int, user: int) -> bool:
+    """Return whether a group has a user's name and no other members, as many systems make one for each user."""
+    import grp
+    import pwd
+
     try:
-        whole = Path(path).read_bytes()
+        name, members = pwd.getpwuid(user).pw_name, grp.getgrgid(group)
+    except KeyError:
+        return False
+    return members.gr_name == name and set(members.gr_mem) <= {name}
+
+
+def _read(file: Path) -> bytes | None:
+    """Return the content of a file without the digest at its end; None: it is missing, damaged or not the user's."""
+    shipped = shipped_kernels()
+    is_shipped = shipped is not None and file.parent == shipped.folder
+    try:
+        with open(file, "rb") as stream:
+            if not (is_shipped or is_private(os.fstat(stream.fileno()))):
+                warn_once("refused", f"{file} is not read: {NOT_PRIVATE}.")
+                return None
+            whole = stream.read()
     except OSError:
         return None
     content, digest = whole[:-DIGEST], whole[-DIGEST:]
-    return content if sha256(content).digest() == digest else None
+    if sha256(content).digest() != digest:
+        warn_once("damaged", f"{file} is damaged: the kernel is compiled again.")
+        return None
+    return content
+
+
+def _write(file: Path, content: bytes) -> None:
+    """Write a file at once, with a digest at its end: other processes see all of it, or nothing."""
+    number, temporary = tempfile.mkstemp(dir=file.parent, prefix=f"{file.stem[:40]}.", suffix=".tmp")
+    try:
+        with open(number, "wb") as stream:
+            stream.write(content + sha256(content).digest())
+        os.replace(temporary, file)
+    except BaseException:
+        with suppress(OSError):
+            os.unlink(temporary)
+        raise

@@ -131,12 +131,12 @@ def missing_tasks(signatures: Signatures) -> list[Task]:
     for name, words in signatures.items():
         kernel = find_kernel(name)
         cache = None if kernel is None else getattr(kernel, "_cache", None)
-        if kernel is None or not isinstance(cache, KernelCache):
+        if kernel is None or not isinstance(cache, KernelCache) or cache.cache_path is None:
             continue
         for signature in words:
             context: Any = kernel.targetctx
             if not cache.holds(decode_signature(signature), context.codegen()):
-                tasks.append(Task(name, signature, _code_sizes(kernel), cache.folder))
+                tasks.append(Task(name, signature, _code_sizes(kernel), cache.cache_path))
     return tasks
 
 

@@ -3,10 +3,14 @@
 import math
 
 from slam_backend.core.jit import bits_float, float_bits, simd_inline
+from slam_backend.core.validation import FloatArray
 from slam_backend.fastslam._kernels.layout import LN2
 
 HALF_PI_HIGH = 1.5707963267341256  # pi / 2 in two parts: the first has 33 bits, so that small multiples are exact
 HALF_PI_LOW = 6.077100506506192e-11
+# Terms that a sum takes at a time: were they as many as a processor's vector registers hold, the last bits would differ
+# between processors.
+WIDE, NARROW = 32, 8
 ROUND = 6755399441055744.0  # 1.5 * 2^52: adding and subtracting it rounds to the nearest integer
 
 
@@ -132,3 +136,20 @@ def mantissa_exponent(x: float) -> tuple[float, float]:
 def wrapped(angle: float) -> float:
     """Return the angle in [-pi, pi)."""
     return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
+
+
+@simd_inline
+def added_up(sums: FloatArray) -> float:
+    """Return the sum of `WIDE` numbers, by halves; the first `NARROW` of them are written to."""
+    for i in range(NARROW):
+        sums[i] = (sums[i] + sums[i + NARROW]) + (sums[i + 2 * NARROW] + sums[i + 3 * NARROW])
+    return added_up_narrow(sums)
+
+
+@simd_inline
+def added_up_narrow(sums: FloatArray) -> float:
+    """Return the sum of the first `NARROW` numbers, by halves."""
+    even = (sums[0] + sums[4]) + (sums[2] + sums[6])
+    odd = (sums[1] + sums[5]) + (sums[3] + sums[7])
+    total: float = even + odd
+    return total

@@ -4,7 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.core.jit import device, jit, simd_inline, simd_sum
+from slam_backend.core.jit import device, jit, simd, simd_inline, stack_array
+from slam_backend.core.simd_math import NARROW, WIDE, added_up, added_up_narrow
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.fastslam import _kernels
 from slam_backend.fastslam._kernels import LANES
@@ -30,37 +31,60 @@ def pose_mixtures(means: FloatArray, covariances: FloatArray, weights: FloatArra
     return mixed
 
 
-@simd_sum
+@device
+@simd
+def _weighed(shares: FloatArray, values: FloatArray, wide: int) -> float:
+    """Return the weighted sum of values, in a fixed order: all processors round alike.
+
+    Args:
+        shares: Weights (n,).
+        values: Values (n,); what has no share may be anything.
+        wide: Terms taken at a time, `WIDE` or half as many; what is left is taken `NARROW` at a time, then one by one.
+    """
+    sums, size = stack_array(WIDE), len(shares)
+    rest, last = size - size % wide, size - size % NARROW
+    for i in range(WIDE):
+        sums[i] = 0.0
+    for j in range(0, rest, wide):
+        for i in range(wide):
+            more = sums[i] + shares[j + i] * values[j + i]
+            sums[i] = more if shares[j + i] > 0.0 else sums[i]
+    sums[0] = added_up(sums)
+    for i in range(1, NARROW):
+        sums[i] = 0.0
+    for j in range(rest, last, NARROW):
+        for i in range(NARROW):
+            more = sums[i] + shares[j + i] * values[j + i]
+            sums[i] = more if shares[j + i] > 0.0 else sums[i]
+    total = added_up_narrow(sums)
+    for j in range(last, size):
+        more = total + shares[j] * values[j]
+        total = more if shares[j] > 0.0 else total
+    return total
+
+
+@simd_inline
 def _shared_mean(shares: FloatArray, tile: FloatArray) -> tuple[float, float, float]:
     """Return the weighted sums of the means in a block of lanes (9, lanes); what has no share may be anything."""
-    x, y, z = 0.0, 0.0, 0.0
-    for i in range(len(shares)):
-        share, own_x, own_y, own_z = shares[i], tile[0, i], tile[1, i], tile[2, i]
-        x += share * own_x if share > 0.0 else 0.0
-        y += share * own_y if share > 0.0 else 0.0
-        z += share * own_z if share > 0.0 else 0.0
-    return x, y, z
+    return _weighed(shares, tile[0], WIDE), _weighed(shares, tile[1], WIDE), _weighed(shares, tile[2], WIDE)
 
 
-@simd_sum
+@simd_inline
 def _shared_spread(
     shares: FloatArray, tile: FloatArray, x: float, y: float, z: float
 ) -> tuple[float, float, float, float, float, float]:
     """Return the weighted sums (6) of covariances, and of products of what means are off (x, y, z), likewise."""
-    xx, xy, xz, yy, yz, zz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    for i in range(len(shares)):
-        share, dx, dy, dz = shares[i], tile[0, i] - x, tile[1, i] - y, tile[2, i] - z
-        own_xx, own_xy, own_xz, own_yy, own_yz, own_zz = (
-            tile[3, i] + dx * dx, tile[4, i] + dx * dy, tile[5, i] + dx * dz,
-            tile[6, i] + dy * dy, tile[7, i] + dy * dz, tile[8, i] + dz * dz,
-        )  # fmt: skip
-        xx += share * own_xx if share > 0.0 else 0.0
-        xy += share * own_xy if share > 0.0 else 0.0
-        xz += share * own_xz if share > 0.0 else 0.0
-        yy += share * own_yy if share > 0.0 else 0.0
-        yz += share * own_yz if share > 0.0 else 0.0
-        zz += share * own_zz if share > 0.0 else 0.0
-    return xx, xy, xz, yy, yz, zz
+    own_xx, own_xy, own_xz = stack_array(LANES), stack_array(LANES), stack_array(LANES)
+    own_yy, own_yz, own_zz = stack_array(LANES), stack_array(LANES), stack_array(LANES)
+    for i in range(LANES):
+        dx, dy, dz = tile[0, i] - x, tile[1, i] - y, tile[2, i] - z
+        own_xx[i], own_xy[i], own_xz[i] = tile[3, i] + dx * dx, tile[4, i] + dx * dy, tile[5, i] + dx * dz
+        own_yy[i], own_yz[i], own_zz[i] = tile[6, i] + dy * dy, tile[7, i] + dy * dz, tile[8, i] + dz * dz
+    half = WIDE // 2
+    return (
+        _weighed(shares, own_xx, half), _weighed(shares, own_xy, half), _weighed(shares, own_xz, half),
+        _weighed(shares, own_yy, half), _weighed(shares, own_yz, half), _weighed(shares, own_zz, half),
+    )  # fmt: skip
 
 
 @simd_inline

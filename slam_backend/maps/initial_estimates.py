@@ -8,7 +8,6 @@ the largest set of candidates that agree pairwise (`_clique_kernels`).
 """
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.geometry import transform_points
@@ -33,6 +32,8 @@ def icp(map_a: LandmarkMap, map_b: LandmarkMap, start: FloatArray) -> FloatArray
         map_b: The other.
         start: (3,) First motion a_from_b [m, m, rad].
     """
+    from scipy.spatial import KDTree  # slow to import, and not always needed
+
     tree = KDTree(map_a.means)
     pose, before = start, np.empty((0, 2), np.int64)
     for _ in range(ICP_ROUNDS):

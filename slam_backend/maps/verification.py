@@ -3,8 +3,6 @@
 import math
 
 import numpy as np
-from scipy.spatial import KDTree
-from scipy.special import bdtrc
 
 from slam_backend.core.packed_symmetric import UNPACK_INDEX, UPPER
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
@@ -37,6 +35,8 @@ def has_perceptual_alias(landmarks: LandmarkMap, rows: IntArray, variance: float
     points, variance = landmarks.means, max(variance, options.position_floor**2)
     rows = rows[:: 1 + len(rows) // MOST_LANDMARKS]
     looks = landmarks.descriptors
+    from scipy.special import bdtrc  # slow to import, and not always needed
+
     pairs = similar_pairs(looks[rows], looks, options.descriptor_gate, MOST_ALIKE)
     matches = np.column_stack([rows[pairs[:, 0]], pairs[:, 1]])
     apart = points[matches[:, 0]] - points[matches[:, 1]]
@@ -121,6 +121,9 @@ def is_chance_alignment(
     """
     if one_to_one(matches):
         return False
+    from scipy.spatial import KDTree
+    from scipy.special import bdtrc
+
     inside = inlier_mask(table, matches, pose, variance, options.position_gate)
     spread = (table[:, 6] + table[:, 9] + table[:, 12] + table[:, 15]) / 2.0 + variance
     reach = np.sqrt(options.position_gate * spread)

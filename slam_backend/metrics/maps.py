@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.optimize import linear_sum_assignment
 
 from slam_backend.core.jit import jit
 from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_array, check_float
@@ -238,6 +237,8 @@ def _assigned(
     estimates: ArrayLike, truths: ArrayLike, cutoff: float, order: float
 ) -> tuple[FloatArray, IntArray, IntArray]:
     """Return costs (n, N) min(d, cutoff)^order and the rows and columns of their optimal assignment."""
+    from scipy.optimize import linear_sum_assignment  # slow to import, and not always needed
+
     cutoff = check_float("cutoff", cutoff, "Give a distance in metres.", above=0.0)
     width = np.shape(estimates)[1] if np.ndim(estimates) == 2 and np.shape(estimates)[1] == 2 else 3
     a = check_array("estimates", estimates, (None, width), "Give one position per row.")

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.sparse.csgraph import connected_components
 
 from slam_backend.core.validation import BoolArray, IntArray, argument_error, check_array
 from slam_backend.fastslam._kernels import EXACT_POSE, MOVED
@@ -49,6 +48,8 @@ def contact_components(contacts: BoolArray | None, num_robots: int) -> IntArray:
     """
     if contacts is None or contacts.all():
         return np.zeros(num_robots, dtype=np.int64)
+    from scipy.sparse.csgraph import connected_components  # slow to import, and not always needed
+
     return np.asarray(connected_components(contacts, directed=False)[1], dtype=np.int64)
 
 

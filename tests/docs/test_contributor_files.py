@@ -54,7 +54,7 @@ def test_the_citation_names_the_version_and_licence_of_the_package() -> None:
 def test_the_guide_lists_all_kernel_decorators() -> None:
     """The table of decorators in CONTRIBUTING.md lists exactly those that take a function or a kernel."""
     guide = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
-    table = guide[guide.index("| decorator |") : guide.index("- Kernels that call each other")]
+    table = guide[guide.index("| decorator |") : guide.index("- The disk cache keys a kernel")]
     explained = {name for row in table.split("\n|")[2:] for name in re.findall(r"`(\w+)`", row.split("|")[0])}
     decorators = {
         name

@@ -306,6 +306,23 @@ class StereoBenchConfig(ExperimentConfig):
     descriptors: tuple[Descriptor, ...] = option(("usurf", "sift", "orb"), "Descriptors to compare.")
 
 
+class StartBenchConfig(ExperimentConfig):
+    """The start-up bench: what a user waits for at first."""
+
+    parts: tuple[Literal["demo", "kernels", "steps", "wheel", "import", "count"], ...] = option(
+        ("demo", "kernels", "steps", "import", "count"), "Parts to time: demo, kernels, steps, wheel, import, count."
+    )
+    repeats: int = option(3, "Runs of each part.", ge=1, hint="Time at least one run.")
+    wheel: str | None = option(None, "Wheel of kernels, which adds the part wheel.", shown="none", is_path=True)
+    seed: int = setting(0)
+
+    def with_wheel(self) -> "StartBenchConfig":
+        """Return the configuration with the part `wheel`, if there is a wheel."""
+        if self.wheel is None or "wheel" in self.parts:
+            return self
+        return self.model_copy(update={"parts": (*self.parts, "wheel")})
+
+
 class TrainBenchConfig(ExperimentConfig):
     """Training benchmark; its environments are those of the preset `quick` of `vslam train`."""
 

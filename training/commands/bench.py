@@ -17,6 +17,7 @@ from training.bench.config import (
     ExplorationTrial,
     FilterBenchConfig,
     MrclamPairsConfig,
+    StartBenchConfig,
     StereoBenchConfig,
     TrainBenchConfig,
 )
@@ -205,6 +206,29 @@ def _first_steps(config: ExplorationBenchConfig, trial: ExplorationTrial) -> Non
     env = vslam_v0.parallel_env(config=config.environment(trial))
     run_episode(env, config.run(trial).make_policies(env), trial.seed, should_stop=lambda: next(steps, None) is None)
     env.close()
+
+
+@bench.command("start")
+@options(
+    StartBenchConfig, "bench start", quick={"parts": ("import", "count"), "repeats": 1},
+    quick_help="Imports and numbers of kernels, once.",
+)  # fmt: skip
+def bench_start(call: Call[StartBenchConfig]) -> None:
+    """Time what a user waits for at first: compilation, first steps, imports; on two cores, caches and home empty.
+
+    The part wheel times the first picture with the kernels that `make kernels-wheel` compiles.
+    """
+    from training.bench.start.bench import check_wheel, markdown, print_result, run_bench
+
+    chosen = call.config.with_wheel()
+    check_wheel(chosen)
+    console, folder = call.begin(config=chosen)
+    with trial_progress(console, chosen.repeats * len(chosen.parts)) as (on_trial, interrupted):
+        result = run_bench(chosen, on_trial, interrupted)
+    print_result(console, result)
+    folder.write_text("table.md", markdown(result))
+    call.write(result)
+    call.finish()
 
 
 @bench.command("train")

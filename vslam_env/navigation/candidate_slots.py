@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import linear_sum_assignment
 
 from slam_backend.core.jit import in_place
 from slam_backend.core.validation import BoolArray, FloatArray
@@ -221,6 +220,8 @@ def _together(pose: ArrayLike, teammates: ArrayLike) -> FloatArray:
 
 def _assign(costs: FloatArray) -> FloatArray:
     """Return costs (m, n) that are `SAME_GOAL` but for the pairs, each of other rows and columns, of least total."""
+    from scipy.optimize import linear_sum_assignment  # slow to import, and not always needed
+
     chosen, pairs = np.full_like(costs, SAME_GOAL), linear_sum_assignment(costs)
     chosen[pairs] = costs[pairs]
     return chosen

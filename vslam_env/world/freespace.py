@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import cv2
 import numpy as np
 
 from slam_backend.core.validation import BoolArray, FloatArray, argument_error, check_array, check_float, check_int
@@ -215,6 +214,8 @@ class FreeSpace:
 
     def _near_reachable(self, points: FloatArray) -> BoolArray:
         """Tell which points (n, 2) [m] lie in the open space within two cells of a reachable cell."""
+        import cv2  # slow to import, and not needed until a world is made
+
         grown = cv2.dilate(self.reachable.astype(np.uint8), np.ones((5, 5), dtype=np.uint8)) > 0
         columns, rows = np.floor((points - self.origin) / CELL).astype(np.int64).T
         height, width = grown.shape
@@ -223,4 +224,6 @@ class FreeSpace:
 
 def _label(mask: BoolArray) -> Any:
     """Number the parts of a mask that hang together along cell edges: (H, W) int32, 0 where False."""
+    import cv2
+
     return cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)[1]

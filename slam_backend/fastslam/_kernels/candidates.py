@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from slam_backend.core.jit import device, jit_fma, simd, simd_sum
-from slam_backend.core.simd_math import log_of
+from slam_backend.core.jit import device, jit_fma, simd, simd_inline, stack_array
+from slam_backend.core.simd_math import WIDE, added_up, log_of
 from slam_backend.core.validation import Float32Array, FloatArray, Int32Array, IntArray
 from slam_backend.fastslam._kernels.layout import (
     BEST,
@@ -52,11 +52,20 @@ def _head_distances(
             out[slot] += difference * difference
 
 
-@simd_sum
+@device
+@simd_inline
 def _squared_distance(measured: Float32Array, b: int, stored: Float32Array, slot: int) -> float:
-    """Return the squared distance of two descriptors, in double precision."""
-    total = 0.0
-    for j in range(measured.shape[1]):
+    """Return the squared distance of two descriptors, in double precision and in a fixed order."""
+    sums, size = stack_array(WIDE), measured.shape[1]
+    rest = size - size % WIDE
+    for i in range(WIDE):
+        sums[i] = 0.0
+    for j in range(0, rest, WIDE):
+        for i in range(WIDE):
+            difference = np.float64(measured[b, j + i]) - np.float64(stored[slot, j + i])
+            sums[i] += difference * difference
+    total = added_up(sums)
+    for j in range(rest, size):
         difference = np.float64(measured[b, j]) - np.float64(stored[slot, j])
         total += difference * difference
     return total

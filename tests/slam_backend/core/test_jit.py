@@ -1,12 +1,9 @@
 """How kernels are compiled, kept, found again and warmed up; public names."""
 
-import importlib.util
 import os
-import pickle
 import subprocess
 import sys
 from collections.abc import Callable
-from pathlib import Path
 from types import UnionType
 from typing import Any, get_args, get_type_hints
 
@@ -20,7 +17,6 @@ import slam_backend
 from slam_backend import FastSlam, FilterOptions, StepReport, TeamReport, TeamSlam
 from slam_backend.core import jit as _jit
 from slam_backend.core.compilation import MESSAGE, watch_compilation
-from slam_backend.core.kernel_cache import CheckedFile
 from slam_backend.warm_up import warm_up
 
 
@@ -29,7 +25,7 @@ def test_this_version_of_numba_can_leave_references_uncounted() -> None:
     assert _jit.HAS_NRT_OPTION
 
 
-@pytest.mark.parametrize("compiled", [_jit.in_place, _jit.inline, _jit.simd, _jit.simd_inline, _jit.simd_sum])
+@pytest.mark.parametrize("compiled", [_jit.in_place, _jit.inline, _jit.simd, _jit.simd_inline])
 def test_kernels_that_work_in_place_can_make_no_array(compiled: Callable[[Any], Any]) -> None:
     """Its counter would be missing: numba refuses to compile them."""
 
@@ -155,137 +151,6 @@ def test_a_device_kernel_refuses_a_call_from_python_and_serves_other_kernels() -
         kernel(3.0)
 
 
-def test_entries_of_two_processes_that_save_at_the_same_time_are_never_mixed_up(tmp_path: Any) -> None:
-    """Whatever the order of their writes, an entry holds what was compiled for it, or is missing."""
-    one, other = (CheckedFile(str(tmp_path), "kernel-1", "stamp") for _ in range(2))
-    one._load_index = lambda: {}  # both have read the index before either wrote
-    other._load_index = lambda: {}
-    one.save("float64", "code of float64")
-    other.save("int64", "code of int64")
-    reader = CheckedFile(str(tmp_path), "kernel-1", "stamp")
-    assert reader.load("int64") == "code of int64"
-    assert reader.load("float64") in (None, "code of float64")
-    assert CheckedFile(str(tmp_path), "kernel-1", "another stamp").load("int64") is None
-
-
-def test_options_are_part_of_what_an_entry_of_the_cache_is_checked_for() -> None:
-    """A kernel that is compiled in another way is not loaded from the entry of before."""
-
-    def double(x: float) -> float:
-        return 2.0 * x
-
-    stamps = [kind(double)._cache._cache_file._source_stamp for kind in (_jit.jit, _jit.jit_fma, _jit.in_place)]
-    stamps.append(_jit.device(_jit.jit(double))._cache._cache_file._source_stamp)
-    assert all(stamps.count(stamp) == 1 for stamp in stamps)
-    assert stamps[0] == _jit.jit(double)._cache._cache_file._source_stamp
-
-
-KERNEL = """
-from slam_backend.core.jit import jit
-
-@jit
-def kernel_of_a_test(x):
-    return x + 1
-"""
-DAMAGES: dict[str, Callable[[bytes], bytes]] = {
-    "empty": lambda content: b"",
-    "one byte": lambda content: content[:1],
-    "cut in the middle": lambda content: content[: len(content) // 2],
-    "last byte gone": lambda content: content[:-1],
-    "zeros": lambda content: bytes(len(content)),
-    "noise": lambda content: np.random.default_rng(1).bytes(len(content)),
-    "first byte": lambda content: bytes([content[0] ^ 1]) + content[1:],
-    "a bit in the middle": lambda content: (
-        content[: len(content) // 2] + bytes([content[len(content) // 2] ^ 8]) + content[len(content) // 2 + 1 :]
-    ),
-    "another pickle": lambda content: pickle.dumps("another"),
-    "as numba alone writes it": lambda content: content[:-32],
-}
-
-
-@pytest.fixture
-def play(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[Any], tuple[Any, bool]]:
-    """Call the kernel as a new process would; return its answer and whether it had to be compiled."""
-    file = tmp_path / "module_of_a_test.py"
-    file.write_text(KERNEL)
-    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "cache"))
-
-    def call(x: Any) -> tuple[Any, bool]:
-        spec = importlib.util.spec_from_file_location("module_of_a_test", file)
-        assert spec is not None
-        assert spec.loader is not None
-        module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
-        with watch_compilation(lambda name: None) as watch:
-            answer = module.kernel_of_a_test(x)
-        return answer, watch._begin != 0.0
-
-    return call
-
-
-def _files(tmp_path: Path, kind: str) -> list[Path]:
-    return sorted((tmp_path / "cache").rglob(f"*.{kind}"))
-
-
-@pytest.mark.parametrize("kinds", [("nbi",), ("nbc",), ("nbi", "nbc")])
-@pytest.mark.parametrize("damage", DAMAGES)
-def test_damaged_files_are_written_again(
-    damage: str, kinds: tuple[str, ...], play: Callable[[Any], tuple[Any, bool]], tmp_path: Path
-) -> None:
-    """Whatever happened to index and data, the kernel is right, is compiled once, and is in the cache afterwards."""
-    assert play(1) == (2, True)
-    assert play(1) == (2, False)
-    for kind in kinds:
-        (file,) = _files(tmp_path, kind)
-        file.write_bytes(DAMAGES[damage](file.read_bytes()))
-    assert play(1) == (2, True)
-    assert play(1) == (2, False)
-    assert {file.suffix for file in _files(tmp_path, "*")} == {".nbi", ".nbc"}
-
-
-def test_nothing_of_a_damaged_file_is_run(play: Callable[[Any], tuple[Any, bool]], tmp_path: Path) -> None:
-    """A pickle that would run code is not unpickled, as its check does not hold."""
-
-    class Forged:
-        def __reduce__(self) -> Any:
-            return os.mkdir, (str(tmp_path / "run"),)
-
-    play(1)
-    for kind in ("nbi", "nbc"):
-        (file,) = _files(tmp_path, kind)
-        file.write_bytes(pickle.dumps(Forged()))
-        assert play(1) == (2, True)
-    assert not (tmp_path / "run").exists()
-
-
-def test_data_of_another_signature_are_not_taken(play: Callable[[Any], tuple[Any, bool]], tmp_path: Path) -> None:
-    """Data files that have changed places, as two processes at a time can leave them, are compiled again."""
-    assert (play(1), play(0.5)) == ((2, True), (1.5, True))
-    one, other = _files(tmp_path, "nbc")
-    contents = one.read_bytes(), other.read_bytes()
-    one.write_bytes(contents[1])
-    other.write_bytes(contents[0])
-    assert (play(1), play(0.5)) == ((2, True), (1.5, True))
-    assert (play(1), play(0.5)) == ((2, False), (1.5, False))
-
-
-@pytest.mark.parametrize("what", ["caching.os.replace", "caching.FunctionCache.save_overload"])
-def test_a_cache_that_takes_nothing_stops_nothing(
-    what: str, play: Callable[[Any], tuple[Any, bool]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """On a full disk, and where the folder takes no files any more, kernels are compiled and not kept."""
-
-    def fail(*_: Any) -> None:
-        raise OSError("No space left on device")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(f"numba.core.{what}", fail)
-        assert play(1) == (2, True)
-    assert not _files(tmp_path, "*")
-    assert play(1) == (2, True)
-    assert play(1) == (2, False)
-
-
 # What a process asks of the backend after it has warmed up; each line of output is a kernel compiled or loaded late.
 VARIED_USE = """
 import sys
@@ -385,44 +250,6 @@ def test_a_second_warm_up_finds_everything_compiled() -> None:
     """What is compiled already takes no time."""
     warm_up(everything=True)
     assert warm_up(everything=True) == 0.0
-
-
-def test_kernels_work_where_no_cache_can_be_written(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A folder that is only read, and no home: kernels are compiled again in each process, with the same results."""
-    usual = numba.njit
-
-    def without_place(**options: Any) -> Any:
-        def refuse(function: Callable[..., float]) -> Any:
-            raise RuntimeError(f"cannot cache function {function.__name__!r}: no locator available")
-
-        return refuse if options.get("cache") else usual(**options)
-
-    monkeypatch.setattr(numba, "njit", without_place)
-
-    def double(x: float) -> float:
-        return 2.0 * x
-
-    for kind in (_jit.jit, _jit.inline, _jit.simd, _jit.simd_inline):
-        assert python_entry(kind(double))(4.0) == 8.0
-
-
-@pytest.mark.parametrize("name", ["_kernels", "_other_kernels"])
-def test_an_edit_of_a_kernel_is_noticed_by_kernels_of_its_folder_that_call_it(name: str, tmp_path: Path) -> None:
-    """What is compiled into another module's kernel does not linger in the cache."""
-    folder = tmp_path / name
-    folder.mkdir()
-    (folder / "caller.py").write_text(
-        f"from slam_backend.core.jit import jit\n\nfrom {name}.callee import answer\n\n\n"
-        "@jit\ndef ask(x):\n    return answer(x)\n"
-    )
-    answers = []
-    for number in (1.0, 2.0):
-        (folder / "callee.py").write_text(
-            f"from slam_backend.core.jit import inline\n\n\n@inline\ndef answer(x):\n    return x + {number}\n"
-        )
-        code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); from {name}.caller import ask; print(ask(0.0))"
-        answers.append(float(subprocess.run([sys.executable, "-c", code], capture_output=True, check=True).stdout))
-    assert answers == [1.0, 2.0]
 
 
 def test_a_watch_hears_of_our_kernels_only() -> None:

@@ -69,6 +69,10 @@ BAD: dict[str, dict[str, str]] = {
         "--real full": "real: expected a folder with pairs with a model file: NAMEA, NAMEB and NAME_model.txt",
     },
     "bench env": {"--robots 9": f"{ROBOTS} 9", "--worlds castle": "world: expected one of 'office'"},
+    "bench start": {
+        "--parts imports": "parts: expected one of 'demo', 'kernels', 'steps', 'wheel', 'import', 'count'",
+        "--parts wheel": "wheel: expected the wheel that `make kernels-wheel` writes, got None.",
+    },
     "bench train": {
         "--workers x": f"workers: {LIST}", "--world castle": "world: expected one of 'office'",
         "--envs 1 --workers 2": "workers: expected at most one per environment, 1, got 2",

@@ -1,6 +1,7 @@
 import os
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -22,7 +23,11 @@ def test_a_fault_of_the_program_keeps_its_traceback(monkeypatch: pytest.MonkeyPa
 @pytest.mark.parametrize("module", ["training", "training.cli"])
 def test_modules_run_the_command(module: str) -> None:
     """`python -m training` and `python -m training.cli` have the output and exit status of `vslam`."""
-    for arguments, status, says in ((["--help"], 0, "Usage: vslam"), (["run", "--robots", "0"], 2, "robots: expected")):
+    for arguments, status, says in (
+        (["--help"], 0, "Usage: vslam"),
+        (["--version"], 0, f"vslam-env {version('vslam-env')}"),
+        (["run", "--robots", "0"], 2, "robots: expected"),
+    ):
         done = subprocess.run([sys.executable, "-m", module, *arguments], capture_output=True, text=True)
         assert done.returncode == status
         assert says in done.stdout + done.stderr

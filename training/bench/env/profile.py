@@ -37,7 +37,7 @@ PHASES = (
     Phase("grid painting", ((SharedGrids, "step"),)),
     Phase("filters", ((FastSlam, "step_checked"),)),
     Phase("team, alignment", ((TeamSlam, "step"),)),
-    Phase("errors", ((Episode, "standing"),)),
+    Phase("errors", ((Episode, "team_metrics"),)),
     Phase("observations", ((observation, "observe_team"),)),
     Phase("candidates", ((TeamSlots, "update"),)),
     Phase(

@@ -1,0 +1,123 @@
+"""Stamps of kernels: what a kernel's machine code is made from, apart from its signature and the processor.
+
+A kernel is compiled together with all kernels that it calls, and the constants that these name become part of it. The
+stamp therefore covers the code of the kernel and of all functions that it reaches, in whatever modules they live, their
+options and the values of their constants. An edit of any of these changes it; an edit of a comment does not.
+"""
+
+from collections.abc import Iterator
+from functools import cache
+from hashlib import sha256
+from types import BuiltinFunctionType, CodeType, EllipsisType, FunctionType, ModuleType, NoneType
+from typing import Any
+
+import llvmlite
+import numba
+import numpy as np
+from numba.core import types
+from numba.core.extending import _Intrinsic
+from numba.core.registry import CPUDispatcher
+
+LIBRARIES = ("numba", "llvmlite", "numpy", "math", "builtins")  # what they do depends on their versions alone
+# Settings of numba that change machine code, and that numba's own cache overlooks.
+SETTINGS = ("OPT", "LOOP_VECTORIZE", "SLP_VECTORIZE", "BOUNDSCHECK", "DEBUGINFO_DEFAULT")
+SCALARS = (int, float, complex, str, bytes, NoneType, EllipsisType, types.Type)
+
+
+def stamp_of(kernel: CPUDispatcher) -> str:
+    """Return a digest of all that a kernel is compiled from.
+
+    Raises:
+        TypeError: If a kernel names an object whose value cannot be taken in.
+    """
+    seen: dict[Any, str] = {}
+    todo: list[Any] = [kernel]
+    while todo:
+        function = todo.pop()
+        if function not in seen:
+            seen[function], callees = _described(function, _options(function))
+            todo += callees
+    return sha256(repr([_tools(), *sorted(seen.values())]).encode()).hexdigest()
+
+
+@cache
+def _tools() -> str:
+    """Return the versions and settings of the compiler, as a text."""
+    settings = [str(getattr(numba.config, name, None)) for name in SETTINGS]
+    return repr((numba.__version__, llvmlite.__version__, settings))
+
+
+def _options(function: Any) -> str:
+    """Return the options of a kernel as a text, in an order of their own; empty: it is no kernel."""
+    if not isinstance(function, CPUDispatcher):
+        return ""
+    return repr(sorted((name, sorted(x) if isinstance(x, set) else x) for name, x in function.targetoptions.items()))
+
+
+@cache
+def _described(function: Any, options: str) -> tuple[str, tuple[Any, ...]]:
+    """Return a digest of a function's own code, constants and options, and the functions that it names."""
+    callees: list[Any] = []
+    python: FunctionType = getattr(function, "py_func", None) or getattr(function, "_defn", function)
+    scope = python.__globals__ | {
+        name: cell.cell_contents
+        for name, cell in zip(python.__code__.co_freevars, python.__closure__ or (), strict=True)
+    }
+    names = sorted(set(_names(python.__code__)))
+    found = {name: scope[name] for name in names if name in scope}
+    for module in [value for value in found.values() if isinstance(value, ModuleType) and not _is_library(value)]:
+        del found[next(name for name in found if found[name] is module)]
+        found |= {f"{module.__name__}.{name}": getattr(module, name) for name in names if hasattr(module, name)}
+    values = [(name, _text(value, callees)) for name, value in found.items()]
+    defaults = _text([python.__defaults__, sorted((python.__kwdefaults__ or {}).items())], callees)
+    parts = (_path(python), options, _code(python.__code__), defaults, values)
+    return sha256(repr(parts).encode()).hexdigest(), tuple(callees)
+
+
+def _names(code: CodeType) -> Iterator[str]:
+    """Yield the names that code looks up outside itself, those of functions within it included."""
+    yield from (*code.co_names, *code.co_freevars)
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from _names(constant)
+
+
+def _code(code: CodeType) -> str:
+    """Return what code does as a text: without the lines and the file that it comes from."""
+    constants = [_code(x) if isinstance(x, CodeType) else _text(x, []) for x in code.co_consts]
+    shape = code.co_argcount, code.co_posonlyargcount, code.co_kwonlyargcount, code.co_flags
+    names = code.co_names, code.co_varnames, code.co_freevars, code.co_cellvars
+    return repr((code.co_name, code.co_code.hex(), code.co_exceptiontable.hex(), constants, shape, names))
+
+
+def _text(value: Any, callees: list[Any]) -> str:
+    """Return a value as a text that says all about it; functions are added to the callees instead, and named."""
+    if isinstance(value, (CPUDispatcher, _Intrinsic, FunctionType)):
+        python: Any = getattr(value, "py_func", None) or getattr(value, "_defn", value)
+        if not _is_library(python):
+            callees.append(value)
+        return _path(python)
+    if isinstance(value, (type, BuiltinFunctionType, np.ufunc)):
+        return _path(value)
+    if isinstance(value, ModuleType) and _is_library(value):
+        return value.__name__
+    if isinstance(value, (np.generic, np.ndarray)):
+        return f"{value.dtype.descr} {value.shape} {value.tobytes().hex()}"
+    if isinstance(value, (tuple, list)):
+        return f"{type(value).__name__} {[_text(x, callees) for x in value]}"
+    if isinstance(value, frozenset):
+        return f"set {sorted(_text(x, callees) for x in value)}"
+    if isinstance(value, (*SCALARS, np.dtype)):
+        return f"{type(value).__name__} {value!r}"
+    raise TypeError(f"constant of a kernel: expected a number, text, array or tuple, got {type(value).__name__}.")
+
+
+def _is_library(thing: Any) -> bool:
+    """Return whether a module, or a function, is one of a library."""
+    name = thing.__name__ if isinstance(thing, ModuleType) else thing.__module__
+    return str(name).split(".")[0] in LIBRARIES
+
+
+def _path(thing: Any) -> str:
+    """Return the dotted name of a function or class."""
+    return f"{getattr(thing, '__module__', '')}.{getattr(thing, '__qualname__', thing.__name__)}"

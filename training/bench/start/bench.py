@@ -1,0 +1,271 @@
+"""`vslam bench start`: how long a user waits at first, with empty caches and an empty home, on two cores."""
+
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from slam_backend.core.validation import argument_error
+from training.bench.config import StartBenchConfig
+from training.experiments.tables import console_table, markdown_table, number
+from training.experiments.timing import describe_machine, print_caveats, run_named_trials
+
+CORES = 2
+PACKAGES = ("slam_backend", "vslam_env", "agents", "training")
+MANY_PARAMETERS = 10
+HEADINGS = ("part", "median", "least", "most", "runs", "goal")
+SETTINGS = ("NUMBA_", "PYTHON", "XDG_", "MPL")  # what variables of the user begin with that change what is timed
+DEMO = ("run", "--world", "office", "--robots", "3", "--policy", "frontier", "--seed", "0")
+# Programs print their figures on the last line.
+KERNELS = "import vslam_env; print(vslam_env.warm_up(everything=True, workers={workers}))"
+FIRST_STEPS = """
+import time
+begun = time.perf_counter()
+from vslam_env import vslam_v0
+env = vslam_v0.parallel_env()
+env.reset(seed=0)
+for _ in range(10):
+    env.step({agent: env.action_space(agent).sample() for agent in env.agents})
+print(time.perf_counter() - begun)
+"""
+FIRST_PICTURE = """
+import os, sys, time
+from slam_backend.core.compilation import watch_compilation
+from training.cli import app
+from training.episodes.video import VideoWriter
+
+def stop(writer, picture):
+    print(f"\\n{time.time() - begun} {len(watch.names)}", flush=True)
+    os._exit(0)
+
+begun, VideoWriter.add = float(sys.argv.pop(1)), stop
+with watch_compilation(lambda name: None) as watch:
+    app()
+"""
+LIBRARIES = "numba, gymnasium, pettingzoo, pymunk"
+IMPORT = "import time; begun = time.perf_counter(); import {modules}; print(time.perf_counter() - begun)"
+COUNT = """
+import inspect, numba, vslam_env
+from slam_backend.core.kernel_compiler import find_kernel, recorded_signatures
+found, todo = {}, [find_kernel(name) for name in recorded_signatures("slam_backend", "vslam_env")]
+while todo:
+    function = todo.pop().py_func
+    if function not in found:
+        found[function] = len(inspect.signature(function).parameters)
+        named = [function.__globals__.get(name) for name in function.__code__.co_names]
+        todo += [value for value in named if hasattr(value, "py_func")]
+print(len(found), sum(number >= {many} for number in found.values()))
+"""
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A figure of one part.
+
+    Attributes:
+        part: Part of the start-up that is measured.
+        unit: Unit; empty for a count or a ratio.
+        goal: Upper limit to reach; None: no limit.
+    """
+
+    part: str
+    unit: str = "s"
+    goal: float | None = None
+
+
+FIGURES: dict[str, tuple[Figure, ...]] = {
+    "demo": (Figure("make demo from a fresh clone, after installation"),),
+    "kernels": (Figure("all kernels, one worker"), Figure("all kernels, two workers")),
+    "steps": (Figure("first reset and 10 steps of the default environment"),),
+    "wheel": (
+        Figure("with the kernels' wheel: first picture of vslam run", goal=15.0),
+        Figure("with the kernels' wheel: cache misses until then", "", 0.0),
+    ),
+    "import": (
+        Figure("import vslam_env"), Figure(f"import {LIBRARIES}"), Figure("the former over the latter", "", 1.5),
+    ),
+    "count": (Figure("kernels", ""), Figure(f"kernels with {MANY_PARAMETERS} or more parameters", "")),
+}  # fmt: skip
+
+
+def run_bench(
+    config: StartBenchConfig,
+    on_trial: Callable[[str], None] = lambda name: None,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> dict[str, Any]:
+    """Time each part in processes of their own, as often as asked for.
+
+    Returns:
+        `figures`: rows with part, unit, goal, values; `machine`, `complete`.
+    """
+    measure: dict[str, Callable[[], tuple[float, ...]]] = {
+        "demo": demo, "kernels": lambda: (*kernels(1), *kernels(2)), "steps": first_steps,
+        "wheel": lambda: first_picture(Path(str(config.wheel))), "import": imports, "count": count,
+    }  # fmt: skip
+    values: dict[str, list[tuple[float, ...]]] = {part: [] for part in config.parts}
+    result: dict[str, Any] = {"machine": describe_machine()}
+
+    def trial(part: str) -> Callable[[], None]:
+        return lambda: values[part].append(measure[part]())
+
+    trials = [(part, trial(part)) for _ in range(config.repeats) for part in config.parts]
+    with on_two_cores():
+        result["complete"] = run_named_trials(trials, on_trial, should_stop)
+    rows = [
+        {"part": figure.part, "unit": figure.unit, "goal": figure.goal, "values": [run[i] for run in values[part]]}
+        for part in config.parts
+        for i, figure in enumerate(FIGURES[part])
+    ]
+    return result | {"figures": rows}
+
+
+# ---------------------------------------------------------------------- what is timed
+
+
+def demo() -> tuple[float]:
+    """Return how long the demo takes, from its call to the finished run folder [s]."""
+    with fresh_place() as place:
+        begun = time.perf_counter()
+        place.run("-m", "training", *DEMO)
+        return (time.perf_counter() - begun,)
+
+
+def kernels(workers: int) -> tuple[float]:
+    """Return how long all kernels take to compile [s]."""
+    with fresh_place() as place:
+        return place.figures(KERNELS.format(workers=workers))[:1]  # type: ignore[return-value]
+
+
+def first_steps() -> tuple[float, ...]:
+    """Return how long the first steps of the default environment take, imports included [s]."""
+    with fresh_place() as place:
+        return place.figures(FIRST_STEPS)
+
+
+def first_picture(wheel: Path) -> tuple[float, ...]:
+    """Return when the demo draws its first picture with shipped kernels [s], and how many it had to compile."""
+    with fresh_place() as place:
+        site = place.home / "site"
+        install = ("-m", "pip", "install", "--quiet", "--no-deps", "--no-index", "--target", str(site), str(wheel))
+        subprocess.run([sys.executable, *install], check=True)
+        place.search.append(str(site))
+        place.run("-m", "compileall", "-q", str(place.sources))  # as an installation does
+        return place.figures(FIRST_PICTURE, str(time.time()), *DEMO)
+
+
+def imports() -> tuple[float, float, float]:
+    """Return how long the package and its libraries alone take to import [s], and the ratio; files are cached."""
+    with fresh_place() as place:
+        place.run("-m", "compileall", "-q", str(place.sources))  # as an installation does
+        both = [IMPORT.format(modules=modules) for modules in ("vslam_env", LIBRARIES)]
+        times = [[place.figures(program)[0] for program in both] for _ in range(6)][1:]
+    ours, theirs = (float(x) for x in np.median(times, axis=0))
+    return ours, theirs, ours / theirs
+
+
+def count() -> tuple[float, ...]:
+    """Return how many kernels there are, and how many have many parameters."""
+    with fresh_place() as place:
+        return place.figures(COUNT.replace("{many}", str(MANY_PARAMETERS)))
+
+
+# ---------------------------------------------------------------------- where it runs
+
+
+@dataclass
+class Place:
+    """A copy of the sources without caches, and an empty home."""
+
+    home: Path
+    sources: Path
+    search: list[str]
+
+    def run(self, *arguments: str) -> str:
+        """Run Python here and return what it prints.
+
+        Raises:
+            RuntimeError: If it fails.
+        """
+        kept = {name: value for name, value in os.environ.items() if not name.startswith(SETTINGS)}
+        here = {"HOME": str(self.home), "PYTHONPATH": os.pathsep.join(self.search)}
+        done = subprocess.run(
+            [sys.executable, *arguments], cwd=self.home, env=kept | here, capture_output=True, text=True
+        )
+        if done.returncode:
+            raise RuntimeError(f"{arguments[:2]} failed:\n{done.stderr}")
+        return done.stdout
+
+    def figures(self, program: str, *arguments: str) -> tuple[float, ...]:
+        """Run a program and return the numbers on the last line that it prints."""
+        return tuple(float(word) for word in self.run("-c", program, *arguments).splitlines()[-1].split())
+
+
+@contextmanager
+def fresh_place() -> Iterator[Place]:
+    """Copy the sources to a new folder, without caches, beside an empty home."""
+    root = Path(__file__).parents[3]
+    with TemporaryDirectory() as folder:
+        home, sources = Path(folder, "home"), Path(folder, "sources")
+        home.mkdir()
+        for package in PACKAGES:
+            shutil.copytree(root / package, sources / package, ignore=shutil.ignore_patterns("__pycache__"))
+        yield Place(home, sources, [str(sources)])
+
+
+@contextmanager
+def on_two_cores() -> Iterator[None]:
+    """Let this process, and those that it starts, use two cores, where the system can say so."""
+    if not hasattr(os, "sched_setaffinity"):
+        yield
+        return
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, sorted(before)[:CORES])
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, before)
+
+
+def check_wheel(config: StartBenchConfig) -> None:
+    """Refuse to time a wheel that is not there.
+
+    Raises:
+        ValueError: If the part `wheel` is asked for and there is no such file.
+    """
+    if "wheel" in config.parts and (config.wheel is None or not Path(config.wheel).is_file()):
+        expected = "the wheel that `make kernels-wheel` writes"
+        raise argument_error("wheel", expected, config.wheel, "Or leave the part wheel out.")
+
+
+# ---------------------------------------------------------------------- tables
+
+
+def cells(figure: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return a row of the table."""
+    values, unit = figure["values"], f" {figure['unit']}" if figure["unit"] else ""
+    digits = 0 if all(float(value).is_integer() for value in values) else 2
+    goal = "" if figure["goal"] is None else f"{figure['goal']:g}{unit}"
+    shown = [number(f(values) if values else None, digits) + unit for f in (np.median, min, max)]
+    return (figure["part"], *shown, str(len(values)), goal)
+
+
+def markdown(result: Mapping[str, Any]) -> str:
+    """Return the table as Markdown."""
+    return markdown_table(HEADINGS, [cells(figure) for figure in result["figures"]])
+
+
+def print_result(console: Console, result: Mapping[str, Any]) -> None:
+    """Print the table."""
+    title = f"Start-up with empty caches and home, {CORES} cores, {result['machine']['processor']}"
+    console.print(console_table(title, HEADINGS, [cells(figure) for figure in result["figures"]]))
+    print_caveats(console, result)
