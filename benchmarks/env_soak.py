@@ -29,7 +29,7 @@ import typer
 from slam_backend.core.validation import check_int
 from vslam_env import EnvConfig, ExplorationEnv, load_state, preset_config, save_state, vslam_v0
 from vslam_env.world import WORLD_FAMILIES
-from vslam_env.world._kernels.clearance import distances_to_walls
+from vslam_env.world.clearance import distances_to_walls
 
 SKIN = 0.005  # allowed penetration of a robot into walls and robots [m]
 AGAIN_STEPS = 40  # number of repeated steps of an episode

@@ -401,25 +401,24 @@ def build_infos(
         terms: By name, per robot: what each term of the reward has paid for the step.
         invalid: Per robot 1 if its action was masked.
     """
-    errors, rmses, recalls, precisions, _, pose_errors, heading_errors, _, _, distances, _ = standing.table
-    collisions, bytes_sent = standing.counts
+    figures, counts = standing.per_robot, standing.counts
     infos: dict[str, dict[str, Any]] = {}
     for robot, agent in enumerate(agents):
         group = groups[robot]
         infos[agent] = info = {
-            "map_error": errors[robot],
-            "map_rmse": rmses[robot],
-            "map_recall": recalls[robot],
-            "map_precision": precisions[robot],
-            "pose_error": pose_errors[robot],
-            "heading_error": heading_errors[robot],
+            "map_error": figures.map_errors[robot],
+            "map_rmse": figures.map_rmses[robot],
+            "map_recall": figures.map_recalls[robot],
+            "map_precision": figures.map_precisions[robot],
+            "pose_error": figures.pose_errors[robot],
+            "heading_error": figures.heading_errors[robot],
             "coverage": standing.coverage,
             "group": group[0],
             "group_size": len(group),
             "merges": standing.merges,
-            "collisions": collisions[robot],
-            "distance": distances[robot],
-            "bytes_sent": bytes_sent[robot],
+            "collisions": counts.collisions[robot],
+            "distance": figures.distances[robot],
+            "bytes_sent": counts.bytes_sent[robot],
             "invalid_action": invalid[robot],
         }
         for name, paid in terms.items():

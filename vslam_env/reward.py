@@ -15,16 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from slam_backend.core.validation import argument_error, check_array, check_float
-from vslam_env.evaluation.team_metrics import (
-    ACCURATE_RECALLS,
-    COLLISIONS,
-    DISCOVERED,
-    DISTANCES,
-    ERROR_INTEGRALS,
-    MAP_ERRORS,
-    POSE_SIGMAS,
-    TeamMetrics,
-)
+from vslam_env.evaluation.team_metrics import RobotMetrics, TeamMetrics
 
 __all__ = [
     "COSTS", "POTENTIALS", "RUNNING_COST", "TERMS", "RewardSpec", "RewardTerm", "TeamMetrics", "evaluate",
@@ -60,18 +51,20 @@ class _NamedTerm:
         return TERMS[self.name](before, after)
 
 
-def _rise_of(row: int) -> RewardFunction:
-    """Return the gain that pays how much a row of the figures has risen."""
-    return lambda before, after: list(map(sub, after.table[row], before.table[row]))
+def _rise_of(name: str) -> RewardFunction:
+    """Return the gain that pays how much one of the figures has risen."""
+    row = RobotMetrics._fields.index(name)
+    return lambda before, after: list(map(sub, after.per_robot[row], before.per_robot[row]))
 
 
-def _fall_of(row: int) -> RewardFunction:
-    """Return the gain that pays how much a row of the figures has fallen."""
-    return lambda before, after: list(map(sub, before.table[row], after.table[row]))
+def _fall_of(name: str) -> RewardFunction:
+    """Return the gain that pays how much one of the figures has fallen."""
+    row = RobotMetrics._fields.index(name)
+    return lambda before, after: list(map(sub, before.per_robot[row], after.per_robot[row]))
 
 
 def _map_error_squared(before: TeamMetrics, after: TeamMetrics) -> list[float]:
-    errors = zip(before.table[MAP_ERRORS], after.table[MAP_ERRORS], strict=True)
+    errors = zip(before.per_robot.map_errors, after.per_robot.map_errors, strict=True)
     return [then * then - now * now for then, now in errors]
 
 
@@ -84,7 +77,7 @@ def _coverage(before: TeamMetrics, after: TeamMetrics) -> list[float]:
 
 
 def _collisions(before: TeamMetrics, after: TeamMetrics) -> list[float]:
-    return list(map(float, map(sub, before.counts[COLLISIONS], after.counts[COLLISIONS])))
+    return list(map(float, map(sub, before.counts.collisions, after.counts.collisions)))
 
 
 def _time(before: TeamMetrics, after: TeamMetrics) -> list[float]:
@@ -93,26 +86,26 @@ def _time(before: TeamMetrics, after: TeamMetrics) -> list[float]:
 
 def _shared_by_all(gain: float, after: TeamMetrics) -> list[float]:
     """Return what all robots gain alike, robot by robot."""
-    return [gain] * len(after.table[MAP_ERRORS])
+    return [gain] * len(after.per_robot.map_errors)
 
 
 # Potentials telescope: what an episode pays in all is where it ends minus where it began, so that nothing is gained by
 # going to and fro. Costs only ever fall.
 POTENTIALS: dict[str, RewardFunction] = {
-    "map_error": _fall_of(MAP_ERRORS),
+    "map_error": _fall_of("map_errors"),
     "map_error_squared": _map_error_squared,
     "team_map_error": _team_map_error,
-    "recall": _rise_of(ACCURATE_RECALLS),
-    "pose_uncertainty": _fall_of(POSE_SIGMAS),
+    "recall": _rise_of("accurate_recalls"),
+    "pose_uncertainty": _fall_of("pose_sigmas"),
     "coverage": _coverage,
-    "own_coverage": _rise_of(DISCOVERED),
+    "own_coverage": _rise_of("found"),
 }
 RUNNING_COST = "running_cost"
 COSTS: dict[str, RewardFunction] = {
     "collisions": _collisions,
-    "distance": _fall_of(DISTANCES),
+    "distance": _fall_of("distances"),
     "time": _time,
-    RUNNING_COST: _fall_of(ERROR_INTEGRALS),
+    RUNNING_COST: _fall_of("error_integrals"),
 }
 TERMS = POTENTIALS | COSTS
 
@@ -182,7 +175,7 @@ def evaluate(
 def _own(term: RewardTerm, before: TeamMetrics, after: TeamMetrics) -> list[float]:
     """Return what a term of one's own pays for a step, or raise unless that is a finite number for each robot."""
     given = term(before, after)
-    paid, robots = _floats(given), len(after.table[MAP_ERRORS])
+    paid, robots = _floats(given), len(after.per_robot.map_errors)
     if len(paid) != robots or not all(map(math.isfinite, paid)):
         cure = "Return one number for each robot."
         raise argument_error(f"reward term {term.name!r}", f"{robots} finite numbers", given, cure)

@@ -18,7 +18,7 @@ from vslam_env.belief.team_belief import merge_options
 from vslam_env.config import EnvConfig
 from vslam_env.evaluation.coverage import CoverageCells
 from vslam_env.evaluation.map_scores import UNUSED
-from vslam_env.evaluation.team_metrics import NUM_METRICS, TeamMetrics
+from vslam_env.evaluation.team_metrics import RobotCounts, RobotMetrics, TeamMetrics
 from vslam_env.navigation import GRID_SIZE
 from vslam_env.navigation._grid_kernels import HALF_WIDTH
 from vslam_env.navigation.candidate_slots import NUM_SLOTS
@@ -376,13 +376,14 @@ def check_slots(name: str, slots: Any) -> None:
 def check_standing(name: str, standing: Any, count: int) -> None:
     """Refuse what does not say how K robots stand."""
     check.instance(name, standing, TeamMetrics)
-    for where, row in check.named_items(f"{name}.table", standing.table, NUM_METRICS):
-        check.sequence(where, row, count)
-        for figure in row:
-            check.number(where, figure)
-    for where, numbers in check.named_items(f"{name}.counts", standing.counts, 2):
-        check.integers(where, numbers)
-        check.sequence(where, numbers, count)
+    check.instance(f"{name}.per_robot", standing.per_robot, RobotMetrics)
+    for figure, row in standing.per_robot._asdict().items():
+        for where, number in check.named_items(f"{name}.per_robot.{figure}", row, count):
+            check.number(where, number)
+    check.instance(f"{name}.counts", standing.counts, RobotCounts)
+    for counted, numbers in standing.counts._asdict().items():
+        check.integers(f"{name}.counts.{counted}", numbers)
+        check.sequence(f"{name}.counts.{counted}", numbers, count)
     check.number(f"{name}.coverage", standing.coverage, 0.0, 1.0)
     check.integer(f"{name}.merges", standing.merges)
     check.number(f"{name}.time", standing.time, 0.0)

@@ -10,6 +10,7 @@ import json
 import logging
 import math
 import os
+import re
 import subprocess
 import sys
 import threading
@@ -34,6 +35,7 @@ SIGNATURES = "kernel_signatures.json"  # in the folder of each package
 WORKER = "slam_backend.core.compile_kernels"  # run as `python -m`: no script of the user's needs a main guard
 LOCK = "vslam-compile.lock"
 READ_ONLY = "r"  # ends the code of an array that cannot be written to
+WORD = re.compile(r"[^\s(]+(?:\([^)]*\))?")  # of a signature; a named tuple holds no other
 
 Signatures = Mapping[str, Sequence[str]]  # by dotted name of a kernel: its signatures, see `encoded`
 Progress = Callable[[int, int, float], None]  # kernels done, of how many, and estimated seconds left
@@ -77,11 +79,19 @@ def find_kernel(name: str) -> CPUDispatcher | None:
 
 
 def encode_signature(signature: Sequence[types.Type]) -> str:
-    """Return argument types as words: `float64` a number, `float64[2C]` an array, `float64[2Cr]` a read-only one."""
+    """Return argument types as words.
+
+    `float64` is a number, `float64[2C]` an array, `float64[2Cr]` a read-only one, `module.Class(float64 int64[1C])` a
+    named tuple and `builtins.tuple(float64 int64[1C])` a plain one, which reaches a kernel 1 us sooner.
+    """
     return " ".join(map(_word, signature))
 
 
 def _word(argument: types.Type) -> str:
+    if isinstance(argument, types.BaseTuple):
+        fields: Any = argument
+        kind = getattr(argument, "instance_class", tuple)
+        return f"{kind.__module__}.{kind.__qualname__}({encode_signature(fields.types)})"
     if isinstance(argument, types.Array):
         read_only = "" if argument.mutable else READ_ONLY
         return f"{argument.dtype}[{argument.ndim}{argument.layout}{read_only}]"
@@ -90,12 +100,17 @@ def _word(argument: types.Type) -> str:
 
 def decode_signature(words: str) -> tuple[types.Type, ...]:
     """Return the argument types that `encoded` wrote down."""
-    return tuple(map(_type, words.split()))
+    return tuple(map(_type, WORD.findall(words)))
 
 
 def _type(word: str) -> Any:
     if word == "none":
         return types.none
+    if word.endswith(")"):
+        name, _, fields = word.removesuffix(")").partition("(")
+        module, _, record = name.rpartition(".")
+        from_types: Any = types.BaseTuple.from_types
+        return from_types(decode_signature(fields), getattr(importlib.import_module(module), record))
     name, _, array = word.partition("[")
     element: Any = from_dtype(dtype(name))
     if not array:

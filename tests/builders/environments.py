@@ -10,7 +10,7 @@ from slam_backend.geometry import between, compose
 from slam_backend.maps.landmark_map import TeamMapSummaries
 from vslam_env import ExplorationEnv, World, vslam_v0
 from vslam_env.evaluation.map_scores import GroundTruthAssociation
-from vslam_env.evaluation.team_metrics import NUM_METRICS, TeamMetrics
+from vslam_env.evaluation.team_metrics import RobotCounts, RobotMetrics, TeamMetrics
 
 WALLS = np.array(
     [
@@ -70,9 +70,9 @@ def scored(
 ) -> TeamMetrics:
     """Return how a team stands of which nothing else is known."""
     robots = len(true_poses)
-    figures, nothing = np.full((NUM_METRICS, robots), np.nan), (0,) * robots
+    figures, nothing = np.full((len(RobotMetrics._fields), robots), np.nan), (0,) * robots
     ledger.score(outlines, points, true_starts, true_poses, figures)
-    return TeamMetrics(figures.tolist(), (nothing, nothing), 0.0, 0, 0.0)
+    return TeamMetrics(RobotMetrics(*figures.tolist()), RobotCounts(nothing, nothing), 0.0, 0, 0.0)
 
 
 ANGLES = np.deg2rad(np.linspace(-26.5, 26.5, 32))

@@ -13,10 +13,11 @@ from slam_backend.maps.landmark_map import LandmarkMap, TeamMapSummaries
 from vslam_env import ExplorationEnv, vslam_v0
 from vslam_env.config import TICK
 from vslam_env.evaluation.map_scores import FALSE, GroundTruthAssociation
+from vslam_env.evaluation.team_metrics import RobotCounts, RobotMetrics
 from vslam_env.reward import POTENTIALS, RUNNING_COST, TERMS, TeamMetrics, evaluate, make_terms
 from vslam_env.simulation.episode import true_alignment
 
-FIGURES: dict[str, list[float]] = {  # in the order of their rows
+FIGURES: dict[str, list[float]] = {
     "map_errors": [0.7, 0.6],
     "map_rmses": [0.3, 0.2],
     "map_recalls": [0.1, 0.2],
@@ -35,8 +36,8 @@ def _standing(
     coverage: float = 0.25, collisions: tuple[int, int] = (0, 3), time: float = 3.0, **rows: Any
 ) -> TeamMetrics:
     return TeamMetrics(
-        table=[*(FIGURES | rows).values()],
-        counts=(collisions, (7, 8)),
+        table=RobotMetrics(**FIGURES | rows),
+        counts=RobotCounts(collisions, (7, 8)),
         coverage=coverage,
         merges=0,
         time=time,

@@ -1,1 +1,1 @@
-"""Figures of the paper, reproduced in simulation."""
+"""RobotMetrics of the paper, reproduced in simulation."""

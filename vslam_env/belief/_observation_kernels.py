@@ -22,82 +22,6 @@ def _clip(value: float, low: float, high: float) -> np.float32:
     return min(max(np.float32(value), np.float32(low)), np.float32(high))
 
 
-@device
-@in_place
-def write_pose(belief: Any, pose: Any, sigmas: Any) -> None:
-    """Write `pose` and `pose_std`, each (3,) float32, of a robot that believes this, see `TeamPoses`."""
-    for i in range(3):
-        pose[i] = _clip(belief[OWN + i], -POSE_LIMIT[i], POSE_LIMIT[i])
-        sigmas[i] = _clip(math.sqrt(belief[COVARIANCE + 4 * i]), 0.0, POSE_LIMIT[i])
-
-
-@device
-@in_place
-def write_map_stats(places: Any, names: Any, belief: Any, group_size: int, stats: Any) -> None:
-    """Write `map_stats` of a robot.
-
-    Args:
-        places, names: (m, 4), (m, 2) int64. Of its landmarks, see `MapSummaryRows`.
-        belief: As in `write_pose`.
-        group_size: Robots that share its map.
-        stats: (6,) float32. Written to.
-    """
-    total = largest = 0.0
-    times = 0
-    for landmark in range(len(places)):
-        sigma = math.sqrt(places[landmark, 3] / 3.0)
-        total += sigma
-        largest = max(largest, sigma)
-        times += names[landmark, 0]
-    held = max(len(places), 1)
-    stats[0] = _clip(len(places), 0.0, MAP_STATS_LIMIT[0])
-    stats[1] = _clip(total / held, 0.0, MAP_STATS_LIMIT[1])
-    stats[2] = _clip(largest, 0.0, MAP_STATS_LIMIT[2])
-    stats[3] = _clip(times / held, 0.0, MAP_STATS_LIMIT[3])
-    stats[4] = _clip(belief[ESS], 0.0, MAP_STATS_LIMIT[4])
-    stats[5] = _clip(group_size, 0.0, MAP_STATS_LIMIT[5])
-
-
-@device
-@in_place
-def write_teammates(robot: int, poses: Any, belief: Any, teammates: Any, present: Any) -> int:
-    """Write where a robot believes the others of its group to be; return how many these are.
-
-    Args:
-        robot: Its index.
-        poses: (N, 3). Of all robots, start frame; NaN: it does not know.
-        belief: As in `write_pose`.
-        teammates: (7, 5) float32. Written to, as what follows.
-        present: (7,) int8. `teammates_mask`.
-    """
-    teammates[:], present[:] = 0.0, 0
-    x, y, theta = belief[OWN], belief[OWN + 1], belief[OWN + 2]
-    c, s = math.cos(theta), math.sin(theta)
-    known = 0
-    for mate in range(len(poses)):
-        if mate != robot and not np.isnan(poses[mate, 0]):
-            known += 1
-            to, place = teammates[mate - (mate > robot)], poses[mate]
-            dx, dy, turn = place[0] - x, place[1] - y, place[2] - theta
-            to[0], to[1] = (
-                _clip(c * dx + s * dy, -MAX_POSITION, MAX_POSITION),
-                _clip(c * dy - s * dx, -MAX_POSITION, MAX_POSITION),
-            )
-            to[2], to[3] = np.float32(math.cos(turn)), np.float32(math.sin(turn))
-            to[4] = _clip(belief[SIGMAS + mate], -MAX_POSITION, MAX_POSITION)
-            present[mate - (mate > robot)] = 1
-    return known
-
-
-@device
-@in_place
-def clip_candidates(features: Any) -> None:
-    """Clip the features (16, 5) float32 of a robot's candidates."""
-    for i in range(features.shape[0]):
-        for j in range(features.shape[1]):
-            features[i, j] = _clip(features[i, j], -MAX_POSITION, MAX_POSITION)
-
-
 SIZE = 48
 CHANNELS = ("free", "occupied", "landmarks")
 GRID_ON = 255
@@ -113,9 +37,9 @@ def paint(cells: Any, belief: Any, places: Any, local: Any) -> None:
     in short loops without branches, which become vector instructions but for the look-up itself.
 
     Args:
-        cells: (300, 300) uint8. Of the seen grid.
-        belief: (16 or more,). Of the robot, see `TeamPoses`: where it is, and what moves landmarks to its frame.
-        places: (n, 4). Of the landmarks, see `MapSummaryRows`.
+        cells: (300, 300) uint8. Seen grid.
+        belief: (16 or more,). Pose of the robot, and the motion of landmarks to its frame; see `TeamPoses`.
+        places: (n, 4). Landmarks, see `MapSummaryRows`.
         local: (3, 48, 48) uint8. Channels free, occupied, landmarks, of cells of 0.2 m, 0 or 255. Written to.
     """
     x, y = belief[OWN], belief[OWN + 1]
@@ -126,7 +50,7 @@ def paint(cells: Any, belief: Any, places: Any, local: Any) -> None:
     surely_inside = low < x / CELL < high and low < y / CELL < high
     place, seen = stack_array_of(SIZE, np.int32), stack_array_of(SIZE, np.uint8)
     for row in range(SIZE):
-        ahead = middle - 0.5 - row  # [cells], as what follows
+        ahead = middle - 0.5 - row  # in cells, as are all coordinates of this loop
         first_i, first_j = y / CELL + s * ahead + 0.5 * GRID_SIZE, x / CELL + c * ahead + 0.5 * GRID_SIZE
         if surely_inside:
             for col in range(SIZE):
@@ -159,31 +83,65 @@ def paint(cells: Any, belief: Any, places: Any, local: Any) -> None:
 @in_place
 def write_observations(
     robots: Any, poses: Any, beliefs: Any, places: Any, names: Any, parts: Any, cells: Any, scans: Any,
-    clipped: Any, deviations: Any, stats: Any, ranges: Any, candidates: Any, teammates: Any, present: Any,
-    pictures: Any,
+    observed: tuple[Any, Any, Any, Any, Any, Any, Any, Any],
 ) -> None:  # fmt: skip
     """Write what robots observe.
 
     Args:
-        robots: As in `View`.
-        poses, beliefs: (n, K, 3), (n, 16 + K). Of its points.
-        places, names, parts: (N, 4), (N, 2) int64, (n, 2) int64. Of its outlines.
-        cells: Of the view.
+        robots: (n,) int64. Indices of the robots.
+        poses, beliefs: (n, K, 3), (n, 16 + K). See `TeamPoses`.
+        places, names, parts: (N, 4), (N, 2) int64, (n, 2) int64. Landmarks of all maps, and the part of each robot; see
+            `TeamMapSummaries`.
+        cells: (n, 300, 300) uint8. Seen grids.
         scans: (n, R) float64 [m].
-        clipped, deviations, stats: (n, 3), (n, 3), (n, 6) float32: `pose`, `pose_std`, `map_stats`. Written to, as all
-            that follow.
-        ranges: (n, R) float32: `scan`.
-        candidates: (n, 16, 5) float32, as they are without bounds.
-        teammates: (n, 7, 5) float32.
-        present: (n, 7) int8: `teammates_mask`.
-        pictures: (n, 3, 48, 48) uint8: `local_grid`.
+        observed: Written to, in the order of the table of `observation`: (n, 3), (n, 3) and (n, 6) float32;
+            (n, 3, 48, 48) uint8; (n, R), (n, 16, 5) and (n, 7, 5) float32; (n, 7) int8. The candidates hold their
+            features without bounds before.
     """
+    pose, pose_std, map_stats, local_grid, scan, features, teammates, present = observed
     for k in range(len(robots)):
         for r in range(scans.shape[1]):
-            ranges[k, r] = scans[k, r]
-        held = slice(parts[k, 0], parts[k, 1])
-        known = write_teammates(robots[k], poses[k], beliefs[k], teammates[k], present[k])
-        write_pose(beliefs[k], clipped[k], deviations[k])
-        write_map_stats(places[held], names[held], beliefs[k], 1 + known, stats[k])
-        clip_candidates(candidates[k])
-        paint(cells[k], beliefs[k], places[held], pictures[k])
+            scan[k, r] = scans[k, r]
+
+        belief = beliefs[k]
+        for i in range(3):
+            pose[k, i] = _clip(belief[OWN + i], -POSE_LIMIT[i], POSE_LIMIT[i])
+            pose_std[k, i] = _clip(math.sqrt(belief[COVARIANCE + 4 * i]), 0.0, POSE_LIMIT[i])
+
+        for i in range(features.shape[1]):
+            for j in range(features.shape[2]):
+                features[k, i, j] = _clip(features[k, i, j], -MAX_POSITION, MAX_POSITION)
+
+        teammates[k], present[k] = 0.0, 0
+        x, y, theta = belief[OWN], belief[OWN + 1], belief[OWN + 2]
+        c, s = math.cos(theta), math.sin(theta)
+        group_size = 1
+        for mate in range(poses.shape[1]):
+            if mate != robots[k] and not np.isnan(poses[k, mate, 0]):
+                group_size += 1
+                to, place = teammates[k, mate - (mate > robots[k])], poses[k, mate]
+                dx, dy, turn = place[0] - x, place[1] - y, place[2] - theta
+                to[0], to[1] = (
+                    _clip(c * dx + s * dy, -MAX_POSITION, MAX_POSITION),
+                    _clip(c * dy - s * dx, -MAX_POSITION, MAX_POSITION),
+                )
+                to[2], to[3] = np.float32(math.cos(turn)), np.float32(math.sin(turn))
+                to[4] = _clip(belief[SIGMAS + mate], -MAX_POSITION, MAX_POSITION)
+                present[k, mate - (mate > robots[k])] = 1
+
+        total = largest = 0.0
+        times = 0
+        for landmark in range(parts[k, 0], parts[k, 1]):
+            sigma = math.sqrt(places[landmark, 3] / 3.0)
+            total += sigma
+            largest = max(largest, sigma)
+            times += names[landmark, 0]
+        held, stats = parts[k, 1] - parts[k, 0], map_stats[k]
+        stats[0] = _clip(held, 0.0, MAP_STATS_LIMIT[0])
+        stats[1] = _clip(total / max(held, 1), 0.0, MAP_STATS_LIMIT[1])
+        stats[2] = _clip(largest, 0.0, MAP_STATS_LIMIT[2])
+        stats[3] = _clip(times / max(held, 1), 0.0, MAP_STATS_LIMIT[3])
+        stats[4] = _clip(belief[ESS], 0.0, MAP_STATS_LIMIT[4])
+        stats[5] = _clip(group_size, 0.0, MAP_STATS_LIMIT[5])
+
+        paint(cells[k], belief, places[parts[k, 0] : parts[k, 1]], local_grid[k])

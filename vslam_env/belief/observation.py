@@ -45,7 +45,7 @@ def observe(belief: Belief, scan: FloatArray, goal_actions: bool) -> Observation
     """Return a robot's observation.
 
     Args:
-        belief: Of the robot.
+        belief: Belief of the robot.
         scan: (R,) float64 [m]. Its last scan.
         goal_actions: Whether actions are candidates, and are masked.
 
@@ -72,10 +72,8 @@ def observe_team(view: BeliefBatch, scans: FloatArray, goal_actions: bool) -> li
     teammates, present = np.empty((count, MAX_TEAMMATES, 5), np.float32), np.empty((count, MAX_TEAMMATES), np.int8)
     pictures = np.empty((count, len(CHANNELS), SIZE, SIZE), np.uint8)
     points, ((places, names), parts) = view.points, view.map_summaries
-    write_observations(
-        view.robots, points.poses, points.beliefs, places, names, parts, view.cells, scans,
-        poses, deviations, stats, ranges, candidates, teammates, present, pictures,
-    )  # fmt: skip
+    arrays = poses, deviations, stats, pictures, ranges, candidates, teammates, present
+    write_observations(view.robots, points.poses, points.beliefs, places, names, parts, view.cells, scans, arrays)
     observations: list[Observation] = []
     for i in range(count):  # by index: an array that is looped through ends with an error, and that costs microseconds
         observation: Observation = {
@@ -116,7 +114,7 @@ def observation_space(num_rays: int, scan_range: float, goal_actions: bool, flat
 
     Args:
         num_rays: R.
-        scan_range: [m].
+        scan_range: Range of the scan [m].
         goal_actions: Whether actions are masked.
         flat: One vector instead of named arrays. With masked actions it comes as `{"observation", "action_mask"}`.
 

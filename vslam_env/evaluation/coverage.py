@@ -1,53 +1,67 @@
 """How much of the reachable floor the robots have seen, by their own grids, and which of them found it."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.core.jit import device, in_place
 from slam_backend.core.read_only import as_constant, as_read_only
-from slam_backend.core.validation import FloatArray
+from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.geometry import inverse, transform_points
 from vslam_env.navigation import FREE, GRID_SIZE, TeamGrids, cell_of
 
-PLACE, CELL = 0, 1  # rows of what is laid
-OBSERVER_COUNT, EVER_SEEN = 0, 1  # rows of the floor
+
+class Tally(NamedTuple):
+    """What is counted of N floor cells, of which m entries lie in the grids of K robots.
+
+    Attributes:
+        seen: (m,) int8. Whether a robot sees the cell of each entry.
+        seers: (N,) int64. Number of robots that see each cell.
+        ever: (N,) int64. 1 for cells that have been found.
+        fresh: (1 + N,) int32. Number of cells that may have been found since, then which; -1: any may have been.
+        found: (K,) int64. Number of cells that each robot has found.
+    """
+
+    seen: NDArray[np.int8]
+    seers: IntArray
+    ever: IntArray
+    fresh: NDArray[np.int32]
+    found: IntArray
 
 
 @device
 @in_place
-def _recount(changes: Any, cells: Any, places: Any, laid: Any, seen: Any, floor: Any, fresh: Any) -> int:
-    """Bring up to date what one robot sees of the floor.
+def _recount(changes: Any, cells: Any, laid: Any, first: int, last: int, tally: Tally) -> int:
+    """Bring up to date which entries, from the first to before the last, one robot sees.
 
     Args:
-        changes: (1 + n,) int32. Of its grid, see `TeamGrids`.
-        cells: (300, 300) uint8. Of its grid.
-        places: (m,) int32, ascending. Places of floor cells in the flat grid.
-        laid: (m,) int32. These floor cells.
-        seen: (m,) int8. Whether the robot saw them; changed.
-        floor: (2, N) int64. How many robots see each floor cell, and whether it is known to have been found; the first
-            is changed.
-        fresh: (1 + N,) int32. How many others have come to be seen, then which; -1: any of them. Added to.
+        changes: (1 + n,) int32. Changes of its grid, see `TeamGrids`.
+        cells: (300, 300) uint8. Cells of its grid.
+        laid: (2, m) int32. See `CoverageCells`.
+        first: First entry of the robot.
+        last: One past its last entry.
+        tally: Changed.
 
     Returns:
         How many more floor cells are seen by some robot than before.
     """
-    seers, ever = floor[OBSERVER_COUNT], floor[EVER_SEEN]
-    more, flat, all_may_have = 0, cells.reshape(cells.size), changes[0] < 0
+    seen, seers, fresh = tally.seen, tally.seers, tally.fresh
+    places, more, flat, all_may_have = laid[0, :last], 0, cells.reshape(cells.size), changes[0] < 0
     for k in range(1 if all_may_have else changes[0]):
-        for i in range(0 if all_may_have else np.searchsorted(places, changes[1 + k]), len(places)):
+        begin = first if all_may_have else first + np.searchsorted(places[first:], changes[1 + k])
+        for i in range(begin, last):
             if not all_may_have and places[i] != changes[1 + k]:
                 break
-            now, cell = flat[places[i]] == FREE, laid[i]
+            now, cell = flat[places[i]] == FREE, laid[1, i]
             if now != seen[i]:
                 seen[i] = now
                 seers[cell] += 1 if now else -1
                 if now and seers[cell] == 1:
                     more += 1
-                    if not ever[cell] and fresh[0] >= 0:
-                        fresh[0] = fresh[0] + 1 if fresh[0] < len(ever) else -1
+                    if not tally.ever[cell] and fresh[0] >= 0:
+                        fresh[0] = fresh[0] + 1 if fresh[0] < len(seers) else -1
                         if fresh[0] > 0:
                             fresh[fresh[0]] = cell
                 elif not now:
@@ -55,56 +69,42 @@ def _recount(changes: Any, cells: Any, places: Any, laid: Any, seen: Any, floor:
     return more
 
 
-@device
 @in_place
-def _find(fresh: Any, floor: Any, area: Any, positions: Any, found: Any) -> None:
-    """Count floor cells that are seen for the first time for the robot nearest to them.
+def _update(
+    changes: Any, cells: Any, laid: Any, bounds: Any, area: Any, positions: Any, arrays: tuple[Any, ...], shares: Any
+) -> int:
+    """Take in what has changed in all grids; count floor cells seen for the first time for the robot nearest to them.
 
     Args:
-        fresh: (1 + N,) int32. Which may be, as `_recount` leaves them; none afterwards.
-        floor: (2, N) int64. As in `_recount`; whether each cell has been found is changed.
-        area: (N, 2) float64 [m], world frame. The floor cells.
+        changes: (K, 1 + n) int32. Changes of the grids, see `TeamGrids`; none afterwards.
+        cells: (K, 300, 300) uint8. Cells of the grids.
+        laid, bounds: See `CoverageCells`.
+        area: (N, 2) float64 [m], world frame. Floor cells.
         positions: (K, 2 or 3) float64 [m], world frame.
-        found: (K,) int64. How many each robot has found; changed.
+        arrays: Those of a `Tally`, changed.
+        shares: (K,) float64. Written to: what each robot has found as a share of the floor.
+
+    Returns:
+        How many more floor cells are seen by some robot than before.
     """
-    seers, ever = floor[OBSERVER_COUNT], floor[EVER_SEEN]
-    for k in range(len(ever) if fresh[0] < 0 else fresh[0]):
+    tally, more = Tally(*arrays), 0
+    for robot in range(len(cells)):
+        more += _recount(changes[robot], cells[robot], laid, bounds[robot], bounds[robot + 1], tally)
+        changes[robot, 0] = 0
+    fresh = tally.fresh
+    for k in range(len(area) if fresh[0] < 0 else fresh[0]):
         i = k if fresh[0] < 0 else fresh[1 + k]
-        if seers[i] > 0 and not ever[i]:
-            ever[i] = 1
+        if tally.seers[i] > 0 and not tally.ever[i]:
+            tally.ever[i] = 1
             nearest, least = 0, np.inf
             for robot in range(len(positions)):
                 gap = (area[i, 0] - positions[robot, 0]) ** 2 + (area[i, 1] - positions[robot, 1]) ** 2
                 if gap < least:
                     nearest, least = robot, gap
-            found[nearest] += 1
+            tally.found[nearest] += 1
     fresh[0] = 0
-
-
-@in_place
-def _update(
-    changes: Any, cells: Any, laid: Any, bounds: Any, seen: Any, floor: Any, fresh: Any, area: Any, positions: Any,
-    found: Any, shares: Any,
-) -> int:  # fmt: skip
-    """Take in what has changed in all grids; return how many more floor cells are seen by some robot than before.
-
-    Args:
-        changes: (K, 1 + n) int32. Of the grids, see `TeamGrids`; none afterwards.
-        cells: (K, 300, 300) uint8. Of the grids.
-        laid, bounds: Of the floor, see `CoverageCells`.
-        seen: As in `_recount`, of all robots.
-        floor, fresh: As in `_recount`.
-        area, positions, found: As in `_find`.
-        shares: (K,) float64. Written to: what each has found as a share of the floor.
-    """
-    more = 0
-    for robot in range(len(cells)):
-        own = slice(bounds[robot], bounds[robot + 1])
-        more += _recount(changes[robot], cells[robot], laid[PLACE, own], laid[CELL, own], seen[own], floor, fresh)
-        changes[robot, 0] = 0
-    _find(fresh, floor, area, positions, found)
-    for robot in range(len(found)):
-        shares[robot] = found[robot] / max(len(area), 1)
+    for robot in range(len(tally.found)):
+        shares[robot] = tally.found[robot] / max(len(area), 1)
     return more
 
 
@@ -132,21 +132,24 @@ class CoverageCells:
 class CoverageTracker:
     """Share of the free floor inside the union of the robots' grids, and each robot's part in it.
 
-    It goes by what has changed in the grids since it was asked last, so it is asked about the same ones throughout.
+    It counts what has changed in the grids since the last update, so every update takes the same grids.
 
     Args:
-        meter: Of the world and the robots' starts.
+        meter: Meter of the world and the robots' starts.
     """
 
     def __init__(self, meter: CoverageCells) -> None:
         self._meter = meter
         count = len(meter.cells)
-        self._seen = np.zeros(meter.laid.shape[1], np.int8)
-        self._floor = np.zeros((2, count), np.int64)
+        self._tally = Tally(
+            seen=np.zeros(meter.laid.shape[1], np.int8),
+            seers=np.zeros(count, np.int64),
+            ever=np.zeros(count, np.int64),
+            fresh=np.zeros(1 + count, np.int32),
+            found=np.zeros(len(meter.bounds) - 1, np.int64),
+        )
         self._covered = 0
         self._began = False
-        self._fresh = np.zeros(1 + count, np.int32)
-        self._found = np.zeros(len(meter.bounds) - 1, np.int64)
 
     def update(self, grids: TeamGrids, positions: FloatArray, found: FloatArray) -> float:
         """Look at what the robots have seen by now, and take their grids' changes.
@@ -155,7 +158,7 @@ class CoverageTracker:
         lost again.
 
         Args:
-            grids: Of the robots.
+            grids: Grids of the robots.
             positions: (K, 2 or 3) float64 [m], world frame. True positions of the robots.
             found: (K,) float64. Written to: the share of the free floor that each robot was nearest to when it was
                 first seen.
@@ -168,19 +171,18 @@ class CoverageTracker:
             self._began = True
         meter = self._meter
         self._covered += _update(
-            grids.changes, grids.cells, meter.laid, meter.bounds, self._seen, self._floor, self._fresh, meter.cells,
-            positions, self._found, found,
-        )  # fmt: skip
+            grids.changes, grids.cells, meter.laid, meter.bounds, meter.cells, positions, tuple(self._tally), found
+        )
         return self._covered / max(len(meter.cells), 1)
 
     def get_state(self) -> dict[str, Any]:
         """Return a copy of what cannot be counted again from the grids."""
-        return {"ever": self._floor[EVER_SEEN] > 0, "found": self._found.copy()}
+        return {"ever": self._tally.ever > 0, "found": self._tally.found.copy()}
 
     def set_state(self, state: Mapping[str, Any]) -> None:
-        """Go on with what `get_state` returned; the grids are asked for their changes as ever."""
-        self._floor[EVER_SEEN], self._found = state["ever"], state["found"].copy()
-        self._fresh[0] = -1
+        """Go on with what `get_state` returned; the changes of the grids count as before."""
+        self._tally.ever[:], self._tally.found[:] = state["ever"], state["found"]
+        self._tally.fresh[0] = -1
 
 
 def _flat_cells(points: FloatArray) -> NDArray[np.int32]:

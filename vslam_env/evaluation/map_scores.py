@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.core.jit import in_place, inline
+from slam_backend.core.jit import in_place
 from slam_backend.core.read_only import with_constants, with_read_only
 from slam_backend.core.validation import FloatArray, IntArray, check_float
 from slam_backend.fastslam.relative_poses import OWN, SIGMAS, START, TeamPoses
@@ -18,128 +18,78 @@ FALSE, UNCOUNTED = -1, -2  # claims of landmarks that are no true one, or one th
 PLACED = 0.5  # [m] a landmark held nearer than this is well placed
 
 
-@inline
-def pose_error(start: FloatArray, estimated: FloatArray, true: FloatArray) -> tuple[float, float]:
-    """Return how far an estimated pose, laid at the true start, is from the true one.
-
-    Args:
-        start: (3,) float64 [m, m, rad], world frame. True start pose.
-        estimated: (3,) float64 [m, m, rad], own start frame.
-        true: (3,) float64 [m, m, rad], world frame.
-
-    Returns:
-        The distance [m], and the difference of the headings [rad] in [0, pi].
-    """
-    c, s = math.cos(start[2]), math.sin(start[2])
-    dx = start[0] + c * estimated[0] - s * estimated[1] - true[0]
-    dy = start[1] + s * estimated[0] + c * estimated[1] - true[1]
-    turn = start[2] + estimated[2] - true[2]
-    return math.hypot(dx, dy), abs((turn + math.pi) % (2.0 * math.pi) - math.pi)
-
-
-@inline
-def _score_map(
-    places: FloatArray, names: IntArray, book: IntArray, x0: float, y0: float, turn: float, truths: FloatArray,
-    cutoff: float, least: FloatArray,
-) -> tuple[float, float, float, float, float]:  # fmt: skip
-    """Return the scores of a robot's map, in the order of `score_team`.
-
-    Args:
-        places, names: (n, 4), (n, 2) int64. Of its landmarks, as in `MapSummaryRows`.
-        book: What the landmark of each name claims.
-        x0, y0, turn: The motion [m, m, rad] of the places to the frame of the truths.
-        truths: (N, 3) [m], N >= 1.
-        cutoff: c of the map error [m].
-        least: (N,) overwritten: the squared distance of the nearest landmark that claims each, else infinite.
-    """
-    least[:] = np.inf
-    c, s = math.cos(turn), math.sin(turn)
-    estimated = surplus = 0
-    for i in range(len(places)):
-        claim = book[names[i, 1]]
-        estimated += claim != UNCOUNTED
-        if claim == FALSE:
-            surplus += 1
-        elif claim >= 0:
-            x = x0 + c * places[i, 0] - s * places[i, 1] - truths[claim, 0]
-            y = y0 + s * places[i, 0] + c * places[i, 1] - truths[claim, 1]
-            z = places[i, 2] - truths[claim, 2]
-            surplus += least[claim] < np.inf
-            least[claim] = min(least[claim], x * x + y * y + z * z)
-    matched = placed = 0
-    squares = 0.0
-    total = 0.5 * cutoff * cutoff * surplus
-    for square in least:
-        if square < np.inf:
-            matched += 1
-            placed += square < PLACED * PLACED
-            squares += square
-            total += min(square, cutoff * cutoff)
-        else:
-            total += 0.5 * cutoff * cutoff
-    count = len(truths)
-    rmse = math.sqrt(squares / matched) if matched else cutoff
-    return math.sqrt(total / count), rmse, matched / count, matched / max(estimated, 1), placed / count
-
-
-@in_place
-def score_team(
-    places: Any, names: Any, parts: Any, books: Any, book_of: Any, truths: Any, cutoff: float, beliefs: Any,
-    true_starts: Any, true_poses: Any, scores: Any, least: Any,
-) -> None:  # fmt: skip
-    """Write how wrong the robots' maps and poses are, in their own start frames and without fitting.
-
-    Args:
-        places, names, parts: (N, 4), (N, 2) int64, (K, 2) int64. Of `TeamMapSummaries`.
-        books: (B, n) int64. What the landmark of each name claims, map by map: a row of truths, or as above.
-        book_of: (K,) int64. Which book is that of each robot's map.
-        truths: (N', 3) [m], world frame. The landmarks that count, N' >= 1.
-        cutoff: c of the map error [m].
-        beliefs: (K, 16 + K). Of `TeamPoses`.
-        true_starts, true_poses: (K, 3) [m, m, rad], world frame.
-        scores: (8 or more, K) float64. Written to: per robot the map error E of the contract [m]; the RMSE [m] of the
-            matched landmarks, the cutoff where nothing is matched; matched landmarks over the true ones, and over
-            those of the map; matched ones nearer than 0.5 m over the true ones; errors of position [m] and heading
-            [rad]; and what the robot believes of the former, one sigma [m].
-        least: (N',) room to work in.
-    """
-    for robot in range(len(beliefs)):
-        held, belief = slice(parts[robot, 0], parts[robot, 1]), beliefs[robot]
-        x, y, theta = belief[START], belief[START + 1], belief[START + 2]
-        c, s = math.cos(true_starts[robot, 2]), math.sin(true_starts[robot, 2])
-        x0 = true_starts[robot, 0] + c * x - s * y
-        y0 = true_starts[robot, 1] + s * x + c * y
-        turn, book = true_starts[robot, 2] + theta, books[book_of[robot]]
-        of_map = _score_map(places[held], names[held], book, x0, y0, turn, truths, cutoff, least)
-        scores[0, robot], scores[1, robot], scores[2, robot], scores[3, robot], scores[4, robot] = of_map
-        scores[5, robot], scores[6, robot] = pose_error(true_starts[robot], belief[OWN : OWN + 3], true_poses[robot])
-        scores[7, robot] = belief[SIGMAS + robot]
-
-
 UNUSED = -3  # an id that no landmark has had so far
 
 
 @in_place
-def _record_true_ids(book: IntArray, ids: IntArray, true_ids: IntArray, claim_of: IntArray) -> int:
-    """Note what new landmarks claim, if there is room for all of them.
+def score_team(
+    places: Any,
+    names: Any,
+    parts: Any,
+    claims: tuple[Any, ...],
+    beliefs: Any,
+    true_starts: Any,
+    true_poses: Any,
+    scores: Any,
+) -> None:
+    """Write how wrong the robots' maps and poses are, in their own start frames and without fitting.
 
     Args:
-        book: (n,) int64. What the landmark of each id claims; changed.
-        ids: (m,) int64. Of the landmarks that measurements created, -1 = none.
-        true_ids: (m,) int64, read-only. The landmark behind each measurement; -1 for a false point.
-        claim_of: (N',) int64. What is noted of each of these.
-
-    Returns:
-        How long the book has to be; where it is shorter nothing is noted.
+        places, names, parts: (n, 4), (n, 2) int64, (K, 2) int64. Landmarks of all maps, and the part of each robot; see
+            `TeamMapSummaries`.
+        claims: What the landmarks claim to be, and how that is scored:
+            (B, n) int64. Claim of the landmark of each name, map by map: a row of the truths, or as above.
+            (K,) int64. Book of each robot's map, one of the B.
+            (N, 3) float64 [m], world frame. The landmarks that count, N >= 1.
+            c of the map error [m].
+            (N,) float64. Room to work in.
+        beliefs: (K, 16 + K). See `TeamPoses`.
+        true_starts, true_poses: (K, 3) [m, m, rad], world frame.
+        scores: (8 or more, K) float64. Written to: per robot the map error E of the contract [m]; the RMSE [m] of the
+            matched landmarks, the cutoff where nothing is matched; matched landmarks over the true ones, and over
+            those of the map; matched ones nearer than 0.5 m over the true ones; errors of position [m] and heading
+            [rad] in [0, pi]; and what the robot believes of the former, one sigma [m].
     """
-    needed = 0
-    for i in range(len(ids)):
-        needed = max(needed, ids[i] + 1)
-    if needed <= len(book):
-        for i in range(len(ids)):
-            if ids[i] >= 0:
-                book[ids[i]] = claim_of[true_ids[i]] if true_ids[i] >= 0 else FALSE
-    return needed
+    books, book_of, truths, cutoff, least = claims
+    for robot in range(len(beliefs)):
+        belief, start, true, score = beliefs[robot], true_starts[robot], true_poses[robot], scores[:, robot]
+        c, s = math.cos(start[2]), math.sin(start[2])
+        dx = start[0] + c * belief[OWN] - s * belief[OWN + 1] - true[0]
+        dy = start[1] + s * belief[OWN] + c * belief[OWN + 1] - true[1]
+        turned = start[2] + belief[OWN + 2] - true[2]
+        score[5], score[6] = math.hypot(dx, dy), abs((turned + math.pi) % (2.0 * math.pi) - math.pi)
+        score[7] = belief[SIGMAS + robot]
+
+        x0 = start[0] + c * belief[START] - s * belief[START + 1]
+        y0 = start[1] + s * belief[START] + c * belief[START + 1]
+        c, s = math.cos(start[2] + belief[START + 2]), math.sin(start[2] + belief[START + 2])
+        least[:] = np.inf  # squared distance of the nearest landmark that claims each
+        estimated = surplus = 0
+        for i in range(parts[robot, 0], parts[robot, 1]):
+            claim = books[book_of[robot], names[i, 1]]
+            estimated += claim != UNCOUNTED
+            if claim == FALSE:
+                surplus += 1
+            elif claim >= 0:
+                x = x0 + c * places[i, 0] - s * places[i, 1] - truths[claim, 0]
+                y = y0 + s * places[i, 0] + c * places[i, 1] - truths[claim, 1]
+                z = places[i, 2] - truths[claim, 2]
+                surplus += least[claim] < np.inf
+                least[claim] = min(least[claim], x * x + y * y + z * z)
+        matched = placed = 0
+        squares, total = 0.0, 0.5 * cutoff * cutoff * surplus
+        for square in least:
+            if square < np.inf:
+                matched += 1
+                placed += square < PLACED * PLACED
+                squares += square
+                total += min(square, cutoff * cutoff)
+            else:
+                total += 0.5 * cutoff * cutoff
+        score[0] = math.sqrt(total / len(truths))
+        score[1] = math.sqrt(squares / matched) if matched else cutoff
+        score[2], score[3] = matched / len(truths), matched / max(estimated, 1)
+        score[4] = placed / len(truths)
 
 
 class GroundTruthAssociation:
@@ -166,7 +116,7 @@ class GroundTruthAssociation:
         """Enter all that a step did to maps.
 
         Args:
-            report: Of the step.
+            report: Report of the step.
             true_ids: Per robot (n_i or more,) int64. The landmark behind each measurement; -1 for a false point.
         """
         self._seen[report.step] = with_read_only(true_ids)
@@ -214,17 +164,15 @@ class GroundTruthAssociation:
         """Score the robots' maps and poses where their own estimates put them.
 
         Args:
-            outlines: Of the maps of the K robots, in their map frames.
-            points: Where they believe to be.
-            true_starts: (K, 3) [m, m, rad]. The true start poses, in the frame of the true positions.
-            true_poses: (K, 3) [m, m, rad]. Likewise.
+            outlines: Outlines of the maps of the K robots, in their map frames.
+            points: Poses that the robots believe.
+            true_starts: (K, 3) [m, m, rad]. True start poses, in the frame of the true positions.
+            true_poses: (K, 3) [m, m, rad]. True poses, in the same frame.
             scores: (8 or more, K) float64. Written to: the first figures of `TeamMetrics`.
         """
         (places, names), parts = outlines
-        score_team(
-            places, names, parts, self._books, self._book_of, self.true_positions, self.cutoff, points.beliefs,
-            true_starts, true_poses, scores, self._least,
-        )  # fmt: skip
+        claims = self._books, self._book_of, self.true_positions, self.cutoff, self._least
+        score_team(places, names, parts, claims, points.beliefs, true_starts, true_poses, scores)
 
     def get_state(self) -> dict[str, Any]:
         """Return a copy of the books, for the same world's landmarks; what was seen is read-only and shared."""
@@ -263,9 +211,10 @@ class GroundTruthAssociation:
             self._books = np.pad(self._books, ((0, 0), (0, more)), constant_values=UNUSED)
 
     def _enter(self, number: int, ids: IntArray, true_ids: IntArray) -> None:
-        """Note what measurements (m,) of landmarks (m,) created in a map."""
-        row = self._row_of[number]
-        needed = _record_true_ids(self._books[row], ids, true_ids, self._claim_of)
-        if needed > self._books.shape[1]:
-            self._reserve(needed)
-            _record_true_ids(self._books[row], ids, true_ids, self._claim_of)
+        """Note what landmarks (m,) claim that measurements (m,) created in a map; -1 stands for none."""
+        names = ids.tolist()  # few: a loop in Python takes less than calls of numpy
+        self._reserve(max(names, default=-1) + 1)
+        book = self._books[self._row_of[number]]
+        for name, true_id in zip(names, true_ids.tolist(), strict=False):
+            if name >= 0:
+                book[name] = self._claim_of[true_id] if true_id >= 0 else FALSE

@@ -6,52 +6,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from slam_backend.core.jit import in_place
 from slam_backend.core.validation import BoolArray, FloatArray
-from vslam_env.navigation._grid_kernels import GRID_SIZE, known_bounds
+from vslam_env.navigation._grid_kernels import GRID_SIZE
 from vslam_env.navigation._planning_kernels import (
-    HEADING,
-    LENGTH,
-    NUM_COLUMNS,
+    FRONTIER_SIZE,
     SAME_GOAL,
-    SIZE,
-    XY,
+    FrontierColumns,
+    describe,
     fill_slots,
     update_slots,
 )
-from vslam_env.navigation.planning import start_of
+from vslam_env.navigation.occupancy_grid import known_bounds
 from vslam_env.navigation.team_grids import TeamGrids
 from vslam_env.navigation.validation import check_cells, pose_floats, positions_array
 
+__all__ = ["FRONTIER_SIZE", "NUM_FEATURES", "NUM_SLOTS", "CandidateSlots", "TeamSlots"]
+
 NUM_SLOTS, NUM_FEATURES = 16, 5
-FRONTIER_SIZE = 3  # the feature that is above 0 where there is a candidate
+NUM_COLUMNS = len(FrontierColumns._fields)
 ROBOT_RADIUS = 0.2  # [m]
-
-NO_TEAMMATE = 60.0  # [m] stands for the distance of a teammate when there is none
-
-
-@in_place
-def _write_features(slots: Any, poses: Any, features: Any) -> None:
-    """Write `CandidateSlots.features` (K, 16, 5) of the rows of all slots (K, 16, ...).
-
-    Poses (K, n, 3), n >= K, are as in `TeamSlots.features`.
-    """
-    for robot in range(len(slots)):
-        x, y, theta = poses[robot, robot]
-        c, s = math.cos(theta), math.sin(theta)
-        for i in range(NUM_SLOTS):
-            goal_x, goal_y = slots[robot, i, 0], slots[robot, i, 1]
-            if np.isnan(goal_x):
-                features[robot, i] = 0.0
-                continue
-            u, v = goal_x - x, goal_y - y
-            nearest = NO_TEAMMATE
-            for mate in range(poses.shape[1]):
-                if mate != robot and not np.isnan(poses[robot, mate, 0]):
-                    nearest = min(nearest, np.hypot(goal_x - poses[robot, mate, 0], goal_y - poses[robot, mate, 1]))
-            features[robot, i, 0], features[robot, i, 1] = c * u + s * v, c * v - s * u
-            features[robot, i, 2], features[robot, i, FRONTIER_SIZE] = slots[robot, i, LENGTH], slots[robot, i, SIZE]
-            features[robot, i, 4] = nearest
 
 
 class CandidateSlots:
@@ -59,8 +32,9 @@ class CandidateSlots:
 
     At an update, old candidates are paired with the frontiers found now, at least total distance, and live on where a
     pair is less than 1 m apart; others die. New frontiers fill free slots, nearest first. A frontier that stays though
-    the robot looked at it from its goal at 4 updates (or somebody was there at 16) cannot be seen, as it is a speck of
-    noise or a nook behind a corner: what is unknown within 0.8 m of the goal is given up, so that exploration ends.
+    the robot looked at it from its goal at 4 updates (or a robot of its group was there at 16) cannot be seen, as it is
+    a speck of noise or a nook behind a corner: what is unknown within 0.8 m of the goal is given up, so that
+    exploration ends.
     """
 
     __slots__ = ("_given_up", "_rows", "_visits")
@@ -85,40 +59,44 @@ class CandidateSlots:
     @property
     def valid(self) -> BoolArray:
         """Which slots hold a candidate, (16,) bool; none when nothing is left to explore."""
-        return ~np.isnan(self._rows[:, 0])
+        return ~np.isnan(self._columns.x)
+
+    @property
+    def _columns(self) -> FrontierColumns:
+        return FrontierColumns.of(self._rows)
 
     @property
     def goals(self) -> FloatArray:
         """Where to go, (16, 2) float64 [m], start frame; NaN in empty slots."""
-        return self._rows[:, XY].copy()
+        return self._columns.goals
 
     @property
     def headings(self) -> FloatArray:
         """Where to look from the goals, (16,) float64 [rad], start frame; NaN in empty slots."""
-        return self._rows[:, HEADING].copy()
+        return self._columns.heading.copy()
 
     @property
     def sizes(self) -> FloatArray:
         """How long the frontiers are, (16,) float64 [m]; NaN in empty slots."""
-        return self._rows[:, SIZE].copy()
+        return self._columns.size.copy()
 
     @property
     def lengths(self) -> FloatArray:
         """How long the robot's paths to the goals were at the last update, (16,) float64 [m]; NaN in empty slots."""
-        return self._rows[:, LENGTH].copy()
+        return self._columns.length.copy()
 
     def candidate(self, slot: int) -> tuple[FloatArray, float] | None:
         """Return the goal (2,) [m] of a slot and where to look from there [rad], start frame; None if it is empty."""
-        row = self._rows[slot]
-        return None if math.isnan(row[0]) else (row[XY].copy(), float(row[HEADING]))
+        x, y, heading, _, _ = self._rows[slot].tolist()
+        return None if math.isnan(x) else (np.array([x, y]), heading)
 
     def update(self, cells: NDArray[np.uint8], pose: ArrayLike, teammates: ArrayLike = ()) -> None:
         """Bring the candidates up to date; meant to be called once a second.
 
         Args:
             cells: (300, 300) uint8. `SeenGrid.cells`.
-            pose: (3,) float64 [m, m, rad], start frame. Of the robot.
-            teammates: (k, 2) float64 [m], start frame. Where the others of its group are: their visits count as well.
+            pose: (3,) float64 [m, m, rad], start frame. Pose of the robot.
+            teammates: (k, 2) float64 [m], start frame. Places of the others in its group: their visits count as well.
 
         Raises:
             ValueError: If an array has the wrong shape or is not finite.
@@ -131,16 +109,13 @@ class CandidateSlots:
         """Bring the candidates of a robot up to date.
 
         Args:
-            cells: (300, 300) uint8. Of its grid.
-            bounds: (4,) int32. Likewise, see `TeamGrids`.
+            cells: (300, 300) uint8. Cells of its grid.
+            bounds: (4,) int32. Bounds of its grid, see `TeamGrids`.
             poses: (n, 3) float64 [m, m, rad], start frame. Its own and those of teammates; NaN: it does not know.
-            robot: Its row of them.
+            robot: Its row in the poses.
         """
-        x, y, _ = poses[robot].tolist()
         slots = self._rows, self._visits
-        found, costs, is_clear = update_slots(
-            cells, bounds, *start_of(x, y, ROBOT_RADIUS), poses, robot, *slots, self._given_up
-        )  # fmt: skip
+        found, costs, is_clear = update_slots(cells, bounds, ROBOT_RADIUS, poses, robot, *slots, self._given_up)
         if not is_clear:
             fill_slots(_assign(costs), found, *slots)
 
@@ -148,8 +123,8 @@ class CandidateSlots:
         """Describe the candidates to a policy.
 
         Args:
-            pose: (3,) float64 [m, m, rad], start frame. Of the robot.
-            teammates: (k, 2) float64 [m], start frame. Of the others in its group.
+            pose: (3,) float64 [m, m, rad], start frame. Pose of the robot.
+            teammates: (k, 2) float64 [m], start frame. Places of the others in its group.
 
         Returns:
             (16, 5) float32, all metres: x and y of the goal in the robot frame, length of the path at the last update,
@@ -157,7 +132,7 @@ class CandidateSlots:
             empty slots.
         """
         features = np.empty((1, NUM_SLOTS, NUM_FEATURES), np.float32)
-        _write_features(self._rows[None], _together(pose, teammates)[None], features)
+        describe(self._rows[None], _together(pose, teammates)[None], features)
         return np.asarray(features[0])
 
     def get_state(self) -> dict[str, Any]:
@@ -178,7 +153,7 @@ class TeamSlots:
         num_robots: K.
 
     Attributes:
-        slots: Of the robots.
+        slots: Slots of each robot.
     """
 
     def __init__(self, num_robots: int) -> None:
@@ -189,9 +164,9 @@ class TeamSlots:
         """Bring a robot's candidates up to date, as `CandidateSlots.update` does; nothing is checked.
 
         Args:
-            robot: Its index.
-            grids: What the robots have seen.
-            poses: As in `features`.
+            robot: Index of the robot.
+            grids: Grids of the team.
+            poses: (K, K, 3) float64 [m, m, rad]. See `features`.
         """
         self.slots[robot].renew(grids.grids[robot].cells, grids.bounds[robot], poses[robot], robot)
 
@@ -206,7 +181,7 @@ class TeamSlots:
             `CandidateSlots.features` (K, 16, 5). A fresh array.
         """
         features = np.empty((len(self._rows), NUM_SLOTS, NUM_FEATURES), np.float32)
-        _write_features(self._rows, poses, features)
+        describe(self._rows, poses, features)
         return features
 
 

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from slam_backend.core.read_only import as_read_only
 from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_array, check_float
 from vslam_env.navigation import _grid_kernels as _painting
-from vslam_env.navigation._grid_kernels import CELL, FREE, GRID_SIZE, HALF_WIDTH, OCCUPIED, UNKNOWN
+from vslam_env.navigation._grid_kernels import CELL, FREE, GRID_SIZE, HALF_WIDTH, OCCUPIED, UNKNOWN, Grid
 from vslam_env.navigation.validation import check_ranges, pose_floats, ray_directions
 
 # What each evidence, as an unsigned byte, says of a cell.
@@ -49,6 +49,12 @@ def centre_of(cells: ArrayLike) -> FloatArray:
     return np.asarray((np.asarray(cells)[..., ::-1] + 0.5) * CELL - HALF_WIDTH, dtype=np.float64)
 
 
+def known_bounds(cells: NDArray[np.uint8]) -> NDArray[np.int32]:
+    """Return the bounds (4,) of what is known of a grid's cells (300, 300), as in `TeamGrids`."""
+    rows, cols = np.flatnonzero(cells.any(axis=1)), np.flatnonzero(cells.any(axis=0))
+    return np.array([rows[0], cols[0], rows[-1] + 1, cols[-1] + 1] if len(rows) else [0, 0, 0, 0], np.int32)
+
+
 class SeenGrid:
     """An occupancy grid of 60 x 60 m around a robot's start pose, whatever the world, so that it reveals nothing.
 
@@ -60,36 +66,23 @@ class SeenGrid:
             `FREE` or `OCCUPIED`. It shares memory with the grid and follows its changes.
     """
 
-    __slots__ = ("_bounds", "_cells", "_changes", "_evidence", "_read_only", "cells")
+    __slots__ = ("_grid", "_read_only", "cells")
 
     def __init__(self) -> None:
         shape = (GRID_SIZE, GRID_SIZE)
-        self._adopt(np.zeros(shape, np.int8), np.full(shape, UNKNOWN, np.uint8), _no_changes(), np.zeros(4, np.int32))
+        bounds = np.zeros(4, np.int32)
+        self._adopt(Grid(np.zeros(shape, np.int8), np.full(shape, UNKNOWN, np.uint8), _no_changes(), bounds))
 
-    def _adopt(
-        self,
-        evidence: NDArray[np.int8],
-        cells: NDArray[np.uint8],
-        changes: NDArray[np.int32],
-        bounds: NDArray[np.int32],
-        *,
-        read_only: bool = False,
-    ) -> "SeenGrid":
-        """Make arrays, as the kernels expect them, this grid's own."""
-        self._evidence, self._cells, self._changes, self._bounds = evidence, cells, changes, bounds
-        self._read_only = read_only
-        self.cells = as_read_only(cells)
+    def _adopt(self, grid: Grid, *, read_only: bool = False) -> "SeenGrid":
+        """Make arrays this grid's own."""
+        self._grid, self._read_only = grid, read_only
+        self.cells = as_read_only(grid.cells)
         return self
 
     @classmethod
     def over(cls, *arrays: NDArray[Any], read_only: bool = False) -> "SeenGrid":
-        """Return the grid that lies in some arrays, as `_arrays` has them."""
-        return cls.__new__(cls)._adopt(*arrays, read_only=read_only)
-
-    @property
-    def _arrays(self) -> tuple[NDArray[np.int8], NDArray[np.uint8], NDArray[np.int32], NDArray[np.int32]]:
-        """The grid as kernels paint it."""
-        return self._evidence, self._cells, self._changes, self._bounds
+        """Return the grid that lies in some arrays, those of a `Grid`."""
+        return cls.__new__(cls)._adopt(Grid(*arrays), read_only=read_only)
 
     def update_from_scan(self, pose: ArrayLike, ranges: ArrayLike, angles: ArrayLike, max_range: float = 8.0) -> None:
         """Mark what a range scan saw: free before the first surface, occupied on it.
@@ -98,7 +91,7 @@ class SeenGrid:
             pose: (3,) float64 [m, m, rad], start frame. Where the robot was.
             ranges: (n,) float64 [m]. A reading of `max_range` or more saw nothing.
             angles: (n,) float64 [rad], robot frame. Ascending, n >= 2, spanning less than pi.
-            max_range: [m].
+            max_range: Range of the scan [m].
 
         Raises:
             ValueError: If the pose is not finite, or ranges or angles are not as described.
@@ -117,19 +110,19 @@ class SeenGrid:
             )
         check_ranges(ranges)
         directions = ray_directions(angles)
-        _painting.update_from_scan(*self._arrays, x, y, theta, ranges, directions, float(max_range))
+        _painting.update_from_scan(self._grid, x, y, theta, ranges, directions, float(max_range))
 
     def clear_disc(self, pose: ArrayLike, radius: float = 0.2) -> None:
         """Mark as free what the body of a robot covers.
 
         Args:
             pose: (3,) float64 [m, m, rad], start frame.
-            radius: Of the robot [m]. Occupied cells at its rim stay: they hold the wall that the robot touches.
+            radius: Radius of the robot [m]. Occupied cells at its rim stay: they hold the wall that the robot touches.
         """
         self._refuse_if_read_only()
         x, y, _ = pose_floats(pose)
         radius = check_float("radius", radius, "Give the robot's radius in metres.", above=0.0)
-        _painting.clear_disc(*self._arrays, x, y, radius)
+        _painting.clear_disc(self._grid, x, y, radius)
 
     def bump(self, pose: ArrayLike, radius: float = 0.2) -> None:
         """Mark the cell just ahead of a robot's rim as occupied: it bumped into something there.
@@ -138,11 +131,11 @@ class SeenGrid:
 
         Args:
             pose: (3,) float64 [m, m, rad], start frame.
-            radius: Of the robot [m].
+            radius: Radius of the robot [m].
         """
         self._refuse_if_read_only()
         x, y, theta = pose_floats(pose)
-        _painting.mark_bump(*self._arrays, x, y, theta, radius)
+        _painting.mark_bump(self._grid, x, y, theta, radius)
 
     def merge(self, other: "SeenGrid", self_from_other: ArrayLike) -> None:
         """Add the evidence of another robot's grid.
@@ -153,19 +146,20 @@ class SeenGrid:
         """
         self._refuse_if_read_only()
         x, y, theta = pose_floats(self_from_other, "self_from_other")
-        _painting.merge_grid(*self._arrays, other._evidence.copy(), x, y, theta)
+        _painting.merge_grid(self._grid, other._grid.evidence.copy(), other._grid.bounds.copy(), x, y, theta)
 
     def copy(self) -> "SeenGrid":
         """Return an independent grid, which can be written to, with the same content."""
-        return SeenGrid.over(self._evidence.copy(), self._cells.copy(), _no_changes(), self._bounds.copy())
+        evidence, cells, _, bounds = self._grid
+        return SeenGrid.over(evidence.copy(), cells.copy(), _no_changes(), bounds.copy())
 
     def read_only_view(self) -> "SeenGrid":
         """Return a view that refuses changes and shares memory with this grid: it follows changes made here."""
-        return SeenGrid.over(*self._arrays, read_only=True)
+        return SeenGrid.over(*self._grid, read_only=True)
 
     def get_state(self) -> dict[str, Any]:
         """Return a copy of all that `set_state` needs to continue bit by bit."""
-        return {"evidence": self._evidence.copy()}
+        return {"evidence": self._grid.evidence.copy()}
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Restore what `get_state` returned, in place: views made by `frozen` follow."""
@@ -174,10 +168,10 @@ class SeenGrid:
         evidence = state["evidence"]
         if not (isinstance(evidence, np.ndarray) and evidence.dtype == np.int8 and evidence.shape == shape):
             evidence = check_array("evidence", evidence, shape, "Use what get_state returned.", dtype=np.int8)
-        self._evidence[:] = evidence
-        np.take(_CELL_STATES, evidence.view(np.uint8), out=self._cells, mode="wrap")
-        self._changes[0] = -1
-        self._bounds[:] = _painting.known_bounds(self.cells)  # read-only: as planners ask, so that it is compiled once
+        self._grid.evidence[:] = evidence
+        np.take(_CELL_STATES, evidence.view(np.uint8), out=self._grid.cells, mode="wrap")
+        self._grid.changes[0] = -1
+        self._grid.bounds[:] = known_bounds(self.cells)
 
     def _refuse_if_read_only(self) -> None:
         if self._read_only:

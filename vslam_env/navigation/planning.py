@@ -4,7 +4,7 @@ Only cells known to be free are travelled: unknown ones may hide walls, and fron
 reached over free cells anyway. Walls are widened by the robot's radius and half a cell, and cells within 0.4 m of
 that cost more, so that a path keeps away from walls where there is room but still goes through a door.
 
-The search is one of our own (`_search_kernels`), because candidates for a robot have to cost less than 0.4 ms: over
+The search is one of our own (`_planning_kernels`), because candidates for a robot have to cost less than 0.4 ms: over
 the 7,000 cells of a 20 x 14 m office, on one core, scipy.sparse.csgraph needs 1.5 ms to build the graph and 0.9 ms
 for `dijkstra` (0.3 ms for `breadth_first_order`, which ignores costs). Here weights and wavefront take
 0.1 ms, and an update of the candidates 0.1 to 0.2 ms in all. scipy's `dijkstra` is the oracle of the tests.
@@ -18,20 +18,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from slam_backend.core.jit import in_place
 from slam_backend.core.validation import BoolArray, FloatArray, argument_error, check_array, check_float
-from vslam_env.navigation._grid_kernels import CELL, GRID_SIZE, HALF_WIDTH, known_bounds
+from vslam_env.navigation._grid_kernels import CELL, GRID_SIZE, HALF_WIDTH
 from vslam_env.navigation._planning_kernels import (
-    HEADING,
-    LENGTH,
-    SIZE,
     UNREACHED,
-    XY,
+    FrontierColumns,
     compute_frontiers,
     dijkstra,
     nearest_open,
-    parents_of,
     shorten_path,
 )
-from vslam_env.navigation.occupancy_grid import centre_of
+from vslam_env.navigation.occupancy_grid import centre_of, known_bounds
 from vslam_env.navigation.validation import check_cells, point_floats, pose_floats
 
 
@@ -62,8 +58,8 @@ def find_frontiers(
 
     Args:
         cells: (300, 300) uint8. `SeenGrid.cells`.
-        start_xy: (2,) float64 [m], start frame. Where the robot is.
-        radius: Of the robot [m].
+        start_xy: (2,) float64 [m], start frame. Place of the robot.
+        radius: Radius of the robot [m].
         ignored: (300, 300) bool. Unknown cells that do not count; None to count all.
 
     Returns:
@@ -76,16 +72,13 @@ def find_frontiers(
         ignored = np.zeros((GRID_SIZE, GRID_SIZE), np.bool_)
     mask = check_array("ignored", ignored, (GRID_SIZE, GRID_SIZE), "Mark cells of the grid.", dtype=np.bool_)
     check_cells(cells)
-    rows = compute_frontiers(cells, known_bounds(cells), *checked_start(start_xy, radius), mask)
+    rows = compute_frontiers(cells, known_bounds(cells), *_checked_start(start_xy, radius), mask)
+    found = FrontierColumns.of(rows)
     return Frontiers(
-        goals=rows[:, XY].copy(),
-        headings=rows[:, HEADING].copy(),
-        sizes=rows[:, SIZE].copy(),
-        lengths=rows[:, LENGTH].copy(),
+        goals=found.goals, headings=found.heading.copy(), sizes=found.size.copy(), lengths=found.length.copy()
     )
 
 
-ESCAPE_CELLS = 5  # a robot that drift or a bump put into a wall's margin looks this far for open floor
 GOAL_CELLS = 2  # a goal in a wall's margin is served by open floor this near
 
 MIN_RADIUS = 0.11  # [m] for a smaller one walls would not be widened enough to keep diagonal steps from crossing them
@@ -120,14 +113,10 @@ class DistanceMap:
 
     def cell_of(self, xy: ArrayLike) -> tuple[int, int]:
         """Return the arrays' (row, column) in which a point (2,) [m] lies; it may be outside the arrays."""
-        return _cell_in_box(self.corner, *point_floats(xy, "xy"))
-
-
-def _cell_in_box(corner: tuple[int, int], x: float, y: float) -> tuple[int, int]:
-    """Return the row and column of a point [m] in a box whose first cell is the grid's `corner`."""
-    far = 2.0 * HALF_WIDTH  # as good as anywhere outside
-    x, y = min(max(x, -far), far), min(max(y, -far), far)
-    return math.floor((y + HALF_WIDTH) / CELL) - corner[0], math.floor((x + HALF_WIDTH) / CELL) - corner[1]
+        far = 2.0 * HALF_WIDTH  # as good as anywhere outside
+        x, y = (min(max(coordinate, -far), far) for coordinate in point_floats(xy, "xy"))
+        row, col = math.floor((y + HALF_WIDTH) / CELL), math.floor((x + HALF_WIDTH) / CELL)
+        return row - self.corner[0], col - self.corner[1]
 
 
 def distance_map(cells: NDArray[np.uint8], start_xy: ArrayLike, radius: float = 0.2) -> DistanceMap:
@@ -137,7 +126,7 @@ def distance_map(cells: NDArray[np.uint8], start_xy: ArrayLike, radius: float = 
         cells: (300, 300) uint8. `SeenGrid.cells`.
         start_xy: (2,) float64 [m], start frame. If a robot may not be there, the nearest open cell within 1 m that no
             wall separates stands in.
-        radius: Of the robot [m], at least 0.11.
+        radius: Radius of the robot [m], at least 0.11.
 
     Returns:
         The map; all of it is unreached if there is no open cell near the start.
@@ -146,21 +135,16 @@ def distance_map(cells: NDArray[np.uint8], start_xy: ArrayLike, radius: float = 
         ValueError: If the cells are not a grid's, or a number is not finite.
     """
     check_cells(cells)
-    start = checked_start(start_xy, radius)
-    box, weights, cost, ways, row, col = dijkstra(cells, known_bounds(cells), *start)
-    return DistanceMap(corner=(row, col), box=box, weights=weights, cost=cost, parent=parents_of(ways))
+    start = _checked_start(start_xy, radius)
+    box, weights, cost, parent, row, col = dijkstra(cells, known_bounds(cells), *start)
+    return DistanceMap(corner=(row, col), box=box, weights=weights, cost=cost, parent=parent)
 
 
-def checked_start(start_xy: ArrayLike, radius: float) -> tuple[int, int, float, int]:
-    """Return `start_of` a place (2,) [m] for a radius [m], or raise."""
+def _checked_start(start_xy: ArrayLike, radius: float) -> tuple[float, float, float]:
+    """Return a place (2,) [m] and the radius [m] of a robot as three floats, or raise."""
     x, y = point_floats(start_xy, "start_xy")
     radius = check_float("radius", radius, "Give the robot's radius in metres.", at_least=MIN_RADIUS, at_most=1.0)
-    return start_of(x, y, radius)
-
-
-def start_of(x: float, y: float, radius: float) -> tuple[int, int, float, int]:
-    """Return how `dijkstra` looks for ways of a robot [m] from a place [m]: row and column, reach and escape."""
-    return *_cell_in_box((0, 0), x, y), radius / CELL + 0.5, ESCAPE_CELLS
+    return x, y, radius
 
 
 def plan_path(
@@ -172,7 +156,7 @@ def plan_path(
         cells: (300, 300) uint8. `SeenGrid.cells`.
         start_xy: (2,) float64 [m], start frame. May lie in a wall's margin: the path then begins with the way out.
         goal_xy: (2,) float64 [m], start frame. If it lies in a wall's margin, the path ends up to 0.4 m away from it.
-        radius: Of the robot [m].
+        radius: Radius of the robot [m].
 
     Returns:
         (n, 2) float64 [m], start frame: the corners, n >= 2, from `start_xy` to the goal; or None if no way is known.
@@ -231,8 +215,8 @@ def follow_path(
     Args:
         pose: (3,) float64 [m, m, rad], start frame.
         path: (n, 2) float64 [m], start frame, n >= 1, as `plan_path` returns it.
-        max_speed: [m/s].
-        max_turn: [rad/s].
+        max_speed: Largest speed [m/s].
+        max_turn: Largest rate of turn [rad/s].
         final_heading: Where to look once at the end [rad], start frame; None to stay as the robot comes.
 
     Returns:

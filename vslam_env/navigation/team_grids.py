@@ -3,7 +3,7 @@
 import numpy as np
 
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
-from vslam_env.navigation import _grid_kernels as _painting
+from vslam_env.navigation._grid_kernels import MOST_CHANGES, NUM_PAINT_ROWS, update_grids
 from vslam_env.navigation.occupancy_grid import GRID_SIZE, UNKNOWN, SeenGrid
 from vslam_env.navigation.validation import check_ranges, pose_floats
 
@@ -15,22 +15,23 @@ class TeamGrids:
         num_robots: K.
 
     Attributes:
-        grids: Of the robots.
+        grids: Grids of the robots.
         cells: (K, 300, 300) uint8. Their cells, one after the other. To be looked at.
-        changes: (K, 1 + n) int32. Per grid how many verdicts have changed since whoever keeps count of the cells set
-            this number to 0, then the places of that many cells in the flat grid (some may stand there twice). -1 if
-            all may have changed, as in the beginning.
+        changes: (K, 1 + n) int32. Per grid the number of verdicts that have changed since a reader of the cells set it
+            to 0, then the places of that many cells in the flat grid, some perhaps twice. -1 if all may have changed,
+            as in the beginning.
         bounds: (K, 4) int32. First row and column of what is known of each grid, and one past the last ones; zeros if
             nothing is. To be looked at.
     """
 
     def __init__(self, num_robots: int) -> None:
         shape = (num_robots, GRID_SIZE, GRID_SIZE)
-        self._evidence, self.cells = np.zeros(shape, np.int8), np.full(shape, UNKNOWN, np.uint8)
-        self.changes = np.full((num_robots, 1 + _painting.MOST_CHANGES), -1, np.int32)
+        evidence, self.cells = np.zeros(shape, np.int8), np.full(shape, UNKNOWN, np.uint8)
+        self.changes = np.full((num_robots, 1 + MOST_CHANGES), -1, np.int32)
         self.bounds = np.zeros((num_robots, 4), np.int32)
         self._room = np.empty((0, 0))
-        self.grids = list(map(SeenGrid.over, self._evidence, self.cells, self.changes, self.bounds))
+        self._together = evidence, self.cells, self.changes, self.bounds
+        self.grids = list(map(SeenGrid.over, *self._together))
 
     def update(
         self,
@@ -50,19 +51,18 @@ class TeamGrids:
             scans: (K, R) float64 [m]. As `SeenGrid.update_from_scan` expects each.
             bumps: (K,) bool. Which robots bumped into something.
             directions: (2, R) float64. Of the rays, as `ray_directions` returns them.
-            max_range: [m].
-            radius: Of the robots [m].
+            max_range: Range of the scans [m].
+            radius: Radius of the robots [m].
 
         Raises:
             ValueError: If one of these poses is not finite, or ranges are less than 0; then nothing is painted.
         """
         num_rays = scans.shape[1]
         if self._room.shape[1] != num_rays + 1:
-            self._room = _painting.scan_workspace(num_rays)
-        owner, robot = _painting.update_grids(
-            self._evidence, self.cells, self.changes, self.bounds, shared, poses, scans, bumps, directions, max_range,
-            radius, self._room,
-        )  # fmt: skip
+            self._room = np.empty((NUM_PAINT_ROWS, num_rays + 1))
+        owner, robot = update_grids(
+            self._together, shared, poses, scans, bumps, directions, max_range, radius, self._room
+        )
         if owner >= 0:
             pose_floats(poses[owner, robot])
             check_ranges(scans[robot])

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slam_backend.core.validation import FloatArray, argument_error
-from vslam_env.navigation._grid_kernels import GRID_SIZE, directions_of, good_angles, good_ranges
+from vslam_env.navigation._grid_kernels import GRID_SIZE
 
 
 def pose_floats(pose: ArrayLike, name: str = "pose") -> tuple[float, float, float]:
@@ -44,17 +44,17 @@ def positions_array(positions: ArrayLike, name: str) -> FloatArray:
 
 def check_ranges(ranges: FloatArray) -> None:
     """Raise if ranges (n,) [m] are not at least 0."""
-    if not good_ranges(ranges):
+    if not (ranges >= 0.0).all():  # NaN is not
         raise argument_error("ranges", "distances >= 0 [m]", ranges, "Use max_range where a ray saw nothing.")
 
 
 def ray_directions(angles: FloatArray) -> FloatArray:
     """Return the unit vectors (2, n) of rays at angles (n,) [rad], n >= 1, ascending over less than pi, or raise."""
-    if not (len(angles) and good_angles(angles)):
+    are_good = len(angles) and (np.abs(angles) <= 2.0 * math.pi).all() and (np.diff(angles) > 0.0).all()
+    if not (are_good and angles[-1] - angles[0] < math.pi):
         expected = "ascending angles spanning less than pi [rad]"
         raise argument_error("angles", expected, angles, "Order the rays from right to left.")
-    directions: FloatArray = directions_of(angles)
-    return directions
+    return np.array([[math.cos(angle) for angle in angles], [math.sin(angle) for angle in angles]])
 
 
 def check_cells(cells: NDArray[np.uint8]) -> None:

@@ -3,24 +3,12 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.core.jit import device, in_place
+from slam_backend.core.jit import in_place
 from slam_backend.core.validation import FloatArray, IntArray
 
 NEAREST_FALSE_POINT = 0.5  # [m]
 NEAREST = 0.05  # [m] no matcher reports smaller depths, and filters take none
 FARTHEST, BEYOND = 1e3, 1.2  # [m], and in ranges of the camera: no camera reports points farther than either
-
-
-@device
-@in_place
-def _bring_to(length: float, vector: FloatArray) -> None:
-    """Scale a vector (n,) that is not 0 to a length."""
-    square = 0.0
-    for i in range(len(vector)):
-        square += vector[i] ** 2
-    scale = length / np.sqrt(square)
-    for i in range(len(vector)):
-        vector[i] *= scale
 
 
 @in_place
@@ -32,8 +20,8 @@ def sample_clutter(
     Args:
         places: (3, m) float64, uniform in [0, 1).
         looks: (m, d) float64, standard normal.
-        common: (d,) float64. What all descriptors have in common.
-        own_share: Length of what each has of its own.
+        common: (d,) float64. Common part of all descriptors.
+        own_share: Length of the part that each descriptor has alone.
         view: (7,) float64. See `view_limits`.
         points: (m, 3 + d) float64. Written to: points [m], camera frame, and descriptors.
     """
@@ -43,39 +31,15 @@ def sample_clutter(
         farthest = max_range / np.sqrt(right * right + down * down + 1.0)
         ahead = max(min(NEAREST_FALSE_POINT, max_range), places[2, j] * farthest)
         points[j, 0], points[j, 1], points[j, 2] = right * ahead, down * ahead, ahead
-        look = points[j, 3:]
+        look, square = points[j, 3:], 0.0
         for i in range(len(look)):
-            look[i] = looks[j, i]
-        _bring_to(own_share, look)
+            square += looks[j, i] ** 2
+        scale, square = own_share / np.sqrt(square), 0.0
         for i in range(len(look)):
-            look[i] += common[i]
-        _bring_to(1.0, look)
-
-
-@in_place
-def shuffle_clutter(num_false: IntArray, keys: FloatArray, ids: IntArray, counts: IntArray) -> None:
-    """Put the false points of each robot among its landmarks, in random order.
-
-    Args:
-        num_false: (K,) int64. How many false points each robot reports.
-        keys: (n,) float64, uniform. Of each robot's landmarks, then of its false points. Changed: put in order.
-        ids: (K, B) int64. In each row the landmarks that a robot reports; changed to landmarks, and -1 - j for false
-            point j, by rising keys.
-        counts: (K,) int64. How many landmarks each robot reports; changed to how many points.
-    """
-    begin = false = 0
-    for k in range(len(ids)):
-        num_true = counts[k]
-        counts[k] += num_false[k]
-        own = keys[begin : begin + counts[k]]
-        for i in range(counts[k]):
-            name = ids[k, i] if i < num_true else num_true - i - 1 - false
-            key, at = own[i], i
-            while at > 0 and own[at - 1] > key:
-                own[at], ids[k, at] = own[at - 1], ids[k, at - 1]
-                at -= 1
-            own[at], ids[k, at] = key, name
-        begin, false = begin + counts[k], false + num_false[k]
+            look[i] = looks[j, i] * scale + common[i]
+            square += look[i] ** 2
+        for i in range(len(look)):
+            look[i] *= 1.0 / np.sqrt(square)
 
 
 @in_place
@@ -87,7 +51,6 @@ def measure(
     false_points: FloatArray,
     noise: FloatArray,
     optics: FloatArray,
-    descriptor_noise: float,
     points: FloatArray,
     looks: NDArray[np.float32],
 ) -> int:
@@ -99,22 +62,23 @@ def measure(
 
     Args:
         ids: (K, B) int64. In each row the landmarks that a robot reports; -1 - j for false point j. Changed to those
-            behind what is written, -1 for a false point.
-        counts: (K,) int64. How many each robot reports; changed to where those of each robot that are written end.
+            behind the written points, -1 for a false point.
+        counts: (K,) int64. Number of points that each robot reports; changed to where the written ones of each robot
+            end.
         poses: (K, 3) float64 [m, m, rad], world frame. Robots.
-        landmarks: (N, 3 + d) float64. Their positions [m], world frame, and descriptors, unit vectors.
-        false_points: (m, 3 + d) float64. Likewise, but in the camera frame.
+        landmarks: (N, 3 + d) float64. Positions [m], world frame, and descriptors, unit vectors.
+        false_points: (m, 3 + d) float64. Positions [m], camera frame, and descriptors.
         noise: (n, 3 + d) float64, standard normal. Overwritten.
-        optics: (8,) float64. Place of the camera in the robot frame [m], its focal length [px] and baseline [m], its
-            sigmas of image coordinates and disparity [px], and how far off measured points may be [m].
-        descriptor_noise: Root mean square length of the noise of a descriptor.
-        points: (n, 3) float64 [m], camera frame. Written to, as what follows.
-        looks: (n, d) float32, unit vectors.
+        optics: (9,) float64. Place of the camera in the robot frame [m], its focal length [px] and baseline [m], its
+            sigmas of image coordinates and disparity [px], largest distance of a measured point [m], and root mean
+            square length of the noise of a descriptor.
+        points: (n, 3) float64 [m], camera frame. Written to.
+        looks: (n, d) float32, unit vectors. Written to.
 
     Returns:
         How many are written.
     """
-    forward, aside, height, focal, baseline, sigma, sigma_disparity, farthest = optics
+    forward, aside, height, focal, baseline, sigma, sigma_disparity, farthest, descriptor_noise = optics
     size = looks.shape[1]
     each = descriptor_noise / np.sqrt(size)
     i = kept = 0

@@ -1,6 +1,7 @@
 """The landmark sensor: true poses become noisy measurements of the landmarks that each camera sees."""
 
 from dataclasses import dataclass, field
+from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +18,7 @@ from slam_backend.core.validation import (
 )
 from slam_backend.models.camera import StereoCamera
 from slam_backend.models.measurements import Measurements, TeamMeasurements
-from vslam_env.sensors._landmark_kernels import BEYOND, FARTHEST, measure, sample_clutter, shuffle_clutter
+from vslam_env.sensors._landmark_kernels import BEYOND, FARTHEST, measure, sample_clutter
 from vslam_env.world._kernels import detect
 from vslam_env.world.spec import Landmarks
 from vslam_env.world.visibility import as_coordinate_rows, landmark_geometry, view_limits, visible_landmarks
@@ -30,9 +31,9 @@ class LandmarkSensorConfig:
     """How well cameras see, in truth; what a filter assumes is set elsewhere.
 
     Attributes:
-        camera: Its field of view, range and true noise.
+        camera: Field of view, range and true noise.
         max_measurements: At most so many measurements a frame (B).
-        detection_probability: Of a visible landmark, in [0, 1].
+        detection_probability: Probability that a visible landmark is detected, in [0, 1].
         false_points: Expected number of points per frame that are no landmark.
         descriptor_noise: Root mean square length of the noise added to a descriptor before it is normalised again.
         max_incidence: A face seen at a larger angle to its normal shows no landmarks [rad].
@@ -108,7 +109,7 @@ class LandmarkSensor:
         robot_radius: Robots hide what stands behind them [m].
 
     Attributes:
-        config: As given.
+        config: Configuration of the sensor.
         robot_radius: Radius of the robots [m].
     """
 
@@ -123,7 +124,7 @@ class LandmarkSensor:
         self.robot_radius = check_float("robot_radius", robot_radius, "Give metres.", at_least=0.0)
         camera = config.camera
         lens = camera.focal_px, camera.baseline, camera.sigma_px, camera.sigma_disparity_px
-        self._optics = as_read_only(np.array([*camera.mount, *lens, config.farthest]))
+        self._optics = as_read_only(np.array([*camera.mount, *lens, config.farthest, config.descriptor_noise]))
         self._view = view_limits(camera, config.max_incidence)
         self._sight = (
             landmark_geometry(landmarks),
@@ -160,7 +161,7 @@ class LandmarkSensor:
         num_false = rng.poisson(config.false_points, robots)
         keys = rng.random((robots, len(self._points)))
         ids, ends = np.full((robots, most), -1), np.empty(robots, np.int64)
-        total, extra = detect(poses, *self._sight, keys, config.detection_probability, num_false, ids, ends)
+        total, extra = detect(poses, self._sight, keys, config.detection_probability, num_false, ids, ends)
         false_points = self._no_false_points
         if extra:
             total += extra
@@ -168,8 +169,7 @@ class LandmarkSensor:
             shuffle_clutter(num_false, rng.random(total), ids, ends)
         noise = rng.standard_normal((total, size))
         points, looks = np.empty((total, 3)), np.empty((total, size - 3), np.float32)
-        truth = ids, ends, poses, self._points, false_points
-        kept = measure(*truth, noise, self._optics, config.descriptor_noise, points, looks)
+        kept = measure(ids, ends, poses, self._points, false_points, noise, self._optics, points, looks)
         if kept < total:
             points, looks = points[:kept], looks[:kept]
         return TeamSensorFrames(TeamMeasurements(points, looks, ends), ids)
@@ -181,3 +181,22 @@ class LandmarkSensor:
         points = np.empty((count, 3 + size))
         sample_clutter(places, looks, self._common, self._own_share, self._view, points)
         return points
+
+
+def shuffle_clutter(num_false: IntArray, keys: FloatArray, ids: IntArray, counts: IntArray) -> None:
+    """Put the false points of each robot among its landmarks, in random order.
+
+    Args:
+        num_false: (K,) int64. Number of false points that each robot reports.
+        keys: (n,) float64, uniform. Keys of each robot's landmarks, then of its false points.
+        ids: (K, B) int64. In each row the landmarks that a robot reports; changed to landmarks, and -1 - j for false
+            point j, by rising keys.
+        counts: (K,) int64. Number of landmarks that each robot reports; changed to the number of points.
+    """
+    begin, next_false = 0, -1
+    for row, num_true, more in zip(ids, counts.tolist(), num_false.tolist(), strict=True):
+        names = [*row[:num_true].tolist(), *range(next_false, next_false - more, -1)]
+        own = keys[begin : begin + len(names)].tolist()
+        row[: len(names)] = [name for _, name in sorted(zip(own, names, strict=True), key=itemgetter(0))]
+        begin, next_false = begin + len(names), next_false - more
+    counts += num_false

@@ -18,14 +18,7 @@ from vslam_env.belief.readings import Readings, TeamReadings
 from vslam_env.belief.team_belief import RobotHardware, TeamBelief
 from vslam_env.config import TICK, EnvConfig
 from vslam_env.evaluation.coverage import CoverageTracker
-from vslam_env.evaluation.team_metrics import (
-    DISCOVERED,
-    DISTANCES,
-    ERROR_INTEGRALS,
-    MAP_ERRORS,
-    NUM_METRICS,
-    TeamMetrics,
-)
+from vslam_env.evaluation.team_metrics import RobotCounts, RobotMetrics, TeamMetrics
 from vslam_env.reward import RUNNING_COST
 from vslam_env.sensors import RenderedFrame, SensorFrame, TeamRenderedFrames, TeamSensorFrames
 from vslam_env.simulation.communication import contacts
@@ -128,9 +121,10 @@ class Episode:
 
         self.tick = 0
         self._collisions: tuple[int, ...] = (0,) * config.num_robots
-        self._figures = np.zeros((NUM_METRICS, config.num_robots))  # of `TeamMetrics`; ways are added up in their row
-        self._found, self._distances = self._figures[DISCOVERED], self._figures[DISTANCES]
-        self._error_integrals = self._figures[ERROR_INTEGRALS]
+        self._figures = np.zeros((len(RobotMetrics._fields), config.num_robots))  # ways are added up in their row
+        rows: RobotMetrics[FloatArray] = RobotMetrics(*self._figures)
+        self._map_errors, self._found, self._distances = rows.map_errors, rows.found, rows.distances
+        self._error_integrals = rows.error_integrals
         self._integrates = RUNNING_COST in config.reward  # scoring every tick costs time: only where it is asked for
         self.true_path: list[FloatArray] = []
         self.estimated_path: list[FloatArray] = []
@@ -184,7 +178,7 @@ class Episode:
         self._perceive(read_odometry(before, simulator.poses, self.setting.bias, noise, stream, self._distances))
         if self._integrates:
             self._score(simulator.poses)
-            self._error_integrals += self._figures[MAP_ERRORS] * TICK
+            self._error_integrals += self._map_errors * TICK
 
     def estimated_poses(self) -> FloatArray:
         """Return where the robots believe to be (K, 3) [m, m, rad], laid at their true starts, world frame."""
@@ -195,8 +189,11 @@ class Episode:
         belief, poses = self.belief, self._simulator.poses
         self._score(poses)
         coverage = self._coverage.update(belief.grids, poses, self._found)
-        counts = self._collisions, tuple(belief.exchange.sent)
-        return TeamMetrics(self._figures.tolist(), counts, coverage, len(self.merge_ticks), self.tick * TICK)
+        counts, figures = (
+            RobotCounts(self._collisions, tuple(belief.exchange.sent)),
+            RobotMetrics(*self._figures.tolist()),
+        )
+        return TeamMetrics(figures, counts, coverage, len(self.merge_ticks), self.tick * TICK)
 
     # ------------------------------------------------------------------ snapshots
 

@@ -8,7 +8,7 @@ from slam_backend.core.validation import BoolArray, FloatArray, argument_error, 
 from slam_backend.geometry import wrap_angle
 from slam_backend.models.camera import StereoCamera
 from vslam_env.world._kernels import cast_scans, observable_anywhere
-from vslam_env.world._kernels.clearance import clearance_raster, distances_to_walls
+from vslam_env.world.clearance import clearance_raster, distances_to_walls
 from vslam_env.world.spec import FARTHEST_PLACE, Landmarks, World
 from vslam_env.world.visibility import as_coordinate_rows, ray_fan, view_limits, visible_landmarks
 

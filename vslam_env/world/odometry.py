@@ -66,7 +66,7 @@ def read_odometry(
         bias: (K, 2) float64, from `draw_bias`.
         noise: Standard deviations.
         rng: Source of the draws: 2 K of them, whatever the motion.
-        travelled: (K,) float64 [m]. The true way of each robot is added to it; None: nobody asks.
+        travelled: (K,) float64 [m]. The true way of each robot is added to it; None: ways are not added up.
 
     Returns:
         (K, 3) float64 [m, m, rad], each robot's previous frame: (dx, dy, dtheta).

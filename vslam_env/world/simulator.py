@@ -34,7 +34,7 @@ def _drive_freely(
         commands: (K, 2) float64 [m/s, rad/s].
         tick: [s].
         walls: (S, 4) float64 [m], world frame.
-        radius: Of the robots [m].
+        radius: Radius of the robots [m].
         goals: (K, 3) float64 [m, m, rad], world frame. Written to.
         reach: (K,) float64 [m]. Written to: how far from where it was each robot may have come, its body included.
     """
@@ -68,10 +68,10 @@ class Simulator:
     wait outside the walls, where it forgets both, for the rest of the time.
 
     Attributes:
-        radius: Of the robots [m].
+        radius: Radius of the robots [m].
         tick: Duration of a step [s].
         poses: True poses (K, 3) float64 [m, m, rad], world frame, theta in [-pi, pi). Each tick makes both
-            arrays anew: what was looked at stays as it was, and nobody is to write to it.
+            arrays anew: earlier arrays stay as they were, and are not to be written to.
         bumped: Which robots (K,) bool something kept from going where they were commanded in the last tick. Read-only.
 
     Raises:

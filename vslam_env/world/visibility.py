@@ -1,11 +1,13 @@
 """What cameras can see, and which landmarks they do."""
 
+import math
+
 import numpy as np
 
 from slam_backend.core.read_only import as_read_only
 from slam_backend.core.validation import BoolArray, FloatArray
 from slam_backend.models.camera import StereoCamera
-from vslam_env.world._kernels import rays_at, visible
+from vslam_env.world._kernels import EPSILON, detect
 from vslam_env.world.spec import Landmarks
 
 
@@ -35,9 +37,13 @@ def as_coordinate_rows(walls: FloatArray) -> FloatArray:
 
 
 def ray_fan(angles: FloatArray) -> tuple[FloatArray, float]:
-    """Return unit vectors (2, R) at angles (R,) [rad], read-only, and the tangent of the wedge that holds them all."""
-    rays, tan_half = rays_at(angles)
-    return as_read_only(rays), tan_half
+    """Return unit vectors (2, R) at angles (R,) [rad], read-only, and the tangent of the wedge that holds them all.
+
+    The tangent is 0, for all round, where the wedge is nearly a half plane or wider.
+    """
+    rays = np.array([[math.cos(angle) for angle in angles], [math.sin(angle) for angle in angles]])
+    widest = float(np.abs(angles).max())
+    return as_read_only(rays), math.tan(widest) + EPSILON if widest < 1.5 else 0.0
 
 
 def visible_landmarks(
@@ -52,6 +58,10 @@ def visible_landmarks(
         robot_radius: Robots hide what stands behind them [m].
         view: From `view_limits`.
     """
-    seen = np.empty((len(poses), len(landmarks)), dtype=np.bool_)
-    visible(poses, landmark_geometry(landmarks), landmarks.walls, as_coordinate_rows(walls), robot_radius, view, seen)
+    shape = len(poses), len(landmarks)
+    sight = landmark_geometry(landmarks), landmarks.walls, as_coordinate_rows(walls), robot_radius, view
+    chosen, counts, seen = np.empty(shape, np.int64), np.empty(len(poses), np.int64), np.zeros(shape, np.bool_)
+    detect(poses, sight, np.zeros(shape), 1.0, np.zeros(len(poses), np.int64), chosen, counts)
+    for row, names, count in zip(seen, chosen, counts, strict=True):
+        row[names[:count]] = True
     return seen

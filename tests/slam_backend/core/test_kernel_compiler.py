@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import pytest
 from numba import types
@@ -20,6 +21,27 @@ from slam_backend.core.kernel_compiler import (
 )
 
 ROOT = Path(__file__).parents[3]
+
+
+class Row(NamedTuple):
+    """Fields of a record."""
+
+    left: Any
+    right: Any
+
+
+class Cell(NamedTuple):
+    """A record with one field."""
+
+    value: Any
+
+
+def tuple_of(record: Any, *fields: types.Type) -> Any:
+    """Return numba's type of a named tuple."""
+    from_types: Any = types.BaseTuple.from_types
+    return from_types(fields, record)
+
+
 SMALL = "slam_backend.smoother.reassociation.find_only"  # a kernel that calls few others
 PROGRAM = """
 import sys
@@ -46,6 +68,9 @@ def program(folder: Path, **variables: str) -> str:
         (types.int64, types.float64, types.boolean),
         (types.Array(types.float32, 2, "C"), types.Array(types.int8, 1, "C", readonly=True)),
         (types.Array(types.boolean, 3, "F"), types.Array(types.uint64, 1, "A")),
+        (tuple_of(Row, types.Array(types.float64, 2, "C"), types.int64), types.float64),
+        (tuple_of(Row, types.int64, types.int64), tuple_of(Cell, types.int64)),
+        (tuple_of(tuple, types.int64, types.float64), tuple_of(tuple, types.int64, types.int64)),
         (),
     ],
 )

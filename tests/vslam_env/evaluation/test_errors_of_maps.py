@@ -18,7 +18,7 @@ from slam_backend.fastslam.reports import (
 from slam_backend.geometry import compose, inverse, transform_points, wrap_angle
 from slam_backend.maps.landmark_map import LandmarkMap, TeamMapSummaries
 from slam_backend.metrics import map_error, map_rmse
-from vslam_env.evaluation.coverage import OBSERVER_COUNT, CoverageCells, CoverageTracker
+from vslam_env.evaluation.coverage import CoverageCells, CoverageTracker
 from vslam_env.evaluation.map_scores import GroundTruthAssociation
 from vslam_env.navigation import FREE, SeenGrid, TeamGrids, cell_of
 
@@ -252,12 +252,12 @@ def test_finds_are_those_of_a_plain_count() -> None:
         positions = rng.uniform(0.0, 8.0, (3, 2))
         said = np.empty(3)
         share = coverage.update(team, positions, said)
-        fresh = (coverage._floor[OBSERVER_COUNT] > 0) & ~ever
+        fresh = (coverage._tally.seers > 0) & ~ever
         nearest = np.hypot(*np.moveaxis(SQUARES[:, None] - positions, -1, 0)).argmin(axis=1)
         found += np.bincount(nearest[fresh], minlength=3) / len(SQUARES)
         ever |= fresh
         np.testing.assert_allclose(said, found)
-        assert share == np.mean(coverage._floor[OBSERVER_COUNT] > 0)
+        assert share == np.mean(coverage._tally.seers > 0)
     assert ever.mean() > 0.3
 
 

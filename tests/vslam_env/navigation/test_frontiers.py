@@ -21,13 +21,13 @@ from vslam_env.navigation import (
     follow_path,
     plan_path,
 )
-from vslam_env.navigation._grid_kernels import known_bounds
-from vslam_env.navigation._planning_kernels import SAME_GOAL, pair_distances
-from vslam_env.navigation._planning_kernels.costmap import OUTSIDE, PAD, known_region
+from vslam_env.navigation._planning_kernels.candidates import SAME_GOAL, pair_distances
+from vslam_env.navigation._planning_kernels.costmap import OUTSIDE, PAD
 from vslam_env.navigation._planning_kernels.frontiers import _unseen_edges
 from vslam_env.navigation.candidate_slots import NUM_SLOTS, _assign
+from vslam_env.navigation.occupancy_grid import known_bounds
 
-_unseen_edges, known_region = map(python_entry, (_unseen_edges, known_region))
+_unseen_edges, pair_distances = map(python_entry, (_unseen_edges, pair_distances))
 
 
 def room(doors: tuple[float, ...] = (), width: float = 1.2) -> np.ndarray:
@@ -254,12 +254,11 @@ def test_frontiers_are_made_of_unknown_cells_beside_free_ones(corner: tuple[int,
     padded = np.pad(cells, 1, constant_values=OUTSIDE) == FREE
     beside = padded[:-2, 1:-1] | padded[2:, 1:-1] | padded[1:-1, :-2] | padded[1:-1, 2:]
     bounds = known_bounds(cells)
-    edges = _unseen_edges(known_region(cells, bounds), ignored, bounds[0] - PAD, bounds[1] - PAD)
+    around = np.pad(cells, PAD, constant_values=OUTSIDE)
+    box = np.ascontiguousarray(around[bounds[0] : bounds[2] + 2 * PAD, bounds[1] : bounds[3] + 2 * PAD])
+    edges = _unseen_edges(box, ignored, bounds[0] - PAD, bounds[1] - PAD)
     found = np.argwhere(edges) + bounds[:2] - PAD
     assert found.tolist() == np.argwhere((cells == UNKNOWN) & beside & ~ignored).tolist()
-
-
-pair_distances = python_entry(pair_distances)
 
 
 def test_pairs_that_are_clear_are_those_of_the_least_total() -> None:

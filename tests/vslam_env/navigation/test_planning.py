@@ -23,11 +23,11 @@ from vslam_env.navigation import (
     follow_path,
     plan_path,
 )
-from vslam_env.navigation._grid_kernels import known_bounds
-from vslam_env.navigation._planning_kernels.costmap import CLOSE, NEAR, OPEN, OUTSIDE, PAD, inflate_costs, known_region
-from vslam_env.navigation._planning_kernels.dijkstra import UNREACHED, parents_of, wavefront
+from vslam_env.navigation._planning_kernels.costmap import CLOSE, NEAR, OPEN, OUTSIDE, PAD, inflate_costs
+from vslam_env.navigation._planning_kernels.dijkstra import UNREACHED, wavefront
+from vslam_env.navigation.occupancy_grid import known_bounds
 
-known_region, wavefront, inflate_costs = map(python_entry, (known_region, wavefront, inflate_costs))
+wavefront, inflate_costs = map(python_entry, (wavefront, inflate_costs))
 
 
 def floor(low: tuple[float, float], high: tuple[float, float], walls: list[tuple[float, ...]]) -> np.ndarray:
@@ -64,8 +64,7 @@ def test_the_wavefront_agrees_with_scipys_dijkstra(inner: np.ndarray, data: st.D
     weights = np.pad(inner, 1)
     width = weights.shape[1]
     start = tuple(int(i) for i in np.argwhere(weights)[data.draw(st.integers(0, int((weights > 0).sum()) - 1))])
-    cost, ways = wavefront(weights, *start)
-    parent = parents_of(ways)
+    cost, parent = wavefront(weights, *start)
 
     edges = {}
     for r, c in np.argwhere(weights):
@@ -255,5 +254,6 @@ def test_the_known_box_holds_all_known_cells_and_no_more(places: list[tuple[int,
     rows, cols = np.nonzero(cells)
     assert bounds.tolist() == ([rows.min(), cols.min(), rows.max() + 1, cols.max() + 1] if places else [0, 0, 0, 0])
     padded = np.pad(cells, PAD, constant_values=OUTSIDE)
-    box = known_region(cells, bounds)
-    np.testing.assert_array_equal(box, padded[bounds[0] : bounds[2] + 2 * PAD, bounds[1] : bounds[3] + 2 * PAD])
+    ways = distance_map(cells, (0.0, 0.0))
+    assert ways.corner == (bounds[0] - PAD, bounds[1] - PAD)
+    np.testing.assert_array_equal(ways.box, padded[bounds[0] : bounds[2] + 2 * PAD, bounds[1] : bounds[3] + 2 * PAD])

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from builders.kernels import python_entry
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -13,12 +12,11 @@ from slam_backend.fastslam._kernels import MIN_DEPTH
 from slam_backend.geometry import compose
 from slam_backend.models.camera import StereoCamera
 from vslam_env.sensors import LandmarkSensor, LandmarkSensorConfig
-from vslam_env.sensors._landmark_kernels import NEAREST, measure, sample_clutter, shuffle_clutter
+from vslam_env.sensors._landmark_kernels import NEAREST, measure, sample_clutter
+from vslam_env.sensors.landmark_sensor import shuffle_clutter
 from vslam_env.world import FreeSpace, Landmarks, World, make_world, place_landmarks
-from vslam_env.world._kernels import choose_detected, detect
+from vslam_env.world._kernels import detect
 from vslam_env.world.visibility import landmark_geometry, view_limits, visible_landmarks
-
-choose_detected = python_entry(choose_detected)
 
 SHARP = StereoCamera(sigma_px=1e-9, sigma_disparity_px=1e-9)
 PERFECT = LandmarkSensorConfig(
@@ -137,10 +135,10 @@ def test_a_frame_is_the_plain_definition() -> None:
     disturbed = np.where(is_true, looks[ids[sharp]], false_looks[made_up]) + 0.15 * noise[sharp, 3:]
 
     lens = camera.focal_px, camera.baseline, camera.sigma_px, camera.sigma_disparity_px
-    optics = np.array([*camera.mount, *lens, 1e3])
+    optics = np.array([*camera.mount, *lens, 1e3, 0.3])
     made_of = np.hstack([positions, looks]), np.hstack([false, false_looks[:2]])
     got_points, got_looks = np.empty((6, 3)), np.empty((6, 4), np.float32)
-    assert measure(in_rows, counts, poses, *made_of, noise, optics, 0.3, got_points, got_looks) == 4
+    assert measure(in_rows, counts, poses, *made_of, noise, optics, got_points, got_looks) == 4
     assert counts.tolist() == [2, 2, 4]  # where those that are written end
     assert [in_rows[0, :2].tolist(), in_rows[2, :2].tolist()] == [[-1, 4], [0, 3]]
     np.testing.assert_allclose(got_points[:4], camera.triangulate(pixels), rtol=1e-9)
@@ -179,37 +177,24 @@ def test_false_points_are_mixed_in_by_their_keys() -> None:
     assert [row[:n].tolist() for row, n in zip(mixed, counts, strict=True)] == expected
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_the_choice_is_that_of_the_smallest_keys(seed: int) -> None:
+@pytest.mark.parametrize("size", [4, 6, 30])
+def test_each_robot_detects_what_it_sees_as_false_points_leave_places(size: int) -> None:
     """Of what is visible and detected the smallest keys are taken, in their order, as many as there are places."""
-    rng = np.random.default_rng(seed)
-    for places in (0, 2, 4, 6, 30):
-        visible, keys = np.flatnonzero(rng.random(30) < 0.4), rng.random(30)
-        detected = visible[keys[visible] < 0.7]
-        expected = detected[np.argsort(keys[detected])][:places]
-        chosen = np.empty(max(places, 1), np.int64)
-        count = choose_detected(visible, keys, 0.7, places, chosen)
-        assert chosen[:count].tolist() == expected.tolist()
-
-
-def test_each_robot_detects_what_it_sees_as_false_points_leave_places() -> None:
-    """Compiled for all robots in one, it is the choice for each of them among what it sees."""
-    world, free, marks = office(5)
-    camera, rng = StereoCamera(), np.random.default_rng(12)
-    poses, view = free.draw_starts(4, rng, 1.0), view_limits(camera, 1.0)
-    keys, num_false = rng.random((4, len(marks))), np.array([0, 2, 4, 9])
-    chosen, counts = np.empty((4, 4), np.int64), np.empty(4, np.int64)
-    sight = landmark_geometry(marks), marks.walls.copy(), world.walls.T.copy(), 0.2, view
-    total, extra = detect(poses, *sight, keys, 0.8, num_false, chosen, counts)
-    assert num_false.tolist() == [0, 2, 4, 4]
-    assert (total, extra) == (counts.sum(), 10)
-    for seen, own, left, names in zip(
-        visible_landmarks(poses, marks, world.walls, 0.2, view), keys, [4, 2, 0, 0], chosen, strict=True
-    ):
-        detected = np.flatnonzero(seen & (own < 0.8))
-        expected = detected[np.argsort(own[detected])][:left]
-        assert names[: len(expected)].tolist() == expected.tolist()
-    assert counts[0] > 0
+    marks, view = on_wall([[0.2 * i - 2.8, 0.0] for i in range(29)], 29), view_limits(StereoCamera(), 1.0)
+    poses, rng = np.array([[0.0, y, 0.0] for y in (-1.5, -0.5, 0.5, 1.5)]), np.random.default_rng(12)
+    sight = landmark_geometry(marks), marks.walls, WALL.T.copy(), 0.2, view
+    visible = visible_landmarks(poses, marks, WALL, 0.2, view)
+    assert 8 < visible.sum(axis=1).min() < 29
+    for _ in range(5):
+        keys, num_false = rng.random((4, len(marks))), np.array([0, 2, size, 9])
+        chosen, counts = np.empty((4, size), np.int64), np.empty(4, np.int64)
+        total, extra = detect(poses, sight, keys, 0.8, num_false, chosen, counts)
+        assert num_false.tolist() == [0, 2, size, min(9, size)]
+        assert (total, extra) == (counts.sum(), num_false.sum())
+        for seen, own, left, names, count in zip(visible, keys, size - num_false, chosen, counts, strict=True):
+            detected = np.flatnonzero(seen & (own < 0.8))
+            expected = detected[np.argsort(own[detected])][:left]
+            assert names[:count].tolist() == expected.tolist()
 
 
 def test_descriptor_noise_has_the_stated_length() -> None:

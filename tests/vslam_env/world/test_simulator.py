@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from slam_backend.geometry import compose, wrap_angle
 from vslam_env.sensors import RangeFinder, ScanConfig
 from vslam_env.world import FreeSpace, OdometryNoise, Simulator, World, draw_bias, make_world, read_odometry
-from vslam_env.world._kernels.clearance import distances_to_walls
+from vslam_env.world.clearance import distances_to_walls
 
 RADIUS = 0.2
 # Thin walls with free ends, a slit narrower than a robot, and an acute corner.

@@ -28,7 +28,7 @@ from vslam_env.world import (
     place_landmarks,
     save_walls_json,
 )
-from vslam_env.world._kernels.clearance import distances_to_walls
+from vslam_env.world.clearance import distances_to_walls
 from vslam_env.world.landmarks import CORNER, draw_descriptors
 from vslam_env.world.loaders.splits import files_of_split
 

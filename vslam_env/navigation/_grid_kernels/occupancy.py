@@ -1,11 +1,12 @@
 """Evidence of a grid's cells: counted within bounds, turned into states, and merged from another robot's grid."""
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from slam_backend.core.jit import device, in_place, inline, jit
+from slam_backend.core.jit import device, in_place, inline
 
 GRID_SIZE = 300
 CELL = 0.2
@@ -18,7 +19,26 @@ HALF_WIDTH = 0.5 * GRID_SIZE * CELL  # [m]; the start pose is the middle of the 
 HIT = 3
 MOST_FREE, MOST_OCCUPIED = -8, 12
 
-MOST_CHANGES = 4096  # that a grid keeps for whoever counts its free cells; a scan makes a hundred at most
+MOST_CHANGES = 4096  # a grid keeps so many; a scan makes a hundred at most
+
+
+class Grid(NamedTuple):
+    """The arrays of a seen grid; those of a team's grids have one dimension more.
+
+    Rows go with y and columns with x. The start pose is the middle.
+
+    Attributes:
+        evidence: (300, 300) int8. Hits against passes.
+        cells: (300, 300) uint8. Verdict on each cell.
+        changes: (1 + n,) int32. Number of changed verdicts, -1 if it is not known; then the places of these cells in
+            the flat grid.
+        bounds: (4,) int32. First row and column of what is known, and one past the last ones; zeros if nothing is.
+    """
+
+    evidence: NDArray[np.int8]
+    cells: NDArray[np.uint8]
+    changes: NDArray[np.int32]
+    bounds: NDArray[np.int32]
 
 
 @inline
@@ -30,21 +50,15 @@ def clamp_evidence(evidence: int) -> int:
 
 @device
 @in_place
-def set_state(cells: Any, changes: Any, bounds: Any, row: int, col: int, verdict: int) -> None:
-    """Set a cell's verdict, and note it if it changed or was not known before.
-
-    Args:
-        cells: (300, 300) uint8.
-        changes: (1 + n,) int32. How many changed, -1 if that is not known any more; then which, as places in the flat
-            grid.
-        bounds: (4,) int32. Of what is known.
-        row: Of the cell.
-        col: Of the cell.
-        verdict: The new one.
-    """
+def set_state(grid: Grid, row: int, col: int, verdict: int) -> None:
+    """Set the verdict on a cell; if it is a new one, note the change and widen the bounds."""
+    cells, changes, bounds = grid.cells, grid.changes, grid.bounds
     if cells[row, col] != verdict:
         if cells[row, col] == UNKNOWN:
-            extend_bounds(bounds, row, col)
+            if bounds[2] == 0:
+                bounds[0], bounds[1], bounds[2], bounds[3] = row, col, row + 1, col + 1
+            bounds[0], bounds[1] = min(bounds[0], row), min(bounds[1], col)
+            bounds[2], bounds[3] = max(bounds[2], row + 1), max(bounds[3], col + 1)
         cells[row, col] = verdict
         if 0 <= changes[0] < len(changes) - 1:
             changes[0] += 1
@@ -61,68 +75,30 @@ def cell_range(low: float, high: float) -> tuple[int, int]:
     return int(first), int(last)
 
 
-@device
 @in_place
-def extend_bounds(bounds: Any, row: int, col: int) -> None:
-    """Move bounds (4,) int32 so that a cell is within."""
-    if bounds[2] == 0:
-        bounds[0], bounds[1], bounds[2], bounds[3] = row, col, row + 1, col + 1
-    bounds[0], bounds[1] = min(bounds[0], row), min(bounds[1], col)
-    bounds[2], bounds[3] = max(bounds[2], row + 1), max(bounds[3], col + 1)
-
-
-@jit
-def known_bounds(cells: Any) -> Any:
-    """Return the bounds (4,) int32 of what is known of a grid's cells (300, 300) uint8."""
-    height, width = cells.shape
-    bounds, in_columns = np.zeros(4, np.int32), np.zeros(width, np.uint8)
-    for row in range(height):
-        line, known = cells[row], 0
-        for col in range(width):  # two loops: each becomes vector instructions
-            known |= line[col]
-        if known:
-            for col in range(width):
-                in_columns[col] |= line[col]
-            if bounds[2] == 0:
-                bounds[0] = row
-            bounds[2] = row + 1
-    columns = np.flatnonzero(in_columns)
-    if len(columns) > 0:
-        bounds[1], bounds[3] = columns[0], columns[-1] + 1
-    return bounds
-
-
-@device
-@in_place
-def _bounds_in_frame(other: Any, x: float, y: float, c: float, s: float) -> tuple[float, float, float, float]:
-    """Return low x, high x, low y and high y [m] of what a grid knows, seen from pose (x, y) turned by (c, s)."""
-    low_row, high_row, low_col, high_col = GRID_SIZE, -1, GRID_SIZE, -1
-    for row in range(GRID_SIZE):
-        for col in range(GRID_SIZE):
-            if other[row, col] != 0:
-                low_row, high_row = min(low_row, row), row
-                low_col, high_col = min(low_col, col), max(high_col, col)
-    low_x, high_x, low_y, high_y = math.inf, -math.inf, math.inf, -math.inf
-    if high_row >= 0:
-        for row in (low_row, high_row + 1):
-            for col in (low_col, high_col + 1):
-                u, v = col * CELL - HALF_WIDTH, row * CELL - HALF_WIDTH
-                low_x, high_x = min(low_x, x + c * u - s * v), max(high_x, x + c * u - s * v)
-                low_y, high_y = min(low_y, y + s * u + c * v), max(high_y, y + s * u + c * v)
-    return low_x, high_x, low_y, high_y
-
-
-@in_place
-def merge_grid(
-    evidence: Any, cells: Any, changes: Any, bounds: Any, other: Any, x: float, y: float, theta: float
-) -> None:
+def merge_grid(grid: Grid, other: Any, known: Any, x: float, y: float, theta: float) -> None:
     """Add another grid's evidence, seen from pose (x, y, theta) of its frame in this one.
 
     Each cell takes the other's value at its centre, or the firmest wall among four points around it: without these,
     a wall one cell thick would come out of a rotation with holes.
+
+    Args:
+        grid: Changed.
+        other: (300, 300) int8. Evidence of the other grid.
+        known: (4,) int32. Bounds of the other grid.
+        x: Place of the other's start pose [m].
+        y: See `x`.
+        theta: Heading of the other's start pose [rad].
     """
+    if known[2] == 0:
+        return
     c, s = math.cos(theta), math.sin(theta)
-    low_x, high_x, low_y, high_y = _bounds_in_frame(other, x, y, c, s)
+    low_x, high_x, low_y, high_y = math.inf, -math.inf, math.inf, -math.inf
+    for row in (known[0], known[2]):
+        for col in (known[1], known[3]):
+            u, v = col * CELL - HALF_WIDTH, row * CELL - HALF_WIDTH
+            low_x, high_x = min(low_x, x + c * u - s * v), max(high_x, x + c * u - s * v)
+            low_y, high_y = min(low_y, y + s * u + c * v), max(high_y, y + s * u + c * v)
     first_row, last_row = cell_range(low_y, high_y)
     first_col, last_col = cell_range(low_x, high_x)
     for row in range(first_row, last_row):
@@ -140,5 +116,5 @@ def merge_grid(
                     if point == 0 or value > max(found, 0):
                         found = value
             if found != 0:
-                evidence[row, col] = clamp_evidence(evidence[row, col] + found)
-                set_state(cells, changes, bounds, row, col, OCCUPIED if evidence[row, col] > 0 else FREE)
+                grid.evidence[row, col] = clamp_evidence(grid.evidence[row, col] + found)
+                set_state(grid, row, col, OCCUPIED if grid.evidence[row, col] > 0 else FREE)

@@ -14,53 +14,17 @@ from vslam_env.navigation._grid_kernels.occupancy import (
     HALF_WIDTH,
     HIT,
     OCCUPIED,
+    Grid,
     cell_range,
     clamp_evidence,
     set_state,
 )
 
-# Rays as they are seen in the frame of a grid: after the rows of a survey that turn, how far to the left a ray gets
-# from row to row [cells], left as seen by the robot that looks to these rows; how far off the rows are of which it can
-# tell [m], less than 0 if it leads away; before which cell it crosses a row.
+# Rays as they are seen in the frame of a grid: below the rows of a survey that turn, how far to the left a ray gets
+# from row to row [cells], left as seen by the robot that looks to these rows; distance of the farthest row that it says
+# anything about [m], less than 0 if it leads away; the cell before which it crosses a row.
 SLOPE, TOP, CROSSING, NUM_SEEN_ROWS = 4, 5, 6, 7
 ASIDE = 1e12  # [cells] per row: how far off a ray crosses rows that it leads away from
-
-
-@in_place
-def good_ranges(ranges: FloatArray) -> bool:
-    """Tell whether ranges (n,) [m] are at least 0."""
-    good = True
-    for i in range(len(ranges)):
-        good &= ranges[i] >= 0.0  # no NaN is
-    return good
-
-
-@in_place
-def good_angles(angles: FloatArray) -> bool:
-    """Tell whether the angles (n,) [rad] of rays ascend and span less than pi."""
-    for i in range(len(angles)):
-        if not abs(angles[i]) <= 2.0 * math.pi or (i > 0 and not angles[i] > angles[i - 1]):
-            return False
-    return bool(angles[-1] - angles[0] < math.pi)
-
-
-@device
-@in_place
-def look_to_side(told: Any, side: float, seen: Any) -> None:
-    """Write how rays lead to the rows above the robot, or to those below.
-
-    Args:
-        told: (15, n + 1) float64, of `survey`.
-        side: 1 for the rows above, -1 for those below.
-        seen: (7, n + 1) float64, of `turn`, and as described above.
-    """
-    aside = -ASIDE  # all cells lie to the left of what comes before the rays that lead there, none of what comes after
-    for i in range(told.shape[1] - 1):
-        up = seen[ALONG_Y, i]
-        leads_there = side * up > 0.0
-        seen[SLOPE, i] = -seen[ALONG_X, i] / (up if leads_there else 1.0) if leads_there else aside
-        seen[TOP, i] = side * told[OBSERVED, i] * up + 0.5 * CELL if leads_there else -1.0
-        aside = ASIDE if leads_there else aside
 
 
 @inline
@@ -68,11 +32,11 @@ def cross_row(seen: Any, begin: int, end: int, steps: float, beside: float, pass
     """Tell which rays the cells of a row lie to the left of.
 
     Args:
-        seen: (7, n + 1) float64, of `look_to_side`. The crossings are written to it.
-        begin: The first ray that is asked about.
-        end: One past the last.
-        steps: How far the row is from the robot [cells].
-        beside: Where the robot is, counted from the rightmost cell [cells].
+        seen: (7, n + 1) float64. Rays as `update_from_geometry` sees them; the crossings are written to it.
+        begin: First ray that matters.
+        end: One past the last ray that matters.
+        steps: Distance of the row from the robot [cells].
+        beside: Place of the robot, counted from the rightmost cell [cells].
         passed: (width + 1,) uint32, cells from right to left. Written to: one past the last ray that is crossed just
             before a cell; 0 if none is.
 
@@ -81,7 +45,7 @@ def cross_row(seen: Any, begin: int, end: int, steps: float, beside: float, pass
     """
     most = float(len(passed) - 1)
     slopes, crossings = seen[SLOPE, begin:end], seen[CROSSING, begin:end]
-    for i in range(len(slopes)):  # by itself, it becomes vector instructions
+    for i in range(len(slopes)):  # a loop of its own becomes vector instructions
         crossings[i] = np.ceil(min(max(beside + steps * slopes[i], 0.0), most))
     passed[:] = 0
     first, crossing = len(passed) - 1, 0
@@ -98,31 +62,32 @@ STRAIGHT_TOLERANCE = 0.1  # [m]
 WALL_HALF_THICKNESS = 0.12  # [m] half a cell and a little, so that a wall marks at least one cell wherever it lies
 LEAST = 1e-9  # of what is divided by
 
-# A survey has a row for each of these, and columns for the n rays of a scan, the last one for none: which way they go,
-# how far [m], where they end [m], whether they met something, whether the hit lies on a line through those beside it,
-# how far along them anything may be told of cells beside them [m]. What follows is of rays k - 1 and k, while the first
-# and the last column stand for no rays: the surface that both see lies where NORMAL_X x + NORMAL_Y y + OFFSET is 0,
-# infinitely far off if they see none; where this is above WALL_ABOVE, it is a wall, and before it all is free nearer
-# than the root of FREE_BELOW; whether there is a jump in range; how far along both something may be told where they see
-# no surface [m].
+# A survey has a row for each of these, and columns for the n rays of a scan, the last one for none: direction, length
+# [m], end [m], whether the ray met something, whether the hit lies on a line through those beside it, and the distance
+# up to which the ray may say something about cells beside it [m]. The other rows describe rays k - 1 and k, and their
+# first and last columns no rays: the surface that both see lies where NORMAL_X x + NORMAL_Y y + OFFSET is 0, infinitely
+# far off if they see none; where this is above WALL_ABOVE, it is a wall, and before it all is free nearer than the root
+# of FREE_BELOW; whether there is a jump in range; and TELLING of both where they see no surface [m].
 ALONG_X, ALONG_Y, NORMAL_X, NORMAL_Y = range(4)  # these turn with the robot
 REACH, END_X, END_Y, IS_HIT, IN_LINE, OBSERVED, OFFSET, WALL_ABOVE, FREE_BELOW, IS_JUMP, OBSERVED_FREE = range(4, 15)
 NUM_ROWS = 15
-
-
-@jit
-def directions_of(angles: FloatArray) -> Any:
-    """Return unit vectors (2, n) at angles (n,) [rad]."""
-    directions = np.empty((2, len(angles)))
-    for i in range(len(angles)):
-        directions[0, i], directions[1, i] = math.cos(angles[i]), math.sin(angles[i])
-    return directions
+NUM_PAINT_ROWS = NUM_ROWS + NUM_SEEN_ROWS
 
 
 @device
 @in_place
-def _ray_geometry(ranges: FloatArray, directions: FloatArray, max_range: float, told: Any) -> None:
-    """Write what each ray tells by itself, and whether three hits lie on one line."""
+def scan_geometry(ranges: FloatArray, directions: FloatArray, max_range: float, told: Any) -> None:
+    """Find out what a scan says: each ray by itself, then neighbouring rays together, then how far all that goes.
+
+    Neighbouring rays see one surface if there is no gap between their hits to drive through, or if the hits line up
+    with a third one; where that leaves room for a gap, nothing is a wall between them.
+
+    Args:
+        ranges: (n,) float64 [m], at least 0.
+        directions: (2, n) float64. Unit vectors along the rays, from right to left, robot frame.
+        max_range: A reading as far as this saw nothing [m].
+        told: (15, n + 1) float64, robot frame. Written to, as described above.
+    """
     count = len(ranges)
     for i in range(count):
         reach = min(ranges[i], max_range)
@@ -138,16 +103,6 @@ def _ray_geometry(ranges: FloatArray, directions: FloatArray, max_range: float, 
         on_line = abs(cross) <= STRAIGHT_TOLERANCE * math.sqrt(along_x * along_x + along_y * along_y)
         told[IN_LINE, i] = told[IS_HIT, i - 1] * told[IS_HIT, i] * told[IS_HIT, i + 1] * on_line
 
-
-@device
-@in_place
-def _pair_geometry(told: Any) -> None:
-    """Write what neighbouring rays see between them: one surface, a jump in range, or nothing.
-
-    It is one surface if there is no gap between the hits to drive through, or if they line up with a third one; where
-    that leaves room for a gap, nothing is a wall between them.
-    """
-    count = told.shape[1] - 1
     for k in (0, count):
         told[NORMAL_X, k], told[NORMAL_Y, k], told[OFFSET, k], told[WALL_ABOVE, k] = 0.0, 0.0, np.inf, np.inf
         told[FREE_BELOW, k], told[IS_JUMP, k], told[OBSERVED_FREE, k] = np.inf, 0.0, 0.0
@@ -169,20 +124,6 @@ def _pair_geometry(told: Any) -> None:
         end_of_tangent = reach / max(math.sqrt(0.5 * max(1.0 + cosine, 0.0)), LEAST)  # of the arc up to the reach
         told[OBSERVED_FREE, k] = 0.0 if is_surface else end_of_tangent
 
-
-@device
-@in_place
-def scan_geometry(ranges: FloatArray, directions: FloatArray, max_range: float, told: Any) -> None:
-    """Find out what a scan of `good_ranges` tells.
-
-    Args:
-        ranges: (n,) float64 [m].
-        directions: (2, n) float64. Of the rays, ascending, robot frame.
-        max_range: A reading as far as this saw nothing [m].
-        told: (15, n + 1) float64, robot frame. Written to, as described above.
-    """
-    _ray_geometry(ranges, directions, max_range, told)
-    _pair_geometry(told)
     for i in range(len(ranges)):
         telling = told[REACH, i]
         for k in (i, i + 1):
@@ -192,40 +133,24 @@ def scan_geometry(ranges: FloatArray, directions: FloatArray, max_range: float, 
         told[OBSERVED, i] = telling
 
 
-@device
-@in_place
-def rotate_geometry(told: Any, theta: float, seen: Any) -> None:
-    """Write the rows (4, n + 1) of a survey that turn as they are seen at a heading theta [rad]."""
-    c, s = math.cos(theta), math.sin(theta)
-    for x, y in ((ALONG_X, ALONG_Y), (NORMAL_X, NORMAL_Y)):
-        for i in range(told.shape[1]):
-            seen[x, i] = c * told[x, i] - s * told[y, i]
-            seen[y, i] = s * told[x, i] + c * told[y, i]
-
-
 NONE_PASSED: Any = np.uint32(0)  # unsigned, as are other places of arrays below, so that none counts from the end
 MOST_PLACES = GRID_SIZE + 1  # before the cells of a row, and after the last one
 LEAST_HEIGHT = 1e-9  # [m] that a row is taken to be from the robot, so that no ray crosses it nowhere
 
 
-@inline
-def _before(told: Any, seen: Any, k: Any, u: float, v: float) -> float:
-    """Return how far before the surface of a pair of rays a point lies [m]."""
-    before: float = seen[NORMAL_X, k] * u + seen[NORMAL_Y, k] * v + told[OFFSET, k]
-    return before
-
-
 @device
 @in_place
-def _free_range_at_jump(told: Any, seen: Any, k: Any, u: float, v: float, change: int) -> int:
+def _change_at_jump(told: Any, seen: Any, k: Any, u: float, v: float, change: int) -> int:
     """Return the evidence for a cell between two rays at whose ends the range jumps; seen from the robot at (u, v) [m].
 
     What is free by its distance may be on a surface that goes on from beside; what is not may hold one of the hits.
     """
     right = np.int64(k) - 1
     if change < 0:
-        beside = min(abs(_before(told, seen, right, u, v)), abs(_before(told, seen, k + 1, u, v)))
-        return 0 if beside < WALL_HALF_THICKNESS else change
+        left = right + 2
+        before_right = seen[NORMAL_X, right] * u + seen[NORMAL_Y, right] * v + told[OFFSET, right]
+        before_left = seen[NORMAL_X, left] * u + seen[NORMAL_Y, left] * v + told[OFFSET, left]
+        return 0 if min(abs(before_right), abs(before_left)) < WALL_HALF_THICKNESS else change
     for i in range(right, right + 2):
         off_x = u - told[REACH, i] * seen[ALONG_X, i]
         off_y = v - told[REACH, i] * seen[ALONG_Y, i]
@@ -234,40 +159,33 @@ def _free_range_at_jump(told: Any, seen: Any, k: Any, u: float, v: float, change
     return 0
 
 
-@jit
-def scan_workspace(num_rays: int) -> FloatArray:
-    """Return room (22, n + 1) for a survey of n rays, and below it for what `update_from_geometry` makes of it."""
-    return np.empty((NUM_ROWS + NUM_SEEN_ROWS, num_rays + 1))
-
-
 @device
 @in_place
-def update_from_geometry(
-    evidence: Any, cells: Any, changes: Any, bounds: Any, x: float, y: float, theta: float, room: FloatArray
-) -> None:
-    """Write what a scan tells into a grid, visiting each cell between rays that reach its row once.
+def update_from_geometry(grid: Grid, x: float, y: float, theta: float, room: FloatArray) -> None:
+    """Write what a scan says into a grid, visiting each cell between rays that reach its row once.
 
     Two neighbouring rays that see one surface span a triangle: a cell of it is free before the surface, occupied on
-    it, untold behind. Where hits are sparse, as on a wall seen at a grazing angle, what lies between them stays
-    untold. Where the range jumps, the cells nearer than both readings are free, if they are not on a surface that may
-    go on there, and each hit marks its own cell.
+    it, and as it was behind. Where hits are sparse, as on a wall seen at a grazing angle, cells between them stay as
+    they were. Where the range jumps, the cells nearer than both readings are free, if they are not on a surface that
+    may go on there, and each hit marks its own cell.
 
-    Which two rays a cell lies between is told by where they cross its row. Rays that can tell nothing of a row are
-    passed over at both ends of the fan; from row to row away from the robot there are more of them.
+    Where rays cross the row of a cell decides between which two it lies. Rays that say nothing about a row are passed
+    over at both ends of the fan; from row to row away from the robot there are more of them.
 
     Args:
-        evidence: (300, 300) int8.
-        cells: (300, 300) uint8.
-        changes: See `set_state`, also for the bounds.
-        bounds: (4,) int32.
-        x: Where the robot was [m].
-        y: Likewise.
-        theta: Its heading [rad].
-        room: Of `scan_workspace`, holding a survey.
+        grid: Changed.
+        x: Place of the robot [m].
+        y: See `x`.
+        theta: Heading of the robot [rad].
+        room: (NUM_PAINT_ROWS, n + 1) float64. Survey of the scan, and below it room for the rays as the grid sees them.
     """
     told, seen, count = room[:NUM_ROWS], room[NUM_ROWS:], room.shape[1] - 1
     all_passed = stack_array_of(MOST_PLACES, np.uint32)
-    rotate_geometry(told, theta, seen)
+    c, s = math.cos(theta), math.sin(theta)
+    for along_x, along_y in ((ALONG_X, ALONG_Y), (NORMAL_X, NORMAL_Y)):
+        for i in range(count + 1):
+            seen[along_x, i] = c * told[along_x, i] - s * told[along_y, i]
+            seen[along_y, i] = s * told[along_x, i] + c * told[along_y, i]
     low_x = high_x = low_y = high_y = 0.0
     for i in range(count):
         end_x, end_y = told[REACH, i] * seen[ALONG_X, i], told[REACH, i] * seen[ALONG_Y, i]
@@ -279,7 +197,13 @@ def update_from_geometry(
     own_row = int(min(max((y + HALF_WIDTH) / CELL + 0.5, float(first_row)), float(last_row)))
     passed, tops = all_passed[: width + 1], seen[TOP]
     for side in (-1, 1):
-        look_to_side(told, float(side), seen)
+        aside = -ASIDE  # all cells are left of what comes before the rays that lead there, none of what comes after
+        for i in range(count):
+            up = seen[ALONG_Y, i]
+            leads_there = side * up > 0.0
+            seen[SLOPE, i] = -seen[ALONG_X, i] / (up if leads_there else 1.0) if leads_there else aside
+            tops[i] = side * told[OBSERVED, i] * up + 0.5 * CELL if leads_there else -1.0
+            aside = ASIDE if leads_there else aside
         right = first_col if side < 0 else last_col - 1  # seen by the robot that looks to these rows
         beside = side * (right + 0.5 - (x + HALF_WIDTH) / CELL)
         first, last = 0, count - 1
@@ -293,40 +217,31 @@ def update_from_geometry(
                 break
             begin, end = max(first - 1, 0), min(last + 2, count)
             start, stop = cross_row(seen, begin, end, max(side * v, LEAST_HEIGHT) / CELL, beside, passed)
-            evidence_row, k = evidence[row], NONE_PASSED
+            evidence_row, k = grid.evidence[row], NONE_PASSED
             for j in range(start, stop):
                 k = max(k, passed[np.uint32(j)])
                 col: Any = np.uint32(right - side * j)
                 u = (col + 0.5) * CELL - HALF_WIDTH - x
-                before, change = _before(told, seen, k, u, v), 0
+                before, change = seen[NORMAL_X, k] * u + seen[NORMAL_Y, k] * v + told[OFFSET, k], 0
                 if (before > WALL_HALF_THICKNESS) & (u * u + v * v < told[FREE_BELOW, k]):
                     change = -1
                 elif before > told[WALL_ABOVE, k]:
                     change = HIT
                 if told[IS_JUMP, k] > 0.0:
-                    change = _free_range_at_jump(told, seen, k, u, v, change)
+                    change = _change_at_jump(told, seen, k, u, v, change)
                 old = evidence_row[col]
                 new = clamp_evidence(old + change) if change != 0 else old
                 if new != old:
                     evidence_row[col] = new
                     if old == 0 or (new > 0) != (old > 0):
-                        set_state(cells, changes, bounds, row, col, OCCUPIED if new > 0 else FREE)
+                        set_state(grid, row, col, OCCUPIED if new > 0 else FREE)
 
 
 @jit
 def update_from_scan(
-    evidence: Any,
-    cells: Any,
-    changes: Any,
-    bounds: Any,
-    x: float,
-    y: float,
-    theta: float,
-    ranges: FloatArray,
-    directions: FloatArray,
-    max_range: float,
+    grid: Grid, x: float, y: float, theta: float, ranges: FloatArray, directions: FloatArray, max_range: float
 ) -> None:
-    """Write one scan of `good_ranges` into a grid: `survey` and `update_from_geometry`."""
-    room = scan_workspace(len(ranges))
+    """Write one scan into a grid; arguments as in `survey` and `update_from_geometry`."""
+    room = np.empty((NUM_PAINT_ROWS, len(ranges) + 1))
     scan_geometry(ranges, directions, max_range, room[:NUM_ROWS])
-    update_from_geometry(evidence, cells, changes, bounds, x, y, theta, room)
+    update_from_geometry(grid, x, y, theta, room)

@@ -3,8 +3,8 @@
 import math
 from typing import Any
 
-from slam_backend.core.jit import device, in_place
-from slam_backend.core.validation import BoolArray, FloatArray
+from slam_backend.core.jit import in_place
+from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from vslam_env.navigation._grid_kernels.occupancy import (
     CELL,
     FREE,
@@ -12,15 +12,17 @@ from vslam_env.navigation._grid_kernels.occupancy import (
     HALF_WIDTH,
     HIT,
     OCCUPIED,
+    Grid,
     cell_range,
     set_state,
 )
-from vslam_env.navigation._grid_kernels.scan_update import NUM_ROWS, good_ranges, scan_geometry, update_from_geometry
+from vslam_env.navigation._grid_kernels.scan_update import NUM_ROWS, scan_geometry, update_from_geometry
 
 
 @in_place
-def clear_disc(evidence: Any, cells: Any, changes: Any, bounds: Any, x: float, y: float, radius: float) -> None:
+def clear_disc(grid: Grid, x: float, y: float, radius: float) -> None:
     """Free what a robot covers: unknown cells centred in its disc, and occupied ones that lie wholly inside."""
+    evidence = grid.evidence
     first_row, last_row = cell_range(y - radius, y + radius)
     first_col, last_col = cell_range(x - radius, x + radius)
     for row in range(first_row, last_row):
@@ -33,43 +35,24 @@ def clear_disc(evidence: Any, cells: Any, changes: Any, bounds: Any, x: float, y
             inside = distance <= max(radius - 0.5 * CELL, 0.0)
             if inside or (evidence[row, col] == 0 and distance <= radius):
                 evidence[row, col] = min(evidence[row, col], -1)
-                set_state(cells, changes, bounds, row, col, FREE)
+                set_state(grid, row, col, FREE)
 
 
 @in_place
-def mark_bump(
-    evidence: Any, cells: Any, changes: Any, bounds: Any, x: float, y: float, theta: float, radius: float
-) -> None:
+def mark_bump(grid: Grid, x: float, y: float, theta: float, radius: float) -> None:
     """Mark the cell just ahead of a robot's rim as occupied, no firmer than two hits."""
     ahead = radius + 0.5 * CELL
     row = math.floor((y + ahead * math.sin(theta) + HALF_WIDTH) / CELL)
     col = math.floor((x + ahead * math.cos(theta) + HALF_WIDTH) / CELL)
     if 0 <= row < GRID_SIZE and 0 <= col < GRID_SIZE:
-        evidence[row, col] = max(evidence[row, col], 2 * HIT)
-        set_state(cells, changes, bounds, row, col, OCCUPIED)
-
-
-@device
-@in_place
-def _find_bad(shared: Any, poses: FloatArray, scans: FloatArray) -> tuple[int, int]:
-    """Return what `paint_readings` returns."""
-    for robot in range(len(scans)):
-        if not good_ranges(scans[robot]):
-            return robot, robot
-        for owner in range(len(shared)):
-            x, y, theta = poses[owner, robot]
-            if shared[owner, robot] and not math.isfinite(x + y + theta):
-                return owner, robot
-    return -1, -1
+        grid.evidence[row, col] = max(grid.evidence[row, col], 2 * HIT)
+        set_state(grid, row, col, OCCUPIED)
 
 
 @in_place
 def update_grids(
-    evidence: Any,
-    cells: Any,
-    changes: Any,
-    bounds: Any,
-    shared: Any,
+    grids: tuple[Any, Any, Any, Any],
+    shared: IntArray,
     poses: FloatArray,
     scans: FloatArray,
     bumps: BoolArray,
@@ -81,33 +64,39 @@ def update_grids(
     """Write what robots read in a tick: their scans, the floor that they cover, and their bumps.
 
     Args:
-        evidence: (K, 300, 300) int8, as what follows: the grids, one after the other.
-        cells: (K, 300, 300) uint8.
-        changes: (K, 1 + n) int32.
-        bounds: (K, 4) int32.
-        shared: See `TeamGrids.update`, also for the rest.
+        grids: Grids of K robots, as the arrays of a `Grid`; changed.
+        shared: (K, K) int64. See `TeamGrids.update`, as for poses, scans, bumps and directions.
         poses: (K, K, 3) float64 [m, m, rad].
         scans: (K, R) float64 [m].
         bumps: (K,) bool.
         directions: (2, R) float64.
-        max_range: [m].
-        radius: [m].
-        room: Of `scan_workspace`.
+        max_range: Range of the scans [m].
+        radius: Radius of the robots [m].
+        room: See `update_from_geometry`.
 
     Returns:
         Whose grid and whose reading do not go together, as its pose or its ranges are bad; nothing was written then.
         -1 if all are good.
     """
-    bad = _find_bad(shared, poses, scans)
-    if bad[0] >= 0:
-        return bad
+    evidence, cells, changes, bounds = grids
+    for robot in range(len(scans)):
+        good = True
+        for i in range(scans.shape[1]):
+            good &= scans[robot, i] >= 0.0  # no NaN is
+        if not good:
+            return robot, robot
+        for owner in range(len(shared)):
+            x, y, theta = poses[owner, robot]
+            if shared[owner, robot] and not math.isfinite(x + y + theta):
+                return owner, robot
     for robot in range(len(scans)):
         scan_geometry(scans[robot], directions, max_range, room[:NUM_ROWS])
         for owner in range(len(shared)):
             if shared[owner, robot]:
+                grid = Grid(evidence[owner], cells[owner], changes[owner], bounds[owner])
                 x, y, theta = poses[owner, robot]
-                update_from_geometry(evidence[owner], cells[owner], changes[owner], bounds[owner], x, y, theta, room)
-                clear_disc(evidence[owner], cells[owner], changes[owner], bounds[owner], x, y, radius)
+                update_from_geometry(grid, x, y, theta, room)
+                clear_disc(grid, x, y, radius)
                 if bumps[robot]:
-                    mark_bump(evidence[owner], cells[owner], changes[owner], bounds[owner], x, y, theta, radius)
-    return bad
+                    mark_bump(grid, x, y, theta, radius)
+    return -1, -1

@@ -1,29 +1,25 @@
 """The compiled searches over the known part of a grid: where a disc fits, the cheapest ways, frontiers, candidates."""
 
-from vslam_env.navigation._planning_kernels.candidates import SAME_GOAL, fill_slots, pair_distances, update_slots
-from vslam_env.navigation._planning_kernels.dijkstra import (
-    UNREACHED,
-    dijkstra,
-    nearest_open,
-    parents_of,
-    shorten_path,
+from vslam_env.navigation._planning_kernels.candidates import (
+    FRONTIER_SIZE,
+    SAME_GOAL,
+    describe,
+    fill_slots,
+    update_slots,
 )
-from vslam_env.navigation._planning_kernels.frontiers import HEADING, LENGTH, NUM_COLUMNS, SIZE, XY, compute_frontiers
+from vslam_env.navigation._planning_kernels.dijkstra import UNREACHED, dijkstra, nearest_open, shorten_path
+from vslam_env.navigation._planning_kernels.frontiers import FrontierColumns, compute_frontiers
 
 __all__ = [
-    "HEADING",
-    "LENGTH",
-    "NUM_COLUMNS",
+    "FRONTIER_SIZE",
     "SAME_GOAL",
-    "SIZE",
     "UNREACHED",
-    "XY",
+    "FrontierColumns",
     "compute_frontiers",
+    "describe",
     "dijkstra",
     "fill_slots",
     "nearest_open",
-    "pair_distances",
-    "parents_of",
     "shorten_path",
     "update_slots",
 ]  # fmt: skip

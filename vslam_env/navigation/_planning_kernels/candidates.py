@@ -7,7 +7,7 @@ import numpy as np
 
 from slam_backend.core.jit import device, in_place, jit
 from vslam_env.navigation._grid_kernels import CELL, GRID_SIZE, HALF_WIDTH
-from vslam_env.navigation._planning_kernels.frontiers import HEADING, NUM_COLUMNS, compute_frontiers
+from vslam_env.navigation._planning_kernels.frontiers import HEADING, LENGTH, NUM_COLUMNS, SIZE, compute_frontiers
 
 SAME_GOAL = 1.0  # [m] between updates the goal of a living candidate moves less than this
 AT_GOAL = 0.5  # [m]
@@ -16,39 +16,8 @@ LOOK_COUNTS = 4  # times as much as a visit without a look, for a teammate's dir
 PATIENCE = 16  # visits, after which what is still unseen there never will be seen
 GIVEN_UP = 0.8  # [m] radius of what is then left out
 
-
-@device
-@in_place
-def _visit(rows: Any, poses: Any, robot: int, visits: Any, given_up: Any) -> None:
-    """Add to the visits (m,) of candidates what a robot and its teammates count; where patience runs out, give up.
-
-    Args:
-        rows: (m, 5) of the slots, as of `compute_frontiers`; NaN in empty ones.
-        poses: (n, 3) [m, m, rad] of the robot and of teammates; NaN: it does not know.
-        robot: Its row of them.
-        visits: (m,) counted so far; begun anew where it gives up.
-        given_up: (300, 300) bool, cells of the grid that do not count any more; added to.
-    """
-    x, y, theta = poses[robot]
-    for i in range(len(rows)):
-        at_goal = np.hypot(rows[i, 0] - x, rows[i, 1] - y) <= AT_GOAL
-        looked = at_goal and math.cos(rows[i, HEADING] - theta) > math.cos(LOOKING)
-        for k in range(len(poses)):  # those that are unknown are nowhere near
-            at_goal |= np.hypot(rows[i, 0] - poses[k, 0], rows[i, 1] - poses[k, 1]) <= AT_GOAL
-        visits[i] += (1 if at_goal else 0) + (LOOK_COUNTS - 1 if looked else 0)
-        if visits[i] >= PATIENCE:
-            _give_up(rows[i, 0], rows[i, 1], given_up)
-            visits[i] = 0
-
-
-@device
-@in_place
-def _give_up(goal_x: float, goal_y: float, given_up: Any) -> None:
-    """Mark the cells of a grid around a goal that nobody can see."""
-    for r in range(GRID_SIZE):
-        for c in range(GRID_SIZE):
-            x, y = (c + 0.5) * CELL - HALF_WIDTH, (r + 0.5) * CELL - HALF_WIDTH
-            given_up[r, c] |= (x - goal_x) ** 2 + (y - goal_y) ** 2 <= GIVEN_UP**2
+FRONTIER_SIZE = 3  # the feature that is above 0 where there is a candidate
+NO_TEAMMATE = 60.0  # [m] stands for the distance of a teammate when there is none
 
 
 @device
@@ -105,23 +74,68 @@ def fill_slots(costs: Any, found: Any, rows: Any, visits: Any) -> None:
 
 @jit
 def update_slots(
-    cells: Any, bounds: Any, row: int, col: int, reach: float, escape: int, poses: Any, robot: int,
-    rows: Any, visits: Any, given_up: Any,
-) -> tuple[Any, Any, bool]:  # fmt: skip
+    cells: Any, bounds: Any, radius: float, poses: Any, robot: int, rows: Any, visits: Any, given_up: Any
+) -> tuple[Any, Any, bool]:
     """Bring a robot's candidates up to date, if it is clear which of them are found again.
 
+    The robot and its teammates visit candidates; where patience runs out, a candidate is given up.
+
     Args:
-        cells, bounds, row, col, reach, escape: As of `compute_frontiers`.
-        poses, robot, rows, visits, given_up: As of `_visit`; the last three are written.
+        cells: (300, 300) uint8. The grid.
+        bounds: (4,) int32, of `known_bounds`.
+        radius: Radius of the robot [m].
+        poses: (n, 3) [m, m, rad]. Of the robot and of teammates; NaN: the robot does not know.
+        robot: Row of the robot in the poses.
+        rows: (m, 5). Slots, see `FrontierColumns`; NaN in empty ones. Changed.
+        visits: (m,) int64. Visits of each candidate so far; changed.
+        given_up: (300, 300) bool. Cells of the grid that no longer count; added to.
 
     Returns:
         The frontiers (n, 5); the distances (m, n), of `pair_distances`; and whether the slots are filled: if not, the
         pairs are to be chosen, and `fill_slots` called.
     """
-    _visit(rows, poses, robot, visits, given_up)
-    found = compute_frontiers(cells, bounds, row, col, reach, escape, given_up)
+    x, y, theta = poses[robot]
+    for i in range(len(rows)):
+        goal_x, goal_y = rows[i, 0], rows[i, 1]
+        at_goal = np.hypot(goal_x - x, goal_y - y) <= AT_GOAL
+        looked = at_goal and math.cos(rows[i, HEADING] - theta) > math.cos(LOOKING)
+        for k in range(len(poses)):  # those that are unknown are nowhere near
+            at_goal |= np.hypot(goal_x - poses[k, 0], goal_y - poses[k, 1]) <= AT_GOAL
+        visits[i] += (1 if at_goal else 0) + (LOOK_COUNTS - 1 if looked else 0)
+        if visits[i] >= PATIENCE:
+            visits[i] = 0
+            for r in range(GRID_SIZE):
+                for c in range(GRID_SIZE):
+                    cell_x, cell_y = (c + 0.5) * CELL - HALF_WIDTH, (r + 0.5) * CELL - HALF_WIDTH
+                    given_up[r, c] |= (cell_x - goal_x) ** 2 + (cell_y - goal_y) ** 2 <= GIVEN_UP**2
+
+    found = compute_frontiers(cells, bounds, x, y, radius, given_up)
     costs = np.empty((len(rows), len(found)))
     is_clear = pair_distances(rows, found, costs)
     if is_clear:
         fill_slots(costs, found, rows, visits)
     return found, costs, is_clear
+
+
+@in_place
+def describe(slots: Any, poses: Any, features: Any) -> None:
+    """Write `CandidateSlots.features` (K, 16, 5) of the rows of all slots (K, 16, 5).
+
+    Poses (K, n, 3), n >= K, are as in `TeamSlots.features`.
+    """
+    for robot in range(len(slots)):
+        x, y, theta = poses[robot, robot]
+        c, s = math.cos(theta), math.sin(theta)
+        for i in range(slots.shape[1]):
+            goal_x, goal_y = slots[robot, i, 0], slots[robot, i, 1]
+            if np.isnan(goal_x):
+                features[robot, i] = 0.0
+                continue
+            u, v = goal_x - x, goal_y - y
+            nearest = NO_TEAMMATE
+            for mate in range(poses.shape[1]):
+                if mate != robot and not np.isnan(poses[robot, mate, 0]):
+                    nearest = min(nearest, np.hypot(goal_x - poses[robot, mate, 0], goal_y - poses[robot, mate, 1]))
+            features[robot, i, 0], features[robot, i, 1] = c * u + s * v, c * v - s * u
+            features[robot, i, 2], features[robot, i, FRONTIER_SIZE] = slots[robot, i, LENGTH], slots[robot, i, SIZE]
+            features[robot, i, 4] = nearest

@@ -1,4 +1,4 @@
-"""Costs of a grid's cells: the known part cut out, walls inflated by the robot's radius, and costs near them."""
+"""Costs of a grid's cells: walls inflated by the robot's radius, and costs near them."""
 
 import math
 from typing import Any
@@ -6,42 +6,10 @@ from typing import Any
 import numpy as np
 
 from slam_backend.core.jit import device, in_place, jit
-from vslam_env.navigation._grid_kernels import FREE, GRID_SIZE, OCCUPIED, UNKNOWN
+from vslam_env.navigation._grid_kernels import FREE, OCCUPIED, UNKNOWN
 
 PAD = 2  # cells around the known box, so that loops over frontiers and neighbours need no bounds
 OUTSIDE = 3  # beyond the 60 x 60 m: neither known nor worth exploring
-
-
-@device
-@in_place
-def any_above_zero(numbers: Any) -> bool:
-    """Tell whether any of some small numbers (n,), >= 0, is above 0."""
-    seen = np.uint8(0)
-    for i in range(len(numbers)):
-        seen = np.uint8(seen | numbers[i])
-    return bool(seen > 0)
-
-
-@device
-@jit
-def known_region(cells: Any, bounds: Any) -> Any:
-    """Cut the known box out of a grid, and pad it with the cells around.
-
-    Args:
-        cells: (300, 300) uint8. The grid.
-        bounds: (4,) int32, of `known_bounds`.
-
-    Returns:
-        (h + 2 PAD, w + 2 PAD) uint8, `PAD` cells before its bounds and after them.
-    """
-    row, col, height, width = bounds[0], bounds[1], bounds[2] - bounds[0], bounds[3] - bounds[1]
-    box = np.full((height + 2 * PAD, width + 2 * PAD), OUTSIDE, np.uint8)
-    first, last = max(col - PAD, 0), min(col + width + PAD, GRID_SIZE)
-    for grid_row in range(max(row - PAD, 0), min(row + height + PAD, GRID_SIZE)):
-        here, there = box[grid_row - row + PAD, first - col + PAD :], cells[grid_row, first:last]
-        for i in range(len(there)):  # an assignment of slices would take ten times as long
-            here[i] = there[i]
-    return box
 
 
 CLOSE, NEAR, OPEN = 4, 2, 1  # weights of cells by their distance from walls
@@ -73,29 +41,6 @@ def _spread(squares: Any, span: int, stride: int, least: Any) -> None:
 
 @device
 @jit
-def _squared_clearance(box: Any, span: int) -> Any:
-    """Return each cell's squared distance to the nearest occupied one, (h, w) uint8, if at most `span`; else more.
-
-    Args:
-        box: (h, w) uint8.
-        span: At most 10, so that sums of squares fit.
-    """
-    height, width = box.shape
-    wide = width + span  # rows end in what keeps the next one out of reach
-    squares, along_rows = np.empty(height * wide, np.uint8), np.empty(height * wide, np.uint8)
-    far = np.uint8((span + 1) ** 2)
-    for r in range(height):
-        here = squares[r * wide : (r + 1) * wide]
-        for c in range(width):
-            here[c] = 0 if box[r, c] == OCCUPIED else far
-        here[width:] = far
-    _spread(squares, span, 1, along_rows)
-    _spread(along_rows, span, wide, squares)
-    return squares.reshape((height, wide))
-
-
-@device
-@jit
 def inflate_costs(box: Any, reach: float) -> Any:
     """Weigh the cells of a box by how near they are to walls.
 
@@ -107,13 +52,26 @@ def inflate_costs(box: Any, reach: float) -> Any:
         (h, w) uint8: 0 where a robot may not be (occupied, unknown, too near to a wall, or at the edge of the box),
         `CLOSE` within one more cell of that, `NEAR` within two or beside the unknown, else `OPEN`.
     """
-    clearance = _squared_clearance(box, math.ceil(reach + 1.0))
+    height, width = box.shape
+    span = math.ceil(reach + 1.0)
+    wide = width + span  # rows end in what keeps the next one out of reach
+    squares, along_rows = np.empty(height * wide, np.uint8), np.empty(height * wide, np.uint8)
+    far = np.uint8((span + 1) ** 2)
+    for r in range(height):
+        here = squares[r * wide : (r + 1) * wide]
+        for c in range(width):
+            here[c] = 0 if box[r, c] == OCCUPIED else far
+        here[width:] = far
+    _spread(squares, span, 1, along_rows)
+    _spread(along_rows, span, wide, squares)
+    clearance = squares.reshape((height, wide))  # squared distance to the nearest occupied cell, if within the span
+
     # Squared distances are whole numbers, so that those below a bound are those below the next whole number.
     closed, close = np.uint8(math.ceil(reach**2)), np.uint8(math.ceil((reach + 1.0) ** 2))
     near = np.uint8(math.ceil((reach + 2.0) ** 2))
     weights = np.zeros(box.shape, np.uint8)
-    for r in range(1, box.shape[0] - 1):
-        for c in range(1, box.shape[1] - 1):
+    for r in range(1, height - 1):
+        for c in range(1, width - 1):
             gap = clearance[r, c]
             at_edge = (
                 (box[r - 1, c] == UNKNOWN)

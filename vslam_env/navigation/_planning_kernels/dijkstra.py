@@ -5,25 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.core.jit import device, in_place, jit
-from vslam_env.navigation._grid_kernels import OCCUPIED
-from vslam_env.navigation._planning_kernels.costmap import PAD, inflate_costs, known_region
-
-
-@device
-@in_place
-def _line_cost(weights: Any, row: float, col: float, to_row: float, to_col: float) -> float:
-    """Return the cost of a straight line between two cells, infinite if it leaves the open ones."""
-    distance = math.hypot(to_row - row, to_col - col)
-    samples = int(4.0 * distance) + 1
-    total = 0.0
-    for i in range(samples + 1):
-        share = i / samples
-        weight = weights[int(row + share * (to_row - row) + 0.5), int(col + share * (to_col - col) + 0.5)]
-        if weight == 0:
-            return np.inf
-        total += weight
-    return 2.0 * STRAIGHT * distance * total / (samples + 1)
+from slam_backend.core.jit import device, jit
+from vslam_env.navigation._grid_kernels import CELL, GRID_SIZE, HALF_WIDTH, OCCUPIED
+from vslam_env.navigation._planning_kernels.costmap import OUTSIDE, PAD, inflate_costs
 
 
 @jit
@@ -33,7 +17,7 @@ def shorten_path(weights: Any, cost: Any, parent: Any, row: int, col: int) -> An
     Args:
         weights: (h, w) uint8.
         cost: (h, w) int32, of `wavefront`.
-        parent: (h, w) int32, of `parents_of`.
+        parent: (h, w) int32, of `wavefront`.
         row: The goal, a reached cell.
         col: See `row`.
 
@@ -62,8 +46,19 @@ def shorten_path(weights: Any, cost: Any, parent: Any, row: int, col: int) -> An
         reached = anchor + 1
         while reached + 1 < count:
             ahead = way[reached + 1]
-            line = _line_cost(weights, way[anchor] // width, way[anchor] % width, ahead // width, ahead % width)
-            if line > 1.02 * (costs[ahead] - costs[way[anchor]]):  # 2 % for the short diagonal and the sampling
+            first_row, first_col = way[anchor] // width, way[anchor] % width
+            rows, cols = ahead // width - first_row, ahead % width - first_col
+            distance = math.hypot(rows, cols)
+            samples = int(4.0 * distance) + 1
+            total, is_open = 0.0, True
+            for i in range(samples + 1):
+                share = i / samples
+                weight = weights[int(first_row + share * rows + 0.5), int(first_col + share * cols + 0.5)]
+                total += weight
+                is_open &= weight > 0
+            straight = 2.0 * STRAIGHT * distance * total / (samples + 1)
+            # 2 % for the short diagonal and the sampling
+            if not is_open or straight > 1.02 * (costs[ahead] - costs[way[anchor]]):
                 break
             reached += 1
         corners[num, 0], corners[num, 1] = way[reached] // width, way[reached] % width
@@ -74,6 +69,7 @@ def shorten_path(weights: Any, cost: Any, parent: Any, row: int, col: int) -> An
 
 STRAIGHT, DIAGONAL = 5, 7  # length of a step in fifths of a cell; 7/5 is 1 % short of the diagonal
 NUM_STRAIGHT = 4  # of the eight directions, the first ones
+ESCAPE_CELLS = 5  # a robot that drift or a bump put into a wall's margin looks this far for open floor
 NUM_BUCKETS = 64  # a power of two above the dearest step, DIAGONAL * (CLOSE + CLOSE)
 UNREACHED = np.iinfo(np.int32).max
 
@@ -119,23 +115,6 @@ def nearest_open(box: Any, weights: Any, row: int, col: int, reach: int) -> tupl
 
 
 @device
-@in_place
-def neighbour_offsets(width: int) -> tuple[int, ...]:
-    """Return how far a step in each of the eight directions leads in a flat grid of rows as wide as this."""
-    return 1, width, -1, -width, 1 + width, width - 1, -1 - width, 1 - width
-
-
-@jit
-def parents_of(ways: Any) -> Any:
-    """Return of each cell the flat index of the one before it on its way, (h, w) int32; -1 where `ways` has that."""
-    steps = neighbour_offsets(ways.shape[1])
-    parents = np.empty(ways.size, np.int32)
-    for cell, direction in enumerate(ways.ravel()):
-        parents[cell] = cell - steps[direction] if direction >= 0 else -1
-    return parents.reshape(ways.shape)
-
-
-@device
 @jit
 def wavefront(weights: Any, row: int, col: int) -> tuple[Any, Any]:
     """Find the cheapest ways from one cell to all others (Dijkstra's algorithm with Dial's buckets).
@@ -151,8 +130,8 @@ def wavefront(weights: Any, row: int, col: int) -> tuple[Any, Any]:
         col: See `row`.
 
     Returns:
-        Of each cell (h, w): the cost, int32, `UNREACHED` if there is no way; and the direction of the last step to
-        it, int8 as in `neighbour_offsets`, -1 at the first cell and where there is no way.
+        Of each cell (h, w) int32: the cost, `UNREACHED` if there is no way; and the flat index of the cell before it on
+        its way, -1 at the first cell and where there is no way.
     """
     width = weights.shape[1]
     weight = weights.ravel()
@@ -162,11 +141,11 @@ def wavefront(weights: Any, row: int, col: int) -> tuple[Any, Any]:
         # Closed cells are below all costs, so that one comparison passes over closed and settled cells alike.
         cost[i] = UNREACHED if weight[i] > 0 else -1
         num_open += weight[i] > 0
-    ways = np.full(weight.size, -1, np.int8)
+    parents = np.full(weight.size, -1, np.int32)
     # Cells, and which entry follows each; a cost falls at most once per neighbour.
     entries = np.empty((8 * num_open + 1, 2), np.int32)
     heads = np.full(NUM_BUCKETS, -1, np.int32)
-    steps = np.array(neighbour_offsets(width))
+    steps = np.array((1, width, -1, -width, 1 + width, width - 1, -1 - width, 1 - width))
 
     used, taken, current = 0, 0, 0
     if row >= 0:
@@ -188,36 +167,43 @@ def wavefront(weights: Any, row: int, col: int) -> tuple[Any, Any]:
                 length = STRAIGHT if k < NUM_STRAIGHT else DIAGONAL
                 through = np.int32(current + length * (here + np.int32(weight[neighbour])))
                 if through < cost[neighbour]:
-                    cost[neighbour], ways[neighbour] = through, k
+                    cost[neighbour], parents[neighbour] = through, cell
                     target, place = np.uint32(through & (NUM_BUCKETS - 1)), np.uint32(used)
                     entries[place, 0], entries[place, 1], heads[target] = neighbour, heads[target], used
                     used += 1
         current += 1
     for i in range(weight.size):
         cost[i] &= UNREACHED  # turns -1 into it, and leaves all costs as they are
-    return cost.reshape(weights.shape), ways.reshape(weights.shape)
+    return cost.reshape(weights.shape), parents.reshape(weights.shape)
 
 
 @jit
-def dijkstra(
-    cells: Any, bounds: Any, row: int, col: int, reach: float, escape: int
-) -> tuple[Any, Any, Any, Any, int, int]:
+def dijkstra(cells: Any, bounds: Any, x: float, y: float, radius: float) -> tuple[Any, Any, Any, Any, int, int]:
     """Find the cheapest ways over the known floor of a grid.
 
     Args:
         cells: (300, 300) uint8. The grid.
         bounds: (4,) int32, of `known_bounds`.
-        row: Of the cell where they begin, or near which: the nearest open one is taken.
-        col: Likewise.
-        reach: See `weigh`.
-        escape: How far to look for an open cell, in cells.
+        x: Place where the ways begin [m]. If a robot may not be there, they begin at the nearest open cell.
+        y: See `x`.
+        radius: Radius of the robot [m].
 
     Returns:
-        The known box, (h, w) uint8; its weights, of `weigh`; costs and last steps, of `wavefront`; and the grid's row
-        and column of its first cell.
+        The known box (h, w) uint8, with `PAD` cells before its bounds and after them; its weights, of `weigh`; costs
+        and parents, of `wavefront`; and the grid's row and column of the box's first cell.
     """
-    box, first_row, first_col = known_region(cells, bounds), bounds[0] - PAD, bounds[1] - PAD
-    weights = inflate_costs(box, reach)
-    start_row, start_col = nearest_open(box, weights, row - first_row, col - first_col, escape)
-    cost, ways = wavefront(weights, start_row, start_col)
-    return box, weights, cost, ways, first_row, first_col
+    first_row, first_col = bounds[0] - PAD, bounds[1] - PAD
+    box = np.full((bounds[2] + PAD - first_row, bounds[3] + PAD - first_col), OUTSIDE, np.uint8)
+    first, last = max(first_col, 0), min(bounds[3] + PAD, GRID_SIZE)
+    for grid_row in range(max(first_row, 0), min(bounds[2] + PAD, GRID_SIZE)):
+        here, there = box[grid_row - first_row, first - first_col :], cells[grid_row, first:last]
+        for i in range(len(there)):  # an assignment of slices would take ten times as long
+            here[i] = there[i]
+
+    weights = inflate_costs(box, radius / CELL + 0.5)
+    far = 2.0 * HALF_WIDTH  # as good as anywhere outside
+    row = math.floor((min(max(y, -far), far) + HALF_WIDTH) / CELL) - first_row
+    col = math.floor((min(max(x, -far), far) + HALF_WIDTH) / CELL) - first_col
+    start_row, start_col = nearest_open(box, weights, row, col, ESCAPE_CELLS)
+    cost, parents = wavefront(weights, start_row, start_col)
+    return box, weights, cost, parents, first_row, first_col

@@ -1,14 +1,14 @@
 """Where the known floor of a box borders on what has not been seen."""
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from slam_backend.core.jit import device, in_place, jit
+from slam_backend.core.validation import FloatArray
 from vslam_env.navigation._grid_kernels import CELL, FREE, GRID_SIZE, HALF_WIDTH, UNKNOWN
-from vslam_env.navigation._planning_kernels.costmap import any_above_zero
-from vslam_env.navigation._planning_kernels.dijkstra import NUM_STRAIGHT, UNREACHED, dijkstra, neighbour_offsets
+from vslam_env.navigation._planning_kernels.dijkstra import UNREACHED, dijkstra
 
 MIN_CELLS = 3  # a robot needs 0.4 m; what is smaller is a speck or the corner of a wall
 MAX_CELLS = 20  # longer frontiers are cut, as one goal cannot stand for them
@@ -17,7 +17,35 @@ MOST_NEAR = 1 + 2 * GOAL_STEPS * (GOAL_STEPS + 1)  # cells that so many steps le
 LOOKED_AT = 4  # added to the marks of cells while a goal is looked for
 SIGHT_CELLS = 3  # the unknown this near to a goal tells where to look from it
 
-XY, HEADING, SIZE, LENGTH, NUM_COLUMNS = slice(0, 2), 2, 3, 4, 5  # columns of the rows that describe frontiers
+HEADING, SIZE, LENGTH, NUM_COLUMNS = 2, 3, 4, 5  # columns of the rows that describe frontiers, see `FrontierColumns`
+
+
+class FrontierColumns(NamedTuple):
+    """The columns of rows that describe frontiers, each (n,) float64; start frame.
+
+    Attributes:
+        x: Place of the goal [m].
+        y: See `x`.
+        heading: Direction from the goal to the unknown [rad].
+        size: Length of the frontier [m].
+        length: Length of the path to the goal [m].
+    """
+
+    x: FloatArray
+    y: FloatArray
+    heading: FloatArray
+    size: FloatArray
+    length: FloatArray
+
+    @classmethod
+    def of(cls, rows: FloatArray) -> "FrontierColumns":
+        """Return views of the columns of rows (n, 5)."""
+        return cls(*rows.T)
+
+    @property
+    def goals(self) -> FloatArray:
+        """Places of the goals (n, 2) [m], a copy."""
+        return np.column_stack([self.x, self.y])
 
 
 @device
@@ -83,76 +111,52 @@ def _goal_near(members: Any, box: Any, cost: Any, mark: Any) -> tuple[int, int]:
 
 
 @device
-@in_place
-def _path_length(ways: Any, row: int, col: int) -> float:
-    """Measure the way to a reached cell [m]."""
-    width = ways.shape[1]
-    directions, steps = ways.reshape(ways.size), neighbour_offsets(width)
-    cell, length = row * width + col, 0.0
-    while directions[cell] >= 0:
-        direction = directions[cell]
-        length += CELL if direction < NUM_STRAIGHT else math.sqrt(2.0) * CELL
-        cell -= steps[direction]
-    return length
-
-
-@device
-@in_place
-def _heading_to_unknown(box: Any, row: int, col: int) -> float:
-    """Return the direction from a cell to the unknown cells around it [rad]."""
-    up = right = 0
-    for r in range(max(row - SIGHT_CELLS, 0), min(row + SIGHT_CELLS + 1, box.shape[0])):
-        for c in range(max(col - SIGHT_CELLS, 0), min(col + SIGHT_CELLS + 1, box.shape[1])):
-            if box[r, c] == UNKNOWN:
-                up, right = up + r - row, right + c - col
-    return math.atan2(up, right)
-
-
-@device
 @jit
 def _unseen_edges(box: Any, ignored: Any, row: int, col: int) -> Any:
-    """Return (h, w) int8, 1 for unknown cells beside free ones that are not to be ignored; see `_frontier_rows`."""
+    """Return (h, w) int8, 1 for unknown cells beside free ones that are not to be ignored."""
     height, width = box.shape
     edges = np.zeros((height, width), np.int8)
     for r in range(max(1, -row), min(height - 1, GRID_SIZE - row)):
         first, last = max(1, -col), min(width - 1, GRID_SIZE - col)
-        asked = ignored[row + r, col + first : col + last]
+        left_out = ignored[row + r, col + first : col + last]
         here, edge = box[r, first:last], edges[r, first:last]
         below, above = box[r - 1, first:last], box[r + 1, first:last]
         right, left = box[r, first - 1 : last - 1], box[r, first + 1 : last + 1]
         for i in range(len(here)):  # without branches, it becomes vector code
             beside = (below[i] == FREE) | (above[i] == FREE) | (right[i] == FREE) | (left[i] == FREE)
-            edge[i] = beside & (here[i] == UNKNOWN) & ~asked[i]
+            edge[i] = beside & (here[i] == UNKNOWN) & ~left_out[i]
     return edges
 
 
-@device
 @jit
-def _frontier_rows(box: Any, cost: Any, ways: Any, ignored: Any, row: int, col: int) -> Any:
-    """Collect the frontiers of a box.
+def compute_frontiers(cells: Any, bounds: Any, x: float, y: float, radius: float, ignored: Any) -> Any:
+    """Collect the frontiers to which a way is known.
 
     Args:
-        box: (h, w) uint8, of `known_region`.
-        cost: (h, w) int32, of `wavefront`.
-        ways: (h, w) int8, likewise.
-        ignored: (300, 300) bool. Unknown cells of the grid that do not count.
-        row: Of the box's first cell in the grid.
-        col: Likewise.
+        cells: (300, 300) uint8. The grid; see `dijkstra` for the next arguments.
+        bounds: (4,) int32.
+        x: Place where the ways begin [m].
+        y: See `x`.
+        radius: Radius of the robot [m].
+        ignored: (300, 300) bool. Unknown cells that do not count.
 
     Returns:
-        (n, 5) float64 rows (x, y, heading, size, length), by increasing length.
+        (n, 5) float64 rows (x, y, heading, size, length), see `FrontierColumns`, by increasing length.
     """
+    box, _, cost, parents, first_row, first_col = dijkstra(cells, bounds, x, y, radius)
     height, width = box.shape
-    mark = _unseen_edges(box, ignored, row, col)  # 1: such an edge; 2: its component known; 3: in a piece
+    before = parents.ravel()
+    mark = _unseen_edges(box, ignored, first_row, first_col)  # 1: such an edge; 2: its component known; 3: in a piece
 
     found = np.empty((height * width // MIN_CELLS + 1, NUM_COLUMNS))
     count = 0
     whole = np.empty((height * width, 2), np.int64)
     piece = np.empty((MAX_CELLS, 2), np.int64)
     for r in range(1, height - 1):
-        if not any_above_zero(mark[r]):
-            continue
-        for c in range(1, width - 1):
+        line, marks = mark[r], np.uint8(0)
+        for c in range(width):  # a loop of its own becomes vector instructions
+            marks = np.uint8(marks | line[c])
+        for c in range(1, width - 1 if marks > 0 else 1):
             if mark[r, c] != 1:
                 continue
             size = _flood(mark, 1, 2, r, c, height * width, whole)
@@ -164,37 +168,27 @@ def _frontier_rows(box: Any, cost: Any, ways: Any, ignored: Any, row: int, col: 
                 num = _flood(mark, 2, 3, whole[k, 0], whole[k, 1], share, piece)
                 if num < MIN_CELLS:
                     continue
-                goal_row, goal_col = _goal_near(piece[:num], box, cost, mark)
-                if goal_row < 0:
+                row, col = _goal_near(piece[:num], box, cost, mark)
+                if row < 0:
                     continue
-                length, at = _path_length(ways, goal_row, goal_col), count
+                cell, length = row * width + col, 0.0
+                while before[cell] >= 0:
+                    step = abs(cell - before[cell])
+                    length += CELL if step == 1 or step == width else math.sqrt(2.0) * CELL
+                    cell = before[cell]
+                up = right = 0  # to the unknown cells around the goal
+                for i in range(max(row - SIGHT_CELLS, 0), min(row + SIGHT_CELLS + 1, height)):
+                    for j in range(max(col - SIGHT_CELLS, 0), min(col + SIGHT_CELLS + 1, width)):
+                        if box[i, j] == UNKNOWN:
+                            up, right = up + i - row, right + j - col
+                at = count
                 while at > 0 and found[at - 1, LENGTH] > length:
                     found[at] = found[at - 1]
                     at -= 1
-                found[at, 0] = (col + goal_col + 0.5) * CELL - HALF_WIDTH
-                found[at, 1] = (row + goal_row + 0.5) * CELL - HALF_WIDTH
-                found[at, HEADING] = _heading_to_unknown(box, goal_row, goal_col)
+                found[at, 0] = (first_col + col + 0.5) * CELL - HALF_WIDTH
+                found[at, 1] = (first_row + row + 0.5) * CELL - HALF_WIDTH
+                found[at, HEADING] = math.atan2(up, right)
                 found[at, SIZE] = num * CELL
                 found[at, LENGTH] = length
                 count += 1
     return found[:count]
-
-
-@jit
-def compute_frontiers(cells: Any, bounds: Any, row: int, col: int, reach: float, escape: int, ignored: Any) -> Any:
-    """Collect the frontiers to which a way is known.
-
-    Args:
-        cells: (300, 300) uint8. The grid, and how ways over it are looked for: see `dijkstra`.
-        bounds: (4,) int32.
-        row: Where the ways begin.
-        col: Likewise.
-        reach: [cells].
-        escape: [cells].
-        ignored: (300, 300) bool. Unknown cells that do not count.
-
-    Returns:
-        (n, 5) float64 rows (x, y, heading, size, length), by increasing length.
-    """
-    box, _, cost, ways, first_row, first_col = dijkstra(cells, bounds, row, col, reach, escape)
-    return _frontier_rows(box, cost, ways, ignored, first_row, first_col)

@@ -5,6 +5,8 @@ box along the texture's axes. One table of sums gives its mean exactly, at any d
 sub-columns, each of which meets one wall.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,7 +31,7 @@ def _nearest(slope: float, local: FloatArray, robots: FloatArray, radius: float)
         slope: Metres to the left per metre ahead.
         local: (n, 4) float64 [m]. Walls, camera frame (ahead, left).
         robots: (m, 2) float64 [m]. Discs, camera frame.
-        radius: Of these [m].
+        radius: Radius of these [m].
 
     Returns:
         Row of the wall (`NOTHING`: none, `ROBOT`: a disc first); metres ahead; and how far along the wall, in [0, 1],
@@ -92,13 +94,13 @@ def _fill_column(
     """Add `share` times the mean of each pixel of a sub-column to `out` (H,).
 
     Args:
-        sums: Of `WallTextures`.
-        begin: Where the face begins in it.
+        sums: (C, T + 1) int32. See `Faces`.
+        begin: First row of the face.
         first: Left end of what the sub-column covers [texels].
         last: Right end, greater [texels].
         top: Upper end of the first pixel [texels], from the ceiling down.
         step: Height of a pixel [texels].
-        share: Of this sub-column in its column.
+        share: Share of this sub-column in its column.
         cumulative: (T + 1,) float32. Room.
         out: (H,) float32.
     """
@@ -115,25 +117,33 @@ def _fill_column(
         cumulative[k] = between + g * right - f * left
     width = np.float32(last - first)
     scale = np.float32(share / ((last - first) * step))
-    y = top
-    before = _up_to(y, rows, width, cumulative)
-    for v in range(height):
-        y = top + step * (v + 1)
-        after = _up_to(y, rows, width, cumulative)
-        out[v] += scale * (after - before)
+    before = np.float32(0.0)
+    for v in range(height + 1):  # sums from the ceiling down to the upper end of each pixel
+        y = top + step * v
+        if y <= 0.0:
+            after = np.float32(y * width * CEILING)
+        elif y >= rows:
+            after = np.float32(cumulative[rows] + np.float32(y - rows) * width * FLOOR)
+        else:
+            k = int(y)
+            after = np.float32(cumulative[k] + np.float32(y - k) * (cumulative[k + 1] - cumulative[k]))
+        if v > 0:
+            out[v - 1] += scale * (after - before)
         before = after
 
 
-@device
-@simd
-def _up_to(y: float, rows: int, width: np.float32, cumulative: Float32Array) -> np.float32:
-    """Return the sum of a strip of `width` texels from the ceiling down to `y`; ceiling and floor have no texture."""
-    if y <= 0.0:
-        return np.float32(y * width * CEILING)
-    if y >= rows:
-        return np.float32(cumulative[rows] + np.float32(y - rows) * width * FLOOR)
-    k = int(y)
-    return np.float32(cumulative[k] + np.float32(y - k) * (cumulative[k + 1] - cumulative[k]))
+class Faces(NamedTuple):
+    """The pictures of the faces of S walls, see `WallTextures`.
+
+    Attributes:
+        sums: (C, T + 1) int32.
+        starts: (2 S,) int64.
+        columns: (2 S,) int64.
+    """
+
+    sums: NDArray[np.int32]
+    starts: IntArray
+    columns: IntArray
 
 
 @jit_fma
@@ -142,12 +152,8 @@ def render(
     indices: IntArray,
     robots: FloatArray,
     radius: float,
-    height: float,
     optics: FloatArray,
-    sums: NDArray[np.int32],
-    starts: IntArray,
-    columns: IntArray,
-    span: FloatArray,
+    faces: Faces,
     parts: int,
     out: Float32Array,
 ) -> None:
@@ -155,21 +161,17 @@ def render(
 
     Args:
         local: (n, 4) float64 [m]. Walls near the eye, camera frame (ahead, left).
-        indices: (n,) int64. Which walls these are.
+        indices: (n,) int64. Indices of these walls.
         robots: (m, 2) float64 [m]. Other robots, camera frame.
-        radius: Of these [m].
-        height: Of the camera above the reference height [m].
-        optics: (3,) float64 [px]. Focal length, column and row of the axis.
-        sums: Of `WallTextures`, as are the following two.
-        starts: (2 S,) int64.
-        columns: (2 S,) int64.
-        span: (2,) float64 [m]. Ceiling, height of a texel.
-        parts: Sub-columns of a column.
+        radius: Radius of these [m].
+        optics: (6,) float64. Focal length, column and row of the axis [px]; heights of the camera and of the ceiling
+            above the reference height, and height of a texel [m].
+        faces: Pictures of the walls.
+        parts: Number of sub-columns of a column.
         out: (W, H) float32, column after column. Grey levels without noise.
     """
-    focal, centre_x, centre_y = optics
-    ceiling, texel = span
-    rows = sums.shape[1] - 1
+    focal, centre_x, centre_y, height, ceiling, texel = optics
+    rows = faces.sums.shape[1] - 1
     cumulative = np.empty(rows + 1, dtype=np.float32)
     share = 1.0 / parts
     for column in range(out.shape[0]):
@@ -199,7 +201,7 @@ def render(
             x1, y1 = local[found, 0], local[found, 1]
             ex, ey = local[found, 2] - x1, local[found, 3] - y1
             face = 2 * indices[found] + (0 if ex * y1 - ey * x1 < 0.0 else 1)
-            texels = float(columns[face])
+            texels = float(faces.columns[face])
             ends = (0.0, 0.0)
             for side in range(2):
                 ray = -(left_edge + side * share - centre_x) / focal
@@ -213,7 +215,7 @@ def render(
                 last = first + 1e-3
             last = min(last, texels - 1e-6)
             first = min(first, last - 1e-3) if last - 1e-3 >= 0.0 else 0.0
-            _fill_column(sums, starts[face], first, last, top, per_pixel, share, cumulative, out[column])
+            _fill_column(faces.sums, faces.starts[face], first, last, top, per_pixel, share, cumulative, out[column])
 
 
 @simd

@@ -10,7 +10,7 @@ from slam_backend.core.read_only import as_read_only
 from slam_backend.core.validation import Float32Array, FloatArray, IntArray, check_float, check_int
 from slam_backend.frontend.images import Image
 from slam_backend.models.camera import StereoCamera
-from vslam_env.sensors.stereo._render_kernels import expose, render, trace
+from vslam_env.sensors.stereo._render_kernels import Faces, expose, render, trace
 from vslam_env.sensors.stereo.textures import WallTextures
 from vslam_env.world._kernels import walls_in_wedge
 from vslam_env.world.visibility import as_coordinate_rows
@@ -25,7 +25,7 @@ class ImagingConfig:
     Attributes:
         noise: Standard deviation of a pixel's noise, independent in each eye [grey levels].
         gain_sigma: Standard deviation of the exposure, drawn for each pair: a factor about 1, the same in both eyes.
-        eye_gain_sigma: Likewise of what the right eye differs by.
+        eye_gain_sigma: Standard deviation of the factor by which the right eye's exposure differs.
         blur_px: Standard deviation of a Gaussian blur before noise [px]; 0: none.
         parts: Sub-columns of a column.
     """
@@ -47,7 +47,7 @@ class Traced(NamedTuple):
 
     Attributes:
         walls: (n,) int64. Wall, -1: nothing, -2: a robot.
-        sides: (n,) int64. 0: its left face, seen from its beginning; 1: its right one.
+        sides: (n,) int64. 0: left face of the wall, seen from its beginning; 1: right face.
         depths: (n,) float64 [m]. Ahead of the camera; infinity where there is nothing.
         along: (n,) float64. How far along the wall, in [0, 1].
     """
@@ -68,8 +68,8 @@ class StereoRenderer:
         camera: Optics, mount and size of the images.
         imaging: Noise and exposure.
         walls: (S, 4) float64 [m], world frame.
-        textures: Of these walls.
-        robot_radius: [m].
+        textures: Textures of these walls.
+        robot_radius: Radius of the robots [m].
     """
 
     def __init__(
@@ -82,9 +82,10 @@ class StereoRenderer:
     ) -> None:
         self.camera, self.imaging, self.textures = camera, imaging, textures
         self._walls, self._radius = as_coordinate_rows(walls), robot_radius
-        self._optics = as_read_only(np.array([camera.focal_px, 0.5 * (camera.width - 1), 0.5 * (camera.height - 1)]))
+        lens = camera.focal_px, 0.5 * (camera.width - 1), 0.5 * (camera.height - 1)
         paint = textures.config
-        self._span = as_read_only(np.array([paint.ceiling, (paint.ceiling - paint.floor) / textures.rows]))
+        texel = (paint.ceiling - paint.floor) / textures.rows
+        self._optics = as_read_only(np.array([*lens, camera.mount[2], paint.ceiling, texel]))
         self._tan_half = (0.5 * camera.width + 1.0) / camera.focal_px
 
     def take(self, poses: FloatArray, robot: int, rng: np.random.Generator) -> tuple[Image, Image]:
@@ -114,22 +115,10 @@ class StereoRenderer:
         """Return the grey levels (W, H) float32, without noise, of an eye `shift` [m] to the right of the left one."""
         place = self._place(poses[robot], shift)
         local, indices = self._walls_ahead(place)
-        textures = self.textures
+        faces = Faces(self.textures.sums, self.textures.starts, self.textures.columns)
         radiance = np.empty((self.camera.width, self.camera.height), dtype=np.float32)
-        render(
-            local,
-            indices,
-            self._others(poses, robot, place),
-            self._radius,
-            self.camera.mount[2],
-            self._optics,
-            textures.sums,
-            textures.starts,
-            textures.columns,
-            self._span,
-            self.imaging.parts,
-            radiance,
-        )
+        others = self._others(poses, robot, place)
+        render(local, indices, others, self._radius, self._optics, faces, self.imaging.parts, radiance)
         blur = self.imaging.blur_px
         return radiance if blur == 0.0 else np.asarray(cv2.GaussianBlur(radiance, (0, 0), blur), dtype=np.float32)
 

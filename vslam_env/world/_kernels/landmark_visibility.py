@@ -25,170 +25,34 @@ def _hidden(x: float, y: float, dx: float, dy: float, own_wall: int, walls: Floa
     return False
 
 
-@device
-@in_place
-def _find_visible(
-    robot: int,
-    poses: FloatArray,
-    marks: FloatArray,
-    own_walls: IntArray,
-    walls: FloatArray,
-    robot_radius: float,
-    view: FloatArray,
-    near: FloatArray,
-    near_rows: IntArray,
-    rows: IntArray,
-) -> int:
-    """Find the landmarks that a robot's camera sees.
-
-    Args:
-        robot: Its row of the poses.
-        poses: As of `visible`, as what follows.
-        marks: (5, N) float64.
-        own_walls: (N,) int64.
-        walls: (4, S) float64.
-        robot_radius: [m].
-        view: (7,) float64.
-        near: (S, 4) float64. Room for the walls ahead.
-        near_rows: (S,) int64. Room for which they are.
-        rows: (N,) int64. Written to: their indices, in rising order.
-
-    Returns:
-        How many they are.
-    """
-    forward, aside, height, max_range, tan_half, tan_vertical, cos_incidence = view
-    c, s = np.cos(poses[robot, 2]), np.sin(poses[robot, 2])
-    eye_x, eye_y = poses[robot, 0] + c * forward - s * aside, poses[robot, 1] + s * forward + c * aside
-    num_near = walls_in_wedge(eye_x, eye_y, c, s, walls, tan_half + EPSILON, max_range, near, near_rows)
-    for n in range(marks.shape[1]):
-        dx, dy, dz = marks[0, n] - eye_x, marks[1, n] - eye_y, marks[2, n] - height
-        ahead, left = c * dx + s * dy, c * dy - s * dx
-        rows[n] = (ahead > TOUCH) & (abs(left) <= tan_half * ahead) & (abs(dz) <= tan_vertical * ahead)
-    count = 0
-    for n in rows[: indices_of_set(rows)]:
-        dx, dy, dz = marks[0, n] - eye_x, marks[1, n] - eye_y, marks[2, n] - height
-        ahead, left = c * dx + s * dy, c * dy - s * dx
-        distance = np.sqrt(dx * dx + dy * dy + dz * dz)
-        if distance > max_range or -(dx * marks[3, n] + dy * marks[4, n]) <= cos_incidence * distance:
-            continue
-        if _hidden(0.0, 0.0, ahead, left, own_walls[n], near[:num_near], near_rows):
-            continue
-        length = np.sqrt(ahead * ahead + left * left)
-        free = True
-        for j in range(len(poses)):
-            if j != robot and free:
-                ox, oy = poses[j, 0] - eye_x, poses[j, 1] - eye_y
-                x, y = c * ox + s * oy, c * oy - s * ox
-                free = ray_to_disc(ahead / length, left / length, x, y, robot_radius) >= length
-        if free:
-            rows[count] = n
-            count += 1
-    return count
-
-
-@device
-@jit
-def _visibility_workspace(num_walls: int, num_landmarks: int) -> tuple[FloatArray, IntArray, IntArray]:
-    """Return what `_find_visible` works in and writes to."""
-    return np.empty((num_walls, 4)), np.empty(num_walls, np.int64), np.empty(num_landmarks, np.int64)
-
-
-@jit
-def visible(
-    poses: FloatArray,
-    marks: FloatArray,
-    own_walls: IntArray,
-    walls: FloatArray,
-    robot_radius: float,
-    view: FloatArray,
-    seen: BoolArray,
-) -> None:
-    """Write down which landmarks each robot's camera sees.
-
-    A landmark is seen if it lies in range and in the image, if its face is seen at less than the largest incidence,
-    and if neither another wall nor another robot stands between. Its own wall does not hide it.
-
-    Args:
-        poses: (K, 3) float64 [m, m, rad], world frame. Robots.
-        marks: (5, N) float64, world frame. Positions [m] and normals [-] of the landmarks; by rows, for vector
-            instructions.
-        own_walls: (N,) int64. Index of the wall that carries each landmark.
-        walls: (4, S) float64 [m], world frame. By rows as well.
-        robot_radius: Of the other robots [m]; robots are as tall as their cameras.
-        view: (7,) float64. See `view_limits`.
-        seen: (K, N) bool. Written to.
-    """
-    seen[:] = False
-    near, near_rows, rows = _visibility_workspace(walls.shape[1], marks.shape[1])
-    for k in range(len(poses)):
-        count = _find_visible(k, poses, marks, own_walls, walls, robot_radius, view, near, near_rows, rows)
-        for n in rows[:count]:
-            seen[k, n] = True
-
-
-@device
-@in_place
-def choose_detected(
-    visible: IntArray, keys: FloatArray, detection_probability: float, places: int, chosen: IntArray
-) -> int:
-    """Detect landmarks and choose among the detected ones.
-
-    A landmark with a uniform key in [0, 1) is detected if the key is below the probability. The detected ones with the
-    smallest keys are then a uniform choice in uniformly random order.
-
-    Args:
-        visible: (n,) int64. Indices of visible landmarks.
-        keys: (N,) float64, uniform. Of all landmarks.
-        detection_probability: Of a visible landmark.
-        places: How many may be chosen.
-        chosen: (at least places,) int64. Written to: the chosen landmarks.
-
-    Returns:
-        How many are chosen.
-    """
-    count = 0
-    for n in visible:
-        if keys[n] >= detection_probability:
-            continue
-        if count < places:
-            at = count
-            count += 1
-        elif count > 0 and keys[n] < keys[chosen[count - 1]]:
-            at = count - 1
-        else:
-            continue
-        while at > 0 and keys[chosen[at - 1]] > keys[n]:
-            chosen[at] = chosen[at - 1]
-            at -= 1
-        chosen[at] = n
-    return count
-
-
 @jit
 def detect(
     poses: FloatArray,
-    marks: FloatArray,
-    own_walls: IntArray,
-    walls: FloatArray,
-    robot_radius: float,
-    view: FloatArray,
+    sight: tuple[FloatArray, IntArray, FloatArray, float, FloatArray],
     keys: FloatArray,
     detection_probability: float,
     num_false: IntArray,
     chosen: IntArray,
     counts: IntArray,
 ) -> tuple[int, int]:
-    """Choose among the landmarks that each camera sees and detects.
+    """Choose among the landmarks that each robot's camera sees and detects.
+
+    A landmark is seen if it lies in range and in the image, if its face is seen at less than the largest incidence,
+    and if neither another wall nor another robot stands between. Its own wall does not hide it. With a uniform key in
+    [0, 1) it is detected if the key is below the probability. The detected landmarks with the smallest keys are then a
+    uniform choice in uniformly random order.
 
     Args:
-        poses: (K, 3) float64. As of `visible`, as what follows.
-        marks: (5, N) float64.
-        own_walls: (N,) int64.
-        walls: (4, S) float64.
-        robot_radius: [m].
-        view: (7,) float64.
-        keys: (K, N) float64, uniform. See `choose`.
-        detection_probability: Likewise.
+        poses: (K, 3) float64 [m, m, rad], world frame. Robots.
+        sight: What decides which landmarks cameras see, wherever they are:
+            (5, N) float64, world frame. Positions [m] and normals [-] of the landmarks; by rows, for vector
+            instructions.
+            (N,) int64. Index of the wall that carries each landmark.
+            (4, S) float64 [m], world frame. Walls, by rows as well.
+            Radius of the robots [m]; they are as tall as their cameras.
+            (7,) float64. See `view_limits`.
+        keys: (K, N) float64, uniform. Key of each landmark for each robot.
+        detection_probability: Probability that a visible landmark is detected.
         num_false: (K,) int64. Places that false points take in the frame of each robot; changed to B where larger.
         chosen: (K, B) int64. Written to: the chosen landmarks of each robot.
         counts: (K,) int64. Written to: how many they are.
@@ -196,14 +60,48 @@ def detect(
     Returns:
         How many are chosen in all, and how many false points there are.
     """
-    near, near_rows, rows = _visibility_workspace(walls.shape[1], marks.shape[1])
+    marks, own_walls, walls, robot_radius, limits = sight
+    forward, aside, height, max_range, tan_half, tan_vertical, cos_incidence = limits
+    near, near_rows = np.empty((walls.shape[1], 4)), np.empty(walls.shape[1], np.int64)
+    rows = np.empty(marks.shape[1], np.int64)
     total = extra = 0
     for k in range(len(poses)):
-        count = _find_visible(k, poses, marks, own_walls, walls, robot_radius, view, near, near_rows, rows)
+        c, s = np.cos(poses[k, 2]), np.sin(poses[k, 2])
+        eye_x, eye_y = poses[k, 0] + c * forward - s * aside, poses[k, 1] + s * forward + c * aside
+        num_near = walls_in_wedge(eye_x, eye_y, c, s, walls, tan_half + EPSILON, max_range, near, near_rows)
+        for n in range(marks.shape[1]):
+            dx, dy, dz = marks[0, n] - eye_x, marks[1, n] - eye_y, marks[2, n] - height
+            ahead, left = c * dx + s * dy, c * dy - s * dx
+            rows[n] = (ahead > TOUCH) & (abs(left) <= tan_half * ahead) & (abs(dz) <= tan_vertical * ahead)
+
         num_false[k] = min(num_false[k], chosen.shape[1])
-        places = chosen.shape[1] - num_false[k]
-        counts[k] = choose_detected(rows[:count], keys[k], detection_probability, places, chosen[k])
-        total, extra = total + counts[k], extra + num_false[k]
+        places, count, own_keys, own = chosen.shape[1] - num_false[k], 0, keys[k], chosen[k]
+        for n in rows[: indices_of_set(rows)]:
+            is_worse = count == places and (count == 0 or own_keys[n] >= own_keys[own[count - 1]])
+            if own_keys[n] >= detection_probability or is_worse:
+                continue
+            dx, dy, dz = marks[0, n] - eye_x, marks[1, n] - eye_y, marks[2, n] - height
+            ahead, left = c * dx + s * dy, c * dy - s * dx
+            distance = np.sqrt(dx * dx + dy * dy + dz * dz)
+            if distance > max_range or -(dx * marks[3, n] + dy * marks[4, n]) <= cos_incidence * distance:
+                continue
+            if _hidden(0.0, 0.0, ahead, left, own_walls[n], near[:num_near], near_rows):
+                continue
+            length, free = np.sqrt(ahead * ahead + left * left), True
+            for j in range(len(poses)):
+                if j != k and free:
+                    ox, oy = poses[j, 0] - eye_x, poses[j, 1] - eye_y
+                    x, y = c * ox + s * oy, c * oy - s * ox
+                    free = ray_to_disc(ahead / length, left / length, x, y, robot_radius) >= length
+            if free:
+                count = min(count + 1, places)
+                at = count - 1
+                while at > 0 and own_keys[own[at - 1]] > own_keys[n]:
+                    own[at] = own[at - 1]
+                    at -= 1
+                own[at] = n
+        counts[k] = count
+        total, extra = total + count, extra + num_false[k]
     return total, extra
 
 
@@ -231,7 +129,7 @@ def observable_anywhere(
         reachable: (H, W) bool, row = y upwards. Cells in which a robot can stand.
         origin: (2,) float64 [m], world frame. Lower left corner of cell (0, 0).
         cell: Side of a cell [m].
-        view: As in `visible`.
+        view: (7,) float64. See `view_limits`.
 
     Returns:
         (N,) bool.

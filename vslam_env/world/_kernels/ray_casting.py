@@ -41,13 +41,13 @@ def walls_in_wedge(
     none that matters is lost.
 
     Args:
-        x: Where the wedge begins [m], world frame.
-        y: Likewise.
-        cosine: Of the direction of its axis.
-        sine: Likewise.
+        x: Apex of the wedge [m], world frame.
+        y: See `x`.
+        cosine: Cosine of the direction of its axis.
+        sine: Sine of the direction of its axis.
         walls: (4, S) float64 [m], world frame. By rows, for vector instructions.
         tan_half: The wedge opens by +-atan of this around its axis; <= 0 stands for all round.
-        reach: Its length [m].
+        reach: Length of the wedge [m].
         near: (S, 4) float64 [m], in the frame of the wedge. Written to: the ends of these walls, one after the other.
         rows: (S,) int64. Written to: their indices.
 
@@ -96,19 +96,6 @@ def ray_to_disc(dx: float, dy: float, x: float, y: float, radius: float) -> floa
 
 
 @jit
-def rays_at(angles: FloatArray) -> tuple[FloatArray, float]:
-    """Return unit vectors (2, R) at angles (R,) [rad], and the tangent of the wedge that holds them all.
-
-    The wedge is that of `walls_in_wedge`; the tangent is 0, for all round, where it is not much less than a half plane.
-    """
-    rays = np.empty((2, len(angles)))
-    for r in range(len(angles)):
-        rays[0, r], rays[1, r] = np.cos(angles[r]), np.sin(angles[r])
-    widest = np.max(np.abs(angles))
-    return rays, np.tan(widest) + EPSILON if widest < 1.5 else 0.0
-
-
-@jit
 def cast_scans(
     poses: FloatArray,
     rays: FloatArray,
@@ -123,9 +110,9 @@ def cast_scans(
 
     Args:
         poses: (K, 3) float64 [m, m, rad], world frame.
-        rays, tan_half: Of `rays_at`, robot frame. The same for all robots.
+        rays, tan_half: (2, R) float64 and float. As `ray_fan` returns them, the same for all robots.
         walls: (4, S) float64 [m], world frame. See `walls_in_wedge`.
-        robot_radius: Of the other robots, which stop rays [m].
+        robot_radius: Radius of the other robots, which stop rays [m].
         max_range: Where rays end [m]; what ends there is read without error.
         sigma: Standard deviation of a reading, as a share of the distance.
         ranges: (K, R) float64. Standard normal draws; the readings [m], from 0 to `max_range`, take their places.
