@@ -20,8 +20,8 @@ CONFIGURATIONS = (
     OdometryNoise, ScanConfig, StereoSensorConfig, TextureConfig,
 )  # fmt: skip
 RECORDS = (
-    RobotCounts, RobotMetrics, GridSnapshot, GridUpdate, Landmarks, StereoFrame, StereoMatches, TeamMetrics, TeamReadings,
-    TeamRenderedFrames, TeamSensorFrames, WallTextures, World,
+    RobotCounts, RobotMetrics, GridSnapshot, GridUpdate, Landmarks, StereoFrame, StereoMatches, TeamMetrics,
+    TeamReadings, TeamRenderedFrames, TeamSensorFrames, WallTextures, World,
 )  # fmt: skip
 
 
