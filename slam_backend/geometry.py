@@ -77,7 +77,7 @@ def _compose_one(a: list[float], b: list[float]) -> FloatArray:
 
 
 def _inverse_one(a: list[float]) -> FloatArray:
-    """Turn one motion (3,) around, as `inverse` does, likewise."""
+    """Turn one motion (3,) around, as `inverse` does, without the cost of arrays."""
     c, s = math.cos(a[2]), math.sin(a[2])
     return np.array([-c * a[0] - s * a[1], s * a[0] - c * a[1], (math.pi - a[2]) % (2.0 * math.pi) - math.pi])
 

@@ -19,9 +19,6 @@ from slam_backend.metrics.maps import map_error
 from slam_backend.models.camera import StereoCamera
 from slam_backend.models.measurements import Measurements, TeamMeasurements
 from slam_backend.smoother import gauge as holding
-from slam_backend.smoother._kernels import recent_key_mask
-from slam_backend.smoother.graph import SlamGraph
-from slam_backend.smoother.graph_building import InitialPoses
 from slam_backend.smoother.options import SmoothingOptions
 from slam_backend.smoother.reassociation import find_only
 from slam_backend.smoother.sampling import retract_on_se2
@@ -126,13 +123,8 @@ def run_all_paths(extras: Collection[str]) -> float:
         root.setflags(write=False)
         are_linked(root, root)
         retract_on_se2(np.zeros((1, 3)), root, np.zeros((1, 3, 1)))
-        SlamGraph.at_starts(np.zeros((1, 3))).resolve_ids(names)  # of groups that merge
-        InitialPoses.empty().at(root)  # of what was refused
         inverse(np.zeros((2, 3)))  # of starts that are held
         find_only(points, descriptors, points, descriptors, 1.0, 1.0, names.copy())
-        recent_key_mask(
-            root, root[:0], 1, 1, np.empty(1, dtype=np.bool_), np.empty(1, dtype=np.bool_)
-        )  # and contradicted
         holding.move(np.zeros((1, 3, 1)), np.zeros((1, 3)), np.zeros((1, 3, 1)))  # of starts that are sought
         team = TeamSlam(2, num_particles=4, attempts=AttemptOptions(every=1), merging=MergeOptions(watch_every=1))
         for _ in range(STEPS):

@@ -30,8 +30,7 @@ def match_rows(
         left_descriptors: (n, d) float32.
         right_descriptors: (m, d) float32.
         row_tolerance: Largest difference of rows [px].
-        least_disparity: Of left minus right columns [px].
-        largest_disparity: Likewise [px].
+        least_disparity, largest_disparity: Bounds on left minus right columns [px].
         ceiling: Largest squared L2 distance of descriptors [-].
 
     Returns:
@@ -73,7 +72,6 @@ def _align_patch(
     row: int,
     start_x: float,
     start_y: float,
-    half: int,
     iterations: int,
     patches: Float32Array,
     sums: Float32Array,
@@ -87,21 +85,18 @@ def _align_patch(
     Args:
         source: (H, W) uint8.
         target: (H, W) uint8.
-        column: Of the patch.
-        row: Likewise.
-        start_x: Where to begin in `target` [px].
-        start_y: Likewise.
-        half: The patch is 2 `half` + 1 pixels wide.
-        iterations: At most so many.
-        patches: (3, side, side) float32. Room for the template and its two slopes.
+        column, row: Centre of the patch [px].
+        start_x, start_y: Where to begin in `target` [px].
+        iterations: Limit of their number.
+        patches: (3, side, side) float32. Room for the template and its two slopes; the side is odd.
         sums: (6, side) float32. Room.
 
     Returns:
         Column and row in `target` and the correlation of the patches; correlation -1 where the patch leaves an image
         or has no contrast.
     """
-    side = 2 * half + 1
-    count = side * side
+    side = patches.shape[1]
+    half, count = side // 2, side * side
     left, top = column - half, row - half
     if left < 1 or top < 1 or left + side >= source.shape[1] or top + side >= source.shape[0]:
         return start_x, start_y, -1.0
@@ -194,7 +189,7 @@ def refine(
         left: (n, 2) float64 [px]. Corners.
         right: (n, 2) float64 [px]. Their partners.
         half: Patches are 2 `half` + 1 pixels wide.
-        iterations: At most so many for each way.
+        iterations: Limit of their number for each way.
 
     Returns:
         (n, 6) float64: disparity and row difference (right minus left) by the way forward [px]; the same by the way
@@ -213,7 +208,6 @@ def refine(
             row,
             column + right[n, 0] - left[n, 0],
             row + right[n, 1] - left[n, 1],
-            half,
             iterations,
             patches,
             sums,
@@ -230,7 +224,6 @@ def refine(
             row,
             column + found[n, 0],
             row - found[n, 1],
-            half,
             iterations,
             patches,
             sums,

@@ -116,22 +116,11 @@ def grid_order(points: FloatArray, quality: FloatArray, cell: float) -> IntArray
     """
     best_first = np.argsort(-quality, kind="stable")
     squares = np.floor(points[best_first] / cell).astype(np.int64)
-    if len(squares):
-        squares -= squares.min(axis=0)
-    ranks = _ranks(squares)
-    return np.asarray(best_first[np.argsort(ranks, kind="stable")])
-
-
-@jit
-def _ranks(squares: IntArray) -> IntArray:
-    """Return how many rows before each one of (n, 2), whose numbers are not negative, equal it."""
+    _, cells, sizes = np.unique(squares, axis=0, return_inverse=True, return_counts=True)
+    by_cell = np.argsort(cells, kind="stable")
     ranks = np.empty(len(squares), dtype=np.int64)
-    if len(squares):
-        seen = np.zeros((squares[:, 0].max() + 1, squares[:, 1].max() + 1), dtype=np.int64)
-        for n in range(len(squares)):
-            ranks[n] = seen[squares[n, 0], squares[n, 1]]
-            seen[squares[n, 0], squares[n, 1]] += 1
-    return ranks
+    ranks[by_cell] = np.arange(len(squares)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+    return np.asarray(best_first[np.argsort(ranks, kind="stable")])
 
 
 @jit

@@ -26,6 +26,7 @@ from slam_backend.maps.verification import (
     one_to_one,
     principal_extent,
     runner_up_ratio,
+    unexplained,
     worst_bound,
 )
 from slam_backend.metrics import align_se2
@@ -133,7 +134,7 @@ def align_maps(
         return Alignment.refused("mirrored", ratio)
     if principal_extent(points_b) < options.min_spread:
         return Alignment.refused("poorly spread", ratio)
-    contradiction = kernels.reduced_chi2(table, members, pose, variance)
+    contradiction = unexplained(table, members, pose, variance)
     covariance = covariance_of(kernels.information(table, members, pose, variance)[0] / contradiction)
     influence = kernels.largest_influence(table, members, pose, variance)
     missed, excess = worst_bound(covariance, influence, options)
@@ -220,7 +221,7 @@ def _propose(
         return proposals.clique_estimate(table, matches, unlike, floor, gate)
     if method == "impicp":
         return proposals.improved_icp(map_a, map_b, matches, table, floor, gate)
-    fit = align_se2(table[:, :2], table[:, 3:5])
+    fit = align_se2(*kernels.planar_points(table))
     return fit if method == "svd" else proposals.icp(map_a, map_b, fit)
 
 

@@ -5,7 +5,6 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.core.packed_symmetric import OF_NINE
 from slam_backend.core.validation import BoolArray, Float32Array, FloatArray, IntArray, argument_error
 from slam_backend.maps import _kernels as kernels
 from slam_backend.maps._kernels import descriptor_matching
@@ -74,14 +73,10 @@ def match_table(map_a: LandmarkMap, map_b: LandmarkMap, matches: IntArray) -> Fl
         matches: (k, 2) int64 rows (row in a, row in b).
 
     Returns:
-        (k, 18) float64: means of a and b [m], upper triangles of their covariances [m^2], each in its map's frame.
+        (k, 18) float64, see `_kernels.match_table`.
     """
-    table = np.empty((len(matches), kernels.MATCH_COLUMNS))
-    for offset, source, rows in ((0, map_a, matches[:, 0]), (1, map_b, matches[:, 1])):
-        packed = source.covariances[rows].reshape(-1, 9).take(OF_NINE, axis=1)
-        table[:, 3 * offset : 3 * offset + 3] = source.means[rows]
-        table[:, 6 + 6 * offset : 12 + 6 * offset] = packed
-    return table
+    a, b = matches.T
+    return kernels.table_of(map_a.means[a], map_a.covariances[a], map_b.means[b], map_b.covariances[b])
 
 
 Scalar = TypeVar("Scalar", bound=np.generic)
@@ -101,12 +96,12 @@ def similar_pairs(a: Float32Array, b: Float32Array, gate: float, most: int) -> I
     """
     if not len(a) or not len(b):
         return np.empty((0, 2), np.int64)
-    return descriptor_matching.similar_pairs(_fresh(a), _fresh(b.T), gate * gate, most)
+    return descriptor_matching.alike(_fresh(a), _fresh(b.T), gate * gate, most)[0]
 
 
 def count_similar(a: Float32Array, b: Float32Array, gate: float) -> int:
     """Return how many pairs of descriptors (n, d) and (m, d) are no farther apart than `gate`."""
-    return descriptor_matching.count_similar(_fresh(a), _fresh(b.T), gate * gate) if len(a) and len(b) else 0
+    return descriptor_matching.alike(_fresh(a), _fresh(b.T), gate * gate, 0)[1] if len(a) and len(b) else 0
 
 
 def mutual_nearest(a: Float32Array, b: Float32Array, gate: float) -> IntArray:

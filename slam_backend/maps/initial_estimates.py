@@ -4,7 +4,7 @@
 closest, with far pairs left out as by Zhang (1994), because maps overlap only in part. `impicp` is the improved ICP of
 Ballesta et al. (2010), of which we know only the idea: two starts from two sets of matches, the better end is kept.
 `gnc` is graduated non-convexity with truncated least squares (Yang, Antonante, Tzoumas and Carlone 2020). `clique` is
-the largest set of candidates that agree pairwise (`_clique_kernels`).
+the largest set of candidates that agree pairwise (`_kernels.max_clique`).
 """
 
 import numpy as np
@@ -70,9 +70,9 @@ def gnc_tls(table: FloatArray, floor: float, gate: float) -> FloatArray:
         floor: Variance added to each residual [m^2].
         gate: Squared residual c^2, in units of its variance, beyond which a match counts no more.
     """
-    a, b = table[:, :2], table[:, 3:5]
+    a, b = kernels.planar_points(table)
     # The solver inside is a closed form, which asks for one variance per match in place of a covariance.
-    variance = 0.5 * (table[:, 6] + table[:, 9] + table[:, 12] + table[:, 15]) + floor
+    variance = kernels.planar_variances(table) + floor
     weights = np.ones(len(table))
     pose = align_se2(a, b, weights / variance)
     squares = _squares(pose, a, b, variance)
@@ -106,7 +106,7 @@ def clique_estimate(table: FloatArray, matches: IntArray, unlike: FloatArray, fl
     chosen = np.sort(np.argsort(unlike, kind="stable")[:MOST_IN_GRAPH])
     agrees = cliques.agreement(table[chosen], matches[chosen], floor, gate)
     members = chosen[cliques.largest_clique(agrees, MAX_NODES)]
-    return align_se2(table[members, :2], table[members, 3:5])
+    return align_se2(*kernels.planar_points(table[members]))
 
 
 def _squares(pose: FloatArray, a: FloatArray, b: FloatArray, variance: FloatArray) -> FloatArray:

@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 
-from slam_backend.core.packed_symmetric import UNPACK_INDEX, UPPER
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.geometry import transform_points, wrap_angle
 from slam_backend.maps import _kernels as kernels
@@ -67,7 +66,7 @@ def _chance(
     table: FloatArray, landmarks: LandmarkMap, matches: IntArray, size: int, variance: float, options: AlignmentOptions
 ) -> float:
     """Return the mean probability that a landmark has a look-alike near where some motion takes it, by chance."""
-    spread = (table[:, 6] + table[:, 9] + table[:, 12] + table[:, 15]) / 2.0 + variance
+    spread = kernels.planar_variances(table) + variance
     area = np.prod(np.ptp(landmarks.means[:, :2], axis=0))
     share = np.minimum(np.pi * options.position_gate * spread / max(area, 1e-9), 1.0)
     owners = np.unique(matches[:, 0], return_inverse=True)[1]
@@ -125,10 +124,10 @@ def is_chance_alignment(
     from scipy.special import bdtrc
 
     inside = inlier_mask(table, matches, pose, variance, options.position_gate)
-    spread = (table[:, 6] + table[:, 9] + table[:, 12] + table[:, 15]) / 2.0 + variance
+    spread = kernels.planar_variances(table) + variance
     reach = np.sqrt(options.position_gate * spread)
     if options.appearance:
-        moved = transform_points(pose, table[:, 3:5])
+        moved = transform_points(pose, kernels.planar_points(table)[1])
         near = KDTree(map_a.means[:, :2]).query_ball_point(moved, reach, return_length=True)
         fitted = np.isin(matches[:, 1], matches[inside, 1])  # one of those near is the partner found, not chance
         share = (np.asarray(near, dtype=np.float64) - fitted).clip(min=0.0) / len(map_a)
@@ -174,13 +173,10 @@ def is_mirrored(
 
     The one wall of a mirrored corridor fits a motion, too; but then all the rest fits the image.
     """
-    points = table[inside, 3:5]
+    points = kernels.planar_points(table)[1][inside]
     centre = points.mean(axis=0)
-    x, y = np.linalg.eigh((points - centre).T @ (points - centre))[1][:, -1].tolist()
-    mirror = np.array([[2.0 * x * x - 1.0, 2.0 * x * y, 0.0], [2.0 * x * y, 2.0 * y * y - 1.0, 0.0], [0.0, 0.0, 1.0]])
-    image = table.copy()
-    image[:, 3:5] = centre + (table[:, 3:5] - centre) @ mirror[:2, :2]
-    image[:, 12:] = (mirror @ table[:, 12:][:, UNPACK_INDEX] @ mirror)[:, *UPPER]
+    axis = np.linalg.eigh((points - centre).T @ (points - centre))[1][:, -1]
+    image = kernels.mirrored(table, centre, axis)
     fits = inlier_mask(image, matches, pose, options.position_floor**2, options.position_gate)
     more = np.count_nonzero(fits & ~inside) - np.count_nonzero(inside & ~fits)
     share = min(OF_INLIERS * np.count_nonzero(inside), OF_REST * np.count_nonzero(~inside))
@@ -202,6 +198,19 @@ def principal_extent(points: FloatArray) -> float:
     centred = points - points.mean(axis=0)
     main_axis = np.linalg.eigh(centred.T @ centred)[1][:, -1]
     return float(np.ptp(centred @ main_axis))
+
+
+def unexplained(table: FloatArray, members: BoolArray, pose: FloatArray, floor: float) -> float:
+    """Return by how much, at least 1, the members' median D exceeds that of 3 degrees of freedom (a Birge ratio).
+
+    Above 1 only by chance, and where covariances are more over-confident than any variance that may be added explains.
+    """
+    k = np.count_nonzero(members)
+    if k < 2:
+        return 1.0
+    median = np.median(kernels.squared_distances(table[members], pose, floor))
+    ratio = float(median / (kernels.MEDIAN_CHI2_3 * (1.0 - 1.0 / k)))
+    return ratio if ratio > 1.0 + kernels.CHANCE_EXCESS / math.sqrt(k) else 1.0
 
 
 def covariance_of(h: FloatArray) -> FloatArray | None:

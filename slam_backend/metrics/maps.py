@@ -50,13 +50,13 @@ class MapScore:
 
 @jit
 def _nearest_claimants(
-    means: FloatArray, claims: IntArray, truths: FloatArray
-) -> tuple[FloatArray, IntArray, int, int]:
-    """Return who holds each truth and what is too much.
+    means: FloatArray, claims: IntArray, truths: FloatArray, cutoff: float
+) -> tuple[IntArray, float, int]:
+    """Return who holds each truth, and how wrong the map is.
 
-    That is, per truth the least squared distance of a claimant (inf: none) and its index (-1: none); the number of
-    false estimates and of those whose truth a nearer claimant holds; and the first row that is not finite or claims
-    what does not exist (-1: none).
+    That is, per truth the index of the nearest claimant (-1: none); the sum under the root of the map error E, in which
+    false estimates and those whose truth a nearer claimant holds count as surplus; and the first row that is not finite
+    or claims what does not exist (-1: none).
     """
     least, holder = np.full(len(truths), np.inf), np.full(len(truths), -1)
     surplus = 0
@@ -64,7 +64,7 @@ def _nearest_claimants(
         claim = claims[i]
         finite = math.isfinite(means[i, 0]) and math.isfinite(means[i, 1]) and math.isfinite(means[i, 2])
         if not finite or claim >= len(truths) or claim < UNCOUNTED:
-            return least, holder, surplus, i
+            return holder, np.nan, i
         if claim == FALSE:
             surplus += 1
         elif claim >= 0:
@@ -75,17 +75,11 @@ def _nearest_claimants(
                 surplus += 1
             if distance < least[claim]:
                 least[claim], holder[claim] = distance, i
-    return least, holder, surplus, -1
-
-
-@jit
-def _map_error(least: FloatArray, surplus: int, cutoff: float) -> float:
-    """Return E from the squared distances of the holders (inf: missed) and the number of surplus estimates."""
     squared = cutoff * cutoff
     total = 0.5 * squared * surplus
     for square in least:
         total += 0.5 * squared if square == np.inf else min(square, squared)
-    return math.sqrt(total / len(least))
+    return holder, total, -1
 
 
 def map_error(means: FloatArray, claims: IntArray, true_positions: FloatArray, cutoff: float = 1.0) -> float:
@@ -109,32 +103,32 @@ def map_error(means: FloatArray, claims: IntArray, true_positions: FloatArray, c
     >>> map_error(np.array([[0.0, 0.6, 0.0]]), np.array([0]), np.array([[0.0, 0.0, 0.0]]))
     0.6
     """
-    least, _, surplus = _claimed(means, claims, true_positions)
+    holder, total = _claimed(means, claims, true_positions, float(cutoff))
     if not cutoff > 0.0:
         raise argument_error("cutoff", "a number > 0", cutoff, "Give the cutoff distance in metres.")
-    if not len(least):
+    if not len(holder):
         raise argument_error(
             "true_positions", "at least one landmark", "an array of none", "Use a world with landmarks."
         )
-    return _map_error(least, surplus, cutoff)
+    return math.sqrt(total / len(holder))
 
 
-def _claimed(means: FloatArray, claims: IntArray, truths: FloatArray) -> tuple[FloatArray, IntArray, int]:
-    """Check the arrays cheaply and return `_nearest_claimants` of them."""
+def _claimed(means: FloatArray, claims: IntArray, truths: FloatArray, cutoff: float) -> tuple[IntArray, float]:
+    """Check the arrays cheaply and return what `_nearest_claimants` says of them."""
     means, truths = np.ascontiguousarray(means, np.float64), np.ascontiguousarray(truths, np.float64)
     claims = np.ascontiguousarray(claims, np.int64)
     if means.shape != (len(claims), 3):
         raise argument_error("means", f"an array of shape ({len(claims)}, 3)", f"shape {means.shape}", "One per claim.")
     if truths.ndim != 2 or truths.shape[1] != 3:
         raise argument_error("true_positions", "an array of shape (N, 3)", f"shape {truths.shape}", "One row each.")
-    least, holder, surplus, bad = _nearest_claimants(means, claims, truths)
+    holder, total, bad = _nearest_claimants(means, claims, truths, cutoff)
     if bad >= 0:
         if not np.isfinite(means[bad]).all():
             cure = "Drop landmarks that are not finite."
             raise argument_error("means", "finite numbers", f"NaN or infinity in row {bad}", cure)
         expected = f"indices below {len(truths)}, -1 for false or -2 for uncounted ones"
         raise argument_error("claims", expected, int(claims[bad]), "Claim landmarks that exist.")
-    return least, holder, surplus
+    return holder, total
 
 
 def gospa(
@@ -220,7 +214,7 @@ def map_rmse(estimates: ArrayLike, truths: ArrayLike, claims: ArrayLike | None =
         matched = np.column_stack([rows[near], columns[near]]).astype(np.int64)
     else:
         named = check_array("claims", claims, (len(means),), "Give one claim per estimate.", dtype=np.int64)
-        holder = _claimed(means, named, true)[1]
+        holder = _claimed(means, named, true, float(gate))[0]
         held = np.flatnonzero(holder >= 0)
         matched = np.column_stack([holder[held], held])
         uncounted = int(np.count_nonzero(named == UNCOUNTED))

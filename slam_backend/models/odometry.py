@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam_backend.core.jit import in_place
 from slam_backend.core.validation import FloatArray, check_float, known_names
 from slam_backend.geometry import compose
 
@@ -61,8 +60,11 @@ class OdometryModel:
     def variances(self, odometry: FloatArray) -> FloatArray:
         """Return the variances (n, 3) [m^2, m^2, rad^2] of n odometry readings (n, 3), previous robot frames."""
         result = np.empty((len(odometry), 3))
-        grown = self.sigma_along**2, self.sigma_across**2, self.sigma_heading**2
-        _write_variances(odometry, *grown, self.sigma_turn, self.floor_position**2, self.floor_heading**2, result)
+        dx, dy, turn = odometry[:, 0], odometry[:, 1], self.sigma_turn * odometry[:, 2]
+        square = dx * dx + dy * dy
+        result[:, 0] = self.sigma_along**2 * square + self.floor_position**2
+        result[:, 1] = self.sigma_across**2 * square + self.floor_position**2
+        result[:, 2] = self.sigma_heading**2 * square + turn * turn + self.floor_heading**2
         return result
 
     def sample(self, poses: FloatArray, odometry: FloatArray, rng: np.random.Generator) -> FloatArray:
@@ -78,17 +80,3 @@ class OdometryModel:
         """
         noise = rng.standard_normal((len(poses), 3)) * self.sigmas(odometry)
         return compose(poses, odometry + noise)  # Eq. 4
-
-
-@in_place
-def _write_variances(
-    odometry: FloatArray, along: float, across: float, heading: float, sigma_turn: float, floor_position: float,
-    floor_heading: float, result: FloatArray,
-) -> None:  # fmt: skip
-    """Write the variances (n, 3) of readings (n, 3); all but the sigma of turns are squares of what the model has."""
-    for n in range(len(odometry)):
-        dx, dy, turn = odometry[n, 0], odometry[n, 1], sigma_turn * odometry[n, 2]
-        square = dx * dx + dy * dy
-        result[n, 0] = along * square + floor_position
-        result[n, 1] = across * square + floor_position
-        result[n, 2] = heading * square + turn * turn + floor_heading

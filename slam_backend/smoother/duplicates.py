@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.core.blas import single_threaded_blas
-from slam_backend.core.jit import inline, jit
+from slam_backend.core.jit import jit
 from slam_backend.core.packed_symmetric import UNPACK_INDEX
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.smoother.graph import SlamGraph
@@ -42,29 +42,6 @@ def find_duplicates(
     return np.array(rows, dtype=np.int64).reshape(-1, 2)
 
 
-@inline
-def _squared_distance(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
-    """Return the squared L2 distance of two descriptors (d,)."""
-    total = 0.0
-    for i in range(len(a)):
-        total += (a[i] - b[i]) * (a[i] - b[i])
-    return total
-
-
-@inline
-def _apart(a: IntArray, b: IntArray) -> bool:
-    """Return whether two ascending rows, have elements, and none in common."""
-    i, j = 0, 0
-    while i < len(a) and j < len(b):
-        if a[i] == b[j]:
-            return False
-        if a[i] < b[j]:
-            i += 1
-        else:
-            j += 1
-    return len(a) > 0 and len(b) > 0
-
-
 @jit
 def similar_pairs(
     order: IntArray, landmarks: FloatArray, descriptors: NDArray[np.float32], keys: IntArray, starts: IntArray,
@@ -91,9 +68,20 @@ def similar_pairs(
                 break
             if dx * dx + dy * dy + dz * dz > reach * reach:
                 continue
-            if not _squared_distance(descriptors[a], descriptors[b]) <= gate * gate:
+            square = 0.0
+            for k in range(descriptors.shape[1]):
+                square += (descriptors[a, k] - descriptors[b, k]) * (descriptors[a, k] - descriptors[b, k])
+            if not square <= gate * gate:
                 continue
-            if _apart(keys[starts[a] : starts[a + 1]], keys[starts[b] : starts[b + 1]]):
+            p, q = starts[a], starts[b]
+            apart = p < starts[a + 1] and q < starts[b + 1]
+            while apart and p < starts[a + 1] and q < starts[b + 1]:
+                apart = keys[p] != keys[q]
+                if keys[p] < keys[q]:
+                    p += 1
+                else:
+                    q += 1
+            if apart:
                 if num == len(pairs):
                     pairs = np.concatenate((pairs, np.empty_like(pairs)))
                 pairs[num, 0], pairs[num, 1] = a, b

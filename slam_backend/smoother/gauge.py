@@ -17,7 +17,7 @@ from slam_backend.core.jit import device, in_place, jit, simd, stack_array
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.geometry import between, wrap_angle
 from slam_backend.smoother._kernels import LANES
-from slam_backend.smoother.graph import LEVER_ARM
+from slam_backend.smoother.graph import LEVER
 
 XX, YY = 3, 6  # rows of a tile: variances of a landmark in the plane
 MIN_SHARED = 2  # landmarks that say how a particle is turned
@@ -57,10 +57,8 @@ def fix_gauge(
     """
     if len(seen) < MIN_SHARED:
         return None
-    moved, motions, scatter = np.empty_like(poses), np.empty((len(weights), 3)), np.zeros((3, 3))
-    if not compute_gauge_fix(tiles, seen, landmarks, poses, means, LEVER_ARM, weights, moved, motions, scatter):
-        return None
-    return GaugeFix(moved, motions, scatter)
+    gained, held = compute_gauge_fix(tiles, seen, landmarks, poses, means, weights, LEVER)
+    return held if gained > 0.0 else None
 
 
 def fix_start(
@@ -84,7 +82,7 @@ def fix_start(
     own, apart = between(start, mean), between(starts.T, start)
     off = [between(origins, poses.T) - own for origins in (starts.T, start)]
     squares = [
-        weights @ (each * each) for each in (np.column_stack([d[:, :2], LEVER_ARM * wrap_angle(d[:, 2])]) for d in off)
+        weights @ (each * each) for each in (np.column_stack([d[:, :2], LEVER * wrap_angle(d[:, 2])]) for d in off)
     ]
     if squares[1].sum() >= squares[0].sum():
         return np.zeros((3, 3))
@@ -94,41 +92,53 @@ def fix_start(
 
 @jit
 def compute_gauge_fix(
-    tiles: FloatArray, seen: IntArray, landmarks: FloatArray, poses: FloatArray, means: FloatArray, lever: float,
-    weights: FloatArray, moved: FloatArray, motions: FloatArray, scatter: FloatArray,
-) -> bool:  # fmt: skip
-    """Write what `GaugeFix` holds, `scatter` from zeros on; return whether that helps.
+    tiles: FloatArray, seen: IntArray, landmarks: FloatArray, poses: FloatArray, means: FloatArray,
+    weights: FloatArray, lever: float,
+) -> tuple[float, GaugeFix]:  # fmt: skip
+    """Fit the motions that hold particles; return by how much poses are then less far off, and what is held.
 
     Args:
-        tiles, seen, landmarks, poses, means, weights: As of `fix_gauge`.
+        tiles, seen, landmarks, poses, means, weights: See `fix_gauge`.
         lever: [m] At which headings are felt.
-        moved, motions, scatter: As of `GaugeFix`, results.
     """
-    n, m = len(seen), len(weights)
-    targets, points, squares = landmarks[seen], np.empty((n, 2, m)), np.empty((n, m))
-    gather_landmarks(tiles, seen, targets, points, squares)
-    shares = np.empty(n)
-    landmark_weights(squares, weights, shares)
-    fit_rigid_2d(points, targets, shares, motions)
-    if not apply_if_closer(poses, motions, means, lever, weights, moved):
-        return False
-    add_covariance(motions, weights, scatter)
-    return True
-
-
-@device
-@in_place
-def landmark_weights(squares: FloatArray, weights: FloatArray, shares: FloatArray) -> None:
-    """Write weights of landmarks (n,) that sum to 1, by the inverse of the mean of squares (n, M), weighed by (M,)."""
+    n, m, num_lanes = len(seen), len(weights), tiles.shape[3]
+    points, shares = np.empty((n, 2, m)), np.empty(n)
     total = 0.0
-    for n in range(len(squares)):
-        mean = 0.0
-        for i in range(len(weights)):
-            mean += squares[n, i] * weights[i]
-        shares[n] = 1.0 / max(mean, 1e-300)
-        total += shares[n]
-    for n in range(len(shares)):
-        shares[n] /= total
+    for k in range(n):
+        mean, target = 0.0, landmarks[seen[k]]
+        for block in range(tiles.shape[1]):
+            tile, first = tiles[seen[k], block], block * num_lanes
+            for lane in range(min(num_lanes, m - first)):
+                x, y = tile[0, lane], tile[1, lane]
+                points[k, 0, first + lane], points[k, 1, first + lane] = x, y
+                dx, dy = x - target[0], y - target[1]
+                mean += (dx * dx + dy * dy + tile[XX, lane] + tile[YY, lane]) * weights[first + lane]
+        shares[k] = 1.0 / max(mean, 1e-300)
+        total += shares[k]
+    for k in range(n):
+        shares[k] /= total
+    motions, moved, scatter = np.empty((m, 3)), np.empty(poses.shape), np.zeros((3, 3))
+    fit_rigid_2d(points, landmarks[seen], shares, motions)
+    move(poses, motions, moved)
+    gained = 0.0
+    for i in range(m):
+        before, after = 0.0, 0.0
+        for robot in range(len(poses)):
+            x, y, heading = means[robot, 0], means[robot, 1], means[robot, 2]
+            dx, dy = poses[robot, 0, i] - x, poses[robot, 1, i] - y
+            turn = lever * ((poses[robot, 2, i] - heading + math.pi) % (2.0 * math.pi) - math.pi)
+            before = before + dx * dx + dy * dy + turn * turn
+            dx, dy = moved[robot, 0, i] - x, moved[robot, 1, i] - y
+            turn = lever * ((moved[robot, 2, i] - heading + math.pi) % (2.0 * math.pi) - math.pi)
+            after = after + dx * dx + dy * dy + turn * turn
+        gained += weights[i] * (before - after)
+        x, y, turn = motions[i, 0], motions[i, 1], motions[i, 2]
+        c, s = math.cos(turn), math.sin(turn)
+        back = (-(c * x + s * y), s * x - c * y, -turn)
+        for row in range(3):
+            for column in range(3):
+                scatter[row, column] += weights[i] * back[row] * back[column]  # (9)
+    return gained, GaugeFix(moved, motions, scatter)
 
 
 @device
@@ -157,43 +167,6 @@ def fit_rigid_2d(points: FloatArray, targets: FloatArray, shares: FloatArray, mo
         motions[i, 2] = turn
 
 
-@device
-@in_place
-def add_covariance(motions: FloatArray, weights: FloatArray, scatter: FloatArray) -> None:
-    """Add the mean square (3, 3) of the inverses of motions (M, 3), weighed by (M,)."""
-    for i in range(len(motions)):
-        x, y, turn = motions[i, 0], motions[i, 1], motions[i, 2]
-        c, s = math.cos(turn), math.sin(turn)
-        back = (-(c * x + s * y), s * x - c * y, -turn)
-        for row in range(3):
-            for column in range(3):
-                scatter[row, column] += weights[i] * back[row] * back[column]  # (9)
-
-
-@device
-@in_place
-def gather_landmarks(
-    tiles: FloatArray, seen: IntArray, targets: FloatArray, points: FloatArray, squares: FloatArray
-) -> None:  # fmt: skip
-    """Write where particles hold some landmarks to be in the plane, and how far off that may be.
-
-    Args:
-        tiles, seen: As of `fix_gauge`.
-        targets: (n, 2 or 3) [m] where they are in the most probable path.
-        points: (n, 2, M) [m], result.
-        squares: (n, M) [m^2], result: squared distances from there, and the variances of the landmarks.
-    """
-    num_lanes = tiles.shape[3]
-    for n in range(len(seen)):
-        for block in range(tiles.shape[1]):
-            tile, first = tiles[seen[n], block], block * num_lanes
-            for lane in range(min(num_lanes, squares.shape[1] - first)):
-                x, y = tile[0, lane], tile[1, lane]
-                points[n, 0, first + lane], points[n, 1, first + lane] = x, y
-                dx, dy = x - targets[n, 0], y - targets[n, 1]
-                squares[n, first + lane] = dx * dx + dy * dy + tile[XX, lane] + tile[YY, lane]
-
-
 @in_place
 def move(poses: FloatArray, motions: FloatArray, moved: FloatArray) -> None:
     """Write poses (K, 3, M) of each particle moved by its motion (M, 3); `moved` may be `poses`."""
@@ -204,49 +177,6 @@ def move(poses: FloatArray, motions: FloatArray, moved: FloatArray) -> None:
             moved[robot, 0, i] = motions[i, 0] + c * x - s * y
             moved[robot, 1, i] = motions[i, 1] + s * x + c * y
             moved[robot, 2, i] = (motions[i, 2] + heading + math.pi) % (2.0 * math.pi) - math.pi
-
-
-@in_place
-def wrap(poses: FloatArray) -> None:
-    """Bring the headings of poses (K, 3, M) [m, m, rad] to [-pi, pi), in place."""
-    for robot in range(len(poses)):
-        for i in range(poses.shape[2]):
-            poses[robot, 2, i] = (poses[robot, 2, i] + math.pi) % (2.0 * math.pi) - math.pi
-
-
-@device
-@in_place
-def squared_error(poses: FloatArray, means: FloatArray, lever: float, squares: FloatArray) -> None:
-    """Write how far off particles are.
-
-    Args:
-        poses: (K, 3, M) [m, m, rad].
-        means: (K, 3) likewise.
-        lever: [m] At which headings are felt.
-        squares: (M,) [m^2], result: sum over the robots of squared distances.
-    """
-    squares[:] = 0.0
-    for robot in range(len(poses)):
-        for i in range(len(squares)):
-            dx, dy = poses[robot, 0, i] - means[robot, 0], poses[robot, 1, i] - means[robot, 1]
-            turn = lever * ((poses[robot, 2, i] - means[robot, 2] + math.pi) % (2.0 * math.pi) - math.pi)
-            squares[i] = squares[i] + dx * dx + dy * dy + turn * turn
-
-
-@device
-@jit
-def apply_if_closer(
-    poses: FloatArray, motions: FloatArray, means: FloatArray, lever: float, weights: FloatArray, moved: FloatArray
-) -> bool:
-    """Move particles as `move` does; return whether this lowers their mean `squared_error`, weighted by (M,)."""
-    before, after = np.empty(len(weights)), np.empty(len(weights))
-    move(poses, motions, moved)
-    squared_error(poses, means, lever, before)
-    squared_error(moved, means, lever, after)
-    gained = 0.0
-    for i in range(len(weights)):
-        gained += weights[i] * (before[i] - after[i])
-    return gained > 0.0
 
 
 def transform_tiles(tiles: FloatArray, motions: FloatArray) -> None:

@@ -1,8 +1,8 @@
 """`SlamGraph`: key poses of all robots, the odometry between them, and what was measured there. It never changes."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,20 +10,19 @@ from numpy.typing import NDArray
 from slam_backend.core.read_only import as_read_only, with_constants
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.geometry import between, wrap_angle
-from slam_backend.smoother._kernels import rename
+from slam_backend.smoother._kernels import LEVER as LEVER
+from slam_backend.smoother._kernels import NONE as NONE
+from slam_backend.smoother._kernels import Frames, Frozen, Keys, Landmarks, Points
 
-NONE = -1
 UNINFORMATIVE = (1e4, 1e4, 10.0)  # variances [m^2, m^2, rad^2] of a start of which nothing is known
-LEVER_ARM = 3.0  # [m]; where an error of the heading between two keys is felt
 RIGID = 1e-4  # [m, rad]; starts that scatter less against each other do not move
 
+Part = TypeVar("Part", Keys, Frames, Points, Frozen, Landmarks)  # columns of a graph that go together, row by row
 
-# The columns of a graph that go together, row by row.
-OF_KEYS = ("robots", "poses", "parents", "odometry", "odometry_covariances", "transition_variances", "rigid_variances")
-OF_FRAMES = ("frame_keys", "frame_offsets")
-OF_POINTS = ("points", "point_noises", "has_covariance", "point_frames", "point_landmarks")
-OF_FROZEN = ("condensed_keys", "condensed_landmarks", "linearisation_points", "information", "gradients", "counts")
-OF_LANDMARKS = ("landmark_ids", "landmarks")
+
+def mapped(part: Part, act: Callable[[Any], Any]) -> Part:
+    """Return a part with `act` done to each column."""
+    return type(part)(*map(act, part))
 
 
 def _empty(*shape: int) -> FloatArray:
@@ -49,9 +48,9 @@ class SlamGraph:
         parents: (k,) int64. The key before, `NONE` where the pose is given: the origin, or a robot's start. A start
             that is not known hangs on the origin, or on another robot's start.
         odometry: (k, 3) float64 [m, m, rad]. Odometry from the previous key, in its frame.
-        odometry_covariances: (k, 3, 3) float64. Its covariance, likewise.
+        odometry_covariances: (k, 3, 3) float64. Covariances of that odometry.
         transition_variances: (k,) float64 [m^2]. How far the motion from the previous key scattered when that was last
-            asked, or as far as odometry says before that; see `LEVER_ARM`.
+            asked, or as far as odometry says before that; see `LEVER`.
         rigid_variances: (k,) float64 [m^2]. How much those poses may move against each other that stand rigidly to the
             key.
         frame_keys, frame_offsets: (f,) int64, (f, 3) float64. Key of each frame, and the frame's pose seen from it.
@@ -175,8 +174,13 @@ class SlamGraph:
     def resolve_ids(self, ids: IntArray) -> IntArray:
         """Return the names by which landmarks `ids` (n,) int64 go, `aliases` applied."""
         result = ids.copy()
-        rename(result, self.merged_ids)
+        for name, other in self.merged_ids.tolist():
+            result[result == name] = other
         return result
+
+    def part(self, kind: type[Part]) -> Part:
+        """Return some of the columns."""
+        return kind(*map(vars(self).__getitem__, kind._fields))
 
     def to_mapping(self) -> dict[str, Any]:
         """Return all arrays by name; they are read-only."""

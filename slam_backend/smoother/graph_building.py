@@ -10,19 +10,8 @@ from slam_backend.core.validation import BoolArray, FloatArray, IntArray, argume
 from slam_backend.geometry import between, compose, rotation
 from slam_backend.models.odometry import OdometryModel
 from slam_backend.smoother import _kernels
-from slam_backend.smoother._kernels import find_initial_poses
-from slam_backend.smoother.graph import (
-    LEVER_ARM,
-    NONE,
-    OF_FRAMES,
-    OF_FROZEN,
-    OF_KEYS,
-    OF_LANDMARKS,
-    OF_POINTS,
-    RIGID,
-    UNINFORMATIVE,
-    SlamGraph,
-)
+from slam_backend.smoother._kernels import Frames, Frozen, Keys, Landmarks, Log, Points
+from slam_backend.smoother.graph import NONE, RIGID, UNINFORMATIVE, Part, SlamGraph, mapped
 from slam_backend.smoother.log_arrays import EXACT, LogArrays
 
 
@@ -39,7 +28,7 @@ class InitialPoses(NamedTuple):
 
     @classmethod
     def empty(cls) -> "InitialPoses":
-        """Return those of a robot of which nobody says anything."""
+        """Return guesses that say nothing."""
         return cls(np.empty(0, dtype=np.int64), np.empty((0, 3)))
 
     def with_later(self, steps: IntArray, poses: FloatArray) -> "InitialPoses":
@@ -52,9 +41,10 @@ class InitialPoses(NamedTuple):
         return InitialPoses(self.steps[first:], self.poses[first:])
 
     def at(self, steps: IntArray) -> FloatArray:
-        """Return the poses (m, 3) after steps (m,), ascending; NaN where nobody says."""
-        poses = np.empty((len(steps), 3))
-        find_initial_poses(self.steps, self.poses, steps, poses)
+        """Return the poses (m, 3) after steps (m,), ascending; NaN where none is known."""
+        poses = np.full((len(steps), 3), np.nan)
+        _, rows, own = np.intersect1d(steps, self.steps, assume_unique=True, return_indices=True)
+        poses[rows] = self.poses[own]
         return poses
 
 
@@ -109,64 +99,43 @@ def extend_graph(
         ValueError: If a log holds a pose that was given as exact: there is nothing to smooth.
     """
     steps, most = sum(map(len, logs)), sum(len(log.ids) for log in logs)
-    room = {OF_KEYS: steps, OF_FRAMES: steps, OF_POINTS: most, OF_LANDMARKS: most}
-    columns = {name: _with_room(getattr(graph, name), more) for names, more in room.items() for name in names}
-    keys, frames, points, tips, is_guided = _add_keyframes(graph, logs, motion, guesses, rigid_within, columns)
-    new, held = slice(len(graph.points), points), NO_LANDMARK_POSITIONS if places is None else places
-    landmarks = _kernels.close_keyframe(
-        graph.merged_ids, len(graph.landmarks), columns["point_landmarks"][new], columns["points"][new],
-        columns["point_frames"][new], columns["poses"], columns["frame_keys"], columns["frame_offsets"], mount,
-        is_guided and len(held.ids) > 0, graph.condensed_landmarks, graph.counts, graph.point_landmarks, held.ids,
-        held.means, columns["landmark_ids"], columns["landmarks"],
-    )  # fmt: skip
-    latest = [int(log.steps[-1]) if len(log) else before for log, before in zip(logs, graph.latest, strict=True)]
-    used = {OF_KEYS: keys, OF_FRAMES: frames, OF_POINTS: points, OF_LANDMARKS: landmarks}
-    return graph.with_columns(
-        **{name: columns[name][:num] for names, num in used.items() for name in names},
-        last_keys=tips,
-        latest=np.array(latest, dtype=np.int64),
-    )
-
-
-def _add_keyframes(
-    graph: SlamGraph, logs: Sequence[LogArrays], motion: OdometryModel, guesses: Sequence[InitialPoses] | None,
-    rigid_within: float, columns: dict[str, NDArray[Any]],
-) -> tuple[int, int, int, IntArray, bool]:  # fmt: skip
-    """Walk through the robots' new steps: which of them become keys, and what was measured.
-
-    Args:
-        graph, logs, motion, guesses, rigid_within: As of `extend_graph`.
-        columns: Of the graph with room; those of keys, frames and measurements are written, with landmarks' names in
-            place of their rows.
-
-    Returns:
-        How many keys, frames and measurements there are then, the newest key of each robot (K,), and whether each robot
-        is supposed to be anywhere where it measured something.
-    """
-    tips, is_guided = graph.last_keys.copy(), guesses is not None
-    written = [columns[name] for name in (*OF_KEYS, *OF_FRAMES, *OF_POINTS)]
-    keys, frames, points = graph.num_keys, len(graph.frame_keys), len(graph.points)
+    keys, frames = _with_room(graph.part(Keys), steps), _with_room(graph.part(Frames), steps)
+    raw = _with_room(graph.part(Points), most)
+    tips, ends = graph.last_keys.copy(), np.array([graph.num_keys, len(graph.frame_keys), len(graph.points)])
+    is_guided = guesses is not None
     for robot, log in enumerate(logs):
         if EXACT in log.kinds.tolist():
             raise argument_error("logs", "odometry", "a pose that was given as exact", "There is nothing to smooth.")
         variances = motion.variances(log.motions)
         if not motion.is_noiseless:
             variances = np.maximum(variances, MIN_NOISE**2)
-        guessed = NO_INITIAL_POSES if guesses is None else guesses[robot]
         covariances = NO_COVARIANCES if log.covariances is None else log.covariances
-        keys, frames, points, is_own = _kernels.add_log(
-            log.steps, log.kinds, log.motions, log.given, log.starts, log.points, log.ids, covariances, variances,
-            *guessed, robot, rigid_within, LEVER_ARM, keys, frames, points, tips, *written,
-        )  # fmt: skip
-        is_guided = is_guided and is_own
-    return keys, frames, points, tips, is_guided
+        arrays = Log(
+            log.steps, log.kinds, log.motions, log.given, log.starts, log.points, log.ids, covariances, variances
+        )
+        guessed = NO_INITIAL_POSES if guesses is None else guesses[robot]
+        is_guided &= _kernels.add_log(arrays, guessed, robot, rigid_within, tips, ends, keys, frames, raw)
+    num_keys, num_frames, num_points = ends.tolist()
+    held = places if is_guided and places is not None else NO_LANDMARK_POSITIONS
+    landmarks = _kernels.close_keyframe(
+        graph.merged_ids, mapped(raw, lambda column: column[len(graph.points) : num_points]), graph.point_landmarks,
+        graph.part(Frozen), graph.part(Landmarks), held, frames, keys.poses, mount,
+    )  # fmt: skip
+    latest = [int(log.steps[-1]) if len(log) else before for log, before in zip(logs, graph.latest, strict=True)]
+    parts = ((keys, num_keys), (frames, num_frames), (raw, num_points), (landmarks, None))
+    columns = {name: column[:num] for part, num in parts for name, column in part._asdict().items()}
+    return graph.with_columns(**columns, last_keys=tips, latest=np.array(latest, dtype=np.int64))
 
 
-def _with_room(column: NDArray[Any], extra: int) -> NDArray[Any]:
-    """Return a copy of a column (n, ...) with so many more rows, yet to be written."""
-    longer = np.empty((len(column) + extra, *column.shape[1:]), dtype=column.dtype)
-    longer[: len(column)] = column
-    return longer
+def _with_room(part: Part, extra: int) -> Part:
+    """Return copies of columns (n, ...) with so many more rows, yet to be written."""
+
+    def longer(column: NDArray[Any]) -> NDArray[Any]:
+        result = np.empty((len(column) + extra, *column.shape[1:]), column.dtype)
+        result[: len(column)] = column
+        return result
+
+    return mapped(part, longer)
 
 
 def log_head(log: LogArrays, count: int) -> LogArrays:
@@ -251,17 +220,17 @@ def _named(graph: SlamGraph, names: Mapping[int, int]) -> SlamGraph:
     row = np.cumsum(kept) - 1
     aliases = [(names[old], names[by]) for old, by in graph.merged_ids.tolist() if old in names and by in names]
     return graph.with_columns(
-        **_rows(graph, OF_POINTS, kept[graph.point_landmarks], row),
-        **_rows(graph, OF_FROZEN, kept[graph.condensed_landmarks], row),
+        **_rows(graph.part(Points), kept[graph.point_landmarks], row),
+        **_rows(graph.part(Frozen), kept[graph.condensed_landmarks], row),
         landmark_ids=new[kept],
         landmarks=graph.landmarks[kept],
         merged_ids=np.array(aliases, dtype=np.int64).reshape(-1, 2),
     )
 
 
-def _rows(graph: SlamGraph, names: tuple[str, ...], kept: BoolArray, row: IntArray) -> dict[str, Any]:
-    """Return some rows of columns; landmarks are counted anew."""
-    columns = {name: getattr(graph, name)[kept] for name in names}
+def _rows(part: Points | Frozen, kept: BoolArray, row: IntArray) -> dict[str, Any]:
+    """Return some rows of columns by name; landmarks are renumbered by `row`."""
+    columns = {name: column[kept] for name, column in part._asdict().items()}
     return columns | {name: row[column] for name, column in columns.items() if name.endswith("_landmarks")}
 
 

@@ -14,11 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.core.validation import FloatArray, IntArray
+from slam_backend.geometry import wrap_angle
 from slam_backend.models.odometry import OdometryModel
 from slam_backend.resampling import systematic
 from slam_backend.smoother import _kernels
 from slam_backend.smoother.duplicates import find_duplicates, without_duplicates
-from slam_backend.smoother.gauge import fix_gauge, fix_start, move, transform_tiles, wrap
+from slam_backend.smoother.gauge import fix_gauge, fix_start, move, transform_tiles
 from slam_backend.smoother.graph import SlamGraph
 from slam_backend.smoother.graph_building import InitialPoses, LandmarkPositions, extend_graph, log_head
 from slam_backend.smoother.graph_reduction import reduce_keyframes, relinearise, without_unused_frames
@@ -218,8 +219,9 @@ def _descriptors(graph: SlamGraph, looks: LandmarkDescriptors) -> NDArray[np.flo
 def _particles(graph: SlamGraph, mode: MapEstimate, draws: PathSamples) -> Particles:
     """Gather what particles hold."""
     weights, tiles, ids, landmarks = draws.weights, draws.tiles, graph.landmark_ids, mode.landmarks
-    counts, in_view = np.empty(len(ids), dtype=np.int64), np.empty(len(ids), dtype=np.bool_)
-    _kernels.count(mode.sightings.starts, mode.sightings.counts, graph.point_landmarks, counts, in_view)
+    counts, in_view = np.zeros(len(ids), dtype=np.int64), np.zeros(len(ids), dtype=np.bool_)
+    np.add.at(counts, mode.sightings.landmarks, mode.sightings.counts)
+    in_view[graph.point_landmarks] = True
     if not counts.all():
         seen = counts > 0
         tiles, ids, landmarks, in_view, counts = tiles[seen], ids[seen], landmarks[seen], in_view[seen], counts[seen]
@@ -245,8 +247,8 @@ def _particles(graph: SlamGraph, mode: MapEstimate, draws: PathSamples) -> Parti
             move(own, held.motions, own)
         at = mode.poses[graph.first_keys[index]], means[index]
         start_scatters[index] = fix_start(own[0], poses[index], *at, weights)
-    for array in (poses, starts, means[:, :, None]):
-        wrap(array)
+    for array in (poses, starts, means):
+        array[:, 2] = wrap_angle(array[:, 2])
     return Particles(
         poses, starts, np.log(np.maximum(weights, 1e-300)), densities, ids, tiles, counts, means, covariances, frame,
         start_scatters,

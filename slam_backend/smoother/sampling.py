@@ -13,8 +13,8 @@ import numpy as np
 from slam_backend.core.jit import jit
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.smoother import _kernels
-from slam_backend.smoother._kernels import LANES, POSE_ROWS
-from slam_backend.smoother.graph import LEVER_ARM, SlamGraph
+from slam_backend.smoother._kernels import LANES, POSE_ROWS, Keys
+from slam_backend.smoother.graph import SlamGraph
 from slam_backend.smoother.optimizer import MapEstimate
 
 
@@ -76,8 +76,8 @@ class PathSamples(NamedTuple):
         tiles: (l, P / LANES, 9, LANES) float64. Means (3) and covariances (6) of the landmarks, map frame, by lanes.
         log_weights: (M,) float64. Importance weights, not normalised.
         weights: (M,) float64. The same, summing to 1; NaN where one is not finite.
-        sample_size: Effective sample size of the weights, likewise.
-        spreads: (k,) float64 [m^2]. How far the motions from the keys before scatter, headings felt at `LEVER_ARM`.
+        sample_size: Effective sample size of the weights; NaN where one is not finite.
+        spreads: (k,) float64 [m^2]. How far the motions from the keys before scatter, headings felt at `LEVER`.
     """
 
     poses: FloatArray
@@ -176,20 +176,16 @@ def replay(mode: MapEstimate, rows: FloatArray, num_particles: int) -> tuple[Flo
 
     Args:
         mode: Sightings, linearised there.
-        rows: Of `lane_rows`.
+        rows: Paths as `lane_rows` returns them.
         num_particles: M.
 
     Returns:
         (l, P / LANES, 9, LANES) means and covariances in blocks of lanes, zeros where a landmark has no sighting; (M,).
     """
     blocks, k = rows.shape[:2]
-    seen = mode.sightings
     tiles = np.empty((len(mode.landmarks), blocks, 9, LANES))
     log_likelihood = np.empty(blocks * LANES)
-    _kernels.replay(
-        rows.reshape(-1), k, blocks, mode.landmarks, seen.keys, seen.starts, seen.centres, seen.infos, seen.slopes,
-        tiles.reshape(-1), log_likelihood,
-    )  # fmt: skip
+    _kernels.replay(rows.reshape(-1), k, blocks, mode.landmarks, mode.sightings, tiles.reshape(-1), log_likelihood)
     return tiles, log_likelihood[:num_particles]
 
 
@@ -201,17 +197,17 @@ def odometry_log_density(
     Args:
         graph: The odometry between keys.
         mode: Motions are compared about those of the mode.
-        rows: Of `lane_rows`.
+        rows: Paths as `lane_rows` returns them.
         num_particles: M.
 
     Returns:
         (M,) log p(path given odometry) up to a constant, and (k,) [m^2] how far the motions from the keys before
-        scatter, headings felt at `LEVER_ARM`.
+        scatter, headings felt at `LEVER`.
     """
     blocks, k = rows.shape[:2]
     log_density, spreads = np.empty(blocks * LANES), np.empty(k)
     _kernels.odometry_log_density(
-        rows.reshape(-1), k, blocks, num_particles, graph.parents, mode.poses, graph.odometry, mode.odometry_infos,
-        LEVER_ARM, log_density, spreads,
+        rows.reshape(-1), k, blocks, num_particles, graph.part(Keys), mode.odometry_infos, mode.poses, log_density,
+        spreads,
     )  # fmt: skip
     return log_density[:num_particles], spreads

@@ -27,7 +27,7 @@ from slam_backend.fastslam.reports import StepReport
 from slam_backend.geometry import transform_points
 from slam_backend.maps import _kernels as kernels
 from slam_backend.maps.alignment import DISTINCT_ROTATION, DISTINCT_TRANSLATION, Alignment, AlignmentOptions, align_maps
-from slam_backend.maps.correspondences import has_enough_candidates
+from slam_backend.maps.correspondences import has_enough_candidates, match_table
 from slam_backend.maps.landmark_map import LandmarkMap, unchecked_map
 from slam_backend.team.options import MergeOptions
 
@@ -149,9 +149,11 @@ def deformed_fraction(old: LandmarkMap, joint: LandmarkMap, options: AlignmentOp
     Returns:
         In [0, 1]: of the landmarks that both maps hold, those beyond the gate at the rigid motion on which most agree.
     """
-    # Copies: the kernel is compiled for arrays that can be written alone.
-    now, then = ((each.means.copy(), each.covariances.copy(), each.ids.copy()) for each in (joint, old))
-    return kernels.deformed_fraction(*now, *then, options.min_inliers, options.position_floor**2, options.position_gate)
+    rows = np.column_stack(np.intersect1d(joint.ids, old.ids, return_indices=True)[1:])
+    if len(rows) < options.min_inliers:
+        return 0.0
+    table = match_table(joint, old, rows)
+    return kernels.moved_away(table, options.position_floor**2, options.position_gate) / len(rows)
 
 
 def is_significant_motion(motion: FloatArray, points: FloatArray) -> bool:

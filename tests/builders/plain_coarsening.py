@@ -8,9 +8,10 @@ import numpy as np
 from slam_backend.core.packed_symmetric import UNPACK_INDEX, UPPER
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.geometry import between, compose, rotation
-from slam_backend.smoother.graph import NONE, OF_POINTS, SlamGraph
+from slam_backend.smoother._kernels import Points, Sightings
+from slam_backend.smoother.graph import NONE, SlamGraph
 from slam_backend.smoother.graph_reduction import CONTRADICTION
-from slam_backend.smoother.optimizer import LandmarkFactors
+from slam_backend.smoother.optimizer import gathered, linearise
 from slam_backend.smoother.options import SmoothingOptions
 
 
@@ -71,13 +72,13 @@ def _condensed(graph: SlamGraph, fresh: BoolArray, camera: FloatArray, options: 
     old = ~fresh[graph.frame_keys[graph.point_frames]]
     seen = _linearised(graph, camera, options)
     if options.kernel and (lost := old & (seen.squares > CONTRADICTION * options.kernel)).any():
-        graph = replace(graph, **{name: getattr(graph, name)[~lost] for name in OF_POINTS})
+        graph = replace(graph, **{name: getattr(graph, name)[~lost] for name in Points._fields})
         seen = _linearised(graph, camera, options)
     frozen = seen.frozen | ~fresh[seen.keys]
     keep = fresh[graph.frame_keys[graph.point_frames]]
     return replace(
         graph,
-        **{name: getattr(graph, name)[keep] for name in OF_POINTS},
+        **{name: getattr(graph, name)[keep] for name in Points._fields},
         condensed_keys=seen.keys[frozen],
         condensed_landmarks=seen.landmarks[frozen],
         linearisation_points=seen.centres[frozen],
@@ -87,10 +88,10 @@ def _condensed(graph: SlamGraph, fresh: BoolArray, camera: FloatArray, options: 
     )
 
 
-def _linearised(graph: SlamGraph, camera: FloatArray, options: SmoothingOptions) -> LandmarkFactors:
+def _linearised(graph: SlamGraph, camera: FloatArray, options: SmoothingOptions) -> Sightings:
     """Return all that was measured as forms, linearised where the graph's poses and landmarks are."""
-    seen = LandmarkFactors.of(graph)
-    seen.linearise(graph, graph.poses, graph.landmarks, camera, options.noise_scale, options.kernel)
+    seen = gathered(graph)
+    linearise(seen, graph, graph.poses, graph.landmarks, camera, options)
     return seen
 
 

@@ -10,7 +10,7 @@ from slam_backend.core.jit import device, jit
 from slam_backend.core.validation import BoolArray, Float32Array, FloatArray, IntArray
 
 BLOCK = 256  # columns whose products are held at once: with 64 numbers each they fit a core's own cache
-HEAD = 40  # numbers of a descriptor that are compared first, enough to tell most apart; a multiple of four
+HEAD = 40  # numbers of a descriptor that are compared first, enough to rule out most pairs; a multiple of four
 SLACK = np.float32(1e-5)  # of squared lengths, far more than sums of their products are rounded
 
 
@@ -46,31 +46,25 @@ def _add_products(
 
 @device
 @jit
-def _squared_length(row: Float32Array, first: int) -> np.float32:
-    """Return the squared length of a row from its number `first` on."""
-    length = np.float32(0.0)
-    for k in range(first, len(row)):
-        length += row[k] * row[k]
-    return length
-
-
-@device
-@jit
 def _squared_distances(
     row: Float32Array, b_columns: Float32Array, lengths_b: Float32Array, start: int, stop: int, out: Float32Array
 ) -> None:
     """Write |row|^2 + |b|^2 - 2 row . b for the columns b from `start` to `stop` of `b_columns` (d, m) to `out`."""
     out[: stop - start] = np.float32(0.0)
     _add_products(row, 0, len(row), b_columns, start, stop, out)
-    length = _squared_length(row, 0)
+    length = np.float32(0.0)
+    for k in range(len(row)):
+        length += row[k] * row[k]
     for j in range(stop - start):
         out[j] = length + lengths_b[start + j] - np.float32(2.0) * out[j]
 
 
-@device
 @jit
-def _nearest(a: Float32Array, b_columns: Float32Array) -> tuple[IntArray, Float32Array, IntArray]:
-    """Return each a's nearest b (n,), its squared distance (n,), and each b's nearest a (m,); the first if equal."""
+def mutual_pairs(a: Float32Array, b_columns: Float32Array, limit: float) -> IntArray:
+    """Return the pairs (k, 2) that are each other's nearest, up to a squared distance `limit`, by rising a.
+
+    Of several that are equally near the first one counts.
+    """
     n, m = len(a), b_columns.shape[1]
     nearest_b, nearest_a = np.zeros(n, np.int64), np.zeros(m, np.int64)
     least_a, least_b = np.full(n, np.float32(np.inf)), np.full(m, np.float32(np.inf))
@@ -87,17 +81,10 @@ def _nearest(a: Float32Array, b_columns: Float32Array) -> tuple[IntArray, Float3
                     least_a[i], nearest_b[i] = square, start + j
                 if square < least[j]:
                     least[j], nearest[j] = square, i
-    return nearest_b, least_a, nearest_a
-
-
-@jit
-def mutual_pairs(a: Float32Array, b_columns: Float32Array, limit: float) -> IntArray:
-    """Return the pairs (k, 2) that are each other's nearest, up to a squared distance `limit`, by rising a."""
-    nearest_b, squares, nearest_a = _nearest(a, b_columns)
-    pairs = np.empty((len(a), 2), np.int64)
+    pairs = np.empty((n, 2), np.int64)
     k = 0
-    for i in range(len(a)):
-        if nearest_a[nearest_b[i]] == i and squares[i] <= np.float32(limit):
+    for i in range(n):
+        if nearest_a[nearest_b[i]] == i and least_a[i] <= np.float32(limit):
             pairs[k, 0], pairs[k, 1] = i, nearest_b[i]
             k += 1
     return pairs[:k]
@@ -112,7 +99,7 @@ def ratio_test_mask(
     same_place: float,
     ratio: float,
 ) -> BoolArray:
-    """Tell which matches (k,) stand out, see `_matching.passes_ratio_test`."""
+    """Tell which matches (k,) stand out, see `correspondences.passes_ratio_test`."""
     passed = np.ones(len(a), np.bool_)
     lengths_b = _squared_lengths(b_columns)
     squares = np.empty(BLOCK, np.float32)
@@ -135,13 +122,15 @@ def ratio_test_mask(
     return passed
 
 
-@device
 @jit
-def _similar(a: Float32Array, b_columns: Float32Array, limit: float, most: int) -> tuple[IntArray, IntArray, IntArray]:
-    """Return the b within a squared distance `limit` of each a (n, most), and how many each a (n,) and b (m,) has.
+def alike(a: Float32Array, b_columns: Float32Array, limit: float, most: int) -> tuple[IntArray, int]:
+    """Pair descriptors within a squared distance `limit`.
 
-    Most descriptors are told apart by their heads: a . b is at most that of the heads and the product of the tails'
-    lengths, and where no b can so be near the tails are not multiplied.
+    The heads alone rule out most pairs: a . b is at most that of the heads plus the product of the lengths of the
+    tails, and the tails are not multiplied where no b can be near. `SLACK` of the squared lengths allows for rounding.
+
+    Returns:
+        The pairs (k, 2) of which neither has more than `most`, by rising a; and the number of all pairs.
     """
     n, m, size = len(a), b_columns.shape[1], a.shape[1]
     found = np.zeros((n, most), np.int64)
@@ -149,14 +138,24 @@ def _similar(a: Float32Array, b_columns: Float32Array, limit: float, most: int) 
     head = min(HEAD, size)
     lengths_b, tails_b = _squared_lengths(b_columns), np.sqrt(_squared_lengths(b_columns[head:]))
     squares = np.empty(BLOCK, np.float32)
+    bound = np.float32(limit)
     for start in range(0, m, BLOCK):
         stop = min(start + BLOCK, m)
         lengths, tails = lengths_b[start:stop], tails_b[start:stop]
         for i in range(n):
-            length, tail = _squared_length(a[i], 0), np.sqrt(_squared_length(a[i], head))
+            length, tail = np.float32(0.0), np.float32(0.0)
+            for k in range(size):
+                length += a[i, k] * a[i, k]
+            for k in range(head, size):
+                tail += a[i, k] * a[i, k]
+            tail = np.sqrt(tail)
             squares[: stop - start] = np.float32(0.0)
             _add_products(a[i], 0, head, b_columns, start, stop, squares)
-            if not _may_be_near(squares, length, tail, lengths, tails, np.float32(limit)):
+            near = 0
+            for j in range(len(lengths)):
+                whole = length + lengths[j]
+                near += whole - np.float32(2.0) * (squares[j] + tail * tails[j]) <= bound + SLACK * whole
+            if near == 0:
                 continue
             _add_products(a[i], head, size, b_columns, start, stop, squares)
             for j in range(stop - start):
@@ -165,45 +164,12 @@ def _similar(a: Float32Array, b_columns: Float32Array, limit: float, most: int) 
                         found[i, of_a[i]] = start + j
                     of_a[i] += 1
                     of_b[start + j] += 1
-    return found, of_a, of_b
-
-
-@device
-@jit
-def _may_be_near(
-    products: Float32Array, length: np.float32, tail: np.float32, lengths: Float32Array, tails: Float32Array,
-    limit: np.float32,
-) -> bool:  # fmt: skip
-    """Tell whether some b may be within a squared distance `limit` of a, by the products of heads (m,).
-
-    Args:
-        products: Of the head of a with those of all b.
-        length, tail: Squared length of a, and length of its tail; of the b (m,) likewise.
-        limit: No rounding lets a b above it seem to be near, for `SLACK` of the squared lengths is left to that.
-    """
-    near = 0
-    for j in range(len(lengths)):
-        whole = length + lengths[j]
-        near += whole - np.float32(2.0) * (products[j] + tail * tails[j]) <= limit + SLACK * whole
-    return near > 0
-
-
-@jit
-def count_similar(a: Float32Array, b_columns: Float32Array, limit: float) -> int:
-    """Return how many pairs are within a squared distance `limit`."""
-    return int(_similar(a, b_columns, limit, 0)[1].sum())
-
-
-@jit
-def similar_pairs(a: Float32Array, b_columns: Float32Array, limit: float, most: int) -> IntArray:
-    """Return the pairs (k, 2) within a squared distance `limit` of which neither has more than `most`, by rising a."""
-    found, of_a, of_b = _similar(a, b_columns, limit, most)
     pairs = np.empty((found.size, 2), np.int64)
     k = 0
-    for i in range(len(a)):
+    for i in range(n):
         if of_a[i] <= most:
             for j in found[i, : of_a[i]]:
                 if of_b[j] <= most:
                     pairs[k, 0], pairs[k, 1] = i, j
                     k += 1
-    return pairs[:k]
+    return pairs[:k], int(of_a.sum())

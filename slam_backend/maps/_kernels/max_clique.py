@@ -31,7 +31,7 @@ def agreement(table: FloatArray, matches: IntArray, floor: float, gate: float) -
     """Tell which candidates agree pairwise.
 
     Args:
-        table: (k, 18) as in `_alignment_kernels`.
+        table: (k, 18), see `match_table`.
         matches: (k, 2) rows (a, b): two matches of the same landmark never agree.
         floor: Variance added in each map [m^2].
         gate: Largest squared difference of the two planar distances over its variance [-].

@@ -36,26 +36,6 @@ def _pose_from_two(table: FloatArray, i: int, j: int, gate: float, floor: float,
     return np.array([tx, ty, theta])
 
 
-@device
-@jit
-def _same(pose: FloatArray, other: FloatArray, x: float, y: float) -> bool:
-    """Tell whether two poses agree so well about the point (x, y) of map b that refining both would waste time."""
-    turned = abs((pose[2] - other[2] + math.pi) % (2.0 * math.pi) - math.pi)
-    cos, sin = math.cos(pose[2]) - math.cos(other[2]), math.sin(pose[2]) - math.sin(other[2])
-    apart = math.hypot(pose[0] - other[0] + cos * x - sin * y, pose[1] - other[1] + sin * x + cos * y)
-    return turned < SAME_ANGLE and apart < SAME_DISTANCE
-
-
-@device
-@jit
-def _samples_needed(share: float, log_failure: float) -> float:
-    """Return how many pairs to draw so that one stems from a consensus set that holds `share` of the candidates.
-
-    Half of that set's pairs are taken to lie too close together to give a useful rotation.
-    """
-    return log_failure / math.log(1.0 - 0.5 * min(share, 1.0) ** 2)
-
-
 @jit
 def search(
     table: FloatArray,
@@ -79,8 +59,11 @@ def search(
     found = np.empty((len(samples), 5))
     members = np.zeros(len(table), np.bool_)
     h, most, best = 0, min_inliers, np.full(3, np.nan)
-    needed = _samples_needed(max_ratio * most / len(table), log_failure)
+    considered, needed = 0, 0.0
     for drawn in range(len(samples)):
+        if considered != most:  # half of the pairs of a consensus set are taken to lie too close together to be useful
+            considered = most
+            needed = log_failure / math.log(1.0 - 0.5 * min(max_ratio * most / len(table), 1.0) ** 2)
         if drawn >= needed:
             break
         n = samples[drawn]
@@ -88,7 +71,14 @@ def search(
         i -= i * (i - 1) // 2 > n
         i += i * (i + 1) // 2 <= n
         pose = _pose_from_two(table, i, n - i * (i - 1) // 2, gate, floor, min_baseline)
-        if math.isnan(pose[0]) or _same(pose, best, table[i, 3], table[i, 4]):
+        if math.isnan(pose[0]):
+            continue
+        # Refining a pose that agrees with the best one about a landmark of b would waste time.
+        turned = abs((pose[2] - best[2] + math.pi) % (2.0 * math.pi) - math.pi)
+        cos, sin = math.cos(pose[2]) - math.cos(best[2]), math.sin(pose[2]) - math.sin(best[2])
+        x, y = table[i, 3], table[i, 4]
+        apart = math.hypot(pose[0] - best[0] + cos * x - sin * y, pose[1] - best[1] + sin * x + cos * y)
+        if turned < SAME_ANGLE and apart < SAME_DISTANCE:
             continue
         # Two noisy points aim badly at far ones: the first set is taken at twice the distance.
         count, score = support(table, pose, floor, 4.0 * gate, members)
@@ -102,5 +92,4 @@ def search(
             h += 1
             if count > most:
                 most, best = count, pose
-                needed = _samples_needed(max_ratio * most / len(table), log_failure)
     return found[:h]

@@ -7,8 +7,6 @@ import numpy as np
 from slam_backend.core.jit import device, jit
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 
-MATCH_COLUMNS = 18
-
 
 @device
 @jit
@@ -62,7 +60,7 @@ def support(table: FloatArray, pose: FloatArray, floor: float, gate: float, memb
         members[i] = False
         rx = table[i, 0] - cos * table[i, 3] + sin * table[i, 4] - tx
         ry = table[i, 1] - sin * table[i, 3] - cos * table[i, 4] - ty
-        # No direction's variance exceeds the traces' sum: most outliers are told by this alone.
+        # No direction's variance exceeds the sum of the traces: this alone rules out most outliers.
         largest = table[i, 6] + table[i, 9] + table[i, 11] + table[i, 12] + table[i, 15] + table[i, 17] + floor
         if rx * rx + ry * ry <= gate * largest:
             distance = residual(table, i, cos, sin, tx, ty, floor)[0]
@@ -167,20 +165,6 @@ def between_map_variance(table: FloatArray, members: BoolArray, pose: FloatArray
         else:
             high = middle
     return high
-
-
-@jit
-def reduced_chi2(table: FloatArray, members: BoolArray, pose: FloatArray, floor: float) -> float:
-    """Return by how much, at least 1, the members' median D exceeds that of 3 degrees of freedom (a Birge ratio).
-
-    Above 1 only by chance, and where covariances are more over-confident than any variance that may be added explains.
-    """
-    chosen = table[members]
-    k = len(chosen)
-    if k < 2:
-        return 1.0
-    ratio = np.median(squared_distances(chosen, pose, floor)) / (MEDIAN_CHI2_3 * (1.0 - 1.0 / k))
-    return ratio if ratio > 1.0 + CHANCE_EXCESS / math.sqrt(k) else 1.0
 
 
 @device

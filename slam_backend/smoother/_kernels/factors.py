@@ -8,10 +8,12 @@ as their upper triangles by rows (6).
 
 import math
 
-from slam_backend.core.jit import device, in_place, inline, stack_array
-from slam_backend.core.validation import BoolArray, FloatArray, IntArray
+import numpy as np
 
-FREE = -1  # column of a pose that is given, not sought
+from slam_backend.core.jit import in_place, inline, jit, stack_array
+from slam_backend.core.validation import FloatArray, IntArray
+from slam_backend.smoother._kernels.records import FREE, Frames, Points, Sightings
+
 MIN_DEPTH = 0.05  # [m]; a landmark predicted nearer than this to the camera plane is linearised where it was measured
 
 
@@ -43,161 +45,111 @@ def _inverse(a: FloatArray, out: FloatArray) -> float:
     return det
 
 
-@device
-@in_place
-def optimise_landmark(previous: IntArray, columns: IntArray) -> int:
-    """Give each pose that is sought the rows after those of the one before.
+@jit
+def sum_pose_information(previous: IntArray, noises: FloatArray) -> tuple[IntArray, FloatArray, int, bool]:
+    """Number the poses that are sought, and invert the covariances of the odometry that leads to them.
 
     Args:
-        previous: (k,) key that odometry comes from, -1 where a pose is given.
-        columns: (k,), result: first row of each pose, `FREE` if it is given.
+        previous: (k,) key that odometry comes from, `NONE` where a pose is given.
+        noises: (k, 3, 3) covariance of that odometry.
 
     Returns:
-        How many are sought.
+        (k,) First of the three rows of each pose that is sought, `FREE` of the others; (k, 3, 3) information of the
+        odometry, zeros where a pose is given; how many poses are sought; whether all of their odometry has noise.
     """
-    num = 0
-    for b in range(len(previous)):
-        columns[b] = 3 * num if previous[b] >= 0 else FREE
-        num += previous[b] >= 0
-    return num
-
-
-@device
-@in_place
-def invert(matrices: FloatArray, columns: IntArray, out: FloatArray) -> bool:
-    """Write the inverses of symmetric matrices (n, 3, 3) to `out`, likewise; return whether all are positive definite.
-
-    Zeros are written, whatever the matrix, where `columns` (n,) says `FREE`. Where one that is to be inverted is not
-    positive definite, those after it are not written.
-    """
+    columns, informations = np.full(len(previous), FREE), np.zeros(noises.shape)
     upper, inverse = stack_array(6), stack_array(6)
-    for n in range(len(matrices)):
-        if columns[n] == FREE:
-            out[n] = 0.0
+    size, is_noisy = 0, True
+    for n in range(len(previous)):
+        if previous[n] < 0:
             continue
-        a = matrices[n]
+        columns[n] = 3 * size
+        size += 1
+        a, b = noises[n], informations[n]
         upper[0], upper[1], upper[2], upper[3], upper[4], upper[5] = (
             a[0, 0], a[0, 1], a[0, 2], a[1, 1], a[1, 2], a[2, 2],
         )  # fmt: skip
         minor = upper[0] * upper[3] - upper[1] * upper[1]
         if not (upper[0] > 0.0 and minor > 0.0 and _inverse(upper, inverse) > 0.0):
-            return False
-        b = out[n]
+            is_noisy = False
+            continue
         b[0, 0], b[1, 1], b[2, 2] = inverse[0], inverse[3], inverse[5]
         b[0, 1], b[0, 2], b[1, 2] = inverse[1], inverse[2], inverse[4]
         b[1, 0], b[2, 0], b[2, 1] = inverse[1], inverse[2], inverse[4]
-    return True
-
-
-@in_place
-def sum_pose_information(
-    previous: IntArray, noises: FloatArray, columns: IntArray, informations: FloatArray
-) -> tuple[int, bool]:  # fmt: skip
-    """Say which poses are sought, and what the odometry that leads to these tells.
-
-    Args:
-        previous, columns: As of `optimise_landmark`.
-        noises: (k, 3, 3) of that odometry.
-        informations: (k, 3, 3), result: their inverses, zeros where a pose is given.
-
-    Returns:
-        How many are sought, and whether all of their odometry has noise.
-    """
-    size = optimise_landmark(previous, columns)
-    return size, invert(noises, columns, informations)
-
-
-@inline
-def linearise(
-    point: FloatArray, noise: FloatArray, given: bool, camera: FloatArray, e: FloatArray, y: FloatArray,
-    info: FloatArray,
-) -> None:  # fmt: skip
-    """Write the measured point `y` (3), robot axes, from the camera centre, and its information (6), at `e` (3).
-
-    Stereo: an error of (u, v, disparity) at the predicted point e is, in metres, that of y = e + k (v - e),
-    k = e_x / v_x, under the information J^T diag(1/su^2, 1/su^2, 1/sd^2) J with J = d(u, v, d)/de.
-
-    Args:
-        point: (3,) as measured [m], robot axes, from the camera centre.
-        noise: (6,) its covariance [m^2], if the sensor gave it.
-        given: Whether it did.
-        camera: (focal, baseline, sigma_px, sigma_disparity, mount (3)).
-        e: (3,) as predicted [m], likewise.
-        y, info: Results.
-    """
-    if given:
-        _inverse(noise, info)
-        y[0], y[1], y[2] = point[0], point[1], point[2]
-        return
-    ahead = e[0] >= MIN_DEPTH
-    x0, x1, x2 = (e[0], e[1], e[2]) if ahead else (point[0], point[1], point[2])
-    k = x0 / point[0] if ahead else 1.0
-    for i in range(3):
-        y[i] = e[i] + k * (point[i] - e[i]) if ahead else point[i]  # (3)
-    pixel = (camera[0] / (camera[2] * x0)) ** 2
-    disparity = (camera[0] * camera[1] / (camera[3] * x0 * x0)) ** 2
-    across, up = x1 / x0, x2 / x0
-    info[0] = pixel * (across * across + up * up) + disparity
-    info[1], info[2] = -pixel * across, -pixel * up
-    info[3], info[4], info[5] = pixel, 0.0, pixel
+    return columns, informations, size, is_noisy
 
 
 @in_place
 def condense(
-    points: FloatArray, noises: FloatArray, given: BoolArray, frames: IntArray, sightings: IntArray,
-    frame_keys: IntArray, frame_offsets: FloatArray, poses: FloatArray, landmarks: FloatArray,
-    keys: IntArray, named: IntArray, frozen: BoolArray, camera: FloatArray, scale: float, kernel: float,
-    centres: FloatArray, infos: FloatArray, slopes: FloatArray, squares: FloatArray,
+    raw: Points, frames: Frames, seen: Sightings, poses: FloatArray, landmarks: FloatArray, camera: FloatArray,
+    scale: float, kernel: float,
 ) -> float:  # fmt: skip
     """Write centre, information and slope of all sightings that are not frozen, from their measurements.
 
+    Stereo: an error of (u, v, disparity) at the predicted point e is, in metres, that of y = e + k (v - e),
+    k = e_x / v_x, under the information J^T diag(1/su^2, 1/su^2, 1/sd^2) J with J = d(u, v, d)/de. Where the sensor
+    gave a covariance, y is the measured point, and the information the inverse of that.
+
     Args:
-        points, noises, given, frames, sightings: (n,) measurements: (n, 3) robot axes from the camera centre; their
-            covariances (n, 6), if given; the frame and the sighting to which each belongs.
-        frame_keys, frame_offsets: (f,) key of each frame, (f, 3) its pose in that of the key.
+        raw, frames: Measurements, and the frames that they were taken from.
+        seen: Sightings of these; `centres`, `infos`, `slopes` and `squares` are written.
         poses, landmarks: (k, 3), (l, 3) where to linearise, map frame.
-        keys, named, frozen: (s,) of the sightings: key, landmark, whether to leave it alone.
         camera: (focal, baseline, sigma_px, sigma_disparity, mount (3)).
-        scale: Of all measurement covariances.
+        scale: Factor on all measurement covariances.
         kernel: Squared distance above which Geman and McClure's kernel, scaled to leave the rest alone, sets in; 0:
             none.
-        centres, infos, slopes: (s, 3), (s, 6), (s, 3), results.
-        squares: (n,), result: squared Mahalanobis distances of the measurements.
 
     Returns:
         Half the sum of the (robust) squared distances.
     """
+    keys, frozen, centres, infos, slopes = seen.keys, seen.frozen, seen.centres, seen.infos, seen.slopes
+    point_frames, offsets = raw.point_frames, frames.frame_offsets
     e, y, d = stack_array(3), stack_array(3), stack_array(3)
     info, turned = stack_array(6), stack_array(6)
     for s in range(len(keys)):
         if frozen[s]:
             continue
-        pose, landmark = poses[keys[s]], landmarks[named[s]]
+        pose, landmark = poses[keys[s]], landmarks[seen.landmarks[s]]
         c, sn = math.cos(pose[2]), math.sin(pose[2])
         dx, dy = landmark[0] - pose[0], landmark[1] - pose[1]
         centres[s, 0], centres[s, 1], centres[s, 2] = c * dx + sn * dy, -sn * dx + c * dy, landmark[2]
         infos[s] = 0.0
         slopes[s] = 0.0
     total, frame, c, sn = 0.0, -1, 1.0, 0.0
-    for n in range(len(sightings)):
-        s = sightings[n]
+    for n in range(len(point_frames)):
+        s = seen.of_points[n]
         if frozen[s]:
             continue
-        offset = frame_offsets[frames[n]]
-        if frame != frames[n]:  # they come one after the other
-            frame, c, sn = frames[n], math.cos(offset[2]), math.sin(offset[2])
+        offset = offsets[point_frames[n]]
+        if frame != point_frames[n]:  # they come one after the other
+            frame, c, sn = point_frames[n], math.cos(offset[2]), math.sin(offset[2])
         dx, dy = centres[s, 0] - offset[0], centres[s, 1] - offset[1]
         e[0] = c * dx + sn * dy - camera[4]
         e[1] = -sn * dx + c * dy - camera[5]
         e[2] = centres[s, 2] - camera[6]
-        linearise(points[n], noises[n], given[n], camera, e, y, info)
+        point = raw.points[n]
+        if raw.given[n]:
+            _inverse(raw.point_noises[n], info)
+            y[0], y[1], y[2] = point[0], point[1], point[2]
+        else:
+            ahead = e[0] >= MIN_DEPTH
+            x0, x1, x2 = (e[0], e[1], e[2]) if ahead else (point[0], point[1], point[2])
+            k = x0 / point[0] if ahead else 1.0
+            for i in range(3):
+                y[i] = e[i] + k * (point[i] - e[i]) if ahead else point[i]  # (3)
+            pixel = (camera[0] / (camera[2] * x0)) ** 2
+            disparity = (camera[0] * camera[1] / (camera[3] * x0 * x0)) ** 2
+            across, up = x1 / x0, x2 / x0
+            info[0] = pixel * (across * across + up * up) + disparity
+            info[1], info[2] = -pixel * across, -pixel * up
+            info[3], info[4], info[5] = pixel, 0.0, pixel
         for i in range(3):
             d[i] = y[i] - e[i]
         v0 = (info[0] * d[0] + info[1] * d[1] + info[2] * d[2]) / scale
         v1 = (info[1] * d[0] + info[3] * d[1] + info[4] * d[2]) / scale
         v2 = (info[2] * d[0] + info[4] * d[1] + info[5] * d[2]) / scale
         square = d[0] * v0 + d[1] * v1 + d[2] * v2
-        squares[n] = square
+        seen.squares[n] = square
         weight, loss = 1.0, square
         if 0.0 < kernel < square:
             weight = (2.0 * kernel / (kernel + square)) ** 2

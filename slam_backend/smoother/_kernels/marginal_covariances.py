@@ -4,42 +4,27 @@ import math
 
 import numpy as np
 
-from slam_backend.core.jit import jit_fma, simd_inline
+from slam_backend.core.jit import jit_fma
 from slam_backend.core.validation import FloatArray, IntArray
-
-
-@simd_inline
-def _times(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
-    """Add the product of two blocks."""
-    for i in range(0, 9, 3):
-        for j in range(3):
-            out[i + j] += a[i] * b[j] + a[i + 1] * b[3 + j] + a[i + 2] * b[6 + j]
-
-
-@simd_inline
-def _times_turned(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
-    """Add the product of a block's transpose and a block."""
-    for i in range(3):
-        for j in range(3):
-            out[3 * i + j] += a[i] * b[j] + a[3 + i] * b[3 + j] + a[6 + i] * b[6 + j]
+from slam_backend.smoother._kernels.records import LEVER, Factor, Pattern
 
 
 @jit_fma
 def scatter_of_links(
-    poses: FloatArray, columns: IntArray, previous: IntArray, lever: float, pivots: FloatArray, values: FloatArray,
-    order: IntArray, ranks: IntArray, tops: IntArray, rows: IntArray, row_tops: IntArray, link_places: IntArray,
-) -> FloatArray:  # fmt: skip
-    """Return (k,) [m^2] the mean square by which the motion from the previous key scatters about that of the mode.
+    poses: FloatArray, columns: IntArray, previous: IntArray, factor: Factor, pattern: Pattern
+) -> FloatArray:
+    """Return the mean square (k,) [m^2] by which the motion from the previous key scatters about that of the mode.
 
     Covariances of neighbours are blocks of the inverse that the factor has room for; these follow from each other, from
     the last column to the first (Takahashi, Fagan, Chin 1973). To first order in the deviations.
 
     Args:
-        poses, columns, previous: (k, 3) the mode, and as of `form`.
-        lever: [m] At which an error of the heading counts.
-        pivots, values: As `factorise` wrote them.
-        order, ranks, tops, rows, row_tops, link_places: As of `lay_out`.
+        poses: (k, 3) the mode.
+        columns, previous: (k,) first column of each pose, and its previous key.
+        factor, pattern: Factor of the normal equations at the mode.
     """
+    pivots, values, order, ranks, tops = factor.pivots, factor.values, pattern.order, pattern.ranks, pattern.tops
+    rows, row_tops, link_places = pattern.rows, pattern.row_tops, pattern.link_places
     num, num_poses = len(order), 0
     for b in range(len(columns)):
         num_poses += columns[b] >= 0
@@ -51,7 +36,7 @@ def scatter_of_links(
     scaled, sums = np.empty((most, 9)), np.empty((most, 9))
     for j in range(num - 1, -1, -1):
         if order[j] >= num_poses and row_tops[j] == row_tops[j + 1]:
-            continue  # a landmark that no pose waits for: nobody asks
+            continue  # no pose depends on this landmark
         pivot = pivots[j]
         i0, l10, i1, l20, l21, i2 = pivot[0], pivot[1], pivot[2], pivot[3], pivot[4], pivot[5]
         first, count = tops[j], tops[j + 1] - tops[j]
@@ -68,11 +53,18 @@ def scatter_of_links(
             for p in range(tops[column], tops[column + 1]):
                 where[rows[p]] = p
             m, total = scaled[n], sums[n]
-            _times(diagonal[column], m, total)
+            z = diagonal[column]
+            for i in range(0, 9, 3):
+                for c in range(3):
+                    total[i + c] += z[i] * m[c] + z[i + 1] * m[3 + c] + z[i + 2] * m[6 + c]
             for o in range(n + 1, count):
-                z = inverse[where[rows[first + o]]]
-                _times(z, m, sums[o])
-                _times_turned(z, scaled[o], total)
+                z, v, out = inverse[where[rows[first + o]]], scaled[o], sums[o]
+                for i in range(0, 9, 3):
+                    for c in range(3):
+                        out[i + c] += z[i] * m[c] + z[i + 1] * m[3 + c] + z[i + 2] * m[6 + c]
+                for i in range(3):
+                    for c in range(3):
+                        total[3 * i + c] += z[i] * v[c] + z[3 + i] * v[3 + c] + z[6 + i] * v[6 + c]
         own = diagonal[j]
         t10, t21 = -l10 * i0 * i1, -l21 * i1 * i2
         t20 = -(l20 * i0 + l21 * t10) * i2
@@ -113,7 +105,7 @@ def scatter_of_links(
                 for e in range(3):
                     joint[i, e] = z[3 * i + e] if place > 0 else z[3 * e + i]
         for i in range(3):
-            weight = lever * lever if i == 2 else 1.0
+            weight = LEVER * LEVER if i == 2 else 1.0
             for e in range(3):
                 for n in range(3):
                     total += weight * g[i, e] * of_b[3 * e + n] * g[i, n]

@@ -9,101 +9,81 @@ import math
 
 import numpy as np
 
-from slam_backend.core.jit import device, in_place, jit, stack_array
-from slam_backend.core.validation import BoolArray, FloatArray, IntArray
-from slam_backend.smoother._kernels.factors import FREE, _inverse, _rotate_in_plane
-from slam_backend.smoother._kernels.sparse_cholesky import solve
-
-
-@device
-@jit
-def _sorted_by(codes: IntArray, order: IntArray, num_codes: int) -> IntArray:
-    """Return an order (n,) by codes in [0, num_codes), that of equal ones as it was."""
-    tops, result = np.zeros(num_codes + 1, dtype=np.int64), np.empty(len(order), dtype=np.int64)
-    for item in order:
-        tops[codes[item] + 1] += 1
-    for code in range(num_codes):
-        tops[code + 1] += tops[code]
-    for item in order:
-        result[tops[codes[item]]] = item
-        tops[codes[item]] += 1
-    return result
+from slam_backend.core.jit import in_place, jit, stack_array
+from slam_backend.core.validation import FloatArray, IntArray
+from slam_backend.smoother._kernels.factors import _inverse, _rotate_in_plane
+from slam_backend.smoother._kernels.records import (
+    FREE,
+    Equations,
+    Factor,
+    Frames,
+    Frozen,
+    Keys,
+    Pattern,
+    Points,
+    Sightings,
+)
+from slam_backend.smoother._kernels.sparse_cholesky import sweep
 
 
 @jit
-def gather(
-    condensed_keys: IntArray, condensed_landmarks: IntArray, frozen_centres: FloatArray, frozen_infos: FloatArray,
-    frozen_slopes: FloatArray, frozen_counts: IntArray, point_frames: IntArray, point_landmarks: IntArray,
-    frame_keys: IntArray, num_keys: int, keys: IntArray, landmarks: IntArray, starts: IntArray, frozen: BoolArray,
-    centres: FloatArray, infos: FloatArray, slopes: FloatArray, counts: IntArray, of_points: IntArray,
-) -> int:  # fmt: skip
-    """Write the sightings of a graph by landmark and key, frozen ones before the others of a pair.
+def gather(frozen: Frozen, raw: Points, frames: Frames, num_keys: int, num_landmarks: int) -> Sightings:
+    """Return the sightings of a graph by landmark and key, frozen ones before the others of a pair.
+
+    Forms of raw measurements are zeros: they are still to be linearised.
 
     Args:
-        condensed_keys, condensed_landmarks, frozen_centres, frozen_infos, frozen_slopes, frozen_counts: The f
-            condensed factors.
-        point_frames, point_landmarks: (n,) of the raw measurements.
-        frame_keys: (F,) key of each frame.
-        num_keys: k.
-        keys, landmarks, frozen, centres, infos, slopes, counts: (f + n, ...), results, of which the first rows are
-            written; forms of raw measurements are zeros.
-        starts: (l + 1,), result: first row of each landmark.
-        of_points: (n,), result: row of each raw measurement.
-
-    Returns:
-        How many rows there are.
+        frozen, raw, frames: Parts of the graph.
+        num_keys, num_landmarks: Sizes of the graph.
     """
-    num_frozen, num_points = len(condensed_keys), len(point_frames)
-    of_key, of_landmark = np.empty(num_frozen + num_points, np.int64), np.empty(num_frozen + num_points, np.int64)
-    of_key[:num_frozen], of_landmark[:num_frozen] = condensed_keys, condensed_landmarks
+    num_frozen, num_points = len(frozen.counts), len(raw.point_frames)
+    most = num_frozen + num_points
+    of_key, of_landmark = np.empty(most, np.int64), np.empty(most, np.int64)
+    of_key[:num_frozen], of_landmark[:num_frozen] = frozen.condensed_keys, frozen.condensed_landmarks
     for n in range(num_points):
-        of_key[num_frozen + n], of_landmark[num_frozen + n] = frame_keys[point_frames[n]], point_landmarks[n]
-    order = _sorted_by(of_key, np.arange(num_frozen + num_points), num_keys)
-    order = _sorted_by(of_landmark, order, len(starts) - 1)
+        of_key[num_frozen + n] = frames.frame_keys[raw.point_frames[n]]
+        of_landmark[num_frozen + n] = raw.point_landmarks[n]
+    order = np.arange(most)
+    for codes, num_codes in (
+        (of_key, num_keys),
+        (of_landmark, num_landmarks),
+    ):  # sorted by counting
+        tops, later = np.zeros(num_codes + 1, dtype=np.int64), np.empty(most, dtype=np.int64)
+        for item in order:
+            tops[codes[item] + 1] += 1
+        for code in range(num_codes):
+            tops[code + 1] += tops[code]
+        for item in order:
+            later[tops[codes[item]]] = item
+            tops[codes[item]] += 1
+        order = later
+    keys, landmarks, is_frozen = np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most, np.bool_)
+    centres, infos, slopes = np.zeros((most, 3)), np.zeros((most, 6)), np.zeros((most, 3))
+    counts, of_points = np.empty(most, np.int64), np.empty(num_points, np.int64)
+    starts = np.zeros(num_landmarks + 1, np.int64)
     num = 0
-    starts[:] = 0
     for item in order:
         key, landmark = of_key[item], of_landmark[item]
-        again = item >= num_frozen and num > 0 and not frozen[num - 1]
+        again = item >= num_frozen and num > 0 and not is_frozen[num - 1]
         if again and keys[num - 1] == key and landmarks[num - 1] == landmark:
             counts[num - 1] += 1
             of_points[item - num_frozen] = num - 1
             continue
-        keys[num], landmarks[num], frozen[num] = key, landmark, item < num_frozen
+        keys[num], landmarks[num], is_frozen[num] = key, landmark, item < num_frozen
         if item < num_frozen:
-            centres[num], infos[num], slopes[num] = frozen_centres[item], frozen_infos[item], frozen_slopes[item]
-            counts[num] = frozen_counts[item]
+            centres[num], infos[num], slopes[num] = frozen.centres[item], frozen.infos[item], frozen.slopes[item]
+            counts[num] = frozen.counts[item]
         else:
-            centres[num] = 0.0
-            infos[num] = 0.0
-            slopes[num] = 0.0
             counts[num] = 1
             of_points[item - num_frozen] = num
         starts[landmark + 1] += 1
         num += 1
-    for landmark in range(len(starts) - 1):
+    for landmark in range(num_landmarks):
         starts[landmark + 1] += starts[landmark]
-    return num
-
-
-@in_place
-def count(
-    starts: IntArray, counts: IntArray, point_landmarks: IntArray, totals: IntArray, in_view: BoolArray
-) -> None:  # fmt: skip
-    """Say how often each landmark was measured, and which of them have raw measurements.
-
-    Args:
-        starts, counts: (l + 1,), (s,) as of `gather`.
-        point_landmarks: (n,) of the raw measurements.
-        totals, in_view: (l,), results.
-    """
-    for landmark in range(len(totals)):
-        totals[landmark] = 0
-        for q in range(starts[landmark], starts[landmark + 1]):
-            totals[landmark] += counts[q]
-    in_view[:] = False
-    for landmark in point_landmarks:
-        in_view[landmark] = True
+    return Sightings(
+        keys[:num], landmarks[:num], starts, is_frozen[:num], centres[:num], infos[:num], slopes[:num], counts[:num],
+        of_points, np.zeros(num_points),
+    )  # fmt: skip
 
 
 # Information [1/m^2] of a landmark about where it stands now, 1 km along each axis: where all its sightings have lost
@@ -111,38 +91,28 @@ def count(
 WEAK = 1e-6
 
 
-@device
-@in_place
-def _wrapped(angle: float) -> float:
-    """Return an angle [rad] in [-pi, pi)."""
-    return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
-
-
 @in_place
 def form(
-    poses: FloatArray, landmarks: FloatArray, columns: IntArray, previous: IntArray, motions: FloatArray,
-    link_infos: FloatArray, keys: IntArray, starts: IntArray, centres: FloatArray, infos: FloatArray,
-    slopes: FloatArray, turns: FloatArray, blocks: FloatArray, links: FloatArray, cross: FloatArray, vector: FloatArray,
+    poses: FloatArray, landmarks: FloatArray, graph_keys: Keys, columns: IntArray, link_infos: FloatArray,
+    seen: Sightings, equations: Equations,
 ) -> tuple[float, float]:  # fmt: skip
     """Write the normal equations of n poses and l landmarks.
 
     Args:
         poses, landmarks: (k, 3), (l, 3) where to linearise.
+        graph_keys: Keys of the graph, of which the odometry is used.
         columns: (k,) first row of each pose among those sought, `FREE` if it is given.
-        previous: (k,) key that odometry comes from, -1 for none. motions, link_infos: (k, 3), (k, 3, 3) that odometry,
-            in the frame of the previous key, and its information.
-        keys, starts: (s,) key of each sighting; those of landmark i are starts[i] to starts[i + 1].
-        centres, infos, slopes: Of the sightings.
-        turns: (k, 2), result: cosine and sine of each heading.
-        blocks: (n + l, 6), result: second derivatives by each node.
-        links: (k, 3, 3), result: by a key (rows) and the one before (columns), where both are sought.
-        cross: (s, 3, 3), result: by pose (rows) and landmark (columns), where the pose is sought.
-        vector: (n + l, 3), result: slope of the cost.
+        link_infos: (k, 3, 3) information of the odometry, in the frame of the previous key.
+        seen: Sightings, linearised there.
+        equations: Result.
 
     Returns:
         Half the sum of squares of odometry, and of frozen sightings' forms up to a constant; infinite if a landmark is
         at no finite place. And by how much the cost would fall if landmarks alone moved.
     """
+    previous, motions, keys, starts = graph_keys.previous, graph_keys.motions, seen.keys, seen.starts
+    centres, infos, slopes = seen.centres, seen.infos, seen.slopes
+    turns, blocks, links, cross, vector = equations
     blocks[:] = 0.0
     vector[:] = 0.0
     cost = 0.0
@@ -158,7 +128,8 @@ def form(
         dx, dy = poses[b, 0] - poses[a, 0], poses[b, 1] - poses[a, 1]
         mx, my = c * dx + s * dy, -s * dx + c * dy
         r[0], r[1] = mx - motions[b, 0], my - motions[b, 1]
-        r[2] = _wrapped(poses[b, 2] - poses[a, 2] - motions[b, 2])
+        turn = poses[b, 2] - poses[a, 2] - motions[b, 2]
+        r[2] = turn - 2.0 * math.pi * math.floor((turn + math.pi) / (2.0 * math.pi))
         g[:] = 0.0
         g[0, 0], g[0, 1], g[1, 0], g[1, 1], g[2, 2] = c, s, -s, c, 1.0
         f[:] = 0.0
@@ -240,55 +211,41 @@ def form(
     return cost, eased
 
 
-@device
-@in_place
-def advance(
-    change: FloatArray, vector: FloatArray, columns: IntArray, poses: FloatArray, landmarks: FloatArray,
-    new_poses: FloatArray, new_landmarks: FloatArray,
-) -> tuple[float, float]:  # fmt: skip
-    """Write where a change of all nodes leads.
-
-    Args:
-        change: (n + l, 3) of the poses that are sought, then of the landmarks.
-        vector, columns: As of `form`.
-        poses, landmarks: (k, 3), (l, 3) where they are.
-        new_poses, new_landmarks: (k, 3), (l, 3), results.
-
-    Returns:
-        By how much the cost rises along its slope, and the largest change of a pose, NaN if any is.
-    """
-    rise, largest = 0.0, 0.0
-    for node in range(len(change)):
-        for axis in range(3):
-            rise += vector[node, axis] * change[node, axis]
-    for key in range(len(poses)):
-        for axis in range(3):
-            new_poses[key, axis] = poses[key, axis]
-            if columns[key] != FREE:
-                step = change[columns[key] // 3, axis]
-                new_poses[key, axis] += step
-                if abs(step) > largest or math.isnan(step):
-                    largest = abs(step)
-    first_landmark = len(change) - len(landmarks)
-    for landmark in range(len(landmarks)):
-        for axis in range(3):
-            new_landmarks[landmark, axis] = landmarks[landmark, axis] + change[first_landmark + landmark, axis]
-    return rise, largest
-
-
 @jit
 def step(
-    pivots: FloatArray, values: FloatArray, order: IntArray, tops: IntArray, rows: IntArray, vector: FloatArray,
-    columns: IntArray, poses: FloatArray, landmarks: FloatArray, new_poses: FloatArray, new_landmarks: FloatArray,
-) -> tuple[float, float]:  # fmt: skip
-    """Write where the factored equations lead.
+    equations: Equations, factor: Factor, pattern: Pattern, columns: IntArray, poses: FloatArray, landmarks: FloatArray
+) -> tuple[FloatArray, FloatArray, float, float]:
+    """Solve the factored equations.
 
     Args:
-        pivots, values, order, tops, rows: As of `solve`.
-        vector, columns, poses, landmarks, new_poses, new_landmarks: As of `advance`.
+        equations, factor, pattern: The equations, and their factor.
+        columns: (k,) first column of each pose, `FREE` if it is given.
+        poses, landmarks: (k, 3), (l, 3) where the equations were formed.
 
     Returns:
-        As `advance`.
+        Poses (k, 3) and landmarks (l, 3) to which the solution leads; by how much the cost rises along its slope; the
+        largest change of a pose, NaN if any is.
     """
-    change = solve(pivots, values, order, tops, rows, -vector)
-    return advance(change, vector, columns, poses, landmarks, new_poses, new_landmarks)
+    vector, order, ranks = equations.vector, pattern.order, pattern.ranks
+    change = np.empty((len(order), 3))  # by rank
+    for j in range(len(order)):
+        for axis in range(3):
+            change[j, axis] = -vector[order[j], axis]
+    sweep(factor, pattern, np.arange(len(order)), change)
+    rise, largest = 0.0, 0.0
+    for node in range(len(order)):
+        for axis in range(3):
+            rise += vector[node, axis] * change[ranks[node], axis]
+    new_poses, new_landmarks = poses.copy(), landmarks.copy()
+    for key in range(len(poses)):
+        if columns[key] != FREE:
+            for axis in range(3):
+                own = change[ranks[columns[key] // 3], axis]
+                new_poses[key, axis] += own
+                if abs(own) > largest or math.isnan(own):
+                    largest = abs(own)
+    first_landmark = len(order) - len(landmarks)
+    for landmark in range(len(landmarks)):
+        for axis in range(3):
+            new_landmarks[landmark, axis] += change[ranks[first_landmark + landmark], axis]
+    return new_poses, new_landmarks, rise, largest

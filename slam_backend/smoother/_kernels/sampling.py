@@ -9,6 +9,7 @@ from slam_backend.core.simd_math import log_of, sine_cosine
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.smoother._kernels.factors import _inverse
 from slam_backend.smoother._kernels.normal_equations import WEAK
+from slam_backend.smoother._kernels.records import LEVER, Equations, Factor, Keys, Pattern, Sightings
 
 
 @jit_fma
@@ -66,11 +67,10 @@ def normalise(log_weights: FloatArray, weights: FloatArray) -> float:
 
 @jit_fma
 def draw(
-    draws: FloatArray, poses: FloatArray, columns: IntArray, keys: IntArray, starts: IntArray, blocks: FloatArray,
-    cross: FloatArray, pivots: FloatArray, values: FloatArray, order: IntArray, ranks: IntArray, tops: IntArray,
-    rows: IntArray, row_tops: IntArray, paths: FloatArray, log_densities: FloatArray,
-) -> None:  # fmt: skip
-    """Write M paths, the landmarks that come with them left out.
+    draws: FloatArray, poses: FloatArray, columns: IntArray, seen: Sightings, equations: Equations, factor: Factor,
+    pattern: Pattern,
+) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+    """Return M paths without the landmarks that come with them, and the logarithms of their densities.
 
     Of L L^T the information of all nodes, x = mode + L^-T z. A landmark that goes before all poses that see it is not
     drawn, for no pose depends on it. Of the others' density what they have given the path is taken off: with S the
@@ -81,16 +81,19 @@ def draw(
         draws: (D, 3, M) standard normal draws: of the nodes that are drawn, in the order of elimination. Changed: by
             how much these deviate from the mode.
         poses: (k, 3) of the mode.
-        columns, keys, starts, blocks, cross: As of `form`.
-        pivots, values: As `factorise` wrote them.
-        order, ranks, tops, rows, row_tops: As of `lay_out`.
-        paths: (k, 3, M), result.
-        log_densities: (M,), result: log of the density of each path, up to a constant.
+        columns: (k,) first column of each pose, `FREE` where it is given.
+        seen, equations, factor, pattern: Sightings, normal equations at the mode, and their factor.
+
+    Returns:
+        (k, 3, M) paths; (M,) logarithm of the density of each, up to a constant.
     """
+    keys, starts, blocks, cross = seen.keys, seen.starts, equations.blocks, equations.cross
+    pivots, values, order, ranks, tops = factor.pivots, factor.values, pattern.order, pattern.ranks, pattern.tops
+    rows, row_tops = pattern.rows, pattern.row_tops
     num, m, num_landmarks = len(order), draws.shape[2], len(starts) - 1
     num_poses = num - num_landmarks
     places = np.empty(num, dtype=np.int64)  # of nodes among those that are drawn, by rank
-    log_densities[:] = 0.0
+    paths, log_densities = np.empty((len(poses), 3, m)), np.zeros(m)
     drawn = len(draws)
     for j in range(num - 1, -1, -1):
         if order[j] >= num_poses and row_tops[j] == row_tops[j + 1]:
@@ -148,6 +151,7 @@ def draw(
             o0, o1, o2 = off[0, i], off[1, i], off[2, i]
             log_densities[i] += 0.5 * (t0 * o0 * o0 + t3 * o1 * o1 + t5 * o2 * o2)
             log_densities[i] += t1 * o0 * o1 + t2 * o0 * o2 + t4 * o1 * o2
+    return paths, log_densities
 
 
 LANES = 52  # as in the filter, which takes over tiles as they are
@@ -185,8 +189,8 @@ def to_lanes(poses: FloatArray, rows: FloatArray) -> None:
 
 @simd
 def replay(
-    poses: FloatArray, num_keys: int, num_blocks: int, landmarks: FloatArray, keys: IntArray, starts: IntArray,
-    centres: FloatArray, infos: FloatArray, slopes: FloatArray, tiles: FloatArray, log_likelihood: FloatArray,
+    poses: FloatArray, num_keys: int, num_blocks: int, landmarks: FloatArray, seen: Sightings, tiles: FloatArray,
+    log_likelihood: FloatArray,
 ) -> None:  # fmt: skip
     """Give each path the landmarks that its sightings ask for, and the log-likelihood of these, up to a constant.
 
@@ -194,11 +198,12 @@ def replay(
         poses: (num_blocks * num_keys * 5 * LANES,) x, y, cos, sin, heading of each block and key.
         num_keys, num_blocks: k, and the number of blocks of lanes.
         landmarks: (l, 3) about which forms are evaluated, map frame.
-        keys, starts, centres, infos, slopes: Sightings, those of landmark i are starts[i] to starts[i + 1].
+        seen: Sightings, linearised there.
         tiles: (l * num_blocks * 9 * LANES,), result: mean (3) and covariance (6) per lane; zeros for a landmark without
             sightings.
         log_likelihood: (num_blocks * LANES,), result.
     """
+    keys, starts, centres, infos, slopes = seen.keys, seen.starts, seen.centres, seen.infos, seen.slopes
     log_likelihood[:] = 0.0
     work = stack_array(WORK_SIZE)
     for block in range(num_blocks):  # one after the other, for the poses of one are as many as a cache holds
@@ -267,20 +272,20 @@ def replay(
 
 @simd
 def odometry_log_density(
-    poses: FloatArray, num_keys: int, num_blocks: int, num_paths: int, previous: IntArray, mode: FloatArray,
-    motions: FloatArray, infos: FloatArray, lever: float, log_density: FloatArray, spreads: FloatArray,
+    poses: FloatArray, num_keys: int, num_blocks: int, num_paths: int, keys: Keys, infos: FloatArray,
+    mode: FloatArray, log_density: FloatArray, spreads: FloatArray,
 ) -> None:  # fmt: skip
     """Weigh paths by odometry, and say how rigid they are from each key to the next.
 
     Args:
-        poses, num_keys, num_blocks: As in `replay`.
+        poses, num_keys, num_blocks: Paths in blocks of lanes, as `replay` takes them.
         num_paths: M; the lanes after these are copies.
-        previous, motions, infos: (k,), (k, 3), (k, 3, 3) odometry from the previous key and its information.
+        keys, infos: Keys of the graph, of which the odometry is used, and the information (k, 3, 3) of that.
         mode: (k, 3) [m, m, rad] the most probable path.
-        lever: [m] At which an error of the heading counts.
         log_density: (num_blocks * LANES,), result: log p(path given odometry) up to a constant.
         spreads: (k,), result [m^2]: mean square of what the motion from the previous key differs from that of the mode.
     """
+    previous, motions = keys.previous, keys.motions
     log_density[:] = 0.0
     squares = stack_array(LANES)
     for b in range(num_keys):
@@ -311,7 +316,7 @@ def odometry_log_density(
                 )
                 r0, r1, r2 = r0 - d0, r1 - d1, turn - d2
                 r2 = r2 - 2.0 * math.pi * math.floor((r2 + math.pi) / (2.0 * math.pi))
-                squares[i] = r0 * r0 + r1 * r1 + lever * lever * r2 * r2
+                squares[i] = r0 * r0 + r1 * r1 + LEVER * LEVER * r2 * r2
             for i in range(min(LANES, num_paths - block * LANES)):
                 total += squares[i]
         spreads[b] = total / num_paths

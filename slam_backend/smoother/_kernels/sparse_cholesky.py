@@ -1,7 +1,6 @@
 """Sparse Cholesky factorisation by blocks of 3 x 3: ordering, symbolic pattern, factor, solutions, inverse blocks.
 
-Blocks are kept as `lay_out` says, each as nine numbers row by row. A pivot is a lower triangle, by rows, with the
-reciprocals of its diagonal (6).
+`Pattern` says where blocks are kept, `Factor` what they hold.
 """
 
 import math
@@ -10,8 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.core.jit import device, in_place, inline, jit, jit_fma, simd, simd_inline
+from slam_backend.core.jit import device, inline, jit, jit_fma, simd
 from slam_backend.core.validation import FloatArray, IntArray
+from slam_backend.smoother._kernels.records import Equations, Factor, Pattern, Sightings
 
 Bits = NDArray[np.uint64]
 
@@ -28,13 +28,7 @@ def _num_bits(word: Any) -> int:
     return int((word * np.uint64(0x0101010101010101)) >> np.uint64(56))
 
 
-@inline
-def _connect(near: Bits, a: int, b: int) -> None:
-    """Note that nodes a and b share a block."""
-    near[a, b >> 6] |= ONE << np.uint64(b & 63)
-    near[b, a >> 6] |= ONE << np.uint64(a & 63)
-
-
+@device
 @jit
 def minimum_degree(near: Bits, order: IntArray) -> int:
     """Eliminate always a node that shares blocks with fewest others, the first of them.
@@ -91,25 +85,6 @@ def minimum_degree(near: Bits, order: IntArray) -> int:
     return filled
 
 
-@in_place
-def neighbours(columns: IntArray, previous: IntArray, keys: IntArray, starts: IntArray, near: Bits) -> None:
-    """Set the bits of the nodes that share a block of the normal equations.
-
-    Args:
-        columns, previous, keys, starts: As of `form`.
-        near: (N, W) zeros; result.
-    """
-    first_landmark = len(near) - (len(starts) - 1)
-    for b in range(len(columns)):
-        a = previous[b]
-        if a >= 0 and columns[a] >= 0 and columns[b] >= 0:
-            _connect(near, columns[a] // 3, columns[b] // 3)
-    for landmark in range(len(starts) - 1):
-        for q in range(starts[landmark], starts[landmark + 1]):
-            if columns[keys[q]] >= 0:
-                _connect(near, columns[keys[q]] // 3, first_landmark + landmark)
-
-
 @inline
 def _place(tops: IntArray, rows: IntArray, a: int, b: int) -> int:
     """Return 1 + where the block of ranks (a, b) is, negative if it is kept as that of (b, a)."""
@@ -126,29 +101,36 @@ def _place(tops: IntArray, rows: IntArray, a: int, b: int) -> int:
 
 
 @jit
-def lay_out(
-    near: Bits, order: IntArray, columns: IntArray, previous: IntArray, keys: IntArray, starts: IntArray,
-    ranks: IntArray, tops: IntArray, rows: IntArray, link_places: IntArray, cross_places: IntArray,
-    row_tops: IntArray, row_columns: IntArray, row_places: IntArray,
-) -> tuple[int, int]:  # fmt: skip
-    """Say where each block of the factor lies: column by column, in each by ascending rows.
+def lay_out(columns: IntArray, previous: IntArray, seen: Sightings, num: int) -> Pattern:
+    """Choose the order in which `num` poses and landmarks are eliminated, and lay out the blocks of the factor.
 
     Args:
-        near, order: As `minimum_degree` left them.
-        columns, previous, keys, starts: As of `form`.
-        ranks: (N,), result: when each node is eliminated.
-        tops, rows: (N + 1,), (filled,), results: blocks of column j are tops[j] to tops[j + 1], and their rows.
-        link_places, cross_places: (k,), (s,), results: 1 + place of each block of `links` and `cross`, negative if
-            it is transposed there, 0 if there is none.
-        row_tops, row_columns, row_places: (N + 1,), (filled,), (filled,), results: the same blocks row by row.
-
-    Returns:
-        How many nodes `draw` draws, and the sum of the squares of the columns' lengths.
+        columns, previous: (k,) first column of each pose, and its previous key.
+        seen: Sightings.
+        num: Poses that are sought, and landmarks.
     """
-    num, words = near.shape
+    keys, starts = seen.keys, seen.starts
+    words, first_landmark = -(-num // WORD), num - (len(starts) - 1)
+    near = np.zeros((num, words), np.uint64)  # bits of the nodes that share a block
+    for b in range(len(columns)):
+        a = previous[b]
+        if a >= 0 and columns[a] >= 0 and columns[b] >= 0:
+            one, two = columns[a] // 3, columns[b] // 3
+            near[one, two >> 6] |= ONE << np.uint64(two & 63)
+            near[two, one >> 6] |= ONE << np.uint64(one & 63)
+    for landmark in range(len(starts) - 1):
+        for q in range(starts[landmark], starts[landmark + 1]):
+            if columns[keys[q]] >= 0:
+                one, two = columns[keys[q]] // 3, first_landmark + landmark
+                near[one, two >> 6] |= ONE << np.uint64(two & 63)
+                near[two, one >> 6] |= ONE << np.uint64(one & 63)
+    order = np.empty(num, np.int64)
+    filled = minimum_degree(near, order)
+    ranks, tops, row_tops = np.empty(num, np.int64), np.empty(num + 1, np.int64), np.zeros(num + 1, np.int64)
+    rows, row_columns, row_places = np.empty(filled, np.int64), np.empty(filled, np.int64), np.empty(filled, np.int64)
+    link_places, cross_places = np.zeros(len(columns), np.int64), np.zeros(len(keys), np.int64)
     for j in range(num):
         ranks[order[j]] = j
-    row_tops[:] = 0
     top = 0
     for j in range(num):
         tops[j] = top
@@ -175,61 +157,47 @@ def lay_out(
             p = done[row_columns[n]]
             rows[p], row_places[n] = row, p
             done[row_columns[n]] += 1
-    first_landmark = num - (len(starts) - 1)
     for b in range(len(columns)):
         a = previous[b]
-        link_places[b] = 0
         if a >= 0 and columns[a] >= 0 and columns[b] >= 0:
             link_places[b] = _place(tops, rows, ranks[columns[b] // 3], ranks[columns[a] // 3])
     for landmark in range(len(starts) - 1):
         for q in range(starts[landmark], starts[landmark + 1]):
             own = columns[keys[q]]
-            cross_places[q] = 0
             if own >= 0:
                 cross_places[q] = _place(tops, rows, ranks[own // 3], ranks[first_landmark + landmark])
     drawn, squares = 0, 0
     for j in range(num):
         drawn += order[j] < first_landmark or row_tops[j] < row_tops[j + 1]
         squares += (tops[j + 1] - tops[j]) * (tops[j + 1] - tops[j])
-    return drawn, squares
-
-
-@simd_inline
-def _added(values: FloatArray, place: int, block: FloatArray) -> None:
-    """Add a block (3, 3) where `lay_out` says."""
-    if place == 0:
-        return
-    out = values[abs(place) - 1]
-    for i in range(3):
-        for j in range(3):
-            if place > 0:
-                out[3 * i + j] += block[i, j]
-            else:
-                out[3 * j + i] += block[i, j]
+    return Pattern(
+        order, ranks, tops, rows, link_places, cross_places, row_tops, row_columns, row_places, drawn, squares
+    )
 
 
 @simd
-def factorise(
-    blocks: FloatArray, links: FloatArray, cross: FloatArray, damping: float, num_poses: int, order: IntArray,
-    tops: IntArray, rows: IntArray, link_places: IntArray, cross_places: IntArray, row_tops: IntArray,
-    row_columns: IntArray, row_places: IntArray, where: IntArray, pivots: FloatArray, values: FloatArray,
-) -> bool:  # fmt: skip
+def factorise(equations: Equations, pattern: Pattern, damping: float, num_poses: int, factor: Factor) -> bool:
     """Write the factor of the normal equations, column by column from those to the left; False if there is none.
 
     Args:
-        blocks, links, cross: As `form` wrote them.
+        equations, pattern: The equations, and where the blocks of their factor lie.
         damping: The diagonal of each pose is enlarged by this share.
         num_poses: The nodes before this one are poses.
-        order, tops, rows, link_places, cross_places, row_tops, row_columns, row_places: As of `lay_out`.
-        where: (N,) room.
-        pivots, values: (N, 6), (filled, 9), results.
+        factor: Result.
     """
+    blocks, order, tops, rows = equations.blocks, pattern.order, pattern.tops, pattern.rows
+    row_tops, row_columns, row_places = pattern.row_tops, pattern.row_columns, pattern.row_places
+    pivots, values, where = factor
     num = len(order)
     values[:] = 0.0
-    for b in range(len(link_places)):
-        _added(values, link_places[b], links[b])
-    for q in range(len(cross_places)):
-        _added(values, cross_places[q], cross[q])
+    for places, parts in ((pattern.link_places, equations.links), (pattern.cross_places, equations.cross)):
+        for n in range(len(places)):
+            if places[n] == 0:
+                continue
+            out = values[abs(places[n]) - 1]
+            for i in range(3):
+                for j in range(3):
+                    out[3 * i + j if places[n] > 0 else 3 * j + i] += parts[n, i, j]
     for j in range(num):
         node = order[j]
         first, last = tops[j], tops[j + 1]
@@ -281,41 +249,14 @@ def factorise(
     return True
 
 
-@device
 @jit_fma
-def solve(
-    pivots: FloatArray, values: FloatArray, order: IntArray, tops: IntArray, rows: IntArray, vector: FloatArray
-) -> FloatArray:
-    """Return the x (N, 3) with (normal equations) x = vector (N, 3), both by node.
+def covariance(factor: Factor, pattern: Pattern, nodes: IntArray) -> FloatArray:
+    """Return the blocks (3 r, 3 r) of the inverse that belong to r nodes (r,), the mean of either half of it.
 
-    Args:
-        pivots, values: As `factorise` wrote them.
-        order, tops, rows: As of `lay_out`.
-        vector: (N, 3).
+    Only columns take part to which the first blocks lead from the nodes' own columns: all other elements are zero in
+    the forward sweep, and do not matter in the backward one.
     """
-    x, result = np.empty((len(order), 3)), np.empty((len(order), 3))
-    for j in range(len(order)):
-        x[j] = vector[order[j]]
-    _sweep(pivots, values, tops, rows, np.arange(len(order)), x)
-    for j in range(len(order)):
-        result[order[j]] = x[j]
-    return result
-
-
-@jit_fma
-def covariance(
-    pivots: FloatArray, values: FloatArray, ranks: IntArray, tops: IntArray, rows: IntArray, nodes: IntArray
-) -> FloatArray:
-    """Return the blocks (3 r, 3 r) of the inverse that belong to r nodes, the mean of either half of it.
-
-    Only columns to which the first blocks lead from these nodes' own take part: all other elements are zero on the way
-    down, and not asked for on the way up.
-
-    Args:
-        pivots, values: As `factorise` wrote them.
-        ranks, tops, rows: As of `lay_out`.
-        nodes: (r,) int64.
-    """
+    ranks, tops, rows = pattern.ranks, pattern.tops, pattern.rows
     needed = np.zeros(len(ranks), dtype=np.bool_)
     for node in nodes:
         j = ranks[node]
@@ -330,7 +271,7 @@ def covariance(
             for j in columns:
                 x[j] = 0.0
             x[ranks[nodes[n]], axis] = 1.0
-            _sweep(pivots, values, tops, rows, columns, x)
+            sweep(factor, pattern, columns, x)
             for m in range(len(nodes)):
                 for i in range(3):
                     result[3 * m + i, 3 * n + axis] = x[ranks[nodes[m]], i]
@@ -342,10 +283,9 @@ def covariance(
 
 @device
 @jit_fma
-def _sweep(
-    pivots: FloatArray, values: FloatArray, tops: IntArray, rows: IntArray, columns: IntArray, x: FloatArray
-) -> None:
+def sweep(factor: Factor, pattern: Pattern, columns: IntArray, x: FloatArray) -> None:
     """Solve for x (N, 3) by rank, in place; all but these columns (n,), ascending, are left out."""
+    pivots, values, tops, rows = factor.pivots, factor.values, pattern.tops, pattern.rows
     for j in columns:
         pivot = pivots[j]
         x0 = x[j, 0] * pivot[0]

@@ -11,7 +11,7 @@ from slam_backend.fastslam._kernels import LANES
 from slam_backend.fastslam.existence import ExistenceModel
 from slam_backend.fastslam.particle_maps import ParticleMaps
 from slam_backend.geometry import rotation
-from slam_backend.team.filter_merging._kernels.joint_map import join, places, read
+from slam_backend.team.filter_merging._kernels.joint_map import Side, join
 
 
 class Landmarks(NamedTuple):
@@ -38,13 +38,16 @@ class Landmarks(NamedTuple):
         if ids is not None:
             slots = slots[np.searchsorted(maps.ids[slots], ids)]
         chosen = np.arange(maps.num_particles) if chosen is None else chosen
-        where, counts = places(slots, maps.row_of, maps.map_of, maps.maps, maps.counts, chosen, LANES)
-        return cls(maps, slots, chosen, where, counts)
+        rows, ancestors = maps.row_of[slots][:, None], maps.map_of[slots][:, None]
+        particles = np.where(ancestors > 0, maps.maps[ancestors, chosen], chosen)
+        blocks, lanes = np.divmod(particles, LANES)
+        where = 9 * (rows * maps.counts.shape[1] + blocks * LANES) + lanes
+        return cls(maps, slots, chosen, where, maps.counts[rows, particles].astype(np.int64))
 
     @property
     def values(self) -> FloatArray:
         """(n, 9, M) float64 [m, m^2]: means and upper triangles of covariances. A copy."""
-        return read(self.maps.values, self.where, LANES)
+        return np.asarray(self.maps.values[self.where[:, None] + LANES * np.arange(9)[:, None]])
 
     @property
     def ids(self) -> IntArray:
@@ -144,8 +147,8 @@ def write_joint(
     Raises:
         ValueError: If two estimates of a landmark are exact along one direction.
     """
-    sides = a.maps.values, a.where, a.counts, b.maps.values, b.where, b.counts
-    if not join(*sides, rows_a, rows_b, motion, extra, scales, LANES, blocks):
+    one, two = (Side(each.maps.values, each.where, each.counts, rows) for each, rows in ((a, rows_a), (b, rows_b)))
+    if not join(one, two, motion, extra, scales, LANES, blocks):
         cure = "Give each landmark some uncertainty in every direction."
         raise argument_error("landmarks in common", "positive definite covariances", "singular ones", cure)
 

@@ -23,7 +23,7 @@ from slam_backend.maps.alignment import (
 )
 from slam_backend.maps.correspondences import count_similar, similar_pairs
 from slam_backend.maps.landmark_map import LandmarkMap
-from slam_backend.maps.verification import has_perceptual_alias
+from slam_backend.maps.verification import has_perceptual_alias, unexplained
 
 TURNED = np.array([4.0, -3.0, 2.0])
 
@@ -252,8 +252,8 @@ def test_what_no_variance_explains_widens_the_covariance() -> None:
     for factor, ratio in ((3.0, 9.0), (1.0, 1.0), (0.1, 1.0)):
         table[:, :3] = table[:, 3:6] + 0.1 * factor * rng.standard_normal((400, 3))
         # The median of 400 has a standard deviation of 6 %.
-        assert kernels.reduced_chi2(table, everyone, np.zeros(3), 0.01) == pytest.approx(ratio, rel=0.25)
-    assert kernels.reduced_chi2(table, nobody, np.zeros(3), 0.01) == 1.0
+        assert unexplained(table, everyone, np.zeros(3), 0.01) == pytest.approx(ratio, rel=0.25)
+    assert unexplained(table, nobody, np.zeros(3), 0.01) == 1.0
 
 
 def test_members_without_extent_are_left_alone() -> None:

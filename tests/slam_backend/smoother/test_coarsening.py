@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from builders.kernels import python_entry
 from builders.plain_coarsening import chained, plainly_coarsened
 from builders.runs import TIGHT, camera_of, graph_of, logs_of, small_run, upper
 from hypothesis import given, settings
@@ -13,16 +12,9 @@ from hypothesis import strategies as st
 from slam_backend.fastslam.run_log import RobotLog
 from slam_backend.geometry import between, compose, transform_points, wrap_angle
 from slam_backend.models.odometry import OdometryModel
-from slam_backend.smoother._kernels.keyframes import (
-    add_keyframes,
-    number,
-    place,
-    rename,
-    select_measurements,
-    start_keyframe,
-)
-from slam_backend.smoother.graph import LEVER_ARM, SlamGraph
-from slam_backend.smoother.graph_building import extend_graph
+from slam_backend.smoother._kernels import Frames, Frozen, Keys, Landmarks, Log, Points, add_log, close_keyframe
+from slam_backend.smoother.graph import LEVER, SlamGraph
+from slam_backend.smoother.graph_building import NO_LANDMARK_POSITIONS, InitialPoses, LandmarkPositions, extend_graph
 from slam_backend.smoother.graph_reduction import reduce_keyframes, relinearise
 from slam_backend.smoother.log_arrays import ODOMETRY, REJECTED, STATIONARY
 from slam_backend.smoother.optimizer import optimize
@@ -202,38 +194,62 @@ def test_keys_are_joined_as_by_the_plain_program(max_keys, kernel):
         graph = found
 
 
-select_measurements, number, place, start_keyframe, add_keyframes = map(
-    python_entry, (select_measurements, number, place, start_keyframe, add_keyframes)
-)
-
 OLD = 4  # keys and frames of others before
 TIP = 2
 
 
+def log_of(kinds, motions, variances, counts):
+    """Return a log in which each step measured `counts` landmarks at one place."""
+    n = int(counts.sum())
+    return Log(
+        np.arange(len(kinds)), kinds, motions, np.zeros(len(kinds), dtype=np.bool_), np.append(0, np.cumsum(counts)),
+        np.ones((n, 3)), np.arange(n), np.empty((0, 6)), variances,
+    )  # fmt: skip
+
+
+def room_for(keys, frames, points):
+    """Return so many rows of keys, frames and raw measurements, not yet written."""
+    return (
+        Keys(
+            np.full(keys, -7), np.empty((keys, 3)), np.full(keys, -7), np.empty((keys, 3)), np.empty((keys, 3, 3)),
+            np.empty(keys), np.zeros(keys),
+        ),
+        Frames(np.full(frames, -7), np.empty((frames, 3))),
+        Points(
+            np.full((points, 3), -7.0), np.full((points, 6), -7.0), np.zeros(points, dtype=np.bool_),
+            np.full(points, -7), np.full(points, -7),
+        ),
+    )  # fmt: skip
+
+
 def walked(kinds, motions, variances, counts, guesses, start, rigid_within):
     """Return what the compiled walk of robot 1 found: keys, odometry between them, its noise, slack, frames."""
-    n = OLD + len(kinds)
-    robots, previous, frame_keys = (np.full(n, -7) for _ in range(3))
-    poses, between_keys, offsets, noises = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3, 3))
-    spreads, slack, tips = np.empty(n), np.zeros(n), np.array([0, TIP, 3])
-    poses[TIP] = start
-    keys, frames = add_keyframes(
-        kinds, motions, variances, counts, guesses, 1, rigid_within, LEVER_ARM, OLD, OLD, tips, robots, poses, previous,
-        between_keys, noises, spreads, slack, frame_keys, offsets,
-    )  # fmt: skip
-    new = np.arange(OLD, keys)
+    keys, frames, raw = room_for(OLD + len(kinds), OLD + len(kinds), int(counts.sum()))
+    keys.poses[TIP] = start
+    tips, ends, known = np.array([0, TIP, 3]), np.array([OLD, OLD, 0]), np.flatnonzero(np.isfinite(guesses[:, 0]))
+    log = log_of(kinds, motions, variances, counts)
+    is_guided = add_log(log, InitialPoses(known, guesses[known]), 1, rigid_within, tips, ends, keys, frames, raw)
+    first = np.flatnonzero(counts)[:1]
+    assert is_guided == np.isfinite(guesses[first, 0]).all()
+    num_keys, num_frames, num_points = ends
+    new = np.arange(OLD, num_keys)
     chain = np.array([TIP, *new])
-    np.testing.assert_array_equal(robots[new], 1)
-    np.testing.assert_array_equal(previous[new], chain[:-1])
-    np.testing.assert_allclose(spreads[new], scatter(noises[new]))
+    np.testing.assert_array_equal(keys.robots[new], 1)
+    np.testing.assert_array_equal(keys.previous[new], chain[:-1])
+    np.testing.assert_allclose(keys.spreads[new], scatter(keys.noises[new]))
     np.testing.assert_array_equal(tips, [0, chain[-1], 3])
-    own = np.searchsorted(new, frame_keys[OLD:frames]) - (frame_keys[OLD:frames] == TIP)
-    return poses[new], between_keys[new], noises[new], slack[chain], own, offsets[OLD:frames]
+    assert num_points == counts.sum()
+    own = frames.frame_keys[OLD:num_frames]
+    own = np.searchsorted(new, own) - (own == TIP)
+    return (
+        keys.poses[new], keys.motions[new], keys.noises[new], keys.slack[chain], own,
+        frames.frame_offsets[OLD:num_frames],
+    )  # fmt: skip
 
 
 def scatter(noises):
-    """Return the mean squares (n,) [m^2] by which motions of covariances (n, 3, 3) scatter, headings at `LEVER_ARM`."""
-    return noises[:, 0, 0] + noises[:, 1, 1] + LEVER_ARM**2 * noises[:, 2, 2]
+    """Return the mean squares (n,) [m^2] by which motions of covariances (n, 3, 3) scatter, headings at `LEVER`."""
+    return noises[:, 0, 0] + noises[:, 1, 1] + LEVER**2 * noises[:, 2, 2]
 
 
 def plainly_walked(kinds, motions, variances, counts, guesses, start, rigid_within):
@@ -285,67 +301,84 @@ def test_measurements_with_names_are_taken(covered):
     rng, rows = np.random.default_rng(3), [0, 2, 4, 5]
     points, covariances = rng.normal(size=(6, 3)), rng.normal(size=(6 if covered else 0, 6))
     given_steps = np.array([False, True, False, False, True]) & covered
-    taken, noises, marks = np.full((8, 3), -7.0), np.full((8, 6), -7.0), np.zeros(8, dtype=np.bool_)
-    names, frames, counts = np.full(8, -7), np.full(8, -7), np.empty(5, dtype=np.int64)
-    num = select_measurements(
-        ids, points, given_steps, covariances, starts, 2, 5, counts, taken, noises, marks, frames, names
-    )
-    assert num == 6
-    assert counts.tolist() == [0, 2, 0, 1, 1]
-    assert names.tolist() == [-7, -7, 4, 9, 4, 2, -7, -7]
-    assert frames.tolist() == [-7, -7, 5, 5, 6, 7, -7, -7]
-    assert marks.tolist() == [False, False, covered, covered, False, covered, False, False]
-    np.testing.assert_array_equal(taken[2:6], points[rows])
-    np.testing.assert_array_equal(noises[2:6], covariances[rows] if covered else np.zeros((4, 6)))
-    assert (taken[[0, 1, 6, 7]] == -7.0).all()
+    keys, frames, raw = room_for(3, 9, 8)
+    keys.poses[0] = 0.0
+    kinds, still, ends = np.full(5, STATIONARY, dtype=np.int8), np.zeros((5, 3)), np.array([1, 5, 2])
+    log = Log(np.arange(5), kinds, still, given_steps, starts, points, ids, covariances, still)
+    assert not add_log(log, InitialPoses.empty(), 0, 0.0, np.zeros(1, dtype=np.int64), ends, keys, frames, raw)
+    assert ends.tolist() == [1, 8, 6]
+    assert frames.frame_keys.tolist() == [-7] * 5 + [0, 0, 0, -7]
+    assert raw.point_landmarks.tolist() == [-7, -7, 4, 9, 4, 2, -7, -7]
+    assert raw.point_frames.tolist() == [-7, -7, 5, 5, 6, 7, -7, -7]
+    assert raw.given.tolist() == [False, False, covered, covered, False, covered, False, False]
+    np.testing.assert_array_equal(raw.points[2:6], points[rows])
+    np.testing.assert_array_equal(raw.point_noises[2:6], covariances[rows] if covered else np.zeros((4, 6)))
+    assert (raw.points[[0, 1, 6, 7]] == -7.0).all()
+
+
+NO_ALIASES = np.zeros((0, 2), dtype=np.int64)
+
+
+def settled(known, names, aliases=NO_ALIASES, old=(), frozen=((), ()), held=NO_LANDMARK_POSITIONS, seed=0):
+    """Return rows of new measurements' landmarks, all landmarks, and where each measurement lies in the map."""
+    rng, n = np.random.default_rng(seed), len(names)
+    poses, offsets, mount = rng.normal(size=(3, 3)), rng.normal(size=(5, 3)), rng.normal(size=3)
+    frame_keys, frames = rng.integers(0, 3, 5), rng.integers(0, 5, n)
+    raw = room_for(0, 0, n)[2]._replace(point_frames=frames, point_landmarks=np.array(names, dtype=np.int64))
+    raw.points[:] = rng.normal(size=(n, 3))
+    at = compose(poses[frame_keys[frames]], offsets[frames])
+    expected = [transform_points(pose, point + mount) for pose, point in zip(at, raw.points, strict=True)]
+    s = len(frozen[0])
+    landmarks = close_keyframe(
+        aliases, raw, np.array(old, dtype=np.int64),
+        Frozen(
+            np.zeros(s, dtype=np.int64), np.array(frozen[0], dtype=np.int64), np.zeros((s, 3)), np.zeros((s, 6)),
+            np.zeros((s, 3)), np.array(frozen[1], dtype=np.int64),
+        ),
+        Landmarks(np.array(known, dtype=np.int64), np.full((len(known), 3), -1.0)), held,
+        Frames(frame_keys, offsets), poses, mount,
+    )  # fmt: skip
+    return raw.point_landmarks, landmarks, np.array(expected).reshape(-1, 3)
 
 
 @given(st.lists(st.integers(0, 9), unique=True, max_size=8), st.lists(st.integers(0, 12), max_size=20))
 def test_landmarks_are_numbered_as_they_come(known, names):
-    """A known landmark keeps its row, a new one gets the next at its first measurement."""
+    """A known landmark keeps row and place, a new one gets the next row and the place of its first measurement.
+
+    A point is placed as composed of the key, the frame seen from it and the camera on the robot.
+    """
     expected = {name: row for row, name in enumerate(known)}
     first = [n for n, name in enumerate(names) if name not in known and name not in names[:n]]
     for n in first:
         expected[names[n]] = len(expected)
-    rows, ids, firsts = np.array(names, dtype=np.int64), np.full(len(known) + len(names), -7), np.full(len(names), -7)
-    ids[: len(known)] = known
-    assert number(rows, np.argsort(known).astype(np.int64), ids, firsts) == len(expected)
+    rows, landmarks, places = settled(known, names)
     assert rows.tolist() == [expected[name] for name in names]
-    assert ids[: len(expected)].tolist() == list(expected)
-    assert firsts[: len(first)].tolist() == first
+    assert landmarks.landmark_ids.tolist() == list(expected)
+    assert (landmarks.landmarks[: len(known)] == -1.0).all()
+    np.testing.assert_allclose(landmarks.landmarks[len(known) :], places[first], atol=1e-12)
 
 
 @given(st.lists(st.integers(0, 5), max_size=8), st.lists(st.tuples(st.integers(0, 5), st.integers(0, 5)), max_size=4))
 def test_names_are_changed_in_the_order_in_which_landmarks_were_found_to_be_one(names, aliases):
-    """Each pair is applied to all names before the next one is."""
-    found, expected = np.array(names, dtype=np.int64), list(names)
-    rename(found, np.array(aliases, dtype=np.int64).reshape(-1, 2))
+    """Each pair is applied to all names before the next one is, in a graph as where measurements are taken in."""
+    given_aliases = np.array(aliases, dtype=np.int64).reshape(-1, 2)
+    graph = replace(SlamGraph.at_starts(np.zeros((1, 3))), merged_ids=given_aliases)
+    found, expected = graph.resolve_ids(np.array(names, dtype=np.int64)), list(names)
     for old, new in aliases:
         expected = [new if name == old else name for name in expected]
     assert found.tolist() == expected
-
-
-def test_points_are_placed_by_their_frames():
-    """Compiled as composed: the key, the frame seen from it, the camera on the robot."""
-    rng = np.random.default_rng(6)
-    poses, offsets, mount = rng.normal(size=(3, 3)), rng.normal(size=(5, 3)), rng.normal(size=3)
-    frame_keys, frames, points = rng.integers(0, 3, 5), rng.integers(0, 5, 20), rng.normal(size=(20, 3))
-    chosen = rng.permutation(20)[:12]
-    found = np.empty((12, 3))
-    place(poses, frame_keys, offsets, frames, points, chosen, mount, found)
-    for n, place_of_n in zip(chosen, found, strict=True):
-        at = compose(poses[frame_keys[frames[n]]], offsets[frames[n]])
-        np.testing.assert_allclose(place_of_n, transform_points(at, points[n] + mount), atol=1e-12)
+    rows, landmarks, _ = settled([], names, given_aliases)
+    assert landmarks.landmark_ids[rows].tolist() == expected
 
 
 def test_landmarks_with_more_new_measurements_than_old_start_again():
     """Old ones are those in frozen sightings and raw ones; as many is not more. Only what the filter holds moves."""
-    frozen, counts, raw = np.array([0, 1, 1]), np.array([2, 1, 1]), np.array([0, 2])
-    new = np.array([0, 1, 1, 1, 2, 3, 5])
-    names, held = np.array([9, 3, 8, 7, 1, 6]), np.array([1, 3, 7, 8, 9])
-    means, landmarks = np.arange(15.0).reshape(5, 3), np.full((6, 3), -1.0)
-    start_keyframe(frozen, counts, raw, new, names, held, means, landmarks)
-    assert landmarks[:, 0].tolist() == [-1.0, 3.0, -1.0, 6.0, -1.0, -1.0]  # 3 and 7 are held, and 6 is not
+    known, held = [9, 3, 8, 7, 1, 6], LandmarkPositions(np.array([1, 3, 7, 8, 9]), np.arange(15.0).reshape(5, 3))
+    new = [9, 3, 3, 3, 8, 7, 6]
+    old = {"old": (0, 2), "frozen": ((0, 1, 1), (2, 1, 1))}
+    _, landmarks, _ = settled(known, new, held=held, **old)
+    assert landmarks.landmarks[:, 0].tolist() == [-1.0, 3.0, -1.0, 6.0, -1.0, -1.0]  # 3 and 7 are held, and 6 is not
+    assert (settled(known, new, **old)[1].landmarks == -1.0).all()
 
 
 def test_variances_are_squared_sigmas():

@@ -4,7 +4,6 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from builders.kernels import python_entry
 from builders.runs import TIGHT, camera_of, graph_of, small_run
 
 from slam_backend.core.validation import FloatArray
@@ -12,14 +11,11 @@ from slam_backend.fastslam.run_log import RobotLog
 from slam_backend.geometry import between
 from slam_backend.models.odometry import OdometryModel
 from slam_backend.smoother import _kernels
-from slam_backend.smoother._kernels.sparse_cholesky import solve
-from slam_backend.smoother.graph import LEVER_ARM, SlamGraph
+from slam_backend.smoother.graph import LEVER, SlamGraph
 from slam_backend.smoother.graph_building import extend_graph
 from slam_backend.smoother.graph_reduction import reduce_keyframes, relinearise
-from slam_backend.smoother.optimizer import LandmarkFactors, MapEstimate, optimize
+from slam_backend.smoother.optimizer import MapEstimate, gathered, optimize
 from slam_backend.smoother.options import SmoothingOptions
-
-solve = python_entry(solve)
 
 
 class Problem(NamedTuple):
@@ -44,17 +40,17 @@ def problem(robots: int, max_keys: int) -> Problem:
     n = system.num_poses
     size = n + len(graph.landmarks)
     dense = np.zeros((size, 3, size, 3))
-    for node, block in enumerate(system.blocks):
+    for node, block in enumerate(system.equations.blocks):
         dense[node, :, node] = block[[[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
     for b, a in enumerate(graph.parents):
         if a >= 0 and min(mode.columns[a], mode.columns[b]) >= 0:
             i, j = mode.columns[[b, a]] // 3
-            dense[i, :, j], dense[j, :, i] = system.links[b], system.links[b].T
+            dense[i, :, j], dense[j, :, i] = system.equations.links[b], system.equations.links[b].T
     for q, (key, landmark) in enumerate(zip(seen.keys, seen.landmarks, strict=True)):
         if mode.columns[key] >= 0:
             i, j = mode.columns[key] // 3, n + landmark
-            dense[i, :, j] += system.cross[q]
-            dense[j, :, i] += system.cross[q].T
+            dense[i, :, j] += system.equations.cross[q]
+            dense[j, :, i] += system.equations.cross[q].T
     return Problem(graph, mode, dense)
 
 
@@ -79,12 +75,9 @@ def test_a_node_with_the_fewest_neighbours_goes_first(posed):
     """The order is that of the textbook with sets for neighbours, and so is what it fills in."""
     size = len(posed.dense)
     near = [set(np.flatnonzero(row)) - {i} for i, row in enumerate(np.abs(posed.dense).sum(axis=(1, 3)) > 0)]
-    words = np.zeros((size, -(-size // 64)), dtype=np.uint64)
-    for node, others in enumerate(near):
-        for other in others:
-            words[node, other // 64] |= np.uint64(1) << np.uint64(other % 64)
-    order = np.empty(size, dtype=np.int64)
-    filled = _kernels.minimum_degree(words, order)
+    assert posed.mode.system is not None
+    pattern = posed.mode.system.pattern
+    order = pattern.order
     assert sorted(order.tolist()) == list(range(size))
     left, count = set(range(size)), 0
     for node in order.tolist():
@@ -93,9 +86,7 @@ def test_a_node_with_the_fewest_neighbours_goes_first(posed):
         count += len(near[node])
         for other in near[node]:
             near[other] = (near[other] | near[node]) - {other, node}
-    assert filled == count
-    assert posed.mode.system is not None
-    assert len(posed.mode.system.pattern.rows) == count
+    assert len(pattern.rows) == count
 
 
 @pytest.mark.parametrize("damping", [0.0, 0.3])
@@ -107,31 +98,31 @@ def test_the_solution_is_the_dense_one(posed, damping):
     whole = dense.reshape(size, size)
     each = np.arange(3 * system.num_poses)
     whole[each, each] *= 1.0 + damping
-    assert system.factor(damping)
-    p = system.pattern
-    found = solve(system.pivots, system.values, p.order, p.tops, p.rows, -system.vector)
-    poses, landmarks = posed.mode.poses, posed.mode.landmarks
-    new_poses, new_landmarks = np.empty_like(poses), np.empty_like(landmarks)
-    rise, largest = system.step(poses, landmarks, new_poses, new_landmarks)
-    assert rise == pytest.approx((found * system.vector).sum())
-    assert largest == np.abs(found[: system.num_poses]).max()
+    assert system.factorise(damping)
+    poses, landmarks, vector = posed.mode.poses, posed.mode.landmarks, system.equations.vector
+    new_poses, new_landmarks, rise, largest = system.step(poses, landmarks)
+    assert system.factorise(0.0)
+    found = -np.linalg.solve(whole, vector.ravel()).reshape(-1, 3)
+    assert rise == pytest.approx((found * vector).sum())
+    assert largest == pytest.approx(np.abs(found[: system.num_poses]).max())
     sought = system.columns >= 0
-    np.testing.assert_array_equal(new_poses[sought], poses[sought] + found[system.columns[sought] // 3])
-    np.testing.assert_array_equal(new_landmarks, landmarks + found[system.num_poses :])
-    assert system.factor(0.0)
-    np.testing.assert_allclose(found.ravel(), -np.linalg.solve(whole, system.vector.ravel()), rtol=1e-6, atol=1e-12)
+    np.testing.assert_array_equal(new_poses[~sought], poses[~sought])
+    order = system.columns[sought] // 3
+    np.testing.assert_allclose((new_poses - poses)[sought], found[order], rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(new_landmarks - landmarks, found[system.num_poses :], rtol=1e-6, atol=1e-12)
 
 
 def test_what_is_not_positive_definite_has_no_factor(posed):
     """A node of negative information is reported wherever it stands."""
     system = posed.mode.system
     assert system is not None
-    for node in (0, len(system.blocks) - 1):
-        kept = system.blocks[node].copy()
-        system.blocks[node] = -kept
-        assert not system.factor(0.0)
-        system.blocks[node] = kept
-    assert system.factor(0.0)
+    blocks = system.equations.blocks
+    for node in (0, len(blocks) - 1):
+        kept = blocks[node].copy()
+        blocks[node] = -kept
+        assert not system.factorise(0.0)
+        blocks[node] = kept
+    assert system.factorise(0.0)
 
 
 def test_covariances_of_poses_are_the_dense_ones(posed):
@@ -144,14 +135,19 @@ def test_blocks_of_the_inverse_are_the_solutions_for_unit_vectors(posed):
     """Columns that are left out on the way to a few nodes would have added nothing: the same bits, made symmetric."""
     system = posed.mode.system
     assert system is not None
-    p, nodes = system.pattern, np.array([system.num_poses - 1, 2])
-    found = _kernels.covariance(system.pivots, system.values, p.ranks, p.tops, p.rows, nodes)
-    expected = np.empty((6, 6))
+    nodes = np.array([system.num_poses - 1, 2])
+    found = _kernels.covariance(system.factor, system.pattern, nodes)
+    expected, poses, landmarks = (
+        np.empty((6, 6)),
+        np.zeros(posed.mode.poses.shape),
+        np.zeros(posed.mode.landmarks.shape),
+    )
     for column in range(6):
-        unit = np.zeros(system.vector.shape)
-        unit[nodes[column // 3], column % 3] = 1.0
-        solved = solve(system.pivots, system.values, p.order, p.tops, p.rows, unit)
-        expected[:, column] = solved[nodes].ravel()
+        vector = np.zeros(system.equations.vector.shape)
+        vector[nodes[column // 3], column % 3] = -1.0
+        equations = system.equations._replace(vector=vector)
+        solved = _kernels.step(equations, system.factor, system.pattern, system.columns, poses, landmarks)[0]
+        expected[:, column] = np.concatenate([solved[system.columns == 3 * node].ravel() for node in nodes])
     np.testing.assert_array_equal(found, 0.5 * (expected + expected.T))
 
 
@@ -173,7 +169,7 @@ def test_spreads_are_those_of_the_dense_covariance(posed):
                 rows.append(mode.columns[key] + axis)
         by = np.array(columns).T
         scatter = np.diag(by @ covariance[np.ix_(rows, rows)] @ by.T)
-        assert found[b] == pytest.approx(scatter[0] + scatter[1] + LEVER_ARM**2 * scatter[2], rel=1e-5)
+        assert found[b] == pytest.approx(scatter[0] + scatter[1] + LEVER**2 * scatter[2], rel=1e-5)
 
 
 def test_a_graph_is_crowded_where_all_poses_see_all_landmarks(posed):
@@ -224,7 +220,7 @@ def test_sightings_are_gathered_as_by_sorting():
         counts=rng.integers(1, 5, 8), frame_keys=rng.integers(0, keys, frames), points=np.zeros((60, 3)),
         point_frames=rng.integers(0, frames, 60), point_landmarks=rng.integers(0, landmarks, 60),
     )  # fmt: skip
-    seen = LandmarkFactors.of(graph)
+    seen = gathered(graph)
     of_raw = graph.point_landmarks * keys + graph.frame_keys[graph.point_frames]
     raw, counts = np.unique(of_raw, return_counts=True)
     codes = seen.landmarks * keys + seen.keys
@@ -238,8 +234,3 @@ def test_sightings_are_gathered_as_by_sorting():
     for name in ("linearisation_points", "information", "gradients"):
         np.testing.assert_array_equal(getattr(seen, name)[seen.frozen], getattr(graph, name))
         assert not getattr(seen, name)[~seen.frozen].any()
-    totals, in_view = np.empty(landmarks + 1, dtype=np.int64), np.empty(landmarks + 1, dtype=np.bool_)
-    starts = np.append(seen.starts, seen.starts[-1])  # of one more that was never measured
-    _kernels.count(starts, seen.counts, graph.point_landmarks, totals, in_view)
-    np.testing.assert_array_equal(totals, np.bincount(seen.landmarks, seen.counts, landmarks + 1))
-    np.testing.assert_array_equal(in_view, np.isin(np.arange(landmarks + 1), graph.point_landmarks))

@@ -14,41 +14,11 @@ from slam_backend.fastslam.rejuvenation import RejuvenationScheduler
 from slam_backend.geometry import between, compose, inverse, rotation, transform_points, wrap_angle
 from slam_backend.smoother import rejuvenation
 from slam_backend.smoother._kernels import LANES
-from slam_backend.smoother.gauge import (
-    add_covariance,
-    apply_if_closer,
-    fit_rigid_2d,
-    fix_gauge,
-    fix_start,
-    gather_landmarks,
-    landmark_weights,
-    move,
-    squared_error,
-    transform_tiles,
-)
+from slam_backend.smoother.gauge import compute_gauge_fix, fix_gauge, fix_start, move, transform_tiles
 from slam_backend.smoother.graph import RIGID, SlamGraph
 from training.bench.accuracy.runs import RunSpec, simulate_run
 
-(
-    add_covariance,
-    apply_if_closer,
-    fit_rigid_2d,
-    gather_landmarks,
-    squared_error,
-    landmark_weights,
-    add_gauge_to_landmarks,
-) = map(
-    python_entry,
-    (
-        add_covariance,
-        apply_if_closer,
-        fit_rigid_2d,
-        gather_landmarks,
-        squared_error,
-        landmark_weights,
-        add_gauge_to_landmarks,
-    ),
-)
+add_gauge_to_landmarks = python_entry(add_gauge_to_landmarks)
 
 SCATTER = np.array([[0.04, 0.01, -0.02], [0.01, 0.09, 0.03], [-0.02, 0.03, 0.05]])
 UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
@@ -119,44 +89,38 @@ def off_by(poses: FloatArray, means: FloatArray) -> FloatArray:
     return np.asarray((off**2).sum(axis=(0, 1)))
 
 
-def test_what_holding_looks_at_is_as_by_arrays():
-    """Where landmarks are in the plane and how far off, poses moved, and how far off these: of each particle."""
-    rng = np.random.default_rng(4)
-    count, seen = LANES + 9, np.array([4, 0, 3])
-    values, motions, poses = random_maps(5, count, rng), rng.normal(size=(count, 3)), rng.normal(size=(2, 3, count))
-    targets, means, points = rng.normal(size=(3, 2)), rng.normal(size=(2, 3)), np.empty((3, 2, count))
-    gather_landmarks(laned(values), seen, targets, points, found := np.empty((3, count)))
-    np.testing.assert_array_equal(points, values[seen, :2])
-    off = values[seen, :2] - targets[:, :, None]
-    np.testing.assert_allclose(found, (off**2).sum(axis=1) + values[seen, 3] + values[seen, 6], rtol=1e-12)
-    move(poses, motions, moved := np.empty_like(poses))
-    np.testing.assert_allclose(moved, compose(motions, poses.transpose(0, 2, 1)).transpose(0, 2, 1), atol=1e-12)
-    squared_error(poses, means, 3.0, squares := np.empty(count))
-    np.testing.assert_allclose(squares, off_by(poses, means), rtol=1e-12)
-    weights, again = rng.random(count), np.empty_like(poses)
-    for by, gained in ((motions, squares @ weights - off_by(moved, means) @ weights), (0.0 * motions, 0.0)):
-        assert apply_if_closer(poses, by, means, 3.0, weights, again) == (gained > 0.0)
-    apply_if_closer(poses, motions, means, 3.0, weights, again)
-    np.testing.assert_array_equal(again, moved)
-    move(poses, motions, poses)
-    np.testing.assert_array_equal(poses, moved)
-
-
-def test_motions_are_fitted_as_by_arrays():
-    """Least squares by the singular value decomposition, one particle at a time; weights and scatter by their sums."""
-    rng = np.random.default_rng(7)
-    points, targets, weights = rng.normal(size=(5, 2, 30)), rng.normal(size=(5, 2)), rng.dirichlet(np.ones(30))
-    landmark_weights(squares := rng.uniform(0.1, 2.0, (5, 30)), weights, shares := np.empty(5))
-    np.testing.assert_allclose(shares, 1.0 / (squares @ weights) / (1.0 / (squares @ weights)).sum(), rtol=1e-12)
-    fit_rigid_2d(points, targets, shares, motions := np.empty((30, 3)))
+def fitted_plainly(points: FloatArray, targets: FloatArray, shares: FloatArray) -> FloatArray:
+    """Return the rigid motions (M, 3) of points (n, 2, M) to targets (n, 2) by the singular value decomposition."""
+    motions = np.empty((points.shape[2], 3))
     for m, motion in enumerate(motions):
         centre, target = shares @ points[:, :, m], shares @ targets
         u, _, v = np.linalg.svd((shares[:, None] * (targets - target)).T @ (points[:, :, m] - centre))
         turn = u @ np.diag([1.0, np.linalg.det(u @ v)]) @ v
-        np.testing.assert_allclose(rotation(motion[2]), turn, atol=1e-12)
-        np.testing.assert_allclose(motion[:2], target - turn @ centre, atol=1e-12)
-    add_covariance(motions, weights, scatter := np.zeros((3, 3)))
-    np.testing.assert_allclose(scatter, (weights * inverse(motions).T) @ inverse(motions), atol=1e-12)
+        motion[:2], motion[2] = target - turn @ centre, np.arctan2(turn[1, 0], turn[0, 0])
+    return motions
+
+
+@pytest.mark.parametrize("spread", [0.01, 1.0])
+def test_what_is_held_is_as_by_arrays(spread: float):
+    """Least squares one particle at a time, landmarks weighed by their scatter; poses moved; scatter by its sum."""
+    rng = np.random.default_rng(4)
+    count, seen = LANES + 9, np.array([4, 0, 3])
+    values, landmarks, weights = random_maps(5, count, rng), rng.normal(size=(5, 3)), rng.dirichlet(np.ones(LANES + 9))
+    values[:, :2] += spread * rng.normal(size=(5, 2, count))
+    poses, means = rng.normal(size=(2, 3, count)), rng.normal(size=(2, 3))
+    gained, held = compute_gauge_fix(laned(values), seen, landmarks, poses, means, weights, 3.0)
+    off = values[seen, :2] - landmarks[seen, :2, None]
+    squares = ((off**2).sum(axis=1) + values[seen, 3] + values[seen, 6]) @ weights
+    motions = fitted_plainly(values[seen, :2], landmarks[seen, :2], 1.0 / squares / (1.0 / squares).sum())
+    np.testing.assert_allclose(between(held.motions, motions), 0.0, atol=1e-12)
+    moved = compose(motions, poses.transpose(0, 2, 1)).transpose(0, 2, 1)
+    np.testing.assert_allclose(held.poses, moved, atol=1e-12)
+    np.testing.assert_allclose(held.scatter, (weights * inverse(motions).T) @ inverse(motions), atol=1e-12)
+    assert gained == pytest.approx((off_by(poses, means) - off_by(moved, means)) @ weights)
+    helps = fix_gauge(laned(values), seen, landmarks, poses, means, weights) is not None
+    assert helps == (gained > 0.0)
+    move(poses, held.motions, poses)
+    np.testing.assert_array_equal(poses, held.poses)
 
 
 def test_a_scattered_frame_scatters_poses_and_points():

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from builders.kernels import python_entry
 from builders.plain_coarsening import chained
 from builders.runs import (
     TIGHT,
@@ -22,9 +21,8 @@ from slam_backend.fastslam.run_log import RobotLog
 from slam_backend.geometry import between, compose
 from slam_backend.models.camera import StereoCamera
 from slam_backend.models.odometry import OdometryModel
-from slam_backend.smoother._kernels import FREE
-from slam_backend.smoother._kernels.factors import invert, optimise_landmark, sum_pose_information
-from slam_backend.smoother._kernels.normal_equations import advance
+from slam_backend.smoother import _kernels
+from slam_backend.smoother._kernels import FREE, Equations, Factor, Pattern, sum_pose_information
 from slam_backend.smoother.graph import SlamGraph
 from slam_backend.smoother.graph_building import InitialPoses, LandmarkPositions, extend_graph, log_head
 from slam_backend.smoother.graph_reduction import relinearise
@@ -179,9 +177,6 @@ def test_a_graph_cannot_be_written():
         graph_of(small_run()).poses[0] = 0.0
 
 
-advance, invert, optimise_landmark = map(python_entry, (advance, invert, optimise_landmark))
-
-
 @pytest.mark.parametrize("robots", [1, 2])
 def test_with_every_step_a_key_the_mode_is_batch_maximum_likelihood(robots):
     """Two programs that share no line find the same paths, landmarks and cost."""
@@ -333,45 +328,55 @@ def test_small_matrices_are_inverted_as_by_lapack():
     rng = np.random.default_rng(5)
     roots = rng.normal(size=(50, 3, 3)) * [1e-3, 1e-2, 1.0]
     matrices = roots @ roots.transpose(0, 2, 1) + 1e-4 * np.eye(3)
-    found, columns = np.empty_like(matrices), 3 * np.arange(50)
-    columns[[4, 20]] = FREE
+    previous = np.zeros(50, dtype=np.int64)
+    previous[[4, 20]] = -1
     expected = np.linalg.inv(matrices)
     expected[[4, 20]] = 0.0
     matrices[20] = 0.0
-    assert invert(matrices, columns, found)
+    _, found, _, is_noisy = sum_pose_information(previous, matrices)
+    assert is_noisy
     np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-7)
     for bad in (np.zeros((3, 3)), np.diag([1.0, -1.0, -1.0]), np.diag([-1.0, 1.0, 1.0])):
         matrices[7] = bad
-        assert not invert(matrices, columns, found)
+        assert not sum_pose_information(previous, matrices)[3]
 
 
 def test_only_poses_with_odometry_from_another_are_sought():
     """They get three rows each, in their order; poses that are given get none."""
-    columns = np.empty(5, dtype=np.int64)
-    assert optimise_landmark(np.array([-1, 0, -1, 1, 2]), columns) == 3
+    previous, noises = np.array([-1, 0, -1, 1, 2]), np.zeros((5, 3, 3))
+    columns, _, size, is_noisy = sum_pose_information(previous, noises)
     assert columns.tolist() == [FREE, 0, FREE, 3, 6]
-    noises, informations = np.zeros((5, 3, 3)), np.empty((5, 3, 3))
-    assert sum_pose_information(np.array([-1, 0, -1, 1, 2]), noises, columns, informations) == (3, False)
+    assert (size, is_noisy) == (3, False)
     noises[[1, 3, 4]] = 0.5 * np.eye(3)
-    assert sum_pose_information(np.array([-1, 0, -1, 1, 2]), noises, columns, informations) == (3, True)
+    _, informations, *rest = sum_pose_information(previous, noises)
+    assert rest == [3, True]
     np.testing.assert_array_equal(informations, 4.0 * noises)
 
 
 def test_a_change_leads_where_it_says():
     """Poses that are given stay; the slope is taken along all of it, and no change that is not finite looks small."""
     rng = np.random.default_rng(8)
-    change, vector, poses, landmarks = (rng.normal(size=(n, 3)) for n in (5, 5, 4, 2))
-    columns = np.array([FREE, 0, 3, 6])
-    new_poses, new_landmarks = np.empty_like(poses), np.empty_like(landmarks)
-    rise, largest = advance(change, vector, columns, poses, landmarks, new_poses, new_landmarks)
-    assert rise == pytest.approx((change * vector).sum())
+    change, poses, landmarks = (rng.normal(size=(n, 3)) for n in (5, 4, 2))
+    columns, order, none = np.array([FREE, 0, 3, 6]), np.arange(5), np.zeros(0, dtype=np.int64)
+    tops, empty = np.zeros(6, dtype=np.int64), np.zeros((0, 3))
+    pattern = Pattern(order, order, tops, none, none, none, tops, none, none, 5, 0)
+    factor = Factor(np.tile([1.0, 0.0, 1.0, 0.0, 0.0, 1.0], (5, 1)), np.zeros((0, 9)), order)  # of unit matrices
+
+    def solved(vector):
+        blocks = np.zeros((5, 6)), np.zeros((0, 3, 3)), np.zeros((0, 3, 3))
+        return _kernels.step(
+            Equations(empty[:, :2].copy(), *blocks, vector), factor, pattern, columns, poses, landmarks
+        )
+
+    new_poses, new_landmarks, rise, largest = solved(-change)
+    assert rise == pytest.approx(-(change * change).sum())
     assert largest == np.abs(change[:3]).max()
     np.testing.assert_array_equal(new_poses, poses + np.concatenate([np.zeros((1, 3)), change[:3]]))
     np.testing.assert_array_equal(new_landmarks, landmarks + change[3:])
     for row, axis in ((0, 0), (2, 2)):
         bad = change.copy()
         bad[row, axis] = np.nan
-        assert not advance(bad, vector, columns, poses, landmarks, new_poses, new_landmarks)[1] < np.inf
+        assert not solved(-bad)[3] < np.inf
 
 
 def test_exact_motions_and_poses_leave_nothing_to_smooth():

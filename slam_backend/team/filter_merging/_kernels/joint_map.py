@@ -1,11 +1,10 @@
 """The compiled inner loops of a joint map: landmarks of both sides read where they lie, moved, fused, written in tiles.
 
-A landmark of a particle is nine numbers, x, y, z, Sxx, Sxy, Sxz, Syy, Syz, Szz, a number of lanes apart; `places` says
-where it begins. The number of lanes is always an argument: a compiled kernel would not notice that it changed in
-another file.
+A landmark of a particle is nine numbers, x, y, z, Sxx, Sxy, Sxz, Syy, Syz, Szz, a number of lanes apart. The number of
+lanes is an argument: a compiled kernel would not notice that it changed in another file.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,34 +12,20 @@ from slam_backend.core.jit import device, inline, jit
 from slam_backend.core.validation import FloatArray, IntArray
 
 
-@jit
-def places(
-    slots: Any, row_of: Any, map_of: Any, maps: Any, counts: Any, chosen: Any, lanes: int
-) -> tuple[IntArray, IntArray]:
-    """Return where the landmarks of slots (n,) begin in the chosen particles (M,), and their counts: both (n, M)."""
-    where, times = np.empty((len(slots), len(chosen)), np.int64), np.empty((len(slots), len(chosen)), np.int64)
-    padded = counts.shape[1]
-    offsets = np.empty(padded, np.int64)  # of each particle in a row: a table, as divisions are dear
-    for m in range(padded):
-        offsets[m] = m // lanes * 9 * lanes + m % lanes
-    for i in range(len(slots)):
-        row, ancestors = row_of[slots[i]], map_of[slots[i]]
-        for p in range(len(chosen)):
-            m = maps[ancestors, chosen[p]] if ancestors > 0 else chosen[p]
-            where[i, p] = row * 9 * padded + offsets[m]
-            times[i, p] = counts[row, m]
-    return where, times
+class Side(NamedTuple):
+    """Landmarks of one filter.
 
+    Attributes:
+        values: All numbers of its map.
+        where: (n, M) place of the first number of each landmark in each particle.
+        counts: (n, M) measurements, 0 where a particle lacks the landmark.
+        rows: (joint,) row of each joint landmark, -1 where this side lacks it.
+    """
 
-@jit
-def read(values: Any, where: Any, lanes: int) -> FloatArray:
-    """Return the landmarks (n, 9, M) that begin at `where` (n, M)."""
-    result = np.empty((where.shape[0], 9, where.shape[1]))
-    for i in range(where.shape[0]):
-        for c in range(9):
-            for p in range(where.shape[1]):
-                result[i, c, p] = values[where[i, p] + c * lanes]
-    return result
+    values: Any
+    where: IntArray
+    counts: IntArray
+    rows: IntArray
 
 
 @inline
@@ -52,19 +37,6 @@ def _widened(values: Any, at: int, lanes: int, extra: float, scale: float, landm
         landmark[c] += extra
     for c in range(3, 9):
         landmark[c] *= scale
-
-
-@inline
-def _move(landmark: Any, x: float, y: float, c: float, s: float) -> None:
-    """Move a landmark (9,) in place by a motion of which c, s are cosine and sine; its covariance by Eq. 16 *."""
-    px, py = landmark[0], landmark[1]
-    landmark[0], landmark[1] = c * px - s * py + x, s * px + c * py + y
-    xx, xy, xz, yy, yz = landmark[3], landmark[4], landmark[5], landmark[6], landmark[7]
-    landmark[3] = c * c * xx - 2.0 * c * s * xy + s * s * yy  # R Sigma R^T
-    landmark[4] = c * s * (xx - yy) + (c * c - s * s) * xy
-    landmark[5] = c * xz - s * yz
-    landmark[6] = s * s * xx + 2.0 * c * s * xy + c * c * yy
-    landmark[7] = s * xz + c * yz
 
 
 @device
@@ -109,15 +81,11 @@ def _fuse(one: FloatArray, two: FloatArray, work: FloatArray) -> bool:
 
 
 @jit
-def join(
-    values_a: Any, where_a: Any, times_a: Any, values_b: Any, where_b: Any, times_b: Any, rows_a: Any, rows_b: Any,
-    motion: Any, extra: float, scales: Any, lanes: int, tiles: Any,
-) -> bool:  # fmt: skip
+def join(a: Side, b: Side, motion: FloatArray, extra: float, scales: FloatArray, lanes: int, tiles: FloatArray) -> bool:
     """Write the landmarks of a joint map, those of b moved, those of both fused where a particle holds both.
 
     Args:
-        values_a: All numbers of one map, of which (n_a, M) begin at `where_a` with counts `times_a`; of b likewise.
-        rows_a: (n,) row in a of each joint landmark, -1 if only b has it; `rows_b` likewise.
+        a, b: Landmarks of either filter.
         motion: (M, 3) from b's map frame to a's, of each particle.
         extra: Added to all variances of either side first [m^2].
         scales: (n,) factor on the covariances of each then [-].
@@ -129,21 +97,28 @@ def join(
     """
     one, two, work = np.empty(9), np.empty(9), np.empty((5, 3, 3))
     cos, sin = np.cos(motion[:, 2]), np.sin(motion[:, 2])
-    for i in range(len(rows_a)):
-        j, k, scale = rows_a[i], rows_b[i], scales[i]
+    for i in range(len(a.rows)):
+        j, k, scale = a.rows[i], b.rows[i], scales[i]
         for block in range(tiles.shape[1]):
             tile, first = tiles[i, block], block * lanes
             for lane in range(lanes):
                 p = first + lane
                 there = p < len(motion)
-                in_a, in_b = there and j >= 0 and times_a[j, p] > 0, there and k >= 0 and times_b[k, p] > 0
+                in_a, in_b = there and j >= 0 and a.counts[j, p] > 0, there and k >= 0 and b.counts[k, p] > 0
                 if in_b:
-                    _widened(values_b, where_b[k, p], lanes, extra, scale, two)
-                    _move(two, motion[p, 0], motion[p, 1], cos[p], sin[p])
+                    _widened(b.values, b.where[k, p], lanes, extra, scale, two)
+                    x, y, c, s = two[0], two[1], cos[p], sin[p]
+                    two[0], two[1] = c * x - s * y + motion[p, 0], s * x + c * y + motion[p, 1]
+                    xx, xy, xz, yy, yz = two[3], two[4], two[5], two[6], two[7]
+                    two[3] = c * c * xx - 2.0 * c * s * xy + s * s * yy  # R Sigma R^T, Eq. 16 *
+                    two[4] = c * s * (xx - yy) + (c * c - s * s) * xy
+                    two[5] = c * xz - s * yz
+                    two[6] = s * s * xx + 2.0 * c * s * xy + c * c * yy
+                    two[7] = s * xz + c * yz
                 if in_a:
-                    _widened(values_a, where_a[j, p], lanes, extra, scale, one)
+                    _widened(a.values, a.where[j, p], lanes, extra, scale, one)
                     if in_b and not _fuse(one, two, work):
                         return False
-                for c in range(9):
-                    tile[c, lane] = one[c] if in_a else two[c] if in_b else 0.0
+                for axis in range(9):
+                    tile[axis, lane] = one[axis] if in_a else two[axis] if in_b else 0.0
     return True

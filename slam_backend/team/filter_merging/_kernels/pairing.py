@@ -93,7 +93,7 @@ def _gather(
 @device
 @in_place
 def _sum(records: FloatArray, motions: FloatArray, first: int, state: FloatArray, log_dets: FloatArray) -> None:
-    """Sum over all landmarks of a block at its motions; the logs of |2 pi S|, too, where they are asked for."""
+    """Sum over all landmarks of a block at its motions; add the logs of |2 pi S| where `log_dets` has rows."""
     for p in range(WIDTH):
         motion = motions[min(first + p, len(motions) - 1)]
         state[X + p], state[Y + p] = motion[0], motion[1]
@@ -110,7 +110,7 @@ def _sum(records: FloatArray, motions: FloatArray, first: int, state: FloatArray
 @device
 @in_place
 def _step(state: FloatArray, first: int, shared: IntArray, motions: FloatArray) -> None:
-    """Do a step of Gauss and Newton with the pairs of a block that share enough."""
+    """Do a Gauss-Newton step with the pairs of a block that share enough landmarks."""
     for p in range(min(WIDTH, len(motions) - first)):
         xx, xy, yy, xt, yt = state[N00 + p], state[N01 + p], state[N11 + p], state[N02 + p], state[N12 + p]
         det = xx * yy - xy * xy
@@ -131,12 +131,12 @@ def fit(
     """Fit the motions of pairs of particles to the landmarks that both of each hold.
 
     Args:
-        landmarks_a: (k, 9, M_a) shared landmarks, `held_a` (k, M_a) whether each particle has them; those of b likewise
-            in the same order.
-        from_a: (c,) particle of a in each pair; `from_b` likewise.
-        start: (3,) where all begin.
+        landmarks_a, landmarks_b: (k, 9, M_a), (k, 9, M_b) shared landmarks of both filters, in the same order.
+        held_a, held_b: (k, M_a), (k, M_b) whether each particle has them.
+        from_a, from_b: (c,) particles of each pair.
+        start: (3,) motion from which all begin.
         extra: tau^2, added to the variances of all differences [m^2].
-        iterations: Of Gauss and Newton.
+        iterations: Number of Gauss-Newton steps.
 
     Returns:
         Motions (c, 3), information matrices (c, 3, 3), chi^2 (c,), sums of log|2 pi S| (c,), and how many landmarks
@@ -172,8 +172,10 @@ def reduced_chi2(
 
     By Newton's method on the latter over the former, which is concave in tau^2: it rises to the root and not beyond.
 
+    The arguments are those of `fit`.
+
     Returns:
-        That, and how many landmarks both particles of a pair hold (c,). The arguments are those of `fit`.
+        tau^2, and how many landmarks both particles of a pair hold (c,).
     """
     count = len(from_a)
     extra, shared, motions = np.zeros(count), np.empty(count, np.int64), np.empty((count, 3))

@@ -1,0 +1,163 @@
+"""Records of arrays that kernels take and return together: parts of a graph, its sightings, equations and factor."""
+
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_backend.core.validation import BoolArray, FloatArray, IntArray
+
+NONE: Final = -1  # no key, no robot
+FREE: Final = -1  # column of a pose that is given, not sought
+LEVER: Final = 3.0  # [m]; where an error of the heading between two keys is felt
+
+
+class Keys(NamedTuple):
+    """Columns of `SlamGraph` with one row for each of k keys."""
+
+    robots: IntArray
+    poses: FloatArray
+    previous: IntArray
+    motions: FloatArray
+    noises: FloatArray
+    spreads: FloatArray
+    slack: FloatArray
+
+
+class Frames(NamedTuple):
+    """Columns of `SlamGraph` with one row for each of f frames."""
+
+    frame_keys: IntArray
+    frame_offsets: FloatArray
+
+
+class Points(NamedTuple):
+    """Columns of `SlamGraph` with one row for each of n raw measurements."""
+
+    points: FloatArray
+    point_noises: FloatArray
+    given: BoolArray
+    point_frames: IntArray
+    point_landmarks: IntArray
+
+
+class Frozen(NamedTuple):
+    """Columns of `SlamGraph` with one row for each frozen sighting."""
+
+    condensed_keys: IntArray
+    condensed_landmarks: IntArray
+    centres: FloatArray
+    infos: FloatArray
+    slopes: FloatArray
+    counts: IntArray
+
+
+class Landmarks(NamedTuple):
+    """Columns of `SlamGraph` with one row for each of l landmarks."""
+
+    landmark_ids: IntArray
+    landmarks: FloatArray
+
+
+class Log(NamedTuple):
+    """T steps of one robot.
+
+    Attributes:
+        steps, kinds, motions, given, starts, points, ids: Columns of `LogArrays`.
+        covariances: (n, 6) [m^2] of the measured points, (0, 6) where there are none at all.
+        variances: (T, 3) [m^2, m^2, rad^2] of the parts of each motion.
+    """
+
+    steps: IntArray
+    kinds: NDArray[np.int8]
+    motions: FloatArray
+    given: BoolArray
+    starts: IntArray
+    points: FloatArray
+    ids: IntArray
+    covariances: FloatArray
+    variances: FloatArray
+
+
+class Sightings(NamedTuple):
+    """Forms of s sightings, by landmark; those of raw measurements change with the point of linearisation.
+
+    Attributes:
+        keys, landmarks: (s,) int64.
+        starts: (l + 1,) int64. Those of landmark i are starts[i] to starts[i + 1].
+        frozen: (s,) bool.
+        centres, infos, slopes: (s, 3), (s, 6), (s, 3) float64. See `_kernels.factors`.
+        counts: (s,) int64. Measurements in each.
+        of_points: (n,) int64. Sighting of each raw measurement.
+        squares: (n,) float64. Squared Mahalanobis distance of each, where it was last linearised.
+    """
+
+    keys: IntArray
+    landmarks: IntArray
+    starts: IntArray
+    frozen: BoolArray
+    centres: FloatArray
+    infos: FloatArray
+    slopes: FloatArray
+    counts: IntArray
+    of_points: IntArray
+    squares: FloatArray
+
+
+class Equations(NamedTuple):
+    """Normal equations of n poses that are sought and l landmarks; nodes are the poses, then the landmarks.
+
+    Attributes:
+        turns: (k, 2) cosine and sine of each heading.
+        blocks: (n + l, 6) second derivatives by each node.
+        links: (k, 3, 3) by a key (rows) and the one before (columns), where both are sought.
+        cross: (s, 3, 3) by pose (rows) and landmark (columns) of each sighting, where the pose is sought.
+        vector: (n + l, 3) slope of the cost.
+    """
+
+    turns: FloatArray
+    blocks: FloatArray
+    links: FloatArray
+    cross: FloatArray
+    vector: FloatArray
+
+
+class Pattern(NamedTuple):
+    """Places of the blocks of a factor of N nodes: column by column, in each by ascending rows.
+
+    Attributes:
+        order: (N,) nodes in the order of elimination.
+        ranks: (N,) place of each node in that order.
+        tops, rows: (N + 1,), (filled,) blocks of column j are tops[j] to tops[j + 1], and their rows.
+        link_places, cross_places: (k,), (s,) 1 + place of each block of `links` and `cross`, negative if it is
+            transposed there, 0 if there is none.
+        row_tops, row_columns, row_places: (N + 1,), (filled,), (filled,) the same blocks row by row.
+        drawn: How many nodes `draw` draws.
+        squares: Sum of the squares of the columns' lengths.
+    """
+
+    order: IntArray
+    ranks: IntArray
+    tops: IntArray
+    rows: IntArray
+    link_places: IntArray
+    cross_places: IntArray
+    row_tops: IntArray
+    row_columns: IntArray
+    row_places: IntArray
+    drawn: int
+    squares: int
+
+
+class Factor(NamedTuple):
+    """Blocks of a factor of N nodes, nine numbers row by row, where a `Pattern` says.
+
+    Attributes:
+        pivots: (N, 6) lower triangles by rows, with the reciprocals of their diagonals.
+        values: (filled, 9) blocks off the diagonal.
+        where: (N,) room.
+    """
+
+    pivots: FloatArray
+    values: FloatArray
+    where: IntArray
