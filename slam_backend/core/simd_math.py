@@ -14,37 +14,28 @@ WIDE, NARROW = 32, 8
 ROUND = 6755399441055744.0  # 1.5 * 2^52: adding and subtracting it rounds to the nearest integer
 
 
+Symmetric = tuple[float, float, float, float, float, float]  # upper triangle of a 3 x 3 matrix, by rows
+
+
 @simd_inline
-def inverted(
-    a: float, b: float, c: float, d: float, e: float, f: float
-) -> tuple[float, float, float, float, float, float, float]:
-    """Invert the symmetric [[a, b, c], [b, d, e], [c, e, f]]: its inverse likewise (6), and its determinant."""
+def inverted(matrix: Symmetric) -> tuple[Symmetric, float]:
+    """Return the inverse of a symmetric matrix, by cofactors, and its determinant."""
+    a, b, c, d, e, f = matrix
     p = d * f - e * e
     q = c * e - b * f
     r = b * e - c * d
     det = a * p + b * q + c * r
     g = 1.0 / det
-    return p * g, q * g, r * g, (a * f - c * c) * g, (b * c - a * e) * g, (a * d - b * b) * g, det
+    return (p * g, q * g, r * g, (a * f - c * c) * g, (b * c - a * e) * g, (a * d - b * b) * g), det
 
 
 @simd_inline
-def cofactors_cancel(a: float, b: float, c: float, d: float, e: float, f: float, least: float) -> bool:
-    """Tell whether the determinant by cofactors is less than this share of the product of the diagonal.
-
-    The matrix is that of `inverted`, positive definite, and so flat and so turned that its digits are lost.
-    """
-    det = a * (d * f - e * e) + b * (c * e - b * f) + c * (b * e - c * d)
-    return det < least * a * d * f
-
-
-@simd_inline
-def inverted_by_parts(
-    a: float, b: float, c: float, d: float, e: float, f: float
-) -> tuple[float, float, float, float, float, float, float]:
-    """Return what `inverted` does of a positive definite matrix, by L D L^T: three divisions, and it stays definite.
+def inverted_by_parts(matrix: Symmetric) -> tuple[Symmetric, float]:
+    """Return the inverse of a positive definite matrix, by L D L^T, and its determinant: the inverse stays definite.
 
     Errors grow with the ratio of the extreme eigenvalues, those of `inverted` with its square.
     """
+    a, b, c, d, e, f = matrix
     per_a = 1.0 / a
     m10, m20 = b * per_a, c * per_a
     d1, n = d - m10 * b, e - m10 * c
@@ -52,18 +43,18 @@ def inverted_by_parts(
     m21 = n * per_d1
     d2 = f - m20 * c - m21 * n
     per_d2, k = 1.0 / d2, m10 * m21 - m20
-    return (
+    inverse = (
         per_a + m10 * m10 * per_d1 + k * k * per_d2, -m10 * per_d1 - k * m21 * per_d2, k * per_d2,
-        per_d1 + m21 * m21 * per_d2, -m21 * per_d2, per_d2, a * d1 * d2,
+        per_d1 + m21 * m21 * per_d2, -m21 * per_d2, per_d2,
     )  # fmt: skip
+    return inverse, a * d1 * d2
 
 
 @simd_inline
-def quadratic_form(
-    i00: float, i01: float, i02: float, i11: float, i12: float, i22: float, x: float, y: float, z: float
-) -> float:
+def quadratic_form(matrix: Symmetric, x: float, y: float, z: float) -> float:
     """Return the quadratic form of (x, y, z)."""
-    return i00 * x * x + i11 * y * y + i22 * z * z + 2.0 * (i01 * x * y + i02 * x * z + i12 * y * z)
+    m00, m01, m02, m11, m12, m22 = matrix
+    return m00 * x * x + m11 * y * y + m22 * z * z + 2.0 * (m01 * x * y + m02 * x * z + m12 * y * z)
 
 
 @simd_inline

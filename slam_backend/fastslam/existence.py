@@ -14,13 +14,13 @@ loops over landmarks and particles are in `fastslam/_kernels/existence.py`.
 
 from dataclasses import dataclass
 from math import exp, floor, log
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.core.validation import MOST, FloatArray, IntArray, argument_error, check_float, check_int, known_names
 from slam_backend.fastslam._kernels import existence as kernels
+from slam_backend.fastslam._kernels.records import ViewBounds, Viewpoint
 from slam_backend.fastslam.particle_maps import ParticleMaps
 from slam_backend.models.camera import StereoCamera
 
@@ -135,20 +135,8 @@ class ExistenceModel:
         return FieldOfView(self.nearest, side / camera.focal_px, rise / camera.focal_px, reach * reach)
 
 
-class FieldOfView(NamedTuple):
-    """Where landmarks are expected to be seen: bounds relative to a camera, for compiled loops.
-
-    Attributes:
-        nearest: Least depth [m].
-        side: Largest |lateral| / depth [-].
-        rise: Largest |vertical| / depth [-].
-        reach_squared: Largest squared distance [m^2].
-    """
-
-    nearest: float
-    side: float
-    rise: float
-    reach_squared: float
+class FieldOfView(ViewBounds):
+    """Where landmarks are expected to be seen: bounds relative to a camera."""
 
 
 def _log_odds(probability: float) -> float:
@@ -187,19 +175,14 @@ class ExistenceUpdate:
             Slots that no particle holds any more. They are to be released once nobody asks for their ids.
         """
         maps.add_odds(new_slots)
-        view = self._view
-        seen_from = (poses, np.cos(poses[2]), np.sin(poses[2]), self._mount)
+        camera = Viewpoint(poses, np.cos(poses[2]), np.sin(poses[2]), self._mount)
         slots = kernels.landmarks_in_view(
-            maps.ids, maps.row_of, maps.map_of, maps.maps, maps.blocks, maps.counts, maps.num_particles, best,
-            *seen_from, self._near, view.nearest, view.side, view.reach_squared, found, new_slots,
-        )  # fmt: skip
+            maps.arrays, maps.num_particles, best, camera, self._view, self._near, found, new_slots
+        )
         if not len(slots):
             return slots
         maps.refresh(slots)
         pose = np.ascontiguousarray(poses[:, best])
-        store = (maps.row_of, maps.blocks, maps.counts)
-        expected = kernels.count_expected(slots, *store, best, pose, self._mount, *view)
-        return kernels.update_existence(
-            slots, kernels.mark_seen(slots, len(maps.ids), found), maps.odds, *store,
-            *seen_from, *view, *self._model.increments(expected), *self._bounds,
-        )  # fmt: skip
+        expected = kernels.count_expected(slots, maps.arrays, best, pose, self._mount, self._view)
+        increments = self._model.increments(expected)
+        return kernels.update_existence(slots, found, maps.arrays, camera, self._view, *increments, *self._bounds)

@@ -320,8 +320,8 @@ class FastSlam:
         state = self.state
         weights = NO_WEIGHTS if state.starts_at_origin else np.exp(state.log_weights)
         _kernels.write_team_poses(
-            state.pose_arrays, state.start_covariances, weights, state.best, state.starts_at_origin, *state.estimates,
-            membership_table(names, live), ess, points.poses, points.beliefs,
+            state.pose_arrays, state.start_covariances, weights, state.best, *state.estimates,
+            membership_table(names, live), ess, _kernels.StandpointArrays(points.poses, points.beliefs),
         )  # fmt: skip
 
     def particles_from_start(self, robot: int = 0) -> FloatArray:

@@ -134,6 +134,12 @@ class FilterOptions:
         return float(self.landmark_noise) ** 2
 
 
+def packed_camera(camera: StereoCamera) -> FloatArray:
+    """Return what kernels take of a camera, (7,) float64, see `Frame` of the kernels."""
+    sigmas = camera.sigma_px, camera.sigma_disparity_px
+    return np.array([camera.focal_px, camera.baseline, *sigmas, *camera.mount], np.float64)
+
+
 def pack_options(options: FilterOptions) -> FloatArray:
     """Return what a filter assumes, (27,) float64, as `_kernels.layout` names the numbers.
 
@@ -141,10 +147,9 @@ def pack_options(options: FilterOptions) -> FloatArray:
     sigmas of image coordinates and of the disparity [px], and the mount [m]; the sigmas (3,) [m, m, rad] of the prior
     of a lost pose; then one number each.
     """
-    camera = options.camera
     return np.array([
         *astuple(options.motion),
-        camera.focal_px, camera.baseline, camera.sigma_px, camera.sigma_disparity_px, *camera.mount,
+        *packed_camera(options.camera),
         options.recovery_position, options.recovery_position, options.recovery_heading,
         options.descriptor_gate**2, options.descriptor_sigma**2, options.position_gate, options.new_landmark_gate,
         options.new_landmark_radius, options.ambiguity_margin,

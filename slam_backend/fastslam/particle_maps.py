@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.core.jit import LINE
+from slam_backend.core.packed_symmetric import UNPACK_INDEX
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.fastslam import _kernels
 from slam_backend.fastslam._kernels import LANES
-from slam_backend.fastslam._kernels import existence as _existence_kernels
-from slam_backend.fastslam._kernels.layout import FREE_SLOTS, IDENTITIES, IDS, LAST_SEEN, MAP_OF, ROW_OF
+from slam_backend.fastslam._kernels.records import Slots
 from slam_backend.maps.landmark_map import MapSummaryRows
 
 
@@ -60,8 +60,7 @@ class MapStore:
         values: (rows * 9 * P,) float64 [m, m^2], map frame, each row
             [block][x, y, z, Sxx, Sxy, Sxz, Syy, Syz, Szz][lane].
         counts: (rows, P) int32. How often the particle matched the landmark, its start included; 0: it lacks it.
-        table: (6, slots) int64. Per slot `row_of`, `map_of`, `ids`, `identities` and `last_seen`; and the stack
-            `free_slots`.
+        table: (6, slots) int64, see `Slots`.
         maps: (maps, P) int32. users: (maps,) int64, how many slots read by each.
         odds: (slots, P) float64. Log-odds that the landmark exists, read through its map as a row is; (0, P) without.
         descriptors: (slots, d) float32. heads: (h, slots) every (d / h)-th component of them, `FAR` where free.
@@ -91,32 +90,32 @@ class MapStore:
     @property
     def row_of(self) -> IntArray:
         """(slots,) row of each slot. A view, as the others."""
-        return np.asarray(self.table[ROW_OF])
+        return Slots(*self.table).row_of
 
     @property
     def map_of(self) -> IntArray:
         """(slots,) the ancestor map by which each is to be read."""
-        return np.asarray(self.table[MAP_OF])
+        return Slots(*self.table).map_of
 
     @property
     def ids(self) -> IntArray:
         """(slots,) stable names of the landmarks, -1 = free slot."""
-        return np.asarray(self.table[IDS])
+        return Slots(*self.table).ids
 
     @property
     def identities(self) -> IntArray:
         """(slots,) the caller's own names, -1 = none."""
-        return np.asarray(self.table[IDENTITIES])
+        return Slots(*self.table).identities
 
     @property
     def last_seen(self) -> IntArray:
         """(slots,) steps of the smoother in which the most probable particle matched landmarks last, 0 = never."""
-        return np.asarray(self.table[LAST_SEEN])
+        return Slots(*self.table).last_seen
 
     @property
     def free_slots(self) -> IntArray:
         """(slots,) a stack of free slots."""
-        return np.asarray(self.table[FREE_SLOTS])
+        return Slots(*self.table).free_slots
 
     @property
     def next_id(self) -> int:
@@ -131,6 +130,14 @@ class MapStore:
             self.odds,
         )  # fmt: skip
         return sum(array.nbytes for array in arrays)
+
+    @property
+    def arrays(self) -> _kernels.MapArrays:
+        """The arrays as kernels take them."""
+        return _kernels.MapArrays(
+            self.values, self.counts, self.odds, self.table, self.maps, self.users, self.free_rows, self.tops,
+            self.descriptors, self.heads,
+        )  # fmt: skip
 
     @property
     def blocks(self) -> FloatArray:
@@ -183,7 +190,9 @@ class MapStore:
         """Provide so many more slots, with room for descriptors of that size."""
         old = len(self.ids)
         table = np.zeros((len(self.table), old + extra), dtype=np.int64)
-        table[:, :old], table[IDS, old:], table[IDENTITIES, old:] = self.table, -1, -1
+        table[:, :old] = self.table
+        slots = Slots(*table)
+        slots.ids[old:] = slots.identities[old:] = -1
         descriptors = zeros_aligned((old + extra, descriptor_size), np.float32)
         if old and self.descriptors.shape[1]:
             descriptors[:old] = self.descriptors
@@ -199,8 +208,8 @@ class MapStore:
             self.odds = odds
         top = int(self.tops[1])
         # The lowest is taken first once the old ones are gone.
-        table[FREE_SLOTS, :extra] = np.arange(old + extra - 1, old - 1, -1)
-        table[FREE_SLOTS, extra : extra + top] = self.free_slots[:top]
+        slots.free_slots[:extra] = np.arange(old + extra - 1, old - 1, -1)
+        slots.free_slots[extra : extra + top] = self.free_slots[:top]
         self.table = table
         self.tops[1] = extra + top
 
@@ -252,10 +261,8 @@ class ParticleMaps(MapStore):
         """
         if not self._free_maps:
             self._make_maps()
-        self._free_maps, best = _kernels.resample(
-            ancestors, of_robots, of_particles, self.counts, self.table, self.maps, self.users, self.free_rows,
-            self.tops, self.heads, np.empty((3, len(ancestors)), np.uint32),
-        )  # fmt: skip
+        room = np.empty((3, len(ancestors)), np.uint32)
+        self._free_maps, best = _kernels.resample(ancestors, of_robots, of_particles, self.arrays, room)
         return best
 
     def _make_maps(self) -> None:
@@ -277,17 +284,9 @@ class ParticleMaps(MapStore):
         """Bring slots up to date: afterwards they are read in place."""
         if not self.tops[0]:
             self._grow_rows(64)
-        self.gather_odds(slots)
-        _kernels.apply_resampling(
-            slots, self.values, self.counts, self.row_of, self.map_of, self.maps, self.users, self.free_rows, self.tops
-        )
+        _kernels.apply_resampling(slots, self.arrays)
 
     # ------------------------------------------------------------------ existence
-
-    def gather_odds(self, slots: IntArray) -> None:
-        """Bring the log-odds of slots up to date, just before a kernel does so with all else that they hold."""
-        if self.log_odds_prior is not None:
-            _kernels.gather_odds(slots, self.odds, self.map_of, self.maps)
 
     def add_odds(self, new_slots: IntArray) -> None:
         """Give landmarks that were just started their prior; -1 among `new_slots` stands for none."""
@@ -306,9 +305,7 @@ class ParticleMaps(MapStore):
 
     def release(self, slots: IntArray) -> None:
         """Forget the landmarks of slots (n,), up to date, that no particle holds."""
-        _existence_kernels.delete_landmarks(
-            slots, self.ids, self.row_of, self.heads, self.free_rows, self.free_slots, self.tops, _kernels.FAR
-        )
+        _kernels.release(slots, self.arrays)
 
     # ------------------------------------------------------------------ reading and writing whole maps
 
@@ -418,8 +415,8 @@ def write_summary(maps: ParticleMaps, m: int, min_count: int, rows: MapSummaryRo
 
 def present_slots(maps: ParticleMaps, m: int, min_count: int) -> IntArray:
     """Return the slots (n,) of `best_map`, which takes the same, by ascending id."""
-    slots, ascending = _kernels.present_slots(maps.table, maps.maps, maps.counts, m, min_count)
-    return slots if ascending else slots[np.argsort(maps.ids[slots])]
+    slots = maps.used_slots()
+    return slots[maps.of_particle(m, slots)[1] >= max(min_count, 1)]
 
 
 def best_map(maps: ParticleMaps, m: int, min_count: int) -> tuple[FloatArray, FloatArray, Any, IntArray, IntArray]:
@@ -435,5 +432,6 @@ def best_map(maps: ParticleMaps, m: int, min_count: int) -> tuple[FloatArray, Fl
         all fresh.
     """
     slots = present_slots(maps, m, min_count)
-    means, covariances, times, names = _kernels.gather(slots, maps.table, maps.maps, maps.values, maps.counts, m)
-    return means, covariances, maps.descriptors[slots], times, names
+    values, counts = maps.of_particle(m, slots)
+    covariances = np.take(values, 3 + UNPACK_INDEX, axis=1)
+    return values[:, :3].copy(), covariances, maps.descriptors[slots], counts.astype(np.int64), maps.ids[slots]

@@ -65,7 +65,6 @@ def max_pending_steps(logs: Sequence[RobotLog], graph: SlamGraph) -> int:
     return max(log.num_since(step + 1) for log, step in zip(logs, graph.latest.tolist(), strict=True))
 
 
-NONE = -1  # no row of the new particles' landmarks
 XX, YY, ZZ = 3, 6, 8  # the diagonal of a landmark's covariance, in the rows of a tile
 
 
@@ -83,10 +82,9 @@ def write_maps(maps: ParticleMaps, best: int, particles: Particles, walk: float)
         walk: Variance [m^2] along each axis, see `FilterOptions.landmark_walk`.
     """
     slots = present_slots(maps, best, 1)
-    rows = np.empty_like(slots)
-    find_rows(maps.ids[slots], particles.ids, particles.ids.argsort(), rows)
-    supported = rows != NONE
-    slots, rows = slots[supported], rows[supported]
+    order, names = particles.ids.argsort(), maps.ids[slots]
+    _, of_slots, at = np.intersect1d(names, particles.ids[order], assume_unique=True, return_indices=True)
+    slots, rows = slots[of_slots], order[at]
     odds = maps.dense_odds(slots)
     if odds is not None:
         held = maps.dense(slots)[1] > 0
@@ -100,30 +98,14 @@ def write_maps(maps: ParticleMaps, best: int, particles: Particles, walk: float)
 
 
 @in_place
-def find_rows(names: IntArray, ids: IntArray, order: IntArray, rows: IntArray) -> None:
-    """Write where the landmarks of some names lie among others.
-
-    Args:
-        names: (n,) ascending.
-        ids, order: (l,), of the others, and their rows by ascending id.
-        rows: (n,), result, `NONE` where there is none of that name.
-    """
-    at = 0
-    for n in range(len(names)):
-        while at < len(order) and ids[order[at]] < names[n]:
-            at += 1
-        rows[n] = order[at] if at < len(order) and ids[order[at]] == names[n] else NONE
-
-
-@in_place
 def write_tiles(tiles: FloatArray, rows: IntArray, walk: float, blocks: FloatArray) -> None:
     """Write some landmarks of new particles, with a variance [m^2] along each axis added to theirs.
 
     Args:
         tiles: (l, P / lanes, 9, lanes) means and covariances.
-        rows: (n,) which of them.
-        walk: The variance.
-        blocks: (>= n, P / lanes, 9, lanes), of which the first are written.
+        rows: (n,) rows of the landmarks there.
+        walk: Variance.
+        blocks: (>= n, P / lanes, 9, lanes) values, of which the first are written.
     """
     for n in range(len(rows)):
         for b in range(tiles.shape[1]):

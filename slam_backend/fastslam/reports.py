@@ -8,8 +8,7 @@ import numpy as np
 
 from slam_backend.core.read_only import Act, as_constant, as_read_only, map_arrays
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
-from slam_backend.fastslam._kernels import STATIONARY
-from slam_backend.fastslam._kernels.layout import ASSOCIATED, COUNT, CREATED, REJECTED
+from slam_backend.fastslam._kernels import REJECTED, STATIONARY
 from slam_backend.fastslam.step_input import NO_INPUT, RobotInput, StepInput
 
 
@@ -55,34 +54,39 @@ class Associations(NamedTuple):
 
     def num_measurements(self, row: int) -> int:
         """Return how many measurements a robot was given, used or not."""
-        return max(self.inputs[row][COUNT], 0)
+        _, _, _, _, _, count = self.inputs[row]
+        return max(count, 0)
 
     def associated(self, row: int) -> IntArray:
         """Return what the measurements (n_i,) of a robot were taken for; there are none of robot -1. A copy."""
-        return self._per_measurement(row, ASSOCIATED)
+        associated, _ = self.ids
+        return self._per_measurement(row, associated)
 
     def created(self, row: int) -> IntArray:
         """Return likewise which landmarks they created."""
-        return self._per_measurement(row, CREATED)
+        _, created = self.ids
+        return self._per_measurement(row, created)
 
     def associated_ids(self, row: int) -> list[int]:
         """Return the landmarks that measurements of a robot were taken for, in their order."""
-        return self._valid_ids(row, ASSOCIATED)
+        associated, _ = self.ids
+        return self._valid_ids(row, associated)
 
     def created_ids(self, row: int) -> list[int]:
         """Return likewise the landmarks that they created."""
-        return self._valid_ids(row, CREATED)
+        _, created = self.ids
+        return self._valid_ids(row, created)
 
-    def _valid_ids(self, row: int, kind: int) -> list[int]:
+    def _valid_ids(self, row: int, became: IntArray) -> list[int]:
         """Return the names among what became of the measurements of a robot."""
         _, begin, end, _, _, _ = self.inputs[row] if row >= 0 else NO_INPUT
-        found: list[int] = self.ids[kind, begin:end].tolist()
+        found: list[int] = became[begin:end].tolist()
         return [name for name in found if name != REJECTED]
 
-    def _per_measurement(self, row: int, kind: int) -> IntArray:
+    def _per_measurement(self, row: int, became: IntArray) -> IntArray:
         """Return what became of the measurements of a robot, -1 for those that were not used."""
         _, begin, end, _, _, _ = self.inputs[row] if row >= 0 else NO_INPUT
-        used: IntArray = self.ids[kind, begin:end].copy()
+        used: IntArray = became[begin:end].copy()
         if row not in self.masks:
             return used
         every: IntArray = np.full(len(self.masks[row]), REJECTED)

@@ -9,18 +9,8 @@ from numpy.typing import ArrayLike
 
 from slam_backend.core.read_only import with_constants, with_read_only
 from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_array, check_choice, check_int
-from slam_backend.fastslam._kernels.layout import (
-    ESTIMATE,
-    EXACT_POSE,
-    HAS_COVARIANCES,
-    LOGGED,
-    LOGGED_KIND,
-    MOTION,
-    MOVED,
-    NAME,
-    USED,
-)
-from slam_backend.fastslam._kernels.run_log import write_rows
+from slam_backend.fastslam._kernels.records import LogColumns
+from slam_backend.fastslam._kernels.run_log import turn_of, write_rows
 from slam_backend.smoother.log_arrays import (
     EXACT,
     ODOMETRY,
@@ -134,9 +124,9 @@ class RobotLog:
         """Add the steps in which one of K robots did or measured anything, as `append` does one by one.
 
         Args:
-            robot: Which.
-            steps: (T,) their indices in the run.
-            noted, measured: (T, K, 10), (n, 10). Of all steps, as in a `Journal`.
+            robot: Index of the robot.
+            steps: (T,) indices of the steps in the run.
+            noted, measured: (T, K, 10), (n, 10) journal of all steps, see `PendingSteps`.
 
         Raises:
             ValueError: If steps go back; the log then holds no more than the steps before.
@@ -145,27 +135,18 @@ class RobotLog:
         while k < len(steps):
             if self._covariances is None and steps[k] > self._last:
                 most = min(MEASUREMENTS, len(self._ids))
+                columns = LogColumns(
+                    self._steps, self._kinds, self._motions, self._given, self._starts, self._points, self._ids
+                )
                 k, self._num_rows, self._num_measurements = write_rows(
-                    robot, k, steps, noted, measured, most, self._num_rows, self._num_measurements,
-                    self._steps, self._kinds, self._motions, self._given, self._starts, self._points, self._ids,
-                )  # fmt: skip
+                    robot, k, steps, noted, measured, most, self._num_rows, self._num_measurements, columns
+                )
                 if self._num_rows:
                     self._last = int(self._steps[self._num_rows - 1])
             if k < len(steps):  # what cannot stand there yet
-                self._append_turn(k, robot, steps, noted, measured)
+                if (turn := turn_of(robot, k, noted, measured)) is not None:
+                    self.append(int(steps[k]), **turn)
                 k += 1
-
-    def _append_turn(self, k: int, robot: int, steps: IntArray, noted: FloatArray, measured: FloatArray) -> None:
-        """Append what a robot did and measured in step k, if it did; the others are as of `extend`."""
-        note = noted[k, robot]
-        if not note[LOGGED]:
-            return
-        begin = int(noted[:k, :, USED].sum() + noted[k, :robot, USED].sum())
-        own = measured[begin : begin + int(note[USED])]
-        move = note[MOTION:ESTIMATE] if note[LOGGED_KIND] in (MOVED, EXACT_POSE) else None
-        pose = move if note[LOGGED_KIND] == EXACT_POSE else None
-        spreads = own[:, 3:NAME] if note[HAS_COVARIANCES] else None
-        self.append(int(steps[k]), move, pose, own[:, :3], own[:, NAME].astype(np.int64), spreads)
 
     def _refusal(self, step: int, odometry: Any, pose: Any, points: Any, ids: Any, covariances: Any) -> ValueError:
         """Say what is wrong with a step; told apart only then, for `append` is in the filter's loop."""

@@ -11,27 +11,13 @@ from slam_backend.core.packed_symmetric import UNPACK_INDEX, UPPER
 from slam_backend.core.state_checks import restore_generator
 from slam_backend.core.validation import BoolArray, FloatArray, Int32Array, IntArray, check_int, check_seed
 from slam_backend.fastslam import _kernels
-from slam_backend.fastslam._kernels import EXACT_POSE, NO_READING, add_gauge_covariance
-from slam_backend.fastslam._kernels.layout import (
-    ASSOCIATED,
-    CAMERA,
-    COVARIANCES,
-    CREATED,
-    LOG_WEIGHTS,
-    MEANS,
-    NUM_MEASURED,
-    NUM_NOTED,
-    PATH_LOG_WEIGHTS,
-    POSES,
-    RECOVERY,
-    STARTS,
-    WEIGHTS,
-)
-from slam_backend.fastslam._kernels.run_log import write_initial_poses
+from slam_backend.fastslam._kernels import EXACT_POSE, NO_READING, NUM_MEASURED, NUM_NOTED, add_gauge_covariance
+from slam_backend.fastslam._kernels.records import WeightArrays, robot_arrays
+from slam_backend.fastslam._kernels.run_log import guesses_of
 from slam_backend.fastslam.consistency import ConsistencyTest
 from slam_backend.fastslam.estimates import pose_mixtures
 from slam_backend.fastslam.existence import ExistenceUpdate
-from slam_backend.fastslam.options import MAX_ROBOTS, FilterOptions, pack_options, robot_batches
+from slam_backend.fastslam.options import MAX_ROBOTS, FilterOptions, pack_options, packed_camera, robot_batches
 from slam_backend.fastslam.particle_maps import ParticleMaps, zeros_aligned
 from slam_backend.fastslam.rejuvenation import RejuvenationScheduler, write_maps
 from slam_backend.fastslam.reports import PoseEstimates, RejuvenationReport
@@ -90,9 +76,7 @@ class PendingSteps:
         for robot, log in enumerate(logs):
             log.extend(robot, steps, noted, measured)
             if smoother is not None:
-                heard, poses = np.empty_like(steps), np.empty((len(steps), 3))
-                count, is_placed = write_initial_poses(robot, steps, noted, heard, poses)
-                smoother.add_initial_poses(robot, heard[:count], poses[:count], is_placed)
+                smoother.add_initial_poses(robot, *guesses_of(robot, steps, noted))
         self.clear()
 
 
@@ -100,10 +84,11 @@ def record_rejected(
     smoother: RejuvenationScheduler, step: int, inputs: StepInput, seats: RobotRows, told: IntArray
 ) -> None:
     """Tell the smoother what of a step's measurements, those with names left out, was neither matched nor new."""
+    associated, _ = told
     for robot, row in seats.active:
         _, begin, end, _, named, _ = inputs.inputs[row]
         if not named:
-            smoother.add_rejected(robot, step, told[ASSOCIATED, begin:end], inputs.descriptors[begin:end])
+            smoother.add_rejected(robot, step, associated[begin:end], inputs.descriptors[begin:end])
 
 
 class StepSummary(NamedTuple):
@@ -169,7 +154,7 @@ class FilterState:
         self.num_particles = m
         self.rng = np.random.default_rng(check_seed(seed))
         self.packed_options = pack_options(options)
-        self.packed_camera = self.packed_options[CAMERA:RECOVERY]
+        self.packed_camera = packed_camera(options.camera)
         self.existence = None if existence is None else ExistenceUpdate(existence, options.camera)
         self.rejuvenation = None if options.rejuvenate_every is None else RejuvenationScheduler(options, k)
         self.maps = ParticleMaps(m, None if existence is None else existence.log_odds_prior)
@@ -208,37 +193,37 @@ class FilterState:
     @property
     def poses(self) -> FloatArray:
         """Poses x_t^[m] of the robots, (K, 3, P) [m, m, rad]."""
-        return np.asarray(self.pose_arrays[POSES])
+        return robot_arrays(self.pose_arrays).poses
 
     @property
     def starts(self) -> FloatArray:
         """Start poses of the robots, (K, 3, P) [m, m, rad]; they spread at a merge."""
-        return np.asarray(self.pose_arrays[STARTS])
+        return robot_arrays(self.pose_arrays).starts
 
     @property
     def means(self) -> FloatArray:
         """Means of N(x^, P^), each particle's pose before sampling, (K, 3, P) [m, m, rad]."""
-        return np.asarray(self.pose_arrays[MEANS])
+        return robot_arrays(self.pose_arrays).means
 
     @property
     def covariances(self) -> FloatArray:
         """Covariances of N(x^, P^), (K, 6, P), upper triangles."""
-        return self.pose_arrays[COVARIANCES:].reshape(self.num_robots, 6, -1)
+        return robot_arrays(self.pose_arrays).covariances
 
     @property
     def log_weights(self) -> FloatArray:
         """Log-weights since the last resampling, normalised, (M,)."""
-        return np.asarray(self.weight_arrays[LOG_WEIGHTS, : self.num_particles])
+        return WeightArrays(*self.weight_arrays).log_weights[: self.num_particles]
 
     @property
     def path_log_weights(self) -> FloatArray:
         """Log-weights accumulated along the ancestral line (Eq. 12), (M,)."""
-        return np.asarray(self.weight_arrays[PATH_LOG_WEIGHTS, : self.num_particles])
+        return WeightArrays(*self.weight_arrays).path_log_weights[: self.num_particles]
 
     @property
     def weights(self) -> FloatArray:
         """Weights after the last step, summing to 1, (M,)."""
-        return np.asarray(self.weight_arrays[WEIGHTS, : self.num_particles])
+        return WeightArrays(*self.weight_arrays).weights[: self.num_particles]
 
     @property
     def _held_starts(self) -> BoolArray:
@@ -287,6 +272,7 @@ class FilterState:
         now = 0 if self.rejuvenation is None else self.rejuvenation.steps + 1
         normals = self.rng.standard_normal((active, maps.num_particles, 3))
         means, covariances = self.estimates
+        _, started = told  # by slot, until the step is over
         deleted: list[IntArray] = []
         fastslam1 = None if self.options.proposal == "fastslam2" else 1
         for low, high, is_over in self._batches:
@@ -301,7 +287,7 @@ class FilterState:
             if self.existence is not None and not is_over and (row := seats.rows[low]) >= 0:
                 _, begin, end, _, _, count = inputs.inputs[row]
                 if count >= 0:
-                    found, new_slots = self._associations[begin:end], told[CREATED, begin:end]
+                    found, new_slots = self._associations[begin:end], started[begin:end]
                     deleted.append(self.existence.update(maps, self.poses[low], self.best, found, new_slots))
         self.best, long_unseen, created, new, matched, rejected, ess, nis, is_depleted = summary
         pending.steps.append(self.next_step)

@@ -248,11 +248,10 @@ def _joined(used: Sequence[Used]) -> tuple[FloatArray, Float32Array, IntArray]:
         if named:
             names = np.concatenate([np.zeros(len(own[0]), np.int64) if own[3] is None else own[3] for own in used])
     points.setflags(write=False)  # as those of a frame: the kernel is compiled for one kind of array
-    sightings = np.empty((len(points), 9))
-    _kernels.to_robot_axes(points, sightings)
     if covariances is not None:
         covariances.setflags(write=False)
-        _kernels.noises_to_robot_axes(covariances, sightings)
+    sightings = np.empty((len(points), 9))
+    _kernels.to_robot_axes(points, covariances, sightings)
     return sightings, descriptors, NO_NAMES if names is None else names
 
 

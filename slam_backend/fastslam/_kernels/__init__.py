@@ -20,17 +20,22 @@ special case. With A = (dr/dx) C and S = Sigma + R, a match adds J = A^T S^-1 A 
 g = A^T S^-1 r to the gradient. A gate takes S + A P A^T, with P the covariance of xi.
 """
 
-from slam_backend.fastslam._kernels.inputs import extent, noises_to_robot_axes, read_team, to_robot_axes
+from slam_backend.fastslam._kernels.inputs import extent, read_team, to_robot_axes
 from slam_backend.fastslam._kernels.landmark_ekf import RELINEARISE_BELOW
-from slam_backend.fastslam._kernels.layout import EXACT_POSE, FAR, LANES, MIN_DEPTH, MOVED, NO_READING, STATIONARY
-from slam_backend.fastslam._kernels.map_storage import (
-    apply_resampling,
-    gather,
-    gather_odds,
-    map_summary,
-    present_slots,
-    resample,
+from slam_backend.fastslam._kernels.layout import (
+    EXACT_POSE,
+    FAR,
+    LANES,
+    MIN_DEPTH,
+    MOVED,
+    NO_READING,
+    NUM_MEASURED,
+    NUM_NOTED,
+    REJECTED,
+    STATIONARY,
 )
+from slam_backend.fastslam._kernels.map_storage import apply_resampling, map_summary, release, resample
+from slam_backend.fastslam._kernels.records import MapArrays, StandpointArrays
 from slam_backend.fastslam._kernels.step import step_robots, write_sigmas
 from slam_backend.fastslam._kernels.weights import add_gauge_covariance, mixture, write_team_poses
 
@@ -41,18 +46,20 @@ __all__ = [
     "MIN_DEPTH",
     "MOVED",
     "NO_READING",
+    "NUM_MEASURED",
+    "NUM_NOTED",
+    "REJECTED",
     "RELINEARISE_BELOW",
     "STATIONARY",
+    "MapArrays",
+    "StandpointArrays",
     "add_gauge_covariance",
     "apply_resampling",
     "extent",
-    "gather",
-    "gather_odds",
     "map_summary",
     "mixture",
-    "noises_to_robot_axes",
-    "present_slots",
     "read_team",
+    "release",
     "resample",
     "step_robots",
     "to_robot_axes",

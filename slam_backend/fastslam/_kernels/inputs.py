@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from slam_backend.core.jit import device, in_place
+from slam_backend.core.jit import in_place
 from slam_backend.core.validation import Float32Array, FloatArray, IntArray
 from slam_backend.fastslam._kernels.layout import (
     BEGIN,
@@ -35,35 +35,24 @@ def extent(points: FloatArray) -> tuple[float, float]:
 
 
 @in_place
-def to_robot_axes(points: FloatArray, sightings: FloatArray) -> None:
-    """Turn measured points (n, 3) from camera axes to the robot's: x ahead, y left, z up.
+def to_robot_axes(points: FloatArray, covariances: FloatArray | None, sightings: FloatArray) -> None:
+    """Turn measured points from camera axes to the robot's: x ahead, y left, z up.
 
-    They are written into `sightings` (n, 9), relative to the camera centre, followed by zeros.
+    Args:
+        points: (n, 3) [m], camera frame.
+        covariances: (n, 3, 3) [m^2], camera frame, or None.
+        sightings: (n, 9), written: the points relative to the camera centre, and the upper triangles of their
+            covariances by rows, or zeros.
     """
     for i in range(len(points)):
         sightings[i, 0], sightings[i, 1], sightings[i, 2] = points[i, 2], -points[i, 0], -points[i, 1]
         for c in range(3, 9):
             sightings[i, c] = 0.0
-
-
-@in_place
-def noises_to_robot_axes(covariances: FloatArray, sightings: FloatArray) -> None:
-    """Turn covariances (n, 3, 3) of measured points likewise, into the last six columns, upper triangles by rows."""
-    for i in range(len(covariances)):
-        own, noise = covariances[i], sightings[i, 3:]
-        noise[0], noise[1], noise[2] = own[2, 2], -own[2, 0], -own[2, 1]
-        noise[3], noise[4], noise[5] = own[0, 0], own[0, 1], own[1, 1]
-
-
-@device
-@in_place
-def _are_within(vectors: Float32Array, limit: float) -> bool:
-    """Return whether no component of vectors (n, d) is larger, by magnitude, or NaN."""
-    within, most = True, np.float32(limit)
-    for i in range(len(vectors)):
-        for j in range(vectors.shape[1]):
-            within &= abs(vectors[i, j]) <= most
-    return within
+    if covariances is not None:
+        for i in range(len(points)):
+            own, noise = covariances[i], sightings[i, 3:]
+            noise[0], noise[1], noise[2] = own[2, 2], -own[2, 0], -own[2, 1]
+            noise[3], noise[4], noise[5] = own[0, 0], own[0, 1], own[1, 1]
 
 
 @in_place
@@ -104,7 +93,11 @@ def read_team(
             end - begin,
         )
         begin = end
-    to_robot_axes(points, sightings)
+    to_robot_axes(points, None, sightings)
     nearest, farthest = extent(points)
-    near = nearest >= MIN_DEPTH and farthest <= farthest_point
-    return begin == len(points) and near and _are_within(looks, largest_look)
+    fine = begin == len(points) and nearest >= MIN_DEPTH and farthest <= farthest_point
+    largest = np.float32(largest_look)
+    for i in range(len(looks)):
+        for j in range(looks.shape[1]):
+            fine &= abs(looks[i, j]) <= largest
+    return fine

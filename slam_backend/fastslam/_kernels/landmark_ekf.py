@@ -3,13 +3,15 @@
 import numpy as np
 
 from slam_backend.core.jit import device, simd, simd_inline, stack_array
-from slam_backend.core.simd_math import cofactors_cancel, inverted, inverted_by_parts, quadratic_form
+from slam_backend.core.simd_math import Symmetric, inverted, inverted_by_parts, quadratic_form
 from slam_backend.core.validation import FloatArray, Int32Array, IntArray
 from slam_backend.fastslam._kernels.candidates import mask_of
 from slam_backend.fastslam._kernels.layout import (
     COS,
     DEPTH,
+    FREE_SLOTS,
     LANES,
+    MAP_OF,
     MIN_DEPTH,
     N00,
     N01,
@@ -21,24 +23,29 @@ from slam_backend.fastslam._kernels.layout import (
     R0,
     R1,
     R2,
+    REJECTED,
+    ROW_OF,
     SIN,
+    TAKEN,
     TILE,
     X,
     Y,
 )
 from slam_backend.fastslam._kernels.map_storage import tile_of
 from slam_backend.fastslam._kernels.measurement_model import accumulate_likelihood, innovate
+from slam_backend.fastslam._kernels.records import Candidates, Frame, MapArrays, Space
 
 FLAT = 1e-12  # where cofactors keep less, S has eigenvalues in a ratio of a million, and K R loses its digits
 RELINEARISE_BELOW = 4  # a landmark seen up to so many times is updated by the iterated EKF: its depth is still vague
 
+Matrix = tuple[float, float, float, float, float, float, float, float, float]  # by rows
+
 
 @simd_inline
-def _congruent(
-    m00: float, m01: float, m02: float, m10: float, m11: float, m12: float, m20: float, m21: float, m22: float,
-    a00: float, a01: float, a02: float, a11: float, a12: float, a22: float,
-) -> tuple[float, float, float, float, float, float]:  # fmt: skip
-    """Return M A M^T (6) of a symmetric A (6)."""
+def _congruent(m: Matrix, a: Symmetric) -> Symmetric:
+    """Return M A M^T of a symmetric A."""
+    m00, m01, m02, m10, m11, m12, m20, m21, m22 = m
+    a00, a01, a02, a11, a12, a22 = a
     h00, h01, h02 = m00 * a00 + m01 * a01 + m02 * a02, m00 * a01 + m01 * a11 + m02 * a12, (
         m00 * a02 + m01 * a12 + m02 * a22
     )  # fmt: skip
@@ -56,13 +63,13 @@ def _congruent(
 
 @simd_inline
 def _updated(
-    work: FloatArray, tile: FloatArray, i: int, i00: float, i01: float, i02: float, i11: float, i12: float, i22: float,
-    match: bool, walk: float, flat: bool,
-) -> None:  # fmt: skip
-    """Update a landmark where `match`, S^-1 given (Eqs. 8-10), and let it walk: Sigma + walk I.
+    work: FloatArray, tile: FloatArray, i: int, inverse: Symmetric, match: bool, walk: float, flat: bool
+) -> None:
+    """Update a landmark where `match`, by S^-1 (Eqs. 8-10), and let it walk: Sigma + walk I.
 
     `flat` (a constant) says that K has lost digits which K R cannot do without: then by Joseph's form.
     """
+    i00, i01, i02, i11, i12, i22 = inverse
     p00, p01, p02 = tile[3 * LANES + i], tile[4 * LANES + i], tile[5 * LANES + i]
     p11, p12, p22 = tile[6 * LANES + i], tile[7 * LANES + i], tile[8 * LANES + i]
     n00, n01, n02 = work[N00 + i], work[N01 + i], work[N02 + i]
@@ -81,12 +88,10 @@ def _updated(
     tile[LANES + i] += k10 * rx + k11 * ry + k12 * rz if match else 0.0
     tile[2 * LANES + i] += k20 * rx + k21 * ry + k22 * rz if match else 0.0
     if flat:
-        a00, a01, a02, a11, a12, a22 = _congruent(
-            1.0 - k00, -k01, -k02, -k10, 1.0 - k11, -k12, -k20, -k21, 1.0 - k22, p00, p01, p02, p11, p12, p22
-        )
-        b00, b01, b02, b11, b12, b22 = _congruent(
-            k00, k01, k02, k10, k11, k12, k20, k21, k22, n00, n01, n02, n11, n12, n22
-        )
+        rest = 1.0 - k00, -k01, -k02, -k10, 1.0 - k11, -k12, -k20, -k21, 1.0 - k22
+        gain = k00, k01, k02, k10, k11, k12, k20, k21, k22
+        a00, a01, a02, a11, a12, a22 = _congruent(rest, (p00, p01, p02, p11, p12, p22))
+        b00, b01, b02, b11, b12, b22 = _congruent(gain, (n00, n01, n02, n11, n12, n22))
         tile[3 * LANES + i] = a00 + b00 + walk if match else p00
         tile[4 * LANES + i] = a01 + b01 if match else p01
         tile[5 * LANES + i] = a02 + b02 if match else p02
@@ -107,7 +112,7 @@ def _updated(
 
 
 @simd_inline
-def _sum(work: FloatArray, tile: FloatArray, i: int) -> tuple[float, float, float, float, float, float]:
+def _sum(work: FloatArray, tile: FloatArray, i: int) -> Symmetric:
     """Return S = Sigma + R (Eq. 7)."""
     return (
         tile[3 * LANES + i] + work[N00 + i], tile[4 * LANES + i] + work[N01 + i], tile[5 * LANES + i] + work[N02 + i],
@@ -115,61 +120,56 @@ def _sum(work: FloatArray, tile: FloatArray, i: int) -> tuple[float, float, floa
     )  # fmt: skip
 
 
-@simd_inline
-def _inverse_of_sum(
-    work: FloatArray, tile: FloatArray, i: int, flat: bool
-) -> tuple[float, float, float, float, float, float, float]:
-    """Return S^-1 and |S|; `flat` (a constant) says that cofactors cancel."""
-    a, b, c, d, e, f = _sum(work, tile, i)
-    return inverted_by_parts(a, b, c, d, e, f) if flat else inverted(a, b, c, d, e, f)
-
-
 @device
 @simd
 def _any_flat(work: FloatArray, tile: FloatArray) -> bool:
-    """Tell whether S is flat in any lane."""
+    """Tell whether S is so flat and so turned in any lane that the digits of its cofactors are lost.
+
+    The determinant that they give is then much less than the product of the diagonal.
+    """
     count = 0
     for i in range(LANES):
         a, b, c, d, e, f = _sum(work, tile, i)
-        count += 1 if cofactors_cancel(a, b, c, d, e, f, FLAT) else 0
+        det = a * (d * f - e * e) + b * (c * e - b * f) + c * (b * e - c * d)
+        count += 1 if det < FLAT * a * d * f else 0
     return count > 0
-
-
-@simd_inline
-def _update(work: FloatArray, tile: FloatArray, mask: FloatArray, walk: float, flat: bool) -> None:
-    """Do what `update` does."""
-    for i in range(LANES):
-        i00, i01, i02, i11, i12, i22, _ = _inverse_of_sum(work, tile, i, flat)
-        match = mask[i] > 0.0 and work[DEPTH + i] >= MIN_DEPTH
-        _updated(work, tile, i, i00, i01, i02, i11, i12, i22, match, walk, flat)
 
 
 @device
 @simd
 def update(work: FloatArray, tile: FloatArray, mask: FloatArray, walk: float) -> None:
-    """At a known pose: update the landmark where `mask` is 1 and it lies ahead of the camera (Eqs. 5-10).
+    """Update the landmark at a known pose where `mask` is 1 and it lies ahead of the camera (Eqs. 5-10).
 
     Args:
+        work: Rows of the block.
+        tile: Values of the landmark there.
+        mask: (LANES,) 1 where it was measured.
         walk: Variance [m^2] by which the landmark may have moved, along each axis, when it is seen the next time.
     """
     if _any_flat(work, tile):
-        _update(work, tile, mask, walk, True)
+        for i in range(LANES):
+            inverse, _ = inverted_by_parts(_sum(work, tile, i))
+            _updated(work, tile, i, inverse, mask[i] > 0.0 and work[DEPTH + i] >= MIN_DEPTH, walk, True)
     else:
-        _update(work, tile, mask, walk, False)
+        for i in range(LANES):
+            inverse, _ = inverted(_sum(work, tile, i))
+            _updated(work, tile, i, inverse, mask[i] > 0.0 and work[DEPTH + i] >= MIN_DEPTH, walk, False)
 
 
 @simd_inline
 def _gate_and_update(
     work: FloatArray, tile: FloatArray, record: FloatArray, chosen: FloatArray, seen: Int32Array, q: float,
-    admit: FloatArray, gate: float, walk: float, flat: bool,
+    gate: float, walk: float, flat: bool,
 ) -> None:  # fmt: skip
-    """Do what `gate_and_update` does."""
+    """Do what `gate_and_update` does; `flat` is a constant."""
     for i in range(LANES):
-        i00, i01, i02, i11, i12, i22, det = _inverse_of_sum(work, tile, i, flat)
-        distance = quadratic_form(i00, i01, i02, i11, i12, i22, work[R0 + i], work[R1 + i], work[R2 + i])
+        s = _sum(work, tile, i)
+        inverse, det = inverted_by_parts(s) if flat else inverted(s)
+        distance = quadratic_form(inverse, work[R0 + i], work[R1 + i], work[R2 + i])
         depth = work[DEPTH + i]
-        match = admit[i] > 0.0 and distance <= gate and depth >= MIN_DEPTH
-        _updated(work, tile, i, i00, i01, i02, i11, i12, i22, match, walk, flat)
+        admitted = chosen[i] == -2.0 and seen[i] > 0 and work[TAKEN + i] == 0.0
+        match = admitted and distance <= gate and depth >= MIN_DEPTH
+        _updated(work, tile, i, inverse, match, walk, flat)
         accumulate_likelihood(work, i, match, distance, det, depth)
         record[Q_D + i] = distance
         chosen[i] = q if match else chosen[i]
@@ -180,101 +180,102 @@ def _gate_and_update(
 @simd
 def gate_and_update(
     work: FloatArray, tile: FloatArray, record: FloatArray, chosen: FloatArray, seen: Int32Array, q: float,
-    admit: FloatArray, gate: float, walk: float,
+    gate: float, walk: float,
 ) -> None:  # fmt: skip
-    """At a known pose: where admitted and inside the gate, weigh and update the landmark (Eqs. 5-11).
+    """Weigh and update the landmark at a known pose where it is admitted and inside the gate (Eqs. 5-11).
+
+    A lane admits it if it holds it, the measurement is still without a match, and row TAKEN does not say that an
+    earlier measurement has taken it.
 
     Args:
-        chosen: (LANES,) becomes q where the lane matched.
-        seen: (LANES,) is counted up there.
-        admit: (LANES,) 1 where the lane may match.
-        record: Row Q_D is written.
-        walk: As in `update`.
+        work: Rows of the block.
+        tile: Values of the landmark there.
+        record: Rows of the candidate, of which Q_D is written.
+        chosen: (LANES,) match of the measurement, written: q where it is this candidate.
+        seen: (LANES,) counts of the landmark, raised there.
+        q: Number of the candidate.
+        gate: D0.
+        walk: See `update`.
     """
     if _any_flat(work, tile):
-        _gate_and_update(work, tile, record, chosen, seen, q, admit, gate, walk, True)
+        _gate_and_update(work, tile, record, chosen, seen, q, gate, walk, True)
     else:
-        _gate_and_update(work, tile, record, chosen, seen, q, admit, gate, walk, False)
-
-
-@device
-@simd
-def find_recent(seen: Int32Array, mask: FloatArray, young: FloatArray) -> int:
-    """Write 1 where a matched landmark was seen a few times only; return how many those are."""
-    count = 0
-    for i in range(len(seen)):
-        on = mask[i] > 0.0 and seen[i] <= RELINEARISE_BELOW
-        young[i] = 1.0 if on else 0.0
-        count += 1 if on else 0
-    return count
-
-
-@device
-@simd
-def relinearise(work: FloatArray, tile: FloatArray, before: FloatArray) -> None:
-    """Refer the innovation, taken at the means in `tile`, to those in `before`, which come back (iterated EKF)."""
-    for i in range(LANES):
-        work[R0 + i] += tile[i] - before[i]
-        work[R1 + i] += tile[LANES + i] - before[LANES + i]
-        work[R2 + i] += tile[2 * LANES + i] - before[2 * LANES + i]
-    for j in range(TILE):
-        tile[j] = before[j]
-
-
-@device
-@simd
-def count_matches(seen: Int32Array, mask: FloatArray) -> None:
-    for i in range(len(seen)):
-        seen[i] += np.int32(1) if mask[i] > 0.0 else np.int32(0)
+        _gate_and_update(work, tile, record, chosen, seen, q, gate, walk, False)
 
 
 @device
 @simd
 def update_matched(
-    work: FloatArray, match: FloatArray, mask: FloatArray, values: FloatArray, counts: Int32Array, row_of: IntArray,
-    block: int, points: FloatArray, noises: FloatArray, given: bool, camera: FloatArray, starts: IntArray,
-    slots: IntArray, walk: float,
-) -> None:  # fmt: skip
-    """At a known pose: update the landmarks that the lanes of one block matched, young ones by the iterated EKF."""
-    padded, first = counts.shape[1], block * LANES
+    space: Space, block: int, maps: MapArrays, frame: Frame, candidates: Candidates, walk: float
+) -> None:
+    """Update at a known pose the landmarks that the lanes of one block matched, young ones by the iterated EKF."""
+    work, match, mask, row_of = space.work, space.match, space.mask, maps.table[ROW_OF]
+    padded, first = maps.counts.shape[1], block * LANES
     young, before = stack_array(LANES), stack_array(TILE)
-    for b in range(len(starts) - 1):
-        for q in range(starts[b], starts[b + 1]):
+    for b in range(len(match)):
+        for q in range(candidates.starts[b], candidates.starts[b + 1]):
             if mask_of(match[b], float(q), mask) == 0:
                 continue
-            row = row_of[slots[q]]
-            tile, seen = values[tile_of(padded, row, block)], counts[row, first : first + LANES]
-            num_young = find_recent(seen, mask, young)
-            count_matches(seen, mask)
-            innovate(work, tile, points, noises, b, given, camera)
+            row = row_of[candidates.slots[q]]
+            tile, seen = maps.values[tile_of(padded, row, block)], maps.counts[row, first : first + LANES]
+            num_young = 0
+            for i in range(len(seen)):
+                on = mask[i] > 0.0
+                is_young = on and seen[i] <= RELINEARISE_BELOW
+                young[i] = 1.0 if is_young else 0.0
+                num_young += 1 if is_young else 0
+                seen[i] += np.int32(1) if on else np.int32(0)
+            innovate(work, tile, frame, b)
             if num_young > 0:
                 for j in range(TILE):
                     before[j] = tile[j]
                 update(work, tile, young, 0.0)
-                innovate(work, tile, points, noises, b, given, camera)
-                relinearise(work, tile, before)
+                innovate(work, tile, frame, b)
+                for i in range(LANES):  # the innovation at the new means is referred to those before
+                    work[R0 + i] += tile[i] - before[i]
+                    work[R1 + i] += tile[LANES + i] - before[LANES + i]
+                    work[R2 + i] += tile[2 * LANES + i] - before[2 * LANES + i]
+                for j in range(TILE):
+                    tile[j] = before[j]
             update(work, tile, mask, walk)
 
 
 @device
 @simd
 def new_landmark(
-    work: FloatArray, values: FloatArray, counts: Int32Array, row: int, block: int, points: FloatArray,
-    noises: FloatArray, n: int, given: bool, camera: FloatArray, mask: FloatArray, walk: float,
-) -> None:  # fmt: skip
-    """Write mean and covariance of a landmark first seen from a known pose (Algorithm 1, l. 30-31 corrected).
+    space: Space, block: int, maps: MapArrays, frame: Frame, n: int, new_slots: IntArray, walk: float
+) -> None:
+    """Start a landmark from a known pose in the lanes of one block where the mask is 1 (Algorithm 1, l. 30-31 *).
 
-    All lanes of the block are written; counts become 1 where `mask` is, and 0 elsewhere: those do not hold it.
+    The first block gives it a free slot and row. All lanes of a block are written; those that do not hold the landmark
+    get a count of 0.
+
+    Args:
+        space, block: Working space, and the block.
+        maps: Landmarks.
+        frame, n: Measurements of the robot, and the one that starts the landmark.
+        new_slots: (B,) slots of the landmarks that measurements started, -1 = none; written.
+        walk: See `update`.
     """
-    tile = values[tile_of(counts.shape[1], row, block)]
-    seen = counts[row, block * LANES : (block + 1) * LANES]
+    work, row_of, tops = space.work, maps.table[ROW_OF], maps.tops
+    if new_slots[n] == REJECTED:
+        tops[0] -= 1
+        tops[1] -= 1
+        row, slot = maps.free_rows[tops[0]], maps.table[FREE_SLOTS, tops[1]]
+        size = 9 * maps.counts.shape[1]
+        maps.counts[row, :] = 0
+        maps.values[row * size : (row + 1) * size] = 0.0
+        row_of[slot], maps.table[MAP_OF, slot], new_slots[n] = row, 0, slot
+    row, points, camera = row_of[new_slots[n]], frame.points, frame.camera
+    tile = maps.values[tile_of(maps.counts.shape[1], row, block)]
+    seen = maps.counts[row, block * LANES : (block + 1) * LANES]
     ahead, left, up = camera[4] + points[n, 0], camera[5] + points[n, 1], camera[6] + points[n, 2]
     for i in range(LANES):
         c, s = work[COS + i], work[SIN + i]
         tile[i] = work[X + i] + c * ahead - s * left
         tile[LANES + i] = work[Y + i] + s * ahead + c * left
         tile[2 * LANES + i] = up
-    innovate(work, tile, points, noises, n, given, camera)
+    innovate(work, tile, frame, n)
     for i in range(LANES):  # l. 31 *: G^-1 R G^-T
         tile[3 * LANES + i] = work[N00 + i] + walk
         tile[4 * LANES + i] = work[N01 + i]
@@ -283,4 +284,4 @@ def new_landmark(
         tile[7 * LANES + i] = work[N12 + i]
         tile[8 * LANES + i] = work[N22 + i] + walk
     for i in range(len(seen)):
-        seen[i] = np.int32(1) if mask[i] > 0.0 else np.int32(0)
+        seen[i] = np.int32(1) if space.mask[i] > 0.0 else np.int32(0)

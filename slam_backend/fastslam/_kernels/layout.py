@@ -48,7 +48,7 @@ NO_READING, STATIONARY, MOVED, EXACT_POSE = (
     1,
     2,
     3,
-)  # what a robot did: nothing at all, stood and looked, moved, was told its pose
+)  # what a robot did: nothing at all, stood and looked, moved, was placed
 # What a journal holds of a robot's turn: whether it did or was given anything, what it did, whether its measurements
 # come with covariances, and how many were used; its odometry or pose (3), and where it was thought to be then (3).
 LOGGED, LOGGED_KIND, HAS_COVARIANCES, USED, MOTION, ESTIMATE, NUM_NOTED = 0, 1, 2, 3, 4, 7, 10

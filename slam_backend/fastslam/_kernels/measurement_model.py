@@ -4,7 +4,7 @@ import numpy as np
 
 from slam_backend.core.jit import device, simd, simd_inline
 from slam_backend.core.simd_math import log_of, mantissa_exponent
-from slam_backend.core.validation import FloatArray
+from slam_backend.core.validation import FloatArray, Int32Array
 from slam_backend.fastslam._kernels.layout import (
     C00,
     C01,
@@ -35,6 +35,7 @@ from slam_backend.fastslam._kernels.layout import (
     Q_DEPTH,
     Q_DET,
     Q_DET_POSE,
+    Q_HELD,
     Q_METRES2,
     Q_SQUARE,
     QG0,
@@ -60,28 +61,34 @@ from slam_backend.fastslam._kernels.layout import (
     X,
     Y,
 )
+from slam_backend.fastslam._kernels.records import Frame
+
+# Share of a match in the system of xi: J (6) and g (3), see the package.
+Terms = tuple[float, float, float, float, float, float, float, float, float]
 
 
 @device
 @simd
-def innovate(
-    work: FloatArray, tile: FloatArray, points: FloatArray, noises: FloatArray, n: int, given: bool, camera: FloatArray
-) -> None:
+def innovate(work: FloatArray, tile: FloatArray, frame: Frame, n: int) -> None:
     """Write r (3), its sensor covariance in map axes (6) and the predicted depth, at the pose rows X .. SIN.
 
-    `points[n]` is the measured point relative to the camera centre in robot axes (x ahead = depth); `noises[n]` its
-    covariance (6) in robot axes, used if `given`; the depth is then 1, for it plays no part. `camera` = (focal,
-    baseline, sigma_px, sigma_disparity, mount (3)).
+    The depth is 1 where covariances come with the measurements: it plays no part then.
+
+    Args:
+        work: Rows of the block.
+        tile: Values of the landmark there.
+        frame, n: Measurements of the robot, and the one that the landmark may have caused.
     """
-    v0, v1, v2 = points[n, 0], points[n, 1], points[n, 2]
-    a, b, d, e, f, g = noises[n, 0], noises[n, 1], noises[n, 2], noises[n, 3], noises[n, 4], noises[n, 5]
+    noise, camera, given = frame.noises[n], frame.camera, frame.given
+    v0, v1, v2 = frame.points[n, 0], frame.points[n, 1], frame.points[n, 2]
+    a, b, d, e, f, g = noise[0], noise[1], noise[2], noise[3], noise[4], noise[5]
     m0, m1, m2 = camera[4], camera[5], camera[6]
     pixel = (camera[2] / camera[0]) ** 2
     disparity = (camera[3] / (camera[0] * camera[1])) ** 2
     per_depth = 1.0 / v0
     for i in range(LANES):
         c, s = work[COS + i], work[SIN + i]
-        if given:  # asked here, not around two loops, after which references to each array would be counted
+        if given:
             work[R0 + i] = c * (v0 + m0) - s * (v1 + m1) + work[X + i] - tile[i]
             work[R1 + i] = s * (v0 + m0) + c * (v1 + m1) + work[Y + i] - tile[LANES + i]
             work[R2 + i] = v2 + m2 - tile[2 * LANES + i]
@@ -114,9 +121,7 @@ def innovate(
 @simd_inline
 def match_terms(
     work: FloatArray, tile: FloatArray, i: int, refined: bool
-) -> tuple[
-    float, float, float, float, float, float, float, float, float, float, float, float, float, float, float
-]:  # fmt: skip
+) -> tuple[Terms, float, float, float, float, float, float]:
     """Return what a match would add to the system of xi, and its gate, from the innovation in `work`.
 
     A robot turns about the vertical, so the pose says nothing of heights: r_z is eliminated first, and what is left is
@@ -124,10 +129,13 @@ def match_terms(
     A^T S^-1 r = A_xy^T T^-1 p, and the gate takes T + A_xy P A_xy^T.
 
     Args:
+        work: Rows of the block.
+        tile: Values of the landmark there.
+        i: The lane.
         refined: Whether the covariance P of xi is that of the rows SPREAD00 ..; else it is the identity.
 
     Returns:
-        J (6), g (3), r^T S^-1 r, |S|, |S + A P A^T|, the predicted depth, r^T r, and the squared distance of the gate,
+        J and g, r^T S^-1 r, |S|, |S + A P A^T|, the predicted depth, r^T r, and the squared distance of the gate,
         infinite behind the camera.
     """
     rx, ry, rz = work[R0 + i], work[R1 + i], work[R2 + i]
@@ -162,8 +170,8 @@ def match_terms(
     det_pose = d00 * d11 - d01 * d01
     distance = height + (d11 * px * px - 2.0 * d01 * px * py + d00 * py * py) / det_pose
     return (
-        a0 * u0 + b0 * w0, a0 * u1 + b0 * w1, a0 * u2 + b0 * w2, a1 * u1 + b1 * w1, a1 * u2 + b1 * w2,
-        a2 * u2 + b2 * w2, a0 * sx + b0 * sy, a1 * sx + b1 * sy, a2 * sx + b2 * sy,
+        (a0 * u0 + b0 * w0, a0 * u1 + b0 * w1, a0 * u2 + b0 * w2, a1 * u1 + b1 * w1, a1 * u2 + b1 * w2,
+         a2 * u2 + b2 * w2, a0 * sx + b0 * sy, a1 * sx + b1 * sy, a2 * sx + b2 * sy),
         height + px * sx + py * sy, det * s22, det_pose * s22, depth, rx * rx + ry * ry + rz * rz,
         distance if depth >= MIN_DEPTH else np.inf,
     )  # fmt: skip
@@ -171,21 +179,20 @@ def match_terms(
 
 @device
 @simd
-def evaluate(work: FloatArray, tile: FloatArray, record: FloatArray, refined: bool) -> None:
-    """Write the terms of a match, see `match_terms`."""
+def evaluate(work: FloatArray, tile: FloatArray, record: FloatArray, seen: Int32Array, refined: bool) -> None:
+    """Write the record of a candidate: the terms of a match, see `match_terms`, and whether the lanes hold it."""
     for i in range(LANES):
-        j00, j01, j02, j11, j12, j22, g0, g1, g2, square, det, det_pose, depth, metres2, distance = match_terms(
-            work, tile, i, refined
-        )
-        record[QJ00 + i], record[QJ01 + i], record[QJ02 + i] = j00, j01, j02
-        record[QJ11 + i], record[QJ12 + i], record[QJ22 + i] = j11, j12, j22
-        record[QG0 + i], record[QG1 + i], record[QG2 + i] = g0, g1, g2
+        terms, square, det, det_pose, depth, metres2, distance = match_terms(work, tile, i, refined)
+        record[QJ00 + i], record[QJ01 + i], record[QJ02 + i] = terms[0], terms[1], terms[2]
+        record[QJ11 + i], record[QJ12 + i], record[QJ22 + i] = terms[3], terms[4], terms[5]
+        record[QG0 + i], record[QG1 + i], record[QG2 + i] = terms[6], terms[7], terms[8]
         record[Q_SQUARE + i] = square
         record[Q_DET + i] = det
         record[Q_DET_POSE + i] = det_pose
         record[Q_DEPTH + i] = depth
         record[Q_METRES2 + i] = metres2
         record[Q_D + i] = distance
+        record[Q_HELD + i] = 1.0 if seen[i] > 0 else 0.0
 
 
 @simd_inline
@@ -203,15 +210,8 @@ def accumulate_likelihood(work: FloatArray, i: int, on: bool, square: float, det
 
 @device
 @simd
-def add_likelihood(work: FloatArray, record: FloatArray, mask: FloatArray) -> None:
-    """Add a match's part of the log-likelihood where `mask` is 1."""
-    for i in range(LANES):
-        accumulate_likelihood(work, i, mask[i] > 0.0, record[Q_SQUARE + i], record[Q_DET + i], record[Q_DEPTH + i])
-
-
-@device
-@simd
 def clear_likelihood(work: FloatArray) -> None:
+    """Clear the sums of the log-likelihood of a frame."""
     for i in range(LANES):
         work[SUM_D + i] = 0.0
         work[MATCHED + i] = 0.0

@@ -2,7 +2,7 @@
 
 import math
 
-from slam_backend.core.jit import device, simd, simd_inline
+from slam_backend.core.jit import device, simd
 from slam_backend.core.simd_math import sine_cosine, wrapped
 from slam_backend.core.validation import FloatArray
 from slam_backend.fastslam._kernels.layout import (
@@ -28,11 +28,15 @@ from slam_backend.fastslam._kernels.layout import (
     T0,
     WIDE,
     X0,
+    XI0,
+    XI1,
+    XI2,
     Y0,
     T,
     X,
     Y,
 )
+from slam_backend.fastslam._kernels.records import Motion, Poses
 
 WIDE_HEADING = 0.03  # [rad]; where the heading is less sure, one step of Gauss-Newton is not enough
 ZERO_PIVOT = 1e-12  # relative to the variance: below it a direction is taken to be exact
@@ -60,36 +64,29 @@ def store_rows(work: FloatArray, low: int, rows: FloatArray, first: int) -> None
 
 @device
 @simd
-def prior(
-    work: FloatArray, poses: FloatArray, means: FloatArray, covariances: FloatArray, blind: bool, first: int
-) -> None:
-    """Write a block's poses before the motion into rows X0 .. T0, their covariances into rows N00 .. N22.
+def predict(work: FloatArray, robot: Poses, motion: Motion, blind: bool, first: int) -> None:
+    """Predict the poses of a block, of particles from `first` on, and write a factor C of their covariance P0 (Eq. 4).
 
-    They are N(x^, P^) where the robot is blind, else the samples, exact.
-    """
-    if blind:
-        load_rows(work, X0, means, first)
-        load_rows(work, N00, covariances, first)
-    else:
-        load_rows(work, X0, poses, first)
-        for j in range(N00, N22 + LANES):
-            work[j] = 0.0
-
-
-@device
-@simd
-def predict(work: FloatArray, move: FloatArray, sigmas: FloatArray) -> None:
-    """Move the poses in rows X0 .. N22 to the predicted x0, and write a factor C of its covariance P0 (Eq. 4).
-
-    C = T L with L the lower Cholesky factor of T^T P0 T, where T is the turn by the predicted heading. Rows N00 .. N22
-    hold T^T P0 T afterwards, COS and SIN the turn.
+    C = T L with L the lower Cholesky factor of T^T P0 T, where T is the turn by the predicted heading: factorised in
+    the robot's axes, how the map frame happens to be turned plays no part. Rows X0 .. T0 hold the predicted pose
+    afterwards, N00 .. N22 hold T^T P0 T, COS and SIN the turn, and xi is 0.
 
     Args:
-        move: (3,) u, previous robot frame.
-        sigmas: (3,) standard deviations of u.
+        work: Rows of the block.
+        robot: Poses before the motion: N(x^, P^) if `blind`, else the samples, exact.
+        motion: Odometry and its standard deviations.
+        blind: Whether the robot has not been sampled at a sighting since N(x^, P^) was propagated.
+        first: First particle of the block.
     """
-    dx, dy, turn = move[0], move[1], move[2]
-    v0, v1, v2 = sigmas[0] ** 2, sigmas[1] ** 2, sigmas[2] ** 2
+    if blind:
+        load_rows(work, X0, robot.means, first)
+        load_rows(work, N00, robot.covariances, first)
+    else:
+        load_rows(work, X0, robot.samples, first)
+        for j in range(N00, N22 + LANES):
+            work[j] = 0.0
+    dx, dy, turn = motion.odometry[0], motion.odometry[1], motion.odometry[2]
+    v0, v1, v2 = motion.sigmas[0] ** 2, motion.sigmas[1] ** 2, motion.sigmas[2] ** 2
     for i in range(LANES):
         s, c = sine_cosine(work[T0 + i])
         ox, oy = c * dx - s * dy, s * dx + c * dy
@@ -104,7 +101,6 @@ def predict(work: FloatArray, move: FloatArray, sigmas: FloatArray) -> None:
         q02 = p02 - oy * p22
         q11 = p11 + 2.0 * ox * p12 + ox * ox * p22 + s * s * v0 + c * c * v1
         q12 = p12 + ox * p22
-        # Factorised in the robot's axes, T^T P0 T: how the map frame happens to be turned plays no part.
         s, c = sine_cosine(work[T0 + i])
         work[N00 + i] = c * c * q00 + 2.0 * c * s * q01 + s * s * q11
         work[N01 + i] = c * s * (q11 - q00) + (c * c - s * s) * q01
@@ -114,51 +110,23 @@ def predict(work: FloatArray, move: FloatArray, sigmas: FloatArray) -> None:
         work[N22 + i] = p22 + v2
         work[COS + i], work[SIN + i] = c, s
         work[WIDE + i] = 1.0 if p22 + v2 > WIDE_HEADING**2 else 0.0
+        work[XI0 + i], work[XI1 + i], work[XI2 + i] = 0.0, 0.0, 0.0
     for i in range(LANES):
-        _factorise(work, i)
-
-
-@device
-@simd
-def _to_map_axes(work: FloatArray) -> None:
-    """Turn the covariance in rows N00 .. N22 from the robot's axes to the map's: T P T^T."""
-    for i in range(LANES):
+        q00, q11, q22 = work[N00 + i], work[N11 + i], work[N22 + i]
         c, s = work[COS + i], work[SIN + i]
-        r00, r01, r02 = work[N00 + i], work[N01 + i], work[N02 + i]
-        r11, r12 = work[N11 + i], work[N12 + i]
-        work[N00 + i] = c * c * r00 - 2.0 * c * s * r01 + s * s * r11
-        work[N01 + i] = c * s * (r00 - r11) + (c * c - s * s) * r01
-        work[N02 + i] = c * r02 - s * r12
-        work[N11 + i] = s * s * r00 + 2.0 * c * s * r01 + c * c * r11
-        work[N12 + i] = s * r02 + c * r12
-
-
-@simd_inline
-def _factorise(work: FloatArray, i: int) -> None:
-    """Write C = T L, L L^T the covariance in rows N00 .. N22; a vanishing pivot gives L a column of zeros."""
-    q00, q11, q22 = work[N00 + i], work[N11 + i], work[N22 + i]
-    c, s = work[COS + i], work[SIN + i]
-    l00 = math.sqrt(q00 if q00 > 0.0 else 0.0)
-    inverse = 1.0 / l00 if q00 > 0.0 else 0.0
-    l10, l20 = work[N01 + i] * inverse, work[N02 + i] * inverse
-    rest = q11 - l10 * l10
-    rest = rest if rest > ZERO_PIVOT * q11 else 0.0
-    l11 = math.sqrt(rest)
-    inverse = 1.0 / l11 if rest > 0.0 else 0.0
-    l21 = (work[N12 + i] - l20 * l10) * inverse
-    rest = q22 - l20 * l20 - l21 * l21
-    work[C00 + i], work[C01 + i] = c * l00 - s * l10, -s * l11
-    work[C10 + i], work[C11 + i] = s * l00 + c * l10, c * l11
-    work[C20 + i], work[C21 + i] = l20, l21
-    work[C22 + i] = math.sqrt(rest if rest > ZERO_PIVOT * q22 else 0.0)
-
-
-@device
-@simd
-def load_pose(work: FloatArray, poses: FloatArray, first: int) -> None:
-    load_rows(work, X, poses, first)
-    for i in range(LANES):
-        work[SIN + i], work[COS + i] = sine_cosine(work[T + i])
+        l00 = math.sqrt(q00 if q00 > 0.0 else 0.0)
+        inverse = 1.0 / l00 if q00 > 0.0 else 0.0  # a vanishing pivot gives L a column of zeros
+        l10, l20 = work[N01 + i] * inverse, work[N02 + i] * inverse
+        rest = q11 - l10 * l10
+        rest = rest if rest > ZERO_PIVOT * q11 else 0.0
+        l11 = math.sqrt(rest)
+        inverse = 1.0 / l11 if rest > 0.0 else 0.0
+        l21 = (work[N12 + i] - l20 * l10) * inverse
+        rest = q22 - l20 * l20 - l21 * l21
+        work[C00 + i], work[C01 + i] = c * l00 - s * l10, -s * l11
+        work[C10 + i], work[C11 + i] = s * l00 + c * l10, c * l11
+        work[C20 + i], work[C21 + i] = l20, l21
+        work[C22 + i] = math.sqrt(rest if rest > ZERO_PIVOT * q22 else 0.0)
 
 
 @device
@@ -173,50 +141,55 @@ def take_draws(work: FloatArray, normals: FloatArray, first: int) -> None:
 
 @device
 @simd
-def sample_motion(
-    work: FloatArray, poses: FloatArray, first: int, odometry: FloatArray, sigmas: FloatArray, normals: FloatArray
-) -> None:
-    """Replace poses by draws from p(x_t | x_{t-1}, u_t), each particle from its own past (Eq. 4)."""
-    take_draws(work, normals, first)
-    load_pose(work, poses, first)
+def sample_motion(work: FloatArray, samples: FloatArray, motion: Motion, first: int) -> None:
+    """Replace poses (3, P) by draws from p(x_t | x_{t-1}, u_t), each particle from its own past (Eq. 4)."""
+    odometry, sigmas = motion.odometry, motion.sigmas
+    take_draws(work, motion.normals, first)
+    load_rows(work, X, samples, first)
+    for i in range(LANES):
+        work[SIN + i], work[COS + i] = sine_cosine(work[T + i])
     for i in range(LANES):
         dx = odometry[0] + work[DRAW0 + i] * sigmas[0]
         dy = odometry[1] + work[DRAW1 + i] * sigmas[1]
         c, s = work[COS + i], work[SIN + i]
-        poses[0, first + i] = work[X + i] + (c * dx - s * dy)
-        poses[1, first + i] = work[Y + i] + (s * dx + c * dy)
-        poses[2, first + i] = wrapped(work[T + i] + odometry[2] + work[DRAW2 + i] * sigmas[2])
+        samples[0, first + i] = work[X + i] + (c * dx - s * dy)
+        samples[1, first + i] = work[Y + i] + (s * dx + c * dy)
+        samples[2, first + i] = wrapped(work[T + i] + odometry[2] + work[DRAW2 + i] * sigmas[2])
 
 
 @device
 @simd
-def set_exact(poses: FloatArray, means: FloatArray, covariances: FloatArray) -> None:
-    """Write N(x^, P^), (3, P) and (6, P), of poses (3, P) that are exactly where their particles have them."""
+def set_exact(robot: Poses) -> None:
+    """Write N(x^, P^) of poses that are exactly where their particles have them."""
     for c in range(3):
-        for m in range(poses.shape[1]):
-            means[c, m] = poses[c, m]
-    covariances[:] = 0.0
+        for m in range(robot.samples.shape[1]):
+            robot.means[c, m] = robot.samples[c, m]
+    robot.covariances[:] = 0.0
 
 
 @device
 @simd
-def propagate(
-    poses: FloatArray, means: FloatArray, covariances: FloatArray, blind: bool, odometry: FloatArray,
-    sigmas: FloatArray, normals: FloatArray, work: FloatArray,
-) -> None:  # fmt: skip
+def propagate(robot: Poses, motion: Motion, blind: bool, work: FloatArray) -> None:
     """Move a robot that sees nothing: each particle's N(x^, P^) is propagated, and its sample moves by itself.
 
     Args:
-        poses: (3, P) the samples; replaced.
-        means, covariances: (3, P), (6, P) N(x^, P^), written; read if `blind`, else particles start from their samples.
-        odometry, sigmas, normals: As in `update_fastslam1`.
+        robot: Poses, written; N(x^, P^) is read if `blind`, else particles start from their samples.
+        motion: Motion of the robot.
+        blind: See `predict`.
         work: Working space.
     """
-    for block in range(poses.shape[1] // LANES):
+    for block in range(robot.samples.shape[1] // LANES):
         first = block * LANES
-        prior(work, poses, means, covariances, blind, first)
-        predict(work, odometry, sigmas)
-        _to_map_axes(work)
-        store_rows(work, X0, means, first)
-        store_rows(work, N00, covariances, first)
-        sample_motion(work, poses, first, odometry, sigmas, normals)
+        predict(work, robot, motion, blind, first)
+        for i in range(LANES):  # the covariance is turned from the robot's axes to the map's: T P T^T
+            c, s = work[COS + i], work[SIN + i]
+            r00, r01, r02 = work[N00 + i], work[N01 + i], work[N02 + i]
+            r11, r12 = work[N11 + i], work[N12 + i]
+            work[N00 + i] = c * c * r00 - 2.0 * c * s * r01 + s * s * r11
+            work[N01 + i] = c * s * (r00 - r11) + (c * c - s * s) * r01
+            work[N02 + i] = c * r02 - s * r12
+            work[N11 + i] = s * s * r00 + 2.0 * c * s * r01 + c * c * r11
+            work[N12 + i] = s * r02 + c * r12
+        store_rows(work, X0, robot.means, first)
+        store_rows(work, N00, robot.covariances, first)
+        sample_motion(work, robot.samples, motion, first)

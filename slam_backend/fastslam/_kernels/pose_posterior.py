@@ -2,7 +2,7 @@
 
 import math
 
-from slam_backend.core.jit import device, simd, simd_inline
+from slam_backend.core.jit import device, simd, simd_inline, stack_array
 from slam_backend.core.simd_math import inverted, log_of, quadratic_form, sine_cosine, wrapped
 from slam_backend.core.validation import FloatArray
 from slam_backend.fastslam._kernels.layout import (
@@ -55,26 +55,13 @@ from slam_backend.fastslam._kernels.layout import (
     X,
     Y,
 )
-from slam_backend.fastslam._kernels.measurement_model import total_log_likelihood
-
-
-@device
-@simd
-def begin_pose(work: FloatArray) -> None:
-    """Start from xi = 0, at the predicted pose, whose turn is in rows COS and SIN already."""
-    for i in range(LANES):
-        work[XI0 + i] = 0.0
-        work[XI1 + i] = 0.0
-        work[XI2 + i] = 0.0
-        work[X + i] = work[X0 + i]
-        work[Y + i] = work[Y0 + i]
-        work[T + i] = work[T0 + i]
+from slam_backend.fastslam._kernels.measurement_model import Terms, total_log_likelihood
 
 
 @device
 @simd
 def set_linearisation_point(work: FloatArray) -> None:
-    """Write the pose rows X .. SIN of x0 + C xi."""
+    """Write the pose rows X .. SIN of x0 + C xi, and start the system of xi from its prior N(0, I)."""
     for i in range(LANES):
         xi0, xi1, xi2 = work[XI0 + i], work[XI1 + i], work[XI2 + i]
         theta = work[T0 + i] + work[C20 + i] * xi0 + work[C21 + i] * xi1 + work[C22 + i] * xi2
@@ -82,12 +69,6 @@ def set_linearisation_point(work: FloatArray) -> None:
         work[Y + i] = work[Y0 + i] + work[C10 + i] * xi0 + work[C11 + i] * xi1
         work[T + i] = theta
         work[SIN + i], work[COS + i] = sine_cosine(theta)
-
-
-@device
-@simd
-def clear_sums(work: FloatArray) -> None:
-    """Start the system of xi from its prior N(0, I)."""
     for i in range(LANES):
         work[J00 + i] = 1.0
         work[J01 + i] = 0.0
@@ -101,52 +82,38 @@ def clear_sums(work: FloatArray) -> None:
 
 
 @simd_inline
-def add_terms(
-    work: FloatArray, i: int, on: bool, w: float, j00: float, j01: float, j02: float, j11: float, j12: float,
-    j22: float, g0: float, g1: float, g2: float,
-) -> None:  # fmt: skip
+def add_terms(work: FloatArray, i: int, on: bool, w: float, terms: Terms) -> None:
     """Where `on`, add a match's share of the Gauss-Newton system, times w; elsewhere it may be NaN."""
-    work[J00 + i] += w * j00 if on else 0.0
-    work[J01 + i] += w * j01 if on else 0.0
-    work[J02 + i] += w * j02 if on else 0.0
-    work[J11 + i] += w * j11 if on else 0.0
-    work[J12 + i] += w * j12 if on else 0.0
-    work[J22 + i] += w * j22 if on else 0.0
-    work[G0 + i] += w * g0 if on else 0.0
-    work[G1 + i] += w * g1 if on else 0.0
-    work[G2 + i] += w * g2 if on else 0.0
+    work[J00 + i] += w * terms[0] if on else 0.0
+    work[J01 + i] += w * terms[1] if on else 0.0
+    work[J02 + i] += w * terms[2] if on else 0.0
+    work[J11 + i] += w * terms[3] if on else 0.0
+    work[J12 + i] += w * terms[4] if on else 0.0
+    work[J22 + i] += w * terms[5] if on else 0.0
+    work[G0 + i] += w * terms[6] if on else 0.0
+    work[G1 + i] += w * terms[7] if on else 0.0
+    work[G2 + i] += w * terms[8] if on else 0.0
 
 
 @device
 @simd
-def sum_matches(work: FloatArray, record: FloatArray, weights: FloatArray) -> None:
-    """Add a candidate's share of the Gauss-Newton system, times `weights` (LANES)."""
-    for i in range(LANES):
-        add_terms(
-            work, i, weights[i] > 0.0, weights[i],
-            record[QJ00 + i], record[QJ01 + i], record[QJ02 + i], record[QJ11 + i], record[QJ12 + i], record[QJ22 + i],
-            record[QG0 + i], record[QG1 + i], record[QG2 + i],
-        )  # fmt: skip
+def sum_matches(work: FloatArray, record: FloatArray, chosen: FloatArray, q: float, gate: float) -> int:
+    """Add the share of candidate q in the Gauss-Newton system where it was chosen; return in how many lanes that is.
 
-
-@device
-@simd
-def robust_weights(record: FloatArray, chosen: FloatArray, q: float, gate: float, weights: FloatArray) -> int:
-    """Write Cauchy's weights 1 / (1 + D / gate) where the lane chose candidate q, else 0; return how many chose it."""
-    count = 0
+    It is weighed by Cauchy's 1 / (1 + D / gate): an infinite gate weighs all alike.
+    """
+    weights, count = stack_array(LANES), 0
     for i in range(len(chosen)):
         on = chosen[i] == q
         weights[i] = 1.0 / (1.0 + record[Q_D + i] / gate) if on else 0.0
         count += 1 if on else 0
-    return count
-
-
-@device
-@simd
-def any_wide(work: FloatArray) -> int:
-    count = 0
-    for i in range(LANES):
-        count += 1 if work[WIDE + i] > 0.0 else 0
+    if count > 0:
+        for i in range(LANES):
+            terms = (
+                record[QJ00 + i], record[QJ01 + i], record[QJ02 + i], record[QJ11 + i], record[QJ12 + i],
+                record[QJ22 + i], record[QG0 + i], record[QG1 + i], record[QG2 + i],
+            )  # fmt: skip
+            add_terms(work, i, weights[i] > 0.0, weights[i], terms)
     return count
 
 
@@ -156,9 +123,10 @@ def gauss_newton_step(work: FloatArray, only_wide: bool) -> None:
     """Take one step of Gauss-Newton from the sums: xi <- xi - J^-1 G, with covariance J^-1."""
     for i in range(LANES):
         go = work[WIDE + i] > 0.0 or not only_wide
-        i00, i01, i02, i11, i12, i22, _ = inverted(
-            work[J00 + i], work[J01 + i], work[J02 + i], work[J11 + i], work[J12 + i], work[J22 + i]
+        inverse, _ = inverted(
+            (work[J00 + i], work[J01 + i], work[J02 + i], work[J11 + i], work[J12 + i], work[J22 + i])
         )
+        i00, i01, i02, i11, i12, i22 = inverse
         g0, g1, g2 = work[G0 + i], work[G1 + i], work[G2 + i]
         work[XI0 + i] -= i00 * g0 + i01 * g1 + i02 * g2 if go else 0.0
         work[XI1 + i] -= i01 * g0 + i11 * g1 + i12 * g2 if go else 0.0
@@ -180,16 +148,19 @@ def posterior(work: FloatArray, log_likelihood: FloatArray, first: int) -> None:
     P^, X .. SIN the sample, theta wrapped.
 
     Args:
-        log_likelihood: (P,), added to from lane `first` on.
+        work: Rows of the block.
+        log_likelihood: (P,), added to.
+        first: First particle of the block.
     """
     own = log_likelihood[first : first + LANES]
     for i in range(LANES):
-        i00, i01, i02, i11, i12, i22, det = inverted(
-            work[J00 + i], work[J01 + i], work[J02 + i], work[J11 + i], work[J12 + i], work[J22 + i]
+        inverse, det = inverted(
+            (work[J00 + i], work[J01 + i], work[J02 + i], work[J11 + i], work[J12 + i], work[J22 + i])
         )
+        i00, i01, i02, i11, i12, i22 = inverse
         g0, g1, g2 = work[G0 + i], work[G1 + i], work[G2 + i]
         xi0, xi1, xi2 = work[XI0 + i], work[XI1 + i], work[XI2 + i]
-        gain = quadratic_form(i00, i01, i02, i11, i12, i22, g0, g1, g2)
+        gain = quadratic_form(inverse, g0, g1, g2)
         own[i] += total_log_likelihood(work, i) - 0.5 * (xi0 * xi0 + xi1 * xi1 + xi2 * xi2 - gain + log_of(det))
         xi0 -= i00 * g0 + i01 * g1 + i02 * g2
         xi1 -= i01 * g0 + i11 * g1 + i12 * g2

@@ -20,19 +20,14 @@ from slam_backend.fastslam._kernels.layout import (
     END,
     ESTIMATE,
     EXACT_POSE,
-    FREE_SLOTS,
     HAS_COVARIANCES,
     HAS_IDS,
-    IDENTITIES,
-    IDS,
     IS_ONE_TO_ONE,
-    LAST_SEEN,
     LOG_LIKELIHOOD,
     LOG_P0,
     LOGGED,
     LOGGED_KIND,
     LONG,
-    MAP_OF,
     MEANS,
     MOTION,
     MOTION_KIND,
@@ -42,17 +37,20 @@ from slam_backend.fastslam._kernels.layout import (
     NEW_LANDMARK_RADIUS,
     NO_READING,
     NOISE,
+    PATH_LOG_WEIGHTS,
     POSES,
     POSITION_GATE,
     RECOVERY,
     RESAMPLE_THRESHOLD,
-    ROW_OF,
     USED,
     WALK,
+    WEIGHTS,
     WORK_SIZE,
 )
+from slam_backend.fastslam._kernels.map_storage import register_new
 from slam_backend.fastslam._kernels.motion_model import propagate, set_exact
-from slam_backend.fastslam._kernels.weights import finish_step
+from slam_backend.fastslam._kernels.records import Frame, MapArrays, Motion, Outcome, Poses, Rules
+from slam_backend.fastslam._kernels.weights import add_gauge_covariance, mixture, summarise, weigh
 
 
 @device
@@ -64,12 +62,12 @@ def log_step(
     """Note the turns of a step.
 
     Args:
-        rows, turns, moves, sightings: As of `step_robots`.
-        told: (2, n) what became of the measurements, as in `Associations`.
-        means: (K, 3) [m, m, rad] where the robots are thought to be now.
-        noted: (K, 10) of the step, see `layout`; written.
-        measured: (>= first + used, 10): sightings, and the landmarks that they were taken for; written from `first` on.
-        first: Measurements that were noted before.
+        rows, turns, moves, sightings: See `step_robots`.
+        told: (2, n) results of the measurements, see `Associations`.
+        means: (K, 3) [m, m, rad] poses over all particles.
+        noted: (K, 10) notes of the step, see `layout`, written.
+        measured: (>= first + used, 10) sightings, and the landmarks that they were taken for, written from `first` on.
+        first: Number of measurements that were noted before.
     """
     for robot in range(len(rows)):
         row, note = rows[robot], noted[robot]
@@ -103,60 +101,57 @@ def write_sigmas(noise: FloatArray, move: FloatArray, sigmas: FloatArray) -> Non
 def step_robots(
     low: int, high: int, is_over: bool, now: int, assumed: FloatArray,
     rows: IntArray, turns: IntArray, moves: FloatArray, normals: FloatArray,
-    robots: FloatArray, blind: IntArray, weights: FloatArray, frame: FloatArray,
-    values: FloatArray, counts: Int32Array, odds: FloatArray, table: IntArray, maps: Int32Array, users: IntArray,
+    robots: FloatArray, blind: IntArray, weights: FloatArray, gauge: FloatArray,
+    values: FloatArray, counts: Int32Array, odds: FloatArray, table: IntArray, ancestors: Int32Array, users: IntArray,
     free_rows: IntArray, tops: IntArray, stored: Float32Array, heads: Float32Array,
     sightings: FloatArray, descriptors: Float32Array, names: IntArray,
     found: Int32Array, distances: FloatArray, told: IntArray,
     mean: FloatArray, covariance: FloatArray, noted: FloatArray, measured: FloatArray, num_measured: int,
     fastslam1: int | None,
 ) -> tuple[int, int, int, int, int, int, float, float, bool]:  # fmt: skip
-    """Move robots `low` to `high` - 1 in all particles, match, weigh and update landmarks (Algorithm 1, l. 6-8).
+    """Move robots `low` to `high` - 1 in all particles, match, weigh and update landmarks (Algorithm 1, l. 6-9).
 
-    What belongs together comes in one array, whose rows `layout` names: it is the number of arrays that a call costs.
+    What belongs together comes in one array, whose rows `layout` names: a call from Python pays for each array.
 
     Args:
-        low, high: Whose turns are taken; the step begins with the first robot.
-        is_over: Whether these were the last turns, and the step is concluded.
+        low, high: Robots whose turns are taken; the step begins with the first robot.
+        is_over: Whether these are the last turns, and the step is concluded.
         now: Number of the step, above 0 if anyone asks when landmarks were seen last.
         assumed: (27,) noise of the odometry, camera, and the rest, see `layout`.
-        rows: (K,) which of the N robots that `turns` tells of each is; -1: none, it did nothing at all.
-        turns: (N, 6) int64. What each did: `NO_READING`, `STATIONARY`, `MOVED`, or `PLACED`, with the pose already
-            written; where its measurements begin and end among all n; whether these come with covariances, and with
-            names.
+        rows: (K,) row of each robot in `turns`; -1: it did nothing at all.
+        turns: (N, 6) int64, see `layout`: act, begin and end of the measurements among all n, and whether these come
+            with covariances and with names. The pose of `PLACED` is already written.
         moves: (N, 3) odometry [m, m, rad] of those that moved.
         normals: (k, M, 3) standard normal draws, for the k robots that are not idle.
         robots: (5, K, 3, P) samples, starts, and N(x^, P^) before sampling.
         blind: (K,) 1 where that was propagated since the last sighting, else 0.
-        weights: (4, P), read and written up to M.
-        frame: (3, 3) as in `finish_step`.
-        values, ..., heads: The store, see `ParticleMaps`. n + 1 rows and n slots are free.
+        weights: (4, P), see `layout`, read and written up to M.
+        gauge: (3, 3) covariance of a motion of the whole map that particles do not show, or zeros.
+        values, ..., heads: Landmarks, see `MapArrays`. n + 1 rows and n slots are free.
         sightings: (n, 9) [m, m^2] points and, of the robots that have them, covariances, as in `to_robot_axes`.
         descriptors: (n, d).
         names: (n,) the caller's names, of the robots that have them; or (0,).
-        found, distances: (n, P), written as in `update_fastslam2`.
+        found, distances: (n, P), written, see `Outcome`.
         told: (2, n), written: the slots of the landmarks that were started, -1 = none; in the end as in `summarise`.
-        mean, covariance: (K, 3), (K, 3, 3), written in the end, as in `finish_step`.
-        noted, measured, num_measured: Of a journal, likewise, see `log_step`.
+        mean, covariance: (K, 3), (K, 3, 3), written in the end: each robot's pose over all particles.
+        noted, measured, num_measured: Journal, written in the end, see `log_step`.
         fastslam1: None: the proposal of FastSLAM 2.0; a filter that has it never compiles the other one. Any number:
             that of FastSLAM 1.0.
 
     Returns:
-        What `finish_step` returns; zeros before that.
+        The most probable particle; the first five that `summarise` returns of it; the effective sample size; the last
+        one; and whether the particles are to be resampled, now that something was measured. Zeros before the end.
     """
     num_robots, num_particles = len(rows), normals.shape[1]
-    camera, recovery = assumed[CAMERA : CAMERA + 7], assumed[RECOVERY : RECOVERY + 3]
-    is_one_to_one = assumed[IS_ONE_TO_ONE] > 0.0
     poses, means = robots[POSES], robots[MEANS]
     covariances = robots[COVARIANCES:].reshape((num_robots, 6, robots.shape[3]))
-    log_likelihood, new_slots = weights[LOG_LIKELIHOOD], told[CREATED]
-    row_of, map_of, ids, identities = table[ROW_OF], table[MAP_OF], table[IDS], table[IDENTITIES]
-    free_slots = table[FREE_SLOTS]
+    maps = MapArrays(values, counts, odds, table, ancestors, users, free_rows, tops, stored, heads)
+    camera, recovery = assumed[CAMERA : CAMERA + 7], assumed[RECOVERY : RECOVERY + 3]
     points, noises = sightings[:, :3], sightings[:, 3:]
     work, still, move, sigmas, drawn = stack_array(WORK_SIZE), stack_array(3), stack_array(3), stack_array(3), -1
     still[:] = 0.0
     if low == 0:
-        log_likelihood[:] = 0.0
+        weights[LOG_LIKELIHOOD][:] = 0.0
     for robot in range(high):
         row = rows[robot]
         act = turns[row, MOTION_KIND] if row >= 0 else NO_READING
@@ -164,46 +159,58 @@ def step_robots(
         if robot < low or act == NO_READING:
             continue
         a, b = turns[row, BEGIN], turns[row, END]
-        given, named = turns[row, COVARIANCES_GIVEN] > 0, turns[row, HAS_IDS] > 0
         placed = act == EXACT_POSE
         move[:] = 0.0
         sigmas[:] = 0.0
         if act == MOVED:
             move[0], move[1], move[2] = moves[row, 0], moves[row, 1], moves[row, 2]
             write_sigmas(assumed[NOISE : NOISE + 6], move, sigmas)
-        own_poses, own_means, own_covariances = poses[robot], means[robot], covariances[robot]
+        own = Poses(poses[robot], means[robot], covariances[robot])
+        motion = Motion(move, sigmas, normals[drawn])
+        frame = Frame(
+            points[a:b],
+            noises[a:b],
+            turns[row, COVARIANCES_GIVEN] > 0,
+            camera,
+            descriptors[a:b],
+            names[a:b],
+            turns[row, HAS_IDS] > 0,
+        )
+        rules = Rules(
+            assumed[DESCRIPTOR_GATE], assumed[DESCRIPTOR_VARIANCE], assumed[POSITION_GATE], assumed[NEW_LANDMARK_GATE],
+            assumed[NEW_LANDMARK_RADIUS], assumed[AMBIGUITY_MARGIN],
+            still if placed else recovery, assumed[LOG_P0], assumed[WALK],
+            assumed[IS_ONE_TO_ONE] > 0.0,
+        )  # fmt: skip
+        outcome = Outcome(found[a:b], distances[a:b], told[CREATED, a:b], weights[LOG_LIKELIHOOD])
         was_blind = blind[robot] > 0 and not placed
-        lost = still if placed else recovery
         if fastslam1 is not None:
-            update_fastslam1(
-                own_poses, own_means, own_covariances, not placed, move, sigmas, normals[drawn],
-                values, counts, odds, row_of, map_of, maps, users, free_rows, free_slots, tops, ids, identities, stored,
-                heads, points[a:b], noises[a:b], given, camera, descriptors[a:b], names[a:b], named,
-                assumed[DESCRIPTOR_GATE], assumed[POSITION_GATE], assumed[LOG_P0], assumed[WALK], is_one_to_one,
-                work, found[a:b], distances[a:b], new_slots[a:b], log_likelihood,
-            )  # fmt: skip
+            update_fastslam1(own, not placed, motion, maps, frame, rules, work, outcome)
+            register_new(outcome.new_slots, frame, maps)
         elif b > a:
-            update_fastslam2(
-                own_poses, own_means, own_covariances, was_blind, move, sigmas, normals[drawn],
-                values, counts, odds, row_of, map_of, maps, users, free_rows, free_slots, tops, ids, identities, stored,
-                heads, points[a:b], noises[a:b], given, camera, descriptors[a:b], names[a:b], named,
-                assumed[DESCRIPTOR_GATE], assumed[DESCRIPTOR_VARIANCE], assumed[POSITION_GATE],
-                assumed[NEW_LANDMARK_GATE], assumed[NEW_LANDMARK_RADIUS], assumed[AMBIGUITY_MARGIN], lost,
-                assumed[LOG_P0], assumed[WALK], is_one_to_one,
-                work, found[a:b], distances[a:b], new_slots[a:b], log_likelihood,
-            )  # fmt: skip
+            update_fastslam2(own, was_blind, motion, maps, frame, rules, work, outcome)
+            register_new(outcome.new_slots, frame, maps)
             was_blind = False
         elif placed:
-            set_exact(own_poses, own_means, own_covariances)
+            set_exact(own)
         else:
-            propagate(own_poses, own_means, own_covariances, was_blind, move, sigmas, normals[drawn], work)
+            propagate(own, motion, was_blind, work)
             was_blind = True
         blind[robot] = was_blind
     if not is_over:
         return 0, 0, 0, 0, 0, 0, 0.0, 0.0, False
-    summary = finish_step(
-        weights, num_particles, means, covariances, frame, mean, covariance, rows, turns, found, distances, told, ids,
-        table[LAST_SEEN], now, assumed[LONG], assumed[RESAMPLE_THRESHOLD],
-    )  # fmt: skip
+    own_weights, path_log_weights = weights[WEIGHTS][:num_particles], weights[PATH_LOG_WEIGHTS][:num_particles]
+    ess, used = weigh(weights, num_particles), 0
+    for robot in range(num_robots):
+        mixture(means[robot], covariances[robot], own_weights, mean[robot], covariance[robot])
+        used += turns[rows[robot], END] - turns[rows[robot], BEGIN] if rows[robot] >= 0 else 0
+    if gauge[0, 0] != 0.0 or gauge[2, 2] != 0.0:
+        add_gauge_covariance(gauge, mean, covariance)
+    best = int(path_log_weights.argmax())
+    long_unseen, created, new, matched, rejected, nis = summarise(
+        rows, turns, found, distances, told, best, table, now, assumed[LONG]
+    )
     log_step(rows, turns, moves, sightings, told, mean, noted, measured, num_measured)
-    return summary
+    least = assumed[RESAMPLE_THRESHOLD] * num_particles * (1.0 + 1e-9)  # rounding must not decide
+    is_depleted = used > 0 and ess <= least
+    return best, long_unseen, created, new, matched, rejected, ess, nis, is_depleted

@@ -14,7 +14,9 @@ from slam_backend.fastslam._kernels.layout import (
     COVARIANCES,
     CREATED,
     END,
+    IDS,
     LANES,
+    LAST_SEEN,
     LOG_LIKELIHOOD,
     LOG_WEIGHTS,
     MEANS,
@@ -24,48 +26,39 @@ from slam_backend.fastslam._kernels.layout import (
     STARTS,
     WEIGHTS,
 )
+from slam_backend.fastslam._kernels.records import StandpointArrays
 from slam_backend.fastslam.relative_poses import COVARIANCE, ESS, OWN, SIGMAS, START
 
 
 @device
 @in_place
-def weigh(
-    log_likelihood: FloatArray, log_weights: FloatArray, path_log_weights: FloatArray, weights: FloatArray
-) -> float:
-    """Add a step's log-likelihood to the log-weights (M,) and normalise (Eqs. 3, 11, 12; Algorithm 1, l. 9).
+def weigh(weights: FloatArray, count: int) -> float:
+    """Add a step's log-likelihood to the log-weights and normalise (Eqs. 3, 11, 12; Algorithm 1, l. 9).
 
     Args:
-        log_likelihood: (M,).
-        log_weights, path_log_weights: (M,), updated.
-        weights: (M,), written: they sum to 1.
+        weights: (4, P), see `layout`; all rows but the likelihood are written up to `count`.
+        count: M.
 
     Returns:
         The effective sample size.
     """
-    m = len(log_weights)
-    largest = -np.inf
-    for i in range(m):
+    log_weights, path_log_weights, own = weights[LOG_WEIGHTS], weights[PATH_LOG_WEIGHTS], weights[WEIGHTS]
+    log_likelihood, largest = weights[LOG_LIKELIHOOD], -np.inf
+    for i in range(count):
         path_log_weights[i] += log_likelihood[i]  # Eq. 12
         log_weights[i] += log_likelihood[i]  # Eqs. 3, 11
         largest = max(largest, log_weights[i])
     total = 0.0
-    for i in range(m):
-        weights[i] = math.exp(log_weights[i] - largest)
-        total += weights[i]
+    for i in range(count):
+        own[i] = math.exp(log_weights[i] - largest)
+        total += own[i]
     log_total = math.log(total)
     squares = 0.0
-    for i in range(m):
+    for i in range(count):
         log_weights[i] = log_weights[i] - largest - log_total  # one after the other: the largest may be huge
-        weights[i] /= total
-        squares += weights[i] * weights[i]
+        own[i] /= total
+        squares += own[i] * own[i]
     return 1.0 / squares
-
-
-@simd_inline
-def _load_weights(weights: FloatArray, first: int, block: FloatArray) -> None:
-    """Write the weights (M,) of a block (LANES,) from `first` on, zeros for surplus lanes."""
-    for i in range(LANES):
-        block[i] = weights[first + i] if first + i < len(weights) else 0.0
 
 
 @simd_inline
@@ -91,7 +84,8 @@ def mixture(
     w, sums, share = stack_array(LANES), stack_array(6), stack_array(SPREAD_SIZE)
     share[:] = 0.0
     for first in range(0, len(weights), LANES):
-        _load_weights(weights, first, w)
+        for i in range(LANES):  # zeros for surplus lanes
+            w[i] = weights[first + i] if first + i < len(weights) else 0.0
         for i in range(LANES):
             sine, cosine = sine_cosine(means[2, first + i])
             share[i] += w[i] * means[0, first + i]
@@ -103,7 +97,8 @@ def mixture(
     mean[0], mean[1], mean[2] = mean_x, mean_y, mean_theta
     share[:] = 0.0
     for first in range(0, len(weights), LANES):
-        _load_weights(weights, first, w)
+        for i in range(LANES):
+            w[i] = weights[first + i] if first + i < len(weights) else 0.0
         for i in range(LANES):
             x, y = means[0, first + i] - mean_x, means[1, first + i] - mean_y
             t = wrapped(means[2, first + i] - mean_theta)
@@ -147,31 +142,29 @@ def add_gauge_covariance(scatter: FloatArray, poses: FloatArray, covariances: Fl
 @device
 @in_place
 def summarise(
-    rows: IntArray, turns: IntArray, found: Int32Array, distances: FloatArray, told: IntArray, best: int, ids: IntArray,
-    last_seen: IntArray, now: int, long: float,
+    rows: IntArray, turns: IntArray, found: Int32Array, distances: FloatArray, told: IntArray, best: int,
+    table: IntArray, now: int, long: float,
 ) -> tuple[int, int, int, int, int, float]:  # fmt: skip
-    """Tell what became of the robots' measurements.
+    """Count what became of the robots' measurements.
 
     Args:
-        rows, turns: Which of all n measurements they are, as in `step_robots`; those of others are passed over.
+        rows, turns: Robots and their turns, see `step_robots`; measurements of other robots are passed over.
         found: (n, P) slots to which the particles gave the measurements, -1 = rejected.
         distances: (n, P) squared distances of matches.
         told: (2, n), written: the id to which the most probable particle gave each measurement, -1 = rejected; and the
             id of the landmark that it created in any particle, -1 = none. There the slots of these landmarks stand.
         best: The most probable particle.
-        ids: (slots,) stable names.
-        last_seen: (slots,) number of the step in which the most probable particle last matched a landmark, 0 = it never
-            did. Changed.
-        now: That of this step.
-        long: Steps after which a landmark was not seen for long.
+        table: (6, slots), see `layout`; `LAST_SEEN` is written.
+        now: Number of the step.
+        long: Number of steps after which a landmark was not seen for long.
 
     Returns:
-        How many landmarks not seen for long the most probable particle matched; how many measurements started a
-        landmark in any particle; how many the most probable particle started, matched, and made nothing of, unused ones
-        included; and the mean of its squared distances, without what it predicted behind the camera, NaN if there is
-        none.
+        The number of landmarks not seen for long that the most probable particle matched; the number of measurements
+        that started a landmark in any particle; the numbers of those that the most probable particle started, matched,
+        and made nothing of, unused ones included; and the mean of its squared distances, without what it predicted
+        behind the camera, NaN if there is none.
     """
-    associated, created = told[ASSOCIATED], told[CREATED]
+    associated, created, ids, last_seen = told[ASSOCIATED], told[CREATED], table[IDS], table[LAST_SEEN]
     num_measurements, num_created, num_new, num_matched, num_long_unseen, squares, judged = 0, 0, 0, 0, 0, 0.0, 0
     for row in rows:
         if row < 0:
@@ -197,46 +190,6 @@ def summarise(
                     judged += 1
     num_rejected = num_measurements - num_new - num_matched
     return num_long_unseen, num_created, num_new, num_matched, num_rejected, squares / judged if judged > 0 else np.nan
-
-
-@device
-@in_place
-def finish_step(
-    weights: FloatArray, count: int, means: FloatArray, covariances: FloatArray, frame: FloatArray,
-    mean: FloatArray, covariance: FloatArray, rows: IntArray, turns: IntArray, found: Int32Array, distances: FloatArray,
-    told: IntArray, ids: IntArray, last_seen: IntArray, now: int, long: float, threshold: float,
-) -> tuple[int, int, int, int, int, int, float, float, bool]:  # fmt: skip
-    """Weigh the particles, estimate the poses of K robots, and summarise their measurements.
-
-    Args:
-        weights: (4, P) log-weights, those along paths, weights, and a step's log-likelihood; the first three change.
-        count: M.
-        means, covariances: (K, 3, P), (K, 6, P) N(x^, P^) before sampling.
-        frame: (3, 3) covariance of a motion of the whole map that particles do not show, or zeros.
-        mean, covariance: (K, 3), (K, 3, 3), written: of each robot's pose over all particles.
-        rows, ..., long: As in `summarise`.
-        threshold: Share of M below which the effective sample size asks for resampling.
-
-    Returns:
-        The most probable particle; the first five that `summarise` returns of it; the effective sample size; the last
-        one; and whether the particles are to be resampled, now that something was measured.
-    """
-    path_log_weights, own = weights[PATH_LOG_WEIGHTS][:count], weights[WEIGHTS][:count]
-    ess = weigh(weights[LOG_LIKELIHOOD][:count], weights[LOG_WEIGHTS][:count], path_log_weights, own)
-    for robot in range(len(means)):
-        mixture(means[robot], covariances[robot], own, mean[robot], covariance[robot])
-    if frame[0, 0] != 0.0 or frame[2, 2] != 0.0:
-        add_gauge_covariance(frame, mean, covariance)
-    best = int(path_log_weights.argmax())
-    long_unseen, created, new, matched, rejected, nis = summarise(
-        rows, turns, found, distances, told, best, ids, last_seen, now, long
-    )  # fmt: skip
-    used = 0
-    for row in rows:
-        if row >= 0:
-            used += turns[row, END] - turns[row, BEGIN]
-    is_depleted = used > 0 and ess <= threshold * count * (1.0 + 1e-9)  # rounding must not decide
-    return best, long_unseen, created, new, matched, rejected, ess, nis, is_depleted
 
 
 AT_ORIGIN, KNOWN, SPREAD = 0, 1, 2  # what starts of particles can be
@@ -319,8 +272,8 @@ def _relative_pose_of_self(
 
 @in_place
 def write_team_poses(
-    robots: FloatArray, scatters: FloatArray, weights: FloatArray, best: int, at_origin: bool, estimates: FloatArray,
-    spreads: FloatArray, members: IntArray, ess: float, poses: FloatArray, beliefs: FloatArray,
+    robots: FloatArray, scatters: FloatArray, weights: FloatArray, best: int, estimates: FloatArray,
+    spreads: FloatArray, members: IntArray, ess: float, points: StandpointArrays,
 ) -> None:  # fmt: skip
     """Write where the robots of a filter stand, and where they see each other, in their own start frames.
 
@@ -331,14 +284,13 @@ def write_team_poses(
         robots: (5, n, 3, P) what its robots have in all particles, see `layout`, map frame.
         scatters: (n, 3, 3) covariances of their starts that particles do not show [m, m, rad], start frames; 0 where
             they show all.
-        weights: (M,) summing to 1.
+        weights: (M,) summing to 1; (0,) where all robots started at the origin in all particles.
         best: The most probable particle.
-        at_origin: Whether all robots started at the origin in all particles.
         estimates, spreads: (n, 3), (n, 3, 3) [m, m, rad] the robots' poses over all particles, map frame.
         members: (2, n) int64. Which robots of the team they are, and which of them go by this filter: only these are
             written of.
         ess: Effective sample size of the filter, as a share of M.
-        poses, beliefs: Of the `TeamPoses` of all robots of the team; written.
+        points: Standpoints of all robots of the team, written.
     """
     count = members.shape[1]
     starts, means = robots[STARTS], robots[MEANS]
@@ -347,7 +299,7 @@ def write_team_poses(
         if not members[1, i]:
             continue
         own = members[0, i]
-        seen, belief = poses[own], beliefs[own]
+        seen, belief = points.poses[own], points.beliefs[own]
         x, y, theta = starts[i, 0, best], starts[i, 1, best], starts[i, 2, best]
         c, s = math.cos(theta), math.sin(theta)
         to_x, to_y, turn = -c * x - s * y, s * x - c * y, (math.pi - theta) % (2.0 * math.pi) - math.pi
@@ -356,7 +308,7 @@ def write_team_poses(
             belief[OWN + j] = estimates[i, j]
             for k in range(3):
                 belief[COVARIANCE + 3 * j + k] = spreads[i, j, k]
-        if not at_origin:
+        if len(weights) > 0:
             is_held = scatters[i, 2, 2] > 0.0  # then the estimate's share of the frame is not its own
             kind = SPREAD if is_held else start_kind(starts[i], len(weights))
             pose, spread = belief[OWN : OWN + 3], belief[COVARIANCE:SIGMAS].reshape((3, 3))

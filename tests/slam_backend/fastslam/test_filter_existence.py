@@ -15,10 +15,13 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from slam_backend.core.validation import FloatArray
-from slam_backend.fastslam._kernels.existence import in_view, updated_log_odds
-from slam_backend.fastslam.existence import ExistenceModel
+from slam_backend.fastslam._kernels import LANES
+from slam_backend.fastslam._kernels.existence import in_view, landmarks_in_view, updated_log_odds
+from slam_backend.fastslam._kernels.records import Viewpoint
+from slam_backend.fastslam.existence import ExistenceModel, FieldOfView
 from slam_backend.fastslam.filter import FastSlam
-from slam_backend.geometry import compose
+from slam_backend.fastslam.particle_maps import ParticleMaps
+from slam_backend.geometry import between, compose
 from slam_backend.maps.alignment import Alignment
 from slam_backend.models.camera import StereoCamera
 from slam_backend.models.measurements import Measurements
@@ -119,10 +122,10 @@ def test_a_sensor_that_reports_few_points_makes_a_miss_say_less() -> None:
 
 
 @numba.njit
-def compiled(points: FloatArray, nearest: float, side: float, rise: float, reach: float, out: Any) -> None:
+def compiled(points: FloatArray, view: FieldOfView, out: Any) -> None:
     """Ask for each point as a filter's loop does."""
     for i in range(len(points)):
-        out[i] = in_view(points[i, 0], points[i, 1], points[i, 2], nearest, side, rise, reach)
+        out[i] = in_view(points[i, 0], points[i, 1], points[i, 2], view)
 
 
 def test_expected_in_view_is_what_a_smaller_camera_sees() -> None:
@@ -136,11 +139,48 @@ def test_expected_in_view_is_what_a_smaller_camera_sees() -> None:
     expected = smaller.sees(camera_points) & (depth > 0.6)
     in_robot_axes = camera.robot_from_camera(camera_points) - camera.mount
     found = np.zeros(4000, dtype=np.bool_)
-    compiled(np.ascontiguousarray(in_robot_axes), *model.view(camera), found)
+    compiled(np.ascontiguousarray(in_robot_axes), model.view(camera), found)
     np.testing.assert_array_equal(found, expected)
-    np.testing.assert_array_equal([in_view(*point, *model.view(camera)) for point in in_robot_axes[:300]], found[:300])
+    np.testing.assert_array_equal([in_view(*point, model.view(camera)) for point in in_robot_axes[:300]], found[:300])
     assert 500 < found.sum() < 3500
     assert np.any(camera.sees(camera_points) & ~expected)
+
+
+def test_a_frame_tells_of_what_some_particle_matched_or_expects_in_view() -> None:
+    """Landmarks are read through their ancestor maps, in all blocks of lanes; those just started are left out."""
+    rng, count, num, best = np.random.default_rng(11), LANES + 9, 60, 3
+    maps, model = ParticleMaps(count, 0.0), ExistenceModel()
+    held = rng.random((num, count)) < 0.2
+    held[:, 0] = True
+    ids = np.arange(num)
+    maps.load_metadata(held.astype(np.int32), np.zeros((num, 4), np.float32), ids, ids, num)
+    maps.blocks[:num] = rng.uniform(-9.0, 9.0, maps.blocks[:num].shape)
+    maps.maps = np.tile(np.arange(maps.padded, dtype=np.int32), (2, 1))
+    maps.maps[1, :count] = np.sort(rng.integers(0, count, count))
+    maps.users, maps.map_of[:num:2] = np.array([0, num // 2]), 1
+    places = np.where(maps.map_of[:num, None] > 0, maps.maps[1, :count], np.arange(count))
+    poses = rng.uniform(-3.0, 3.0, (3, maps.padded))
+    view, mount, near = model.view(StereoCamera()), np.array([0.1, 0.0, 0.2]), 12.0
+    camera = Viewpoint(poses, np.cos(poses[2]), np.sin(poses[2]), mount)
+    found, new_slots = np.full((2, maps.padded), -1, np.int32), np.array([7, -1])
+    found[1, 5] = 8
+    told = landmarks_in_view(maps.arrays, count, best, camera, view, near, found, new_slots)
+
+    expected = []
+    for slot in range(num):
+        row, own = maps.row_of[slot], places[slot]
+        values, holds = maps.blocks[row, own // LANES, :, own % LANES], maps.counts[row, own] > 0
+        if not holds.any() or slot == 7:
+            continue
+        first = best if holds[best] else int(np.argmax(holds))
+        is_near = np.hypot(*(values[first, :2] - poses[:2, best])) <= near
+        in_robot_axes = between(poses[:, :count].T, np.column_stack([values[:, :2], np.zeros(count)])) - mount
+        in_sight = [in_view(depth, lateral, 0.0, view) for depth, lateral, _ in in_robot_axes]
+        if slot == 8 or (is_near and (holds & in_sight).any()):
+            expected.append(slot)
+    assert told.tolist() == expected
+    assert 8 in expected
+    assert 10 < len(expected) < num - 10
 
 
 PROPOSALS = pytest.mark.parametrize("proposal", ["fastslam2", "fastslam1"])

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from slam_backend.fastslam._kernels import EXACT_POSE, MOVED, NO_READING
 from slam_backend.fastslam._kernels import STATIONARY as STOOD_STILL
 from slam_backend.fastslam._kernels.layout import ESTIMATE, LOGGED, LOGGED_KIND, MOTION, NAME, NUM_MEASURED, NUM_NOTED
-from slam_backend.fastslam._kernels.run_log import write_initial_poses
+from slam_backend.fastslam._kernels.run_log import guesses_of
 from slam_backend.fastslam._kernels.step import log_step
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.run_log import MEASUREMENTS, ROWS, RobotLog
@@ -280,11 +280,10 @@ def test_guesses_are_of_the_steps_in_which_a_robot_did_or_measured_anything() ->
         did = noted[:, robot, LOGGED_KIND] = rng.choice(acts, num_steps)
         kept = did != NO_READING
         noted[:, robot, LOGGED] = kept
-        steps, poses = np.empty(num_steps, np.int64), np.empty((num_steps, 3))
-        num, is_placed = write_initial_poses(robot, numbers, noted, steps, poses)
-        np.testing.assert_array_equal(steps[:num], numbers[kept])
-        np.testing.assert_array_equal(poses[:num], noted[kept, robot, ESTIMATE:])
-        assert 0 < num < num_steps
+        steps, poses, is_placed = guesses_of(robot, numbers, noted)
+        np.testing.assert_array_equal(steps, numbers[kept])
+        np.testing.assert_array_equal(poses, noted[kept, robot, ESTIMATE:])
+        assert 0 < len(steps) < num_steps
         assert is_placed == (EXACT_POSE in acts)
 
 

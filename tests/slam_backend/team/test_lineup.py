@@ -10,7 +10,7 @@ from builders.kernels import python_entry
 from builders.teams import NEVER, SimulatedTeam, false_alignment, links, true_alignment
 
 from slam_backend.core.packed_symmetric import UNPACK_INDEX
-from slam_backend.fastslam._kernels import LANES, add_gauge_covariance
+from slam_backend.fastslam._kernels import LANES, StandpointArrays, add_gauge_covariance
 from slam_backend.fastslam._kernels.weights import (
     AT_ORIGIN,
     KNOWN,
@@ -216,8 +216,8 @@ def test_own_frames_are_the_plain_definition() -> None:
     points.poses.fill(7.0)
     points.beliefs.fill(7.0)
     write_team_poses(
-        robots, np.zeros((4, 3, 3)), weights, best, False, *estimates, np.array([names, live]), 0.5, points.poses,
-        points.beliefs,
+        robots, np.zeros((4, 3, 3)), weights, best, *estimates, np.array([names, live]), 0.5,
+        StandpointArrays(points.poses, points.beliefs),
     )  # fmt: skip
 
     for field in (points.poses, points.beliefs):
@@ -262,7 +262,8 @@ def test_a_held_start_widens_what_is_seen_from_it_and_the_frame_does_not() -> No
     estimates.covariances[:] += 7.0
     scatter = np.array([[0.04, 0.01, -0.02], [0.01, 0.09, 0.03], [-0.02, 0.03, 0.05]])
     points, members = TeamPoses(1), np.array([[0], [1]])
-    write_team_poses(robots, scatter[None], weights, 4, False, *estimates, members, 0.5, points.poses, points.beliefs)
+    arrays = StandpointArrays(points.poses, points.beliefs)
+    write_team_poses(robots, scatter[None], weights, 4, *estimates, members, 0.5, arrays)
     expected = rotate_covariances(-start[2], shown.covariances)
     add_gauge_covariance(scatter, (own := between(start, shown.means)), expected)
     np.testing.assert_allclose(points.own, own, atol=1e-12)

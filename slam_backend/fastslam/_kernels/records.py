@@ -1,0 +1,281 @@
+"""Records of the arrays and numbers that travel together from kernel to kernel.
+
+P lanes are M particles, rounded up to whole blocks of `LANES`; B is the number of measurements of one robot's frame.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_backend.core.validation import BoolArray, Float32Array, FloatArray, Int32Array, IntArray
+from slam_backend.fastslam._kernels.layout import COVARIANCES, MEANS, POSES, STARTS
+
+
+class MapArrays(NamedTuple):
+    """Storage of the landmarks of all particles, see `particle_maps`.
+
+    Attributes:
+        values: (rows * 9 * P,) [m, m^2], map frame, each row [block][x, y, z, Sxx, Sxy, Sxz, Syy, Syz, Szz][lane].
+        counts: (rows, P). Number of matches of the landmark in the particle, its start included; 0: it lacks it.
+        odds: (slots, P) log-odds of existence; (0, P) where existence is not kept.
+        table: (6, slots), see `Slots`.
+        maps: (maps, P). Ancestor maps; map 0 stands for the identity.
+        users: (maps,). Number of slots read by each map.
+        free_rows: (rows,). Stack of free rows.
+        tops: (3,). Heights of the stacks of free rows and of free slots, and the name of the next landmark.
+        descriptors: (slots, d).
+        heads: (h, slots). Every (d / h)-th component of the descriptors, `FAR` where the slot is free.
+    """
+
+    values: FloatArray
+    counts: Int32Array
+    odds: FloatArray
+    table: IntArray
+    maps: Int32Array
+    users: IntArray
+    free_rows: IntArray
+    tops: IntArray
+    descriptors: Float32Array
+    heads: Float32Array
+
+
+class Slots(NamedTuple):
+    """Rows of the table of a map's slots, in their order, each (slots,).
+
+    Attributes:
+        row_of: Row of each slot.
+        map_of: Ancestor map by which it is to be read.
+        ids: Stable name of the landmark, -1 = free slot.
+        identities: The caller's own name, -1 = none.
+        last_seen: Step of the smoother in which the most probable particle last matched the landmark, 0 = never.
+        free_slots: Stack of free slots.
+    """
+
+    row_of: IntArray
+    map_of: IntArray
+    ids: IntArray
+    identities: IntArray
+    last_seen: IntArray
+    free_slots: IntArray
+
+
+class WeightArrays(NamedTuple):
+    """Rows of the weights of all particles, in their order, each (P,).
+
+    Attributes:
+        log_weights: Log-weights since the last resampling, normalised.
+        path_log_weights: Log-weights accumulated along the ancestral line (Eq. 12).
+        weights: Weights after the last step, summing to 1.
+        log_likelihood: Increments of a step.
+    """
+
+    log_weights: FloatArray
+    path_log_weights: FloatArray
+    weights: FloatArray
+    log_likelihood: FloatArray
+
+
+class RobotArrays(NamedTuple):
+    """K robots in all particles, map frame [m, m, rad].
+
+    Attributes:
+        poses: (K, 3, P) samples.
+        starts: (K, 3, P) where they started.
+        means: (K, 3, P) means x^ before sampling.
+        covariances: (K, 6, P) upper triangles of the covariances P^ before sampling.
+    """
+
+    poses: FloatArray
+    starts: FloatArray
+    means: FloatArray
+    covariances: FloatArray
+
+
+def robot_arrays(whole: FloatArray) -> RobotArrays:
+    """Return views of the one array (5, K, 3, P) that kernels take."""
+    covariances = whole[COVARIANCES:].reshape(whole.shape[1], 6, -1)
+    return RobotArrays(whole[POSES], whole[STARTS], whole[MEANS], covariances)
+
+
+class Poses(NamedTuple):
+    """One robot in all particles.
+
+    Attributes:
+        samples: (3, P) rows x, y, theta [m, m, rad], map frame.
+        means: (3, P) means x^ before sampling.
+        covariances: (6, P) upper triangles of the covariances P^ before sampling.
+    """
+
+    samples: FloatArray
+    means: FloatArray
+    covariances: FloatArray
+
+
+class Motion(NamedTuple):
+    """Motion of one robot in one step.
+
+    Attributes:
+        odometry: (3,) u [m, m, rad], previous robot frame.
+        sigmas: (3,) standard deviations of u.
+        normals: (M, 3) standard normal draws.
+    """
+
+    odometry: FloatArray
+    sigmas: FloatArray
+    normals: FloatArray
+
+
+class Frame(NamedTuple):
+    """Measurements of one robot in one step.
+
+    Attributes:
+        points: (B, 3) [m] measured points relative to the camera centre, robot axes (x ahead is the depth).
+        noises: (B, 6) [m^2] their covariances, robot axes, if `given`.
+        given: Whether the covariances come with the measurements.
+        camera: (7,) focal length, baseline, sigma of image coordinates, sigma of the disparity [px], mount (3) [m].
+        descriptors: (B, d).
+        names: (B,) the caller's names of the landmarks measured, if `named`; gates then play no part.
+        named: Whether names decide instead of descriptors.
+    """
+
+    points: FloatArray
+    noises: FloatArray
+    given: bool
+    camera: FloatArray
+    descriptors: Float32Array
+    names: IntArray
+    named: bool
+
+
+class Rules(NamedTuple):
+    """Thresholds of data association and of the update of landmarks.
+
+    Attributes:
+        descriptor_gate: Largest admitted squared distance E0 of descriptors.
+        descriptor_variance: Divisor of squared distances between descriptors that are weighed against D.
+        position_gate: D0.
+        new_landmark_gate: Largest D at which a measurement that is not matched is not new either.
+        new_landmark_radius: Distance [m] from a landmark of the same looks up to which a measurement is not new.
+        ambiguity: Cost within which a runner-up makes a measurement ambiguous: it is held back.
+        recovery: (3,) standard deviations [m, m, rad] of the pose where most matches contradict it; zeros: never.
+        log_p0: Log-density of a measurement that starts a new landmark.
+        walk: Variance [m^2] along each axis by which a landmark may have moved between two sightings.
+        one_to_one: Whether a landmark is matched at most once in a frame.
+    """
+
+    descriptor_gate: float
+    descriptor_variance: float
+    position_gate: float
+    new_landmark_gate: float
+    new_landmark_radius: float
+    ambiguity: float
+    recovery: FloatArray
+    log_p0: float
+    walk: float
+    one_to_one: bool
+
+
+class Candidates(NamedTuple):
+    """Landmarks that may have caused the measurements of a frame, nearest descriptor first.
+
+    Attributes:
+        starts: (B + 1,) where the candidates of each measurement begin among all C.
+        slots: (C,) slots of the landmarks.
+        looks: (C,) squared distances E of the descriptors.
+        owners: (C,) measurements.
+        same: (C,) previous candidate of the same slot, -1 if there is none.
+    """
+
+    starts: IntArray
+    slots: IntArray
+    looks: FloatArray
+    owners: IntArray
+    same: IntArray
+
+
+class Space(NamedTuple):
+    """Working space of one block of lanes.
+
+    Attributes:
+        work: (WORK_SIZE,) rows of the block, see `layout`.
+        records: (C, CANDIDATE_ROWS * LANES) rows of each candidate.
+        match: (B, LANES) candidate matched, -1 for rejected, -2 for new.
+        mask: (LANES,) 1 where a lane takes part.
+    """
+
+    work: FloatArray
+    records: FloatArray
+    match: FloatArray
+    mask: FloatArray
+
+
+class Outcome(NamedTuple):
+    """Results of one robot's frame.
+
+    Attributes:
+        found: (B, P) slots, new ones included, -1 = rejected.
+        distances: (B, P) D of matches, NaN otherwise.
+        new_slots: (B,) slot of the landmark that each measurement started in some particle, -1 = none.
+        log_likelihood: (P,) log-likelihood of the step, added to.
+    """
+
+    found: Int32Array
+    distances: FloatArray
+    new_slots: IntArray
+    log_likelihood: FloatArray
+
+
+class StandpointArrays(NamedTuple):
+    """Arrays of the `TeamPoses` of n robots of a team of K.
+
+    Attributes:
+        poses: (n, K, 3) [m, m, rad].
+        beliefs: (n, 16 + K), see `relative_poses`.
+    """
+
+    poses: FloatArray
+    beliefs: FloatArray
+
+
+class LogColumns(NamedTuple):
+    """Columns of `LogArrays`, with room for more rows and measurements."""
+
+    steps: IntArray
+    kinds: NDArray[np.int8]
+    motions: FloatArray
+    given: BoolArray
+    starts: IntArray
+    points: FloatArray
+    ids: IntArray
+
+
+class ViewBounds(NamedTuple):
+    """Where landmarks are expected to be seen: bounds relative to a camera.
+
+    Attributes:
+        nearest: Least depth [m].
+        side: Largest |lateral| / depth [-].
+        rise: Largest |vertical| / depth [-].
+        reach_squared: Largest squared distance [m^2].
+    """
+
+    nearest: float
+    side: float
+    rise: float
+    reach_squared: float
+
+
+class Viewpoint(NamedTuple):
+    """Camera of one robot in all particles.
+
+    Attributes:
+        poses: (3, P) poses of the robot [m, m, rad], map frame.
+        cosines, sines: (P,) of their headings.
+        mount: (3,) place of the camera on the robot [m].
+    """
+
+    poses: FloatArray
+    cosines: FloatArray
+    sines: FloatArray
+    mount: FloatArray
