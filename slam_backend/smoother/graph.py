@@ -12,12 +12,12 @@ from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.geometry import between, wrap_angle
 from slam_backend.smoother._kernels import LEVER as LEVER
 from slam_backend.smoother._kernels import NONE as NONE
-from slam_backend.smoother._kernels import Frames, Frozen, Keys, Landmarks, Points
+from slam_backend.smoother._kernels import Condensed, Frames, Keys, Landmarks, Points
 
 UNINFORMATIVE = (1e4, 1e4, 10.0)  # variances [m^2, m^2, rad^2] of a start of which nothing is known
 RIGID = 1e-4  # [m, rad]; starts that scatter less against each other do not move
 
-Part = TypeVar("Part", Keys, Frames, Points, Frozen, Landmarks)  # columns of a graph that go together, row by row
+Part = TypeVar("Part", Keys, Frames, Points, Condensed, Landmarks)  # columns of a graph that go together, row by row
 
 
 def mapped(part: Part, act: Callable[[Any], Any]) -> Part:

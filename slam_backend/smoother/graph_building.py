@@ -10,7 +10,7 @@ from slam_backend.core.validation import BoolArray, FloatArray, IntArray, argume
 from slam_backend.geometry import between, compose, rotation
 from slam_backend.models.odometry import OdometryModel
 from slam_backend.smoother import _kernels
-from slam_backend.smoother._kernels import Frames, Frozen, Keys, Landmarks, Log, Points
+from slam_backend.smoother._kernels import Condensed, Frames, Keys, Landmarks, Log, Points
 from slam_backend.smoother.graph import NONE, RIGID, UNINFORMATIVE, Part, SlamGraph, mapped
 from slam_backend.smoother.log_arrays import EXACT, LogArrays
 
@@ -119,7 +119,7 @@ def extend_graph(
     held = places if is_guided and places is not None else NO_LANDMARK_POSITIONS
     landmarks = _kernels.close_keyframe(
         graph.merged_ids, mapped(raw, lambda column: column[len(graph.points) : num_points]), graph.point_landmarks,
-        graph.part(Frozen), graph.part(Landmarks), held, frames, keys.poses, mount,
+        graph.part(Condensed), graph.part(Landmarks), held, frames, keys.poses, mount,
     )  # fmt: skip
     latest = [int(log.steps[-1]) if len(log) else before for log, before in zip(logs, graph.latest, strict=True)]
     parts = ((keys, num_keys), (frames, num_frames), (raw, num_points), (landmarks, None))
@@ -221,14 +221,14 @@ def _named(graph: SlamGraph, names: Mapping[int, int]) -> SlamGraph:
     aliases = [(names[old], names[by]) for old, by in graph.merged_ids.tolist() if old in names and by in names]
     return graph.with_columns(
         **_rows(graph.part(Points), kept[graph.point_landmarks], row),
-        **_rows(graph.part(Frozen), kept[graph.condensed_landmarks], row),
+        **_rows(graph.part(Condensed), kept[graph.condensed_landmarks], row),
         landmark_ids=new[kept],
         landmarks=graph.landmarks[kept],
         merged_ids=np.array(aliases, dtype=np.int64).reshape(-1, 2),
     )
 
 
-def _rows(part: Points | Frozen, kept: BoolArray, row: IntArray) -> dict[str, Any]:
+def _rows(part: Points | Condensed, kept: BoolArray, row: IntArray) -> dict[str, Any]:
     """Return some rows of columns by name; landmarks are renumbered by `row`."""
     columns = {name: column[kept] for name, column in part._asdict().items()}
     return columns | {name: row[column] for name, column in columns.items() if name.endswith("_landmarks")}

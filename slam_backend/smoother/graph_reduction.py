@@ -9,7 +9,7 @@ import numpy as np
 
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.smoother import _kernels
-from slam_backend.smoother._kernels import Keys, Points, Sightings
+from slam_backend.smoother._kernels import Keys, LandmarkFactors, Points
 from slam_backend.smoother.graph import SlamGraph, mapped
 from slam_backend.smoother.optimizer import MapEstimate, gathered, linearise
 from slam_backend.smoother.options import SmoothingOptions
@@ -19,7 +19,7 @@ CONTRADICTION = 2.0  # times the kernel's squared distance: measurements farther
 
 
 def reduce_keyframes(
-    graph: SlamGraph, camera: FloatArray, options: SmoothingOptions, sightings: Sightings | None = None
+    graph: SlamGraph, camera: FloatArray, options: SmoothingOptions, sightings: LandmarkFactors | None = None
 ) -> SlamGraph:
     """Return the graph with old keys condensed and at most `most_keys` of them, if the fresh ones allow.
 
@@ -40,7 +40,7 @@ def reduce_keyframes(
         fresh[np.flatnonzero(graph.robots == robot)[-share:]] = True
     raw = fresh & (np.bincount(graph.frame_keys, minlength=graph.num_keys) <= MAX_FRAMES)
     graph, seen = _consistent(graph, seen, raw, camera, options)
-    rows, sighted = np.flatnonzero(seen.frozen | ~raw[seen.keys]), np.zeros(graph.num_keys, dtype=np.bool_)
+    rows, sighted = np.flatnonzero(seen.condensed | ~raw[seen.keys]), np.zeros(graph.num_keys, dtype=np.bool_)
     sighted[seen.keys[rows]] = True
     keys = mapped(graph.part(Keys), np.copy)
     left, roots, numbers, offsets = _kernels.merge_keys(fresh, sighted, options.most_keys(len(graph.last_keys)), keys)
@@ -89,8 +89,8 @@ def _used(num: int, *rows: IntArray) -> tuple[BoolArray, IntArray]:
 
 
 def _consistent(
-    graph: SlamGraph, seen: Sightings, raw: BoolArray, camera: FloatArray, options: SmoothingOptions
-) -> tuple[SlamGraph, Sightings]:
+    graph: SlamGraph, seen: LandmarkFactors, raw: BoolArray, camera: FloatArray, options: SmoothingOptions
+) -> tuple[SlamGraph, LandmarkFactors]:
     """Return the graph without old measurements that the smoothed path contradicts, and its sightings, linearised.
 
     Args:

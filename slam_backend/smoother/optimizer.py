@@ -6,19 +6,27 @@ import numpy as np
 
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.smoother import _kernels
-from slam_backend.smoother._kernels import Equations, Factor, Frames, Frozen, Keys, Points, Sightings
+from slam_backend.smoother._kernels import (
+    CholeskyFactor,
+    Condensed,
+    EquationBlocks,
+    Frames,
+    Keys,
+    LandmarkFactors,
+    Points,
+)
 from slam_backend.smoother.graph import SlamGraph
 from slam_backend.smoother.options import SmoothingOptions
 
 
-def gathered(graph: SlamGraph) -> Sightings:
+def gathered(graph: SlamGraph) -> LandmarkFactors:
     """Return a graph's sightings; those of raw measurements are still to be linearised."""
-    parts = graph.part(Frozen), graph.part(Points), graph.part(Frames)
+    parts = graph.part(Condensed), graph.part(Points), graph.part(Frames)
     return _kernels.gather(*parts, graph.num_keys, len(graph.landmark_ids))
 
 
 def linearise(
-    seen: Sightings, graph: SlamGraph, poses: FloatArray, landmarks: FloatArray, camera: FloatArray,
+    seen: LandmarkFactors, graph: SlamGraph, poses: FloatArray, landmarks: FloatArray, camera: FloatArray,
     options: SmoothingOptions,
 ) -> float:  # fmt: skip
     """Linearise raw measurements, and return half the sum of their (robust) squared distances.
@@ -64,7 +72,7 @@ class MapEstimate(NamedTuple):
     poses: FloatArray
     landmarks: FloatArray
     columns: IntArray
-    sightings: Sightings
+    sightings: LandmarkFactors
     odometry_infos: FloatArray
     cost: float
     iterations: int
@@ -178,7 +186,7 @@ class NormalEquations:
     """Normal equations, their factor, and what they are formed of."""
 
     def __init__(
-        self, graph: SlamGraph, columns: IntArray, size: int, informations: FloatArray, sightings: Sightings,
+        self, graph: SlamGraph, columns: IntArray, size: int, informations: FloatArray, sightings: LandmarkFactors,
         camera: FloatArray, options: SmoothingOptions,
     ) -> None:  # fmt: skip
         self.graph, self.columns, self.sightings = graph, columns, sightings
@@ -187,9 +195,11 @@ class NormalEquations:
         self.num_poses = size
         self.pattern = _kernels.lay_out(columns, graph.parents, sightings, num)
         cross = np.empty((len(sightings.keys), 3, 3))
-        self.equations = Equations(np.empty((k, 2)), np.empty((num, 6)), np.empty((k, 3, 3)), cross, np.empty((num, 3)))
+        self.equations = EquationBlocks(
+            np.empty((k, 2)), np.empty((num, 6)), np.empty((k, 3, 3)), cross, np.empty((num, 3))
+        )
         values = np.empty((len(self.pattern.rows), 9))
-        self.factor = Factor(np.empty((num, 6)), values, np.empty(num, dtype=np.int64))
+        self.factor = CholeskyFactor(np.empty((num, 6)), values, np.empty(num, dtype=np.int64))
         self.eased = 0.0  # by so much the cost would fall if landmarks alone moved
 
     def form(self, poses: FloatArray, landmarks: FloatArray) -> float:

@@ -8,7 +8,7 @@ import numpy as np
 from slam_backend.core.packed_symmetric import UNPACK_INDEX, UPPER
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.geometry import between, compose, rotation
-from slam_backend.smoother._kernels import Points, Sightings
+from slam_backend.smoother._kernels import LandmarkFactors, Points
 from slam_backend.smoother.graph import NONE, SlamGraph
 from slam_backend.smoother.graph_reduction import CONTRADICTION
 from slam_backend.smoother.optimizer import gathered, linearise
@@ -74,21 +74,21 @@ def _condensed(graph: SlamGraph, fresh: BoolArray, camera: FloatArray, options: 
     if options.kernel and (lost := old & (seen.squares > CONTRADICTION * options.kernel)).any():
         graph = replace(graph, **{name: getattr(graph, name)[~lost] for name in Points._fields})
         seen = _linearised(graph, camera, options)
-    frozen = seen.frozen | ~fresh[seen.keys]
+    frozen = seen.condensed | ~fresh[seen.keys]
     keep = fresh[graph.frame_keys[graph.point_frames]]
     return replace(
         graph,
         **{name: getattr(graph, name)[keep] for name in Points._fields},
         condensed_keys=seen.keys[frozen],
         condensed_landmarks=seen.landmarks[frozen],
-        linearisation_points=seen.centres[frozen],
-        information=seen.infos[frozen],
-        gradients=seen.slopes[frozen],
+        linearisation_points=seen.linearisation_points[frozen],
+        information=seen.information[frozen],
+        gradients=seen.gradients[frozen],
         counts=seen.counts[frozen],
     )
 
 
-def _linearised(graph: SlamGraph, camera: FloatArray, options: SmoothingOptions) -> Sightings:
+def _linearised(graph: SlamGraph, camera: FloatArray, options: SmoothingOptions) -> LandmarkFactors:
     """Return all that was measured as forms, linearised where the graph's poses and landmarks are."""
     seen = gathered(graph)
     linearise(seen, graph, graph.poses, graph.landmarks, camera, options)

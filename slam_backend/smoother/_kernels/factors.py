@@ -12,7 +12,7 @@ import numpy as np
 
 from slam_backend.core.jit import in_place, inline, jit, stack_array
 from slam_backend.core.validation import FloatArray, IntArray
-from slam_backend.smoother._kernels.records import FREE, Frames, Points, Sightings
+from slam_backend.smoother._kernels.records import FREE, Frames, LandmarkFactors, Points
 
 MIN_DEPTH = 0.05  # [m]; a landmark predicted nearer than this to the camera plane is linearised where it was measured
 
@@ -81,7 +81,7 @@ def sum_pose_information(previous: IntArray, noises: FloatArray) -> tuple[IntArr
 
 @in_place
 def condense(
-    raw: Points, frames: Frames, seen: Sightings, poses: FloatArray, landmarks: FloatArray, camera: FloatArray,
+    raw: Points, frames: Frames, seen: LandmarkFactors, poses: FloatArray, landmarks: FloatArray, camera: FloatArray,
     scale: float, kernel: float,
 ) -> float:  # fmt: skip
     """Write centre, information and slope of all sightings that are not frozen, from their measurements.
@@ -102,7 +102,13 @@ def condense(
     Returns:
         Half the sum of the (robust) squared distances.
     """
-    keys, frozen, centres, infos, slopes = seen.keys, seen.frozen, seen.centres, seen.infos, seen.slopes
+    keys, frozen, centres, infos, slopes = (
+        seen.keys,
+        seen.condensed,
+        seen.linearisation_points,
+        seen.information,
+        seen.gradients,
+    )
     point_frames, offsets = raw.point_frames, frames.frame_offsets
     e, y, d = stack_array(3), stack_array(3), stack_array(3)
     info, turned = stack_array(6), stack_array(6)
@@ -128,7 +134,7 @@ def condense(
         e[1] = -sn * dx + c * dy - camera[5]
         e[2] = centres[s, 2] - camera[6]
         point = raw.points[n]
-        if raw.given[n]:
+        if raw.has_covariance[n]:
             _inverse(raw.point_noises[n], info)
             y[0], y[1], y[2] = point[0], point[1], point[2]
         else:

@@ -7,7 +7,7 @@ import numpy as np
 from slam_backend.core.jit import inline, jit, stack_array
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.smoother._kernels.factors import _rotate_in_plane
-from slam_backend.smoother._kernels.records import NONE, Frozen, Keys, Sightings
+from slam_backend.smoother._kernels.records import NONE, Condensed, Keys, LandmarkFactors
 
 
 @inline
@@ -136,7 +136,9 @@ def merge_keys(
 
 
 @jit
-def add_sightings(rows: IntArray, seen: Sightings, roots: IntArray, numbers: IntArray, offsets: FloatArray) -> Frozen:
+def add_sightings(
+    rows: IntArray, seen: LandmarkFactors, roots: IntArray, numbers: IntArray, offsets: FloatArray
+) -> Condensed:
     """Move sightings to the keys to which theirs stand rigidly, add up the forms of each pair, and return the sums.
 
     A sum lies about the centre of its first part.
@@ -147,7 +149,7 @@ def add_sightings(rows: IntArray, seen: Sightings, roots: IntArray, numbers: Int
         roots, numbers, offsets: As returned by `merge_keys`; keys of the sums are by their new numbers.
     """
     n, keys, landmarks, counts = len(rows), seen.keys, seen.landmarks, seen.counts
-    centres, infos, slopes = seen.centres, seen.infos, seen.slopes
+    centres, infos, slopes = seen.linearisation_points, seen.information, seen.gradients
     for i in range(1, len(rows)):
         row, at = rows[i], i
         while at > 0 and landmarks[rows[at - 1]] == landmarks[row] and roots[keys[rows[at - 1]]] > roots[keys[row]]:
@@ -184,6 +186,6 @@ def add_sightings(rows: IntArray, seen: Sightings, roots: IntArray, numbers: Int
         for i in range(6):
             new_infos[num, i] = info[i]
         num += 1
-    return Frozen(
+    return Condensed(
         new_keys[:num], new_landmarks[:num], new_centres[:num], new_infos[:num], new_slopes[:num], new_counts[:num]
     )

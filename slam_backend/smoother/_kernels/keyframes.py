@@ -7,7 +7,7 @@ import numpy as np
 
 from slam_backend.core.jit import jit
 from slam_backend.core.validation import FloatArray, IntArray
-from slam_backend.smoother._kernels.records import LEVER, Frames, Frozen, Keys, Landmarks, Log, Points
+from slam_backend.smoother._kernels.records import LEVER, Condensed, Frames, Keys, Landmarks, Log, Points
 from slam_backend.smoother.log_arrays import ODOMETRY, REJECTED
 
 if TYPE_CHECKING:
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @jit
 def close_keyframe(
-    aliases: IntArray, new: Points, old_landmarks: IntArray, frozen: Frozen, known: Landmarks,
+    aliases: IntArray, new: Points, old_landmarks: IntArray, frozen: Condensed, known: Landmarks,
     held: "LandmarkPositions",
     frames: Frames, poses: FloatArray, mount: FloatArray,
 ) -> Landmarks:  # fmt: skip
@@ -113,7 +113,7 @@ def add_log(
         first = num
         for row in range(starts[t], starts[t + 1]):
             if ids[row] != REJECTED:
-                raw.points[num], raw.given[num] = log.points[row], log.given[t]
+                raw.points[num], raw.has_covariance[num] = log.points[row], log.given[t]
                 raw.point_frames[num], raw.point_landmarks[num] = frame, ids[row]
                 if len(log.covariances) > 0:
                     raw.point_noises[num] = log.covariances[row]
@@ -152,15 +152,15 @@ def add_log(
         scatter = noise[0, 0] + noise[1, 1] + LEVER * LEVER * noise[2, 2]
         far = num > first and scatter >= rigid_within * rigid_within
         if moved and (far or t == len(log.steps) - 1):
-            keys.robots[key], keys.previous[key], keys.poses[key] = robot, tip, pose
-            keys.motions[key], keys.noises[key], keys.spreads[key] = chain, noise, scatter
+            keys.robots[key], keys.parents[key], keys.poses[key] = robot, tip, pose
+            keys.odometry[key], keys.odometry_covariances[key], keys.transition_variances[key] = chain, noise, scatter
             chain[:] = 0.0
             noise[:] = 0.0
             scatter, moved = 0.0, False
-            tip, keys.slack[key] = key, 0.0
+            tip, keys.rigid_variances[key] = key, 0.0
             key += 1
         if num > first:
-            keys.slack[tip] = max(keys.slack[tip], scatter)
+            keys.rigid_variances[tip] = max(keys.rigid_variances[tip], scatter)
             frames.frame_keys[frame], frames.frame_offsets[frame] = tip, chain
             frame += 1
     tips[robot] = tip

@@ -6,12 +6,12 @@ import numpy as np
 
 from slam_backend.core.jit import jit_fma
 from slam_backend.core.validation import FloatArray, IntArray
-from slam_backend.smoother._kernels.records import LEVER, Factor, Pattern
+from slam_backend.smoother._kernels.records import LEVER, CholeskyFactor, SymbolicFactor
 
 
 @jit_fma
 def scatter_of_links(
-    poses: FloatArray, columns: IntArray, previous: IntArray, factor: Factor, pattern: Pattern
+    poses: FloatArray, columns: IntArray, previous: IntArray, factor: CholeskyFactor, pattern: SymbolicFactor
 ) -> FloatArray:
     """Return the mean square (k,) [m^2] by which the motion from the previous key scatters about that of the mode.
 

@@ -14,20 +14,20 @@ from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.smoother._kernels.factors import _inverse, _rotate_in_plane
 from slam_backend.smoother._kernels.records import (
     FREE,
-    Equations,
-    Factor,
+    CholeskyFactor,
+    Condensed,
+    EquationBlocks,
     Frames,
-    Frozen,
     Keys,
-    Pattern,
+    LandmarkFactors,
     Points,
-    Sightings,
+    SymbolicFactor,
 )
 from slam_backend.smoother._kernels.sparse_cholesky import sweep
 
 
 @jit
-def gather(frozen: Frozen, raw: Points, frames: Frames, num_keys: int, num_landmarks: int) -> Sightings:
+def gather(frozen: Condensed, raw: Points, frames: Frames, num_keys: int, num_landmarks: int) -> LandmarkFactors:
     """Return the sightings of a graph by landmark and key, frozen ones before the others of a pair.
 
     Forms of raw measurements are zeros: they are still to be linearised.
@@ -71,7 +71,11 @@ def gather(frozen: Frozen, raw: Points, frames: Frames, num_keys: int, num_landm
             continue
         keys[num], landmarks[num], is_frozen[num] = key, landmark, item < num_frozen
         if item < num_frozen:
-            centres[num], infos[num], slopes[num] = frozen.centres[item], frozen.infos[item], frozen.slopes[item]
+            centres[num], infos[num], slopes[num] = (
+                frozen.linearisation_points[item],
+                frozen.information[item],
+                frozen.gradients[item],
+            )
             counts[num] = frozen.counts[item]
         else:
             counts[num] = 1
@@ -80,7 +84,7 @@ def gather(frozen: Frozen, raw: Points, frames: Frames, num_keys: int, num_landm
         num += 1
     for landmark in range(num_landmarks):
         starts[landmark + 1] += starts[landmark]
-    return Sightings(
+    return LandmarkFactors(
         keys[:num], landmarks[:num], starts, is_frozen[:num], centres[:num], infos[:num], slopes[:num], counts[:num],
         of_points, np.zeros(num_points),
     )  # fmt: skip
@@ -94,7 +98,7 @@ WEAK = 1e-6
 @in_place
 def form(
     poses: FloatArray, landmarks: FloatArray, graph_keys: Keys, columns: IntArray, link_infos: FloatArray,
-    seen: Sightings, equations: Equations,
+    seen: LandmarkFactors, equations: EquationBlocks,
 ) -> tuple[float, float]:  # fmt: skip
     """Write the normal equations of n poses and l landmarks.
 
@@ -110,8 +114,8 @@ def form(
         Half the sum of squares of odometry, and of frozen sightings' forms up to a constant; infinite if a landmark is
         at no finite place. And by how much the cost would fall if landmarks alone moved.
     """
-    previous, motions, keys, starts = graph_keys.previous, graph_keys.motions, seen.keys, seen.starts
-    centres, infos, slopes = seen.centres, seen.infos, seen.slopes
+    previous, motions, keys, starts = graph_keys.parents, graph_keys.odometry, seen.keys, seen.starts
+    centres, infos, slopes = seen.linearisation_points, seen.information, seen.gradients
     turns, blocks, links, cross, vector = equations
     blocks[:] = 0.0
     vector[:] = 0.0
@@ -213,7 +217,12 @@ def form(
 
 @jit
 def step(
-    equations: Equations, factor: Factor, pattern: Pattern, columns: IntArray, poses: FloatArray, landmarks: FloatArray
+    equations: EquationBlocks,
+    factor: CholeskyFactor,
+    pattern: SymbolicFactor,
+    columns: IntArray,
+    poses: FloatArray,
+    landmarks: FloatArray,
 ) -> tuple[FloatArray, FloatArray, float, float]:
     """Solve the factored equations.
 

@@ -17,11 +17,11 @@ class Keys(NamedTuple):
 
     robots: IntArray
     poses: FloatArray
-    previous: IntArray
-    motions: FloatArray
-    noises: FloatArray
-    spreads: FloatArray
-    slack: FloatArray
+    parents: IntArray
+    odometry: FloatArray
+    odometry_covariances: FloatArray
+    transition_variances: FloatArray
+    rigid_variances: FloatArray
 
 
 class Frames(NamedTuple):
@@ -36,19 +36,19 @@ class Points(NamedTuple):
 
     points: FloatArray
     point_noises: FloatArray
-    given: BoolArray
+    has_covariance: BoolArray
     point_frames: IntArray
     point_landmarks: IntArray
 
 
-class Frozen(NamedTuple):
+class Condensed(NamedTuple):
     """Columns of `SlamGraph` with one row for each frozen sighting."""
 
     condensed_keys: IntArray
     condensed_landmarks: IntArray
-    centres: FloatArray
-    infos: FloatArray
-    slopes: FloatArray
+    linearisation_points: FloatArray
+    information: FloatArray
+    gradients: FloatArray
     counts: IntArray
 
 
@@ -79,7 +79,7 @@ class Log(NamedTuple):
     variances: FloatArray
 
 
-class Sightings(NamedTuple):
+class LandmarkFactors(NamedTuple):
     """Forms of s sightings, by landmark; those of raw measurements change with the point of linearisation.
 
     Attributes:
@@ -95,16 +95,16 @@ class Sightings(NamedTuple):
     keys: IntArray
     landmarks: IntArray
     starts: IntArray
-    frozen: BoolArray
-    centres: FloatArray
-    infos: FloatArray
-    slopes: FloatArray
+    condensed: BoolArray
+    linearisation_points: FloatArray
+    information: FloatArray
+    gradients: FloatArray
     counts: IntArray
     of_points: IntArray
     squares: FloatArray
 
 
-class Equations(NamedTuple):
+class EquationBlocks(NamedTuple):
     """Normal equations of n poses that are sought and l landmarks; nodes are the poses, then the landmarks.
 
     Attributes:
@@ -122,7 +122,7 @@ class Equations(NamedTuple):
     vector: FloatArray
 
 
-class Pattern(NamedTuple):
+class SymbolicFactor(NamedTuple):
     """Places of the blocks of a factor of N nodes: column by column, in each by ascending rows.
 
     Attributes:
@@ -149,7 +149,7 @@ class Pattern(NamedTuple):
     squares: int
 
 
-class Factor(NamedTuple):
+class CholeskyFactor(NamedTuple):
     """Blocks of a factor of N nodes, nine numbers row by row, where a `Pattern` says.
 
     Attributes:

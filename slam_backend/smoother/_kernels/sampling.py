@@ -9,7 +9,14 @@ from slam_backend.core.simd_math import log_of, sine_cosine
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.smoother._kernels.factors import _inverse
 from slam_backend.smoother._kernels.normal_equations import WEAK
-from slam_backend.smoother._kernels.records import LEVER, Equations, Factor, Keys, Pattern, Sightings
+from slam_backend.smoother._kernels.records import (
+    LEVER,
+    CholeskyFactor,
+    EquationBlocks,
+    Keys,
+    LandmarkFactors,
+    SymbolicFactor,
+)
 
 
 @jit_fma
@@ -67,8 +74,8 @@ def normalise(log_weights: FloatArray, weights: FloatArray) -> float:
 
 @jit_fma
 def draw(
-    draws: FloatArray, poses: FloatArray, columns: IntArray, seen: Sightings, equations: Equations, factor: Factor,
-    pattern: Pattern,
+    draws: FloatArray, poses: FloatArray, columns: IntArray, seen: LandmarkFactors, equations: EquationBlocks,
+    factor: CholeskyFactor, pattern: SymbolicFactor,
 ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
     """Return M paths without the landmarks that come with them, and the logarithms of their densities.
 
@@ -189,7 +196,7 @@ def to_lanes(poses: FloatArray, rows: FloatArray) -> None:
 
 @simd
 def replay(
-    poses: FloatArray, num_keys: int, num_blocks: int, landmarks: FloatArray, seen: Sightings, tiles: FloatArray,
+    poses: FloatArray, num_keys: int, num_blocks: int, landmarks: FloatArray, seen: LandmarkFactors, tiles: FloatArray,
     log_likelihood: FloatArray,
 ) -> None:  # fmt: skip
     """Give each path the landmarks that its sightings ask for, and the log-likelihood of these, up to a constant.
@@ -203,7 +210,13 @@ def replay(
             sightings.
         log_likelihood: (num_blocks * LANES,), result.
     """
-    keys, starts, centres, infos, slopes = seen.keys, seen.starts, seen.centres, seen.infos, seen.slopes
+    keys, starts, centres, infos, slopes = (
+        seen.keys,
+        seen.starts,
+        seen.linearisation_points,
+        seen.information,
+        seen.gradients,
+    )
     log_likelihood[:] = 0.0
     work = stack_array(WORK_SIZE)
     for block in range(num_blocks):  # one after the other, for the poses of one are as many as a cache holds
@@ -285,7 +298,7 @@ def odometry_log_density(
         log_density: (num_blocks * LANES,), result: log p(path given odometry) up to a constant.
         spreads: (k,), result [m^2]: mean square of what the motion from the previous key differs from that of the mode.
     """
-    previous, motions = keys.previous, keys.motions
+    previous, motions = keys.parents, keys.odometry
     log_density[:] = 0.0
     squares = stack_array(LANES)
     for b in range(num_keys):

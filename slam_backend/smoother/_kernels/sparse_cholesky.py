@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from slam_backend.core.jit import device, inline, jit, jit_fma, simd
 from slam_backend.core.validation import FloatArray, IntArray
-from slam_backend.smoother._kernels.records import Equations, Factor, Pattern, Sightings
+from slam_backend.smoother._kernels.records import CholeskyFactor, EquationBlocks, LandmarkFactors, SymbolicFactor
 
 Bits = NDArray[np.uint64]
 
@@ -101,7 +101,7 @@ def _place(tops: IntArray, rows: IntArray, a: int, b: int) -> int:
 
 
 @jit
-def lay_out(columns: IntArray, previous: IntArray, seen: Sightings, num: int) -> Pattern:
+def lay_out(columns: IntArray, previous: IntArray, seen: LandmarkFactors, num: int) -> SymbolicFactor:
     """Choose the order in which `num` poses and landmarks are eliminated, and lay out the blocks of the factor.
 
     Args:
@@ -170,13 +170,15 @@ def lay_out(columns: IntArray, previous: IntArray, seen: Sightings, num: int) ->
     for j in range(num):
         drawn += order[j] < first_landmark or row_tops[j] < row_tops[j + 1]
         squares += (tops[j + 1] - tops[j]) * (tops[j + 1] - tops[j])
-    return Pattern(
+    return SymbolicFactor(
         order, ranks, tops, rows, link_places, cross_places, row_tops, row_columns, row_places, drawn, squares
     )
 
 
 @simd
-def factorise(equations: Equations, pattern: Pattern, damping: float, num_poses: int, factor: Factor) -> bool:
+def factorise(
+    equations: EquationBlocks, pattern: SymbolicFactor, damping: float, num_poses: int, factor: CholeskyFactor
+) -> bool:
     """Write the factor of the normal equations, column by column from those to the left; False if there is none.
 
     Args:
@@ -250,7 +252,7 @@ def factorise(equations: Equations, pattern: Pattern, damping: float, num_poses:
 
 
 @jit_fma
-def covariance(factor: Factor, pattern: Pattern, nodes: IntArray) -> FloatArray:
+def covariance(factor: CholeskyFactor, pattern: SymbolicFactor, nodes: IntArray) -> FloatArray:
     """Return the blocks (3 r, 3 r) of the inverse that belong to r nodes (r,), the mean of either half of it.
 
     Only columns take part to which the first blocks lead from the nodes' own columns: all other elements are zero in
@@ -283,7 +285,7 @@ def covariance(factor: Factor, pattern: Pattern, nodes: IntArray) -> FloatArray:
 
 @device
 @jit_fma
-def sweep(factor: Factor, pattern: Pattern, columns: IntArray, x: FloatArray) -> None:
+def sweep(factor: CholeskyFactor, pattern: SymbolicFactor, columns: IntArray, x: FloatArray) -> None:
     """Solve for x (N, 3) by rank, in place; all but these columns (n,), ascending, are left out."""
     pivots, values, tops, rows = factor.pivots, factor.values, pattern.tops, pattern.rows
     for j in columns:

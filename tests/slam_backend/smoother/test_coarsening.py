@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from slam_backend.fastslam.run_log import RobotLog
 from slam_backend.geometry import between, compose, transform_points, wrap_angle
 from slam_backend.models.odometry import OdometryModel
-from slam_backend.smoother._kernels import Frames, Frozen, Keys, Landmarks, Log, Points, add_log, close_keyframe
+from slam_backend.smoother._kernels import Condensed, Frames, Keys, Landmarks, Log, Points, add_log, close_keyframe
 from slam_backend.smoother.graph import LEVER, SlamGraph
 from slam_backend.smoother.graph_building import NO_LANDMARK_POSITIONS, InitialPoses, LandmarkPositions, extend_graph
 from slam_backend.smoother.graph_reduction import reduce_keyframes, relinearise
@@ -235,14 +235,14 @@ def walked(kinds, motions, variances, counts, guesses, start, rigid_within):
     new = np.arange(OLD, num_keys)
     chain = np.array([TIP, *new])
     np.testing.assert_array_equal(keys.robots[new], 1)
-    np.testing.assert_array_equal(keys.previous[new], chain[:-1])
-    np.testing.assert_allclose(keys.spreads[new], scatter(keys.noises[new]))
+    np.testing.assert_array_equal(keys.parents[new], chain[:-1])
+    np.testing.assert_allclose(keys.transition_variances[new], scatter(keys.odometry_covariances[new]))
     np.testing.assert_array_equal(tips, [0, chain[-1], 3])
     assert num_points == counts.sum()
     own = frames.frame_keys[OLD:num_frames]
     own = np.searchsorted(new, own) - (own == TIP)
     return (
-        keys.poses[new], keys.motions[new], keys.noises[new], keys.slack[chain], own,
+        keys.poses[new], keys.odometry[new], keys.odometry_covariances[new], keys.rigid_variances[chain], own,
         frames.frame_offsets[OLD:num_frames],
     )  # fmt: skip
 
@@ -331,7 +331,7 @@ def settled(known, names, aliases=NO_ALIASES, old=(), frozen=((), ()), held=NO_L
     s = len(frozen[0])
     landmarks = close_keyframe(
         aliases, raw, np.array(old, dtype=np.int64),
-        Frozen(
+        Condensed(
             np.zeros(s, dtype=np.int64), np.array(frozen[0], dtype=np.int64), np.zeros((s, 3)), np.zeros((s, 6)),
             np.zeros((s, 3)), np.array(frozen[1], dtype=np.int64),
         ),

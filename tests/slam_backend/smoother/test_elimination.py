@@ -155,7 +155,7 @@ def test_spreads_are_those_of_the_dense_covariance(posed):
     """Derivatives of motions by differences, and the dense inverse, give how far each motion scatters."""
     graph, mode = posed.graph, posed.mode
     covariance, found = np.linalg.inv(information(posed)), mode.spreads()
-    for b, a in enumerate(graph.previous):
+    for b, a in enumerate(graph.parents):
         if a < 0:
             assert found[b] == 0.0
             continue
@@ -225,12 +225,12 @@ def test_sightings_are_gathered_as_by_sorting():
     raw, counts = np.unique(of_raw, return_counts=True)
     codes = seen.landmarks * keys + seen.keys
     np.testing.assert_array_equal(codes, np.sort(np.concatenate([frozen, raw]), kind="stable"))
-    np.testing.assert_array_equal(codes[seen.frozen], frozen)
+    np.testing.assert_array_equal(codes[seen.condensed], frozen)
     np.testing.assert_array_equal(codes[seen.of_points], of_raw)
-    assert not seen.frozen[seen.of_points].any()
-    np.testing.assert_array_equal(seen.counts[seen.frozen], graph.counts)
-    np.testing.assert_array_equal(seen.counts[~seen.frozen], counts)
+    assert not seen.condensed[seen.of_points].any()
+    np.testing.assert_array_equal(seen.counts[seen.condensed], graph.counts)
+    np.testing.assert_array_equal(seen.counts[~seen.condensed], counts)
     np.testing.assert_array_equal(seen.starts, np.searchsorted(seen.landmarks, np.arange(landmarks + 1)))
     for name in ("linearisation_points", "information", "gradients"):
-        np.testing.assert_array_equal(getattr(seen, name)[seen.frozen], getattr(graph, name))
-        assert not getattr(seen, name)[~seen.frozen].any()
+        np.testing.assert_array_equal(getattr(seen, name)[seen.condensed], getattr(graph, name))
+        assert not getattr(seen, name)[~seen.condensed].any()

@@ -22,7 +22,7 @@ from slam_backend.geometry import between, compose
 from slam_backend.models.camera import StereoCamera
 from slam_backend.models.odometry import OdometryModel
 from slam_backend.smoother import _kernels
-from slam_backend.smoother._kernels import FREE, Equations, Factor, Pattern, sum_pose_information
+from slam_backend.smoother._kernels import FREE, CholeskyFactor, EquationBlocks, SymbolicFactor, sum_pose_information
 from slam_backend.smoother.graph import SlamGraph
 from slam_backend.smoother.graph_building import InitialPoses, LandmarkPositions, extend_graph, log_head
 from slam_backend.smoother.graph_reduction import relinearise
@@ -359,13 +359,15 @@ def test_a_change_leads_where_it_says():
     change, poses, landmarks = (rng.normal(size=(n, 3)) for n in (5, 4, 2))
     columns, order, none = np.array([FREE, 0, 3, 6]), np.arange(5), np.zeros(0, dtype=np.int64)
     tops, empty = np.zeros(6, dtype=np.int64), np.zeros((0, 3))
-    pattern = Pattern(order, order, tops, none, none, none, tops, none, none, 5, 0)
-    factor = Factor(np.tile([1.0, 0.0, 1.0, 0.0, 0.0, 1.0], (5, 1)), np.zeros((0, 9)), order)  # of unit matrices
+    pattern = SymbolicFactor(order, order, tops, none, none, none, tops, none, none, 5, 0)
+    factor = CholeskyFactor(
+        np.tile([1.0, 0.0, 1.0, 0.0, 0.0, 1.0], (5, 1)), np.zeros((0, 9)), order
+    )  # of unit matrices
 
     def solved(vector):
         blocks = np.zeros((5, 6)), np.zeros((0, 3, 3)), np.zeros((0, 3, 3))
         return _kernels.step(
-            Equations(empty[:, :2].copy(), *blocks, vector), factor, pattern, columns, poses, landmarks
+            EquationBlocks(empty[:, :2].copy(), *blocks, vector), factor, pattern, columns, poses, landmarks
         )
 
     new_poses, new_landmarks, rise, largest = solved(-change)
