@@ -1,1 +1,1 @@
-"""What every part of the backend builds on: validation, compilation of kernels, files, states."""
+"""Foundations of the backend: validation, kernel compilation, files and states."""

@@ -1,4 +1,4 @@
-"""Archives of arrays (.npz) that others may have made: read without running code, and within bounds of memory."""
+"""Reader of untrusted archives of arrays (.npz): it runs no code and bounds the memory."""
 
 import io
 import zipfile
@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from slam_backend.core.state_codec import MAX_BYTES, read_file
 
 HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
-KINDS = "biufUS"  # of numbers and texts; objects would be pickles
+KINDS = "biufUS"  # dtype kinds of numbers and texts; objects would be pickles
 
 
 class UnreadableArchiveError(ValueError):
-    """A file is no whole archive of plain arrays."""
+    """File that is not an intact archive of plain arrays."""
 
 
 def read_arrays(path: Path, names: Iterable[str] | None = None) -> dict[str, NDArray[np.generic]]:
@@ -25,11 +25,11 @@ def read_arrays(path: Path, names: Iterable[str] | None = None) -> dict[str, NDA
 
     Args:
         path: File that `numpy.savez` or `numpy.savez_compressed` wrote.
-        names: Which; None: all. Those that are not there are left out.
+        names: Names of the arrays wanted; None: all. Missing arrays are left out.
 
     Raises:
-        UnreadableArchiveError: If it is no such file, is damaged, holds anything but numbers and texts, or unpacks to
-            more than any file of this project's.
+        UnreadableArchiveError: If the file is no such archive, is damaged, holds other data than numbers and texts, or
+            unpacks to more than `MAX_BYTES`.
     """
     try:
         with zipfile.ZipFile(io.BytesIO(read_file(path))) as archive:
@@ -40,12 +40,12 @@ def read_arrays(path: Path, names: Iterable[str] | None = None) -> dict[str, NDA
             return {name: _array(archive, member) for name, member in wanted.items()}
     except UnreadableArchiveError:
         raise
-    except Exception as error:  # whatever zipfile, zlib and numpy say of bytes that somebody made up
+    except Exception as error:  # any error of zipfile, zlib or numpy for damaged bytes
         raise UnreadableArchiveError(str(error) or type(error).__name__) from error
 
 
 def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[np.generic]:
-    """Return an array whose header says how many bytes follow, if so many do."""
+    """Return an array, after checking its size against its header."""
     with archive.open(member) as stream:
         shape, by_columns, dtype = HEADERS[npy.read_magic(stream)](stream)
         if dtype.kind not in KINDS or dtype.hasobject:

@@ -1,4 +1,4 @@
-"""BLAS on one thread: sums must not depend on how many there are, and systems this small gain nothing from more."""
+"""Single-threaded BLAS: sums do not depend on the number of threads, and small systems gain nothing from more."""
 
 from collections.abc import Callable
 from functools import cache, wraps
@@ -12,13 +12,13 @@ R = TypeVar("R")
 
 @cache
 def _blas_libraries() -> list[LibController]:
-    """Return what sets the threads of the BLAS loaded by now, found once, as finding it takes milliseconds."""
+    """Return the controllers of the loaded BLAS libraries, cached, as the search takes milliseconds."""
     libraries: list[LibController] = ThreadpoolController().select(user_api="blas").lib_controllers
     return libraries
 
 
 def single_threaded_blas(function: Callable[P, R]) -> Callable[P, R]:
-    """Let BLAS work on one thread while `function` runs; as before afterwards."""
+    """Limit BLAS to one thread while `function` runs; the previous limits return afterwards."""
 
     @wraps(function)
     def limited(*args: P.args, **kwargs: P.kwargs) -> R:

@@ -1,4 +1,4 @@
-"""Who waits for the compiler is told so: kernels are compiled once, and come from numba's cache on disk ever after."""
+"""Messages about the compilation of kernels. numba compiles them once and caches them on disk."""
 
 import logging
 import time
@@ -9,22 +9,21 @@ from typing import Any
 from numba.core import event as numba_event
 
 LOGGER = logging.getLogger("slam_backend")
-PACKAGES = ("slam_backend", "vslam_env", "agents", "training")  # whose kernels are meant
+PACKAGES = ("slam_backend", "vslam_env", "agents", "training")  # packages with kernels of this project
 MESSAGE = "Compiling the kernels (once, one to two minutes) ..."
 
 
 class CompilationListener(numba_event.Listener):
-    """Hears of each kernel that numba compiles; of those that it finds in its cache it hears nothing.
+    """Listener for each kernel that numba compiles; kernels from the disk cache cause no events.
 
-    A kernel that another one calls is a part of that one. numba compiles under one lock, so that two threads never do
-    at the same time.
+    Kernels called by another kernel count as part of it. numba compiles under one lock, so that threads never overlap.
 
     Args:
         tell: Called with a kernel's name when its compilation begins.
 
     Attributes:
-        names: What was compiled, in order.
-        seconds: How long that took [s].
+        names: Names of the compiled kernels, in order.
+        seconds: Total compilation time [s].
     """
 
     def __init__(self, tell: Callable[[str], None]) -> None:
@@ -35,7 +34,7 @@ class CompilationListener(numba_event.Listener):
         self._begin = 0.0
 
     def on_start(self, event: Any) -> None:
-        """Take in that a compilation begins."""
+        """Note the start of a compilation."""
         self._depth += 1
         if self._depth == 1:
             self._begin = time.perf_counter()
@@ -43,7 +42,7 @@ class CompilationListener(numba_event.Listener):
                 self._tell(_name(event))
 
     def on_end(self, event: Any) -> None:
-        """Take in that it is over."""
+        """Note the end of a compilation."""
         self._depth -= 1
         if self._depth == 0 and _is_ours(event):
             self.names.append(_name(event))
@@ -52,20 +51,20 @@ class CompilationListener(numba_event.Listener):
 
 @contextmanager
 def watch_compilation(tell: Callable[[str], None]) -> Iterator[CompilationListener]:
-    """Watch, within a block, which kernels are compiled.
+    """Record which kernels are compiled within a block.
 
     Args:
-        tell: Called with a kernel's name when its compilation begins; never where all come from the cache.
+        tell: Called with a kernel's name when its compilation begins; not called for kernels from the cache.
     """
     with numba_event.install_listener("numba:compile", CompilationListener(tell)) as watch:
         yield watch
 
 
 def log_compilation(tell_first: Callable[[str], object] = LOGGER.info) -> None:
-    """Announce the first compilation from now on, and log the name of each kernel with level DEBUG.
+    """Announce the next compilation, and log the name of each kernel with level DEBUG.
 
     Args:
-        tell_first: Called with the announcement; logged with level INFO by default.
+        tell_first: Called with the announcement; logs with level INFO by default.
     """
     first = iter([True])
 
@@ -78,11 +77,11 @@ def log_compilation(tell_first: Callable[[str], object] = LOGGER.info) -> None:
 
 
 def _name(event: Any) -> str:
-    """Return the dotted name of the function that an event of numba is about."""
+    """Return the dotted name of the function that a numba event refers to."""
     function = event.data["dispatcher"].py_func
     return f"{function.__module__}.{function.__qualname__}"
 
 
 def _is_ours(event: Any) -> bool:
-    """Tell whether it is one of this project."""
+    """Return whether the function belongs to this project."""
     return _name(event).split(".")[0] in PACKAGES

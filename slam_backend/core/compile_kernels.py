@@ -1,4 +1,6 @@
-"""Process that compiles kernels: reads lines of a kernel's name and a signature, prints each when it is compiled.
+"""Worker process that compiles kernels.
+
+Each input line names a kernel and a signature; it is printed when the kernel is compiled.
 
 python -m slam_backend.core.compile_kernels
 """

@@ -1,4 +1,4 @@
-"""Output files: written whole or not at all; what is no regular file is written into, never replaced."""
+"""Atomic output of files. A path that is not a regular file is written into, never replaced."""
 
 import errno
 import os
@@ -13,10 +13,15 @@ from typing import Any
 
 from slam_backend.core.validation import argument_error
 
-READER_S = 10.0  # a FIFO that nothing reads is refused after so long
+READER_S = 10.0  # longest wait for a reader of a FIFO [s]
 POLL_S = 0.02
 OWN_DESCRIPTORS = ("/dev/fd", "/proc/self/fd")
-IN_PLACE = (errno.EBUSY, errno.EPERM, errno.EACCES, errno.EROFS)  # a file that may be written but not replaced
+IN_PLACE = (
+    errno.EBUSY,
+    errno.EPERM,
+    errno.EACCES,
+    errno.EROFS,
+)  # writable files that cannot be replaced
 
 AnyPath = str | PathLike[str]
 
@@ -24,15 +29,15 @@ AnyPath = str | PathLike[str]
 def write_file(path: AnyPath, content: str | bytes, name: str = "path") -> Path:
     """Write a file so that a reader finds the old content or the new one, never a part.
 
-    The content of a regular file, or of a new one, goes into a temporary file beside it, which is then renamed. Links
-    are followed; an existing file keeps its permissions and its owner. A device, a FIFO or a descriptor of this process
-    (`/dev/stdout`) is opened and written. So is a regular file that cannot be replaced, such as one in a folder that
-    takes no new files.
+    The content of a regular or new file goes into a temporary file beside it, which is then renamed. Links are
+    followed; an existing file keeps its permissions and its owner. A device, a FIFO or a descriptor of this process
+    (`/dev/stdout`) is opened and written into. So is a regular file that cannot be replaced, for example one in a
+    read-only folder.
 
     Args:
         path: The file.
-        content: All of it; text is encoded as UTF-8.
-        name: The argument that the file was given by, for the error.
+        content: The whole content; text is encoded as UTF-8.
+        name: The argument that gave the path, for the error.
 
     Returns:
         `path`.
@@ -48,15 +53,15 @@ def write_file(path: AnyPath, content: str | bytes, name: str = "path") -> Path:
 
 
 def move_file(part: AnyPath, path: AnyPath, name: str = "path") -> None:
-    """Put a finished file in its place, with the rules of `write_file`.
+    """Move a finished file to a path, with the rules of `write_file`.
 
     Args:
-        part: The finished file; it is gone afterwards, also after an error. It should lie beside `resolved(path)`.
-        path: Its place.
-        name: The argument that the place was given by, for the error.
+        part: The finished file; it is removed even after an error. It should lie beside `resolved(path)`.
+        path: The destination.
+        name: The argument that gave the destination, for the error.
 
     Raises:
-        ValueError: If it cannot be put there.
+        ValueError: If the destination cannot be written.
     """
     try:
         with os_errors_as_argument_errors(path, name):
@@ -68,10 +73,10 @@ def move_file(part: AnyPath, path: AnyPath, name: str = "path") -> None:
 
 
 def append_text(path: AnyPath, text: str, name: str = "path") -> None:
-    """Append text to a regular file, all of it or nothing; the file is made if it is not there.
+    """Append text to a regular file, all of it or nothing; a missing file is created.
 
     Raises:
-        ValueError: If it cannot be written; the file is left as it was.
+        ValueError: If it cannot be written; the file stays as it was.
     """
     with os_errors_as_argument_errors(path, name):
         number = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o666)
@@ -87,10 +92,10 @@ def append_text(path: AnyPath, text: str, name: str = "path") -> None:
 
 
 def check_writable(path: AnyPath, name: str) -> None:
-    """Refuse a file that cannot be written, before the work whose result it is to hold; nothing is changed.
+    """Refuse a path that cannot be written, before the work whose result it receives; no file is changed.
 
     Raises:
-        ValueError: If `write_file` could not write it as things are.
+        ValueError: If `write_file` could not write it now.
     """
     path = checked_path(path, name)
     with os_errors_as_argument_errors(path, name):
@@ -108,7 +113,7 @@ def check_writable(path: AnyPath, name: str) -> None:
 
 
 def resolved(path: AnyPath) -> Path:
-    """Return the file that a path leads to, links followed; it need not exist."""
+    """Return the file that a path leads to, following links; it need not exist."""
     return Path(os.path.realpath(path))
 
 
@@ -121,16 +126,16 @@ def checked_path(path: Any, name: str = "path") -> Path:
 
 @contextmanager
 def os_errors_as_argument_errors(path: AnyPath, name: str) -> Iterator[None]:
-    """Turn an error of the system within a block that writes a file into a `ValueError` that gives the reason."""
+    """Turn a system error within a block that writes a file into a `ValueError` with the reason."""
     try:
         yield
     except OSError as error:
-        cure = f"The system says: {error.strerror or error}."
-        raise argument_error(name, "a file that can be written", Path(path), cure) from error
+        hint = f"The system says: {error.strerror or error}."
+        raise argument_error(name, "a file that can be written", Path(path), hint) from error
 
 
 def _write(path: AnyPath, data: bytes) -> None:
-    """Write a file by renaming where that is right, and otherwise into what is there."""
+    """Write a file by renaming where possible, and otherwise into the existing file."""
     target = _replaceable(path)
     if target is None:
         _write_into(path, data)
@@ -152,10 +157,10 @@ def _write(path: AnyPath, data: bytes) -> None:
 
 
 def _replaceable(path: AnyPath) -> Path | None:
-    """Return the regular or new file that a path leads to; None if what is there is to be written into.
+    """Return the regular or new file that a path leads to; None if the existing one must be written into.
 
     Raises:
-        OSError: If a file is there that may not be written.
+        OSError: If the file is write-protected.
     """
     if _own_descriptor(path) is not None:
         return None
@@ -164,10 +169,10 @@ def _replaceable(path: AnyPath) -> Path | None:
     except FileNotFoundError:
         return resolved(path)
     target = resolved(path)
-    # A link of /proc to an open file leads to a name that may be that of another file, or of none.
+    # A link in /proc to an open file may give the name of another file, or of none.
     if not stat.S_ISREG(found.st_mode) or not target.exists() or not os.path.samestat(found, target.stat()):
         return None
-    _check_access(target)  # a rename would replace a file that is write-protected
+    _check_access(target)  # renaming would replace a write-protected file
     return target
 
 
@@ -184,7 +189,7 @@ def _new_part(target: Path) -> Path:
 
 
 def _renamed(part: Path, target: Path) -> bool:
-    """Rename a finished file onto another one, whose permissions and owner it takes; return whether that can be."""
+    """Rename a finished file onto another, keeping the latter's permissions and owner; return whether it worked."""
     if target.exists():
         old, new = target.stat(), part.stat()
         if (old.st_uid, old.st_gid) != (new.st_uid, new.st_gid):
@@ -196,16 +201,16 @@ def _renamed(part: Path, target: Path) -> bool:
     try:
         part.replace(target)
     except OSError as error:
-        if error.errno in IN_PLACE and target.exists():  # busy: a file that is mounted by itself, as in a container
+        if error.errno in IN_PLACE and target.exists():  # busy: a file that is a mount point, as in a container
             return False
         raise
     return True
 
 
 def _write_into(path: AnyPath, data: bytes) -> None:
-    """Write into what is there: a device, a FIFO, an open descriptor, or a file that cannot be replaced."""
+    """Write into a device, a FIFO, an open descriptor, or a file that cannot be replaced."""
     number = _own_descriptor(path)
-    # The descriptor itself, as opening its name would begin at the first byte of a file that other output goes to.
+    # Duplicate the descriptor: opening its name would overwrite a file from its start that other output goes to.
     opened = _opened(path) if number is None else os.dup(number)
     try:
         _write_all(opened, data)
@@ -214,7 +219,7 @@ def _write_into(path: AnyPath, data: bytes) -> None:
 
 
 def _opened(path: AnyPath) -> int:
-    """Open what is there for writing; a FIFO gets a while until something reads it."""
+    """Open an existing file for writing; a FIFO waits for a reader."""
     mode = os.stat(path).st_mode
     if not stat.S_ISFIFO(mode):
         return os.open(path, os.O_WRONLY | os.O_CLOEXEC | os.O_NOCTTY | (os.O_TRUNC if stat.S_ISREG(mode) else 0))
@@ -241,11 +246,11 @@ def _write_all(number: int, data: bytes) -> None:
 
 def _own_descriptor(path: AnyPath) -> int | None:
     """Return the number of the descriptor of this process that a path such as /dev/stdout leads to, or None."""
-    own = {os.path.realpath(folder) for folder in OWN_DESCRIPTORS}
+    folders = {os.path.realpath(folder) for folder in OWN_DESCRIPTORS}
     place = os.fspath(path)
-    for _ in range(40):  # as many links as the system follows
+    for _ in range(40):  # limit of links that the system follows
         folder, name = os.path.split(place)
-        if name.isdecimal() and os.path.realpath(folder) in own:
+        if name.isdecimal() and os.path.realpath(folder) in folders:
             return int(name)
         link = None
         with suppress(OSError):

@@ -1,4 +1,4 @@
-"""The few ways in which this project compiles a kernel: serial, cached on disk, without the interpreter lock."""
+"""Decorators that compile kernels: serial, cached on disk, without the interpreter lock."""
 
 import logging
 from collections.abc import Callable
@@ -24,30 +24,30 @@ T = TypeVar("T")
 Scalar = TypeVar("Scalar", bound=np.generic)
 
 IS_PLAIN = bool(CONFIG.DISABLE_JIT)  # whether kernels are plain functions
-LINE = 64  # bytes of a line of the cache
+LINE = 64  # size of a cache line [bytes]
 
-# numba counts the references to each array: it makes a counter for each one that Python hands over, and each slice in a
-# kernel costs two atomic instructions. A kernel that only works in arrays which it is given can do without. numba
-# refuses to make an array in one of those, but not to call a kernel that returns some, which nobody would free: a test
-# looks for that. The option is numba's own; in a version that does not know it references are counted everywhere.
+# numba counts the references to each array: it makes a counter for each array passed from Python, and each slice in a
+# kernel costs two atomic instructions. A kernel that only works in arrays passed to it needs no counts. numba rejects
+# such a kernel if it makes an array, but not if it calls a kernel that returns one, whose memory would leak: a test
+# detects this. The option belongs to numba; a version without it counts references everywhere.
 HAS_NRT_OPTION = hasattr(CPUTargetOptions, "_nrt")
 
-# A kernel inherits `fastmath`, `error_model`, `forceinline` and `_nrt` from the kernel whose compilation first
-# asked for it, where it does not set them: results would depend on the order. Each kind of kernel sets all four.
+# A kernel inherits those of `fastmath`, `error_model`, `forceinline` and `_nrt` that it does not set from the kernel
+# whose compilation first calls it: results would depend on the order. Each kind of kernel sets all four.
 _STRICT: dict[str, Any] = {"fastmath": False, "error_model": "python"}
 
-# Lane kernels run the same arithmetic over a fixed number of particles, so that the compiler turns it into vector
-# instructions. Two things it needs: a product and a sum may be fused into one instruction (`contract`), and a division
-# by zero gives inf instead of an exception. Sums are never reordered: their last bits would depend on how many numbers
-# a processor adds at a time, and kernels compiled for another one would give other bytes.
+# Lane kernels run the same arithmetic over a fixed number of particles, so that the compiler emits vector instructions.
+# This needs two settings: a product and a sum may be fused into one instruction (`contract`), and a division by zero
+# gives inf instead of an exception. Sums are never reordered: their last bits would depend on the width of the
+# processor's vectors, and kernels compiled for another processor would give other bytes.
 _LANES: dict[str, Any] = {"fastmath": {"contract"}, "error_model": "numpy"}
 
 
 class DeviceKernel(CPUDispatcher):
-    """Kernel that has no wrapper for Python: only other kernels can call it."""
+    """Kernel without a wrapper for Python, which only other kernels can call."""
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        """Refuse a call from Python, which would end in a segmentation fault.
+        """Refuse a call from Python, which would cause a segmentation fault.
 
         Raises:
             TypeError: Always.
@@ -56,7 +56,7 @@ class DeviceKernel(CPUDispatcher):
 
 
 def jit(function: Callable[P, T]) -> Callable[P, T]:
-    """Compile a kernel that may make arrays, and keep its signature for the type checker.
+    """Compile a kernel that may make arrays; the type checker sees the signature of `function`.
 
     `parallel=True` is left out on purpose, because it breaks forked workers.
     """
@@ -64,35 +64,35 @@ def jit(function: Callable[P, T]) -> Callable[P, T]:
 
 
 def jit_fma(function: Callable[P, T]) -> Callable[P, T]:
-    """Compile a kernel that may make arrays and does little but add products: each is rounded once, as by `lanes`."""
+    """Compile a kernel that may make arrays and mainly sums products: products and sums are fused, as by `simd`."""
     return _compiled(function, counted=True, forceinline=False, **_LANES)
 
 
 def in_place(function: Callable[P, T]) -> Callable[P, T]:
-    """Compile a kernel that works in the arrays it is given: references to them are not counted.
+    """Compile a kernel that works in the arrays passed to it, without reference counts.
 
-    It makes no arrays, returns none, and calls none that returns some. So do all kernels compiled by the following.
+    It makes no arrays, returns none, and calls no kernel that returns one. This holds for all decorators below, too.
     """
     return _compiled(function, counted=False, forceinline=False, **_STRICT)
 
 
 def inline(function: Callable[P, T]) -> Callable[P, T]:
-    """Compile a small building block into each kernel that calls it: passing arrays costs more than its arithmetic."""
+    """Inline a small kernel into each caller: passing arrays costs more than its arithmetic."""
     return device(_compiled(function, counted=False, forceinline=True, **_STRICT))
 
 
 def simd(function: Callable[P, T]) -> Callable[P, T]:
-    """Compile a kernel whose loops over lanes are to become vector instructions, or one as of `fused` in place."""
+    """Compile a kernel whose loops over lanes become vector instructions, or an in-place kernel of `jit_fma`'s kind."""
     return _compiled(function, counted=False, forceinline=False, **_LANES)
 
 
 def simd_inline(function: Callable[P, T]) -> Callable[P, T]:
-    """Compile the arithmetic of one lane into the loops that call it."""
+    """Inline the arithmetic of one lane into the loops that call it."""
     return device(_compiled(function, counted=False, forceinline=True, **_LANES))
 
 
 def device(kernel: Callable[P, T]) -> Callable[P, T]:
-    """Leave out the Python wrapper of a kernel that only other kernels call; stands above the kernel's own decorator.
+    """Omit the Python wrapper of a kernel that only other kernels call; goes above the kernel's own decorator.
 
     The wrapper takes as long to compile as a small kernel. A call from Python raises TypeError.
     """
@@ -123,7 +123,7 @@ def _float_bits(typing_context: Any, x: Any) -> Any:
 
 
 def _bits_float(typing_context: Any, x: Any) -> Any:
-    """Return the float64 that an int64's bits stand for (inside kernels only)."""
+    """Return the float64 with the bits of an int64 (inside kernels only)."""
 
     def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return builder.bitcast(args[0], ir.DoubleType())
@@ -137,7 +137,7 @@ populate_array: Callable[..., Any] = arrayobj.populate_array
 
 
 def _unset(number: Any, size: Any, *others: Any) -> Any:
-    """Return type and code of a function of a constant size, and perhaps more, that returns an array on the stack."""
+    """Return type and code of a function that returns an array of constant size on the stack."""
     if not isinstance(size, types.IntegerLiteral):
         return None
     row = types.Array(number, 1, "C")
@@ -163,7 +163,7 @@ def _room_of(typing_context: Any, size: Any, dtype: Any) -> Any:
     return _unset(dtype.dtype, size, dtype)
 
 
-# numba refuses calls of intrinsics from Python, which kernels are where compilation is switched off.
+# numba refuses calls of intrinsics from Python, as happen with compilation switched off.
 if IS_PLAIN:
     LOGGER.warning("NUMBA_DISABLE_JIT is set: kernels run as plain Python, some hundred times as slow.")
 float_bits = cast(
@@ -172,8 +172,8 @@ float_bits = cast(
 bits_float = cast(
     Callable[[int], float], (lambda x: np.int64(x).view(np.float64)) if IS_PLAIN else intrinsic(_bits_float)
 )
-# An array of as many numbers as a constant says, unset, that lives as long as the call of a kernel: it costs nothing,
-# and even a kernel that works `in_place` may have it, but not return it.
+# Uninitialised array of a constant size that lives as long as the call of a kernel. It costs nothing, and a kernel
+# compiled by `in_place` may use it, but not return it.
 stack_array = cast(Callable[[int], FloatArray], np.empty if IS_PLAIN else intrinsic(prefer_literal=True)(_room))
 stack_array_of = cast(
     Callable[[int, type[Scalar]], NDArray[Scalar]],

@@ -1,7 +1,7 @@
-"""Disk cache of compiled kernels: several processes may use it at a time, and damaged files are compiled again.
+"""Disk cache of compiled kernels, safe for concurrent processes; damaged files are compiled again.
 
 A kernel is looked up in the user's own cache first, then among those that the package `vslam-env-kernels` ships. Files
-are named after all that decides what is in them, so that a stale one is never found.
+are named after all inputs of the compilation, so that a stale file is never found.
 """
 
 import os
@@ -34,10 +34,10 @@ PYTHON = f"{sys.implementation.cache_tag}{getattr(sys, 'abiflags', '')}"
 
 
 class KernelCache(NullCache):
-    """The cache of one kernel: a place that cannot be used costs time, and stops nothing.
+    """Disk cache of one kernel. Without a usable folder each process compiles the kernel.
 
     Args:
-        kernel: Kernel; what it calls need not be defined yet.
+        kernel: Kernel; the functions that it calls need not be defined yet.
     """
 
     def __init__(self, kernel: CPUDispatcher) -> None:
@@ -46,7 +46,7 @@ class KernelCache(NullCache):
 
     @property
     def cache_path(self) -> str | None:
-        """Folder of the user's cache for this kernel; None: there is none."""
+        """Folder of the user's cache for this kernel; None: no usable folder."""
         folder = cache_folder(Path(self._kernel.py_func.__code__.co_filename).parent, CONFIG.CACHE_DIR)
         return None if folder is None else str(folder)
 
@@ -61,17 +61,17 @@ class KernelCache(NullCache):
 
     @property
     def stamp(self) -> str:
-        """Digest of what the kernel is compiled from; it is taken when the kernel is first asked for."""
+        """Digest of all inputs of the compilation, computed on first use."""
         if not self._stamp:
             self._stamp = stamp_of(self._kernel)
         return self._stamp
 
     def holds(self, signature: Any, codegen: Any) -> bool:
-        """Return whether a kernel that can be used is kept or shipped for a signature; it is not unpickled."""
+        """Return whether a usable kernel is cached or shipped for a signature, without unpickling it."""
         return any(_read(file) is not None for file in self._files(signature, codegen))
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Return the kernel of a signature; None: there is none that can be used."""
+        """Return the kernel of a signature; None: no usable one."""
         target_context.refresh()
         for file in self._files(sig, target_context.codegen()):
             content = _read(file)
@@ -82,7 +82,7 @@ class KernelCache(NullCache):
         return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Keep a kernel, if that can be: there may be no folder for it, or the disk may be full."""
+        """Save a kernel if possible: there may be no folder, or the disk may be full."""
         folder = self.cache_path
         if data.library.has_dynamic_globals:
             return
@@ -101,7 +101,7 @@ class KernelCache(NullCache):
                 file.unlink(missing_ok=True)
 
     def _files(self, signature: Any, codegen: Any) -> Iterator[Path]:
-        """Yield the files that would hold a kernel: the user's own, and the shipped one."""
+        """Yield the possible files of a kernel: the user's own, and the shipped one."""
         folder = self.cache_path
         if folder is not None:
             yield Path(folder) / self.file_name(signature, codegen.magic_tuple())
@@ -110,7 +110,7 @@ class KernelCache(NullCache):
             yield shipped.folder / self.file_name(signature, shipped.target)
 
     def _start(self, signature: Any, target: tuple[str, ...]) -> str:
-        """Return how the names of the files of a signature begin, whatever the kernel is compiled from."""
+        """Return the part of a file's name that does not depend on the stamp."""
         function = self._kernel.py_func
         name = f"{function.__module__}.{function.__qualname__}"
         types = str(sigutils.normalize_signature(signature))  # type: ignore[no-untyped-call]
@@ -123,13 +123,13 @@ class KernelCache(NullCache):
 
 @lru_cache
 def cache_folder(sources: Path, chosen: str = "") -> Path | None:
-    """Return the folder in which the kernels of a folder of sources are kept; None: there is none that can be used.
+    """Return the folder of the cached kernels of a folder of sources; None: no usable folder.
 
     Kernels are code: the folder belongs to the user, and no other user may write to it.
 
     Args:
         sources: Folder of sources.
-        chosen: Folder that is tried first; empty: none.
+        chosen: Preferred folder; empty: none.
     """
     name = f"{sources.name}_{sha256(str(sources.absolute()).encode()).hexdigest()[:32]}"
     places = [sources / "__pycache__", Path(_user_cache()) / name]
@@ -146,7 +146,7 @@ def cache_folder(sources: Path, chosen: str = "") -> Path | None:
 
 
 def _user_cache() -> str:
-    """Return the folder for numba's caches of all projects of the user."""
+    """Return the user's folder for numba's caches of all projects."""
     return str(AppDirs(appname="numba", appauthor=False).user_cache_dir)  # type: ignore[no-untyped-call]
 
 
@@ -154,7 +154,8 @@ def is_private(status: os.stat_result, may_write: Any = lambda group, user: Fals
     """Return whether a file or folder belongs to the user, and only the user may write to it.
 
     Args:
-        may_write: Whether a group, by its number, that may write is the user's own.
+        status: Status of the file or folder.
+        may_write: Function of the numbers of a group and of the user: whether the group is the user's own.
     """
     if not hasattr(os, "geteuid"):  # Windows
         return True
@@ -164,7 +165,7 @@ def is_private(status: os.stat_result, may_write: Any = lambda group, user: Fals
 
 
 def _is_own_group(group: int, user: int) -> bool:
-    """Return whether a group has a user's name and no other members, as many systems make one for each user."""
+    """Return whether a group has a user's name and no other members, as many systems create for each user."""
     import grp
     import pwd
 
@@ -176,7 +177,7 @@ def _is_own_group(group: int, user: int) -> bool:
 
 
 def _read(file: Path) -> bytes | None:
-    """Return the content of a file without the digest at its end; None: it is missing, damaged or not the user's."""
+    """Return the content of a file without its digest; None: it is missing, damaged or not the user's."""
     shipped = shipped_kernels()
     is_shipped = shipped is not None and file.parent == shipped.folder
     try:
@@ -195,7 +196,7 @@ def _read(file: Path) -> bytes | None:
 
 
 def _write(file: Path, content: bytes) -> None:
-    """Write a file at once, with a digest at its end: other processes see all of it, or nothing."""
+    """Write a file atomically, with a digest at its end."""
     number, temporary = tempfile.mkstemp(dir=file.parent, prefix=f"{file.stem[:40]}.", suffix=".tmp")
     try:
         with open(number, "wb") as stream:

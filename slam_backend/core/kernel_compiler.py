@@ -1,8 +1,8 @@
-"""Compilation of kernels by several processes, into the disk cache that later processes read.
+"""Compilation of kernels by several processes into the disk cache.
 
-numba compiles under one lock per process, so that threads do not help. The signatures of the kernels that Python calls
-are recorded in a file of each package; the kernels that these call are compiled with them. Which process compiles what
-decides nothing: a kernel's machine code depends on its sources, its signature and its options alone.
+numba compiles under one lock per process, so that threads do not help. A file in each package lists the signatures of
+the kernels that Python calls; the kernels that these call are compiled with them. A kernel's machine code depends only
+on its sources, its signature and its options, not on the process that compiles it.
 """
 
 import importlib
@@ -31,21 +31,21 @@ from slam_backend.core.kernel_cache import KernelCache
 from slam_backend.core.validation import check_int
 
 LOGGER = logging.getLogger("slam_backend")
-SIGNATURES = "kernel_signatures.json"  # in the folder of each package
-WORKER = "slam_backend.core.compile_kernels"  # run as `python -m`: no script of the user's needs a main guard
+SIGNATURES = "kernel_signatures.json"  # file in the folder of each package
+WORKER = "slam_backend.core.compile_kernels"  # run as `python -m`, so that user scripts need no main guard
 LOCK = "vslam-compile.lock"
-READ_ONLY = "r"  # ends the code of an array that cannot be written to
-WORD = re.compile(r"[^\s(]+(?:\([^)]*\))?")  # of a signature; a named tuple holds no other
+READ_ONLY = "r"  # suffix of the code of a read-only array
+WORD = re.compile(r"[^\s(]+(?:\([^)]*\))?")  # word of a signature; named tuples are not nested
 
-Signatures = Mapping[str, Sequence[str]]  # by dotted name of a kernel: its signatures, see `encoded`
-Progress = Callable[[int, int, float], None]  # kernels done, of how many, and estimated seconds left
+Signatures = Mapping[str, Sequence[str]]  # signatures by dotted name of a kernel, see `encode_signature`
+Progress = Callable[[int, int, float], None]  # number of kernels compiled, total number, estimated seconds left
 
 
 # ---------------------------------------------------------------------- signatures
 
 
 def recorded_signatures(*packages: str) -> dict[str, list[str]]:
-    """Return the signatures that are recorded of the kernels that Python calls in some packages."""
+    """Return the recorded signatures of the kernels that Python calls in some packages."""
     found: dict[str, list[str]] = {}
     for package in packages:
         file = Path(str(importlib.import_module(package).__file__)).with_name(SIGNATURES)
@@ -54,7 +54,7 @@ def recorded_signatures(*packages: str) -> dict[str, list[str]]:
 
 
 def compiled_signatures(package: str) -> dict[str, list[str]]:
-    """Return the signatures of all kernels of a package that Python called in this process, by name, ascending."""
+    """Return the signatures of all kernels of a package that Python called in this process, sorted by name."""
     modules = [module for name, module in sys.modules.items() if name.split(".")[0] == package]
     kernels = {
         kernel_name(value): value
@@ -62,8 +62,8 @@ def compiled_signatures(package: str) -> dict[str, list[str]]:
         for value in vars(module).values()
         if isinstance(value, CPUDispatcher) and not isinstance(value, DeviceKernel)
     }
-    own = {name: kernel for name, kernel in kernels.items() if name.split(".")[0] == package and kernel.signatures}
-    return {name: sorted(map(encode_signature, own[name].signatures)) for name in sorted(own)}
+    called = {name: kernel for name, kernel in kernels.items() if name.split(".")[0] == package and kernel.signatures}
+    return {name: sorted(map(encode_signature, called[name].signatures)) for name in sorted(called)}
 
 
 def kernel_name(kernel: CPUDispatcher) -> str:
@@ -82,7 +82,7 @@ def encode_signature(signature: Sequence[types.Type]) -> str:
     """Return argument types as words.
 
     `float64` is a number, `float64[2C]` an array, `float64[2Cr]` a read-only one, `module.Class(float64 int64[1C])` a
-    named tuple and `builtins.tuple(float64 int64[1C])` a plain one, which reaches a kernel 1 us sooner.
+    named tuple and `builtins.tuple(float64 int64[1C])` a plain one, whose conversion from Python is 1 us faster.
     """
     return " ".join(map(_word, signature))
 
@@ -99,7 +99,7 @@ def _word(argument: types.Type) -> str:
 
 
 def decode_signature(words: str) -> tuple[types.Type, ...]:
-    """Return the argument types that `encoded` wrote down."""
+    """Return the argument types that `encode_signature` wrote."""
     return tuple(map(_type, WORD.findall(words)))
 
 
@@ -120,18 +120,18 @@ def _type(word: str) -> Any:
     return types.Array(element, int(shape[:-1]), layout, readonly=array.endswith(READ_ONLY + "]"))
 
 
-# ---------------------------------------------------------------------- what has to be compiled, and by whom
+# ---------------------------------------------------------------------- division of the work
 
 
 @dataclass(frozen=True)
 class Task:
-    """A kernel that Python calls, in one of its signatures.
+    """Kernel that Python calls, in one of its signatures.
 
     Attributes:
         name: Dotted name.
-        signature: See `encoded`.
-        parts: Size of the code of the kernel and of each that it calls, by dotted name.
-        folder: Of the cache's files.
+        signature: Argument types, see `encode_signature`.
+        parts: Code size of the kernel and of each kernel that it calls, by dotted name.
+        folder: Folder of the cache's files.
     """
 
     name: str
@@ -141,7 +141,7 @@ class Task:
 
 
 def missing_tasks(signatures: Signatures) -> list[Task]:
-    """Return what the disk cache does not hold; nothing where there is no cache, or no compiler."""
+    """Return the kernels that the disk cache lacks; none without a cache or a compiler."""
     tasks = []
     for name, words in signatures.items():
         kernel = find_kernel(name)
@@ -156,7 +156,7 @@ def missing_tasks(signatures: Signatures) -> list[Task]:
 
 
 def _code_sizes(kernel: CPUDispatcher) -> dict[str, int]:
-    """Return the size of the code of a kernel and of all that it calls, by dotted name."""
+    """Return the code size of a kernel and of all kernels that it calls, by dotted name."""
     sizes: dict[str, int] = {}
     todo = [kernel]
     while todo:
@@ -170,7 +170,7 @@ def _code_sizes(kernel: CPUDispatcher) -> dict[str, int]:
 
 
 def divide_tasks(tasks: Sequence[Task], workers: int) -> list[list[Task]]:
-    """Divide tasks so that all workers have about as much to do; what two tasks both call is compiled once by each."""
+    """Divide tasks into shares of similar cost; a kernel that several shares call is compiled once in each."""
     shares: list[list[Task]] = [[] for _ in range(workers)]
     known: list[dict[str, int]] = [{} for _ in range(workers)]
     for task in sorted(tasks, key=lambda task: -sum(task.parts.values())):
@@ -185,15 +185,15 @@ def divide_tasks(tasks: Sequence[Task], workers: int) -> list[list[Task]]:
 
 
 def compile_kernels(signatures: Signatures, workers: int | None = None, progress: Progress | None = None) -> float:
-    """Compile what the disk cache does not hold, in several processes; another process that does so is waited for.
+    """Compile the kernels that the disk cache lacks, in several processes, after waiting for any other such process.
 
     Args:
-        signatures: By dotted name of a kernel, see `encoded`.
-        workers: Processes; None: one for each core. With one nothing is started: kernels are compiled when called.
-        progress: Called when a kernel is done.
+        signatures: Signatures by dotted name of a kernel, see `encode_signature`.
+        workers: Number of processes; None: one for each core. With one, kernels are compiled when they are called.
+        progress: Called after each kernel.
 
     Returns:
-        Seconds that this took; 0 if nothing was missing.
+        Seconds that this took; 0 if no kernel was missing.
     """
     workers = available_cores() if workers is None else check_int("workers", workers, 1, "Use at least one process.")
     if workers < 2 or not (tasks := missing_tasks(signatures)):
@@ -204,13 +204,13 @@ def compile_kernels(signatures: Signatures, workers: int | None = None, progress
         try:
             lock.acquire(blocking=False)
         except Timeout:
-            LOGGER.info("Waiting for another process, which compiles the kernels ...")
+            LOGGER.info("Waiting for another process that compiles the kernels ...")
             lock.acquire()
         tasks = missing_tasks(signatures)  # another process may have compiled them meanwhile
         for done, left in _compiled(divide_tasks(tasks, workers), begun):
             if progress is not None:
                 progress(done, len(tasks), left)
-    except OSError as error:  # kernels are compiled when they are called, then
+    except OSError as error:  # kernels are compiled when they are called
         LOGGER.debug("Not compiled in advance: %s", error)
     finally:
         lock.release()
@@ -218,12 +218,12 @@ def compile_kernels(signatures: Signatures, workers: int | None = None, progress
 
 
 def available_cores() -> int:
-    """Return how many cores this process may use."""
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _compiled(shares: Sequence[Sequence[Task]], begun: float) -> Iterator[tuple[int, float]]:
-    """Let one process compile each share; yield, when a kernel is done, how many are, and about how long it will take.
+    """Compile each share in a process of its own; yield after each kernel the number compiled and the seconds left.
 
     Kernels of a process that fails are compiled when they are called.
     """
@@ -270,7 +270,7 @@ def _forward_lines(process: subprocess.Popen[str], lines: "Queue[str | None]") -
 
 
 def compile_lines(lines: Iterator[str], report: Callable[[str], Any]) -> None:
-    """Compile the kernels that lines name, each followed by a signature; report each when it is in the cache."""
+    """Compile the kernels named by lines, each with its signature; report each line once its kernel is cached."""
     for line in lines:
         name, _, words = line.strip().partition(" ")
         kernel = find_kernel(name)

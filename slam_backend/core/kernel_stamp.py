@@ -1,8 +1,8 @@
-"""Stamps of kernels: what a kernel's machine code is made from, apart from its signature and the processor.
+"""Stamps of kernels: digests of the inputs of their compilation, apart from signature and processor.
 
 A kernel is compiled together with all kernels that it calls, and the constants that these name become part of it. The
-stamp therefore covers the code of the kernel and of all functions that it reaches, in whatever modules they live, their
-options and the values of their constants. An edit of any of these changes it; an edit of a comment does not.
+stamp therefore covers the code of the kernel and of all functions that it reaches, in any module, their options and the
+values of their constants. A change of any of these changes the stamp; a change of a comment does not.
 """
 
 from collections.abc import Iterator
@@ -18,17 +18,17 @@ from numba.core import types
 from numba.core.extending import _Intrinsic
 from numba.core.registry import CPUDispatcher
 
-LIBRARIES = ("numba", "llvmlite", "numpy", "math", "builtins")  # what they do depends on their versions alone
+LIBRARIES = ("numba", "llvmlite", "numpy", "math", "builtins")  # modules covered by their versions
 # Settings of numba that change machine code, and that numba's own cache overlooks.
 SETTINGS = ("OPT", "LOOP_VECTORIZE", "SLP_VECTORIZE", "BOUNDSCHECK", "DEBUGINFO_DEFAULT")
 SCALARS = (int, float, complex, str, bytes, NoneType, EllipsisType, types.Type)
 
 
 def stamp_of(kernel: CPUDispatcher) -> str:
-    """Return a digest of all that a kernel is compiled from.
+    """Return a digest of all inputs of a kernel's compilation.
 
     Raises:
-        TypeError: If a kernel names an object whose value cannot be taken in.
+        TypeError: If a kernel names an object whose value has no digest.
     """
     seen: dict[Any, str] = {}
     todo: list[Any] = [kernel]
@@ -48,7 +48,7 @@ def _tools() -> str:
 
 
 def _options(function: Any) -> str:
-    """Return the options of a kernel as a text, in an order of their own; empty: it is no kernel."""
+    """Return the options of a kernel as a text, sorted; empty for other functions."""
     if not isinstance(function, CPUDispatcher):
         return ""
     return repr(sorted((name, sorted(x) if isinstance(x, set) else x) for name, x in function.targetoptions.items()))
@@ -75,7 +75,7 @@ def _described(function: Any, options: str) -> tuple[str, tuple[Any, ...]]:
 
 
 def _names(code: CodeType) -> Iterator[str]:
-    """Yield the names that code looks up outside itself, those of functions within it included."""
+    """Yield the names that code looks up outside itself, including those in nested functions."""
     yield from (*code.co_names, *code.co_freevars)
     for constant in code.co_consts:
         if isinstance(constant, CodeType):
@@ -83,7 +83,7 @@ def _names(code: CodeType) -> Iterator[str]:
 
 
 def _code(code: CodeType) -> str:
-    """Return what code does as a text: without the lines and the file that it comes from."""
+    """Return code as a text, without line numbers and file names."""
     constants = [_code(x) if isinstance(x, CodeType) else _text(x, []) for x in code.co_consts]
     shape = code.co_argcount, code.co_posonlyargcount, code.co_kwonlyargcount, code.co_flags
     names = code.co_names, code.co_varnames, code.co_freevars, code.co_cellvars
@@ -91,7 +91,7 @@ def _code(code: CodeType) -> str:
 
 
 def _text(value: Any, callees: list[Any]) -> str:
-    """Return a value as a text that says all about it; functions are added to the callees instead, and named."""
+    """Return a value as a complete text; functions are named and added to the callees."""
     if isinstance(value, (CPUDispatcher, _Intrinsic, FunctionType)):
         python: Any = getattr(value, "py_func", None) or getattr(value, "_defn", value)
         if not _is_library(python):
@@ -113,7 +113,7 @@ def _text(value: Any, callees: list[Any]) -> str:
 
 
 def _is_library(thing: Any) -> bool:
-    """Return whether a module, or a function, is one of a library."""
+    """Return whether a module or function belongs to a library."""
     name = thing.__name__ if isinstance(thing, ModuleType) else thing.__module__
     return str(name).split(".")[0] in LIBRARIES
 

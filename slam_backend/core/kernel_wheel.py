@@ -1,9 +1,9 @@
-"""Builder of the wheel `vslam-env-kernels`: all kernels compiled for portable levels of x86-64, ready to be loaded.
+"""Builder of the wheel `vslam-env-kernels`, with all kernels compiled for portable levels of x86-64.
 
     python -m slam_backend.core.kernel_wheel FOLDER PACKAGE ...   # packages whose kernels are compiled
 
 The wheel holds files of the kernel cache and a manifest, and no program. It fits one minor version of Python and the
-exact versions of numba and llvmlite that built it; what a kernel is compiled from is part of its file's name.
+exact versions of numba and llvmlite that built it; the name of a kernel's file includes its stamp.
 """
 
 import json
@@ -24,7 +24,7 @@ from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 from slam_backend.core.kernel_compiler import compile_kernels, decode_signature, find_kernel, recorded_signatures
 from slam_backend.core.shipped_kernels import LEVELS, MANIFEST, PACKAGE, versions
 
-DISTRIBUTION = "vslam-env"  # whose kernels these are
+DISTRIBUTION = "vslam-env"  # distribution with the sources of the kernels
 COMPILE = "import sys; from slam_backend.core.kernel_wheel import compile_into; compile_into(*sys.argv[1:])"
 INIT = '"""Compiled kernels of vslam_env: data only, read by `slam_backend.core.shipped_kernels`."""\n'
 METADATA = """Metadata-Version: 2.4
@@ -48,8 +48,8 @@ def build_wheel(
         folder: Folder that gets the wheel.
         packages: Packages with recorded signatures.
         levels: Keys of `LEVELS`.
-        only: What the dotted names of the kernels begin with, for a part of them.
-        workers: Processes that compile; 0: one for each core.
+        only: Prefix of the dotted names of the kernels, to build a part of them.
+        workers: Number of processes that compile; 0: one for each core.
 
     Returns:
         Path of the wheel.
@@ -72,7 +72,7 @@ def build_wheel(
 
 
 def compile_into(folder: str, workers: str, only: str, *packages: str) -> None:
-    """Compile the kernels of some packages for the processor that `NUMBA_CPU_NAME` names; copy their cache files."""
+    """Compile the kernels of some packages for the processor `NUMBA_CPU_NAME`, and copy their cache files."""
     recorded = recorded_signatures(*packages)
     signatures = {name: words for name, words in recorded.items() if name.startswith(only)}
     compile_kernels(signatures, int(workers) or None)
@@ -86,7 +86,7 @@ def compile_into(folder: str, workers: str, only: str, *packages: str) -> None:
 
 
 def _pack(folder: Path, files: Mapping[str, bytes], about: Mapping[str, str]) -> Path:
-    """Write a wheel; the same files give the same bytes."""
+    """Write a wheel; equal files give equal bytes."""
     python = f"cp{sys.version_info[0]}{sys.version_info[1]}"
     platform = sysconfig.get_platform().replace("-", "_").replace(".", "_")
     tag = f"{python}-{python}{getattr(sys, 'abiflags', '')}-{platform}"

@@ -1,4 +1,4 @@
-"""Arrays that are handed out or shared: who holds one can neither write to it nor make it writable."""
+"""Read-only views and copies of arrays that are handed out or shared."""
 
 from collections.abc import Callable
 from operator import is_
@@ -13,14 +13,14 @@ Tree = TypeVar("Tree")
 
 Act = Callable[[NDArray[Any]], NDArray[Any]]
 
-PLAIN = frozenset((int, float, bool, str, type(None)))  # looked up first, for most parts of states are such
+PLAIN = frozenset((int, float, bool, str, type(None)))  # checked first: most parts of states are of these types
 
 
 def is_read_only(array: NDArray[Any]) -> bool:
-    """Tell whether an array lies on a read-only buffer, so that numpy refuses to make it writable.
+    """Return whether an array lies on a read-only buffer, so that numpy refuses to make it writable.
 
     >>> frozen = np.zeros(2)
-    >>> frozen.setflags(write=False)  # which can be taken back
+    >>> frozen.setflags(write=False)  # can be reverted
     >>> is_read_only(frozen), is_read_only(as_read_only(frozen)), is_read_only(as_read_only(frozen)[1:])
     (False, True, True)
     """
@@ -33,7 +33,7 @@ def is_read_only(array: NDArray[Any]) -> bool:
 def as_read_only(array: NDArray[Scalar]) -> NDArray[Scalar]:
     """Return a view that follows the array's changes and refuses `flags.writeable = True`.
 
-    numpy makes a view writable if the array that owns its memory is. The view lies on a read-only buffer, which is not.
+    numpy lets a view become writable if the owner of its memory is writable. This view lies on a read-only buffer.
 
     >>> view = as_read_only(np.zeros(2))
     >>> view.flags.writeable = True
@@ -44,28 +44,28 @@ def as_read_only(array: NDArray[Scalar]) -> NDArray[Scalar]:
 
 
 def as_constant(array: NDArray[Scalar]) -> NDArray[Scalar]:
-    """Return an array with the same numbers that no other holder can change: a copy unless it is read-only already."""
+    """Return an array with the same numbers that cannot change: a copy unless it is read-only already."""
     return array if is_read_only(array) else as_read_only(array.copy())
 
 
 def with_read_only(tree: Tree) -> Tree:
-    """Return a tree of tuples, lists and dicts with read-only views of the arrays in it; all else is shared.
+    """Return a tree of tuples, lists and dicts with read-only views of its arrays; all other parts are shared.
 
-    A part in which nothing can be written comes back itself. Objects that hold arrays take part by a method
-    `with_arrays(act)`, which returns the same with `act` done to each array.
+    A part without writable arrays is returned itself. Objects that hold arrays have a method `with_arrays(act)`, which
+    returns the object with `act` applied to each array.
     """
     result: Tree = map_arrays(tree, as_read_only)
     return result
 
 
 def with_constants(tree: Tree) -> Tree:
-    """Return such a tree whose arrays no other holder can change: copies unless they are read-only already."""
+    """Return such a tree with arrays that cannot change: copies unless they are read-only already."""
     result: Tree = map_arrays(tree, as_constant)
     return result
 
 
 def map_arrays(tree: Any, act: Act) -> Any:
-    """Return a tree with `act` done to all arrays in it; parts in which that changes nothing come back themselves."""
+    """Return a tree with `act` applied to all its arrays; parts that do not change are returned themselves."""
     cls = type(tree)
     if cls in PLAIN:
         return tree

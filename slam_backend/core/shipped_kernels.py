@@ -1,6 +1,6 @@
-"""Kernels that the package `vslam-env-kernels` ships, compiled for portable levels of x86-64.
+"""Kernels shipped by the package `vslam-env-kernels`, compiled for portable levels of x86-64.
 
-The package is installed like any other, so that what it holds is trusted as far as it is. It is only read.
+The package is installed like any other, and its files have the same trust. They are only read.
 """
 
 import json
@@ -22,7 +22,7 @@ LOGGER = logging.getLogger("slam_backend")
 CONFIG: Any = numba.config
 PACKAGE = "vslam_env_kernels"
 MANIFEST = "manifest.json"
-# Features of a processor of each level, highest first, beyond those of all processors of 64 bits.
+# Processor features of each level, highest first, beyond those of all 64-bit processors.
 V2 = frozenset({"cx16", "popcnt", "sahf", "sse3", "sse4.1", "sse4.2", "ssse3"})
 V3 = V2 | {"avx", "avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe", "xsave"}
 V4 = V3 | {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"}
@@ -37,7 +37,7 @@ class ShippedKernels:
 
     Attributes:
         folder: Folder of the files.
-        target: Triple, processor and features that they are compiled for, as the code generator names them.
+        target: Triple, processor and features of the kernels, as the code generator names them.
     """
 
     folder: Path
@@ -46,7 +46,7 @@ class ShippedKernels:
 
 @lru_cache
 def shipped_kernels() -> ShippedKernels | None:
-    """Return the installed kernels that this process can run; None: there are none, and it compiles all."""
+    """Return the installed kernels that this process can run; None: none, and it compiles all kernels."""
     spec = find_spec(PACKAGE)
     if spec is None or not spec.submodule_search_locations or is_pinned():
         return None
@@ -63,14 +63,14 @@ def shipped_kernels() -> ShippedKernels | None:
 
 
 def reason_against(manifest: Mapping[str, Any], features: Collection[str]) -> tuple[str, str]:
-    """Return why shipped kernels cannot be used, or else their level for a processor.
+    """Return the reason why shipped kernels cannot be used, or their level for a processor.
 
     Args:
         manifest: Versions that the kernels were compiled with, and their levels.
         features: Features of the processor.
 
     Returns:
-        Reason, empty if there is none; level, empty if there is a reason.
+        Reason, empty if they can be used; level, empty if they cannot.
     """
     for name, here in versions().items():
         if manifest[name] != here:
@@ -82,7 +82,7 @@ def reason_against(manifest: Mapping[str, Any], features: Collection[str]) -> tu
 
 
 def versions() -> dict[str, str]:
-    """Return what compiled kernels depend on besides their sources, by its name in the manifest."""
+    """Return the versions that compiled kernels depend on besides their sources, by name in the manifest."""
     return {
         "python": f"{sys.implementation.name} {sys.version_info[0]}.{sys.version_info[1]}",
         "numba": numba.__version__,
@@ -92,7 +92,7 @@ def versions() -> dict[str, str]:
 
 
 def host_features() -> set[str]:
-    """Return the names of what this processor can do, as far as numba may use it."""
+    """Return the names of the processor features that numba may use."""
     flags = get_host_cpu_features().split(",")  # type: ignore[no-untyped-call]
     return {flag[1:] for flag in flags if flag.startswith("+")}
 
@@ -103,7 +103,7 @@ def is_pinned() -> bool:
 
 
 def warn_once(subject: str, text: str) -> None:
-    """Log a warning, the first one on a subject in this process."""
+    """Log the first warning on a subject in this process."""
     if subject not in _warned:
         _warned.add(subject)
         LOGGER.warning(text)

@@ -1,4 +1,4 @@
-"""Arithmetic of one lane: what loops over lanes are made of."""
+"""Arithmetic of one lane, for loops over lanes."""
 
 import math
 
@@ -8,8 +8,8 @@ from slam_backend.fastslam._kernels.layout import LN2
 
 HALF_PI_HIGH = 1.5707963267341256  # pi / 2 in two parts: the first has 33 bits, so that small multiples are exact
 HALF_PI_LOW = 6.077100506506192e-11
-# Terms that a sum takes at a time: were they as many as a processor's vector registers hold, the last bits would differ
-# between processors.
+# Number of terms that a sum adds in parallel. It is fixed, as with the width of the processor's vector registers the
+# last bits would differ between processors.
 WIDE, NARROW = 32, 8
 ROUND = 6755399441055744.0  # 1.5 * 2^52: adding and subtracting it rounds to the nearest integer
 
@@ -59,9 +59,9 @@ def quadratic_form(matrix: Symmetric, x: float, y: float, z: float) -> float:
 
 @simd_inline
 def sine_cosine(angle: float) -> tuple[float, float]:
-    """Return sine and cosine to the last bits but one, for angles up to some thousand turns, without a branch.
+    """Return sine and cosine within two units in the last place, for up to some thousand turns, without a branch.
 
-    Reduction to [-pi/4, pi/4] and Taylor's series there.
+    The angle is reduced to [-pi/4, pi/4]; Taylor series follow.
     """
     quarter = (angle * (2.0 / math.pi) + ROUND) - ROUND
     x = (angle - quarter * HALF_PI_HIGH) - quarter * HALF_PI_LOW
@@ -94,7 +94,7 @@ def sine_cosine(angle: float) -> tuple[float, float]:
 
 @simd_inline
 def log_of(x: float) -> float:
-    """Return the natural logarithm of a positive normal number, without a branch: x = 2^e m, and atanh's series."""
+    """Return the natural logarithm of a positive normal number, without a branch, by x = 2^e m and the atanh series."""
     bits = float_bits(x)
     exponent = float((bits >> 52) - 1023)
     m = bits_float((bits & 0x000FFFFFFFFFFFFF) | 0x3FF0000000000000)
@@ -118,7 +118,7 @@ def log_of(x: float) -> float:
 
 @simd_inline
 def mantissa_exponent(x: float) -> tuple[float, float]:
-    """Return mantissa in [1, 2) and exponent of a positive normal number: products of many never overflow."""
+    """Return mantissa in [1, 2) and exponent of a positive normal number, so that long products never overflow."""
     bits = float_bits(x)
     return bits_float((bits & 0x000FFFFFFFFFFFFF) | 0x3FF0000000000000), float((bits >> 52) - 1023)
 
@@ -131,7 +131,7 @@ def wrapped(angle: float) -> float:
 
 @simd_inline
 def added_up(sums: FloatArray) -> float:
-    """Return the sum of `WIDE` numbers, by halves; the first `NARROW` of them are written to."""
+    """Return the pairwise sum of `WIDE` numbers; the first `NARROW` of them are overwritten."""
     for i in range(NARROW):
         sums[i] = (sums[i] + sums[i + NARROW]) + (sums[i + 2 * NARROW] + sums[i + 3 * NARROW])
     return added_up_narrow(sums)
@@ -139,7 +139,7 @@ def added_up(sums: FloatArray) -> float:
 
 @simd_inline
 def added_up_narrow(sums: FloatArray) -> float:
-    """Return the sum of the first `NARROW` numbers, by halves."""
+    """Return the pairwise sum of the first `NARROW` numbers."""
     even = (sums[0] + sums[4]) + (sums[2] + sums[6])
     odd = (sums[1] + sums[5]) + (sums[3] + sums[7])
     total: float = even + odd

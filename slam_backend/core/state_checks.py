@@ -1,7 +1,7 @@
-"""Checks of state that comes back from a caller: kinds, shapes, index ranges and sizes, each array looked at once.
+"""Checks of state passed in by a caller: kinds, shapes, index ranges and sizes, in one pass over each array.
 
-Kernels do not check the indices that they are given: what a state holds is checked before it is taken over, whether it
-comes from a file or from a program.
+Kernels do not check the indices that they receive. A state is therefore checked before use, whether it comes from a
+file or from a program.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -15,17 +15,17 @@ from numpy.typing import NDArray
 from slam_backend.core.jit import in_place
 from slam_backend.core.validation import argument_error
 
-CURE = "Pass it unchanged."
-LARGEST = 1e12  # of plain numbers [m, rad, 1]; squares and products of a few of them are finite
-MAX_DISTANCE = 1e7  # [m, rad] of poses and landmarks
-MAX_INT = 1 << 62  # of counts and steps: sums of two of them are int64
-MAX_LANDMARKS = 1 << 30  # names of landmarks: tables are as long as the largest of them
+HINT = "Pass it unchanged."
+LARGEST = 1e12  # limit of plain numbers [m, rad, 1]; squares and products of a few of them are finite
+MAX_DISTANCE = 1e7  # limit of poses and landmarks [m, rad]
+MAX_INT = 1 << 62  # limit of counts and steps: sums of two of them fit int64
+MAX_LANDMARKS = 1 << 30  # limit of landmark names: tables are as long as the largest name
 LANDMARK = (0, MAX_LANDMARKS)
 
 BOOL, INT8, UINT8 = np.dtype(np.bool_), np.dtype(np.int8), np.dtype(np.uint8)
 INT32, INT64 = np.dtype(np.int32), np.dtype(np.int64)
 FLOAT32, FLOAT64 = np.dtype(np.float32), np.dtype(np.float64)
-STREAMS: dict[str, dict[str, tuple[np.dtype[Any], tuple[int, ...]]]] = {  # arrays in the states of numpy's streams
+STREAMS: dict[str, dict[str, tuple[np.dtype[Any], tuple[int, ...]]]] = {  # arrays in the states of numpy's generators
     "PCG64": {},
     "PCG64DXSM": {},
     "MT19937": {"key": (np.dtype(np.uint32), (624,))},
@@ -36,7 +36,7 @@ STREAMS: dict[str, dict[str, tuple[np.dtype[Any], tuple[int, ...]]]] = {  # arra
 
 @in_place
 def count_outside(values: Any, columns: int, low: Any, high: Any) -> int:
-    """Return how many of the first columns of values (n, P) are not within bounds; those that are NaN are not."""
+    """Return how many values in the first columns of values (n, P) are out of bounds; NaN is out of bounds."""
     outside = 0
     for i in range(len(values)):
         for j in range(columns):
@@ -46,7 +46,7 @@ def count_outside(values: Any, columns: int, low: Any, high: Any) -> int:
 
 @in_place
 def count_falls(values: Any) -> int:
-    """Return how many of the values (n,) are not above the one before."""
+    """Return how many of the values (n,) do not exceed the previous one."""
     falls = 0
     for i in range(1, len(values)):
         falls += values[i] <= values[i - 1]
@@ -55,29 +55,29 @@ def count_falls(values: Any) -> int:
 
 def refuse(name: str, expected: str, got: object) -> NoReturn:
     """Raise the error for a part of a state."""
-    raise argument_error(name, expected, got, CURE)
+    raise argument_error(name, expected, got, HINT)
 
 
 @contextmanager
 def refuse_malformed(name: str) -> Iterator[None]:
-    """Turn what a check trips over, in a state of a form that it does not expect, into a refusal as well."""
+    """Turn any error that a check meets in a malformed state into a refusal."""
     try:
         yield
     except ValueError:
         raise
     except Exception as error:
-        got = f"'{type(error).__name__}: {error}' as it was looked at"
-        raise argument_error(name, "what get_state returned", got, CURE) from error
+        got = f"'{type(error).__name__}: {error}' while checking it"
+        raise argument_error(name, "what get_state returned", got, HINT) from error
 
 
 def instance(name: str, value: Any, *kinds: type) -> None:
-    """Refuse what is of none of some types; subclasses are other types."""
+    """Refuse a value that is of none of the types; subclasses count as other types."""
     if type(value) not in kinds:
         refuse(name, f"a {' or '.join(kind.__name__ for kind in kinds)}", f"a {type(value).__name__}")
 
 
 def keys(name: str, value: Any, keys: Iterable[str]) -> None:
-    """Refuse what is no dict, or lacks a key."""
+    """Refuse a value that is not a dict, or lacks a key."""
     if not isinstance(value, Mapping):
         refuse(name, "a dict from get_state", f"a {type(value).__name__}")
     for key in keys:
@@ -86,31 +86,31 @@ def keys(name: str, value: Any, keys: Iterable[str]) -> None:
 
 
 def sequence(name: str, value: Any, length: int | None = None) -> None:
-    """Refuse what is neither a tuple nor a list, or of another length."""
+    """Refuse a value that is neither a tuple nor a list, or has another length."""
     instance(name, value, tuple, list)
     if length is not None and len(value) != length:
         refuse(name, f"{length} of them", len(value))
 
 
 def integer(name: str, value: Any, low: int = 0, high: int = MAX_INT) -> None:
-    """Refuse what is no int, or not within bounds."""
+    """Refuse a value that is not an int, or out of bounds."""
     if type(value) is not int or not low <= value <= high:
         refuse(name, f"an int from {low} to {high}", value)
 
 
 def number(name: str, value: Any, low: float = -LARGEST, high: float = LARGEST) -> None:
-    """Refuse what is no float, or not within bounds."""
+    """Refuse a value that is not a float, or out of bounds."""
     if not isinstance(value, float) or not low <= value <= high:
         refuse(name, f"a float from {low:g} to {high:g}", value)
 
 
 def boolean(name: str, value: Any) -> None:
-    """Refuse what is no bool."""
+    """Refuse a value that is not a bool."""
     instance(name, value, bool)
 
 
 def integers(name: str, values: Any, low: int = 0, high: int = MAX_INT, kind: type = tuple) -> None:
-    """Refuse what is no collection of a type, of ints within bounds."""
+    """Refuse a value that is not a collection of one type with ints within bounds."""
     instance(name, values, kind)
     for value in values:
         if type(value) is not int or not low <= value <= high:
@@ -118,14 +118,14 @@ def integers(name: str, values: Any, low: int = 0, high: int = MAX_INT, kind: ty
 
 
 def int_dict(name: str, value: Any, of_keys: tuple[int, int], of_values: tuple[int, int] = (0, MAX_INT)) -> None:
-    """Refuse what is no dict whose keys and values are ints within bounds."""
+    """Refuse a value that is not a dict whose keys and values are ints within bounds."""
     instance(name, value, dict)
     integers(name, tuple(value), *of_keys)
     integers(name, tuple(value.values()), *of_values)
 
 
 def robots(name: str, robots: Any, count: int) -> None:
-    """Refuse what is no tuple of some of so many robots, at least one, in ascending order."""
+    """Refuse a value that is not a tuple of at least one of `count` robots in ascending order."""
     integers(name, robots, 0, count - 1)
     if not robots or list(robots) != sorted(set(robots)):
         refuse(name, "robots in ascending order", robots)
@@ -135,15 +135,15 @@ def array(
     name: str, value: Any, dtype: np.dtype[Any], shape: tuple[int | None, ...], low: Any = None, high: Any = None,
     columns: int | None = None,
 ) -> int:  # fmt: skip
-    """Return the length of an array, or refuse what is none of a type and a shape with all numbers within bounds.
+    """Return the length of an array, or refuse a wrong type or shape or a number out of bounds.
 
     Args:
         name: Name of the part.
         value: The value to check.
         dtype: Type of the array.
-        shape: None for a free axis.
-        low, high: The bounds; NaN is not within them. None: the numbers are not looked at.
-        columns: Only so many entries of the last axis mean something; None: all.
+        shape: Expected shape, None for a free axis.
+        low, high: The bounds; NaN is out of bounds. None: values are not checked.
+        columns: Number of entries of the last axis that are in use; None: all.
     """
     if type(value) is not np.ndarray or value.dtype != dtype:
         got = f"an array of {value.dtype}" if isinstance(value, np.ndarray) else f"a {type(value).__name__}"
@@ -158,7 +158,7 @@ def array(
         wide = value.reshape(-1, value.size if columns is None else found[-1])
         if count_outside(wide, wide.shape[1] if columns is None else columns, low, high):
             kind = "numbers from {:g} to {:g}" if dtype.kind == "f" else "integers from {} to {}"
-            refuse(name, kind.format(low, high), "others, or NaN" if dtype.kind == "f" else "others")
+            refuse(name, kind.format(low, high), "a value out of range" + " or NaN" * (dtype.kind == "f"))
     return len(value)
 
 
@@ -184,42 +184,42 @@ def indices(
 
 
 def ascending(name: str, values: NDArray[Any]) -> None:
-    """Refuse values (n,) of which one is not above the one before."""
+    """Refuse values (n,) that are not strictly ascending."""
     if count_falls(values):
-        refuse(name, "numbers in ascending order, each once", "others")
+        refuse(name, "distinct numbers in ascending order", "a number that is out of order or repeated")
 
 
 def unique(name: str, values: NDArray[Any]) -> None:
-    """Refuse values (n,) of which two are equal."""
+    """Refuse values (n,) with a duplicate."""
     if len(np.unique(values)) < len(values):
-        refuse(name, "each number once", "one that repeats")
+        refuse(name, "distinct numbers", "a repeated number")
 
 
 def options(name: str, options: Any, kind: type, known: Iterable[Any] = ()) -> None:
-    """Refuse what are no options of a type, or such that its constructor refuses.
+    """Refuse a value that is not an options object of a type, or whose constructor refuses its fields.
 
     Args:
         name: Name of the part.
         options: The value to check.
         kind: A frozen dataclass.
-        known: Options that need not be looked at again.
+        known: Options that are known to be valid.
     """
     instance(name, options, kind)
     try:
         if not any(options is other or options == other for other in known):
             _rebuilt(options)
-    except Exception as error:  # of whatever kind: options may hold anything where no constructor looked at them
-        raise argument_error(name, f"{kind.__name__} that can be built", f"'{error}'", CURE) from error
+    except Exception as error:  # of any kind: unchecked options may hold anything
+        raise argument_error(name, f"{kind.__name__} that can be built", f"'{error}'", HINT) from error
 
 
 def _rebuilt(options: Any) -> Any:
-    """Return options, and those that are parts of them, built once more."""
+    """Return options rebuilt by their constructors, nested ones included."""
     parts = {field.name: getattr(options, field.name) for field in fields(options)}
     return type(options)(**{name: _rebuilt(part) if is_dataclass(part) else part for name, part in parts.items()})
 
 
 def generator(name: str, state: Any) -> None:
-    """Refuse what is no state of one of numpy's random streams; numpy itself would read beyond its buffers."""
+    """Refuse a value that is not the state of a numpy bit generator; numpy itself would read beyond its buffers."""
     keys(name, state, ("bit_generator", "state"))
     kind = state["bit_generator"]
     if type(kind) is not str or kind not in STREAMS:
@@ -242,7 +242,7 @@ def generator(name: str, state: Any) -> None:
 
 
 def restore_generator(state: Mapping[str, Any]) -> np.random.Generator:
-    """Return a random stream that goes on from a state that `generator` passed."""
+    """Return a random generator that continues from a state that `generator` accepted."""
     kinds: dict[str, Any] = {name: getattr(np.random, name) for name in STREAMS}
     stream = np.random.Generator(kinds[state["bit_generator"]](0))
     stream.bit_generator.state = state
@@ -250,13 +250,13 @@ def restore_generator(state: Mapping[str, Any]) -> np.random.Generator:
 
 
 def named_items(name: str, values: Sequence[Any], length: int | None = None) -> Iterable[tuple[str, Any]]:
-    """Return each of so many parts with its name, or refuse what is no tuple or list of them."""
+    """Return each of the parts with its name, or refuse a value that is not a tuple or list of `length` parts."""
     sequence(name, values, length)
     return [(f"{name}[{i}]", value) for i, value in enumerate(values)]
 
 
 def compile_checks() -> None:
-    """Make all versions of the kernels ready that states need."""
+    """Compile all versions of the kernels that states need."""
     for is_open in (True, False):
         for dtype in (FLOAT64, FLOAT32, INT64, INT32):
             values = np.zeros((1, 1), dtype)

@@ -1,13 +1,12 @@
-"""State trees as bytes and back, by a format that holds data alone: to read it runs no code of the file's.
+"""Binary format of state trees. It holds data only: reading a file runs none of its content.
 
-A tree is made of None, bools, ints, floats, texts, bytes, dicts, lists, tuples, sets, arrays of plain numbers, numpy
-scalars, and objects of the classes that the caller lists (`StateTypes`). What stands in several places stands in one
-place
-afterwards, too. Floats keep every bit, arrays their layout and whether they can be written to.
+A tree consists of None, bools, ints, floats, texts, bytes, dicts, lists, tuples, sets, arrays of plain numbers, numpy
+scalars, and objects of the classes that the caller lists (`StateTypes`). Parts that are shared in a tree are shared
+after reading, too. Floats keep every bit. Arrays keep their memory layout and whether they are writable.
 
-The bytes are the length of a table, the table as JSON, and the arrays' own bytes one after the other. Rows of the table
-are the parts of the tree, each of which names earlier rows only, so that reading neither recurses nor loops. Arrays are
-not compressed and do not overlap: what is read takes about as much memory as the file has bytes.
+The bytes are the length of a table, the table as JSON, and the bytes of the arrays. Rows of the table are the parts of
+the tree. Each row refers to earlier rows only, so that reading neither recurses nor loops. Arrays are not compressed
+and do not overlap: a tree takes about as much memory as its file has bytes.
 """
 
 import json
@@ -26,10 +25,10 @@ from numpy.typing import NDArray
 
 from slam_backend.core.read_only import as_read_only
 
-ALIGNMENT = 64  # bytes; where arrays begin
-MAX_BYTES = 1 << 30  # of a file: a state has some megabytes
-MAX_TABLE = 1 << 26  # bytes of a table: Python takes up to twenty times as many to hold it
-LARGEST_INT = 1 << 63  # ints from here on are written as hexadecimal digits, as many as it takes
+ALIGNMENT = 64  # alignment of arrays [bytes]
+MAX_BYTES = 1 << 30  # limit of a file [bytes]; a state has some megabytes
+MAX_TABLE = 1 << 26  # limit of a table [bytes]; parsed, it takes up to twenty times as much memory
+LARGEST_INT = 1 << 63  # larger ints are written as hexadecimal digits
 DTYPES = {
     np.dtype(kind).newbyteorder("<").str: np.dtype(kind)
     for kind in ("?", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f2", "f4", "f8")
@@ -44,12 +43,12 @@ BUILT = dict(SEQUENCES.values())
 
 
 class StateType(NamedTuple):
-    """How objects of one class are taken apart and built.
+    """Conversion of the objects of one class to parts and back.
 
     Attributes:
-        name: By which files call the class.
-        apart: Returns the parts of an object, which are trees.
-        build: Returns the object of these parts, or raises a ValueError.
+        name: Name of the class in files.
+        apart: Function that returns the parts of an object; each part is a tree.
+        build: Function that returns the object made of these parts, or raises a ValueError.
     """
 
     name: str
@@ -58,11 +57,11 @@ class StateType(NamedTuple):
 
 
 class StateTypes:
-    """The classes of which objects may stand in a tree: no other class is ever named or called.
+    """Classes whose objects a tree may hold; no other class is written or called.
 
     Args:
-        classes: Dataclasses, named tuples and enumerations, built from their fields by their constructors.
-        special: How objects of other classes are taken apart and built.
+        classes: Dataclasses, named tuples and enumerations. Their constructors rebuild them from their fields.
+        special: Conversions of other classes.
     """
 
     def __init__(self, classes: Iterable[type] = (), special: dict[type, StateType] | None = None) -> None:
@@ -71,12 +70,12 @@ class StateTypes:
         assert len(self.by_name) == len(self.by_class)
 
     def with_others(self, others: "StateTypes") -> Self:
-        """Return these and others."""
+        """Return the union of two sets of classes."""
         return type(self)((), self.by_class | others.by_class)
 
 
 def _kind_of(cls: type) -> StateType:
-    """Return how objects of a class are taken apart into their fields, and built of these by its constructor."""
+    """Return the conversion of a class to its fields and back by its constructor."""
     if issubclass(cls, Enum):
         return StateType(cls.__name__, lambda member: (member.value,), cls)
     if is_dataclass(cls):
@@ -91,13 +90,13 @@ def _kind_of(cls: type) -> StateType:
 
 
 def sequence_parts(sequence: SeedSequence) -> tuple[Any, ...]:
-    """Return what a seed sequence is made of, its count of children included."""
+    """Return the arguments that rebuild a seed sequence, its count of children included."""
     return sequence.entropy, sequence.spawn_key, sequence.pool_size, sequence.n_children_spawned
 
 
 def sequence_of(entropy: Any, spawn_key: Any, pool_size: int, n_children_spawned: int) -> SeedSequence:
-    """Return the seed sequence that is made of these, or raise a ValueError."""
-    if not 4 <= pool_size <= 64:  # numpy would allocate any
+    """Return the seed sequence with these arguments, or raise a ValueError."""
+    if not 4 <= pool_size <= 64:  # numpy would allocate any size
         raise ValueError(f"a seed sequence has a pool of {pool_size} words")
     return SeedSequence(entropy, spawn_key=spawn_key, pool_size=pool_size, n_children_spawned=n_children_spawned)
 
@@ -106,28 +105,28 @@ SEEDS = StateTypes(special={SeedSequence: StateType("SeedSequence", sequence_par
 
 
 class ForeignObjectError(ValueError):
-    """A tree holds what no file can: an object of another class than the listed ones."""
+    """Tree with an object that cannot be written: its class is not listed."""
 
 
 # ---------------------------------------------------------------------- writing
 
 
 class _Writer:
-    """Writes the table of a tree and lists its arrays.
+    """Writer of the table of a tree; it lists the arrays.
 
     Args:
-        kinds: Which objects may stand in it.
+        kinds: Classes that the tree may hold.
     """
 
     def __init__(self, kinds: StateTypes) -> None:
         self.rows: list[list[Any]] = []
         self.blobs: list[bytes | NDArray[Any]] = []
         self._kinds = kinds.by_class
-        self._row_of: dict[int, Any] = {}  # by `id`; None while an object's parts are being written
-        self._kept: list[Any] = []  # so that no `id` is used again
+        self._row_of: dict[int, Any] = {}  # row by `id` of an object; None while its parts are being written
+        self._kept: list[Any] = []  # written objects, so that their `id` stays unique
 
     def entry(self, value: Any) -> Any:
-        """Return how a row names a value; values that have parts become rows of their own, once each."""
+        """Return the entry of a value in a row; each value that has parts becomes a row of its own."""
         cls = type(value)
         if value is None or cls is bool or cls is str:
             return value
@@ -150,7 +149,7 @@ class _Writer:
         return [len(self.rows) - 1]
 
     def _written(self, value: Any, cls: type) -> list[Any]:
-        """Return the row of a value that has parts, whose rows are written first."""
+        """Return the row of a value that has parts, after writing the rows of its parts."""
         if cls is np.ndarray:
             return self._array(value)
         if cls is dict:
@@ -169,13 +168,13 @@ class _Writer:
             kind = self._kinds[cls]
             try:
                 parts = list(kind.apart(value))
-            except Exception as error:  # of whatever kind: of an object that no constructor of its class has made
+            except Exception as error:  # of any kind: the object may not come from a constructor of its class
                 raise ForeignObjectError(f"a damaged {kind.name} ({error})") from error
             return ["object", kind.name, *(self._at(place, part) for place, part in enumerate(parts))]
         raise ForeignObjectError(f"a {cls.__module__}.{cls.__qualname__}")
 
     def _at(self, place: Any, part: Any) -> Any:
-        """Return the entry of a part; errors say where it stands."""
+        """Return the entry of a part; an error names its place."""
         try:
             return self.entry(part)
         except ForeignObjectError as error:
@@ -193,8 +192,7 @@ def encode(tree: Any, kinds: StateTypes) -> bytes:
     """Return a tree as bytes.
 
     Raises:
-        ForeignObjectError: If something in it is neither plain data nor of the listed classes; the text says what and
-            where.
+        ForeignObjectError: If an object is neither plain data nor of the listed classes; the text says what and where.
     """
     writer = _Writer(kinds)
     root = writer.entry(tree)
@@ -213,11 +211,11 @@ def encode(tree: Any, kinds: StateTypes) -> bytes:
 
 
 class _Reader:
-    """Builds the parts of a tree, row by row.
+    """Reader of a tree, row by row.
 
     Args:
-        body: Bytes that `encoded` returned, or what somebody made of it.
-        kinds: Which objects may stand in it.
+        body: Bytes that `encode` returned, or any others.
+        kinds: Classes that the tree may hold.
     """
 
     def __init__(self, body: bytes, kinds: StateTypes) -> None:
@@ -241,12 +239,12 @@ class _Reader:
         return self._value(self._root)
 
     def _value(self, entry: Any) -> Any:
-        """Return what an entry of a row names."""
+        """Return the value of an entry."""
         if type(entry) is not list:
             return entry
         (row,) = entry
         if type(row) is not int or not 0 <= row < len(self._parts):
-            raise ValueError(f"a row {row} that is not there yet")
+            raise ValueError(f"a row {row} before it is defined")
         return self._parts[row]
 
     def _built(self, tag: str, entries: list[Any]) -> Any:
@@ -284,23 +282,23 @@ class _Reader:
         return array if writeable else as_read_only(array)
 
     def _taken(self, size: int) -> memoryview:
-        """Return the next bytes that are not in the table."""
+        """Return the next bytes after the table."""
         start = -(-self._at // ALIGNMENT) * ALIGNMENT
         if size < 0 or start + size > len(self._body):
-            raise ValueError("more numbers than the file has bytes")
+            raise ValueError("arrays larger than the file")
         self._at = start + size
         return memoryview(self._body)[start : self._at]
 
 
 def decode(body: bytes, kinds: StateTypes) -> Any:
-    """Return the tree that `encoded` wrote; nothing of the bytes is run, whatever they are.
+    """Return the tree that `encode` wrote; the bytes are never executed.
 
     Raises:
-        ValueError: If they are none that `encoded` wrote for these kinds; the text says what was found.
+        ValueError: If `encode` did not write the bytes for these kinds; the text says what was found.
     """
     try:
         return _Reader(body, kinds).tree()
-    except Exception as error:  # whatever bytes somebody made up, or constructors of the listed classes refuse
+    except Exception as error:  # damaged bytes, or values that constructors of the listed classes refuse
         raise ValueError(str(error) or type(error).__name__) from error
 
 
@@ -308,7 +306,7 @@ def read_file(path: Path) -> bytes:
     """Return the content of a regular file of bounded size.
 
     Raises:
-        OSError: If it cannot be read, is none, or larger than any file of this project's.
+        OSError: If it cannot be read, is not a regular file, or exceeds `MAX_BYTES`.
     """
     found = path.stat()
     if not S_ISREG(found.st_mode):

@@ -1,4 +1,4 @@
-"""The one form in which bad input is refused: argument, what was expected, what came, and the cure."""
+"""Argument checks with one form of error: argument, expected value, value received, and hint."""
 
 import math
 from functools import wraps
@@ -19,18 +19,18 @@ Int32Array = NDArray[np.int32]
 BoolArray = NDArray[np.bool_]
 
 WRITTEN_IN_PYTHON = 1 << 9  # Py_TPFLAGS_HEAPTYPE of a class
-MOST = 10**9  # of steps and the like: kernels hold such numbers, and no run takes more
-NUMBERS = "biuf"  # kinds of dtypes that are real numbers
+MOST = 10**9  # limit of steps and other counts: kernels hold such numbers, and no run needs more
+NUMBERS = "biuf"  # dtype kinds of real numbers
 
 
-def argument_error(name: str, expected: str, got: object, cure: str) -> ValueError:
+def argument_error(name: str, expected: str, got: object, hint: str) -> ValueError:
     """Build the error for a bad argument.
 
     Args:
         name: The argument as the caller wrote it, e.g. `"num_particles"`.
-        expected: What is accepted, e.g. `"an int >= 1"`.
-        got: What came; its `repr` is shown, shortened to 80 characters, or a whole path.
-        cure: What to do about it, a full sentence.
+        expected: Description of accepted values, e.g. `"an int >= 1"`.
+        got: Value received; shown as its `repr`, shortened to 80 characters, or as a whole path.
+        hint: Advice, a full sentence.
 
     Returns:
         The exception, for the caller to raise.
@@ -39,47 +39,47 @@ def argument_error(name: str, expected: str, got: object, cure: str) -> ValueErr
     num_particles: expected an int >= 1, got 0. Use at least one particle.
     """
     if isinstance(got, PurePath):
-        return ValueError(f"{name}: expected {expected}, got {str(got)!r}. {cure}")
+        return ValueError(f"{name}: expected {expected}, got {str(got)!r}. {hint}")
     described = isinstance(got, str) and got.startswith(("shape ", "an array ", "a ", "'", "no ", "NaN"))
     text = str(got) if described else _short_text(got)
     if len(text) > 80:
         text = text[:77] + "..."
-    return ValueError(f"{name}: expected {expected}, got {text}. {cure}")
+    return ValueError(f"{name}: expected {expected}, got {text}. {hint}")
 
 
 def _short_text(got: object) -> str:
     """Return the `repr` of something, or its type where that fails."""
     try:
         return repr(got)
-    except Exception:  # an int of 5000 digits has none, and an object of the caller's may raise anything
+    except Exception:  # an int of 5000 digits has none, and an object of the caller may raise anything
         return f"a {type(got).__name__} that cannot be shown"
 
 
-def check_kind(name: str, value: Any, kind: type[T], cure: str = "") -> T:
+def check_kind(name: str, value: Any, kind: type[T], hint: str = "") -> T:
     """Return `value` if it is an instance of a class, or raise.
 
     Args:
         name: The argument as the caller wrote it.
         value: The value to check.
         kind: The class.
-        cure: Advice for another, a full sentence; empty: to build one.
+        hint: Advice, a full sentence; empty: to build one.
 
     Raises:
         ValueError: As `argument_error` words it.
     """
     if not isinstance(value, kind):
         article = "an" if kind.__name__[0] in "AEIOU" else "a"
-        raise argument_error(name, f"{article} {kind.__name__}", value, cure or f"Build one: {kind.__name__}(...).")
+        raise argument_error(name, f"{article} {kind.__name__}", value, hint or f"Build one: {kind.__name__}(...).")
     return value
 
 
 def is_built_in(maker: object) -> bool:
-    """Tell whether a function or class is one of Python or of an extension, which nothing of the user's ever is."""
+    """Return whether a function or class belongs to Python or to an extension, and is thus none of the user's."""
     return isbuiltin(maker) or (isinstance(maker, type) and not maker.__flags__ & WRITTEN_IN_PYTHON)
 
 
 def known_names(kind: type[T]) -> type[T]:
-    """Let a class refuse keyword arguments that it does not have, with a list of those it has; to decorate a class.
+    """Make a class refuse unknown keyword arguments with a list of the known ones; a class decorator.
 
     >>> @known_names
     ... class Gate:
@@ -96,39 +96,39 @@ def known_names(kind: type[T]) -> type[T]:
     def checked(self: Any, *values: Any, **named: Any) -> None:
         for name in named:
             if name not in known:
-                got, cure = f"a name that {kind.__name__} does not have", f"It has {', '.join(known)}."
-                raise argument_error(name, "a known argument", got, cure)
+                got, hint = f"a name that {kind.__name__} does not have", f"It has {', '.join(known)}."
+                raise argument_error(name, "a known argument", got, hint)
         begin(self, *values, **named)
 
     kind.__init__ = checked  # type: ignore[method-assign]
     return kind
 
 
-def check_int(name: str, value: Any, minimum: int, cure: str, maximum: int | None = None) -> int:
+def check_int(name: str, value: Any, minimum: int, hint: str, maximum: int | None = None) -> int:
     """Return `value` as an int, or raise if it is not an integer (bools are not) or out of bounds.
 
     Args:
         name: The argument as the caller wrote it.
-        value: What came.
-        minimum: The least that is accepted.
-        cure: What to do about another, a full sentence.
-        maximum: The most that is accepted; None: any.
+        value: Value received.
+        minimum: Least value accepted.
+        hint: Advice, a full sentence.
+        maximum: Largest value accepted; None: no limit.
 
     Raises:
         ValueError: As `argument_error` words it.
     """
     is_int = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
     if not is_int or value < minimum:
-        raise argument_error(name, f"an int >= {minimum}", value, cure)
+        raise argument_error(name, f"an int >= {minimum}", value, hint)
     if maximum is not None and value > maximum:
-        raise argument_error(name, f"an int <= {maximum}", value, cure)
+        raise argument_error(name, f"an int <= {maximum}", value, hint)
     return int(value)
 
 
 def check_float(
     name: str,
     value: Any,
-    cure: str,
+    hint: str,
     *,
     above: float | None = None,
     at_least: float | None = None,
@@ -138,11 +138,11 @@ def check_float(
 
     Args:
         name: The argument as the caller wrote it.
-        value: What came.
-        cure: What to do about one outside, a full sentence.
-        above: It must be greater than this.
-        at_least: It must not be less than this.
-        at_most: It must not be greater than this.
+        value: Value received.
+        hint: Advice, a full sentence.
+        above: Exclusive lower bound.
+        at_least: Inclusive lower bound.
+        at_most: Inclusive upper bound.
 
     Raises:
         ValueError: As `argument_error` words it.
@@ -157,7 +157,7 @@ def check_float(
     try:
         is_number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
         number = float(value) if is_number else math.nan
-    except OverflowError:  # an int beyond all floats
+    except OverflowError:  # an int too large for a float
         number = math.inf
     if (
         not math.isfinite(number)
@@ -165,7 +165,7 @@ def check_float(
         or (at_least is not None and number < at_least)
         or (at_most is not None and number > at_most)
     ):
-        raise argument_error(name, expected, value, cure)
+        raise argument_error(name, expected, value, hint)
     return number
 
 
@@ -174,25 +174,25 @@ def check_seed(seed: Any) -> Any:
     if isinstance(seed, (np.random.SeedSequence, np.random.Generator)):
         return seed
     if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
-        cure = "Give an int, so that the run can be repeated."
-        raise argument_error("seed", "an int >= 0, a SeedSequence or a Generator", seed, cure)
+        hint = "Give an int, so that the run can be repeated."
+        raise argument_error("seed", "an int >= 0, a SeedSequence or a Generator", seed, hint)
     return int(seed)
 
 
-def check_choice(name: str, value: Any, choices: tuple[str, ...], cure: str = "Choose one of these names.") -> str:
+def check_choice(name: str, value: Any, choices: tuple[str, ...], hint: str = "Choose one of these names.") -> str:
     """Return `value` if it is one of `choices`, or raise with the list of them.
 
     Args:
         name: The argument as the caller wrote it.
-        value: What came.
-        choices: All that are accepted.
-        cure: What to do about another, a full sentence.
+        value: Value received.
+        choices: Accepted values.
+        hint: Advice, a full sentence.
 
     Raises:
         ValueError: As `argument_error` words it.
     """
     if not isinstance(value, str) or value not in choices:
-        raise argument_error(name, "one of " + ", ".join(repr(c) for c in choices), value, cure)
+        raise argument_error(name, "one of " + ", ".join(repr(c) for c in choices), value, hint)
     return value
 
 
@@ -200,7 +200,7 @@ def check_array(
     name: str,
     value: Any,
     shape: tuple[int | None, ...],
-    cure: str,
+    hint: str,
     *,
     dtype: Any = np.float64,
     finite: bool = True,
@@ -212,10 +212,10 @@ def check_array(
         name: The argument as the caller wrote it.
         value: Anything that numpy can read.
         shape: Expected shape, None for a free axis.
-        cure: What to do about it.
-        dtype: Of the result; None: as it comes.
-        finite: Refuse NaN and infinity.
-        within: Refuse larger numbers, by magnitude.
+        hint: Advice, a full sentence.
+        dtype: Type of the result; None: unchanged.
+        finite: Whether NaN and infinity are refused.
+        within: Largest magnitude accepted.
 
     Returns:
         An array of that shape. Integer dtypes accept floats only if these are whole numbers.
@@ -223,50 +223,50 @@ def check_array(
     Raises:
         ValueError: As `argument_error` words it.
     """
-    given = value if type(value) is np.ndarray and value.dtype.kind in NUMBERS else _read(name, value, shape, cure)
+    given = value if type(value) is np.ndarray and value.dtype.kind in NUMBERS else _read(name, value, shape, hint)
     is_ready = dtype is None or given.dtype == dtype
-    array = np.array(given, order="C") if is_ready else _cast(name, value, given, dtype, cure)
+    array = np.array(given, order="C") if is_ready else _cast(name, value, given, dtype, hint)
     if array.ndim != len(shape) or any(s is not None and s != n for s, n in zip(shape, array.shape, strict=True)):
-        raise argument_error(name, f"an array of shape {_shape_text(shape)}", f"shape {array.shape}", cure)
+        raise argument_error(name, f"an array of shape {_shape_text(shape)}", f"shape {array.shape}", hint)
     if finite and array.size and not np.isfinite(array).all():
         where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
         if np.isfinite(given[where]):
-            raise argument_error(name, f"numbers that {array.dtype} can hold", given[where].item(), cure)
-        raise argument_error(name, "finite numbers", f"NaN or infinity at index {where}", cure)
+            raise argument_error(name, f"numbers that {array.dtype} can hold", given[where].item(), hint)
+        raise argument_error(name, "finite numbers", f"NaN or infinity at index {where}", hint)
     if within is not None and array.size and (largest := float(np.abs(array).max())) > within:
-        raise argument_error(name, f"numbers within +-{within:g}", largest, cure)
+        raise argument_error(name, f"numbers within +-{within:g}", largest, hint)
     return array
 
 
-def _read(name: str, value: Any, shape: tuple[int | None, ...], cure: str) -> NDArray[Any]:
-    """Return what is not plainly an array of real numbers as one, perhaps the caller's own, or raise."""
+def _read(name: str, value: Any, shape: tuple[int | None, ...], hint: str) -> NDArray[Any]:
+    """Return any other value as an array of real numbers, perhaps the caller's own array, or raise."""
     expected = f"an array of shape {_shape_text(shape)}"
-    if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value):  # numpy would take what the mask hides
-        raise argument_error(name, expected, "a masked array with hidden entries", cure)
+    if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value):  # numpy would read the masked entries
+        raise argument_error(name, expected, "a masked array with hidden entries", hint)
     try:
         given = np.asarray(value)
         if given.dtype.kind == "O" and all(isinstance(entry, Real) for entry in given.flat):
-            given = np.asarray(given.tolist())  # of the kind that the numbers have
+            given = np.asarray(given.tolist())  # converts to the numbers' own type
             given = given.astype(np.float64) if given.dtype.kind == "O" else given
     except (TypeError, ValueError, OverflowError) as error:
-        raise argument_error(name, expected, value, cure) from error
-    if given.dtype.kind not in NUMBERS:  # of complex numbers numpy would drop a part, and it would read texts
+        raise argument_error(name, expected, value, hint) from error
+    if given.dtype.kind not in NUMBERS:  # numpy would drop imaginary parts and parse texts
         got = f"an array of {given.dtype}" if given.dtype.kind == "c" else value
-        raise argument_error(name, expected + " of real numbers", got, cure)
+        raise argument_error(name, expected + " of real numbers", got, hint)
     return given
 
 
-def _cast(name: str, value: Any, given: NDArray[Any], dtype: Any, cure: str) -> NDArray[Any]:
-    """Return the numbers `given`, read from `value`, as a fresh array of `dtype`, or raise if they are none of these.
+def _cast(name: str, value: Any, given: NDArray[Any], dtype: Any, hint: str) -> NDArray[Any]:
+    """Return the numbers `given`, read from `value`, as a fresh array of `dtype`, or raise if it cannot hold them.
 
-    Only integers are asked for that here; what is too large for floats becomes infinite.
+    Only integer types raise here; numbers too large for a float type become infinite.
     """
     if np.issubdtype(dtype, np.integer):
         if given.dtype.kind == "f" and not np.array_equal(given, np.rint(given)):
-            raise argument_error(name, "whole numbers", value, cure)
+            raise argument_error(name, "whole numbers", value, hint)
         bounds = np.iinfo(dtype)
         if given.size and not bounds.min <= given.min().item() <= given.max().item() <= bounds.max:
-            raise argument_error(name, f"whole numbers that {np.dtype(dtype)} can hold", value, cure)
+            raise argument_error(name, f"whole numbers that {np.dtype(dtype)} can hold", value, hint)
     with np.errstate(over="ignore"):  # infinity is refused by the caller
         return np.array(given, dtype=dtype, order="C")
 

@@ -17,10 +17,10 @@ def pose_mixtures(means: FloatArray, covariances: FloatArray, weights: FloatArra
     Args:
         means: (K, 3, P) float64 [m, m, rad], P >= M whole blocks of lanes.
         covariances: (K, 6, P) float64: xx, xy, xt, yy, yt, tt of each.
-        weights: (M,) float64, summing to 1; lanes beyond M mean nothing.
+        weights: (M,) float64, summing to 1; lanes beyond M are unused.
 
     Returns:
-        All in the frame of `means`. Fresh arrays.
+        Means and covariances in the frame of `means`. Fresh arrays.
     """
     mixed = PoseEstimates(np.empty((len(means), 3)), np.empty((len(means), 3, 3)))
     for robot in range(len(means)):
@@ -31,18 +31,18 @@ def pose_mixtures(means: FloatArray, covariances: FloatArray, weights: FloatArra
 def map_mixture(
     maps: ParticleMaps, best: int, log_weights: FloatArray, scatter: FloatArray, min_count: int
 ) -> tuple[FloatArray, FloatArray, Any, IntArray, IntArray]:
-    """Return the landmarks of one particle with mean and covariance over all that hold them, by ascending id.
+    """Return the landmarks of one particle with mean and covariance over all particles that hold them, by ascending id.
 
     The covariance is sum w_m (Sigma_m + (mu_m - mu)(mu_m - mu)^T), with the weights of those particles scaled to sum
-    to 1 (Sec. 3.2, see `docs/reference/errata.md`): Sigma_m alone is conditioned on the path of particle m. To it comes
-    what the particles do not show of the map's frame.
+    to 1 (Sec. 3.2, see `docs/reference/errata.md`): Sigma_m alone is conditioned on the path of particle m. The
+    uncertainty of the map's frame (gauge) is added.
 
     Args:
-        maps: Of all particles; only looked at.
-        best: The particle that says which landmarks there are.
+        maps: Maps of all particles; not changed.
+        best: Index of the particle whose landmarks are returned.
         log_weights: (M,) normalised.
-        scatter: (3, 3) covariance of the map's frame about its origin [m, m, rad]; 0 where particles show all.
-        min_count: Landmarks that it measured fewer times are left out.
+        scatter: (3, 3) [m, m, rad] covariance of the map's frame about its origin; 0 if the particles represent it.
+        min_count: Least number of measurements of a landmark in the result.
 
     Returns:
         Means (n, 3) [m] and covariances (n, 3, 3) [m^2], map frame, descriptors (n, d) float32, counts (n,) of

@@ -1,15 +1,15 @@
-"""Whether a landmark exists: log-odds that grow when it is seen, and fall when it is expected in view and not seen.
+"""Existence of landmarks: log-odds that grow with detections and fall with missed ones.
 
-The idea of using what is not seen is that of Montemerlo and Thrun (2003), "Simultaneous Localization and Mapping with
-Unknown Data Association Using FastSLAM", IEEE Int. Conf. on Robotics and Automation: each landmark of each particle
-carries the log-odds of its existence, a binary Bayes filter with a constant for a sighting and one for a miss. Here the
-constants follow from a detection model: with P(seen | it exists and is expected in view) = d and P(something is taken
-for it | it does not exist) = f,
+The use of missed detections follows Montemerlo and Thrun (2003), "Simultaneous Localization and Mapping with Unknown
+Data Association Using FastSLAM", IEEE Int. Conf. on Robotics and Automation: each landmark of each particle has the
+log-odds of its existence, a binary Bayes filter with one constant for a detection and one for a miss. Here the
+constants follow from a detection model: with P(detection | it exists and is expected in view) = d and P(false match |
+it does not exist) = f,
 
-    sighting: + log(d / f)          miss: + log((1 - d) / (1 - f)).
+    detection: + log(d / f)         miss: + log((1 - d) / (1 - f)).
 
-Log-odds stop at a cap, so that a landmark that was seen a thousand times can still be found to be gone. The filter's
-loops over landmarks and particles are in `fastslam/_kernels/existence.py`.
+The log-odds are capped, so that a landmark with a thousand detections can still be deleted. The filter's loops over
+landmarks and particles are in `fastslam/_kernels/existence.py`.
 """
 
 from dataclasses import dataclass
@@ -28,21 +28,20 @@ from slam_backend.models.camera import StereoCamera
 @known_names
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExistenceModel:
-    """How likely landmarks are seen, and when they are given up.
+    """Detection model of landmarks, and the rule that deletes them.
 
     Attributes:
-        detection: d. Share of frames in which a right landmark that is expected in view is matched. What hides
-            landmarks and is not in the model (walls, other robots, measurements that are rejected) lowers it; too high
-            a value deletes good landmarks.
-        false_alarm: f. Share of frames in which something is matched to a landmark that does not exist.
-        prior: Probability that a landmark exists once it has been measured for the first time.
-        delete_below: A landmark less probable than this is deleted.
-        cap: Landmarks never become more probable than this.
-        margin_px: Landmarks nearer than this to the border of the image are not expected in view [px].
-        range_share: Nor are those farther than this share of the camera's largest range.
-        nearest: Nor are those whose depth is below this [m]: a stereo pair does not see them.
-        frame_limit: Largest number of measurements that the sensor reports in a frame; None: it reports all. Of E
-            landmarks expected in view, each is then seen with probability d min(1, limit / E).
+        detection: d. Share of frames in which a true landmark that is expected in view is matched. Unmodelled causes of
+            misses (walls, other robots, rejected measurements) lower it; too high a value deletes good landmarks.
+        false_alarm: f. Share of frames in which a measurement is matched to a landmark that does not exist.
+        prior: Probability that a landmark exists after its first measurement.
+        delete_below: Probability below which a landmark is deleted.
+        cap: Upper limit of the probability.
+        margin_px: Distance to the border of the image within which landmarks are not expected in view [px].
+        range_share: Share of the camera's largest range beyond which landmarks are not expected in view.
+        nearest: Depth below which landmarks are not expected in view [m]: a stereo pair does not see them.
+        frame_limit: Largest number of measurements that the sensor reports in a frame; None: no limit. Of E landmarks
+            expected in view, each is then detected with probability d min(1, limit / E).
     """
 
     detection: float = 0.8
@@ -69,7 +68,7 @@ class ExistenceModel:
         check_float("existence.range_share", self.range_share, "Use 1 for the whole range.", above=0.0, at_most=1.0)
         check_float("existence.nearest", self.nearest, "Use 0 for all points ahead.", at_least=0.0)
         if self.frame_limit is not None:
-            check_int("existence.frame_limit", self.frame_limit, 1, "Use None if the sensor reports all it sees.", MOST)
+            check_int("existence.frame_limit", self.frame_limit, 1, "Use None for a sensor without a limit.", MOST)
 
     @property
     def log_odds_prior(self) -> float:
@@ -78,40 +77,39 @@ class ExistenceModel:
 
     @property
     def log_odds_floor(self) -> float:
-        """Below these log-odds a landmark is deleted."""
+        """Log-odds below which a landmark is deleted."""
         return _log_odds(self.delete_below)
 
     @property
     def log_odds_cap(self) -> float:
-        """Log-odds stop here."""
+        """Upper limit of the log-odds."""
         return _log_odds(self.cap)
 
     def increments(self, expected: int = 1) -> tuple[float, float]:
-        """Return what a sighting and a miss add to the log-odds, in a frame with `expected` landmarks in view.
+        """Return the log-odds increments of a detection and a miss, in a frame with `expected` landmarks in view.
 
-        A landmark that is seen gets the first, whether it was expected or not: where it was not, a sighting says more,
-        not less. One that is expected and not seen gets the second; any other keeps its log-odds.
-
+        A detected landmark gets the first, expected or not: an unexpected detection is stronger evidence, not weaker.
+        An expected landmark without detection gets the second; all others keep their log-odds.
         >>> sighting, miss = ExistenceModel(detection=0.9, false_alarm=0.1).increments()
         >>> round(sighting, 3), round(miss, 3)          # log 9 and -log 9
         (2.197, -2.197)
         """
         seen = self.detection
         if self.frame_limit is not None and expected > self.frame_limit:
-            # Seen less often than a false one would be, a landmark tells nothing any more.
+            # Below the rate of false alarms a detection would count against the landmark.
             seen = max(seen * self.frame_limit / expected, self.false_alarm)
         return log(seen / self.false_alarm), log((1.0 - seen) / (1.0 - self.false_alarm))
 
     def misses_to_delete(self, log_odds: float) -> int:
-        """Return after how many misses in a row, and no sooner, a landmark of these log-odds is deleted."""
+        """Return the least number of consecutive misses that deletes a landmark with these log-odds."""
         return max(0, floor((log_odds - self.log_odds_floor) / -self.increments()[1]) + 1)
 
     def deletion_bound(self, looks: int) -> float:
-        """Return a bound on the probability that a right landmark, expected in view so many times, is ever deleted.
+        """Return a bound on the probability that a true landmark, expected in view `looks` times, is ever deleted.
 
-        A landmark that exists and is seen with probability `detection` has log-odds l with E exp(-l) constant; by
-        Ville's inequality they ever fall by h with probability at most exp(-h). A landmark starts at its prior, and
-        once more whenever it leaves the cap, at most `looks` times:
+        For a landmark that exists and is detected with probability `detection`, E exp(-l) of its log-odds l is
+        constant. By Ville's inequality they ever fall by h with probability at most exp(-h). A landmark starts at its
+        prior, and again whenever it leaves the cap, at most `looks` times:
 
             exp(floor - prior) + looks exp(floor - cap).
         """
@@ -119,10 +117,10 @@ class ExistenceModel:
         return min(1.0, from_prior + looks * exp(self.log_odds_floor - self.log_odds_cap))
 
     def view(self, camera: StereoCamera) -> "FieldOfView":
-        """Return where landmarks are expected to be seen by a camera.
+        """Return the part of a camera's field of view in which landmarks are expected.
 
         Raises:
-            ValueError: If the margin leaves nothing of the image, or the range ends before `nearest`.
+            ValueError: If the margins cover the image, or the range ends before `nearest`.
         """
         side, rise = 0.5 * camera.width - self.margin_px, 0.5 * camera.height - self.margin_px
         if min(side, rise) <= 0.0:
@@ -130,8 +128,8 @@ class ExistenceModel:
             raise argument_error("existence.margin_px", expected, self.margin_px, "Leave some of the image.")
         reach = self.range_share * camera.max_range
         if reach <= self.nearest:
-            cure = "Leave some of the range."
-            raise argument_error("existence.nearest", f"a number < {reach:g}, the range", self.nearest, cure)
+            hint = "Leave some of the range."
+            raise argument_error("existence.nearest", f"a number < {reach:g}, the range", self.nearest, hint)
         return FieldOfView(self.nearest, side / camera.focal_px, rise / camera.focal_px, reach * reach)
 
 
@@ -145,11 +143,11 @@ def _log_odds(probability: float) -> float:
 
 
 class ExistenceUpdate:
-    """An existence model together with the camera that sees the landmarks.
+    """Existence model combined with a camera.
 
     Args:
-        model: How likely landmarks are seen, and when they are given up.
-        camera: The filter's.
+        model: Detection model and deletion rule.
+        camera: Camera of the filter.
     """
 
     def __init__(self, model: ExistenceModel, camera: StereoCamera) -> None:
@@ -162,17 +160,17 @@ class ExistenceUpdate:
     def update(
         self, maps: ParticleMaps, poses: FloatArray, best: int, found: NDArray[np.int32], new_slots: IntArray
     ) -> IntArray:
-        """Update the log-odds after one robot's frame, which may be empty; particles drop what is too improbable.
+        """Update the log-odds after one robot's frame, which may be empty; particles delete improbable landmarks.
 
         Args:
-            maps: Changed; the landmarks that the frame started begin at the prior.
-            poses: (3, P) the robot's sampled poses [m, m, rad], map frame.
-            best: The most probable particle before the step: what it has around the robot is looked at.
-            found: (n, P) slot to which each particle gave each measurement of the frame, -1 = none.
+            maps: Maps of all particles, changed; landmarks that the frame started begin at the prior.
+            poses: (3, P) [m, m, rad], map frame. Sampled poses of the robot.
+            best: Index of the most probable particle before the step; its landmarks near the robot are considered.
+            found: (n, P) slot matched by each particle to each measurement of the frame, -1 = none.
             new_slots: (n,) slot of the landmark that each measurement started, -1 = none.
 
         Returns:
-            Slots that no particle holds any more. They are to be released once nobody asks for their ids.
+            Slots that no particle holds any more, to be released once their ids are no longer needed.
         """
         maps.add_odds(new_slots)
         camera = Viewpoint(poses, np.cos(poses[2]), np.sin(poses[2]), self._mount)

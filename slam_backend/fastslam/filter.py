@@ -1,8 +1,8 @@
 """`FastSlam`: a Rao-Blackwellized particle filter over the paths of K robots, with one EKF per landmark and particle.
 
-Sections 2 and 4 of the paper, with its errata. Robots are taken in turn (Algorithm 1): each moves, matches what it sees
-to the map that the robots before it have just updated, weighs the particles and updates the landmarks; then the joint
-particles are resampled.
+The filter implements Sections 2 and 4 of the paper, with its errata. Robots are processed in turn (Algorithm 1): each
+one moves, matches its measurements to the map as updated by the robots before it, weighs the particles and updates the
+landmarks. Then the joint particles are resampled.
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from slam_backend.core.state_checks import CURE, refuse_malformed
+from slam_backend.core.state_checks import HINT, refuse_malformed
 from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_array, check_choice, known_names
 from slam_backend.fastslam import _kernels
 from slam_backend.fastslam.consistency import Consistency
@@ -34,7 +34,7 @@ from slam_backend.models.measurements import Measurements
 from slam_backend.models.odometry import OdometryModel
 from slam_backend.smoother.options import SmoothingOptions
 
-NO_WEIGHTS = np.empty(0)  # unused where all particles start at the same place
+NO_WEIGHTS = np.empty(0)  # unused where all particles start at the same pose
 
 
 @known_names
@@ -43,7 +43,7 @@ class FastSlam:
 
     Args:
         num_robots: K. Each particle holds K poses and one map (Eq. 19).
-        seed: Of the filter's own random stream: an int, a `numpy.random.SeedSequence` or a Generator.
+        seed: Seed of the filter's own random stream: an int, a `numpy.random.SeedSequence` or a Generator.
         initial_poses: (K, 3) [m, m, rad], map frame. None: all at the origin.
         num_particles, camera, motion, proposal, resampling, resample_threshold, position_gate, descriptor_gate,
         new_landmark_gate, new_landmark_radius, recovery_position, recovery_heading, descriptor_sigma, ambiguity_margin,
@@ -113,8 +113,8 @@ class FastSlam:
         self.state = FilterState(num_robots, options, seed)
         self.may_smooth = True
         if initial_poses is not None:
-            cure = "Give one pose (x, y, theta) per robot."
-            self.state.start_at(check_array("initial_poses", initial_poses, (num_robots, 3), cure, within=MAX_POSE))
+            hint = "Give one pose (x, y, theta) per robot."
+            self.state.start_at(check_array("initial_poses", initial_poses, (num_robots, 3), hint, within=MAX_POSE))
 
     @classmethod
     def from_options(
@@ -124,7 +124,7 @@ class FastSlam:
 
         Args:
             num_robots: K.
-            options: What it assumes and how it decides.
+            options: Assumptions and decision rules of the filter.
             seed: Seed of the random stream, see the class.
 
         Raises:
@@ -149,20 +149,21 @@ class FastSlam:
         identities: Sequence[ArrayLike | None] | None = None,
         poses: Sequence[ArrayLike | None] | None = None,
     ) -> StepReport:
-        """Move the robots, match what they see, weigh, update, and resample if needed.
+        """Move the robots, match their measurements, weigh, update, and resample if needed.
 
         Args:
-            odometry: Per robot (3,) [m, m, rad], motion since its last step in its previous frame; None: it stood.
-            measurements: Per robot its frame, or None.
-            identities: Per robot (n_i,) int, the caller's own names of the landmarks measured, -1 for a measurement to
-                be rejected; association then follows these names. None: association by gates and descriptors.
-            poses: Per robot (3,) [m, m, rad], its pose in its own start frame, taken as exact; odometry is ignored.
+            odometry: One (3,) [m, m, rad] per robot, motion since its last step in its previous frame; None: it stood
+                still.
+            measurements: One frame per robot, or None.
+            identities: One (n_i,) int per robot, the caller's own names of the measured landmarks, -1 for a measurement
+                to be rejected; data association follows these names. None: association by gates and descriptors.
+            poses: One (3,) [m, m, rad] per robot, its exact pose in its own start frame; odometry is ignored.
 
         Returns:
-            What was matched and created.
+            Data association and statistics of the step.
 
         Raises:
-            ValueError: If an argument is ill-formed; the filter is then as before.
+            ValueError: If an argument is ill-formed; the filter is then unchanged.
         """
         count, size = self.num_robots, self.descriptor_size
         inputs = validate_step(count, size, self.options.camera, odometry, measurements, identities, poses)
@@ -171,14 +172,14 @@ class FastSlam:
     def step_checked(
         self, inputs: StepInput, seats: RobotRows, findings: Associations, told: IntArray, step: int | None = None
     ) -> StepReport:
-        """Do what `step` does with readings that `validate_step` returned.
+        """Do a step, as `step`, with inputs from `validate_step`.
 
         Args:
-            inputs: What these robots, and perhaps others, read; it is not written to.
-            seats: Rows of these robots there.
-            findings: Of `inputs`.
-            told: Their buffer, see `Associations.allocate`; what becomes of these robots' measurements is written
-                there.
+            inputs: Input of these robots, and perhaps of others; not changed.
+            seats: Rows of these robots in `inputs`.
+            findings: Data association of `inputs`.
+            told: Writable array of `findings`, see `Associations.allocate`; the association of these robots'
+                measurements is written there.
             step: Number of the step in the logs; None: the next one.
         """
         state = self.state
@@ -198,10 +199,10 @@ class FastSlam:
     def rejuvenate(self) -> RejuvenationReport:
         """Sample the particles from the posterior of whole paths now, whether or not `rejuvenate_every` is set.
 
-        Where it is not, all steps so far are smoothed from the log, and nothing is kept for the next time.
+        If it is not set, all steps so far are smoothed from the log, and the smoother is discarded.
 
         Returns:
-            What came of it; where there is a reason the particles are as before.
+            The outcome; if it has a reason, the particles are unchanged.
         """
         smoother = self.state.rejuvenation
         if smoother is None:
@@ -213,7 +214,7 @@ class FastSlam:
 
     @property
     def smooths_incrementally(self) -> bool:
-        """Whether the filter keeps a smoother that works in slices, one at a time."""
+        """Whether the filter has a smoother that works in slices."""
         return self.state.rejuvenation is not None and self.options.smoothing.slice_steps is not None
 
     def request_rejuvenation(self) -> None:
@@ -223,14 +224,14 @@ class FastSlam:
 
     @property
     def rejuvenation_requested(self) -> bool:
-        """Whether `hasten` was called and nothing has come of it yet."""
+        """Whether `request_rejuvenation` was called and the rejuvenation is still outstanding."""
         return self.state.rejuvenation is not None and self.state.rejuvenation.requested
 
     # ------------------------------------------------------------------ estimates
 
     @property
     def options(self) -> FilterOptions:
-        """What the filter assumes and how it decides."""
+        """Assumptions and decision rules of the filter."""
         return self.state.options
 
     @property
@@ -250,18 +251,18 @@ class FastSlam:
 
     @property
     def num_landmarks(self) -> int:
-        """Landmarks that at least one particle holds."""
+        """Number of landmarks that at least one particle holds."""
         return int(np.count_nonzero(self.state.maps.ids >= 0))
 
     @property
     def map_size(self) -> int:
-        """Landmarks that the most probable particle holds: the length of `map()`."""
+        """Number of landmarks that the most probable particle holds: the length of `map()`."""
         slots = np.flatnonzero(self.state.maps.ids >= 0)
         return int(np.count_nonzero(self.state.maps.of_particle(self.state.best, slots)[1]))
 
     @property
     def map_capacity(self) -> int:
-        """Landmarks for which there is room: no particle holds more."""
+        """Largest number of landmarks that fit in the allocated arrays."""
         return int(self.state.maps.table.shape[1])
 
     @property
@@ -271,16 +272,16 @@ class FastSlam:
 
     @property
     def consistency(self) -> Consistency:
-        """Whether the filter errs as little as it claims, as far as its frames tell, and what to try if not."""
+        """Consistency of the filter in its frames so far, with advice if it is inconsistent."""
         return self.state.consistency.report()
 
     def log(self, robot: int = 0) -> RobotLog:
-        """Return what the robot did and measured so far: odometry, points, and the landmarks they were taken for."""
+        """Return a copy of a robot's log: odometry, measured points and their data association."""
         return self.state.logs[self._check_robot(robot)].copy()
 
     @property
     def nbytes(self) -> int:
-        """Memory that the particles hold [bytes]: mostly (72 + 4) per particle and landmark."""
+        """Memory of the particles [bytes]: mostly (72 + 4) per particle and landmark."""
         state = self.state
         return state.maps.nbytes + state.pose_arrays.nbytes + state.log_weights.nbytes + state.path_log_weights.nbytes
 
@@ -292,7 +293,7 @@ class FastSlam:
     def pose(self, robot: int = 0) -> PoseEstimate:
         """Return the mean and covariance of a robot's pose [m, m, rad] over all particles, map frame. Copies.
 
-        They are those of the mixture of N(x^, P^) before sampling, which scatters less than the samples.
+        They are those of the mixture of N(x^, P^) before sampling, which has less variance than the samples.
         """
         return self.state.estimates.of(self._check_robot(robot))
 
@@ -301,14 +302,14 @@ class FastSlam:
         return self._columns(self.state.poses[self._check_robot(robot)]), self.state.log_weights.copy()
 
     def start_pose(self, robot: int = 0) -> FloatArray:
-        """Return (3,) [m, m, rad] where the robot started, map frame, by the most probable particle. A copy."""
+        """Return the start pose (3,) [m, m, rad] of a robot, map frame, in the most probable particle. A copy."""
         return np.array(self.state.starts[self._check_robot(robot), :, self.state.best])
 
     def pose_from_start(self, robot: int = 0) -> PoseEstimate:
         """Return the mean and covariance of a robot's pose [m, m, rad] in its own start frame. Copies.
 
-        Each particle's pose is seen from where the robot started in that particle, so that what the filter does not
-        know of the start, after a merge, does not blur it.
+        Each particle's pose is taken relative to the robot's start pose in the same particle, so that the uncertainty
+        of the start after a merge does not enter.
         """
         index, every = self._check_robot(robot), tuple(range(self.num_robots))
         points = TeamPoses(len(every))
@@ -316,7 +317,7 @@ class FastSlam:
         return PoseEstimate(points.own[index].copy(), points.covariances[index].copy())
 
     def write_team_poses(self, names: tuple[int, ...], live: tuple[int, ...], ess: float, points: TeamPoses) -> None:
-        """Write where the robots stand, which the team calls by these names, of those that are live; `ess` as it is."""
+        """Write the poses of the robots in `live`; `names` are the team's indices of all, `ess` is copied."""
         state = self.state
         weights = NO_WEIGHTS if state.starts_at_origin else np.exp(state.log_weights)
         _kernels.write_team_poses(
@@ -325,7 +326,7 @@ class FastSlam:
         )  # fmt: skip
 
     def particles_from_start(self, robot: int = 0) -> FloatArray:
-        """Return a robot's poses (M, 3) [m, m, rad], each seen from where it started in that particle."""
+        """Return a robot's poses (M, 3) [m, m, rad], each relative to its start pose in the same particle."""
         starts = self._columns(self.state.starts[self._check_robot(robot)])
         return between(starts, self._columns(self.state.poses[robot]))
 
@@ -358,7 +359,7 @@ class FastSlam:
         return np.asarray(self.state.maps.descriptors[present_slots(self.state.maps, self.state.best, 1)])
 
     def map_summary(self, min_count: int = 1) -> MapSummary:
-        """Return the outline of `map(min_count=min_count)`, much faster. Fresh arrays."""
+        """Return the summary of `map(min_count=min_count)`, much faster. Fresh arrays."""
         rows = MapSummaryRows.allocate(self.map_capacity)
         return rows.part(0, write_summary(self.state.maps, self.state.best, min_count, rows, 0))
 
@@ -369,15 +370,15 @@ class FastSlam:
             ValueError: If the filter was built without `existence`.
         """
         if self.state.existence is None:
-            cure = "Build the filter with existence=ExistenceModel()."
-            raise argument_error("existence", "a filter that keeps it", "one that does not", cure)
+            hint = "Build the filter with existence=ExistenceModel()."
+            raise argument_error("existence", "a filter that estimates it", "a filter that does not", hint)
         maps, best = self.state.maps, self.state.best
         slots = maps.used_slots()
         slots = slots[maps.of_particle(best, slots)[1] > 0]
         return maps.ids[slots], 1.0 / (1.0 + np.exp(-maps.odds_of_particle(best, slots)))
 
     def _check_robot(self, robot: int) -> int:
-        """Return the index of a robot that there is."""
+        """Return the index of a robot, or raise if it is out of range."""
         if isinstance(robot, bool) or not isinstance(robot, (int, np.integer)) or not 0 <= robot < self.num_robots:
             raise argument_error("robot", f"an index from 0 to {self.num_robots - 1}", robot, "Count robots from 0.")
         return int(robot)
@@ -385,27 +386,27 @@ class FastSlam:
     # ------------------------------------------------------------------ snapshots
 
     def reorder(self, order: IntArray) -> None:
-        """Renumber the robots: robot i becomes the one that was `order[i]`; (K,) a permutation."""
+        """Renumber the robots: robot i is the former `order[i]`; (K,) a permutation."""
         self.state.reorder(order)
 
     def get_state(self) -> dict[str, Any]:
-        """Return all that decides how the filter goes on, its random stream included. Shares nothing with it."""
+        """Return the complete state of the filter, its random stream included. Nothing is shared."""
         return self.state.get_state()
 
     def set_state(self, state: Mapping[str, Any]) -> None:
-        """Go on exactly as the filter that gave `state`.
+        """Restore a state from `get_state`; the filter then continues identically.
 
         Raises:
-            ValueError: If `state` is not one of `get_state`.
+            ValueError: If `state` is not from `get_state`.
         """
         with refuse_malformed("state"):
             check_filter("state", state, (self.options,))
         if (last := max(map(last_step, state["logs"]))) >= state["steps"]:
-            raise argument_error("state['steps']", f"an int > {last}, the last step logged", state["steps"], CURE)
+            raise argument_error("state['steps']", f"an int > {last}, the last step logged", state["steps"], HINT)
         self.restore_checked(state)
 
     def restore_checked(self, state: Mapping[str, Any]) -> None:
-        """Go on from a state that was checked."""
+        """Restore a state that was validated."""
         previous = self.state
         self.state = FilterState.restored(state, previous)
         if self.state is not previous:

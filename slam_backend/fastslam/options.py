@@ -1,4 +1,4 @@
-"""What a `FastSlam` assumes and how it decides: one frozen, validated record."""
+"""Options of a `FastSlam`: one frozen, validated record."""
 
 from dataclasses import astuple, dataclass, field
 from typing import Literal
@@ -22,14 +22,14 @@ from slam_backend.resampling import RESAMPLING
 from slam_backend.smoother.options import SmoothingOptions
 
 PROPOSALS = ("fastslam2", "fastslam1")
-MAX_ROBOTS, MAX_PARTICLES = 1_000, 1_000_000  # memory ends before
+MAX_ROBOTS, MAX_PARTICLES = 1_000, 1_000_000  # beyond any memory
 CALIBRATED_NOISE = 0.005  # [m]; chosen on simulated stereo runs, see docs/explanation/smoothing.md
 
 
 @known_names
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FilterOptions:
-    """What a `FastSlam` assumes and how it decides; the arguments of `FastSlam` without the number of robots and seed.
+    """Assumptions and decision rules of a `FastSlam`: its arguments without the number of robots and the seed.
 
     Attributes:
         num_particles: M.
@@ -38,32 +38,31 @@ class FilterOptions:
         proposal: "fastslam2": the measurements shape the sampled pose. "fastslam1": poses are sampled from the motion
             model alone and association follows Algorithm 1 to the letter (as corrected).
         resampling: Scheme, a key of `slam_backend.resampling.RESAMPLING`.
-        resample_threshold: Resample when ESS / M falls below this; 1 = at every step with a measurement.
+        resample_threshold: ESS / M below which particles are resampled; 1 = at every step with a measurement.
         position_gate: D0, largest squared Mahalanobis distance of a match [-] (11.34: 99 % at 3 degrees of freedom).
         descriptor_gate: Square root of E0, largest L2 distance between matched descriptors [-].
-        new_landmark_gate: Measurements whose nearest candidate lies between `position_gate` and this are neither
-            matched nor new (`fastslam2`) [-].
+        new_landmark_gate: Upper end of the dead zone: measurements whose nearest candidate lies between `position_gate`
+            and this are neither matched nor new (`fastslam2`) [-].
         new_landmark_radius: Distance from a similar landmark within which no measurement is new (`fastslam2`) [m].
-        recovery_position: Where a pose this uncertain explains three or more measurements, and most of all that it can
-            explain, which a particle's stated uncertainty does not, the particle is lost and corrected from there
-            (`fastslam2`) [m]; 0: its own uncertainty is always believed.
-        recovery_heading: Likewise its heading [rad].
+        recovery_position: Position sigma of the prior for recovery (`fastslam2`) [m]. If a pose with this prior
+            explains at least three measurements and most of those it can explain, but the particle's own pose does not,
+            the particle is lost and re-localised from this prior. 0: no recovery.
+        recovery_heading: Heading sigma of the prior for recovery [rad].
         descriptor_sigma: L2 distance between descriptors that costs a match as much as one sigma of position
             (`fastslam2`) [-].
-        ambiguity_margin: A runner-up whose cost (squared Mahalanobis + log-determinant + descriptor) is nearer than
-            this makes a measurement ambiguous, and it is held back (`fastslam2`) [-].
+        ambiguity_margin: Least difference of cost (squared Mahalanobis + log-determinant + descriptor) to the second
+            best candidate; below it a measurement is ambiguous and rejected (`fastslam2`) [-].
         new_landmark_density: p0, density of measurements that match nothing [1/m^3].
         one_to_one: Match a landmark at most once in a frame; False: measurements choose independently, as in the paper.
-        landmark_noise: Standard deviation q [m] along each axis by which a landmark may move between two sightings: a
-            random walk, Sigma + q^2 I after each update, the first included. However often it is seen, its variance
-            then does not fall below the fixed point of Riccati's recursion. 0: landmarks stand still. None:
-            `CALIBRATED_NOISE` where particles are rejuvenated, for it makes honest what they claim in between, else 0:
-            a filter without smoother would only forget.
-        existence: How the probability that a landmark exists follows from being seen and missed; particles delete
-            landmarks that are too improbable. None: what is once in a map stays there.
-        rejuvenate_every: Steps after which particles are drawn anew from the posterior of whole paths, as a smoother
-            finds it; also at the first step after a merge, and sooner when a loop is closed. None: never.
-        smoothing: How that is done.
+        landmark_noise: Standard deviation q [m] along each axis of a landmark's random walk between two sightings:
+            Sigma + q^2 I after each update, the first included. The variance then never falls below the fixed point of
+            the Riccati recursion. 0: static landmarks. None: `CALIBRATED_NOISE` if particles are rejuvenated, where it
+            keeps the covariances consistent in between, else 0: without a smoother the filter would only forget.
+        existence: Detection model that updates the probability of existence of landmarks; particles delete improbable
+            ones. None: landmarks are never deleted.
+        rejuvenate_every: Steps after which particles are sampled from the smoother's posterior of whole paths; also at
+            the first step after a merge, and sooner after a loop closure. None: never.
+        smoothing: Options of the smoother.
     """
 
     num_particles: int = 100
@@ -88,8 +87,8 @@ class FilterOptions:
     smoothing: SmoothingOptions = field(default_factory=SmoothingOptions)
 
     def __post_init__(self) -> None:
-        cure = "Use at least one particle; 100 is a good start."
-        check_int("num_particles", self.num_particles, 1, cure, MAX_PARTICLES)
+        hint = "Use at least one particle; 100 is a good start."
+        check_int("num_particles", self.num_particles, 1, hint, MAX_PARTICLES)
         for name, kind in (("camera", StereoCamera), ("motion", OdometryModel)):
             if not isinstance(getattr(self, name), kind):
                 raise argument_error(
@@ -110,15 +109,17 @@ class FilterOptions:
         for name in ("recovery_position", "recovery_heading"):
             check_float(name, getattr(self, name), "Use 0 to switch it off.", at_least=0.0, at_most=LARGEST_SIGMA)
         if self.landmark_noise is not None:
-            cure = "Use 0 for landmarks that stand still."
-            check_float("landmark_noise", self.landmark_noise, cure, at_least=0.0, at_most=LARGEST_SIGMA)
-        check_float("ambiguity_margin", self.ambiguity_margin, "Use 0 to hold nothing back.", at_least=0.0)
+            hint = "Use 0 for landmarks that stand still."
+            check_float("landmark_noise", self.landmark_noise, hint, at_least=0.0, at_most=LARGEST_SIGMA)
+        check_float(
+            "ambiguity_margin", self.ambiguity_margin, "Use 0 to reject no ambiguous measurement.", at_least=0.0
+        )
         existence: object = self.existence
         if not isinstance(existence, ExistenceModel | None):
-            cure = "Build one: ExistenceModel()."
-            raise argument_error("existence", "ExistenceModel or None", self.existence, cure)
+            hint = "Build one: ExistenceModel()."
+            raise argument_error("existence", "ExistenceModel or None", self.existence, hint)
         if self.existence is not None:
-            self.existence.view(self.camera)  # raises if nothing is left of the view
+            self.existence.view(self.camera)  # raises if the view is empty
         if self.rejuvenate_every is not None:
             check_int("rejuvenate_every", self.rejuvenate_every, 1, "Give a number of steps, or None for never.", MOST)
         if not isinstance(self.smoothing, SmoothingOptions):
@@ -141,11 +142,11 @@ def packed_camera(camera: StereoCamera) -> FloatArray:
 
 
 def pack_options(options: FilterOptions) -> FloatArray:
-    """Return what a filter assumes, (27,) float64, as `_kernels.layout` names the numbers.
+    """Return the options of a filter as numbers, (27,) float64, named in `_kernels.layout`.
 
-    The noise of the odometry (6,), see `OdometryModel`; of the camera (7,) the focal length [px], the baseline [m], the
-    sigmas of image coordinates and of the disparity [px], and the mount [m]; the sigmas (3,) [m, m, rad] of the prior
-    of a lost pose; then one number each.
+    These are the noise of the odometry (6,), see `OdometryModel`; of the camera (7,) the focal length [px], the
+    baseline [m], the sigmas of image coordinates and of the disparity [px], and the mount [m]; the sigmas (3,)
+    [m, m, rad] of the prior for recovery; then one number each.
     """
     return np.array([
         *astuple(options.motion),
@@ -160,7 +161,7 @@ def pack_options(options: FilterOptions) -> FloatArray:
 
 
 def robot_batches(num_robots: int, one_by_one: bool) -> tuple[tuple[int, int, bool], ...]:
-    """Return whose turns are taken in each call of a step, from which robot to before which, and if it is over then."""
+    """Return for each kernel call of a step its first robot, the end of its robots, and whether it ends the step."""
     if one_by_one:
         return (*((robot, robot + 1, False) for robot in range(num_robots)), (num_robots, num_robots, True))
     return ((0, num_robots, True),)

@@ -1,11 +1,11 @@
 """Landmarks of all particles: storage, lazy resampling, and the map of the best particle.
 
-A *slot* is one landmark of the joint map; its values lie in a *row* of `values` and `counts`, one entry per particle. A
-resampling moves no row. Instead each slot says by which *ancestor map* its row is to be read: particle m's values are
-those at `maps[map_of[slot], m]`; map 0 stands for the identity. Slots last brought up to date at the same time share a
-map, and a resampling composes the maps in use with its own ancestors: O(maps M) small integers in place of O(N M)
-landmarks. A frame touches only its candidates: their rows are copied, through their maps, to free ones, and from then
-on every particle's values are at its own place. So no two particles ever share what one of them writes.
+A *slot* is one landmark of the joint map; its values lie in a *row* of `values` and `counts`, one entry per particle.
+Resampling moves no row. Instead each slot refers to an *ancestor map* for reading its row: the values of particle m are
+at `maps[map_of[slot], m]`; map 0 is the identity. Slots that were last refreshed at the same time share a map.
+Resampling composes the maps in use with its ancestors: O(maps M) small integers in place of O(N M) landmarks. A frame
+touches only its candidates: their rows are copied, through their maps, to free rows, after which the values of each
+particle are at its own place. Thus no two particles share values that one of them writes.
 """
 
 import math
@@ -24,7 +24,7 @@ from slam_backend.maps.landmark_map import MapSummaryRows
 
 
 def empty_aligned(shape: tuple[int, ...], dtype: Any) -> Any:
-    """Return an array, yet to be written, that starts at a cache line: vectors that straddle two are slow."""
+    """Return an uninitialised array that starts at a cache line: vectors that straddle two lines are slow."""
     kind = np.dtype(dtype)
     size = math.prod(shape) * kind.itemsize
     raw = np.empty(size + LINE, dtype=np.uint8)
@@ -33,27 +33,27 @@ def empty_aligned(shape: tuple[int, ...], dtype: Any) -> Any:
 
 
 def zeros_aligned(shape: tuple[int, ...], dtype: Any) -> Any:
-    """Return zeros of a shape and a numpy type that start at a cache line."""
+    """Return zeros of a shape and a numpy type, aligned to a cache line."""
     array = empty_aligned(shape, dtype)
     array.fill(0)
     return array
 
 
 def _num_heads(descriptor_size: int) -> int:
-    """Return how many components of a descriptor are compared first: half where they are many.
+    """Return how many components of a descriptor are compared first: half of a long descriptor.
 
-    Descriptors of one building have much in common: by a quarter of 64 three landmarks in four would still be in
-    question, by half of them one in thirty.
+    Descriptors of one building have much in common: with a quarter of 64 components three landmarks in four would still
+    be candidates, with half of them one in thirty.
     """
     return descriptor_size // 2 if descriptor_size >= 32 and descriptor_size % 2 == 0 else descriptor_size
 
 
 class MapStore:
-    """Landmark Gaussians, counts, descriptors and names of all particles; `_particle_maps` says how they are read.
+    """Storage of the landmark Gaussians, counts, descriptors and names of all particles; see the module.
 
     Args:
         num_particles: M.
-        log_odds_prior: Of the existence of a new landmark; None: existence is not kept.
+        log_odds_prior: Log-odds of the existence of a new landmark; None: existence is not estimated.
 
     Attributes:
         padded: P, M rounded up to whole blocks of lanes.
@@ -72,7 +72,7 @@ class MapStore:
         self._clear(num_particles)
 
     def _clear(self, num_particles: int) -> None:
-        """Hold nothing, for M particles."""
+        """Allocate empty arrays for M particles."""
         self.num_particles = num_particles
         self.padded = -(-num_particles // LANES) * LANES
         self.values: FloatArray = empty_aligned((0,), np.float64)
@@ -119,12 +119,12 @@ class MapStore:
 
     @property
     def next_id(self) -> int:
-        """The name that the next landmark will get."""
+        """Name of the next landmark."""
         return int(self.tops[2])
 
     @property
     def nbytes(self) -> int:
-        """Memory held [bytes]."""
+        """Memory in use [bytes]."""
         arrays = (
             self.values, self.counts, self.maps, self.users, self.table, self.descriptors, self.heads, self.free_rows,
             self.odds,
@@ -145,18 +145,18 @@ class MapStore:
         return self.values.reshape(-1, self.padded // LANES, 9, LANES)
 
     def used_slots(self) -> IntArray:
-        """Return the slots that hold a landmark of at least one particle, by ascending id."""
+        """Return the slots of landmarks that at least one particle holds, by ascending id."""
         used = np.flatnonzero(self.ids >= 0)
         return used[np.argsort(self.ids[used])]
 
-    # ------------------------------------------------------------------ room
+    # ------------------------------------------------------------------ capacity
 
     def reserve(self, new: int, descriptor_size: int) -> None:
-        """See to it that `new` landmarks can start, and a row is left to bring landmarks up to date.
+        """Provide slots and rows for `new` landmarks, and one row for refreshing landmarks.
 
         Args:
-            new: How many at most.
-            descriptor_size: d of the landmarks; that of the map, if there are any.
+            new: Largest number of new landmarks.
+            descriptor_size: Length d of their descriptors, equal to that in the map unless that is empty.
         """
         rows, slots, _ = self.tops.tolist()
         if slots < new:
@@ -165,13 +165,13 @@ class MapStore:
             self._grow_rows(max(64, len(self.counts), new + 1))
 
     def _begin(self, new: int, descriptor_size: int) -> None:
-        """Begin with `new` landmarks in the lowest slots and rows, yet to be written; arrays with room are used again.
+        """Assign the lowest slots and rows to `new` landmarks, yet to be written; large enough arrays are reused.
 
-        New ones have room for half as many landmarks more: the first to come shall not move all.
+        New arrays have space for half as many landmarks more, so that the next landmark does not move all.
 
         Args:
-            new: How many.
-            descriptor_size: d.
+            new: Number of landmarks.
+            descriptor_size: Length d of the descriptors.
         """
         if min(len(self.ids), len(self.counts)) < new or self.descriptors.shape[1] != descriptor_size:
             self._clear(self.num_particles)
@@ -187,7 +187,7 @@ class MapStore:
         self.tops[:2] = rows - new, slots - new
 
     def _grow_slots(self, extra: int, descriptor_size: int) -> None:
-        """Provide so many more slots, with room for descriptors of that size."""
+        """Add `extra` slots for descriptors of the given length."""
         old = len(self.ids)
         table = np.zeros((len(self.table), old + extra), dtype=np.int64)
         table[:, :old] = self.table
@@ -214,7 +214,7 @@ class MapStore:
         self.tops[1] = extra + top
 
     def _grow_rows(self, extra: int) -> None:
-        """Provide so many more rows, written as a whole when they are taken."""
+        """Add `extra` rows, uninitialised."""
         old, padded = len(self.counts), self.padded
         values = empty_aligned(((old + extra) * 9 * padded,), np.float64)
         values[: len(self.values)] = self.values
@@ -229,35 +229,35 @@ class MapStore:
         self.tops[0] = extra + top
 
     def _set_descriptor_prefixes(self, n: int) -> None:
-        """Write the heads of the first n slots; the others are free."""
+        """Write the heads of the first n slots and mark the others free."""
         if len(self.heads):
             self.heads[:, :n] = self.descriptors[:n, :: self.descriptors.shape[1] // len(self.heads)].T
             self.heads[:, n:] = _kernels.FAR
 
 
-MAX_MAPS = 512  # slots whose map is the oldest are brought up to date rather than keep more maps than this
-MAPS_KEPT = (  # in a state
+MAX_MAPS = 512  # limit of ancestor maps; beyond it the slots of the least used maps are refreshed
+MAPS_KEPT = (  # parts of a state
     "num_particles", "values", "counts", "odds", "maps", "map_of", "ids", "identities", "last_seen", "descriptors",
     "next_id",
 )  # fmt: skip
 
 
 class ParticleMaps(MapStore):
-    """The landmarks of all particles, each of which has its own values of them.
+    """Landmarks of all particles, with separate values for each particle.
 
     Args:
         num_particles: M.
-        log_odds_prior: Of the existence of a new landmark; None: existence is not kept.
+        log_odds_prior: Log-odds of the existence of a new landmark; None: existence is not estimated.
     """
 
     # ------------------------------------------------------------------ resampling
 
     def resample(self, ancestors: IntArray, of_robots: FloatArray, of_particles: FloatArray) -> int:
-        """Let each particle become a copy of its ancestor, weighed alike; return the most probable one.
+        """Replace each particle by its ancestor, with equal weights; return the most probable one.
 
         Args:
             ancestors: (M,) ascending.
-            of_robots, of_particles: What else particles hold, see `FilterArrays`.
+            of_robots, of_particles: Pose and weight arrays of the filter, see `FilterState`.
         """
         if not self._free_maps:
             self._make_maps()
@@ -266,7 +266,7 @@ class ParticleMaps(MapStore):
         return best
 
     def _make_maps(self) -> None:
-        """Provide a free map, by one more or by bringing slots up to date."""
+        """Provide a free ancestor map, by allocation or by refreshing slots."""
         if len(self.users) > MAX_MAPS:
             self._refresh_oldest()
         else:
@@ -275,13 +275,13 @@ class ParticleMaps(MapStore):
             self.users = np.concatenate([self.users, np.zeros(extra, dtype=np.int64)])
 
     def _refresh_oldest(self) -> None:
-        """Bring up to date the slots of the maps with the fewest users, a quarter of them."""
+        """Refresh the slots of the quarter of the maps with the fewest users."""
         order = np.argsort(np.where(self.users[1:] > 0, self.users[1:], np.iinfo(np.int64).max))
         chosen = order[: MAX_MAPS // 4] + 1
         self.refresh(np.flatnonzero(np.isin(self.map_of, chosen) & (self.ids >= 0)))
 
     def refresh(self, slots: IntArray) -> None:
-        """Bring slots up to date: afterwards they are read in place."""
+        """Copy slots through their ancestor maps, so that each particle's values are at its own place."""
         if not self.tops[0]:
             self._grow_rows(64)
         _kernels.apply_resampling(slots, self.arrays)
@@ -289,7 +289,7 @@ class ParticleMaps(MapStore):
     # ------------------------------------------------------------------ existence
 
     def add_odds(self, new_slots: IntArray) -> None:
-        """Give landmarks that were just started their prior; -1 among `new_slots` stands for none."""
+        """Set the log-odds of new landmarks to the prior; -1 among `new_slots` = none."""
         self.odds[new_slots[new_slots >= 0]] = self.log_odds_prior
 
     def odds_of_particle(self, m: int, slots: IntArray) -> FloatArray:
@@ -297,7 +297,7 @@ class ParticleMaps(MapStore):
         return np.asarray(self.odds[slots, np.where(self.map_of[slots] > 0, self.maps[self.map_of[slots], m], m)])
 
     def dense_odds(self, slots: IntArray) -> FloatArray | None:
-        """Return the log-odds (n, M) of slots (n,) in all particles, None where existence is not kept. A copy."""
+        """Return the log-odds (n, M) of slots (n,) in all particles, None if existence is not estimated. A copy."""
         if self.log_odds_prior is None:
             return None
         self.refresh(slots)
@@ -328,15 +328,15 @@ class ParticleMaps(MapStore):
         self, counts: NDArray[np.integer[Any]], descriptors: NDArray[np.float32], ids: IntArray, identities: IntArray,
         next_id: int, odds: FloatArray | None = None, last_seen: IntArray | None = None,
     ) -> None:  # fmt: skip
-        """Replace all landmarks by these but for the values: the first n of `blocks` are then to be written.
+        """Replace all landmarks, except for the values: the caller then writes the first n of `blocks`.
 
         Args:
-            counts: (n, M), or (n, 1) where all particles have the same; 0 where a particle lacks the landmark. Each
-                landmark is held by a particle.
+            counts: (n, M), or (n, 1) if all particles have the same. Measurement counts, 0 where a particle lacks the
+                landmark; at least one particle holds each landmark.
             descriptors: (n, d) float32.
             ids, identities: (n,) int64. Stable names, and the caller's own, -1 = none.
-            next_id: The name that the next landmark will get.
-            odds: (n, M) float64, log-odds of existence; None: where existence is kept, landmarks get the prior.
+            next_id: Name of the next landmark.
+            odds: (n, M) float64, log-odds of existence; None: the prior, if existence is estimated.
             last_seen: (n,) int64, see `MapStore`; None: never.
         """
         n, m = len(ids), self.num_particles
@@ -352,11 +352,11 @@ class ParticleMaps(MapStore):
     # ------------------------------------------------------------------ snapshots
 
     def get_state(self) -> dict[str, Any]:
-        """Return all that decides how the maps go on, compact and shared with nothing."""
+        """Return the complete state of the maps, compact; nothing is shared."""
         used = self.used_slots()
         of, rows = self.map_of[used], self.row_of[used]
         live, first = np.unique(of[of > 0], return_index=True)
-        live = live[np.argsort(first)]  # by their first users: equal maps give equal states
+        live = live[np.argsort(first)]  # ordered by their first users: equal maps give equal states
         number = np.zeros(len(self.users), dtype=np.int64)
         number[live] = np.arange(1, len(live) + 1)
         return {
@@ -374,7 +374,7 @@ class ParticleMaps(MapStore):
         }
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Go on as the maps that gave `state`; rows already allocated are used again."""
+        """Restore the maps from `get_state`; allocated rows are reused."""
         n, m, maps = len(state["ids"]), int(state["num_particles"]), state["maps"]
         if m != self.num_particles:
             self._clear(m)
@@ -393,17 +393,17 @@ class ParticleMaps(MapStore):
 
 
 def write_summary(maps: ParticleMaps, m: int, min_count: int, rows: MapSummaryRows, first: int) -> int:
-    """Write the outline of `best_map`, which takes the same: the same landmarks in the same order.
+    """Write the summary of `best_map`, with the same arguments: the same landmarks in the same order.
 
     Args:
-        maps: Of all particles.
-        m: Which of them.
-        min_count: What it measured fewer times is left out.
-        rows: Written to, as far as there are rows.
-        first: From this row on.
+        maps: Maps of all particles.
+        m: Index of the particle.
+        min_count: Least number of measurements of a landmark in the summary.
+        rows: Arrays to write, as far as they reach.
+        first: First row to write.
 
     Returns:
-        The row after the last, be it there or not.
+        The row after the last, which may lie beyond the arrays.
     """
     last, ascending = _kernels.map_summary(maps.table, maps.maps, maps.values, maps.counts, m, min_count, *rows, first)
     if not ascending:
@@ -420,12 +420,12 @@ def present_slots(maps: ParticleMaps, m: int, min_count: int) -> IntArray:
 
 
 def best_map(maps: ParticleMaps, m: int, min_count: int) -> tuple[FloatArray, FloatArray, Any, IntArray, IntArray]:
-    """Return what one particle holds, by ascending id.
+    """Return the map of one particle, by ascending id.
 
     Args:
-        maps: Of all particles.
-        m: Which of them.
-        min_count: What it measured fewer times is left out.
+        maps: Maps of all particles.
+        m: Index of the particle.
+        min_count: Least number of measurements of a landmark in the result.
 
     Returns:
         Means (n, 3) [m], covariances (n, 3, 3) [m^2], map frame, descriptors (n, d) float32, counts (n,) and ids (n,):

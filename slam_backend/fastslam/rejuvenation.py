@@ -1,4 +1,4 @@
-"""Rejuvenation of a filter: when the smoother runs, what it reads, and how its samples replace the particles."""
+"""Rejuvenation of a filter: schedule and inputs of the smoother, and replacement of the particles by its samples."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -28,14 +28,14 @@ from slam_backend.smoother.rejuvenation import Draft, LandmarkDescriptors, Parti
 
 
 def landmark_positions(maps: ParticleMaps, best: int) -> LandmarkPositions:
-    """Return where the most probable particle holds its landmarks to be."""
+    """Return the landmark positions in the most probable particle."""
     rows = MapSummaryRows.allocate(len(maps.ids))
     num = write_summary(maps, best, 1, rows, 0)
     return LandmarkPositions(rows.counts_and_ids[:num, 1].copy(), rows.positions[:num, :3].copy())
 
 
 def landmark_table(maps: ParticleMaps, best: int) -> LandmarkTable:
-    """Return what the most probable particle knows of the landmarks that no caller has named."""
+    """Return the landmarks of the most probable particle that have no caller's name."""
     slots = maps.used_slots()
     slots = slots[maps.identities[slots] < 0]
     values, counts = maps.of_particle(best, slots)
@@ -45,14 +45,14 @@ def landmark_table(maps: ParticleMaps, best: int) -> LandmarkTable:
 
 
 def landmark_descriptors(maps: ParticleMaps, gate: float) -> LandmarkDescriptors:
-    """Return the appearance of landmarks that no caller has named; beyond the gate two do not look alike."""
+    """Return the descriptors of landmarks without a caller's name; the gate limits the distance of similar ones."""
     slots = maps.used_slots()
     slots = slots[maps.identities[slots] < 0]
     return LandmarkDescriptors(maps.ids[slots], maps.descriptors[slots], gate)
 
 
 def log_tails(logs: Sequence[RobotLog], graph: SlamGraph, until: SlamGraph | None = None) -> list[LogArrays]:
-    """Return what the logs hold after a graph's last steps, up to another's."""
+    """Return the entries of the logs after a graph's last steps, up to those of another."""
     new = [log.arrays(int(latest) + 1) for log, latest in zip(logs, graph.latest, strict=True)]
     if until is None:
         return new
@@ -61,7 +61,7 @@ def log_tails(logs: Sequence[RobotLog], graph: SlamGraph, until: SlamGraph | Non
 
 
 def max_pending_steps(logs: Sequence[RobotLog], graph: SlamGraph) -> int:
-    """Return how many steps after the last ones of a graph the log has that holds most of them."""
+    """Return the largest number of steps in a log after a graph's last ones."""
     return max(log.num_since(step + 1) for log, step in zip(logs, graph.latest.tolist(), strict=True))
 
 
@@ -69,16 +69,16 @@ XX, YY, ZZ = 3, 6, 8  # the diagonal of a landmark's covariance, in the rows of 
 
 
 def write_maps(maps: ParticleMaps, best: int, particles: Particles, walk: float) -> None:
-    """Give all particles the landmarks of their paths: those that the most probable one held and a sighting supports.
+    """Write to all particles the landmarks of their paths: those of the most probable one that a sighting supports.
 
-    What only others held was a mistake, as far as is known: the log's association is that of the most probable. Names,
-    descriptors and odds stay; where a landmark's odds differ between particles, all get the mean of those that held it.
-    To the smoother landmarks stand still; that they may move until they are seen the next time is added here.
+    Landmarks of other particles only are dropped: the log holds the data association of the most probable one. Names,
+    descriptors and odds stay; where a landmark's odds differ between particles, all get the mean of those that hold it.
+    The smoother assumes static landmarks; their random walk until the next sighting is added here.
 
     Args:
-        maps: Of the filter, changed.
-        best: Its most probable particle.
-        particles: The new ones.
+        maps: Maps of the filter, changed.
+        best: Index of its most probable particle.
+        particles: The new particles.
         walk: Variance [m^2] along each axis, see `FilterOptions.landmark_walk`.
     """
     slots = present_slots(maps, best, 1)
@@ -99,7 +99,7 @@ def write_maps(maps: ParticleMaps, best: int, particles: Particles, walk: float)
 
 @in_place
 def write_tiles(tiles: FloatArray, rows: IntArray, walk: float, blocks: FloatArray) -> None:
-    """Write some landmarks of new particles, with a variance [m^2] along each axis added to theirs.
+    """Write landmarks of new particles, with a variance [m^2] along each axis added.
 
     Args:
         tiles: (l, P / lanes, 9, lanes) means and covariances.
@@ -117,59 +117,57 @@ def write_tiles(tiles: FloatArray, rows: IntArray, walk: float, blocks: FloatArr
 
 
 def joint_graph(
-    own: SlamGraph, other: SlamGraph, starts: Sequence[FloatArray], frames: tuple[FloatArray, FloatArray],
+    graph_a: SlamGraph, graph_b: SlamGraph, starts: Sequence[FloatArray], frames: tuple[FloatArray, FloatArray],
     renamed: IntArray, camera: FloatArray, options: SmoothingOptions,
 ) -> tuple[SlamGraph, FloatArray]:  # fmt: skip
     """Return the graph of both groups' robots, and the motion (3,) [m, m, rad] from b's frame to a's.
 
     Args:
-        own, other: Graphs of groups a and b, in their frames.
-        starts: Three arrays (K, 3, M): where the robots of a, of b, and of both, a's first, started; in a's frame, in
-            b's, in a's.
-        frames: Two covariances (3, 3) of what a's and b's particles do not show of their maps' frames.
+        graph_a, graph_b: Graphs of groups a and b, in their frames.
+        starts: Start poses, three arrays (K, 3, M): of the robots of a, in a's frame; of b, in b's; of both, a's first,
+            in a's.
+        frames: Gauge covariances (3, 3) of a's and b's maps, not represented by the particles.
         renamed: (n, 2) rows (name in b, name in the joint map).
         camera: (7,) as kernels take it.
-        options: How many keys; in slices either graph is first thinned to its share where both have too many.
+        options: Options of the smoother. With slices and too many keyframes, each graph is first reduced to its share.
     """
     robots = len(starts[2])
-    if options.slice_steps is not None and own.num_keys + other.num_keys > options.most_keys(robots):
-        own, other = (_thinned(graph, robots, camera, options) for graph in (own, other))
-    robot = int(np.flatnonzero(other.parents[other.first_keys] < 0)[0])  # one that defines b's frame
+    if options.slice_steps is not None and graph_a.num_keys + graph_b.num_keys > options.most_keys(robots):
+        graph_a, graph_b = (_thinned(graph, robots, camera, options) for graph in (graph_a, graph_b))
+    robot = int(np.flatnonzero(graph_b.parents[graph_b.first_keys] < 0)[0])  # one that defines b's frame
     start = starts[2][len(starts[0]) + robot]
-    began = other.poses[
-        other.first_keys[robot]
-    ].copy()  # can be written: `add_gauge_covariance` is compiled for such arrays alone
+    began = graph_b.poses[graph_b.first_keys[robot]].copy()  # writable, as `add_gauge_covariance` is compiled for
     motion = compose(mean_pose(start), inverse(began))
     spreads = scattered(start)[None], np.zeros((1, 3, 3))
     for frame, pose, spread in zip(frames, (mean_pose(start), began), spreads, strict=True):
         _kernels.add_gauge_covariance(frame, pose[None], spread)
     spread = spreads[0][0] + rotate_covariances(float(motion[2]), spreads[1][0])
-    return merge_graphs(own, other, motion, renamed, spread), motion
+    return merge_graphs(graph_a, graph_b, motion, renamed, spread), motion
 
 
 def _thinned(graph: SlamGraph, robots: int, camera: FloatArray, options: SmoothingOptions) -> SlamGraph:
-    """Return a graph with no more than its share of all robots' keys."""
+    """Return a graph reduced to its share of the keyframes of all robots."""
     share = len(graph.last_keys) / robots
     keys, fresh = max(2, int(share * options.most_keys(robots))), max(1, int(share * options.recent_keys))
     return reduce_keyframes(graph, camera, replace(options, max_keys=keys, further_keys=0, recent_keys=fresh))
 
 
-MIN_CLOSURE_MATCHES = 3  # landmarks not seen for long that are matched in one step: a loop is closed
-MIN_INTERVAL_FRACTION = 5  # after a fifth of the usual time at the earliest
-MIN_ROWS = 8  # of each log in a slice, so that no more of them come while it is worked through
-MAX_FAILURES = 2  # descents that fail in a row, where all is done at once, before something is given up
+MIN_CLOSURE_MATCHES = 3  # matches with landmarks not seen for long that count as a loop closure in one step
+MIN_INTERVAL_FRACTION = 5  # a loop closure shortens the interval to a fifth at most
+MIN_ROWS = 8  # least steps of each log in a slice, so that the work keeps up with the input
+MAX_FAILURES = 2  # failed optimisations in a row, without slices, before measurements are dropped
 SCHEDULE = ("_asked", "_waited", "_read", "_closed", "_failures", "_exact", "_last_closing", "steps")
 
 
 class RejuvenationScheduler:
-    """The smoother of one filter, its schedule, and where the robots were thought to be since it last ran.
+    """Smoother of one filter, its schedule, and initial poses of the steps since it last ran.
 
     Args:
-        options: Of the filter, with `rejuvenate_every` set.
+        options: Options of the filter, with `rejuvenate_every` set.
         num_robots: K.
 
     Attributes:
-        steps: How many were counted.
+        steps: Number of steps recorded.
     """
 
     def __init__(self, options: FilterOptions, num_robots: int) -> None:
@@ -177,25 +175,25 @@ class RejuvenationScheduler:
         self.steps = 0
         self._options = options
         self._every = options.rejuvenate_every
-        self._share = max(MIN_ROWS, (options.smoothing.slice_steps or 0) // num_robots)  # steps a slice takes in
+        self._share = max(MIN_ROWS, (options.smoothing.slice_steps or 0) // num_robots)  # steps of a robot in a slice
         self._noiseless = options.motion.is_noiseless
         self._graph: SlamGraph | None = None  # at its mode
-        self._oldest = -1  # of the robots' newest steps there
-        self._draft: Draft | None = None  # the same and a little more, on its way there
-        self._asked = False  # for new particles now, whatever has been read since
-        self._waited = 0  # steps since the last time
+        self._oldest = -1  # least of the robots' last steps in the graph
+        self._draft: Draft | None = None  # the graph with new steps, before convergence
+        self._asked = False  # rejuvenation requested
+        self._waited = 0  # steps since the last rejuvenation
         self._read = 0  # measurements since then
-        self._closed = False
-        self._failures = 0  # descents in a row
-        self._exact = False  # a pose was given as exact: there never will be
-        self._last_closing = 0  # step in which landmarks not seen for long were matched
+        self._closed = False  # loop closure since then
+        self._failures = 0  # failed optimisations in a row
+        self._exact = False  # an exact pose disables rejuvenation for good
+        self._last_closing = 0  # last step with matches of landmarks not seen for long
         self._guesses = [InitialPoses.empty() for _ in range(num_robots)]
         self._refused: list[dict[int, RejectedMeasurements]] = [{} for _ in range(num_robots)]
 
     # ------------------------------------------------------------------ in each step
 
     def add_initial_poses(self, robot: int, steps: IntArray, poses: FloatArray, is_placed: bool) -> None:
-        """Remember where a robot was thought to be (n, 3) after steps (n,) in which it read something, or was told."""
+        """Record the estimated poses (n, 3) of a robot after steps (n,) with input; `is_placed` marks exact poses."""
         if is_placed:
             self._exact = True
             self._guesses = [InitialPoses.empty() for _ in self._guesses]
@@ -205,41 +203,41 @@ class RejuvenationScheduler:
             self._guesses[robot] = self._guesses[robot].with_later(steps, poses)
 
     def add_rejected(self, robot: int, step: int, ids: IntArray, descriptors: NDArray[np.float32]) -> None:
-        """Remember what was neither matched nor new of all that a robot measured without names: ids (n,), looks."""
+        """Record which of a robot's measurements without names were neither matched nor new, by their ids (n,)."""
         refused = [row for row, name in enumerate(ids.tolist()) if name < 0]
         if refused and not self._why_disabled:
             rows = np.array(refused)
             self._refused[robot][step] = with_read_only(RejectedMeasurements(rows, descriptors[rows]))
 
     def record_step(self, matched: int, long_unseen: int) -> None:
-        """Count a step, what was matched or started in it, and how much of it to landmarks not seen for long."""
+        """Record a step: number of measurements matched or new, and of matches with landmarks not seen for long."""
         self.steps += 1
         self._waited += 1
         self._read += matched
         after = self._options.smoothing.closure_after
         if after > 0 and long_unseen >= MIN_CLOSURE_MATCHES:
-            self._closed |= 2 * (self.steps - self._last_closing) > after  # else it is the same one that goes on
+            self._closed |= 2 * (self.steps - self._last_closing) > after  # otherwise the same loop closure goes on
             self._last_closing = self.steps
 
     def request(self) -> None:
-        """Be due now, as before a merge."""
+        """Make a rejuvenation due now, as before a merge."""
         self._asked = True
 
     @property
     def requested(self) -> bool:
-        """Whether it was told to `hasten`, and nothing has come of it yet."""
+        """Whether `request` was called and the rejuvenation is still outstanding."""
         return self._asked
 
     @property
     def _why_disabled(self) -> str:
-        """Why there never will be new particles; "" if there may be."""
+        """Reason why rejuvenation is impossible; "" if it is possible."""
         if self._exact:
             return "poses that were given as exact"
         return "odometry without noise" if self._noiseless else ""
 
     @property
     def is_due(self) -> bool:
-        """Whether it is time for new particles."""
+        """Whether a rejuvenation is due."""
         if self._asked:
             return True
         haste = MIN_INTERVAL_FRACTION if self._closed else 1
@@ -250,13 +248,13 @@ class RejuvenationScheduler:
         return haste * smoothing.effort * self._read >= sightings
 
     def is_waiting(self, step: int) -> bool:
-        """Return whether there is nothing to do after a step, whatever the logs hold up to it; else see `rests`."""
+        """Return whether nothing is due after a step for any content of the logs; a fast check before `is_idle`."""
         if self._graph is None or self._draft is not None or step - self._oldest >= self._share:
             return False
         return not self.is_due
 
     def is_idle(self, logs: Sequence[RobotLog]) -> bool:
-        """Return whether there is nothing to do now: the rule. Else it is due, or a slice of the work can be done."""
+        """Return whether neither a rejuvenation nor a slice of work is due now."""
         if self.is_due:
             return False
         if self._exact or self._noiseless or self._options.smoothing.slice_steps is None:
@@ -266,32 +264,32 @@ class RejuvenationScheduler:
         for log, step in zip(logs, self._graph.latest.tolist(), strict=True):
             if log.last_step - step >= self._share:
                 return max_pending_steps(logs, self._graph) < self._share
-        return True  # there cannot be more of them, and to count costs more
+        return True  # no log has more, and counting costs more
 
-    # ------------------------------------------------------------------ where there is time for it
+    # ------------------------------------------------------------------ smoothing
 
     def run(
         self, logs: Sequence[RobotLog], starts: FloatArray, held: BoolArray, maps: ParticleMaps, best: int,
         camera: FloatArray, rng: np.random.Generator,
     ) -> Rejuvenation | None:  # fmt: skip
-        """Do all that is due, or a slice of it, if it does not rest; return None if there is nothing to tell of it.
+        """Run what is due, at once or as one slice; return None if there is nothing to report.
 
         Args:
-            logs: Per robot.
-            starts: (K, 3, M) where the robots started, map frame.
-            held: (K,) whether these are held, see `fix_start`.
-            maps: Of the present particles; only looked at.
-            best: The most probable of them.
+            logs: Log of each robot.
+            starts: (K, 3, M) start poses, map frame.
+            held: (K,) whether each start pose has a covariance in `FilterState.start_covariances`.
+            maps: Maps of the present particles; not changed.
+            best: Index of the most probable particle.
             camera: (7,) as kernels take it.
             rng: Source of the draws.
         """
         options = self._options
         graph = SlamGraph.at_uncertain_starts(starts, held) if self._graph is None else self._graph
         if self._exact or (self._graph is None and any(log.has_exact_poses for log in logs)):
-            self._exact = True  # nobody may have noted it: a filter that is never rejuvenated is asked to, by a merge
+            self._exact = True  # not recorded yet by the temporary scheduler of a filter without rejuvenation
         if reason := self._why_disabled:
             self._restart_interval()
-            return _told(graph, reason)
+            return _failed(graph, reason)
         smoother = Smoother(options.motion, camera, options.smoothing, rng)
         if options.smoothing.slice_steps is None:
             return self._run_at_once(graph, self._new_log_rows(logs, graph, maps, best), smoother, maps, best)
@@ -307,8 +305,9 @@ class RejuvenationScheduler:
             outcome = smoother.add_logs(graph, taken, self._guesses, landmark_positions(maps, best))
             return self._finish_slice(graph, outcome, lambda: taken, smoother)
         last = self._new_log_rows(logs, graph, maps, best)
-        places, looks = landmark_positions(maps, best), landmark_descriptors(maps, self._options.descriptor_gate)
-        drawn = smoother.draw(graph, last, self._guesses, places, maps.num_particles, looks)
+        positions = landmark_positions(maps, best)
+        descriptors = landmark_descriptors(maps, self._options.descriptor_gate)
+        drawn = smoother.draw(graph, last, self._guesses, positions, maps.num_particles, descriptors)
         if isinstance(drawn, Rejuvenation):
             self._restart_interval()
             self._accept(drawn.graph)
@@ -318,7 +317,7 @@ class RejuvenationScheduler:
     def _new_log_rows(
         self, logs: Sequence[RobotLog], graph: SlamGraph, maps: ParticleMaps, best: int
     ) -> list[LogArrays]:  # fmt: skip
-        """Return what the logs hold after a graph's last steps; what was refused has a name where it must be."""
+        """Return the log entries after a graph's last steps; rejected measurements are matched again."""
         new = log_tails(logs, graph)
         if not any(self._refused):
             return new
@@ -330,23 +329,23 @@ class RejuvenationScheduler:
         held: tuple[BoolArray, BoolArray], frames: tuple[FloatArray, FloatArray], renamed: IntArray,
         camera: FloatArray,
     ) -> None:  # fmt: skip
-        """Go on as the smoothers of two groups did that are one now, and be due at the next step.
+        """Continue from the smoothers of two groups that have merged; a rejuvenation is due at the next step.
 
         Args:
-            a, b: Theirs; they stay as they are.
-            starts: Three arrays (K, 3, M): where the robots of a, of b, and of both, a's first, started; in a's frame,
-                in b's, in a's.
-            held: (K,) of a, of b: whether these are held, see `fix_start`.
-            frames: Two covariances (3, 3) of what a's and b's particles do not show of their maps' frames.
+            a, b: Schedulers of the groups; they do not change.
+            starts: Start poses, three arrays (K, 3, M): of the robots of a, in a's frame; of b, in b's; of both, a's
+                first, in a's.
+            held: (K,) of a, of b: whether each start pose has a covariance in `FilterState.start_covariances`.
+            frames: Gauge covariances (3, 3) of a's and b's maps, not represented by the particles.
             renamed: (n, 2) rows (name in b, name in the joint map).
             camera: (7,) as kernels take it.
         """
-        own, other = (
+        graph_a, graph_b = (
             SlamGraph.at_uncertain_starts(where, fixed) if step._graph is None else step._graph
             for step, where, fixed in zip((a, b), starts[:2], held, strict=True)
         )
         options = self._options.smoothing
-        graph, motion = joint_graph(own, other, starts, frames, renamed, camera, options)
+        graph, motion = joint_graph(graph_a, graph_b, starts, frames, renamed, camera, options)
         self._set_graph(graph)
         self._draft = None if options.slice_steps is None else Draft(graph=graph)
         self._guesses = a._guesses + [InitialPoses(steps, compose(motion, poses)) for steps, poses in b._guesses]
@@ -354,12 +353,12 @@ class RejuvenationScheduler:
         self._read, self._exact = a._read + b._read, a._exact or b._exact
         self._waited = self._every
 
-    # ------------------------------------------------------------------ what came of it
+    # ------------------------------------------------------------------ results
 
     def _run_at_once(
         self, graph: SlamGraph, logs: Sequence[LogArrays], smoother: Smoother, maps: ParticleMaps, best: int
     ) -> Rejuvenation:
-        """Do all at once."""
+        """Smooth all logs at once."""
         result = rejuvenate(
             graph, logs, smoother.motion, smoother.camera, maps.num_particles, smoother.rng, smoother.options,
             self._guesses, landmark_descriptors(maps, self._options.descriptor_gate), landmark_positions(maps, best),
@@ -377,7 +376,7 @@ class RejuvenationScheduler:
         self, tried: SlamGraph, outcome: SlamGraph | Draft | str, logs: Callable[[], Sequence[LogArrays]],
         smoother: Smoother,
     ) -> Rejuvenation | None:  # fmt: skip
-        """Take note of what a slice came to; `logs` tells what it took in, if that matters."""
+        """Process the result of a slice; `logs` returns the log entries that it added."""
         assert self._graph is not None
         self._draft = None
         if isinstance(outcome, SlamGraph):
@@ -391,19 +390,19 @@ class RejuvenationScheduler:
     def _reset_after_failure(
         self, graph: SlamGraph, tried: SlamGraph, logs: Sequence[LogArrays], smoother: Smoother, reason: str
     ) -> Rejuvenation:
-        """Do not try for ever what does not come to an end: leave out what was measured since, or begin anew."""
+        """Recover from a failed optimisation: drop the measurements since the last one, or restart from the logs."""
         if any(map(len, logs)):
             self._accept(smoother.without_measurements(graph, logs))
-            return _told(tried, f"{reason}; what was measured since the last time is left out")
+            return _failed(tried, f"{reason}; measurements since the last rejuvenation are dropped")
         self._graph = None
-        return _told(tried, f"{reason}; it begins anew from the logs")
+        return _failed(tried, f"{reason}; the smoother restarts from the logs")
 
     def _set_graph(self, graph: SlamGraph) -> None:
-        """Take note of a graph and of how old it is."""
+        """Set the graph and its oldest step."""
         self._graph, self._oldest = graph, min(graph.latest.tolist())
 
     def _accept(self, graph: SlamGraph) -> None:
-        """Go on from a graph at its mode."""
+        """Continue from a graph at its mode."""
         self._set_graph(graph)
         self._failures = 0
         for robot, latest in enumerate(graph.latest.tolist()):
@@ -412,7 +411,7 @@ class RejuvenationScheduler:
                 del self._refused[robot][step]
 
     def _restart_interval(self) -> None:
-        """Wait anew."""
+        """Start a new interval."""
         self._asked, self._waited, self._read, self._closed = False, 0, 0, False
 
     def reorder(self, order: IntArray) -> None:
@@ -426,7 +425,7 @@ class RejuvenationScheduler:
     # ------------------------------------------------------------------ snapshots
 
     def get_state(self) -> dict[str, Any]:
-        """Return all that decides how it goes on; arrays of graphs and of what was refused are shared and read-only."""
+        """Return the complete state; arrays of graphs and of rejected measurements are shared and read-only."""
         draft = self._draft
         return {
             "graph": None if self._graph is None else self._graph.to_mapping(),
@@ -437,7 +436,7 @@ class RejuvenationScheduler:
         }
 
     def set_state(self, state: Mapping[str, Any]) -> None:
-        """Go on exactly as the one that gave `state`."""
+        """Restore the state from `get_state`."""
         self._graph = None
         if state["graph"] is not None:
             self._set_graph(SlamGraph.of_mapping(state["graph"]))
@@ -451,5 +450,5 @@ class RejuvenationScheduler:
         self._refused = [dict(with_constants(refused)) for refused in state["refused"]]
 
 
-def _told(graph: SlamGraph, reason: str) -> Rejuvenation:
+def _failed(graph: SlamGraph, reason: str) -> Rejuvenation:
     return Rejuvenation(graph, reason, float("nan"), 0, None)

@@ -1,4 +1,4 @@
-"""`TeamPoses`: where the robots of a team believe themselves and each other to be, each in its own start frame."""
+"""Relative pose estimates of the robots of a team, each robot's in its own start frame."""
 
 from functools import lru_cache
 
@@ -11,23 +11,24 @@ OWN, START, ESS, COVARIANCE, SIGMAS = 0, 3, 6, 7, 16
 
 
 class TeamPoses:
-    """What some robots of a team believe, each in its own start frame: a row for each of them.
+    """Pose estimates by some robots, each in its own start frame: a row for each of them.
 
-    Of a robot out of contact others know where it was when contact was lost. The arrays begin unwritten.
+    The pose of a robot out of contact is its last one before contact was lost. The arrays are initially unset.
 
     Args:
-        num_rows: n, as a rule the K robots of the team.
+        num_rows: n, usually the K robots of the team.
         num_robots: K; None: n.
 
     Attributes:
-        poses: (n, K, 3) float64 [m, m, rad]. Where each believes robot j to be; NaN if its filter does not know j.
-        beliefs: (n, 16 + K) float64. All that follows, which are views of it: kernels pay for each array.
-        own: (n, 3) float64 [m, m, rad]. Where each robot believes itself to be: also one of its `poses`.
-        starts: (n, 3) float64 [m, m, rad]. The motion from the map frame of its filter to its own start frame, in the
-            most probable particle.
-        ess: (n,) float64. Effective sample size of its filter, as a share of M.
-        covariances: (n, 3, 3) float64 [m, m, rad]. Of `own`.
-        sigmas: (n, K) float64 [m]. One sigma of the positions of `poses`, averaged over directions; likewise.
+        poses: (n, K, 3) float64 [m, m, rad]. Each robot's estimate of the pose of robot j; NaN if its filter lacks j.
+        beliefs: (n, 16 + K) float64. Array of all the following views: kernels are faster with fewer arrays.
+        own: (n, 3) float64 [m, m, rad]. Each robot's estimate of its own pose, also one of its `poses`.
+        starts: (n, 3) float64 [m, m, rad]. Motion from the map frame of the robot's filter to its own start frame, in
+            the most probable particle.
+        ess: (n,) float64. Effective sample size of the robot's filter, as a share of M.
+        covariances: (n, 3, 3) float64 [m, m, rad]. Covariances of `own`.
+        sigmas: (n, K) float64 [m]. Standard deviations of the positions of `poses`, averaged over directions; NaN as
+            there.
     """
 
     __slots__ = ("beliefs", "covariances", "ess", "own", "poses", "sigmas", "starts")
@@ -37,11 +38,11 @@ class TeamPoses:
         self.__setstate__((np.empty((num_rows, known, 3)), np.empty((num_rows, SIGMAS + known))))
 
     def __getstate__(self) -> tuple[FloatArray, FloatArray]:
-        """Return what copies begin with; their views are of their own beliefs."""
+        """Return the two arrays; the views of copies refer to their own arrays."""
         return self.poses, self.beliefs
 
     def __setstate__(self, state: tuple[FloatArray, FloatArray]) -> None:
-        """Hold poses and beliefs, and all views of these."""
+        """Set the two arrays and all views."""
         self.poses, self.beliefs = poses, beliefs = state
         self.own: FloatArray = beliefs[:, OWN : OWN + 3]
         self.starts: FloatArray = beliefs[:, START : START + 3]
@@ -52,5 +53,5 @@ class TeamPoses:
 
 @lru_cache(maxsize=256)
 def membership_table(robots: tuple[int, ...], live: tuple[int, ...]) -> IntArray:
-    """Return the robots (n,) of a filter, and below each 1 if it goes by it, as kernels take them; only looked at."""
+    """Return the robots (n,) of a filter, and below each whether it uses it (1) or not (0), for kernels; shared."""
     return np.array([robots, [robot in live for robot in robots]], np.int64)

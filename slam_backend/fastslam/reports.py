@@ -13,13 +13,13 @@ from slam_backend.fastslam.step_input import NO_INPUT, RobotInput, StepInput
 
 
 class Associations(NamedTuple):
-    """What became of N robots' measurements in one step; read-only.
+    """Data association of N robots' measurements in one step; read-only.
 
     Attributes:
-        ids: (2, n) int64. Of all measurements used, one robot's after the other's: the landmark that each was taken
-            for, and that which it created, as in `StepReport`.
-        inputs: Of each robot, as in `StepInput`.
-        masks: By robot which of its measurements were used, as there.
+        ids: (2, n) int64. Landmarks that all used measurements were associated with, robot by robot, and landmarks that
+            they created, as in `StepReport`.
+        inputs: Input of each robot, as in `StepInput`.
+        masks: Used measurements by robot, as in `StepInput`.
     """
 
     ids: IntArray
@@ -28,26 +28,26 @@ class Associations(NamedTuple):
 
     @classmethod
     def allocate(cls, inputs: StepInput) -> tuple[Self, IntArray]:
-        """Return what becomes of some readings, and the room (2, n) int64 where the step is to write it.
+        """Return the data association of some inputs, and its array (2, n) int64 for the step to write.
 
-        Until it is written all measurements are rejected.
+        Initially all measurements are rejected.
         """
-        room = np.empty((2, len(inputs.measurements)), np.int64)
-        room.fill(REJECTED)
-        return cls(as_read_only(room), inputs.inputs, inputs.masks), room
+        buffer = np.empty((2, len(inputs.measurements)), np.int64)
+        buffer.fill(REJECTED)
+        return cls(as_read_only(buffer), inputs.inputs, inputs.masks), buffer
 
     @classmethod
     def from_arrays(cls, associations: Sequence[IntArray], created: Sequence[IntArray]) -> Self:
-        """Return those of robots of each of which both are known, (n_i,) ids."""
-        told = as_read_only(np.stack([np.concatenate(associations), np.concatenate(created)]))
-        turns, begin = [], 0
-        for own in associations:
-            turns.append((STATIONARY, begin, begin + len(own), False, False, len(own)))
-            begin += len(own)
-        return cls(told, turns, {})
+        """Return the data association of robots from their ids (n_i,)."""
+        ids = as_read_only(np.stack([np.concatenate(associations), np.concatenate(created)]))
+        inputs, begin = [], 0
+        for of_robot in associations:
+            inputs.append((STATIONARY, begin, begin + len(of_robot), False, False, len(of_robot)))
+            begin += len(of_robot)
+        return cls(ids, inputs, {})
 
     def with_arrays(self, act: Act) -> Self:
-        """Return the same with `act` done to each array; itself if that changes nothing."""
+        """Return the associations with `act` applied to each array; themselves if that changes nothing."""
         before = self.ids, self.masks
         after = map_arrays(before, act)
         return self if after is before else type(self)(after[0], self.inputs, after[1])
@@ -99,7 +99,7 @@ if TYPE_CHECKING:
 
 
 class PoseEstimate(NamedTuple):
-    """A Gaussian summary of a robot's pose.
+    """Gaussian summary of a robot's pose.
 
     Attributes:
         mean: (3,) float64 [m, m, rad].
@@ -122,29 +122,29 @@ class PoseEstimates(NamedTuple):
     covariances: FloatArray
 
     def copy(self) -> "PoseEstimates":
-        """Return the same in arrays of their own."""
+        """Return a copy of the arrays."""
         return PoseEstimates(self.means.copy(), self.covariances.copy())
 
     def of(self, robot: int) -> PoseEstimate:
-        """Return that of one robot. A copy."""
+        """Return the estimate of one robot. A copy."""
         return PoseEstimate(self.means[robot].copy(), self.covariances[robot].copy())
 
 
 class StepReport(NamedTuple):
-    """What one step of `FastSlam` did.
+    """Outcome of one step of `FastSlam`.
 
     Attributes:
-        all_associations: What became of the measurements; `associations` and `created` are cut out of it.
-        rows: Of each robot there, -1: none.
+        all_associations: Data association of all inputs; `associations` and `created` are parts of it.
+        rows: Row of each robot in `all_associations`, -1: none.
         num_created: Measurements that created a landmark in at least one particle.
         num_new: Landmarks created by the most probable particle.
         num_matched: Measurements that the most probable particle matched to landmarks it held.
-        num_rejected: Measurements of which it made nothing: held back, in the dead zone, or named -1 by the caller.
+        num_rejected: Measurements that it rejected: ambiguous, in the dead zone, or named -1 by the caller.
         ess: Effective sample size after this step's weights, before resampling, in [1, M].
         nis: Mean of the squared Mahalanobis innovations (3 degrees of freedom, ideal 3) over the measurements that
-            the most probable particle matched, without those it had predicted behind the camera; NaN if there is none.
+            the most probable particle matched, without those predicted behind the camera; NaN without matches.
         resampled: Whether the particles were resampled.
-        rejuvenation: What came of drawing particles anew from smoothed paths; None: it was not tried in this step.
+        rejuvenation: Outcome of a rejuvenation; None: no attempt in this step.
     """
 
     all_associations: Associations
@@ -160,9 +160,9 @@ class StepReport(NamedTuple):
 
     @property
     def associations(self) -> tuple[IntArray, ...]:
-        """Per robot (n_i,) int64. Id of the landmark to which the most probable particle gave each measurement.
+        """Per robot (n_i,) int64. Id of the landmark that the most probable particle associated each measurement with.
 
-        That is the id of a new one if it made one; -1 = rejected. Copies.
+        The landmark may be new; -1 = rejected. Copies.
         """
         return tuple([self.all_associations.associated(row) for row in self.rows])
 
@@ -170,20 +170,20 @@ class StepReport(NamedTuple):
     def created(self) -> tuple[IntArray, ...]:
         """Per robot (n_i,) int64. Id of the landmark that the measurement created in at least one particle.
 
-        -1 if none did. A landmark stems from exactly one measurement. Copies.
+        -1 = none. Each landmark is created by exactly one measurement. Copies.
         """
         return tuple([self.all_associations.created(row) for row in self.rows])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RejuvenationReport:
-    """What came of an attempt to rejuvenate a filter.
+    """Outcome of an attempt to rejuvenate a filter.
 
     Attributes:
-        reason: Why the old particles stay; "" if there are new ones.
-        ess: Effective sample size of the importance weights of whole paths, in [1, M]; NaN if it did not come to that.
-        iterations: Of the smoother.
-        num_keys: Key poses that it keeps.
+        reason: Reason why the old particles stay; "" after success.
+        ess: Effective sample size of the importance weights of whole paths, in [1, M]; NaN if none were computed.
+        iterations: Number of iterations of the smoother.
+        num_keys: Number of keyframes in the graph.
     """
 
     reason: str
@@ -194,18 +194,18 @@ class RejuvenationReport:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MergeEvent:
-    """An attempt to align two groups' maps, a merge, or the undoing of one.
+    """Attempt to align two groups' maps, merge, or undo of a merge.
 
     Attributes:
         step: Number of the team's step (the first is 0).
-        kind: What happened.
-        robots_a: The group whose map frame stays.
+        kind: Kind of the event.
+        robots_a: Group whose map frame stays.
         robots_b: The other group.
-        alignment: `map` of group a from `map` of group b, as found; refused attempts carry the reason.
-        unsmoothed_alignment: Of an attempt: the alignment of the maps as the filters had bent them, where these were
-            straightened then and `alignment` is that of the straight ones; else None.
-        uncertainty: For an attempt whose maps align, the uncertainty of the motion between them over the particles of
-            the merge, relative to what a merge has to be sure of; beyond 1 it may wait. NaN if that was not asked.
+        alignment: `map` of group a from `map` of group b; refused attempts carry the reason.
+        unsmoothed_alignment: Alignment of the filters' own maps, if the attempt smoothed the maps and `alignment` is
+            that of the smoothed ones; else None.
+        uncertainty: Uncertainty of the motion between aligned maps over the particles of the merge, relative to the
+            limit for a merge; beyond 1 the merge may be deferred. NaN if not computed.
     """
 
     step: int
@@ -219,14 +219,14 @@ class MergeEvent:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LandmarkIdMap:
-    """How landmark ids of two groups became ids of their joint map.
+    """Renaming of the landmark ids of two groups to ids of their joint map.
 
     Attributes:
         robots_a: Group a before the merge; its landmark ids stay.
         robots_b: Group b before the merge.
-        ids_b: (k, 2) int64, read-only. Rows (id in b's map, id in the joint map); fused landmarks carry the id of a.
+        ids_b: (k, 2) int64, read-only. Rows (id in b's map, id in the joint map); fused landmarks get the id of a.
         maps: Numbers of a's map, of b's and of the joint one. The first two are kept until their `MapReleased`: an undo
-            takes them up again as they were.
+            restores them.
     """
 
     robots_a: tuple[int, ...]
@@ -238,13 +238,13 @@ class LandmarkIdMap:
         object.__setattr__(self, "ids_b", as_constant(self.ids_b))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Let copies and what was pickled be read-only, too."""
+        """Make copies and unpickled objects read-only, too."""
         return LandmarkIdMap, (self.robots_a, self.robots_b, self.ids_b, self.maps)
 
 
 @dataclass(frozen=True, slots=True)
 class MapForked:
-    """A filter forked: map number `copy` begins as what map number `source` is now."""
+    """Fork of a filter: map number `copy` starts as a copy of map number `source`."""
 
     source: int
     copy: int
@@ -252,19 +252,19 @@ class MapForked:
 
 @dataclass(frozen=True, slots=True)
 class MapReleased:
-    """Map number `number` is gone for good."""
+    """End of map number `number`."""
 
     number: int
 
 
 class LandmarksCreated(NamedTuple):
-    """What a robot read in a step created landmarks in a map.
+    """Landmarks that a robot's measurements of one step created in a map.
 
     Attributes:
-        number: Of the map.
-        robot: Who read it.
-        step: When it was read; with a replay that is earlier than the step of the report.
-        ids: (n,) int64, read-only. Id of the landmark that each of its measurements created, -1 = none.
+        number: Number of the map.
+        robot: Index of the robot.
+        step: Step of the measurements; in a replay earlier than the step of the report.
+        ids: (n,) int64, read-only. Id of the landmark that each measurement created, -1 = none.
     """
 
     number: int
@@ -275,7 +275,7 @@ class LandmarksCreated(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class MergeUndone:
-    """A merge was taken back: two maps are taken up again as they were before it, and the joint one ends.
+    """Undo of a merge: the two maps before it are restored, and the joint one ends.
 
     Attributes:
         maps: Numbers of a's map, of b's and of the joint one, as in its `LandmarkIdMap`.
@@ -288,20 +288,20 @@ MapChange = MapForked | MapReleased | LandmarksCreated | MergeUndone | LandmarkI
 
 
 class TeamReport(NamedTuple):
-    """What one step of `TeamSlam` did.
+    """Outcome of one step of `TeamSlam`.
 
     Attributes:
         step: Number of this step (the first is 0).
-        all_associations: What became of the measurements; `associations` and `created` are cut out of it.
+        all_associations: Data association of all measurements; `associations` and `created` are parts of it.
         groups: The groups after this step.
         events: This step's attempts, merges and undos, in order.
-        id_maps: One for each merge of this step, in order; apply them after `created`.
-        maps: Per robot the number of the map that it goes by after this step. Before the first step they are 0, 1, ...
-        map_changes: All that happened to maps in this step, in order, replays and `created` included: whoever keeps
-            books on landmarks goes by these.
-        oldest_step: Steps from this one on may still be taken in again; 1 + `step` if none.
-        rejuvenations: For each filter of which something is to be told the robots that go by it, and what came of
-            drawing its particles anew in this step, or what its smoother could not make sense of.
+        id_maps: Landmark renaming of each merge of this step, in order; apply them after `created`.
+        maps: Number of each robot's map after this step. Before the first step they are 0, 1, ...
+        map_changes: All changes of maps in this step, in order, replays and `created` included: the complete record for
+            keeping track of landmarks.
+        oldest_step: First step that may still be replayed; 1 + `step` if none.
+        rejuvenations: Pairs of robots and outcome, for each filter with a rejuvenation, or a failure of its smoother,
+            in this step.
     """
 
     step: int
@@ -316,10 +316,10 @@ class TeamReport(NamedTuple):
 
     @property
     def associations(self) -> tuple[IntArray, ...]:
-        """Per robot (n_i,) int64, as in `StepReport`, ids in the robot's map BEFORE this step's merges and undos."""
+        """Per robot (n_i,) int64, as in `StepReport`; ids of the robot's map BEFORE this step's merges and undos."""
         return tuple([self.all_associations.associated(robot) for robot in range(len(self.maps))])
 
     @property
     def created(self) -> tuple[IntArray, ...]:
-        """Per robot (n_i,) int64, as in `StepReport`, ids likewise."""
+        """Per robot (n_i,) int64, as in `StepReport`; ids as in `associations`."""
         return tuple([self.all_associations.created(robot) for robot in range(len(self.maps))])

@@ -1,4 +1,4 @@
-"""`RobotLog`: all that one robot did and measured in a run, kept compactly for a smoother."""
+"""Compact log of one robot's odometry and measurements, the input of the smoother."""
 
 from bisect import bisect_left
 from collections.abc import Iterator, Mapping
@@ -22,24 +22,24 @@ from slam_backend.smoother.log_arrays import (
     join,
 )
 
-ROWS = 256  # of a chunk: so many steps,
-MEASUREMENTS = 2048  # and so many measurements, unless one frame alone has more
+ROWS = 256  # steps of a chunk
+MEASUREMENTS = 2048  # measurements of a chunk, unless one frame alone has more
 NO_MOTION = np.zeros(3)
 NO_POINTS = np.empty((0, 3))
 NO_IDS = np.empty(0, dtype=np.int64)
 
 
 class RobotLog:
-    """An append-only log of one robot: odometry or exact poses, the points it measured, and what they were taken for.
+    """Append-only log of one robot: odometry or exact poses, measured points, and their data association.
 
-    Steps lie in chunks. A finished chunk is never written again: snapshots and copies share it, so that they cost
-    O(number of chunks) and a copy of the last, unfinished one, however long the run. A step takes 42 bytes, a
-    measurement 32; covariances (48) are stored only in chunks where they came.
+    Steps lie in chunks. A finished chunk never changes: snapshots and copies share it, so that they cost O(number of
+    chunks) and a copy of the last, unfinished one, however long the run. A step takes 42 bytes, a measurement 32;
+    covariances (48) are stored only in chunks that have some.
 
     Example:
         >>> log = RobotLog()
         >>> log.append(0, points=np.array([[2.0, 0.0, 0.1]]), ids=np.array([7]))       # the first frame
-        >>> log.append(1, odometry=np.array([0.1, 0.0, 0.02]))                         # it only moved
+        >>> log.append(1, odometry=np.array([0.1, 0.0, 0.02]))                         # motion only
         >>> len(log), log.num_measurements, log.arrays().starts.tolist()
         (2, 1, [0, 1, 1])
     """
@@ -53,7 +53,7 @@ class RobotLog:
         self._open(MEASUREMENTS)
 
     def _open(self, capacity: int) -> None:
-        """Start an empty chunk with room for `capacity` measurements."""
+        """Start an empty chunk for up to `capacity` measurements."""
         self._num_rows = self._num_measurements = 0
         self._steps = np.empty(ROWS, dtype=np.int64)
         self._kinds = np.empty(ROWS, dtype=np.int8)
@@ -75,21 +75,20 @@ class RobotLog:
         ids: IntArray = NO_IDS,
         covariances: FloatArray | None = None,
     ) -> None:
-        """Add a step. Order and shapes are checked; the numbers are those that a filter has accepted.
+        """Add a step. Order and shapes are checked; the numbers have been checked by the filter.
 
         Args:
-            step: Its index in the run, above that of the step before.
-            odometry: (3,) [m, m, rad], motion since the last step, previous robot frame. None: it stood.
-            pose: (3,) [m, m, rad], own start frame, if it was given as exact; odometry is then ignored, as in the
-                filter.
-            points: (n, 3) [m], robot axes, relative to the camera centre. All that was measured, rejected ones as well:
-                a smoother may find their landmarks.
+            step: Index of the step in the run, larger than that of the previous one.
+            odometry: (3,) [m, m, rad], motion since the last step, previous robot frame. None: the robot stood still.
+            pose: (3,) [m, m, rad], own start frame. Exact pose, if known; odometry is then ignored, as in the filter.
+            points: (n, 3) [m], robot axes, relative to the camera centre. All measured points, rejected ones included:
+                the smoother may find their landmarks.
             ids: (n,) landmarks by the most probable particle, -1 = rejected.
             covariances: (n, 6) [m^2], robot axes, upper triangles by rows (xx, xy, xz, yy, yz, zz). None: the camera
                 model.
 
         Raises:
-            ValueError: If steps go back or shapes disagree; the log is then as before.
+            ValueError: If steps go back or shapes disagree; the log is then unchanged.
         """
         n = len(ids)
         motion = odometry if pose is None else pose
@@ -105,7 +104,7 @@ class RobotLog:
             self._chunks.append(with_read_only(self._unfinished()))
             self._open(max(MEASUREMENTS, n))
             start = t = 0
-        elif n > len(self._ids):  # one huge frame after steps that have none
+        elif n > len(self._ids):  # one huge frame after steps without measurements
             self._points, self._ids = np.empty((n, 3)), np.empty(n, dtype=np.int64)
         end = start + n
         self._steps[t] = step
@@ -121,7 +120,7 @@ class RobotLog:
         self._num_rows, self._num_measurements, self._last = t + 1, end, step
 
     def extend(self, robot: int, steps: IntArray, noted: FloatArray, measured: FloatArray) -> None:
-        """Add the steps in which one of K robots did or measured anything, as `append` does one by one.
+        """Add the steps in which one of K robots has an entry, as `append` does one by one.
 
         Args:
             robot: Index of the robot.
@@ -129,7 +128,7 @@ class RobotLog:
             noted, measured: (T, K, 10), (n, 10) journal of all steps, see `PendingSteps`.
 
         Raises:
-            ValueError: If steps go back; the log then holds no more than the steps before.
+            ValueError: If steps go back; the log then holds the steps before.
         """
         k = 0
         while k < len(steps):
@@ -149,7 +148,7 @@ class RobotLog:
                 k += 1
 
     def _refusal(self, step: int, odometry: Any, pose: Any, points: Any, ids: Any, covariances: Any) -> ValueError:
-        """Say what is wrong with a step; told apart only then, for `append` is in the filter's loop."""
+        """Return the error for a bad step; the details are found only here, as `append` is in the filter's loop."""
         if step <= self._last:
             return argument_error("step", f"an int > {self._last}", step, "Log steps in order, each once.")
         n = len(ids)
@@ -161,8 +160,8 @@ class RobotLog:
             "odometry": (odometry, (3,), motion),
         }
         name = next(key for key, (value, shape, _) in wanted.items() if value is not None and value.shape != shape)
-        value, shape, cure = wanted[name]
-        return argument_error(name, f"an array of shape {shape}", f"shape {value.shape}", cure)
+        value, shape, hint = wanted[name]
+        return argument_error(name, f"an array of shape {shape}", f"shape {value.shape}", hint)
 
     def _reserve_covariances(self) -> FloatArray:
         """Return the open chunk's covariances, NaN where none were given."""
@@ -171,7 +170,7 @@ class RobotLog:
         return self._covariances
 
     def _unfinished(self, first: int = 0) -> LogArrays:
-        """Return a copy of the open chunk from a row on, no longer than what it holds."""
+        """Return a copy of the open chunk from a row on, trimmed to its content."""
         t, start = self._num_rows, int(self._starts[first])
         measured = slice(start, self._num_measurements)
         return LogArrays(
@@ -203,14 +202,14 @@ class RobotLog:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of all arrays, the room of the open chunk included; shared chunks count in full."""
+        """Bytes of all arrays, unused space of the open chunk included; shared chunks count in full."""
         arrays = (self._steps, self._kinds, self._motions, self._given, self._starts, self._points, self._ids,
                   self._covariances)  # fmt: skip
         open_bytes = sum(array.nbytes for array in arrays if array is not None)
         return open_bytes + sum(chunk.nbytes for chunk in self._chunks)
 
     def arrays(self, since: int = 0) -> LogArrays:
-        """Return all steps with an index of at least `since` as flat arrays; cost O(what is returned + one chunk)."""
+        """Return all steps with an index of at least `since` as flat arrays; cost O(result + one chunk)."""
         check_int("since", since, 0, "Use 0 for the whole run.")
         first = len(self._chunks)
         while first > 0 and self._chunks[first - 1].steps[-1] >= since:
@@ -221,13 +220,13 @@ class RobotLog:
 
     @property
     def has_exact_poses(self) -> bool:
-        """Whether a pose was given as exact in any step."""
+        """Whether any step has an exact pose."""
         return any(
             (kinds == EXACT).any() for kinds in (*(c.kinds for c in self._chunks), self._kinds[: self._num_rows])
         )
 
     def num_since(self, since: int) -> int:
-        """Return how many steps there are with an index of at least `since`; cost O(number of chunks with such)."""
+        """Return the number of steps with an index of at least `since`; cost O(number of their chunks)."""
         count = self._num_rows - bisect_left(self._steps, since, 0, self._num_rows)
         for chunk in reversed(self._chunks):
             if chunk.steps[-1] < since:
@@ -236,14 +235,14 @@ class RobotLog:
         return count
 
     def __iter__(self) -> Iterator[LogStep]:
-        """Return the steps in order, as the log stands when the loop begins."""
+        """Iterate over the steps in order, in a snapshot taken when the loop begins."""
         for chunk in [*self._chunks, self._unfinished()]:
             yield from map(chunk.row, range(len(chunk)))
 
     # ------------------------------------------------------------------ copies
 
     def copy(self) -> "RobotLog":
-        """Return a log that goes on by itself; finished chunks are shared."""
+        """Return an independent log; finished chunks are shared."""
         return _restored(self.get_state())
 
     __copy__ = copy
@@ -257,19 +256,19 @@ class RobotLog:
     def renamed(
         self, old_ids: ArrayLike, new_ids: ArrayLike, others: Literal["reject", "keep"] = "reject"
     ) -> "RobotLog":
-        """Return a copy in which landmarks bear other names, as after a merge of maps.
+        """Return a copy with renamed landmarks, as after a merge of maps.
 
         Args:
-            old_ids: (k,) int64 >= 0, each once. Names in this log.
-            new_ids: (k,) int64 >= -1. Their names in the copy; -1 rejects their measurements.
-            others: What becomes of names that are not in `old_ids`. "reject": -1, for the name of a landmark that died
-                before a merge means nothing, or something else, in the joint map. "keep": they stay.
+            old_ids: (k,) int64 >= 0, distinct. Names in this log.
+            new_ids: (k,) int64 >= -1. New names of the same landmarks; -1 rejects their measurements.
+            others: Treatment of names that are not in `old_ids`. "reject": -1, as the name of a landmark deleted before
+                a merge may denote another landmark in the joint map. "keep": unchanged.
 
         Returns:
-            The copy; its finished chunks share all but the ids with this log.
+            The copy; its finished chunks share all arrays but the ids with this log.
 
         Raises:
-            ValueError: If lengths disagree, an old name comes twice, or a name is too low.
+            ValueError: If lengths disagree, an old name is repeated, or a name is too low.
         """
         old: IntArray = check_array("old_ids", old_ids, (None,), "Give landmark ids.", dtype=np.int64)
         new: IntArray = check_array("new_ids", new_ids, old.shape, "Give one per old id.", dtype=np.int64)
@@ -278,21 +277,21 @@ class RobotLog:
                 raise argument_error(name, f"ids >= {least}", int(values.min()), "Give landmark ids.")
         unique, order = np.unique(old, return_index=True)
         if len(unique) < len(old):
-            raise argument_error("old_ids", "each id once", old.tolist(), "Give one new name per landmark.")
+            raise argument_error("old_ids", "distinct ids", old.tolist(), "Give one new name per landmark.")
         keep = check_choice("others", others, ("reject", "keep")) == "keep"
         state = self.get_state()
         chunks = tuple(chunk.renamed(unique, new[order], keep) for chunk in state["chunks"])
         return _restored({"chunks": chunks, "unfinished": state["unfinished"].renamed(unique, new[order], keep)})
 
     def get_state(self) -> dict[str, Any]:
-        """Return the log as it stands; finished chunks are shared and read-only, the rest is a copy."""
+        """Return the content of the log; finished chunks are shared and read-only, the last one is a copy."""
         return {"chunks": tuple(self._chunks), "unfinished": self._unfinished()}
 
     def set_state(self, state: Mapping[str, Any]) -> None:
-        """Go on exactly as the log that gave `state`.
+        """Replace the content by that of the log that returned `state`.
 
         Raises:
-            ValueError: If `state` is not one of `get_state`.
+            ValueError: If `state` is not from `get_state`.
         """
         for name in ("chunks", "unfinished"):
             if name not in state:
@@ -313,7 +312,7 @@ class RobotLog:
 
 
 def _restored(state: Mapping[str, Any]) -> RobotLog:
-    """Build a log from `get_state`, as copying does."""
+    """Return a log with the given state."""
     log = RobotLog()
     log.set_state(state)
     return log

@@ -1,4 +1,4 @@
-"""`FilterState`: all that a filter holds, and how a step, a resampling, a rejuvenation or a merge changes it."""
+"""State of a filter, and the operations that change it: step, resampling, rejuvenation and merge."""
 
 import copy
 from collections.abc import Mapping, Sequence
@@ -28,20 +28,20 @@ from slam_backend.geometry import compose, rotation, wrap_angle
 from slam_backend.resampling import RESAMPLING
 from slam_backend.smoother.rejuvenation import Particles
 
-LONGEST = 32  # steps that wait
-ROOM = 16 * LONGEST  # for measurements at first
+LONGEST = 32  # largest number of pending steps
+ROOM = 16 * LONGEST  # initial capacity for measurements
 
 
 class PendingSteps:
-    """Steps that wait; kernels write into its arrays.
+    """Buffer of steps that are not in the logs yet; kernels write into its arrays.
 
     Args:
-        num_robots: K, of the filter.
+        num_robots: Number of robots of the filter, K.
 
     Attributes:
-        steps: Numbers of the steps, T.
-        noted: (`LONGEST`, K, 10) float64. Of each step, of which T are written, and robot; see `_kernels.layout`.
-        measured: (>= n, 10) float64. What was measured in all of them, one robot's after the other's.
+        steps: Numbers of the T buffered steps.
+        noted: (`LONGEST`, K, 10) float64. Entry of each step and robot, the first T are in use; see `_kernels.layout`.
+        measured: (>= n, 10) float64. Measurements of all steps, robot by robot.
         num_measured: n.
     """
 
@@ -54,7 +54,7 @@ class PendingSteps:
         self.num_measured = 0
 
     def reserve(self, used: int) -> None:
-        """Provide room for so many more measurements."""
+        """Provide capacity for `used` more measurements."""
         needed = self.num_measured + used
         if needed > len(self.measured):
             wider = np.empty((2 * needed, NUM_MEASURED))
@@ -62,14 +62,14 @@ class PendingSteps:
             self.measured = wider
 
     def clear(self) -> None:
-        """Let no step wait any more."""
+        """Drop all steps."""
         self.steps.clear()
         self.num_measured = 0
 
     def flush(self, logs: Sequence[RobotLog], smoother: RejuvenationScheduler | None) -> None:
-        """Enter what waits into the logs of K robots, and tell the smoother of the filter, if it has one.
+        """Move the steps into the logs of K robots, and the estimated poses to the smoother, if there is one.
 
-        A step in which a robot did nothing and was given no measurement gets no row.
+        A step without motion and measurement of a robot gets no row in its log.
         """
         steps = np.array(self.steps)
         noted, measured = self.noted[: len(steps)], self.measured[: self.num_measured]
@@ -81,21 +81,21 @@ class PendingSteps:
 
 
 def record_rejected(
-    smoother: RejuvenationScheduler, step: int, inputs: StepInput, seats: RobotRows, told: IntArray
+    smoother: RejuvenationScheduler, step: int, inputs: StepInput, robots: RobotRows, associations: IntArray
 ) -> None:
-    """Tell the smoother what of a step's measurements, those with names left out, was neither matched nor new."""
-    associated, _ = told
-    for robot, row in seats.active:
+    """Pass the rejected measurements of a step to the smoother, without those that have identities."""
+    associated, _ = associations
+    for robot, row in robots.active:
         _, begin, end, _, named, _ = inputs.inputs[row]
         if not named:
             smoother.add_rejected(robot, step, associated[begin:end], inputs.descriptors[begin:end])
 
 
 class StepSummary(NamedTuple):
-    """Outcome of a step, but for the association of each measurement.
+    """Outcome of a step without the association of each measurement.
 
     Attributes:
-        long_unseen: Measurements matched to landmarks that were not seen for long.
+        long_unseen: Number of measurements matched to landmarks not seen for long.
         created, new, matched, rejected, ess, nis: See `StepReport`.
         is_depleted: Whether the effective sample size fell below the threshold of resampling.
     """
@@ -111,33 +111,33 @@ class StepSummary(NamedTuple):
 
 
 class FilterState:
-    """State of a filter of K robots with M particles, in P lanes; lanes beyond M mean nothing.
+    """State of a filter of K robots with M particles, padded to P lanes; lanes beyond M are unused.
 
     Poses are in the map frame. `poses`, `starts`, `means`, `covariances` and the weights are views of the two arrays
     that the kernels take.
 
     Args:
         num_robots: K. All robots start at the origin of the map frame.
-        options: What the filter assumes and how it decides.
+        options: Assumptions and decision rules of the filter.
         seed: An int, a `numpy.random.SeedSequence` or a Generator.
         num_particles: M; None: that of `options`.
 
     Attributes:
-        options: As given.
+        options: Options of the filter.
         num_particles: M.
         pose_arrays: (5, K, 3, P) float64: `poses`, `starts`, `means`, and in the last two `covariances`.
         weight_arrays: (4, P) float64: `log_weights`, `path_log_weights`, `weights`, and the increments of a step.
         propagated_only: (K,) int64. 1 where N(x^, P^) was only propagated since the last match, else 0.
         gauge_covariance: (3, 3) float64 [m, m, rad]. Covariance of a motion of the whole map that the particles do not
-            show, because their frame was fixed when they were sampled from smoothed paths; estimates include it.
-        start_covariances: (K, 3, 3) float64 [m, m, rad], start frames. Covariance of where each robot started in the
-            map, as far as the particles do not show it, see `fix_start`; poses seen from there include it.
+            represent, as their frame was fixed when they were sampled from smoothed paths; estimates include it.
+        start_covariances: (K, 3, 3) float64 [m, m, rad], start frames. Covariance of each robot's start pose that the
+            particles do not represent; poses in the start frame include it.
         maps: Landmarks of all particles.
-        estimates: Poses of all robots over all particles; written in each step.
+        estimates: Poses of all robots over all particles; updated in each step.
         best: Index of the most probable particle, by accumulated log-weight (Eq. 12).
-        starts_at_origin: Whether all robots started at the origin, as in a filter that was never merged.
+        starts_at_origin: Whether all robots started at the origin, as in a filter without merges.
         next_step: Number of the next step.
-        consistency: Running test of whether the errors are as small as the filter claims.
+        consistency: Running consistency test.
         existence: Update of the landmarks' log-odds of existence, or None.
         rejuvenation: Schedule and graph of the smoother, or None.
         rng: Random stream of the filter.
@@ -173,12 +173,12 @@ class FilterState:
         self.estimates = self._mixtures()
         self._batches = robot_batches(k, existence is not None)  # robots of each kernel call: one by one with existence
         self._logs = [RobotLog() for _ in range(k)]
-        self._pending = PendingSteps(k)  # not in the logs yet
+        self._pending = PendingSteps(k)
         self._associations: Int32Array = np.empty((0, padded), np.int32)  # work space of `update_fastslam2`
         self._mahalanobis_sq: FloatArray = np.empty((0, padded))
 
     def start_at(self, poses: FloatArray) -> None:
-        """Let the robots start at poses (K, 3) [m, m, rad], map frame, without uncertainty."""
+        """Set the start poses (K, 3) [m, m, rad], map frame, without uncertainty."""
         self.poses[:] = poses[:, :, None]
         self.poses[:, 2] = wrap_angle(self.poses[:, 2])
         self.starts[:] = self.means[:] = self.poses
@@ -227,39 +227,39 @@ class FilterState:
 
     @property
     def _held_starts(self) -> BoolArray:
-        """Whether the particles hide some uncertainty of where a robot started, (K,)."""
+        """Whether each start pose has a covariance that the particles do not represent, (K,)."""
         return np.asarray(self.start_covariances[:, 2, 2] > 0.0)
 
     def _mixtures(self) -> PoseEstimates:
-        """Return the robots' poses over all particles, map frame. Fresh arrays."""
+        """Return the robots' pose estimates over all particles, map frame. Fresh arrays."""
         return pose_mixtures(self.means, self.covariances, self.weights)
 
     def _refresh_starts(self) -> None:
-        """Update `starts_at_origin` after the start poses were written."""
+        """Recompute `starts_at_origin` from the start poses."""
         self.starts_at_origin = not self.starts[:, :, : self.num_particles].any()
 
     def _refresh_best_particle(self) -> None:
-        """Update `best` after the weights along paths were written."""
+        """Recompute `best` from the accumulated weights."""
         self.best = int(self.path_log_weights.argmax())
 
     # ------------------------------------------------------------------ one step
 
-    def update(self, inputs: StepInput, seats: RobotRows, told: IntArray) -> StepSummary:
-        """Move all robots, match what they saw, weigh and update (Algorithm 1, l. 6-8).
+    def update(self, inputs: StepInput, robots: RobotRows, associations: IntArray) -> StepSummary:
+        """Move all robots, match their measurements, weigh and update (Algorithm 1, l. 6-8).
 
-        Where a robot did and saw nothing no random number is drawn.
+        A robot without input draws no random number.
 
         Args:
-            inputs: What these robots, and perhaps others, read.
-            seats: Rows of these robots there.
-            told: (2, n) int64, written: what becomes of their measurements, see `Associations`.
+            inputs: Input of these robots, and perhaps of others.
+            robots: Rows of these robots in `inputs`.
+            associations: (2, n) int64, written: data association of their measurements, see `Associations`.
         """
         maps, pending = self.maps, self._pending
         active = used = 0
-        for robot, row in seats.active:
-            act, begin, end, _, _, _ = inputs.inputs[row]
-            active, used = active + (act != NO_READING), used + end - begin
-            if act == EXACT_POSE:
+        for robot, row in robots.active:
+            kind, begin, end, _, _, _ = inputs.inputs[row]
+            active, used = active + (kind != NO_READING), used + end - begin
+            if kind == EXACT_POSE:
                 self._set_exact_pose(robot, inputs.moves[row])
         if used:
             maps.reserve(used, inputs.descriptors.shape[1])
@@ -272,19 +272,19 @@ class FilterState:
         now = 0 if self.rejuvenation is None else self.rejuvenation.steps + 1
         normals = self.rng.standard_normal((active, maps.num_particles, 3))
         means, covariances = self.estimates
-        _, started = told  # by slot, until the step is over
+        _, started = associations  # by slot, until the step is over
         deleted: list[IntArray] = []
         fastslam1 = None if self.options.proposal == "fastslam2" else 1
         for low, high, is_over in self._batches:
             summary = _kernels.step_robots(
-                low, high, is_over, now, self.packed_options, seats.array, inputs.inputs_table, inputs.moves, normals,
+                low, high, is_over, now, self.packed_options, robots.array, inputs.inputs_table, inputs.moves, normals,
                 self.pose_arrays, self.propagated_only, self.weight_arrays, self.gauge_covariance,
                 maps.values, maps.counts, maps.odds, maps.table, maps.maps, maps.users, maps.free_rows, maps.tops,
                 maps.descriptors, maps.heads, inputs.measurements, inputs.descriptors, inputs.names,
-                self._associations, self._mahalanobis_sq, told, means, covariances,
+                self._associations, self._mahalanobis_sq, associations, means, covariances,
                 pending.noted[len(pending.steps)], pending.measured, pending.num_measured, fastslam1,
             )  # fmt: skip
-            if self.existence is not None and not is_over and (row := seats.rows[low]) >= 0:
+            if self.existence is not None and not is_over and (row := robots.rows[low]) >= 0:
                 _, begin, end, _, _, count = inputs.inputs[row]
                 if count >= 0:
                     found, new_slots = self._associations[begin:end], started[begin:end]
@@ -295,26 +295,26 @@ class FilterState:
         if used:
             self.consistency.update(self.next_step, nis, ess / self.num_particles, used, used - new - matched)
         if rejected and self.rejuvenation is not None:
-            record_rejected(self.rejuvenation, self.next_step, inputs, seats, told)
+            record_rejected(self.rejuvenation, self.next_step, inputs, robots, associations)
         self.next_step += 1
-        for slots in deleted:  # only now: until here their ids were asked for
+        for slots in deleted:  # last, as the ids are needed until here
             maps.release(slots)
         return StepSummary(long_unseen, created, new, matched, rejected, ess, nis, is_depleted)
 
     def _set_exact_pose(self, robot: int, pose: FloatArray) -> None:
-        """Set a robot's pose in all particles from an exact one (3,) [m, m, rad] in its own start frame."""
+        """Set a robot's pose in all particles to an exact one (3,) [m, m, rad] in its own start frame."""
         count = self.num_particles
         self.poses[robot, :, :count] = compose(self.starts[robot, :, :count].T.copy(), pose).T
         self.gauge_covariance.fill(0.0)
         self.start_covariances[robot] = 0.0
 
     def resample(self) -> None:
-        """Resample the particles in proportion to their weights, with all that they hold."""
+        """Resample the particles in proportion to their weights."""
         ancestors = RESAMPLING[self.options.resampling](self.weights, self.rng, self.num_particles)
         self.best = self.maps.resample(ancestors, self.pose_arrays, self.weight_arrays)
 
     def rejuvenate(self, smoother: RejuvenationScheduler) -> RejuvenationReport | None:
-        """Sample the particles from the smoothed paths, if it is time and those can be found."""
+        """Sample the particles from the smoothed paths, if due; return None if there is nothing to report."""
         if smoother.is_idle(self.logs):
             return None
         starts = self.starts[:, :, : self.num_particles]
@@ -328,7 +328,7 @@ class FilterState:
         return RejuvenationReport(result.reason, result.ess, result.iterations, result.graph.num_keys)
 
     def _replace_particles(self, new: Particles) -> None:
-        """Go on with M particles from smoothed paths; landmarks are those of the most probable particle so far."""
+        """Replace the M particles by samples of smoothed paths, with landmarks of the most probable particle so far."""
         m = self.num_particles
         write_maps(self.maps, self.best, new, self.options.landmark_walk)
         self.poses[:, :, :m], self.starts[:, :, :m] = new.poses, new.starts
@@ -344,15 +344,15 @@ class FilterState:
 
     @property
     def logs(self) -> list[RobotLog]:
-        """Per robot what it did and measured so far, and which landmarks that was associated with."""
+        """Log of each robot, up to date."""
         if self._pending.steps:
             self._pending.flush(self._logs, self.rejuvenation)
         return self._logs
 
-    # ------------------------------------------------------------------ other robots
+    # ------------------------------------------------------------------ merging
 
     def reorder(self, order: IntArray) -> None:
-        """Renumber the robots: robot i becomes the one that was `order[i]`; (K,) a permutation."""
+        """Renumber the robots: robot i is the former `order[i]`; (K,) a permutation."""
         for array in (
             self.poses,
             self.starts,
@@ -372,14 +372,14 @@ class FilterState:
         cls, a: "FilterState", from_a: IntArray, b: "FilterState", from_b: IntArray, motion: FloatArray,
         evidence: FloatArray, rng: np.random.Generator,
     ) -> "FilterState":  # fmt: skip
-        """Return the state of both groups' robots, a's first, in a's map frame, still without landmarks.
+        """Return the state of both groups' robots, a's first, in a's map frame, without landmarks yet.
 
         Args:
-            a, b: State of either group.
-            from_a, from_b: (M,) particles of either that each joint particle pairs.
+            a, b: State of each group.
+            from_a, from_b: (M,) particles of each group that form the joint particles.
             motion: (M, 3) [m, m, rad], frame a from frame b, of each joint particle.
             evidence: (M,) log-weight of each pair.
-            rng: Seeds the joint filter's own stream.
+            rng: Generator that seeds the joint filter's own stream.
         """
         count, k = len(motion), a.num_robots
         same = a.options.num_particles == count
@@ -402,10 +402,10 @@ class FilterState:
         return joint
 
     def finish_join(self, a: "FilterState", b: "FilterState", renamed: IntArray) -> None:
-        """Take over the step count, warnings, logs and smoothers of two groups, once the joint map is loaded.
+        """Join the step counts, warnings, logs and smoothers of two groups, once the joint map is loaded.
 
         Args:
-            a, b: State of either group.
+            a, b: State of each group.
             renamed: (n, 2) int64 rows (id in b, id in the joint map) of all of b's landmarks.
         """
         self._refresh_best_particle()
@@ -424,8 +424,8 @@ class FilterState:
     # ------------------------------------------------------------------ snapshots
 
     def get_state(self) -> dict[str, Any]:
-        """Return all that decides how the filter goes on, its random stream included; what it shares is read-only."""
-        logs = tuple(log.get_state() for log in self.logs)  # first, for it informs the smoother as well
+        """Return the complete state of the filter, its random stream included; shared parts are read-only."""
+        logs = tuple(log.get_state() for log in self.logs)  # first, as it also updates the smoother
         state: dict[str, Any] = {name: getattr(self, name).copy() for name in KEPT}
         state |= {"steps": self.next_step, "estimates": self.estimates.copy(), "maps": self.maps.get_state()}
         state |= {"logs": logs, "consistency": self.consistency.get_state()}
@@ -435,7 +435,7 @@ class FilterState:
 
     @classmethod
     def restored(cls, state: Mapping[str, Any], previous: "FilterState") -> "FilterState":
-        """Return a state from a snapshot that was checked, in the arrays of `previous` if they fit."""
+        """Return a state from a validated snapshot, in the arrays of `previous` if they fit."""
         shapes = [state[name].shape == getattr(previous, name).shape for name in ("poses", "weights")]
         if state["options"] == previous.options and all(shapes):
             self = previous
@@ -453,5 +453,5 @@ class FilterState:
             self.rejuvenation.set_state(state["rejuvenation"])
         self.consistency.set_state(state["consistency"])
         self.next_step, self.estimates = state["steps"], state["estimates"].copy()
-        self.rng = restore_generator(state["rng"])  # a new one: the old one may be the caller's, or of another kind
+        self.rng = restore_generator(state["rng"])  # a new one: the old one may be shared or of another kind
         return self

@@ -1,4 +1,4 @@
-"""What a state of `FastSlam` must be so that a filter can go on from it: its kernels check nothing."""
+"""Validation of a `FastSlam` state before a filter continues from it, as kernels check nothing."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
@@ -24,7 +24,7 @@ from slam_backend.smoother.graph import NONE, SlamGraph
 from slam_backend.smoother.log_arrays import EXACT, REJECTED, STATIONARY, LogArrays, has_been_checked, note_checked
 from slam_backend.smoother.reassociation import RejectedMeasurements
 
-POSE_FIELDS = ("poses", "starts", "means", "covariances")  # (K, 3 or 6, P), of each robot
+POSE_FIELDS = ("poses", "starts", "means", "covariances")  # (K, 3 or 6, P)
 KEPT = (
     *POSE_FIELDS,
     "gauge_covariance",
@@ -36,7 +36,7 @@ KEPT = (
 )
 OTHERS_KEPT = ("steps", "estimates", "maps", "logs", "consistency", "options", "rng")
 LONGEST_DESCRIPTOR = 1 << 16
-LEAST = float(np.finfo(np.float64).min)  # of log-weights
+LEAST = float(np.finfo(np.float64).min)  # lower limit of log-weights
 GRAPH_COLUMNS = frozenset(field.name for field in fields(SlamGraph))
 
 
@@ -44,15 +44,15 @@ GRAPH_COLUMNS = frozenset(field.name for field in fields(SlamGraph))
 
 
 def check_filter(name: str, state: Any, known: Sequence[FilterOptions] = ()) -> None:
-    """Refuse what is no state from which `FastSlam` can go on.
+    """Refuse a value that is not a valid state of `FastSlam`.
 
     Args:
         name: Name of the part.
         state: The value to check.
-        known: Options that were checked before.
+        known: Options known to be valid.
 
     Raises:
-        ValueError: By name of the part that is wrong.
+        ValueError: If a part is wrong; the text names it.
     """
     check.keys(name, state, (*KEPT, *OTHERS_KEPT))
     options = state["options"]
@@ -89,7 +89,7 @@ def check_filter(name: str, state: Any, known: Sequence[FilterOptions] = ()) -> 
 
 
 def check_consistency(name: str, state: Any) -> None:
-    """Refuse what are not the running sums of a consistency test."""
+    """Refuse a value that is not the state of a consistency test."""
     check.keys(name, state, (*SUMS, *LISTS))
     for sum_, most in (
         ("frames", check.MAX_INT),
@@ -107,13 +107,13 @@ def check_consistency(name: str, state: Any) -> None:
 
 
 def _check_fit(name: str, options: FilterOptions) -> None:
-    """Refuse options that are fine one by one, but with which no filter can be built."""
+    """Refuse options that are valid one by one, but not together."""
     try:
         pack_options(options)
         if options.existence is not None:
             ExistenceUpdate(options.existence, options.camera)
-    except Exception as error:  # of whatever kind: of numbers that are too large for floats, or not fit for the camera
-        raise argument_error(name, "options that fit together", f"'{error}'", check.CURE) from error
+    except Exception as error:  # of any kind: numbers too large for floats, or unfit for the camera
+        raise argument_error(name, "options that fit together", f"'{error}'", check.HINT) from error
 
 
 # ---------------------------------------------------------------------- maps
@@ -121,14 +121,14 @@ def _check_fit(name: str, options: FilterOptions) -> None:
 
 @in_place
 def count_bad_values(values: FloatArray, counts: Any, num_particles: int, farthest: float, largest: float) -> int:
-    """Return how many landmarks that particles hold are no Gaussians in the world.
+    """Return how many landmarks of particles have no valid Gaussian within limits.
 
     Args:
         values: (n, 9 P) float64 [m, m^2], read-only. Blocks of lanes, as in `MapStore`.
         counts: (n, P) int32, read-only. 0 where the particle lacks the landmark.
         num_particles: M.
-        farthest: [m].
-        largest: [m^2].
+        farthest: Limit of coordinates [m].
+        largest: Limit of covariances [m^2].
     """
     bad = 0
     for i in range(len(counts)):
@@ -147,7 +147,7 @@ def count_bad_values(values: FloatArray, counts: Any, num_particles: int, farthe
 
 
 def check_maps(name: str, maps: Any, m: int, options: FilterOptions) -> None:
-    """Refuse what are no maps of m particles."""
+    """Refuse a value that is not a state of the maps of m particles."""
     check.keys(name, maps, MAPS_KEPT)
     if maps["num_particles"] != m:
         check.refuse(f"{name}['num_particles']", f"{m}, the number of weights", maps["num_particles"])
@@ -160,22 +160,22 @@ def check_maps(name: str, maps: Any, m: int, options: FilterOptions) -> None:
     check.array(f"{name}['values']", maps["values"], check.FLOAT64, (n, 9 * padded))
     held = as_read_only(maps["values"]), as_read_only(maps["counts"])
     if n and count_bad_values(*held, m, check.MAX_DISTANCE, check.LARGEST):
-        check.refuse(f"{name}['values']", "means and positive variances", "others")
+        check.refuse(f"{name}['values']", "finite means and positive variances", "a Gaussian out of range")
     check.indices(f"{name}['maps']", maps["maps"], (None, padded), 0, m - 1, m, check.INT32)
-    check.indices(f"{name}['maps']", maps["maps"], (None, padded), 0, padded - 1, dtype=check.INT32)  # of all lanes
+    check.indices(f"{name}['maps']", maps["maps"], (None, padded), 0, padded - 1, dtype=check.INT32)  # all lanes
     check.indices(f"{name}['map_of']", maps["map_of"], (n,), 0, len(maps["maps"]))
     check.indices(f"{name}['identities']", maps["identities"], (n,), -1)
     check.indices(f"{name}['last_seen']", maps["last_seen"], (n,))
     check_descriptors(f"{name}['descriptors']", maps["descriptors"], n)
     if options.existence is None:
         if maps["odds"] is not None:
-            check.refuse(f"{name}['odds']", "None where existence is not kept", "an array")
+            check.refuse(f"{name}['odds']", "None without an existence model", "an array")
     else:
         check.floats(f"{name}['odds']", maps["odds"], (n, padded), columns=m)
 
 
 def check_landmarks(name: str, landmarks: Any) -> None:
-    """Refuse what is no map of landmarks."""
+    """Refuse a value that is not a landmark map."""
     check.instance(name, landmarks, LandmarkMap)
     n = check.positions(f"{name}.means", landmarks.means, (None, 3))
     check.floats(f"{name}.covariances", landmarks.covariances, (n, 3, 3))
@@ -186,7 +186,7 @@ def check_landmarks(name: str, landmarks: Any) -> None:
 
 
 def check_descriptors(name: str, value: Any, n: int, size: int | None = None) -> int:
-    """Return the length d of n descriptors, or refuse what are none, or of another length."""
+    """Return the length d of n descriptors, or refuse a wrong array or length."""
     largest = float(LARGEST_DESCRIPTOR)
     check.floats(name, value, (n, size), -largest, largest, dtype=check.FLOAT32)
     if value.shape[1] > LONGEST_DESCRIPTOR:
@@ -198,7 +198,7 @@ def check_descriptors(name: str, value: Any, n: int, size: int | None = None) ->
 
 
 def check_log(name: str, log: Any) -> None:
-    """Refuse what is no state of a `RobotLog`; chunks that never change are looked at once."""
+    """Refuse a value that is not a state of a `RobotLog`; each immutable chunk is checked once."""
     check.keys(name, log, ("chunks", "unfinished"))
     check.sequence(f"{name}['chunks']", log["chunks"])
     last = -1
@@ -206,15 +206,15 @@ def check_log(name: str, log: Any) -> None:
         if not has_been_checked(chunk):
             check_steps(f"{name}['chunks']", chunk)
             if not len(chunk):
-                check.refuse(f"{name}['chunks']", "chunks of some steps", "none")
+                check.refuse(f"{name}['chunks']", "non-empty chunks", "an empty chunk")
             note_checked(chunk)
         if chunk.steps[0] <= last:
-            check.refuse(f"{name}['chunks']", "steps in order", "others")
+            check.refuse(f"{name}['chunks']", "steps in order", "a step out of order")
         last = chunk.steps[-1]
     unfinished = log["unfinished"]
     check_steps(f"{name}['unfinished']", unfinished)
     if len(unfinished) > ROWS or (len(unfinished) and unfinished.steps[0] <= last):
-        check.refuse(f"{name}['unfinished']", f"at most {ROWS} steps after the others", len(unfinished))
+        check.refuse(f"{name}['unfinished']", f"at most {ROWS} steps after the chunks", len(unfinished))
 
 
 def last_step(log: Mapping[str, Any]) -> int:
@@ -226,26 +226,26 @@ def last_step(log: Mapping[str, Any]) -> int:
 
 
 def check_steps(name: str, rows: Any) -> None:
-    """Refuse what are no `LogArrays`."""
+    """Refuse a value that is not a valid `LogArrays`."""
     check.instance(name, rows, LogArrays)
     starts, t = rows.starts, check.indices(f"{name}.steps", rows.steps, (None,))
     check.ascending(f"{name}.steps", rows.steps)
     check.array(f"{name}.kinds", rows.kinds, check.INT8, (t,))
     if t and not STATIONARY <= rows.kinds.min() <= rows.kinds.max() <= EXACT:
-        check.refuse(f"{name}.kinds", f"kinds from {STATIONARY} to {EXACT}", "others")
+        check.refuse(f"{name}.kinds", f"kinds from {STATIONARY} to {EXACT}", "a value out of range")
     check.positions(f"{name}.motions", rows.motions, (t, 3))
     check.array(f"{name}.given", rows.given, check.BOOL, (t,))
     n = check.positions(f"{name}.points", rows.points, (None, 3))
     check.array(f"{name}.starts", starts, check.INT64, (t + 1,))
     if starts[0] != 0 or starts[-1] != n or (starts[1:] < starts[:-1]).any():
-        check.refuse(f"{name}.starts", f"rows that rise from 0 to {n}", "others")
+        check.refuse(f"{name}.starts", f"ascending rows from 0 to {n}", "a row out of order")
     check.indices(f"{name}.ids", rows.ids, (n,), REJECTED, check.MAX_LANDMARKS)
     if rows.covariances is not None:
         check.array(f"{name}.covariances", rows.covariances, check.FLOAT64, (n, 6))
-        own = rows.covariances[np.repeat(rows.given, np.diff(starts))]
-        check.floats(f"{name}.covariances", own, (len(own), 6))
+        given = rows.covariances[np.repeat(rows.given, np.diff(starts))]
+        check.floats(f"{name}.covariances", given, (len(given), 6))
     elif rows.given.any():
-        check.refuse(f"{name}.given", "none without covariances", "some")
+        check.refuse(f"{name}.given", "no given covariances", "an array with some")
 
 
 # ---------------------------------------------------------------------- the smoother
@@ -253,7 +253,7 @@ def check_steps(name: str, rows: Any) -> None:
 
 @jit
 def are_linked(previous: IntArray, robots: IntArray) -> bool:
-    """Tell whether each key (k,) leads back to one that is given, those of one robot in the order of time."""
+    """Return whether each key (k,) leads back to a start, with the keys of one robot in order of time."""
     known = np.zeros(len(previous), np.bool_)
     for b in range(len(previous)):
         a, length = b, 0
@@ -272,10 +272,10 @@ def are_linked(previous: IntArray, robots: IntArray) -> bool:
 
 
 def check_graph(name: str, graph: Any, k: int) -> None:
-    """Refuse what are no columns of a `SlamGraph` of k robots."""
+    """Refuse a value that is not the columns of a `SlamGraph` of k robots."""
     check.keys(name, graph, GRAPH_COLUMNS)
     if len(graph) != len(GRAPH_COLUMNS):
-        check.refuse(name, "the columns of a graph", "others")
+        check.refuse(name, "the columns of a graph", "a dict with others")
     where = {column: f"{name}[{column!r}]" for column in graph}
 
     def indices(column: str, rows: int | None, last: int, low: int = 0) -> int:
@@ -303,14 +303,14 @@ def check_graph(name: str, graph: Any, k: int) -> None:
     for column in ("first_keys", "last_keys"):
         indices(column, k, keys - 1)
         if (robots[graph[column]] != np.arange(k)).any():
-            check.refuse(where[column], "a key of each robot", "others")
+            check.refuse(where[column], "a key of each robot", "a key of another robot")
     indices("latest", k, check.MAX_INT, -1)
     if not are_linked(graph["parents"], robots):
-        check.refuse(where["parents"], "keys that lead back to a start", "others")
+        check.refuse(where["parents"], "keys that lead back to a start", "a key that does not")
 
 
 def check_rejuvenation(name: str, state: Any, logs: Sequence[Mapping[str, Any]], size: int) -> None:
-    """Refuse what is no state of the smoother of a filter with these logs, whose descriptors have this size."""
+    """Refuse a value that is not a smoother state of a filter with these logs and this descriptor length."""
     check.keys(name, state, ("graph", "draft", "schedule", "guesses", "refused"))
     k, schedule = len(logs), state["schedule"]
     check.keys(f"{name}['schedule']", schedule, SCHEDULE)
@@ -323,21 +323,21 @@ def check_rejuvenation(name: str, state: Any, logs: Sequence[Mapping[str, Any]],
         check.sequence(f"{name}['draft']", state["draft"], 3)
         graph, damping, steps = state["draft"]
         if state["graph"] is None:
-            check.refuse(f"{name}['draft']", "none without a graph", "one")
+            check.refuse(f"{name}['draft']", "None without a graph", "a draft")
         check_graph(f"{name}['draft'][0]", graph, k)
         check.number(f"{name}['draft'][1]", damping, 0.0)
         check.integer(f"{name}['draft'][2]", steps)
     for where, guesses in check.named_items(f"{name}['guesses']", state["guesses"], k):
         check.sequence(where, guesses, 2)
-        heard = check.indices(f"{where}[0]", guesses[0], (None,))
+        count = check.indices(f"{where}[0]", guesses[0], (None,))
         check.ascending(f"{where}[0]", guesses[0])
-        check.positions(f"{where}[1]", guesses[1], (heard, 3))
+        check.positions(f"{where}[1]", guesses[1], (count, 3))
     for (where, refused), log in zip(check.named_items(f"{name}['refused']", state["refused"], k), logs, strict=True):
         _check_refused(where, refused, log, size)
 
 
 def _check_refused(name: str, refused: Any, log: Mapping[str, Any], size: int) -> None:
-    """Refuse what are no refused measurements of a log, by step."""
+    """Refuse a value that is not the rejected measurements of a log, by step."""
     check.instance(name, refused, dict)
     if not refused:
         return
@@ -347,9 +347,9 @@ def _check_refused(name: str, refused: Any, log: Mapping[str, Any], size: int) -
             counts |= dict(zip(part.steps.tolist(), np.diff(part.starts).tolist(), strict=True))
             if part.steps[0] <= min((step for step in refused if type(step) is int), default=0):
                 break
-    for step, (rows, looks) in refused.items():
+    for step, (rows, descriptors) in refused.items():
         check.instance(name, refused[step], RejectedMeasurements)
         check.integer(f"{name}: step", step)
         n = check.indices(f"{name}[{step}].rows", rows, (None,), 0, counts.get(step, check.MAX_INT) - 1)
         check.ascending(f"{name}[{step}].rows", rows)
-        check_descriptors(f"{name}[{step}].descriptors", looks, n, size)
+        check_descriptors(f"{name}[{step}].descriptors", descriptors, n, size)

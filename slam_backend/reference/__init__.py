@@ -1,7 +1,7 @@
-"""The filter once more, written for readers: one particle, one landmark, one 3 x 3 matrix at a time.
+"""Reference implementation of the filter: one particle, one landmark, one 3 x 3 matrix at a time.
 
-`ReferenceFastSlam` decides and computes what `slam_backend.FastSlam` does, which is held against it, and is hundreds of
-times slower.
+`ReferenceFastSlam` makes the decisions and computes the numbers of `slam_backend.FastSlam`, which is tested against it,
+and is hundreds of times slower.
 """
 
 from slam_backend.reference.filter import ReferenceFastSlam

@@ -1,4 +1,4 @@
-"""What a robot's frame says of the existence of the landmarks around it (Montemerlo and Thrun 2003)."""
+"""Update of the existence of landmarks after a robot's frame (Montemerlo and Thrun 2003)."""
 
 from collections.abc import Sequence
 
@@ -20,15 +20,15 @@ def update_existence(
     model: ExistenceModel,
     camera: StereoCamera,
 ) -> None:
-    """Update the log-odds of the landmarks around a robot after its frame; particles drop what is too improbable.
+    """Update the log-odds of the landmarks around a robot after its frame; particles delete improbable landmarks.
 
     Args:
-        particles: All; their maps are changed.
-        best: The most probable one before the step: what it has around the robot is looked at.
-        robot: Which robot.
-        record: What its frame came to.
-        model: How likely landmarks are seen.
-        camera: Its assumed model.
+        particles: All particles; their maps are changed.
+        best: The most probable particle before the step; its landmarks near the robot are considered.
+        robot: Index of the robot.
+        record: Outcome of the robot's frame.
+        model: Detection model and deletion rule.
+        camera: Assumed model of the camera.
     """
     started = {int(name) for name in record.created if name >= 0}
     matched = [{int(name) for name in names if name >= 0} for names in record.associations.T]
@@ -57,13 +57,13 @@ def update_existence(
 
 
 def is_expected(pose: FloatArray, landmark: Landmark, model: ExistenceModel, camera: StereoCamera) -> bool:
-    """Tell whether a landmark would lie well inside the image, and near enough, to be seen.
+    """Return whether a landmark lies inside the image, with a margin, and within range.
 
     Args:
         pose: (3,) of the robot [m, m, rad], map frame.
-        landmark: Whose mean counts.
-        model: Its margins say what is well inside.
-        camera: The robot's.
+        landmark: The landmark; its mean is used.
+        model: Detection model with the margins.
+        camera: Assumed model of the camera.
     """
     offset = landmark.mean - [pose[0], pose[1], 0.0]
     point = camera.camera_from_robot(turn_about_vertical(pose[2]).T @ offset)

@@ -1,4 +1,4 @@
-"""One robot's turn as the paper has it: the pose comes from the odometry alone (Algorithm 1, l. 14-41)."""
+"""Update of one robot with the proposal of the paper, the motion model alone (Algorithm 1, l. 14-41)."""
 
 import numpy as np
 
@@ -15,14 +15,14 @@ def update_fastslam1(
     """Match, weigh and update one measurement after the other at the sampled pose.
 
     Args:
-        landmarks: The particle's map; it is changed.
+        landmarks: Map of the particle, changed.
         pose: (3,) [m, m, rad], map frame, as sampled from the motion model (Eq. 4).
-        frame: What the robot measured.
-        candidates: Per measurement the landmarks of the particle that may have caused it.
-        options: Of the filter.
+        frame: Measurements of the robot.
+        candidates: Candidate landmarks of the particle for each measurement.
+        options: Options of the filter.
 
     Returns:
-        The choices, the pose as it was given, and the log-likelihood of the frame.
+        The associations, the pose as given, and the log-likelihood of the frame.
     """
     chosen: list[int] = []
     distances: list[float] = []

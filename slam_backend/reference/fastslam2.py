@@ -1,8 +1,8 @@
-"""One robot's turn with the proposal of FastSLAM 2.0: the measurements shape the pose that is sampled.
+"""Update of one robot with the proposal of FastSLAM 2.0, which includes the measurements.
 
-Montemerlo et al., FastSLAM 2.0 (IJCAI 2003), for frames of several measurements with unknown association: what is
-beyond doubt at the predicted pose refines the pose; there every measurement is matched, held back or becomes a
-landmark; the matches give the Gaussian from which the pose is sampled, and the weight.
+Montemerlo et al., FastSLAM 2.0 (IJCAI 2003), extended to frames of several measurements with unknown association:
+matches that are unambiguous at the predicted pose refine the pose; there each measurement is matched, rejected or
+starts a landmark; the matches give the Gaussian from which the pose is sampled, and the weight.
 """
 
 import numpy as np
@@ -13,11 +13,11 @@ from slam_backend.reference.measurement_model import Frame, Innovation, log_dens
 from slam_backend.reference.particles import NEW, REJECTED, Candidates, Landmarks, RobotUpdate, is_held
 from slam_backend.reference.pose_gaussian import GaussianPose, WhitenedPose
 
-WIDE_HEADING = 0.03  # [rad]; a predicted heading less certain than this asks for more iterations
+WIDE_HEADING = 0.03  # [rad]; a larger sigma of the predicted heading needs more iterations
 MORE_ITERATIONS = 3
-RELINEARISE_BELOW = 4  # a landmark seen up to so many times is updated by the iterated EKF: its depth is still vague
+RELINEARISE_BELOW = 4  # largest count of a landmark updated by the iterated EKF, as its depth is still uncertain
 
-Gates = dict[tuple[int, int], Innovation]  # by measurement and landmark, for the candidates that can be seen
+Gates = dict[tuple[int, int], Innovation]  # by measurement and landmark, for visible candidates
 
 
 def update_fastslam2(
@@ -32,26 +32,26 @@ def update_fastslam2(
     """Associate in two passes, sample the pose, weigh the particle and update its map.
 
     Args:
-        landmarks: The particle's map; it is changed.
-        prior: Of the pose, after the motion.
-        frame: What the robot measured, at least one measurement.
-        candidates: Per measurement the landmarks of the particle that may have caused it.
+        landmarks: Map of the particle, changed.
+        prior: Pose after the motion.
+        frame: Measurements of the robot, at least one.
+        candidates: Candidate landmarks of the particle for each measurement.
         normals: (3,) standard normal numbers, from which the pose is sampled.
-        options: Of the filter.
-        is_exact: Whether the caller gave the pose, which is then never doubted.
+        options: Options of the filter.
+        is_exact: Whether the caller gave the pose; recovery is then disabled.
 
     Returns:
-        The choices, the sampled pose and the log-evidence of the frame.
+        The associations, the sampled pose and the log-evidence of the frame.
     """
     predicted = WhitenedPose.of(prior)
     iterations = 1 + MORE_ITERATIONS * bool(prior.covariance[2, 2] > WIDE_HEADING**2)
     gates = gates_at(predicted, landmarks, frame, candidates)  # pass A
     if options.recovery_position > 0.0 and not is_exact:
-        doubt = np.diag([options.recovery_position, options.recovery_position, options.recovery_heading]) ** 2
-        doubtful = WhitenedPose.of(GaussianPose(prior.mean, doubt))
-        wide_gates = gates_at(doubtful, landmarks, frame, candidates)
+        wide = np.diag([options.recovery_position, options.recovery_position, options.recovery_heading]) ** 2
+        inflated = WhitenedPose.of(GaussianPose(prior.mean, wide))
+        wide_gates = gates_at(inflated, landmarks, frame, candidates)
         if is_lost(gates, wide_gates, candidates, options):
-            predicted, gates, iterations = doubtful, wide_gates, 1 + MORE_ITERATIONS
+            predicted, gates, iterations = inflated, wide_gates, 1 + MORE_ITERATIONS
     tentative = unambiguous_matches(gates, frame, candidates, options)
     refined = refine(predicted, landmarks, frame, tentative, iterations, options.position_gate)
     chosen, log_unmatched = decide(refined, landmarks, frame, candidates, options)  # pass B
@@ -74,13 +74,13 @@ def update_fastslam2(
 
 
 def gates_at(here: WhitenedPose, landmarks: Landmarks, frame: Frame, candidates: Candidates) -> Gates:
-    """Compare each measurement with each of its candidates that can be seen, the doubt about the pose included.
+    """Return the innovation of each measurement and visible candidate, pose uncertainty included.
 
     Args:
-        here: Where the robot may be, map frame.
-        landmarks: The particle's map.
-        frame: What the robot measured (n measurements).
-        candidates: Per measurement the landmarks of the particle that may have caused it.
+        here: Estimated pose of the robot, map frame.
+        landmarks: Map of the particle.
+        frame: Measurements of the robot (n).
+        candidates: Candidate landmarks of the particle for each measurement.
     """
     gates: Gates = {}
     for b, possible in enumerate(candidates):
@@ -92,34 +92,34 @@ def gates_at(here: WhitenedPose, landmarks: Landmarks, frame: Frame, candidates:
 
 
 def is_lost(gates: Gates, wide_gates: Gates, candidates: Candidates, options: FilterOptions) -> bool:
-    """Tell whether a wide prior explains three or more, and most, of what it can explain better than the pose's own.
+    """Return whether a wide prior explains at least three measurements, and most of those it can, that the pose cannot.
 
     A measurement that even the wide prior cannot explain says nothing about the pose: it may be of a new landmark.
 
     Args:
-        gates: Under the pose's own prior.
-        wide_gates: Under the wide one.
-        candidates: As in `gates_at`.
-        options: Of the filter; `position_gate` says what is explained.
+        gates: Innovations under the pose's own prior.
+        wide_gates: Innovations under the wide prior.
+        candidates: Argument of `gates_at`.
+        options: Options of the filter; within `position_gate` a measurement is explained.
     """
     verdicts = []
     for b, possible in enumerate(candidates):
-        own, wide = (
+        narrow, wide = (
             min((found[b, name].distance for _, name in possible if (b, name) in found), default=np.inf)
             for found in (gates, wide_gates)
         )
         if wide <= options.position_gate:
-            verdicts.append(own > options.position_gate)
+            verdicts.append(narrow > options.position_gate)
     return sum(verdicts) >= 3 and 2 * sum(verdicts) > len(verdicts)
 
 
 def unambiguous_matches(gates: Gates, frame: Frame, candidates: Candidates, options: FilterOptions) -> dict[int, int]:
-    """Match, at the predicted pose, each measurement that has one good candidate and no good second.
+    """Match at the predicted pose each measurement with one good candidate and no good second one.
 
     Args:
-        gates: At the predicted pose.
-        frame, candidates: As in `gates_at`.
-        options: Of the filter: its gates, its ambiguity, and whether matches are one-to-one.
+        gates: Innovations at the predicted pose.
+        frame, candidates: Arguments of `gates_at`.
+        options: Options of the filter: gates, ambiguity margin, and one-to-one matching.
 
     Returns:
         Landmark by measurement.
@@ -148,16 +148,16 @@ def refine(
     iterations: int,
     scale: float,
 ) -> WhitenedPose:
-    """Go towards the mode of p(pose, matched measurements) by Gauss-Newton, with weights 1 / (1 + D / scale) (Cauchy).
+    """Approach the mode of p(pose, matched measurements) by Gauss-Newton, with weights 1 / (1 + D / scale) (Cauchy).
 
-    D counts what is known of the pose so far: one wrong match hardly counts once the right ones agree.
+    D includes the present uncertainty of the pose: a single wrong match has little weight once the others agree.
 
     Args:
-        predicted: The pose before the measurements, where it starts.
-        landmarks: The particle's map.
-        frame: What the robot measured.
+        predicted: Pose before the measurements, the initial value.
+        landmarks: Map of the particle.
+        frame: Measurements of the robot.
         matches: Landmark by measurement.
-        iterations: Steps of Gauss-Newton.
+        iterations: Number of Gauss-Newton iterations.
         scale: Squared Mahalanobis distance [-] at which a match has half its weight.
     """
     here = predicted
@@ -168,8 +168,8 @@ def refine(
             if term is None:
                 continue
             weight = 1.0 / (1.0 + term.widened(here.covariance).distance / scale)
-            told, slope = term.in_terms_of(here.root)
-            information = information + weight * told
+            term_information, slope = term.in_terms_of(here.root)
+            information = information + weight * term_information
             gradient = gradient + weight * slope
         here = here.at(here.xi - np.linalg.solve(information, gradient), information)
     return here
@@ -178,15 +178,15 @@ def refine(
 def decide(
     refined: WhitenedPose, landmarks: Landmarks, frame: Frame, candidates: Candidates, options: FilterOptions
 ) -> tuple[list[int], float]:
-    """Match, hold back, pass over or start a landmark, measurement by measurement, at the refined pose.
+    """Match, reject or start a landmark, measurement by measurement, at the refined pose.
 
     Args:
-        refined: The pose that `refine` found.
-        landmarks, frame, candidates: As in `gates_at`.
-        options: Of the filter: its gates, its ambiguity, its dead zone, and whether matches are one-to-one.
+        refined: Result of `refine`.
+        landmarks, frame, candidates: Arguments of `gates_at`.
+        options: Options of the filter: gates, ambiguity margin, dead zone, and one-to-one matching.
 
     Returns:
-        The choices, and the log-likelihood of the measurements that were not matched.
+        The associations, and the log-likelihood of the measurements that were not matched.
     """
     gates = gates_at(refined, landmarks, frame, candidates)
     chosen: list[int] = []
@@ -206,7 +206,7 @@ def decide(
                 costs.append((cost, name, log_density(distance, gate.log_det)))
         costs.sort()
         if len(costs) > 1 and costs[1][0] - costs[0][0] < options.ambiguity_margin:
-            chosen.append(REJECTED)  # held back; yet it is explained as well as its better candidate explains it
+            chosen.append(REJECTED)  # ambiguous, but as likely as its best candidate makes it
             total += costs[0][2]
         elif costs:
             chosen.append(costs[0][1])
@@ -222,22 +222,22 @@ def pose_given(
     """Return the posterior of the pose given the matched measurements, linearised at the refined pose.
 
     Args:
-        refined: The pose that `refine` found.
-        landmarks: The particle's map, before it is updated.
-        frame: What the robot measured.
-        matches: Landmark by measurement; each can be seen from the refined pose.
+        refined: Result of `refine`.
+        landmarks: Map of the particle before its update.
+        frame: Measurements of the robot.
+        matches: Landmark by measurement, all visible from the refined pose.
 
     Returns:
-        The posterior, and the log-evidence of the measurements: of the linearised model, without approximation.
+        The posterior, and the log-evidence of the measurements, exact for the linearised model.
     """
     xi = refined.xi
     information, gradient = np.eye(3), xi
     log_evidence = -0.5 * float(xi @ xi)
     for b, name in matches.items():
         term = frame.compare(refined.pose, landmarks[name], b)
-        assert term is not None, "what cannot be seen from the refined pose is not matched there"
-        told, slope = term.in_terms_of(refined.root)
-        information = information + told
+        assert term is not None, "matches are visible from the refined pose"
+        term_information, slope = term.in_terms_of(refined.root)
+        information = information + term_information
         gradient = gradient + slope
         log_evidence += term.log_density
     step = np.linalg.solve(information, gradient)

@@ -1,7 +1,7 @@
-"""`ReferenceFastSlam`: the particle filter over the paths of K robots as Algorithm 1 has it, in Python, line by line.
+"""Reference implementation of the particle filter over the paths of K robots, Algorithm 1 line by line in Python.
 
-Random numbers are consumed in this order: for each robot that moved or measured one normal triple per particle, then
-the resampling.
+Random numbers are drawn in this order: one normal triple per particle for each robot that moved or measured, then the
+resampling.
 """
 
 from collections.abc import Mapping, Sequence
@@ -35,12 +35,12 @@ from slam_backend.resampling import RESAMPLING
 
 
 class ReferenceFastSlam:
-    """What `FastSlam` does, slowly: the same decisions, and the same numbers up to rounding, from the same seed.
+    """Slow reference of `FastSlam`: the same decisions, and the same numbers up to rounding, from the same seed.
 
     Args:
         num_robots: K.
-        options: As of `FastSlam`.
-        seed: Of the random stream.
+        options: Options of the filter, as for `FastSlam`.
+        seed: Seed of the random stream.
         initial_poses: (K, 3) [m, m, rad], map frame. None: all at the origin.
 
     Raises:
@@ -72,14 +72,14 @@ class ReferenceFastSlam:
             Particle(list(poses), [GaussianPose.known(pose) for pose in poses], list(poses), weight)
             for _ in range(options.num_particles)
         ]
-        self.is_blind = [False] * k  # moved without measuring since its pose was last sampled
-        self.descriptors: dict[int, FloatArray] = {}  # by landmark, of the measurement that started it
+        self.is_blind = [False] * k  # whether each robot moved without measuring since its pose was last sampled
+        self.descriptors: dict[int, FloatArray] = {}  # by landmark, from its first measurement
         self.identities: dict[int, int] = {}
         self.next_id = 0
         self._descriptor_size = 0
         self._estimates = [self._mixture(robot) for robot in range(k)]
 
-    # ------------------------------------------------------------------ what it knows
+    # ------------------------------------------------------------------ estimates
 
     @property
     def weights(self) -> FloatArray:
@@ -92,20 +92,20 @@ class ReferenceFastSlam:
         return int(np.argmax([particle.path_log_weight for particle in self.particles]))
 
     def pose(self, robot: int = 0) -> PoseEstimate:
-        """Return mean and covariance of a robot's pose, map frame, over all particles before they were sampled."""
+        """Return mean and covariance of a robot's pose, map frame, over all particles before sampling."""
         return self._estimates[robot]
 
     def map(self, estimate: Literal["best", "mixture"] = "best") -> LandmarkMap:
         """Return the landmarks of the most probable particle, map frame, by ascending id.
 
         Args:
-            estimate: "best": as that particle has them. "mixture": mean and covariance over all that hold them.
+            estimate: "best": values of that particle. "mixture": mean and covariance over all particles with them.
         """
         check_choice("estimate", estimate, ("best", "mixture"))
         return self._map_of(self.particles[self.best_particle], estimate)
 
     def _map_of(self, best: Particle, estimate: str) -> LandmarkMap:
-        """Return the landmarks that one particle holds, as `map` says."""
+        """Return the landmarks of one particle, with estimates as in `map`."""
         if not best.landmarks:
             return LandmarkMap.empty(self._descriptor_size)
         return landmark_map(best, self.particles if estimate == "mixture" else [best], self.descriptors)
@@ -119,16 +119,16 @@ class ReferenceFastSlam:
         identities: Sequence[ArrayLike | None] | None = None,
         poses: Sequence[ArrayLike | None] | None = None,
     ) -> StepReport:
-        """Move the robots, match what they see, weigh, update, and resample if needed.
+        """Move the robots, match their measurements, weigh, update, and resample if needed.
 
         Args:
-            odometry, measurements, identities, poses: As of `FastSlam.step`, one entry per robot.
+            odometry, measurements, identities, poses: Arguments of `FastSlam.step`, one entry per robot.
 
         Returns:
-            What was matched and created, as of `FastSlam.step`.
+            Data association and statistics, as from `FastSlam.step`.
 
         Raises:
-            ValueError: If an argument is ill-formed; the filter is then as before.
+            ValueError: If an argument is ill-formed; the filter is then unchanged.
         """
         k = len(self.is_blind)
         validate_step(k, self._descriptor_size, self.options.camera, odometry, measurements, identities, poses)
@@ -137,10 +137,10 @@ class ReferenceFastSlam:
         for robot, frame in enumerate(measurements):
             records.append(self._step_robot(robot, moves[robot], frame, names[robot], exact[robot]))
             if self.options.existence is not None and frame is not None:
-                best = self.particles[self.best_particle]  # weights change once all robots have had their turns
+                best = self.particles[self.best_particle]  # weights change after the last robot
                 model, camera = self.options.existence, self.options.camera
                 update_existence(self.particles, best, robot, records[robot], model, camera)
-        for record in records:  # Algorithm 1, l. 9, in logarithms; weights of before are kept
+        for record in records:  # Algorithm 1, l. 9, in logarithms, on top of the previous weights
             for particle, value in zip(self.particles, record.log_likelihoods, strict=True):
                 particle.path_log_weight += value  # Eq. 12, along the ancestral line
                 particle.log_weight += value  # Eqs. 3, 11
@@ -163,7 +163,7 @@ class ReferenceFastSlam:
         names: IntArray | None,
         exact: FloatArray | None,
     ) -> RobotStep:
-        """Take one robot's turn (l. 6-8) in all particles."""
+        """Process one robot's step (l. 6-8) in all particles."""
         size = 0 if seen is None else len(seen)
         record = RobotStep(size, len(self.particles))
         kept = [b for b in range(size) if names is None or names[b] >= 0]
@@ -189,14 +189,14 @@ class ReferenceFastSlam:
         return record
 
     def _candidates(self, frame: Frame) -> Candidates:
-        """Return, for each measurement, the landmarks of all particles that may have caused it (l. 20)."""
+        """Return the candidate landmarks of all particles for each measurement (l. 20)."""
         held = sorted({name for particle in self.particles for name in particle.landmarks})
         if not held:
             return [[] for _ in range(len(frame))]
-        looks = np.array([self.descriptors[name] for name in held])
+        descriptors = np.array([self.descriptors[name] for name in held])
         result: Candidates = []
         for b in range(len(frame)):
-            squares = np.sum((looks - frame.descriptors[b]) ** 2, axis=1)
+            squares = np.sum((descriptors - frame.descriptors[b]) ** 2, axis=1)
             if frame.names is None:
                 possible = [e <= self.options.descriptor_gate**2 for e in squares]
             else:
@@ -214,7 +214,7 @@ class ReferenceFastSlam:
         exact: FloatArray | None,
         normals: FloatArray,
     ) -> RobotUpdate:
-        """Let one particle live through one robot's step."""
+        """Process one robot's step in one particle."""
         options = self.options
         sampled = particle.poses[robot]
         prior = particle.posteriors[robot] if self.is_blind[robot] else GaussianPose.known(sampled)
@@ -225,7 +225,7 @@ class ReferenceFastSlam:
             sigmas = options.motion.sigmas(move)
             sampled = compose(sampled, move + sigmas * normals)  # l. 14, Eq. 4
             prior = prior.moved(move, sigmas)
-        candidates = [[one for one in looks if one[1] in particle.landmarks] for looks in possible]
+        candidates = [[one for one in every if one[1] in particle.landmarks] for every in possible]
         if options.proposal == "fastslam1":
             turn = update_fastslam1(particle.landmarks, sampled, frame, candidates, options)
         elif len(frame):
@@ -237,7 +237,7 @@ class ReferenceFastSlam:
         return turn
 
     def _name_new(self, turns: list[RobotUpdate], frame: Frame) -> dict[int, int]:
-        """Give each landmark that at least one particle has started its lasting name, one per measurement."""
+        """Give permanent names to the landmarks that at least one particle has started, one per measurement."""
         lasting = {}
         for b in range(len(frame)):
             if any(turn.chosen[b] == NEW - b for turn in turns):
@@ -256,17 +256,17 @@ class ReferenceFastSlam:
         return pose_mixture([particle.posteriors[robot] for particle in self.particles], self.weights)
 
     def _report(self, records: list[RobotStep], best: int) -> StepReport:
-        """Tell what particle `best` did in this step."""
+        """Return the report of this step for particle `best`."""
         return report_of(records, best, self.weights, self.options.resample_threshold)
 
     def _resample(self) -> None:
-        """Draw the particles anew in proportion to their weights; all that a particle holds is copied with it."""
+        """Resample the particles in proportion to their weights, with their poses and maps."""
         ancestors = RESAMPLING[self.options.resampling](self.weights, self.rng)
         self.particles = descendants(self.particles, ancestors)
 
 
 def _arrays(values: Sequence[ArrayLike | None] | None, k: int, dtype: Any = np.float64) -> list[NDArray[Any] | None]:
-    """Return one kind of reading of k robots as arrays, None where there is none."""
+    """Return one kind of input of k robots as arrays, None where missing."""
     given = [None] * k if values is None else values
     return [None if value is None else np.asarray(value, dtype) for value in given]
 
@@ -293,8 +293,8 @@ def landmark_mixture(landmarks: Sequence[Landmark], weights: FloatArray) -> tupl
     """Return the mixture of the particles' estimates of one landmark (Sec. 3.2, see `docs/reference/errata.md`).
 
     Args:
-        landmarks: Those of the particles that hold it (n).
-        weights: (n,) float64, of these particles; they are scaled to sum to 1.
+        landmarks: Landmark in each of the n particles that hold it.
+        weights: (n,) float64, weights of these particles; they are scaled to sum to 1.
 
     Returns:
         Mean mu (3,) [m] and covariance (3, 3) [m^2], sum w_m (Sigma_m + (mu_m - mu)(mu_m - mu)^T), map frame.
@@ -308,15 +308,15 @@ def landmark_mixture(landmarks: Sequence[Landmark], weights: FloatArray) -> tupl
 
 
 def landmark_map(best: Particle, holders: Sequence[Particle], descriptors: Mapping[int, FloatArray]) -> LandmarkMap:
-    """Return the landmarks of one particle, each as the mixture of what some particles hold of it.
+    """Return the landmarks of one particle, each as the mixture over some particles.
 
     Args:
-        best: Which says what landmarks there are, at least one, and how often they were measured.
-        holders: Whose estimates are mixed; `best` among them.
+        best: Particle with at least one landmark; its landmarks and counts are returned.
+        holders: Particles of the mixture, `best` among them.
         descriptors: (d,) by landmark.
 
     Returns:
-        By ascending id, map frame.
+        The landmarks by ascending id, map frame.
     """
     names = sorted(best.landmarks)
     found = []
@@ -325,6 +325,6 @@ def landmark_map(best: Particle, holders: Sequence[Particle], descriptors: Mappi
         weights = np.exp([particle.log_weight for particle in sharers])
         found.append(landmark_mixture([particle.landmarks[name] for particle in sharers], weights))
     means, covariances = zip(*found, strict=True)
-    looks = np.array([descriptors[name] for name in names], np.float32)
+    rows = np.array([descriptors[name] for name in names], np.float32)
     counts = [best.landmarks[name].count for name in names]
-    return LandmarkMap(np.array(means), np.array(covariances), looks, np.array(counts), np.array(names))
+    return LandmarkMap(np.array(means), np.array(covariances), rows, np.array(counts), np.array(names))

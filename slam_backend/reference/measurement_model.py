@@ -1,8 +1,8 @@
-"""One robot's frame in the plain filter: predictions with explicit Jacobians, densities, landmark EKFs.
+"""Measurement model of the reference filter: predictions with explicit Jacobians, densities, and landmark EKFs.
 
-Measurements are compared in the space in which they are made, (u, v, disparity) for a stereo camera and the camera
-frame for points with given covariances. Densities per pixel^3 are multiplied by the camera's constant f^3 b; they are
-then those of points in space, N(r; 0, S) Z^4, where r and S are measured in metres and Z is the predicted depth.
+Measurements are compared in their own space, (u, v, disparity) for a stereo camera and the camera frame for points with
+given covariances. Densities per pixel^3 are multiplied by the camera's constant f^3 b, which makes them densities of
+points in space, N(r; 0, S) Z^4, where r and S are measured in metres and Z is the predicted depth.
 """
 
 from collections.abc import Sequence
@@ -22,9 +22,9 @@ LOG_2PI = float(np.log(2.0 * np.pi))
 
 @dataclass
 class Landmark:
-    """One EKF: mean (3,) [m] and covariance (3, 3) [m^2] in the map frame, and how often it was measured.
+    """Landmark EKF: mean (3,) [m] and covariance (3, 3) [m^2] in the map frame, and number of measurements.
 
-    The log-odds that it exists mean something only where the filter has an existence model.
+    The log-odds of existence are unused without an existence model.
     """
 
     mean: FloatArray
@@ -35,13 +35,13 @@ class Landmark:
 
 @dataclass(frozen=True)
 class Innovation:
-    """How far a measurement is from its prediction, and how far it may be.
+    """Difference of a measurement from its prediction, with its covariance.
 
     Attributes:
         innovation: (3,) measured minus predicted (z - z^), in the space of the measurement.
-        covariance: (3, 3) S, of the innovation.
+        covariance: (3, 3) S, covariance of the innovation.
         by_pose: (3, 3) H = dz^ / d pose.
-        log_unit: Added to log-densities of the innovation, so that they are those of points in space.
+        log_unit: Term added to log-densities of the innovation, to convert them to points in space.
     """
 
     innovation: FloatArray
@@ -56,7 +56,7 @@ class Innovation:
 
     @cached_property
     def log_det(self) -> float:
-        """The log-determinant of S, for points in space."""
+        """Log-determinant of S, for points in space."""
         return float(np.linalg.slogdet(self.covariance)[1]) - 2.0 * self.log_unit
 
     @property
@@ -65,7 +65,7 @@ class Innovation:
         return log_density(self.distance, self.log_det)
 
     def widened(self, pose_covariance: FloatArray) -> "Innovation":
-        """Return the same where the pose is uncertain too: S + H P H^T.
+        """Return the innovation with the uncertainty of the pose included: S + H P H^T.
 
         Args:
             pose_covariance: (3, 3) P of (x, y, theta) [m, m, rad], map frame.
@@ -73,7 +73,7 @@ class Innovation:
         return replace(self, covariance=self.covariance + self.by_pose @ pose_covariance @ self.by_pose.T)
 
     def in_terms_of(self, root: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return what the measurement tells of xi, where pose = x + root xi, at xi = 0.
+        """Return the information of the measurement about xi, where pose = x + root xi, at xi = 0.
 
         Args:
             root: (3, 3) factor of the pose's covariance [m, m, rad].
@@ -90,23 +90,23 @@ def log_density(distance: float, log_det: float) -> float:
     """Return the log of a Gaussian density in three dimensions.
 
     Args:
-        distance: D, the squared Mahalanobis distance from its mean.
-        log_det: log|S| of its covariance.
+        distance: D, squared Mahalanobis distance from the mean.
+        log_det: log|S| of the covariance.
     """
     return -0.5 * (distance + log_det + 3.0 * LOG_2PI)  # Eq. 11
 
 
 class Frame:
-    """The measurements of one robot in one step as vectors z (n, 3) with their noise covariances R (n, 3, 3).
+    """Measurements of one robot in one step as vectors z (n, 3) with their noise covariances R (n, 3, 3).
 
     Args:
-        measurements: What the camera reported; None: nothing.
-        kept: Indices of the measurements to be used.
-        names: Of the landmarks measured, by the caller's word; None: unknown.
-        camera: Its assumed model.
+        measurements: Measurements of the camera; None: none.
+        kept: Indices of the measurements in use.
+        names: Caller's names of the measured landmarks; None: unknown.
+        camera: Assumed model of the camera.
 
     Attributes:
-        points: (n, 3) float64 [m], camera frame. As measured.
+        points: (n, 3) float64 [m], camera frame. Measured points.
         descriptors: (n, d) float64.
         in_image: Whether z is (u, v, disparity) [px]; otherwise it is `points`.
         z: (n, 3) float64, the measurements.
@@ -150,7 +150,7 @@ class Frame:
 
         Returns:
             z^ (3,), and its Jacobians by landmark (G) and by pose (H), (3, 3) each, all in the units of `z`; None if
-            the landmark cannot be seen, as it lies less than `MIN_DEPTH` ahead of a stereo camera.
+            the landmark is not visible, as it lies less than `MIN_DEPTH` ahead of a stereo camera.
         """
         turn = turn_about_vertical(pose[2])
         c, s = np.cos(pose[2]), np.sin(pose[2])
@@ -171,11 +171,11 @@ class Frame:
         return self.camera.project(point), by_point @ g, by_point @ h  # Eqs. 5, 6
 
     def compare(self, pose: FloatArray, landmark: Landmark, b: int) -> Innovation | None:
-        """Return how a measurement differs from what a known pose predicts (Eqs. 5-7); None if it cannot be seen.
+        """Return the innovation of a measurement at an exact pose (Eqs. 5-7); None if the landmark is not visible.
 
         Args:
             pose: (3,) of the robot [m, m, rad], map frame.
-            landmark: Of which it may be.
+            landmark: Candidate landmark.
             b: Number of the measurement.
         """
         prediction = self.predict(pose, landmark.mean)
@@ -186,11 +186,11 @@ class Frame:
         return Innovation(self.z[b] - z_hat, covariance, h, self.log_unit)
 
     def metres(self, pose: FloatArray, landmark: Landmark, b: int) -> float:
-        """Return how far a measured point lies from a landmark [m]; a camera's are scaled to the landmark's depth.
+        """Return the distance of a measured point from a landmark [m], in images scaled to the landmark's depth.
 
         Args:
             pose: (3,) of the robot [m, m, rad], map frame.
-            landmark: Any.
+            landmark: Any landmark.
             b: Number of the measurement.
         """
         offset = landmark.mean - [pose[0], pose[1], 0.0]
@@ -199,7 +199,7 @@ class Frame:
         return float(scale * np.linalg.norm(self.points[b] - point))
 
     def log_clutter(self, b: int, p0: float) -> float:
-        """Return the log-density of a measurement that matches nothing, where it was measured (l. 32).
+        """Return the log-density of an unmatched measurement, in its own space (l. 32).
 
         Args:
             b: Number of the measurement.
@@ -209,14 +209,14 @@ class Frame:
         return float(np.log(p0) + jacobian)
 
     def new_landmark(self, pose: FloatArray, b: int, walk: float = 0.0) -> Landmark:
-        """Place what was never seen before (l. 30-31): mean g^-1(x, v), covariance G^-1 R G^-T + walk I.
+        """Start a landmark (l. 30-31): mean g^-1(x, v), covariance G^-1 R G^-T + walk I.
 
-        Printed is the inverse of G^-1 R G^-T; see `docs/reference/errata.md`.
+        The paper prints the inverse of G^-1 R G^-T; see `docs/reference/errata.md`.
 
         Args:
             pose: (3,) of the robot [m, m, rad], map frame.
             b: Number of the measurement.
-            walk: Variance [m^2] by which the landmark may have moved, along each axis, when it is seen the next time.
+            walk: Variance [m^2] of the landmark's random walk until its next measurement, along each axis.
         """
         turn = turn_about_vertical(pose[2])
         mean = turn @ self.camera.robot_from_camera(self.points[b]) + [pose[0], pose[1], 0.0]  # l. 30
@@ -225,14 +225,14 @@ class Frame:
         return Landmark(mean, to_map @ noise @ to_map.T + walk * np.eye(3))  # l. 31 *
 
     def update(self, pose: FloatArray, landmark: Landmark, b: int, walk: float = 0.0, iterations: int = 1) -> None:
-        """Improve a landmark by its measurement at a known pose (iterated EKF); what cannot be seen is only counted.
+        """Update a landmark by its measurement at an exact pose (iterated EKF); if it is not visible, only count it.
 
         Args:
             pose: (3,) of the robot [m, m, rad], map frame.
-            landmark: Changed.
+            landmark: The landmark, changed.
             b: Number of the measurement.
-            walk: As in `new_landmark`.
-            iterations: From the second on the model is linearised where the one before has led.
+            walk: Variance of the random walk, see `new_landmark`.
+            iterations: Number of linearisations, each at the estimate of the one before.
         """
         landmark.count += 1
         mean, sigma = landmark.mean, landmark.covariance
@@ -248,5 +248,5 @@ class Frame:
             if iteration == iterations - 1:
                 keep = np.eye(3) - gain @ g
                 landmark.mean = here
-                landmark.covariance = keep @ sigma @ keep.T + gain @ self.noises[b] @ gain.T  # Eq. 10, Joseph's form
+                landmark.covariance = keep @ sigma @ keep.T + gain @ self.noises[b] @ gain.T  # Eq. 10, Joseph form
                 landmark.covariance += walk * np.eye(3)

@@ -1,4 +1,4 @@
-"""Particles of the reference filter, and the input of one robot in one step."""
+"""Particles of the reference filter, and the results of one robot's step."""
 
 import copy
 from collections.abc import Sequence
@@ -13,23 +13,23 @@ from slam_backend.reference.pose_gaussian import GaussianPose
 from slam_backend.resampling import effective_sample_size
 
 REJECTED = -1
-NEW = -2  # minus b: the landmark that measurement b starts, until all particles have decided and it gets its name
+NEW = -2  # minus b: provisional name of the landmark that measurement b starts
 
 Landmarks = dict[int, Landmark]  # one particle's map, by name
-Candidates = list[list[tuple[float, int]]]  # per measurement (squared descriptor distance E, landmark), nearest first
+Candidates = list[list[tuple[float, int]]]  # by measurement (squared descriptor distance E, landmark), nearest first
 
 
 @dataclass(frozen=True)
 class RobotUpdate:
-    """What one particle made of one robot's step.
+    """Result of one robot's step in one particle.
 
     Attributes:
-        posterior: Of the pose, before it was sampled.
+        posterior: Distribution from which the pose was sampled.
         pose: (3,) the sample [m, m, rad].
-        chosen: Per measurement the landmark to which it was given, `REJECTED`, or `NEW` minus its number.
-        distances: Per measurement the squared Mahalanobis distance of its match at the predicted pose, infinite
-            where the match could not be seen from there; NaN where nothing was matched.
-        log_likelihood: Of the measurements, given the particle's past.
+        chosen: Landmark associated with each measurement, `REJECTED`, or `NEW` minus its number.
+        distances: Squared Mahalanobis distance of each match at the predicted pose, infinite if it was not visible from
+            there; NaN without a match.
+        log_likelihood: Log-likelihood of the measurements, given the particle's past.
     """
 
     posterior: GaussianPose
@@ -40,25 +40,25 @@ class RobotUpdate:
 
 
 def is_held(b: int, possible: Sequence[tuple[float, int]], chosen: Sequence[int], names: Sequence[int]) -> bool:
-    """Tell whether a particle has a landmark of a measurement's name: then it starts no second one.
+    """Return whether a particle has a landmark with the name of a measurement, which then starts no other.
 
     Args:
-        b: The measurement.
-        possible: The landmarks of the particle that have its name.
-        chosen: Outcome of the measurements before it.
+        b: Number of the measurement.
+        possible: Landmarks of the particle with this name.
+        chosen: Associations of the measurements before it.
         names: The caller's names of all measurements of the frame.
     """
     return bool(possible) or any(chosen[a] == NEW - a and names[a] == names[b] for a in range(b))
 
 
 class RobotStep:
-    """What one robot's step came to: per measurement of its frame (n) and per particle (M).
+    """Result of one robot's step, per measurement of its frame (n) and per particle (M).
 
     Attributes:
-        associations: (n, M) int64. The landmark to which the particle gave the measurement; -1: to none.
+        associations: (n, M) int64. Landmark that the particle associated with the measurement, -1 = none.
         distances: (n, M) float64. Squared Mahalanobis distance of the match; NaN where there is none.
-        created: (n,) int64. The landmark that the measurement started in at least one particle; -1: none.
-        log_likelihoods: (M,) float64. What the particle's weight is multiplied by.
+        created: (n,) int64. Landmark that the measurement started in at least one particle, -1 = none.
+        log_likelihoods: (M,) float64. Log of the factor of the particle's weight.
         measured: Whether a measurement was used.
     """
 
@@ -71,13 +71,13 @@ class RobotStep:
 
 
 def report_of(records: Sequence[RobotStep], best: int, weights: FloatArray, resample_threshold: float) -> StepReport:
-    """Tell what one particle did in a step, and whether the particles are to be resampled (l. 10).
+    """Return the report of a step for one particle, with the decision to resample (l. 10).
 
     Args:
-        records: Of all robots.
-        best: The most probable particle.
+        records: Results of all robots.
+        best: Index of the most probable particle.
         weights: (M,) float64, summing to 1, after the step.
-        resample_threshold: Share of M below which the effective sample size asks for it.
+        resample_threshold: Share of M below which the effective sample size triggers resampling.
     """
     associations = tuple(record.associations[:, best] for record in records)
     created = tuple(record.created for record in records)
@@ -85,7 +85,7 @@ def report_of(records: Sequence[RobotStep], best: int, weights: FloatArray, resa
     num_new = int(np.sum((given >= 0) & (given == started)))
     num_rejected = int(np.sum(given < 0))
     distances = np.concatenate([record.distances[:, best] for record in records])
-    judged = distances[distances < np.inf]  # neither NaN nor infinite
+    finite = distances[distances < np.inf]  # neither NaN nor infinite
     ess = effective_sample_size(weights)
     threshold = resample_threshold * len(weights) * (1.0 + 1e-9)  # rounding must not decide
     measured = any(record.measured for record in records)
@@ -97,22 +97,22 @@ def report_of(records: Sequence[RobotStep], best: int, weights: FloatArray, resa
         num_matched=len(given) - num_new - num_rejected,
         num_rejected=num_rejected,
         ess=ess,
-        nis=float(judged.mean()) if len(judged) else float("nan"),
+        nis=float(finite.mean()) if len(finite) else float("nan"),
         resampled=measured and ess <= threshold,
     )
 
 
 @dataclass
 class Particle:
-    """One hypothesis (Eq. 19): the poses of the K robots and the map conditioned on their paths.
+    """Hypothesis (Eq. 19): poses of the K robots and the map conditioned on their paths.
 
     Attributes:
-        poses: Of each robot (3,) [m, m, rad], map frame.
-        posteriors: Of these poses, before they were sampled.
-        starts: Of each robot (3,) [m, m, rad], map frame.
-        log_weight: Since the last resampling, normalised.
-        path_log_weight: Accumulated along the ancestral line (Eq. 12).
-        landmarks: The map, by name.
+        poses: Pose of each robot (3,) [m, m, rad], map frame.
+        posteriors: Distributions from which these poses were sampled.
+        starts: Start pose of each robot (3,) [m, m, rad], map frame.
+        log_weight: Log-weight since the last resampling, normalised.
+        path_log_weight: Log-weight accumulated along the ancestral line (Eq. 12).
+        landmarks: Map, by name.
     """
 
     poses: list[FloatArray]
@@ -124,9 +124,9 @@ class Particle:
 
 
 def keep_survivors_in_place(ancestors: IntArray) -> IntArray:
-    """Reorder ancestors (M,) so that every particle that is drawn keeps its own place.
+    """Reorder ancestors (M,) so that each surviving particle keeps its place.
 
-    The surplus copies, by ascending parent, fill the places of those that were not drawn, in ascending order.
+    Additional copies, by ascending parent, fill the places of the other particles, in ascending order.
 
     >>> keep_survivors_in_place(np.array([3, 3, 3, 1])).tolist()
     [3, 1, 3, 3]
@@ -138,11 +138,11 @@ def keep_survivors_in_place(ancestors: IntArray) -> IntArray:
 
 
 def descendants(particles: list[Particle], ancestors: IntArray) -> list[Particle]:
-    """Return the particles that were drawn, equally weighted; no two of them share anything that a step writes.
+    """Return the resampled particles, equally weighted, without shared mutable parts.
 
     Args:
-        particles: M; those that keep their place are used again.
-        ancestors: (M,) int64, the index of each one's ancestor, in any order.
+        particles: M; those that keep their place are reused.
+        ancestors: (M,) int64. Index of the ancestor of each new particle, in any order.
     """
     parents = keep_survivors_in_place(ancestors)
     drawn = [

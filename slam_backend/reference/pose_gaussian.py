@@ -1,4 +1,4 @@
-"""What is known of one robot's pose: a Gaussian, and the same with its uncertainty scaled to one (whitened)."""
+"""Gaussian pose of one robot, and its whitened form with unit covariance."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ import numpy as np
 from slam_backend.core.validation import FloatArray
 from slam_backend.geometry import wrap_angle
 
-ZERO_PIVOT = 1e-12  # relative to the variance: below it a direction is taken to be exact
+ZERO_PIVOT = 1e-12  # relative to the variance; below it a direction counts as exact
 
 
 def turn_about_vertical(theta: float) -> FloatArray:
@@ -24,7 +24,7 @@ def wrapped(pose: FloatArray) -> FloatArray:
 def lower_root(covariance: FloatArray) -> FloatArray:
     """Return the lower triangular C (3, 3) with C C^T = covariance (Cholesky).
 
-    A direction without uncertainty (a pivot that vanishes beside its diagonal element) gets a column of zeros.
+    A direction without uncertainty (a pivot that is negligible beside its diagonal element) gets a column of zeros.
     """
     root = np.zeros((3, 3))
     for j in range(3):
@@ -36,14 +36,14 @@ def lower_root(covariance: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class GaussianPose:
-    """A Gaussian pose: mean (3,) [m, m, rad], map frame, heading on any branch; covariance (3, 3), 0 where known."""
+    """Gaussian pose: mean (3,) [m, m, rad], map frame, heading on any branch; covariance (3, 3), 0 if exact."""
 
     mean: FloatArray
     covariance: FloatArray
 
     @classmethod
     def known(cls, pose: FloatArray) -> "GaussianPose":
-        """Return the belief of a pose without any doubt."""
+        """Return an exact pose."""
         return cls(pose, np.zeros((3, 3)))
 
     def moved(self, odometry: FloatArray, sigmas: FloatArray) -> "GaussianPose":
@@ -55,14 +55,14 @@ class GaussianPose:
         """
         turn = turn_about_vertical(self.mean[2])
         x, y, _ = turn @ odometry
-        by_before = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])  # F = d(mean o u) / d mean
-        carried = by_before @ self.covariance @ by_before.T
+        by_previous = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])  # F = d(mean o u) / d mean
+        carried = by_previous @ self.covariance @ by_previous.T
         return GaussianPose(self.mean + turn @ odometry, carried + turn @ np.diag(sigmas**2) @ turn.T)
 
 
 @dataclass(frozen=True)
 class WhitenedPose:
-    """A pose written as start + root xi, where xi ~ N(0, 1) before the measurements and N(xi, information^-1) now.
+    """Pose written as start + root xi, where xi ~ N(0, 1) before the measurements and N(xi, information^-1) now.
 
     Attributes:
         start: (3,) [m, m, rad], map frame, heading on any branch.
@@ -83,12 +83,12 @@ class WhitenedPose:
 
     @classmethod
     def of(cls, belief: GaussianPose) -> "WhitenedPose":
-        """Whiten a belief along the robot's own axes, however the map frame happens to be turned."""
+        """Whiten a Gaussian along the robot's own axes, independent of the heading of the map frame."""
         turn = turn_about_vertical(belief.mean[2])
         return cls.before_measurements(belief.mean, turn @ lower_root(turn.T @ belief.covariance @ turn))
 
     def at(self, xi: FloatArray, information: FloatArray) -> "WhitenedPose":
-        """Return the same prior with something else known of xi: its mean (3,) and its information (3, 3)."""
+        """Return the same prior with another estimate of xi: mean (3,) and information (3, 3)."""
         return WhitenedPose(self.start, self.root, xi, information)
 
     @property
@@ -107,5 +107,5 @@ class WhitenedPose:
         return self.root @ self.spread @ self.root.T
 
     def sample(self, normals: FloatArray) -> FloatArray:
-        """Return the pose (3,) that standard normal numbers (3,) draw, heading wrapped."""
+        """Return the pose (3,) for standard normal numbers (3,), heading wrapped."""
         return wrapped(self.pose + self.root @ lower_root(self.spread) @ normals)

@@ -1,1 +1,1 @@
-"""Teams of filters: groups, communication, merges and their undoing."""
+"""Teams of filters: groups, communication, merges and rollback."""

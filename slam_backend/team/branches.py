@@ -1,8 +1,8 @@
-"""`Branch`: a filter and the robots that go by it; how a filter forks when robots lose contact, and is told later.
+"""Filters with the robots that use them, forks for robots that lose contact, and replay on their return.
 
-A group's *trunk* is its joint filter. Robots that lose contact with those who keep it go on with a copy, a *fork*, that
-takes in only what they read themselves, while the trunk holds their poses as they were. On return the trunk takes in
-what they have read meanwhile, in order of time, and the fork is dropped.
+A group's *trunk* is its joint filter. Robots that lose contact with the trunk's robots continue with a copy, a *fork*,
+which gets their own inputs only, while the trunk keeps their last poses. On return the trunk replays their inputs since
+then, in order of time, and the fork is dropped.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,26 +18,26 @@ from slam_backend.fastslam.reports import Associations, StepReport
 from slam_backend.fastslam.step_input import InputBuffer, RobotRows, StepInput, rows_of
 from slam_backend.team.merge_monitor import MergeMonitor
 
-MAX_REPLAYED = 20  # buffered steps that a filter takes in per tick
-TURNS = 4  # filters smooth in turn: that of a robot only in every fourth step
+MAX_REPLAYED = 20  # buffered steps that a filter replays per tick
+TURNS = 4  # each robot's filter may smooth in one of this many steps
 
 
 @dataclass(slots=True, eq=False)
 class Branch:
-    """A filter and the robots that go by it.
+    """Filter with the robots that use it.
 
     Attributes:
-        robots: Of the filter, ascending, in the filter's order.
-        active_robots: Those of them that go by it now, ascending.
-        filter: Of all `robots`.
-        last_steps: Per robot of the filter the last step whose readings it has taken in, -1 = none.
-        number: Of its map; each filter that ever was has one of its own.
-        epoch: How many merges and undos the team had seen when the filter was made: the higher the more it knows.
-        report: Of its last step.
-        split_from: Number of the map with which it had all in common at the split; None before any.
-        monitors: Of its merges that can still be undone, oldest first.
-        split_counts: The landmarks of that map whose descriptors its robots know, by id, and how often each had been
-            measured when they were last told.
+        robots: Robots of the filter, ascending, in the filter's order.
+        active_robots: Robots that use it now, ascending.
+        filter: Filter of all `robots`.
+        last_steps: Last step processed for each robot of the filter, -1 = none.
+        number: Number of its map, unique among all filters ever made.
+        epoch: Number of merges and undos in the team when the filter was made; a higher one knows more.
+        report: Report of its last step.
+        split_from: Number of the map that it was split from; None before any split.
+        monitors: Monitors of its merges that can still be undone, oldest first.
+        split_counts: Number of measurements, when last received, of each landmark of that map whose descriptor its
+            robots know, by id.
     """
 
     robots: tuple[int, ...]
@@ -52,11 +52,11 @@ class Branch:
     split_counts: dict[int, int] = field(default_factory=dict)
 
     def known_landmarks(self, main: "Branch", replayed: Sequence["ReplayedStep"]) -> dict[int, int]:
-        """Return which landmarks of the filter they return to the robots know, those included that they just created.
+        """Return the landmarks of the filter they return to that the robots know, those just created included.
 
         Args:
-            main: Which took in `replayed`.
-            replayed: Among others what these robots read.
+            main: Branch that replayed the steps.
+            replayed: Steps replayed, those of these robots among them.
         """
         if self.split_from != main.number:
             self.split_from, self.split_counts = main.number, {}
@@ -68,7 +68,7 @@ class Branch:
         return self.split_counts
 
     def get_state(self) -> dict[str, Any]:
-        """Return all that decides how the branch goes on."""
+        """Return the complete state of the branch."""
         return {
             "robots": self.robots,
             "active_robots": self.active_robots,
@@ -77,20 +77,20 @@ class Branch:
             "number": self.number,
             "epoch": self.epoch,
             "report": self.report,
-            "monitors": tuple(watch.copy() for watch in self.monitors),
+            "monitors": tuple(monitor.copy() for monitor in self.monitors),
             "split_from": self.split_from,
             "split_counts": dict(self.split_counts),
         }
 
     @classmethod
     def from_state(cls, state: Mapping[str, Any], at_hand: FastSlam | None = None) -> "Branch":
-        """Build a branch from `get_state`; a filter at hand is filled in place of a new one."""
+        """Build a branch from `get_state`; a given filter is reused."""
         slam = restored_filter(state["filter"], at_hand)
         rest = {name: state[name] for name in ("robots", "active_robots", "number", "epoch", "split_from")}
         return cls(
             filter=slam,
             last_steps=dict(state["last_steps"]),
-            monitors=[watch.copy() for watch in state["monitors"]],
+            monitors=[monitor.copy() for monitor in state["monitors"]],
             split_counts=dict(state["split_counts"]),
             report=with_constants(state["report"]),
             **rest,
@@ -98,13 +98,13 @@ class Branch:
 
 
 class ReplayedStep(NamedTuple):
-    """What a filter made of a step that it took in later.
+    """Step that a filter processed later.
 
     Attributes:
         step: Number of the step.
-        robots: Whose readings it took in.
-        inputs: Those readings, and the other robots'.
-        report: Of the filter, one entry for each of its robots.
+        robots: Robots whose inputs were processed.
+        inputs: Inputs of all robots in the step.
+        report: Report of the filter, one entry for each of its robots.
     """
 
     step: int
@@ -114,25 +114,25 @@ class ReplayedStep(NamedTuple):
 
 
 def restored_filter(state: Mapping[str, Any], at_hand: FastSlam | None = None) -> FastSlam:
-    """Return a filter that goes on from `FastSlam.get_state`; one at hand is filled, which is faster than building."""
+    """Return a filter with a state from `FastSlam.get_state`; reuse of a given one is faster than construction."""
     slam = at_hand if at_hand is not None else FastSlam.from_options(len(state["poses"]), state["options"])
     slam.restore_checked(state)
     return slam
 
 
 def landmark_counts(slam: FastSlam) -> dict[int, int]:
-    """Return how often each landmark of the most probable particle was measured, by id."""
+    """Return the number of measurements of each landmark of the most probable particle, by id."""
     held = slam.map()
     return dict(zip(held.ids.tolist(), held.counts.tolist(), strict=True))
 
 
 class StepRouting(NamedTuple):
-    """How a filter takes in steps, as long as nobody joins or leaves.
+    """Routing of steps to a filter, valid until a robot joins or leaves.
 
     Attributes:
-        robots: Whose readings it takes in.
-        rows: Of its robots; the others stand still, unseeing.
-        batches: In which of `TURNS` steps it smooths.
+        robots: Robots whose inputs are processed.
+        rows: Rows of the filter's robots; the others stand still and see nothing.
+        batches: Steps modulo `TURNS` in which the filter may smooth.
     """
 
     robots: tuple[int, ...]
@@ -141,52 +141,53 @@ class StepRouting(NamedTuple):
 
     @classmethod
     def of(cls, branch: Branch, robots: tuple[int, ...]) -> Self:
-        """Return how a filter takes in what some of its robots read."""
+        """Return the routing of some robots' inputs to a filter."""
         rows = tuple(robot if robot in robots else -1 for robot in branch.robots)
         smoothing = branch.robots if branch.split_from is None else branch.active_robots
         return cls(robots, rows_of(rows), frozenset(robot % TURNS for robot in smoothing))
 
 
 def process_step(
-    branch: Branch, step: int, intake: StepRouting, inputs: StepInput, findings: Associations, told: IntArray
+    branch: Branch, step: int, routing: StepRouting, inputs: StepInput, associations: Associations, buffer: IntArray
 ) -> StepReport:
-    """Let a filter take in what some of its robots read in one step.
+    """Process the inputs of some robots of a filter in one step.
 
-    If there is nothing to take in the filter stays as it is, bit for bit, so that a later replay finds it unchanged.
+    Without any input the filter does not change, bit for bit, so that a later replay gives the same result.
 
     Args:
-        branch: Whose filter steps; its `known`, `report` and watches move on.
-        step: Number of the step; the filter's logs bear it, whenever it is taken in.
-        intake: Of the branch and these robots.
-        inputs: Of all robots of the team, checked by `validate_step`.
-        findings: Of `inputs`.
-        told: Their buffer, see `Associations.allocate`; what becomes of these robots' measurements is written there.
+        branch: Branch of the filter; its `last_steps`, `report` and monitors are updated.
+        step: Number of the step in the filter's logs, in a replay too.
+        routing: Routing of these robots' inputs to the branch.
+        inputs: Inputs of all robots of the team, from `validate_step`.
+        associations: Data association of `inputs`.
+        buffer: Writable array of `associations`, see `Associations.allocate`; the association of these robots'
+            measurements is written there.
     """
-    robots, seats, turns = intake
+    robots, rows, batches = routing
     for robot in robots:
         branch.last_steps[robot] = step
-    for watch in branch.monitors:
-        watch.steps += len(robots) == len(branch.robots) or watch.both_sides_connected(robots)
+    for monitor in branch.monitors:
+        monitor.steps += len(robots) == len(branch.robots) or monitor.both_sides_connected(robots)
     if inputs.inactive and inputs.inactive.issuperset(robots):
-        branch.report = report = _silent_report(branch, seats, findings)
+        branch.report = report = _silent_report(branch, rows, associations)
         return report
     slam = branch.filter
-    slam.may_smooth = step % TURNS in turns
-    branch.report = report = slam.step_checked(inputs, seats, findings, told, step)
+    slam.may_smooth = step % TURNS in batches
+    branch.report = report = slam.step_checked(inputs, rows, associations, buffer, step)
     if report.num_created:
-        for watch in branch.monitors:
-            watch.update(branch.robots, report)
+        for monitor in branch.monitors:
+            monitor.update(branch.robots, report)
     return report
 
 
-def _silent_report(branch: Branch, seats: RobotRows, findings: Associations) -> StepReport:
-    """Return the report of a step in which nothing happened."""
+def _silent_report(branch: Branch, rows: RobotRows, associations: Associations) -> StepReport:
+    """Return the report of a step without input."""
     ess = float(branch.filter.num_particles) if branch.report is None else branch.report.ess
-    return StepReport(findings, seats.rows, 0, 0, 0, 0, ess, float("nan"), False)
+    return StepReport(associations, rows.rows, 0, 0, 0, 0, ess, float("nan"), False)
 
 
 def fork(branch: Branch, live: tuple[int, ...], number: int, rng: np.random.Generator) -> Branch:
-    """Copy a branch for robots that lose contact with it; the copy draws from a stream of its own."""
+    """Copy a branch for robots that lose contact with it; the copy has its own random stream."""
     stream = np.random.default_rng(rng.integers(2**63, size=4)).bit_generator.state
     slam = restored_filter(branch.filter.get_state() | {"rng": stream})
     return Branch(
@@ -197,14 +198,14 @@ def fork(branch: Branch, live: tuple[int, ...], number: int, rng: np.random.Gene
         number=number,
         epoch=branch.epoch,
         report=branch.report,
-        monitors=[watch.copy() for watch in branch.monitors],
+        monitors=[monitor.copy() for monitor in branch.monitors],
         split_from=branch.number if branch.split_from is None else branch.split_from,
         split_counts=landmark_counts(slam) if branch.split_from is None else dict(branch.split_counts),
     )
 
 
 def split_by_component(live: Sequence[int], networks: IntArray) -> list[tuple[int, ...]]:
-    """Divide robots by their networks: the largest part first, of equal ones that with the lowest robot."""
+    """Divide robots by network: the largest part first, among equal ones that with the lowest robot."""
     by_network: dict[int, list[int]] = {}
     for robot in live:
         by_network.setdefault(int(networks[robot]), []).append(robot)
@@ -212,7 +213,7 @@ def split_by_component(live: Sequence[int], networks: IntArray) -> list[tuple[in
 
 
 def missing(branch: Branch, other: Branch) -> dict[int, int]:
-    """Return per robot the last step that `other` knows of it, where `branch` has not taken in so much."""
+    """Return the last step that `other` has processed for each robot whose steps `branch` lacks."""
     return {
         robot: last
         for robot, last in other.last_steps.items()
@@ -223,16 +224,16 @@ def missing(branch: Branch, other: Branch) -> dict[int, int]:
 def replay(
     branch: Branch, log: InputBuffer, wanted: Mapping[int, int], most: int | None = MAX_REPLAYED
 ) -> list[ReplayedStep]:
-    """Let a filter take in what it lacks, in order of time.
+    """Process the steps that a filter lacks, in order of time.
 
     Args:
-        branch: Whose filter; its `known` moves on.
-        log: Holds all that is wanted.
-        wanted: Per robot the last step to take in.
-        most: Steps to take in at most; None: all.
+        branch: Branch of the filter; its `last_steps` are updated.
+        log: Buffer with all these steps.
+        wanted: Last step to process for each robot.
+        most: Limit of the number of steps; None: no limit.
 
     Returns:
-        One entry for each step taken in.
+        One entry for each step processed.
     """
     done: list[ReplayedStep] = []
     while wanted and (most is None or len(done) < most):
@@ -242,7 +243,7 @@ def replay(
         step = min(due.values())
         robots = tuple(sorted(robot for robot, first in due.items() if first == step))
         inputs = log.read(step)
-        intake = StepRouting.of(branch, robots)
-        report = process_step(branch, step, intake, inputs.with_copies(), *Associations.allocate(inputs))
+        routing = StepRouting.of(branch, robots)
+        report = process_step(branch, step, routing, inputs.with_copies(), *Associations.allocate(inputs))
         done.append(ReplayedStep(step, robots, inputs, report))
     return done

@@ -1,4 +1,4 @@
-"""Communication of a team: who can reach whom, and how many bytes were sent."""
+"""Communication within a team: connected components and a traffic count."""
 
 import copy
 from collections.abc import Mapping, Sequence
@@ -18,25 +18,25 @@ def check_contacts(contacts: ArrayLike, num_robots: int) -> BoolArray:
     """Return contacts as a checked array.
 
     Args:
-        contacts: (K, K) bool, symmetric; the diagonal means nothing.
+        contacts: (K, K) bool, symmetric; the diagonal is ignored.
         num_robots: K.
 
     Raises:
-        ValueError: If they are no symmetric array of bools.
+        ValueError: If they are not a symmetric array of bools.
     """
-    cure = "Say for each pair of robots whether it can exchange data."
-    touch = check_array("contacts", contacts, (num_robots, num_robots), cure, dtype=None, finite=False)
+    hint = "Say for each pair of robots whether it can exchange data."
+    touch = check_array("contacts", contacts, (num_robots, num_robots), hint, dtype=None, finite=False)
     if touch.dtype != np.bool_ or not np.array_equal(touch, touch.T):
         got = f"an array of {touch.dtype}" if touch.dtype != np.bool_ else "a matrix that is not symmetric"
-        raise argument_error("contacts", "a symmetric array of bools", got, cure)
+        raise argument_error("contacts", "a symmetric array of bools", got, hint)
     return np.asarray(touch)
 
 
 def contact_components(contacts: BoolArray | None, num_robots: int) -> IntArray:
-    """Number the networks: robots pass on what they hear, so that those who reach each other by steps are in contact.
+    """Number the connected components of the contact graph: robots relay messages.
 
     Args:
-        contacts: (K, K) bool, symmetric; the diagonal means nothing. None = all.
+        contacts: (K, K) bool, symmetric; the diagonal is ignored. None = all.
         num_robots: K.
 
     Returns:
@@ -60,7 +60,7 @@ COVARIANCE_BYTES = 6 * 8
 
 
 class TrafficCounter:
-    """Counts the bytes that each robot sends.
+    """Counter of the bytes that each robot sends.
 
     Args:
         num_robots: K.
@@ -74,40 +74,38 @@ class TrafficCounter:
         self._known: dict[tuple[int, int], dict[int, int]] = {}  # (from, to) -> landmark id -> its count when last sent
 
     def record_step(self, report: StepReport, descriptor_size: int) -> None:
-        """Count what the robots of a joint filter broadcast in one step: pose, landmarks updated and created.
+        """Count the broadcasts of a joint filter's robots in one step: pose, landmarks updated and created.
 
         Args:
-            report: Of the step; those of its robots that were heard hear each other.
+            report: Report of the step; its robots with a row are in contact.
             descriptor_size: d.
         """
-        findings = report.all_associations
+        found = report.all_associations
         for robot in report.rows:
             if robot >= 0:
-                touched = (
-                    len(findings.associated_ids(robot)) if report.num_rejected else findings.num_measurements(robot)
-                )
-                created = len(findings.created_ids(robot)) if report.num_created else 0
-                self.sent[robot] += POSE_BYTES + touched * LANDMARK_BYTES + created * 4 * descriptor_size
+                updated = len(found.associated_ids(robot)) if report.num_rejected else found.num_measurements(robot)
+                created = len(found.created_ids(robot)) if report.num_created else 0
+                self.sent[robot] += POSE_BYTES + updated * LANDMARK_BYTES + created * 4 * descriptor_size
 
     def record_replay(self, replayed: Sequence[ReplayedStep]) -> None:
-        """Count the buffered readings that returning robots send."""
+        """Count the buffered inputs that returning robots send."""
         for done in replayed:
             each = POINT_BYTES + 4 * done.inputs.descriptors.shape[1]
             for robot in done.robots:
-                act, _, _, covered, _, count = done.inputs.inputs[robot]
-                if act in (MOVED, EXACT_POSE):
+                kind, _, _, covered, _, count = done.inputs.inputs[robot]
+                if kind in (MOVED, EXACT_POSE):
                     self.sent[robot] += POSE_BYTES
                 self.sent[robot] += max(count, 0) * (each + covered * COVARIANCE_BYTES)
 
     def record_return(
         self, sender: int, known: Mapping[int, int], counts: Mapping[int, int], descriptor_size: int
     ) -> None:
-        """Count what returning robots are told of the map that they come back to.
+        """Count the map updates sent to returning robots.
 
         Args:
-            sender: Who tells them.
-            known: Per landmark whose descriptor they know: how often it had been measured when they were last told.
-            counts: Per landmark of the map: how often it has been measured now.
+            sender: Robot that sends them.
+            known: Number of measurements of each landmark when it was last sent to the returning robots, by id.
+            counts: Present number of measurements of each landmark of the map, by id.
             descriptor_size: d.
         """
         changed = sum(1 for name, count in counts.items() if known.get(name) != count)
@@ -115,7 +113,7 @@ class TrafficCounter:
         self.sent[sender] += changed * LANDMARK_BYTES + new * 4 * descriptor_size
 
     def record_maps(self, robot_a: int, robot_b: int, map_a: LandmarkMap, map_b: LandmarkMap) -> None:
-        """Count the maps that two groups' first robots exchange to align them."""
+        """Count the maps that the first robots of two groups exchange for alignment."""
         for sender, receiver, landmarks in ((robot_a, robot_b, map_a), (robot_b, robot_a, map_b)):
             known = self._known.setdefault((sender, receiver), {})
             counts = dict(zip(landmarks.ids.tolist(), landmarks.counts.tolist(), strict=True))
@@ -125,7 +123,7 @@ class TrafficCounter:
             known.update(counts)
 
     def record_smoothed(self, robot_a: int, robot_b: int, map_a: LandmarkMap, map_b: LandmarkMap) -> None:
-        """Count the maps once more, after both were straightened: all landmarks have moved, none looks otherwise."""
+        """Count the maps again after smoothing: all landmarks have moved, no descriptor has changed."""
         for sender, landmarks in ((robot_a, map_a), (robot_b, map_b)):
             self.sent[sender] += len(landmarks) * LANDMARK_BYTES
 
@@ -134,6 +132,6 @@ class TrafficCounter:
         return {"bytes_sent": tuple(self.sent), "known": copy.deepcopy(self._known)}
 
     def set_state(self, state: Mapping[str, Any]) -> None:
-        """Take over counts that `get_state` returned."""
+        """Restore the counts from `get_state`."""
         self.sent = list(state["bytes_sent"])
         self._known = copy.deepcopy(state["known"])

@@ -1,4 +1,4 @@
-"""Two groups become one, a merge is doubted, and taken back."""
+"""Merging of two groups, detection of inconsistent merges, and restoration of the groups before a merge."""
 
 import math
 from typing import NamedTuple, Self
@@ -31,12 +31,12 @@ from slam_backend.team.shared_records import SharedRecords
 
 
 def smoothed_maps(group_a: Group, group_b: Group) -> tuple[LandmarkMap, LandmarkMap] | None:
-    """Draw the particles of both joint filters anew from their smoothed paths.
+    """Rejuvenate both joint filters from their smoothed paths.
 
-    Where a smoother finds nothing better the filter stays as it is.
+    A filter whose smoother finds no better paths does not change.
 
     Returns:
-        Their maps with mixture covariances as they are now; None if neither filter has changed.
+        Present maps of both with mixture covariances; None if neither filter has changed.
     """
     filters = group_a.trunk.filter, group_b.trunk.filter
     reports = [slam.rejuvenate() for slam in filters]
@@ -44,14 +44,14 @@ def smoothed_maps(group_a: Group, group_b: Group) -> tuple[LandmarkMap, Landmark
 
 
 class MergePlan(NamedTuple):
-    """Two groups whose maps align, and what is known of their merge before it is made.
+    """Two groups with an alignment of their maps, ready to merge.
 
     Attributes:
-        groups: Whose map frame and landmark ids stay, and the other.
-        maps: Of their joint filters as they are, with mixture covariances.
+        groups: Group whose map frame and landmark ids stay, and the other.
+        maps: Maps of their joint filters, with mixture covariances.
         alignment: Motion from b's map frame to a's; `inliers` are rows of the maps.
-        pairing: Of the joint filters' particles, if that is drawn already.
-        joint: Filter that `merge_filters` made of it, if that is done already.
+        pairing: Pairing of the joint filters' particles, if drawn already.
+        joint: Result of `merge_filters`, if merged already.
     """
 
     groups: tuple[Group, Group]
@@ -62,10 +62,10 @@ class MergePlan(NamedTuple):
 
     @classmethod
     def of(cls, group_a: Group, group_b: Group, alignment: Alignment) -> Self:
-        """Return a plan by an alignment from outside.
+        """Return a plan for a given alignment.
 
         Raises:
-            ValueError: If the inliers name rows that do not exist or the same one twice.
+            ValueError: If the inliers name rows that do not exist or repeat one.
         """
         maps = group_a.trunk.filter.map("mixture"), group_b.trunk.filter.map("mixture")
         check_inliers(alignment.inliers, len(maps[0]), len(maps[1]))
@@ -78,26 +78,26 @@ class MergePlan(NamedTuple):
 
     @property
     def pairs(self) -> IntArray:
-        """(k, 2) int64 rows (landmark id in a, landmark id in b) in common."""
+        """(k, 2) int64 rows (landmark id in a, landmark id in b) of the common landmarks."""
         rows = self.alignment.inliers
         return np.column_stack([self.maps[0].ids[rows[:, 0]], self.maps[1].ids[rows[:, 1]]])
 
     def with_pairing(self, merging: MergeOptions, rng: np.random.Generator) -> Self:
-        """Return the plan with the particles paired, as a merge of particles would draw it from `rng`."""
+        """Return the plan with the particles paired by draws from `rng`, as in a merge."""
         pairing = pair_filters(*self.filters, self.alignment, self.pairs, rng, merging.merged_particles)
         return self._replace(pairing=pairing)
 
     def on_trial(
         self, merging: MergeOptions, options: AlignmentOptions, rng: np.random.Generator
     ) -> tuple[Self, float] | None:
-        """Merge both filters into one whose particles are drawn from its smoothed paths; both stay as they are.
+        """Merge both filters into one and rejuvenate it from its smoothed paths; the filters do not change.
 
-        Each map tells of the other robots' ways from their starts to what both have in common, so that the joint filter
-        may know well how the groups began where neither map does.
+        Each map constrains the other robots' paths between their starts and the common landmarks. The joint filter may
+        therefore know the relative start of the groups well where neither map does.
 
         Returns:
-            The plan by the motion that the joint filter has, and its uncertainty, see `transform_uncertainty`: infinite
-            where the merge would be undone for the shape of the joint map. None if the smoother finds nothing.
+            The plan with the motion estimated by the joint filter, and its uncertainty, see `transform_uncertainty`;
+            infinite if the shape of the joint map is inconsistent. None if the smoother fails.
         """
         a, b = self.filters
         joint, renamed = merge_filters(
@@ -107,22 +107,22 @@ class MergePlan(NamedTuple):
             return None
         starts = joint.state.starts[a.num_robots, :, : joint.num_particles]
         motion = mean_pose(starts)
-        own = rotate_covariances(float(motion[2]), joint.state.start_covariances[a.num_robots])
-        covariance = scattered(starts) + own
+        start = rotate_covariances(float(motion[2]), joint.state.start_covariances[a.num_robots])
+        covariance = scattered(starts) + start
         _kernels.add_gauge_covariance(joint.state.gauge_covariance, motion[None], covariance[None])
         x, y, theta = motion.tolist()
         alignment = Alignment(True, "", x, y, theta, covariance, self.alignment.inliers, self.alignment.ratio)
-        sides, straight = (self.maps[0], renamed_map(self.maps[1], dict(renamed.tolist()))), joint.map("mixture")
-        bent = any(deformed_fraction(old, straight, options) > merging.max_deformed for old in sides)
+        before, after = (self.maps[0], renamed_map(self.maps[1], dict(renamed.tolist()))), joint.map("mixture")
+        deformed = any(deformed_fraction(old, after, options) > merging.max_deformed for old in before)
         plan = self._replace(alignment=alignment, joint=(joint, renamed))
-        return plan, math.inf if bent else _in_bounds(covariance)
+        return plan, math.inf if deformed else _relative_uncertainty(covariance)
 
 
 def transform_uncertainty(plan: MergePlan) -> float:
-    """Return how uncertain the motion between two maps is, as the particles of a merge have it, which are paired.
+    """Return the uncertainty of the motion between two maps over the paired particles of a merge.
 
-    Landmarks of one map err together where its paths are uncertain. Their covariances, and the alignment's, do not say
-    so; that particles differ in the motion does, with what these do not show where the frames of the maps are held.
+    The errors of landmarks in one map are correlated where its paths are uncertain, which neither their covariances nor
+    the alignment's include. The scatter of the motion over particles does; gauge covariances are added.
 
     Returns:
         The standard deviation of the motion in its least certain direction over 0.5 m, or in heading over 5 degrees,
@@ -132,11 +132,11 @@ def transform_uncertainty(plan: MergePlan) -> float:
     a, b = plan.filters
     covariance = transform_covariance(plan.pairing.motion, plan.alignment)
     covariance += _gauge_covariance(a.state.gauge_covariance, b.state.gauge_covariance, plan.alignment)
-    return _in_bounds(covariance)
+    return _relative_uncertainty(covariance)
 
 
-def _in_bounds(covariance: FloatArray) -> float:
-    """Return the largest standard deviation of a motion over what makes it another one."""
+def _relative_uncertainty(covariance: FloatArray) -> float:
+    """Return the largest standard deviation of a motion relative to that of a distinct motion."""
     position, heading = math.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1]), math.sqrt(covariance[2, 2])
     return max(position / DISTINCT_TRANSLATION, heading / DISTINCT_ROTATION)
 
@@ -149,15 +149,15 @@ def merge_groups(
     epoch: int,
     known: bool = False,
 ) -> tuple[Group, LandmarkIdMap]:
-    """Merge the joint filters of two groups; robots out of contact keep their forks. The merge is then watched.
+    """Merge the joint filters of two groups; robots out of contact keep their forks. The merge is then monitored.
 
     Args:
-        plan: Of the groups, which are not to be used any more.
-        merging: How.
-        records: Of the team.
-        rng: For pairing and draws.
-        epoch: Of the joint filter.
-        known: As of `merge_filters`.
+        plan: Plan of the merge; its groups are not to be used afterwards.
+        merging: Options of merges.
+        records: Records of the team.
+        rng: Generator for pairing and draws.
+        epoch: Epoch of the joint filter.
+        known: Whether the motion is known from the alignment, see `merge_filters`.
     """
     (group_a, group_b), alignment, pairs = plan.groups, plan.alignment, plan.pairs
     a, b = group_a.trunk, group_b.trunk
@@ -170,20 +170,20 @@ def merge_groups(
     trunk = Branch(tuple(sorted(robots)), tuple(sorted(live)), joint, a.last_steps | b.last_steps, number, epoch)
     if merging.watch_steps:
         new_ids = dict(renamed.tolist())
-        older = [*(watch.copy() for watch in a.monitors), *(watch.copy(new_ids) for watch in b.monitors)]
+        older = [*(monitor.copy() for monitor in a.monitors), *(monitor.copy(new_ids) for monitor in b.monitors)]
         sides = PreMergeSnapshot.of(a.get_state()), PreMergeSnapshot.of(b.get_state())
         common = renamed[np.isin(renamed[:, 1], a.filter.state.maps.ids), ::-1]
         fresh = begin_monitoring(number, alignment, sides, plan.maps, renamed, common)
-        trunk.monitors = [*sorted(older, key=lambda watch: watch.number), fresh]
-    renaming = LandmarkIdMap(a.robots, b.robots, renamed, (a.number, b.number, number))
-    records.entries.append(renaming)
-    return Group(trunk, [*group_a.branches[1:], *group_b.branches[1:]]), renaming
+        trunk.monitors = [*sorted(older, key=lambda monitor: monitor.number), fresh]
+    id_map = LandmarkIdMap(a.robots, b.robots, renamed, (a.number, b.number, number))
+    records.entries.append(id_map)
+    return Group(trunk, [*group_a.branches[1:], *group_b.branches[1:]]), id_map
 
 
 def find_inconsistent_merge(trunk: Branch, merging: MergeOptions, options: AlignmentOptions) -> MergeMonitor | None:
-    """Return the oldest merge that the evidence contradicts, and that can be undone with those on top of it now.
+    """Return the oldest merge that contradicts the evidence and can be undone now, with those on top of it.
 
-    For that, robots of both sides of each of them have to be in contact.
+    To be undone, each of them needs robots of both sides in contact.
     """
     watches = [
         w for w in trunk.monitors if w.steps <= merging.watch_steps and w.both_sides_connected(trunk.active_robots)
@@ -191,30 +191,30 @@ def find_inconsistent_merge(trunk: Branch, merging: MergeOptions, options: Align
     if not watches:
         return None
     joint = trunk.filter.map("mixture")
-    for watch in watches:
-        above = [newer for newer in trunk.monitors if newer.number > watch.number]
-        if all(newer.both_sides_connected(trunk.active_robots) for newer in above) and watch.is_inconsistent(
+    for monitor in watches:
+        above = [newer for newer in trunk.monitors if newer.number > monitor.number]
+        if all(newer.both_sides_connected(trunk.active_robots) for newer in above) and monitor.is_inconsistent(
             joint, merging, options
         ):
-            return watch
+            return monitor
     return None
 
 
 def restore_groups(group: Group, undoing: MergeRollback, records: SharedRecords, epoch: int) -> list[Group]:
-    """Take back a merge of a group, and those on top of it: all sides go on as if they had not been.
+    """Undo a merge of a group, and those on top of it: all sides continue as if they had never merged.
 
     Robots out of contact keep their forks until they return.
 
     Args:
-        group: Not to be used any more.
-        undoing: Of it; its sides have caught up with the group's joint filter.
-        records: Of the team.
-        epoch: Of the restored filters.
+        group: The group; not to be used afterwards.
+        undoing: Rollback of the group's merge; its sides have caught up with the group's joint filter.
+        records: Records of the team.
+        epoch: Epoch of the restored filters.
     """
     now = group.trunk
-    for watch in undoing.merges(now):
-        number_a, number_b = (side.trunk["number"] for side in watch.sides)
-        records.entries.append(MergeUndone((number_a, number_b, watch.number)))
+    for monitor in undoing.merges(now):
+        number_a, number_b = (side.trunk["number"] for side in monitor.sides)
+        records.entries.append(MergeUndone((number_a, number_b, monitor.number)))
     restored = []
     for trunk, replayed in zip(undoing.sides, undoing.replayed, strict=True):
         trunk.active_robots, trunk.epoch = tuple(robot for robot in trunk.robots if robot in now.active_robots), epoch
@@ -226,11 +226,11 @@ def restore_groups(group: Group, undoing: MergeRollback, records: SharedRecords,
 
 
 def _reassign_branch(branch: Branch, restored: list[Group], records: SharedRecords) -> None:
-    """Give a fork to the restored group of its robots; one that several need is copied."""
+    """Assign a fork to the restored group of its robots; a fork needed by several is copied."""
     homes = [group for group in restored if any(robot in group.robots for robot in branch.active_robots)]
     for group in homes[1:]:
-        own = tuple(robot for robot in branch.active_robots if robot in group.robots)
-        copied = fork(branch, own, records.new_number(), records.rng)
+        members = tuple(robot for robot in branch.active_robots if robot in group.robots)
+        copied = fork(branch, members, records.new_number(), records.rng)
         records.copied(branch.number, copied.number)
         group.branches.append(copied)
     branch.active_robots = tuple(robot for robot in branch.active_robots if robot in homes[0].robots)
@@ -238,8 +238,8 @@ def _reassign_branch(branch: Branch, restored: list[Group], records: SharedRecor
 
 
 def _gauge_covariance(frame_a: FloatArray, frame_b: FloatArray, alignment: Alignment) -> FloatArray:
-    """Return what two frames that are held, (3, 3) each, leave open of the motion between where the groups began."""
+    """Return the covariance of the motion between two groups' starts due to their gauge covariances (3, 3)."""
     covariance = rotate_covariances(alignment.theta, frame_b)
-    transform = alignment.transform.copy()  # can be written: the kernel is compiled for such arrays alone
+    transform = alignment.transform.copy()  # writable, as the kernel is compiled for
     _kernels.add_gauge_covariance(frame_a, transform[None], covariance[None])
     return covariance

@@ -1,4 +1,4 @@
-"""Groups of robots that share a map frame, and the table of who belongs to which."""
+"""Groups of robots that share a map frame, and the assignment of robots to groups and filters."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, Self
@@ -14,15 +14,15 @@ from slam_backend.team.shared_records import SharedRecords
 
 
 class Group:
-    """Robots in ascending order; their map frame is the start frame of the lowest.
+    """Group of robots in ascending order; the map frame is the start frame of the lowest.
 
     Args:
-        trunk: The joint filter's branch.
-        forks: The branches of robots that are out of contact with it.
+        trunk: Branch of the joint filter.
+        forks: Branches of robots that are out of contact with it.
 
     Attributes:
-        branches: The trunk, then the forks. Each robot goes by exactly one of them.
-        undoing: Of a merge that is being taken back; None: none is.
+        branches: The trunk, then the forks. Each robot uses exactly one of them.
+        undoing: Rollback of a merge in progress, or None.
     """
 
     def __init__(self, trunk: Branch, forks: Sequence[Branch] = ()) -> None:
@@ -39,14 +39,14 @@ class Group:
         """All robots of the group."""
         return self.branches[0].robots
 
-    # ------------------------------------------------------------------ contact lost and found
+    # ------------------------------------------------------------------ loss and return of contact
 
     def update_connectivity(self, networks: IntArray, records: SharedRecords) -> None:
-        """Fork filters whose robots have lost contact, and tell filters what returning robots have read.
+        """Fork filters whose robots have lost contact, and replay the inputs of returning robots.
 
         Args:
             networks: (K,) robots with the same number are in contact.
-            records: Of the team.
+            records: Records of the team.
         """
         if len(self.robots) == 1:
             return
@@ -64,9 +64,9 @@ class Group:
                     self._rejoin(here, records)
 
     def _choose_trunk(self, networks: IntArray) -> None:
-        """Hand the joint filter to those who meet other groups, if those who have it meet none: so they can merge.
+        """Pass the joint filter to robots that meet other groups, if its own robots meet none, so that they can merge.
 
-        A fork can take its place unless the joint filter has lived through a merge or an undo since.
+        A fork can replace the trunk unless the trunk has had a merge or an undo since the fork.
         """
         outside = set(np.delete(networks, self.robots).tolist())
         meeting = [branch for branch in self.branches if networks[branch.active_robots[0]] in outside]
@@ -77,7 +77,7 @@ class Group:
             self.branches = [new, *(branch for branch in self.branches if branch is not new)]
 
     def _rejoin(self, here: list[Branch], records: SharedRecords) -> None:
-        """Let the best informed of some branches in contact take in what the others know, and end those it caught."""
+        """Replay in the best informed of some branches in contact what the others know, and end those it covers."""
         main = max(here, key=self._rank)
         others = [branch for branch in here if branch is not main and set(branch.active_robots) <= set(main.robots)]
         wanted: dict[int, int] = {}
@@ -96,28 +96,28 @@ class Group:
                 self.branches = [branch for branch in self.branches if branch is not other]
 
     def _rank(self, branch: Branch) -> tuple[bool, int, int, int]:
-        """Return by what branches in contact are ranked: the trunk, then who has lived through more merges."""
+        """Return the sort key of branches in contact: the trunk first, then the one with the most merges."""
         return branch is self.trunk, branch.epoch, len(branch.active_robots), -branch.active_robots[0]
 
     # ------------------------------------------------------------------ snapshots
 
     def steps_unknown(self) -> list[int]:
-        """Return from which past steps on its filters may have to take in readings yet; none if they know all."""
+        """Return the first steps that filters may have to replay; empty if all are up to date."""
         held = [
             1 + last
             for branch in self.branches
             for robot, last in branch.last_steps.items()
             if robot not in branch.active_robots
         ]
-        return held + [side.oldest for branch in self.branches for watch in branch.monitors for side in watch.sides]
+        return held + [side.oldest for branch in self.branches for monitor in branch.monitors for side in monitor.sides]
 
     def numbers(self) -> set[int]:
-        """Return the numbers of all maps that the group uses or may take up again."""
-        watches = [watch for branch in self.branches for watch in branch.monitors]
+        """Return the numbers of all maps that the group uses or may restore."""
+        watches = [monitor for branch in self.branches for monitor in branch.monitors]
         return {branch.number for branch in self.branches}.union(*map(_numbers, watches))
 
     def get_state(self) -> dict[str, Any]:
-        """Return all that decides how the group goes on."""
+        """Return the complete state of the group."""
         return {
             "branches": tuple(branch.get_state() for branch in self.branches),
             "undoing": None if self.undoing is None else self.undoing.get_state(),
@@ -125,7 +125,7 @@ class Group:
 
     @classmethod
     def from_state(cls, state: Mapping[str, Any], at_hand: Mapping[tuple[int, ...], FastSlam] | None = None) -> "Group":
-        """Build a group from `get_state`; a filter at hand for the trunk, by its robots, is filled."""
+        """Build a group from `get_state`; a given filter with the trunk's robots is reused."""
         at_hand = {} if at_hand is None else at_hand
         trunk, *forks = state["branches"]
         group = cls(
@@ -135,27 +135,27 @@ class Group:
         return group
 
 
-def _numbers(watch: MergeMonitor) -> set[int]:
-    """Return the numbers of the maps that an undo of a merge would take up again."""
-    older = [_numbers(one) for side in watch.sides for one in side.watches]
-    return {side.trunk["number"] for side in watch.sides}.union(*older)
+def _numbers(monitor: MergeMonitor) -> set[int]:
+    """Return the numbers of the maps that an undo of a merge would restore."""
+    older = [_numbers(one) for side in monitor.sides for one in side.watches]
+    return {side.trunk["number"] for side in monitor.sides}.union(*older)
 
 
 class TeamTopology(NamedTuple):
-    """What the groups of a team come to, as long as no group, branch or watch of a merge begins or ends.
+    """Assignment of robots to groups and filters, valid until a group, branch or monitor starts or ends.
 
     Attributes:
         groups: The robots of each group, by ascending first robot.
-        branches: Of all groups.
-        routings: Of each, how it takes in a step.
-        places: Per robot its group, the branch that it goes by, and its place in that.
-        known_robots: Per robot those whose places its filter knows, itself included, ascending.
-        same_filter: Per robot those that go by the same filter, itself included, ascending.
-        maps: Per robot the number of the map that it goes by.
-        numbers: Of all maps that are in use or may be taken up again.
-        oldest: The first step that some filter may have to take in yet; None: there is none.
+        branches: Branches of all groups.
+        routings: Step routing of each branch.
+        places: Group, branch, and index in the branch of each robot.
+        known_robots: Robots in the filter of each robot, itself included, ascending.
+        same_filter: Robots that use the same filter as each robot, itself included, ascending.
+        maps: Number of each robot's map.
+        numbers: Numbers of all maps that are in use or may be restored.
+        oldest: First step that a filter may have to replay; None: none.
         is_split: Whether some robots are out of contact with their group's joint filter.
-        has_monitors: Whether some merge can still be undone, or is being taken back.
+        has_monitors: Whether a merge can still be undone, or is being undone.
     """
 
     groups: tuple[tuple[int, ...], ...]
@@ -172,7 +172,7 @@ class TeamTopology(NamedTuple):
 
     @classmethod
     def of(cls, groups: Sequence[Group]) -> Self:
-        """Return that of these groups."""
+        """Return the topology of some groups."""
         owned = [(group, branch) for group in groups for branch in group.branches]
         by_robot = {r: (group, branch, branch.robots.index(r)) for group, branch in owned for r in branch.active_robots}
         places = tuple(by_robot[robot] for robot in sorted(by_robot))

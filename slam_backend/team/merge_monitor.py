@@ -1,18 +1,18 @@
-"""`MergeMonitor`: after a merge the team gathers evidence of whether it was right, and keeps what it takes to undo it.
+"""Consistency check of a merge, and the snapshots that undo it.
 
-A false merge hardly shows in the innovations of single measurements: descriptors tell landmarks apart, so that a robot
-goes on matching its own, and a filter that has to make two maps agree bends both. So two things are watched.
+A false merge hardly shows in the innovations of single measurements: descriptors distinguish landmarks, so that a robot
+keeps matching its own, and a filter that must make two maps agree deforms both. Two tests are used.
 
-*Shape.* Either side's map from before the merge is laid over the joint map as it is now, by the rigid motion that most
-landmarks agree on, and each landmark's innovation d^2 = r^T S^-1 r is held against its chi-square gate (99 %; S is
-the sum of both covariances and the floor that alignments have). What the other side knew can only move a landmark
-within its own uncertainty, so that beyond the gate lies next to nothing; where maps are bent to agree, much does.
+*Shape.* Each side's map from before the merge is aligned with the present joint map by the rigid motion that most
+landmarks agree on, and each landmark's innovation d^2 = r^T S^-1 r is compared with its chi-square gate (99 %; S is the
+sum of both covariances and the noise floor of alignments). Information from the other side moves a landmark only within
+its own uncertainty, so that hardly any lie beyond the gate; in maps deformed to agree, many do.
 
-*Place.* Landmarks that either side found for itself are aligned with each other, by the test that every merge has to
-pass. If they are seen to fit by another motion than the one in force (0.5 m or 5 degrees off), the merge was wrong,
-unless it rests on more: for that test the pairs of landmarks alike that it joined are a rival, and may be no more than
-`max_ratio` of those that fit now. So a robot that is lost after a right merge, and maps landmarks a second time, does
-not undo it.
+*Place.* The landmarks that only one side found are aligned with those of the other, by the test that every merge has to
+pass. If another motion than the present one fits them (0.5 m or 5 degrees off), the merge was false, unless it has more
+support: the pairs of similar landmarks that it joined count as a rival of that test, and may be no more than
+`max_ratio` of the new inliers. Thus a robot that gets lost after a correct merge, and maps landmarks twice, does not
+undo it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -34,11 +34,11 @@ from slam_backend.team.options import MergeOptions
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PreMergeSnapshot:
-    """One group as it was just before a merge; its arrays are read-only.
+    """State of one group just before a merge; its arrays are read-only.
 
     Attributes:
-        trunk: State of its joint filter's branch, the watches of earlier merges among it.
-        oldest: The first step that an undo of the merge, or of earlier ones, would take in.
+        trunk: State of its joint filter's branch, with the monitors of earlier merges.
+        oldest: First step that an undo of the merge, or of earlier ones, would replay.
     """
 
     trunk: Mapping[str, Any]
@@ -46,42 +46,42 @@ class PreMergeSnapshot:
 
     @classmethod
     def of(cls, trunk: Mapping[str, Any]) -> "PreMergeSnapshot":
-        """Return a side with this trunk, whose arrays nobody is to write to afterwards."""
-        earlier = [side.oldest for watch in trunk["monitors"] for side in watch.sides]
+        """Return the snapshot of a trunk's state, whose arrays are not to be changed afterwards."""
+        earlier = [side.oldest for monitor in trunk["monitors"] for side in monitor.sides]
         return cls(with_read_only(trunk), min([1 + min(trunk["last_steps"].values()), *earlier]))
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "trunk", with_constants(self.trunk))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Let copies and what was pickled be read-only, too."""
+        """Make copies and unpickled objects read-only, too."""
         return PreMergeSnapshot, (self.trunk, self.oldest)
 
     @property
     def robots(self) -> tuple[int, ...]:
-        """Of the group."""
+        """Robots of the group."""
         robots: tuple[int, ...] = self.trunk["robots"]
         return robots
 
     @property
     def watches(self) -> tuple["MergeMonitor", ...]:
-        """Of earlier merges in it, as they stood."""
+        """Monitors of earlier merges in the group, as they were."""
         watches: tuple[MergeMonitor, ...] = self.trunk["monitors"]
         return watches
 
 
 @dataclass(slots=True, eq=False)
 class MergeMonitor:
-    """The evidence about one merge. Landmarks bear their names in the joint map.
+    """Evidence about one merge. Landmarks have their names in the joint map.
 
     Attributes:
-        number: Of the joint map when it was made; it names the merge.
-        alignment: By which the sides were merged.
-        sides: As they were before.
+        number: First number of the joint map; it names the merge.
+        alignment: Alignment by which the sides were merged.
+        sides: Snapshots of the two groups before the merge.
         pre_merge_maps: Each side's map just before the merge, in its own frame, with mixture covariances.
-        exclusive_landmarks: Landmarks that each side found for itself, before the merge or since, without those that
-            the merge took for common.
-        steps: In which robots of both sides were in contact since.
+        exclusive_landmarks: Landmarks found by each side alone, before the merge or since, without those that the merge
+            fused.
+        steps: Number of steps since the merge with robots of both sides in contact.
     """
 
     number: int
@@ -92,15 +92,16 @@ class MergeMonitor:
     steps: int = field(default=0)
 
     def copy(self, new_ids: Mapping[int, int] | None = None) -> "MergeMonitor":
-        """Return a watch that goes on by itself, with landmarks renamed if need be; what does not change is shared."""
-        before, own = self.pre_merge_maps, (set(self.exclusive_landmarks[0]), set(self.exclusive_landmarks[1]))
+        """Return an independent monitor, with landmarks renamed if needed; constant parts are shared."""
+        before, exclusive = self.pre_merge_maps, (set(self.exclusive_landmarks[0]), set(self.exclusive_landmarks[1]))
         if new_ids is not None:
             before = (renamed_map(before[0], new_ids), renamed_map(before[1], new_ids))
-            own = ({new_ids[i] for i in own[0] if i in new_ids}, {new_ids[i] for i in own[1] if i in new_ids})
-        return MergeMonitor(self.number, self.alignment, self.sides, before, own, self.steps)
+            one, other = exclusive
+            exclusive = ({new_ids[i] for i in one if i in new_ids}, {new_ids[i] for i in other if i in new_ids})
+        return MergeMonitor(self.number, self.alignment, self.sides, before, exclusive, self.steps)
 
     def update(self, robots: Sequence[int], report: StepReport) -> None:
-        """Note which side has found which landmarks, from a step of the joint filter of `robots`."""
+        """Add the landmarks that each side found in a step of the joint filter of `robots`."""
         for robot, row in zip(robots, report.rows, strict=True):
             if row >= 0:
                 self.exclusive_landmarks[robot not in self.sides[0].robots].update(
@@ -108,18 +109,20 @@ class MergeMonitor:
                 )
 
     def both_sides_connected(self, live: Sequence[int]) -> bool:
-        """Tell whether robots of both sides are among those that go by the joint filter."""
+        """Return whether robots of both sides are among the active robots `live` of the joint filter."""
         here = set(live)
         return not (here.isdisjoint(self.sides[0].robots) or here.isdisjoint(self.sides[1].robots))
 
     def is_inconsistent(self, joint: LandmarkMap, merging: MergeOptions, options: AlignmentOptions) -> bool:
-        """Tell whether the joint map, with mixture covariances, contradicts the merge by its shape or by its places."""
+        """Return whether the joint map, with mixture covariances, contradicts the merge in shape or place."""
         if any(deformed_fraction(old, joint, options) > merging.max_deformed for old in self.pre_merge_maps):
             return True
         ids = joint.ids.tolist()
-        masks = [np.fromiter(map(own.__contains__, ids), np.bool_, len(ids)) for own in self.exclusive_landmarks]
-        looks = [joint.descriptors[mask] for mask in masks]
-        if min(map(len, looks)) < options.min_inliers or not has_enough_candidates(looks[0], looks[1], options):
+        masks = [np.fromiter(map(found.__contains__, ids), np.bool_, len(ids)) for found in self.exclusive_landmarks]
+        descriptors = [joint.descriptors[mask] for mask in masks]
+        if min(map(len, descriptors)) < options.min_inliers:
+            return False
+        if not has_enough_candidates(descriptors[0], descriptors[1], options):
             return False
         parts = [joint.subset(mask) for mask in masks]
         rival = align_maps(parts[0], parts[1], options=options)
@@ -128,7 +131,7 @@ class MergeMonitor:
         return is_significant_motion(rival.transform, parts[1].means[rival.inliers[:, 1]])
 
     def _joined(self, options: AlignmentOptions) -> int:
-        """Return how many landmarks the merge joined that look alike."""
+        """Return how many pairs of similar landmarks the merge fused."""
         _, rows, others = np.intersect1d(self.pre_merge_maps[0].ids, self.pre_merge_maps[1].ids, return_indices=True)
         apart = np.linalg.norm(
             self.pre_merge_maps[0].descriptors[rows] - self.pre_merge_maps[1].descriptors[others], axis=1
@@ -138,16 +141,16 @@ class MergeMonitor:
 
 
 def deformed_fraction(old: LandmarkMap, joint: LandmarkMap, options: AlignmentOptions) -> float:
-    """Return the share of a map's landmarks that have left their places among each other.
+    """Return the share of a map's landmarks that have moved relative to each other.
 
     Args:
-        old: The map as it was, in any planar frame.
-        joint: The map that holds it now; landmarks are found by their ids.
-        options: `position_gate` and `position_floor` of the innovations; with fewer than `min_inliers` landmarks left
-            the share is 0.
+        old: The map before, in any planar frame.
+        joint: The joint map; landmarks are matched by their ids.
+        options: `position_gate` and `position_floor` of the innovations, and `min_inliers`: with fewer landmarks in
+            both maps the share is 0.
 
     Returns:
-        In [0, 1]: of the landmarks that both maps hold, those beyond the gate at the rigid motion on which most agree.
+        Share in [0, 1] of the landmarks in both maps that lie beyond the gate at the rigid motion on which most agree.
     """
     rows = np.column_stack(np.intersect1d(joint.ids, old.ids, return_indices=True)[1:])
     if len(rows) < options.min_inliers:
@@ -157,13 +160,13 @@ def deformed_fraction(old: LandmarkMap, joint: LandmarkMap, options: AlignmentOp
 
 
 def is_significant_motion(motion: FloatArray, points: FloatArray) -> bool:
-    """Tell whether a motion (3,) moves points (n, 3), on average, by 0.5 m, or turns them by 5 degrees."""
+    """Return whether a motion (3,) moves points (n, 3), on average, by 0.5 m, or turns them by 5 degrees."""
     moved: FloatArray = transform_points(motion, points) - points
     return bool(np.hypot(*moved.mean(axis=0)[:2]) > DISTINCT_TRANSLATION or abs(motion[2]) > DISTINCT_ROTATION)
 
 
 def renamed_map(landmarks: LandmarkMap, new_ids: Mapping[int, int]) -> LandmarkMap:
-    """Return the landmarks that have new names, under these."""
+    """Return the landmarks that have new ids, under these ids."""
     names = np.array([new_ids.get(name, -1) for name in landmarks.ids.tolist()], dtype=np.int64)
     kept = landmarks.subset(names >= 0)
     return unchecked_map(kept.means, kept.covariances, kept.descriptors, kept.counts, names[names >= 0])
@@ -177,16 +180,17 @@ def begin_monitoring(
     renamed: IntArray,
     pairs: IntArray,
 ) -> MergeMonitor:
-    """Return the watch of a fresh merge.
+    """Return the monitor of a new merge.
 
     Args:
-        number: Of the joint map.
-        alignment: By which the sides were merged.
-        sides: Whose ids stay, and the other.
-        before: Their maps with mixture covariances, under their own ids.
+        number: Number of the joint map.
+        alignment: Alignment by which the sides were merged.
+        sides: Snapshots of the side whose ids stay and of the other.
+        before: Maps of the sides with mixture covariances, under their own ids.
         renamed: (k, 2) int64 rows (id in b's map, id in the joint map).
-        pairs: (j, 2) int64 rows (id in a, id in b) of landmarks taken for common.
+        pairs: (j, 2) int64 rows (id in a, id in b) of the fused landmarks.
     """
     common = set(pairs[:, 0].tolist())
-    own = (set(before[0].ids.tolist()) - common, set(renamed[:, 1].tolist()) - common)
-    return MergeMonitor(number, alignment, sides, (before[0], renamed_map(before[1], dict(renamed.tolist()))), own)
+    exclusive = (set(before[0].ids.tolist()) - common, set(renamed[:, 1].tolist()) - common)
+    maps = before[0], renamed_map(before[1], dict(renamed.tolist()))
+    return MergeMonitor(number, alignment, sides, maps, exclusive)

@@ -1,7 +1,7 @@
-"""`MergeRollback`: a false merge is taken back over some steps, so that no step has to take in all that was read since.
+"""Rollback of a false merge over several steps, which bounds the replayed input per step.
 
-The groups that there were are taken up again as they were and catch up, a few steps of readings at a time, while their
-robots still go by the joint filter. When they have caught up they take over, as if the merge had never been.
+The groups before the merge are restored and catch up, a few steps of input at a time, while their robots still use the
+joint filter. When they have caught up they replace it, as if the merge had never happened.
 """
 
 from collections.abc import Iterator, Mapping
@@ -15,17 +15,17 @@ from slam_backend.fastslam.step_input import InputBuffer
 from slam_backend.team.branches import MAX_REPLAYED, Branch, ReplayedStep, replay
 from slam_backend.team.merge_monitor import MergeMonitor, PreMergeSnapshot
 
-LEAST_REPLAYED = 2  # per tick and side: one is read in every tick
+LEAST_REPLAYED = 2  # steps per tick and side: each tick adds one
 
 
 @dataclass(slots=True, eq=False)
 class MergeRollback:
-    """Where the taking back of a merge, and of those on top of it, has got to.
+    """Progress of the rollback of a merge, and of those on top of it.
 
     Attributes:
-        number: Of the map that the false merge made.
-        sides: The joint filters of the groups that there will be, each on its way to the present.
-        replayed: What each has taken in so far.
+        number: Number of the map that the false merge made.
+        sides: Joint filters of the restored groups, on their way to the present.
+        replayed: Steps replayed by each side so far.
     """
 
     number: int
@@ -34,7 +34,7 @@ class MergeRollback:
 
     @classmethod
     def of(cls, trunk: Branch, number: int) -> "MergeRollback":
-        """Begin to take back the merge that made map `number`, which a joint filter watches.
+        """Start the rollback of the merge that made map `number`, monitored by a joint filter.
 
         Raises:
             ValueError: If a filter from before it is damaged: states share the dicts that hold it with the team.
@@ -47,13 +47,13 @@ class MergeRollback:
         return cls(number, sides, [[] for _ in sides])
 
     def merges(self, trunk: Branch) -> list[MergeMonitor]:
-        """Return the merges of a joint filter that go, the last one first; none if it does not watch the false one."""
-        if all(watch.number != self.number for watch in trunk.monitors):
+        """Return the merges to undo, the last one first; none if the joint filter does not monitor the false one."""
+        if all(monitor.number != self.number for monitor in trunk.monitors):
             return []
         return list(_down_to(trunk.monitors[-1], self.number))
 
     def catch_up(self, trunk: Branch, log: InputBuffer) -> bool:
-        """Take in some steps of what the joint filter knows, and tell whether that was all."""
+        """Replay some steps that the joint filter has processed, and return whether all sides are up to date."""
         share = max(LEAST_REPLAYED, MAX_REPLAYED // len(self.sides))
         caught_up = True
         for side, done in zip(self.sides, self.replayed, strict=True):
@@ -67,7 +67,7 @@ class MergeRollback:
         return caught_up
 
     def get_state(self) -> dict[str, Any]:
-        """Return all that decides how it goes on."""
+        """Return the complete state of the rollback."""
         return {
             "number": self.number,
             "sides": tuple(side.get_state() for side in self.sides),
@@ -76,22 +76,22 @@ class MergeRollback:
 
     @classmethod
     def from_state(cls, state: Mapping[str, Any]) -> "MergeRollback":
-        """Go on with what `get_state` returned."""
+        """Build a rollback from `get_state`."""
         sides = [Branch.from_state(side) for side in state["sides"]]
         return cls(state["number"], sides, [list(with_constants(done)) for done in state["replayed"]])
 
 
-def _down_to(watch: MergeMonitor, number: int) -> Iterator[MergeMonitor]:
-    """Yield a merge and those under it, down to the one that made map `number`."""
-    yield watch
-    for side in watch.sides:
+def _down_to(monitor: MergeMonitor, number: int) -> Iterator[MergeMonitor]:
+    """Yield a merge and those below it, down to the one that made map `number`."""
+    yield monitor
+    for side in monitor.sides:
         if any(older.number == number for older in side.watches):
             yield from _down_to(side.watches[-1], number)
 
 
-def _sides(watch: MergeMonitor, number: int) -> Iterator[PreMergeSnapshot]:
-    """Yield the groups that are left when a merge and those under it, down to map `number`, are taken back."""
-    for side in watch.sides:
+def _sides(monitor: MergeMonitor, number: int) -> Iterator[PreMergeSnapshot]:
+    """Yield the groups that remain when a merge and those below it, down to map `number`, are undone."""
+    for side in monitor.sides:
         if any(older.number == number for older in side.watches):
             yield from _sides(side.watches[-1], number)
         else:

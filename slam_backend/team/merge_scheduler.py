@@ -1,4 +1,4 @@
-"""Which pair of groups tries to align its maps, and when: alignment is dear, and the same evidence fails twice."""
+"""Scheduler of merge attempts: alignment is expensive, and a retry on the same evidence fails again."""
 
 import copy
 import math
@@ -20,22 +20,22 @@ from slam_backend.maps.correspondences import too_many
 from slam_backend.maps.landmark_map import LandmarkMap
 
 PairKey = tuple[tuple[int, ...], tuple[int, ...]]  # two groups, as tuples of robots
-MIN_LOG_GROWTH = 0.125  # of all that was read has to be new before logs are smoothed once more for the same pair
-MIN_IMPROVEMENT = 0.7  # waiting has helped where no more of a doubt is left
+MIN_LOG_GROWTH = 0.125  # least share of new entries in the logs before they are smoothed again for the same pair
+MIN_IMPROVEMENT = 0.7  # waiting helps if the uncertainty falls below this share of its last value
 
 
 @known_names
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AttemptOptions:
-    """When groups try to align their maps.
+    """Schedule of alignment attempts.
 
     Attributes:
-        every: At most one pair tries in so many steps.
-        new_candidates: A refused pair tries again only when so many of its candidate matches are new, or the last
-            attempt is more than `longest_wait` steps ago: by then the same landmarks are known better. If its maps did
-            align, and were refused only when they were straight, it needs no new ones.
-        longest_wait: After each refusal a pair waits twice as long as before, at most so many steps; or longer, after
-            one for which logs were smoothed (`MergeScheduler.record`).
+        every: Steps between attempts; one pair tries at a time.
+        new_candidates: Least number of new candidate matches for another attempt of a refused pair, unless the last one
+            is more than `longest_wait` steps ago: by then the same landmarks are known better. A pair whose maps
+            aligned, but not after smoothing, needs no new ones.
+        longest_wait: Limit of the wait after a refusal, which doubles with each one [steps]; the wait is longer after
+            smoothing of the logs (`MergeScheduler.record`).
         enabled: Whether any pair tries at all.
     """
 
@@ -53,7 +53,7 @@ class AttemptOptions:
 
 @dataclass(slots=True)
 class AttemptRecord:
-    """What one pair of groups has tried."""
+    """Past attempts of one pair of groups."""
 
     wait: int
     last_step: int = 0
@@ -63,14 +63,14 @@ class AttemptRecord:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PendingAttempt:
-    """An attempt whose maps fit as the filters bent them, and which goes on when these have straightened them.
+    """Attempt whose unsmoothed maps align, and which continues when the filters have smoothed them.
 
     Attributes:
-        pair: That tries.
-        numbers: Of both joint filters' maps: with others it does not go on.
-        alignment: How the maps fit.
+        pair: Groups of the attempt.
+        numbers: Numbers of both joint filters' maps; the attempt ends if they change.
+        alignment: Alignment of the unsmoothed maps.
         since: Step in which it began.
-        ready: Whether both maps are straight; it goes on one step later.
+        ready: Whether both maps are smoothed; the attempt continues one step later.
     """
 
     pair: PairKey
@@ -81,14 +81,14 @@ class PendingAttempt:
 
 
 class MergeScheduler:
-    """The memory of past attempts.
+    """Scheduler of attempts, with a memory of past ones.
 
     Args:
-        options: The rhythm.
-        alignment: What makes a candidate match, and how many an alignment needs.
+        options: Options of the schedule.
+        alignment: Options of alignments, with the gate of candidate matches and the least number of inliers.
 
     Attributes:
-        straightening: The attempt that goes on; None: none does.
+        straightening: Pending attempt, or None.
     """
 
     def __init__(self, options: AttemptOptions, alignment: AlignmentOptions) -> None:
@@ -96,18 +96,18 @@ class MergeScheduler:
         self._alignment = alignment
         self._records: dict[PairKey, AttemptRecord] = {}
         self._proposed: dict[PairKey, set[tuple[int, int]]] = {}
-        self._bars: list[tuple[PairKey, int]] = []
-        self._uncertainties: dict[tuple[int, int], float] = {}  # robot of either side -> the least that there has been
-        self._trials: dict[tuple[int, int], FloatArray] = {}  # robots whose starts are the frames -> the last motion
+        self._bars: list[tuple[PairKey, int]] = []  # blocked pairs, and the step when the block ends
+        self._uncertainties: dict[tuple[int, int], float] = {}  # least uncertainty by robots of both sides
+        self._trials: dict[tuple[int, int], FloatArray] = {}  # last motion by the robots that define the frames
         self.straightening: PendingAttempt | None = None
 
     def is_due(self, step: int) -> bool:
-        """Tell whether a pair may try at this step, or an attempt goes on."""
+        """Return whether a pair may try at this step, or an attempt is pending."""
         options = self._options
         return self.straightening is not None or (options.enabled and step % options.every == options.every - 1)
 
     def may_try(self, pair: PairKey, step: int) -> bool:
-        """Tell whether the pair's wait is over, and nothing bars it."""
+        """Return whether the pair's wait is over, and no block applies."""
         if any(step < until and _touches(pair, barred) for barred, until in self._bars):
             return False
         return pair not in self._records or step >= self._records[pair].next_step
@@ -119,7 +119,7 @@ class MergeScheduler:
         self._proposed = {}
         for pair, (map_a, map_b) in maps.items():
             if not len(map_a) or not len(map_b):
-                continue  # before its first landmark a map does not know how long descriptors are
+                continue  # an empty map has no descriptor length yet
             if too_many(map_a, map_b, self._alignment):
                 continue
             rows = candidate_matches(map_a, map_b, self._alignment)
@@ -134,32 +134,32 @@ class MergeScheduler:
                 self._proposed = {pair: found}
         return best
 
-    def should_defer(self, pair: PairKey, doubt: float, most: float = math.inf) -> bool:
-        """Tell whether a pair whose maps align had better try again later, and remember its doubt.
+    def should_defer(self, pair: PairKey, uncertainty: float, limit: float = math.inf) -> bool:
+        """Return whether a pair whose maps align should try again later, and record its uncertainty.
 
-        It had at first, as long as the doubt falls by a good part from one attempt to the next, and while the doubt is
-        beyond what can be taken at all. Where it does not fall, the ways of the robots to what they have in common are
-        as uncertain as they will be for long, and the particles of the merge know it.
+        It should while the uncertainty falls substantially from one attempt to the next, or exceeds the limit. If it
+        does not fall, the paths between the starts and the common landmarks will stay as uncertain for long, and the
+        particles of the merge represent this.
 
         Args:
-            pair: That tries; what either group's robots went through before they were in it counts.
-            doubt: How uncertain the motion between its maps is, 1 = just sure enough [-].
-            most: Doubt beyond which no pair merges, whether waiting helps or not [-].
+            pair: Groups of the attempt; earlier uncertainties count for any of their robots.
+            uncertainty: Relative uncertainty of the motion between the maps, at most 1 for a merge [-].
+            limit: Uncertainty above which no pair merges, even if waiting does not help [-].
         """
         robots = [(a, b) for a in pair[0] for b in pair[1]]
         before = min(self._uncertainties.get(key, math.inf) for key in robots)
-        self._uncertainties |= {key: min(doubt, self._uncertainties.get(key, math.inf)) for key in robots}
-        return doubt > 1.0 and (doubt > most or doubt < MIN_IMPROVEMENT * before)
+        self._uncertainties |= {key: min(uncertainty, self._uncertainties.get(key, math.inf)) for key in robots}
+        return uncertainty > 1.0 and (uncertainty > limit or uncertainty < MIN_IMPROVEMENT * before)
 
     def change(self, pair: PairKey, motion: FloatArray) -> float:
-        """Return by how much the last trial of two groups was another motion, and remember this one.
+        """Return the change of the motion since the last trial of two groups, and record this motion.
 
         Args:
-            pair: That tries.
-            motion: (3,) [m, m, rad] between the frames of the two groups, as their joint filter has it on trial.
+            pair: Groups of the attempt.
+            motion: (3,) [m, m, rad] between the frames of the two groups, estimated by their joint filter on trial.
 
         Returns:
-            The shift over 0.25 m or the turn over 2.5 degrees, whichever is more; infinite if there was no trial of
+            The shift over 0.25 m or the turn over 2.5 degrees, whichever is more; infinite without an earlier trial of
             these frames.
         """
         frames = pair[0][0], pair[1][0]
@@ -172,29 +172,29 @@ class MergeScheduler:
             math.hypot(x, y) / (0.5 * DISTINCT_TRANSLATION), abs(float(wrap_angle(turn))) / (0.5 * DISTINCT_ROTATION)
         )
 
-    def record(self, pair: PairKey, step: int, success: bool, straightened: bool = False) -> None:
-        """Remember an attempt of the pair that `choose` returned: its evidence, and how long it now waits.
+    def record(self, pair: PairKey, step: int, success: bool, smoothed: bool = False) -> None:
+        """Record an attempt of the pair that `choose` returned: its candidate matches, and its next wait.
 
         Args:
-            pair: Which tried.
-            step: When.
-            success: Whether it merges.
-            straightened: Whether its logs were smoothed, because its candidates did fit: they need no new ones then to
-                try again. But smoothing may cost in proportion to all that was read, so that a refused pair waits until
-                an eighth of that is new: however long it goes on, it costs a multiple of it.
+            pair: Groups of the attempt.
+            step: Step of the attempt.
+            success: Whether the groups merge.
+            smoothed: Whether the logs were smoothed for the attempt, as the candidates fitted; the next attempt then
+                needs no new ones. The cost of smoothing may grow with the logs, so that a refused pair waits until an
+                eighth of them is new: the total cost is then at most a multiple of the last one.
         """
         if success:
             gone = set(pair[0]) | set(pair[1])
             self._records = {key: value for key, value in self._records.items() if not gone & set(key[0] + key[1])}
             return
         record = self._records.setdefault(pair, AttemptRecord(self._options.every))
-        record.tried = set() if straightened else self._proposed.get(pair, set())
+        record.tried = set() if smoothed else self._proposed.get(pair, set())
         record.last_step = step
-        record.next_step = step + max(record.wait, math.ceil(MIN_LOG_GROWTH * step) if straightened else 0)
+        record.next_step = step + max(record.wait, math.ceil(MIN_LOG_GROWTH * step) if smoothed else 0)
         record.wait = min(2 * record.wait, self._options.longest_wait)
 
     def block(self, pair: PairKey, until: int) -> None:
-        """Keep a pair, and every pair of groups that robots of either side belong to, from trying before this step."""
+        """Block all pairs of groups with a robot of each side of a pair before a step."""
         self._bars = [*(bar for bar in self._bars if bar[0] != pair), (pair, until)]
 
     def get_state(self) -> dict[str, Any]:
@@ -205,7 +205,7 @@ class MergeScheduler:
         return fixed | memory
 
     def set_state(self, state: Mapping[str, Any]) -> None:
-        """Take over options and a memory that `get_state` returned."""
+        """Restore options and memory from `get_state`."""
         self._options, self._alignment = state["options"], state["alignment"]
         self.straightening = state["straightening"]
         self._records = copy.deepcopy(state["records"])
@@ -214,6 +214,6 @@ class MergeScheduler:
 
 
 def _touches(pair: PairKey, barred: PairKey) -> bool:
-    """Tell whether one group of a pair has robots of the one barred side, and the other of the other."""
+    """Return whether a pair has robots of both sides of a blocked pair, one side in each group."""
     one, other = set(pair[0]), set(pair[1])
     return any(one & set(a) and other & set(b) for a, b in (barred, barred[::-1]))

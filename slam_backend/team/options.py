@@ -1,4 +1,4 @@
-"""`MergeOptions`: how two groups' filters become one, how sure they must be, and how long the team doubts it."""
+"""Options of merges: verification, consistency check and undo."""
 
 import math
 from dataclasses import dataclass
@@ -10,25 +10,25 @@ from slam_backend.fastslam.options import MAX_PARTICLES
 @known_names
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MergeOptions:
-    """How filters are merged, and when a merge is undone.
+    """Options of merges and of their undo.
 
     Attributes:
-        merged_particles: Of the joint filter; None: as many as the larger of the two.
-        smooth_first: Before a merge both sides' particles are drawn anew from the posterior of whole paths
-            (`FastSlam.rejuvenate`; over some steps, where smoothers work in slices), and their maps have to align once
-            more. False: maps are taken as the filters bent them.
-        min_sigmas: An attempt is refused, as long as waiting helps, while so many standard deviations of the motion
-            among the particles that the merge would make reach 0.5 m or 5 degrees; 0: never for that.
-        min_sigmas_on_trial: Above 0 a pair that is less than `min_sigmas` merges on trial: the joint filter is
-            smoothed, and kept if the motion that it has passes twice running; where waiting does not help, so many
-            standard deviations of it suffice. 0: there are no trials, and where waiting does not help the pair merges
-            however uncertain it is, as is right where nothing would ever tell more about the robots' starts.
-        watch_steps: A merge is watched for so many steps in which robots of both sides are in contact, and can be
-            undone so long; then its snapshot is freed. 0: merges are final.
-        watch_every: In so many steps the evidence is weighed once.
-        blocked_steps: After an undo the two sides do not try again for so long.
-        max_deformed: A merge is undone if a larger share of the landmarks of either side have left their places among
-            each other [-].
+        merged_particles: Number of particles of the joint filter; None: the larger of the two.
+        smooth_first: Whether both sides are rejuvenated from the posterior of whole paths before a merge
+            (`FastSlam.rejuvenate`; over several steps, if smoothers work in slices), and their maps must align again.
+            False: maps are used without smoothing.
+        min_sigmas: Least distance of 0.5 m and 5 degrees in standard deviations of the motion between the maps, over
+            the particles of the merge. An attempt below it is refused, as long as waiting helps. 0: no such refusal.
+        min_sigmas_on_trial: Reduced limit after a trial. Above 0 a pair below `min_sigmas` merges on trial: the joint
+            filter is smoothed, and kept if its motion passes twice in a row; where waiting does not help, this limit
+            suffices. 0: no trials, and where waiting does not help the pair merges with any uncertainty, as is right if
+            no later measurement could reduce it.
+        watch_steps: Number of steps, counted with robots of both sides in contact, in which a merge is monitored and
+            can be undone; then its snapshot is freed. 0: merges are final.
+        watch_every: Steps between two checks of a merge.
+        blocked_steps: Steps after an undo before the two sides try again.
+        max_deformed: Largest share of the landmarks of each side that may move relative to each other; beyond it a
+            merge is undone [-].
     """
 
     merged_particles: int | None = None
@@ -42,21 +42,19 @@ class MergeOptions:
 
     def __post_init__(self) -> None:
         if self.merged_particles is not None:
-            cure = "Use None for the larger of the two."
-            check_int("merging.merged_particles", self.merged_particles, 1, cure, MAX_PARTICLES)
+            hint = "Use None for the larger of the two."
+            check_int("merging.merged_particles", self.merged_particles, 1, hint, MAX_PARTICLES)
         if not isinstance(self.smooth_first, bool):
             raise argument_error("merging.smooth_first", "True or False", self.smooth_first, "Give a bool.")
-        check_float(
-            "merging.min_sigmas", self.min_sigmas, "Use 5, or 0 to merge however uncertain it is.", at_least=0.0
-        )
-        cure = "Use 5, or 0 to merge in the end however uncertain it is."
-        check_float("merging.min_sigmas_on_trial", self.min_sigmas_on_trial, cure, at_least=0.0)
+        check_float("merging.min_sigmas", self.min_sigmas, "Use 5, or 0 to merge with any uncertainty.", at_least=0.0)
+        hint = "Use 5, or 0 to merge in the end with any uncertainty."
+        check_float("merging.min_sigmas_on_trial", self.min_sigmas_on_trial, hint, at_least=0.0)
         check_int("merging.watch_steps", self.watch_steps, 0, "Use 0 to make merges final.", MOST)
-        check_int("merging.watch_every", self.watch_every, 1, "Weigh the evidence at every step or less often.", MOST)
+        check_int("merging.watch_every", self.watch_every, 1, "Give a number of steps, 1 for every step.", MOST)
         check_int("merging.blocked_steps", self.blocked_steps, 0, "Use 0 to let them try at once.", MOST)
         check_float("merging.max_deformed", self.max_deformed, "Give a share.", at_least=0.0, at_most=1.0)
 
     @property
     def max_uncertainty(self) -> float:
-        """Uncertainty, 1 = `min_sigmas`, beyond which no pair merges; infinite if any merges in the end."""
+        """Uncertainty, 1 = `min_sigmas`, above which no pair merges; infinite if any merges in the end."""
         return self.min_sigmas / self.min_sigmas_on_trial if self.min_sigmas_on_trial else math.inf

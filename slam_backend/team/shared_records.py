@@ -1,4 +1,4 @@
-"""`SharedRecords`: what the groups of a team write down in common: readings, bytes, and what becomes of their maps."""
+"""Records shared by the groups of a team: inputs, traffic, and changes of maps."""
 
 import copy
 from collections.abc import Mapping, Sequence
@@ -14,17 +14,17 @@ from slam_backend.team.communication import TrafficCounter
 
 
 class SharedRecords:
-    """The common records of a team.
+    """Shared records of a team.
 
     Args:
-        num_robots: K; the first K maps are those of the robots alone.
-        seed: Of the streams from which forks draw.
+        num_robots: K; the first K maps are those of the single robots.
+        seed: Seed of the forks' random streams.
 
     Attributes:
-        log: What was read and may have to be taken in again.
-        exchange: Counts bytes.
-        rng: From which forks get their own streams.
-        entries: What happened to maps since the last report.
+        log: Inputs that may have to be replayed.
+        exchange: Traffic counter.
+        rng: Generator that seeds the forks' random streams.
+        entries: Changes of maps since the last report.
     """
 
     def __init__(self, num_robots: int, seed: np.random.SeedSequence) -> None:
@@ -35,28 +35,28 @@ class SharedRecords:
         self._next_number = num_robots
 
     def new_number(self) -> int:
-        """Return a number that no map has had."""
+        """Return a map number that was never used."""
         self._next_number += 1
         return self._next_number - 1
 
     def copied(self, source: int, copy: int) -> None:
-        """Write down that a filter forked."""
+        """Record the fork of a filter."""
         self.entries.append(MapForked(source, copy))
 
     def note_created(self, number: int, step: int, report: StepReport) -> None:
-        """Write down which landmarks a step of the filter of a map created."""
+        """Record the landmarks that a step of a map's filter created."""
         for robot in report.rows:
             if robot >= 0 and report.all_associations.created_ids(robot):
                 created = as_read_only(report.all_associations.created(robot))
                 self.entries.append(LandmarksCreated(number, robot, step, created))
 
     def note_replay(self, number: int, replayed: Sequence[ReplayedStep]) -> None:
-        """Write down which landmarks a replay created in a map."""
+        """Record the landmarks that a replay created in a map."""
         for done in replayed:
             self.note_created(number, done.step, done.report)
 
     def get_state(self) -> dict[str, Any]:
-        """Return all that decides how the records go on."""
+        """Return the complete state of the records."""
         return {
             "log": self.log.get_state(),
             "exchange": self.exchange.get_state(),
@@ -66,7 +66,7 @@ class SharedRecords:
         }
 
     def set_state(self, state: Mapping[str, Any]) -> None:
-        """Go on with what `get_state` returned."""
+        """Restore the records from `get_state`."""
         self.log.set_state(state["log"])
         self.exchange.set_state(state["exchange"])
         self.rng.bit_generator.state = copy.deepcopy(state["rng"])

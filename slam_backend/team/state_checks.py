@@ -1,4 +1,4 @@
-"""What a state of `TeamSlam` must be so that a team can go on from it."""
+"""Validation of a `TeamSlam` state before a team continues from it."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -38,15 +38,15 @@ KINDS = ("attempt", "merge", "undo")
 
 
 class TeamCheck:
-    """Checks the parts of one state.
+    """Checks of the parts of one state.
 
     Args:
         num_robots: K.
-        kept: Readings by step that the team holds already: the same ones are not looked at again.
-        known: Options of its filters that were checked before.
+        kept: Inputs by step that the team already holds and need no check.
+        known: Options of its filters known to be valid.
 
     Attributes:
-        descriptor_sizes: Lengths of the descriptors in it.
+        descriptor_sizes: Lengths of the descriptors in the state.
         options: Options of all its filters.
     """
 
@@ -56,13 +56,13 @@ class TeamCheck:
         self._inputs: Mapping[int, StepInput] = {}
         self.descriptor_sizes: set[int] = set()
         self.options: list[FilterOptions] = []
-        self._done: set[int] = set()  # by `id`: sides that were looked at, for merges share them
+        self._done: set[int] = set()  # `id` of the snapshots checked, as merges share them
 
     def check(self, name: str, state: Any) -> None:
-        """Refuse what is no state of a team of K robots.
+        """Refuse a value that is not a valid state of a team of K robots.
 
         Raises:
-            ValueError: By name of the part that is wrong.
+            ValueError: If a part is wrong; the text names it.
         """
         check.keys(name, state, KEYS)
         for of_group, group in check.named_items(f"{name}['groups']", state["groups"]):
@@ -88,7 +88,7 @@ class TeamCheck:
             self._check_group(where, group)
         trunks = [group["branches"][0]["robots"] for group in state["groups"]]
         if sorted(sum(trunks, ())) != list(range(self._count)) or trunks != sorted(trunks):
-            check.refuse(f"{name}['groups']", "groups of all robots, in the order of their first ones", trunks)
+            check.refuse(f"{name}['groups']", "groups of all robots, ordered by their first robots", trunks)
         if len(self.descriptor_sizes) > 1:
             check.refuse(name, "descriptors of one length", sorted(self.descriptor_sizes))
 
@@ -99,17 +99,17 @@ class TeamCheck:
         for where, branch in check.named_items(f"{name}['branches']", group["branches"]):
             self._check_branch(where, branch)
             if not branch["active_robots"]:
-                check.refuse(f"{where}['active_robots']", "some robots", "none")
+                check.refuse(f"{where}['active_robots']", "at least one robot", "no robot")
             live += branch["active_robots"]
             self._check_oldest(where, branch)
         trunk = group["branches"][0]
         if sorted(live) != list(trunk["robots"]):
-            check.refuse(f"{name}['branches']", f"branches by which {trunk['robots']} go, each by one", live)
+            check.refuse(f"{name}['branches']", f"branches with each of {trunk['robots']} active in one", live)
         if group["undoing"] is not None:
             self._check_undoing(f"{name}['undoing']", group["undoing"], trunk)
 
     def _check_undoing(self, name: str, undoing: Any, trunk: Mapping[str, Any]) -> None:
-        """Refuse what is no undoing of a merge that the branch of the joint filter had."""
+        """Refuse a value that is not the rollback of a merge that the trunk monitors."""
         check.keys(name, undoing, ("number", "sides", "replayed"))
         check.integer(f"{name}['number']", undoing["number"], 0, self._next_number - 1)
         sides = check.named_items(f"{name}['sides']", undoing["sides"])
@@ -121,16 +121,16 @@ class TeamCheck:
         for of_side, replayed in check.named_items(f"{name}['replayed']", undoing["replayed"], len(parts)):
             for where, done in check.named_items(of_side, replayed):
                 self._check_replayed(where, done)
-        if all(watch.number != undoing["number"] for watch in trunk["monitors"]):
-            return  # the joint filter is another one now
+        if all(monitor.number != undoing["number"] for monitor in trunk["monitors"]):
+            return  # the joint filter has been replaced
         for where, side in sides:
             for robot, last in side["last_steps"].items():
                 self._need_from(where, last + 1)
                 if last > trunk["last_steps"].get(robot, -1):
-                    check.refuse(where, "sides that know no more than the joint filter", last)
+                    check.refuse(where, "sides that know no more steps than the joint filter", last)
 
     def _check_branch(self, name: str, branch: Any) -> None:
-        """Refuse what is no branch, whose filter and watches are checked with it."""
+        """Refuse a value that is not a branch with a valid filter and monitors."""
         check.keys(name, branch, BRANCH)
         robots, live, known = branch["robots"], branch["active_robots"], branch["last_steps"]
         check.robots(f"{name}['robots']", robots, self._count)
@@ -149,74 +149,74 @@ class TeamCheck:
             if last_step(log) > known[robot]:
                 check.refuse(f"{name}['last_steps']", f"at least {last_step(log)}, the last step logged", known[robot])
         self.options.append(branch["filter"]["options"])
-        looks = branch["filter"]["maps"]["descriptors"]
-        if len(looks):
-            self.descriptor_sizes.add(looks.shape[1])
+        descriptors = branch["filter"]["maps"]["descriptors"]
+        if len(descriptors):
+            self.descriptor_sizes.add(descriptors.shape[1])
         if branch["report"] is not None:
             self._check_report(f"{name}['report']", branch["report"], len(robots))
         if branch["split_from"] is not None:
             check.integer(f"{name}['split_from']", branch["split_from"], 0, self._next_number - 1)
         check.int_dict(f"{name}['split_counts']", branch["split_counts"], check.LANDMARK)
-        for where, watch in check.named_items(f"{name}['monitors']", branch["monitors"]):
-            self._check_watch(where, watch, robots)
-        numbers = [watch.number for watch in branch["monitors"]]
+        for where, monitor in check.named_items(f"{name}['monitors']", branch["monitors"]):
+            self._check_watch(where, monitor, robots)
+        numbers = [monitor.number for monitor in branch["monitors"]]
         if numbers != sorted(set(numbers)):
             check.refuse(f"{name}['monitors']", "merges from the oldest to the newest", numbers)
 
     def _check_oldest(self, name: str, branch: Mapping[str, Any]) -> None:
-        """Refuse a branch that may have to take in steps that are not kept."""
+        """Refuse a branch that may have to replay steps that are not buffered."""
         for robot, last in branch["last_steps"].items():
             if robot not in branch["active_robots"]:
                 self._need_from(name, last + 1)
             elif last != self._step - 1 and self._step:
-                check.refuse(f"{name}['last_steps']", f"{self._step - 1} of a robot that goes by it", last)
-        for watch in branch["monitors"]:
-            for side in watch.sides:
+                check.refuse(f"{name}['last_steps']", f"{self._step - 1} for an active robot", last)
+        for monitor in branch["monitors"]:
+            for side in monitor.sides:
                 self._need_from(name, side.oldest)
 
     def _need_from(self, name: str, first: int) -> None:
-        """Refuse a state in which a step from `first` on is not kept."""
+        """Refuse a state in which a step from `first` on is not buffered."""
         if first < self._step and (first not in self._inputs or len(self._inputs) < self._step - first):
-            check.refuse(name, "steps whose readings are kept", f"one that knows nothing from step {first} on")
+            check.refuse(name, "only buffered steps to replay", f"a filter without the steps from {first} on")
 
-    def _check_watch(self, name: str, watch: Any, robots: Sequence[int]) -> None:
-        """Refuse what is no watch of a merge of some of these robots."""
-        check.instance(name, watch, MergeMonitor)
-        check.integer(f"{name}.number", watch.number, 0, self._next_number - 1)
-        check.integer(f"{name}.steps", watch.steps)
-        check.instance(f"{name}.alignment", watch.alignment, Alignment)
-        for where, landmarks in check.named_items(f"{name}.pre_merge_maps", watch.pre_merge_maps, 2):
+    def _check_watch(self, name: str, monitor: Any, robots: Sequence[int]) -> None:
+        """Refuse a value that is not the monitor of a merge of some of these robots."""
+        check.instance(name, monitor, MergeMonitor)
+        check.integer(f"{name}.number", monitor.number, 0, self._next_number - 1)
+        check.integer(f"{name}.steps", monitor.steps)
+        check.instance(f"{name}.alignment", monitor.alignment, Alignment)
+        for where, landmarks in check.named_items(f"{name}.pre_merge_maps", monitor.pre_merge_maps, 2):
             check_landmarks(where, landmarks)
-        for where, own in check.named_items(f"{name}.exclusive_landmarks", watch.exclusive_landmarks, 2):
-            check.integers(where, own, *check.LANDMARK, set)
-        for where, side in check.named_items(f"{name}.sides", watch.sides, 2):
+        for where, exclusive in check.named_items(f"{name}.exclusive_landmarks", monitor.exclusive_landmarks, 2):
+            check.integers(where, exclusive, *check.LANDMARK, set)
+        for where, side in check.named_items(f"{name}.sides", monitor.sides, 2):
             check.instance(where, side, PreMergeSnapshot)
             if id(side) not in self._done:
                 self._done.add(id(side))
                 self._check_branch(f"{where}.trunk", side.trunk)
-            earliest = [1 + min(side.trunk["last_steps"].values()), *(s.oldest for w in side.monitors for s in w.sides)]
+            earliest = [1 + min(side.trunk["last_steps"].values()), *(s.oldest for w in side.watches for s in w.sides)]
             check.integer(f"{where}.oldest", side.oldest, 0, min(earliest))
-        one, two = (side.robots for side in watch.sides)
+        one, two = (side.robots for side in monitor.sides)
         if set(one) & set(two) or not {*one, *two} <= set(robots):
             check.refuse(f"{name}.sides", f"two parts of {robots}", (one, two))
 
-    # ------------------------------------------------------------------ readings and reports
+    # ------------------------------------------------------------------ inputs and reports
 
     def _check_inputs(self, name: str, inputs: Any) -> None:
-        """Refuse what are no readings of K robots in one step."""
+        """Refuse a value that is not the input of K robots in one step."""
         check.instance(name, inputs, StepInput)
         n, table = check.positions(f"{name}.measurements", inputs.measurements, (None, 9), 3), inputs.inputs_table
-        check.indices(f"{name}.table", table, (self._count, 6), -1)
+        check.indices(f"{name}.inputs_table", table, (self._count, 6), -1)
         check_turns(f"{name}.inputs", inputs.inputs, n, self._count)
         if [list(turn) for turn in inputs.inputs] != table.tolist():
-            check.refuse(f"{name}.table", "the turns", "others")
+            check.refuse(f"{name}.inputs_table", "the numbers of `inputs`", "a table that differs")
         check.positions(f"{name}.moves", inputs.moves, (self._count, 3))
         size = check_descriptors(f"{name}.descriptors", inputs.descriptors, n)
         if n:
             self.descriptor_sizes.add(size)
         named = check.indices(f"{name}.names", inputs.names, (None,), -1)
         if named != n and (named or table[:, HAS_IDS].any()):
-            check.refuse(f"{name}.names", "one for each measurement, or none", named)
+            check.refuse(f"{name}.names", "one name per measurement, or none", named)
         for _, begin, end, given, _, _ in inputs.inputs:
             if given:
                 check.floats(f"{name}.measurements", inputs.measurements[begin:end], (None, 9))
@@ -224,7 +224,7 @@ class TeamCheck:
         check.integers(f"{name}.inactive", inputs.inactive, 0, self._count - 1, frozenset)
 
     def _check_replayed(self, name: str, done: Any) -> None:
-        """Refuse what is no step that was taken in late."""
+        """Refuse a value that is not a replayed step."""
         check.instance(name, done, ReplayedStep)
         check.integer(f"{name}.step", done.step, 0, self._step)
         check.robots(f"{name}.robots", done.robots, self._count)
@@ -233,10 +233,10 @@ class TeamCheck:
         self._check_report(f"{name}.report", done.report, None)
 
     def _check_report(self, name: str, report: Any, robots: int | None) -> None:
-        """Refuse what is no report of a step of a filter of some robots; None: of any number."""
+        """Refuse a value that is not the step report of a filter of some robots; None: of any number."""
         check.instance(name, report, reports.StepReport)
         found = report.all_associations
-        check.instance(f"{name}.findings", found, reports.Associations)
+        check.instance(f"{name}.all_associations", found, reports.Associations)
         check.indices(f"{name}.all_associations.ids", found.ids, (2, None), REJECTED, check.MAX_LANDMARKS)
         check_turns(f"{name}.all_associations.inputs", found.inputs, found.ids.shape[1], None)
         check_masks(f"{name}.all_associations.masks", found.masks, found.inputs)
@@ -251,7 +251,7 @@ class TeamCheck:
         if report.rejuvenation is not None:
             check.instance(f"{name}.rejuvenation", report.rejuvenation, reports.RejuvenationReport)
 
-    # ------------------------------------------------------------------ what is written down
+    # ------------------------------------------------------------------ records
 
     def _check_records(self, name: str, records: Any) -> None:
         check.keys(name, records, ("log", "exchange", "rng", "entries", "next_number"))
@@ -262,7 +262,7 @@ class TeamCheck:
         check.instance(f"{name}['log']['steps']", steps, dict)
         check.integers(f"{name}['log']['steps']", tuple(steps), 0, self._step - 1)
         if list(steps) != list(range(self._step - len(steps), self._step)):
-            check.refuse(f"{name}['log']['steps']", "the last steps, in order", "others")
+            check.refuse(f"{name}['log']['steps']", "the last steps, in order", "a step missing or out of order")
         for step, inputs in steps.items():
             if self._kept.get(step) is not inputs:
                 self._check_inputs(f"{name}['log']['steps'][{step}]", inputs)
@@ -282,7 +282,7 @@ class TeamCheck:
             self._check_entry(where, entry)
 
     def _check_entry(self, name: str, entry: Any) -> None:
-        """Refuse what is no entry about maps."""
+        """Refuse a value that is not a change of maps."""
         kind = type(entry)
         if kind is reports.LandmarksCreated:
             numbers: tuple[Any, ...] = (entry.number,)
@@ -353,7 +353,7 @@ class TeamCheck:
             check.floats(f"{name}['trials']", motion, (3,))
 
     def _check_pair(self, name: str, pair: Any) -> None:
-        """Refuse what are no two groups of robots."""
+        """Refuse a value that is not two groups of robots."""
         check.instance(name, pair, tuple)
         check.sequence(name, pair, 2)
         for robots in pair:
@@ -361,7 +361,7 @@ class TeamCheck:
 
 
 def check_turns(name: str, turns: Any, n: int, robots: int | None) -> None:
-    """Refuse what are no turns of robots whose measurements lie among n, one robot's after the other's."""
+    """Refuse a value that is not the inputs of robots whose measurements lie among n, robot by robot."""
     check.sequence(name, turns, robots)
     last = 0
     for turn in turns:
@@ -369,22 +369,22 @@ def check_turns(name: str, turns: Any, n: int, robots: int | None) -> None:
         for number in turn:
             if type(number) is not int and type(number) is not bool:
                 check.refuse(name, "ints", turn)
-        fine = (0 <= turn[MOTION_KIND] <= EXACT_POSE and last <= turn[BEGIN] <= turn[END] <= n) or turn[BEGIN] == turn[
+        valid = (0 <= turn[MOTION_KIND] <= EXACT_POSE and last <= turn[BEGIN] <= turn[END] <= n) or turn[BEGIN] == turn[
             END
         ] == 0
-        if not fine or not (
+        if not valid or not (
             0 <= turn[COVARIANCES_GIVEN] <= 1 and 0 <= turn[HAS_IDS] <= 1 and -1 <= turn[COUNT] <= check.MAX_LANDMARKS
         ):
-            check.refuse(name, f"measurements among {n}", turn)
+            check.refuse(name, f"rows of {n} measurements in order", turn)
         last = max(last, turn[END])
 
 
 def check_masks(name: str, masks: Any, turns: Sequence[Sequence[int]]) -> None:
-    """Refuse what does not say which measurements of some robots are used."""
+    """Refuse a value that is not the masks of used measurements of some robots."""
     if not isinstance(masks, Mapping):
         check.refuse(name, "a dict", f"a {type(masks).__name__}")
     for robot, mask in masks.items():
         check.integer(name, robot, 0, len(turns) - 1)
         check.array(name, mask, check.BOOL, (max(turns[robot][COUNT], 0),))
         if np.count_nonzero(mask) != turns[robot][END] - turns[robot][BEGIN]:
-            check.refuse(name, "as many as are used", int(np.count_nonzero(mask)))
+            check.refuse(name, "as many True values as used measurements", int(np.count_nonzero(mask)))

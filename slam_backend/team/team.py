@@ -1,11 +1,11 @@
-"""`TeamSlam`: robots that start at unknown places, one filter each, until their maps can be aligned and merged.
+"""Multi-robot FastSLAM with unknown start poses: one filter per robot until maps can be aligned and merged.
 
-A group is a set of robots that share a map frame and a joint filter (Sec. 4); at the start each robot is its own
-group. The frame of a group is the start frame of its first robot, the one of lowest index. From time to time one pair
-of groups tries to align its maps (Sec. 3.1); when that succeeds their filters are merged particle by particle
-(Sec. 3.2). A merge can be refused, with a reason: a false merge is worse than a late one. For a while after a merge the
-team watches whether its maps contradict each other, and if they do it undoes the merge. Robots that lose contact with
-their group go on with a fork of the joint filter, which is told on their return what they have read meanwhile.
+A group is a set of robots that share a map frame and a joint filter (Sec. 4); initially each robot is its own group.
+The frame of a group is the start frame of its first robot, the one of lowest index. At intervals one pair of groups
+attempts to align its maps (Sec. 3.1); after a success their filters are merged particle by particle (Sec. 3.2). A merge
+can be refused, with a reason: a false merge is worse than a late one. For a while after a merge the team checks whether
+its maps contradict each other, and if so it undoes the merge. Robots that lose contact with their group use a fork of
+the joint filter; on their return the joint filter replays their inputs.
 """
 
 import copy
@@ -50,19 +50,19 @@ from slam_backend.team.options import MergeOptions
 from slam_backend.team.shared_records import SharedRecords
 from slam_backend.team.state_checks import TeamCheck
 
-Rejuvenation = tuple[tuple[int, ...], RejuvenationReport]  # of a filter: who goes by it, and what came of it
+Rejuvenation = tuple[tuple[int, ...], RejuvenationReport]  # active robots of a filter, and outcome
 
 
 class TeamSlam:
-    """Visual FastSLAM for a team whose robots do not know where they start.
+    """Visual FastSLAM for a team of robots with unknown start poses.
 
     Args:
         num_robots: K.
-        alignment: When two maps are believed to fit together.
-        attempts: When a pair of groups tries.
-        merging: How filters are merged, and when a merge is undone.
-        seed: Of all random streams of the team: an int or a `numpy.random.SeedSequence`.
-        **fastslam_options: Of each filter; the fields of `FilterOptions`.
+        alignment: Options of map alignments.
+        attempts: Options that schedule the attempts of groups.
+        merging: Options of merges and of their undo.
+        seed: Seed of all random streams of the team: an int or a `numpy.random.SeedSequence`.
+        **fastslam_options: Options of each filter; the fields of `FilterOptions`.
 
     Raises:
         ValueError: If an argument is unknown or out of its range; the text names it.
@@ -77,12 +77,12 @@ class TeamSlam:
         merging: MergeOptions | None = None,
         **fastslam_options: Any,
     ) -> None:
-        count = check_int("num_robots", num_robots, 1, "A team has at least one robot.", MAX_ROBOTS)
+        count = check_int("num_robots", num_robots, 1, "Use at least one robot.", MAX_ROBOTS)
         known = {field.name for field in fields(FilterOptions)}
         for name in fastslam_options:
             if name not in known:
-                cure = f"Options of the filters are {', '.join(sorted(known))}."
-                raise argument_error(name, "a known argument", "a name that no option has", cure)
+                hint = f"Filters have the options {', '.join(sorted(known))}."
+                raise argument_error(name, "a known argument", "a name that is not an option", hint)
         options = FilterOptions(**fastslam_options)
         for name, value, kind in (
             ("alignment", alignment, AlignmentOptions),
@@ -93,11 +93,11 @@ class TeamSlam:
                 raise argument_error(name, f"{kind.__name__} or None", value, f"Build one: {kind.__name__}(...).")
         if isinstance(seed, np.random.Generator):
             raise argument_error(
-                "seed", "an int >= 0 or a SeedSequence", seed, "A team spawns a stream for each robot."
+                "seed", "an int >= 0 or a SeedSequence", seed, "The team spawns a stream for each robot."
             )
         sequence = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(check_seed(seed))
-        own, *streams, of_forks = sequence.spawn(2 + count)
-        self._rng = np.random.default_rng(own)
+        stream, *streams, of_forks = sequence.spawn(2 + count)
+        self._rng = np.random.default_rng(stream)
         self._alignment = AlignmentOptions() if alignment is None else alignment
         self._merging = MergeOptions() if merging is None else merging
         self._schedule = MergeScheduler(AttemptOptions() if attempts is None else attempts, self._alignment)
@@ -125,57 +125,56 @@ class TeamSlam:
         identities: Sequence[ArrayLike | None] | None = None,
         poses: Sequence[ArrayLike | None] | None = None,
     ) -> TeamReport:
-        """Let robots lose and find each other, step each filter, weigh the last merges, and let one pair of groups try.
+        """Update contacts, step each filter, check recent merges, and run an attempt of one pair of groups.
 
-        Robots pass on what they hear: who reaches another through others is in contact with it. Where robots of a
-        group lose contact, the largest part (of equal ones that with the lowest robot) keeps the joint filter; each
-        other part goes on with a fork of it, and the joint filter holds their poses. On return the joint filter takes
-        in what they have read meanwhile, at most 20 steps of it per step; until it has caught up they go by their
-        fork. Parts that meet away from the joint filter join likewise. Only the robots that keep the joint filter
-        align and merge.
+        Robots relay messages: two robots are in contact if others connect them. Where robots of a group lose contact,
+        the largest part (of equal ones that with the lowest robot) keeps the joint filter; each other part uses a fork
+        of it, and the joint filter keeps their last poses. On return the joint filter replays their inputs, at most 20
+        steps of them per step; until it has caught up they use their fork. Forks that meet without the joint filter
+        rejoin in the same way. Only the robots that use the joint filter align and merge.
 
         Args:
-            odometry: Per robot (3,) [m, m, rad], or None; see `FastSlam.step`. (K, 3) where all have moved.
-            measurements: Per robot its frame, or None; or the frames of all in one piece.
-            contacts: (K, K) bool, symmetric: who hears whom now; the diagonal means nothing. None = all.
-            identities: Per robot (n_i,) int, see `FastSlam.step`.
-            poses: Per robot (3,), see `FastSlam.step`.
+            odometry: One (3,) [m, m, rad] per robot, or None; see `FastSlam.step`. (K, 3) if all have moved.
+            measurements: One frame per robot, or None; or the frames of all robots in one object.
+            contacts: (K, K) bool, symmetric. Pairs of robots in contact now; the diagonal is ignored. None = all.
+            identities: One (n_i,) int per robot, see `FastSlam.step`.
+            poses: One (3,) per robot, see `FastSlam.step`.
 
         Raises:
-            ValueError: If an argument is ill-formed; the team is then as before.
+            ValueError: If an argument is ill-formed; the team is then unchanged.
         """
         count, networks = self._num_robots, self._together
         if contacts is not None:
             networks = contact_components(check_contacts(contacts, count), count)
-        lineup, size = self.lineup, self._size or self._descriptor_size()
-        camera = lineup.branches[0].filter.options.camera
+        topology, size = self.lineup, self._size or self._descriptor_size()
+        camera = topology.branches[0].filter.options.camera
         inputs = validate_step(count, size, camera, odometry, measurements, identities, poses)
         records, before = self._records, len(self._events)
-        if contacts is not None or lineup.is_split:
-            lineup = self._update_groups(networks)
-        if lineup.oldest is not None:
+        if contacts is not None or topology.is_split:
+            topology = self._update_groups(networks)
+        if topology.oldest is not None:
             records.log.record(self._step, inputs)
-        findings, rejuvenations = self._advance(lineup, inputs)
-        if lineup.has_monitors:
+        associations, rejuvenations = self._advance(topology, inputs)
+        if topology.has_monitors:
             self._check_merges()
-        renamings = self._attempt(networks) if self._schedule.is_due(self._step) else ()
+        id_maps = self._attempt(networks) if self._schedule.is_due(self._step) else ()
         if self._is_stale:
             self._refresh_topology()
-            lineup = self.lineup
-        oldest = self._step + 1 if lineup.oldest is None else lineup.oldest
-        if lineup is not self._last_lineup:
-            self._note_dropped(lineup)
+            topology = self.lineup
+        oldest = self._step + 1 if topology.oldest is None else topology.oldest
+        if topology is not self._last_lineup:
+            self._note_dropped(topology)
             records.log.forget_before(oldest)
         events, entries = tuple(self._events[before:]), tuple(records.entries)
         report = TeamReport(
-            self._step, findings, lineup.groups, events, renamings, lineup.maps, entries, oldest, rejuvenations
+            self._step, associations, topology.groups, events, id_maps, topology.maps, entries, oldest, rejuvenations
         )
         records.entries.clear()
         self._step += 1
         return report
 
     def _update_groups(self, networks: IntArray) -> TeamTopology:
-        """Let robots of each group lose and find each other, and return who goes by which filter then."""
+        """Update the contacts of each group, and return the topology."""
         was_split = self.lineup.is_split
         for group in self._groups:
             group.update_connectivity(networks, self._records)
@@ -183,76 +182,75 @@ class TeamSlam:
             self._refresh_topology()
         return self.lineup
 
-    def _advance(self, lineup: TeamTopology, inputs: StepInput) -> tuple[Associations, tuple[Rejuvenation, ...]]:
-        """Step all filters with what their robots have just read; return what `TeamReport` tells of it."""
+    def _advance(self, topology: TeamTopology, inputs: StepInput) -> tuple[Associations, tuple[Rejuvenation, ...]]:
+        """Step all filters with the inputs of their robots; return data association and rejuvenations."""
         step, records = self._step, self._records
-        findings, told = Associations.allocate(inputs)
+        associations, buffer = Associations.allocate(inputs)
         rejuvenations: tuple[Rejuvenation, ...] = ()
-        for branch, intake in zip(lineup.branches, lineup.routings, strict=True):
-            report = process_step(branch, step, intake, inputs, findings, told)
+        for branch, routing in zip(topology.branches, topology.routings, strict=True):
+            report = process_step(branch, step, routing, inputs, associations, buffer)
             if report.num_created:
                 records.note_created(branch.number, step, report)
-            if len(intake.robots) > 1:  # a robot that nobody hears sends nothing
+            if len(routing.robots) > 1:  # a robot without contact sends nothing
                 records.exchange.record_step(report, branch.filter.descriptor_size)
             if report.rejuvenation is not None:
-                rejuvenations += ((intake.robots, report.rejuvenation),)
-        return findings, rejuvenations
+                rejuvenations += ((routing.robots, report.rejuvenation),)
+        return associations, rejuvenations
 
     def merge(self, robot_a: int, robot_b: int, alignment: Alignment, known: bool = False) -> LandmarkIdMap:
-        """Merge the joint filters of two robots' groups with a given alignment, unasked whether it is right.
+        """Merge the joint filters of two robots' groups with a given alignment, without verification.
 
-        The merge is then watched like any other; `MergeOptions(watch_steps=0)` makes it final.
+        The merge is then monitored like any other; `MergeOptions(watch_steps=0)` makes it final.
 
         Args:
-            robot_a: A robot of one group that goes by its joint filter.
-            robot_b: Such a robot of the other.
+            robot_a: Robot of one group that uses its joint filter.
+            robot_b: Such a robot of the other group.
             alignment: Motion from the map frame of b's group to that of a's; `inliers` are rows of `map(robot_a)` and
-                `map(robot_b)`, none if the landmarks in common are not known.
-            known: The motion is drawn from the alignment's covariance as it stands. Else the landmarks in common
-                correct it, for each pair of particles by itself, and the covariance counts where they are few.
+                `map(robot_b)`, none if the common landmarks are unknown.
+            known: Whether the motion is drawn from the alignment's covariance as it is. Otherwise the common landmarks
+                correct it, separately for each pair of particles, and the covariance counts where they are few.
 
         Returns:
-            How landmark ids changed; `robots_a` is the group whose frame stays, the one with the lowest robot.
+            Renaming of the landmarks; `robots_a` is the group whose frame stays, the one with the lowest robot.
 
         Raises:
-            ValueError: If the robots share a group already, or one is out of contact with its joint filter, or the
-                alignment is a refusal or names rows that do not exist or the same one twice; the team is then as
-                before.
+            ValueError: If the robots share a group, or one is out of contact with its joint filter, or the alignment is
+                a refusal or names rows that do not exist or repeat; the team is then unchanged.
         """
         groups = self._group_of(robot_a), self._group_of(robot_b)
         if groups[0] is groups[1]:
             expected = f"a robot outside the group {groups[0].robots}"
-            raise argument_error("robot_b", expected, robot_b, "They share a map already.")
+            raise argument_error("robot_b", expected, robot_b, "These robots already share a map.")
         for name, robot, group in zip(("robot_a", "robot_b"), (robot_a, robot_b), groups, strict=True):
             if robot not in group.trunk.active_robots:
-                cure = "Merge through a robot that goes by the joint filter."
-                raise argument_error(name, f"one of {group.trunk.active_robots}", robot, cure)
+                hint = "Merge through a robot that uses the joint filter."
+                raise argument_error(name, f"one of {group.trunk.active_robots}", robot, hint)
         if not isinstance(alignment, Alignment) or not alignment.success:
             got = f"a refusal ({alignment.reason})" if isinstance(alignment, Alignment) else alignment
             raise argument_error("alignment", "a successful Alignment", got, "Align the two maps first.")
         if groups[1].robots < groups[0].robots:
             groups, alignment = groups[::-1], inverse_alignment(alignment)
-        renaming = self._merge(MergePlan.of(*groups, alignment), known)
+        id_map = self._merge(MergePlan.of(*groups, alignment), known)
         self._refresh_topology()
-        return renaming
+        return id_map
 
     def _merge(self, plan: MergePlan, known: bool = False) -> LandmarkIdMap:
-        """Merge two groups as planned, and write it down."""
+        """Merge two groups as planned, and record it."""
         epoch = self._epoch + 1
-        joint, renaming = merge_groups(plan, self._merging, self._records, self._rng, epoch, known)
+        joint, id_map = merge_groups(plan, self._merging, self._records, self._rng, epoch, known)
         self._epoch = epoch
-        self._events.append(MergeEvent(self._step, "merge", renaming.robots_a, renaming.robots_b, plan.alignment))
+        self._events.append(MergeEvent(self._step, "merge", id_map.robots_a, id_map.robots_b, plan.alignment))
         self._replace(plan.groups, [joint])
-        return renaming
+        return id_map
 
     def _replace(self, old: Sequence[Group], new: Sequence[Group]) -> None:
-        """Put some groups in the place of others."""
+        """Replace some groups by others."""
         self._groups = [group for group in self._groups if all(group is not other for other in old)] + list(new)
         self._groups.sort(key=lambda group: group.robots)
         self._is_stale = True
 
     def _check_merges(self) -> None:
-        """Weigh the evidence about the merges that can still be undone, and undo what contradicts itself."""
+        """Check the merges that can still be undone, and undo inconsistent ones."""
         due = self._step % self._merging.watch_every == 0
         for group in list(self._groups):
             if due and group.undoing is None:
@@ -267,23 +265,23 @@ class TeamSlam:
                     self._is_stale = True
 
     def _undo(self, group: Group, undoing: MergeRollback) -> None:
-        """Go on with taking back a merge; it is done when all sides have caught up and are in contact."""
+        """Continue the rollback of a merge; it ends when all sides have caught up and are in contact."""
         merges = undoing.merges(group.trunk)
-        if not merges:  # the joint filter is another one now, whose window is over
+        if not merges:  # the joint filter was replaced and no longer monitors the merge
             group.undoing, self._is_stale = None, True
             return
         caught_up = undoing.catch_up(group.trunk, self._records.log)
-        if not caught_up or not all(watch.both_sides_connected(group.trunk.active_robots) for watch in merges):
+        if not caught_up or not all(monitor.both_sides_connected(group.trunk.active_robots) for monitor in merges):
             return
         self._epoch += 1
         self._replace([group], restore_groups(group, undoing, self._records, self._epoch))
-        for watch in merges:
-            pair = (watch.sides[0].robots, watch.sides[1].robots)
-            self._events.append(MergeEvent(self._step, "undo", *pair, watch.alignment))
+        for monitor in merges:
+            pair = (monitor.sides[0].robots, monitor.sides[1].robots)
+            self._events.append(MergeEvent(self._step, "undo", *pair, monitor.alignment))
         self._schedule.block(pair, self._step + self._merging.blocked_steps)
 
     def _attempt(self, networks: IntArray) -> tuple[LandmarkIdMap, ...]:
-        """Let a pair of groups try, and merge those whose attempt is a success."""
+        """Run an attempt, and merge the groups if it succeeds."""
         options = self._schedule, self._alignment, self._merging
         tried = run_attempt(self._groups, networks, self._step, *options, self._records, self._rng)
         if tried is None:
@@ -291,25 +289,25 @@ class TeamSlam:
         self._events.append(tried.event)
         return () if tried.plan is None else (self._merge(tried.plan),)
 
-    def _note_dropped(self, lineup: TeamTopology) -> None:
-        """Write down which maps are gone since the last lineup."""
-        self._records.entries += [MapReleased(number) for number in sorted(self._numbers - lineup.numbers)]
-        self._last_lineup, self._numbers = lineup, lineup.numbers
+    def _note_dropped(self, topology: TeamTopology) -> None:
+        """Record the maps that have ended since the last topology."""
+        self._records.entries += [MapReleased(number) for number in sorted(self._numbers - topology.numbers)]
+        self._last_lineup, self._numbers = topology, topology.numbers
 
     def _descriptor_size(self) -> int:
-        """Return the length of the descriptors in use, 0 before the first one; it stays the same from there on."""
+        """Return the length of the descriptors in use, 0 before the first one; it is constant from then on."""
         self._size = max([branch.filter.descriptor_size for branch in self.lineup.branches])
         return self._size
 
     def _refresh_topology(self) -> None:
-        """Find out who goes by which filter now."""
+        """Recompute the assignment of robots to filters."""
         self.lineup, self._is_stale = TeamTopology.of(self._groups), False
 
-    # ------------------------------------------------------------------ what is known
+    # ------------------------------------------------------------------ estimates
 
     @property
     def num_robots(self) -> int:
-        """K."""
+        """Number of robots, K."""
         return self._num_robots
 
     @property
@@ -324,7 +322,7 @@ class TeamSlam:
 
     @property
     def pair_attempts(self) -> tuple[PairAttempts, ...]:
-        """What came of the attempts of each pair of groups so far, and why the last one was refused."""
+        """Outcomes of the attempts of each pair of groups so far, with the reason of the last refusal."""
         return count_attempts(self._events)
 
     @property
@@ -334,21 +332,21 @@ class TeamSlam:
 
     @property
     def exchange(self) -> TrafficCounter:
-        """Counts these bytes; to be looked at."""
+        """Traffic counter of the team; not to be changed."""
         return self._records.exchange
 
     @property
     def maps(self) -> tuple[int, ...]:
-        """Per robot the number of the map that it goes by; see `TeamReport`."""
+        """Number of each robot's map; see `TeamReport`."""
         return self.lineup.maps
 
     @property
     def diagnostics(self) -> tuple[dict[str, float], ...]:
         """Per robot: ESS, NIS, landmarks held, and its accepted, new and rejected measurements of the last step.
 
-        Of the whole life of its filter: `nis_mean`, `nis_share`, `ess_share` and `rejected_share` of `Consistency`,
-        and `warnings`, how many there are; `consistency` has their texts.
-        And of all steps so far the attempts of its groups to align maps, and how many were refused for each reason.
+        Over the lifetime of its filter: `nis_mean`, `nis_share`, `ess_share` and `rejected_share` of `Consistency`, and
+        the number of `warnings`; `consistency` has their texts.
+        Over all steps: the attempts of its groups to align maps, and the number of refusals by reason.
         """
         rows: list[dict[str, float]] = []
         for robot in range(self.num_robots):
@@ -357,7 +355,7 @@ class TeamSlam:
             found = np.empty(0, np.int64) if report is None else report.associations[index]
             made = np.empty(0, np.int64) if report is None else report.created[index]
             new = int(np.count_nonzero((found >= 0) & (found == made)))
-            told = branch.filter.consistency
+            summary = branch.filter.consistency
             rows.append(
                 {
                     "ess": self.ess(robot),
@@ -366,34 +364,34 @@ class TeamSlam:
                     "accepted": float(np.count_nonzero(found >= 0) - new),
                     "new": float(new),
                     "rejected": float(np.count_nonzero(found < 0)),
-                    "nis_mean": told.nis_mean,
-                    "nis_share": told.nis_share,
-                    "ess_share": told.ess_share,
-                    "rejected_share": told.rejected_share,
-                    "warnings": float(len(told.warnings)),
+                    "nis_mean": summary.nis_mean,
+                    "nis_share": summary.nis_share,
+                    "ess_share": summary.ess_share,
+                    "rejected_share": summary.rejected_share,
+                    "warnings": float(len(summary.warnings)),
                     **refusals_of(self._events, robot),
                 }
             )
         return tuple(rows)
 
     def consistency(self, robot: int) -> Consistency:
-        """Return whether the filter that a robot goes by errs as little as it claims; see `FastSlam.consistency`."""
+        """Return the consistency of the filter that a robot uses; see `FastSlam.consistency`."""
         return self._find(robot)[0].filter.consistency
 
     def known_robots(self, robot: int) -> tuple[int, ...]:
-        """Return the robots whose places the robot's filter knows, itself included, in ascending order.
+        """Return the robots in the robot's filter, itself included, in ascending order.
 
-        They are its group, but for a robot that has been out of contact since before a merge or an undo: it knows of
-        neither. The map frame is the start frame of the first of them.
+        They are its group, unless the robot has been out of contact since before a merge or an undo, which its filter
+        then lacks. The map frame is the start frame of the first of them.
         """
         return self._find(robot)[0].robots
 
     def same_filter(self, robot: int) -> tuple[int, ...]:
-        """Return the robots that go by the same filter as this one now, itself included, in ascending order."""
+        """Return the robots that use the same filter now, itself included, in ascending order."""
         return self._find(robot)[0].active_robots
 
     def trunk_robots(self, robot: int) -> tuple[int, ...]:
-        """Return the robots that go by the joint filter of a robot's group, in ascending order: it merges by them."""
+        """Return the robots that use the joint filter of a robot's group, in ascending order: only they can merge."""
         return self._group_of(robot).trunk.active_robots
 
     def ess(self, robot: int) -> float:
@@ -405,18 +403,18 @@ class TeamSlam:
         """Return the robot's pose in the map frame.
 
         Args:
-            robot: Whose.
-            seen_by: In whose filter, one of whose `members` is the robot; None: its own. Of a robot out of contact
-                others know where it was when contact was lost.
+            robot: Index of the robot.
+            seen_by: Robot whose filter gives the pose, one of whose `known_robots` is `robot`; None: `robot` itself. In
+                other filters a robot out of contact has its last pose before contact was lost.
 
         Raises:
-            ValueError: If a robot does not exist or that filter does not know it.
+            ValueError: If a robot does not exist or is not in that filter.
         """
         branch, index = self._find(robot)
         if seen_by is not None:
             branch = self._find(seen_by)[0]
             if robot not in branch.robots:
-                raise argument_error("robot", f"one of {branch.robots}", robot, "Ask about members of its filter.")
+                raise argument_error("robot", f"one of {branch.robots}", robot, "Name a robot in this filter.")
             index = branch.robots.index(robot)
         return branch.filter.pose(index)
 
@@ -436,43 +434,43 @@ class TeamSlam:
         return branch.filter.particles_from_start(index)
 
     def map(self, robot: int, estimate: Literal["best", "mixture"] = "best", min_count: int = 1) -> LandmarkMap:
-        """Return the map that the robot goes by in its map frame; see `FastSlam.map`."""
+        """Return the robot's map in its map frame; see `FastSlam.map`."""
         return self._find(robot)[0].filter.map(estimate, min_count)
 
     def merged_maps(self, merge: MergeEvent) -> tuple[LandmarkMap, LandmarkMap]:
-        """Return the two maps that a merge joined as they were just before it, straight if they had been straightened.
+        """Return the two maps joined by a merge as they were just before it, smoothed if the attempt smoothed them.
 
         Each is in its own frame, under its own ids, and has the rows that the inliers of `merge.alignment` name.
 
         Raises:
-            ValueError: If it is no merge that is still watched.
+            ValueError: If the event is not a merge that is still monitored.
         """
         check_kind("merge", merge, MergeEvent, "Give one of the events of a step's report.")
         for group in self._groups:
-            for watch in group.trunk.monitors:
-                if watch.alignment is merge.alignment:
-                    map_a, map_b = (restored_filter(side.trunk["filter"]).map() for side in watch.sides)
+            for monitor in group.trunk.monitors:
+                if monitor.alignment is merge.alignment:
+                    map_a, map_b = (restored_filter(side.trunk["filter"]).map() for side in monitor.sides)
                     return map_a, map_b
-        expected, got = "a merge still watched", f"the {merge.kind} of step {merge.step}"
-        raise argument_error("merge", expected, got, "Ask in the step in which it is made.")
+        expected, got = "a merge still monitored", f"the {merge.kind} of step {merge.step}"
+        raise argument_error("merge", expected, got, "Call this in the step of the merge.")
 
     def start_from_group(self, robot: int) -> FloatArray:
         """Return (3,) the motion from the map frame of the robot's filter to the robot's own start frame.
 
-        It is that of the most probable particle, so that it fits `map(robot)`.
+        The start pose is that in the most probable particle, as for `map(robot)`.
         """
         branch, index = self._find(robot)
         return inverse(branch.filter.start_pose(index))
 
     def map_summaries(self, min_count: int = 1, into: TeamMapSummaries | None = None) -> TeamMapSummaries:
-        """Return the outlines of `map(robot, min_count=min_count)` of all robots, much faster.
+        """Return the summaries of `map(robot, min_count=min_count)` of all robots, much faster.
 
         Args:
-            min_count: Landmarks that were measured fewer times are left out.
-            into: What this has returned before; it is written to, as long as it has room. None: fresh arrays.
+            min_count: Least number of measurements of a landmark in the result.
+            into: Earlier result, overwritten if it is large enough. None: fresh arrays.
         """
-        outlines = TeamMapSummaries.allocate(self._num_robots, 0) if into is None else into
-        (rows, parts), last = outlines, 0
+        summaries = TeamMapSummaries.allocate(self._num_robots, 0) if into is None else into
+        (rows, parts), last = summaries, 0
         for branch in self.lineup.branches:
             slam = branch.filter
             first, last = last, write_summary(slam.state.maps, slam.state.best, min_count, rows, last)
@@ -480,13 +478,13 @@ class TeamSlam:
                 parts[robot, 0], parts[robot, 1] = first, last
         if last > len(rows.counts_and_ids):
             return self.map_summaries(min_count, TeamMapSummaries.allocate(self._num_robots, 2 * last))
-        return outlines
+        return summaries
 
     def team_poses(self, into: TeamPoses | None = None) -> TeamPoses:
-        """Return where all robots stand: `pose_from_start`, `start_from_group`, `pose` at once.
+        """Return the poses of all robots: `pose_from_start`, `start_from_group` and `pose` at once.
 
         Args:
-            into: What this has returned before; it is written to. None: fresh arrays.
+            into: Earlier result, overwritten. None: fresh arrays.
         """
         points = TeamPoses(self._num_robots) if into is None else into
         for branch in self.lineup.branches:
@@ -500,11 +498,11 @@ class TeamSlam:
         return self._place(robot)[0]
 
     def _find(self, robot: int) -> tuple[Branch, int]:
-        """Return the branch that the robot goes by, and its place in it."""
+        """Return the branch that the robot uses, and its index there."""
         return self._place(robot)[1:]
 
     def _place(self, robot: int) -> tuple[Group, Branch, int]:
-        """Return the robot's group, the branch that it goes by, and its place in that."""
+        """Return the robot's group, its branch, and its index in the branch."""
         if type(robot) is int and 0 <= robot < self._num_robots:
             return self.lineup.places[robot]
         if isinstance(robot, (int, np.integer)) and not isinstance(robot, bool) and 0 <= robot < self._num_robots:
@@ -515,18 +513,18 @@ class TeamSlam:
 
     @property
     def buffered_inputs(self) -> Mapping[int, StepInput]:
-        """Readings of the last steps that some filter may take in later, by step; to be looked at."""
+        """Inputs of the last steps that some filter may replay, by step; not to be changed."""
         return self._records.log.buffered
 
     @property
     def filter_options(self) -> FilterOptions:
-        """What all filters assume, but for their number of particles."""
+        """Options of all filters, except for their number of particles."""
         return self._groups[0].trunk.filter.options
 
     def get_state(self) -> dict[str, Any]:
-        """Return all that decides how the team goes on, random streams included.
+        """Return the complete state of the team, random streams included.
 
-        Snapshots kept for an undo, readings and reports are shared and read-only, all else is copied.
+        Snapshots kept for an undo, inputs and reports are shared and read-only, all else is copied.
         """
         return {
             "step": self._step,
@@ -542,21 +540,21 @@ class TeamSlam:
         }
 
     def set_state(self, state: Mapping[str, Any]) -> None:
-        """Go on exactly as the team that gave `state`.
+        """Restore a state from `get_state`; the team then continues identically.
 
         Raises:
-            ValueError: If `state` is not one of `get_state`, or of a team of another size.
+            ValueError: If `state` is not from `get_state`, or from a team of another size.
         """
         with refuse_malformed("state"):
             TeamCheck(self._num_robots, self.buffered_inputs, (self.filter_options,)).check("state", state)
         self.restore_checked(state)
 
     def restore_checked(self, state: Mapping[str, Any]) -> None:
-        """Go on from a state that was checked."""
+        """Restore a state that was validated."""
         self._step, self._epoch = state["step"], state["epoch"]
         self._rng.bit_generator.state = copy.deepcopy(state["rng"])
         self._events = list(state["events"])
-        at_hand = {group.robots: group.trunk.filter for group in self._groups}  # filling is faster than building
+        at_hand = {group.robots: group.trunk.filter for group in self._groups}  # reuse is faster than construction
         self._groups = [Group.from_state(group, at_hand) for group in state["groups"]]
         self._refresh_topology()
         self._last_lineup, self._size = None, 0

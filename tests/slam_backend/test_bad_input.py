@@ -175,7 +175,7 @@ CALLS: dict[str, list[Callable[[], Any]]] = {
         lambda: FastSlam(existence=ExistenceModel(margin_px=120.0)),
     ],
     "existence.nearest: expected a number < 0.18": [lambda: ExistenceModel().view(StereoCamera(max_range=0.2))],
-    "existence: expected a filter that keeps it": [lambda: FastSlam().existence()],
+    "existence: expected a filter that estimates it": [lambda: FastSlam().existence()],
     "num_robots: expected an int >= 1": [
         *(partial(FastSlam, bad) for bad in (0, 1.0, True)),
         *(partial(TeamSlam, bad) for bad in (0, -2, 2.5, True, None)),

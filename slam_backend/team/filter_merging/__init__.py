@@ -1,1 +1,1 @@
-"""Merging of two particle filters: landmarks paired, particles paired, logs and graphs joined."""
+"""Merging of two particle filters: pairing of particles and fusion of landmarks."""

@@ -1,4 +1,4 @@
-"""Landmarks of all particles of two filters: taken out, brought into one map."""
+"""Landmarks of all particles of two filters: extraction and transfer into one map."""
 
 from typing import NamedTuple, Self
 
@@ -15,14 +15,14 @@ from slam_backend.team.filter_merging._kernels.joint_map import Side, join
 
 
 class Landmarks(NamedTuple):
-    """The landmarks of one filter in some of its particles, wherever they lie.
+    """Landmarks of one filter in selected particles.
 
     Attributes:
-        maps: That hold them.
-        slots: (n,) which.
+        maps: Maps of the filter.
+        slots: (n,) slots of the landmarks.
         chosen: (M,) particles.
-        where: (n, M) at which of the maps' numbers each begins.
-        counts: (n, M), 0 where the particle lacks it.
+        where: (n, M) index of the first value of each landmark and particle in `maps.values`.
+        counts: (n, M), 0 where the particle lacks the landmark.
     """
 
     maps: ParticleMaps
@@ -33,7 +33,7 @@ class Landmarks(NamedTuple):
 
     @classmethod
     def of(cls, maps: ParticleMaps, chosen: IntArray | None = None, ids: IntArray | None = None) -> Self:
-        """Return all by ascending id, or those of these ids (n,) in their order; in all particles or the chosen."""
+        """Return all landmarks by ascending id, or those with given ids (n,); in all particles or the chosen ones."""
         slots = maps.used_slots()
         if ids is not None:
             slots = slots[np.searchsorted(maps.ids[slots], ids)]
@@ -61,11 +61,11 @@ class Landmarks(NamedTuple):
 
     @property
     def descriptors(self) -> NDArray[np.float32]:
-        """(n, d) looks."""
+        """(n, d) descriptors."""
         return np.asarray(self.maps.descriptors[self.slots])
 
     def odds(self, model: ExistenceModel | None) -> FloatArray:
-        """Return the log-odds of existence (n, M): the prior, where the filter does not keep them."""
+        """Return the log-odds of existence (n, M): the prior, if the filter does not estimate them."""
         if self.maps.log_odds_prior is None:
             return np.full(self.counts.shape, 0.0 if model is None else model.log_odds_prior)
         ancestors = self.maps.map_of[self.slots][:, None]
@@ -74,28 +74,27 @@ class Landmarks(NamedTuple):
 
 
 def merge_by_identity(a: ParticleMaps, b: ParticleMaps, pairs: IntArray) -> tuple[IntArray, IntArray]:
-    """Let the caller's names decide which landmarks of two filters are the same, where there are names on both sides.
+    """Decide by the caller's names which landmarks of two filters are the same, where both sides have names.
 
     Args:
         a: Landmarks of one filter.
         b: Landmarks of the other.
-        pairs: (k, 2) int64 rows (id in a, id in b) that an alignment takes for the same, one-to-one.
+        pairs: (k, 2) int64 rows (id in a, id in b) matched by an alignment, one-to-one.
 
     Returns:
-        The rows of `pairs` that no name contradicts; and the rows of landmarks that have one name and are in none of
-        these.
+        The rows of `pairs` that no name contradicts; and the rows of further landmarks with a common name.
     """
     (ids_a, names_a), (ids_b, names_b) = ((maps.ids[slots], maps.identities[slots]) for maps, slots in _used(a, b))
     known = np.intersect1d(names_a[names_a >= 0], names_b[names_b >= 0])
     of_a, of_b = names_a[np.searchsorted(ids_a, pairs[:, 0])], names_b[np.searchsorted(ids_b, pairs[:, 1])]
     differ = (of_a != of_b) & (np.isin(of_a, known) | np.isin(of_b, known) | ((of_a >= 0) & (of_b >= 0)))
     kept = pairs[~differ]
-    told = []
+    named = []
     for name in known.tolist():
         free_a = np.setdiff1d(ids_a[names_a == name], kept[:, 0]).tolist()
         free_b = np.setdiff1d(ids_b[names_b == name], kept[:, 1]).tolist()
-        told += list(zip(free_a, free_b, strict=False))  # particles may hold it under several ids, each under one
-    return kept, np.array(told, dtype=np.int64).reshape(-1, 2)
+        named += list(zip(free_a, free_b, strict=False))  # particles may hold one name under several ids, each once
+    return kept, np.array(named, dtype=np.int64).reshape(-1, 2)
 
 
 def _used(*both: ParticleMaps) -> list[tuple[ParticleMaps, IntArray]]:
@@ -104,10 +103,10 @@ def _used(*both: ParticleMaps) -> list[tuple[ParticleMaps, IntArray]]:
 
 
 def drop_repeated_identities(counts: IntArray, names: IntArray) -> None:
-    """Let no particle hold two landmarks of one name: of those that it holds the first stays.
+    """Keep in each particle only the first of several landmarks with one name.
 
     Args:
-        counts: (n, M) of landmarks in particles, changed: 0 where a particle lacks it now.
+        counts: (n, M) measurements of landmarks in particles, set to 0 where a particle loses one.
         names: (n,) the caller's own, -1 = none.
     """
     found, times = np.unique(names[names >= 0], return_counts=True)
@@ -118,11 +117,11 @@ def drop_repeated_identities(counts: IntArray, names: IntArray) -> None:
 
 
 def joint_counts(a: Landmarks, b: Landmarks, rows_a: IntArray, rows_b: IntArray) -> IntArray:
-    """Return how often each of M particles measured joint landmarks (n, M): on both sides together.
+    """Return the number of measurements of joint landmarks in each of M particles (n, M), summed over both sides.
 
     Args:
-        a, b: Of either filter, in M particles each.
-        rows_a: (n,) row in a of each joint landmark, -1 if only b has it; `rows_b` likewise.
+        a, b: Landmarks of each filter, in M particles.
+        rows_a, rows_b: (n,) rows of each joint landmark in a and in b, -1 if missing there.
     """
     counts = np.zeros((len(rows_a), a.counts.shape[1]), np.int64)
     for side, rows in ((a, rows_a), (b, rows_b)):
@@ -135,14 +134,14 @@ def write_joint(
     a: Landmarks, b: Landmarks, rows_a: IntArray, rows_b: IntArray, motion: FloatArray, extra: float,
     scales: FloatArray, blocks: FloatArray,
 ) -> None:  # fmt: skip
-    """Bring the landmarks of two filters into the map frame of the first, and fuse those that both have.
+    """Transform the landmarks of two filters into the map frame of the first, and fuse the common ones.
 
     Args:
-        a, b, rows_a, rows_b: As of `joint_counts`.
-        motion: (M, 3) by which each particle moves those of b.
-        extra: Added to all variances of either side before [m^2].
-        scales: (n,) factor on the covariances of each then [-].
-        blocks: (>= n, P / lanes, 9, lanes) of the joint map, see `MapStore`, of which the first n are written.
+        a, b, rows_a, rows_b: Arguments of `joint_counts`.
+        motion: (M, 3) motion of b's landmarks in each particle.
+        extra: Variance added to each side first [m^2].
+        scales: (n,) factors of the covariances, applied next [-].
+        blocks: (>= n, P / lanes, 9, lanes) of the joint map, see `MapStore`; the first n are written.
 
     Raises:
         ValueError: If two estimates of a landmark are exact along one direction.
@@ -154,15 +153,15 @@ def write_joint(
 
 
 def birge_ratios(a: Landmarks, b: Landmarks, motion: FloatArray, extra: float) -> FloatArray:
-    """Return by how much the covariances of landmarks that two filters share understate their differences (n,) [-].
+    """Return the Birge ratios (n,) [-] of landmarks shared by two filters, for too small covariances.
 
-    It is the Birge ratio of each: the median over the particles that hold it on both sides of chi^2 / 3, at least 1.
+    The Birge ratio is the median of chi^2 / 3 over the particles that hold the landmark on both sides, at least 1.
 
     Args:
-        a: Values of one filter, in M particles.
+        a: Landmarks of one filter, in M particles.
         b: The same landmarks of the other.
-        motion: (M, 3) by which each particle moves those of b.
-        extra: Added to all variances of either side before [m^2].
+        motion: (M, 3) motion of b's landmarks in each particle.
+        extra: Variance added to each side first [m^2].
     """
     ratios = np.ones(len(a.slots))
     values_a, values_b, turns = a.values, b.values, rotation(motion[:, 2])
@@ -184,10 +183,10 @@ def fuse_odds(
     model: ExistenceModel, odds_a: FloatArray, counts_a: IntArray, rows_a: IntArray,
     odds_b: FloatArray, counts_b: IntArray, rows_b: IntArray,
 ) -> None:  # fmt: skip
-    """Fuse the log-odds of existence (n, M) of b's rows into a's, in place; where a particle has b's alone, take that.
+    """Fuse the log-odds of existence (n, M) of b's rows into a's, in place; copy them where a particle lacks a's.
 
-    What either filter saw is independent given whether the landmark exists: log-odds add up, and the prior that both
-    hold counts once. What then lies below the floor is given one more chance: it stays there until the next miss.
+    The evidence of both filters is independent given the existence of the landmark: log-odds add up, and the common
+    prior counts once. Sums below the floor are raised to it: the landmark stays until the next miss.
     """
     in_a, in_b = counts_a[rows_a] > 0, counts_b[rows_b] > 0
     one, two = odds_a[rows_a], odds_b[rows_b]
@@ -196,7 +195,7 @@ def fuse_odds(
 
 
 def stack_descriptors(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Stack the descriptors of two maps, one of which may still be empty and of unknown width."""
+    """Stack the descriptors of two maps; an empty one may have another width."""
     if not len(a) or not len(b):
         return np.array(a if len(a) else b)
     return np.concatenate([a, b])

@@ -1,22 +1,21 @@
-"""Two filters and an alignment become one joint filter, particle by particle, so that the path uncertainty survives.
+"""Merging of two aligned filters into one joint filter, particle by particle, which keeps the path uncertainty.
 
-Each new particle pairs one of either group. Its own motion between the two maps is estimated from the landmarks that
-the consensus of the maps says are shared, with the means and covariances that this pair of particles holds:
-Gauss-Newton on
+Each new particle pairs one of each group. Its own motion between the two maps is estimated from the landmarks shared by
+the consensus set of the alignment, with the means and covariances of this pair of particles: Gauss-Newton on
 
     chi^2(T) = sum over pairs of r^T S^-1 r,    r = mu_a - (R mu_b + t),    S = Sigma_a + R Sigma_b R^T.
 
-T is then drawn from N(T^, Lambda^-1): the pair's uncertainty about T becomes a spread of particles, and within a
-particle T is known. Pairs are weighed by their evidence, the integral of exp(-chi^2 / 2) over T by Laplace's formula.
-Landmarks in common are fused at the drawn T (Eqs. 13-15), the others of b are moved (Eq. 16).
+T is then drawn from N(T^, Lambda^-1): the pair's uncertainty about T becomes a scatter of particles, and within a
+particle T is known. Pairs are weighted by their evidence, the integral of exp(-chi^2 / 2) over T by Laplace's method.
+Common landmarks are fused at the drawn T (Eqs. 13-15), the others of b are moved (Eq. 16).
 
-Maps of particle filters are over-confident, and two of them then contradict each other. First the variance tau^2 is
-found, up to (5 cm)^2, that has to be added to all S for chi^2 to be its degrees of freedom (Mandel and Paule 1970,
+Maps of particle filters are over-confident, so that two of them contradict each other. The first remedy is a variance
+tau^2, at most (5 cm)^2, added to all S such that chi^2 equals its degrees of freedom (Mandel and Paule 1970,
 "Interlaboratory evaluation of a material with unequal numbers of replicates", Analytical Chemistry 42); the landmarks
-of either map bear half of it. What then still contradicts is measured by phi = median over pairs of chi^2 / degrees of
-freedom, and where that exceeds 1 both maps' covariances are scaled by it (the Birge ratio). So the joint filter starts
-with uncertainties that explain what was seen. To scale from the start would make the worst known landmarks worse by as
-much as the best known ones contradict each other: they would take anything for themselves.
+of each map take half of it. The remaining contradiction is measured by phi = median over pairs of chi^2 / degrees of
+freedom; if it exceeds 1, both maps' covariances are scaled by it (the Birge ratio). Thus the initial uncertainties of
+the joint filter explain the differences. Scaling alone would inflate the least certain landmarks by as much as the most
+certain ones contradict each other, and their gates would accept any measurement.
 """
 
 import math
@@ -43,7 +42,7 @@ from slam_backend.team.filter_merging.pairing import Pairing, pair_particles
 
 
 def inverse_alignment(alignment: Alignment) -> Alignment:
-    """Return the alignment seen from the other map: inverse motion, its covariance to first order, pairs swapped."""
+    """Return the alignment from the other map: inverse motion, its covariance to first order, pairs swapped."""
     x, y, theta = inverse(alignment.transform)
     c, s = math.cos(alignment.theta), math.sin(alignment.theta)
     jacobian = np.array([[-c, -s, y], [s, -c, -x], [0.0, 0.0, -1.0]])
@@ -68,15 +67,15 @@ def merge_filters(
     Args:
         a: Filter whose map frame and landmark ids stay.
         b: The other filter.
-        alignment: Motion a_from_b of the maps, successful; where Gauss-Newton starts, and what is used where two
-            particles share fewer than three landmarks.
-        pairs: (k, 2) int64 rows (landmark id in a, landmark id in b) in common, one-to-one. Where the caller has named
-            landmarks on both sides, names decide: pairs of different names are left out, and landmarks of one name are
-            one in the joint map, whether or not they are listed here. These say nothing of the motion.
-        rng: For the pairing and the draws of T.
-        num_particles: Of the joint filter; None: as many as the larger of the two.
-        known: The motion is drawn from the alignment, whatever the landmarks in common say of it.
-        pairing: What `paired` returned for these arguments; None: it is drawn.
+        alignment: Motion a_from_b of the maps, successful; initial value of Gauss-Newton, and motion of pairs of
+            particles that share fewer than three landmarks.
+        pairs: (k, 2) int64 rows (landmark id in a, landmark id in b) of common landmarks, one-to-one. Caller's names
+            take precedence where both sides have them: pairs of different names are dropped, and landmarks of one name
+            are joined even if not listed, but then do not affect the motion.
+        rng: Generator for the pairing and the draws of T.
+        num_particles: Number of particles of the joint filter; None: the larger of the two.
+        known: Whether the motion is drawn from the alignment alone, ignoring the common landmarks.
+        pairing: Result of `pair_filters` for these arguments; None: a new draw.
 
     Returns:
         The joint filter, a's robots first; and (n, 2) int64 rows (id in b, id in the joint map) of all of b's
@@ -85,8 +84,8 @@ def merge_filters(
     if pairing is None:
         pairing = pair_filters(a, b, alignment, pairs, rng, num_particles, known)
     from_a, from_b, motion, evidence, extra, scale = pairing
-    fitting, told = merge_by_identity(a.state.maps, b.state.maps, pairs)
-    pairs = np.concatenate([fitting, told])
+    fitting, named = merge_by_identity(a.state.maps, b.state.maps, pairs)
+    pairs = np.concatenate([fitting, named])
     joint = FilterState.joined(a.state, from_a, b.state, from_b, motion, evidence, rng)
 
     of_a, of_b = Landmarks.of(a.state.maps, from_a), Landmarks.of(b.state.maps, from_b)
@@ -94,39 +93,40 @@ def merge_filters(
     shared_a, shared_b = np.searchsorted(ids_a, pairs[:, 0]), np.searchsorted(ids_b, pairs[:, 1])
     model = a.options.existence
     odds_a, odds_b = of_a.odds(model), of_b.odds(model)
-    descriptors, identities, looks_b = of_a.descriptors, of_a.identities, of_b.descriptors
+    descriptors, identities, descriptors_b = of_a.descriptors, of_a.identities, of_b.descriptors
     if len(shared_a):
         seen_a, seen_b = of_a.counts[shared_a].max(axis=1), of_b.counts[shared_b].max(axis=1)
         descriptors[shared_a] = fuse_descriptors(
-            descriptors[shared_a], np.maximum(seen_a, 1), looks_b[shared_b], np.maximum(seen_b, 1)
+            descriptors[shared_a], np.maximum(seen_a, 1), descriptors_b[shared_b], np.maximum(seen_b, 1)
         )
         names = identities[shared_a]
         identities[shared_a] = np.where(names < 0, of_b.identities[shared_b], names)
         if model is not None:
             fuse_odds(model, odds_a, of_a.counts, shared_a, odds_b, of_b.counts, shared_b)
-    own = np.setdiff1d(np.arange(len(ids_b)), shared_b)  # b's landmarks that a does not have
-    rows_a, rows_b = np.arange(len(ids_a) + len(own)), np.full(len(ids_a) + len(own), -1)
-    rows_a[len(ids_a) :], rows_b[len(ids_a) :], rows_b[shared_a] = -1, own, shared_b
-    counts, names = joint_counts(of_a, of_b, rows_a, rows_b), np.concatenate([identities, of_b.identities[own]])
+    exclusive = np.setdiff1d(np.arange(len(ids_b)), shared_b)  # b's landmarks that a lacks
+    n_a, n = len(ids_a), len(ids_a) + len(exclusive)
+    rows_a, rows_b = np.arange(n), np.full(n, -1)
+    rows_a[n_a:], rows_b[n_a:], rows_b[shared_a] = -1, exclusive, shared_b
+    counts, names = joint_counts(of_a, of_b, rows_a, rows_b), np.concatenate([identities, of_b.identities[exclusive]])
     drop_repeated_identities(counts, names)
     next_id = a.state.maps.next_id
-    new_ids = next_id + np.arange(len(own))
+    new_ids = next_id + np.arange(len(exclusive))
     held = np.flatnonzero((counts > 0).any(axis=1))
     joint.maps.load_metadata(
         counts[held],
-        stack_descriptors(descriptors, looks_b[own])[held],
+        stack_descriptors(descriptors, descriptors_b[exclusive])[held],
         np.concatenate([ids_a, new_ids])[held],
         names[held],
-        next_id + len(own),
-        np.concatenate([odds_a, odds_b[own]])[held],
+        next_id + len(exclusive),
+        np.concatenate([odds_a, odds_b[exclusive]])[held],
     )
-    # Either map bears half of what they do not explain.
+    # Each map takes half of the extra variance.
     scales = np.full(len(counts), scale)
-    if len(told):
-        sides = Landmarks.of(a.state.maps, from_a, told[:, 0]), Landmarks.of(b.state.maps, from_b, told[:, 1])
-        scales[np.searchsorted(ids_a, told[:, 0])] = np.maximum(scale, birge_ratios(*sides, motion, 0.5 * extra))
+    if len(named):
+        sides = Landmarks.of(a.state.maps, from_a, named[:, 0]), Landmarks.of(b.state.maps, from_b, named[:, 1])
+        scales[np.searchsorted(ids_a, named[:, 0])] = np.maximum(scale, birge_ratios(*sides, motion, 0.5 * extra))
     write_joint(of_a, of_b, rows_a[held], rows_b[held], motion, 0.5 * extra, scales[held], joint.maps.blocks)
-    renamed = np.concatenate([pairs[:, ::-1], np.column_stack([ids_b[own], new_ids])]).astype(np.int64)
+    renamed = np.concatenate([pairs[:, ::-1], np.column_stack([ids_b[exclusive], new_ids])]).astype(np.int64)
     joint.finish_join(a.state, b.state, renamed)
     return FastSlam.from_filter_state(joint), renamed
 
@@ -135,10 +135,10 @@ def pair_filters(
     a: FastSlam, b: FastSlam, alignment: Alignment, pairs: IntArray, rng: np.random.Generator,
     num_particles: int | None = None, known: bool = False,
 ) -> Pairing:  # fmt: skip
-    """Draw which particles become joint ones and by which motions: all of a merge that is left to chance in its maps.
+    """Draw pairs of particles and their motions: the first random part of a merge.
 
     Args:
-        a, b, alignment, pairs, rng, num_particles, known: As of `merge_filters`, which draws it first of all.
+        a, b, alignment, pairs, rng, num_particles, known: Arguments of `merge_filters`, which makes this draw first.
     """
     count = max(a.num_particles, b.num_particles) if num_particles is None else num_particles
     pairs, _ = merge_by_identity(a.state.maps, b.state.maps, pairs)
@@ -147,13 +147,13 @@ def pair_filters(
 
 
 def transform_covariance(motion: FloatArray, alignment: Alignment) -> FloatArray:
-    """Return how the motions between two maps differ among the particles that `merge_filters` makes.
+    """Return the covariance of the motion between two maps over the particles that `merge_filters` makes.
 
-    Where paths are uncertain this is more than the alignment of the two maps claims: landmarks of one map err together.
+    With uncertain paths it exceeds that of the alignment, as the errors of landmarks in one map are correlated.
 
     Args:
-        motion: (M, 3) of each particle [m, m, rad].
-        alignment: About which headings are told apart.
+        motion: (M, 3) [m, m, rad]. Motion of each particle.
+        alignment: Reference of the headings' differences.
 
     Returns:
         (3, 3) covariance of (tx, ty, theta) [m, m, rad].

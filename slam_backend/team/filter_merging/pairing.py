@@ -1,7 +1,7 @@
-"""Which particles of two filters become joint ones: by which motion each pair of them fits, and how well.
+"""Pairing of the particles of two filters, with the motion and the weight of each pair.
 
-Pairs are weighed by their evidence, the integral of exp(-chi^2 / 2) over T by Laplace's formula; see `merging`, which
-also says what tau^2 and phi are.
+Pairs are weighted by their evidence, the integral of exp(-chi^2 / 2) over T by Laplace's method; see `merging`, also
+for tau^2 and phi.
 """
 
 import math
@@ -15,18 +15,17 @@ from slam_backend.resampling import systematic
 from slam_backend.team.filter_merging._kernels.pairing import MIN_PAIRS, fit, reduced_chi2
 from slam_backend.team.filter_merging.landmarks import Landmarks
 
-CANDIDATES = 4  # pairs of particles weighed for each that is kept
-ITERATIONS = 3  # of Gauss and Newton for each pair
-ROUNDS = 8  # of looking for what two maps' covariances do not explain
-MAX_BETWEEN_MAP_VARIANCE = (
-    0.05**2
-)  # [m^2] two robots may place what they take for one corner so far apart; more is a contradiction
+CANDIDATES = 4  # pairs of particles weighted for each one kept
+ITERATIONS = 3  # Gauss-Newton iterations for each pair
+ROUNDS = 8  # iterations for the variance between two maps
+# [m^2] Two robots may place the same corner this far apart; more is a contradiction.
+MAX_BETWEEN_MAP_VARIANCE = 0.05**2
 
 
 class Pairing(NamedTuple):
-    """Which particles of a and of b become joint ones (M,), their motions (M, 3), and their log-evidences (M,).
+    """Particles of a and b that become joint ones (M,), their motions (M, 3), and their log-evidences (M,).
 
-    Before it moves, each landmark that is shared takes half of `extra` [m^2], then all are scaled by `scale`.
+    Before it moves, each shared landmark gets half of `between_map_variance` [m^2], then all are scaled by `scale`.
     """
 
     from_a: IntArray
@@ -44,13 +43,13 @@ def pair_particles(
     """Draw pairs of particles and their motions.
 
     Args:
-        weights_a: (M_a,) of one filter's particles, summing to 1.
-        common_a: Its landmarks in common; those of the other in the same order.
-        weights_b, common_b: Of the other filter.
-        alignment: Where Gauss and Newton start, and the motion of pairs that share too few landmarks.
-        count: M, of pairs.
-        rng: For the pairing and the draws of T.
-        known: The motion is drawn from the alignment, whatever the landmarks in common say of it.
+        weights_a: (M_a,) weights of one filter's particles, summing to 1.
+        common_a: Common landmarks in this filter.
+        weights_b, common_b: Weights and common landmarks of the other filter, in the same order.
+        alignment: Initial value of Gauss-Newton, and motion of pairs that share too few landmarks.
+        count: M, number of pairs.
+        rng: Generator for the pairing and the draws of T.
+        known: Whether the motion is drawn from the alignment alone, ignoring the common landmarks.
     """
     from_a = systematic(weights_a, rng, CANDIDATES * count)
     from_b = rng.permutation(systematic(weights_b, rng, CANDIDATES * count))
@@ -76,7 +75,7 @@ def _between_map_variance(extra: FloatArray, shared: IntArray) -> float:
 
 
 def _birge_ratio(chi2: FloatArray, shared: IntArray) -> float:
-    """Return phi >= 1, by how much the widened covariances still understate the differences between maps."""
+    """Return phi >= 1, the ratio of the differences between maps to the widened covariances."""
     enough = shared >= MIN_PAIRS
     if not enough.any():
         return 1.0
@@ -95,8 +94,8 @@ def _weigh(
 ) -> tuple[FloatArray, FloatArray]:
     """Return log-evidences (c,) and the covariance of each pair's motion (c, 3, 3).
 
-    Pairs of particles that share too little take the consensus motion, and the smallest evidence of the others. Where
-    the motion is `known`, all do.
+    Pairs of particles that share too few landmarks get the motion of the alignment, and the smallest evidence of the
+    others. If the motion is `known`, all do.
     """
     poor = (shared < MIN_PAIRS) | known
     informations = np.where(poor[:, None, None], np.eye(3), informations)
@@ -111,6 +110,6 @@ def _weigh(
 
 
 def _factors(covariances: FloatArray) -> FloatArray:
-    """Return C (c, 3, 3) with C C^T the covariances."""
+    """Return factors C (c, 3, 3) with C C^T = covariance."""
     values, vectors = np.linalg.eigh(0.5 * (covariances + covariances.transpose(0, 2, 1)))
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :])

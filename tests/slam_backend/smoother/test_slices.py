@@ -131,7 +131,7 @@ def test_a_descent_that_keeps_failing_blocks_nothing(slice_steps):
     slam = run.build_filter(20, "fastslam2", 1, landmark_noise=0.0, rejuvenate_every=6, smoothing=smoothing)
     reasons = [slam.step(**reading).rejuvenation for reading in run.readings()]
     told = [report.reason for report in reasons if report is not None]
-    assert any(reason.endswith("; what was measured since the last time is left out") for reason in told)
+    assert any(reason.endswith("; measurements since the last rejuvenation are dropped") for reason in told)
     graph: Mapping[str, np.ndarray] = slam.get_state()["rejuvenation"]["graph"]
     assert graph["latest"][0] > 6
     assert len(slam.get_state()["rejuvenation"]["guesses"][0][0]) <= 2 * 6

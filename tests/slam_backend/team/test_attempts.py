@@ -60,7 +60,7 @@ def test_a_pair_whose_logs_were_smoothed_waits_until_an_eighth_is_new() -> None:
     for step, wait in ((799, 100), (24, 25)):
         plan = schedule()
         assert plan.choose(same, step) == FIRST
-        plan.record(FIRST, step, success=False, straightened=True)
+        plan.record(FIRST, step, success=False, smoothed=True)
         assert not plan.may_try(FIRST, step + wait - 1)
         assert plan.may_try(FIRST, step + wait)
         assert plan.choose(same, step + wait) == FIRST
@@ -72,7 +72,7 @@ def test_smoothing_for_a_pair_that_is_always_refused_costs_a_multiple_of_the_log
         plan, total = schedule(every=1), 0
         for step in range(end):
             if plan.may_try(FIRST, step):
-                plan.record(FIRST, step, success=False, straightened=True)
+                plan.record(FIRST, step, success=False, smoothed=True)
                 total += step
         assert total < 10 * end
 
@@ -218,8 +218,8 @@ def test_one_contact_between_two_groups_is_enough() -> None:
 def test_a_pair_too_doubtful_to_take_waits_however_long() -> None:
     """Beyond the most that can be taken it waits though waiting does not help; below it only as long as that helps."""
     plan = schedule()
-    assert [plan.should_defer(FIRST, 4.0, most=1.25) for _ in range(5)] == [True] * 5
-    assert [plan.should_defer(FIRST, doubt, most=1.25) for doubt in (1.3, 1.25, 1.0)] == [True, False, False]
+    assert [plan.should_defer(FIRST, 4.0, limit=1.25) for _ in range(5)] == [True] * 5
+    assert [plan.should_defer(FIRST, doubt, limit=1.25) for doubt in (1.3, 1.25, 1.0)] == [True, False, False]
 
 
 def test_trials_of_two_frames_are_compared() -> None:

@@ -111,7 +111,7 @@ def test_the_joint_filter_holds_the_pose_and_the_fork_goes_on() -> None:
 def test_a_filter_knows_its_members_only() -> None:
     """Asking for the pose of a robot of another group in one's own map frame is refused."""
     team = SimulatedTeam(seed=1).build()
-    with pytest.raises(ValueError, match=r"robot: expected one of \(0,\), got 2\. Ask about members of its filter\."):
+    with pytest.raises(ValueError, match=r"robot: expected one of \(0,\), got 2\. Name a robot in this filter\."):
         team.pose(2, seen_by=0)
 
 
@@ -244,7 +244,7 @@ def test_only_those_who_keep_the_joint_filter_merge() -> None:
     team.merge(0, 1, true_alignment(simulation, team, 0, 1))
     live(team, readings_of(simulation, 1), links(3))
     assert team.trunk_robots(1) == (0,)
-    with pytest.raises(ValueError, match=r"robot_a: expected one of \(0,\), got 1\. Merge through a robot that goes"):
+    with pytest.raises(ValueError, match=r"robot_a: expected one of \(0,\), got 1\. Merge through a robot that uses"):
         team.merge(1, 2, true_alignment(simulation, team, 1, 2))
 
 

@@ -206,7 +206,7 @@ def test_maps_of_a_merge_that_is_not_watched_are_not_at_hand() -> None:
     """Where merges are final, or nothing was merged, asking for the maps that were joined is refused."""
     _, team = bent_team(112, AT_LAST, merging=MergeOptions(watch_steps=0))
     for event in team.events:
-        with pytest.raises(ValueError, match=r"merge: expected a merge still watched, got 'the (attempt|merge) of"):
+        with pytest.raises(ValueError, match=r"merge: expected a merge still monitored, got 'the (attempt|merge) of"):
             team.merged_maps(event)
 
 
