@@ -1,6 +1,7 @@
-"""A PettingZoo environment in which robots that do not know where they start build one visual map together.
+"""PettingZoo environment for multi-robot SLAM exploration: robots with unknown starts build one visual map.
 
-Importing it registers `vslam_env/Exploration-v0` with PettingZoo and `vslam_env/SoloExploration-v0` with Gymnasium.
+Importing the package registers `vslam_env/Exploration-v0` with PettingZoo and `vslam_env/SoloExploration-v0` with
+Gymnasium.
 """
 
 import gymnasium

@@ -1,4 +1,4 @@
-"""Actions: their spaces, their check, and the velocity commands that continuous and discrete ones stand for."""
+"""Action spaces, validation of actions, and their conversion to velocity commands."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -15,34 +15,34 @@ PAIR_HINT = "Give (speed, turn) in [-1, 1]."
 
 
 def action_space(action_type: str) -> spaces.Space[Any]:
-    """Return the space of one robot's actions of a type."""
+    """Return the action space of one robot."""
     if action_type == "continuous":
         return spaces.Box(-1.0, 1.0, (2,), np.float32)
     return spaces.Discrete(len(DISCRETE_COMMANDS) if action_type == "discrete" else NUM_ACTIONS)
 
 
 def checked_actions(actions: Any, agents: Sequence[str], action_type: str) -> FloatArray | list[int]:
-    """Return what each agent's robot is to do, in their order.
+    """Validate actions and convert them, in the order of the agents.
 
     Args:
         actions: Mapping from agent to action.
-        agents: Those that must act.
-        action_type: Of all of them.
+        agents: Names of the agents, all of which must act.
+        action_type: Type of all actions.
 
     Returns:
-        Velocity commands (K, 2) float64 [m/s, rad/s] of continuous and discrete actions; ints of `goal` actions.
+        Velocity commands (K, 2) float64 [m/s, rad/s] for continuous and discrete actions; ints for `goal` actions.
 
     Raises:
         ValueError: If an agent is unknown or missing, or an action is outside its space.
     """
-    if type(actions) is not dict and not isinstance(actions, Mapping):  # asking a dict of its kin takes 1 us
+    if type(actions) is not dict and not isinstance(actions, Mapping):  # isinstance alone takes 1 us for a dict
         raise argument_error("actions", "a dict from agent to action", actions, "Pass {agent: action}.")
-    if list(actions) != agents and actions.keys() != set(agents):  # nearly all come in order
+    if list(actions) != agents and actions.keys() != set(agents):  # the usual order needs no set
         unknown = [agent for agent in actions if agent not in agents]
         if unknown:
-            raise argument_error("actions", f"actions of {list(agents)}", unknown[0], "Drop agents that are not there.")
-        gone = next(agent for agent in agents if agent not in actions)
-        raise argument_error("actions", f"an action of {gone!r}", f"no {gone!r}", "All agents act at once.")
+            raise argument_error("actions", f"actions for {list(agents)}", unknown[0], "Remove unknown agents.")
+        missing = next(agent for agent in agents if agent not in actions)
+        raise argument_error("actions", f"an action for {missing!r}", f"no {missing!r}", "All agents act in each step.")
     if action_type == "continuous":
         return _continuous_commands(actions, agents)
     if action_type == "discrete":
@@ -52,15 +52,15 @@ def checked_actions(actions: Any, agents: Sequence[str], action_type: str) -> Fl
 
 
 def _continuous_commands(actions: Mapping[str, Any], agents: Sequence[str]) -> FloatArray:
-    """Return the velocity commands (K, 2) [m/s, rad/s] of pairs in [-1, 1], or raise.
+    """Return the velocity commands (K, 2) [m/s, rad/s] for pairs in [-1, 1], or raise.
 
-    They are scaled to the limits of either direction, so that zeros stand still.
+    Each direction is scaled to its own limit; zeros mean standing still.
     """
     commands = np.empty((len(agents), 2))
     for robot, agent in enumerate(agents):
         action = actions[agent]
         try:
-            speed, turn = action.tolist()  # what nearly all send
+            speed, turn = action.tolist()  # fast path for arrays
         except (AttributeError, TypeError, ValueError):
             speed = turn = None
         if type(speed) is not float or type(turn) is not float:
@@ -73,21 +73,21 @@ def _continuous_commands(actions: Mapping[str, Any], agents: Sequence[str]) -> F
 
 
 def _pair(agent: str, action: Any) -> tuple[float, float]:
-    """Return two numbers in any form as floats, or raise."""
+    """Return a pair of numbers of any type as floats, or raise."""
     if isinstance(action, (list, tuple)) and len(action) == 2 and all(type(part) is float for part in action):
         return action[0], action[1]
     name = f"actions[{agent!r}]"
     speed, turn = check_array(name, action, (2,), PAIR_HINT, finite=False).tolist()
     parts = np.asarray(action, dtype=object).tolist()
-    if any(isinstance(part, (bool, np.bool_)) for part in parts):  # they could be turned into floats, but are no speeds
+    if any(isinstance(part, (bool, np.bool_)) for part in parts):  # numpy would convert them
         raise argument_error(name, "an array of shape (2,) of real numbers", action, PAIR_HINT)
     return speed, turn
 
 
 def _checked_index(agent: str, action: Any, limit: int) -> int:
-    """Return a discrete or `goal` action as an int from 0 to `limit` - 1, or raise."""
+    """Return a discrete or `goal` action as an int in [0, limit), or raise."""
     value = action.item() if isinstance(action, (np.generic, np.ndarray)) and np.size(action) == 1 else action
     if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < limit:
-        cure = "Sample from env.action_space(agent)."
-        raise argument_error(f"actions[{agent!r}]", f"an int from 0 to {limit - 1}", action, cure)
+        hint = "Sample from env.action_space(agent)."
+        raise argument_error(f"actions[{agent!r}]", f"an int from 0 to {limit - 1}", action, hint)
     return value

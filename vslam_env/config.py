@@ -1,4 +1,4 @@
-"""`EnvConfig`: everything that defines an environment, frozen and validated, with a TOML form."""
+"""Configuration of an environment: frozen, validated, readable from and writable to TOML."""
 
 import dataclasses
 import json
@@ -19,25 +19,26 @@ from vslam_env.world.spec import LARGEST_EXTENT
 
 T = TypeVar("T")
 
-NONE = "none"  # what TOML, which has no word for it, says for None
+NONE = "none"  # stands for None in TOML
 
 
 def validate(cls: type[T], values: Mapping[str, Any]) -> T:
-    """Build `cls` from nested dicts, or raise the project's one error for the first thing that is wrong."""
+    """Build `cls` from nested dicts, or raise an argument error for the first invalid value."""
     try:
         text = json.dumps(to_plain(values), default=str)
-    except (ValueError, RecursionError) as error:  # an int of 5000 digits, or a part that holds itself
-        raise argument_error("config", "values that JSON can hold", "no such values", f"It says: {error}.") from error
+    except (ValueError, RecursionError) as error:  # e.g. an int of 5000 digits, or a cycle
+        hint = f"The encoder says: {error}."
+        raise argument_error("config", "values that JSON can represent", "no such values", hint) from error
     from pydantic import TypeAdapter, ValidationError  # slow to import, and not always needed
 
     try:
-        # Strict on JSON refuses 2.0, "2" and True as ints, but takes dicts for parts, lists for tuples, int for float.
+        # Strict JSON mode rejects 2.0, "2" and True as ints, but accepts a dict for a dataclass, a list for a tuple.
         return TypeAdapter(cls).validate_json(text, strict=True)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        own = first.get("ctx", {}).get("error")
-        if isinstance(own, ValueError):  # raised by a check of ours, which explains itself
-            raise own from None
+        cause = first.get("ctx", {}).get("error")
+        if isinstance(cause, ValueError):  # raised by __post_init__ with a complete message
+            raise cause from None
         name = ".".join(str(part) for part in first["loc"])
         if first["type"] == "unexpected_keyword_argument":
             raise argument_error(name, "a known field", first["input"], "Check the spelling.") from None
@@ -57,7 +58,7 @@ def to_plain(value: Any) -> Any:
 
 
 def merge(values: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return nested dicts with some entries changed; weights of rewards are replaced as a whole."""
+    """Return nested dicts with some entries changed; the reward weights are replaced as a whole."""
     result = dict(values)
     for key, change in changes.items():
         change = to_plain(change)
@@ -66,16 +67,16 @@ def merge(values: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
     return result
 
 
-def without_none(values: Mapping[str, Any], standard: Any) -> dict[str, Any]:
-    """Return nested dicts without None: left out where the standard is None or knows no such entry, else `NONE`."""
-    usual = standard if isinstance(standard, Mapping) else {}
+def without_none(values: Mapping[str, Any], defaults: Any) -> dict[str, Any]:
+    """Return nested dicts without None: omitted where the default is None or lacks the entry, else `NONE`."""
+    known = defaults if isinstance(defaults, Mapping) else {}
     result: dict[str, Any] = {}
     for key, value in values.items():
         if isinstance(value, Mapping):
-            result[key] = without_none(value, usual.get(key))
+            result[key] = without_none(value, known.get(key))
         elif value is not None:
             result[key] = value
-        elif usual.get(key) is not None:
+        elif known.get(key) is not None:
             result[key] = NONE
     return result
 
@@ -87,14 +88,14 @@ def with_none(values: Any) -> Any:
     return None if values == NONE else values
 
 
-FORMAT = 1  # of TOML files; raised when what a field means changes
+FORMAT = 1  # version of TOML files; raised when the meaning of a field changes
 ACTION_TYPES = ("continuous", "discrete", "goal")
 OBSERVATION_TYPES = ("dict", "flat")
 SENSORS = ("landmark", "stereo")
 MAX_ROBOTS = 8
 TICK = 0.1  # [s]
 GOAL_DECISION_TICKS = 10
-MAX_TICKS = 10**9  # in a step; they would last three years
+MAX_TICKS = 10**9  # per step; three years of simulated time
 NESTED_CONFIGS = {
     "landmarks": LandmarkConfig,
     "odometry": OdometryNoise,
@@ -107,40 +108,40 @@ NESTED_CONFIGS = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EnvConfig:
-    """An environment. The true noise of the simulator and the noise that the filters assume are set separately.
+    """Configuration of an environment, with separate true and assumed noise.
 
     Attributes:
-        world: A family name, or the path of a floor plan, of a JSON file of walls or of a folder of these. Of an
-            environment made with a `World` or a function: its name.
-        world_split: Layouts and textures of the seeds of `"train"`, `"validation"` or `"test"` only; None: any.
-        num_robots: K, at most 8.
-        sensor: What measures landmarks.
+        world: Family name, or path of a floor plan, of a JSON file of walls or of a folder of these; the name of the
+            world if the environment was made with a `World` or a function.
+        world_split: `"train"`, `"validation"` or `"test"`: worlds of that split only; None: any.
+        num_robots: Number of robots K, at most 8.
+        sensor: `"landmark"`: simulated measurements. `"stereo"`: rendered stereo images.
         action_type: `"continuous"`: (speed, turn) in [-1, 1]. `"discrete"`: stay, ahead, left, right. `"goal"`: one of
             the candidates of the last observation.
-        decision_ticks: Ticks of 0.1 s in an `env.step`; None: 1, or 10 with `goal` actions.
-        max_cycles: After so many calls of `env.step` the episode is truncated.
-        stop_at_recall: The episode terminates when every robot's map holds this share of the landmarks; None: never.
+        decision_ticks: Ticks of 0.1 s per `env.step`; None: 1, or 10 with `goal` actions.
+        max_cycles: Number of calls of `env.step` after which the episode is truncated.
+        stop_at_recall: Map recall of all robots at which the episode terminates; None: never.
         observation_type: `"dict"`: named arrays. `"flat"`: one float32 vector.
-        observe_images: Whether a robot observes its left image, as `"image"` (H, W, 1) uint8; with rendered eyes only.
+        observe_images: Whether a robot observes its left image, `"image"` (H, W, 1) uint8; with `sensor="stereo"` only.
         reward: Weights of the named reward terms. Learners discount by at least 0.999 per tick: see `vslam_env.reward`.
-        shared_reward: Each robot gets the mean of all robots' rewards, term by term.
-        oracle_pose: The robots know their poses, each in its own start frame.
-        oracle_association: The robots know which landmark is which.
-        oracle_merge: Groups in contact that share three true landmarks merge with the true transform; none tries by
-            itself.
-        comm_range: Robots hear each other no farther than this [m]; None: at any distance.
-        comm_line_of_sight: Whether walls keep robots from hearing each other.
-        comm_loss: Probability that two robots that could hear each other do not, in each tick.
-        robot_radius: [m].
-        min_start_distance: Between any two robots [m].
+        shared_reward: Whether each robot gets the mean of all robots' rewards, term by term.
+        oracle_pose: Whether each filter receives the true pose in the robot's start frame.
+        oracle_association: Whether data association is replaced by the truth.
+        oracle_merge: Whether groups in contact that share three true landmarks merge with the true transform, and only
+            these.
+        comm_range: Largest distance of two robots in contact [m]; None: unlimited.
+        comm_line_of_sight: Whether walls block contacts.
+        comm_loss: Probability that a contact fails, drawn for each pair and tick.
+        robot_radius: Radius of the robots [m].
+        min_start_distance: Least distance between any two start positions [m].
         shared_start_view: Whether two robots may see a common landmark at their starts.
-        map_error_cutoff: c of the map error [m].
-        landmarks: Where the landmarks of worlds without their own are, and how alike they look.
+        map_error_cutoff: Cutoff c of the map error [m].
+        landmarks: Density and appearance of landmarks, for worlds without landmarks of their own.
         odometry: True noise of the odometry.
         landmark_sensor: True noise of the landmark sensor.
-        stereo: Rendered eyes: what walls look like, how images are taken and measured; with `sensor="stereo"`.
-        scan: The range finder and its true noise.
-        belief: What the robots assume, and how they align their maps.
+        stereo: Textures, rendering and front end; with `sensor="stereo"`.
+        scan: Range finder and its true noise.
+        belief: Assumed noise, filters, map alignment and merging.
     """
 
     __pydantic_config__ = {"extra": "forbid"}  # noqa: RUF012
@@ -195,7 +196,7 @@ class EnvConfig:
             if not isinstance(getattr(self, name), bool):
                 raise argument_error(name, "True or False", getattr(self, name), "Give a bool.")
         if not isinstance(self.reward, Mapping):
-            raise argument_error("reward", "weights by name", self.reward, "E.g. {'map_error': 1.0}.")
+            raise argument_error("reward", "weights by name", self.reward, "For example {'map_error': 1.0}.")
         for name, weight in self.reward.items():
             check_float(f"reward[{name!r}]", weight, "Give the weight of the term.")
         if self.comm_range is not None:
@@ -210,24 +211,24 @@ class EnvConfig:
                     name, f"a {kind.__name__}", getattr(self, name), f"Build one: {kind.__name__}(...)."
                 )
         if self.observe_images and (self.sensor, self.observation_type) != ("stereo", "dict"):
-            cure = 'Use sensor="stereo" and observation_type="dict".'
-            raise argument_error("observe_images", "False without rendered eyes or named arrays", True, cure)
+            hint = 'Use sensor="stereo" and observation_type="dict".'
+            raise argument_error("observe_images", "False unless images are rendered and named", True, hint)
         check_float("scan.half_fov", self.scan.half_fov, "A scan spans less than a half circle.", at_most=1.57)
-        eyes = self.stereo if self.sensor == "stereo" else self.landmark_sensor
+        sensor = self.stereo if self.sensor == "stereo" else self.landmark_sensor
         usable = self.belief.filter.camera.farthest_usable
-        if eyes.farthest > usable:
-            expected = f"noise under which points {eyes.farthest:g} m away can be used"
-            cure = "Raise sigma_px or baseline, lower sigma_disparity_px, or the max_range of the true camera."
-            raise argument_error("belief.filter.camera", expected, f"a limit of {usable:g} m", cure)
+        if sensor.farthest > usable:
+            expected = f"noise that allows the use of points {sensor.farthest:g} m away"
+            hint = "Raise sigma_px or baseline, lower sigma_disparity_px, or the max_range of the true camera."
+            raise argument_error("belief.filter.camera", expected, f"a limit of {usable:g} m", hint)
 
     @property
     def always_in_contact(self) -> bool:
-        """Whether nothing can keep the robots from hearing each other."""
+        """Whether all robots are always in contact."""
         return self.comm_range is None and not self.comm_line_of_sight and self.comm_loss == 0.0
 
     @property
     def ticks_per_step(self) -> int:
-        """Ticks in an `env.step`."""
+        """Number of ticks per `env.step`."""
         if self.decision_ticks is not None:
             return self.decision_ticks
         return GOAL_DECISION_TICKS if self.action_type == "goal" else 1
@@ -241,35 +242,35 @@ class EnvConfig:
         """Return a validated copy with some fields changed.
 
         Args:
-            **changes: Fields by name. A nested part can be given as an object or as a dict, which then changes only
-                the fields that it names.
+            **changes: New values of fields. A nested configuration can be an object, or a dict of the nested fields to
+                change.
 
         Raises:
-            ValueError: If a field is unknown or a value is refused; the text names it.
+            ValueError: If a field is unknown or a value is invalid; the message names it.
         """
         return validate(type(self), merge(to_plain(self), changes))
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """Build a configuration from nested dicts; what is left out has the value of the `standard` preset."""
+        """Build a configuration from nested dicts; omitted fields have the value of the `standard` preset."""
         return validate(cls, merge(to_plain(cls()), values))
 
     @classmethod
     def from_toml(cls, path: str | Path) -> Self:
-        """Read a configuration from a TOML file, as `to_toml` writes it.
+        """Read a configuration from a TOML file, as written by `to_toml`.
 
-        What the file leaves out, in nested tables as well, has the value of the `standard` preset; without a `format`
-        it is of the present one.
+        Omitted fields, also in nested tables, have the value of the `standard` preset; a missing `format` means the
+        current one.
         """
         try:
             values = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-        except (OSError, TypeError, ValueError) as error:  # of the path, of the encoding and of the syntax
+        except (OSError, TypeError, ValueError) as error:  # path, encoding or syntax
             raise argument_error("config", "a readable TOML file", str(path), f"The reader says: {error}.") from error
         return cls._of_file(values)
 
     @classmethod
     def from_toml_text(cls, text: str) -> Self:
-        """Build a configuration from what `to_toml` returned."""
+        """Build a configuration from a text of `to_toml`."""
         if not isinstance(text, str):
             raise argument_error("config", "TOML as text", text, "Pass what to_toml returned, or use from_toml.")
         try:
@@ -280,17 +281,17 @@ class EnvConfig:
 
     @classmethod
     def _of_file(cls, values: dict[str, Any]) -> Self:
-        """Build a configuration from what a TOML file says, or raise if it is of another format."""
+        """Build a configuration from the content of a TOML file, or raise if its format differs."""
         found = values.pop("format", FORMAT)
         if type(found) is not int or found != FORMAT:
-            cure = "Use the release that wrote it, or set the values again."
-            raise argument_error("config", f"one of format {FORMAT}", f"a configuration of format {found!r}", cure)
+            hint = "Use the release that wrote it, or set the values again."
+            raise argument_error("config", f"one of format {FORMAT}", f"a configuration of format {found!r}", hint)
         return cls.from_dict(with_none(values))
 
     def to_toml(self) -> str:
-        """Return the configuration as TOML, with the number of its format.
+        """Return the configuration as TOML, with its format number.
 
-        None is left out where it is the standard, else it is the text "none".
+        None is omitted where it is the default, else written as the text "none".
         """
         values = without_none(to_plain(self), to_plain(type(self)()))
         return tomli_w.dumps({"format": FORMAT} | values)

@@ -1,4 +1,4 @@
-"""`ExplorationEnv`: the PettingZoo parallel environment."""
+"""PettingZoo parallel environment."""
 
 import copy
 import dataclasses
@@ -35,15 +35,15 @@ RENDER_MODES = ("human", "rgb_array")
 
 
 class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # PettingZoo has no type information
-    """Robots that do not know where they start explore a building, build maps, and merge these when they fit.
+    """Multi-robot exploration of a building: robots with unknown starts build maps and merge them after alignment.
 
-    `vslam_v0.parallel_env` describes the arguments; what is observed is described in `vslam_env.belief.observation`.
+    See `vslam_v0.parallel_env` for the arguments and `vslam_env.belief.observation` for the observations.
 
     Attributes:
-        config: All that defines this environment.
+        config: Configuration of the environment.
         possible_agents: Names of the robots.
-        observation_spaces: By name.
-        action_spaces: By name.
+        observation_spaces: Observation spaces by agent.
+        action_spaces: Action spaces by agent.
     """
 
     possible_agents: list[AgentID]
@@ -68,12 +68,12 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
             check_choice("render_mode", render_mode, RENDER_MODES, "Choose one of these, or None.")
         self.render_mode = render_mode
         self.max_cycles = config.max_cycles
-        self._tap = ReadingsHook()  # kept apart, so that an episode does not keep its environment alive
+        self._tap = ReadingsHook()  # separate object, so that an episode does not keep its environment alive
         self._source: WorldSource = config.world if world is None else world
         check_source(self._source)
         if config.world_split is not None and is_single_layout(self._source):
-            cure = "Use a family, a folder or a function, or leave the split out."
-            raise argument_error("world_split", "None for a world of which there is one", config.world_split, cure)
+            hint = "Use a family, a folder or a function, or omit the split."
+            raise argument_error("world_split", "None for a single layout", config.world_split, hint)
         self._terms = make_terms(config.reward if reward is None else reward)
         self.config = dataclasses.replace(config, reward={term.name: term.weight for term in self._terms})
         self.possible_agents = config.agents
@@ -101,32 +101,32 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
     def reset(
         self, seed: int | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[dict[AgentID, Any], dict[AgentID, dict[str, Any]]]:
-        """Build a new world, put the robots at their starts and let them take their first frame.
+        """Build a new world, place the robots at their starts and take the first measurements.
 
         Args:
-            seed: Of this episode and, by continuation, of the following ones; None: go on, or begin anywhere.
-            options: `"world_seed"`: int, of the layout and textures only. `"start_poses"`: (K, 3) [m, m, rad], world
-                frame. Others are ignored.
+            seed: Seed of this and all following episodes; None: continue the seed sequence, or start an arbitrary one.
+            options: `"world_seed"`: int, seed of layout and textures only. `"start_poses"`: (K, 3) [m, m, rad], world
+                frame. Other keys are ignored.
 
         Returns:
             Observations and infos by agent.
 
         Raises:
-            ValueError: If the seed, an option or the world is bad; the text says what would do. Nothing has changed
-                then: a running episode goes on, and the next reset draws what it would have drawn.
+            ValueError: If the seed, an option or the world is invalid. The environment is then unchanged: a running
+                episode continues, and the next reset draws the same random numbers.
         """
         if seed is not None:
             root = np.random.SeedSequence(check_int("seed", seed, 0, "Give an int >= 0, or None."))
-        else:  # a copy: a reset that is refused leaves everything as it was
+        else:  # a copy: a failed reset changes nothing
             root = np.random.SeedSequence() if self._root is None else copy.deepcopy(self._root)
         options = {} if options is None else options
         if not isinstance(options, Mapping):
-            raise argument_error("options", "a dict or None", options, "E.g. {'world_seed': 3}.")
+            raise argument_error("options", "a dict or None", options, "For example {'world_seed': 3}.")
         world_seed = options.get("world_seed")
         if world_seed is not None:
             check_int("options['world_seed']", world_seed, 0, "Give an int >= 0.")
-        setting = sample_scenario(self.config, self._source, root.spawn(1)[0], world_seed, options.get("start_poses"))
-        episode = Episode(self.config, setting, self._tap)
+        scenario = sample_scenario(self.config, self._source, root.spawn(1)[0], world_seed, options.get("start_poses"))
+        episode = Episode(self.config, scenario, self._tap)
         episode.begin()
         self._standing = episode.team_metrics()
         self._root, self._episode, self._drivers = root, episode, ActionExecutor(self.config)
@@ -144,7 +144,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         dict[AgentID, bool],
         dict[AgentID, dict[str, Any]],
     ]:
-        """Let all robots act for `decision_ticks` ticks.
+        """Execute the actions of all robots for `decision_ticks` ticks.
 
         Args:
             actions: One action per agent.
@@ -153,8 +153,8 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
             Observations, rewards, terminations, truncations and infos by agent.
 
         Raises:
-            ValueError: If an agent is unknown or missing, or an action is outside its space; nothing has moved then.
-            RuntimeError: Before the first reset, or after the end.
+            ValueError: If an agent is unknown or missing, or an action is outside its space; nothing is changed then.
+            RuntimeError: Before the first reset, or after the end of the episode.
         """
         episode = self._running_episode("step")
         if not self.agents:
@@ -167,8 +167,8 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         self._cycle += 1
 
         terms = evaluate(self._terms, before, self._standing, self.config.shared_reward)
-        goal = self.config.stop_at_recall
-        terminated = goal is not None and bool(self._standing.map_recalls.min() >= goal)
+        recall = self.config.stop_at_recall
+        terminated = recall is not None and bool(self._standing.map_recalls.min() >= recall)
         truncated = not terminated and self._cycle >= self._max_cycles
         observations, infos = self._observe(episode, terms, invalid)
         results = (
@@ -213,76 +213,75 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         return self.action_spaces[agent]
 
     def state(self) -> NDArray[np.float32]:
-        """Return the truth for centralised critics, as one float32 vector.
+        """Return the true state for centralised critics, as one float32 vector.
 
-        Per robot: true pose (x, y, cos, sin, world frame), pose as estimated (x, y, cos, sin, laid at the true start),
-        map error, map recall, heading error, first robot of its group; then coverage and merges of the team.
+        Per robot: true pose (x, y, cos, sin, world frame), estimated pose (x, y, cos, sin, moved by the true start
+        pose), map error, map recall, heading error, first robot of its group; then coverage and merges of the team.
         """
         episode = self._running_episode("state")
-        true, believed = episode.true_path[-1], episode.estimated_poses()
-        rows = [np.column_stack([poses[:, :2], np.cos(poses[:, 2]), np.sin(poses[:, 2])]) for poses in (true, believed)]
-        standing = self._standing
+        both = episode.true_path[-1], episode.estimated_poses()
+        rows = [np.column_stack([poses[:, :2], np.cos(poses[:, 2]), np.sin(poses[:, 2])]) for poses in both]
+        metrics = self._standing
         frames = [group[0] for group in episode.belief.known_groups]
-        scored = np.column_stack([standing.map_errors, standing.map_recalls, standing.heading_errors, frames])
-        return np.concatenate([np.hstack([*rows, scored]).ravel(), [standing.coverage, standing.merges]]).astype(
-            np.float32
-        )
+        scores = np.column_stack([metrics.map_errors, metrics.map_recalls, metrics.heading_errors, frames])
+        state = np.concatenate([np.hstack([*rows, scores]).ravel(), [metrics.coverage, metrics.merges]])
+        return np.asarray(state, dtype=np.float32)
 
-    # ------------------------------------------------------------------ beyond PettingZoo
+    # ------------------------------------------------------------------ extensions
 
     def belief(self, agent: AgentID) -> Belief:
-        """Return what an agent's robot believes; it holds nothing of the truth."""
+        """Return the belief of an agent's robot, which contains no ground truth."""
         return self._running_episode("belief").belief.belief(self._index(agent))
 
     @property
     def events(self) -> tuple[MergeEvent, ...]:
-        """All attempts and merges since the reset, in order."""
+        """All merge attempts, merges and rollbacks since the reset, in order."""
         return self._running_episode("events").belief.events
 
     @property
     def readings(self) -> tuple[Readings, ...]:
-        """What each robot perceived in the last tick."""
+        """Readings of each robot in the last tick."""
         return self._running_episode("readings").readings.per_robot()
 
     @property
     def world(self) -> World:
-        """The true world of this episode, its landmarks included."""
+        """True world of this episode, including its landmarks."""
         return self._running_episode("world").world
 
     @property
     def true_landmarks(self) -> FloatArray:
-        """(N, 3) float64 [m], world frame. The landmarks that count, those that some robot could ever see; a copy."""
+        """(N, 3) float64 [m], world frame. Copy of the positions of the observable landmarks."""
         return self._running_episode("true_landmarks").ledger.true_positions.copy()
 
     @property
     def true_poses(self) -> FloatArray:
-        """(K, 3) float64 [m, m, rad], world frame."""
+        """(K, 3) float64 [m, m, rad], world frame. True poses after the last tick."""
         return self._running_episode("true_poses").true_poses
 
     @property
     def true_start_poses(self) -> FloatArray:
-        """(K, 3) float64 [m, m, rad], world frame."""
+        """(K, 3) float64 [m, m, rad], world frame. True poses at the reset."""
         return self._running_episode("true_start_poses").true_starts.copy()
 
     @property
     def episode(self) -> Episode:
-        """The running episode, for diagnosis: the simulator's books, paths, seeds."""
+        """Running episode, for diagnosis: ground-truth association, paths, seeds."""
         return self._running_episode("episode")
 
     @property
     def recorder(self) -> Recorder | None:
-        """A function to be called with the readings of every tick, those of the reset included; may be assigned."""
+        """Callback for the readings of every tick, including the reset; may be assigned."""
         return self._tap.recorder
 
     @recorder.setter
     def recorder(self, recorder: Recorder | None) -> None:
         if recorder is not None and not callable(recorder):
-            raise argument_error("recorder", "a function or None", recorder, "It is called with a tuple of Readings.")
+            raise argument_error("recorder", "a function or None", recorder, "It receives a tuple of Readings.")
         self._tap.recorder = recorder
 
     @property
     def max_cycles(self) -> int:
-        """After so many steps the episode is truncated; may be assigned."""
+        """Number of steps after which the episode is truncated; may be assigned."""
         return self._max_cycles
 
     @max_cycles.setter
@@ -290,17 +289,17 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         self._max_cycles = check_int("max_cycles", max_cycles, 1, "Give a number of steps.")
 
     def scene(self) -> Scene:
-        """Return what a picture shows now."""
+        """Return the content of a picture of the current tick."""
         return build_scene(self._running_episode("scene"), self._standing)
 
     # ------------------------------------------------------------------ snapshots
 
     def get_state(self) -> EnvState:
-        """Return all that decides how the environment goes on: world, filters, random streams, resets to come.
+        """Return the complete state: world, filters, random streams and the seed sequence of later resets.
 
-        An environment that is set to it returns the same bytes for the same actions from there on. What never changes
-        in an episode is shared with the environment, its arrays read-only; all else is copied. `vslam_env.save_state`
-        writes it to disk. The recorder, the window and what reward terms of your own remember are not part of it.
+        An environment that restores it returns the same bytes for the same actions. Constant arrays are shared and
+        read-only; all others are copied. `vslam_env.save_state` writes the state to disk. The recorder, the window and
+        the internal state of custom reward terms are not included.
         """
         episode = self._episode
         return {
@@ -316,50 +315,50 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         }
 
     def set_state(self, state: Mapping[str, Any]) -> None:
-        """Go on exactly as the environment that gave `state`, be it of another seed, process, or day.
+        """Restore a state of `get_state` and continue it exactly, also in another process.
 
         Args:
-            state: Of `get_state`; it can be used again.
+            state: Result of `get_state`; it can be restored repeatedly.
 
         Raises:
-            ValueError: If it is no state, one of another version of the package or of another configuration, or a part
-                of it is damaged; the environment is then as before.
+            ValueError: If the state is malformed, or from another version or configuration; the environment is then
+                unchanged.
         """
         with refuse_malformed("state"):
             state = check_state(state, self.config, self._objects)
-            root, setting = check_parts(state, self.config, self._episode)
+            root, scenario = check_parts(state, self.config, self._episode)
         self._root, self.agents = root, []
-        if setting is None:
+        if scenario is None:
             self._episode = None
             return
         if self._episode is None:
-            self._episode = Episode(self.config, setting, self._tap)
-        self._episode.set_state(state["episode"], setting)
+            self._episode = Episode(self.config, scenario, self._tap)
+        self._episode.set_state(state["episode"], scenario)
         self._drivers = ActionExecutor(self.config)
         self._drivers.set_state(state["drivers"])
         self._standing, self._cycle, self.agents = state["standing"], state["cycle"], list(state["agents"])
 
     def clone(self) -> "ExplorationEnv":
-        """Return an independent environment in the same state, for looking ahead; without window and recorder."""
+        """Return an independent environment in the same state, without window and recorder."""
         mode = None if self.render_mode == "human" else self.render_mode
-        twin = ExplorationEnv(self.config, self._source, self._terms, mode)
-        twin.max_cycles = self.max_cycles
-        twin.set_state(self.get_state())
-        return twin
+        clone = ExplorationEnv(self.config, self._source, self._terms, mode)
+        clone.max_cycles = self.max_cycles
+        clone.set_state(self.get_state())
+        return clone
 
     def __deepcopy__(self, memo: Any) -> "ExplorationEnv":
         return self.clone()
 
     def __reduce__(self) -> tuple[Any, ...]:
-        made_from = (self.config, self._source, self._terms, self.render_mode)
-        return _unpickled, (made_from, self.max_cycles, self.get_state())
+        arguments = (self.config, self._source, self._terms, self.render_mode)
+        return _unpickled, (arguments, self.max_cycles, self.get_state())
 
-    # ------------------------------------------------------------------ within
+    # ------------------------------------------------------------------ helpers
 
     def _observe(
         self, episode: Episode, terms: Mapping[str, Sequence[float]], invalid: list[int]
     ) -> tuple[dict[AgentID, Any], dict[AgentID, dict[str, Any]]]:
-        """Return each agent's observation after the last tick, and its figures after a step that paid `terms`."""
+        """Return observations and infos by agent after the last tick; `terms` are the reward terms of the step."""
         agents, belief = self.possible_agents, episode.belief
         observations = build_observations(agents, belief, episode.readings, *self._shown_as)
         return observations, build_infos(agents, belief.known_groups, self._standing, terms, invalid)
@@ -375,9 +374,9 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         return self.possible_agents.index(agent)
 
 
-def _unpickled(made_from: tuple[Any, ...], max_cycles: int, state: EnvState) -> ExplorationEnv:
-    """Return the environment that `ExplorationEnv.__reduce__` took apart."""
-    env = ExplorationEnv(*made_from)
+def _unpickled(arguments: tuple[Any, ...], max_cycles: int, state: EnvState) -> ExplorationEnv:
+    """Rebuild an environment from the parts of `ExplorationEnv.__reduce__`."""
+    env = ExplorationEnv(*arguments)
     env.max_cycles = max_cycles
     env.set_state(state)
     return env
@@ -386,71 +385,71 @@ def _unpickled(made_from: tuple[Any, ...], max_cycles: int, state: EnvState) -> 
 def build_infos(
     agents: Sequence[str],
     groups: Sequence[tuple[int, ...]],
-    standing: TeamMetrics,
+    metrics: TeamMetrics,
     terms: Mapping[str, Sequence[float]],
     invalid: Sequence[int],
 ) -> dict[str, dict[str, Any]]:
-    """Return each agent's figures; `map_rmse` is the cutoff of the map error while nothing is matched.
+    """Return the infos by agent; `map_rmse` is the cutoff of the map error while no landmark is matched.
 
     `collisions` (ticks), `distance` [m], `bytes_sent` and `merges` count since the reset.
 
     Args:
         agents: Names of the K robots.
-        groups: Per robot who shares its map, as far as it knows.
-        standing: Of the team.
-        terms: By name, per robot: what each term of the reward has paid for the step.
-        invalid: Per robot 1 if its action was masked.
+        groups: Known group members of each robot, itself included.
+        metrics: Current metrics of the team.
+        terms: Weighted reward terms of the step by name, each with one value per robot.
+        invalid: 1 for each robot whose action was masked, else 0.
     """
-    figures, counts = standing.per_robot, standing.counts
+    scores, counts = metrics.per_robot, metrics.counts
     infos: dict[str, dict[str, Any]] = {}
     for robot, agent in enumerate(agents):
         group = groups[robot]
         infos[agent] = info = {
-            "map_error": figures.map_errors[robot],
-            "map_rmse": figures.map_rmses[robot],
-            "map_recall": figures.map_recalls[robot],
-            "map_precision": figures.map_precisions[robot],
-            "pose_error": figures.pose_errors[robot],
-            "heading_error": figures.heading_errors[robot],
-            "coverage": standing.coverage,
+            "map_error": scores.map_errors[robot],
+            "map_rmse": scores.map_rmses[robot],
+            "map_recall": scores.map_recalls[robot],
+            "map_precision": scores.map_precisions[robot],
+            "pose_error": scores.pose_errors[robot],
+            "heading_error": scores.heading_errors[robot],
+            "coverage": metrics.coverage,
             "group": group[0],
             "group_size": len(group),
-            "merges": standing.merges,
+            "merges": metrics.merges,
             "collisions": counts.collisions[robot],
-            "distance": figures.distances[robot],
+            "distance": scores.distances[robot],
             "bytes_sent": counts.bytes_sent[robot],
             "invalid_action": invalid[robot],
         }
-        for name, paid in terms.items():
-            info["reward/" + name] = paid[robot]
+        for name, rewards in terms.items():
+            info["reward/" + name] = rewards[robot]
     return infos
 
 
 def build_observations(
     agents: Sequence[str], belief: TeamBelief, readings: TeamReadings | Sequence[Readings], goal: bool, flat: bool
 ) -> dict[str, Any]:
-    """Return each agent's observation after a tick.
+    """Return the observations by agent after a tick.
 
     Args:
         agents: Names of the K robots.
-        belief: What they believe.
-        readings: What they have read in the tick, in one piece or not, with images if these are to be shown.
+        belief: Belief of the team.
+        readings: Readings of the tick, with images if these are observed.
         goal: Whether actions are masked.
-        flat: One vector instead of named arrays.
+        flat: Whether an observation is one vector instead of named arrays.
 
     Returns:
-        By agent fresh arrays by name, as `vslam_env.belief.observation` says; flat ones as one vector, or as
-        `{"observation", "action_mask"}` where actions are masked.
+        New arrays by name, see `vslam_env.belief.observation`; if flat, one vector, or with masked actions
+        `{"observation", "action_mask"}`.
     """
     if not isinstance(readings, TeamReadings):
         readings = TeamReadings.stack(readings)
-    shown = observe_team(belief.view(), readings.scans, goal)
+    named = observe_team(belief.view(), readings.scans, goal)
     if readings.images is not None:
-        for observation, image in zip(shown, readings.images, strict=True):
+        for observation, image in zip(named, readings.images, strict=True):
             observation["image"] = image[:, :, None].copy()
     if not flat:
-        return dict(zip(agents, shown, strict=True))
+        return dict(zip(agents, named, strict=True))
     return {
         agent: {"observation": flatten(each), "action_mask": each["action_mask"]} if goal else flatten(each)
-        for agent, each in zip(agents, shown, strict=True)
+        for agent, each in zip(agents, named, strict=True)
     }

@@ -1,7 +1,7 @@
-"""Rewards as named, weighted terms of what a step changed.
+"""Rewards as named, weighted terms computed from the team metrics before and after a step.
 
-Discount by at least 0.999 per tick of 0.1 s, which is 0.99 per second: `gamma ** decision_ticks` for a step. With less,
-what comes after the first seconds barely counts, and looking around once pays nearly as much as exploring.
+Learners should discount by at least 0.999 per tick of 0.1 s (0.99 per second): `gamma ** decision_ticks` per step. A
+lower discount ignores all but the first seconds, so that turning once on the spot pays nearly as much as exploring.
 """
 
 import math
@@ -25,18 +25,18 @@ __all__ = [
 
 @runtime_checkable
 class RewardTerm(Protocol):
-    """One part of the reward. A term of your own is any object with these three."""
+    """One part of the reward; a custom term is any object with these three members."""
 
     @property
     def name(self) -> str:
-        """Shown in infos as `reward/<name>`."""
+        """Name of the term, shown in infos as `reward/<name>`."""
 
     @property
     def weight(self) -> float:
-        """What the term is multiplied with."""
+        """Factor of the term."""
 
     def __call__(self, before: TeamMetrics, after: TeamMetrics) -> ArrayLike:
-        """Return what each robot gains (K,) by a step, unweighted. Neither standing may be written to."""
+        """Return the unweighted reward (K,) of a step for each robot; the metrics are read-only."""
 
 
 RewardFunction = Callable[[TeamMetrics, TeamMetrics], list[float]]
@@ -52,20 +52,20 @@ class _NamedTerm:
 
 
 def _rise_of(name: str) -> RewardFunction:
-    """Return the gain that pays how much one of the figures has risen."""
+    """Return a reward function: the increase of a metric."""
     row = RobotMetrics._fields.index(name)
     return lambda before, after: list(map(sub, after.per_robot[row], before.per_robot[row]))
 
 
 def _fall_of(name: str) -> RewardFunction:
-    """Return the gain that pays how much one of the figures has fallen."""
+    """Return a reward function: the decrease of a metric."""
     row = RobotMetrics._fields.index(name)
     return lambda before, after: list(map(sub, before.per_robot[row], after.per_robot[row]))
 
 
 def _map_error_squared(before: TeamMetrics, after: TeamMetrics) -> list[float]:
     errors = zip(before.per_robot.map_errors, after.per_robot.map_errors, strict=True)
-    return [then * then - now * now for then, now in errors]
+    return [old * old - new * new for old, new in errors]
 
 
 def _team_map_error(before: TeamMetrics, after: TeamMetrics) -> list[float]:
@@ -84,13 +84,13 @@ def _time(before: TeamMetrics, after: TeamMetrics) -> list[float]:
     return _shared_by_all(before.time - after.time, after)
 
 
-def _shared_by_all(gain: float, after: TeamMetrics) -> list[float]:
-    """Return what all robots gain alike, robot by robot."""
-    return [gain] * len(after.per_robot.map_errors)
+def _shared_by_all(reward: float, after: TeamMetrics) -> list[float]:
+    """Return the same reward for each robot."""
+    return [reward] * len(after.per_robot.map_errors)
 
 
-# Potentials telescope: what an episode pays in all is where it ends minus where it began, so that nothing is gained by
-# going to and fro. Costs only ever fall.
+# Potentials telescope: their sum over an episode is the final value minus the initial one, so that oscillation gains
+# nothing. Costs are never positive.
 POTENTIALS: dict[str, RewardFunction] = {
     "map_error": _fall_of("map_errors"),
     "map_error_squared": _map_error_squared,
@@ -113,31 +113,31 @@ RewardSpec = Mapping[str, float] | list[RewardTerm] | tuple[RewardTerm, ...]
 
 
 def make_terms(reward: RewardSpec) -> tuple[RewardTerm, ...]:
-    """Turn names with weights, or ready-made terms, into terms.
+    """Return the terms for weights by name, or validate a list of terms.
 
     Raises:
-        ValueError: If there is no term, a name is unknown, repeats or is no text, or an object is no term.
+        ValueError: If there is no term, a name is unknown, repeated or not a string, or an object is not a term.
     """
     if isinstance(reward, (Mapping, list, tuple)) and not reward:
-        raise argument_error("reward", "at least one term", reward, "E.g. {'map_error': 1.0}.")
+        raise argument_error("reward", "at least one term", reward, "For example {'map_error': 1.0}.")
     if isinstance(reward, Mapping):
         for name in reward:
             if name not in TERMS:
                 names = "one of " + ", ".join(repr(known) for known in TERMS)
-                raise argument_error("reward", names, name, "Choose one of these names, or pass a term of your own.")
-        cure = "Give the weight of the term."
-        return tuple(_NamedTerm(n, check_float(f"reward[{n!r}]", weight, cure)) for n, weight in reward.items())
+                raise argument_error("reward", names, name, "Choose one of these names, or pass a custom term.")
+        hint = "Give the weight of the term."
+        return tuple(_NamedTerm(n, check_float(f"reward[{n!r}]", weight, hint)) for n, weight in reward.items())
     if not isinstance(reward, (list, tuple)):
-        raise argument_error("reward", "weights by name, or a list of terms", reward, "E.g. {'map_error': 1.0}.")
+        raise argument_error("reward", "weights by name, or a list of terms", reward, "For example {'map_error': 1.0}.")
     for term in reward:
         if isinstance(term, type):
-            raise argument_error("reward", "terms, not their classes", term, f"Make one: {term.__name__}(...).")
+            raise argument_error("reward", "terms, not classes", term, f"Pass an instance: {term.__name__}(...).")
         if not isinstance(term, RewardTerm):
             raise argument_error(
-                "reward", "terms with name, weight and a call", term, "See vslam_env.reward.RewardTerm."
+                "reward", "terms with name, weight and __call__", term, "See vslam_env.reward.RewardTerm."
             )
         if not isinstance(term.name, str) or not term.name:
-            raise argument_error("reward", "terms whose name is a text", term.name, "Infos show it as reward/<name>.")
+            raise argument_error("reward", "terms whose name is a string", term.name, "Infos show it as reward/<name>.")
     names_used = [term.name for term in reward]
     if len(set(names_used)) < len(names_used):
         raise argument_error("reward", "terms with different names", names_used, "Rename one of them.")
@@ -145,55 +145,55 @@ def make_terms(reward: RewardSpec) -> tuple[RewardTerm, ...]:
 
 
 def is_named(term: RewardTerm) -> bool:
-    """Tell whether a term is one of the package's, which its name and weight describe."""
+    """Return whether a term is a built-in one, defined by its name and weight."""
     return isinstance(term, _NamedTerm)
 
 
 def evaluate(
     terms: Sequence[RewardTerm], before: TeamMetrics, after: TeamMetrics, shared: bool = False
 ) -> dict[str, list[float]]:
-    """Return the weighted reward of each term for a step, by name, one for each of the K robots.
+    """Return the weighted rewards of a step by name of the term, each with one value per robot.
 
     Args:
-        terms: What is paid for.
-        before: The step.
-        after: The step.
-        shared: Each robot gets the mean over all robots, term by term.
+        terms: Terms of the reward.
+        before: Metrics before the step.
+        after: Metrics after the step.
+        shared: Whether each robot gets the mean over all robots, term by term.
 
     Raises:
-        ValueError: If a term of one's own returns anything but one finite number for each robot.
+        ValueError: If a custom term returns anything but one finite number for each robot.
     """
     rewards = {}
     for term in terms:
-        paid = term(before, after) if isinstance(term, _NamedTerm) else _own(term, before, after)
+        values = term(before, after) if isinstance(term, _NamedTerm) else _own(term, before, after)
         if shared:
-            paid = _shared_by_all(float(np.mean(paid)), after)
-        rewards[term.name] = list(map(mul, repeat(float(term.weight)), paid))
+            values = _shared_by_all(float(np.mean(values)), after)
+        rewards[term.name] = list(map(mul, repeat(float(term.weight)), values))
     return rewards
 
 
 def _own(term: RewardTerm, before: TeamMetrics, after: TeamMetrics) -> list[float]:
-    """Return what a term of one's own pays for a step, or raise unless that is a finite number for each robot."""
-    given = term(before, after)
-    paid, robots = _floats(given), len(after.per_robot.map_errors)
-    if len(paid) != robots or not all(map(math.isfinite, paid)):
-        cure = "Return one number for each robot."
-        raise argument_error(f"reward term {term.name!r}", f"{robots} finite numbers", given, cure)
-    return paid
+    """Return the rewards of a custom term, or raise unless they are one finite number for each robot."""
+    result = term(before, after)
+    values, robots = _floats(result), len(after.per_robot.map_errors)
+    if len(values) != robots or not all(map(math.isfinite, values)):
+        hint = "Return one number for each robot."
+        raise argument_error(f"reward term {term.name!r}", f"{robots} finite numbers", result, hint)
+    return values
 
 
-def _floats(given: Any) -> list[float]:
-    """Return what a term of one's own gave as a list; an empty one if it is no row of finite numbers."""
+def _floats(values: Any) -> list[float]:
+    """Return the result of a custom term as a list; empty if it is not a row of finite numbers."""
     try:
-        row: list[float] = check_array("reward", given, (None,), "Return one number for each robot.").tolist()
+        row: list[float] = check_array("reward", values, (None,), "Return one number for each robot.").tolist()
     except ValueError:
         return []
     return row
 
 
 def totals(rewards: Mapping[str, Sequence[float]]) -> list[float]:
-    """Return the sum of all terms of `evaluate`, one at least, for each robot."""
+    """Return the sum of the rewards of `evaluate`, at least one term, for each robot."""
     total, *others = rewards.values()
-    for paid in others:
-        total = list(map(add, total, paid))
+    for values in others:
+        total = list(map(add, total, values))
     return list(total)

@@ -1,4 +1,4 @@
-"""Snapshots of an environment: their version, their check, and their form on disk."""
+"""Snapshots of environments: version, validation and file format."""
 
 import dataclasses
 import hashlib
@@ -23,7 +23,7 @@ from vslam_env.state_checks import EpisodeCheck, check_drivers, check_standing
 from vslam_env.state_kinds import ENV_KINDS
 from vslam_env.world import WorldSource
 
-STATE_FORMAT = 30  # raised when what a state holds changes; a state goes on bit by bit only with what made it
+STATE_FORMAT = 30  # raised when the content of states changes; exact continuation needs the same version
 MAGIC = b"vslam_env state "
 KEYS = ("version", "config", "objects", "root", "agents", "cycle", "episode", "drivers", "standing")
 
@@ -32,64 +32,64 @@ EnvState = dict[str, Any]
 
 @cache
 def state_version() -> str:
-    """Return what a state is marked with: the number of its format and the version of the package."""
+    """Return the version of states: format number and package version."""
     try:
         package = version("vslam-env")
-    except PackageNotFoundError:  # run from a source tree that was never installed
+    except PackageNotFoundError:  # not installed: run from a source tree
         package = "source"
     return f"{STATE_FORMAT}/{package}"
 
 
 def snapshot_objects(source: WorldSource, terms: Sequence[RewardTerm]) -> dict[str, str]:
-    """Return what of an environment are objects of the caller's, which no state holds: a word for each."""
+    """Return the class names of the caller's own objects (world, reward terms), which states do not contain."""
     objects = {} if isinstance(source, (str, Path)) else {"world": type(source).__qualname__}
     return objects | {f"reward {term.name!r}": type(term).__qualname__ for term in terms if not is_named(term)}
 
 
 def check_state(state: Any, config: EnvConfig, objects: Mapping[str, str]) -> Mapping[str, Any]:
-    """Return a state if an environment of `config` can go on from it.
+    """Return a state if it fits an environment, or raise.
 
     Args:
-        state: The value to check.
+        state: Value to check.
         config: Configuration of the environment.
-        objects: Names of its parts that are objects of the caller's.
+        objects: Class names of the caller's own objects, see `snapshot_objects`.
 
     Raises:
-        ValueError: If it is no state, one of another version, or one of another configuration.
+        ValueError: If the value is not a state, or a state of another version or configuration.
     """
     found = _checked("state", state)
-    theirs_own = found["objects"]
-    if not isinstance(theirs_own, dict) or not all(isinstance(name, str) for name in theirs_own):
-        check.refuse("state['objects']", "a word for each object of the caller's", theirs_own)
+    custom = found["objects"]
+    if not isinstance(custom, dict) or not all(isinstance(name, str) for name in custom):
+        check.refuse("state['objects']", "class names of the caller's own objects", custom)
     if found["config"] != config:
         name, ours, theirs = _difference(config, found["config"])
-        cure = "Restore into an environment of the same configuration."
-        if theirs_own and name in ("world", "reward"):
-            cure = f"No state holds objects of your own: make the environment with the same {', '.join(theirs_own)}."
-        raise argument_error("state", f"one made with {name} = {_short(ours)}", theirs, cure)
-    if theirs_own != objects:
-        named = [", ".join(f"{name} ({kind})" for name, kind in each.items()) for each in (objects, theirs_own)]
-        cure = "No state holds these: make the environment with the same ones."
-        raise argument_error("state", f"one made with {named[0] or 'no'} objects", f"'{named[1] or 'none'}'", cure)
+        hint = "Restore into an environment of the same configuration."
+        if custom and name in ("world", "reward"):
+            hint = f"States do not contain your own objects: make the environment with the same {', '.join(custom)}."
+        raise argument_error("state", f"one made with {name} = {_short(ours)}", theirs, hint)
+    if custom != objects:
+        named = [", ".join(f"{name} ({kind})" for name, kind in each.items()) for each in (objects, custom)]
+        hint = "States do not contain these: make the environment with the same ones."
+        raise argument_error("state", f"one made with {named[0] or 'no'} objects", f"'{named[1] or 'none'}'", hint)
     return found
 
 
 def check_parts(
     state: Mapping[str, Any], config: EnvConfig, own: Episode | None
 ) -> tuple[np.random.SeedSequence | None, Scenario | None]:
-    """Return the root of all seeds of a state that `check_state` passed, and its setting, if each part is whole.
+    """Validate all parts of a state that passed `check_state`; return its seed sequence and its scenario.
 
     Args:
-        state: Nothing of it is taken over yet.
+        state: State of an environment.
         config: Configuration of the environment.
-        own: The environment's running episode; None: there is none.
+        own: Running episode of the environment, if any.
 
     Raises:
-        ValueError: By name of the part that is wrong.
+        ValueError: If a part is malformed; the message names it.
     """
     try:
         root = restored_sequence(state["root"])
-    except Exception as error:  # whatever numpy says of what are no parts of one
+    except Exception as error:  # any error of numpy
         raise argument_error("state['root']", "a seed sequence", f"'{error}'", "Pass it unchanged.") from error
     check.instance("state['agents']", state["agents"], tuple)
     if state["agents"] not in ((), tuple(config.agents)):
@@ -107,51 +107,51 @@ def check_parts(
 
 
 def save_state(state: Mapping[str, Any], path: str | Path) -> None:
-    """Write a state of `get_state` to a file; an interrupted write leaves no file, or the old one.
+    """Write a state of `get_state` to a file; an interrupted write leaves no file or the old one.
 
-    A file of that name is replaced; what is there and no file is refused. The file holds data alone, with its SHA-256:
-    loading it runs no code. Objects of your own (worlds, reward terms) are not stored.
+    An existing file is replaced. The file contains only data and their SHA-256; loading it executes no code. Your own
+    objects (worlds, reward terms) are not stored.
 
     Raises:
-        ValueError: If it is no state of this version, or the file cannot be written.
+        ValueError: If it is not a state of this version, or the file cannot be written.
     """
     _checked("state", state)
     path = _checked_path(path)
     try:
         body = encode(dict(state), ENV_KINDS)
     except ForeignObjectError as error:
-        cure = "Objects of your own are not stored: make the environment that loads with them."
-        raise argument_error("state", "numbers, arrays and configurations of this package", str(error), cure) from error
+        hint = "Your own objects are not stored: make the environment that loads the state with them."
+        raise argument_error("state", "numbers, arrays and configurations of this package", str(error), hint) from error
     with os_errors_as_argument_errors(path, "path"):
-        is_other = path.exists() and not path.is_file()
-    if is_other:
-        raise argument_error("path", "a file that can be written", Path(path), "There is something else, no file.")
+        is_not_file = path.exists() and not path.is_file()
+    if is_not_file:
+        raise argument_error("path", "a file that can be written", Path(path), "The path exists and is not a file.")
     write_file(path, MAGIC + f"{state['version']}\n{_fingerprint(body)}\n".encode() + body)
 
 
 def load_state(path: str | Path) -> EnvState:
-    """Read a state that `save_state` wrote.
+    """Read a state written by `save_state`.
 
     Raises:
-        ValueError: If there is no such file, it holds no state, a byte of it has changed, or it is of another version.
+        ValueError: If the file does not exist, contains no state, is damaged, or has another version.
     """
     path = _checked_path(path)
     try:
         content = read_file(path)
     except OSError as error:
-        raise argument_error("path", "the file of a state", Path(path), f"The system says: {error}.") from error
+        raise argument_error("path", "a state file", Path(path), f"The system says: {error}.") from error
     head, _, body = content.partition(b"\n")
     if not head.startswith(MAGIC):
-        raise argument_error("path", "the file of a state", Path(path), "Write one with save_state.")
-    _check_version(str(path), head[len(MAGIC) :].decode(errors="replace"))  # before anything of it is read
-    mark, _, body = body.partition(b"\n")
-    if mark.decode(errors="replace") != _fingerprint(body):
-        raise argument_error("path", "a whole file of a state", f"a damaged file {path}", "Save it again.")
+        raise argument_error("path", "a state file", Path(path), "Write one with save_state.")
+    _check_version(str(path), head[len(MAGIC) :].decode(errors="replace"))  # before decoding
+    digest, _, body = body.partition(b"\n")
+    if digest.decode(errors="replace") != _fingerprint(body):
+        raise argument_error("path", "an intact state file", f"a damaged file {path}", "Save it again.")
     try:
         state = decode(body, ENV_KINDS)
     except ValueError as error:
-        cure = f"Save it again; reading says: {error}."
-        raise argument_error("path", "the file of a state that can be read here", Path(path), cure) from error
+        hint = f"Save it again; the reader says: {error}."
+        raise argument_error("path", "a readable state file", Path(path), hint) from error
     return dict(_checked(str(path), state))
 
 
@@ -160,7 +160,7 @@ def _fingerprint(body: bytes) -> str:
 
 
 def sequence_state(sequence: np.random.SeedSequence | None) -> dict[str, Any] | None:
-    """Return what a seed sequence is made of, its count of children included."""
+    """Return the parts of a seed sequence, including the number of spawned children."""
     if sequence is None:
         return None
     names = ("entropy", "spawn_key", "pool_size", "n_children_spawned")
@@ -168,40 +168,40 @@ def sequence_state(sequence: np.random.SeedSequence | None) -> dict[str, Any] | 
 
 
 def restored_sequence(state: Mapping[str, Any] | None) -> np.random.SeedSequence | None:
-    """Return the seed sequence that `sequence_state` described."""
+    """Return the seed sequence with the parts of `sequence_state`."""
     return None if state is None else sequence_of(**state)
 
 
 def _checked_path(path: Any) -> Path:
-    """Return a path that can name a file."""
+    """Return a valid file path, or raise."""
     if not isinstance(path, (str, PathLike)) or "\0" in str(path):
-        raise argument_error("path", "the path of a file", path, "Give a text or a Path, without NUL characters.")
+        raise argument_error("path", "the path of a file", path, "Give a string or a Path without NUL characters.")
     return Path(path)
 
 
 def _check_version(name: str, found: Any) -> None:
     if found != state_version():
-        cure = "Go on with the version that made it; only the same one goes on bit by bit."
-        raise argument_error(name, f"a state of version {state_version()!r}", found, cure)
+        hint = "Use the version that made it; only the same version continues exactly."
+        raise argument_error(name, f"a state of version {state_version()!r}", found, hint)
 
 
 def _checked(name: str, state: Any) -> Mapping[str, Any]:
-    """Return a state of this version, or refuse it; another version's may have other parts, so that is said first."""
-    expected, cure = "what get_state returned", "Pass it unchanged."
+    """Return a state of this version, or raise; the version is checked first, since parts differ between versions."""
+    expected, hint = "what get_state returned", "Pass it unchanged."
     if not isinstance(state, Mapping):
-        raise argument_error(name, expected, f"a {type(state).__name__}", cure)
+        raise argument_error(name, expected, f"a {type(state).__name__}", hint)
     if "version" in state:
         _check_version(name, state["version"])
     for key in KEYS:
         if key not in state:
-            raise argument_error(name, expected, f"a mapping without {key!r}", cure)
+            raise argument_error(name, expected, f"a mapping without {key!r}", hint)
     if not isinstance(state["config"], EnvConfig):
-        raise argument_error(name, expected, f"a mapping whose config is a {type(state['config']).__name__}", cure)
+        raise argument_error(name, expected, f"a mapping whose config is a {type(state['config']).__name__}", hint)
     return state
 
 
 def _difference(ours: Any, theirs: Any, name: str = "") -> tuple[str, Any, Any]:
-    """Return where two unequal configurations differ first: the field, through nested parts, and both values."""
+    """Return the first difference of two unequal configurations: dotted name of the field, and both values."""
     if not dataclasses.is_dataclass(ours) or type(ours) is not type(theirs):
         return name, ours, theirs
     pairs = ((f.name, getattr(ours, f.name), getattr(theirs, f.name)) for f in dataclasses.fields(ours))

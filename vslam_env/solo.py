@@ -1,4 +1,4 @@
-"""`SoloExplorationEnv`: the environment of one robot, as Gymnasium has it."""
+"""Gymnasium environment of one robot."""
 
 from typing import Any, ClassVar
 
@@ -17,17 +17,17 @@ AGENT = "robot_0"
 
 
 class SoloExplorationEnv(gymnasium.Env[Any, Any]):
-    """One robot that does not know where it starts explores a building and maps it.
+    """Exploration and mapping of a building by one robot with an unknown start pose.
 
     Args:
         render_mode: `"human"`, `"rgb_array"` or None.
-        **kwargs: As of `parallel_env`, without `num_robots`.
+        **kwargs: Arguments of `parallel_env` except `num_robots`.
 
     Attributes:
-        parallel: The parallel environment of one robot behind it, with `belief`, `events` and `scene`.
+        parallel: Underlying parallel environment of one robot, with `belief`, `events` and `scene`.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {  # type: ignore[misc]   # Gymnasium declares it for instances
+    metadata: ClassVar[dict[str, Any]] = {  # type: ignore[misc]   # Gymnasium declares an instance variable
         "render_modes": ExplorationEnv.metadata["render_modes"],
         "render_fps": ExplorationEnv.metadata["render_fps"],
     }
@@ -48,30 +48,30 @@ class SoloExplorationEnv(gymnasium.Env[Any, Any]):
         return observations[AGENT], infos[AGENT]
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Act; see `ExplorationEnv.step`."""
+        """Execute an action; see `ExplorationEnv.step`."""
         observations, rewards, terminations, truncations, infos = self.parallel.step({AGENT: action})
         return observations[AGENT], rewards[AGENT], terminations[AGENT], truncations[AGENT], infos[AGENT]
 
     def render(self) -> NDArray[np.uint8] | None:
-        """Return a picture or show it; see `ExplorationEnv.render`."""
+        """Return or show a picture; see `ExplorationEnv.render`."""
         return self.parallel.render()
 
     @property
     def config(self) -> EnvConfig:
-        """All that defines this environment."""
+        """Configuration of the environment."""
         return self.parallel.config
 
     @property
     def events(self) -> tuple[MergeEvent, ...]:
-        """All attempts and merges since the reset: none, as there is nobody to merge with."""
+        """Merge events since the reset: always empty for a single robot."""
         return self.parallel.events
 
     def belief(self) -> Belief:
-        """Return what the robot believes; see `ExplorationEnv.belief`."""
+        """Return the belief of the robot; see `ExplorationEnv.belief`."""
         return self.parallel.belief(AGENT)
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """Return which `goal` actions are valid (17,) bool, under the name that sb3-contrib's MaskablePPO asks for."""
+        """Return which `goal` actions are valid (17,) bool; sb3-contrib's MaskablePPO calls this method."""
         valid = self.belief().candidates.valid
         return np.concatenate([[True], valid])
 

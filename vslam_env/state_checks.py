@@ -1,4 +1,4 @@
-"""What a state of an environment must be so that an episode can go on from it; nothing is taken over before that."""
+"""Validation of environment states before they are restored."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -29,21 +29,21 @@ from vslam_env.world import World
 
 GRID = (GRID_SIZE, GRID_SIZE)
 SLOT_COLUMNS = 5
-AROUND = 1.0  # [m] a robot that is pushed may be so far outside the walls' bounds
+AROUND = 1.0  # [m] tolerated distance of a robot outside the bounds of the walls
 STREAMS = ("odometry", "sensor", "scan", "radio")
 EPISODE = ("setting", "tick", "simulator", "streams", "belief", "ledger", "coverage", "counts", "last", "paths")
 
 
 class EpisodeCheck:
-    """Checks the parts of the state of one episode.
+    """Validation of the state of one episode.
 
     Args:
         config: Configuration of the environment.
-        own: Its running episode: what it shares with the state is not looked at again. None: it has none.
+        own: Running episode of the environment, if any. Objects that it shares with the state are not checked again.
 
     Attributes:
-        setting: After `check`, the setting to go on in. One that comes from elsewhere is built again from its parts, so
-            that nothing within its sensors has to be believed.
+        setting: Scenario to restore, set by `check`. A foreign scenario is rebuilt from its parts, so that its sensors
+            need not be trusted.
     """
 
     def __init__(self, config: EnvConfig, own: Episode | None) -> None:
@@ -52,31 +52,31 @@ class EpisodeCheck:
         self.setting: Scenario | None = None if own is None else own.setting
 
     def check(self, name: str, state: Any) -> None:
-        """Refuse what is no state of an episode.
+        """Raise unless a value is a state of an episode.
 
         Raises:
-            ValueError: By name of the part that is wrong.
+            ValueError: If a part is malformed; the message names it.
         """
         own, count = self._own, self._count
         check.keys(name, state, EPISODE)
-        setting = state["setting"]
-        if own is not None and setting is own.given_scenario:
-            setting = own.setting
-        elif own is None or setting is not own.setting:
-            self._check_setting(f"{name}['setting']", setting)
+        scenario = state["setting"]
+        if own is not None and scenario is own.given_scenario:
+            scenario = own.setting
+        elif own is None or scenario is not own.setting:
+            self._check_setting(f"{name}['setting']", scenario)
             try:
-                self.setting = setting = Scenario.from_parts(*setting.to_parts())
-            except Exception as error:  # whatever constructors say of parts that do not fit together
+                self.setting = scenario = Scenario.from_parts(*scenario.to_parts())
+            except Exception as error:  # any error of a constructor
                 check.refuse(f"{name}['setting']", "parts that fit together", f"'{error}'")
         check.integer(f"{name}['tick']", state["tick"])
         self._tick = tick = state["tick"]
         check.keys(f"{name}['simulator']", state["simulator"], ("poses", "bumped"))
-        self._check_inside(f"{name}['simulator']['poses']", state["simulator"]["poses"], setting.world)
+        self._check_inside(f"{name}['simulator']['poses']", state["simulator"]["poses"], scenario.world)
         check.array(f"{name}['simulator']['bumped']", state["simulator"]["bumped"], check.BOOL, (count,))
         check_streams(f"{name}['streams']", state["streams"])
-        self._check_belief(f"{name}['belief']", state["belief"], setting)
-        self._check_ledger(f"{name}['ledger']", state["ledger"], setting, state["belief"]["team"])
-        cells = len(setting.coverage.cells)
+        self._check_belief(f"{name}['belief']", state["belief"], scenario)
+        self._check_ledger(f"{name}['ledger']", state["ledger"], scenario, state["belief"]["team"])
+        cells = len(scenario.coverage.cells)
         check.keys(f"{name}['coverage']", state["coverage"], ("ever", "found"))
         check.array(f"{name}['coverage']['ever']", state["coverage"]["ever"], check.BOOL, (cells,))
         check.indices(f"{name}['coverage']['found']", state["coverage"]["found"], (count,), 0, cells)
@@ -87,12 +87,12 @@ class EpisodeCheck:
             check.floats(where, of_robots, (count,), 0.0)
         check.sequence(f"{name}['last']", state["last"], 2)
         self._check_readings(f"{name}['last'][0]", state["last"][0])
-        self._check_frames(f"{name}['last'][1]", state["last"][1], setting)
+        self._check_frames(f"{name}['last'][1]", state["last"][1], scenario)
         *paths, (of_merges, merges) = check.named_items(f"{name}['paths']", state["paths"], 3)
         known = ((), ()) if own is None else (own.true_path, own.estimated_path)
         for (where, path), mine in zip(paths, known, strict=True):
             check.sequence(where, path, tick + 1)
-            for poses in path[num_shared(path, mine) :]:  # the episode holds the others itself
+            for poses in path[num_shared(path, mine) :]:  # the first ones are the episode's own
                 check.floats(where, poses, (count, 3), -1e9, 1e9)
         for where, merge in check.named_items(of_merges, merges):
             check.sequence(where, merge, 3)
@@ -103,69 +103,69 @@ class EpisodeCheck:
     # ------------------------------------------------------------------ the world
 
     def _check_inside(self, name: str, poses: Any, world: World) -> None:
-        """Refuse what are no poses (K, 3) in a world: far outside, physics would not come to an end."""
+        """Raise unless poses (K, 3) lie in a world: far outside, the physics would not terminate."""
         check.positions(name, poses, (self._count, 3))
         x_min, y_min, x_max, y_max = world.bounds
         low, high = np.array([x_min, y_min]) - AROUND, np.array([x_max, y_max]) + AROUND
         if ((poses[:, :2] < low) | (poses[:, :2] > high)).any():
-            check.refuse(name, "places in the world", "others")
+            check.refuse(name, "positions inside the world", "others")
 
-    def _check_setting(self, name: str, setting: Any) -> None:
-        """Refuse what is no setting of an environment of this configuration."""
+    def _check_setting(self, name: str, scenario: Any) -> None:
+        """Raise unless a value is a scenario of this configuration."""
         config, count = self._config, self._count
-        check.instance(name, setting, Scenario)
-        check.instance(f"{name}.world", setting.world, World)
-        landmarks = setting.world.landmarks
+        check.instance(name, scenario, Scenario)
+        check.instance(f"{name}.world", scenario.world, World)
+        landmarks = scenario.world.landmarks
         if landmarks is None:
             check.refuse(f"{name}.world", "one with landmarks", "none")
-        check.floats(f"{name}.true_starts", setting.true_starts, (count, 3), -1e8, 1e8)
-        check.floats(f"{name}.bias", setting.bias, (count, 2))
-        check.instance(f"{name}.belief_seed", setting.belief_seed, np.random.SeedSequence)
-        check_streams(f"{name}.stream_states", setting.stream_states)
-        sensor, scan, coverage = setting.sensor, setting.scan, setting.coverage
+        check.floats(f"{name}.true_starts", scenario.true_starts, (count, 3), -1e8, 1e8)
+        check.floats(f"{name}.bias", scenario.bias, (count, 2))
+        check.instance(f"{name}.belief_seed", scenario.belief_seed, np.random.SeedSequence)
+        check_streams(f"{name}.stream_states", scenario.stream_states)
+        sensor, scan, coverage = scenario.sensor, scenario.scan, scenario.coverage
         kind, wanted = (StereoSensor, config.stereo) if config.sensor == "stereo" else (LandmarkSensor, None)
         check.instance(f"{name}.sensor", sensor, kind)
         if sensor.config != (config.landmark_sensor if wanted is None else wanted):
-            check.refuse(f"{name}.sensor", "one of the environment's configuration", "another")
+            check.refuse(f"{name}.sensor", "one with the environment's configuration", "another")
         if isinstance(sensor, StereoSensor):
-            corners, faces = sensor.corners, 2 * len(setting.world.walls)
+            corners, faces = sensor.corners, 2 * len(scenario.world.walls)
             check.indices(f"{name}.sensor.corners.faces", corners.faces, (len(landmarks),), 0, faces - 1)
             check.floats(f"{name}.sensor.corners.offsets", corners.offsets, (len(landmarks), 2))
             if (np.diff(corners.faces) < 0).any():
                 check.refuse(f"{name}.sensor.corners.faces", "faces in order", "others")
         check.instance(f"{name}.scan", scan, RangeFinder)
         if scan.config != config.scan or sensor.robot_radius != config.robot_radius:
-            check.refuse(f"{name}.scan", "one of the environment's configuration", "another")
+            check.refuse(f"{name}.scan", "one with the environment's configuration", "another")
         check.instance(f"{name}.coverage", coverage, CoverageCells)
         check.floats(f"{name}.coverage.cells", coverage.cells, (None, 2), -1e9, 1e9)
-        check.array(f"{name}.observable_landmarks", setting.observable_landmarks, check.BOOL, (len(landmarks),))
-        if not setting.observable_landmarks.any():
-            check.refuse(f"{name}.observable_landmarks", "some landmark that counts", "none")
+        check.array(f"{name}.observable_landmarks", scenario.observable_landmarks, check.BOOL, (len(landmarks),))
+        if not scenario.observable_landmarks.any():
+            check.refuse(f"{name}.observable_landmarks", "at least one observable landmark", "none")
 
     # ------------------------------------------------------------------ beliefs
 
-    def _check_belief(self, name: str, belief: Any, setting: Scenario) -> None:
+    def _check_belief(self, name: str, belief: Any, scenario: Scenario) -> None:
         check.keys(name, belief, ("tick", "team", "grids", "slots"))
         if belief["tick"] != self._tick or type(belief["tick"]) is not int:
-            check.refuse(f"{name}['tick']", f"{self._tick}, as the episode's", belief["tick"])
+            check.refuse(f"{name}['tick']", f"{self._tick}, the tick of the episode", belief["tick"])
         own = None if self._own is None else self._own.belief
         team = TeamCheck(self._count, {} if own is None else own.buffered_inputs, (self._config.belief.filter,))
         team.check(f"{name}['team']", belief["team"])
         if belief["team"]["step"] != self._tick + 1:
             check.refuse(f"{name}['team']['step']", f"{self._tick + 1}", belief["team"]["step"])
-        landmarks = setting.world.landmarks
+        landmarks = scenario.world.landmarks
         assert landmarks is not None
         if self._config.sensor == "landmark" and not team.descriptor_sizes <= {landmarks.descriptors.shape[1]}:
             sizes = sorted(team.descriptor_sizes)
             check.refuse(f"{name}['team']", f"descriptors of length {landmarks.descriptors.shape[1]}", sizes)
         config, given = self._config.belief, belief["team"]
-        rhythm, merging = merge_options(config, not self._config.oracle_merge)
+        attempts, merging = merge_options(config, not self._config.oracle_merge)
         found = [*team.options, given["alignment"], given["schedule"]["alignment"], given["schedule"]["options"]]
-        wanted = [config.filter] * len(team.options) + [config.alignment, config.alignment, rhythm]
+        wanted = [config.filter] * len(team.options) + [config.alignment, config.alignment, attempts]
         if [*found, given["merging"]] != [*wanted, merging]:
             check.refuse(f"{name}['team']", "options of the environment's configuration", "others")
-        strokes = {} if own is None else own.grid_updates
-        self._check_grids(f"{name}['grids']", belief["grids"], strokes)
+        updates = {} if own is None else own.grid_updates
+        self._check_grids(f"{name}['grids']", belief["grids"], updates)
         for where, slots in check.named_items(f"{name}['slots']", belief["slots"], self._count):
             check_slots(where, slots)
 
@@ -179,52 +179,52 @@ class EpisodeCheck:
         for robot, (where, group) in enumerate(check.named_items(f"{name}['mates']", mates, count)):
             check.robots(where, group, count)
             if robot not in group or any(mates[mate] != group for mate in group):
-                check.refuse(where, "robots that are together", group)
+                check.refuse(where, "robots of one group", group)
         check.indices(f"{name}['parted']", grids["parted"], (count, count), NEVER_MET, self._tick + 1)
-        for where, kept in check.named_items(f"{name}['kept']", grids["kept"]):
-            check.instance(where, kept, GridSnapshot)
-            check.integer(f"{where}.tick", kept.tick, 0, self._tick + 1)
-            for of_side, side in check.named_items(f"{where}.sides", kept.sides, 2):
-                check.robots(of_side, side, count)
-            check.integers(f"{where}.maps", kept.maps)
-            check.sequence(f"{where}.maps", kept.maps, 3)
-            check.instance(f"{where}.grids", kept.grids, dict)
-            robots = [*kept.sides[0], *kept.sides[1]]
-            if set(kept.grids) != set(robots) or len(set(robots)) < len(robots):
-                check.refuse(f"{where}.grids", f"the grid of each of {robots}", list(kept.grids))
-            for grid in kept.grids.values():
+        for where, snapshot in check.named_items(f"{name}['kept']", grids["kept"]):
+            check.instance(where, snapshot, GridSnapshot)
+            check.integer(f"{where}.tick", snapshot.tick, 0, self._tick + 1)
+            for where_side, side in check.named_items(f"{where}.sides", snapshot.sides, 2):
+                check.robots(where_side, side, count)
+            check.integers(f"{where}.maps", snapshot.maps)
+            check.sequence(f"{where}.maps", snapshot.maps, 3)
+            check.instance(f"{where}.grids", snapshot.grids, dict)
+            robots = [*snapshot.sides[0], *snapshot.sides[1]]
+            if set(snapshot.grids) != set(robots) or len(set(robots)) < len(robots):
+                check.refuse(f"{where}.grids", f"the grid of each of {robots}", list(snapshot.grids))
+            for grid in snapshot.grids.values():
                 check_grid(f"{where}.grids", grid)
-            self._check_strokes(f"{where}.updates", kept.updates, known)
+            self._check_strokes(f"{where}.updates", snapshot.updates, known)
         self._check_strokes(f"{name}['strokes']", grids["strokes"], known)
 
     def _check_strokes(self, name: str, history: Any, known: Mapping[int, GridUpdate]) -> None:
-        """Refuse what are no strokes of some ticks, in order."""
+        """Raise unless a value is a sequence of grid updates in ascending order of ticks."""
         count, scan = self._count, self._config.scan
         check.instance(name, history, tuple)
         last = -1
-        for strokes in history:
-            if known.get(id(strokes)) is not strokes:
-                check.instance(name, strokes, GridUpdate)
-                check.integer(f"{name}.tick", strokes.tick, 0, self._tick)
-                check.indices(f"{name}.shared", strokes.shared, (count, count), 0, 1)
-                check.array(f"{name}.poses", strokes.poses, check.FLOAT64, (count, count, 3))
-                near = (np.abs(strokes.poses) <= check.MAX_DISTANCE).all(axis=2)
-                if not (near | (np.isnan(strokes.poses).any(axis=2) & (strokes.shared == 0))).all():
-                    check.refuse(f"{name}.poses", "poses of those who share what they scan", "others")
-                check.floats(f"{name}.scans", strokes.scans, (count, scan.num_rays), 0.0, scan.max_range)
-                check.array(f"{name}.bumps", strokes.bumps, check.BOOL, (count,))
-            if strokes.tick <= last:
-                check.refuse(name, "strokes in order", "others")
-            last = strokes.tick
+        for update in history:
+            if known.get(id(update)) is not update:
+                check.instance(name, update, GridUpdate)
+                check.integer(f"{name}.tick", update.tick, 0, self._tick)
+                check.indices(f"{name}.shared", update.shared, (count, count), 0, 1)
+                check.array(f"{name}.poses", update.poses, check.FLOAT64, (count, count, 3))
+                near = (np.abs(update.poses) <= check.MAX_DISTANCE).all(axis=2)
+                if not (near | (np.isnan(update.poses).any(axis=2) & (update.shared == 0))).all():
+                    check.refuse(f"{name}.poses", "poses of the robots that share scans", "others")
+                check.floats(f"{name}.scans", update.scans, (count, scan.num_rays), 0.0, scan.max_range)
+                check.array(f"{name}.bumps", update.bumps, check.BOOL, (count,))
+            if update.tick <= last:
+                check.refuse(name, "updates in ascending order", "others")
+            last = update.tick
 
-    # ------------------------------------------------------------------ the simulator's books
+    # ------------------------------------------------------------------ ground-truth association
 
-    def _check_ledger(self, name: str, ledger: Any, setting: Scenario, team: Mapping[str, Any]) -> None:
-        """Refuse what are no books on the landmarks of a team's filters, of which the simulator's kernels read rows."""
+    def _check_ledger(self, name: str, ledger: Any, scenario: Scenario, team: Mapping[str, Any]) -> None:
+        """Raise unless a value is the ground-truth association of a team's maps, whose rows kernels index unchecked."""
         check.keys(name, ledger, ("books", "row_of", "map_of", "seen"))
         books, row_of, count = ledger["books"], ledger["row_of"], self._count
         check.indices(
-            f"{name}['books']", books, (None, None), UNUSED, int(np.count_nonzero(setting.observable_landmarks)) - 1
+            f"{name}['books']", books, (None, None), UNUSED, int(np.count_nonzero(scenario.observable_landmarks)) - 1
         )
         check.int_dict(f"{name}['row_of']", row_of, check.LANDMARK, (0, len(books) - 1))
         if len(set(row_of.values())) < len(row_of):
@@ -246,22 +246,22 @@ class EpisodeCheck:
         check.instance(f"{name}['seen']", seen, dict)
         check.integers(f"{name}['seen']", tuple(seen), 0, self._tick)
         for names in seen.values():
-            self._check_names(f"{name}['seen']", names, len(setting.observable_landmarks))
+            self._check_names(f"{name}['seen']", names, len(scenario.observable_landmarks))
         for step, inputs in team["records"]["log"]["steps"].items():
             if step not in seen or any(
                 turn[COUNT] > len(names) for turn, names in zip(inputs.inputs, seen[step], strict=True)
             ):
-                check.refuse(f"{name}['seen']", f"what was seen in step {step}", "less")
+                check.refuse(f"{name}['seen']", f"all identities of step {step}", "fewer")
         for entry in team["records"]["entries"]:
             if isinstance(entry, LandmarksCreated) and (
                 entry.step not in seen or len(entry.ids) > len(seen[entry.step][entry.robot])
             ):
-                check.refuse(f"{name}['seen']", f"what was seen in step {entry.step}", "less")
+                check.refuse(f"{name}['seen']", f"all identities of step {entry.step}", "fewer")
             if isinstance(entry, LandmarkIdMap) and len(entry.ids_b) and entry.ids_b.max() >= books.shape[1]:
                 check.refuse(f"{name}['books']", "an entry for each landmark", f"shape {books.shape}")
 
     def _check_names(self, name: str, names: Any, landmarks: int) -> None:
-        """Refuse what does not say of each robot which true landmarks it saw."""
+        """Raise unless a value holds the true landmarks seen by each robot."""
         if isinstance(names, np.ndarray):
             check.indices(name, names, (self._count, None), -1, landmarks - 1)
             return
@@ -297,15 +297,15 @@ class EpisodeCheck:
         check_descriptors(f"{name}.descriptors", frames.descriptors, n)
         check.indices(f"{name}.ends", frames.offsets, (self._count,), 0, n)
         if (np.diff(frames.offsets) < 0).any() or frames.offsets[-1] != n:
-            check.refuse(f"{name}.ends", f"ends that rise to {n}", "others")
+            check.refuse(f"{name}.ends", f"ascending offsets up to {n}", "others")
 
     def _check_images(self, name: str, images: Any) -> None:
         camera = self._config.stereo.camera
         for where, image in check.named_items(name, images, self._count):
             check.array(where, image, check.UINT8, (camera.height, camera.width))
 
-    def _check_frames(self, name: str, frames: Any, setting: Scenario) -> None:
-        landmarks = setting.world.landmarks
+    def _check_frames(self, name: str, frames: Any, scenario: Scenario) -> None:
+        landmarks = scenario.world.landmarks
         assert landmarks is not None
         if self._config.sensor == "stereo":
             check.instance(name, frames, TeamRenderedFrames)
@@ -321,16 +321,16 @@ class EpisodeCheck:
         most = self._config.landmark_sensor.max_measurements
         check.indices(f"{name}.names", frames.names, (self._count, most), -1, len(landmarks) - 1)
         if not isinstance(frames.measurements, TeamMeasurements):
-            check.refuse(f"{name}.measurements", "those of the team in one piece", "others")
+            check.refuse(f"{name}.measurements", "TeamMeasurements", "others")
         if np.diff(frames.measurements.offsets, prepend=0).max() > most:
-            check.refuse(f"{name}.measurements", f"at most {most} of each robot", "more")
+            check.refuse(f"{name}.measurements", f"at most {most} per robot", "more")
 
 
-MOST_MEASURED = 1000  # landmarks that all robots may create in a tick
+MOST_MEASURED = 1000  # most landmarks that all robots together create in a tick
 
 
 def branches_of(team: Mapping[str, Any]) -> Iterable[Mapping[str, Any]]:
-    """Yield all branches of a team's state, those included that an undo would take up again, each once."""
+    """Yield each branch of a team's state once, including those that a rollback would restore."""
     waiting = [branch for group in team["groups"] for branch in group["branches"]]
     waiting += [side for group in team["groups"] if group["undoing"] is not None for side in group["undoing"]["sides"]]
     done: set[int] = set()
@@ -343,7 +343,7 @@ def branches_of(team: Mapping[str, Any]) -> Iterable[Mapping[str, Any]]:
 
 
 def check_streams(name: str, streams: Any) -> None:
-    """Refuse what are no states of an episode's random streams."""
+    """Raise unless a value holds the states of an episode's random streams."""
     check.keys(name, streams, STREAMS)
     if len(streams) != len(STREAMS):
         check.refuse(name, f"the streams {', '.join(STREAMS)}", list(streams))
@@ -354,13 +354,13 @@ def check_streams(name: str, streams: Any) -> None:
 
 
 def check_grid(name: str, grid: Any) -> None:
-    """Refuse what is no state of a `SeenGrid`."""
+    """Raise unless a value is a state of a `SeenGrid`."""
     check.keys(name, grid, ("evidence",))
     check.array(f"{name}['evidence']", grid["evidence"], check.INT8, GRID)
 
 
 def check_slots(name: str, slots: Any) -> None:
-    """Refuse what is no state of `CandidateSlots`."""
+    """Raise unless a value is a state of `CandidateSlots`."""
     check.keys(name, slots, ("rows", "visits", "given_up"))
     rows = slots["rows"]
     check.array(f"{name}['rows']", rows, check.FLOAT64, (NUM_SLOTS, SLOT_COLUMNS))
@@ -368,29 +368,29 @@ def check_slots(name: str, slots: Any) -> None:
     held = rows[~empty[:, 0]]
     check.floats(f"{name}['rows']", held, (len(held), SLOT_COLUMNS))
     if (empty != empty[:, :1]).any() or (held.size and np.abs(held[:, :2]).max() > HALF_WIDTH):
-        check.refuse(f"{name}['rows']", "places in the grid, or NaN", "others")
+        check.refuse(f"{name}['rows']", "positions in the grid, or NaN", "others")
     check.indices(f"{name}['visits']", slots["visits"], (NUM_SLOTS,))
     check.array(f"{name}['given_up']", slots["given_up"], check.BOOL, GRID)
 
 
-def check_standing(name: str, standing: Any, count: int) -> None:
-    """Refuse what does not say how K robots stand."""
-    check.instance(name, standing, TeamMetrics)
-    check.instance(f"{name}.per_robot", standing.per_robot, RobotMetrics)
-    for figure, row in standing.per_robot._asdict().items():
+def check_standing(name: str, metrics: Any, count: int) -> None:
+    """Raise unless a value is the metrics of a team of K robots."""
+    check.instance(name, metrics, TeamMetrics)
+    check.instance(f"{name}.per_robot", metrics.per_robot, RobotMetrics)
+    for figure, row in metrics.per_robot._asdict().items():
         for where, number in check.named_items(f"{name}.per_robot.{figure}", row, count):
             check.number(where, number)
-    check.instance(f"{name}.counts", standing.counts, RobotCounts)
-    for counted, numbers in standing.counts._asdict().items():
+    check.instance(f"{name}.counts", metrics.counts, RobotCounts)
+    for counted, numbers in metrics.counts._asdict().items():
         check.integers(f"{name}.counts.{counted}", numbers)
         check.sequence(f"{name}.counts.{counted}", numbers, count)
-    check.number(f"{name}.coverage", standing.coverage, 0.0, 1.0)
-    check.integer(f"{name}.merges", standing.merges)
-    check.number(f"{name}.time", standing.time, 0.0)
+    check.number(f"{name}.coverage", metrics.coverage, 0.0, 1.0)
+    check.integer(f"{name}.merges", metrics.merges)
+    check.number(f"{name}.time", metrics.time, 0.0)
 
 
 def check_drivers(name: str, drivers: Any, count: int) -> None:
-    """Refuse what does not say where each robot is heading."""
+    """Raise unless a value holds the states of the robots' goal controllers."""
     for where, driver in check.named_items(name, drivers, count):
         check.keys(where, driver, ("goal", "heading", "path"))
         if driver["goal"] is not None:
@@ -399,4 +399,4 @@ def check_drivers(name: str, drivers: Any, count: int) -> None:
         if driver["path"] is not None:
             check.floats(f"{where}['path']", driver["path"], (None, 2), -2.0 * HALF_WIDTH, 2.0 * HALF_WIDTH)
             if not len(driver["path"]):
-                check.refuse(f"{where}['path']", "some points", "none")
+                check.refuse(f"{where}['path']", "at least one point", "none")

@@ -1,4 +1,4 @@
-"""Of which classes objects may stand in states of environments that are kept in files."""
+"""Registry of the classes whose instances may occur in saved environment states."""
 
 from slam_backend.core.state_codec import StateType, StateTypes
 from slam_backend.frontend import CornerOptions, FrontEndOptions, StereoFrame
@@ -28,4 +28,4 @@ RECORDS = (
 ENV_KINDS = StateTypes(
     (*CONFIGURATIONS, *RECORDS), {Scenario: StateType("Scenario", Scenario.to_parts, Scenario.from_parts)}
 ).with_others(BACKEND_KINDS)
-"""All classes whose objects may stand in the state of an environment."""
+"""All classes whose instances may occur in the state of an environment."""

@@ -1,4 +1,4 @@
-"""Version 0 of the environment under PettingZoo's names: `parallel_env`, `env`, `raw_env`."""
+"""Version 0 of the environment, with PettingZoo's constructors `parallel_env`, `env` and `raw_env`."""
 
 from functools import wraps
 from pathlib import Path
@@ -40,43 +40,43 @@ def parallel_env(
     world_split: str | None = None,
     shared_reward: bool | None = None,
 ) -> ExplorationEnv:
-    """Make the parallel environment. An argument that is None leaves what the configuration or preset says.
+    """Make the parallel environment. Arguments that are None keep the value of the configuration or preset.
 
     Args:
         world: `"office"` (default), `"maze"`, `"loops"`, `"hall"`, `"fig5"`; the path of a floor plan (.png, .jpg,
-            .pgm), of a ROS map (.yaml), of a .json file of walls or of a folder of these; a `World`; or a function of
-            a generator that returns one.
-        num_robots: 1 to 8; default 3.
-        sensor: `"landmark"` (default): simulated measurements. `"stereo"`: rendered eyes see textured walls; with the
-            stereo front end their images become measurements.
-        action_type: `"continuous"` (default): (speed, turn) in [-1, 1], zeros stand still. `"discrete"`: stay, ahead,
-            left, right. `"goal"`: 0 stays, 1 to 16 drive to a candidate of the last observation.
-        decision_ticks: Ticks of 0.1 s per step; default 1, with `goal` 10.
-        num_particles: Of each filter; default 100.
-        max_cycles: Steps until the episode is truncated; default 1000.
+            .pgm), of a ROS map (.yaml), of a .json file of walls or of a folder of these; a `World`; or a function
+            that takes a random generator and returns a `World`.
+        num_robots: Number of robots, 1 to 8; default 3.
+        sensor: `"landmark"` (default): simulated measurements. `"stereo"`: rendered images of textured walls, measured
+            by the stereo front end.
+        action_type: `"continuous"` (default): (speed, turn) in [-1, 1], zeros stop. `"discrete"`: stay, ahead,
+            left, right. `"goal"`: 0 to stay, 1 to 16 to drive to a candidate of the last observation.
+        decision_ticks: Ticks of 0.1 s per step; default 1, or 10 with `goal`.
+        num_particles: Number of particles of each filter; default 100.
+        max_cycles: Number of steps after which the episode is truncated; default 1000.
         preset: `"easy"`, `"standard"` (default) or `"hard"`; see `preset_config`.
-        reward: Weights of terms by name (default `{"map_error": 1.0}`), or a list of terms of your own. Learners
-            discount it by at least 0.999 per tick: `gamma ** decision_ticks` per step.
+        reward: Weights of terms by name (default `{"map_error": 1.0}`), or a list of custom terms. Learners should use
+            a discount of at least 0.999 per tick: `gamma ** decision_ticks` per step.
         observation_type: `"dict"` (default) or `"flat"`.
-        observe_images: With `sensor="stereo"`: observations hold the left image, `"image"` (H, W, 1) uint8.
-        oracle_pose: The robots know their poses in their own start frames.
-        oracle_association: They know which landmark is which.
-        oracle_merge: Groups in contact that share three landmarks merge with the true transform.
-        comm_range: Robots hear each other no farther than this [m]; default any distance.
-        comm_line_of_sight: Walls keep robots from hearing each other; default no.
-        comm_loss: Probability that two robots do not hear each other in a tick; default 0.
-        stop_at_recall: Terminate when each map holds this share of the landmarks; default never.
+        observe_images: Whether observations contain the left image, `"image"` (H, W, 1) uint8; with `sensor="stereo"`.
+        oracle_pose: Whether each filter receives the true pose in the robot's start frame.
+        oracle_association: Whether data association is replaced by the truth.
+        oracle_merge: Whether groups in contact that share three true landmarks merge with the true transform.
+        comm_range: Largest distance of two robots in contact [m]; default unlimited.
+        comm_line_of_sight: Whether walls block contacts; default no.
+        comm_loss: Probability that a contact fails in a tick; default 0.
+        stop_at_recall: Map recall of all robots at which the episode terminates; default never.
         render_mode: `"human"`, `"rgb_array"` or None.
-        config: An `EnvConfig` or the path of its TOML file, instead of a preset.
-        world_split: `"train"`, `"validation"` or `"test"`: worlds of that range of world seeds only, or files of a
-            folder by turns; default any.
-        shared_reward: Each robot gets the mean of all robots' rewards; default its own.
+        config: `EnvConfig` or path of its TOML file, instead of a preset.
+        world_split: `"train"`, `"validation"` or `"test"`: worlds from that range of world seeds, or that part of
+            the files in a folder; default any.
+        shared_reward: Whether each robot gets the mean of all robots' rewards; default no.
 
     Raises:
-        ValueError: If an argument is refused; the text names it, what was expected and the cure.
+        ValueError: If an argument is invalid; the message names it.
     """
     if config is not None and preset is not None:
-        raise argument_error("preset", "None beside a config", preset, "Give one of the two.")
+        raise argument_error("preset", "None together with a config", preset, "Give one of the two.")
     if isinstance(config, (str, Path)):
         config = EnvConfig.from_toml(config)
     elif config is None:
@@ -107,20 +107,20 @@ def parallel_env(
     return ExplorationEnv(config, world=world, reward=reward, render_mode=render_mode)
 
 
-@wraps(parallel_env, assigned=())  # the signature alone
+@wraps(parallel_env, assigned=())  # only the signature
 def raw_env(*args: Any, **kwargs: Any) -> AECEnv[str, Any, Any]:
-    """Make the turn-based (AEC) environment, unwrapped; arguments as of `parallel_env`."""
+    """Make the turn-based (AEC) environment, unwrapped; see `parallel_env` for the arguments."""
     return parallel_to_aec(parallel_env(*args, **kwargs))
 
 
 @wraps(parallel_env, assigned=())
 def env(*args: Any, **kwargs: Any) -> AECEnv[str, Any, Any]:
-    """Make the turn-based (AEC) environment with PettingZoo's checks of the order of calls."""
+    """Make the turn-based (AEC) environment with PettingZoo's check of the call order."""
     return OrderEnforcingWrapper(raw_env(*args, **kwargs))
 
 
 def _world_name(world: WorldSource) -> str:
-    """Return what the configuration calls a world."""
+    """Return the name of a world in the configuration."""
     if isinstance(world, (str, Path)):
         return str(world)
     if isinstance(world, World):

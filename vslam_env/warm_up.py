@@ -1,4 +1,4 @@
-"""All kernels that environments share are compiled, or loaded from the cache, before an episode waits for them."""
+"""Compilation of the kernels of an environment before its first episode."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from vslam_env.sensors import LandmarkSensorConfig
 from vslam_env.world import World
 
 WALLS = np.array([[0.0, 0.0, 9.0, 0.0], [9.0, 0.0, 9.0, 9.0], [9.0, 9.0, 0.0, 9.0], [0.0, 9.0, 0.0, 0.0]])
-STARTS = np.array([[3.0, 4.0, 0.0], [3.0, 5.0, 0.1]])  # side by side, looking at the same wall
+STARTS = np.array([[3.0, 4.0, 0.0], [3.0, 5.0, 0.1]])  # side by side, facing the same wall
 STEPS = 3
 
 
@@ -25,13 +25,14 @@ def warm_up(
     """Compile the kernels that an environment needs, or load them from the cache; see `slam_backend.warm_up`.
 
     Args:
-        config: Of the environment; None: the default one.
-        everything: Compile also what this configuration does not need. Else it is compiled when it is first called.
-        workers: Processes that compile; None: one for each core.
-        progress: Called with the number of kernels compiled, how many there are, and the seconds left [s], estimated.
+        config: Configuration of the environment; None: the default one.
+        everything: Whether to compile also the kernels that this configuration does not need. Otherwise these are
+            compiled at their first call.
+        workers: Number of processes that compile; None: one per core.
+        progress: Callback that receives the number of compiled kernels, their total and the estimated time left [s].
 
     Returns:
-        Seconds spent compiling; 0 if all kernels came from the cache.
+        Time spent compiling [s]; 0 if all kernels came from the cache.
     """
     chosen = EnvConfig() if config is None else config
     extras = set(EXTRAS) if everything else extras_of(chosen.belief.filter)
@@ -41,10 +42,10 @@ def warm_up(
     seconds = compile_kernels(signatures, workers, progress)
     with watch_compilation(lambda name: None) as watch:
         run_all_paths(extras)
-        eyes = LandmarkSensorConfig(false_points=2.0)
-        config = EnvConfig(num_robots=2, action_type="goal", oracle_merge=True, landmark_sensor=eyes)
+        sensor = LandmarkSensorConfig(false_points=2.0)
+        config = EnvConfig(num_robots=2, action_type="goal", oracle_merge=True, landmark_sensor=sensor)
         env = ExplorationEnv(config, World("room", WALLS))
-        env.reset(seed=0)  # starts are drawn, where they are given afterwards
+        env.reset(seed=0)  # drawn starts; given ones in the next line
         env.reset(seed=0, options={"start_poses": STARTS})
         for _ in range(STEPS):
             valid = {agent: env.belief(agent).candidates.valid for agent in env.agents}

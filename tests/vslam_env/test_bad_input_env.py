@@ -120,7 +120,7 @@ PARTS = {
     "front_end.nearest": {"stereo": {"front_end": {"nearest": 0.01}}},
     "robots: expected a known field": {"robots": 2},
     "belief.filter.particles: expected a known field": {"belief": {"filter": {"particles": 5}}},
-    "config: expected values that JSON can hold": {"num_robots": 10**5000},
+    "config: expected values that JSON can represent": {"num_robots": 10**5000},
 }
 
 
@@ -136,7 +136,7 @@ def test_noise_under_which_filters_can_use_no_point_is_refused(sensor: str) -> N
     for camera in ({"sigma_px": 1e-9}, {"sigma_disparity_px": 70.0}, {"baseline": 1e-6}, {"sigma_disparity_px": 1e5}):
         refused(
             partial(preset_config("standard", sensor).replace, belief={"filter": {"camera": camera}}),  # type: ignore[arg-type]
-            "belief.filter.camera: expected noise under which points",
+            "belief.filter.camera: expected noise that allows the use of points",
         )
 
 
@@ -225,8 +225,8 @@ CALLS: dict[str, list[Callable[[], Any]]] = {
     "world: expected a path, got": [partial(load_floorplan, None), partial(load_walls_json, 3)],
     "metres_per_pixel: expected a finite number > 0": [partial(load_floorplan, "plan.png", metres_per_pixel=-1)],
     "path: expected": [partial(save_walls_json, CLOSET, to) for to in (None, Path("nowhere") / "copy.json")],
-    "world: expected walls that enclose a space in which a disc": [begin(world=BOX), begin(world=NARROW)],
-    "num_robots: expected as many as can start 5 m apart": [begin(world=CLOSET, num_robots=8)],
+    "world: expected walls that enclose free space for a disc": [begin(world=BOX), begin(world=NARROW)],
+    "num_robots: expected at most as many as fit 5 m apart": [begin(world=CLOSET, num_robots=8)],
     "world: expected landmarks that robots can see": [
         begin(world=marked(places)) for places in (np.zeros((0, 3)), np.array([[500.0, 0.0, 0.0]]))
     ],
@@ -332,7 +332,7 @@ FILES: dict[str, list[tuple[str, bytes]]] = {
         ("plan.json", b'{"walls": ' + walls + b"}")
         for walls in (b'"all"', b'[["0", 0, 9, 0]]', b"[[0, 0, 1" + b"0" * 400 + b", 0]]", b"[[-1e308, 0, 1e308, 0]]")
     ],
-    "world: expected walls that enclose a space": [("plan.json", b'{"walls": [[0, 0, 5, 0]]}')],
+    "world: expected walls that enclose free space": [("plan.json", b'{"walls": [[0, 0, 5, 0]]}')],
     "world: expected": [("plan.json", text) for text in (b"[1, 2]", b'{"wals": []}')],
     "world: expected no other keys in": [("plan.json", b'{"walls": [[0, 0, 5, 0]], "start_pose": [[1, 1, 0]]}')],
     "world: expected a folder with floor plans": [("nested/plan.txt", b"no plan")],
@@ -441,7 +441,7 @@ def test_refused_commands_move_nothing() -> None:
 READINGS: list[tuple[str, Any]] = [
     ("odometry", np.zeros(2)), ("odometry", "ahead"), ("odometry", [0.0, NAN, 0.0]), ("measurements", None),
     ("scan", "far"), ("scan", np.ones(31)), ("bump", np.zeros(2, np.bool_)), ("pose", np.zeros(2)),
-    ("heard", np.ones(3, np.bool_)), ("heard", None),
+    ("contacts", np.ones(3, np.bool_)), ("contacts", None),
 ]  # fmt: skip
 
 
@@ -466,8 +466,8 @@ def test_refused_readings_leave_beliefs_as_they_are() -> None:
         for begins, other in (
             ("readings.scans: expected an array of shape (2, 32)", now._replace(scans=now.scans[:, 1:])),
             ("readings.bumps: expected an array of shape (2,)", now._replace(bumps=now.bumps[:1])),
-            ("readings[0].heard: expected an array of shape (1,)", [first]),
-            ("readings: expected those of each robot", []),
+            ("readings[0].contacts: expected an array of shape (1,)", [first]),
+            ("readings: expected at least one", []),
         ):
             refused(partial(refusing.step, other), begins)
         whole.step(now), refusing.step(now)

@@ -121,7 +121,7 @@ def test_damaged_states_are_refused_or_harmless(kind: str, seeds: range) -> None
         (["ledger", "books"], 10**9, r"\['ledger'\]\['books'\]: expected integers from -3 to"),
         (["coverage", "found"], -3, r"\['coverage'\]\['found'\]: expected integers from 0 to"),
         (["simulator", "poses"], 1e300, r"\['simulator'\]\['poses'\]: expected numbers from"),
-        (["simulator", "poses"], 1e5, r"\['simulator'\]\['poses'\]: expected places in the world"),
+        (["simulator", "poses"], 1e5, r"\['simulator'\]\['poses'\]: expected positions inside the world"),
         (["belief", "slots", 0, "rows"], 1e9, r"\['slots'\]\[0\]\['rows'\]: expected"),
     ],
 )

@@ -252,8 +252,8 @@ def _marked(content: bytes, body: bytes) -> bytes:
 @pytest.mark.parametrize(
     ("spoil", "says"),
     [
-        (lambda content: content[: len(content) // 2], "path: expected a whole file of a state, got a damaged file"),
-        (lambda content: b"hello" + content, "path: expected the file of a state"),
+        (lambda content: content[: len(content) // 2], "path: expected an intact state file, got a damaged file"),
+        (lambda content: b"hello" + content, "path: expected a state file"),
         (
             lambda content: content.replace(f"state {STATE_FORMAT}/".encode(), b"state 999/", 1),
             r"expected a state of version .*got '999/",
@@ -261,9 +261,9 @@ def _marked(content: bytes, body: bytes) -> bytes:
         (lambda content: content[:-9] + bytes([content[-9] ^ 1]) + content[-8:], "a damaged file"),
         (lambda content: content + b".", "a damaged file"),
         (lambda content: content[: content.index(b"\n") + 1] + pickle.dumps(3), "a damaged file"),
-        (lambda content: _marked(content, pickle.dumps(3)), "expected the file of a state that can be read here"),
+        (lambda content: _marked(content, pickle.dumps(3)), "expected a readable state file"),
         (lambda content: _marked(content, encode(3, ENV_KINDS)), "expected what get_state returned, got a int"),
-        (None, "path: expected the file of a state, .*no such file|No such file"),
+        (None, "path: expected a state file, .*no such file|No such file"),
     ],
 )
 def test_bad_files_are_refused(spoil: Callable[[bytes], bytes] | None, says: str, tmp_path: Path) -> None:
@@ -284,7 +284,7 @@ def test_a_pickle_in_the_place_of_a_state_is_not_run(number: int, tmp_path: Path
     save_state(_begun(steps=1).get_state(), path)
     content = _marked(path.read_bytes(), body)
     path.write_bytes(content.replace(f"state {STATE_FORMAT}/".encode(), f"state {number}/".encode(), 1))
-    with pytest.raises(ValueError, match="can be read here" if number == STATE_FORMAT else f"got '{number}/"):
+    with pytest.raises(ValueError, match="readable state file" if number == STATE_FORMAT else f"got '{number}/"):
         load_state(path)
     assert not proof.exists()
     pickle.loads(body)
@@ -304,7 +304,7 @@ def test_objects_of_the_caller_are_asked_for(tmp_path: Path) -> None:
     env.reset(seed=1)
     save_state(env.get_state(), tmp_path / "state")
     state = load_state(tmp_path / "state")
-    with pytest.raises(ValueError, match=r"No state holds objects of your own: make .* the same world, reward 'found'"):
+    with pytest.raises(ValueError, match=r"States do not contain your own objects: .* the same world, reward 'found'"):
         small_env().set_state(state)
     with pytest.raises(ValueError, match=r"expected one made with no objects, got 'world \(World\), reward 'found' \("):
         check_state(state, env.config, {})
@@ -331,7 +331,7 @@ def test_files_are_whole_or_not_there(tmp_path: Path) -> None:
     state = _begun(steps=1).get_state()
     save_state(state, path)
     before = path.read_bytes()
-    says = r"state: expected numbers, arrays and configurations .* 'cycle'. Objects of your own are not stored: make"
+    says = r"state: expected numbers, arrays and configurations .* 'cycle'. Your own objects are not stored: make"
     with pytest.raises(ValueError, match=says):
         save_state(state | {"cycle": lambda: None}, path)
     assert path.read_bytes() == before
@@ -360,7 +360,7 @@ def test_files_are_those_that_open_makes(tmp_path: Path) -> None:
         os.umask(former)
     assert stat.S_IMODE((tmp_path / "state").stat().st_mode) == 0o640
     for other in (pipe, tmp_path, "."):
-        with pytest.raises(ValueError, match=r"path: expected a file that can be written, got .*something else"):
+        with pytest.raises(ValueError, match=r"path: expected a file that can be written, got .*is not a file"):
             save_state(state, other)
     assert sorted(file.name for file in tmp_path.iterdir()) == ["pipe", "state"]
     assert stat.S_ISFIFO(pipe.stat().st_mode)

@@ -1,1 +1,1 @@
-"""What robots believe: readings, the team's filters and grids, beliefs and observations. It knows no simulator."""
+"""Beliefs of the robots, independent of the simulator: readings, filters, occupancy grids and observations."""

@@ -1,4 +1,4 @@
-"""`Belief`: what one robot believes after a tick, and `BeliefConfig`: what it assumes."""
+"""Belief of one robot after a tick, and the configuration of beliefs."""
 
 import math
 from dataclasses import dataclass, field, fields
@@ -22,12 +22,12 @@ from vslam_env.navigation import SeenGrid
 
 
 def default_filter_options() -> FilterOptions:
-    """Return the default filter: it assumes twice the camera noise of the default camera, and is rejuvenated in slices.
+    """Return the default filter options: twice the noise of the default camera, rejuvenation in slices.
 
-    Particle filters are over-confident. In the recorded readings of four office episodes of 220 s (seeds 100-103,
-    three robots) the team's map error at the end was 0.41, 0.22, 0.42, 0.38 m with 1.5 times the true noise, 0.35,
-    0.22, 0.39, 0.32 m with twice, and 0.54, 0.22, 0.43, 0.34 m with three times. That was without rejuvenation; what
-    that does, and what it costs, is in docs/explanation/smoothing.md.
+    Particle filters are over-confident. On recorded readings of four office episodes of 220 s (seeds 100-103, three
+    robots, no rejuvenation) the final team map error was 0.41, 0.22, 0.42, 0.38 m with 1.5 times the true noise, 0.35,
+    0.22, 0.39, 0.32 m with twice, and 0.54, 0.22, 0.43, 0.34 m with three times the true noise. For the effect and the
+    cost of rejuvenation see docs/explanation/smoothing.md.
     """
     true = StereoCamera()
     return FilterOptions(
@@ -39,16 +39,15 @@ def default_filter_options() -> FilterOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BeliefConfig:
-    """What the robots assume about their sensors, and how they align their maps.
+    """Configuration of beliefs: assumed noise, filters, map alignment and merging.
 
     Attributes:
-        filter: Options of each robot's FastSLAM, whose camera and motion hold the assumed noise; by default those of
-            `default_filter_options`.
-        alignment: When two maps are believed to fit together.
-        attempts: When a pair of groups tries.
-        merging: How their filters are merged, and when a merge is undone. By default robots merge on trial where they
-            are not sure (`MergeOptions.min_sigmas_on_trial`): they are scored in the frames of their own starts.
-        confirm_after: Landmarks measured fewer times than this are not yet part of a robot's map: what is seen but
+        filter: Options of each FastSLAM filter; its camera and motion model hold the assumed noise.
+        alignment: Criteria for accepting an alignment of two maps.
+        attempts: Schedule of the merge attempts.
+        merging: Options of merges and their rollback. By default uncertain alignments lead to a trial merge
+            (`MergeOptions.min_sigmas_on_trial`), since maps are scored in the robots' own start frames.
+        confirm_after: Number of measurements after which a landmark belongs to a robot's map; a landmark measured only
             once may be a false point.
     """
 
@@ -64,12 +63,12 @@ class BeliefConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RobotHardware:
-    """What each robot knows of its own hardware.
+    """Hardware parameters known to each robot.
 
     Attributes:
-        radius: Of its disc [m].
+        radius: Radius of the robot's disc [m].
         ray_angles: (R,) float64 [rad], robot frame, ascending. Directions of the range finder's rays.
-        scan_range: A ray that meets nothing reads this [m].
+        scan_range: Range that a ray without a hit reads [m].
     """
 
     radius: float
@@ -79,12 +78,12 @@ class RobotHardware:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Teammate:
-    """Another robot of the same group, in the own start frame.
+    """Estimate of another robot of the same group, in the start frame of the believing robot.
 
     Attributes:
-        robot: Its index.
-        pose: (3,) float64 [m, m, rad].
-        covariance: (3, 3) float64 [m, m, rad].
+        robot: Index of the teammate.
+        pose: (3,) float64 [m, m, rad]. Pose estimate.
+        covariance: (3, 3) float64 [m, m, rad]. Covariance of the pose.
     """
 
     robot: int
@@ -96,20 +95,20 @@ class Teammate:
 
     @property
     def position_sigma(self) -> float:
-        """One sigma of its position [m], averaged over directions."""
+        """One sigma of the position [m], averaged over directions."""
         return position_sigma(self.covariance)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidates:
-    """Sixteen places to explore, in stable slots; see `CandidateSlots`.
+    """Sixteen slots with candidate places to explore; see `CandidateSlots`.
 
     Attributes:
-        goals: (16, 2) float64 [m], start frame; NaN in empty slots.
-        headings: (16,) float64 [rad], start frame; NaN in empty slots.
-        lengths: (16,) float64 [m]. Of the path to each at the last update.
-        valid: (16,) bool.
-        features: (16, 5) float32 [m], robot frame; see `CandidateSlots.features`.
+        goals: (16, 2) float64 [m], start frame. Goal positions; NaN in empty slots.
+        headings: (16,) float64 [rad], start frame. Headings at the goals; NaN in empty slots.
+        lengths: (16,) float64 [m]. Lengths of the paths to the goals at the last update.
+        valid: (16,) bool. True where a slot holds a candidate.
+        features: (16, 5) float32 [m], robot frame. Features, see `CandidateSlots.features`.
     """
 
     goals: FloatArray
@@ -124,25 +123,25 @@ class Candidates:
 
 @dataclass(frozen=True, eq=False)
 class Belief:
-    """What one robot believes after a tick; everything is in its own start frame, and nothing of it is the truth.
+    """Belief of one robot after a tick, in its own start frame and without ground truth.
 
-    Its arrays, those of its candidates and teammates included, are read-only copies.
+    All arrays, including those of candidates and teammates, are read-only copies.
 
     Attributes:
-        robot: Its index.
+        robot: Index of the robot.
         tick: Ticks since the reset.
         frame: Identity of the group's map frame: the index of the group's first robot.
-        group: The robots that share the map, itself included, as far as it has been told.
-        pose: (3,) float64 [m, m, rad].
-        covariance: (3, 3) float64 [m, m, rad].
+        group: Robots known to share the map, itself included.
+        pose: (3,) float64 [m, m, rad]. Pose estimate.
+        covariance: (3, 3) float64 [m, m, rad]. Covariance of the pose.
         particles: (M, 3) float64 [m, m, rad]. The robot's pose in each particle.
-        log_weights: (M,) float64, normalised.
-        ess: Effective sample size, as a share of M.
-        grid: The seen grid, read-only. It follows the robot: `copy()` it to keep it.
-        candidates: Places to explore.
-        teammates: The other robots of the group; those out of contact where they were when it was lost.
-        start_from_group: (3,) float64 [m, m, rad]. Moves the group's map frame to the own start frame.
-        group_map: The confirmed landmarks in the group's frame; `map` has it in the own start frame.
+        log_weights: (M,) float64. Normalised logarithmic weights of the particles.
+        ess: Effective sample size as a share of M.
+        grid: Read-only view of the occupancy grid, updated in later ticks; use `copy()` to keep its content.
+        candidates: Candidate places to explore.
+        teammates: Other robots of the group; for those out of contact, the last estimate before contact was lost.
+        start_from_group: (3,) float64 [m, m, rad]. Motion from the group's map frame to the own start frame.
+        group_map: Confirmed landmarks in the group's map frame; see `map` for the own start frame.
     """
 
     robot: int
@@ -165,19 +164,19 @@ class Belief:
 
     @cached_property
     def map(self) -> LandmarkMap:
-        """The confirmed landmarks of the group's most probable particle."""
+        """Confirmed landmarks of the best particle, in the own start frame."""
         return self.group_map.moved(self.start_from_group)
 
 
 class BeliefBatch(NamedTuple):
-    """The part of some robots' beliefs that observations show, gathered without copies: read it before the next step.
+    """Observable part of n robots' beliefs, without copies: valid until the next step.
 
     Attributes:
-        robots: (n,) int64. Their indices.
-        points: Where they stand: their rows, and columns for all robots of the team up to the last one known.
-        map_summaries: Of the confirmed landmarks in the map frames.
-        cells: (n, 300, 300) uint8. Of the seen grids.
-        features: (n, 16, 5) float32 [m], robot frames. Of the candidates; the reader's own.
+        robots: (n,) int64. Indices of the robots.
+        points: Poses, with one row per robot and columns for the team up to the last known robot.
+        map_summaries: Summaries of the confirmed landmarks in the map frames.
+        cells: (n, 300, 300) uint8. Cells of the occupancy grids.
+        features: (n, 16, 5) float32 [m], robot frames. Features of the candidates; a new array.
     """
 
     robots: IntArray
@@ -188,7 +187,7 @@ class BeliefBatch(NamedTuple):
 
     @classmethod
     def of(cls, belief: Belief) -> "BeliefBatch":
-        """Return what an observation shows of one belief."""
+        """Return the batch of a single belief."""
         known = {mate.robot: (mate.pose, mate.position_sigma) for mate in belief.teammates}
         known[belief.robot] = belief.pose, position_sigma(belief.covariance)
         points = TeamPoses(1, max(known) + 1)
@@ -208,12 +207,12 @@ class BeliefBatch(NamedTuple):
 
 
 def position_sigma(covariance: FloatArray) -> float:
-    """Return one sigma of the position [m], averaged over directions, of a pose's covariance (3, 3) [m, m, rad]."""
+    """Return one sigma of the position [m], averaged over directions, for the covariance (3, 3) of a pose."""
     return math.sqrt(0.5 * (covariance[0, 0] + covariance[1, 1]))
 
 
 def _freeze_arrays(record: Any) -> None:
-    """Replace the arrays of a frozen record by read-only copies: what a policy holds is not what the filters use."""
+    """Replace the arrays of a frozen record by read-only copies, which policies cannot share with the filters."""
     for item in fields(record):
         value = getattr(record, item.name)
         if isinstance(value, np.ndarray):

@@ -1,19 +1,19 @@
-"""Belief and scan become the arrays that PettingZoo hands to an agent: pure functions, and their spaces.
+"""Observations of agents, computed from belief and scan, and their spaces.
 
-| key | shape | content, own estimated frames only | bounds |
+| key | shape | content, in estimated frames | bounds |
 |---|---|---|---|
 | `pose` | (3,) | x, y [m], theta [rad], start frame | +-30, pi |
 | `pose_std` | (3,) | one sigma of each [m, m, rad] | 30, pi |
 | `map_stats` | (6,) | landmarks; mean and largest one sigma [m]; mean count; ESS / M; group size | `MAP_STATS_LIMIT` |
-| `local_grid` | (3, 48, 48) uint8 | free, occupied, landmarks; cells of 0.2 m, ahead is up | 0, 255 |
+| `local_grid` | (3, 48, 48) uint8 | free, occupied, landmarks; cells of 0.2 m, robot heading up | 0, 255 |
 | `scan` | (R,) | ranges from right to left [m] | range of the scan |
 | `candidates` | (16, 5) | see `CandidateSlots.features` [m] | +-90 |
 | `teammates` | (7, 5) | x, y [m], cos and sin of the heading, robot frame; one sigma of the position [m] | +-90 |
 | `teammates_mask` | (7,) int8 | which rows hold a robot of the same group | 0, 1 |
 | `action_mask` | (17,) int8 | `goal` actions only: which actions are valid | 0, 1 |
 
-Rows of `teammates` belong to the other robots by rising index, whatever the group; rows without a member are zeros. The
-one sigma of a landmark is the root of its mean variance. Values beyond the bounds are clipped.
+Rows of `teammates` belong to the other robots in ascending order, whatever their group; rows of robots outside the
+group are zero. One sigma of a landmark is the root of its mean variance. Values are clipped to the bounds.
 """
 
 from typing import Any
@@ -42,29 +42,29 @@ Observation = dict[str, NDArray[Any]]
 
 
 def observe(belief: Belief, scan: FloatArray, goal_actions: bool) -> Observation:
-    """Return a robot's observation.
+    """Return the observation of one robot.
 
     Args:
         belief: Belief of the robot.
-        scan: (R,) float64 [m]. Its last scan.
-        goal_actions: Whether actions are candidates, and are masked.
+        scan: (R,) float64 [m]. Last scan of the robot.
+        goal_actions: Whether actions choose candidates and are masked.
 
     Returns:
-        Fresh arrays by name, as the table of this module says.
+        New arrays by name, see the table of this module.
     """
     return observe_team(BeliefBatch.of(belief), scan[None], goal_actions)[0]
 
 
 def observe_team(view: BeliefBatch, scans: FloatArray, goal_actions: bool) -> list[Observation]:
-    """Return the observations of some robots.
+    """Return the observations of n robots.
 
     Args:
-        view: What they show of the robots' beliefs.
-        scans: (n, R) float64 [m]. The robots' last scans.
-        goal_actions: Whether actions are candidates, and are masked.
+        view: Observable part of the robots' beliefs.
+        scans: (n, R) float64 [m]. Last scans of the robots.
+        goal_actions: Whether actions choose candidates and are masked.
 
     Returns:
-        Per robot what `observe` returns, in memory that nothing else uses.
+        New arrays by name for each robot, see `observe`.
     """
     count, candidates = len(view.robots), view.features
     poses, deviations = np.empty((count, 3), np.float32), np.empty((count, 3), np.float32)
@@ -75,7 +75,7 @@ def observe_team(view: BeliefBatch, scans: FloatArray, goal_actions: bool) -> li
     arrays = poses, deviations, stats, pictures, ranges, candidates, teammates, present
     write_observations(view.robots, points.poses, points.beliefs, places, names, parts, view.cells, scans, arrays)
     observations: list[Observation] = []
-    for i in range(count):  # by index: an array that is looped through ends with an error, and that costs microseconds
+    for i in range(count):  # by index: iterating over arrays costs microseconds
         observation: Observation = {
             "pose": poses[i],
             "pose_std": deviations[i],
@@ -93,14 +93,14 @@ def observe_team(view: BeliefBatch, scans: FloatArray, goal_actions: bool) -> li
 
 
 def action_mask(candidates: NDArray[np.float32]) -> NDArray[np.int8]:
-    """Return which `goal` actions are valid (17,) int8: staying always is, the others where there is a candidate."""
+    """Return which `goal` actions are valid (17,) int8: staying, and the slots with a candidate."""
     mask = np.ones(NUM_ACTIONS, np.int8)
     mask[1:] = candidates[:, FRONTIER_SIZE] > 0.0
     return mask
 
 
 def flatten(observation: Observation) -> NDArray[np.float32]:
-    """Return everything but the action mask as one float32 vector, in the order of the table; the grid as 0 and 1."""
+    """Return an observation without its action mask as one float32 vector in table order, the grid as 0 and 1."""
     parts = [
         (value / np.float32(GRID_ON) if name == "local_grid" else value).ravel()
         for name, value in observation.items()
@@ -110,16 +110,16 @@ def flatten(observation: Observation) -> NDArray[np.float32]:
 
 
 def observation_space(num_rays: int, scan_range: float, goal_actions: bool, flat: bool) -> spaces.Space[Any]:
-    """Return the space of the observations.
+    """Return the observation space of one agent.
 
     Args:
-        num_rays: R.
+        num_rays: Number of rays R of a scan.
         scan_range: Range of the scan [m].
         goal_actions: Whether actions are masked.
-        flat: One vector instead of named arrays. With masked actions it comes as `{"observation", "action_mask"}`.
+        flat: Whether observations are one vector, or with masked actions `{"observation", "action_mask"}`.
 
     Returns:
-        A `Dict`, or a `Box` if flat and without a mask.
+        `Dict` space, or a `Box` if flat and without a mask.
     """
     named: dict[str, spaces.Space[Any]] = {
         "pose": _box(-POSE_LIMIT, POSE_LIMIT),

@@ -1,4 +1,4 @@
-"""`Readings`: all that robots perceive in one tick, and so all that their beliefs and observations can depend on."""
+"""Readings of the robots in one tick: the only inputs of beliefs and observations."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -11,17 +11,17 @@ from slam_backend.models.measurements import Measurements, TeamMeasurements
 
 
 class Readings(NamedTuple):
-    """What one robot's own sensors say in one tick.
+    """Readings of one robot's sensors and radio in one tick.
 
     Attributes:
-        odometry: (3,) float64 [m, m, rad], previous robot frame: motion since the last tick; None at a reset.
-        measurements: Landmarks that the camera measured.
+        odometry: (3,) float64 [m, m, rad], previous robot frame. Motion since the last tick; None at a reset.
+        measurements: Measured landmarks.
         scan: (R,) float64 [m]. Ranges along the rays of the range finder.
-        bump: Whether something kept the robot from going where it was commanded.
+        bump: Whether an obstacle blocked the commanded motion.
         pose: (3,) float64 [m, m, rad], own start frame. The true pose if `oracle_pose` is on, else None.
-        identities: (n,) int64. The true landmark behind each measurement, -1 for a false point, if
+        identities: (n,) int64. The true landmark of each measurement, -1 for a false point, if
             `oracle_association` is on, else None.
-        contacts: (K,) bool. Which robots its radio hears, itself included; None: all, always.
+        contacts: (K,) bool. Robots in contact, itself included; None: always all.
         image: (H, W) uint8. The left image, if `observe_images` is on, else None.
     """
 
@@ -36,19 +36,19 @@ class Readings(NamedTuple):
 
 
 class TeamReadings(NamedTuple):
-    """The `Readings` of all K robots in one tick, in one piece each.
+    """`Readings` of all K robots in one tick, stacked by kind.
 
-    Who takes them in may keep them: nobody is to write to them afterwards.
+    Receivers may keep the arrays, so they must not be written to afterwards.
 
     Attributes:
         odometry: (K, 3) float64 [m, m, rad], or None at a reset.
-        measurements: Per robot, or in one piece.
+        measurements: Measurements of each robot, or of the team in one record.
         scans: (K, R) float64 [m].
         bumps: (K,) bool.
         poses: (K, 3) float64 [m, m, rad], or None.
-        identities: Per robot, or None.
+        identities: True landmarks of each robot's measurements, or None.
         contacts: (K, K) bool, or None.
-        images: Per robot, or None.
+        images: Left image of each robot, or None.
     """
 
     odometry: FloatArray | None
@@ -61,7 +61,7 @@ class TeamReadings(NamedTuple):
     images: Sequence[NDArray[np.uint8]] | None = None
 
     def per_robot(self) -> tuple[Readings, ...]:
-        """Return what each robot reads; arrays that can be written are copies."""
+        """Return the readings of each robot; writable arrays are copied."""
         frames = self.measurements
         nothing = [None] * len(self.bumps)
         return tuple(
@@ -80,21 +80,20 @@ class TeamReadings(NamedTuple):
 
     @classmethod
     def stack(cls, readings: Sequence[Readings]) -> "TeamReadings":
-        """Return the readings of all K robots as those of a team.
+        """Stack the readings of all K robots.
 
         Raises:
-            ValueError: If some robots have a kind of reading that others have not, or scans of another length, or a
-                reading is no array of its shape.
+            ValueError: If robots differ in the kinds of readings or the number of rays, or an array has a wrong shape.
         """
         if not readings:
-            raise argument_error("readings", "those of each robot", readings, "Give one for each robot.")
+            raise argument_error("readings", "at least one", readings, "Give the readings of each robot.")
         columns = list(zip(*readings, strict=True))
         for name, column in zip(Readings._fields, columns, strict=True):
             missing = [reading is None for reading in column]
             if any(missing) and not all(missing):
-                cure = "Give this reading of all robots or of none."
-                raise argument_error(f"readings[{missing.index(True)}].{name}", "an array", None, cure)
-        odometry, measurements, scans, bumps, poses, identities, heard, images = columns
+                hint = "Give this reading for all robots or for none."
+                raise argument_error(f"readings[{missing.index(True)}].{name}", "an array", None, hint)
+        odometry, measurements, scans, bumps, poses, identities, contacts, images = columns
         each = (len(readings),)
         return cls(
             odometry=None if odometry[0] is None else _stacked("odometry", odometry, (3,)),
@@ -103,7 +102,7 @@ class TeamReadings(NamedTuple):
             bumps=_stacked("bump", bumps, (), np.bool_),
             poses=None if poses[0] is None else _stacked("pose", poses, (3,)),
             identities=None if identities[0] is None else identities,
-            contacts=None if heard[0] is None else _stacked("heard", heard, each, dtype=None, finite=False),
+            contacts=None if contacts[0] is None else _stacked("contacts", contacts, each, dtype=None, finite=False),
             images=None if images[0] is None else images,
         )
 
@@ -111,13 +110,13 @@ class TeamReadings(NamedTuple):
 def _stacked(
     name: str, column: Sequence[Any], shape: tuple[int, ...], dtype: Any = np.float64, finite: bool = True
 ) -> NDArray[Any]:
-    """Return one kind of reading of all K robots as one array (K, ...), or raise by name of the robot's that is wrong.
+    """Stack one kind of reading of all K robots into a new array (K, ...), or raise with the index of the robot.
 
-    A fresh array; `dtype`, None for any, and `finite` as `check_array` takes them.
+    See `check_array` for `dtype` and `finite`.
     """
-    cure = "Give what env.readings holds of each robot."
+    hint = "Give the readings as returned by env.readings."
     checked = [
-        check_array(f"readings[{robot}].{name}", value, shape, cure, dtype=dtype, finite=finite)
+        check_array(f"readings[{robot}].{name}", value, shape, hint, dtype=dtype, finite=finite)
         for robot, value in enumerate(column)
     ]
     return np.array(checked)

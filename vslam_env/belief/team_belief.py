@@ -1,4 +1,4 @@
-"""`TeamBelief` owns the team's filters and the seen grids, and hands out what each robot believes."""
+"""Beliefs of a team: its filters, occupancy grids and candidates."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
@@ -30,22 +30,22 @@ CANDIDATE_TICKS = 10  # once a second
 
 
 class TeamBelief:
-    """The filters and grids of a team, moved on by readings alone.
+    """Filters and occupancy grids of a team, updated by readings alone.
 
     Args:
-        config: What is assumed.
-        num_robots: K.
-        seed: Of all random streams; the same seed gives the same beliefs from the same readings.
-        body: The robots' hardware.
-        decision_ticks: Where policies choose among the candidates: these are renewed at every decision. None: every
-            ten ticks, the robots taking turns.
-        attempts: Whether the team tries to align its maps by itself; if not, merges from outside are final.
+        config: Configuration of the beliefs.
+        num_robots: Number of robots K.
+        seed: Seed of all random streams; the same seed and readings give the same beliefs.
+        body: Hardware of the robots.
+        decision_ticks: Ticks between updates of the candidates, for policies that choose among them; None: each robot
+            every ten ticks, in turn.
+        attempts: Whether the team attempts merges itself; if not, merges from outside are final.
 
     Attributes:
-        points: Where the robots stand; written to in the next step.
-        known_groups: Per robot those that share a map with it, as far as it knows, itself included.
-        exchange: Counts the bytes that they send; to be looked at.
-        grids: The robots' seen grids; to be looked at.
+        points: Pose estimates; overwritten in the next step.
+        known_groups: Robots known to share a map with each robot, itself included.
+        exchange: Count of the bytes sent; read-only.
+        grids: Occupancy grids of the robots; read-only.
     """
 
     def __init__(
@@ -58,11 +58,11 @@ class TeamBelief:
         attempts: bool = True,
     ) -> None:
         if isinstance(seed, np.random.SeedSequence):
-            # A sequence remembers how often it spawned: a fresh one makes the result depend on its seed alone.
+            # A new sequence: the number of children spawned before must not matter.
             seed = np.random.SeedSequence(seed.entropy, spawn_key=seed.spawn_key)
         options = {f.name: getattr(config.filter, f.name) for f in fields(FilterOptions)}
-        rhythm, merging = merge_options(config, attempts)
-        self._team = TeamSlam(num_robots, config.alignment, seed, rhythm, merging, **options)
+        schedule, merging = merge_options(config, attempts)
+        self._team = TeamSlam(num_robots, config.alignment, seed, schedule, merging, **options)
         self.exchange = self._team.exchange
         self._grids = SharedGrids(num_robots, body)
         self.grids = self._grids.team
@@ -73,50 +73,50 @@ class TeamBelief:
         self._turns = _candidate_schedule(num_robots, decision_ticks)
         self._tick = -1
         self._confirm_after = config.confirm_after
-        self._beliefs: dict[int, Belief] = {}  # of this tick, made when asked for
-        self._maps: dict[int, LandmarkMap] = {}  # of this tick, by the number of the map
+        self._beliefs: dict[int, Belief] = {}  # beliefs of this tick, made on demand
+        self._maps: dict[int, LandmarkMap] = {}  # maps of this tick by number
         self.points = TeamPoses(num_robots)
-        self._outlines = TeamMapSummaries.allocate(num_robots, 0)  # likewise, when asked for
+        self._outlines = TeamMapSummaries.allocate(num_robots, 0)  # of this tick, filled on demand
         self._has_outlines = False
         self._refresh_poses()
 
     @property
     def num_robots(self) -> int:
-        """K."""
+        """Number of robots K."""
         return self._team.num_robots
 
     @property
     def groups(self) -> tuple[tuple[int, ...], ...]:
-        """The groups, each in ascending order of robots."""
+        """Groups, each in ascending order of robots."""
         return self._lineup.groups
 
     @property
     def events(self) -> tuple[MergeEvent, ...]:
-        """All attempts, merges and undos so far, in order."""
+        """All merge attempts, merges and rollbacks so far, in order."""
         return self._team.events
 
     @property
     def poses(self) -> FloatArray:
-        """(K, 3) float64 [m, m, rad]. Where each robot believes to be, in its own start frame. A copy."""
+        """(K, 3) float64 [m, m, rad]. Copy of the pose estimates, each in the robot's own start frame."""
         return self.points.own.copy()
 
     def step(self, readings: TeamReadings | Sequence[Readings]) -> TeamReport:
-        """Take in one tick's readings of all K robots; the first ones are those of the reset.
+        """Update all beliefs with the readings of one tick, beginning with the reset.
 
         Args:
-            readings: As `env.readings` and recorders give them, or in one piece.
+            readings: Readings of all K robots, stacked or one record per robot.
 
         Raises:
-            ValueError: If a reading is ill-formed, or some robots have a kind of reading that others have not.
+            ValueError: If a reading is malformed, or robots differ in the kinds of readings.
         """
         if not isinstance(readings, TeamReadings):
             readings = TeamReadings.stack(readings)
         if readings.scans.shape != self._scanned:
-            got, cure = f"shape {readings.scans.shape}", "Give a range for each ray of each robot."
-            raise argument_error("readings.scans", f"an array of shape {self._scanned}", got, cure)
+            got, hint = f"shape {readings.scans.shape}", "Give one range per ray and robot."
+            raise argument_error("readings.scans", f"an array of shape {self._scanned}", got, hint)
         if len(readings.bumps) != len(self._robots):
-            got, cure = f"shape {readings.bumps.shape}", "Say of each robot whether it bumped into something."
-            raise argument_error("readings.bumps", f"an array of shape ({len(self._robots)},)", got, cure)
+            got, hint = f"shape {readings.bumps.shape}", "Give one bool per robot."
+            raise argument_error("readings.bumps", f"an array of shape ({len(self._robots)},)", got, hint)
         report = self._team.step(
             [None] * len(self._robots) if readings.odometry is None else readings.odometry,
             readings.measurements,
@@ -134,22 +134,22 @@ class TeamBelief:
 
     def merge(self, robot_a: int, robot_b: int, alignment: Alignment, known: bool = False) -> LandmarkIdMap:
         """Merge the groups of two robots with a given alignment of their filter maps; see `TeamSlam.merge`."""
-        renaming = self._team.merge(robot_a, robot_b, alignment, known)
+        id_map = self._team.merge(robot_a, robot_b, alignment, known)
         self._refresh_poses()
-        self._grids.save_for_undo(self._tick + 1, renaming)
+        self._grids.save_for_undo(self._tick + 1, id_map)
         self._grids.share_on_contact(self._tick + 1, self._lineup.same_filter, self.points.starts)
-        return renaming
+        return id_map
 
     def representative(self, group: tuple[int, ...]) -> int:
-        """Return the first robot of a group that goes by its joint filter, and so can merge it with another."""
+        """Return the first robot of a group that uses the joint filter, which merges need."""
         return self._team.trunk_robots(group[0])[0]
 
     def consistency(self, robot: int) -> Consistency:
-        """Return whether the filter that a robot goes by errs as little as it claims; see `FastSlam.consistency`."""
+        """Return the consistency test of a robot's filter; see `FastSlam.consistency`."""
         return self._team.consistency(robot)
 
     def filter_map(self, robot: int) -> LandmarkMap:
-        """Return the whole map of a robot's group, unconfirmed landmarks included, in the group's map frame."""
+        """Return the whole map of a robot's group, including unconfirmed landmarks, in the group's map frame."""
         return self._team.map(robot)
 
     def group_map(self, robot: int) -> LandmarkMap:
@@ -161,43 +161,43 @@ class TeamBelief:
 
     @property
     def map_summaries(self) -> TeamMapSummaries:
-        """The outlines of the `group_map` of all robots, much faster; to be looked at before the next step."""
+        """Summaries of `group_map` for all robots, computed faster; valid until the next step."""
         if not self._has_outlines:
             self._outlines = self._team.map_summaries(self._confirm_after, self._outlines)
             self._has_outlines = True
         return self._outlines
 
     def cells(self, robot: int) -> NDArray[np.uint8]:
-        """Return the cells (300, 300) uint8 of a robot's seen grid; a read-only view that follows its changes."""
+        """Return the cells (300, 300) uint8 of a robot's occupancy grid; a read-only view, updated in later ticks."""
         return self._grids[robot].cells
 
     def candidate(self, robot: int, slot: int) -> tuple[FloatArray, float] | None:
-        """Return the goal (2,) [m] of a robot's slot and where to look from there [rad]; None if it is empty."""
+        """Return goal (2,) [m] and heading [rad] of the candidate in a robot's slot; None if the slot is empty."""
         return self._slots[robot].candidate(slot)
 
     def belief(self, robot: int) -> Belief:
-        """Return what a robot believes after the last tick."""
+        """Return the belief of a robot after the last tick."""
         if robot not in self._beliefs:
             self._beliefs[robot] = self._make_belief(robot)
         return self._beliefs[robot]
 
     def view(self) -> BeliefBatch:
-        """Return what observations show of all robots' beliefs; it shares memory with the grids."""
+        """Return the observable part of all robots' beliefs, sharing memory with the grids."""
         features = self._candidates.features(self.points.poses)
         return BeliefBatch(self._robots, self.points, self.map_summaries, self.grids.cells, features)
 
     @property
     def buffered_inputs(self) -> Mapping[int, StepInput]:
-        """Readings of the last ticks that some filter may take in later, by step; to be looked at."""
+        """Buffered readings by step that some filter may still need; read-only."""
         return self._team.buffered_inputs
 
     @property
     def grid_updates(self) -> dict[int, GridUpdate]:
-        """What the grids may have to paint again, by `id`; to be looked at."""
+        """Buffered updates of the grids by `id`; read-only."""
         return self._grids.grid_updates
 
     def get_state(self) -> dict[str, Any]:
-        """Return all that decides how the beliefs go on; it shares nothing with them."""
+        """Return the complete state of the beliefs."""
         return {
             "tick": self._tick,
             "team": self._team.get_state(),
@@ -206,16 +206,16 @@ class TeamBelief:
         }
 
     def set_state(self, state: Mapping[str, Any]) -> None:
-        """Go on exactly as the beliefs that gave `state`, which was checked."""
+        """Restore a validated state of `get_state`."""
         self._team.restore_checked(state["team"])
         self._tick = state["tick"]
         self._grids.set_state(state["grids"])
-        for slots, candidates in zip(self._slots, state["slots"], strict=True):
-            slots.set_state(candidates)
+        for slots, slot_state in zip(self._slots, state["slots"], strict=True):
+            slots.set_state(slot_state)
         self._refresh_poses()
 
     def _refresh_poses(self) -> None:
-        """Take note of the groups and poses after a step or a merge, and forget what was derived from those before."""
+        """Update groups and poses after a step or a merge, and clear cached beliefs and maps."""
         self._lineup = self._team.lineup
         self.known_groups = self._lineup.known_robots
         self._team.team_poses(self.points)
@@ -224,15 +224,15 @@ class TeamBelief:
         self._has_outlines = False
 
     def _others(self, robot: int) -> list[int]:
-        """Return the other robots that a robot knows of, ascending."""
+        """Return the other known members of a robot's group, ascending."""
         return [mate for mate in self._lineup.known_robots[robot] if mate != robot]
 
     def _teammate_positions(self, robot: int) -> FloatArray:
-        """Return where a robot believes these to be (n, 2) [m], in its own start frame."""
+        """Return the estimated positions (n, 2) [m] of a robot's teammates in its own start frame."""
         return self.points.poses[robot, self._others(robot), :2]
 
     def _teammates(self, robot: int) -> tuple[Teammate, ...]:
-        """Return the other robots that a robot knows of; one out of contact is where it was when contact was lost."""
+        """Return a robot's teammates; those out of contact with their last known pose."""
         points, team = self.points, self._team
         turn = float(points.starts[robot, 2])
         return tuple(
@@ -241,7 +241,7 @@ class TeamBelief:
         )
 
     def _make_belief(self, robot: int) -> Belief:
-        """Put together what `belief` returns."""
+        """Build the belief of a robot."""
         points, slots, group = self.points, self._slots[robot], self._lineup.known_robots[robot]
         return Belief(
             robot=robot,
@@ -268,14 +268,14 @@ class TeamBelief:
 
 
 def merge_options(config: BeliefConfig, attempts: bool) -> tuple[AttemptOptions, MergeOptions]:
-    """Return when groups try to align their maps, and how they merge; where they do not try, merges are final."""
+    """Return the options of merge attempts and merges; without attempts, merges are final."""
     if attempts:
         return config.attempts, config.merging
     return replace(config.attempts, enabled=False), replace(config.merging, watch_steps=0)
 
 
 def _candidate_schedule(num_robots: int, decision_ticks: int | None) -> Sequence[Sequence[int]]:
-    """Return per tick, after the first one, whose candidates are renewed; then it begins anew."""
+    """Return for each tick of a cycle the robots whose candidates are updated."""
     if decision_ticks is not None:
         return [range(num_robots), *[()] * (decision_ticks - 1)]
     return [

@@ -1,1 +1,1 @@
-"""Beliefs measured against the truth: coverage, map errors, metrics of the team."""
+"""Evaluation of beliefs against ground truth: coverage, map errors and team metrics."""

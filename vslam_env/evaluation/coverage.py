@@ -1,4 +1,4 @@
-"""How much of the reachable floor the robots have seen, by their own grids, and which of them found it."""
+"""Coverage of the free floor by the robots' occupancy grids, and each robot's share in its discovery."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -14,14 +14,14 @@ from vslam_env.navigation import FREE, GRID_SIZE, TeamGrids, cell_of
 
 
 class Tally(NamedTuple):
-    """What is counted of N floor cells, of which m entries lie in the grids of K robots.
+    """Observation counts of N floor cells, with m entries in the grids of K robots.
 
     Attributes:
-        seen: (m,) int8. Whether a robot sees the cell of each entry.
+        seen: (m,) int8. 1 for entries whose floor cell the robot has seen.
         seers: (N,) int64. Number of robots that see each cell.
-        ever: (N,) int64. 1 for cells that have been found.
-        fresh: (1 + N,) int32. Number of cells that may have been found since, then which; -1: any may have been.
-        found: (K,) int64. Number of cells that each robot has found.
+        ever: (N,) int64. 1 for cells that have been discovered.
+        fresh: (1 + N,) int32. Number and indices of cells that may be newly discovered; -1: any cells.
+        found: (K,) int64. Number of cells discovered by each robot.
     """
 
     seen: NDArray[np.int8]
@@ -34,18 +34,18 @@ class Tally(NamedTuple):
 @device
 @in_place
 def _recount(changes: Any, cells: Any, laid: Any, first: int, last: int, tally: Tally) -> int:
-    """Bring up to date which entries, from the first to before the last, one robot sees.
+    """Update the floor cells seen by one robot.
 
     Args:
-        changes: (1 + n,) int32. Changes of its grid, see `TeamGrids`.
-        cells: (300, 300) uint8. Cells of its grid.
-        laid: (2, m) int32. See `CoverageCells`.
-        first: First entry of the robot.
+        changes: (1 + n,) int32. Changes of the robot's grid, see `TeamGrids`.
+        cells: (300, 300) uint8. Cells of the robot's grid.
+        laid: (2, m) int32. Floor cells in the grids, see `CoverageCells`.
+        first: First entry of the robot in `laid`.
         last: One past its last entry.
-        tally: Changed.
+        tally: Counts; changed.
 
     Returns:
-        How many more floor cells are seen by some robot than before.
+        Increase in the number of floor cells seen by any robot.
     """
     seen, seers, fresh = tally.seen, tally.seers, tally.fresh
     places, more, flat, all_may_have = laid[0, :last], 0, cells.reshape(cells.size), changes[0] < 0
@@ -73,19 +73,19 @@ def _recount(changes: Any, cells: Any, laid: Any, first: int, last: int, tally: 
 def _update(
     changes: Any, cells: Any, laid: Any, bounds: Any, area: Any, positions: Any, arrays: tuple[Any, ...], shares: Any
 ) -> int:
-    """Take in what has changed in all grids; count floor cells seen for the first time for the robot nearest to them.
+    """Process the changes of all grids, and credit floor cells seen for the first time to the nearest robot.
 
     Args:
-        changes: (K, 1 + n) int32. Changes of the grids, see `TeamGrids`; none afterwards.
+        changes: (K, 1 + n) int32. Changes of the grids, see `TeamGrids`; cleared.
         cells: (K, 300, 300) uint8. Cells of the grids.
-        laid, bounds: See `CoverageCells`.
-        area: (N, 2) float64 [m], world frame. Floor cells.
-        positions: (K, 2 or 3) float64 [m], world frame.
-        arrays: Those of a `Tally`, changed.
-        shares: (K,) float64. Written to: what each robot has found as a share of the floor.
+        laid, bounds: Floor cells in the grids, see `CoverageCells`.
+        area: (N, 2) float64 [m], world frame. Centres of the floor cells.
+        positions: (K, 2 or 3) float64 [m], world frame. Positions of the robots.
+        arrays: Arrays of a `Tally`; changed.
+        shares: (K,) float64. Output: cells discovered by each robot as a share of the floor.
 
     Returns:
-        How many more floor cells are seen by some robot than before.
+        Increase in the number of floor cells seen by any robot.
     """
     tally, more = Tally(*arrays), 0
     for robot in range(len(cells)):
@@ -109,17 +109,17 @@ def _update(
 
 
 class CoverageCells:
-    """Where the cells of the free floor lie in each robot's grid, laid at its true start pose; read-only.
+    """Cells of the free floor in each robot's grid, given its true start pose; read-only.
 
     Args:
         free_area_cells: (n, 2) float64 [m], world frame. Centres of the cells of the free floor.
-        true_starts: (K, 3) float64 [m, m, rad], world frame.
+        true_starts: (K, 3) float64 [m, m, rad], world frame. Start poses.
 
     Attributes:
-        cells: The same centres.
-        laid: (2, m) int32. Robot by robot the places in its flat grid in which floor cells lie, ascending, and below
-            them these floor cells.
-        bounds: (K + 1,) int64. Where each robot's part of that begins, and the last ends.
+        cells: (n, 2) float64 [m], world frame. Centres of the cells of the free floor.
+        laid: (2, m) int32. Flat grid indices of the floor cells, ascending for each robot, and the indices of these
+            floor cells.
+        bounds: (K + 1,) int64. Start of each robot's columns in `laid`, and the end of the last.
     """
 
     def __init__(self, free_area_cells: FloatArray, true_starts: FloatArray) -> None:
@@ -130,63 +130,62 @@ class CoverageCells:
 
 
 class CoverageTracker:
-    """Share of the free floor inside the union of the robots' grids, and each robot's part in it.
+    """Share of the free floor seen in the robots' grids, and each robot's share in its discovery.
 
-    It counts what has changed in the grids since the last update, so every update takes the same grids.
+    Updates are incremental, so all calls must concern the same grids.
 
     Args:
-        meter: Meter of the world and the robots' starts.
+        cells: Floor cells in the robots' grids.
     """
 
-    def __init__(self, meter: CoverageCells) -> None:
-        self._meter = meter
-        count = len(meter.cells)
+    def __init__(self, cells: CoverageCells) -> None:
+        self._meter = cells
+        count = len(cells.cells)
         self._tally = Tally(
-            seen=np.zeros(meter.laid.shape[1], np.int8),
+            seen=np.zeros(cells.laid.shape[1], np.int8),
             seers=np.zeros(count, np.int64),
             ever=np.zeros(count, np.int64),
             fresh=np.zeros(1 + count, np.int32),
-            found=np.zeros(len(meter.bounds) - 1, np.int64),
+            found=np.zeros(len(cells.bounds) - 1, np.int64),
         )
         self._covered = 0
         self._began = False
 
     def update(self, grids: TeamGrids, positions: FloatArray, found: FloatArray) -> float:
-        """Look at what the robots have seen by now, and take their grids' changes.
+        """Update the coverage from the grids and clear their record of changes.
 
-        A cell is found once, so that what has been found never falls, and sums up to the coverage unless floor has been
-        lost again.
+        A cell is discovered once, so the shares of discovery never decrease. Their sum is the coverage unless seen
+        floor is lost again.
 
         Args:
-            grids: Grids of the robots.
+            grids: Occupancy grids of the robots.
             positions: (K, 2 or 3) float64 [m], world frame. True positions of the robots.
-            found: (K,) float64. Written to: the share of the free floor that each robot was nearest to when it was
-                first seen.
+            found: (K,) float64. Output: share of the free floor that each robot was nearest to when it was first seen.
 
         Returns:
-            The coverage in [0, 1].
+            Coverage in [0, 1].
         """
         if not self._began:
             grids.changes[:, 0] = -1
             self._began = True
-        meter = self._meter
+        area = self._meter
         self._covered += _update(
-            grids.changes, grids.cells, meter.laid, meter.bounds, meter.cells, positions, tuple(self._tally), found
+            grids.changes, grids.cells, area.laid, area.bounds, area.cells, positions, tuple(self._tally), found
         )
-        return self._covered / max(len(meter.cells), 1)
+        return self._covered / max(len(area.cells), 1)
 
     def get_state(self) -> dict[str, Any]:
-        """Return a copy of what cannot be counted again from the grids."""
+        """Return a copy of the state that cannot be recomputed from the grids."""
         return {"ever": self._tally.ever > 0, "found": self._tally.found.copy()}
 
     def set_state(self, state: Mapping[str, Any]) -> None:
-        """Go on with what `get_state` returned; the changes of the grids count as before."""
+        """Restore a state of `get_state`; all else follows from the grids' changes."""
         self._tally.ever[:], self._tally.found[:] = state["ever"], state["found"]
         self._tally.fresh[0] = -1
 
 
 def _flat_cells(points: FloatArray) -> NDArray[np.int32]:
-    """Return the places of a flat grid in which points (n, 2), start frame, lie, ascending, and below their indices."""
+    """Return the flat grid indices of points (n, 2), start frame, ascending, and the indices of these points."""
     rows, cols = cell_of(points).T
     inside = np.flatnonzero((rows >= 0) & (rows < GRID_SIZE) & (cols >= 0) & (cols < GRID_SIZE))
     places = (rows * GRID_SIZE + cols)[inside]

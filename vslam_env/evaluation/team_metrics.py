@@ -1,4 +1,4 @@
-"""`TeamMetrics`: metrics of a team at one moment, computed with the ground truth."""
+"""Metrics of a team at one tick, computed from ground truth."""
 
 from collections.abc import Sequence
 from typing import Generic, NamedTuple, TypeVar
@@ -7,11 +7,11 @@ import numpy as np
 
 from slam_backend.core.validation import FloatArray, IntArray
 
-Row = TypeVar("Row", covariant=True)  # of numbers, one for each robot
+Row = TypeVar("Row", covariant=True)  # sequence of one number per robot
 
 
 class RobotMetrics(NamedTuple, Generic[Row]):
-    """Metrics of all robots, one row per metric, in the order in which they are written; see `TeamMetrics`."""
+    """Metrics of all robots, one row per metric, in the order of `score_team`; see `TeamMetrics`."""
 
     map_errors: Row
     map_rmses: Row
@@ -34,12 +34,12 @@ class RobotCounts(NamedTuple):
 
 
 class TeamMetrics(NamedTuple):
-    """Metrics of a team at one moment, computed with the ground truth.
+    """Metrics of a team at one tick, computed from ground truth.
 
     Attributes:
         per_robot: Metrics of each robot, row by row.
         counts: Counts of each robot since the reset.
-        coverage: Share of the free floor that the team has seen.
+        coverage: Share of the free floor seen by the team.
         merges: Number of merges since the reset.
         time: Simulated time since the reset [s].
     """
@@ -52,68 +52,68 @@ class TeamMetrics(NamedTuple):
 
     @property
     def map_errors(self) -> FloatArray:
-        """(K,) float64 [m]. E of each robot's map."""
+        """(K,) float64 [m]. Map error E of each robot."""
         return np.array(self.per_robot.map_errors)
 
     @property
     def map_rmses(self) -> FloatArray:
-        """(K,) float64 [m]. Of the landmarks that each holds; the cutoff of the map error where it holds none."""
+        """(K,) float64 [m]. RMSE of each robot's matched landmarks; the cutoff of the map error without a match."""
         return np.array(self.per_robot.map_rmses)
 
     @property
     def map_recalls(self) -> FloatArray:
-        """(K,) float64. Share of the landmarks that each holds, wherever it has them."""
+        """(K,) float64. Share of the true landmarks in each robot's map, whatever their error."""
         return np.array(self.per_robot.map_recalls)
 
     @property
     def map_precisions(self) -> FloatArray:
-        """(K,) float64. Share of the landmarks in each map that are matched; of duplicates one is."""
+        """(K,) float64. Share of the landmarks in each robot's map that are matched; of duplicates one counts."""
         return np.array(self.per_robot.map_precisions)
 
     @property
     def accurate_recalls(self) -> FloatArray:
-        """(K,) float64. Share of the landmarks that each holds closer than 0.5 m to where they are."""
+        """(K,) float64. Share of the true landmarks in each robot's map with an error below 0.5 m."""
         return np.array(self.per_robot.accurate_recalls)
 
     @property
     def pose_errors(self) -> FloatArray:
-        """(K,) float64 [m]."""
+        """(K,) float64 [m]. Position error of each robot."""
         return np.array(self.per_robot.pose_errors)
 
     @property
     def heading_errors(self) -> FloatArray:
-        """(K,) float64 [rad], at least 0."""
+        """(K,) float64 [rad]. Absolute heading error of each robot."""
         return np.array(self.per_robot.heading_errors)
 
     @property
     def pose_sigmas(self) -> FloatArray:
-        """(K,) float64 [m]. One sigma of the position in its own start frame, as each believes."""
+        """(K,) float64 [m]. Estimated one sigma of each robot's position in its own start frame."""
         return np.array(self.per_robot.pose_sigmas)
 
     @property
     def discovered(self) -> FloatArray:
-        """(K,) float64. Share of the free floor that each was nearest to when the team first saw it."""
+        """(K,) float64. Share of the free floor that each robot was nearest to when the team first saw it."""
         return np.array(self.per_robot.found)
 
     @property
     def distances(self) -> FloatArray:
-        """(K,) float64 [m]. Way that each has gone since the reset."""
+        """(K,) float64 [m]. True distance travelled by each robot since the reset."""
         return np.array(self.per_robot.distances)
 
     @property
     def error_integrals(self) -> FloatArray:
-        """(K,) float64 [m s]. E of each robot's map, summed over the ticks since the reset, times their length.
+        """(K,) float64 [m s]. Time integral of each robot's map error E since the reset.
 
-        Zeros unless the reward has the term `running_cost`: maps are then scored at every tick.
+        Zeros unless the reward has the term `running_cost`, which requires scores at every tick.
         """
         return np.array(self.per_robot.error_integrals)
 
     @property
     def collisions(self) -> IntArray:
-        """(K,) int64. Ticks since the reset in which each robot was kept from moving as commanded."""
+        """(K,) int64. Number of ticks since the reset in which each robot's motion was blocked."""
         return np.array(self.counts.collisions, np.int64)
 
     @property
     def bytes_sent(self) -> IntArray:
-        """(K,) int64. Since the reset."""
+        """(K,) int64. Bytes sent by each robot since the reset."""
         return np.array(self.counts.bytes_sent, np.int64)

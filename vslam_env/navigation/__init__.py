@@ -1,4 +1,4 @@
-"""What a robot does with the floor it has seen: grid, frontiers, paths. It knows no simulator, no sensor, no reward."""
+"""Navigation: occupancy grids, frontiers, candidates and path planning, independent of simulator and sensors."""
 
 from vslam_env.navigation.candidate_slots import CandidateSlots, TeamSlots
 from vslam_env.navigation.occupancy_grid import CELL, FREE, GRID_SIZE, OCCUPIED, UNKNOWN, SeenGrid, cell_of, centre_of

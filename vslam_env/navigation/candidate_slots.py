@@ -1,4 +1,4 @@
-"""The 16 slots that hand frontiers to a policy under stable numbers."""
+"""Candidate slots: frontiers presented to policies under stable indices."""
 
 import math
 from typing import Any
@@ -28,13 +28,13 @@ ROBOT_RADIUS = 0.2  # [m]
 
 
 class CandidateSlots:
-    """Sixteen places to explore, each in a slot that it keeps while it lives.
+    """Sixteen slots for candidate places to explore; a candidate keeps its slot while its frontier exists.
 
-    At an update, old candidates are paired with the frontiers found now, at least total distance, and live on where a
-    pair is less than 1 m apart; others die. New frontiers fill free slots, nearest first. A frontier that stays though
-    the robot looked at it from its goal at 4 updates (or a robot of its group was there at 16) cannot be seen, as it is
-    a speck of noise or a nook behind a corner: what is unknown within 0.8 m of the goal is given up, so that
-    exploration ends.
+    An update assigns the old candidates to the current frontiers at minimal total distance. Pairs less than 1 m apart
+    persist; other candidates are dropped. New frontiers fill free slots, nearest first. A frontier that persists
+    although the robot looked at it from its goal at 4 updates (or a robot of its group was there at 16) cannot be seen:
+    it is noise or lies behind a corner. Unknown cells within 0.8 m of its goal are then ignored, so that exploration
+    ends.
     """
 
     __slots__ = ("_given_up", "_rows", "_visits")
@@ -44,21 +44,21 @@ class CandidateSlots:
 
     @classmethod
     def over(cls, rows: FloatArray) -> "CandidateSlots":
-        """Return empty slots whose rows (16, ...) are these."""
+        """Return empty slots that use given memory for their rows (16, ...)."""
         self = cls.__new__(cls)
         rows.fill(np.nan)
         self._settle(rows)
         return self
 
     def _settle(self, rows: FloatArray) -> None:
-        """Begin with these rows, which are NaN."""
+        """Initialise the state with rows of NaN."""
         self._rows = rows
         self._visits = np.zeros(NUM_SLOTS, np.int64)
         self._given_up = np.zeros((GRID_SIZE, GRID_SIZE), np.bool_)
 
     @property
     def valid(self) -> BoolArray:
-        """Which slots hold a candidate, (16,) bool; none when nothing is left to explore."""
+        """(16,) bool. True for slots with a candidate; all False when exploration is complete."""
         return ~np.isnan(self._columns.x)
 
     @property
@@ -67,36 +67,36 @@ class CandidateSlots:
 
     @property
     def goals(self) -> FloatArray:
-        """Where to go, (16, 2) float64 [m], start frame; NaN in empty slots."""
+        """(16, 2) float64 [m], start frame. Goal positions; NaN in empty slots."""
         return self._columns.goals
 
     @property
     def headings(self) -> FloatArray:
-        """Where to look from the goals, (16,) float64 [rad], start frame; NaN in empty slots."""
+        """(16,) float64 [rad], start frame. Headings at the goals towards the frontiers; NaN in empty slots."""
         return self._columns.heading.copy()
 
     @property
     def sizes(self) -> FloatArray:
-        """How long the frontiers are, (16,) float64 [m]; NaN in empty slots."""
+        """(16,) float64 [m]. Lengths of the frontiers; NaN in empty slots."""
         return self._columns.size.copy()
 
     @property
     def lengths(self) -> FloatArray:
-        """How long the robot's paths to the goals were at the last update, (16,) float64 [m]; NaN in empty slots."""
+        """(16,) float64 [m]. Lengths of the paths to the goals at the last update; NaN in empty slots."""
         return self._columns.length.copy()
 
     def candidate(self, slot: int) -> tuple[FloatArray, float] | None:
-        """Return the goal (2,) [m] of a slot and where to look from there [rad], start frame; None if it is empty."""
+        """Return goal (2,) [m] and heading [rad] of a slot, start frame; None if the slot is empty."""
         x, y, heading, _, _ = self._rows[slot].tolist()
         return None if math.isnan(x) else (np.array([x, y]), heading)
 
     def update(self, cells: NDArray[np.uint8], pose: ArrayLike, teammates: ArrayLike = ()) -> None:
-        """Bring the candidates up to date; meant to be called once a second.
+        """Update the candidates; intended once a second.
 
         Args:
-            cells: (300, 300) uint8. `SeenGrid.cells`.
+            cells: (300, 300) uint8. Cells of the robot's `SeenGrid`.
             pose: (3,) float64 [m, m, rad], start frame. Pose of the robot.
-            teammates: (k, 2) float64 [m], start frame. Places of the others in its group: their visits count as well.
+            teammates: (k, 2) float64 [m], start frame. Positions of its teammates, whose visits also count.
 
         Raises:
             ValueError: If an array has the wrong shape or is not finite.
@@ -106,13 +106,13 @@ class CandidateSlots:
         self.renew(cells, known_bounds(cells), poses, 0)
 
     def renew(self, cells: NDArray[np.uint8], bounds: NDArray[np.int32], poses: FloatArray, robot: int) -> None:
-        """Bring the candidates of a robot up to date.
+        """Update the candidates of a robot without checks.
 
         Args:
-            cells: (300, 300) uint8. Cells of its grid.
-            bounds: (4,) int32. Bounds of its grid, see `TeamGrids`.
-            poses: (n, 3) float64 [m, m, rad], start frame. Its own and those of teammates; NaN: it does not know.
-            robot: Its row in the poses.
+            cells: (300, 300) uint8. Cells of the robot's grid.
+            bounds: (4,) int32. Bounds of the known part of the grid, see `TeamGrids`.
+            poses: (n, 3) float64 [m, m, rad], start frame. Poses of the robot and its teammates; NaN: unknown.
+            robot: Row of the robot in `poses`.
         """
         slots = self._rows, self._visits
         found, costs, is_clear = update_slots(cells, bounds, ROBOT_RADIUS, poses, robot, *slots, self._given_up)
@@ -120,37 +120,37 @@ class CandidateSlots:
             fill_slots(_assign(costs), found, *slots)
 
     def features(self, pose: ArrayLike, teammates: ArrayLike = ()) -> NDArray[np.float32]:
-        """Describe the candidates to a policy.
+        """Return the features of the candidates for a policy.
 
         Args:
             pose: (3,) float64 [m, m, rad], start frame. Pose of the robot.
-            teammates: (k, 2) float64 [m], start frame. Places of the others in its group.
+            teammates: (k, 2) float64 [m], start frame. Positions of its teammates.
 
         Returns:
-            (16, 5) float32, all metres: x and y of the goal in the robot frame, length of the path at the last update,
-            size of the frontier, and distance from the goal to the nearest teammate, 60 if there is none. Zeros in
-            empty slots.
+            (16, 5) float32 [m]. x and y of the goal in the robot frame, length of the path at the last update, length
+            of the frontier, and distance from the goal to the nearest teammate, 60 without teammates. Zeros in empty
+            slots.
         """
         features = np.empty((1, NUM_SLOTS, NUM_FEATURES), np.float32)
         describe(self._rows[None], _together(pose, teammates)[None], features)
         return np.asarray(features[0])
 
     def get_state(self) -> dict[str, Any]:
-        """Return a copy of all that `set_state` needs to continue bit by bit."""
+        """Return a copy of the complete state."""
         return {"rows": self._rows.copy(), "visits": self._visits.copy(), "given_up": self._given_up.copy()}
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Restore what `get_state` returned."""
+        """Restore a state of `get_state`."""
         self._rows[:] = state["rows"]
         self._visits = state["visits"].copy()
         self._given_up = state["given_up"].copy()
 
 
 class TeamSlots:
-    """The slots of all robots of a team, whose rows lie in an array of one piece.
+    """Candidate slots of all robots of a team, stored in one array.
 
     Args:
-        num_robots: K.
+        num_robots: Number of robots K.
 
     Attributes:
         slots: Slots of each robot.
@@ -161,24 +161,23 @@ class TeamSlots:
         self.slots = list(map(CandidateSlots.over, self._rows))
 
     def update(self, robot: int, grids: TeamGrids, poses: FloatArray) -> None:
-        """Bring a robot's candidates up to date, as `CandidateSlots.update` does; nothing is checked.
+        """Update a robot's candidates without checks; see `CandidateSlots.update`.
 
         Args:
             robot: Index of the robot.
-            grids: Grids of the team.
-            poses: (K, K, 3) float64 [m, m, rad]. See `features`.
+            grids: Occupancy grids of the robots.
+            poses: (K, K, 3) float64 [m, m, rad]. Estimated poses, see `features`.
         """
         self.slots[robot].renew(grids.grids[robot].cells, grids.bounds[robot], poses[robot], robot)
 
     def features(self, poses: FloatArray) -> NDArray[np.float32]:
-        """Describe all robots' candidates to policies; nothing is checked.
+        """Return the features of all robots' candidates without checks.
 
         Args:
-            poses: (K, K, 3) float64 [m, m, rad]. Where robot i believes robot j to be, in i's start frame; NaN: it
-                does not know.
+            poses: (K, K, 3) float64 [m, m, rad]. Estimated pose of robot j in the start frame of robot i; NaN: unknown.
 
         Returns:
-            `CandidateSlots.features` (K, 16, 5). A fresh array.
+            (K, 16, 5) float32 [m]. New array, see `CandidateSlots.features`.
         """
         features = np.empty((len(self._rows), NUM_SLOTS, NUM_FEATURES), np.float32)
         describe(self._rows, poses, features)
@@ -186,16 +185,16 @@ class TeamSlots:
 
 
 def _together(pose: ArrayLike, teammates: ArrayLike) -> FloatArray:
-    """Return a robot's pose (3,) and the positions (k, 2) of its teammates as poses (1 + k, 3), or raise."""
-    own, places = pose_floats(pose), positions_array(teammates, "teammates")
-    poses = np.zeros((1 + len(places), 3))
-    poses[0], poses[1:, :2] = own, places
+    """Return the pose (3,) of a robot and the positions (k, 2) of its teammates as poses (1 + k, 3), or raise."""
+    own, positions = pose_floats(pose), positions_array(teammates, "teammates")
+    poses = np.zeros((1 + len(positions), 3))
+    poses[0], poses[1:, :2] = own, positions
     return poses
 
 
 def _assign(costs: FloatArray) -> FloatArray:
-    """Return costs (m, n) that are `SAME_GOAL` but for the pairs, each of other rows and columns, of least total."""
-    from scipy.optimize import linear_sum_assignment  # slow to import, and not always needed
+    """Return the costs (m, n) of the minimal assignment, and `SAME_GOAL` for all other pairs."""
+    from scipy.optimize import linear_sum_assignment  # slow import, not always needed
 
     chosen, pairs = np.full_like(costs, SAME_GOAL), linear_sum_assignment(costs)
     chosen[pairs] = costs[pairs]

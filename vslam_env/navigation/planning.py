@@ -1,13 +1,13 @@
-"""Paths over the floor that a robot has seen, and the commands that drive it along one.
+"""Path planning over known free floor, frontiers, and path following.
 
-Only cells known to be free are travelled: unknown ones may hide walls, and frontiers, the goals of exploration, are
-reached over free cells anyway. Walls are widened by the robot's radius and half a cell, and cells within 0.4 m of
-that cost more, so that a path keeps away from walls where there is room but still goes through a door.
+Paths use only cells known to be free: unknown cells may hide walls, and frontiers are reachable over free cells. Walls
+are inflated by the robot's radius and half a cell, and cells within another 0.4 m cost more, so that paths keep away
+from walls where possible but still pass through doors.
 
-The search is one of our own (`_planning_kernels`), because candidates for a robot have to cost less than 0.4 ms: over
-the 7,000 cells of a 20 x 14 m office, on one core, scipy.sparse.csgraph needs 1.5 ms to build the graph and 0.9 ms
-for `dijkstra` (0.3 ms for `breadth_first_order`, which ignores costs). Here weights and wavefront take
-0.1 ms, and an update of the candidates 0.1 to 0.2 ms in all. scipy's `dijkstra` is the oracle of the tests.
+The Dijkstra search is our own (`_planning_kernels`), because updating a robot's candidates must take less than 0.4 ms.
+For the 7,000 cells of a 20 x 14 m office, on one core, scipy.sparse.csgraph takes 1.5 ms to build the graph and 0.9 ms
+for `dijkstra` (0.3 ms for `breadth_first_order`, which ignores costs). Here costmap and search take 0.1 ms, and an
+update of the candidates 0.1 to 0.2 ms in total. The tests compare with scipy's `dijkstra`.
 """
 
 import math
@@ -33,13 +33,13 @@ from vslam_env.navigation.validation import check_cells, point_floats, pose_floa
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Frontiers:
-    """Places to explore, by increasing path length.
+    """Frontiers in ascending order of path length.
 
     Attributes:
-        goals: (n, 2) float64 [m], start frame. Open floor next to the middle of each frontier.
-        headings: (n,) float64 [rad], start frame. Where the unknown lies, seen from the goal.
+        goals: (n, 2) float64 [m], start frame. Open positions next to the middle of each frontier.
+        headings: (n,) float64 [rad], start frame. Directions from the goals towards the unknown area.
         sizes: (n,) float64 [m]. Length of each frontier.
-        lengths: (n,) float64 [m]. Of the path from the robot to the goal.
+        lengths: (n,) float64 [m]. Length of the path from the robot to each goal.
     """
 
     goals: FloatArray
@@ -51,19 +51,19 @@ class Frontiers:
 def find_frontiers(
     cells: NDArray[np.uint8], start_xy: ArrayLike, radius: float = 0.2, ignored: BoolArray | None = None
 ) -> Frontiers:
-    """Find where floor that a robot can reach borders on what has not been seen.
+    """Find the frontiers that a robot can reach.
 
-    A frontier is a connected set of unknown cells beside free ones, of at least 0.6 m, and with an open cell within
-    1 m of it to which a way is known. Those above 4 m are cut into pieces of equal size.
+    A frontier is a connected set of unknown cells next to free ones, at least 0.6 m long, with a reachable open cell
+    within 1 m. Frontiers longer than 4 m are split into equal parts.
 
     Args:
-        cells: (300, 300) uint8. `SeenGrid.cells`.
-        start_xy: (2,) float64 [m], start frame. Place of the robot.
+        cells: (300, 300) uint8. Cells of a `SeenGrid`.
+        start_xy: (2,) float64 [m], start frame. Position of the robot.
         radius: Radius of the robot [m].
-        ignored: (300, 300) bool. Unknown cells that do not count; None to count all.
+        ignored: (300, 300) bool. Unknown cells to ignore; None: none.
 
     Returns:
-        The frontiers, nearest first; none if nothing is left to explore.
+        Frontiers, nearest first; none if exploration is complete.
 
     Raises:
         ValueError: If an array has the wrong shape, or a number is not finite.
@@ -79,30 +79,30 @@ def find_frontiers(
     )
 
 
-GOAL_CELLS = 2  # a goal in a wall's margin is served by open floor this near
+GOAL_CELLS = 2  # search radius for an open cell if the goal lies in an inflated wall
 
-MIN_RADIUS = 0.11  # [m] for a smaller one walls would not be widened enough to keep diagonal steps from crossing them
+MIN_RADIUS = 0.11  # [m] below, diagonal steps could cross inflated walls
 
 LOOKAHEAD = 0.4  # [m]
-TURN_GAIN = 3.0  # [1/s]; times the tick of 0.1 s it is well below 1, so the heading settles without swinging
-TURN_ONLY = 0.7  # [rad] with a larger heading error the robot turns in place
+TURN_GAIN = 3.0  # [1/s] times a tick of 0.1 s well below 1, so that the heading does not oscillate
+TURN_ONLY = 0.7  # [rad] heading error above which the robot turns in place
 ARRIVED = 0.1  # [m]
-SLOW_DOWN = 1.5  # [1/s] speed allowed per metre that is left
+SLOW_DOWN = 1.5  # [1/s] speed limit per metre of remaining path
 FACED = 0.05  # [rad]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DistanceMap:
-    """The cheapest ways from one place to all known floor.
+    """Cheapest paths from one position to all known free floor.
 
-    Arrays cover the known part of the grid and a margin.
+    The arrays cover the known part of the grid and a margin.
 
     Attributes:
-        corner: The grid's row and column of the arrays' first cell.
-        box: (h, w) uint8. The grid's cells; 3 outside the grid.
-        weights: (h, w) uint8. Cost per length; 0 where the robot may not be.
-        cost: (h, w) int32. Of the cheapest way; 2^31 - 1 where there is none.
-        parent: (h, w) int32. Flat index of the cell before on that way; -1 at the first cell and where there is none.
+        corner: Row and column in the grid of the first cell of the arrays.
+        box: (h, w) uint8. Cells of the grid; 3 outside the grid.
+        weights: (h, w) uint8. Cost per length; 0 for impassable cells.
+        cost: (h, w) int32. Cost of the cheapest path; 2^31 - 1 if unreachable.
+        parent: (h, w) int32. Flat index of the previous cell on that path; -1 at the start and if unreachable.
     """
 
     corner: tuple[int, int]
@@ -112,24 +112,24 @@ class DistanceMap:
     parent: NDArray[np.int32]
 
     def cell_of(self, xy: ArrayLike) -> tuple[int, int]:
-        """Return the arrays' (row, column) in which a point (2,) [m] lies; it may be outside the arrays."""
-        far = 2.0 * HALF_WIDTH  # as good as anywhere outside
-        x, y = (min(max(coordinate, -far), far) for coordinate in point_floats(xy, "xy"))
+        """Return the (row, column) of a point (2,) [m] in the arrays; it may lie outside."""
+        limit = 2.0 * HALF_WIDTH  # outside the grid
+        x, y = (min(max(coordinate, -limit), limit) for coordinate in point_floats(xy, "xy"))
         row, col = math.floor((y + HALF_WIDTH) / CELL), math.floor((x + HALF_WIDTH) / CELL)
         return row - self.corner[0], col - self.corner[1]
 
 
 def distance_map(cells: NDArray[np.uint8], start_xy: ArrayLike, radius: float = 0.2) -> DistanceMap:
-    """Find the cheapest ways from a place to all floor that is known to be free.
+    """Find the cheapest paths from a position to all known free floor.
 
     Args:
-        cells: (300, 300) uint8. `SeenGrid.cells`.
-        start_xy: (2,) float64 [m], start frame. If a robot may not be there, the nearest open cell within 1 m that no
-            wall separates stands in.
+        cells: (300, 300) uint8. Cells of a `SeenGrid`.
+        start_xy: (2,) float64 [m], start frame. If its cell is impassable, the search starts from the nearest open cell
+            within 1 m that is not behind a wall.
         radius: Radius of the robot [m], at least 0.11.
 
     Returns:
-        The map; all of it is unreached if there is no open cell near the start.
+        Distance map; all cells are unreachable if there is no open cell near the start.
 
     Raises:
         ValueError: If the cells are not a grid's, or a number is not finite.
@@ -141,7 +141,7 @@ def distance_map(cells: NDArray[np.uint8], start_xy: ArrayLike, radius: float = 
 
 
 def _checked_start(start_xy: ArrayLike, radius: float) -> tuple[float, float, float]:
-    """Return a place (2,) [m] and the radius [m] of a robot as three floats, or raise."""
+    """Return a validated position (2,) [m] and radius [m] as three floats, or raise."""
     x, y = point_floats(start_xy, "start_xy")
     radius = check_float("radius", radius, "Give the robot's radius in metres.", at_least=MIN_RADIUS, at_most=1.0)
     return x, y, radius
@@ -150,35 +150,36 @@ def _checked_start(start_xy: ArrayLike, radius: float) -> tuple[float, float, fl
 def plan_path(
     cells: NDArray[np.uint8], start_xy: ArrayLike, goal_xy: ArrayLike, radius: float = 0.2
 ) -> FloatArray | None:
-    """Plan a short path over known floor that keeps away from walls where there is room.
+    """Plan a short path over known free floor that keeps away from walls where possible.
 
     Args:
-        cells: (300, 300) uint8. `SeenGrid.cells`.
-        start_xy: (2,) float64 [m], start frame. May lie in a wall's margin: the path then begins with the way out.
-        goal_xy: (2,) float64 [m], start frame. If it lies in a wall's margin, the path ends up to 0.4 m away from it.
+        cells: (300, 300) uint8. Cells of a `SeenGrid`.
+        start_xy: (2,) float64 [m], start frame. If it lies in an inflated wall, the path first leaves it.
+        goal_xy: (2,) float64 [m], start frame. If it lies in an inflated wall, the path ends up to 0.4 m away from it.
         radius: Radius of the robot [m].
 
     Returns:
-        (n, 2) float64 [m], start frame: the corners, n >= 2, from `start_xy` to the goal; or None if no way is known.
+        (n, 2) float64 [m], start frame. Corners of the path from `start_xy` to the goal, n >= 2; None if no path is
+        known.
 
     Raises:
         ValueError: If the cells are not a grid's, or a number is not finite.
     """
     start, goal = point_floats(start_xy, "start_xy"), point_floats(goal_xy, "goal_xy")
-    ways = distance_map(cells, start, radius)
-    goal_cell = ways.cell_of(goal)
-    end_cell = nearest_open(ways.box, ways.weights, *goal_cell, GOAL_CELLS)
-    if end_cell[0] < 0 or ways.cost[end_cell] == UNREACHED:
+    paths = distance_map(cells, start, radius)
+    goal_cell = paths.cell_of(goal)
+    end_cell = nearest_open(paths.box, paths.weights, *goal_cell, GOAL_CELLS)
+    if end_cell[0] < 0 or paths.cost[end_cell] == UNREACHED:
         return None
-    corners = shorten_path(ways.weights, ways.cost, ways.parent, *end_cell)
-    centres = centre_of(corners + np.array(ways.corner))
-    between = centres[1:-1] if tuple(corners[0]) == ways.cell_of(start) else centres[:-1]
+    corners = shorten_path(paths.weights, paths.cost, paths.parent, *end_cell)
+    centres = centre_of(corners + np.array(paths.corner))
+    between = centres[1:-1] if tuple(corners[0]) == paths.cell_of(start) else centres[:-1]
     return np.vstack([start, between, goal if end_cell == goal_cell else centres[-1]])
 
 
 @in_place
 def _pursue(x: float, y: float, path: FloatArray) -> tuple[float, float, float]:
-    """Return the point `LOOKAHEAD` beyond a path's nearest point to (x, y), and the length that is left [m]."""
+    """Return the point `LOOKAHEAD` beyond the path's nearest point to (x, y), and the remaining length [m]."""
     best, segment, along = math.inf, 0, 0.0
     left = 0.0
     for i in range(len(path) - 1):
@@ -210,17 +211,17 @@ def follow_path(
     max_turn: float = 1.5,
     final_heading: float | None = None,
 ) -> tuple[float, float]:
-    """Drive along a path by pure pursuit: turn towards a point a little ahead, the slower the more there is to turn.
+    """Return a velocity command that follows a path by pure pursuit, slower for larger heading errors.
 
     Args:
-        pose: (3,) float64 [m, m, rad], start frame.
-        path: (n, 2) float64 [m], start frame, n >= 1, as `plan_path` returns it.
+        pose: (3,) float64 [m, m, rad], start frame. Pose of the robot.
+        path: (n, 2) float64 [m], start frame, n >= 1. Path from `plan_path`.
         max_speed: Largest speed [m/s].
-        max_turn: Largest rate of turn [rad/s].
-        final_heading: Where to look once at the end [rad], start frame; None to stay as the robot comes.
+        max_turn: Largest turn rate [rad/s].
+        final_heading: Heading to turn to at the end of the path [rad], start frame; None: any.
 
     Returns:
-        (v, omega): 0 <= v <= max_speed [m/s] and |omega| <= max_turn [rad/s]; (0, 0) at the end.
+        (v, omega) with 0 <= v <= max_speed [m/s] and |omega| <= max_turn [rad/s]; (0, 0) at the end.
 
     Raises:
         ValueError: If the pose or the path has the wrong shape.
@@ -229,7 +230,7 @@ def follow_path(
     path_array = np.ascontiguousarray(path, dtype=np.float64)
     if path_array.ndim != 2 or path_array.shape[1] != 2 or len(path_array) == 0:
         raise argument_error(
-            "path", "an array of shape (n, 2), n >= 1", f"shape {path_array.shape}", "Give what plan_path returned."
+            "path", "an array of shape (n, 2), n >= 1", f"shape {path_array.shape}", "Pass what plan_path returned."
         )
     target_x, target_y, left = _pursue(x, y, path_array)
     left = max(left, math.hypot(path_array[-1, 0] - x, path_array[-1, 1] - y))

@@ -1,4 +1,4 @@
-"""`TeamGrids`: the seen grids of a team, into all of which a tick's readings are painted at once."""
+"""Occupancy grids of a team, updated together with the readings of a tick."""
 
 import numpy as np
 
@@ -9,19 +9,19 @@ from vslam_env.navigation.validation import check_ranges, pose_floats
 
 
 class TeamGrids:
-    """A seen grid for each robot; they lie in arrays of one piece.
+    """Occupancy grid of each robot, stored in common arrays.
 
     Args:
-        num_robots: K.
+        num_robots: Number of robots K.
 
     Attributes:
-        grids: Grids of the robots.
-        cells: (K, 300, 300) uint8. Their cells, one after the other. To be looked at.
-        changes: (K, 1 + n) int32. Per grid the number of verdicts that have changed since a reader of the cells set it
-            to 0, then the places of that many cells in the flat grid, some perhaps twice. -1 if all may have changed,
-            as in the beginning.
-        bounds: (K, 4) int32. First row and column of what is known of each grid, and one past the last ones; zeros if
-            nothing is. To be looked at.
+        grids: Grid of each robot.
+        cells: (K, 300, 300) uint8. Cells of all grids; read-only.
+        changes: (K, 1 + n) int32. Number of cells of each grid that changed state since the reader last set this number
+            to 0, followed by their flat indices, possibly with duplicates. -1 if any cell may have changed, as
+            initially.
+        bounds: (K, 4) int32. First row and column of the known part of each grid, and one past the last ones; zeros if
+            nothing is known; read-only.
     """
 
     def __init__(self, num_robots: int) -> None:
@@ -43,19 +43,19 @@ class TeamGrids:
         max_range: float,
         radius: float,
     ) -> None:
-        """Paint what robots read in a tick: by `update_from_scan`, `clear_disc` and, after a bump, `bump`.
+        """Paint the readings of a tick by `update_from_scan`, `clear_disc` and, after a bump, `bump`.
 
         Args:
-            shared: (K, K) int64. 1 where what robot j reads is painted into i's grid; of the robots in ascending order.
-            poses: (K, K, 3) float64 [m, m, rad]. Where robot j was, in the start frame of i's grid.
-            scans: (K, R) float64 [m]. As `SeenGrid.update_from_scan` expects each.
-            bumps: (K,) bool. Which robots bumped into something.
-            directions: (2, R) float64. Of the rays, as `ray_directions` returns them.
-            max_range: Range of the scans [m].
+            shared: (K, K) int64. 1 where the readings of robot j are painted into the grid of robot i.
+            poses: (K, K, 3) float64 [m, m, rad]. Pose of robot j in the start frame of robot i.
+            scans: (K, R) float64 [m]. Scans of the robots, see `SeenGrid.update_from_scan`.
+            bumps: (K,) bool. True for robots that bumped into an obstacle.
+            directions: (2, R) float64. Unit vectors of the rays from `ray_directions`.
+            max_range: Range of the range finder [m].
             radius: Radius of the robots [m].
 
         Raises:
-            ValueError: If one of these poses is not finite, or ranges are less than 0; then nothing is painted.
+            ValueError: If a pose of a shared reading is not finite, or a range is negative; nothing is painted then.
         """
         num_rays = scans.shape[1]
         if self._room.shape[1] != num_rays + 1:

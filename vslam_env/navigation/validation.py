@@ -1,4 +1,4 @@
-"""Checks of arguments that are cheap enough to make several times a tick."""
+"""Fast argument checks for functions that run several times a tick."""
 
 import math
 
@@ -32,7 +32,7 @@ def point_floats(point: ArrayLike, name: str) -> tuple[float, float]:
 
 
 def positions_array(positions: ArrayLike, name: str) -> FloatArray:
-    """Return positions as an array (k, 2), also if there are none, or raise."""
+    """Return positions as an array (k, 2), k >= 0, or raise."""
     values = np.ascontiguousarray(positions, dtype=np.float64)
     if values.size == 0:
         return np.empty((0, 2))
@@ -43,9 +43,9 @@ def positions_array(positions: ArrayLike, name: str) -> FloatArray:
 
 
 def check_ranges(ranges: FloatArray) -> None:
-    """Raise if ranges (n,) [m] are not at least 0."""
-    if not (ranges >= 0.0).all():  # NaN is not
-        raise argument_error("ranges", "distances >= 0 [m]", ranges, "Use max_range where a ray saw nothing.")
+    """Raise unless ranges (n,) [m] are at least 0."""
+    if not (ranges >= 0.0).all():  # False for NaN
+        raise argument_error("ranges", "distances >= 0 [m]", ranges, "Use max_range for a ray without a hit.")
 
 
 def ray_directions(angles: FloatArray) -> FloatArray:
@@ -58,7 +58,7 @@ def ray_directions(angles: FloatArray) -> FloatArray:
 
 
 def check_cells(cells: NDArray[np.uint8]) -> None:
-    """Raise if an array is not the cells of a `SeenGrid`."""
+    """Raise unless an array has shape and dtype of `SeenGrid.cells`."""
     if not isinstance(cells, np.ndarray) or cells.shape != (GRID_SIZE, GRID_SIZE) or cells.dtype != np.uint8:
         got = f"shape {cells.shape} of {cells.dtype}" if isinstance(cells, np.ndarray) else cells
         raise argument_error("cells", "an array of shape (300, 300) of uint8", got, "Pass SeenGrid.cells.")

@@ -1,4 +1,4 @@
-"""Pictures of an episode: `Scene` says what is to be seen, `draw_frame` paints it."""
+"""Rendering of episodes: `Scene` holds the content of a picture, `draw_frame` draws it."""
 
 from vslam_env.rendering.draw import draw_frame
 from vslam_env.rendering.scene import MergeFlash, RobotView, Scene

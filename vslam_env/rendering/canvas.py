@@ -1,4 +1,4 @@
-"""From metres to pixels, and the few strokes that a picture is made of, all with sub-pixel positions."""
+"""Drawing primitives with sub-pixel positions, and the mapping from metres to pixels."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,9 +14,9 @@ from vslam_env.rendering.palette import Colour
 Image = NDArray[np.uint8]
 
 SHIFT = 4  # fractional bits of the coordinates that OpenCV gets
-FARTHEST = 20_000.0  # [px] OpenCV's fixed-point coordinates overflow not far beyond
-MARGIN_M = 0.4  # [m] of paper around the world
-UNSEEN_PX = 0.3  # a path may be off by so much
+FARTHEST = 20_000.0  # [px] limit against overflow of OpenCV's fixed-point coordinates
+MARGIN_M = 0.4  # [m] margin around the world
+UNSEEN_PX = 0.3  # tolerance of simplified paths
 CHI_SQUARE_95 = 5.991  # 95 % of a planar Gaussian lie inside this squared Mahalanobis distance
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 _TURN = 2.0 * np.pi * np.arange(16) / 16
@@ -25,10 +25,10 @@ _CIRCLE = np.stack([np.cos(_TURN), np.sin(_TURN)], axis=-1)
 
 @dataclass(frozen=True, slots=True)
 class Viewport:
-    """Where world points fall on an image: y points up in the world and down in the image.
+    """Mapping from world points to an image: y points up in the world and down in the image.
 
     Attributes:
-        scale: [px/m], the same both ways.
+        scale: Scale in both directions [px/m].
         left: World x of the image's left edge [m].
         top: World y of the image's top edge [m].
     """
@@ -39,11 +39,11 @@ class Viewport:
 
     @classmethod
     def around(cls, points: FloatArray, width: int, height: int) -> Self:
-        """Fit points with a margin into an image, centred and undistorted.
+        """Return the viewport that fits points with a margin into an image, centred and undistorted.
 
         Args:
-            points: (n, 2) float64 [m], world frame, n >= 1.
-            width, height: Of the image [px].
+            points: (n, 2) float64 [m], world frame, n >= 1. Points to show.
+            width, height: Size of the image [px].
         """
         low, high = points.min(axis=0) - MARGIN_M, points.max(axis=0) + MARGIN_M
         scale = float(min(width / (high[0] - low[0]), height / (high[1] - low[1])))
@@ -57,12 +57,12 @@ class Viewport:
 
 
 def fixed(points: FloatArray) -> NDArray[np.int32]:
-    """Return positions (..., 2) [px] as OpenCV's fixed-point numbers; the centre of the first pixel is (0, 0) there."""
+    """Return positions (..., 2) [px] as OpenCV's fixed-point numbers, with (0, 0) at the centre of the first pixel."""
     return np.rint((points - 0.5) * (1 << SHIFT)).astype(np.int32)
 
 
 def fill(image: Image, colour: Colour) -> None:
-    """Paint a whole image in one colour."""
+    """Fill an image with one colour."""
     image[:] = np.full((image.shape[1], 3), colour, np.uint8)  # row by row: eight times as fast as pixel by pixel
 
 
@@ -71,9 +71,9 @@ def lines(image: Image, points: Sequence[FloatArray] | FloatArray, colour: Colou
 
     Args:
         image: (H, W, 3) uint8; changed in place.
-        points: Of each line (n, 2) float64 [px]; an array (lines, n, 2) if all are as long.
-        colour: RGB.
-        width: [px].
+        points: Points of each line (n, 2) float64 [px]; an array (lines, n, 2) if all have the same length.
+        colour: Colour (RGB).
+        width: Width of the lines [px].
         closed: Whether the last point is joined to the first.
     """
     if len(points):
@@ -82,13 +82,13 @@ def lines(image: Image, points: Sequence[FloatArray] | FloatArray, colour: Colou
 
 
 def path(image: Image, points: FloatArray, colour: Colour, width: int) -> None:
-    """Draw a long polyline without the corners that nobody would see.
+    """Draw a long polyline, simplified below the visible resolution.
 
     Args:
         image: (H, W, 3) uint8; changed in place.
-        points: (n, 2) float64 [px].
-        colour: RGB.
-        width: [px].
+        points: (n, 2) float64 [px]. Points of the line.
+        colour: Colour (RGB).
+        width: Width of the line [px].
     """
     if len(points) > 1:
         corners = cv2.approxPolyDP(points.astype(np.float32)[:, None], UNSEEN_PX, closed=False)
@@ -100,23 +100,23 @@ def disc(image: Image, centre: FloatArray, radius: float, colour: Colour, width:
 
     Args:
         image: (H, W, 3) uint8; changed in place.
-        centre: (2,) float64 [px].
-        radius: [px].
-        colour: RGB.
-        width: Of the line [px]; -1 fills the circle.
+        centre: (2,) float64 [px]. Centre.
+        radius: Radius [px].
+        colour: Colour (RGB).
+        width: Width of the line [px]; -1 for a filled circle.
     """
     x, y = fixed(centre).tolist()
     cv2.circle(image, (x, y), max(1, round(radius * (1 << SHIFT))), colour, width, cv2.LINE_AA, SHIFT)
 
 
 def dots(image: Image, centres: FloatArray, radius: float, colour: Colour) -> None:
-    """Draw small equal filled discs: polygons, as OpenCV's small circles are diamonds.
+    """Draw small equal filled discs as polygons, because OpenCV's small circles are diamonds.
 
     Args:
         image: (H, W, 3) uint8; changed in place.
-        centres: (n, 2) float64 [px].
-        radius: [px].
-        colour: RGB.
+        centres: (n, 2) float64 [px]. Centres.
+        radius: Radius [px].
+        colour: Colour (RGB).
     """
     # Anti-aliasing adds half a pixel all around.
     for outline in fixed(centres[:, None] + (radius - 0.5) * _CIRCLE[::2]):
@@ -124,14 +124,14 @@ def dots(image: Image, centres: FloatArray, radius: float, colour: Colour) -> No
 
 
 def translucent_fill(image: Image, centres: FloatArray, radius: float, colour: Colour, opacity: float) -> None:
-    """Draw equal translucent discs, which add up where they overlap.
+    """Draw equal translucent discs whose opacity accumulates where they overlap.
 
     Args:
         image: (H, W, 3) uint8; changed in place.
-        centres: (n, 2) float64 [px]. Those outside the image are cut off.
-        radius: [px].
-        colour: RGB.
-        opacity: Of one disc, in (0, 1).
+        centres: (n, 2) float64 [px]. Centres; discs are clipped to the image.
+        radius: Radius [px].
+        colour: Colour (RGB).
+        opacity: Opacity of one disc, in (0, 1).
     """
     reach = int(np.ceil(radius + 0.5))
     inside = (centres > -reach).all(axis=1) & (centres < np.array(image.shape[1::-1]) + reach).all(axis=1)
@@ -159,13 +159,13 @@ def ellipse_outlines(means: FloatArray, covariances: FloatArray, view: Viewport,
     """Return the 95 % regions of planar Gaussians as polygons.
 
     Args:
-        means: (n, 2) float64 [m].
-        covariances: (n, 2, 2) float64 [m^2]. Of ones that are not positive semi-definite the sound part is drawn.
-        view: From metres to pixels.
-        smallest: [px] Ellipses whose long half axis is shorter are left out: a dot would hide them.
+        means: (n, 2) float64 [m]. Means.
+        covariances: (n, 2, 2) float64 [m^2]. Covariances; indefinite ones give degenerate ellipses.
+        view: Mapping from metres to pixels.
+        smallest: Least long half axis of a drawn ellipse [px]; smaller ones would be hidden by a dot.
 
     Returns:
-        (m, 16, 2) [px], m <= n.
+        (m, 16, 2) [px]. Outlines, m <= n.
     """
     xx, xy, yy = covariances[:, 0, 0], 0.5 * (covariances[:, 0, 1] + covariances[:, 1, 0]), covariances[:, 1, 1]
     largest = 0.5 * (xx + yy) + np.hypot(0.5 * (xx - yy), xy)
@@ -181,7 +181,7 @@ def ellipse_outlines(means: FloatArray, covariances: FloatArray, view: Viewport,
 
 
 def text_width(text: str, size: float) -> float:
-    """Return how wide a line of text is [px]; `size` is the height of a capital [px]."""
+    """Return the width of a line of text [px]; `size` is the height of a capital [px]."""
     (width, _), _ = cv2.getTextSize(text, FONT, size / 21.0, 1)
     return float(width)
 
@@ -191,11 +191,11 @@ def write(image: Image, text: str, left: float, middle: float, size: float, colo
 
     Args:
         image: (H, W, 3) uint8; changed in place.
-        text: ASCII, as OpenCV's font has no more.
-        left: Where it starts, x [px].
-        middle: Where it is centred, y [px].
+        text: ASCII text, the character set of OpenCV's font.
+        left: Left edge x [px].
+        middle: Vertical centre y [px].
         size: Height of a capital [px].
-        colour: RGB.
+        colour: Colour (RGB).
     """
     where = (round(left), round(middle + 0.5 * size))
     cv2.putText(image, text, where, FONT, size / 21.0, colour, 1, cv2.LINE_AA)

@@ -1,4 +1,4 @@
-"""One frame: the world from above, what each robot makes of it, and a header and footer with figures."""
+"""Drawing of one frame: top view of the world and the robots' beliefs, header and footer."""
 
 import numpy as np
 
@@ -23,26 +23,25 @@ from vslam_env.rendering.scene import RobotView, Scene
 SMALLEST_SIZE = (160, 120)
 WALL_WIDTH_M = 0.08
 PARTICLES_SHOWN = 100
-# What may stretch the picture when there are no walls to frame it.
-EMPTY_EXTENT_M = 2.0
+EMPTY_EXTENT_M = 2.0  # [m] margin around the robots if there are no walls
 
 
 def draw_frame(scene: Scene, size: tuple[int, int] = (960, 720)) -> Image:
-    """Paint a scene.
+    """Draw a scene.
 
-    Truth is grey or faint: walls, landmarks, paths and filled bodies. Estimates have the robot's colour: dots with
-    95 % ellipses are its map, the outlined disc and the cloud around it are its belief of its own pose. Members of one
-    group wear a halo of one colour. A merge flashes for `flash.FLASH_TICKS` ticks.
+    The truth is grey or faint: walls, landmarks, paths and filled bodies. Estimates have the robot's colour: dots with
+    95 % ellipses are its map, the outlined disc and the particle cloud its pose. Members of a group have a halo of the
+    same colour. A merge flashes for `merge_effect.FLASH_TICKS` ticks.
 
     Args:
-        scene: What is to be seen, in the world frame.
-        size: Width and height [px], at least 160 x 120. The world keeps its proportions.
+        scene: Content of the picture in the world frame.
+        size: Width and height [px], at least 160 x 120; the aspect ratio of the world is kept.
 
     Returns:
-        (height, width, 3) uint8, RGB, a fresh array.
+        (height, width, 3) uint8, RGB. New array.
 
     Raises:
-        ValueError: If the size is not a pair of integers that large.
+        ValueError: If the size is not a pair of sufficiently large integers.
     """
     width, height = _checked_size(size)
     unit = min(width / 960.0, height / 720.0)
@@ -65,16 +64,16 @@ def draw_frame(scene: Scene, size: tuple[int, int] = (960, 720)) -> Image:
 
 
 def _checked_size(size: tuple[int, int]) -> tuple[int, int]:
-    """Return width and height, or raise."""
+    """Return the validated width and height, or raise."""
     if not isinstance(size, (tuple, list)) or len(size) != 2:
-        raise argument_error("size", "a pair (width, height)", size, "Give the picture's size in pixels.")
+        raise argument_error("size", "a pair (width, height)", size, "Give the size of the picture in pixels.")
     width = check_int("size[0]", size[0], SMALLEST_SIZE[0], "Give the width in pixels.")
     height = check_int("size[1]", size[1], SMALLEST_SIZE[1], "Give the height in pixels.")
     return width, height
 
 
 def _extent(scene: Scene) -> FloatArray:
-    """Return points (n, 2) that the picture must hold: the walls, or the true robots where there are no walls."""
+    """Return points (n, 2) that the picture must show: the walls, or without walls the true robots."""
     if len(scene.walls):
         return np.concatenate([scene.walls[:, :2], scene.walls[:, 2:]])
     spread = EMPTY_EXTENT_M * np.array([[-1.0, -1.0], [1.0, 1.0]])
@@ -83,7 +82,7 @@ def _extent(scene: Scene) -> FloatArray:
 
 
 def _draw_truth(plot: Image, view: Viewport, scene: Scene, unit: float) -> None:
-    """Draw what the robots cannot know: true landmarks, paths and walls."""
+    """Draw the true landmarks, paths and walls."""
     for index, robot in enumerate(scene.robots):
         faint = mix(robot_colour(index), palette.PAPER, 0.72)
         path(plot, view.pixels(robot.true_path), faint, max(1, round(4 * unit)))
@@ -93,19 +92,19 @@ def _draw_truth(plot: Image, view: Viewport, scene: Scene, unit: float) -> None:
 
 
 def _draw_map(plot: Image, view: Viewport, robot: RobotView, colour: palette.Colour, unit: float) -> None:
-    """Draw the landmarks that a robot holds with their 95 % ellipses."""
+    """Draw the landmarks of a robot's map with their 95 % ellipses."""
     means, covariances = robot.landmark_means, robot.landmark_covariances[:, :2, :2]
-    sound = np.isfinite(means).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2))
+    finite = np.isfinite(means).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2))
     dot = max(1.4, 2.2 * unit)
-    outlines = ellipse_outlines(means[sound, :2], covariances[sound], view, dot + 1.5)
+    outlines = ellipse_outlines(means[finite, :2], covariances[finite], view, dot + 1.5)
     lines(plot, outlines, mix(colour, palette.PAPER, 0.55), 1, True)
-    dots(plot, view.pixels(means[sound]), dot, colour)
+    dots(plot, view.pixels(means[finite]), dot, colour)
 
 
 def _draw_belief(
     plot: Image, view: Viewport, robot: RobotView, colour: palette.Colour, unit: float, radius: float
 ) -> None:
-    """Draw where a robot believes to be and to have been."""
+    """Draw a robot's estimated path, pose and particles, and the lines of sight to seen landmarks."""
     path(plot, view.pixels(robot.estimated_path), mix(colour, palette.PAPER, 0.2), max(1, round(1.6 * unit)))
     body = view.pixels(robot.true_pose)
     if len(robot.sight_lines):
@@ -119,7 +118,7 @@ def _draw_belief(
 
 
 def _outline(plot: Image, view: Viewport, pose: FloatArray, radius: float, colour: palette.Colour, unit: float) -> None:
-    """Draw an estimated pose: an outlined disc whose heading sticks out."""
+    """Draw an estimated pose: an outlined disc with a line in its heading."""
     centre, ahead = view.pixels(pose), np.array([np.cos(pose[2]), -np.sin(pose[2])])
     pen = max(1, round(2 * unit))
     disc(plot, centre, radius + 2.0 * unit, colour, pen)
@@ -127,7 +126,7 @@ def _outline(plot: Image, view: Viewport, pose: FloatArray, radius: float, colou
 
 
 def _draw_bodies(plot: Image, view: Viewport, scene: Scene, unit: float) -> None:
-    """Draw the true robots, in groups of several with a halo in the colour of the group's first robot."""
+    """Draw the true robots; members of larger groups with a halo in the colour of the group's first robot."""
     radius = max(scene.robot_radius * view.scale, 5.0 * unit)
     groups = [robot.group for robot in scene.robots]
     for index, robot in enumerate(scene.robots):

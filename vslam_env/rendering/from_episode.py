@@ -1,4 +1,4 @@
-"""An episode as it stands becomes a `Scene`: the truth, and each robot's estimates laid at its true start."""
+"""Conversion of an episode to a `Scene`: the truth, and the estimates moved by the robots' true start poses."""
 
 import numpy as np
 
@@ -12,12 +12,12 @@ from vslam_env.simulation.episode import Episode
 FLASH_TICKS = 30
 
 
-def build_scene(episode: Episode, standing: TeamMetrics) -> Scene:
-    """Return what a picture of an episode shows.
+def build_scene(episode: Episode, metrics: TeamMetrics) -> Scene:
+    """Return the scene of an episode after the last tick.
 
     Args:
-        episode: As it stands; nothing of it is shared with the scene but arrays that never change.
-        standing: Of the team at this moment.
+        episode: Running episode; only its constant arrays are shared with the scene.
+        metrics: Current metrics of the team.
     """
     landmarks = episode.world.landmarks
     assert landmarks is not None
@@ -33,8 +33,8 @@ def build_scene(episode: Episode, standing: TeamMetrics) -> Scene:
             for tick, robots_a, robots_b in episode.merge_ticks
             if episode.tick - tick <= FLASH_TICKS
         ),
-        map_errors=tuple(float(error) for error in standing.map_errors),
-        coverage=standing.coverage,
+        map_errors=tuple(float(error) for error in metrics.map_errors),
+        coverage=metrics.coverage,
     )
 
 

@@ -1,4 +1,4 @@
-"""The moment of a merge: lines between the two groups, expanding rings, and a caption, all fading."""
+"""Visual effect of a merge: fading lines between the groups, expanding rings and a caption."""
 
 import cv2
 import numpy as np
@@ -10,36 +10,36 @@ from vslam_env.rendering.palette import mix
 from vslam_env.rendering.scene import MergeFlash, Scene
 
 FLASH_TICKS = 20
-RING_M = 2.2  # [m] how far the rings run
+RING_M = 2.2  # [m] final radius of the rings
 
 
 def draw_flashes(plot: Image, view: Viewport, scene: Scene, unit: float) -> None:
-    """Draw rings and lines of the merges that are younger than `FLASH_TICKS`.
+    """Draw rings and lines for merges younger than `FLASH_TICKS`.
 
     Args:
-        plot: (H, W, 3) uint8, the part of the picture that shows the world; changed in place.
-        view: From metres to its pixels.
-        scene: What is to be seen.
-        unit: Size of the picture, 1 for 960 x 720.
+        plot: (H, W, 3) uint8. Part of the picture that shows the world; changed in place.
+        view: Mapping from metres to pixels.
+        scene: Content of the picture.
+        unit: Relative size of the picture, 1 for 960 x 720.
     """
     for merge in _recent_merges(scene):
         _draw_glow(plot, view, scene, merge, unit)
 
 
 def draw_captions(plot: Image, scene: Scene, unit: float) -> None:
-    """Write who merged, the youngest merge on top; the arguments are those of `draw_flashes`."""
+    """Write captions of recent merges, the latest on top; see `draw_flashes` for the arguments."""
     for line, merge in enumerate(_recent_merges(scene)):
         _draw_caption(plot, merge, line, unit)
 
 
 def _recent_merges(scene: Scene) -> list[MergeFlash]:
-    """Return the merges that still flash, the youngest first."""
-    young = (merge for merge in scene.merges if merge.age_ticks < FLASH_TICKS)
-    return sorted(young, key=lambda merge: merge.age_ticks)
+    """Return the merges younger than `FLASH_TICKS`, latest first."""
+    recent = (merge for merge in scene.merges if merge.age_ticks < FLASH_TICKS)
+    return sorted(recent, key=lambda merge: merge.age_ticks)
 
 
 def caption(merge: MergeFlash) -> str:
-    """Say who merged.
+    """Return the caption of a merge.
 
     >>> caption(MergeFlash(0, (1,), (2,)))
     'robot 1 + robot 2: maps merged'
@@ -53,15 +53,15 @@ def _names(robots: tuple[int, ...]) -> str:
 
 
 def _draw_glow(plot: Image, view: Viewport, scene: Scene, merge: MergeFlash, unit: float) -> None:
-    """Join every robot of one group to the nearest of the other, and let a ring run out from each."""
+    """Draw a line from every robot of one group to the nearest of the other, and rings around each robot."""
     age = merge.age_ticks / FLASH_TICKS
     overlay = plot.copy()
-    here, there = (_positions(view, scene, robots) for robots in (merge.robots_a, merge.robots_b))
-    for start in here:
-        end = there[np.argmin(np.hypot(*(there - start).T))]
+    side_a, side_b = (_positions(view, scene, robots) for robots in (merge.robots_a, merge.robots_b))
+    for start in side_a:
+        end = side_b[np.argmin(np.hypot(*(side_b - start).T))]
         lines(overlay, [np.stack([start, end])], palette.FLASH, max(2, round(5 * unit)), False)
     start_radius = scene.robot_radius * view.scale
-    for centre in (*here, *there):
+    for centre in (*side_a, *side_b):
         for lag in (0.0, 0.25):
             radius = start_radius + RING_M * view.scale * np.sqrt(max(age - lag, 0.0))
             disc(overlay, centre, radius, palette.FLASH, max(1, round((5 - 3 * age) * unit)))
@@ -74,16 +74,16 @@ def _positions(view: Viewport, scene: Scene, robots: tuple[int, ...]) -> FloatAr
 
 
 def _draw_caption(plot: Image, merge: MergeFlash, line: int, unit: float) -> None:
-    """Write who merged on a plate at the top of the plot."""
+    """Write the caption of a merge on a plate at the top of the plot."""
     age = merge.age_ticks / FLASH_TICKS
     size = max(6.0, 13.0 * unit)
     text = caption(merge)
-    width, high = text_width(text, size) + 3.0 * size, 2.6 * size
+    width, height = text_width(text, size) + 3.0 * size, 2.6 * size
     middle = 0.5 * plot.shape[1]
-    row, column = round(8 * unit + line * 1.15 * high), round(middle - 0.5 * width)
-    plate = plot[row : row + round(high), max(column, 0) : column + round(width)]
+    row, column = round(8 * unit + line * 1.15 * height), round(middle - 0.5 * width)
+    plate = plot[row : row + round(height), max(column, 0) : column + round(width)]
     fade = 0.5 * age * age
     before = plate.copy()
     plate[:] = mix(palette.FLASH, palette.PAPER, 0.25)
-    write(plate, text, 1.5 * size, 0.5 * high, size, palette.INK)
+    write(plate, text, 1.5 * size, 0.5 * height, size, palette.INK)
     cv2.addWeighted(plate.copy(), 1.0 - fade, before, fade, 0.0, plate)

@@ -1,4 +1,4 @@
-"""The header, with time and coverage, and the footer, with the map error of each robot and who shares a map."""
+"""Header with time and coverage, and footer with the robots' map errors and groups."""
 
 import numpy as np
 
@@ -9,11 +9,11 @@ from vslam_env.rendering.scene import Scene
 
 
 def draw_header(strip: Image, scene: Scene) -> None:
-    """Write the simulated time and how many maps there are, and draw the coverage as a bar.
+    """Draw the simulated time, the number of maps and a bar of the coverage.
 
     Args:
-        strip: (H, W, 3) uint8, the top of the picture; changed in place, sizes go by its height.
-        scene: What is to be seen.
+        strip: (H, W, 3) uint8. Top of the picture, whose height sets all sizes; changed in place.
+        scene: Content of the picture.
     """
     height, width = strip.shape[:2]
     fill(strip, palette.STRIP)
@@ -35,16 +35,16 @@ def draw_header(strip: Image, scene: Scene) -> None:
 
 
 def _bar(strip: Image, left: float, right: float, middle: float, half: float, colour: palette.Colour) -> None:
-    """Fill a rectangle given in pixels."""
+    """Fill a rectangle [px]."""
     strip[round(middle - half) : round(middle + half), round(left) : max(round(right), round(left) + 1)] = colour
 
 
 def draw_footer(strip: Image, scene: Scene) -> None:
-    """Give each robot a card with its map error [m], those of one group side by side on one plate.
+    """Draw a card with the map error [m] of each robot; the cards of a group share a plate.
 
     Args:
-        strip: (H, W, 3) uint8, the foot of the picture; changed in place, sizes go by its height.
-        scene: What is to be seen.
+        strip: (H, W, 3) uint8. Bottom of the picture, whose height sets all sizes; changed in place.
+        scene: Content of the picture.
     """
     height, width = strip.shape[:2]
     fill(strip, palette.STRIP)
@@ -67,7 +67,7 @@ def draw_footer(strip: Image, scene: Scene) -> None:
 
 
 def _plate(strip: Image, left: float, width: float, gap: float, accent: palette.Colour) -> None:
-    """Draw the plate that carries the cards of one group, with a thick edge in the group's colour."""
+    """Draw the plate under the cards of one group, with a thick edge in the group's colour."""
     height = strip.shape[0]
     top, bottom = round(gap), round(height - gap)
     start, end = round(left), round(left + width)
@@ -76,14 +76,14 @@ def _plate(strip: Image, left: float, width: float, gap: float, accent: palette.
 
 
 def _card(strip: Image, robot: int, error: float, left: float, width: float) -> None:
-    """Write a robot's number and its map error, on one line or, where there is no room, in two."""
+    """Write a robot's index and map error, on two lines if one is too narrow."""
     height = strip.shape[0]
     size, middle = 0.19 * height, 0.48 * height
     disc(strip, np.array([left + 0.32 * height, middle]), 0.13 * height, robot_colour(robot))
     figure = f"{error:.2f} m" if np.isfinite(error) else "-"
-    start, room = left + 0.56 * height, width - 0.7 * height
+    start, available = left + 0.56 * height, width - 0.7 * height
     name, wide = f"robot {robot}", f"robot {robot}   map error {figure}"
-    if text_width(wide, size) <= room:
+    if text_width(wide, size) <= available:
         write(strip, wide, start, middle, size, palette.INK)
     else:
         write(strip, name, start, middle - 0.8 * size, 0.85 * size, palette.FAINT_INK)

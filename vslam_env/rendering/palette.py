@@ -1,4 +1,4 @@
-"""The colours of a picture, RGB: few, quiet, and told apart by colour-blind readers."""
+"""Colours (RGB), distinguishable with colour vision deficiency."""
 
 import numpy as np
 
@@ -13,7 +13,7 @@ WALL: Colour = (176, 178, 184)
 TRUE_LANDMARK: Colour = (160, 160, 158)
 FLASH: Colour = (240, 196, 25)
 
-# Okabe and Ito's set, its yellow (too light on paper) replaced by a brown.
+# Palette of Okabe and Ito, with brown instead of yellow, which is too light on this background.
 ROBOTS: tuple[Colour, ...] = (
     (0, 114, 178),
     (213, 94, 0),
@@ -27,12 +27,12 @@ ROBOTS: tuple[Colour, ...] = (
 
 
 def robot_colour(index: int) -> Colour:
-    """Return the colour (RGB) of the robot of an index >= 0; they repeat after eight."""
+    """Return the colour (RGB) of the robot with an index >= 0; colours repeat after eight."""
     return ROBOTS[index % len(ROBOTS)]
 
 
 def mix(colour: Colour, other: Colour, share: float) -> Colour:
-    """Return `colour` with a `share` in [0, 1] of `other`: drawn on paper this looks translucent.
+    """Return the mixture of `colour` and a `share` in [0, 1] of `other`; with the background it looks translucent.
 
     >>> mix((0, 100, 200), (100, 100, 100), 0.5)
     (50, 100, 150)

@@ -1,4 +1,4 @@
-"""What a picture shows: plain frozen arrays in the world frame, free of simulator and filter."""
+"""Content of a picture: plain arrays in the world frame, independent of simulator and filters."""
 
 from dataclasses import dataclass
 
@@ -7,19 +7,19 @@ from slam_backend.core.validation import FloatArray
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RobotView:
-    """One robot: where it is, where it believes to be, and the map it holds.
+    """True and estimated poses and map of one robot.
 
-    Estimates are moved by the robot's true start pose, so that drift shows as distance from the truth.
+    Estimates are moved by the robot's true start pose, so that drift appears as distance from the truth.
 
     Attributes:
-        true_pose: (3,) float64 [m, m, rad].
-        true_path: (T, 2) float64 [m]. Positions up to now, oldest first; may be empty.
-        estimated_pose: (3,) float64 [m, m, rad].
-        estimated_path: (T, 2) float64 [m]. The pose estimates as they were made, oldest first; may be empty.
-        particles: (M, 3) float64 [m, m, rad].
-        landmark_means: (n, 3) float64 [m].
-        landmark_covariances: (n, 3, 3) float64 [m^2].
-        sight_lines: (k, 2) float64 [m]. Where the lines from the true position to the landmarks seen now end.
+        true_pose: (3,) float64 [m, m, rad]. True pose.
+        true_path: (T, 2) float64 [m]. True positions so far, oldest first; may be empty.
+        estimated_pose: (3,) float64 [m, m, rad]. Estimated pose.
+        estimated_path: (T, 2) float64 [m]. Online position estimates, oldest first; may be empty.
+        particles: (M, 3) float64 [m, m, rad]. Pose in each particle.
+        landmark_means: (n, 3) float64 [m]. Means of the map's landmarks.
+        landmark_covariances: (n, 3, 3) float64 [m^2]. Covariances of the map's landmarks.
+        sight_lines: (k, 2) float64 [m]. True positions of the landmarks seen in the last tick.
         group: Label of the robot's group; robots with the same label share one map.
     """
 
@@ -36,10 +36,10 @@ class RobotView:
 
 @dataclass(frozen=True, slots=True)
 class MergeFlash:
-    """A merge that has just happened.
+    """Recent merge of two groups.
 
     Attributes:
-        age_ticks: Ticks since then, >= 0.
+        age_ticks: Ticks since the merge, >= 0.
         robots_a: Indices of the robots of one group.
         robots_b: Indices of the robots of the other.
     """
@@ -51,16 +51,16 @@ class MergeFlash:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """All that one frame shows.
+    """Content of one frame.
 
     Attributes:
-        walls: (S, 4) float64 [m]. Segments (x1, y1, x2, y2).
+        walls: (S, 4) float64 [m]. Wall segments (x1, y1, x2, y2).
         landmarks: (N, 3) float64 [m]. True positions.
-        robots: One view per robot.
+        robots: View of each robot.
         tick: Ticks since the reset.
         time: Simulated time since the reset [s].
-        robot_radius: [m].
-        merges: Recent merges; a drawing may leave out old ones.
+        robot_radius: Radius of the robots [m].
+        merges: Recent merges; a drawing may omit older ones.
         map_errors: Map error of each robot [m].
         coverage: Share of the reachable free area that has been seen, in [0, 1].
     """

@@ -1,4 +1,4 @@
-"""A window on the screen for `render_mode="human"`, where there is a screen, and the keys that are pressed in it."""
+"""Window for `render_mode="human"`, with keyboard input."""
 
 import os
 import sys
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 
 def display_unavailable_reason() -> str:
-    """Return why no window can be opened here, with the cure; the empty string where one can."""
+    """Return why no window can be opened, with a hint; an empty string if one can be opened."""
     try:
         import pygame  # noqa: F401
     except ImportError:
@@ -18,16 +18,16 @@ def display_unavailable_reason() -> str:
     named = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"))
     if named or sys.platform in ("win32", "darwin"):
         return ""
-    return "there is no screen. Without one, render_mode='rgb_array' gives pictures and `vslam run` a video"
+    return "there is no display. Use render_mode='rgb_array' for pictures, or `vslam run` for a video"
 
 
 class Window:
-    """Shows frames; without pygame or a screen it says so once and shows nothing.
+    """Window that shows frames; without pygame or a display it warns once and shows nothing.
 
     Attributes:
-        held: Names of the keys that are held down, as of the last frame.
-        typed: Names of the keys that went down since the frame before, in order.
-        closed: Whether the user has closed the window; it shows nothing more then.
+        held: Names of the keys held down at the last frame.
+        typed: Names of the keys pressed since the previous frame, in order.
+        closed: Whether the user has closed the window; it then shows no more frames.
     """
 
     def __init__(self, title: str) -> None:
@@ -50,14 +50,14 @@ class Window:
             self._pygame.display.flip()
 
     def close(self) -> None:
-        """Close the window; a later `show` opens another one, unless the user closed it."""
+        """Close the window; a later `show` opens a new one, unless the user closed it."""
         if self._surface is not None:
             self._pygame.display.quit()
             self._surface = None
         self.held.clear()
 
     def _read_keys(self) -> None:
-        """Take note of the keys and of the window's own cross."""
+        """Update the keys, and close the window if the user has closed it."""
         pygame = self._pygame
         self.typed = []
         for event in pygame.event.get():

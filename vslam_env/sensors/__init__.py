@@ -1,4 +1,4 @@
-"""What the robots' sensors report of the world: measured landmarks and scans, with the true noise."""
+"""Simulated sensors with true noise: landmark sensor, rendered stereo cameras and range finder."""
 
 from vslam_env.sensors.landmark_sensor import LandmarkSensor, LandmarkSensorConfig, SensorFrame, TeamSensorFrames
 from vslam_env.sensors.range_finder import RangeFinder, ScanConfig

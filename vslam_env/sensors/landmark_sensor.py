@@ -1,4 +1,4 @@
-"""The landmark sensor: true poses become noisy measurements of the landmarks that each camera sees."""
+"""Landmark sensor: noisy measurements of the landmarks in view of each camera."""
 
 from dataclasses import dataclass, field
 from operator import itemgetter
@@ -23,20 +23,20 @@ from vslam_env.world._kernels import detect
 from vslam_env.world.spec import Landmarks
 from vslam_env.world.visibility import as_coordinate_rows, landmark_geometry, view_limits, visible_landmarks
 
-MAX_POINTS = 10_000  # of a frame; time ends before
+MAX_POINTS = 10_000  # limit per frame
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LandmarkSensorConfig:
-    """How well cameras see, in truth; what a filter assumes is set elsewhere.
+    """True noise and limits of the cameras; the assumed noise is part of `BeliefConfig`.
 
     Attributes:
         camera: Field of view, range and true noise.
-        max_measurements: At most so many measurements a frame (B).
+        max_measurements: Largest number of measurements per frame (B).
         detection_probability: Probability that a visible landmark is detected, in [0, 1].
-        false_points: Expected number of points per frame that are no landmark.
-        descriptor_noise: Root mean square length of the noise added to a descriptor before it is normalised again.
-        max_incidence: A face seen at a larger angle to its normal shows no landmarks [rad].
+        false_points: Expected number of false points per frame.
+        descriptor_noise: Root mean square length of the noise added to a descriptor before normalisation.
+        max_incidence: Largest angle between line of sight and face normal at which landmarks are visible [rad].
     """
 
     camera: StereoCamera = field(default_factory=StereoCamera)
@@ -53,23 +53,23 @@ class LandmarkSensorConfig:
         check_float(
             "sensor.detection_probability", self.detection_probability, "Give a share.", at_least=0.0, at_most=1.0
         )
-        cure = "Give points per frame."
-        check_float("sensor.false_points", self.false_points, cure, at_least=0.0, at_most=MAX_POINTS)
+        hint = "Give points per frame."
+        check_float("sensor.false_points", self.false_points, hint, at_least=0.0, at_most=MAX_POINTS)
         check_float("sensor.descriptor_noise", self.descriptor_noise, "Give an L2 length.", at_least=0.0, at_most=1e6)
         check_float("sensor.max_incidence", self.max_incidence, "Give radians.", above=0.0, at_most=np.pi / 2)
 
     @property
     def farthest(self) -> float:
-        """No point is reported whose measured place is farther from the camera [m], whatever its noise."""
+        """Largest measured distance from the camera [m]; farther points are discarded."""
         return min(FARTHEST, BEYOND * self.camera.max_range)
 
 
 class SensorFrame(NamedTuple):
-    """What one camera reports in one tick, and, for the simulator's books, what it was.
+    """Measurements of one camera in one tick, with the true association.
 
     Attributes:
-        measurements: n points in random order, camera frame; without covariances.
-        true_ids: (n,) int64. Index of the landmark behind each point; -1 for a false point.
+        measurements: Measurements of n points in random order, camera frame; without covariances.
+        true_ids: (n,) int64. True landmark of each point; -1 for a false point.
     """
 
     measurements: Measurements
@@ -80,9 +80,9 @@ class TeamSensorFrames(NamedTuple):
     """The frames of all robots in one tick.
 
     Attributes:
-        measurements: In one piece.
-        names: (K, B) int64. In each row the landmarks behind a robot's points, -1 for a false point. What follows them
-            means nothing, but names no other landmarks.
+        measurements: Measurements of the team.
+        names: (K, B) int64. True landmarks of each robot's points, -1 for a false point. Entries beyond a robot's
+            points are arbitrary but valid indices.
     """
 
     measurements: TeamMeasurements
@@ -90,7 +90,7 @@ class TeamSensorFrames(NamedTuple):
 
     @property
     def true_ids(self) -> list[IntArray]:
-        """Per robot as of its `Frame`. Copies: the books go by `names`."""
+        """Copies of the true landmarks of each robot's points."""
         ends = self.measurements.offsets.tolist()
         return [row[: end - begin].copy() for row, begin, end in zip(self.names, [0, *ends[:-1]], ends, strict=True)]
 
@@ -100,16 +100,16 @@ class TeamSensorFrames(NamedTuple):
 
 
 class LandmarkSensor:
-    """Measures the landmarks of one world with the cameras of all robots.
+    """Cameras of all robots that measure the landmarks of one world.
 
     Args:
-        config: How well.
-        walls: (S, 4) float64 [m], world frame.
-        landmarks: On these walls.
-        robot_radius: Robots hide what stands behind them [m].
+        config: True noise and limits.
+        walls: (S, 4) float64 [m], world frame. Wall segments.
+        landmarks: Landmarks on these walls.
+        robot_radius: Radius of the robots, which occlude landmarks [m].
 
     Attributes:
-        config: Configuration of the sensor.
+        config: True noise and limits.
         robot_radius: Radius of the robots [m].
     """
 
@@ -135,27 +135,27 @@ class LandmarkSensor:
         )
         self._frame_shape = config.max_measurements, self._points.shape[1]
         self._no_false_points = np.empty((0, self._points.shape[1]))
-        # False points look like landmarks of this world: the common part of all descriptors and a part of their own.
+        # Descriptors of false points resemble those of landmarks: a common part and an individual part.
         common = descriptors.mean(axis=0) if len(landmarks) else np.zeros(descriptors.shape[1])
         self._common = as_read_only(common)
         self._own_share = np.sqrt(max(0.0, 1.0 - float(self._common @ self._common)))
 
     def visible(self, poses: FloatArray) -> BoolArray:
-        """Tell which landmarks (K, N) the robots at `poses` (K, 3) [m, m, rad], world frame, can see."""
+        """Return which landmarks are visible (K, N) from poses (K, 3) [m, m, rad], world frame."""
         return visible_landmarks(poses, self._landmarks, self._walls, self.robot_radius, self._view)
 
     def measure(self, poses: FloatArray, rng: np.random.Generator) -> TeamSensorFrames:
         """Take a frame with each robot's camera.
 
-        Each visible landmark is detected independently. False points take their places among the at most B points;
-        the others are drawn uniformly from the detected landmarks.
+        Visible landmarks are detected independently. A frame has at most B points: its false points and a uniform
+        sample of the detected landmarks.
 
         Args:
             poses: (K, 3) float64 [m, m, rad], world frame. True poses.
             rng: Source of the draws.
 
         Returns:
-            One frame of each robot. Nothing in the order of its points tells anything about them.
+            One frame per robot, with its points in random order.
         """
         config, robots, (most, size) = self.config, len(poses), self._frame_shape
         num_false = rng.poisson(config.false_points, robots)
@@ -168,35 +168,35 @@ class LandmarkSensor:
             false_points = self._sample_clutter(extra, rng)
             shuffle_clutter(num_false, rng.random(total), ids, ends)
         noise = rng.standard_normal((total, size))
-        points, looks = np.empty((total, 3)), np.empty((total, size - 3), np.float32)
-        kept = measure(ids, ends, poses, self._points, false_points, noise, self._optics, points, looks)
-        if kept < total:
-            points, looks = points[:kept], looks[:kept]
-        return TeamSensorFrames(TeamMeasurements(points, looks, ends), ids)
+        points, descriptors = np.empty((total, 3)), np.empty((total, size - 3), np.float32)
+        count = measure(ids, ends, poses, self._points, false_points, noise, self._optics, points, descriptors)
+        if count < total:
+            points, descriptors = points[:count], descriptors[:count]
+        return TeamSensorFrames(TeamMeasurements(points, descriptors, ends), ids)
 
     def _sample_clutter(self, count: int, rng: np.random.Generator) -> FloatArray:
-        """Draw points that are no landmarks, and descriptors of them (count, 3 + d)."""
+        """Draw false points and their descriptors (count, 3 + d)."""
         size = len(self._common)
-        places, looks = rng.random((3, count)), rng.standard_normal((count, size))
+        positions, descriptors = rng.random((3, count)), rng.standard_normal((count, size))
         points = np.empty((count, 3 + size))
-        sample_clutter(places, looks, self._common, self._own_share, self._view, points)
+        sample_clutter(positions, descriptors, self._common, self._own_share, self._view, points)
         return points
 
 
 def shuffle_clutter(num_false: IntArray, keys: FloatArray, ids: IntArray, counts: IntArray) -> None:
-    """Put the false points of each robot among its landmarks, in random order.
+    """Insert the false points of each robot among its landmarks in random order.
 
     Args:
-        num_false: (K,) int64. Number of false points that each robot reports.
-        keys: (n,) float64, uniform. Keys of each robot's landmarks, then of its false points.
-        ids: (K, B) int64. In each row the landmarks that a robot reports; changed to landmarks, and -1 - j for false
-            point j, by rising keys.
-        counts: (K,) int64. Number of landmarks that each robot reports; changed to the number of points.
+        num_false: (K,) int64. Number of false points of each robot.
+        keys: (n,) float64, uniform. Sort keys of each robot's landmarks, then of its false points.
+        ids: (K, B) int64. Detected landmarks of each robot; changed to landmarks, and -1 - j for false point j, in
+            ascending order of keys.
+        counts: (K,) int64. Number of detected landmarks of each robot; changed to the number of points.
     """
     begin, next_false = 0, -1
     for row, num_true, more in zip(ids, counts.tolist(), num_false.tolist(), strict=True):
-        names = [*row[:num_true].tolist(), *range(next_false, next_false - more, -1)]
-        own = keys[begin : begin + len(names)].tolist()
-        row[: len(names)] = [name for _, name in sorted(zip(own, names, strict=True), key=itemgetter(0))]
-        begin, next_false = begin + len(names), next_false - more
+        points = [*row[:num_true].tolist(), *range(next_false, next_false - more, -1)]
+        own = keys[begin : begin + len(points)].tolist()
+        row[: len(points)] = [point for _, point in sorted(zip(own, points, strict=True), key=itemgetter(0))]
+        begin, next_false = begin + len(points), next_false - more
     counts += num_false

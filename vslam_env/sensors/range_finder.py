@@ -1,4 +1,4 @@
-"""The range finder: how far each robot can look along 32 rays in its camera's field of view."""
+"""Range finder: distances along a fan of rays in the field of view of a robot's camera."""
 
 from dataclasses import dataclass, field
 
@@ -10,17 +10,17 @@ from slam_backend.models.camera import StereoCamera
 from vslam_env.world._kernels import cast_scans
 from vslam_env.world.visibility import as_coordinate_rows, ray_fan
 
-MOST_RAYS = 100_000  # of a robot; memory ends before
+MOST_RAYS = 100_000  # limit per robot
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScanConfig:
-    """What the range finder looks at and how well.
+    """Field of view, range and true noise of the range finder.
 
     Attributes:
-        num_rays: Rays, evenly spread over the field of view from right to left, the outermost on its edges (R).
-        half_fov: Half of the field of view [rad]; by default that of the camera.
-        max_range: Where nothing is met nearer, this is read [m].
+        num_rays: Number of rays (R), evenly spaced over the field of view from right to left, including its edges.
+        half_fov: Half of the field of view [rad]; by default the same as for the camera.
+        max_range: Range of a ray without a hit [m].
         sigma: Standard deviation of a reading, as a share of the distance.
     """
 
@@ -42,11 +42,11 @@ class ScanConfig:
 
 
 class RangeFinder:
-    """Range finders of all robots in one world; they see walls and the other robots.
+    """Range finders of all robots in one world, which detect walls and other robots.
 
     Attributes:
-        config: What they look at and how well.
-        ray_angles: (R,) float64 [rad], robot frame. Read-only.
+        config: Field of view, range and true noise.
+        ray_angles: (R,) float64 [rad], robot frame. Directions of the rays; read-only.
     """
 
     def __init__(self, config: ScanConfig, walls: FloatArray, robot_radius: float = 0.2) -> None:
@@ -55,17 +55,17 @@ class RangeFinder:
         walls = check_array("walls", walls, (None, 4), "Give rows x1 y1 x2 y2 in metres.")
         robot_radius = check_float("robot_radius", robot_radius, "Give metres.", at_least=0.0)
         fan = *ray_fan(config.ray_angles), as_coordinate_rows(walls)
-        self._sight = *fan, robot_radius, config.max_range, config.sigma  # as the kernel expects it
+        self._sight = *fan, robot_radius, config.max_range, config.sigma  # in the order of the kernel's arguments
 
     def measure(self, poses: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Read all rays of all robots.
 
         Args:
             poses: (K, 3) float64 [m, m, rad], world frame. True poses.
-            rng: Source of the draws: K R of them, whatever is in view.
+            rng: Source of the draws, always K R of them.
 
         Returns:
-            (K, R) float64 [m] in [0, max_range]. A ray that meets nothing reads exactly `max_range`.
+            (K, R) float64 [m] in [0, max_range]. A ray without a hit reads exactly `max_range`.
         """
         ranges = rng.standard_normal((len(poses), len(self.ray_angles)))
         cast_scans(poses, *self._sight, ranges)

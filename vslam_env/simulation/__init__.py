@@ -1,1 +1,1 @@
-"""Episodes: a world with robots in it, their controllers, their radio, and the truth about them."""
+"""Episodes, scenarios, controllers and communication of simulated robots."""

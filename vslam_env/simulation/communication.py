@@ -1,4 +1,4 @@
-"""Which robots hear each other: range, sight and loss of their radios."""
+"""Communication between robots: contacts limited by range, line of sight and random loss."""
 
 import numpy as np
 
@@ -13,35 +13,35 @@ def contacts(
     loss: float,
     rng: np.random.Generator,
 ) -> BoolArray:
-    """Return who hears whom in a tick; links work both ways or not at all.
+    """Return the contacts of a tick.
 
     Args:
-        poses: (K, 3) float64 [m, m, rad], world frame. True ones.
+        poses: (K, 3) float64 [m, m, rad], world frame. True poses.
         walls: (S, 4) float64 [m], world frame, rows (x1, y1, x2, y2).
-        comm_range: No link is longer than this [m]; None: any length.
-        line_of_sight: Whether walls cut links. Robots do not.
-        loss: Probability that a link that is there fails in this tick, each by itself.
-        rng: Drawn from only where links can fail, and then as often whatever the poses.
+        comm_range: Largest length of a link [m]; None: unlimited.
+        line_of_sight: Whether walls block links. Robots never do.
+        loss: Probability that an available link fails in this tick, independently of the others.
+        rng: Source of the draws; unused if `loss` is 0, else drawn from equally often for all poses.
 
     Returns:
-        (K, K) bool, symmetric; each robot hears itself.
+        (K, K) bool. Symmetric matrix of contacts; each robot is in contact with itself.
     """
     count = len(poses)
     one, other = np.triu_indices(count, 1)
-    heard = np.ones(len(one), dtype=np.bool_)
+    linked = np.ones(len(one), dtype=np.bool_)
     if comm_range is not None:
-        heard &= np.hypot(*(poses[one, :2] - poses[other, :2]).T) <= comm_range
-    if line_of_sight and heard.any():
-        heard[heard] = ~crosses_wall(poses[one[heard], :2], poses[other[heard], :2], walls)
+        linked &= np.hypot(*(poses[one, :2] - poses[other, :2]).T) <= comm_range
+    if line_of_sight and linked.any():
+        linked[linked] = ~crosses_wall(poses[one[linked], :2], poses[other[linked], :2], walls)
     if loss > 0.0:
-        heard &= rng.random(len(one)) >= loss
+        linked &= rng.random(len(one)) >= loss
     matrix = np.eye(count, dtype=np.bool_)
-    matrix[one, other] = matrix[other, one] = heard
+    matrix[one, other] = matrix[other, one] = linked
     return matrix
 
 
 def crosses_wall(starts: FloatArray, ends: FloatArray, walls: FloatArray) -> BoolArray:
-    """Tell which straight lines (n, 2) to (n, 2) [m] cross or touch any of the walls (S, 4) [m].
+    """Return which segments, from (n, 2) to (n, 2) [m], cross or touch any of the walls (S, 4) [m].
 
     >>> wall = np.array([[1.0, -1.0, 1.0, 1.0]])
     >>> crosses_wall(np.zeros((3, 2)), np.array([[2.0, 0.0], [0.5, 0.0], [2.0, 5.0]]), wall).tolist()

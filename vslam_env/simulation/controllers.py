@@ -1,4 +1,4 @@
-"""Robots carry out actions: commands as they stand, or the ways to the `goal` candidates that they chose."""
+"""Execution of actions: velocity commands, and drives to the candidates chosen by `goal` actions."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -15,9 +15,9 @@ from vslam_env.simulation.episode import Episode
 
 
 class GoalController:
-    """Drives one robot to the candidate that it chose, over the floor of its own grid.
+    """Controller that drives one robot to a chosen candidate over its own occupancy grid.
 
-    A path is planned when the goal is set, and again when the robot bumps into something.
+    It plans a path when the goal is set, and again after a bump.
     """
 
     def __init__(self) -> None:
@@ -26,11 +26,11 @@ class GoalController:
         self._path: FloatArray | None = None
 
     def set_goal(self, candidate: tuple[FloatArray, float] | None, pose: FloatArray, cells: NDArray[np.uint8]) -> None:
-        """Head for a goal (2,) [m], start frame, and look in a direction [rad] there; or stay with None.
+        """Set the goal and plan a path to it.
 
         Args:
-            candidate: Goal and direction.
-            pose, cells: As of `command`.
+            candidate: Goal (2,) [m] and heading at the goal [rad], start frame; None: stay.
+            pose, cells: Pose and grid, see `command`.
         """
         if candidate is None:
             self._goal = None
@@ -42,9 +42,9 @@ class GoalController:
         """Return the velocity command (2,) [m/s, rad/s] for the next tick.
 
         Args:
-            pose: (3,) float64 [m, m, rad], start frame. As the robot believes.
-            cells: (300, 300) uint8. Of its seen grid.
-            bumped: Whether it bumped into something in the last tick.
+            pose: (3,) float64 [m, m, rad], start frame. Pose estimate of the robot.
+            cells: (300, 300) uint8. Cells of its occupancy grid.
+            bumped: Whether the robot bumped into an obstacle in the last tick.
         """
         if self._goal is None:
             return np.zeros(2)
@@ -55,21 +55,21 @@ class GoalController:
         return np.array(follow_path(pose, self._path, MAX_SPEED, MAX_TURN, self._heading))
 
     def get_state(self) -> dict[str, Any]:
-        """Return where it is heading, and by which way. Arrays are read-only."""
+        """Return goal, heading and path; arrays are read-only."""
         goal, path = (None if array is None else as_read_only(array) for array in (self._goal, self._path))
         return {"goal": goal, "heading": self._heading, "path": path}
 
     def set_state(self, state: Mapping[str, Any]) -> None:
-        """Go on as the driver that gave `state`, with copies of goal and path."""
+        """Restore a state of `get_state`, with copies of goal and path."""
         goal, self._heading, path = state["goal"], state["heading"], state["path"]
         self._goal, self._path = (None if array is None else array.copy() for array in (goal, path))
 
 
 class ActionExecutor:
-    """Drives all robots of an environment for a step.
+    """Executor of the actions of all robots for a step.
 
     Args:
-        config: Of the environment.
+        config: Configuration of the environment.
     """
 
     def __init__(self, config: EnvConfig) -> None:
@@ -77,14 +77,14 @@ class ActionExecutor:
         self._drivers = [GoalController() for _ in range(config.num_robots)]
 
     def execute(self, episode: Episode, chosen: Any) -> list[int]:
-        """Let an episode advance by the ticks of a step.
+        """Advance an episode by the ticks of a step.
 
         Args:
-            episode: It is changed.
-            chosen: What each robot is to do, as `checked_actions` returns it.
+            episode: Episode to change.
+            chosen: Commands or actions, as returned by `checked_actions`.
 
         Returns:
-            Per robot 1 if its action was masked, else 0.
+            1 for each robot whose action was masked, else 0.
         """
         if self._action_type != "goal":
             for _ in range(self._ticks):
@@ -97,18 +97,18 @@ class ActionExecutor:
             driver.set_goal(candidate, poses[robot], beliefs.cells(robot))
         for _ in range(self._ticks):
             poses, bumps = beliefs.poses, episode.readings.bumps.tolist()
-            driven = [
+            commands = [
                 driver.command(poses[robot], beliefs.cells(robot), bumps[robot])
                 for robot, driver in enumerate(self._drivers)
             ]
-            episode.advance(np.array(driven))
-        return [int(action != 0 and found is None) for action, found in zip(chosen, candidates, strict=True)]
+            episode.advance(np.array(commands))
+        return [int(action != 0 and candidate is None) for action, candidate in zip(chosen, candidates, strict=True)]
 
     def get_state(self) -> list[dict[str, Any]]:
-        """Return where each robot is heading."""
+        """Return the states of all controllers."""
         return [driver.get_state() for driver in self._drivers]
 
     def set_state(self, state: Sequence[Mapping[str, Any]]) -> None:
-        """Go on as the drivers that gave `state`."""
-        for driver, kept in zip(self._drivers, state, strict=True):
-            driver.set_state(kept)
+        """Restore a state of `get_state`."""
+        for driver, driver_state in zip(self._drivers, state, strict=True):
+            driver.set_state(driver_state)

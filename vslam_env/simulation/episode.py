@@ -1,4 +1,4 @@
-"""`Episode`: one world with robots in it, what they perceive and believe, and the simulator's books; tick by tick."""
+"""Episode: simulation of the world, the sensors, the beliefs and the ground-truth association, tick by tick."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ from vslam_env.simulation.scenario import Scenario
 from vslam_env.world import Simulator, read_odometry
 
 MIN_SHARED = 3
-SIGMA = 1e-4  # [m, rad] what stands for certainty where a covariance is needed
+SIGMA = 1e-4  # [m, rad] standard deviation of a true alignment
 
 
 def true_alignment(
@@ -36,13 +36,13 @@ def true_alignment(
 
     Args:
         claims_a: (n,) int64. True landmark of each row of map a, negative for none.
-        claims_b: (m,) int64. Likewise of map b.
+        claims_b: (m,) int64. True landmark of each row of map b, negative for none.
         true_start_a: (3,) [m, m, rad]. True start pose of a's first robot, whose start frame is the map frame.
-        true_start_b: (3,) Likewise of b.
+        true_start_b: (3,) [m, m, rad]. True start pose of b's first robot.
     """
-    real_a, real_b = (np.where(claims >= 0, claims, -1 - np.arange(len(claims))) for claims in (claims_a, claims_b))
-    # Of duplicates the first is taken; what is negative is unique in its map and must not match across maps.
-    shared, rows_a, rows_b = np.intersect1d(real_a, real_b, return_indices=True)
+    unique_a, unique_b = (np.where(claims >= 0, claims, -1 - np.arange(len(claims))) for claims in (claims_a, claims_b))
+    # The first of duplicates is taken; negative numbers are unique in a map and must not match across maps.
+    shared, rows_a, rows_b = np.intersect1d(unique_a, unique_b, return_indices=True)
     inliers = np.column_stack([rows_a, rows_b])[shared >= 0]
     if len(inliers) < MIN_SHARED:
         return None
@@ -54,59 +54,57 @@ Recorder = Callable[[tuple[Readings, ...]], None]
 
 
 def num_shared(path: Sequence[FloatArray], own: Sequence[FloatArray]) -> int:
-    """Return how many of the first entries of a path are the same arrays as of another, all that both have or none."""
+    """Return the length of the common prefix of two paths, if it covers the shorter path; else 0."""
     known = min(len(path), len(own))
     try:
         return known if list(path[:known]) == list(own[:known]) else 0
-    except ValueError:  # of arrays that are other ones
+    except ValueError:  # comparison of different arrays
         return 0
 
 
 def path_of(path: Sequence[FloatArray], own: list[FloatArray]) -> list[FloatArray]:
-    """Return a path whose arrays no other holder can change; the first ones are taken from an own path if it can be."""
+    """Return a read-only copy of a path that shares its common prefix with an own path."""
     known = num_shared(path, own)
     return own[:known] + [as_constant(poses) for poses in path[known:]]
 
 
 @dataclass(slots=True)
 class ReadingsHook:
-    """Where readings can be listened to: an environment keeps it over its episodes."""
+    """Hook for a recorder of readings, kept by an environment over its episodes."""
 
     recorder: Recorder | None = None
 
 
 class Episode:
-    """From a reset to the next.
-
-    Each concern draws from a stream of its own, so that a new draw in one never shifts another.
+    """Simulation from one reset to the next, with an independent random stream for each concern.
 
     Args:
-        config: Of the environment.
-        setting: What was drawn at the reset.
-        tap: Its recorder is called with the readings of each tick, the first ones included.
+        config: Configuration of the environment.
+        scenario: Scenario drawn at the reset.
+        hook: Hook whose recorder receives the readings of each tick, including the reset.
 
     Attributes:
-        setting: What was drawn at the reset; of these:
+        setting: Scenario of the episode.
         world: Walls and landmarks.
-        true_starts: (K, 3) float64 [m, m, rad], world frame.
-        belief_seed: From which the team's beliefs draw.
-        body: The robots' hardware.
-        belief: What the robots believe.
-        ledger: What their landmarks are in truth.
+        true_starts: (K, 3) float64 [m, m, rad], world frame. Start poses.
+        belief_seed: Seed of the team's beliefs.
+        body: Hardware of the robots.
+        belief: Beliefs of the team.
+        ledger: Ground-truth association of the estimated landmarks.
         tick: Ticks since the reset.
-        readings: Of the last tick; none before `begin`.
-        true_path: Poses (K, 3) after each tick, world frame; read-only.
-        estimated_path: Poses (K, 3) as estimated after each tick, each in the robot's own start frame; read-only.
+        readings: Readings of the last tick; unset before `begin`.
+        true_path: True poses (K, 3) after each tick, world frame; read-only.
+        estimated_path: Estimated poses (K, 3) after each tick, each in the robot's own start frame; read-only.
         merge_ticks: Tick and groups of each merge.
     """
 
-    def __init__(self, config: EnvConfig, setting: Scenario, tap: ReadingsHook | None = None) -> None:
+    def __init__(self, config: EnvConfig, scenario: Scenario, hook: ReadingsHook | None = None) -> None:
         self._config = config
-        self._tap = ReadingsHook() if tap is None else tap
+        self._tap = ReadingsHook() if hook is None else hook
         self._all_hear_all = config.always_in_contact
-        self._streams = {name: np.random.default_rng(0) for name in setting.stream_states}
-        self._given = ref(setting)
-        self._load_scenario(setting)
+        self._streams = {name: np.random.default_rng(0) for name in scenario.stream_states}
+        self._given = ref(scenario)
+        self._load_scenario(scenario)
         self.body = RobotHardware(
             radius=config.robot_radius, ray_angles=config.scan.ray_angles, scan_range=config.scan.max_range
         )
@@ -121,54 +119,54 @@ class Episode:
 
         self.tick = 0
         self._collisions: tuple[int, ...] = (0,) * config.num_robots
-        self._figures = np.zeros((len(RobotMetrics._fields), config.num_robots))  # ways are added up in their row
+        self._figures = np.zeros((len(RobotMetrics._fields), config.num_robots))  # distances accumulate
         rows: RobotMetrics[FloatArray] = RobotMetrics(*self._figures)
         self._map_errors, self._found, self._distances = rows.map_errors, rows.found, rows.distances
         self._error_integrals = rows.error_integrals
-        self._integrates = RUNNING_COST in config.reward  # scoring every tick costs time: only where it is asked for
+        self._integrates = RUNNING_COST in config.reward  # scoring every tick is slow
         self.true_path: list[FloatArray] = []
         self.estimated_path: list[FloatArray] = []
         self.merge_ticks: list[tuple[int, tuple[int, ...], tuple[int, ...]]] = []
         self.readings: TeamReadings  # set by `begin`
-        self._frames: TeamSensorFrames | TeamRenderedFrames  # likewise
+        self._frames: TeamSensorFrames | TeamRenderedFrames  # set by `begin`
 
-    def _load_scenario(self, setting: Scenario) -> None:
-        """Move into a setting, as at its reset."""
-        self.setting = setting
-        self.world, self.true_starts, self.belief_seed = setting.world, setting.true_starts, setting.belief_seed
-        self._simulator = Simulator(setting.world, setting.true_starts, self._config.robot_radius, TICK)
-        self.ledger = setting.new_ground_truth(self._config.map_error_cutoff)
-        self._coverage = CoverageTracker(setting.coverage)
-        for name, state in setting.stream_states.items():
+    def _load_scenario(self, scenario: Scenario) -> None:
+        """Initialise the simulator, the ground truth and the random streams from a scenario."""
+        self.setting = scenario
+        self.world, self.true_starts, self.belief_seed = scenario.world, scenario.true_starts, scenario.belief_seed
+        self._simulator = Simulator(scenario.world, scenario.true_starts, self._config.robot_radius, TICK)
+        self.ledger = scenario.new_ground_truth(self._config.map_error_cutoff)
+        self._coverage = CoverageTracker(scenario.coverage)
+        for name, state in scenario.stream_states.items():
             self._streams[name].bit_generator.state = state
 
     def begin(self) -> None:
-        """Let the robots take their first frame."""
+        """Take the first measurements."""
         self._perceive(None)
 
     @property
     def given_scenario(self) -> Scenario | None:
-        """The setting in the last state that was set, from which the own one was built again if it came from elsewhere.
+        """Scenario object of the last restored state, for recognising it again; None if it no longer exists.
 
-        None if nobody else holds it; the episode goes by nothing in it.
+        The episode itself uses `setting`, which may be a rebuilt copy.
         """
         return self._given()
 
     @property
     def true_poses(self) -> FloatArray:
-        """(K, 3) float64 [m, m, rad], world frame. A copy."""
+        """(K, 3) float64 [m, m, rad], world frame. Copy of the true poses."""
         return self._simulator.poses.copy()
 
     @property
     def frames(self) -> Sequence[SensorFrame | RenderedFrame]:
-        """Each robot's frame of the last tick, with the true landmarks behind its measurements."""
+        """Frames of all robots in the last tick, with the true landmarks of their measurements."""
         return self._frames.per_robot()
 
     def advance(self, commands: FloatArray) -> None:
-        """Drive all robots with velocity commands (K, 2) [m/s, rad/s] for a tick, and let them perceive and believe.
+        """Execute velocity commands (K, 2) [m/s, rad/s] for a tick, read the sensors and update the beliefs.
 
         Raises:
-            ValueError: If `Simulator.step` refuses them; nothing has changed then.
+            ValueError: If `Simulator.step` rejects the commands; the episode is then unchanged.
         """
         simulator, noise, stream = self._simulator, self._config.odometry, self._streams["odometry"]
         before = simulator.poses
@@ -181,11 +179,11 @@ class Episode:
             self._error_integrals += self._map_errors * TICK
 
     def estimated_poses(self) -> FloatArray:
-        """Return where the robots believe to be (K, 3) [m, m, rad], laid at their true starts, world frame."""
+        """Return the estimated poses (K, 3) [m, m, rad], moved by the true start poses to the world frame."""
         return compose(self.true_starts, self.estimated_path[-1])
 
     def team_metrics(self) -> TeamMetrics:
-        """Return how the team stands now: its maps and poses are scored."""
+        """Return the current metrics of the team."""
         belief, poses = self.belief, self._simulator.poses
         self._score(poses)
         coverage = self._coverage.update(belief.grids, poses, self._found)
@@ -198,7 +196,7 @@ class Episode:
     # ------------------------------------------------------------------ snapshots
 
     def get_state(self) -> dict[str, Any]:
-        """Return all that decides how the episode goes on; what is shared is read-only."""
+        """Return the complete state of the episode; shared arrays are read-only."""
         return {
             "setting": self.setting,
             "tick": self.tick,
@@ -212,11 +210,11 @@ class Episode:
             "paths": (tuple(self.true_path), tuple(self.estimated_path), tuple(self.merge_ticks)),
         }
 
-    def set_state(self, state: Mapping[str, Any], setting: Scenario) -> None:
-        """Go on exactly as the episode that gave `state`, which was checked, in its setting."""
+    def set_state(self, state: Mapping[str, Any], scenario: Scenario) -> None:
+        """Restore a validated state of `get_state` and its scenario."""
         self._given = ref(state["setting"])
-        if setting is not self.setting:
-            self._load_scenario(setting)
+        if scenario is not self.setting:
+            self._load_scenario(scenario)
         self._simulator.set_state(state["simulator"])
         for name, stream in state["streams"].items():
             self._streams[name].bit_generator.state = stream
@@ -231,19 +229,19 @@ class Episode:
         self.estimated_path = path_of(estimated_path, self.estimated_path)
         self.merge_ticks = list(merge_ticks)
 
-    # ------------------------------------------------------------------ within
+    # ------------------------------------------------------------------ helpers
 
     def _score(self, poses: FloatArray) -> None:
-        """Write the scores of all maps and poses, with robots at true poses (K, 3), into the first figures."""
+        """Score all maps and poses, given the true poses (K, 3), into the first rows of the metrics."""
         belief = self.belief
         self.ledger.score(belief.map_summaries, belief.points, self.true_starts, poses, self._figures)
 
     def _perceive(self, odometry: FloatArray | None) -> None:
-        """Read all other sensors at the true poses, and let the robots take it in."""
+        """Read the sensors at the true poses and update the beliefs and the ground-truth association."""
         config, poses = self._config, self._simulator.poses
         self._frames = frames = self.setting.sensor.measure(poses, self._streams["sensor"])
         scans = self.setting.scan.measure(poses, self._streams["scan"])
-        heard = None if self._all_hear_all else self._contacts(poses)
+        in_contact = None if self._all_hear_all else self._contacts(poses)
         self.readings = TeamReadings(
             odometry,
             frames.measurements,
@@ -251,45 +249,45 @@ class Episode:
             self._simulator.bumped,
             between(self.true_starts, poses) if config.oracle_pose else None,
             frames.true_ids if config.oracle_association else None,
-            heard,
+            in_contact,
             frames.left if config.observe_images and isinstance(frames, TeamRenderedFrames) else None,
         )
         if self._tap.recorder is not None:
             self._tap.recorder(self.readings.per_robot())
         report = self.belief.step(self.readings)
         self.ledger.record(report, frames.names)
-        for made in report.id_maps:
-            self.merge_ticks.append((self.tick, made.robots_a, made.robots_b))
+        for id_map in report.id_maps:
+            self.merge_ticks.append((self.tick, id_map.robots_a, id_map.robots_b))
         if config.oracle_merge:
-            self._merge_by_oracle(contact_components(heard, config.num_robots))
+            self._merge_by_oracle(contact_components(in_contact, config.num_robots))
         self.true_path.append(as_constant(poses))
         self.estimated_path.append(as_constant(self.belief.points.own))
 
     def _contacts(self, poses: FloatArray) -> BoolArray:
-        """Return who hears whom (K, K)."""
+        """Return the matrix of contacts (K, K)."""
         config = self._config
         limits = config.comm_range, config.comm_line_of_sight, config.comm_loss
         return contacts(poses, self.world.walls, *limits, self._streams["radio"])
 
     def _merge_by_oracle(self, networks: IntArray) -> None:
-        """Merge groups that share true landmarks until none do; robots of one network (K,) are in contact."""
+        """Merge all groups in contact that share true landmarks; robots with equal `networks` (K,) are in contact."""
         merged = True
         while merged:
             merged = False
             for a, b in combinations(self.belief.groups, 2):
-                speakers = self.belief.representative(a), self.belief.representative(b)
-                if networks[speakers[0]] != networks[speakers[1]]:
+                robots = self.belief.representative(a), self.belief.representative(b)
+                if networks[robots[0]] != networks[robots[1]]:
                     continue
                 alignment = true_alignment(
                     self._true_ids(a), self._true_ids(b), self.true_starts[a[0]], self.true_starts[b[0]]
                 )
                 if alignment is not None:
-                    self.ledger.merge(self.belief.merge(*speakers, alignment, known=True))
+                    self.ledger.merge(self.belief.merge(*robots, alignment, known=True))
                     self.merge_ticks.append((self.tick, a, b))
                     merged = True
                     break
 
     def _true_ids(self, group: tuple[int, ...]) -> IntArray:
-        """Return which true landmark each row of a group's filter map claims."""
-        speaker = self.belief.representative(group)
-        return self.ledger.true_ids(speaker, self.belief.filter_map(speaker).ids)
+        """Return the true landmark of each row of a group's filter map."""
+        robot = self.belief.representative(group)
+        return self.ledger.true_ids(robot, self.belief.filter_map(robot).ids)

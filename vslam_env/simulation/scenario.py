@@ -1,4 +1,4 @@
-"""`Scenario`: all of an episode that is drawn at its reset and never changes afterwards."""
+"""Scenario of an episode: everything drawn at its reset and constant afterwards."""
 
 from dataclasses import dataclass
 from typing import Any, Self
@@ -18,18 +18,18 @@ from vslam_env.world import FreeSpace, World, WorldSource, draw_bias, draw_world
 
 @dataclass(frozen=True, slots=True, weakref_slot=True, kw_only=True, eq=False)
 class Scenario:
-    """A world with the robots' starts and sensors in it. Episodes and their snapshots share it; arrays are read-only.
+    """World, start poses and sensors of an episode, shared with its snapshots; arrays are read-only.
 
     Attributes:
         world: Walls and landmarks.
-        true_starts: (K, 3) float64 [m, m, rad], world frame.
-        bias: (K, 2) float64. What each robot's odometry misreads throughout the episode, see `draw_bias`.
-        belief_seed: From which the team's beliefs draw.
-        stream_states: Where the random streams (odometry, sensor, scan, radio) stand before the first frame, by name.
-        sensor: The cameras.
-        scan: The range finders.
-        coverage: Where the free floor lies in the robots' grids.
-        observable_landmarks: (N',) bool. Landmarks that some robot could ever see: only they count.
+        true_starts: (K, 3) float64 [m, m, rad], world frame. Start poses.
+        bias: (K, 2) float64. Odometry biases of the robots, see `draw_bias`.
+        belief_seed: Seed of the team's beliefs.
+        stream_states: Initial states of the random streams (odometry, sensor, scan, radio) by name.
+        sensor: Cameras of the robots.
+        scan: Range finders of the robots.
+        coverage: Cells of the free floor in the robots' grids.
+        observable_landmarks: (N',) bool. True for landmarks visible from some reachable place; only these are scored.
     """
 
     world: World
@@ -47,52 +47,52 @@ class Scenario:
             object.__setattr__(self, name, as_constant(getattr(self, name)))
 
     def to_parts(self) -> tuple[Any, ...]:
-        """Return what the setting is made of; what follows from that is left out."""
+        """Return the parts that define the scenario, without derived ones."""
         sensor = self.sensor
-        painted = None
+        texture_parts = None
         if isinstance(sensor, StereoSensor):
-            painted = sensor.textures, sensor.corners.faces, sensor.corners.offsets
+            texture_parts = sensor.textures, sensor.corners.faces, sensor.corners.offsets
         return (
             self.world, self.true_starts, self.bias, self.belief_seed, self.stream_states, sensor.config,
-            sensor.robot_radius, painted, self.scan.config, self.coverage.cells, self.observable_landmarks,
+            sensor.robot_radius, texture_parts, self.scan.config, self.coverage.cells, self.observable_landmarks,
         )  # fmt: skip
 
     @classmethod
     def from_parts(
         cls, world: World, true_starts: FloatArray, bias: FloatArray, belief_seed: np.random.SeedSequence,
-        stream_states: dict[str, Any], sensor: Any, robot_radius: float, painted: Any, scan: ScanConfig,
-        cells: FloatArray, countable: np.ndarray,
+        stream_states: dict[str, Any], sensor_config: Any, robot_radius: float, texture_parts: Any, scan: ScanConfig,
+        cells: FloatArray, observable_landmarks: np.ndarray,
     ) -> Self:  # fmt: skip
-        """Return the setting that is made of these parts; its sensors are built again.
+        """Rebuild a scenario, including its sensors, from the result of `to_parts`.
 
         Raises:
-            ValueError: If the parts do not fit together.
+            ValueError: If the parts are inconsistent.
         """
         landmarks = world.landmarks
         if landmarks is None:
             raise ValueError("a world without landmarks")
-        eyes: LandmarkSensor | StereoSensor
-        if isinstance(sensor, StereoSensorConfig):
-            textures, faces, offsets = painted
+        sensor: LandmarkSensor | StereoSensor
+        if isinstance(sensor_config, StereoSensorConfig):
+            textures, faces, offsets = texture_parts
             check_textures(textures, world.walls)
-            corners = TextureCorners.found(world.walls, landmarks, faces, offsets, sensor.tolerance)
-            eyes = StereoSensor.of_textures(sensor, world.walls, textures, corners, robot_radius)
+            corners = TextureCorners.found(world.walls, landmarks, faces, offsets, sensor_config.tolerance)
+            sensor = StereoSensor.of_textures(sensor_config, world.walls, textures, corners, robot_radius)
         else:
-            eyes = LandmarkSensor(sensor, world.walls, landmarks, robot_radius)
+            sensor = LandmarkSensor(sensor_config, world.walls, landmarks, robot_radius)
         return cls(
             world=world,
             true_starts=true_starts,
             bias=bias,
             belief_seed=belief_seed,
             stream_states=stream_states,
-            sensor=eyes,
+            sensor=sensor,
             scan=RangeFinder(scan, world.walls, robot_radius),
             coverage=CoverageCells(cells, true_starts),
-            observable_landmarks=countable,
+            observable_landmarks=observable_landmarks,
         )
 
     def new_ground_truth(self, cutoff: float) -> GroundTruthAssociation:
-        """Return empty books for this world's landmarks; `cutoff` is c of the map error [m]."""
+        """Return an empty ground-truth association for this world; `cutoff` is c of the map error [m]."""
         landmarks = self.world.landmarks
         assert landmarks is not None
         return GroundTruthAssociation(len(self.true_starts), landmarks.positions, self.observable_landmarks, cutoff)
@@ -105,43 +105,43 @@ def sample_scenario(
     world_seed: int | None = None,
     start_poses: Any = None,
 ) -> Scenario:
-    """Draw an episode's setting. Each concern draws from a stream of its own, so that none shifts another.
+    """Draw the scenario of an episode, with an independent random stream for each concern.
 
     Args:
-        config: Of the environment.
-        source: What the world is made from.
-        seed: Of all streams.
-        world_seed: Of the layout and its textures, if these are to differ from what `seed` would give.
-        start_poses: (K, 3) [m, m, rad], world frame; None: those of the world, or drawn.
+        config: Configuration of the environment.
+        source: Source of the world.
+        seed: Seed of all streams.
+        world_seed: Seed of layout and textures; None: derived from `seed` or drawn from the world split.
+        start_poses: (K, 3) [m, m, rad], world frame; None: start poses of the world, or drawn ones.
 
     Raises:
-        ValueError: If there is no such world, robots cannot start there, or no landmark can be seen.
+        ValueError: If the world does not exist, robots cannot start there, or no landmark is observable.
     """
-    layout, textures, starts, odometry, sensor, scan, belief_seed, radio = seed.spawn(8)
+    layout, textures, starts, odometry, detections, scan, belief_seed, radio = seed.spawn(8)
     if world_seed is None and config.world_split is not None:
         world_seed = draw_world_seed(config.world_split, np.random.default_rng(layout))
     if world_seed is not None:
         layout, textures = np.random.SeedSequence(world_seed).spawn(2)
     bare = make_world(source, np.random.default_rng(layout), config.world_split)
     free_space = FreeSpace(bare, config.robot_radius)
-    paint = np.random.default_rng(textures)
-    eyes: LandmarkSensor | StereoSensor
+    texture_rng = np.random.default_rng(textures)
+    sensor: LandmarkSensor | StereoSensor
     if config.sensor == "stereo":
-        eyes = StereoSensor(config.stereo, bare, free_space, paint, config.robot_radius)
-        landmarks = eyes.landmarks
+        sensor = StereoSensor(config.stereo, bare, free_space, texture_rng, config.robot_radius)
+        landmarks = sensor.landmarks
     else:
         given = bare.landmarks
-        landmarks = place_landmarks(bare, paint, config.landmarks, free_space) if given is None else given
-        eyes = LandmarkSensor(config.landmark_sensor, bare.walls, landmarks, config.robot_radius)
-    countable = free_space.visible_landmarks(landmarks, eyes.config.camera, eyes.config.max_incidence)
-    if not countable.any():
-        got, cure = f"no such landmark among {len(landmarks)} in {bare.name!r}", "Put some on walls that robots pass."
-        raise argument_error("world", "landmarks that robots can see", got, cure)
+        landmarks = place_landmarks(bare, texture_rng, config.landmarks, free_space) if given is None else given
+        sensor = LandmarkSensor(config.landmark_sensor, bare.walls, landmarks, config.robot_radius)
+    observable = free_space.visible_landmarks(landmarks, sensor.config.camera, sensor.config.max_incidence)
+    if not observable.any():
+        got, hint = f"no such landmark among {len(landmarks)} in {bare.name!r}", "Put some on walls that robots pass."
+        raise argument_error("world", "landmarks that robots can see", got, hint)
     world = World(bare.name, bare.walls, landmarks, bare.start_poses)
     true_starts = _starts(config, world, free_space, start_poses, np.random.default_rng(starts))
     streams = {
         name: np.random.default_rng(stream)
-        for name, stream in (("odometry", odometry), ("sensor", sensor), ("scan", scan), ("radio", radio))
+        for name, stream in (("odometry", odometry), ("sensor", detections), ("scan", scan), ("radio", radio))
     }
     return Scenario(
         world=world,
@@ -149,10 +149,10 @@ def sample_scenario(
         bias=as_read_only(draw_bias(config.odometry, config.num_robots, streams["odometry"])),
         belief_seed=belief_seed,
         stream_states={name: stream.bit_generator.state for name, stream in streams.items()},
-        sensor=eyes,
+        sensor=sensor,
         scan=RangeFinder(config.scan, world.walls, config.robot_radius),
         coverage=CoverageCells(free_space.free_area_cells, true_starts),
-        observable_landmarks=as_read_only(countable),
+        observable_landmarks=as_read_only(observable),
     )
 
 
@@ -164,7 +164,7 @@ def _starts(
     rng: np.random.Generator,
 ) -> FloatArray:
     given = world.start_poses
-    sight = config.stereo if config.sensor == "stereo" else config.landmark_sensor
+    sensor = config.stereo if config.sensor == "stereo" else config.landmark_sensor
     if start_poses is not None:
         return free_space.check_starts(start_poses, config.num_robots)
     if given is not None:
@@ -173,14 +173,14 @@ def _starts(
                 "world.start_poses",
                 f"a row for each of {config.num_robots} robots",
                 f"shape {given.shape}",
-                "Add rows, use fewer robots, or leave them out to have starts drawn.",
+                "Add rows, use fewer robots, or omit them to draw starts.",
             )
         return free_space.check_starts(given[: config.num_robots], config.num_robots)
     return free_space.draw_starts(
         config.num_robots,
         rng,
         config.min_start_distance,
-        no_shared_view=None if config.shared_start_view else sight.camera,
+        no_shared_view=None if config.shared_start_view else sensor.camera,
         landmarks=world.landmarks,
-        max_incidence=sight.max_incidence,
+        max_incidence=sensor.max_incidence,
     )

@@ -1,7 +1,7 @@
-"""The true world: walls, landmarks, free space, and the simulator that moves robots in it.
+"""True world: walls, landmarks, free space, odometry noise and the physics simulator.
 
-A reset goes: `make_world` -> `FreeSpace` -> `place_landmarks` (unless the world has some) -> `draw_starts` or
-`check_starts` -> `Simulator`.
+Order of construction at a reset: `make_world` -> `FreeSpace` -> `place_landmarks` (unless the world has landmarks) ->
+`draw_starts` or `check_starts` -> `Simulator`.
 """
 
 from vslam_env.world.freespace import FreeSpace

@@ -1,4 +1,4 @@
-"""Distances to walls: of points, and of the cells of a raster."""
+"""Distances of points and raster cells to walls."""
 
 import numpy as np
 
@@ -9,8 +9,8 @@ def distances_to_walls(points: FloatArray, walls: FloatArray) -> FloatArray:
     """Return the distance (P,) float64 [m] from each point to the nearest wall.
 
     Args:
-        points: (P, 2) float64 [m], world frame.
-        walls: (S, 4) float64 [m], world frame.
+        points: (P, 2) float64 [m], world frame. Points.
+        walls: (S, 4) float64 [m], world frame. Wall segments.
     """
     nearest = np.full(len(points), np.inf)
     for x1, y1, x2, y2 in walls:
@@ -24,12 +24,12 @@ def clearance_raster(
     """Return the exact distance (rows, columns) [m] of cell centres to the nearest wall, cut off at `limit` [m].
 
     Args:
-        walls: (S, 4) float64 [m], world frame.
+        walls: (S, 4) float64 [m], world frame. Wall segments.
         origin: (2,) float64 [m], world frame. Lower left corner of cell (0, 0).
         cell: Side of a cell [m].
-        rows: Cells along y.
-        columns: Cells along x.
-        limit: Largest distance that is told apart [m].
+        rows: Number of cells along y.
+        columns: Number of cells along x.
+        limit: Cutoff of the distances [m].
     """
     clearance = np.full((rows, columns), limit)
     ys, xs = (np.arange(rows)[:, None] + 0.5) * cell, (np.arange(columns) + 0.5) * cell
@@ -42,12 +42,12 @@ def clearance_raster(
 
 
 def _span(start: float, extent: float, cell: float, count: int, limit: float) -> slice:
-    """Return which cells of an axis may lie within `limit` [m] of a wall from `start` to `start + extent` [m]."""
+    """Return the cells of an axis that may lie within `limit` [m] of a wall from `start` to `start + extent` [m]."""
     first = max(0, int((min(start, start + extent) - limit) / cell))
     return slice(first, max(first, min(count, int((max(start, start + extent) + limit) / cell) + 1)))
 
 
 def _distance(px: FloatArray, py: FloatArray, ex: float, ey: float) -> FloatArray:
-    """Return how far the points (px, py) are from the line from the origin to (ex, ey) [m]."""
+    """Return the distances of points (px, py) from the segment from the origin to (ex, ey) [m]."""
     u = np.minimum(1.0, np.maximum(0.0, (px * ex + py * ey) / (ex * ex + ey * ey)))
     return np.asarray(np.sqrt((px - u * ex) ** 2 + (py - u * ey) ** 2))

@@ -1,4 +1,4 @@
-"""Where robots fit in a world, what they can reach, which landmarks they could ever see, and where they start."""
+"""Free space of a world: reachable places, observable landmarks and start poses."""
 
 from typing import Any
 
@@ -13,28 +13,28 @@ from vslam_env.world.spec import FARTHEST_PLACE, Landmarks, World
 from vslam_env.world.visibility import as_coordinate_rows, ray_fan, view_limits, visible_landmarks
 
 CELL = 0.1  # [m] side of a raster cell
-AREA_STEP = 2  # free area is counted in squares of 2 x 2 raster cells
-VIEW_AHEAD = 1.5  # [m] a robot should not start with its nose at a wall
+AREA_STEP = 2  # [cells] side of the squares that measure free area
+VIEW_AHEAD = 1.5  # [m] preferred free distance ahead of a start pose
 MAX_INCIDENCE = np.radians(60.0)
 
 
 class FreeSpace:
-    """The part of a world that robots can reach, on a raster of 0.1 m.
+    """Reachable part of a world on a raster of 0.1 m.
 
-    The part is the one that holds the world's start poses, or else the largest that walls enclose. A cell counts as
-    reachable if the robot's disc fits wherever in the cell its centre stands.
+    It is the connected part that contains the first start pose of the world, or else the largest enclosed one. A cell
+    is reachable if the robot's disc fits at every position of its centre in the cell.
 
     Attributes:
-        world: The world it was made from.
-        radius: Of the robots' discs [m].
+        world: World of the walls.
+        radius: Radius of the robots [m].
         origin: (2,) float64 [m], world frame. Lower left corner of cell (0, 0).
-        reachable: (H, W) bool, row = y upwards. Cells in which a robot's centre can be.
-        open_space: (H, W) bool. Cells joined to these through which sight passes, if no disc.
-        free_area_cells: (n, 2) float64 [m], world frame. Centres of the 0.2 m squares that no wall touches, in the
-            open space: the area that robots can explore.
+        reachable: (H, W) bool, row = y upwards. Cells that can contain a robot's centre.
+        open_space: (H, W) bool. Cells connected to the reachable ones, including gaps too narrow for a robot.
+        free_area_cells: (n, 2) float64 [m], world frame. Centres of the 0.2 m squares in the open space that no wall
+            touches: the area to explore.
 
     Raises:
-        ValueError: If the walls enclose no space in which a robot fits.
+        ValueError: If the walls enclose no space large enough for a robot.
     """
 
     def __init__(self, world: World, radius: float = 0.2) -> None:
@@ -47,7 +47,7 @@ class FreeSpace:
         half_diagonal = 0.5 * np.sqrt(2.0) * CELL
         margin = radius + half_diagonal
         clearance = clearance_raster(world.walls, self.origin, CELL, rows, columns, margin + CELL)
-        # Cells farther than half a cell from any wall: no step between two neighbours of one edge crosses a wall.
+        # Cells more than half a cell from any wall: no step between edge neighbours crosses a wall.
         labels = _label(clearance > 0.5 * CELL + 1e-6)
         fits = _label(clearance >= margin)
         outside = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
@@ -55,7 +55,7 @@ class FreeSpace:
         if not fits.any():
             raise argument_error(
                 "world",
-                f"walls that enclose a space in which a disc of radius {radius:g} m fits anywhere in a {CELL:g} m cell",
+                f"walls that enclose free space for a disc of radius {radius:g} m anywhere in a {CELL:g} m cell",
                 f"no such cell in {world.name!r}",
                 f"Close the outer walls, make rooms {2 * radius + 0.3:g} m wide, or check that the unit is metres.",
             )
@@ -67,7 +67,7 @@ class FreeSpace:
         self.free_area_cells: FloatArray = self._centres(squares & every_second)
 
     def _main_part(self, fits: Any) -> int:
-        """Return the label of the part with the world's first start pose, or else of the largest part."""
+        """Return the label of the part with the first start pose, or else of the largest part."""
         if self.world.start_poses is not None and len(self.world.start_poses):
             distances = np.linalg.norm(self._centres(fits > 0) - self.world.start_poses[0, :2], axis=1)
             return int(fits[fits > 0][np.argmin(distances)])
@@ -79,7 +79,7 @@ class FreeSpace:
         return np.asarray(self.origin + CELL * (np.stack([columns, rows], axis=1) + 0.5))
 
     def contains(self, points: FloatArray) -> BoolArray:
-        """Tell which points (n, 2) [m], world frame, lie in the open space."""
+        """Return which points (n, 2) [m], world frame, lie in the open space."""
         columns, rows = np.floor((np.asarray(points) - self.origin) / CELL).astype(np.int64).T
         height, width = self.open_space.shape
         inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
@@ -88,15 +88,15 @@ class FreeSpace:
     def visible_landmarks(
         self, landmarks: Landmarks, camera: StereoCamera, max_incidence: float = MAX_INCIDENCE
     ) -> BoolArray:
-        """Tell which landmarks some robot can see from a reachable place, whatever its heading.
+        """Return which landmarks are observable: visible from some reachable place at some heading.
 
         Args:
-            landmarks: Of the world.
-            camera: Its range, height and vertical field of view count.
-            max_incidence: Largest angle between a face's normal and the line of sight [rad].
+            landmarks: Landmarks of the world.
+            camera: Camera; its range, height and vertical field of view matter.
+            max_incidence: Largest angle between line of sight and face normal at which landmarks are visible [rad].
 
         Returns:
-            (N,) bool. The count of True is the N of the map error.
+            (N,) bool. True for observable landmarks, whose number is N in the map error.
         """
         return observable_anywhere(
             landmarks.positions,
@@ -118,55 +118,54 @@ class FreeSpace:
         landmarks: Landmarks | None = None,
         max_incidence: float = MAX_INCIDENCE,
     ) -> FloatArray:
-        """Draw start poses from which the robots can reach one another, far apart and looking at different things.
+        """Draw start poses in the reachable part of the world.
 
         Args:
-            num_robots: How many (K).
+            num_robots: Number of robots K.
             rng: Source of the draws.
-            min_distance: Between any two robots [m].
-            no_shared_view: The camera; no landmark is then seen by two robots at their starts. None: views may
-                overlap.
-            landmarks: What the cameras see; by default those of the world, if it has any.
-            max_incidence: As in `visible_landmarks` [rad].
+            min_distance: Least distance between any two robots [m].
+            no_shared_view: Camera with which no two robots may see a common landmark; None: views may overlap.
+            landmarks: Landmarks to see; None: those of the world, if any.
+            max_incidence: Largest angle of incidence, see `visible_landmarks` [rad].
 
         Returns:
-            (K, 3) float64 [m, m, rad], world frame.
+            (K, 3) float64 [m, m, rad], world frame. Start poses.
 
         Raises:
-            ValueError: If 30 rounds of 100 draws a robot find none.
+            ValueError: If 30 rounds of 100 draws find no start poses for all robots.
         """
         num_robots = check_int("num_robots", num_robots, 1, "Use at least one robot.")
         min_distance = check_float("min_distance", min_distance, "Give metres.", at_least=0.0)
         landmarks = self.world.landmarks if landmarks is None else landmarks
         centres = self._centres(self.reachable)
-        apart = max(min_distance, 2.0 * self.radius)
+        spacing = max(min_distance, 2.0 * self.radius)
         for _ in range(30):
             starts = np.empty((0, 3))
-            taken = np.zeros(0 if landmarks is None else len(landmarks), dtype=np.bool_)
+            claimed = np.zeros(0 if landmarks is None else len(landmarks), dtype=np.bool_)
             for _ in range(100):
                 position = centres[rng.integers(len(centres))] + rng.uniform(-0.5 * CELL, 0.5 * CELL, 2)
-                if len(starts) and np.linalg.norm(starts[:, :2] - position, axis=1).min() < apart:
+                if len(starts) and np.linalg.norm(starts[:, :2] - position, axis=1).min() < spacing:
                     continue
                 pose = np.array([*position, self._draw_heading(position, rng)])
                 if landmarks is not None and no_shared_view is not None:
                     view = view_limits(no_shared_view, max_incidence)
                     seen = visible_landmarks(pose[None], landmarks, self.world.walls, self.radius, view)[0]
-                    if np.any(seen & taken):
+                    if np.any(seen & claimed):
                         continue
-                    taken |= seen
+                    claimed |= seen
                 starts = np.vstack([starts, pose])
                 if len(starts) == num_robots:
                     return starts
         unshared = " with no shared view" if no_shared_view is not None else ""
         raise argument_error(
             "num_robots",
-            f"as many as can start {min_distance:g} m apart{unshared} in {self.world.name!r}",
+            f"at most as many as fit {min_distance:g} m apart{unshared} in {self.world.name!r}",
             num_robots,
-            "Use fewer robots, a smaller distance between starts, starts that may share a view, or a larger world.",
+            "Use fewer robots, a smaller start distance, shared start views, or a larger world.",
         )
 
     def _draw_heading(self, position: FloatArray, rng: np.random.Generator) -> float:
-        """Draw a heading [rad] with some free way ahead, or, after a few draws, any."""
+        """Draw a heading [rad] with free space ahead, or any if eight draws find none."""
         headings = rng.uniform(-np.pi, np.pi, 8)
         poses, free = np.empty((len(headings), 3)), np.zeros((len(headings), 1))
         poses[:, :2], poses[:, 2] = position, headings
@@ -174,18 +173,18 @@ class FreeSpace:
         return float(headings[int(np.argmax(free[:, 0] >= VIEW_AHEAD))])
 
     def check_starts(self, start_poses: Any, num_robots: int | None = None) -> FloatArray:
-        """Check that robots can start there; return (K, 3) float64 [m, m, rad], theta in [-pi, pi).
+        """Validate start poses; return them as (K, 3) float64 [m, m, rad], theta in [-pi, pi).
 
         Args:
-            start_poses: (K, 3) [m, m, rad], world frame.
-            num_robots: K, if it is given by something else.
+            start_poses: (K, 3) [m, m, rad], world frame. Start poses.
+            num_robots: Expected number of robots K; None: any.
 
         Raises:
-            ValueError: If a shape is wrong, or a robot touches a wall, is cut off from the reachable space, or
-                overlaps another. The message names the robot.
+            ValueError: If a shape is wrong, or a robot touches a wall, is outside the reachable space, or overlaps
+                another. The message names the robot.
         """
-        cure = "Give one row x y theta, in metres and radians, for each robot."
-        starts = check_array("start_poses", start_poses, (num_robots, 3), cure, within=FARTHEST_PLACE)
+        hint = "Give one row x y theta, in metres and radians, for each robot."
+        starts = check_array("start_poses", start_poses, (num_robots, 3), hint, within=FARTHEST_PLACE)
         starts[:, 2] = wrap_angle(starts[:, 2])
         gaps = distances_to_walls(starts[:, :2], self.world.walls)
         near = self._near_reachable(starts[:, :2])
@@ -193,7 +192,7 @@ class FreeSpace:
             name = f"start_poses[{robot}]"
             if not inside:
                 raise argument_error(
-                    name, "a place that robots can reach", starts[robot].tolist(), "Move the robot inside the walls."
+                    name, "a reachable place", starts[robot].tolist(), "Move the robot inside the walls."
                 )
             if gap < self.radius:
                 raise argument_error(
@@ -213,8 +212,8 @@ class FreeSpace:
         return starts
 
     def _near_reachable(self, points: FloatArray) -> BoolArray:
-        """Tell which points (n, 2) [m] lie in the open space within two cells of a reachable cell."""
-        import cv2  # slow to import, and not needed until a world is made
+        """Return which points (n, 2) [m] lie in the open space within two cells of a reachable cell."""
+        import cv2  # slow import, needed only to make worlds
 
         grown = cv2.dilate(self.reachable.astype(np.uint8), np.ones((5, 5), dtype=np.uint8)) > 0
         columns, rows = np.floor((points - self.origin) / CELL).astype(np.int64).T
@@ -223,7 +222,7 @@ class FreeSpace:
 
 
 def _label(mask: BoolArray) -> Any:
-    """Number the parts of a mask that hang together along cell edges: (H, W) int32, 0 where False."""
+    """Label the 4-connected components of a mask: (H, W) int32, 0 where False."""
     import cv2
 
     return cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)[1]

@@ -1,4 +1,4 @@
-"""Landmarks with descriptors are put on those wall faces that robots can look at."""
+"""Random landmarks with descriptors on the wall faces that border on free space."""
 
 from dataclasses import dataclass
 
@@ -9,21 +9,21 @@ from slam_backend.core.validation import FloatArray, argument_error, check_float
 from vslam_env.world.freespace import FreeSpace
 from vslam_env.world.spec import Landmarks, World
 
-HIGHEST = 1e3  # [m] above or below the robots; nothing there is in view
-CORNER = 0.05  # [m] landmarks keep this far from the ends of their wall
-LOOK = 0.12  # [m] a face looks into the free space if the point this far in front of it lies there
+HIGHEST = 1e3  # [m] limit of heights above or below the robots
+CORNER = 0.05  # [m] distance of landmarks from the ends of their wall
+LOOK = 0.12  # [m] a face is visible if the point this far in front of it lies in the free space
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LandmarkConfig:
-    """How many landmarks there are, where, and how alike they look.
+    """Density, positions and appearance of landmarks.
 
     Attributes:
         density: Landmarks per metre of wall face [1/m].
-        min_height: Lowest height above the robots' reference height [m].
-        max_height: Greatest height [m].
-        min_spacing: Between neighbours along a face [m].
-        descriptor_size: Numbers in a descriptor (d).
+        min_height: Least height above the robots' reference height [m].
+        max_height: Greatest height above the reference height [m].
+        min_spacing: Least distance between neighbours along a face [m].
+        descriptor_size: Dimension d of a descriptor.
         distinctness: Typical L2 distance between the descriptors of two landmarks, at most sqrt(2). The nearest of
             300 others is about a fifth closer.
         repeated: Share of the landmarks that copy the descriptor of another one, in [0, 1].
@@ -39,14 +39,14 @@ class LandmarkConfig:
 
     def __post_init__(self) -> None:
         check_float("landmarks.density", self.density, "Give landmarks per metre of wall face.", above=0.0, at_most=1e4)
-        cure = "Give metres."
-        check_float("landmarks.min_height", self.min_height, cure, at_least=-HIGHEST, at_most=HIGHEST)
-        cure = "Give metres, above min_height."
-        check_float("landmarks.max_height", self.max_height, cure, at_least=self.min_height, at_most=HIGHEST)
+        hint = "Give metres."
+        check_float("landmarks.min_height", self.min_height, hint, at_least=-HIGHEST, at_most=HIGHEST)
+        hint = "Give metres, above min_height."
+        check_float("landmarks.max_height", self.max_height, hint, at_least=self.min_height, at_most=HIGHEST)
         check_float("landmarks.min_spacing", self.min_spacing, "Give metres.", at_least=0.0)
         check_int("landmarks.descriptor_size", self.descriptor_size, 2, "Use 64 for u-SURF.", 10_000)
-        cure = "Unrelated unit vectors differ by 1.41."
-        check_float("landmarks.distinctness", self.distinctness, cure, above=0.0, at_most=2**0.5)
+        hint = "Unrelated unit vectors differ by 1.41."
+        check_float("landmarks.distinctness", self.distinctness, hint, above=0.0, at_most=2**0.5)
         check_float("landmarks.repeated", self.repeated, "Give a share.", at_least=0.0, at_most=1.0)
 
 
@@ -56,19 +56,19 @@ def place_landmarks(
     config: LandmarkConfig | None = None,
     free_space: FreeSpace | None = None,
 ) -> Landmarks:
-    """Put landmarks on both faces of all walls, where a face looks into the space that robots can reach.
+    """Place landmarks on all wall faces that border on the free space.
 
     Args:
-        world: The walls.
+        world: World with the walls.
         rng: Source of the draws.
-        config: How many and how alike.
-        free_space: Of this world, if it has been made already.
+        config: Density, positions and appearance.
+        free_space: Free space of this world; None: computed.
 
     Returns:
         Landmarks on the wall lines, face by face.
 
     Raises:
-        ValueError: If no face looks into the free space.
+        ValueError: If no landmark borders on the free space.
     """
     config = LandmarkConfig() if config is None else config
     free_space = FreeSpace(world) if free_space is None else free_space
@@ -91,9 +91,9 @@ def place_landmarks(
     if not keep.any():
         raise argument_error(
             "landmarks.density",
-            "enough for one landmark on the walls that robots can look at",
+            "a density that gives at least one visible landmark",
             config.density,
-            "Raise the density, or give the world landmarks of its own.",
+            "Raise the density, or give the world its own landmarks.",
         )
     return Landmarks(
         positions=np.column_stack([positions, heights])[keep],
@@ -104,29 +104,29 @@ def place_landmarks(
 
 
 def _draw_offsets(length: float, config: LandmarkConfig, rng: np.random.Generator) -> FloatArray:
-    """Draw where along a face of `length` [m] landmarks sit: uniformly, but never closer than the spacing.
+    """Draw positions along a face of `length` [m]: uniform, subject to the least spacing.
 
-    Sorted uniform draws on the room that is left, each moved on by the spacings before it, have exactly that law.
+    Sorted uniform draws on the remaining length, shifted by the spacings before them, have exactly this distribution.
     """
-    room = length - 2.0 * CORNER
-    if room <= 0.0:
+    usable = length - 2.0 * CORNER
+    if usable <= 0.0:
         return np.empty(0)
     count = int(config.density * length + rng.random())
-    if (count - 1) * config.min_spacing > room:
-        count = int(room / config.min_spacing) + 1
-    slack = room - (count - 1) * config.min_spacing
+    if (count - 1) * config.min_spacing > usable:
+        count = int(usable / config.min_spacing) + 1
+    slack = usable - (count - 1) * config.min_spacing
     return CORNER + np.sort(rng.uniform(0.0, slack, count)) + config.min_spacing * np.arange(count)
 
 
 def draw_descriptors(count: int, config: LandmarkConfig, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Draw unit descriptors around a common mean, as those of real images are.
+    """Draw unit descriptors around a common mean, like descriptors of real images.
 
-    With a share a^2 of the common mean and 1 - a^2 of its own, two descriptors have the cosine a^2 on average and thus
-    the distance sqrt(2 (1 - a^2)).
+    With a share a^2 of the common mean and 1 - a^2 of an individual part, two descriptors have the mean cosine a^2 and
+    thus the distance sqrt(2 (1 - a^2)).
 
     Args:
-        count: How many, at least 1.
-        config: Their size d, their distinctness, and how many are repeated.
+        count: Number of descriptors, at least 1.
+        config: Size d, distinctness and share of repeated descriptors.
         rng: Source of the draws.
 
     Returns:
@@ -140,7 +140,7 @@ def draw_descriptors(count: int, config: LandmarkConfig, rng: np.random.Generato
     own /= np.linalg.norm(own, axis=1, keepdims=True)
     descriptors = np.sqrt(1.0 - own_share) * common + np.sqrt(own_share) * own
     copies = rng.random(count) < config.repeated
-    copies[0] = False  # there is always one to copy
+    copies[0] = False  # at least one original to copy
     originals = np.flatnonzero(~copies)
     descriptors[copies] = descriptors[originals[rng.integers(len(originals), size=count)]][copies]
     return np.asarray(descriptors, dtype=np.float32)

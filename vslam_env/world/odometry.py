@@ -1,4 +1,4 @@
-"""True odometry noise: what wheel encoders read of the way that robots really went."""
+"""Simulated odometry with true noise and bias."""
 
 import math
 from dataclasses import dataclass
@@ -8,18 +8,18 @@ import numpy as np
 from slam_backend.core.jit import in_place
 from slam_backend.core.validation import FloatArray, check_float
 
-LARGEST_SIGMA = 100.0  # per metre; filters take no motion of 10 km in a tick
+LARGEST_SIGMA = 100.0  # per metre; limits the readings to what filters accept
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OdometryNoise:
-    """Noise of odometry readings; everything grows with the distance d travelled in a tick.
+    """True noise of odometry, proportional to the distance d travelled in a tick.
 
     Attributes:
-        sigma_distance: Standard deviation of the distance read, as a share of d [m/m].
-        sigma_heading_per_metre: Standard deviation of the turn read [rad/m].
-        bias_distance: Standard deviation of the share by which a robot misreads all distances of an episode [m/m].
-        bias_heading_per_metre: Standard deviation of the turn per metre by which it misreads them [rad/m].
+        sigma_distance: Standard deviation of the measured distance, as a share of d [m/m].
+        sigma_heading_per_metre: Standard deviation of the measured turn [rad/m].
+        bias_distance: Standard deviation of a robot's relative distance bias, constant in an episode [m/m].
+        bias_heading_per_metre: Standard deviation of a robot's turn bias, constant in an episode [rad/m].
     """
 
     sigma_distance: float = 0.05
@@ -29,20 +29,20 @@ class OdometryNoise:
 
     def __post_init__(self) -> None:
         for name in self.__slots__:
-            cure = "Give a standard deviation."
-            check_float(f"odometry.{name}", getattr(self, name), cure, at_least=0.0, at_most=LARGEST_SIGMA)
+            hint = "Give a standard deviation."
+            check_float(f"odometry.{name}", getattr(self, name), hint, at_least=0.0, at_most=LARGEST_SIGMA)
 
 
 def draw_bias(noise: OdometryNoise, num_robots: int, rng: np.random.Generator) -> FloatArray:
-    """Draw what each robot misreads throughout an episode.
+    """Draw the odometry bias of each robot for an episode.
 
     Args:
         noise: Standard deviations.
-        num_robots: K.
+        num_robots: Number of robots K.
         rng: Source of the draws, 2 K of them.
 
     Returns:
-        (K, 2) float64. Share of the distance [m/m] and turn per metre [rad/m].
+        (K, 2) float64. Relative distance bias [m/m] and turn bias [rad/m].
     """
     return rng.standard_normal((num_robots, 2)) * (noise.bias_distance, noise.bias_heading_per_metre)
 
@@ -55,21 +55,21 @@ def read_odometry(
     rng: np.random.Generator,
     travelled: FloatArray | None = None,
 ) -> FloatArray:
-    """Read the motion of one tick with the encoders' errors.
+    """Return noisy odometry of one tick.
 
-    An encoder misjudges how far a wheel rolled, so one factor stretches the reading as a whole, whatever its direction
-    in the robot's frame; the direction itself suffers from the misread turn. A robot at rest reads exactly zero.
+    Encoder errors scale the whole translation by one factor; the error of the turn also rotates its direction. A robot
+    at rest reads exactly zero.
 
     Args:
-        previous_poses: (K, 3) float64 [m, m, rad], world frame. At the last tick.
-        poses: (K, 3) float64 [m, m, rad], world frame. Now.
-        bias: (K, 2) float64, from `draw_bias`.
+        previous_poses: (K, 3) float64 [m, m, rad], world frame. True poses at the last tick.
+        poses: (K, 3) float64 [m, m, rad], world frame. Current true poses.
+        bias: (K, 2) float64. Biases from `draw_bias`.
         noise: Standard deviations.
-        rng: Source of the draws: 2 K of them, whatever the motion.
-        travelled: (K,) float64 [m]. The true way of each robot is added to it; None: ways are not added up.
+        rng: Source of the draws, always 2 K of them.
+        travelled: (K,) float64 [m]. Accumulator of the true distances, updated if given.
 
     Returns:
-        (K, 3) float64 [m, m, rad], each robot's previous frame: (dx, dy, dtheta).
+        (K, 3) float64 [m, m, rad], each robot's previous frame. Motions (dx, dy, dtheta).
     """
     robots = len(poses)
     travelled = np.zeros(robots) if travelled is None else travelled
@@ -90,14 +90,14 @@ def _read(
     travelled: FloatArray,
     read: FloatArray,
 ) -> None:
-    """Write down the readings (K, 3) of motions between poses (K, 3) under standard normal draws (K, 2), add ways."""
+    """Write the readings (K, 3) of motions between poses (K, 3), given standard normal draws (K, 2); add distances."""
     for k in range(len(after)):
         dx, dy, turned = after[k, 0] - before[k, 0], after[k, 1] - before[k, 1], after[k, 2] - before[k, 2]
         distance = math.hypot(dx, dy)
         travelled[k] += distance
         stretch = 1.0 + bias[k, 0] + sigma_distance * draws[k, 0]
         turn = distance * (bias[k, 1] + sigma_heading_per_metre * draws[k, 1])
-        into_robot = 0.5 * turn - before[k, 2]  # half of the misread turn falls before the middle of the way
+        into_robot = 0.5 * turn - before[k, 2]  # half of the turn error arises before the midpoint
         c, s = math.cos(into_robot), math.sin(into_robot)
         read[k, 0] = stretch * (c * dx - s * dy)
         read[k, 1] = stretch * (s * dx + c * dy)

@@ -1,4 +1,4 @@
-"""A name, a path, a `World` or a function becomes a `World`."""
+"""Construction of worlds from names, paths and functions."""
 
 from collections.abc import Callable
 from functools import lru_cache
@@ -32,14 +32,14 @@ def make_world(world: WorldSource, rng: np.random.Generator, split: str | None =
     """Make a world.
 
     Args:
-        world: A family name (see `WORLD_FAMILIES`); a path of a floor plan (.png, .jpg, .pgm), of a ROS map (.yaml), of
-            a .json file of walls, or of a folder of such files, of which one is drawn; a `World`; or a function of
-            `rng` that returns one.
+        world: Family name (see `WORLD_FAMILIES`); path of a floor plan (.png, .jpg, .pgm), of a ROS map (.yaml), of a
+            .json file of walls, or of a folder of such files to draw from; `World`; or a function of `rng` that returns
+            a `World`.
         rng: Source of all draws.
-        split: Of a folder, only files of this split are drawn; see `splits`. Else of no effect.
+        split: Split of the files in a folder, see `splits`; ignored for other sources.
 
     Raises:
-        ValueError: If there is no such family or file, or the function returns something else.
+        ValueError: If the family or file does not exist, or the function does not return a `World`.
     """
     check_source(world)
     if isinstance(world, World):
@@ -55,10 +55,10 @@ def make_world(world: WorldSource, rng: np.random.Generator, split: str | None =
 
 
 def check_source(world: object) -> None:
-    """Refuse what `make_world` could not make a world from, without making one.
+    """Validate a source of worlds without making a world.
 
     Raises:
-        ValueError: If there is no such family or file, or a folder holds none, or it is nothing of the kind.
+        ValueError: If the family or file does not exist, a folder has no suitable file, or the type is wrong.
     """
     if isinstance(world, (str, Path)):
         if not (isinstance(world, str) and world in WORLD_FAMILIES):
@@ -68,33 +68,33 @@ def check_source(world: object) -> None:
     elif callable(world):
         _check_maker(world)
     else:
-        cure = f"Names: {', '.join(WORLD_FAMILIES)}."
-        raise argument_error("world", "a name, a path, a World or a function", world, cure)
+        hint = f"Names: {', '.join(WORLD_FAMILIES)}."
+        raise argument_error("world", "a name, a path, a World or a function", world, hint)
 
 
 def _check_maker(maker: Callable[..., Any]) -> None:
-    """Refuse a function that cannot be called with a random generator alone."""
+    """Raise unless a function can be called with a random generator alone."""
     if is_built_in(maker):
         raise argument_error("world", "a function of rng that returns a World", maker, "Write one in Python.")
     try:
-        taken = signature(maker)
-    except (TypeError, ValueError):  # some built-in functions do not tell
+        parameters = signature(maker)
+    except (TypeError, ValueError):  # some built-in functions have no signature
         return
     try:
-        taken.bind(None)
+        parameters.bind(None)
     except TypeError as error:
-        cure = f"Define it as def make(rng); the call says: {error}."
-        raise argument_error("world", "a function of one argument, a random generator", maker, cure) from error
+        hint = f"Define it as def make(rng); Python says: {error}."
+        raise argument_error("world", "a function of one argument, a random generator", maker, hint) from error
 
 
 def is_single_layout(world: WorldSource) -> bool:
-    """Tell whether all worlds of a source have the same walls, so that there is nothing to split."""
-    named = isinstance(world, (str, Path)) and not (isinstance(world, str) and world in WORLD_FAMILIES)
-    return isinstance(world, World) or (named and not Path(world).is_dir())  # type: ignore[arg-type]
+    """Return whether a source always has the same walls, so that it cannot be split."""
+    is_path = isinstance(world, (str, Path)) and not (isinstance(world, str) and world in WORLD_FAMILIES)
+    return isinstance(world, World) or (is_path and not Path(world).is_dir())  # type: ignore[arg-type]
 
 
 def _load(world: str | Path, rng: np.random.Generator, split: str | None) -> World:
-    """Load the world at a path, or one of a folder's."""
+    """Load the world at a path, or a random one of a folder."""
     files = _files(world)
     if Path(world).is_dir() and split is not None:
         files = files_of_split(files, split)
@@ -104,7 +104,7 @@ def _load(world: str | Path, rng: np.random.Generator, split: str | None) -> Wor
 
 @lru_cache(maxsize=64)
 def _read(path: Path, changed: int) -> World:
-    """Read a file once for as long as it does not change; what is wrong with it names it, among many of a folder."""
+    """Load a file, cached by path and time of change; errors name the file."""
     suffix = path.suffix.lower()
     try:
         if suffix in MAP_SUFFIXES:
@@ -117,19 +117,19 @@ def _read(path: Path, changed: int) -> World:
 
 
 def _files(world: str | Path) -> list[Path]:
-    """Return the file at a path, or those of a folder, at least one; an image of a YAML file counts with it."""
+    """Return the file at a path, or the files of a folder, at least one; images with a YAML file are omitted."""
     path = Path(world)
     try:
         is_folder = path.is_dir()
     except OSError as error:  # e.g. a name too long for the system
         raise argument_error("world", "a file", Path(path), f"Check the path: {error.strerror}.") from error
-    if is_folder and world != "":  # the path of no characters would be the current folder
+    if is_folder and world != "":  # Path("") is the current folder
         files = sorted(p for p in path.iterdir() if p.suffix.lower() in FILE_SUFFIXES)
         maps = {file.stem for file in files if file.suffix.lower() in MAP_SUFFIXES}
         files = [file for file in files if file.stem not in maps or file.suffix.lower() not in IMAGE_SUFFIXES]
         if not files:
-            cure = "Put .png, .jpg, .pgm, .yaml or .json files there."
-            raise argument_error("world", "a folder with floor plans", Path(path), cure)
+            hint = "Add .png, .jpg, .pgm, .yaml or .json files."
+            raise argument_error("world", "a folder with floor plans", Path(path), hint)
         return files
     if path.suffix.lower() not in FILE_SUFFIXES:
         names = ", ".join(repr(name) for name in WORLD_FAMILIES)

@@ -1,4 +1,4 @@
-"""What a world is: walls, the landmarks on them, and perhaps where robots start. Frozen and checked."""
+"""Immutable, validated description of a world: walls, landmarks and optional start poses."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -9,24 +9,24 @@ from numpy.typing import NDArray
 from slam_backend.core.read_only import as_read_only
 from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_array
 
-SHORTEST_WALL = 1e-3  # [m] anything shorter has no direction worth the name
-LARGEST_EXTENT = 200.0  # [m] grids of free space grow with its square
-LONGEST = 1e6  # component of a vector whose square is still a float32
-FARTHEST_PLACE = 1e8  # [m] from the origin; no map frame on earth has more, and differences keep their micrometres
+SHORTEST_WALL = 1e-3  # [m] below, the direction is ill-defined
+LARGEST_EXTENT = 200.0  # [m] limits the size of the free-space raster
+LONGEST = 1e6  # limit of vector components: squares fit in float32
+FARTHEST_PLACE = 1e8  # [m] from the origin: map frames on earth fit, and differences keep micrometres
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Landmarks:
-    """Points with a texture on the faces of walls.
+    """Point landmarks on the faces of walls.
 
     Attributes:
-        positions: (N, 3) float64 [m], world frame. z is the height above the robots' reference height.
-        normals: (N, 2) float64 [-], world frame. Unit vectors that point out of the face, horizontally.
-        walls: (N,) int64. Index of the wall that carries the landmark.
+        positions: (N, 3) float64 [m], world frame. Positions, z relative to the robots' reference height.
+        normals: (N, 2) float64 [-], world frame. Horizontal unit normals of the faces, pointing outwards.
+        walls: (N,) int64. Index of each landmark's wall.
         descriptors: (N, d) float32 [-]. Unit appearance vectors.
 
     Raises:
-        ValueError: If a shape is wrong, a number is not finite, or a vector has not length 1.
+        ValueError: If a shape is wrong, a number is not finite, or a vector is not of length 1.
     """
 
     positions: FloatArray
@@ -35,12 +35,12 @@ class Landmarks:
     descriptors: NDArray[np.float32]
 
     def __post_init__(self) -> None:
-        cure = "Give one row per landmark."
-        positions: Any = check_array("landmarks.positions", self.positions, (None, 3), cure, within=FARTHEST_PLACE)
-        normals: Any = check_array("landmarks.normals", self.normals, (len(positions), 2), cure, within=LONGEST)
-        walls: Any = check_array("landmarks.walls", self.walls, (len(positions),), cure, dtype=np.int64)
+        hint = "Give one row per landmark."
+        positions: Any = check_array("landmarks.positions", self.positions, (None, 3), hint, within=FARTHEST_PLACE)
+        normals: Any = check_array("landmarks.normals", self.normals, (len(positions), 2), hint, within=LONGEST)
+        walls: Any = check_array("landmarks.walls", self.walls, (len(positions),), hint, dtype=np.int64)
         descriptors: Any = check_array(
-            "landmarks.descriptors", self.descriptors, (len(positions), None), cure, dtype=np.float32, within=LONGEST
+            "landmarks.descriptors", self.descriptors, (len(positions), None), hint, dtype=np.float32, within=LONGEST
         )
         for name, vectors in (("normals", normals), ("descriptors", descriptors)):
             lengths = np.linalg.norm(vectors, axis=1)
@@ -51,7 +51,7 @@ class Landmarks:
             object.__setattr__(self, name, as_read_only(array))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Let copies and what was pickled be read-only, too."""
+        """Keep copies and unpickled instances read-only."""
         return Landmarks, (self.positions, self.normals, self.walls, self.descriptors)
 
     def __len__(self) -> int:
@@ -60,18 +60,18 @@ class Landmarks:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class World:
-    """A flat building seen from above, in metres.
+    """Two-dimensional floor plan in metres.
 
     Attributes:
-        name: Shown in tables and pictures.
-        walls: (S, 4) float64 [m], world frame. Rows x1 y1 x2 y2: thin, opaque, solid segments.
-        landmarks: None: an environment places them on the walls.
-        start_poses: None, or (K, 3) float64 [m, m, rad], world frame, for K robots or fewer. None: an environment draws
-            them.
+        name: Name for tables and pictures.
+        walls: (S, 4) float64 [m], world frame. Thin, opaque, solid segments, rows x1 y1 x2 y2.
+        landmarks: Landmarks on the walls; None: placed by the environment.
+        start_poses: (K, 3) float64 [m, m, rad], world frame. Start poses for up to K robots; None: drawn by the
+            environment.
 
     Raises:
         ValueError: If there is no wall, a wall has no length, the world spans more than 200 m, a number is not
-            finite, or a landmark names no wall.
+            finite, or a wall index of a landmark is invalid.
 
     >>> World("room", [[0, 0, 4, 0], [4, 0, 4, 3], [4, 3, 0, 3], [0, 3, 0, 0]]).bounds
     (0.0, 0.0, 4.0, 3.0)
@@ -85,10 +85,10 @@ class World:
     def __post_init__(self) -> None:
         if not isinstance(self.name, str):
             raise argument_error("world.name", "a string", self.name, "Give the world a name.")
-        cure = "Give rows x1 y1 x2 y2 in metres."
-        walls: Any = check_array("world.walls", self.walls, (None, 4), cure, within=FARTHEST_PLACE)
+        hint = "Give rows x1 y1 x2 y2 in metres."
+        walls: Any = check_array("world.walls", self.walls, (None, 4), hint, within=FARTHEST_PLACE)
         if not len(walls):
-            raise argument_error("world.walls", "at least one wall", "no rows", cure)
+            raise argument_error("world.walls", "at least one wall", "no rows", hint)
         lengths = np.hypot(walls[:, 2] - walls[:, 0], walls[:, 3] - walls[:, 1])
         if lengths.min() < SHORTEST_WALL:
             at = int(np.argmin(lengths))
@@ -96,7 +96,7 @@ class World:
                 f"world.walls[{at}]",
                 f"a wall longer than {SHORTEST_WALL:g} m",
                 f"a length of {lengths[at]:g} m",
-                "Drop it, or check that the unit is metres.",
+                "Remove it, or check that the unit is metres.",
             )
         extent = float(np.ptp(walls.reshape(-1, 2), axis=0).max())
         if extent > LARGEST_EXTENT:
@@ -112,25 +112,25 @@ class World:
                 raise argument_error(
                     "world.landmarks", "Landmarks or None", self.landmarks, "Build them with Landmarks."
                 )
-            named = self.landmarks.walls
-            if len(named) and (named.min() < 0 or named.max() >= len(walls)):
+            indices = self.landmarks.walls
+            if len(indices) and (indices.min() < 0 or indices.max() >= len(walls)):
                 raise argument_error(
                     "world.landmarks.walls",
                     f"wall indices 0 to {len(walls) - 1}",
-                    [int(named.min()), int(named.max())],
+                    [int(indices.min()), int(indices.max())],
                     "Count walls from 0.",
                 )
         if self.start_poses is not None:
-            cure = "Give rows x y theta in metres and radians."
-            starts: Any = check_array("world.start_poses", self.start_poses, (None, 3), cure, within=FARTHEST_PLACE)
+            hint = "Give rows x y theta in metres and radians."
+            starts: Any = check_array("world.start_poses", self.start_poses, (None, 3), hint, within=FARTHEST_PLACE)
             object.__setattr__(self, "start_poses", as_read_only(starts))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Let copies and what was pickled be read-only, too."""
+        """Keep copies and unpickled instances read-only."""
         return World, (self.name, self.walls, self.landmarks, self.start_poses)
 
     @property
     def bounds(self) -> tuple[float, float, float, float]:
-        """The smallest box (xmin, ymin, xmax, ymax) [m] that holds all walls."""
+        """Bounding box (xmin, ymin, xmax, ymax) [m] of all walls."""
         x, y = self.walls[:, 0::2], self.walls[:, 1::2]
         return float(x.min()), float(y.min()), float(x.max()), float(y.max())

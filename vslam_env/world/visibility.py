@@ -1,4 +1,4 @@
-"""What cameras can see, and which landmarks they do."""
+"""Visibility of landmarks from cameras."""
 
 import math
 
@@ -12,34 +12,34 @@ from vslam_env.world.spec import Landmarks
 
 
 def view_limits(camera: StereoCamera, max_incidence: float) -> FloatArray:
-    """Return where a camera is and what it can see in the order that kernels expect it.
+    """Return position and limits of view of a camera for the kernels.
 
     Args:
-        camera: The robots'.
-        max_incidence: Between the line of sight and a face's normal [rad]; more oblique faces show nothing.
+        camera: Camera of the robots.
+        max_incidence: Largest angle between line of sight and face normal at which landmarks are visible [rad].
 
     Returns:
-        (7,) float64, read-only: its place in the robot frame [m], its range [m], tangents of half its fields of view
-        across and upright, cosine of `max_incidence`.
+        (7,) float64, read-only. Position in the robot frame [m], range [m], tangents of half the horizontal and
+        vertical field of view, cosine of `max_incidence`.
     """
     tangents = np.tan(camera.half_fov), np.tan(camera.half_vertical_fov)
     return as_read_only(np.array([*camera.mount, camera.max_range, *tangents, np.cos(max_incidence)]))
 
 
 def landmark_geometry(landmarks: Landmarks) -> FloatArray:
-    """Return positions [m] and normals of landmarks (5, N), world frame, by rows as kernels expect them; read-only."""
+    """Return positions [m] and normals of landmarks as coordinate rows (5, N), world frame; read-only."""
     return as_read_only(np.vstack([landmarks.positions.T, landmarks.normals.T]))
 
 
 def as_coordinate_rows(walls: FloatArray) -> FloatArray:
-    """Return walls (S, 4) [m] as rows (4, S) of coordinates, as kernels expect them; read-only."""
+    """Return walls (S, 4) [m] as coordinate rows (4, S); read-only."""
     return as_read_only(walls.T.copy())
 
 
 def ray_fan(angles: FloatArray) -> tuple[FloatArray, float]:
-    """Return unit vectors (2, R) at angles (R,) [rad], read-only, and the tangent of the wedge that holds them all.
+    """Return unit vectors (2, R) at angles (R,) [rad], read-only, and the tangent of half the wedge around them.
 
-    The tangent is 0, for all round, where the wedge is nearly a half plane or wider.
+    A tangent of 0 stands for all directions, if the wedge is nearly a half plane or wider.
     """
     rays = np.array([[math.cos(angle) for angle in angles], [math.sin(angle) for angle in angles]])
     widest = float(np.abs(angles).max())
@@ -49,14 +49,14 @@ def ray_fan(angles: FloatArray) -> tuple[FloatArray, float]:
 def visible_landmarks(
     poses: FloatArray, landmarks: Landmarks, walls: FloatArray, robot_radius: float, view: FloatArray
 ) -> BoolArray:
-    """Tell which landmarks (K, N) the cameras of robots at `poses` (K, 3) [m, m, rad], world frame, see.
+    """Return which landmarks are visible (K, N) bool from the cameras of K robots.
 
     Args:
-        poses: True ones.
-        landmarks: N of them.
-        walls: (S, 4) float64 [m], world frame.
-        robot_radius: Robots hide what stands behind them [m].
-        view: From `view_limits`.
+        poses: (K, 3) float64 [m, m, rad], world frame. True poses.
+        landmarks: N landmarks.
+        walls: (S, 4) float64 [m], world frame. Wall segments.
+        robot_radius: Radius of the robots, which occlude landmarks [m].
+        view: Limits of view from `view_limits`.
     """
     shape = len(poses), len(landmarks)
     sight = landmark_geometry(landmarks), landmarks.walls, as_coordinate_rows(walls), robot_radius, view

@@ -196,7 +196,7 @@ def test_images_can_be_observed() -> None:
             np.testing.assert_array_equal(observed[agent]["pose"], expected[agent]["pose"])
         expected, observed = (env.step(turning(env.agents))[0] for env in (plain, seeing))
     for refused in ({"sensor": "landmark"}, {"observation_type": "flat"}):
-        with pytest.raises(ValueError, match="observe_images: expected False without rendered eyes or named arrays"):
+        with pytest.raises(ValueError, match="observe_images: expected False unless images are rendered"):
             _env(observe_images=True, **refused)
 
 

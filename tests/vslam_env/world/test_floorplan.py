@@ -79,10 +79,10 @@ def test_the_marked_part_is_kept(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("image", "message"),
     [
-        (np.zeros((50, 60)), "no free space to tell from walls"),
-        (np.full((50, 60), 127), "no free space to tell from walls"),
-        (np.full((50, 60), 255), "no free space to tell from walls"),
-        (np.pad(np.full((4, 30), 255), 10), r"expected free space for robots of radius 0\.2 m, got a widest place"),
+        (np.zeros((50, 60)), "no free space distinct from walls"),
+        (np.full((50, 60), 127), "no free space distinct from walls"),
+        (np.full((50, 60), 255), "no free space distinct from walls"),
+        (np.pad(np.full((4, 30), 255), 10), r"expected free space for robots of radius 0\.2 m, got a largest width"),
     ],
 )
 def test_plans_without_room_are_refused(tmp_path: Path, image: Any, message: str) -> None:
@@ -95,7 +95,7 @@ def test_a_tolerance_that_leaves_no_walls_is_refused(tmp_path: Path) -> None:
     """Outlines that are straightened until nothing is left are refused by the tolerance."""
     room = write(tmp_path / "room.png", np.pad(np.full((40, 60), 255), 10))
     with pytest.raises(
-        ValueError, match=r"tolerance_px: expected less than the free part of .* is wide, got 1000000000\.0"
+        ValueError, match=r"tolerance_px: expected less than the width of the free part of .*, got 1000000000\.0"
     ):
         load_floorplan(room, tolerance_px=1e9)
 

@@ -229,7 +229,7 @@ def test_files_take_turns(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("act", "says"),
     [
-        (lambda path: small_env(world_split="test"), "world_split: expected None for a world of which there is one"),
+        (lambda path: small_env(world_split="test"), "world_split: expected None for a single layout"),
         (lambda path: vslam_v0.parallel_env(world_split="exam"), "world_split: expected .*'train'.*, got 'exam'"),
         (lambda path: small_env(world=path, world_split="train").reset(), "world_split: expected files for 'train'"),
     ],
@@ -293,8 +293,8 @@ def test_start_poses_of_the_world_choose_the_part() -> None:
 @pytest.mark.parametrize(
     ("starts", "message"),
     [
-        ([[2, 1, 0], [9, 1, 0]], r"start_poses\[1\]: expected a place that robots can reach"),
-        ([[2, 1, 0], [0.5, 2.2, 0]], r"start_poses\[1\]: expected a place that robots can reach"),
+        ([[2, 1, 0], [9, 1, 0]], r"start_poses\[1\]: expected a reachable place"),
+        ([[2, 1, 0], [0.5, 2.2, 0]], r"start_poses\[1\]: expected a reachable place"),
         ([[2, 0.1, 0], [5, 1, 0]], r"start_poses\[0\]: expected a place at least 0\.2 m .* got a distance of 0\.100 m"),
         ([[2, 1, 0], [2.3, 1, 0]], r"start_poses\[1\]: expected .* got a distance of 0\.300 m to robot 0"),
         ([[2, 1, 0]], r"start_poses: expected an array of shape \(2, 3\), got shape \(1, 3\)"),

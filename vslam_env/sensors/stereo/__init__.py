@@ -1,1 +1,1 @@
-"""Rendered stereo cameras: textures, images, their ground truth, and the front end that reads them."""
+"""Rendered stereo cameras: textures, images, ground truth and measurements of the front end."""

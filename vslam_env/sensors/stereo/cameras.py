@@ -1,4 +1,4 @@
-"""`StereoRenderer`: the images that a robot's two cameras take of a textured world."""
+"""Renderer of stereo images of a textured world."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -20,14 +20,14 @@ VIEW = 60.0  # [m] farther walls are not drawn
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ImagingConfig:
-    """How images are taken.
+    """Noise, exposure and sampling of images.
 
     Attributes:
-        noise: Standard deviation of a pixel's noise, independent in each eye [grey levels].
+        noise: Standard deviation of the pixel noise, independent in both images [grey levels].
         gain_sigma: Standard deviation of the exposure, drawn for each pair: a factor about 1, the same in both eyes.
         eye_gain_sigma: Standard deviation of the factor by which the right eye's exposure differs.
         blur_px: Standard deviation of a Gaussian blur before noise [px]; 0: none.
-        parts: Sub-columns of a column.
+        parts: Number of sub-columns rendered per column.
     """
 
     noise: float = 2.0
@@ -43,13 +43,13 @@ class ImagingConfig:
 
 
 class Traced(NamedTuple):
-    """What rays through image columns meet.
+    """Hits of rays through image columns.
 
     Attributes:
-        walls: (n,) int64. Wall, -1: nothing, -2: a robot.
-        sides: (n,) int64. 0: left face of the wall, seen from its beginning; 1: right face.
-        depths: (n,) float64 [m]. Ahead of the camera; infinity where there is nothing.
-        along: (n,) float64. How far along the wall, in [0, 1].
+        walls: (n,) int64. Index of the wall; -1: no hit, -2: a robot.
+        sides: (n,) int64. 0: left face of the wall, seen from its start; 1: right face.
+        depths: (n,) float64 [m]. Depth ahead of the camera; infinity without a hit.
+        along: (n,) float64. Position along the wall in [0, 1].
     """
 
     walls: IntArray
@@ -59,15 +59,15 @@ class Traced(NamedTuple):
 
 
 class StereoRenderer:
-    """Takes pairs of images of one world.
+    """Renderer of pairs of images of one world.
 
-    Both eyes look the same way; the right one stands `camera.baseline` to the right of the left one. Other robots block
-    the view.
+    The cameras are parallel, the right one `camera.baseline` to the right of the left one. Other robots occlude the
+    walls.
 
     Args:
         camera: Optics, mount and size of the images.
         imaging: Noise and exposure.
-        walls: (S, 4) float64 [m], world frame.
+        walls: (S, 4) float64 [m], world frame. Wall segments.
         textures: Textures of these walls.
         robot_radius: Radius of the robots [m].
     """
@@ -89,11 +89,11 @@ class StereoRenderer:
         self._tan_half = (0.5 * camera.width + 1.0) / camera.focal_px
 
     def take(self, poses: FloatArray, robot: int, rng: np.random.Generator) -> tuple[Image, Image]:
-        """Take a pair.
+        """Render a pair of images.
 
         Args:
             poses: (K, 3) float64 [m, m, rad], world frame. True poses of all robots.
-            robot: Whose eyes.
+            robot: Index of the robot.
             rng: Source of exposure and noise.
 
         Returns:
@@ -112,29 +112,29 @@ class StereoRenderer:
         return images[0], images[1]
 
     def radiance(self, poses: FloatArray, robot: int, shift: float = 0.0) -> Float32Array:
-        """Return the grey levels (W, H) float32, without noise, of an eye `shift` [m] to the right of the left one."""
-        place = self._place(poses[robot], shift)
-        local, indices = self._walls_ahead(place)
+        """Return the noise-free grey levels (W, H) float32 of a camera `shift` [m] to the right of the left one."""
+        eye = self._place(poses[robot], shift)
+        local, indices = self._walls_ahead(eye)
         faces = Faces(self.textures.sums, self.textures.starts, self.textures.columns)
         radiance = np.empty((self.camera.width, self.camera.height), dtype=np.float32)
-        others = self._others(poses, robot, place)
+        others = self._others(poses, robot, eye)
         render(local, indices, others, self._radius, self._optics, faces, self.imaging.parts, radiance)
         blur = self.imaging.blur_px
         return radiance if blur == 0.0 else np.asarray(cv2.GaussianBlur(radiance, (0, 0), blur), dtype=np.float32)
 
-    def _walls_ahead(self, place: FloatArray) -> tuple[FloatArray, IntArray]:
-        """Return the walls (n, 4) [m] that an eye at `place` may see, in its frame, and their indices (n,)."""
+    def _walls_ahead(self, eye: FloatArray) -> tuple[FloatArray, IntArray]:
+        """Return the walls (n, 4) [m] in the view of a camera at pose `eye`, in its frame, and their indices (n,)."""
         local, indices = np.empty(self._walls.T.shape), np.empty(self._walls.shape[1], np.int64)
-        x, y, theta = place.tolist()
+        x, y, theta = eye.tolist()
         c, s = np.cos(theta), np.sin(theta)
         count = walls_in_wedge(x, y, c, s, self._walls, self._tan_half, VIEW, local, indices)
         return local[:count], indices[:count]
 
     def trace(self, poses: FloatArray, robot: int, columns: FloatArray) -> Traced:
-        """Return what the left eye's rays through columns (n,) [px] meet; pixel centres are at integers."""
-        place = self._place(poses[robot], 0.0)
-        local, indices = self._walls_ahead(place)
-        others = self._others(poses, robot, place)
+        """Return the hits of the left camera's rays through columns (n,) [px]; pixel centres are at integers."""
+        eye = self._place(poses[robot], 0.0)
+        local, indices = self._walls_ahead(eye)
+        others = self._others(poses, robot, eye)
         rows, depths, along = trace(columns, local, others, self._radius, self._optics[0], self._optics[1])
         on_wall = rows >= 0
         walls, sides = rows.copy(), np.zeros(len(rows), dtype=np.int64)
@@ -144,13 +144,13 @@ class StereoRenderer:
         return Traced(walls, sides, depths, along)
 
     def _place(self, pose: FloatArray, shift: float) -> FloatArray:
-        """Return (3,) where an eye is, world frame."""
+        """Return the planar pose (3,) of a camera, world frame."""
         c, s = np.cos(pose[2]), np.sin(pose[2])
         ahead, left = self.camera.mount[0], self.camera.mount[1] - shift
         return np.array([pose[0] + c * ahead - s * left, pose[1] + s * ahead + c * left, pose[2]])
 
-    def _others(self, poses: FloatArray, robot: int, place: FloatArray) -> FloatArray:
-        """Return the other robots (K - 1, 2) [m] in the frame of an eye."""
-        away = np.delete(poses[:, :2], robot, axis=0) - place[:2]
-        c, s = np.cos(place[2]), np.sin(place[2])
-        return np.column_stack([c * away[:, 0] + s * away[:, 1], c * away[:, 1] - s * away[:, 0]])
+    def _others(self, poses: FloatArray, robot: int, eye: FloatArray) -> FloatArray:
+        """Return the positions of the other robots (K - 1, 2) [m] in the frame of a camera at pose `eye`."""
+        offsets = np.delete(poses[:, :2], robot, axis=0) - eye[:2]
+        c, s = np.cos(eye[2]), np.sin(eye[2])
+        return np.column_stack([c * offsets[:, 0] + s * offsets[:, 1], c * offsets[:, 1] - s * offsets[:, 0]])

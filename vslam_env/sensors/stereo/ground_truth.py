@@ -1,7 +1,6 @@
-"""True landmarks of a textured world: the corners that the detector finds in the walls' own textures.
+"""True landmarks of a textured world: corners detected in the textures of its walls.
 
-This is the simulator's side only. The map error counts how many of these landmarks a robot's map holds, and how far off
-they are; a filter never learns of them.
+They serve the evaluation of maps only and are unknown to the filters.
 """
 
 import cv2
@@ -16,26 +15,25 @@ from vslam_env.sensors.stereo.textures import WallTextures
 from vslam_env.world.freespace import FreeSpace
 from vslam_env.world.spec import Landmarks, World
 
-LOOK = 0.12  # [m] a face looks into the free space if the point this far in front of it lies there
+LOOK = 0.12  # [m] a face is visible if the point this far in front of it lies in the free space
 ALL = 1 << 20
 
 
 class TextureCorners:
-    """The corners of all faces of a world, and which of them a point on a wall is.
+    """Corners on all faces of a world, and the association of points on walls with them.
 
     Args:
-        world: Its walls.
-        textures: Of these walls.
-        free_space: Of this world: faces that no robot can stand before have no landmarks.
-        pixels_per_metre: Working resolution at which corners are looked for [px/m]: that at which a camera sees a wall
-            from a typical distance.
-        corners: What is a corner; the numbers of corners are not limited.
-        tolerance: A point on a wall is the corner nearest to it within this distance [m].
+        world: World with the walls.
+        textures: Textures of these walls.
+        free_space: Free space of this world; faces that do not border on it have no landmarks.
+        pixels_per_metre: Resolution of the corner detection [px/m], that of a camera at a typical distance from a wall.
+        corners: Options of the corner detector, except limits of the number of corners.
+        tolerance: Largest distance between a point on a wall and its corner [m].
 
     Attributes:
-        landmarks: The corners, in order of their faces; descriptors are u-SURF at working resolution.
-        faces: (N,) int64, read-only. Their faces, as in `WallTextures`.
-        offsets: (N, 2) float64 [m], read-only. How far along the wall, and the height.
+        landmarks: Corners in order of their faces; descriptors are u-SURF at working resolution.
+        faces: (N,) int64, read-only. Faces of the corners, see `WallTextures`.
+        offsets: (N, 2) float64 [m], read-only. Position along the wall, and height.
     """
 
     def __init__(
@@ -61,14 +59,14 @@ class TextureCorners:
         )
         faces, offsets, descriptors = [], [], []
         for face in range(2 * len(world.walls)):
-            found, described = _corners_of(textures, face, pixels_per_metre, unlimited)
+            found, face_descriptors = _corners_of(textures, face, pixels_per_metre, unlimited)
             wall, side = divmod(face, 2)
             normal = left[wall] if side == 0 else -left[wall]
             places = starts[wall] + found[:, :1] * along[wall] + LOOK * normal
             free = free_space.contains(places)
             faces.append(np.full(int(free.sum()), face))
             offsets.append(found[free])
-            descriptors.append(described[free])
+            descriptors.append(face_descriptors[free])
         of_faces, places = np.concatenate(faces), np.concatenate(offsets)
         walls = of_faces // 2
         positions = starts[walls] + places[:, :1] * along[walls]
@@ -83,7 +81,7 @@ class TextureCorners:
     def _settle(
         self, walls: FloatArray, landmarks: Landmarks, faces: IntArray, offsets: FloatArray, tolerance: float
     ) -> None:
-        """Hold corners that were found."""
+        """Initialise from detected corners."""
         self.landmarks, self.faces, self.offsets = landmarks, as_constant(faces), as_constant(offsets)
         self._tolerance = tolerance
         self._lengths = as_read_only(np.linalg.norm(walls[:, 2:] - walls[:, :2], axis=1))
@@ -93,52 +91,52 @@ class TextureCorners:
     def found(
         cls, walls: FloatArray, landmarks: Landmarks, faces: IntArray, offsets: FloatArray, tolerance: float
     ) -> "TextureCorners":
-        """Return corners that were found before.
+        """Rebuild an instance from its detected corners.
 
         Args:
-            walls: (S, 4) float64 [m], world frame.
-            landmarks: The corners.
-            faces: (N,) int64, ascending.
-            offsets: (N, 2) float64 [m].
-            tolerance: [m].
+            walls: (S, 4) float64 [m], world frame. Wall segments.
+            landmarks: Corners.
+            faces: (N,) int64, ascending. Faces of the corners.
+            offsets: (N, 2) float64 [m]. Position along the wall, and height.
+            tolerance: Largest distance between a point on a wall and its corner [m].
         """
         self = cls.__new__(cls)
         self._settle(walls, landmarks, faces, offsets, tolerance)
         return self
 
     def true_ids(self, traced: Traced, heights: FloatArray) -> IntArray:
-        """Return which landmark (n,) int64 each point on a wall is, -1: none.
+        """Return the landmark (n,) int64 of each point on a wall, -1: none.
 
         Args:
-            traced: What the rays to the points meet.
-            heights: (n,) float64 [m]. Heights at which they meet it.
+            traced: Hits of the rays to the points.
+            heights: (n,) float64 [m]. Heights of the hits.
         """
-        names = np.full(len(heights), -1, dtype=np.int64)
+        ids = np.full(len(heights), -1, dtype=np.int64)
         for n in np.flatnonzero(traced.walls >= 0):
             wall = traced.walls[n]
             face = 2 * wall + traced.sides[n]
             rows = slice(int(self._begins[face]), int(self._begins[face + 1]))
-            away = self.offsets[rows] - [traced.along[n] * self._lengths[wall], heights[n]]
-            squares = (away * away).sum(axis=1)
+            differences = self.offsets[rows] - [traced.along[n] * self._lengths[wall], heights[n]]
+            squares = (differences * differences).sum(axis=1)
             if len(squares) and squares.min() <= self._tolerance**2:
-                names[n] = rows.start + int(squares.argmin())
-        return names
+                ids[n] = rows.start + int(squares.argmin())
+        return ids
 
 
 def _corners_of(
     textures: WallTextures, face: int, pixels_per_metre: float, options: CornerOptions
 ) -> tuple[FloatArray, np.ndarray]:
-    """Return the corners of a face, (n, 2) [m] along the wall and in height, and descriptors (n, 64)."""
+    """Return the corners of a face (n, 2) [m], position along the wall and height, and descriptors (n, 64)."""
     config, picture = textures.config, textures.picture(face)
     width, height = textures.columns[face] * textures.widths[face], config.ceiling - config.floor
     size = max(1, round(width * pixels_per_metre)), max(1, round(height * pixels_per_metre))
     if min(size) < SMALLEST:
         return np.empty((0, 2)), np.empty((0, 64), dtype=np.float32)
-    seen = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-    points = harris_corners(seen, options).points
-    descriptors = usurf_descriptors(seen, points, 2.3)
-    lively = descriptors.any(axis=1)
-    points, descriptors = points[lively], descriptors[lively]
+    image = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    points = harris_corners(image, options).points
+    descriptors = usurf_descriptors(image, points, 2.3)
+    nonzero = descriptors.any(axis=1)
+    points, descriptors = points[nonzero], descriptors[nonzero]
     scale = np.array([width / size[0], height / size[1]])
     offsets = (points + 0.5) * scale
     offsets[:, 1] = config.ceiling - offsets[:, 1]

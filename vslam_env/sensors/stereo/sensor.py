@@ -1,4 +1,4 @@
-"""`StereoSensor`: rendered eyes and the image front end stand in for the landmark sensor."""
+"""Stereo sensor: rendered images measured by the stereo front end."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -18,31 +18,31 @@ from vslam_env.world.freespace import FreeSpace
 from vslam_env.world.spec import Landmarks, World
 from vslam_env.world.visibility import view_limits, visible_landmarks
 
-FINEST = 2e3  # [px/m]; walls are looked at as a whole
-SPURIOUS_PX = 1.0  # a point whose disparity is farther off than this is none of what its ray meets
+FINEST = 2e3  # [px/m] limit of the resolution of corner detection
+SPURIOUS_PX = 1.0  # a point with a larger disparity error is false
 
 
 def default_front_end() -> FrontEndOptions:
-    """Return the default front end of a robot.
+    """Return the default options of the front end.
 
-    At most 20 points a frame, spread over the image, each described by 0.6 m of wall around it: from twice as far 91 %
-    of the landmarks of a wall are then found again by descriptor, and 20 % with a window of constant size in pixels.
+    A frame has at most 20 points, spread over the image, with descriptors of a window of 0.6 m. From twice the
+    distance, these match 91 % of the landmarks of a wall, and descriptors of a window of constant pixel size 20 %.
     """
     return FrontEndOptions(max_measurements=20, window=0.6)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StereoSensorConfig:
-    """Rendered eyes: what the walls look like, how images are taken, and how they are measured.
+    """Configuration of rendered stereo cameras: textures, imaging and front end.
 
     Attributes:
-        camera: Optics and size of the images; its sigmas are not used, since images have the noise that they have.
-        textures: What the walls look like.
+        camera: Optics and size of the images; its sigmas are unused, since noise arises in the images.
+        textures: Textures of the walls.
         imaging: Noise and exposure of the images.
-        front_end: How images are measured.
-        working_distance: True landmarks are the corners of the textures as a camera sees them from so far [m].
-        max_incidence: True landmarks seen at a larger angle to their face are not expected to be found [rad].
-        tolerance: A measured point is the true landmark nearest to it on its wall within this distance [m].
+        front_end: Options of the stereo front end.
+        working_distance: Camera distance whose resolution is used to detect the true landmarks in the textures [m].
+        max_incidence: Largest angle between line of sight and face normal at which landmarks are visible [rad].
+        tolerance: Largest distance on a wall between a measured point and its true landmark [m].
     """
 
     camera: StereoCamera = field(default_factory=StereoCamera)
@@ -57,33 +57,33 @@ class StereoSensorConfig:
         parts = {"camera": StereoCamera, "textures": TextureConfig, "imaging": ImagingConfig}
         for name, kind in (parts | {"front_end": FrontEndOptions}).items():
             if not isinstance(getattr(self, name), kind):
-                cure = f"Build one: {kind.__name__}(...)."
-                raise argument_error(f"stereo.{name}", f"a {kind.__name__}", getattr(self, name), cure)
+                hint = f"Build one: {kind.__name__}(...)."
+                raise argument_error(f"stereo.{name}", f"a {kind.__name__}", getattr(self, name), hint)
         check_float("stereo.max_incidence", self.max_incidence, "Give radians.", above=0.0, at_most=np.pi / 2)
         check_float("stereo.working_distance", self.working_distance, "Give metres.", at_least=0.1, at_most=1e3)
         check_float("stereo.tolerance", self.tolerance, "Give metres.", above=0.0, at_most=1e3)
         width, height = self.camera.width, self.camera.height
         if min(width, height) < SMALLEST or width * height > LARGEST:
             expected = f"images of at least {SMALLEST} rows and columns and at most {LARGEST} pixels"
-            raise argument_error("stereo.camera", expected, f"a size of {width} x {height}", "Render other images.")
+            raise argument_error("stereo.camera", expected, f"a size of {width} x {height}", "Choose another size.")
         if (resolution := self.camera.focal_px / self.working_distance) > FINEST:
-            expected, cure = f"a view of walls in at most {FINEST:g} px/m", "Lower focal_px, or look from farther."
-            raise argument_error("stereo.working_distance", expected, f"a view in {resolution:g} px/m", cure)
+            expected, hint = f"a resolution of at most {FINEST:g} px/m", "Lower focal_px, or raise the distance."
+            raise argument_error("stereo.working_distance", expected, f"a resolution of {resolution:g} px/m", hint)
 
     @property
     def farthest(self) -> float:
-        """No point is reported that is farther from the camera than this [m]."""
+        """Largest measured distance from the camera [m]; farther points are discarded."""
         return self.camera.max_range
 
 
 class RenderedFrame(NamedTuple):
-    """What one robot's eyes saw in one tick, and what was made of it.
+    """Images of one robot in one tick, and the measurements from them.
 
     Attributes:
-        measurements, true_ids: As of a `Frame`.
-        left: (H, W) uint8.
-        right: (H, W) uint8.
-        seen: What the front end found in them.
+        measurements, true_ids: Measurements and true landmarks, see `SensorFrame`.
+        left: (H, W) uint8. Left image.
+        right: (H, W) uint8. Right image.
+        seen: Result of the front end.
     """
 
     measurements: Measurements
@@ -94,7 +94,7 @@ class RenderedFrame(NamedTuple):
 
 
 class TeamRenderedFrames(NamedTuple):
-    """The frames of all robots in one tick: per robot what its `RenderedFrame` has by the same name."""
+    """The frames of all robots in one tick, with the fields of `RenderedFrame` by robot."""
 
     measurements: Sequence[Measurements]
     true_ids: Sequence[IntArray]
@@ -104,29 +104,29 @@ class TeamRenderedFrames(NamedTuple):
 
     @property
     def names(self) -> Sequence[IntArray]:
-        """The true ids, as those who ask any sensor's frames look for them."""
+        """Alias of `true_ids`, common to the frames of all sensors."""
         return self.true_ids
 
     def per_robot(self) -> list[RenderedFrame]:
-        """Return the frame of each robot; its true ids are copies."""
-        return list(map(RenderedFrame, *self._replace(true_ids=[own.copy() for own in self.true_ids])))
+        """Return the frame of each robot, with copies of the true ids."""
+        return list(map(RenderedFrame, *self._replace(true_ids=[ids.copy() for ids in self.true_ids])))
 
 
 class StereoSensor:
-    """Measures the textured walls of one world with the eyes of all robots.
+    """Stereo cameras of all robots that measure the textured walls of one world.
 
     Args:
-        config: How.
-        world: Its walls; landmarks of its own are not used.
-        free_space: Of this world.
+        config: Textures, imaging and front end.
+        world: World with the walls; its own landmarks are ignored.
+        free_space: Free space of this world.
         rng: Source of the textures.
-        robot_radius: Robots hide what stands behind them [m].
+        robot_radius: Radius of the robots, which occlude walls [m].
 
     Attributes:
-        config: As given.
-        textures: Of the walls.
-        corners: The true landmarks.
-        robot_radius: As given.
+        config: Textures, imaging and front end.
+        textures: Textures of the walls.
+        corners: True landmarks.
+        robot_radius: Radius of the robots [m].
     """
 
     def __init__(
@@ -151,7 +151,7 @@ class StereoSensor:
         corners: TextureCorners,
         robot_radius: float,
     ) -> None:
-        """Look at a world whose textures and corners are known."""
+        """Initialise from known textures and corners."""
         self.config, self.textures, self.corners = config, textures, corners
         self._walls, self.robot_radius = walls, robot_radius
         self._view = view_limits(config.camera, config.max_incidence)
@@ -167,30 +167,30 @@ class StereoSensor:
         corners: TextureCorners,
         robot_radius: float,
     ) -> "StereoSensor":
-        """Return the sensor of a world whose textures and corners are known; arguments of `StereoSensor`."""
+        """Return a sensor with known textures and corners; see `StereoSensor` for the other arguments."""
         self = cls.__new__(cls)
         self._settle(config, walls, textures, corners, robot_radius)
         return self
 
     @property
     def landmarks(self) -> Landmarks:
-        """The true landmarks."""
+        """True landmarks."""
         return self.corners.landmarks
 
     def visible(self, poses: FloatArray) -> BoolArray:
-        """Tell which true landmarks (K, N) the robots at `poses` (K, 3) [m, m, rad], world frame, can see."""
+        """Return which true landmarks are visible (K, N) from poses (K, 3) [m, m, rad], world frame."""
         return visible_landmarks(poses, self.landmarks, self._walls, self.robot_radius, self._view)
 
     def measure(self, poses: FloatArray, rng: np.random.Generator) -> TeamRenderedFrames:
-        """Take and measure a pair of images with each robot's eyes.
+        """Render and measure a pair of images for each robot.
 
         Args:
             poses: (K, 3) float64 [m, m, rad], world frame. True poses.
             rng: Source of exposure and noise.
 
         Returns:
-            One frame of each robot, with the true landmark behind each point, -1 where there is none: on edges that
-            are none of a texture, on robots, where nothing stands, and where the depth is wrong.
+            One frame per robot, with the true landmark of each point. It is -1 for points without one: on edges outside
+            the textures, on robots, or with a wrong depth.
         """
         frames = []
         for robot in range(len(poses)):
@@ -200,17 +200,17 @@ class StereoSensor:
         return TeamRenderedFrames(*zip(*frames, strict=True))
 
     def _true_ids(self, poses: FloatArray, robot: int, frame: StereoFrame) -> IntArray:
-        """Return the true landmark (n,) int64 behind each measured point, -1 where there is none.
+        """Return the true landmark (n,) int64 of each measured point, -1: none.
 
-        It is the one where the point's ray meets a wall, if the measured disparity is that of the wall to a pixel:
-        a point in mid-air is spurious, whatever stands behind it.
+        It is the landmark at the hit of the point's ray on a wall, if the measured disparity agrees with the wall to a
+        pixel; otherwise the point is false.
         """
         camera = self.config.camera
         traced = self._eye.trace(poses, robot, frame.pixels[:, 0])
         with np.errstate(invalid="ignore"):
             rise = (0.5 * (camera.height - 1) - frame.pixels[:, 1]) / camera.focal_px * traced.depths
         heights = np.where(traced.walls >= 0, camera.mount[2] + rise, 0.0)
-        names = self.corners.true_ids(traced, heights)
+        ids = self.corners.true_ids(traced, heights)
         spurious = np.abs(frame.pixels[:, 2] - camera.focal_px * camera.baseline / traced.depths) > SPURIOUS_PX
-        names[spurious] = -1
-        return names
+        ids[spurious] = -1
+        return ids

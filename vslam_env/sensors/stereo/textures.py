@@ -1,4 +1,4 @@
-"""Textures of walls: each face of each wall carries a picture of its own, drawn from a stream of its own."""
+"""Random textures of the walls, with an independent random stream for each wall."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,8 +13,8 @@ from slam_backend.core.validation import FloatArray, IntArray, argument_error, c
 from slam_backend.frontend.images import Image
 
 STYLES = ("distinct", "bricks", "posters_alike", "bricks_alike")
-LEVELS = (20.0, 235.0)  # darkest and brightest paint
-HIGHEST = 100.0  # [m]; faces are painted texel by texel
+LEVELS = (20.0, 235.0)  # darkest and brightest grey level
+HIGHEST = 100.0  # [m] limits the number of texels
 BRICK = (0.24, 0.12)  # width and height of a brick [m]
 POSTER = 0.6  # side of a poster [m]
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm")
@@ -22,18 +22,18 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TextureConfig:
-    """What the walls look like.
+    """Style and resolution of the wall textures.
 
     Attributes:
-        style: "distinct": polygons and posters, all different. "bricks": bricks whose edges and greys vary.
-            "posters_alike": plain walls with one and the same poster every metre. "bricks_alike": equal bricks. The
-            last three are there to deceive: places look alike.
-        images: Folder of images that cover the walls instead; None: the style is drawn.
+        style: "distinct": polygons and posters, all different. "bricks": bricks with varying edges and grey levels.
+            "posters_alike": plain walls with the same poster every metre. "bricks_alike": equal bricks. The last three
+            create perceptual aliasing.
+        images: Folder of images to cover the walls with instead of the style; None: use the style.
         texel: Side of a texel [m].
-        floor: Height at which walls begin [m], above the robots' reference height.
-        ceiling: Height at which they end [m].
-        polygons: Of the style "distinct", 4 to 22 cm wide, per square metre [1/m^2].
-        posters: Likewise, 30 to 70 cm wide [1/m^2].
+        floor: Height of the lower edge of walls above the robots' reference height [m].
+        ceiling: Height of their upper edge [m].
+        polygons: Density of the polygons in the style "distinct", 4 to 22 cm wide [1/m^2].
+        posters: Density of the posters in the style "distinct", 30 to 70 cm wide [1/m^2].
     """
 
     style: str = "distinct"
@@ -46,31 +46,31 @@ class TextureConfig:
 
     def __post_init__(self) -> None:
         check_choice("textures.style", self.style, STYLES)
-        check_float("textures.texel", self.texel, "Give metres; 0.01 is a good one.", at_least=0.002, at_most=0.1)
+        check_float("textures.texel", self.texel, "Give metres, for example 0.01.", at_least=0.002, at_most=0.1)
         check_float("textures.floor", self.floor, "Give metres.", at_least=-HIGHEST, at_most=HIGHEST)
-        cure = "Give metres, above the floor."
-        check_float("textures.ceiling", self.ceiling, cure, at_least=self.floor + 0.1, at_most=self.floor + HIGHEST)
+        hint = "Give metres, above the floor."
+        check_float("textures.ceiling", self.ceiling, hint, at_least=self.floor + 0.1, at_most=self.floor + HIGHEST)
         for name in ("polygons", "posters"):
-            cure = "Give a number per square metre."
-            check_float(f"textures.{name}", getattr(self, name), cure, at_least=0.0, at_most=1e4)
+            hint = "Give a number per square metre."
+            check_float(f"textures.{name}", getattr(self, name), hint, at_least=0.0, at_most=1e4)
         if self.images is not None and not isinstance(self.images, str):
             raise argument_error("textures.images", "a folder as a string, or None", self.images, "Give a path.")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WallTextures:
-    """The pictures of all faces, as sums from which the mean over any box follows; read-only.
+    """Textures of all faces as integral images; read-only.
 
-    Face 2 w is the left one of wall w, seen from its beginning, face 2 w + 1 the right one. Columns of a picture run
-    from the beginning of the wall to its end, rows from the ceiling down.
+    Face 2 w is the left face of wall w, seen from its start, face 2 w + 1 the right one. Columns of a texture run from
+    the start of the wall to its end, rows from the ceiling down.
 
     Attributes:
-        config: How they were drawn.
-        sums: (C, T + 1) int32. Sums of the texels of a face left of a column and above a row, face after face; each
-            face has one entry more than columns.
-        starts: (2 S,) int64. Where each face begins in `sums`.
-        columns: (2 S,) int64. Texel columns of each face.
-        widths: (2 S,) float64 [m]. Width of a texel of each face; heights are `config.texel`.
+        config: Style and resolution.
+        sums: (C, T + 1) int32. Integral images of the faces, transposed and concatenated; each face has one row more
+            than columns.
+        starts: (2 S,) int64. First row of each face in `sums`.
+        columns: (2 S,) int64. Number of texel columns of each face.
+        widths: (2 S,) float64 [m]. Texel width of each face; the height is `config.texel`.
     """
 
     config: TextureConfig
@@ -84,31 +84,31 @@ class WallTextures:
             object.__setattr__(self, name, as_constant(getattr(self, name)))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Let copies and what was pickled be read-only, too."""
+        """Keep copies and unpickled instances read-only."""
         return WallTextures, (self.config, self.sums, self.starts, self.columns, self.widths)
 
     @property
     def rows(self) -> int:
-        """T, texel rows of a face."""
+        """Number of texel rows T of a face."""
         return int(self.sums.shape[1]) - 1
 
     def picture(self, face: int) -> Image:
-        """Return the picture (T, columns) uint8 of a face."""
+        """Return the texture (T, columns) uint8 of a face."""
         begin, count = int(self.starts[face]), int(self.columns[face])
         sums = self.sums[begin : begin + count + 1].astype(np.int64)
         return np.diff(np.diff(sums, axis=0), axis=1).T.astype(np.uint8)
 
 
 def draw_textures(walls: FloatArray, rng: np.random.Generator, config: TextureConfig | None = None) -> WallTextures:
-    """Draw the faces of all walls.
+    """Draw the textures of all walls.
 
     Args:
-        walls: (S, 4) float64 [m], world frame.
-        rng: Spawns one stream for each wall, so that a wall looks the same whatever the others are.
-        config: What they look like.
+        walls: (S, 4) float64 [m], world frame. Wall segments.
+        rng: Parent of one stream per wall, so that the texture of a wall is independent of the other walls.
+        config: Style and resolution.
 
     Raises:
-        ValueError: If `config.images` is no folder with images.
+        ValueError: If `config.images` is not a folder with images.
     """
     config = TextureConfig() if config is None else config
     lengths = np.hypot(walls[:, 2] - walls[:, 0], walls[:, 3] - walls[:, 1])
@@ -132,29 +132,29 @@ def draw_textures(walls: FloatArray, rng: np.random.Generator, config: TextureCo
 
 
 def check_textures(textures: WallTextures, walls: FloatArray) -> None:
-    """Refuse textures that are none of these walls (S, 4) [m]: kernels go by where each face begins.
+    """Check that textures match walls (S, 4) [m], since kernels index them unchecked.
 
     Raises:
-        ValueError: As said.
+        ValueError: If a shape, dtype or offset is wrong.
     """
-    cure = "Use those that draw_textures returned for the same walls."
+    hint = "Pass what draw_textures returned for the same walls."
     faces = 2 * len(walls)
-    columns = check_array("textures.columns", textures.columns, (faces,), cure, dtype=np.int64)
-    starts = check_array("textures.starts", textures.starts, (faces,), cure, dtype=np.int64)
-    check_array("textures.widths", textures.widths, (faces,), cure)
+    columns = check_array("textures.columns", textures.columns, (faces,), hint, dtype=np.int64)
+    starts = check_array("textures.starts", textures.starts, (faces,), hint, dtype=np.int64)
+    check_array("textures.widths", textures.widths, (faces,), hint)
     sums = textures.sums
     ends = np.cumsum(columns + 1) if columns.min() > 0 and columns.max() < len(sums) else np.zeros(faces, np.int64)
     kinds = [array.dtype.str for array in (textures.starts, textures.columns, sums)] == ["<i8", "<i8", "<i4"]
     rows = max(1, round((textures.config.ceiling - textures.config.floor) / textures.config.texel))
     if not kinds or sums.shape != (ends[-1], rows + 1) or starts[0] != 0 or (starts[1:] != ends[:-1]).any():
-        raise argument_error("textures", "a picture for each face of each wall", f"shape {sums.shape}", cure)
+        raise argument_error("textures", "a texture for each face of each wall", f"shape {sums.shape}", hint)
 
 
 def load_photographs(folder: str | Path, rows: int) -> list[Image]:
-    """Read the images of a folder in grey, scaled to a height of `rows` texels.
+    """Read the images of a folder in grey levels, scaled to a height of `rows` texels.
 
     Raises:
-        ValueError: If there are none.
+        ValueError: If the folder contains no images.
     """
     files = sorted(file for file in Path(folder).glob("*") if file.suffix.lower() in IMAGE_SUFFIXES)
     photographs = []
@@ -169,7 +169,7 @@ def load_photographs(folder: str | Path, rows: int) -> list[Image]:
 
 
 def _photographed(columns: int, photographs: list[Image], rng: np.random.Generator) -> Image:
-    """Cover a face with photographs side by side, the first one begun anywhere."""
+    """Cover a face with photographs side by side, the first one from a random column."""
     strips: list[Image] = []
     missing = columns
     while missing > 0:
@@ -209,7 +209,7 @@ def _octaves(rows: int, columns: int, texel: float, rng: np.random.Generator) ->
     for size, height in ((0.64, 8.0), (0.16, 5.0), (0.04, 2.5)):
         shape = int(rows * texel / size) + 3, int(columns * texel / size) + 3
         coarse = rng.standard_normal(shape).astype(np.float32)
-        # The field begins anywhere in the first cell, and cells are exactly `size` wide.
+        # The field has a random offset, and cells are exactly `size` wide.
         scale = texel / size
         matrix = np.array([[scale, 0.0, rng.random()], [0.0, scale, rng.random()]])
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
@@ -218,7 +218,7 @@ def _octaves(rows: int, columns: int, texel: float, rng: np.random.Generator) ->
 
 
 def _paint_polygon(picture: Image, size: float, rng: np.random.Generator) -> None:
-    """Paint a polygon of 3 to 6 corners and about `size` texels somewhere into the picture."""
+    """Paint a polygon of 3 to 6 corners and about `size` texels at a random position."""
     rows, columns = picture.shape
     count = int(rng.integers(3, 7))
     angles = np.sort(rng.uniform(0.0, 2.0 * np.pi, count))
@@ -230,7 +230,7 @@ def _paint_polygon(picture: Image, size: float, rng: np.random.Generator) -> Non
 
 
 def _poster(size: int, rng: np.random.Generator) -> Image:
-    """Return a poster (size, size): a frame, and a dozen shapes in it."""
+    """Return a poster (size, size) with a frame and twelve polygons."""
     poster = np.full((size, size), round(rng.uniform(*LEVELS)), dtype=np.uint8)
     for _ in range(12):
         _paint_polygon(poster, rng.uniform(0.15, 0.5) * size, rng)
@@ -240,7 +240,7 @@ def _poster(size: int, rng: np.random.Generator) -> Image:
 
 
 def _lay(picture: Image, patch: Image, left: int, top: int) -> None:
-    """Lay a patch over the picture; what sticks out is cut off."""
+    """Paste a patch into the picture, clipped to its bounds."""
     x0, y0 = max(0, left), max(0, top)
     x1, y1 = min(picture.shape[1], left + patch.shape[1]), min(picture.shape[0], top + patch.shape[0])
     if x0 < x1 and y0 < y1:
@@ -248,7 +248,7 @@ def _lay(picture: Image, patch: Image, left: int, top: int) -> None:
 
 
 def _bricks(rows: int, columns: int, texel: float, jitter: float, rng: np.random.Generator) -> Image:
-    """Return courses of bricks with joints; `jitter` 0: all alike, 1: each with its own edges and grey."""
+    """Return courses of bricks with joints; `jitter` 0: equal bricks, 1: individual edges and grey levels."""
     picture = np.full((rows, columns), 175, dtype=np.uint8)
     width, height, joint = BRICK[0] / texel, BRICK[1] / texel, 0.012 / texel
     for course in range(int(rows / height) + 1):

@@ -1,1 +1,1 @@
-"""Families of random worlds."""
+"""Generators of random worlds by family."""

@@ -1,4 +1,4 @@
-"""Drawing a building: rooms, walls with doors in them, and furniture that leaves the ways free."""
+"""Floor plan under construction: rooms, walls with doors, and furniture."""
 
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -9,17 +9,17 @@ from slam_backend.core.validation import FloatArray
 
 DOOR = (1.1, 1.4)  # [m] least and greatest width
 JAMB = 0.35  # [m] wall left between a door and the end of its wall
-DOOR_CLEARANCE = 1.1  # [m] nothing stands closer than this to the middle of a door
-PASSAGE = 0.75  # [m] left free around things that stand in a room
-FURNISHED = 0.8  # share of rooms, or halves of large ones, in which something stands
-PILASTER = (0.25, 0.35)  # [m] how far one juts into a corridor
+DOOR_CLEARANCE = 1.1  # [m] least distance of furniture from the middle of a door
+PASSAGE = 0.75  # [m] free width around furniture
+FURNISHED = 0.8  # share of rooms, or halves of large ones, with furniture
+PILASTER = (0.25, 0.35)  # [m] least and greatest depth
 
 Segment = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
 class Room:
-    """A rectangle from (x0, y0) to (x1, y1) [m]."""
+    """Rectangular room from (x0, y0) to (x1, y1) [m]."""
 
     x0: float
     y0: float
@@ -32,7 +32,7 @@ class Room:
         return self.x1 - self.x0, self.y1 - self.y0
 
     def halves(self) -> tuple["Room", "Room"]:
-        """Cut the longer side in two and leave a passage between the halves."""
+        """Return the two halves along the longer side, with a passage between them."""
         width, height = self.size
         if width >= height:
             x = 0.5 * (self.x0 + self.x1)
@@ -45,12 +45,12 @@ class Room:
 
 @dataclass(slots=True)
 class Blueprint:
-    """A plan under the pencil.
+    """Floor plan under construction.
 
     Attributes:
         rng: Source of all draws.
-        segments: Walls drawn so far [m].
-        doors: Middles (x, y) of the doors so far [m].
+        segments: Walls [m].
+        doors: Middles (x, y) of the doors [m].
     """
 
     rng: np.random.Generator
@@ -58,12 +58,12 @@ class Blueprint:
     doors: list[tuple[float, float]] = field(default_factory=list)
 
     def wall(self, x0: float, y0: float, x1: float, y1: float, spans: tuple[tuple[float, float], ...] = ()) -> None:
-        """Draw a wall along an axis, with doors in it.
+        """Add an axis-parallel wall with doors.
 
         Args:
-            x0, y0: Where it begins [m], world frame.
-            x1, y1: Where it ends [m]; x1 = x0 or y1 = y0.
-            spans: A door is put somewhere in each (from, to), coordinates along the wall [m].
+            x0, y0: Start of the wall [m], world frame.
+            x1, y1: End of the wall [m], x1 = x0 or y1 = y0.
+            spans: Intervals (from, to) along the wall [m], each with one door at a random position.
         """
         upright = x0 == x1
         begin, end = (y0, y1) if upright else (x0, x1)
@@ -78,18 +78,18 @@ class Blueprint:
             self.segments.append((x0, a, x0, b) if upright else (a, y0, b, y0))
 
     def split(self, begin: float, end: float, parts: int) -> list[float]:
-        """Draw where to cut [begin, end] [m] into parts of similar length; return all their ends [m]."""
+        """Divide [begin, end] [m] at random into parts of similar length; return all boundaries [m]."""
         shares = self.rng.uniform(0.75, 1.25, parts)
         return [begin, *(begin + (end - begin) * np.cumsum(shares)[:-1] / shares.sum()).tolist(), end]
 
     def pilasters(self, begin: float, end: float, low: float, high: float) -> None:
-        """Let columns jut out alternately from both walls of a corridor along x, where no door is near.
+        """Add pilasters alternately to both walls of a corridor along x, away from doors.
 
-        Seen along a corridor its walls are too oblique to show anything; the columns face the traveller.
+        Landmarks on corridor walls are invisible at oblique angles; pilasters face along the corridor.
 
         Args:
-            begin, end: Of the corridor along x [m], world frame.
-            low, high: The y of its walls [m].
+            begin, end: Range of the corridor along x [m], world frame.
+            low, high: Positions y of its walls [m].
         """
         x = begin + self.rng.uniform(1.0, 3.0)
         upper = self.rng.random() < 0.5
@@ -102,20 +102,20 @@ class Blueprint:
             x += 0.4
 
     def furnish(self, room: Room) -> None:
-        """Put something into a room, or into both halves of a large one. Some are left empty."""
+        """Furnish a room, or both halves of a large one; some stay empty."""
         parts = room.halves() if max(room.size) > 5.0 else (room,)
         for part in parts:
             if self.rng.random() > FURNISHED:
                 continue
-            thing = (self._screen, self._cabinet, self._table)[self.rng.choice(3, p=(0.45, 0.25, 0.3))]
+            draw = (self._screen, self._cabinet, self._table)[self.rng.choice(3, p=(0.45, 0.25, 0.3))]
             for _ in range(8):
-                segments = thing(room, part)
+                segments = draw(room, part)
                 if segments and self._clear(segments):
                     self.segments += segments
                     break
 
     def _screen(self, room: Room, part: Room) -> list[Segment]:
-        """Draw a screen that juts out from a wall of the room, deep enough to hide what is behind."""
+        """Return a screen that projects from a wall far enough to occlude part of the room."""
         upright = room.size[0] >= room.size[1]
         depth = room.size[1] if upright else room.size[0]
         length = min(self.rng.uniform(0.3, 0.55) * depth, depth - 1.4)
@@ -127,7 +127,7 @@ class Blueprint:
         return [(room.x1, y, room.x1 - length, y) if from_far else (room.x0, y, room.x0 + length, y)]
 
     def _cabinet(self, room: Room, part: Room) -> list[Segment]:
-        """Draw a cabinet against the upper or lower wall of the room: three sides of a box."""
+        """Return a cabinet against the upper or lower wall of the room: three sides of a box."""
         width, depth = self.rng.uniform(1.0, 1.6), self.rng.uniform(0.4, 0.6)
         if part.x1 - part.x0 < width + 2.0 * PASSAGE or room.size[1] < depth + 1.4:
             return []
@@ -137,7 +137,7 @@ class Blueprint:
         return _chain([(x, y), (x, y + inward), (x + width, y + inward), (x + width, y)])
 
     def _table(self, room: Room, part: Room) -> list[Segment]:
-        """Draw a table, or a column, that stands free."""
+        """Return a free-standing table or column."""
         if self.rng.random() < 0.3:
             width = height = self.rng.uniform(0.35, 0.5)
         else:
@@ -151,16 +151,16 @@ class Blueprint:
         return _chain([(x, y), (x + width, y), (x + width, y + height), (x, y + height), (x, y)])
 
     def _clear(self, segments: list[Segment]) -> bool:
-        """Tell whether a thing leaves all doors free."""
+        """Return whether furniture leaves all doors free."""
         box = np.array(segments).reshape(-1, 2)
         return self._clear_of_doors(*box.min(axis=0).tolist(), *box.max(axis=0).tolist())
 
     def _clear_of_doors(self, x0: float, y0: float, x1: float, y1: float) -> bool:
-        """Tell whether no door's middle is close to a box."""
+        """Return whether no door is close to a box."""
         return all(np.hypot(max(x0 - x, 0.0, x - x1), max(y0 - y, 0.0, y - y1)) > DOOR_CLEARANCE for x, y in self.doors)
 
     def finished(self) -> FloatArray:
-        """Return the walls (S, 4) [m], perhaps mirrored."""
+        """Return the walls (S, 4) [m], randomly mirrored."""
         walls = np.array(self.segments)
         for axes in ([0, 2], [1, 3]):
             if self.rng.random() < 0.5:
@@ -169,5 +169,5 @@ class Blueprint:
 
 
 def _chain(corners: list[tuple[float, float]]) -> list[Segment]:
-    """Return the segments that join corners one after the other."""
+    """Return the segments of a polyline."""
     return [(*a, *b) for a, b in pairwise(corners)]

@@ -1,4 +1,4 @@
-"""A room like that of the paper's Fig. 5: a rectangle with a few walls standing in it that restrict the view."""
+"""Room of the paper's Fig. 5: a rectangle with a few inner walls that restrict the view."""
 
 import numpy as np
 
@@ -17,13 +17,13 @@ _INNER = (
 
 
 def fig5(rng: np.random.Generator) -> World:
-    """Build the room, about 16 x 12 m, with inner walls moved and turned a little.
+    """Build the room, about 16 x 12 m, with small random changes of the inner walls.
 
     Args:
         rng: Source of the variation.
 
     Returns:
-        A world without landmarks, 11 walls.
+        World with 11 walls, without landmarks.
     """
     width, height = rng.uniform(15.5, 16.5), rng.uniform(11.5, 12.5)
     corners = np.array([[0.0, 0.0], [width, 0.0], [width, height], [0.0, height]])

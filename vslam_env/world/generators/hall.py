@@ -1,4 +1,4 @@
-"""Procedural halls: one large room with pillars, which hide some of it from everywhere."""
+"""Procedural halls: one large room with pillars that occlude parts of it."""
 
 import numpy as np
 
@@ -6,18 +6,18 @@ from slam_backend.core.validation import FloatArray
 from vslam_env.world.spec import World
 
 PILLARS = (8, 14)  # least and greatest number
-SIDE = (0.5, 0.9)  # [m] of a pillar
-PASSAGE = 1.4  # [m] left free between pillars, and between them and the walls
+SIDE = (0.5, 0.9)  # [m] least and greatest side of a pillar
+PASSAGE = 1.4  # [m] least gap between pillars, and between pillars and walls
 
 
 def hall(rng: np.random.Generator) -> World:
-    """Build a hall of about 20 x 15 m with 8 to 14 square pillars, turned as they please.
+    """Build a hall of about 20 x 15 m with 8 to 14 square pillars at random angles.
 
     Args:
         rng: Source of the layout.
 
     Returns:
-        A closed world without landmarks, 36 to 60 walls.
+        Closed world with 36 to 60 walls, without landmarks.
     """
     width, height = rng.uniform(18.0, 22.0), rng.uniform(13.0, 16.0)
     corners = np.array([[0.0, 0.0], [width, 0.0], [width, height], [0.0, height]])

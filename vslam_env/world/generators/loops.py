@@ -1,4 +1,4 @@
-"""Procedural loops of corridors: blocks that one can only walk around, all alike at first sight."""
+"""Procedural loops of corridors around similar solid blocks."""
 
 from itertools import product
 
@@ -8,28 +8,28 @@ from vslam_env.world.generators._blueprint import PILASTER, Blueprint
 from vslam_env.world.spec import World
 
 CORRIDOR = (1.8, 2.2)  # [m]
-JOINED = 0.25  # share of neighbouring blocks that are built together, which closes the corridor between them
+JOINED = 0.25  # share of neighbouring blocks joined, without a corridor between them
 WITH_NICHE = 0.5  # share of blocks with a niche
-NICHE = (0.8, 1.2)  # [m] width of one
+NICHE = (0.8, 1.2)  # [m] least and greatest width
 NICHE_DEPTH = (0.4, 0.7)  # [m]
 
 
 def loops(rng: np.random.Generator) -> World:
-    """Build a grid of corridors of about 22 x 15 m around solid blocks, some with a niche, with columns at their sides.
+    """Build a grid of corridors of about 22 x 15 m around solid blocks with pilasters, some with a niche.
 
-    Seen along a corridor its walls are too oblique to show anything; the columns face the traveller.
+    Landmarks on corridor walls are invisible at oblique angles; pilasters face along the corridor.
 
     Args:
         rng: Source of the layout.
 
     Returns:
-        A closed world without landmarks, about 40 to 90 walls. Every place lies on a loop.
+        Closed world with about 40 to 90 walls, without landmarks. Every place lies on a loop.
     """
     plan = Blueprint(rng)
     columns, rows = 3, int(rng.integers(2, 4))
     corridor = rng.uniform(*CORRIDOR)
     width, height = rng.uniform(21.0, 23.0), rng.uniform(14.0, 16.0)
-    across = plan.split(corridor, width, columns)  # a block ends a corridor before the next begins
+    across = plan.split(corridor, width, columns)  # a corridor separates a block from the next
     up = plan.split(corridor, height, rows)
     _shell(plan, width, height)
     for row in range(rows):
@@ -42,7 +42,7 @@ def loops(rng: np.random.Generator) -> World:
 
 
 def _shell(plan: Blueprint, width: float, height: float) -> None:
-    """Draw the outer walls, with a column somewhere on each half of the longer and on each shorter one."""
+    """Add the outer walls, with a pilaster on each half of the longer and on each shorter wall."""
     corners = [(0.0, 0.0), (width, 0.0), (width, height), (0.0, height)]
     for begin, end in zip(corners, corners[1:] + corners[:1], strict=True):
         plan.segments.append((*begin, *end))
@@ -55,7 +55,7 @@ def _shell(plan: Blueprint, width: float, height: float) -> None:
 
 
 def _block(plan: Blueprint, x0: float, y0: float, x1: float, y1: float) -> None:
-    """Draw a block, perhaps with a niche in its lower or upper side, and a column at one side of either direction."""
+    """Add a block with two pilasters and, with some probability, a niche in its lower or upper side."""
     rng = plan.rng
     sides = ((y0, 1.0), (y1, -1.0))
     with_niche = int(rng.integers(2)) if rng.random() < WITH_NICHE else None

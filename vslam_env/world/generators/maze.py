@@ -1,4 +1,4 @@
-"""Procedural mazes: narrow corridors with few dead ends and many ways round."""
+"""Procedural mazes: narrow corridors with few dead ends and many loops."""
 
 from collections.abc import Iterator
 
@@ -10,7 +10,7 @@ from vslam_env.world.spec import World
 
 CORRIDOR = (1.7, 2.1)  # [m] least and greatest width of a cell
 COLUMNS, ROWS = (8, 10), (5, 7)  # least and greatest number of cells
-OPENED = 0.6  # share of the dead ends that get a second way out
+OPENED = 0.6  # share of the dead ends that are opened
 
 Cell = tuple[int, int]
 
@@ -18,18 +18,18 @@ Cell = tuple[int, int]
 def maze(rng: np.random.Generator) -> World:
     """Build a maze of about 17 x 11 m.
 
-    A random spanning tree of the cells joins them all (depth first, so that corridors are long); then most dead ends
-    are opened, so that there are ways round.
+    A random depth-first spanning tree connects all cells by long corridors; then most dead ends are opened, which
+    creates loops.
 
     Args:
         rng: Source of the layout.
 
     Returns:
-        A closed world without landmarks, about 20 to 35 walls, each as long as it goes on straight.
+        Closed world with about 20 to 35 maximal straight walls, without landmarks.
     """
     columns, rows = int(rng.integers(COLUMNS[0], COLUMNS[1] + 1)), int(rng.integers(ROWS[0], ROWS[1] + 1))
     size = rng.uniform(*CORRIDOR)
-    # Walls between a cell and its neighbour to the right, and above it.
+    # Walls between each cell and its right and upper neighbours.
     right, above = np.ones((rows, columns), np.bool_), np.ones((rows, columns), np.bool_)
     for cell, other in _tree(rows, columns, rng):
         _open(right, above, cell, other)
@@ -47,43 +47,43 @@ def _tree(rows: int, columns: int, rng: np.random.Generator) -> Iterator[tuple[C
     stack = [(int(rng.integers(rows)), int(rng.integers(columns)))]
     seen = {stack[0]}
     while stack:
-        fresh = [cell for cell in _neighbours(stack[-1], rows, columns) if cell not in seen]
-        if not fresh:
+        unseen = [cell for cell in _neighbours(stack[-1], rows, columns) if cell not in seen]
+        if not unseen:
             stack.pop()
             continue
-        chosen = fresh[int(rng.integers(len(fresh)))]
+        chosen = unseen[int(rng.integers(len(unseen)))]
         yield stack[-1], chosen
         seen.add(chosen)
         stack.append(chosen)
 
 
 def _neighbours(cell: Cell, rows: int, columns: int) -> list[Cell]:
-    """Return the cells beside one."""
+    """Return the neighbours of a cell."""
     row, column = cell
     around = [(row - 1, column), (row + 1, column), (row, column - 1), (row, column + 1)]
     return [(r, c) for r, c in around if 0 <= r < rows and 0 <= c < columns]
 
 
 def _side(right: BoolArray, above: BoolArray, a: Cell, b: Cell) -> tuple[BoolArray, Cell]:
-    """Return where the wall between two neighbours is kept."""
+    """Return the array and index of the wall between two neighbours."""
     first = (min(a[0], b[0]), min(a[1], b[1]))
     return (right if a[0] == b[0] else above), first
 
 
 def _is_wall(right: BoolArray, above: BoolArray, a: Cell, b: Cell) -> bool:
-    """Tell whether two neighbours are parted."""
+    """Return whether there is a wall between two neighbours."""
     walls, where = _side(right, above, a, b)
     return bool(walls[where])
 
 
 def _open(right: BoolArray, above: BoolArray, a: Cell, b: Cell) -> None:
-    """Take away the wall between two neighbours."""
+    """Remove the wall between two neighbours."""
     walls, where = _side(right, above, a, b)
     walls[where] = False
 
 
 def _walls(right: BoolArray, above: BoolArray) -> list[Segment]:
-    """Return the walls in cells: the frame, and the inner ones joined where they go on straight."""
+    """Return the walls in units of cells: the frame, and maximal straight inner walls."""
     rows, columns = right.shape
     walls: list[Segment] = [(0, 0, columns, 0), (columns, 0, columns, rows), (columns, rows, 0, rows), (0, rows, 0, 0)]
     for column in range(columns - 1):
@@ -94,6 +94,6 @@ def _walls(right: BoolArray, above: BoolArray) -> list[Segment]:
 
 
 def _runs(flags: BoolArray) -> list[tuple[int, int]]:
-    """Return where flags are set in a row, as half-open ranges."""
+    """Return the runs of True flags as half-open ranges."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
     return [(int(a), int(b)) for a, b in zip(edges[0::2], edges[1::2], strict=True)]

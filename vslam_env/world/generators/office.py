@@ -1,4 +1,4 @@
-"""Procedural offices: rooms with doors along corridors that run in a ring or along a spine."""
+"""Procedural offices: rooms with doors along a ring of corridors or a single corridor."""
 
 from itertools import pairwise
 
@@ -7,7 +7,7 @@ import numpy as np
 from vslam_env.world.generators._blueprint import Blueprint, Room
 from vslam_env.world.spec import World
 
-ENOUGH_WALLS = 58  # rooms that come up later stay empty
+ENOUGH_WALLS = 58  # number of walls above which no more rooms are furnished
 
 
 def office(rng: np.random.Generator) -> World:
@@ -17,8 +17,8 @@ def office(rng: np.random.Generator) -> World:
         rng: Source of the layout.
 
     Returns:
-        A closed world without landmarks, about 45 to 65 walls. A robot of radius 0.2 m can reach every room, and there
-        is always a way round: the ring of corridors, or neighbouring rooms with a door between them.
+        Closed world with about 45 to 65 walls, without landmarks. A robot of radius 0.2 m can reach every room. There
+        is always a loop: the ring of corridors, or neighbouring rooms with a door between them.
     """
     plan = Blueprint(rng)
     rooms = _ring(plan) if rng.random() < 0.6 else _spine(plan)
@@ -29,7 +29,7 @@ def office(rng: np.random.Generator) -> World:
 
 
 def _ring(plan: Blueprint) -> list[Room]:
-    """Draw two rows of rooms with a ring of corridors between them, around a core of rooms."""
+    """Add two rows of rooms and a ring of corridors around a core of rooms."""
     rng = plan.rng
     width, height, corridor = rng.uniform(19.5, 21.0), rng.uniform(14.0, 15.0), rng.uniform(1.7, 1.95)
     bottom, top = rng.uniform(3.4, 3.9), height - rng.uniform(3.4, 3.9)
@@ -58,7 +58,7 @@ def _ring(plan: Blueprint) -> list[Room]:
 
 
 def _spine(plan: Blueprint) -> list[Room]:
-    """Draw two rows of rooms along one corridor; neighbours of a row have doors between them."""
+    """Add two rows of rooms along one corridor, each row with one door between neighbours."""
     rng = plan.rng
     width, height, corridor = rng.uniform(19.0, 21.0), rng.uniform(13.0, 14.5), rng.uniform(1.8, 2.2)
     low = 0.5 * (height - corridor) + rng.uniform(-0.6, 0.6)
@@ -75,7 +75,7 @@ def _spine(plan: Blueprint) -> list[Room]:
 
 
 def _shell(plan: Blueprint, width: float, height: float) -> None:
-    """Draw the four outer walls."""
+    """Add the four outer walls."""
     plan.wall(0.0, 0.0, width, 0.0)
     plan.wall(width, 0.0, width, height)
     plan.wall(0.0, height, width, height)
@@ -85,15 +85,15 @@ def _shell(plan: Blueprint, width: float, height: float) -> None:
 def _row(
     plan: Blueprint, ends: list[float], y0: float, y1: float, corridor_wall: float, door_between: int | None = None
 ) -> list[Room]:
-    """Draw a row of rooms between y0 and y1 that open to a corridor.
+    """Add a row of rooms with doors to a corridor.
 
     Args:
-        plan: To draw into.
-        ends: Where rooms end along x, in order.
-        y0: Lower wall of the row [m].
-        y1: Upper wall [m].
-        corridor_wall: y of the one with the doors [m].
-        door_between: The wall ends[i] that has a door, too.
+        plan: Plan to extend.
+        ends: Positions x of the walls between rooms, ascending [m].
+        y0: Position y of the lower wall [m].
+        y1: Position y of the upper wall [m].
+        corridor_wall: Position y of the wall with the doors [m].
+        door_between: Index in `ends` of a wall between rooms with a door; None: none.
     """
     spans = tuple(pairwise(ends))
     plan.wall(ends[0], corridor_wall, ends[-1], corridor_wall, spans)

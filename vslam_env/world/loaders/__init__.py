@@ -1,1 +1,1 @@
-"""Worlds from files: floor plans as images, ROS maps, and how folders of them are split."""
+"""Loaders of worlds from files: floor plans, ROS maps, JSON, and splits of folders."""

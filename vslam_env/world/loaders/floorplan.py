@@ -1,4 +1,4 @@
-"""A floor plan, drawn as an image or written as JSON, becomes a `World`."""
+"""Loaders of floor plans, from images and JSON files of walls."""
 
 import json
 from os import PathLike
@@ -12,10 +12,10 @@ from slam_backend.core.files import write_file
 from slam_backend.core.validation import FloatArray, argument_error, check_float
 from vslam_env.world.spec import World
 
-BRIGHT_SHARE = 0.85  # light grey 195 over mid grey 128, white over black, 254 over the 205 of "unknown" in ROS maps
-COLOURED = 60  # levels between the strongest and the weakest colour of a marker such as a yellow start cell
+BRIGHT_SHARE = 0.85  # separates grey 195 from 128, white from black, and 254 from "unknown" 205 in ROS maps
+COLOURED = 60  # least range of the channels of a coloured marker such as a yellow start cell
 UPSAMPLING = 3
-FORMAT = 1  # of JSON files of walls
+FORMAT = 1  # version of JSON files of walls
 
 
 def load_floorplan(
@@ -23,19 +23,19 @@ def load_floorplan(
 ) -> World:
     """Trace the walls of a floor plan.
 
-    Free space is what is at least 85 % as bright as the brightest grey of the plan, and what is coloured; all else is
-    wall. The part that holds the coloured cell is kept, or else the largest one; its outline and those of its holes
-    become walls. The world's origin is the image's lower left corner, y upwards.
+    Pixels at least 85 % as bright as the brightest grey of the plan and coloured pixels are free; all others are wall.
+    The connected part with the coloured cell is kept, or else the largest one; its outline and the outlines of its
+    holes become walls. The origin of the world is the lower left corner of the image, y upwards.
 
     Args:
         path: PNG, JPEG, PGM or any other format that OpenCV reads.
-        metres_per_pixel: By default 0.045, which makes the corridors of 640 x 480 dungeon plans (32 px) 1.4 m wide, and
-            the farthest two places of any (665 px) 30 m apart: a robot's 60 x 60 m grid holds all of it from any start.
-        tolerance_px: Outlines are straightened where they deviate less than this from a line [px].
-        robot_radius: A plan in which no such disc fits is refused [m].
+        metres_per_pixel: Side of a pixel [m]. With 0.045, corridors of 640 x 480 dungeon plans (32 px) are 1.4 m wide,
+            and the largest distance (665 px) is 30 m: a robot's 60 x 60 m grid covers them from any start.
+        tolerance_px: Largest deviation of the walls from the traced outlines [px].
+        robot_radius: Radius of a robot that must fit into the free space [m].
 
     Raises:
-        ValueError: If the file is missing or no image, or shows no free space that is large enough.
+        ValueError: If the file is missing or not an image, or its free space is too small.
     """
     metres_per_pixel = check_float("metres_per_pixel", metres_per_pixel, "Give the side of a pixel.", above=0.0)
     tolerance_px = check_float("tolerance_px", tolerance_px, "Give pixels.", at_least=0.0)
@@ -48,14 +48,14 @@ def trace(free: Any, metres_per_pixel: float, tolerance_px: float, robot_radius:
     """Trace the outlines of the free part of a plan.
 
     Args:
-        free: (H, W) uint8, 1 = free, rows downwards; all of it hangs together.
+        free: (H, W) uint8, rows downwards. 1 in the free part, which is connected.
         metres_per_pixel: Side of a pixel [m].
-        tolerance_px: As in `load_floorplan`.
-        robot_radius: Likewise.
-        path: What an error names.
+        tolerance_px: Largest deviation of the walls from the traced outlines [px].
+        robot_radius: Radius of a robot that must fit into the free space [m].
+        path: Path for error messages.
 
     Returns:
-        Walls (S, 4) float64 [m]. The origin is the image's lower left corner, y upwards.
+        Walls (S, 4) float64 [m], origin at the lower left corner of the image, y upwards.
 
     Raises:
         ValueError: If no robot fits, or the tolerance leaves no outline.
@@ -67,15 +67,15 @@ def trace(free: Any, metres_per_pixel: float, tolerance_px: float, robot_radius:
         raise argument_error(
             "world",
             f"free space for robots of radius {robot_radius:g} m",
-            f"a widest place of {widest:.2f} m in {path}",
-            "Give pixels a larger side or draw wider rooms.",
+            f"a largest width of {widest:.2f} m in {path}",
+            "Raise metres_per_pixel, or draw wider rooms.",
         )
-    corner = np.array([x - 1, y - 1])  # of the cropped part in the image
+    corner = np.array([x - 1, y - 1])  # position of the cropped part in the image
     to_metres = metres_per_pixel * np.array([1.0, -1.0])  # rows count downwards, y upwards
     outlines = [(line + corner - (0, len(free))) * to_metres for line in _outlines(cropped, tolerance_px)]
     if not outlines:
-        expected = f"less than the free part of {path} is wide"
-        raise argument_error("tolerance_px", expected, tolerance_px, "Give a pixel or two.")
+        expected = f"less than the width of the free part of {path}"
+        raise argument_error("tolerance_px", expected, tolerance_px, "Give one or two pixels.")
     return np.vstack([np.hstack([line, np.roll(line, -1, axis=0)]) for line in outlines])
 
 
@@ -83,36 +83,35 @@ def load_walls_json(path: str | Path) -> World:
     """Read `{"walls": [[x1, y1, x2, y2], ...], "start_poses": [[x, y, theta], ...]}`, in metres and radians.
 
     Args:
-        path: The file; its stem is the world's name, unless the file has a `name`.
+        path: Path of the file; its stem is the default of the optional `name`.
 
     Raises:
-        ValueError: If the file is missing, no JSON, of another `format`, or has other keys; all but `walls` may be left
-            out.
+        ValueError: If the file is missing, not JSON, of another `format`, lacks `walls`, or has unknown keys.
     """
     path = existing(path)
-    cure = 'Write {"walls": [[x1, y1, x2, y2], ...]}, in metres; "start_poses" and "name" are optional.'
+    hint = 'Write {"walls": [[x1, y1, x2, y2], ...]}, in metres; "start_poses" and "name" are optional.'
     try:
         content: Any = json.loads(path.read_text(encoding="utf-8-sig"))
     except (ValueError, RecursionError) as error:
-        raise argument_error("world", "a JSON file", f"a syntax error in {path}: {error}", cure) from error
+        raise argument_error("world", "a JSON file", f"a syntax error in {path}: {error}", hint) from error
     if not isinstance(content, dict) or "walls" not in content:
         got = sorted(content) if isinstance(content, dict) else content
-        raise argument_error("world", f"an object with the key 'walls' in {path}", got, cure)
+        raise argument_error("world", f"an object with the key 'walls' in {path}", got, hint)
     if (found := content.get("format", FORMAT)) != FORMAT or type(found) is not int:
-        cure = "Use the release that wrote it, or write the walls again."
-        raise argument_error("world", f"one of format {FORMAT} in {path}", f"a world of format {found!r}", cure)
+        hint = "Use the release that wrote it, or write the walls again."
+        raise argument_error("world", f"one of format {FORMAT} in {path}", f"a world of format {found!r}", hint)
     unknown = sorted(set(content) - {"format", "walls", "start_poses", "name"})
     if unknown:
-        raise argument_error("world", f"no other keys in {path}", unknown[0], cure)
+        raise argument_error("world", f"no other keys in {path}", unknown[0], hint)
     return World(content.get("name", path.stem), content["walls"], start_poses=content.get("start_poses"))
 
 
 def save_walls_json(world: World, path: str | Path) -> None:
-    """Write walls, start poses and name as `load_walls_json` reads them; landmarks are left out.
+    """Write walls, start poses and name for `load_walls_json`; landmarks are omitted.
 
     Args:
-        world: Its walls are rounded to micrometres.
-        path: Written over, if it exists.
+        world: World to write, with walls rounded to micrometres.
+        path: Path of the file; an existing file is overwritten.
 
     Raises:
         ValueError: If the file cannot be written.
@@ -124,17 +123,17 @@ def save_walls_json(world: World, path: str | Path) -> None:
 
 
 def read_image(path: Path, flags: int) -> Any:
-    """Return an image as OpenCV reads it.
+    """Read an image with OpenCV.
 
     Args:
-        path: Of a file.
-        flags: `cv2.IMREAD_COLOR` and the like.
+        path: Path of the file.
+        flags: Flags of `cv2.imread`, for example `cv2.IMREAD_COLOR`.
 
     Returns:
         (H, W) or (H, W, 3) uint8, BGR.
 
     Raises:
-        ValueError: If it is none.
+        ValueError: If the file is not an image.
     """
     image = cv2.imread(str(path), flags)
     if image is None:
@@ -143,21 +142,21 @@ def read_image(path: Path, flags: int) -> Any:
 
 
 def existing(path: str | Path) -> Path:
-    """Return the path of a file that is there.
+    """Return the path of an existing file.
 
     Raises:
-        ValueError: If there is no such file.
+        ValueError: If the file does not exist.
     """
     if not isinstance(path, (str, PathLike)):
-        raise argument_error("world", "a path", path, "Give a text or a Path.")
+        raise argument_error("world", "a path", path, "Give a string or a Path.")
     path = Path(path)
     try:
-        is_there = path.is_file()
+        exists = path.is_file()
     except OSError as error:  # e.g. a name too long for the system
-        cure = f"Check the path: {error.strerror}."
-        raise argument_error("world", "a file", Path(path), cure) from error
-    if not is_there:
-        raise argument_error("world", "a file", Path(path), "Check the path: there is no such file.")
+        hint = f"Check the path: {error.strerror}."
+        raise argument_error("world", "a file", Path(path), hint) from error
+    if not exists:
+        raise argument_error("world", "a file", Path(path), "Check the path: the file does not exist.")
     return path
 
 
@@ -173,21 +172,21 @@ def _free_part(image: Any, path: str) -> Any:
         raise argument_error(
             "world",
             "a plan with free space lighter than its walls",
-            f"no free space to tell from walls in {path}",
+            f"no free space distinct from walls in {path}",
             "Draw free space white and walls black.",
         )
     return largest_part((grey >= BRIGHT_SHARE * brightest) | coloured, coloured)
 
 
 def largest_part(free: Any, marked_cells: Any = None) -> Any:
-    """Return the largest part of a mask that hangs together, or that with the most marked cells.
+    """Return the largest 4-connected component of a mask, or the one with the most marked cells.
 
     Args:
-        free: (H, W) bool; cells hang together by their sides.
-        marked_cells: (H, W) bool, or None.
+        free: (H, W) bool. Mask.
+        marked_cells: (H, W) bool. Marked cells, if any.
 
     Returns:
-        (H, W) uint8, 1 in the part.
+        (H, W) uint8. 1 in the component, else 0.
     """
     count, labels, stats, _ = cv2.connectedComponentsWithStats(free.astype(np.uint8), connectivity=4)
     marked = np.zeros(count) if marked_cells is None else np.bincount(labels[marked_cells], minlength=count)
@@ -198,10 +197,10 @@ def largest_part(free: Any, marked_cells: Any = None) -> Any:
 
 
 def _outlines(free: Any, tolerance_px: float) -> list[FloatArray]:
-    """Return the closed outlines [(n, 2) px, x right and y down], along pixel edges, of a mask with an empty margin.
+    """Return the closed outlines (n, 2) [px], x right and y down, along pixel edges of a mask with an empty margin.
 
-    OpenCV traces pixel centres. In a mask enlarged threefold these are nearest to the corners of the original pixels,
-    so rounding gives the exact edges.
+    OpenCV traces pixel centres. In a mask enlarged threefold, rounding maps these to the corners of the original
+    pixels.
     """
     enlarged = cv2.resize(free, None, fx=UPSAMPLING, fy=UPSAMPLING, interpolation=cv2.INTER_NEAREST)
     contours, _ = cv2.findContours(enlarged, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
@@ -217,6 +216,6 @@ def _outlines(free: Any, tolerance_px: float) -> list[FloatArray]:
 
 
 def _without_flat_corners(corners: Any) -> Any:
-    """Drop the corners (n, 2) of a closed outline at which it goes straight on."""
+    """Remove the corners (n, 2) of a closed outline between collinear edges."""
     before, after = corners - np.roll(corners, 1, axis=0), np.roll(corners, -1, axis=0) - corners
     return corners[before[:, 0] * after[:, 1] != before[:, 1] * after[:, 0]]
