@@ -1,6 +1,6 @@
-"""Visual FastSLAM for one robot or a team, without any simulator or learner.
+"""Visual FastSLAM for one robot or a team, independent of simulators and learners.
 
-`FastSlam` is the filter, `TeamSlam` a team of them that merges maps; `align_maps` and `fuse_maps` work on any two maps.
+`FastSlam` is the filter, `TeamSlam` a team of filters that merges maps; `align_maps` and `fuse_maps` take any two maps.
 """
 
 from slam_backend.core.compilation import log_compilation

@@ -57,7 +57,7 @@ def compose(a_from_b: ArrayLike, b_from_c: ArrayLike) -> FloatArray:
 
 
 def inverse(a_from_b: ArrayLike) -> FloatArray:
-    """Turn a motion around: the pose (..., 3) [m, m, rad] of a in b from the pose (..., 3) of b in a."""
+    """Invert a motion: return the pose (..., 3) [m, m, rad] of a in b from the pose (..., 3) of b in a."""
     a = np.asarray(a_from_b, dtype=np.float64)
     if a.shape == ONE:
         return _inverse_one(a.tolist())
@@ -66,11 +66,11 @@ def inverse(a_from_b: ArrayLike) -> FloatArray:
     return result
 
 
-# One pose at a time is the rule in a step of an environment: plain floats take half the time of a kernel.
+# Steps of an environment mostly need single poses, for which plain floats take half the time of a kernel.
 
 
 def _compose_one(a: list[float], b: list[float]) -> FloatArray:
-    """Chain two motions (3,), as `compose` does, without the cost of arrays."""
+    """Chain two motions (3,) like `compose`, without the cost of arrays."""
     c, s = math.cos(a[2]), math.sin(a[2])
     x, y = a[0] + c * b[0] - s * b[1], a[1] + s * b[0] + c * b[1]
     return np.array([x, y, (a[2] + b[2] + math.pi) % (2.0 * math.pi) - math.pi])
@@ -83,13 +83,13 @@ def _inverse_one(a: list[float]) -> FloatArray:
 
 
 def _rows(poses: FloatArray) -> FloatArray:
-    """Return poses (..., 3) as rows (n, 3) in the one layout for which kernels are compiled."""
+    """Return poses (..., 3) as rows (n, 3) in the layout for which kernels are compiled."""
     rows = np.ascontiguousarray(poses).reshape(-1, 3)
     return rows if rows.flags.writeable else rows.copy()
 
 
 def _stretched(poses: FloatArray, shape: tuple[int, ...]) -> FloatArray:
-    """Return poses repeated to a shape."""
+    """Return poses broadcast to a shape, as a copy."""
     if poses.shape == shape:
         return poses
     stretched = np.empty(shape)
@@ -99,7 +99,7 @@ def _stretched(poses: FloatArray, shape: tuple[int, ...]) -> FloatArray:
 
 @jit
 def _compose_rows(a: FloatArray, b: FloatArray, result: FloatArray) -> None:
-    """Chain motions (n, 3) row by row, as `compose` does."""
+    """Chain motions (n, 3) row by row, like `compose`."""
     for i in range(len(a)):
         c, s = math.cos(a[i, 2]), math.sin(a[i, 2])
         result[i, 0] = a[i, 0] + c * b[i, 0] - s * b[i, 1]
@@ -109,7 +109,7 @@ def _compose_rows(a: FloatArray, b: FloatArray, result: FloatArray) -> None:
 
 @jit
 def _invert_rows(a: FloatArray, result: FloatArray) -> None:
-    """Turn motions (n, 3) around row by row, as `inverse` does."""
+    """Invert motions (n, 3) row by row, like `inverse`."""
     for i in range(len(a)):
         c, s = math.cos(a[i, 2]), math.sin(a[i, 2])
         result[i, 0] = -c * a[i, 0] - s * a[i, 1]
@@ -118,11 +118,11 @@ def _invert_rows(a: FloatArray, result: FloatArray) -> None:
 
 
 def between(w_from_a: ArrayLike, w_from_b: ArrayLike) -> FloatArray:
-    """Return the pose of b seen from a: what an ideal odometer reads between two poses.
+    """Return the pose of b relative to a, the reading of ideal odometry between two poses.
 
     Args:
         w_from_a: (..., 3) float64 [m, m, rad]. Pose of a.
-        w_from_b: (..., 3) float64 [m, m, rad]. Pose of b, in the same frame.
+        w_from_b: (..., 3) float64 [m, m, rad]. Pose of b, same frame.
 
     Returns:
         (..., 3) float64 [m, m, rad], frame a.
@@ -131,7 +131,7 @@ def between(w_from_a: ArrayLike, w_from_b: ArrayLike) -> FloatArray:
 
 
 def transform_points(a_from_b: ArrayLike, points_b: ArrayLike) -> FloatArray:
-    """Move points from frame b to frame a; heights, where there are any, stay.
+    """Transform points from frame b to frame a; heights, if any, stay.
 
     Args:
         a_from_b: (3,) float64 [m, m, rad]. One pose.
@@ -166,7 +166,7 @@ def rotate_covariances(theta: float, covariances: FloatArray) -> FloatArray:
 
 @jit
 def _rotate_rows(c: float, s: float, covariances: FloatArray) -> None:
-    """Rotate covariances (n, 3, 3) in place, as `rotate_covariances` does."""
+    """Rotate covariances (n, 3, 3) in place, like `rotate_covariances`."""
     for full in covariances:
         for j in range(3):  # R Sigma
             x, y = full[0, j], full[1, j]

@@ -1,8 +1,8 @@
-"""Resampling schemes: normalised weights in, ancestor indices out; gathering is a separate step.
+"""Resampling schemes, from normalised weights to ancestor indices.
 
-Every scheme takes weights (M,) float64 that sum to 1, a source of draws and how many to draw (None: M), and returns
-ancestors (count,) int64 in [0, M). Every one is unbiased: particle m is drawn count w_m times on average. They differ
-in variance.
+Every scheme takes weights (M,) float64 that sum to 1, a source of draws and the number of draws (None: M), and returns
+ancestors (count,) int64 in [0, M). All are unbiased: particle m is drawn count w_m times on average. They differ in
+variance.
 """
 
 from collections.abc import Callable
@@ -23,7 +23,7 @@ def effective_sample_size(weights: FloatArray) -> float:
 
 
 def _invert(weights: FloatArray, uniforms: FloatArray) -> IntArray:
-    """Return the ancestors of sorted or unsorted `uniforms` in [0, 1) under the weights' distribution function."""
+    """Return the ancestors of `uniforms` in [0, 1), in any order, by the inverse of the weights' cumulative sum."""
     edges = np.cumsum(weights)
     edges /= edges[-1]
     return np.minimum(np.searchsorted(edges, uniforms, side="right"), len(weights) - 1).astype(np.int64)
@@ -31,7 +31,7 @@ def _invert(weights: FloatArray, uniforms: FloatArray) -> IntArray:
 
 @in_place
 def _write_strata(weights: FloatArray, offsets: FloatArray, ancestors: IntArray) -> None:
-    """Write the ancestors of (i + offset) / count, i = 0 .. count - 1; `offsets` has one for all or one for each."""
+    """Write the ancestors of (i + offset) / count, i = 0 .. count - 1, with one offset for all or one for each."""
     count = len(ancestors)
     total = 0.0
     for m in range(len(weights)):
@@ -70,10 +70,10 @@ def multinomial(weights: FloatArray, rng: np.random.Generator, count: int | None
 
 
 def residual(weights: FloatArray, rng: np.random.Generator, count: int | None = None) -> IntArray:
-    """Keep floor(count w) copies of each, and draw the rest from what remains."""
+    """Keep floor(count w) copies of each particle, and draw the rest from the residual weights."""
     count = len(weights) if count is None else count
     scaled = count * weights / weights.sum()
-    copies = np.floor(scaled + 1e-9).astype(np.int64)  # a weight of 1/M earns its copy in spite of rounding
+    copies = np.floor(scaled + 1e-9).astype(np.int64)  # a weight of 1/M gives one copy despite rounding
     kept = np.repeat(np.arange(len(weights)), copies)
     missing = count - len(kept)
     if missing == 0:

@@ -1,4 +1,4 @@
-"""Of which classes objects may stand in states of filters and teams that are kept in files."""
+"""Classes whose objects states of filters and teams may contain when saved to files."""
 
 from typing import Any
 
@@ -39,7 +39,7 @@ def _parts_of_map(landmarks: LandmarkMap) -> list[Any]:
 
 BACKEND_KINDS = StateTypes(
     (*CONFIGURATIONS, *RECORDS),
-    # A mixture's covariances are symmetric but for rounding: the constructor would change them.
+    # Covariances of a mixture are symmetric up to rounding: the constructor would change them.
     {LandmarkMap: StateType("LandmarkMap", _parts_of_map, unchecked_map)},
 ).with_others(SEEDS)
-"""All classes of this package whose objects may stand in the states of `FastSlam` and `TeamSlam`."""
+"""All classes of this package whose objects the states of `FastSlam` and `TeamSlam` may contain."""

@@ -1,4 +1,4 @@
-"""Paths with time stamps: interpolation, dead reckoning and the TUM file format."""
+"""Trajectories: interpolation, dead reckoning and the TUM file format."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,14 +16,14 @@ PLANAR_TOLERANCE = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trajectory:
-    """The poses of one robot over time, in one frame. The arrays are read-only copies of what was given.
+    """The poses of one robot over time, in one frame. The arrays are read-only copies of the arguments.
 
     Attributes:
         times: (T,) float64 [s], strictly increasing, T >= 1.
         poses: (T, 3) float64 [m, m, rad].
 
     Raises:
-        ValueError: If a shape is wrong, a number is not finite, or a time does not come after the one before.
+        ValueError: If a shape is wrong, a number is not finite, or times do not increase strictly.
 
     >>> Trajectory([0.0, 2.0], [[0.0, 0.0, 0.0], [4.0, 0.0, 1.0]]).at(0.5).tolist()
     [1.0, 0.0, 0.25]
@@ -54,7 +54,7 @@ class Trajectory:
         return len(self.times)
 
     def at(self, times: ArrayLike) -> FloatArray:
-        """Interpolate: positions along straight lines, headings along the shorter arc.
+        """Return interpolated poses: positions along straight lines, headings along the shorter arc.
 
         Args:
             times: (...) float64 [s], between the first and the last time.
@@ -63,7 +63,7 @@ class Trajectory:
             (..., 3) poses [m, m, rad].
 
         Raises:
-            ValueError: If a time lies outside the recorded ones: nothing is extrapolated.
+            ValueError: If a time lies outside the recorded range.
         """
         try:
             wanted = np.asarray(times, dtype=np.float64)
@@ -91,12 +91,12 @@ class Trajectory:
         """Write `to_tum()` to a file.
 
         Raises:
-            ValueError: If the file cannot be written; an old one of that name is then unchanged.
+            ValueError: If the file cannot be written; an existing file is then unchanged.
         """
         write_file(path, self.to_tum())
 
     def to_tum(self) -> str:
-        """Return lines `time tx ty tz qx qy qz qw`, every number in the shortest form that reads back bit for bit."""
+        """Return lines `time tx ty tz qx qy qz qw`, with numbers in the shortest form that reads back bit for bit."""
         rows = ["# timestamp tx ty tz qx qy qz qw"]
         half = 0.5 * self.poses[:, 2]
         for time, (x, y, _), qz, qw in zip(self.times, self.poses, np.sin(half), np.cos(half), strict=True):
@@ -125,19 +125,19 @@ class Trajectory:
 
 
 def _parse_tum_line(line: str, where: str) -> tuple[float, tuple[float, float, float]]:
-    """Return the time and the planar pose of one line, or raise an error that says `where` it stands."""
-    expected, cure = "time tx ty tz qx qy qz qw", f"Correct {where}."
+    """Return the time and the planar pose of one line, or raise an error that names its place `where`."""
+    expected, hint = "time tx ty tz qx qy qz qw", f"Correct {where}."
     try:
         values = np.array([float(word) for word in line.split()])
     except ValueError as error:
-        raise argument_error("path", expected, repr(line), cure) from error
+        raise argument_error("path", expected, repr(line), hint) from error
     if len(values) != 8 or not np.isfinite(values).all():
-        raise argument_error("path", f"8 finite numbers {expected}", repr(line), cure)
+        raise argument_error("path", f"8 finite numbers {expected}", repr(line), hint)
     time, x, y, _, qx, qy, qz, qw = (float(v) for v in values)
     if abs(np.linalg.norm(values[4:]) - 1.0) > 1e-3:
-        raise argument_error("path", "a unit quaternion qx qy qz qw", repr(line), cure)
+        raise argument_error("path", "a unit quaternion qx qy qz qw", repr(line), hint)
     if max(abs(qx), abs(qy)) > PLANAR_TOLERANCE:
-        raise argument_error("path", "a rotation about the vertical (qx = qy = 0)", repr(line), cure)
+        raise argument_error("path", "a rotation about the vertical (qx = qy = 0)", repr(line), hint)
     return time, (x, y, float(wrap_angle(2.0 * np.arctan2(qz, qw))))
 
 
@@ -146,13 +146,13 @@ def dead_reckoning(start_pose: ArrayLike, odometry: ArrayLike) -> FloatArray:
 
     Args:
         start_pose: (3,) float64 [m, m, rad].
-        odometry: (T, 3) float64 [m, m, rad]. Each the motion since the reading before, in the robot's previous frame.
+        odometry: (T, 3) float64 [m, m, rad]. Motions since the previous reading, in the robot's previous frame.
 
     Returns:
         (T + 1, 3) poses in the frame of `start_pose`, which is the first row.
 
     Raises:
-        ValueError: If a shape is another or a number is not finite.
+        ValueError: If a shape is wrong or a number is not finite.
 
     >>> dead_reckoning([0.0, 0.0, np.pi / 2], [[1.0, 0.0, 0.0], [2.0, 0.0, 0.0]]).round(6)[:, 1].tolist()
     [0.0, 1.0, 3.0]

@@ -1,4 +1,4 @@
-"""All kernels of the backend are compiled, or loaded from the cache, before anything waits for them."""
+"""Compilation of the backend's kernels ahead of their first use."""
 
 from collections.abc import Collection
 from typing import Literal
@@ -18,7 +18,7 @@ from slam_backend.maps.alignment import align_maps
 from slam_backend.metrics.maps import map_error
 from slam_backend.models.camera import StereoCamera
 from slam_backend.models.measurements import Measurements, TeamMeasurements
-from slam_backend.smoother import gauge as holding
+from slam_backend.smoother import gauge
 from slam_backend.smoother.options import SmoothingOptions
 from slam_backend.smoother.reassociation import find_only
 from slam_backend.smoother.sampling import retract_on_se2
@@ -26,17 +26,17 @@ from slam_backend.team.merge_scheduler import AttemptOptions
 from slam_backend.team.options import MergeOptions
 from slam_backend.team.team import TeamSlam
 
-# What a filter of the default options never calls, and how the kernels that only it calls begin, signature included.
+# Features that default options do not use, and the prefixes of the kernels that only these call, signature included.
 EXTRAS = {
     "fastslam1": (),
     "existence": ("slam_backend.fastslam._kernels.existence.",),
     "clique": ("slam_backend.maps._kernels.max_clique.",),
     "images": ("slam_backend.frontend.",),
 }
-STEP = "slam_backend.fastslam._kernels.step.step_robots"  # the filter's kernel
-FASTSLAM2 = "none"  # ends its signature without FastSLAM 1.0
+STEP = "slam_backend.fastslam._kernels.step.step_robots"  # kernel of the filter's step
+FASTSLAM2 = "none"  # end of its signature without FastSLAM 1.0
 STEPS = 4
-LANDMARKS = 12  # more than an alignment asks for
+LANDMARKS = 12  # more than an alignment needs
 
 
 def warm_up(
@@ -48,15 +48,15 @@ def warm_up(
 ) -> float:
     """Compile the kernels that a filter or a team needs, or load them from the cache.
 
-    Kernels are kept beside the package if its folder can be written, else in the user's own cache folder, or where the
-    variable NUMBA_CACHE_DIR says. What is missing there comes from the package `vslam-env-kernels`, if it is installed
-    and fits, and is compiled else. While one process fills the cache others wait.
+    Kernels are stored beside the package if its folder is writable, else in the user's cache folder, or in the folder
+    NUMBA_CACHE_DIR. Missing kernels come from the package `vslam-env-kernels` if a matching version is installed, else
+    they are compiled. While one process fills the cache, others wait.
 
     Args:
-        options: Of the filters; None: the default ones.
-        everything: Compile also what these options do not need. Else it is compiled when it is first called.
-        workers: Processes that compile; None: one for each core. The script that calls this needs no main guard.
-        progress: Called with the number of kernels compiled, how many there are, and the seconds left [s], estimated.
+        options: Options of the filters; None: the defaults.
+        everything: Whether to compile also kernels that these options do not need, which else compile at first call.
+        workers: Number of compiling processes; None: one per core. The calling script needs no main guard.
+        progress: Callback with the number of compiled kernels, the total number, and the estimated seconds left [s].
 
     Returns:
         Seconds spent compiling; 0 if all kernels came from the cache.
@@ -67,7 +67,7 @@ def warm_up(
 
 
 def extras_of(options: FilterOptions) -> set[str]:
-    """Return which of `EXTRAS` filters of some options need."""
+    """Return the keys of `EXTRAS` that filters with these options need."""
     wanted = {"fastslam1": options.proposal == "fastslam1", "existence": options.existence is not None}
     return {name for name, is_wanted in wanted.items() if is_wanted}
 
@@ -94,7 +94,7 @@ def run_all_paths(extras: Collection[str]) -> float:
         angles = np.linspace(0.0, 2.0 * np.pi, LANDMARKS, endpoint=False)
         points = np.column_stack([2.0 * np.cos(angles), np.sin(angles), np.linspace(4.0, 6.0, LANDMARKS)])
         descriptors = np.eye(LANDMARKS, dtype=np.float32)
-        names, some = np.arange(LANDMARKS), np.arange(LANDMARKS) - 1  # one of the latter is to be rejected
+        ids, some_ids = np.arange(LANDMARKS), np.arange(LANDMARKS) - 1  # `some_ids` has one rejected measurement
         plain = Measurements(points, descriptors)
         given = Measurements(points, descriptors, np.tile(1e-4 * np.eye(3), (LANDMARKS, 1, 1)))
         move, still = np.array([0.0, 0.0, 0.01]), np.zeros(3)
@@ -105,44 +105,44 @@ def run_all_paths(extras: Collection[str]) -> float:
                 slam.step([None, None], [frame, None])
                 for _ in range(STEPS):
                     slam.step([move, None], [frame, frame])
-                slam.step([None, None], [frame, frame], [names, some], [still, None])
+                slam.step([None, None], [frame, frame], [ids, some_ids], [still, None])
                 slam.step([move, move], [None, None])
-        few_keys = SmoothingOptions(max_keys=2, recent_keys=1)  # logs come in parts, between which keys are joined
+        few_keys = SmoothingOptions(max_keys=2, recent_keys=1)  # logs are added in parts, between which keys are joined
         smoothing = FastSlam(num_particles=4, rejuvenate_every=STEPS + 1, smoothing=few_keys)
         for _ in range(2 * (STEPS + 1)):
             smoothing.step([move], [plain])
         smoothing.set_state(smoothing.get_state())
         if "existence" in extras:
-            watching = FastSlam(num_particles=4, existence=ExistenceModel(), resample_threshold=1.0)
+            slam = FastSlam(num_particles=4, existence=ExistenceModel(), resample_threshold=1.0)
             for _ in range(STEPS):
-                watching.step([move], [plain])
-            watching.set_state(watching.get_state())
+                slam.step([move], [plain])
+            slam.set_state(slam.get_state())
         state_checks.compile_checks()
         root = np.array([-1])
-        are_linked(root, root)  # of a state that was a pickle
+        are_linked(root, root)  # of an unpickled state
         root.setflags(write=False)
         are_linked(root, root)
         retract_on_se2(np.zeros((1, 3)), root, np.zeros((1, 3, 1)))
-        inverse(np.zeros((2, 3)))  # of starts that are held
-        find_only(points, descriptors, points, descriptors, 1.0, 1.0, names.copy())
-        holding.move(np.zeros((1, 3, 1)), np.zeros((1, 3)), np.zeros((1, 3, 1)))  # of starts that are sought
+        inverse(np.zeros((2, 3)))  # of starts in a fixed gauge
+        find_only(points, descriptors, points, descriptors, 1.0, 1.0, ids.copy())
+        gauge.move(np.zeros((1, 3, 1)), np.zeros((1, 3)), np.zeros((1, 3, 1)))  # of unknown starts
         team = TeamSlam(2, num_particles=4, attempts=AttemptOptions(every=1), merging=MergeOptions(watch_every=1))
         for _ in range(STEPS):
             team.step([None, None], [plain, plain])
         both = np.tile(points, (2, 1)), np.tile(descriptors, (2, 1))
         team.step(np.zeros((2, 3)), TeamMeasurements(*both, np.array([LANDMARKS, 2 * LANDMARKS])))
         team.team_poses(), team.map_summaries()
-        own = team.map(0)
-        map_error(own.means, names, points)
+        landmarks = team.map(0)
+        map_error(landmarks.means, ids, points)
         if "clique" in extras:
-            align_maps(own, own, "clique")
+            align_maps(landmarks, landmarks, "clique")
         if "images" in extras:
             _measure_images()
     return watch.seconds
 
 
 def _measure_images() -> None:
-    """Let the stereo front end measure a tiny pair of images."""
+    """Run the stereo front end on a tiny pair of images."""
     blocks = np.kron(np.random.default_rng(0).integers(0, 256, (8, 12)), np.ones((12, 12))).astype(np.uint8)
-    eye = StereoFrontEnd(StereoCamera(focal_px=100.0, width=128, height=96))
-    eye.measure(blocks[:, :128], blocks[:, 8:136])
+    front_end = StereoFrontEnd(StereoCamera(focal_px=100.0, width=128, height=96))
+    front_end.measure(blocks[:, :128], blocks[:, 8:136])

@@ -1,4 +1,4 @@
-"""The image front end: a rectified stereo pair becomes 3-D points with descriptors; no simulator inside."""
+"""Image front end: 3-D points with descriptors from rectified stereo pairs."""
 
 from slam_backend.frontend.corners import CornerOptions, Corners, grid_order, harris_corners
 from slam_backend.frontend.descriptors import DESCRIPTOR_TYPES, DESCRIPTORS

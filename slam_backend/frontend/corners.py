@@ -1,7 +1,7 @@
 """Harris corners with sub-pixel peaks, spread over the image.
 
 Harris and Stephens (1988), "A Combined Corner and Edge Detector", Alvey Vision Conference. The response comes from
-OpenCV; its peaks are found here, because the place of a peak between pixels needs the response itself.
+OpenCV; its peaks are found here, because their sub-pixel positions need the response itself.
 """
 
 from dataclasses import dataclass
@@ -21,17 +21,17 @@ SENSITIVITY = 0.04  # k of det - k trace^2
 @known_names
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CornerOptions:
-    """What is a corner, and how many are kept.
+    """Options of corner detection.
 
     Attributes:
-        most: At most so many in an image.
+        most: Maximum number of corners in an image.
         block: Side of the window over which gradients are summed [px].
-        spacing: No other corner within this distance along rows and columns is stronger [px].
-        relative: Least response, as a share of the strongest in the image.
-        absolute: Least response, in OpenCV's units for grey levels of 0..1. The response grows with the fourth power
-            of contrast: corners of steps by 10 of 255 grey levels have about 3e-6, noise of 2 grey levels stays below
+        spacing: Distance along rows and columns within which only the strongest corner is kept [px].
+        relative: Minimum response, as a share of the strongest in the image.
+        absolute: Minimum response, in OpenCV's units for grey levels of 0..1. The response grows with the fourth power
+            of contrast: corners of steps by 10 of 255 grey levels have about 3e-6, noise of 2 grey levels less than
             1e-7.
-        border: Corners keep this far from the border [px].
+        border: Minimum distance from the border [px].
         cell: Side of the squares over which the corners are spread [px].
     """
 
@@ -48,10 +48,10 @@ class CornerOptions:
             check_int(f"corners.{name}", getattr(self, name), 1, "Use at least 1.", LARGEST_WINDOW)
         for name in ("most", "cell"):
             check_int(f"corners.{name}", getattr(self, name), 1, "Use at least 1.", MOST)
-        check_int("corners.border", self.border, self.spacing, "Leave room for the search around a corner.", MOST)
+        check_int("corners.border", self.border, self.spacing, "The search around a corner needs this margin.", MOST)
         for name in ("relative", "absolute"):
             value = getattr(self, name)
-            check_float(f"corners.{name}", value, "Give a least response.", at_least=1e-30, at_most=1e30)
+            check_float(f"corners.{name}", value, "Give a minimum response.", at_least=1e-30, at_most=1e30)
 
 
 class Corners(NamedTuple):
@@ -67,27 +67,27 @@ class Corners(NamedTuple):
 
 
 def harris_corners(image: Image, options: CornerOptions | None = None) -> Corners:
-    """Find corners.
+    """Find the corners of an image, in the order of `grid_order`.
 
-    The strongest corner of each square of the image comes first, strongest square first, then the second of each, and
-    so on: any number from the front is spread over the image.
+    The strongest corners of all squares come first, then the second strongest, and so on, so that any number of first
+    corners is spread over the image.
 
     Args:
         image: (H, W) uint8.
-        options: What to look for.
+        options: Options of corner detection; None: the defaults.
 
     Returns:
-        Corners in that order; none where an image has no contrast.
+        Corners in that order; none for an image without contrast.
 
     Raises:
-        ValueError: If the image is not grey and of eight bits.
+        ValueError: If the image is not an eight-bit grey image.
     """
     options = CornerOptions() if options is None else options
     return find_corners(check_image("image", image), options)
 
 
 def find_corners(image: Image, options: CornerOptions) -> Corners:
-    """Find corners in an image that was checked already."""
+    """Find the corners of a checked image."""
     response: Any = cv2.cornerHarris(image, options.block, 3, SENSITIVITY)
     limit = max(options.absolute, options.relative * float(response.max()))
     side = 2 * options.spacing + 1
@@ -104,11 +104,11 @@ def find_corners(image: Image, options: CornerOptions) -> Corners:
 
 
 def grid_order(points: FloatArray, quality: FloatArray, cell: float) -> IntArray:
-    """Return the order (n,) int64 that takes the best of each square cell first, then the second best, and so on.
+    """Return the order (n,) int64 with the best points of all square cells first, then the second best, and so on.
 
     Args:
         points: (n, 2) float64 [px].
-        quality: (n,) float64. Larger is better; decides within a cell, and among the cells' equals.
+        quality: (n,) float64. Quality, larger is better; orders points within a cell, and those of equal rank.
         cell: Side of a cell [px].
 
     >>> grid_order(np.array([[1.0, 1.0], [2.0, 2.0], [40.0, 2.0]]), np.array([5.0, 9.0, 1.0]), 32.0).tolist()
@@ -125,10 +125,10 @@ def grid_order(points: FloatArray, quality: FloatArray, cell: float) -> IntArray
 
 @jit
 def _peaks(response: Float32Array, found: IntArray, spacing: int, points: FloatArray, strengths: FloatArray) -> int:
-    """Fill in the places of the local maxima of (H, W) at the pixels `found` (n, 2) (row, column); return how many.
+    """Write the sub-pixel positions of maxima of (H, W) at pixels `found` (n, 2) (row, column); return their number.
 
-    Of equal maxima within the spacing the first one counts. The place of a peak is that of the paraboloid through its
-    3 x 3 neighbourhood; where that lies outside the pixels around it, or is no peak, the centre of the pixel.
+    The first of equal maxima within the spacing is used. A position is the peak of the paraboloid through the 3 x 3
+    neighbourhood, or the centre of the pixel if that peak does not exist or lies outside the neighbourhood.
     """
     count = 0
     for n in range(len(found)):

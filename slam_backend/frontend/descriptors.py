@@ -1,4 +1,4 @@
-"""Points of an image are described by u-SURF, SIFT or ORB, always upright and always as vectors of unit length."""
+"""Upright image descriptors of unit length: u-SURF, SIFT and ORB."""
 
 from typing import Any, NamedTuple
 
@@ -10,17 +10,17 @@ from slam_backend.frontend.images import Image
 from slam_backend.frontend.usurf import SIZE, describe, integral_of
 
 DESCRIPTORS = ("usurf", "sift", "orb")
-SIFT_DIAMETER = 5.0  # of a SIFT keypoint per scale [px]: its 16 cells then cover about the window of u-SURF, 21 s
+SIFT_DIAMETER = 5.0  # of a SIFT keypoint per scale [px]; its 16 cells cover about the window of u-SURF, 21 s
 ORB_BITS = 256
 
 
 class DescriptorType(NamedTuple):
-    """What a descriptor is like.
+    """Size and gates of a descriptor type.
 
     Attributes:
-        size: Its length d.
-        gate: L2 distance within which two descriptors may be of one point; a filter's `descriptor_gate`.
-        stereo_gate: Likewise between the eyes of one pair.
+        size: Length d of a descriptor.
+        gate: Largest L2 distance of descriptors of one point; a filter's `descriptor_gate`.
+        stereo_gate: Largest L2 distance between the two images of a pair.
     """
 
     size: int
@@ -36,17 +36,17 @@ DESCRIPTOR_TYPES = {
 
 
 def describe_points(image: Image, points: FloatArray, scales: FloatArray, kind: str) -> Float32Array:
-    """Describe points of an image that was checked already.
+    """Return descriptors of points of a checked image.
 
-    SIFT and ORB are OpenCV's, with all keypoints upright. A point that they do not describe, near the border, has the
-    zero vector. ORB has one scale; its bits become signs of 1/16, so that the L2 distance is the square root of the
-    number of different bits, over 8.
+    SIFT and ORB are OpenCV's, with upright keypoints. Points without a descriptor, near the border, have the zero
+    vector. ORB has one scale; its bits become signs of 1/16, so that the L2 distance is the square root of the number
+    of different bits, over 8.
 
     Args:
         image: (H, W) uint8.
         points: (n, 2) float64 [px].
         scales: (n,) float64 [px].
-        kind: Key of `KINDS`.
+        kind: Key of `DESCRIPTOR_TYPES`.
 
     Returns:
         (n, d) float32.
@@ -77,14 +77,14 @@ _EXTRACTORS: dict[str, Any] = {}
 
 
 def _extractor(kind: str) -> Any:
-    """Return OpenCV's object, made once."""
+    """Return OpenCV's extractor, cached."""
     if kind not in _EXTRACTORS:
         _EXTRACTORS[kind] = cv2.SIFT.create() if kind == "sift" else cv2.ORB.create(nlevels=1, edgeThreshold=16)
     return _EXTRACTORS[kind]
 
 
 def nearest(ours: Float32Array, theirs: Float32Array) -> tuple[IntArray, Float32Array]:
-    """Return for each of (n, d) the nearest of (m, d), and its squared L2 distance: one matrix product for all."""
+    """Return for each of (n, d) the nearest of (m, d), and its squared L2 distance, by one matrix product."""
     squares = (ours * ours).sum(axis=1)[:, None] + (theirs * theirs).sum(axis=1)[None] - 2.0 * ours @ theirs.T
     best = squares.argmin(axis=1)
     return best, np.maximum(squares[np.arange(len(ours)), best], 0.0)

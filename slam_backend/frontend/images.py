@@ -1,4 +1,4 @@
-"""What counts as an image: grey, eight bits, two axes; everything else is refused with the cure."""
+"""Validation of grey eight-bit images."""
 
 from typing import Any
 
@@ -9,15 +9,15 @@ from slam_backend.core.validation import argument_error
 
 Image = NDArray[np.uint8]
 
-SMALLEST = 16  # px; a smaller image holds no patch
-LARGEST = 1 << 23  # pixels; sums of grey levels then fit 32 bits
+SMALLEST = 16  # px; smaller images have no room for a patch
+LARGEST = 1 << 23  # pixels; sums of grey levels fit 32 bits
 
 
 def check_image(name: str, image: Any) -> Image:
     """Return `image` as a C-ordered (H, W) uint8 array, without a copy if it is one already.
 
     Args:
-        name: The argument as the caller wrote it.
+        name: Name of the argument in error messages.
         image: (H, W) uint8, at least 16 x 16.
 
     Raises:
@@ -30,15 +30,15 @@ def check_image(name: str, image: Any) -> Image:
     """
     array = np.asarray(image)
     if array.ndim == 3 and array.shape[2] in (1, 3, 4):
-        cure = "Convert it first."
-        raise argument_error(name, "a grey image (H, W)", f"a colour image {array.shape}", cure)
+        hint = "Convert it first."
+        raise argument_error(name, "a grey image (H, W)", f"a colour image {array.shape}", hint)
     if array.ndim != 2:
         raise argument_error(name, "a grey image (H, W)", f"shape {array.shape}", "Give rows and columns.")
     if array.dtype != np.uint8:
-        cure = "Scale it to 0..255 and round."
-        raise argument_error(name, "an image of dtype uint8", f"an array of dtype {array.dtype}", cure)
+        hint = "Scale it to 0..255 and round."
+        raise argument_error(name, "an image of dtype uint8", f"an array of dtype {array.dtype}", hint)
     if min(array.shape) < SMALLEST or array.size > LARGEST:
         expected = f"at least {SMALLEST} rows and columns and at most {LARGEST} pixels"
         raise argument_error(name, expected, f"shape {array.shape}", "Crop or scale it.")
-    # Kernels are compiled for arrays that can be written; others would be compiled for anew.
+    # Kernels are compiled for writable arrays; read-only ones would need another compilation.
     return np.ascontiguousarray(array) if array.flags.writeable else array.copy()

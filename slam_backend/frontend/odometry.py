@@ -1,4 +1,4 @@
-"""Visual odometry: the motion of a stereo camera between two frames, from what both show."""
+"""Visual odometry: the motion of a stereo camera between two frames."""
 
 from typing import NamedTuple
 
@@ -13,18 +13,18 @@ from slam_backend.models.camera import StereoCamera
 from slam_backend.models.measurements import Measurements
 
 AGREE = 3.0  # standard deviations within which two points agree
-HUBER = 1.5  # standard deviations beyond which a residual counts less
-LEAST = 6  # pairs that agree; fewer fix a motion by chance
+HUBER = 1.5  # standard deviations beyond which a residual loses weight
+LEAST = 6  # minimum number of inliers; fewer may agree by chance
 
 
 class CameraMotion(NamedTuple):
     """The motion of a camera from an earlier to a later frame.
 
     Attributes:
-        rotation: (3, 3) float64. Turns later camera axes into earlier ones.
-        translation: (3,) float64 [m]. Where the later camera is, earlier camera frame.
-        pairs: (n, 2) int64. Rows of the earlier and the later frame that were taken for one point.
-        inliers: (n,) bool. Those that agree with the motion.
+        rotation: (3, 3) float64. Rotation from later to earlier camera axes.
+        translation: (3,) float64 [m]. Position of the later camera, earlier camera frame.
+        pairs: (n, 2) int64. Matched rows of the earlier and the later frame.
+        inliers: (n,) bool. Mask of the pairs that agree with the motion.
     """
 
     rotation: FloatArray
@@ -34,13 +34,13 @@ class CameraMotion(NamedTuple):
 
     @property
     def planar(self) -> FloatArray:
-        """(3,) [m, m, rad]: motion in the plane of a level camera, x ahead and y left, as odometry has it."""
+        """Planar motion (3,) [m, m, rad] of a level camera, x ahead and y left, in the format of odometry."""
         heading = np.arctan2(-self.rotation[0, 2], self.rotation[2, 2])
         return np.array([self.translation[2], -self.translation[0], heading])
 
 
 def match_frames(earlier: Measurements, later: Measurements, gate: float) -> IntArray:
-    """Return pairs of rows (n, 2) int64 whose descriptors are each other's nearest and within `gate`."""
+    """Return pairs of rows (n, 2) int64 whose descriptors are mutual nearest neighbours within `gate`."""
     if not len(earlier) or not len(later):
         return np.empty((0, 2), dtype=np.int64)
     there, squares = nearest(earlier.descriptors, later.descriptors)
@@ -57,21 +57,21 @@ def camera_motion(
     rng: np.random.Generator,
     iterations: int = 500,
 ) -> CameraMotion | None:
-    """Estimate how a camera moved between two frames.
+    """Estimate the motion of a camera between two frames.
 
-    Points are paired by descriptors, wrong pairs are found by RANSAC on rigid motions in space, and the motion that
-    explains columns, rows and disparities of the rest in both frames best is returned.
+    Points are matched by descriptors, outliers are rejected by RANSAC on rigid motions in space, and the motion
+    minimises the reprojection error of the inliers in columns, rows and disparities of both frames.
 
     Args:
         earlier: Points with descriptors, earlier camera frame.
-        later: Likewise, later camera frame.
-        camera: With the standard deviations of pixels and disparities.
+        later: Points with descriptors, later camera frame.
+        camera: Stereo camera with its standard deviations of pixels and disparities.
         gate: Largest L2 distance of descriptors of one point [-].
         rng: Source of RANSAC's samples.
-        iterations: Of RANSAC.
+        iterations: Number of RANSAC iterations.
 
     Returns:
-        The motion; None if fewer than six pairs agree.
+        The motion; None if there are fewer than six inliers.
     """
     pairs = match_frames(earlier, later, gate)
     a, b = earlier.points[pairs[:, 0]], later.points[pairs[:, 1]]
@@ -86,7 +86,7 @@ def camera_motion(
 def _least_reprojection(
     a: FloatArray, b: FloatArray, camera: StereoCamera, rotation: FloatArray, translation: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the motion whose predictions of either frame from the other are best, in standard deviations of pixels."""
+    """Return the motion with the smallest reprojection error in both frames, in standard deviations of pixels."""
     sigmas = np.array([camera.sigma_px, camera.sigma_px, camera.sigma_disparity_px]) * np.sqrt(2.0)
     seen_a, seen_b = camera.project(a), camera.project(b)
 

@@ -1,12 +1,12 @@
-"""`StereoFrontEnd`: a rectified pair of images becomes `Measurements`: corners, matches along rows, points.
+"""Stereo front end: corners, matching along rows and triangulation, from rectified images to `Measurements`.
 
-Guards, in this order; each throws matches away and none brings any back:
+A match must pass these checks:
 
-1. mutual: of two matched corners each is the other's most similar one near its row;
-2. patch: the patch around the left corner is laid over the right image, to a fraction of a pixel, and fits;
-3. rows: both rows then agree;
-4. back: laid from right to left, the patch comes back to where it came from;
-5. range: the point is neither nearer nor farther than asked for.
+1. mutual: each corner is the most similar one near the other's row;
+2. patch: the patch around the left corner correlates with the right image after sub-pixel registration;
+3. rows: the registered rows agree;
+4. back: registration from right to left returns to the left corner;
+5. range: the distance of the point is within limits.
 """
 
 from dataclasses import dataclass, field
@@ -35,28 +35,28 @@ from slam_backend.models.camera import StereoCamera
 from slam_backend.models.measurements import Measurements, TeamMeasurements
 
 MATCH_CHECKS = ("mutual", "patch", "rows", "back", "range")
-LEAST_SCALE, LARGEST_SCALE = 1.0, 8.0  # px; of windows of constant physical size
-SWAPPED = 12  # so many points the other way round, and three times as many as the right way, tell of swapped images
+LEAST_SCALE, LARGEST_SCALE = 1.0, 8.0  # px; limits for windows of constant physical size
+SWAPPED = 12  # points at negative disparity, three times the number at positive, above which images count as swapped
 
 
 @known_names
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrontEndOptions:
-    """How a stereo pair is measured.
+    """Options of the stereo front end.
 
     Attributes:
         descriptor: "usurf", "sift" or "orb".
-        corners: What is a corner, and how many are kept in an image.
-        scale: s of the descriptors [px], by which corners are matched between the eyes.
+        corners: Options of corner detection.
+        scale: Scale s of the descriptors for matching between the two images [px].
         window: Side of a descriptor's window [m], the same at any distance; None: 21 `scale` pixels at any distance.
         row_tolerance: Largest difference of the rows of two corners [px].
-        patch_half: Patches are 2 `patch_half` + 1 pixels wide.
-        iterations: At most so many to lay a patch over another.
-        least_correlation: Of two patches that fit.
-        row_difference: Largest difference of their rows [px].
-        back_difference: Largest difference between the ways forward and back [px].
-        nearest: Points nearer than this are dropped [m].
-        max_measurements: At most so many; those in front of `grid_order` are kept. None: all.
+        patch_half: Half size of a patch, which is 2 `patch_half` + 1 pixels wide.
+        iterations: Maximum number of iterations of a patch registration.
+        least_correlation: Minimum correlation of two registered patches.
+        row_difference: Largest difference of the rows of registered patches [px].
+        back_difference: Largest difference between forward and backward registration [px].
+        nearest: Smallest distance of reported points [m].
+        max_measurements: Maximum number of points, the first ones of `grid_order`. None: all.
     """
 
     descriptor: Literal["usurf", "sift", "orb"] = "usurf"
@@ -81,30 +81,30 @@ class FrontEndOptions:
         for name in ("row_tolerance", "row_difference", "back_difference"):
             check_float(f"front_end.{name}", getattr(self, name), "Give a positive number.", above=0.0)
         check_float("front_end.scale", self.scale, "Give pixels.", at_least=0.1, at_most=100.0)
-        check_float("front_end.nearest", self.nearest, "Filters take no point nearer than 5 cm.", at_least=0.06)
+        check_float("front_end.nearest", self.nearest, "Filters reject points nearer than 5 cm.", at_least=0.06)
         if self.window is not None:
             check_float("front_end.window", self.window, "Give metres, or None.", at_least=1e-6, at_most=1e6)
-        half = check_int("front_end.patch_half", self.patch_half, 1, "5 is a good one.")
+        half = check_int("front_end.patch_half", self.patch_half, 1, "5 is a good value.")
         if 2 * half + 1 > LARGEST_PATCH:
             expected = f"an int <= {LARGEST_PATCH // 2}"
             raise argument_error("front_end.patch_half", expected, half, "Large patches cover several depths.")
         check_int("front_end.iterations", self.iterations, 1, "8 are enough.", 1000)
-        cure = "Give a correlation."
-        check_float("front_end.least_correlation", self.least_correlation, cure, at_least=0.0, at_most=1.0)
+        hint = "Give a correlation."
+        check_float("front_end.least_correlation", self.least_correlation, hint, at_least=0.0, at_most=1.0)
         if self.max_measurements is not None:
             check_int("front_end.max_measurements", self.max_measurements, 1, "Use None to keep all.", MOST)
 
 
 class StereoMatches(NamedTuple):
-    """Corners of both eyes that were matched by descriptor, and what each guard said of them.
+    """Corners of both images matched by descriptor, with the results of all checks.
 
     Attributes:
-        corners: (n, 2) float64 [px]. In the left image.
-        responses: (n,) float64 [-]. Harris responses there.
+        corners: (n, 2) float64 [px]. Corners in the left image.
+        responses: (n,) float64 [-]. Harris responses of the left corners.
         corner_disparity: (n,) float64 [px]. Difference of the columns of both corners.
-        disparity: (n,) float64 [px]. By patches; meaningless where the guard "patch" failed.
-        descriptors: (n, d) float32. Of the left corners, at the scale by which they were matched.
-        passed: (5, n) bool. Whether a match passed the guard, for each of `MATCH_CHECKS` and whatever the others said.
+        disparity: (n,) float64 [px]. Disparity by registration of patches; undefined if the check "patch" failed.
+        descriptors: (n, d) float32. Descriptors of the left corners, at the scale of matching.
+        passed: (5, n) bool. Result of each of `MATCH_CHECKS`, independent of the others.
     """
 
     corners: FloatArray
@@ -116,13 +116,13 @@ class StereoMatches(NamedTuple):
 
 
 class StereoFrame(NamedTuple):
-    """What one pair of images says.
+    """Measurements of one pair of images.
 
     Attributes:
-        measurements: n points with descriptors, without covariances: the camera model holds at the predicted point.
+        measurements: n points with descriptors, without covariances: the camera model applies at the predicted point.
         pixels: (n, 3) float64 [px]. Column and row in the left image, and disparity; pixel centres are at integers.
         responses: (n,) float64 [-]. Harris responses.
-        matches: What they were chosen from.
+        matches: All matches by descriptor.
     """
 
     measurements: Measurements
@@ -132,25 +132,25 @@ class StereoFrame(NamedTuple):
 
 
 class StereoFrontEnd:
-    """Measures rectified pairs of one camera.
+    """Stereo front end for rectified pairs of one camera.
 
     Args:
-        camera: Focal length, baseline, size of the images, and the range within which points are reported.
-        options: How.
-        centre_px: (2,) [px]. Column and row of the optical axis, pixel centres at integers, the same in both eyes;
+        camera: Focal length, baseline, size of the images, and the largest distance of reported points.
+        options: Options of the front end; None: the defaults.
+        centre_px: (2,) [px]. Column and row of the optical axis, pixel centres at integers, the same in both images;
             None: the middle of the image.
 
     Example:
-        >>> eye = StereoFrontEnd(StereoCamera(width=64, height=48))
+        >>> front_end = StereoFrontEnd(StereoCamera(width=64, height=48))
         >>> grey = np.full((48, 64), 128, np.uint8)
-        >>> len(eye.measure(grey, grey).measurements)          # nothing to be seen
+        >>> len(front_end.measure(grey, grey).measurements)  # no contrast
         0
     """
 
     def __init__(self, camera: Any, options: FrontEndOptions | None = None, centre_px: Any | None = None) -> None:
         if not isinstance(camera, StereoCamera):
-            cure = "Points need a focal length and a baseline: read them with slam_backend.readers.calibration."
-            raise argument_error("camera", "a StereoCamera", camera, cure)
+            hint = "Points need a focal length and a baseline: read them with slam_backend.readers.calibration."
+            raise argument_error("camera", "a StereoCamera", camera, hint)
         self.camera: StereoCamera = camera
         self.options = FrontEndOptions() if options is None else options
         middle = (0.5 * (camera.width - 1), 0.5 * (camera.height - 1))
@@ -170,14 +170,13 @@ class StereoFrontEnd:
 
         Args:
             left: (H, W) uint8, of the camera's size.
-            right: Likewise.
+            right: (H, W) uint8, of the camera's size.
 
         Returns:
-            What was seen, spread over the image; nothing where images are empty or saturated.
+            Points spread over the image; none for empty or saturated images.
 
         Raises:
-            ValueError: If an image is in colour, not of eight bits or not of the camera's size, or if the pair is
-                swapped.
+            ValueError: If an image is not an eight-bit grey image of the camera's size, or if the pair is swapped.
         """
         left, right = self._check("left", left), self._check("right", right)
         matches = self.match(left, right)
@@ -202,7 +201,7 @@ class StereoFrontEnd:
         return StereoFrame(frame, pixels, matches.responses[kept], matches)
 
     def match(self, left: Image, right: Image) -> StereoMatches:
-        """Match the corners of a pair that was checked already; all matches by descriptor are returned."""
+        """Return all matches by descriptor of the corners of a checked pair."""
         options = self.options
         (ours, described), (theirs, their_descriptors) = (self._describe(image) for image in (left, right))
         partner, mutual, _ = match_rows(
@@ -238,23 +237,23 @@ class StereoFrontEnd:
         )
 
     def _check(self, name: str, image: Any) -> Image:
-        """Return an image of the camera's size."""
+        """Return the image, or raise unless it has the camera's size."""
         checked = check_image(name, image)
         expected = (self.camera.height, self.camera.width)
         if checked.shape != expected:
-            cure = "Rectify it to the camera's size, or correct the camera."
-            raise argument_error(name, f"an image of {expected[1]} x {expected[0]} px", f"shape {checked.shape}", cure)
+            hint = "Rectify it to the camera's size, or correct the camera."
+            raise argument_error(name, f"an image of {expected[1]} x {expected[0]} px", f"shape {checked.shape}", hint)
         return checked
 
     def _check_order(self, left: Image, right: Image, count: int) -> None:
-        """Raise if a pair in which hardly anything was found shows a lot the other way round."""
+        """Raise if a pair with few matches has many after swapping its images."""
         reverse = int(self.match(right, left).passed.all(axis=0).sum())
         if reverse >= SWAPPED and reverse > 3 * count:
             got = f"a pair with {reverse} points at negative disparities and {count} at positive ones"
             raise argument_error("left, right", "the left image first", got, "Swap the images.")
 
     def _describe(self, image: Image) -> tuple[Corners, Float32Array]:
-        """Return the corners of an image and their descriptors; those that cannot be described are left out."""
+        """Return the corners of an image and their descriptors; corners without one are dropped."""
         corners = find_corners(image, self.options.corners)
         scales = np.full(len(corners.points), self.options.scale)
         descriptors = describe_points(image, corners.points, scales, self.options.descriptor)

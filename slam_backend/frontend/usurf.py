@@ -1,4 +1,4 @@
-"""Upright SURF (u-SURF): 64 numbers that describe the surroundings of a point of an image, compiled.
+"""Upright SURF (u-SURF) descriptors of 64 numbers, in compiled code.
 
 Bay, Ess, Tuytelaars, Van Gool (2008), "Speeded-Up Robust Features (SURF)", Computer Vision and Image Understanding 110,
 Sec. 4.2, without the rotation of Sec. 4.1. Box edges are not rounded to pixels. With the scale s:
@@ -8,7 +8,7 @@ Sec. 4.2, without the rotation of Sec. 4.1. Box edges are not rounded to pixels.
 - each response is weighted by one Gaussian of 3.3 s about the point;
 - 4 x 4 cells of 5 x 5 samples, row by row; each gives [sum dx, sum dy, sum |dx|, sum |dy|]; unit L2 norm.
 
-All box edges lie on one lattice of 22 x 22 points, so that 484 looks at the integral image serve all 400 samples.
+All box edges lie on one lattice of 22 x 22 points, so that 484 reads of the integral image suffice for 400 samples.
 """
 
 from typing import Any
@@ -25,32 +25,32 @@ SIZE = 64
 SAMPLES = 20  # along a side of the window
 EDGES = SAMPLES + 2  # lattice points along a side
 GAUSSIAN = 3.3  # standard deviation of the weights, in units of the scale
-FLAT = 1e-3  # [grey level px^2] a patch whose descriptor is shorter before normalisation has no contrast
+FLAT = 1e-3  # [grey level px^2] length of an unnormalised descriptor below which a patch has no contrast
 WEIGHTS = np.exp(-0.5 * ((np.arange(SAMPLES) - 0.5 * (SAMPLES - 1)) / GAUSSIAN) ** 2).astype(np.float32)
 
 
 def usurf_descriptors(image: Any, points_xy: Any, scales: Any) -> Float32Array:
-    """Describe points of an image by upright SURF.
+    """Return upright SURF descriptors of points of an image.
 
-    The image is continued beyond its border by its outermost pixels. A patch without contrast has the zero vector.
+    The image is extended beyond its border by its outermost pixels. A patch without contrast has the zero vector.
 
     Args:
         image: (H, W) uint8.
         points_xy: (n, 2) float64 [px]. Column and row; pixel centres are at integers.
-        scales: (n,) float64 or one number [px]. s; the window is 21 s wide.
+        scales: (n,) float64 or one number [px]. Scales s; the window is 21 s wide.
 
     Returns:
         (n, 64) float32, of unit length.
 
     Raises:
-        ValueError: If the image is not grey and of eight bits, a shape is wrong, or a scale is not positive.
+        ValueError: If the image is not an eight-bit grey image, a shape is wrong, or a scale is not positive.
     """
     image = check_image("image", image)
     points: Any = check_array("points_xy", points_xy, (None, 2), "Give one row (column, row) per point.")
     sizes = np.broadcast_to(np.asarray(scales, dtype=np.float64), (len(points),)) if np.ndim(scales) == 0 else scales
     checked: Any = check_array("scales", sizes, (len(points),), "Give one scale per point, or one for all.")
     if len(checked) and checked.min() <= 0.0:
-        raise argument_error("scales", "numbers > 0", float(checked.min()), "Scales are in pixels; 2.3 is a good one.")
+        raise argument_error("scales", "numbers > 0", float(checked.min()), "Give pixels; 2.3 is a good value.")
     return describe(integral_of(image), points, checked)
 
 
@@ -60,7 +60,7 @@ def integral_of(image: Image) -> NDArray[np.int32]:
 
 
 def describe(integral: NDArray[np.int32], points: FloatArray, scales: FloatArray) -> Float32Array:
-    """Describe points (n, 2) [px] at scales (n,) [px] of the image whose `integral_of` is given; nothing is checked."""
+    """Return descriptors of points (n, 2) [px] at scales (n,) [px] of an image given by `integral_of`, unchecked."""
     descriptors = np.empty((len(points), SIZE), dtype=np.float32)
     _describe(integral, points, scales, WEIGHTS, descriptors)
     return descriptors
@@ -74,10 +74,10 @@ def _describe(
     weights: Float32Array,
     descriptors: Float32Array,
 ) -> None:
-    """Fill `descriptors` (n, 64).
+    """Write `descriptors` (n, 64).
 
-    Between two pixel corners the integral of a piecewise constant image is bilinear. Beyond the border, the same
-    polynomial of the outermost pixel continues it, which replicates the edge.
+    Between two pixel corners the integral of a piecewise constant image is bilinear. The polynomial of the outermost
+    pixel extends it beyond the border, which replicates the edge.
     """
     rows, columns = integral.shape[0] - 1, integral.shape[1] - 1
     lattice = np.empty((EDGES, EDGES), dtype=np.float64)
@@ -103,7 +103,7 @@ def _describe(
                 d, e = np.float64(integral[row + 1, c]), np.float64(integral[row + 1, c + 1])
                 above = a + f * (b - a)
                 lattice[j, i] = above + share * (d + f * (e - d) - above)
-        for j in range(EDGES - 1):  # float64 takes the differences of large sums; what is left suits float32
+        for j in range(EDGES - 1):  # float64 for differences of large sums, float32 for their result
             for i in range(EDGES - 1):
                 boxes[j, i] = (lattice[j + 1, i + 1] - lattice[j + 1, i]) - (lattice[j, i + 1] - lattice[j, i])
         square = np.float32(0.0)

@@ -1,1 +1,1 @@
-"""Landmark maps: aligned, verified, fused."""
+"""Alignment, verification and fusion of landmark maps."""

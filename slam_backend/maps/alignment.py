@@ -1,4 +1,4 @@
-"""The motion between two maps of unknown relative frame, or a reason why it is not known (Sec. 3.1)."""
+"""Alignment: the motion between two maps of unknown relative frame, or a refusal with its reason (Sec. 3.1)."""
 
 import math
 
@@ -48,21 +48,21 @@ METHODS = ("ransac", "svd", "icp", "impicp", "gnc", "clique")
 
 
 def candidate_matches(map_a: LandmarkMap, map_b: LandmarkMap, options: AlignmentOptions) -> IntArray:
-    """Match landmarks by appearance, without regard to where they lie in the plane.
+    """Return candidate matches of landmarks by appearance, whatever their positions in the plane.
 
-    Those that stand out: each is the other's nearest descriptor, within the gate, clearly nearer than any landmark of
-    another place in either map. Beside them all pairs within the gate of landmarks that have few look-alikes: which of
-    them is meant, geometry has to tell, and that there are several is evidence, too. Heights agree, because planar
-    robots with one camera height share z (Sec. 3.1). Without appearance all pairs whose heights agree are candidates.
+    Distinctive candidates are mutual nearest neighbours within the descriptor gate that pass the ratio test in both
+    maps. Further candidates are all pairs within the gate of landmarks with few similar ones; geometry decides between
+    them later. Heights agree, because planar robots with one camera height share z (Sec. 3.1). Without appearance all
+    pairs with equal heights are candidates.
 
     Args:
-        map_a: The one map.
-        map_b: The other, in any other planar frame.
+        map_a: First map.
+        map_b: Second map, in any other planar frame.
         options: Gates.
 
     Returns:
-        (k, 2) int64 rows (index in map_a, index in map_b), by rising index in map_a, then in map_b. One-to-one where
-        all landmarks look different.
+        (k, 2) int64 rows (index in map_a, index in map_b), by rising index in map_a, then in map_b. One-to-one if all
+        landmarks have different descriptors.
 
     Raises:
         ValueError: If the maps' descriptors differ in size, or there are too many pairs to try without appearance.
@@ -77,44 +77,44 @@ def align_maps(
     rng: np.random.Generator | None = None,
     options: AlignmentOptions | None = None,
 ) -> Alignment:
-    """Estimate the planar motion between two maps from landmarks that look alike; refuse when in doubt.
+    """Estimate the planar motion between two maps from similar landmarks; refuse uncertain results.
 
-    Methods differ in where they begin (`propose_motion`). What follows is common to all: inliers within a Mahalanobis
-    gate, heights included, and weighted Gauss-Newton over them in turn until both rest, which is the maximum of the
-    likelihood; its covariance; the best alignment that differs; and the refusals.
+    Methods differ in the initial estimate (`propose_motion`). The following stages are common to all: selection of
+    inliers by a Mahalanobis gate, heights included, alternates with weighted Gauss-Newton until convergence to the
+    maximum of the likelihood; then covariance, best distinct alignment, and refusals.
 
     Args:
-        map_a: The map whose frame the result leads to.
-        map_b: The other map.
+        map_a: Map in the target frame a.
+        map_b: Map in frame b.
         method: `"ransac"`: search over pairs of candidate matches, each hypothesis locally optimised. `"svd"`: closed
-            form over all candidates. `"icp"`: pairs of closest landmarks, from there on. `"impicp"`: ICP from two
-            starts. `"gnc"`: truncated least squares by graduated non-convexity. `"clique"`: largest set of candidates
-            that agree pairwise. Sources are named in `initial_estimates` and
-            `max_clique`; `docs/explanation/alignment.md` compares.
-        rng: Order of the search; None: a fixed one. The same generator state gives the same result.
-        options: Gates and refusals; None: the defaults.
+            form over all candidates. `"icp"`: pairs of closest landmarks, starting from `"svd"`. `"impicp"`: ICP from
+            two starts. `"gnc"`: truncated least squares by graduated non-convexity. `"clique"`: largest set of
+            candidates that agree pairwise. `initial_estimates` and `max_clique` name the sources;
+            `docs/explanation/alignment.md` compares the methods.
+        rng: Generator of the search order; None: a fixed order. The same generator state gives the same result.
+        options: Gates and refusal limits; None: the defaults.
 
     Returns:
-        The alignment, or a refusal with its reason. A refusal is cheap, a false merge is not.
+        The alignment, or a refusal with its reason.
 
     Raises:
-        ValueError: If the method is unknown, the maps' descriptors differ in size or `rng` is no generator.
+        ValueError: If the method is unknown, the maps' descriptors differ in size or `rng` is not a generator.
     """
     options, rng = _checked(map_a, map_b, method, rng, options)
     if too_many(map_a, map_b, options):
         return Alignment.refused("too many candidates")
-    matches, stands_out = candidates(map_a, map_b, options)
+    matches, distinctive = candidates(map_a, map_b, options)
     if len(matches) < options.min_inliers:
         return Alignment.refused("too few candidates")
     table = match_table(map_a, map_b, matches)
     floor, gate = options.position_floor**2, options.position_gate
     hypotheses = _search(table, rng, options)
-    start = _propose(method, map_a, map_b, matches, stands_out, table, hypotheses, options)
+    start = _propose(method, map_a, map_b, matches, distinctive, table, hypotheses, options)
     if start is None:
         return Alignment.refused("too few inliers")
     pose, members, variance = kernels.refine(table, start, floor, gate)
     inside = inlier_mask(table, matches, pose, floor, gate)
-    if not one_to_one(matches):  # of look-alikes that all fit, only the closest shapes the motion
+    if not one_to_one(matches):  # of several matches of one landmark, only the closest is used
         members = np.zeros(len(matches), np.bool_)
         pose, members[inside], variance = kernels.refine(table[inside], pose, floor, gate)
         inside = inlier_mask(table, matches, pose, floor, gate)
@@ -150,28 +150,28 @@ def propose_motion(
     rng: np.random.Generator | None = None,
     options: AlignmentOptions | None = None,
 ) -> FloatArray | None:
-    """Return a method's own estimate of the motion, before any refinement or refusal, as the paper compares them.
+    """Return a method's initial estimate of the motion, without refinement and refusals, as compared in the paper.
 
     Args:
-        map_a: The map whose frame the result leads to.
-        map_b: The other map.
-        method: As in `align_maps`.
-        rng: Likewise.
-        options: Likewise.
+        map_a: Map in the target frame a.
+        map_b: Map in frame b.
+        method: One of `METHODS`, see `align_maps`.
+        rng: Generator of the search order, see `align_maps`.
+        options: Gates of candidates; None: the defaults.
 
     Returns:
-        (3,) a_from_b [m, m, rad]; None if the candidates do not suffice for one.
+        (3,) a_from_b [m, m, rad]; None if there are too few candidates.
 
     Raises:
         ValueError: As `align_maps`.
     """
     options, rng = _checked(map_a, map_b, method, rng, options)
-    matches, stands_out = candidates(map_a, map_b, options)
+    matches, distinctive = candidates(map_a, map_b, options)
     if len(matches) < 2:
         return None
     table = match_table(map_a, map_b, matches)
     hypotheses = _search(table, rng, options) if method == "ransac" else np.empty((0, 5))
-    return _propose(method, map_a, map_b, matches, stands_out, table, hypotheses, options)
+    return _propose(method, map_a, map_b, matches, distinctive, table, hypotheses, options)
 
 
 def _checked(
@@ -181,7 +181,7 @@ def _checked(
     rng: np.random.Generator | None,
     options: AlignmentOptions | None,
 ) -> tuple[AlignmentOptions, np.random.Generator]:
-    """Return options and generator, or raise if an argument is of the wrong kind."""
+    """Return options and generator, or raise if an argument has the wrong type."""
     check_choice("method", method, METHODS)
     options = AlignmentOptions() if options is None else options
     for name, value, kind in (
@@ -200,18 +200,18 @@ def _propose(
     map_a: LandmarkMap,
     map_b: LandmarkMap,
     matches: IntArray,
-    stands_out: BoolArray,
+    distinctive: BoolArray,
     table: FloatArray,
     hypotheses: FloatArray,
     options: AlignmentOptions,
 ) -> FloatArray | None:
-    """Return the motion (3,) at which a method begins; None if it finds none.
+    """Return a method's initial estimate of the motion (3,); None if it finds none.
 
-    Those that cannot choose among look-alikes begin with the candidates that stand out, where there are enough.
+    Methods that cannot choose between similar landmarks use the distinctive candidates, if there are enough.
     """
     floor, gate = options.position_floor**2, options.position_gate
-    if method not in ("ransac", "clique") and np.count_nonzero(stands_out) >= options.min_inliers:
-        matches, table = matches[stands_out], table[stands_out]
+    if method not in ("ransac", "clique") and np.count_nonzero(distinctive) >= options.min_inliers:
+        matches, table = matches[distinctive], table[distinctive]
     if method == "ransac":
         return hypotheses[hypotheses[:, 4].argmax(), :3].copy() if len(hypotheses) else None
     if method == "gnc":
@@ -226,7 +226,7 @@ def _propose(
 
 
 def _search(table: FloatArray, rng: np.random.Generator, options: AlignmentOptions) -> FloatArray:
-    """Return the hypotheses (h, 5) of a random search over pairs of candidates; over all of them if they are few."""
+    """Return the hypotheses (h, 5) of a random search over pairs of candidates, or of all pairs if there are few."""
     pairs = len(table) * (len(table) - 1) // 2
     few = pairs <= options.max_samples
     samples = rng.permutation(pairs) if few else rng.integers(0, pairs, options.max_samples)
@@ -235,7 +235,7 @@ def _search(table: FloatArray, rng: np.random.Generator, options: AlignmentOptio
         samples,
         options.position_floor**2,
         options.position_gate,
-        0.5 * options.min_spread,  # pairs that lie closer say little about the rotation
+        0.5 * options.min_spread,  # closer pairs hardly constrain the rotation
         options.min_inliers,
         options.max_ratio,
         math.log(1.0 - options.success_probability),

@@ -1,4 +1,4 @@
-"""Options and results of map alignment, and the reasons for which it refuses."""
+"""Options, results and refusal reasons of map alignment."""
 
 import math
 from collections import Counter
@@ -27,57 +27,56 @@ Reason = Literal[
 ]  # fmt: skip
 REASONS: tuple[Reason, ...] = (
     "too few candidates",
-    "too many candidates",  # by geometry alone
+    "too many candidates",  # without appearance
     "too few inliers",
     "ambiguous",
-    "mirrored",  # the mirror image fits better, and no robot sees one
+    "mirrored",  # the mirror image fits better, which is physically impossible
     "poorly spread",
     "too uncertain",
 )
-HINTS: dict[str, str] = {  # what helps, by the reason of a refusal
-    "too few candidates": "The maps hold too few landmarks that look alike: let robots see more of the same places.",
+HINTS: dict[str, str] = {  # hints by refusal reason
+    "too few candidates": "The maps have too few similar landmarks: let robots see more of the same places.",
     "too many candidates": "Compare maps by appearance, or compare smaller ones.",
-    "too few inliers": "Few landmarks lie alike in both maps: they share little, or one is bent. Let robots see more of"
-    " the same places, set `rejuvenate_every`, or raise `AlignmentOptions.position_floor` for rough maps.",
-    "ambiguous": "The shared landmarks fit at several places: let robots see more of what is there only once.",
+    "too few inliers": "Few landmarks agree in both maps: the overlap is small, or one map is distorted. Let robots see"
+    " more of the same places, set `rejuvenate_every`, or raise `AlignmentOptions.position_floor` for inaccurate maps.",
+    "ambiguous": "The shared landmarks fit at several places: let robots see more distinctive places.",
     "mirrored": "The mirror image fits better: check the sign of the measured coordinates.",
-    "poorly spread": "The shared landmarks stand too close together: let robots see more of the same places.",
-    "too uncertain": "The way of a robot to what the maps share is too uncertain: close loops or set"
-    " `rejuvenate_every`; or accept it, by a lower `MergeOptions.min_sigmas_on_trial` where paths leave it open, by a"
-    " higher"
-    " `AlignmentOptions.max_sigma_position` or `max_sigma_heading` where landmarks do.",
+    "poorly spread": "The shared landmarks are too close together: let robots see more of the same places.",
+    "too uncertain": "The path of a robot to the shared landmarks is too uncertain: close loops or set"
+    " `rejuvenate_every`; or accept it, with a lower `MergeOptions.min_sigmas_on_trial` if the paths are uncertain, or"
+    " a higher `AlignmentOptions.max_sigma_position` or `max_sigma_heading` if the landmarks are.",
 }
-BOUNDS = ("translation", "rotation", "one match", "paths", "repeat")  # that a refusal as "too uncertain" may miss
-DISTINCT_TRANSLATION = 0.5  # [m]; beyond these two an alignment counts as another one, and as a false one
+BOUNDS = ("translation", "rotation", "one match", "paths", "repeat")  # possible bounds of a "too uncertain" refusal
+DISTINCT_TRANSLATION = 0.5  # [m]; alignments beyond these two limits count as different, and as false
 DISTINCT_ROTATION = math.radians(5.0)
-LARGEST = 1e9  # of gates and distances; their squares are far from infinite
-MAX_SIMILAR = 10_000  # as many pairs as geometry alone may make
-FEWEST_INLIERS = 3  # two matches fit any motion between them: only a third is evidence
+LARGEST = 1e9  # limit of gates and distances; their squares do not overflow
+MAX_SIMILAR = 10_000  # same limit as for pairs without appearance
+FEWEST_INLIERS = 3  # a motion can be made to fit any two matches: only a third is evidence
 
 
 @known_names
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AlignmentOptions:
-    """When two landmarks look alike, when they lie together, and when an alignment is believed.
+    """Gates of candidates and inliers, and refusal limits of an alignment.
 
     Attributes:
-        appearance: Whether only landmarks that look alike may be the same. False: any two of the same height may, where
-            all look the same; two maps then have at most 10,000 such pairs.
+        appearance: Whether candidates need similar descriptors. False: any two landmarks of the same height are
+            candidates, for maps without distinctive descriptors; two maps then have at most 10,000 such pairs.
         descriptor_gate: Largest L2 distance between matched descriptors [-].
-        descriptor_ratio: A match stands out if it is closer than this times the best landmark of another place [-].
-        max_similar: Landmarks that have up to so many look-alikes within the gate in the other map may be any of them;
-            with more they must stand out. 0: all must.
-        same_place: Landmarks of one map within this distance may be duplicates, and do not compete [m].
+        descriptor_ratio: Largest descriptor distance of a distinctive match over that to any other place [-].
+        max_similar: Largest number of similar landmarks in the other map for which all pairs are candidates; landmarks
+            with more need a distinctive match. 0: all do.
+        same_place: Distance within which landmarks of one map may be duplicates and do not compete [m].
         position_gate: Largest squared Mahalanobis residual of an inlier [-]; 11.34 is 99 % of 3 degrees of freedom.
         position_floor: Standard deviation added to the residuals, because filters' maps are over-confident [m].
-        min_inliers: Fewer inliers are refused; at least 3.
-        max_ratio: Refused when the `ratio` of an `Alignment` exceeds this [-].
-        min_spread: Refused when the inliers extend over less than this along their main axis [m].
-        max_sigma_position: Refused when the translation is less certain than this in any direction [m].
-        max_sigma_heading: Refused when the rotation is less certain than this [rad].
-        success_probability: That a random search meets the best alignment, and each rival that would make it
-            ambiguous [-].
-        max_samples: Bound on the minimal samples of that search, whatever the probability.
+        min_inliers: Minimum number of inliers, at least 3.
+        max_ratio: Largest `ratio` of an `Alignment` [-].
+        min_spread: Minimum extent of the inliers along their main axis [m].
+        max_sigma_position: Largest standard deviation of the translation in any direction [m].
+        max_sigma_heading: Largest standard deviation of the rotation [rad].
+        success_probability: Probability that a random search finds the best alignment, and each rival that would make
+            it ambiguous [-].
+        max_samples: Maximum number of minimal samples of that search.
     """
 
     appearance: bool = True
@@ -97,7 +96,7 @@ class AlignmentOptions:
 
     def __post_init__(self) -> None:
         if not isinstance(self.appearance, bool):
-            raise argument_error("options.appearance", "a bool", self.appearance, "Say True or False.")
+            raise argument_error("options.appearance", "a bool", self.appearance, "Give True or False.")
         above = ("descriptor_gate", "position_gate", "position_floor", "max_sigma_position", "max_sigma_heading")
         for name in above:
             check_float(f"options.{name}", getattr(self, name), "Give a positive number.", above=0.0, at_most=LARGEST)
@@ -109,8 +108,8 @@ class AlignmentOptions:
             )
         probability = self.success_probability
         check_float("options.success_probability", probability, "Use e.g. 0.999.", above=0.0, at_most=1.0 - 1e-12)
-        check_int("options.look_alikes", self.max_similar, 0, "Use 0 to demand that all stand out.", MAX_SIMILAR)
-        check_int("options.min_inliers", self.min_inliers, FEWEST_INLIERS, "Two fit any motion: demand more.", MOST)
+        check_int("options.max_similar", self.max_similar, 0, "Use 0 to require distinctive matches.", MAX_SIMILAR)
+        check_int("options.min_inliers", self.min_inliers, FEWEST_INLIERS, "A motion fits any two: require more.", MOST)
         check_int("options.max_samples", self.max_samples, 1, "Allow at least one sample.", MOST)
 
 
@@ -119,20 +118,20 @@ class Alignment:
     """The motion from map b to map a, p_a = R(theta) p_b + t, or a refusal.
 
     Attributes:
-        success: Whether the alignment is believed.
+        success: Whether the alignment is accepted.
         reason: Empty on success, else one of `REASONS`.
-        tx: Translation [m], frame a; NaN when refused.
-        ty: Likewise.
+        tx: Translation along x [m], frame a; NaN when refused.
+        ty: Translation along y [m], frame a; NaN when refused.
         theta: Rotation [rad] in [-pi, pi); NaN when refused.
         covariance: (3, 3) float64 [m, m, rad] of (tx, ty, theta); NaN when refused.
         inliers: (k, 2) int64 rows (index in map a, index in map b), one-to-one; none when refused.
-        ratio: How near the best alignment that differs (by more than 0.5 m or 5 degrees) comes to this one: its own
-            inliers, over this one's own or half of this one's if those are more; own are those that the other has not.
-            0 if there was none.
-        missed: Of a refusal as "too uncertain" the bound that is missed most, one of `BOUNDS`: the standard deviation
-            of the translation or of the rotation, the shift by leaving one match out; in a team also the spread that
-            the robots' paths leave open, or the change since the last trial; else empty.
-        excess: The missed figure over its bound, above 1 [-]; NaN where none is missed.
+        ratio: Support of the best different alignment (by more than 0.5 m or 5 degrees) relative to this one: its
+            exclusive inliers over the exclusive inliers of this one, or over half of all inliers if that is more. 0 if
+            there is no other.
+        missed: Bound that a "too uncertain" refusal exceeds most, one of `BOUNDS`: standard deviation of the
+            translation or of the rotation, shift by leaving one match out; in a team also the uncertainty of the
+            robots' paths, or the change since the last trial. Else empty.
+        excess: Value of the missed bound over its limit, above 1 [-]; NaN if none is missed.
     """
 
     success: bool
@@ -149,23 +148,23 @@ class Alignment:
     def __post_init__(self) -> None:
         if self.reason not in (REASONS if not self.success else ("",)):
             expected = "'' on success, else one of " + ", ".join(REASONS)
-            raise argument_error("reason", expected, self.reason, "Name why it was refused.")
-        cure = "A successful alignment has a finite motion and covariance."
-        pose = check_array("tx, ty, theta", (self.tx, self.ty, self.theta), (3,), cure, finite=self.success)
+            raise argument_error("reason", expected, self.reason, "Give the reason of the refusal.")
+        hint = "A successful alignment has a finite motion and covariance."
+        pose = check_array("tx, ty, theta", (self.tx, self.ty, self.theta), (3,), hint, finite=self.success)
         for name, value in zip(("tx", "ty", "theta"), pose, strict=True):
             object.__setattr__(self, name, float(value))
-        covariance = check_array("covariance", self.covariance, (3, 3), cure, finite=self.success)
+        covariance = check_array("covariance", self.covariance, (3, 3), hint, finite=self.success)
         inliers = check_array("inliers", self.inliers, (None, 2), "Give rows (a, b).", dtype=np.int64)
         for name, array in (("covariance", covariance), ("inliers", inliers)):
             object.__setattr__(self, name, as_read_only(array))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Let copies and what was pickled be read-only, too."""
+        """Keep copies and unpickled alignments read-only."""
         return Alignment, tuple(getattr(self, field.name) for field in fields(self))
 
     @property
     def transform(self) -> FloatArray:
-        """The motion (3,) = a_from_b [m, m, rad]; NaN when refused."""
+        """Motion (3,) a_from_b [m, m, rad]; NaN when refused."""
         return np.array([self.tx, self.ty, self.theta])
 
     @classmethod
@@ -177,17 +176,17 @@ class Alignment:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PairAttempts:
-    """The attempts of one pair of groups to align their maps.
+    """Attempts of one pair of groups to align their maps.
 
     Attributes:
-        robots_a: The one group, as it was then.
-        robots_b: The other group.
-        attempts: How many there were.
-        refusals: Refused attempts by reason, one of `REASONS` each, in that order.
+        robots_a: Robots of the first group at that time.
+        robots_b: Robots of the second group.
+        attempts: Number of attempts.
+        refusals: Number of refused attempts by reason, in the order of `REASONS`.
         last_reason: Reason of the last refusal; empty if there was none.
         last_step: Step of the last refusal; None if there was none.
         missed: Bound that the last refusal missed, see `Alignment.missed`.
-        excess: Figure of that bound over the bound, see `Alignment.excess`.
+        excess: Value of that bound over its limit, see `Alignment.excess`.
     """
 
     robots_a: tuple[int, ...]
@@ -201,20 +200,20 @@ class PairAttempts:
 
 
 def count_attempts(events: Iterable[MergeEvent]) -> tuple[PairAttempts, ...]:
-    """Return what came of the attempts of each pair of groups, in order of their first attempts.
+    """Return the attempts of each pair of groups, in order of their first attempts.
 
     Args:
-        events: All events of a team, in order; merges and undos do not count.
+        events: All events of a team, in order; merges and undos are ignored.
     """
     tried: dict[tuple[tuple[int, ...], tuple[int, ...]], list[MergeEvent]] = {}
     for event in events:
         if event.kind == "attempt":
             tried.setdefault((event.robots_a, event.robots_b), []).append(event)
-    return tuple(_of_pair(own) for own in tried.values())
+    return tuple(_of_pair(attempts) for attempts in tried.values())
 
 
 def refusals_of(events: Iterable[MergeEvent], robot: int) -> dict[str, float]:
-    """Return how many attempts a robot's groups made, and how many were refused for each reason.
+    """Return the number of attempts of a robot's groups, and the number of refusals for each reason.
 
     Args:
         events: All events of a team.
@@ -223,14 +222,14 @@ def refusals_of(events: Iterable[MergeEvent], robot: int) -> dict[str, float]:
     Returns:
         `attempts`, and for each of `REASONS` a key such as `refused_too_uncertain`.
     """
-    own = [event for event in events if event.kind == "attempt" and robot in event.robots_a + event.robots_b]
-    counts = Counter(event.alignment.reason for event in own)
-    named = {f"refused_{reason.replace(' ', '_')}": float(counts[reason]) for reason in REASONS}
-    return {"attempts": float(len(own))} | named
+    attempts = [event for event in events if event.kind == "attempt" and robot in event.robots_a + event.robots_b]
+    counts = Counter(event.alignment.reason for event in attempts)
+    refusals = {f"refused_{reason.replace(' ', '_')}": float(counts[reason]) for reason in REASONS}
+    return {"attempts": float(len(attempts))} | refusals
 
 
 def _of_pair(events: list[MergeEvent]) -> PairAttempts:
-    """Return the attempts of one pair, at least one."""
+    """Return the summary of one pair's attempts, at least one."""
     refused = [event for event in events if not event.alignment.success]
     counts = Counter(event.alignment.reason for event in refused)
     last = refused[-1] if refused else None

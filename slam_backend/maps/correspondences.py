@@ -1,4 +1,4 @@
-"""Candidate correspondences of two maps, by descriptor, as the table that the kernels of alignment read."""
+"""Candidate correspondences of two maps by descriptor, and their table for the alignment kernels."""
 
 from typing import TypeVar
 
@@ -11,16 +11,16 @@ from slam_backend.maps._kernels import descriptor_matching
 from slam_backend.maps.alignment_types import AlignmentOptions
 from slam_backend.maps.landmark_map import LandmarkMap
 
-MAX_PAIRS = 10_000  # candidates by geometry alone
+MAX_PAIRS = 10_000  # candidates without appearance
 
 
 def too_many(map_a: LandmarkMap, map_b: LandmarkMap, options: AlignmentOptions) -> bool:
-    """Tell whether two maps have more pairs than are tried without appearance."""
+    """Return whether two maps have more than `MAX_PAIRS` pairs without appearance."""
     return not options.appearance and len(map_a) * len(map_b) > MAX_PAIRS
 
 
 def candidates(map_a: LandmarkMap, map_b: LandmarkMap, options: AlignmentOptions) -> tuple[IntArray, BoolArray]:
-    """Return the candidates (k, 2), and which of them stand out (k,): these are one-to-one."""
+    """Return the candidates (k, 2), and the mask (k,) of distinctive ones, which are one-to-one."""
     if map_a.descriptors.shape[1] != map_b.descriptors.shape[1]:
         raise argument_error(
             "map_b",
@@ -31,7 +31,7 @@ def candidates(map_a: LandmarkMap, map_b: LandmarkMap, options: AlignmentOptions
     if too_many(map_a, map_b, options):
         raise argument_error(
             "map_b", f"at most {MAX_PAIRS} pairs of landmarks without appearance", len(map_a) * len(map_b),
-            "Give smaller maps, or tell landmarks apart.",
+            "Give smaller maps, or use appearance.",
         )  # fmt: skip
     if options.appearance:
         clear = mutual_nearest(map_a.descriptors, map_b.descriptors, options.descriptor_gate)
@@ -44,21 +44,21 @@ def candidates(map_a: LandmarkMap, map_b: LandmarkMap, options: AlignmentOptions
             alike = similar_pairs(map_a.descriptors, map_b.descriptors, options.descriptor_gate, options.max_similar)
     else:
         clear, alike = np.empty((0, 2), np.int64), np.argwhere(np.ones((len(map_a), len(map_b)), np.bool_))
-    names = np.concatenate([clear, alike]) @ np.array([max(len(map_b), 1), 1])
-    unique, first = np.unique(names, return_index=True)
+    codes = np.concatenate([clear, alike]) @ np.array([max(len(map_b), 1), 1])
+    unique, first = np.unique(codes, return_index=True)
     matches = np.column_stack([unique // max(len(map_b), 1), unique % max(len(map_b), 1)])
-    stands_out = first < len(clear)
+    distinctive = first < len(clear)
     rows_a, rows_b = matches.T
     climb = map_a.means[rows_a, 2] - map_b.means[rows_b, 2]
     variance = map_a.covariances[rows_a, 2, 2] + map_b.covariances[rows_b, 2, 2] + options.position_floor**2
     level = climb**2 <= options.position_gate * variance
-    return matches[level], stands_out[level]
+    return matches[level], distinctive[level]
 
 
 def has_enough_candidates(descriptors_a: Float32Array, descriptors_b: Float32Array, options: AlignmentOptions) -> bool:
-    """Tell by descriptors (n, d), (m, d) alone whether two maps may have candidates enough for an alignment.
+    """Return whether two maps with descriptors (n, d), (m, d) may have enough candidates for an alignment.
 
-    By appearance every candidate is a pair within the gate: so few of them are not worth making maps for.
+    With appearance every candidate is a pair within the gate; with too few of them no maps need to be built.
     """
     if not options.appearance or descriptors_a.shape[1] != descriptors_b.shape[1]:
         return True
@@ -66,7 +66,7 @@ def has_enough_candidates(descriptors_a: Float32Array, descriptors_b: Float32Arr
 
 
 def match_table(map_a: LandmarkMap, map_b: LandmarkMap, matches: IntArray) -> FloatArray:
-    """Return the table of matched landmarks that the kernels of alignment read.
+    """Return the table of matched landmarks for the alignment kernels.
 
     Args:
         map_a, map_b: Both maps.
@@ -83,13 +83,13 @@ Scalar = TypeVar("Scalar", bound=np.generic)
 
 
 def similar_pairs(a: Float32Array, b: Float32Array, gate: float, most: int) -> IntArray:
-    """Pair all descriptors within `gate`, but none that so pairs with more than `most`: those tell nothing.
+    """Pair all descriptors within `gate`, except those with more than `most` partners.
 
     Args:
         a: (n, d) float32 [-].
         b: (m, d) float32 [-].
         gate: Largest L2 distance of a pair [-].
-        most: Most partners of one.
+        most: Maximum number of partners of a descriptor.
 
     Returns:
         (k, 2) int64 rows (index in a, index in b), by rising index in a, then in b; k <= n `most`.
@@ -100,12 +100,12 @@ def similar_pairs(a: Float32Array, b: Float32Array, gate: float, most: int) -> I
 
 
 def count_similar(a: Float32Array, b: Float32Array, gate: float) -> int:
-    """Return how many pairs of descriptors (n, d) and (m, d) are no farther apart than `gate`."""
+    """Return the number of pairs of descriptors (n, d) and (m, d) within `gate`."""
     return descriptor_matching.alike(_fresh(a), _fresh(b.T), gate * gate, 0)[1] if len(a) and len(b) else 0
 
 
 def mutual_nearest(a: Float32Array, b: Float32Array, gate: float) -> IntArray:
-    """Pair descriptors that are each other's nearest and no farther apart than `gate`.
+    """Pair descriptors that are mutual nearest neighbours within `gate`.
 
     Args:
         a: (n, d) float32 [-].
@@ -128,23 +128,23 @@ def passes_ratio_test(
     same_place: float,
     ratio: float,
 ) -> BoolArray:
-    """Tell which matches stand out from all landmarks that lie elsewhere (the ratio test).
+    """Return the mask of matches that pass the ratio test against landmarks at other places.
 
     Args:
-        descriptors: (k, d) float32 [-]. Of the matched landmarks in the one map.
-        partners: (k,) int64. Their partners in the other map.
+        descriptors: (k, d) float32 [-]. Descriptors of the matched landmarks in one map.
+        partners: (k,) int64. Matched rows in the other map.
         others: (m, d) float32 [-]. All descriptors of the other map.
         positions: (m, 3) float64 [m]. All positions in the other map.
-        same_place: Landmarks within this distance [m] of the partner do not compete: they may be its duplicates.
-        ratio: A match must be closer than this times the best competitor [-].
+        same_place: Distance [m] from the partner within which landmarks may be duplicates and do not compete.
+        ratio: Largest distance of a match over that of the best competitor [-].
 
     Returns:
-        (k,) mask of the matches that pass. Without any competitor a match passes.
+        Mask (k,) of the matches that pass; a match without competitors passes.
     """
     arrays = _fresh(descriptors), _fresh(partners), _fresh(others.T), _fresh(positions)
     return descriptor_matching.ratio_test_mask(*arrays, same_place, ratio)
 
 
 def _fresh(array: NDArray[Scalar]) -> NDArray[Scalar]:
-    """Return a copy of one kind of memory, because numba compiles a kernel again for each other kind."""
+    """Return a writable C-ordered copy, because numba compiles a kernel for each array layout."""
     return np.array(array, order="C")

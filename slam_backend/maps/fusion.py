@@ -1,4 +1,4 @@
-"""Two maps whose frames are known to each other become one: Eqs. 13-17, corrected where the printed form is wrong."""
+"""Fusion of two aligned maps (Eqs. 13-17, corrected where the printed form is wrong)."""
 
 from typing import Any
 
@@ -26,8 +26,8 @@ def fuse_landmarks(
         Means (..., 3) and covariances (..., 3, 3), symmetric, equal to (Sigma_1^-1 + Sigma_2^-1)^-1.
 
     Raises:
-        ValueError: If an argument is no such array, or both estimates are exact along one direction: they can only
-            contradict each other.
+        ValueError: If an argument is not such an array, or both estimates are exact along one direction, so that no
+            weighted mean exists.
 
     >>> fuse_landmarks([0.0, 0.0, 0.0], np.eye(3), [3.0, 0.0, 0.0], 2.0 * np.eye(3))[0].round(12).tolist()
     [1.0, 0.0, 0.0]
@@ -37,30 +37,30 @@ def fuse_landmarks(
     try:
         gain = _transposed(np.linalg.solve(sigma1 + sigma2, sigma1))  # Eq. 13
     except np.linalg.LinAlgError as error:
-        cure = "Give each landmark some uncertainty in every direction."
-        raise argument_error("cov1 + cov2", "positive definite matrices", "a singular one", cure) from error
+        hint = "Give each landmark some uncertainty in every direction."
+        raise argument_error("cov1 + cov2", "positive definite matrices", "a singular one", hint) from error
     mean = mu1 + (gain @ (mu2 - mu1)[..., None])[..., 0]  # Eq. 14, with mu2 - mu1: printed, it moves away from mu2
     rest = np.eye(3) - gain
-    # Eq. 15, of Sigma_1 and not of mu_1, in the form that stays symmetric and positive whatever the rounding.
+    # Eq. 15, with Sigma_1 instead of mu_1, in Joseph form, which stays symmetric and positive under rounding.
     covariance = rest @ sigma1 @ _transposed(rest) + gain @ sigma2 @ _transposed(gain)
     return mean, 0.5 * (covariance + _transposed(covariance))
 
 
 def _estimate(name: str, value: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
-    """Return `value` as an array whose last axes have a shape, or raise."""
+    """Return `value` as an array (..., *shape), or raise."""
     expected = f"an array of shape (..., {', '.join(map(str, shape))})"
-    cure = "Give one row, or one matrix, per landmark."
+    hint = "Give one row, or one matrix, per landmark."
     try:
         array = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise argument_error(name, expected, value, cure) from error
+        raise argument_error(name, expected, value, hint) from error
     if array.shape[-len(shape) :] != shape:
-        raise argument_error(name, expected, f"shape {array.shape}", cure)
+        raise argument_error(name, expected, f"shape {array.shape}", hint)
     return array
 
 
 def alignment_jacobian(theta: float, points_b: ArrayLike) -> FloatArray:
-    """Return how points moved from b to a react to (tx, ty, theta): J = [e_x, e_y, dR/dtheta p_b].
+    """Return the Jacobian of points moved from b to a by (tx, ty, theta): J = [e_x, e_y, dR/dtheta p_b].
 
     Args:
         theta: Rotation of the alignment [rad].
@@ -72,15 +72,15 @@ def alignment_jacobian(theta: float, points_b: ArrayLike) -> FloatArray:
     points = np.asarray(points_b, dtype=np.float64)
     jacobian = np.zeros((*points.shape, 3))
     jacobian[..., 0, 0] = jacobian[..., 1, 1] = 1.0
-    jacobian[..., :2, 2] = points[..., :2] @ rotation(theta + 0.5 * np.pi).T  # dR/dtheta is R turned on by 90 degrees
+    jacobian[..., :2, 2] = points[..., :2] @ rotation(theta + 0.5 * np.pi).T  # dR/dtheta is R turned by 90 degrees
     return jacobian
 
 
 def move_covariances(alignment: Alignment, points_b: ArrayLike, covariances_b: FloatArray) -> FloatArray:
-    """Express covariances of landmarks in frame a, the alignment's own uncertainty included (Eqs. 16-17).
+    """Return covariances of landmarks in frame a, the uncertainty of the alignment included (Eqs. 16-17).
 
     Args:
-        alignment: A successful one, a from b.
+        alignment: Successful alignment, a from b.
         points_b: (..., 3) float64 [m], frame b.
         covariances_b: (..., 3, 3) float64 [m^2], frame b.
 
@@ -88,7 +88,7 @@ def move_covariances(alignment: Alignment, points_b: ArrayLike, covariances_b: F
         (..., 3, 3): R Sigma R^T + J Sigma_align J^T.
     """
     jacobian = alignment_jacobian(alignment.theta, points_b)
-    # Eq. 16, as R Sigma R^T because p_a = R p_b + t, plus what the alignment itself does not know.
+    # Eq. 16, as R Sigma R^T because p_a = R p_b + t, plus the uncertainty of the alignment.
     moved = rotate_covariances(alignment.theta, covariances_b) + jacobian @ alignment.covariance @ _transposed(jacobian)
     return np.asarray(0.5 * (moved + _transposed(moved)))
 
@@ -96,17 +96,17 @@ def move_covariances(alignment: Alignment, points_b: ArrayLike, covariances_b: F
 def fuse_descriptors(
     descriptors1: NDArray[np.float32], counts1: ArrayLike, descriptors2: NDArray[np.float32], counts2: ArrayLike
 ) -> NDArray[np.float32]:
-    """Average descriptors by their counts and restore their length, so that distances keep their meaning (Sec. 3.2).
+    """Average descriptors weighted by counts and restore their length, to keep distances comparable (Sec. 3.2).
 
     Args:
         descriptors1: (..., d) float32 [-].
-        counts1: (...) How many measurements each is made of.
+        counts1: (...) Number of measurements of each first descriptor.
         descriptors2: (..., d) float32 [-].
-        counts2: (...) Likewise.
+        counts2: (...) Number of measurements of each second descriptor.
 
     Returns:
-        (..., d) float32: along the weighted mean, as long as the weighted mean of the two lengths; opposite
-        descriptors that cancel leave the first.
+        (..., d) float32 in the direction of the weighted mean, with the weighted mean of the two lengths; the first
+        descriptor if the two cancel.
     """
     one, two = np.asarray(descriptors1, dtype=np.float64), np.asarray(descriptors2, dtype=np.float64)
     n1, n2 = np.asarray(counts1, dtype=np.float64)[..., None], np.asarray(counts2, dtype=np.float64)[..., None]
@@ -119,30 +119,30 @@ def fuse_descriptors(
 
 
 def fuse_maps(map_a: LandmarkMap, map_b: LandmarkMap, alignment: Alignment) -> LandmarkMap:
-    """Merge map b into map a: inliers are fused, the other landmarks of b are moved and appended.
+    """Fuse map b with map a: inliers are fused, the other landmarks of b are moved and appended.
 
     Args:
-        map_a: The map whose frame, order and ids stay.
-        map_b: The other map. Fused landmarks take the id of a; the others keep theirs, or get a fresh one above all
-            ids of both maps where a uses it already.
-        alignment: A successful one, of exactly these maps.
+        map_a: Map whose frame, order and ids stay.
+        map_b: Other map. Fused landmarks take the id of a; the others keep theirs, or get a new one above all ids of
+            both maps if a uses it already.
+        alignment: Successful alignment of these two maps.
 
     Returns:
-        A new map in a's frame: all of a's rows, then b's that were not fused. Counts are added.
+        A new map in a's frame: all rows of a, then the rows of b that were not fused. Counts are added.
 
     Raises:
-        ValueError: If an argument is of another kind, the alignment was refused, names landmarks that do not exist or
-            the same one twice, or the descriptors differ in size.
+        ValueError: If an argument has the wrong type, the alignment was refused, an inlier is out of range or repeated,
+            or the descriptors differ in size.
     """
     check_kind("map_a", map_a, LandmarkMap), check_kind("map_b", map_b, LandmarkMap)
     check_kind("alignment", alignment, Alignment, "Give what align_maps(map_a, map_b) returned.")
     if not alignment.success:
-        cure = "Fuse maps only after a successful alignment."
-        raise argument_error("alignment", "a successful alignment", f"a refusal: {alignment.reason}", cure)
+        hint = "Fuse maps only after a successful alignment."
+        raise argument_error("alignment", "a successful alignment", f"a refusal: {alignment.reason}", hint)
     if map_a.descriptors.shape[1] != map_b.descriptors.shape[1]:
         expected = f"descriptors of size {map_a.descriptors.shape[1]}, as in map_a"
-        cure = "Describe the landmarks of both maps with the same front end."
-        raise argument_error("map_b", expected, map_b.descriptors.shape[1], cure)
+        hint = "Describe the landmarks of both maps with the same front end."
+        raise argument_error("map_b", expected, map_b.descriptors.shape[1], hint)
     check_inliers(alignment.inliers, len(map_a), len(map_b))
     rows_a, rows_b = alignment.inliers.T
     means_b = transform_points(alignment.transform, map_b.means)
@@ -173,22 +173,22 @@ def check_inliers(inliers: IntArray, size_a: int, size_b: int) -> None:
 
     Args:
         inliers: (k, 2) int64. Rows of either map.
-        size_a: Landmarks of the first map.
-        size_b: Landmarks of the second.
+        size_a: Number of landmarks of the first map.
+        size_b: Number of landmarks of the second map.
 
     Raises:
-        ValueError: If a row lies outside or comes twice.
+        ValueError: If a row is out of range or repeated.
     """
     outside = (inliers < 0) | (inliers >= np.array([size_a, size_b]))
     repeated = any(len(np.unique(column)) < len(column) for column in inliers.T)
     if outside.any() or repeated:
         expected = f"one-to-one pairs of rows below {size_a} and {size_b}"
-        got = "an index outside" if outside.any() else "a row that repeats"
+        got = "an index out of range" if outside.any() else "a repeated row"
         raise argument_error("alignment.inliers", expected, got, "Fuse the two maps that were aligned.")
 
 
 def _fresh_ids(ids_a: IntArray, ids_b: IntArray, added: IntArray) -> IntArray:
-    """Return ids for the rows `added` of b: their own, or new numbers where a uses them already."""
+    """Return ids for the rows `added` of b: their own, or new ones if a uses them already."""
     ids = ids_b[added].copy()
     taken = np.isin(ids, ids_a)
     first = 1 + max(ids_a.max(initial=-1), ids_b.max(initial=-1))

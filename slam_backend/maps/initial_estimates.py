@@ -1,4 +1,4 @@
-"""Where an alignment begins: each method's own estimate of the motion, from candidate matches or from closeness alone.
+"""Initial estimates of the motion between two maps, from candidate matches or nearest landmarks.
 
 `svd` is the closed form over all candidates. `icp` is that of Besl and McKay (1992), which pairs each landmark with the
 closest, with far pairs left out as by Zhang (1994), because maps overlap only in part. `impicp` is the improved ICP of
@@ -17,20 +17,20 @@ from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.metrics import align_se2
 
 ICP_ROUNDS = 50
-ICP_FAR = 3.0  # pairs farther apart than this times the median are left out
+ICP_FAR = 3.0  # largest distance of a pair over the median
 GNC_FACTOR = 1.4  # growth of the control parameter per round (Yang et al., Sec. V)
 GNC_ROUNDS = 100
-MOST_IN_GRAPH = 1000  # candidates in a graph: a megabyte of pairs
-MAX_NODES = 20_000  # branchings of the search for a clique
+MOST_IN_GRAPH = 1000  # candidates in a graph, one megabyte of pairs
+MAX_NODES = 20_000  # nodes of the clique search
 
 
 def icp(map_a: LandmarkMap, map_b: LandmarkMap, start: FloatArray) -> FloatArray:
-    """Return where iterated pairing with the closest landmark leads (ICP).
+    """Return the motion (3,) of iterative closest point (ICP).
 
     Args:
-        map_a: The map whose frame the result leads to.
-        map_b: The other.
-        start: (3,) First motion a_from_b [m, m, rad].
+        map_a: Map in the target frame a.
+        map_b: Map in frame b.
+        start: (3,) Initial motion a_from_b [m, m, rad].
     """
     from scipy.spatial import KDTree  # slow to import, and not always needed
 
@@ -50,9 +50,9 @@ def icp(map_a: LandmarkMap, map_b: LandmarkMap, start: FloatArray) -> FloatArray
 def improved_icp(
     map_a: LandmarkMap, map_b: LandmarkMap, matches: IntArray, table: FloatArray, floor: float, gate: float
 ) -> FloatArray:
-    """Return the better end of ICP from two starts: all candidates, and the half of them that look most alike.
+    """Return the better result of ICP from two starts: all candidates, and the half with the most similar descriptors.
 
-    The better end is the one that more candidates support, weighed by how well they fit.
+    The better result has the larger support of candidates, weighted by their fit.
     """
     unlike = np.linalg.norm(map_a.descriptors[matches[:, 0]] - map_b.descriptors[matches[:, 1]], axis=1)
     closer = matches[unlike <= np.median(unlike)]
@@ -68,7 +68,7 @@ def gnc_tls(table: FloatArray, floor: float, gate: float) -> FloatArray:
     Args:
         table: (k, 18) candidates.
         floor: Variance added to each residual [m^2].
-        gate: Squared residual c^2, in units of its variance, beyond which a match counts no more.
+        gate: Squared residual c^2, in units of its variance, at which the cost of a match is truncated.
     """
     a, b = kernels.planar_points(table)
     # The solver inside is a closed form, which asks for one variance per match in place of a covariance.
@@ -94,14 +94,14 @@ def gnc_tls(table: FloatArray, floor: float, gate: float) -> FloatArray:
 
 
 def clique_estimate(table: FloatArray, matches: IntArray, unlike: FloatArray, floor: float, gate: float) -> FloatArray:
-    """Return the motion (3,) fitted to the largest set of candidates whose distances agree pairwise.
+    """Return the motion (3,) fitted to the largest set of candidates with pairwise consistent distances.
 
     Args:
         table: (k, 18) candidates.
-        matches: (k, 2) their rows (a, b).
-        unlike: (k,) Distances of their descriptors: of too many candidates those that look most alike are taken.
+        matches: (k, 2) rows (a, b) of the candidates.
+        unlike: (k,) Descriptor distances; of more than `MOST_IN_GRAPH` candidates the most similar are used.
         floor: Variance added in each map [m^2].
-        gate: Of the test for agreement.
+        gate: Gate of the consistency test.
     """
     chosen = np.sort(np.argsort(unlike, kind="stable")[:MOST_IN_GRAPH])
     agrees = cliques.agreement(table[chosen], matches[chosen], floor, gate)

@@ -1,4 +1,4 @@
-"""A map of landmarks: positions with covariances, descriptors, counts and ids, in one frame."""
+"""Landmark maps: positions with covariances, descriptors, counts and ids in one frame."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ FIELDS = ("means", "covariances", "descriptors", "counts", "ids")
 
 
 class MapSummary(NamedTuple):
-    """What can be asked of a map at every step, for it costs microseconds: no descriptors, no whole covariances.
+    """Summary of a map without descriptors and full covariances, cheap enough for every step.
 
     Attributes:
         means: (N, 3) float64 [m].
@@ -37,58 +37,58 @@ class MapSummary(NamedTuple):
 
 
 class MapSummaryRows(NamedTuple):
-    """Outlines of one map or several, one after the other, in as few arrays as can be: kernels pay for each.
+    """Concatenated summaries of one or more maps in two arrays, because each array argument of a kernel costs time.
 
     Attributes:
-        positions: (N, 4) float64 [m, m, m, m^2]. `means` and `variances`.
-        counts_and_ids: (N, 2) int64. `counts` and `ids`.
+        positions: (N, 4) float64 [m, m, m, m^2]. Columns `means` and `variances` of `MapSummary`.
+        counts_and_ids: (N, 2) int64. Columns `counts` and `ids` of `MapSummary`.
     """
 
     positions: FloatArray
     counts_and_ids: IntArray
 
     @classmethod
-    def allocate(cls, room: int) -> Self:
-        """Return room for so many landmarks."""
-        return cls(np.empty((room, 4)), np.empty((room, 2), np.int64))
+    def allocate(cls, size: int) -> Self:
+        """Return uninitialised rows for `size` landmarks."""
+        return cls(np.empty((size, 4)), np.empty((size, 2), np.int64))
 
     @classmethod
-    def of(cls, outlines: Sequence[MapSummary]) -> Self:
-        """Return these behind one another."""
-        means, variances, counts, ids = map(np.concatenate, zip(*outlines, strict=True))
+    def of(cls, summaries: Sequence[MapSummary]) -> Self:
+        """Return the concatenated summaries."""
+        means, variances, counts, ids = map(np.concatenate, zip(*summaries, strict=True))
         return cls(np.column_stack([means, variances]), np.column_stack([counts, ids]))
 
     def part(self, first: int, last: int) -> MapSummary:
-        """Return the outline of these landmarks; it shares memory with this."""
-        places, names = self.positions[first:last], self.counts_and_ids[first:last]
-        return MapSummary(places[:, :3], places[:, 3], names[:, 0], names[:, 1])
+        """Return the summary of rows `first` to `last`, as views."""
+        positions, integers = self.positions[first:last], self.counts_and_ids[first:last]
+        return MapSummary(positions[:, :3], positions[:, 3], integers[:, 0], integers[:, 1])
 
 
 class TeamMapSummaries(NamedTuple):
-    """The outlines of the maps that the robots of a team go by.
+    """Summaries of the maps that the robots of a team use.
 
     Attributes:
-        rows: The landmarks of all maps; those in no part mean nothing.
-        parts: (K, 2) int64. Where each robot's map begins in `rows`, and where it ends; robots of one filter share one.
+        rows: Landmarks of all maps; rows outside all parts are undefined.
+        parts: (K, 2) int64. First row and end of each robot's map in `rows`; robots of one filter share a map.
     """
 
     rows: MapSummaryRows
     parts: IntArray
 
     @classmethod
-    def allocate(cls, num_robots: int, room: int) -> Self:
-        """Return room for the maps of K robots with so many landmarks in all."""
-        return cls(MapSummaryRows.allocate(room), np.empty((num_robots, 2), np.int64))
+    def allocate(cls, num_robots: int, size: int) -> Self:
+        """Return uninitialised summaries for K robots with `size` landmarks in all."""
+        return cls(MapSummaryRows.allocate(size), np.empty((num_robots, 2), np.int64))
 
     @classmethod
-    def from_maps(cls, outlines: Sequence[MapSummary]) -> Self:
-        """Return these, one for each robot, behind one another."""
-        ends = np.cumsum([len(outline.ids) for outline in outlines])
+    def from_maps(cls, summaries: Sequence[MapSummary]) -> Self:
+        """Return the summaries of a team from one for each robot."""
+        ends = np.cumsum([len(summary.ids) for summary in summaries])
         parts = np.column_stack([np.concatenate([[0], ends[:-1]]), ends])
-        return cls(MapSummaryRows.of(outlines), parts.astype(np.int64))
+        return cls(MapSummaryRows.of(summaries), parts.astype(np.int64))
 
     def of(self, robot: int) -> MapSummary:
-        """Return that of one robot; it shares memory with this."""
+        """Return the summary of one robot's map, as views."""
         return self.rows.part(*self.parts[robot])
 
 
@@ -96,14 +96,14 @@ class TeamMapSummaries(NamedTuple):
 class LandmarkMap:
     """The landmarks l_k = (mu_k, Sigma_k, d_k) of one map (Sec. 3.2), all in the same frame.
 
-    The arrays are read-only copies of what was given.
+    The arrays are read-only copies of the arguments.
 
     Attributes:
         means: (N, 3) float64 [m]. Positions (mu).
         covariances: (N, 3, 3) float64 [m^2]. Symmetric, positive semi-definite (Sigma).
         descriptors: (N, d) float32 [-]. Appearance vectors (d_k), of unit length if matches are gated by distance.
-        counts: (N,) int64. How many measurements each landmark is made of; by default one each.
-        ids: (N,) int64. Stable names, unique and >= 0; by default 0 .. N - 1.
+        counts: (N,) int64. Number of measurements of each landmark; by default 1.
+        ids: (N,) int64. Stable ids, unique and >= 0; by default 0 .. N - 1.
 
     Raises:
         ValueError: If a shape is wrong, a number is not finite, a covariance is not symmetric positive semi-definite,
@@ -120,26 +120,26 @@ class LandmarkMap:
     ids: IntArray = None  # type: ignore[assignment]   # replaced by 0 .. N - 1
 
     def __post_init__(self) -> None:
-        cure = "Give one row per landmark."
-        means = check_array("means", self.means, (None, 3), cure + " Drop landmarks that are not finite.")
+        hint = "Give one row per landmark."
+        means = check_array("means", self.means, (None, 3), hint + " Drop landmarks that are not finite.")
         n = len(means)
         fields: dict[str, NDArray[Any]] = {
             "means": means,
             "covariances": _checked_covariances(self.covariances, n),
-            "descriptors": check_array("descriptors", self.descriptors, (n, None), cure, dtype=np.float32),
+            "descriptors": check_array("descriptors", self.descriptors, (n, None), hint, dtype=np.float32),
             "counts": np.ones(n, np.int64) if self.counts is None else _checked_integers("counts", self.counts, n, 1),
             "ids": np.arange(n) if self.ids is None else _checked_integers("ids", self.ids, n, 0),
         }
         values, repeats = np.unique(fields["ids"], return_counts=True)
         if n and repeats.max() > 1:
             raise argument_error(
-                "ids", "unique ids", f"a repeated id {int(values[repeats.argmax()])}", "Give each its own name."
+                "ids", "unique ids", f"a repeated id {int(values[repeats.argmax()])}", "Give each landmark its own id."
             )
         for name, array in fields.items():
             object.__setattr__(self, name, as_read_only(array))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Let copies and what was pickled be read-only, too; the constructor might change covariances by rounding."""
+        """Keep copies and unpickled maps read-only, without the constructor, which may round covariances."""
         return unchecked_map, tuple(getattr(self, name) for name in FIELDS)
 
     def __len__(self) -> int:
@@ -147,9 +147,9 @@ class LandmarkMap:
 
     @property
     def summary(self) -> MapSummary:
-        """Its places, spreads, counts and names, in the map's order."""
-        spread = self.covariances
-        return MapSummary(self.means, spread[:, 0, 0] + spread[:, 1, 1] + spread[:, 2, 2], self.counts, self.ids)
+        """Positions, variances, counts and ids, in the map's order."""
+        sigma = self.covariances
+        return MapSummary(self.means, sigma[:, 0, 0] + sigma[:, 1, 1] + sigma[:, 2, 2], self.counts, self.ids)
 
     @classmethod
     def empty(cls, descriptor_size: int = 64) -> Self:
@@ -158,17 +158,17 @@ class LandmarkMap:
         return cls(np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, descriptor_size), np.float32))
 
     def moved(self, a_from_b: ArrayLike) -> "LandmarkMap":
-        """Express this map, given in frame b, in frame a; the motion is taken as exact.
+        """Return this map, given in frame b, in frame a; the motion is assumed exact.
 
         Args:
             a_from_b: (3,) float64 [m, m, rad]. Pose of frame b in frame a. `fusion.move_covariances` adds the
-                uncertainty of a motion that was estimated.
+                uncertainty of an estimated motion.
 
         Returns:
-            A new map: means R mu + t, covariances R Sigma R^T, the rest shared with this one.
+            A new map with means R mu + t and covariances R Sigma R^T; other arrays are shared.
 
         Raises:
-            ValueError: If `a_from_b` is no pose.
+            ValueError: If `a_from_b` is not a pose.
         """
         pose = check_array("a_from_b", a_from_b, (3,), "Give a pose (x, y, theta).")
         return unchecked_map(
@@ -180,30 +180,30 @@ class LandmarkMap:
         )
 
     def subset(self, indices: ArrayLike) -> "LandmarkMap":
-        """Return some of the landmarks, in the order asked for.
+        """Return a map of some of the landmarks, in the order of the indices.
 
         Args:
-            indices: (k,) integers, each at most once, or (N,) bool, a mask.
+            indices: (k,) integers without repetition, or a mask (N,) bool.
 
         Raises:
-            ValueError: If they are neither, or name a landmark twice or one that is not there.
+            ValueError: If they are neither, or an index is repeated or out of range.
         """
         chosen = np.asarray(indices)
         if chosen.dtype == np.bool_ and chosen.shape == (len(self),):
             return unchecked_map(*(getattr(self, name)[chosen] for name in FIELDS))
-        cure = f"Give integers from 0 to {len(self) - 1}, or a mask of shape ({len(self)},)."
+        hint = f"Give integers from 0 to {len(self) - 1}, or a mask of shape ({len(self)},)."
         if chosen.ndim != 1 or not (chosen.size == 0 or np.issubdtype(chosen.dtype, np.integer)):
-            raise argument_error("indices", "(k,) integers or a mask", f"an array {chosen.dtype} {chosen.shape}", cure)
+            raise argument_error("indices", "(k,) integers or a mask", f"an array {chosen.dtype} {chosen.shape}", hint)
         rows = chosen.astype(np.int64)
         if rows.size and (rows.min() < 0 or rows.max() >= len(self) or len(np.unique(rows)) < len(rows)):
-            raise argument_error("indices", "rows of the map, each at most once", rows.tolist(), cure)
+            raise argument_error("indices", "rows of the map, each at most once", rows.tolist(), hint)
         return unchecked_map(*(getattr(self, name)[rows] for name in FIELDS))
 
     def save(self, path: str | Path) -> None:
-        """Write the map to `path`, exactly as named, as a numpy archive that `load` reads back bit for bit.
+        """Write the map to `path`, with no suffix added, as a numpy archive that `load` reads back bit for bit.
 
         Raises:
-            ValueError: If the file cannot be written; an old one of that name is then unchanged.
+            ValueError: If the file cannot be written; an existing file is then unchanged.
         """
         arrays: dict[str, Any] = {name: getattr(self, name) for name in FIELDS}
         packed = BytesIO()
@@ -212,7 +212,7 @@ class LandmarkMap:
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read a map that `save` wrote; nothing of the file is run.
+        """Read a map that `save` wrote; no code in the file is run.
 
         Raises:
             ValueError: If the file is missing, broken, of another kind or of another format version.
@@ -220,20 +220,20 @@ class LandmarkMap:
         path, expected = checked_path(path), "a file written by LandmarkMap.save"
         if not Path(path).is_file():
             raise argument_error("path", expected, "no such file", f"Check the path {str(path)!r}.")
-        cure = f"Save the map again; {str(path)!r} cannot be used."
+        hint = f"Save the map again; {str(path)!r} cannot be used."
         try:
             found = read_arrays(Path(path))
             kind, version = str(found["format"]), int(found["version"])
             arrays = {name: found[name] for name in FIELDS} if version == FORMAT_VERSION else {}
         except (ValueError, KeyError, TypeError) as error:
-            raise argument_error("path", expected, "a broken file", cure) from error
+            raise argument_error("path", expected, "a broken file", hint) from error
         if kind != FORMAT or version != FORMAT_VERSION:
-            raise argument_error("path", f"{FORMAT!r} version {FORMAT_VERSION}", f"{kind!r} version {version}", cure)
+            raise argument_error("path", f"{FORMAT!r} version {FORMAT_VERSION}", f"{kind!r} version {version}", hint)
         return cls(**arrays)  # type: ignore[arg-type]
 
 
 def _checked_covariances(value: Any, n: int) -> FloatArray:
-    """Return `value` as fresh (n, 3, 3) covariances, exactly symmetric, or raise."""
+    """Return `value` as new (n, 3, 3) covariances, exactly symmetric, or raise."""
     array: FloatArray = check_array("covariances", value, (n, 3, 3), "Give one 3x3 matrix per landmark.")
     transposed = array.transpose(0, 2, 1)
     if not np.allclose(array, transposed, rtol=1e-6, atol=1e-12):
@@ -251,19 +251,19 @@ def _checked_covariances(value: Any, n: int) -> FloatArray:
 
 
 def _checked_integers(name: str, value: Any, n: int, minimum: int) -> IntArray:
-    """Return `value` as fresh (n,) integers >= `minimum`, or raise; whole numbers in floats are accepted."""
-    cure = f"Give one integer >= {minimum} per landmark."
-    as_float = check_array(name, value, (n,), cure)
+    """Return `value` as new (n,) integers >= `minimum`, or raise; whole numbers in floats are accepted."""
+    hint = f"Give one integer >= {minimum} per landmark."
+    as_float = check_array(name, value, (n,), hint)
     if n and (as_float.min() < minimum or (as_float != np.round(as_float)).any()):
-        raise argument_error(name, f"integers >= {minimum}", as_float.tolist(), cure)
-    array: IntArray = check_array(name, value, (n,), cure, dtype=np.int64)
+        raise argument_error(name, f"integers >= {minimum}", as_float.tolist(), hint)
+    array: IntArray = check_array(name, value, (n,), hint, dtype=np.int64)
     return array
 
 
 def unchecked_map(
     means: FloatArray, covariances: FloatArray, descriptors: NDArray[np.float32], counts: IntArray, ids: IntArray
 ) -> LandmarkMap:
-    """Build a map in a hot loop: no copies, no checks. The caller must not write to the arrays afterwards."""
+    """Build a map without copies and checks. The caller must not write to the arrays afterwards."""
     result = object.__new__(LandmarkMap)
     arrays: tuple[NDArray[Any], ...] = (means, covariances, descriptors, counts, ids)
     for name, array in zip(FIELDS, arrays, strict=True):

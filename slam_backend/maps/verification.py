@@ -1,4 +1,4 @@
-"""Verification of an alignment: its evidence, its rivals, and whether the scene repeats itself."""
+"""Verification of an alignment: chance, rivals, perceptual aliasing, mirror images, spread and uncertainty."""
 
 import math
 
@@ -11,25 +11,25 @@ from slam_backend.maps.alignment_types import DISTINCT_ROTATION, DISTINCT_TRANSL
 from slam_backend.maps.correspondences import match_table, similar_pairs
 from slam_backend.maps.landmark_map import LandmarkMap
 
-MOST_RECURRING = 0.2  # of the shared landmarks, but for the two that any motion can be made to fit
-NEEDLESS = 0.05  # how often a right alignment may be refused because chance makes a double: it is tried again later
-MOST_LANDMARKS = 200  # of a constellation that are looked at, every so many-th of it
-MOST_ALIKE = 50  # landmarks with more look-alikes than this tell nothing
-SAMPLES = 4000  # pairs of pairs that are tried
-STRONGEST = 3  # motions that are refined
+MOST_RECURRING = 0.2  # share of the shared landmarks, without the two that a motion can always fit
+NEEDLESS = 0.05  # rate of false refusals by a chance repetition; a later attempt may succeed
+MOST_LANDMARKS = 200  # landmarks of a constellation to test, evenly subsampled
+MOST_ALIKE = 50  # landmarks with more similar ones carry no information
+SAMPLES = 4000  # number of minimal samples
+STRONGEST = 3  # number of refined motions
 
 
 def has_perceptual_alias(landmarks: LandmarkMap, rows: IntArray, variance: float, options: AlignmentOptions) -> bool:
-    """Tell whether a constellation of a map occurs in it a second time, as far as two maps of one place agree.
+    """Return whether a constellation of landmarks occurs a second time in its map (perceptual aliasing).
 
-    It does if by some motion a fifth of its landmarks come to lie on landmarks that look like them, and so many would
-    do so by chance, among as many look-alikes spread over the map, in less than one of twenty maps.
+    It does if some motion takes a fifth of its landmarks to similar landmarks, and as many would match by chance, with
+    as many similar landmarks spread over the map, in less than one of twenty maps.
 
     Args:
-        landmarks: The map.
-        rows: (k,) int64. The constellation.
+        landmarks: Map to search.
+        rows: (k,) int64. Rows of the constellation.
         variance: Scale of the differences between the two maps [m^2].
-        options: Gates.
+        options: Gates of descriptors and positions.
     """
     points, variance = landmarks.means, max(variance, options.position_floor**2)
     rows = rows[:: 1 + len(rows) // MOST_LANDMARKS]
@@ -45,7 +45,7 @@ def has_perceptual_alias(landmarks: LandmarkMap, rows: IntArray, variance: float
     beyond = max(3, math.ceil(MOST_RECURRING * (len(rows) - 2)))
     if len(np.unique(matches[:, 0])) < beyond + 2:
         return False
-    table = match_table(landmarks, landmarks, matches[:, ::-1])  # motions take the constellation, as b, to its double
+    table = match_table(landmarks, landmarks, matches[:, ::-1])  # motions take the constellation b to its repetition
     count = len(matches) * (len(matches) - 1) // 2
     samples = np.random.default_rng(0).integers(0, count, min(SAMPLES, count))
     found = kernels.search(
@@ -65,7 +65,7 @@ def has_perceptual_alias(landmarks: LandmarkMap, rows: IntArray, variance: float
 def _chance(
     table: FloatArray, landmarks: LandmarkMap, matches: IntArray, size: int, variance: float, options: AlignmentOptions
 ) -> float:
-    """Return the mean probability that a landmark has a look-alike near where some motion takes it, by chance."""
+    """Return the mean probability that a motion takes a landmark near a similar one by chance."""
     spread = kernels.planar_variances(table) + variance
     area = np.prod(np.ptp(landmarks.means[:, :2], axis=0))
     share = np.minimum(np.pi * options.position_gate * spread / max(area, 1e-9), 1.0)
@@ -73,20 +73,20 @@ def _chance(
     return float((1.0 - np.exp(-np.bincount(owners, share))).sum() / size)
 
 
-RIVALS = 5  # most promising rivals that are refined
-FALSE_ALARMS = 1e-3  # expected number of sets of look-alikes that fit by chance as well
-# The mirror image is believed if it fits so many more matches, and these are a tenth of the inliers' number, or three
-# tenths of all that the motion leaves unexplained.
+RIVALS = 5  # number of refined rivals, most promising first
+FALSE_ALARMS = 1e-3  # expected number of equally good sets of similar landmarks by chance
+# The mirror image is accepted if it fits at least `MIRRORED` more matches, and these are a tenth of the number of
+# inliers, or three tenths of the matches that are no inliers.
 MIRRORED, OF_INLIERS, OF_REST = 3, 0.1, 0.3
 
 
 def one_to_one(matches: IntArray) -> bool:
-    """Tell whether no landmark appears twice in matches (k, 2)."""
+    """Return whether no landmark appears twice in matches (k, 2)."""
     return all(len(set(rows)) == len(rows) for rows in matches.T.tolist())
 
 
 def inlier_mask(table: FloatArray, matches: IntArray, pose: FloatArray, floor: float, gate: float) -> BoolArray:
-    """Tell which candidates (k,) lie within the gate under `pose`; of several of one landmark the closest, greedily."""
+    """Return the mask (k,) of candidates within the gate under `pose`, made one-to-one greedily by distance."""
     distances = kernels.squared_distances(table, pose, floor)
     inside = distances <= gate
     rows = np.flatnonzero(inside)
@@ -109,14 +109,14 @@ def is_chance_alignment(
     variance: float,
     options: AlignmentOptions,
 ) -> bool:
-    """Tell whether so many inliers would come together by chance somewhere among so many look-alikes.
+    """Return whether chance alone explains the number of inliers, given the number of similar landmarks.
 
-    Were all pairs wrong, a look-alike would be any landmark of map a, and fit if it lay near by chance; without
-    appearance, a landmark of b would lie anywhere in the area of map a, and fit if one is near there. The chance that
-    as many of b's landmarks fit as do, two of which any motion can be made to fit, times the number of pairs that a
-    motion can be made from, is how often that is expected at all: a number of false alarms (Moisan and Stival 2004).
-    All this at the scale of what is left between the maps, the fitted `variance`. Where candidates are one-to-one by
-    appearance, `min_inliers` alone decides.
+    Null hypothesis: all pairs are wrong. A similar landmark is then any landmark of map a, and fits if it is near by
+    chance; without appearance, a landmark of b lies anywhere in the area of map a, and fits if any landmark is near.
+    The probability of at least the observed number of inliers, not counting the two that a motion can always fit, times
+    the number of pairs that define a motion, is the expected number of false alarms (Moisan and Stival 2004). The scale
+    of the test is the fitted `variance` between the maps. If candidates are one-to-one by appearance, `min_inliers`
+    alone decides.
     """
     if one_to_one(matches):
         return False
@@ -129,7 +129,7 @@ def is_chance_alignment(
     if options.appearance:
         moved = transform_points(pose, kernels.planar_points(table)[1])
         near = KDTree(map_a.means[:, :2]).query_ball_point(moved, reach, return_length=True)
-        fitted = np.isin(matches[:, 1], matches[inside, 1])  # one of those near is the partner found, not chance
+        fitted = np.isin(matches[:, 1], matches[inside, 1])  # one of the near landmarks is the inlier itself
         share = (np.asarray(near, dtype=np.float64) - fitted).clip(min=0.0) / len(map_a)
     else:
         area = np.prod(np.ptp(map_a.means[:, :2], axis=0) + 2.0 * reach.mean())
@@ -150,7 +150,7 @@ def runner_up_ratio(
     centre_b: FloatArray,
     options: AlignmentOptions,
 ) -> float:
-    """Return how near the best hypothesis that differs even when refined comes to `pose`, as `Alignment.ratio` says."""
+    """Return the support of the best distinct hypothesis, after refinement, relative to `pose`: `Alignment.ratio`."""
     floor, gate = options.position_floor**2, options.position_gate
 
     ours = inlier_mask(table, matches, pose, variance, gate)
@@ -161,17 +161,17 @@ def runner_up_ratio(
         refined = kernels.refine(table, others[i].copy(), floor, gate)[0]
         if are_distinct(refined[None], pose, centre_b)[0]:
             theirs = inlier_mask(table, matches, refined, variance, gate)
-            own = max(float(np.count_nonzero(ours & ~theirs)), 0.5 * float(np.count_nonzero(ours)), 1.0)
-            strongest = max(strongest, float(np.count_nonzero(theirs & ~ours)) / own)
+            exclusive = max(float(np.count_nonzero(ours & ~theirs)), 0.5 * float(np.count_nonzero(ours)), 1.0)
+            strongest = max(strongest, float(np.count_nonzero(theirs & ~ours)) / exclusive)
     return strongest
 
 
 def is_mirrored(
     table: FloatArray, matches: IntArray, pose: FloatArray, inside: BoolArray, options: AlignmentOptions
 ) -> bool:
-    """Tell whether the mirror image about the line on which the inliers lie fits clearly more matches.
+    """Return whether the mirror image about the main axis of the inliers fits clearly more matches.
 
-    The one wall of a mirrored corridor fits a motion, too; but then all the rest fits the image.
+    One wall of a mirrored corridor also fits a motion; the other landmarks then fit the mirror image.
     """
     points = kernels.planar_points(table)[1][inside]
     centre = points.mean(axis=0)
@@ -184,7 +184,7 @@ def is_mirrored(
 
 
 def are_distinct(poses: FloatArray, pose: FloatArray, centre_b: FloatArray) -> BoolArray:
-    """Tell which of `poses` (h, 3) put the point `centre_b` (2,) elsewhere than `pose` does, or turn otherwise."""
+    """Return the mask of `poses` (h, 3) that move the point `centre_b` (2,) or rotate differently than `pose`."""
     cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     here = transform_points(pose, centre_b)
     x = poses[:, 0] + cos * centre_b[0] - sin * centre_b[1] - here[0]
@@ -194,7 +194,7 @@ def are_distinct(poses: FloatArray, pose: FloatArray, centre_b: FloatArray) -> B
 
 
 def principal_extent(points: FloatArray) -> float:
-    """Return how far points (k, 2) [m] reach along their main axis [m]."""
+    """Return the extent [m] of points (k, 2) [m] along their main axis."""
     centred = points - points.mean(axis=0)
     main_axis = np.linalg.eigh(centred.T @ centred)[1][:, -1]
     return float(np.ptp(centred @ main_axis))
@@ -214,7 +214,7 @@ def unexplained(table: FloatArray, members: BoolArray, pose: FloatArray, floor: 
 
 
 def covariance_of(h: FloatArray) -> FloatArray | None:
-    """Return the covariance (3, 3) of a solution with information `h`; None if that leaves a direction open."""
+    """Return the covariance (3, 3) of a solution with information `h`; None if `h` is singular."""
     scale = np.sqrt(np.diag(h))
     if not (scale > 0.0).all() or np.linalg.eigvalsh(h / np.outer(scale, scale))[0] < 1e-12:
         return None
@@ -225,12 +225,12 @@ def covariance_of(h: FloatArray) -> FloatArray | None:
 def worst_bound(
     covariance: FloatArray | None, influence: tuple[float, float], options: AlignmentOptions
 ) -> tuple[str, float]:
-    """Return which bound an alignment keeps worst, one of `BOUNDS`, and its figure over the bound; above 1 is a miss.
+    """Return the bound with the largest value over limit, one of `BOUNDS`, and this ratio; above 1 it is missed.
 
     Args:
-        covariance: (3, 3) [m, m, rad] of the motion; None if it leaves a direction open.
-        influence: By how much leaving one match out moves the result at most [m, rad].
-        options: The bounds of the motion.
+        covariance: (3, 3) [m, m, rad] of the motion; None if the information is singular.
+        influence: Largest change of the result by leaving one match out [m, rad].
+        options: Limits of the motion's uncertainty.
     """
     if covariance is None:
         return "translation", math.inf

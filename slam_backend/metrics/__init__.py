@@ -1,4 +1,4 @@
-"""How good a map or a path is, and whether its stated uncertainty is honest."""
+"""Metrics of the accuracy of maps and paths, and of the consistency of their covariances."""
 
 from slam_backend.metrics.consistency import anees, nees, nis
 from slam_backend.metrics.maps import GospaResult, MapScore, gospa, map_error, map_rmse, ospa

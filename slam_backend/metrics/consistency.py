@@ -1,4 +1,4 @@
-"""Whether errors are as large as their covariances say."""
+"""Consistency metrics: errors and innovations in units of their covariances."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,10 +11,10 @@ def nees(errors: ArrayLike, covariances: ArrayLike) -> FloatArray:
 
     Args:
         errors: (n, d) float64. Estimate minus truth; wrap angles to [-pi, pi) first.
-        covariances: (n, d, d) float64, symmetric positive definite. What the estimator claims (P).
+        covariances: (n, d, d) float64, symmetric positive definite. Covariances stated by the estimator (P).
 
     Returns:
-        (n,) float64 [-], chi-square with d degrees of freedom if the claims are honest.
+        (n,) float64 [-], chi-square with d degrees of freedom for a consistent estimator.
 
     Raises:
         ValueError: If shapes disagree, a number is not finite or a covariance is singular.
@@ -28,20 +28,20 @@ def nees(errors: ArrayLike, covariances: ArrayLike) -> FloatArray:
     try:
         solved = np.linalg.solve(p, e[..., None])[..., 0]
     except np.linalg.LinAlgError as error:
-        cure = "Leave out directions that are known exactly."
-        raise argument_error("covariances", "positive definite matrices", "a singular one", cure) from error
+        hint = "Drop directions that are known exactly."
+        raise argument_error("covariances", "positive definite matrices", "a singular one", hint) from error
     return np.asarray(np.einsum("nd,nd->n", e, solved))
 
 
 def anees(errors: ArrayLike, covariances: ArrayLike) -> float:
-    """Return the mean of `nees` divided by the dimension: 1 is honest, more is over-confident.
+    """Return the mean of `nees` divided by the dimension: 1 is consistent, more is over-confident.
 
     Args:
         errors: (n, d) float64, n >= 1. Estimate minus truth.
-        covariances: (n, d, d) float64. As the estimator states them.
+        covariances: (n, d, d) float64. Covariances stated by the estimator.
 
     Raises:
-        ValueError: As `nees`, or if there are no errors at all.
+        ValueError: Same errors as `nees`, or if there are no errors to average.
     """
     values = nees(errors, covariances)
     if not len(values):
@@ -53,6 +53,6 @@ def nis(innovations: ArrayLike, covariances: ArrayLike) -> FloatArray:
     """Return the normalised innovation squared, v^T S^-1 v (n,), of innovations (n, d) with covariances S (n, d, d).
 
     Raises:
-        ValueError: As `nees`.
+        ValueError: Same errors as `nees`.
     """
     return nees(innovations, covariances)

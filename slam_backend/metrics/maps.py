@@ -1,4 +1,4 @@
-"""How far an estimated map is from the true landmarks, counting what is missing and what is too much."""
+"""Error metrics of landmark maps, including missed, false and duplicate landmarks."""
 
 import math
 from dataclasses import dataclass
@@ -17,8 +17,8 @@ class GospaResult:
     """The generalised optimal sub-pattern assignment between estimates and truths.
 
     Attributes:
-        distance: The metric itself [m].
-        error: Divided by the number of truths (at least 1) inside the root, as `map_error` is [m].
+        distance: GOSPA metric [m].
+        error: GOSPA metric with the number of truths (at least 1) as divisor inside the root, as in `map_error` [m].
         localisation: Sum of d^p over the pairs closer than the cutoff [m^p].
         missed: Truths without an estimate closer than the cutoff.
         false: Estimates without a truth closer than the cutoff.
@@ -33,12 +33,12 @@ class GospaResult:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapScore:
-    """The error of the landmarks that were matched; read it together with how many they are.
+    """Error of matched landmarks, with recall and precision.
 
     Attributes:
         rmse: Root mean square distance of the matched landmarks [m]; NaN if none is matched.
-        recall: Matched landmarks over the true ones; 0 if there are none.
-        precision: Matched landmarks over the estimated ones; 0 if there are none.
+        recall: Number of matched over true landmarks; 0 if there are none.
+        precision: Number of matched over estimated landmarks; 0 if there are none.
         matched: (k, 2) int64 rows (index of the estimate, index of the truth), one-to-one.
     """
 
@@ -52,11 +52,11 @@ class MapScore:
 def _nearest_claimants(
     means: FloatArray, claims: IntArray, truths: FloatArray, cutoff: float
 ) -> tuple[IntArray, float, int]:
-    """Return who holds each truth, and how wrong the map is.
+    """Return the nearest claimant of each truth, and the error of the map.
 
-    That is, per truth the index of the nearest claimant (-1: none); the sum under the root of the map error E, in which
-    false estimates and those whose truth a nearer claimant holds count as surplus; and the first row that is not finite
-    or claims what does not exist (-1: none).
+    Per truth the index of the nearest claimant (-1: none); the sum under the root of the map error E, in which false
+    and duplicate estimates count as surplus; and the first row that is not finite or claims an index out of range
+    (-1: none).
     """
     least, holder = np.full(len(truths), np.inf), np.full(len(truths), -1)
     surplus = 0
@@ -83,22 +83,22 @@ def _nearest_claimants(
 
 
 def map_error(means: FloatArray, claims: IntArray, true_positions: FloatArray, cutoff: float = 1.0) -> float:
-    """Return the map error E of landmarks whose origin is known, fast enough for every step of a simulation.
+    """Return the map error E of landmarks with known association, fast enough for every step of a simulation.
 
-    E = sqrt((1/N) (sum over held landmarks of min(d^2, c^2) + c^2/2 (missed + false + duplicate))): the nearest
-    claimant of a true landmark holds it, its other claimants are duplicates, and true landmarks that nobody claims
-    are missed. It equals `gospa(...).error` where true landmarks lie more than 2 c apart and estimates are closer
-    than c to the landmark they claim.
+    E = sqrt((1/N) (sum over matched landmarks of min(d^2, c^2) + c^2/2 (missed + false + duplicate))). The nearest
+    claimant of a true landmark is its match, further claimants are duplicates, and true landmarks without claimants are
+    missed. E equals `gospa(...).error` if true landmarks are more than 2 c apart and estimates are closer than c to
+    their true landmark.
 
     Args:
         means: (n, 3) float64 [m], world frame. Estimated positions.
-        claims: (n,) int64. Index of the true landmark that created each; -1: none, it is false; -2: a true landmark
-            that is not among the countable ones: ignored, neither held nor false.
+        claims: (n,) int64. Index of the true landmark of each estimate; -1: a false landmark; -2: a true landmark that
+            does not count, neither matched nor false.
         true_positions: (N, 3) float64 [m], world frame, N >= 1.
         cutoff: c [m].
 
     Raises:
-        ValueError: If shapes disagree, a claim names no landmark, a mean is not finite, or N = 0.
+        ValueError: If shapes disagree, a claim is out of range, a mean is not finite, or N = 0.
 
     >>> map_error(np.array([[0.0, 0.6, 0.0]]), np.array([0]), np.array([[0.0, 0.0, 0.0]]))
     0.6
@@ -114,7 +114,7 @@ def map_error(means: FloatArray, claims: IntArray, true_positions: FloatArray, c
 
 
 def _claimed(means: FloatArray, claims: IntArray, truths: FloatArray, cutoff: float) -> tuple[IntArray, float]:
-    """Check the arrays cheaply and return what `_nearest_claimants` says of them."""
+    """Check the arrays and return the nearest claimants and the sum from `_nearest_claimants`."""
     means, truths = np.ascontiguousarray(means, np.float64), np.ascontiguousarray(truths, np.float64)
     claims = np.ascontiguousarray(claims, np.int64)
     if means.shape != (len(claims), 3):
@@ -124,10 +124,10 @@ def _claimed(means: FloatArray, claims: IntArray, truths: FloatArray, cutoff: fl
     holder, total, bad = _nearest_claimants(means, claims, truths, cutoff)
     if bad >= 0:
         if not np.isfinite(means[bad]).all():
-            cure = "Drop landmarks that are not finite."
-            raise argument_error("means", "finite numbers", f"NaN or infinity in row {bad}", cure)
+            hint = "Drop landmarks that are not finite."
+            raise argument_error("means", "finite numbers", f"NaN or infinity in row {bad}", hint)
         expected = f"indices below {len(truths)}, -1 for false or -2 for uncounted ones"
-        raise argument_error("claims", expected, int(claims[bad]), "Claim landmarks that exist.")
+        raise argument_error("claims", expected, int(claims[bad]), "Give indices of true landmarks.")
     return holder, total
 
 
@@ -136,15 +136,15 @@ def gospa(
 ) -> GospaResult:
     """Return the GOSPA metric between two point sets, by optimal assignment.
 
-    d = (min over assignments of sum min(d_ij, c)^p + c^p / alpha | n - N |)^(1/p), the smaller set assigned whole.
-    With alpha = 2 this is the sum of `localisation` and c^p / 2 for each missed and each false one.
+    d = (min over assignments of sum min(d_ij, c)^p + c^p / alpha | n - N |)^(1/p), the smaller set fully assigned.
+    With alpha = 2, d^p is the sum of `localisation` and of c^p / 2 for each missed and each false landmark.
 
     Args:
         estimates: (n, 3) or (n, 2) float64 [m].
         truths: (N, 3) or (N, 2) float64 [m], same frame and width.
         cutoff: c [m].
         order: p >= 1.
-        alpha: In (0, 2].
+        alpha: Cardinality parameter in (0, 2].
 
     Raises:
         ValueError: If shapes disagree, a number is not finite or a parameter lies outside its range.
@@ -153,7 +153,7 @@ def gospa(
     1
     """
     check_float("order", order, "The metric needs p >= 1.", at_least=1.0)
-    check_float("alpha", alpha, "Use 2 to count missed and false ones alike.", above=0.0, at_most=2.0)
+    check_float("alpha", alpha, "Use 2 to weight missed and false landmarks equally.", above=0.0, at_most=2.0)
     costs, rows, columns = _assigned(estimates, truths, cutoff, order)
     n, count = costs.shape
     paired = costs[rows, columns]
@@ -178,7 +178,7 @@ def ospa(estimates: ArrayLike, truths: ArrayLike, cutoff: float = 1.0, order: fl
         order: p >= 1.
 
     Raises:
-        ValueError: As `gospa`.
+        ValueError: Same errors as `gospa`.
 
     >>> ospa([[0.0, 0.0]], [[0.0, 0.5]], cutoff=2.0)
     0.5
@@ -195,29 +195,29 @@ def map_rmse(estimates: ArrayLike, truths: ArrayLike, claims: ArrayLike | None =
     Args:
         estimates: (n, 3) float64 [m], world frame.
         truths: (N, 3) float64 [m], world frame.
-        claims: (n,) int64 as in `map_error`: the nearest claimant of each true landmark is its match, however far;
-            claims of -2 count neither way. None: optimal assignment, pairs at `gate` or farther left out.
-        gate: [m].
+        claims: (n,) int64 as in `map_error`: the nearest claimant of each true landmark is its match, at any distance;
+            claims of -2 are not counted. None: optimal assignment of pairs closer than `gate`.
+        gate: Upper limit of the distance of a pair [m].
 
     Raises:
-        ValueError: If shapes disagree, a number is not finite or a claim names no landmark.
+        ValueError: If shapes disagree, a number is not finite or a claim is out of range.
 
     >>> map_rmse([[0.0, 0.3, 0.0], [5.0, 5.0, 0.0]], [[0.0, 0.0, 0.0]]).precision
     0.5
     """
-    cure = "Give one position (x, y, z) per landmark."
-    means, true = (check_array(n, v, (None, 3), cure) for n, v in (("estimates", estimates), ("truths", truths)))
+    hint = "Give one position (x, y, z) per landmark."
+    means, true = (check_array(n, v, (None, 3), hint) for n, v in (("estimates", estimates), ("truths", truths)))
     uncounted = 0
     if claims is None:
         costs, rows, columns = _assigned(means, true, gate, 2.0)
         near = costs[rows, columns] < gate**2
         matched = np.column_stack([rows[near], columns[near]]).astype(np.int64)
     else:
-        named = check_array("claims", claims, (len(means),), "Give one claim per estimate.", dtype=np.int64)
-        holder = _claimed(means, named, true, float(gate))[0]
+        checked = check_array("claims", claims, (len(means),), "Give one claim per estimate.", dtype=np.int64)
+        holder = _claimed(means, checked, true, float(gate))[0]
         held = np.flatnonzero(holder >= 0)
         matched = np.column_stack([holder[held], held])
-        uncounted = int(np.count_nonzero(named == UNCOUNTED))
+        uncounted = int(np.count_nonzero(checked == UNCOUNTED))
     squares = ((means[matched[:, 0]] - true[matched[:, 1]]) ** 2).sum(axis=1)
     return MapScore(
         rmse=float(np.sqrt(squares.mean())) if len(matched) else float("nan"),
@@ -230,7 +230,7 @@ def map_rmse(estimates: ArrayLike, truths: ArrayLike, claims: ArrayLike | None =
 def _assigned(
     estimates: ArrayLike, truths: ArrayLike, cutoff: float, order: float
 ) -> tuple[FloatArray, IntArray, IntArray]:
-    """Return costs (n, N) min(d, cutoff)^order and the rows and columns of their optimal assignment."""
+    """Return costs (n, N) min(d, cutoff)^order, and rows and columns of the optimal assignment."""
     from scipy.optimize import linear_sum_assignment  # slow to import, and not always needed
 
     cutoff = check_float("cutoff", cutoff, "Give a distance in metres.", above=0.0)

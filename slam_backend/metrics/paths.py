@@ -1,4 +1,4 @@
-"""How far an estimated path is from the true one."""
+"""Error metrics of estimated paths."""
 
 from dataclasses import dataclass
 
@@ -14,9 +14,9 @@ class AteResult:
     """The absolute trajectory error: root mean square distance between estimated and true positions.
 
     Attributes:
-        start: In the frame of the start pose, as given, without any fitting [m].
-        aligned: After the rigid motion that fits the estimate best to the truth [m].
-        transform: (3,) float64 [m, m, rad]. That motion, truth_from_estimated.
+        start: Error in the frame of the start pose, without alignment [m].
+        aligned: Error after the best rigid motion of the estimate to the truth [m].
+        transform: (3,) float64 [m, m, rad]. Motion truth_from_estimated of the alignment.
     """
 
     start: float
@@ -26,11 +26,11 @@ class AteResult:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RpeResult:
-    """The relative pose error: root mean squares of the error in the motion over a fixed number of steps.
+    """The relative pose error: root mean square errors of the motion over a fixed number of steps.
 
     Attributes:
-        translation: [m].
-        rotation: [rad].
+        translation: Error of the translation [m].
+        rotation: Error of the rotation [rad].
     """
 
     translation: float
@@ -43,11 +43,10 @@ def align_se2(points_a: ArrayLike, points_b: ArrayLike, weights: ArrayLike | Non
     Args:
         points_a: (n, 2) float64 [m], frame a, n >= 1.
         points_b: (n, 2) float64 [m], frame b. The same points in the same order.
-        weights: (n,) float64 [-], >= 0 with a positive sum; None: all alike.
+        weights: (n,) float64 [-], >= 0 with a positive sum; None: equal weights.
 
     Returns:
-        (3,) a_from_b [m, m, rad], which minimises sum w |a - (R b + t)|^2. Points that all coincide leave the
-        rotation open: it is then 0.
+        (3,) a_from_b [m, m, rad], which minimises sum w |a - (R b + t)|^2. The rotation is 0 if all points coincide.
 
     Raises:
         ValueError: If shapes disagree, there are no points, or the weights are negative or all zero.
@@ -57,12 +56,12 @@ def align_se2(points_a: ArrayLike, points_b: ArrayLike, weights: ArrayLike | Non
     """
     a = check_array("points_a", points_a, (None, 2), "Give one planar point per row.")
     b = check_array("points_b", points_b, (len(a), 2), "Give as many points as in points_a.")
-    cure = "Give weights >= 0, at least one of them positive."
-    w = np.ones(len(a)) if weights is None else check_array("weights", weights, (len(a),), cure)
+    hint = "Give weights >= 0, at least one of them positive."
+    w = np.ones(len(a)) if weights is None else check_array("weights", weights, (len(a),), hint)
     if not len(a):
         raise argument_error("points_a", "at least one point", "an array of none", "There is nothing to align.")
     if w.min() < 0.0 or w.sum() <= 0.0:
-        raise argument_error("weights", "weights >= 0 with a positive sum", w.tolist(), cure)
+        raise argument_error("weights", "weights >= 0 with a positive sum", w.tolist(), hint)
     w = w / w.sum()
     centre_a, centre_b = w @ a, w @ b
     a, b = a - centre_a, b - centre_b
@@ -74,12 +73,12 @@ def align_se2(points_a: ArrayLike, points_b: ArrayLike, weights: ArrayLike | Non
 
 
 def ate(estimated: ArrayLike, truth: ArrayLike, align: bool = True) -> AteResult:
-    """Return the position error of a path, as it is and after alignment.
+    """Return the position error of a path, before and after alignment.
 
     Args:
-        estimated: (T, 2) positions [m] or (T, 3) poses [m, m, rad], of which only positions count.
-        truth: The same for the true path, at the same times.
-        align: Whether to fit the motion; without, `aligned` equals `start` and the transform is zero.
+        estimated: (T, 2) positions [m] or (T, 3) poses [m, m, rad]; headings are ignored.
+        truth: True positions or poses at the same times.
+        align: Whether to align the paths; else `aligned` equals `start` and the transform is zero.
 
     Raises:
         ValueError: If shapes disagree, a number is not finite, or the path is empty.
@@ -93,7 +92,7 @@ def ate(estimated: ArrayLike, truth: ArrayLike, align: bool = True) -> AteResult
 
 
 def rpe(estimated: ArrayLike, truth: ArrayLike, delta: int = 1) -> RpeResult:
-    """Compare the motions over `delta` steps, which no choice of frame changes.
+    """Return the error of the motions over `delta` steps, which is independent of the frame.
 
     Args:
         estimated: (T, 3) poses [m, m, rad].
@@ -115,12 +114,12 @@ def rpe(estimated: ArrayLike, truth: ArrayLike, delta: int = 1) -> RpeResult:
 def _paired(estimated: ArrayLike, truth: ArrayLike) -> tuple[FloatArray, FloatArray]:
     """Return two (T, 2) arrays of positions, T >= 1, or raise."""
     columns = 2 if np.ndim(estimated) == 2 and np.shape(estimated)[1] == 2 else 3
-    cure = "Give (T, 2) positions or (T, 3) poses at the same times."
-    guess = check_array("estimated", estimated, (None, columns), cure)
+    hint = "Give (T, 2) positions or (T, 3) poses at the same times."
+    guess = check_array("estimated", estimated, (None, columns), hint)
     columns = 2 if np.ndim(truth) == 2 and np.shape(truth)[1] == 2 else 3
-    true = check_array("truth", truth, (len(guess), columns), cure)
+    true = check_array("truth", truth, (len(guess), columns), hint)
     if not len(guess):
-        raise argument_error("estimated", "at least one pose", "an array of none", cure)
+        raise argument_error("estimated", "at least one pose", "an array of none", hint)
     return guess[:, :2], true[:, :2]
 
 

@@ -1,1 +1,1 @@
-"""Sensor and motion models: stereo camera, odometry, and what one camera measures in a step."""
+"""Sensor and motion models: stereo camera, odometry and measurements."""

@@ -1,4 +1,4 @@
-"""The stereo camera: its frame on the robot, what it can see, and how its errors grow with depth."""
+"""Stereo camera model: mounting, field of view, projection and measurement noise."""
 
 from dataclasses import dataclass
 
@@ -6,9 +6,9 @@ import numpy as np
 
 from slam_backend.core.validation import FloatArray, argument_error, check_array, check_float, check_int, known_names
 
-MAX_POINT_DISTANCE = 1e4  # [m]; no camera measures so far; at a million times this, covariances overflow
-FLATTEST = 1e4  # depth over breadth of a stereo point's covariance; flatter ones lose their digits
-LEAST, LARGEST = 1e-12, 1e6  # pixels and metres of a camera; squares of what is made of them keep their digits
+MAX_POINT_DISTANCE = 1e4  # [m]; beyond the range of any camera, and far below the overflow of covariances
+FLATTEST = 1e4  # depth over breadth of a stereo point's covariance; more loses precision
+LEAST, LARGEST = 1e-12, 1e6  # pixels and metres of a camera; keeps the precision of squares
 WIDEST = 1 << 20  # px
 MAX_MOUNT_DISTANCE = 1e3  # [m]
 # Columns: the camera's X (right), Y (down), Z (ahead) axes in the robot's x (ahead), y (left), z (up).
@@ -22,10 +22,10 @@ class StereoCamera:
 
     Attributes:
         focal_px: Focal length [px].
-        baseline: Distance between the two eyes [m].
+        baseline: Distance between the two cameras [m].
         width: Image width [px].
         height: Image height [px].
-        max_range: Points farther than this [m] are not reported.
+        max_range: Largest distance of reported points [m].
         mount: (x, y, z) of the left camera on the robot [m]; its axis points along robot x.
         sigma_px: Standard deviation of the image coordinates u and v [px].
         sigma_disparity_px: Standard deviation of the disparity [px].
@@ -46,8 +46,8 @@ class StereoCamera:
             check_float(f"camera.{name}", value, "Give a positive number.", at_least=LEAST, at_most=LARGEST)
         for name in ("width", "height"):
             check_int(f"camera.{name}", getattr(self, name), 1, "Give a number of pixels.", WIDEST)
-        cure = "Give (x, y, z) of the left camera on the robot."
-        mount = check_array("camera.mount", self.mount, (3,), cure, within=MAX_MOUNT_DISTANCE)
+        hint = "Give (x, y, z) of the left camera on the robot."
+        mount = check_array("camera.mount", self.mount, (3,), hint, within=MAX_MOUNT_DISTANCE)
         object.__setattr__(self, "mount", tuple(float(m) for m in mount))
 
     @property
@@ -62,15 +62,15 @@ class StereoCamera:
 
     @property
     def farthest_usable(self) -> float:
-        """Largest coordinate [m] of a point whose covariance under this noise is not too flat for a filter."""
+        """Largest coordinate [m] of a point with a well-conditioned covariance under this noise."""
         return min(MAX_POINT_DISTANCE, FLATTEST * self.baseline * self.sigma_px / self.sigma_disparity_px)
 
     def robot_from_camera(self, points: FloatArray) -> FloatArray:
-        """Move points (..., 3) [m] from the camera frame to the robot frame."""
+        """Transform points (..., 3) [m] from the camera frame to the robot frame."""
         return np.asarray(points @ ROBOT_FROM_CAMERA.T + np.asarray(self.mount))
 
     def camera_from_robot(self, points: FloatArray) -> FloatArray:
-        """Move points (..., 3) [m] from the robot frame to the camera frame."""
+        """Transform points (..., 3) [m] from the robot frame to the camera frame."""
         return np.asarray((points - np.asarray(self.mount)) @ ROBOT_FROM_CAMERA)
 
     def project(self, points: FloatArray) -> FloatArray:
@@ -114,7 +114,7 @@ class StereoCamera:
         )
 
     def sees(self, points: FloatArray) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-        """Tell which points (..., 3) [m], camera frame, lie in the image and within `max_range` (walls ignored)."""
+        """Return the mask of points (..., 3) [m], camera frame, in the image and within `max_range` (walls ignored)."""
         x, y, z = points[..., 0], points[..., 1], points[..., 2]
         ahead = z > 1e-6
         depth = np.where(ahead, z, 1.0)

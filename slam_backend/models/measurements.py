@@ -1,4 +1,4 @@
-"""What one robot's camera reports in one step: points, descriptors and, if the sensor knows them, covariances."""
+"""Measurements of one robot's camera in one step: points, descriptors and optional covariances."""
 
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -10,9 +10,9 @@ from slam_backend.core.read_only import as_read_only
 from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_array
 from slam_backend.fastslam import _kernels
 
-LARGEST_DESCRIPTOR = 1e6  # of one component; squares of distances then stay far from the end of float32
-LEAST_VARIANCE, LARGEST_VARIANCE = 1e-14, 1e12  # [m^2]; log-weights then keep their differences in float64
-LARGEST_CONDITION = 1e8  # about 1 / sqrt(machine epsilon): with more, updates in float64 lose positive definiteness
+LARGEST_DESCRIPTOR = 1e6  # limit of a component; squared distances do not overflow float32
+LEAST_VARIANCE, LARGEST_VARIANCE = 1e-14, 1e12  # [m^2]; keeps differences of log-weights representable in float64
+LARGEST_CONDITION = 1e8  # about 1 / sqrt(machine epsilon); beyond it float64 updates lose positive definiteness
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -22,13 +22,13 @@ class Measurements:
     Attributes:
         points: (n, 3) float64 [m], camera frame (X right, Y down, Z ahead). Measured landmark positions (v_t).
         descriptors: (n, d) float32 [-]. Appearance vectors (d_t); d is the same in all frames of a run.
-        covariances: None, or (n, 3, 3) float64 [m^2], camera frame. None: the camera model is evaluated at the
-            predicted point. Given: used as is.
-        extent: Bounds [m] that all points keep: none has a smaller depth Z, none a larger coordinate by magnitude.
+        covariances: None, or (n, 3, 3) float64 [m^2], camera frame. None: the camera model, evaluated at the predicted
+            point.
+        extent: Smallest depth Z and largest magnitude of a coordinate of all points [m].
 
     Raises:
-        ValueError: If a shape is wrong, a number is not finite or a descriptor too large, or a covariance is not
-            positive definite, or so flat or small that arithmetic cannot keep it so.
+        ValueError: If a shape is wrong, a number is not finite, a descriptor is too large, or a covariance is not
+            positive definite or too ill-conditioned or small for float64.
     """
 
     points: FloatArray
@@ -37,9 +37,9 @@ class Measurements:
     extent: tuple[float, float] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        cure = "Give one row per measured point."
-        points: Any = check_array("points", self.points, (None, 3), cure + " Drop points that are not finite.")
-        descriptors: Any = check_array("descriptors", self.descriptors, (len(points), None), cure, dtype=np.float32)
+        hint = "Give one row per measured point."
+        points: Any = check_array("points", self.points, (None, 3), hint + " Drop points that are not finite.")
+        descriptors: Any = check_array("descriptors", self.descriptors, (len(points), None), hint, dtype=np.float32)
         if descriptors.size and np.abs(descriptors).max() > LARGEST_DESCRIPTOR:
             largest = float(np.abs(descriptors).max())
             expected = f"numbers within +-{LARGEST_DESCRIPTOR:g}"
@@ -47,7 +47,7 @@ class Measurements:
         object.__setattr__(self, "points", points)
         object.__setattr__(self, "descriptors", descriptors)
         if self.covariances is not None:
-            covariances: Any = check_array("covariances", self.covariances, (len(points), 3, 3), cure)
+            covariances: Any = check_array("covariances", self.covariances, (len(points), 3, 3), hint)
             _check_covariances(covariances)
             object.__setattr__(self, "covariances", covariances)
         for name in ("points", "descriptors", "covariances"):
@@ -59,24 +59,24 @@ class Measurements:
         return len(self.points)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Let copies and what was pickled be read-only, too: else the extent would not follow what is written there."""
+        """Keep copies and unpickled frames read-only, so that the extent remains valid."""
         return _restored, (self.points, self.descriptors, self.covariances, self.extent)
 
     @classmethod
     def empty(cls, descriptor_size: int = 64) -> "Measurements":
-        """Return a frame in which nothing was seen."""
+        """Return a frame without points."""
         return cls(np.empty((0, 3)), np.empty((0, descriptor_size), dtype=np.float32))
 
 
 class TeamMeasurements(NamedTuple):
-    """The frames of several robots in one piece, without covariances; cut out for who wants to look at one.
+    """Concatenated frames of several robots, without covariances.
 
-    Nothing is checked before a filter takes them in.
+    A filter checks them at its next step.
 
     Attributes:
-        points: (n, 3) float64 [m]. Each in the frame of its camera, robot by robot.
-        descriptors: (n, d) float32. Likewise.
-        offsets: (K,) int64. Per robot where its points end; they begin where those before it end.
+        points: (n, 3) float64 [m]. Points of all robots in turn, each in its camera's frame.
+        descriptors: (n, d) float32. Descriptors of the points.
+        offsets: (K,) int64. End of each robot's points, the start of the next robot's.
     """
 
     points: FloatArray
@@ -84,25 +84,25 @@ class TeamMeasurements(NamedTuple):
     offsets: IntArray
 
     def per_robot(self) -> list[Measurements]:
-        """Return the frame of each robot. They are read-only, and share memory with this, not to be written to then."""
+        """Return the frame of each robot, as read-only views; the caller must not write to the arrays afterwards."""
         ends = self.offsets.tolist()
-        points, looks = as_read_only(self.points), as_read_only(self.descriptors)
-        cut = [(points[a:b], looks[a:b]) for a, b in zip([0, *ends[:-1]], ends, strict=True)]
-        return [_restored(own, described, None, _kernels.extent(own)) for own, described in cut]
+        points, descriptors = as_read_only(self.points), as_read_only(self.descriptors)
+        parts = [(points[a:b], descriptors[a:b]) for a, b in zip([0, *ends[:-1]], ends, strict=True)]
+        return [_restored(seen, described, None, _kernels.extent(seen)) for seen, described in parts]
 
 
 def _restored(
     points: FloatArray, descriptors: NDArray[np.float32], covariances: FloatArray | None, extent: tuple[float, float]
 ) -> Measurements:
-    """Return a frame of arrays that were checked before and that nobody else writes to."""
-    frame, put = object.__new__(Measurements), object.__setattr__
+    """Return a frame of arrays that were checked before and have no other writer."""
+    frame, assign = object.__new__(Measurements), object.__setattr__
     for name, value in zip(Measurements.__slots__, (points, descriptors, covariances, extent), strict=True):
-        put(frame, name, as_read_only(value) if isinstance(value, np.ndarray) and value.flags.writeable else value)
+        assign(frame, name, as_read_only(value) if isinstance(value, np.ndarray) and value.flags.writeable else value)
     return frame
 
 
 def _check_covariances(covariances: FloatArray) -> None:
-    """Raise unless (n, 3, 3) are symmetric and positive definite with room for rounding."""
+    """Raise unless covariances (n, 3, 3) are symmetric and positive definite with a margin for rounding."""
     if not len(covariances):
         return
     scale = np.abs(covariances).max(axis=(1, 2), keepdims=True)
@@ -123,5 +123,5 @@ def _check_covariances(covariances: FloatArray) -> None:
         raise argument_error("covariances", expected, got, "Check the units: metres squared.")
     if (largest > LARGEST_CONDITION * least).any():
         got = float((largest / least).max())
-        cure = "Raise the least variance: float64 cannot keep so flat a covariance positive definite."
-        raise argument_error("covariances", f"ratios of eigenvalues up to {LARGEST_CONDITION:g}", got, cure)
+        hint = "Raise the smallest variance: updates in float64 would lose positive definiteness."
+        raise argument_error("covariances", f"ratios of eigenvalues up to {LARGEST_CONDITION:g}", got, hint)

@@ -1,4 +1,4 @@
-"""The odometry motion model p(x_t | x_{t-1}, u_t) that a filter assumes (Eq. 4)."""
+"""Odometry motion model p(x_t | x_{t-1}, u_t) of the filter (Eq. 4)."""
 
 import math
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ import numpy as np
 from slam_backend.core.validation import FloatArray, check_float, known_names
 from slam_backend.geometry import compose
 
-LARGEST_SIGMA = 1e3  # [m, rad], or of either per metre or radian; beyond it nothing at all is known
+LARGEST_SIGMA = 1e3  # [m, rad], or either per metre or radian; more carries no information
 
 
 @known_names
@@ -16,15 +16,16 @@ LARGEST_SIGMA = 1e3  # [m, rad], or of either per metre or radian; beyond it not
 class OdometryModel:
     """Gaussian noise of an odometry reading u = (dx, dy, dtheta) in the robot's previous frame.
 
-    The variances of the three components are independent; each adds a part that grows with the motion to a floor.
+    The three components are independent; the variance of each is the sum of a floor and a part that grows with the
+    motion.
 
     Attributes:
-        sigma_along: Of dx, per metre travelled [m/m].
-        sigma_across: Of dy, per metre travelled [m/m].
-        sigma_heading: Of dtheta, per metre travelled [rad/m].
-        sigma_turn: Of dtheta, per radian turned [rad/rad].
-        floor_position: Of dx and dy, whatever the motion [m].
-        floor_heading: Of dtheta, whatever the motion [rad].
+        sigma_along: Standard deviation of dx per metre travelled [m/m].
+        sigma_across: Standard deviation of dy per metre travelled [m/m].
+        sigma_heading: Standard deviation of dtheta per metre travelled [rad/m].
+        sigma_turn: Standard deviation of dtheta per radian turned [rad/rad].
+        floor_position: Constant standard deviation of dx and dy [m].
+        floor_heading: Constant standard deviation of dtheta [rad].
     """
 
     sigma_along: float = 0.05
@@ -36,12 +37,12 @@ class OdometryModel:
 
     def __post_init__(self) -> None:
         for name in ("sigma_along", "sigma_across", "sigma_heading", "sigma_turn", "floor_position", "floor_heading"):
-            cure = "Give a standard deviation."
-            check_float(f"motion.{name}", getattr(self, name), cure, at_least=0.0, at_most=LARGEST_SIGMA)
+            hint = "Give a standard deviation."
+            check_float(f"motion.{name}", getattr(self, name), hint, at_least=0.0, at_most=LARGEST_SIGMA)
 
     @property
     def is_noiseless(self) -> bool:
-        """Whether no odometry has any noise."""
+        """Whether all standard deviations are zero."""
         of_motion = self.sigma_along, self.sigma_across, self.sigma_heading, self.sigma_turn
         return not any((*of_motion, self.floor_position, self.floor_heading))
 
@@ -68,7 +69,7 @@ class OdometryModel:
         return result
 
     def sample(self, poses: FloatArray, odometry: FloatArray, rng: np.random.Generator) -> FloatArray:
-        """Draw x_t^[m] ~ p(x_t | x_{t-1}^[m], u_t), each particle from its own past (Eq. 4).
+        """Draw x_t^[m] ~ p(x_t | x_{t-1}^[m], u_t) for each particle (Eq. 4).
 
         Args:
             poses: (M, 3) float64 [m, m, rad], map frame.

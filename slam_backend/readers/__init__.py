@@ -1,7 +1,7 @@
-"""Readers of real robots' logs: each turns its files into odometry and `Measurements`.
+"""Readers of real robots' logs, from files to odometry and `Measurements`.
 
-For a log of your own: `read_csv` reads columns by their names, and `range_bearing_steps` turns velocities, ranges and
-bearings into steps of a filter. `integrate_commands` and `points_from_polar` are what that is made of.
+For other logs, `read_csv` reads named columns, and `range_bearing_steps` converts velocities, ranges and bearings to
+steps of a filter, with the help of `integrate_commands` and `points_from_polar`.
 """
 
 from slam_backend.readers.conversions import integrate_commands, points_from_polar

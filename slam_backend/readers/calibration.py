@@ -1,4 +1,4 @@
-"""Calibrations of stereo pairs: KITTI's rectified ones and EuRoC's raw ones, and how raw pairs are rectified."""
+"""Calibration of stereo pairs from KITTI and EuRoC files, and rectification of raw pairs."""
 
 import re
 from dataclasses import dataclass
@@ -17,12 +17,12 @@ SMOOTH_ROTATION = 1e-4  # largest deviation of a rotation matrix from orthogonal
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RectifiedPair:
-    """The calibration of a rectified pair: both eyes look the same way, rows agree.
+    """Calibration of a rectified pair, with parallel optical axes and common rows.
 
     Attributes:
         focal_px: Focal length [px]; pixels are square.
-        centre_px: (2,) float64 [px]. Column and row of the optical axis, the same in both eyes.
-        baseline: Distance between the eyes [m].
+        centre_px: (2,) float64 [px]. Column and row of the optical axis, the same in both cameras.
+        baseline: Distance between the cameras [m].
     """
 
     focal_px: float
@@ -36,14 +36,14 @@ class RectifiedPair:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraCalibration:
-    """One camera as its maker calibrated it: a pinhole with radial and tangential distortion.
+    """Calibration of one pinhole camera with radial and tangential distortion.
 
     Attributes:
-        width: Of the image [px].
-        height: Likewise.
+        width: Width of the image [px].
+        height: Height of the image [px].
         matrix: (3, 3) float64. Intrinsics.
-        distortion: (4,) or (5,) float64. k1, k2, p1, p2 and perhaps k3.
-        body_from_camera: (4, 4) float64. Rigid motion from camera axes to those of the body [m].
+        distortion: (4,) or (5,) float64. k1, k2, p1, p2 and optionally k3.
+        body_from_camera: (4, 4) float64. Rigid motion from camera axes to body axes [m].
     """
 
     width: int
@@ -54,24 +54,24 @@ class CameraCalibration:
 
 
 class Rectifier:
-    """Raw images of two eyes become a rectified pair of the same size.
+    """Rectification of raw stereo images, at the same size.
 
     Args:
-        left: The left eye.
-        right: The right eye.
+        left: Calibration of the left camera.
+        right: Calibration of the right camera.
 
     Attributes:
-        pair: The calibration of what `rectify` returns.
-        body_from_camera: (4, 4) float64. From the axes of the rectified left camera to those of the body [m].
+        pair: Calibration of the rectified images.
+        body_from_camera: (4, 4) float64. Rigid motion from axes of the rectified left camera to body axes [m].
 
     Raises:
-        ValueError: If the images differ in size, or the right eye does not stand to the right of the left one.
+        ValueError: If the images differ in size, or the right camera is not to the right of the left one.
     """
 
     def __init__(self, left: CameraCalibration, right: CameraCalibration) -> None:
         if (left.width, left.height) != (right.width, right.height):
             got = f"a pair of {left.width} x {left.height} and {right.width} x {right.height} px"
-            raise argument_error("right", "an eye with images of the left one's size", got, "Check the calibrations.")
+            raise argument_error("right", "a camera with images of the left one's size", got, "Check the calibrations.")
         self._size = left.width, left.height
         right_from_left = np.linalg.solve(right.body_from_camera, left.body_from_camera)
         found: Any = cv2.stereoRectify(
@@ -89,17 +89,17 @@ class Rectifier:
         focal = float(left_projection[0, 0])
         baseline = -float(right_projection[0, 3]) / focal
         if baseline <= 0.0 or abs(float(right_projection[1, 3])) > abs(float(right_projection[0, 3])):
-            cure = "Swap the calibrations; eyes above each other are not supported."
+            hint = "Swap the calibrations; vertical pairs are not supported."
             raise argument_error(
-                "right", "an eye to the right of the left one", f"a baseline of {baseline:.3f} m", cure
+                "right", "a camera to the right of the left one", f"a baseline of {baseline:.3f} m", hint
             )
         self.pair = RectifiedPair(focal, left_projection[:2, 2].copy(), baseline)
         back = np.eye(4)
         back[:3, :3] = rectified_from_left.T
         self.body_from_camera = left.body_from_camera @ back
         self._maps = [
-            self._map(eye, turn, projection)
-            for eye, turn, projection in (
+            self._map(camera, turn, projection)
+            for camera, turn, projection in (
                 (left, rectified_from_left, left_projection),
                 (right, rectified_from_right, right_projection),
             )
@@ -115,41 +115,41 @@ class Rectifier:
 
         Args:
             left: (H, W) uint8, of the size of the calibration.
-            right: Likewise.
+            right: (H, W) uint8, of the same size.
 
         Raises:
-            ValueError: If an image is not grey and of eight bits, or of another size than the calibration's.
+            ValueError: If an image is not an eight-bit grey image of the calibration's size.
         """
         rectified = []
         for name, image, (columns, rows) in zip(("left", "right"), (left, right), self._maps, strict=True):
             checked = check_image(name, image)
             if checked.shape != (self._size[1], self._size[0]):
                 expected = f"an image of {self._size[0]} x {self._size[1]} px"
-                raise argument_error(name, expected, f"shape {checked.shape}", "Check that the calibration is its own.")
+                raise argument_error(name, expected, f"shape {checked.shape}", "Check the calibration.")
             rectified.append(np.asarray(cv2.remap(checked, columns, rows, cv2.INTER_LINEAR), dtype=np.uint8))
         return rectified[0], rectified[1]
 
     def _map(
-        self, eye: CameraCalibration, turn: FloatArray, projection: FloatArray
+        self, camera: CameraCalibration, turn: FloatArray, projection: FloatArray
     ) -> tuple[Float32Array, Float32Array]:
-        """Return where each pixel of the rectified image comes from."""
+        """Return the raw columns and rows of each pixel of the rectified image."""
         maps: Any = cv2.initUndistortRectifyMap(
-            eye.matrix, eye.distortion, turn, projection[:, :3], self._size, cv2.CV_32FC1
+            camera.matrix, camera.distortion, turn, projection[:, :3], self._size, cv2.CV_32FC1
         )
         return maps[0], maps[1]
 
 
 class Rectified:
-    """A rig whose images are rectified already: they stay as they are.
+    """Stereo rig with rectified images, which stay unchanged.
 
     Args:
-        pair: Its calibration.
+        pair: Calibration of the images.
         width: Width of the images [px].
         height: Height of the images [px].
 
     Attributes:
-        pair: The calibration.
-        body_from_camera: (4, 4) float64. The body is the left camera itself.
+        pair: Calibration of the images.
+        body_from_camera: (4, 4) float64. Identity: the body frame is that of the left camera.
     """
 
     def __init__(self, pair: RectifiedPair, width: int, height: int) -> None:
@@ -162,10 +162,10 @@ class Rectified:
         return self.pair.camera(*self._size)
 
     def rectify(self, left: Any, right: Any) -> tuple[Image, Image]:
-        """Return a pair (H, W) uint8 as it is.
+        """Return a pair (H, W) uint8 unchanged.
 
         Raises:
-            ValueError: If an image is not grey and of eight bits, or of another size than the rig's.
+            ValueError: If an image is not an eight-bit grey image of the rig's size.
         """
         for name, image in (("left", left), ("right", right)):
             if check_image(name, image).shape != (self._size[1], self._size[0]):
@@ -175,13 +175,13 @@ class Rectified:
 
 
 def load_kitti_calibration(path: str | Path) -> RectifiedPair:
-    """Read a file `calib.txt` of KITTI's odometry benchmark: projection matrices of the left and the right eye.
+    """Read a file `calib.txt` of KITTI's odometry benchmark: projection matrices of the left and the right camera.
 
     Args:
-        path: The file; its first two matrices of 12 numbers are used, with or without names such as `P0:`.
+        path: File whose first two matrices of 12 numbers are used, with or without names such as `P0:`.
 
     Raises:
-        ValueError: If the file is missing, holds no two such matrices, or these are no rectified pair.
+        ValueError: If the file is missing, lacks two such matrices, or these are not a rectified pair.
     """
     file = Path(path)
     rows = []
@@ -198,7 +198,7 @@ def load_kitti_calibration(path: str | Path) -> RectifiedPair:
     left, right = (np.array(row).reshape(3, 4) for row in rows[:2])
     focal, baseline = left[0, 0], (left[0, 3] - right[0, 3]) / left[0, 0]
     if not (np.allclose(left[:, :3], right[:, :3]) and np.isclose(left[1, 1], focal) and focal > 0.0 and baseline > 0):
-        expected = f"{file.name} with a rectified pair of square pixels, the left eye first"
+        expected = f"{file.name} with a rectified pair of square pixels, the left camera first"
         raise argument_error("calibration", expected, "other matrices", f"Correct {str(file)!r}.")
     return RectifiedPair(float(focal), left[:2, 2].copy(), float(baseline))
 
@@ -208,19 +208,19 @@ def load_euroc_calibration(left: str | Path, right: str | Path) -> Rectifier:
 
     Args:
         left: File of the left camera.
-        right: File of the right one.
+        right: File of the right camera.
 
     Raises:
-        ValueError: If a file is missing or lacks an entry, or the two are no stereo pair.
+        ValueError: If a file is missing or lacks an entry, or the two are not a stereo pair.
     """
     return Rectifier(load_euroc_camera(left), load_euroc_camera(right))
 
 
 def load_euroc_camera(path: str | Path) -> CameraCalibration:
-    """Read one file `sensor.yaml` of EuRoC's cameras: pinhole, radial-tangential distortion, place on the body.
+    """Read one file `sensor.yaml` of EuRoC's cameras: pinhole, radial-tangential distortion, pose on the body.
 
     Raises:
-        ValueError: If the file is missing, lacks an entry, or tells of another kind of camera.
+        ValueError: If the file is missing, lacks an entry, or describes another kind of camera.
     """
     file = Path(path)
     text = re.sub(r"#[^\n]*", "", _text(file))
@@ -248,12 +248,12 @@ def load_euroc_camera(path: str | Path) -> CameraCalibration:
 
 
 def _text(file: Path) -> str:
-    """Return what a file says."""
+    """Return the text of a file."""
     try:
         return file.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        cure = f"Check {str(file)!r}."
-        raise argument_error("calibration", "a readable file of a calibration", "no such file", cure) from error
+        hint = f"Check {str(file)!r}."
+        raise argument_error("calibration", "a readable file of a calibration", "no such file", hint) from error
 
 
 def _numbers(file: Path, text: str, key: str, counts: tuple[int, ...]) -> FloatArray:
@@ -263,9 +263,9 @@ def _numbers(file: Path, text: str, key: str, counts: tuple[int, ...]) -> FloatA
     if len(words) not in counts:
         expected = f"{file.name} with {counts[0]} numbers {key!r}"
         raise argument_error("calibration", expected, f"a list of {len(words)}", f"Get {str(file)!r} again.")
-    cure = f"Correct {key!r} in {str(file)!r}."
+    hint = f"Correct {key!r} in {str(file)!r}."
     try:
         numbers = [float(word) for word in words]
     except ValueError as error:
-        raise argument_error("calibration", f"numbers after {key!r}", words, cure) from error
-    return np.asarray(check_array("calibration", numbers, (len(words),), cure))
+        raise argument_error("calibration", f"numbers after {key!r}", words, hint) from error
+    return np.asarray(check_array("calibration", numbers, (len(words),), hint))

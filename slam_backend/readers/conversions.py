@@ -1,4 +1,4 @@
-"""Conversions of readings: bearings and ranges to points, velocity commands to motions."""
+"""Conversion of ranges and bearings to points, and of velocity commands to motions."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,13 +13,13 @@ def points_from_polar(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the points of range and bearing readings and their covariances, to first order.
 
-    Zc = r cos b, Xc = -r sin b, Yc = 0: a planar sensor is a camera that sees everything at its own height.
+    Zc = r cos b, Xc = -r sin b, Yc = 0: a planar sensor is a camera whose points all have its own height.
 
     Args:
         ranges: (n,) float64 [m].
         bearings: (n,) float64 [rad], positive to the left of straight ahead.
-        variances: (n, 3) float64 [m^2, rad^2, m^2]. Of range, bearing and height.
-        offsets: (n, 3) float64 [m, m, rad]. Where the sensor was at each reading, frame of the step; None: there.
+        variances: (n, 3) float64 [m^2, rad^2, m^2]. Variances of range, bearing and height.
+        offsets: (n, 3) float64 [m, m, rad]. Poses of the sensor at the readings, frame of the step; None: zeros.
 
     Returns:
         Points (n, 3) [m] and covariances (n, 3, 3) [m^2], camera frame at the step.
@@ -41,18 +41,18 @@ HOLD = 1.5  # [s] a velocity older than this no longer moves the robot
 
 
 def integrate_commands(commands: ArrayLike, times: ArrayLike, hold: float = HOLD) -> FloatArray:
-    """Follow velocities exactly along their arcs; one holds until the next, but no longer than `hold`.
+    """Integrate velocities exactly along arcs; each applies until the next one, but no longer than `hold`.
 
     Args:
         commands: (n, 3) float64 [s, m/s, rad/s]. Time, forward and angular velocity, ordered by time, n >= 1.
-        times: (T,) float64 [s], any order. Before the first command the robot stands.
-        hold: Longest time that a command moves the robot [s].
+        times: (T,) float64 [s], any order. The robot is stationary before the first command.
+        hold: Longest effect of a command [s].
 
     Returns:
         (T, 3) poses at these times in the robot's start frame.
 
     Raises:
-        ValueError: If a shape is another, a number is not finite or there is no command.
+        ValueError: If a shape is wrong, a number is not finite or there is no command.
 
     >>> integrate_commands([[0.0, 1.0, 0.0], [2.0, 0.0, 1.0]], [1.0, 5.0], hold=3.0).tolist()
     [[1.0, 0.0, 0.0], [2.0, 0.0, 3.0]]
@@ -76,12 +76,12 @@ def integrate_arc(velocity: FloatArray, angular_velocity: FloatArray, duration: 
     """Return the motions of a unicycle at constant velocities.
 
     Args:
-        velocity: (n,) float64 [m/s]. Forwards.
+        velocity: (n,) float64 [m/s]. Forward velocity.
         angular_velocity: (n,) float64 [rad/s].
         duration: (n,) float64 [s].
 
     Returns:
-        (n, 3) float64 [m, m, rad]. Pose after the motion, seen from that before.
+        (n, 3) float64 [m, m, rad]. Pose after the motion relative to the pose before it.
     """
     turn = angular_velocity * duration
     chord = velocity * duration * np.sinc(turn / (2.0 * np.pi))  # numpy's sinc is sin(pi x) / (pi x)

@@ -1,11 +1,11 @@
-"""Tracked stereo features of a KITTI drive with its velocities: strict reading of the archive and of the true poses.
+"""Reader of tracked stereo features and velocities of a KITTI drive.
 
-The archive is that of UCSD's course ECE 276A: an extract of KITTI raw data (Geiger et al., IJRR 2013) whose features
-were tracked from frame to frame, so that a track's number is a landmark's identity. A track that ends never comes back.
+The archive, of UCSD's course ECE 276A, is an extract of KITTI raw data (Geiger et al., IJRR 2013) with features tracked
+from frame to frame, so that a track's number is a landmark's identity. A track that ends is never resumed.
 
-Where new features were sought, in 91 of the 1,106 frames of `0027.npz`, the archive has each old track just where it
-was in the frame before, while the car went on. The tracker goes on from that pixel, which shows another point of the
-world by then: what follows is a track of its own.
+In frames with new features, 91 of the 1,106 frames of `0027.npz`, the archive repeats the pixels of all old tracks from
+the previous frame although the car moved. The tracker continues from that pixel, which now shows another point of the
+world. The reader therefore starts a new track there.
 """
 
 from collections.abc import Sequence
@@ -23,25 +23,25 @@ from slam_backend.models.odometry import OdometryModel
 from slam_backend.trajectory import Trajectory
 
 KEYS = ("time_stamps", "features", "linear_velocity", "rotational_velocity", "K", "b", "cam_T_imu")
-ABSENT = -1.0  # fills the four pixels of a track in frames that do not show it
+ABSENT = -1.0  # pixels of a track in frames that do not show it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KittiLog:
-    """What a car with a stereo pair and an inertial unit recorded. The arrays are read-only.
+    """Log of a car with a stereo pair and an inertial unit. The arrays are read-only.
 
     Attributes:
-        times: (T,) float64 [s]. Of the frames, strictly increasing.
+        times: (T,) float64 [s]. Times of the frames, strictly increasing.
         velocities: (T, 6) float64 [m/s, rad/s]. Linear, then angular velocity, axes of the unit: ahead, left, up.
-        tracks: T arrays (n,) int64. Numbers of the tracks that a frame shows: rows of the archive, and numbers beyond
-            these for what goes on after a track was held where it stood, see `number_tracks`.
-        pixels: T arrays (n, 4) float64 [px]. Their column and row in the left image, then in the right one.
+        tracks: T arrays (n,) int64. Numbers of the tracks in each frame: rows of the archive, and higher numbers for
+            the continuation of a repeated track, see `number_tracks`.
+        pixels: T arrays (n, 4) float64 [px]. Columns and rows of the tracks in the left image, then in the right one.
         focal_px: Focal length [px]; pixels are square.
         centre_px: (2,) float64 [px]. Column and row of the optical axis.
-        baseline: Distance between the two eyes [m].
+        baseline: Distance between the two cameras [m].
         unit_from_camera: (3, 3) float64. Rotation from the camera's axes (right, down, ahead) to the unit's.
-        mount: (3,) float64 [m]. Where the left camera is, axes of the unit.
-        truth: Poses of the left camera in the plane of its first one, x ahead, y left; None where not known.
+        mount: (3,) float64 [m]. Position of the left camera, axes of the unit.
+        truth: Poses of the left camera in the plane of its first pose, x ahead, y left; None if unknown.
     """
 
     times: FloatArray
@@ -59,19 +59,19 @@ class KittiLog:
 def load_kitti(path: str | Path, truth: str | Path | None = None, duration: float | None = None) -> KittiLog:
     """Read an archive such as `0027.npz`.
 
-    The translation in `cam_T_imu` is read as the camera's place in the axes of the unit, (1.14, -0.31, 0.73) m in
-    `0027.npz`: that is where KITTI's cars carry it, and how it moves in turns; read as the name suggests it would lie
-    behind the unit.
+    The translation in `cam_T_imu` is interpreted as the camera's position in the axes of the unit, (1.14, -0.31,
+    0.73) m in `0027.npz`: this agrees with the mounting on KITTI's cars and with the motion in turns. In the sense of
+    the name the camera would be behind the unit.
 
     Args:
-        path: The archive, or a folder with just one.
-        truth: File of the true poses, one per frame: rows of a 3 x 4 matrix, perhaps after a time. None: that in the
-            folder `poses` beside the archive if there is just one, else unknown.
-        duration: Keep this many seconds [s]. None: all.
+        path: Archive, or a folder with a single archive.
+        truth: File of the true poses, one per frame: rows of a 3 x 4 matrix, optionally after a time. None: the only
+            file in the folder `poses` beside the archive, if any.
+        duration: Length of the log [s]. None: the whole log.
 
     Raises:
-        ValueError: If a file is missing or cannot be read, an array is missing, has another shape or impossible
-            numbers, or times go back; the text names the file.
+        ValueError: If a file is missing or cannot be read, an array is missing or has a wrong shape or impossible
+            numbers, or times go back; the message names the file.
     """
     file = _find(checked_path(path))
     content = _read(file)
@@ -112,14 +112,14 @@ def load_kitti(path: str | Path, truth: str | Path | None = None, duration: floa
 
 
 def number_tracks(features: FloatArray, shown: Sequence[IntArray]) -> list[IntArray]:
-    """Return the numbers of the tracks that each frame shows, new ones for those that were held where they stood.
+    """Return the numbers of the tracks in each frame, with new numbers for repeated ones.
 
-    Tracks are held in a frame that begins new ones and has all that it shares with the frame before at the same pixels,
-    to the last bit.
+    Tracks are repeated in a frame that starts new ones and has all tracks shared with the previous frame at exactly the
+    same pixels.
 
     Args:
-        features: (4, m, T) float64 [px]. Of each track in each frame.
-        shown: Per frame the tracks (n,) that it shows.
+        features: (4, m, T) float64 [px]. Pixels of each track in each frame.
+        shown: Tracks (n,) in each frame.
     """
     numbers, free = np.arange(features.shape[1]), features.shape[1]
     result: list[IntArray] = []
@@ -133,17 +133,17 @@ def number_tracks(features: FloatArray, shown: Sequence[IntArray]) -> list[IntAr
 
 
 def _find(path: Path) -> Path:
-    """Return the archive that a path names, or the only one in a folder."""
+    """Return the archive at a path, or the only one in a folder."""
     found = sorted(path.glob("*.npz")) if path.is_dir() else [path]
     if len(found) != 1 or not found[0].is_file():
-        got = f"a folder with {len(found)} of them" if path.is_dir() else "no such file"
+        got = f"a folder with {len(found)} archives" if path.is_dir() else "no such file"
         expected = "an archive (.npz) of KITTI features, or a folder with one"
         raise argument_error("path", expected, got, f"Check {str(path)!r}.")
     return found[0]
 
 
 def _find_truth(file: Path, truth: str | Path | None) -> Path | None:
-    """Return the file of true poses, if there is one."""
+    """Return the file of true poses, if any."""
     if truth is None:
         found = sorted((file.parent / "poses").glob("*.txt"))
         return found[0] if len(found) == 1 else None
@@ -153,7 +153,7 @@ def _find_truth(file: Path, truth: str | Path | None) -> Path | None:
 
 
 def _read(file: Path) -> dict[str, FloatArray]:
-    """Return the arrays of the archive; all are finite numbers."""
+    """Return the arrays of the archive, all with finite numbers."""
     try:
         archive = read_arrays(file, KEYS)
         missing = [key for key in KEYS if key not in archive]
@@ -169,50 +169,50 @@ def _read(file: Path) -> dict[str, FloatArray]:
 
 
 def read_truth(file: Path, times: FloatArray) -> Trajectory:
-    """Return the true path in the plane: KITTI's z is ahead, its x to the right, its heading that of the z axis.
+    """Return the true path in the plane: KITTI's z is ahead, its x to the right; the heading is that of the z axis.
 
     Args:
-        file: Rows of a 3 x 4 matrix, perhaps after a time; one for each frame, the first of them at least.
-        times: (T,) float64 [s]. Of the frames.
+        file: File with one row per frame of a 3 x 4 matrix, optionally after a time; later frames may be missing.
+        times: (T,) float64 [s]. Times of the frames.
 
     Raises:
-        ValueError: If it is no such file.
+        ValueError: If the file has another format.
     """
     expected = f"{file.name} with rows of 12 numbers, or 13 with a time, one for each frame"
-    cure = f"Correct {str(file)!r}."
+    hint = f"Correct {str(file)!r}."
     try:
         rows = np.array([[float(w) for w in line.split()] for line in file.read_text("utf-8").splitlines() if line])
     except ValueError as error:
-        raise argument_error("truth", expected, "a row that is no such", cure) from error
+        raise argument_error("truth", expected, "a row of another kind", hint) from error
     shaped = rows.ndim == 2 and rows.shape[1] in (12, 13) and 1 < len(rows) <= len(times)
     if not shaped or not np.isfinite(rows).all():
-        raise argument_error("truth", expected, f"an array {rows.shape} for {len(times)} frames", cure)
+        raise argument_error("truth", expected, f"an array {rows.shape} for {len(times)} frames", hint)
     matrices = rows[:, -12:].reshape(-1, 3, 4)
     heading = np.arctan2(-matrices[:, 0, 2], matrices[:, 2, 2])
     return Trajectory(times[: len(rows)], np.stack([matrices[:, 2, 3], -matrices[:, 0, 3], heading], axis=-1))
 
 
 def _check(file: Path, key: str, fine: bool, expected: str) -> None:
-    """Raise unless an entry of a file is fine."""
+    """Raise unless an entry of a file is valid."""
     if not fine:
-        cure = f"Get {str(file)!r} again."
-        raise argument_error("path", f"{file.name} with {expected} in {key!r}", "a different one", cure)
+        hint = f"Get {str(file)!r} again."
+        raise argument_error("path", f"{file.name} with {expected} in {key!r}", "a different one", hint)
 
 
-DIGITS = 32  # a track's number is written with three digits of this base: a descriptor that is its own and no other's
-MAD = 1.4826  # median absolute deviation to standard deviation of a Gaussian
-DEPTHS_KNOWN_TO = 0.2  # share; nearer to infinity a Gaussian point says nothing true
+DIGITS = 32  # base of the three digits of a track's number that form its unique descriptor
+MAD = 1.4826  # ratio of standard deviation to median absolute deviation of a Gaussian
+DEPTHS_KNOWN_TO = 0.2  # largest relative error of depths; beyond it the error of a point is not Gaussian
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KittiSteps:
-    """A drive as steps at the times of its frames.
+    """Drive as steps at the times of its frames.
 
     Attributes:
         times: (T,) float64 [s].
-        odometry: (T, 3) float64 [m, m, rad]. Motion of the inertial unit since the step before; the first is 0.
-        measurements: T entries; None where no track is near enough. All points lie at the camera's height; descriptors
-            are those of `track_descriptors`.
+        odometry: (T, 3) float64 [m, m, rad]. Motion of the inertial unit since the previous step; the first is zero.
+        measurements: T entries; None for a frame without near tracks. All points are at the camera's height, with
+            descriptors from `track_descriptors`.
     """
 
     times: FloatArray
@@ -236,15 +236,15 @@ def make_camera(log: KittiLog, sigma_px: float, sigma_disparity_px: float) -> St
 
 
 def to_filter_steps(log: KittiLog, camera: StereoCamera) -> KittiSteps:
-    """Turn a drive into planar odometry and measurements.
+    """Convert a drive to planar odometry and measurements.
 
-    The filter's robot moves in the plane while a car pitches and rolls by degrees, which moves rows of the image by
-    tens of pixels and columns hardly at all. So rows are not used: a feature is taken to be at the camera's height, in
-    the direction of its column and at the depth of its disparity. Features farther than `camera.max_range` are dropped.
+    The filter assumes planar motion, while a car pitches and rolls by degrees, which shifts image rows by tens of
+    pixels and columns hardly at all. Therefore rows are ignored: a feature is placed at the camera's height, in the
+    direction of its column and at the depth of its disparity. Features farther than `camera.max_range` are dropped.
 
     Args:
-        log: What `load_kitti` returned.
-        camera: Of `make_camera`.
+        log: Log from `load_kitti`.
+        camera: Camera from `make_camera`.
     """
     odometry = planar_motion(log)
     odometry.setflags(write=False)
@@ -253,7 +253,7 @@ def to_filter_steps(log: KittiLog, camera: StereoCamera) -> KittiSteps:
 
 
 def planar_motion(log: KittiLog) -> FloatArray:
-    """Return the motions (T, 3) [m, m, rad] since the frame before at the velocities of that frame."""
+    """Return the motions (T, 3) [m, m, rad] since the previous frame at that frame's velocities."""
     duration = np.diff(log.times)
     moved = log.velocities[:-1, :2] * duration[:, None]
     turn = log.velocities[:-1, 5] * duration
@@ -263,11 +263,11 @@ def planar_motion(log: KittiLog) -> FloatArray:
 
 
 def motion_noise(log: KittiLog) -> OdometryModel:
-    """Return the noise of `planar_motion` as the log itself shows it.
+    """Return the noise of `planar_motion`, estimated from the log.
 
-    Velocities of this extract carry white noise, about 0.5 m/s and 0.05 rad/s in `0027.npz`; a car's own velocity
-    hardly bends within three frames. The second differences of white noise of variance v have the variance 6 v.
-    To it comes 1 % of the distance and 2 % of the turn, a usual unit's scale error.
+    Velocities of this extract have white noise, about 0.5 m/s and 0.05 rad/s in `0027.npz`, while a car's true velocity
+    is nearly linear over three frames. The second differences of white noise of variance v have the variance 6 v. A
+    typical scale error of 1 % of the distance and 2 % of the turn is added.
     """
     second = np.diff(log.velocities, n=2, axis=0)[:, [0, 1, 5]]
     white = MAD * np.median(np.abs(second), axis=0) / np.sqrt(6.0) if len(second) else np.zeros(3)
@@ -283,7 +283,7 @@ def motion_noise(log: KittiLog) -> OdometryModel:
 
 
 def track_descriptors(tracks: IntArray) -> FloatArray:
-    """Return descriptors (n, 3) float64 of tracks (n,): digits, so that any two differ by at least 1.
+    """Return descriptors (n, 3) float64 of tracks (n,): digits, with a distance of at least 1 between any two.
 
     >>> track_descriptors(np.array([5, 32, 1025])).tolist()
     [[5.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 0.0, 1.0]]
@@ -292,7 +292,7 @@ def track_descriptors(tracks: IntArray) -> FloatArray:
 
 
 def _frame(log: KittiLog, camera: StereoCamera, tracks: IntArray, pixels: FloatArray) -> Measurements | None:
-    """Return what is near enough to be known of tracks (n,) with pixels (n, 4), all at the height of the camera."""
+    """Return the points of near tracks among (n,) with pixels (n, 4), all at the height of the camera."""
     disparity = pixels[:, 0] - pixels[:, 2]
     near = disparity * camera.max_range >= camera.focal_px * camera.baseline
     if not near.any():

@@ -1,4 +1,4 @@
-"""A folder of KITTI's odometry benchmark: rectified stereo images, their calibration, and perhaps true poses."""
+"""Reader of KITTI's odometry benchmark: rectified stereo images, calibration and optional true poses."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,23 +13,23 @@ from slam_backend.readers.calibration import Rectified, RectifiedPair, Rectifier
 from slam_backend.readers.kitti import read_truth
 from slam_backend.trajectory import Trajectory
 
-EYES = (("image_0", "image_1"), ("image_l", "image_r"))  # folders of the left and the right eye
-PERIOD = 0.1  # [s] between frames where no times are given: KITTI's cameras run at 10 Hz
+EYES = (("image_0", "image_1"), ("image_l", "image_r"))  # folders of the left and the right camera
+PERIOD = 0.1  # [s] between frames without given times: KITTI's cameras run at 10 Hz
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KittiImages:
-    """A drive as stereo images.
+    """Stereo images of a drive.
 
     Attributes:
-        times: (T,) float64 [s]. Strictly increasing.
-        left: T files.
-        right: T files.
-        pair: Their calibration.
-        width: Of the images [px].
-        height: Likewise.
-        truth: Poses of the left camera in the plane of its first one, x ahead, y left; None where not known.
-        rig: Rectifies the images; None: they are rectified.
+        times: (T,) float64 [s]. Strictly increasing times.
+        left: T files of the left camera.
+        right: T files of the right camera.
+        pair: Calibration of the rectified images.
+        width: Width of the images [px].
+        height: Height of the images [px].
+        truth: Poses of the left camera in the plane of its first pose, x ahead, y left; None if unknown.
+        rig: Rectification of the images; None: already rectified.
     """
 
     times: FloatArray
@@ -45,38 +45,38 @@ class KittiImages:
         """Read the left and the right image of a frame, rectified.
 
         Raises:
-            ValueError: If a file is no image, or of another size than the others.
+            ValueError: If a file is not an image, or has another size than the others.
         """
         pair = read_grey(self.left[frame]), read_grey(self.right[frame])
         return pair if self.rig is None else self.rig.rectify(*pair)
 
 
 def is_image_folder(path: str | Path) -> bool:
-    """Tell whether a folder has images of two eyes, as `load_kitti_images` reads them."""
+    """Return whether a folder has stereo images for `load_kitti_images`."""
     return _eyes(Path(path)) is not None
 
 
 def load_kitti_images(path: str | Path, truth: str | Path | None = None, duration: float | None = None) -> KittiImages:
-    """Read a folder with `image_0` and `image_1` (or `image_l` and `image_r`), `calib.txt` and perhaps `poses.txt`.
+    """Read a folder with `image_0` and `image_1` (or `image_l` and `image_r`), `calib.txt` and optional `poses.txt`.
 
     Args:
-        path: The folder. Seconds of the frames are in `times.txt`, or 0.1 s apart.
-        truth: File of the true poses; None: `poses.txt` of the folder, if it is there.
-        duration: Keep this many seconds [s]. None: all.
+        path: Folder of the drive. Times of the frames are in `times.txt` [s], or 0.1 s apart.
+        truth: File of the true poses; None: `poses.txt` of the folder, if any.
+        duration: Length of the log [s]. None: the whole log.
 
     Raises:
-        ValueError: If a file is missing or cannot be read, or the eyes have different images.
+        ValueError: If a file is missing or cannot be read, or the images of the two cameras have different names.
     """
     folder = checked_path(path)
-    eyes = _eyes(folder)
-    if eyes is None:
+    folders = _eyes(folder)
+    if folders is None:
         names = " or ".join(f"{left} and {right}" for left, right in EYES)
         raise argument_error("path", f"a folder with {names}", "a different one", f"Check {str(folder)!r}.")
-    left, right = (sorted(eye.glob("*.png")) for eye in eyes)
+    left, right = (sorted(place.glob("*.png")) for place in folders)
     if [file.name for file in left] != [file.name for file in right] or len(left) < 2:
         got = f"a pair of folders with {len(left)} and {len(right)}"
         raise argument_error(
-            "path", "two or more images of the same names in both eyes", got, f"Check {str(folder)!r}."
+            "path", "two or more images with the same names of both cameras", got, f"Check {str(folder)!r}."
         )
     times = read_times(folder / "times.txt" if (folder / "times.txt").is_file() else None, len(left))
     keep = len(times)
@@ -102,17 +102,17 @@ def read_grey(file: Path) -> Image:
     """Read an image file as grey levels (H, W) uint8.
 
     Raises:
-        ValueError: If it is none.
+        ValueError: If the file is not an image.
     """
     image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
     if image is None:
-        got = "a file that is none" if file.is_file() else "no such file"
+        got = "another file" if file.is_file() else "no such file"
         raise argument_error("path", "an image file", got, f"Get {str(file)!r} again.")
     return np.asarray(image, dtype=np.uint8)
 
 
 def _eyes(folder: Path) -> tuple[Path, Path] | None:
-    """Return the folders of the left and the right images, None if there are none."""
+    """Return the folders of the left and the right images, or None."""
     for left, right in EYES:
         if (folder / left).is_dir() and (folder / right).is_dir():
             return folder / left, folder / right
@@ -120,10 +120,10 @@ def _eyes(folder: Path) -> tuple[Path, Path] | None:
 
 
 def read_times(file: Path | None, count: int) -> FloatArray:
-    """Return the times (count,) [s] of the images; without a file of them the usual ones.
+    """Return the times (count,) [s] of the images; without a file they are `PERIOD` apart.
 
     Raises:
-        ValueError: If the file holds fewer numbers, or they do not rise.
+        ValueError: If the file has fewer numbers, or they do not increase strictly.
     """
     if file is None:
         return np.arange(count, dtype=np.float64) * PERIOD

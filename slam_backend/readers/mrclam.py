@@ -1,4 +1,4 @@
-"""The log of the UTIAS robots (MR.CLAM): strict parsing, and the landmark sightings of each robot."""
+"""Reader of the UTIAS multi-robot logs (MR.CLAM)."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -14,19 +14,19 @@ from slam_backend.readers.range_bearing import even_times, frames_at, motions
 from slam_backend.readers.tables import MOST_JITTER, sorted_note, steps_back, time_order
 from slam_backend.trajectory import Trajectory
 
-ROBOTS = (1, 2, 3, 4, 5)  # subjects with these numbers are the robots themselves
+ROBOTS = (1, 2, 3, 4, 5)  # subject numbers of the robots
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MrclamRobot:
-    """What one robot recorded, and where it really was. The arrays are read-only.
+    """Readings of one robot, and its true path. The arrays are read-only.
 
     Attributes:
-        robot: Its number in the log, 1 to 5.
-        commands: (n, 3) float64 [s, m/s, rad/s]. Time, forward and angular velocity as commanded; times never go back.
-        sightings: (m, 4) float64 [s, -, m, rad]. Time, subject, range, bearing (positive to the left) of landmarks;
-            times never go back. Sightings of robots and of unknown barcodes are left out.
-        truth: Poses in the world frame, or None where the log has none.
+        robot: Number of the robot in the log, 1 to 5.
+        commands: (n, 3) float64 [s, m/s, rad/s]. Time, forward and angular velocity as commanded, in order of time.
+        sightings: (m, 4) float64 [s, -, m, rad]. Time, subject, range, bearing (positive to the left) of landmarks, in
+            order of time. Sightings of robots and of unknown barcodes are dropped.
+        truth: True poses in the world frame; None if unknown.
     """
 
     robot: int
@@ -40,10 +40,10 @@ class MrclamLog:
     """A log of several robots among landmarks with barcodes. The arrays are read-only.
 
     Attributes:
-        robots: One entry per robot asked for, in that order.
-        subjects: (N,) int64. Numbers of the landmarks that have a barcode, ascending.
-        positions: (N, 2) float64 [m]. True positions of these, world frame; None where the log has none.
-        notes: Lines about the files: which were sorted by time, and where times hardly can be right.
+        robots: One entry per requested robot, in that order.
+        subjects: (N,) int64. Subject numbers of the landmarks with a barcode, ascending.
+        positions: (N, 2) float64 [m]. True positions of the landmarks, world frame; None if unknown.
+        notes: Lines about files that were sorted by time, and about implausible times.
     """
 
     robots: tuple[MrclamRobot, ...]
@@ -60,23 +60,23 @@ def load_mrclam(
 ) -> MrclamLog:
     """Read a folder such as `MRCLAM_Dataset7`.
 
-    Rows up to `MOST_JITTER` back in time are sorted; the notes of the log say so. Of commands at one time the last one
-    in the file holds, of true poses at one time the first one counts, sightings at one time keep the order of the file.
+    Rows up to `MOST_JITTER` back in time are sorted, with a remark in the notes of the log. At equal times the last
+    command and the first true pose of the file apply; sightings keep the order of the file.
 
     Args:
-        path: Folder with `Barcodes.dat` and, for each robot i, `Robot<i>_Odometry.dat` and `Robot<i>_Measurement.dat`.
-            Where the truth is known: `Landmark_Groundtruth.dat` and `Robot<i>_Groundtruth.dat`.
-        robots: Numbers of the robots to read, 1 to 5, each once. None: all whose odometry is there.
-        duration: Keep this many seconds from the earliest command on [s]. None: all.
-        truth: A file of the true poses of the one robot that is read, for folders that lack it: rows of time, x, y and
-            heading, with blanks or commas between, perhaps below a line of names. None: the folder's own, where known.
+        path: Folder with `Barcodes.dat` and, for each robot i, `Robot<i>_Odometry.dat` and `Robot<i>_Measurement.dat`;
+            optional: `Landmark_Groundtruth.dat` and `Robot<i>_Groundtruth.dat`.
+        robots: Numbers of the robots to read, 1 to 5, without repetition. None: all robots with odometry.
+        duration: Length of the log from the earliest command [s]. None: the whole log.
+        truth: File of true poses if a single robot is read: rows of time, x, y and heading, separated by blanks or
+            commas, with an optional header line. None: the file in the folder, if any.
 
     Returns:
-        The log. True poses are kept whole, so that any time of the kept readings can be looked up.
+        The log. True poses are not cut to `duration`.
 
     Raises:
-        ValueError: If the folder or a file is missing, a line is malformed (the text names file and line), a time lies
-            more than `MOST_JITTER` back, all sightings come before a robot's odometry, a robot is unknown,
+        ValueError: If the folder or a file is missing, a line is malformed (the message names file and line), a time
+            lies more than `MOST_JITTER` back, all sightings are earlier than a robot's odometry, a robot is unknown,
             `Landmark_Groundtruth.dat` lacks a landmark, or `truth` is given for several robots.
     """
     folder = checked_path(path)
@@ -88,8 +88,8 @@ def load_mrclam(
     subjects = np.array(sorted(set(subject_of.values()) - set(ROBOTS)), dtype=np.int64)
     positions = _read_positions(folder / "Landmark_Groundtruth.dat", subjects)
     if truth is not None and len(numbers) != 1:
-        cure = "Name the robot whose poses these are with robots."
-        raise argument_error("truth", "a file of one robot's poses", f"a log of robots {numbers}", cure)
+        hint = "Name the robot whose poses these are with robots."
+        raise argument_error("truth", "a file of one robot's poses", f"a log of robots {numbers}", hint)
     if truth is not None and not Path(truth).is_file():
         raise argument_error("truth", "a file of true poses", "no such file", f"Check {str(truth)!r}.")
     truths = {numbers[0]: Path(truth)} if truth is not None else {}
@@ -107,7 +107,7 @@ def load_mrclam(
 
 
 def _overlap_notes(log: MrclamRobot) -> Iterator[str]:
-    """Yield a line for each kind of reading that does not overlap a robot's odometry: clocks differ, probably."""
+    """Yield a line for each kind of reading whose times do not overlap a robot's odometry, perhaps by another clock."""
     first, last = log.commands[0, 0], log.commands[-1, 0]
     stamps = {"sightings": log.sightings[:, 0], "true poses": np.empty(0) if log.truth is None else log.truth.times}
     for name, times in stamps.items():
@@ -119,7 +119,7 @@ def _overlap_notes(log: MrclamRobot) -> Iterator[str]:
 
 
 def _read_positions(file: Path, subjects: IntArray) -> FloatArray | None:
-    """Return the true positions (N, 2) [m] of landmarks (N,), or None if there is no such file."""
+    """Return the true positions (N, 2) [m] of landmarks (N,), or None if the file does not exist."""
     if not file.exists():
         return None
     rows, _ = _read_table(file, ("subject", "x", "y", "sigma_x", "sigma_y"))
@@ -136,8 +136,8 @@ def _check_robots(folder: Path, robots: Sequence[int] | None) -> tuple[int, ...]
     if robots is None:
         present = tuple(robot for robot in ROBOTS if (folder / f"Robot{robot}_Odometry.dat").is_file())
         if not present:
-            cure = f"Check {str(folder / 'Robot1_Odometry.dat')!r}."
-            raise argument_error("path", "a folder of the MR.CLAM log", "no odometry of any robot", cure)
+            hint = f"Check {str(folder / 'Robot1_Odometry.dat')!r}."
+            raise argument_error("path", "a folder of the MR.CLAM log", "no odometry of any robot", hint)
         return present
     numbers = tuple(robots)
     unknown = [robot for robot in numbers if robot not in ROBOTS]
@@ -149,7 +149,7 @@ def _check_robots(folder: Path, robots: Sequence[int] | None) -> tuple[int, ...]
 def _read_robot(
     folder: Path, robot: int, subject_of: dict[int, int], truth_file: Path | None, sorted_files: list[str]
 ) -> MrclamRobot:
-    """Read the files of one robot, and add those that had to be sorted; what it saw of other robots is left out."""
+    """Read the files of one robot, without sightings of robots, and append the remarks about sorting."""
     commands, words = _read_table(folder / f"Robot{robot}_Odometry.dat", ("time", "velocity", "angular_velocity"))
     sorted_files.append(words)
     columns = ("time", "barcode", "range", "bearing")
@@ -158,22 +158,22 @@ def _read_robot(
     if len(rows) and rows[-1, 0] < commands[0, 0] - MOST_JITTER:
         expected = f"sightings of robot {robot} since its first odometry at {commands[0, 0]:.3f} s"
         got = f"a log of sightings from {rows[0, 0]:.3f} to {rows[-1, 0]:.3f} s"
-        cure = f"Check that the times in {folder / f'Robot{robot}_Measurement.dat'} are of the same clock."
-        raise argument_error("path", expected, got, cure)
+        hint = f"Check that the times in {folder / f'Robot{robot}_Measurement.dat'} are of the same clock."
+        raise argument_error("path", expected, got, hint)
     seen = np.array([subject_of.get(int(barcode), 0) for barcode in rows[:, 1]], dtype=np.float64)
     sightings = np.column_stack([rows[:, 0], seen, rows[:, 2:]])[seen > max(ROBOTS)]
-    own = folder / f"Robot{robot}_Groundtruth.dat"
+    default = folder / f"Robot{robot}_Groundtruth.dat"
     truth = None
-    if truth_file is not None or own.is_file():
-        poses, words = _read_table(own if truth_file is None else truth_file, ("time", "x", "y", "theta"))
+    if truth_file is not None or default.is_file():
+        poses, words = _read_table(default if truth_file is None else truth_file, ("time", "x", "y", "theta"))
         sorted_files.append(words)
-        fresh = np.diff(poses[:, 0], prepend=-np.inf) > 0.0  # a repeated stamp says nothing new
-        truth = Trajectory(poses[fresh, 0], poses[fresh, 1:])
+        kept = np.diff(poses[:, 0], prepend=-np.inf) > 0.0  # drops repeated time stamps
+        truth = Trajectory(poses[kept, 0], poses[kept, 1:])
     return MrclamRobot(robot, commands, sightings, truth)
 
 
 def _cut(log: MrclamRobot, end: float) -> MrclamRobot:
-    """Drop the readings after `end` [s]; a robot that has not started by then keeps its first command."""
+    """Drop the readings after `end` [s]; a robot that starts later keeps its first command."""
     kept = log.commands[log.commands[:, 0] <= end]
     return MrclamRobot(
         log.robot, kept if len(kept) else log.commands[:1], log.sightings[log.sightings[:, 0] <= end], log.truth
@@ -181,14 +181,14 @@ def _cut(log: MrclamRobot, end: float) -> MrclamRobot:
 
 
 def _read_table(file: Path, columns: tuple[str, ...], empty: bool = False) -> tuple[FloatArray, str]:
-    """Return the rows (n, columns) of a file of numbers, with blanks or commas between, and what `time_order` says.
+    """Return the rows (n, columns) of a file of numbers separated by blanks or commas, and the remark of `time_order`.
 
-    Comments after `#`, empty lines and a first line of names are skipped. Rows that begin with a time are in its order.
+    Comments after `#`, empty lines and a header line are skipped. Rows with a time are in order of time.
 
     Raises:
-        ValueError: If the file is missing or, unless `empty` says otherwise, has no rows; if a line does not hold one
-            finite number per column; if subjects or barcodes are not whole, ranges not positive, or times go back by
-            more than `MOST_JITTER`.
+        ValueError: If the file is missing or, unless `empty`, has no rows; if a line does not have one finite number
+            per column; if subjects or barcodes are not whole, ranges not positive, or times go back by more than
+            `MOST_JITTER`.
     """
     if not file.is_file():
         raise argument_error("path", f"a folder with {file.name}", "no such file", f"Check {str(file)!r}.")
@@ -217,7 +217,7 @@ def _read_table(file: Path, columns: tuple[str, ...], empty: bool = False) -> tu
 
 
 def _faults(table: FloatArray, columns: tuple[str, ...]) -> Iterator[tuple[str, BoolArray]]:
-    """Yield each rule that rows (n, columns) must keep, with a mask (n,) of those that break it."""
+    """Yield each rule for rows (n, columns), with the mask (n,) of rows that violate it."""
     yield "finite numbers", np.asarray(~np.isfinite(table).all(axis=1))
     for name, column in zip(columns, table.T, strict=True):
         if name in ("subject", "barcode"):
@@ -229,13 +229,13 @@ def _faults(table: FloatArray, columns: tuple[str, ...]) -> Iterator[tuple[str, 
 
 
 def _names(body: str) -> bool:
-    """Tell whether a line holds words with commas between, none of which spells a number."""
+    """Return whether a line is a header: words separated by commas, none of them a number."""
     return "," in body and all(_parse(word) is None for word in body.split(","))
 
 
 def _parse(body: str) -> list[float] | None:
-    """Return the numbers that a line spells, or None if a word spells none."""
-    if "_" in body:  # Python reads 1_000 as a number, a log that holds it is damaged
+    """Return the numbers of a line, or None if a word is not a number."""
+    if "_" in body:  # Python accepts 1_000, which is damage in a log
         return None
     try:
         return [float(word) for word in (body.split(",") if "," in body else body.split())]
@@ -244,25 +244,25 @@ def _parse(body: str) -> list[float] | None:
 
 
 def _bad_line(file: Path, number: int, line: str, columns: tuple[str, ...], rule: str) -> ValueError:
-    """Say what is wrong with a line of a file."""
+    """Return the error of a malformed line of a file."""
     expected = f"{len(columns)} numbers ({' '.join(columns)}){rule}"
     return argument_error("path", expected, repr(line.strip()), f"Correct line {number} of {file}.")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SightingNoise:
-    """Assumed errors of one sighting; the defaults are twice what the sightings of this data set show.
+    """Assumed errors of one sighting; the defaults are twice the errors observed in this data set.
 
-    Against the truth of six robots (five of data set 7, one of 4), ranges scatter by 0.03 to 0.17 m from 1 to 3 m and
-    by 0.07 to 0.21 m from 4 to 6 m, robot by robot, and bearings by 0.006 to 0.018 rad. These errors persist: those of
-    ranges correlate by about 0.85 from one frame to the next, 0.65 over a second and 0.4 over four, those of bearings
-    half as much. A filter takes each sighting for new evidence, hence the factor of two.
+    Compared with the truth of six robots (five of data set 7, one of 4), the standard deviation of ranges is 0.03 to
+    0.17 m from 1 to 3 m and 0.07 to 0.21 m from 4 to 6 m, that of bearings 0.006 to 0.018 rad, depending on the robot.
+    The errors are correlated in time: those of ranges by about 0.85 between frames, 0.65 over 1 s and 0.4 over 4 s,
+    those of bearings half as much. A filter assumes independent sightings, hence the factor of two.
 
     Attributes:
         range_floor: Standard deviation of a range near zero [m].
-        range_share: What each metre of range adds, in quadrature [m/m].
+        range_share: Additional standard deviation per metre of range, added in quadrature [m/m].
         bearing: Standard deviation of a bearing [rad].
-        height: Standard deviation of the height [m]: all landmarks are taken to stand at the camera's own.
+        height: Standard deviation of the landmarks' height relative to the camera, assumed zero [m].
     """
 
     range_floor: float = 0.1
@@ -283,12 +283,12 @@ class SightingNoise:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Drive:
-    """How a robot follows its commands; the default takes them at their word.
+    """Response of a robot to its commands; by default it follows them exactly.
 
     Attributes:
-        delay: From a command to the motion [s].
-        speed: Driven over commanded velocity [-].
-        turn: Driven over commanded angular velocity [-].
+        delay: Time from a command to the motion [s].
+        speed: Ratio of driven to commanded velocity [-].
+        turn: Ratio of driven to commanded angular velocity [-].
     """
 
     delay: float = 0.0
@@ -301,18 +301,19 @@ class Drive:
             check_float(f"drive.{name}", getattr(self, name), "Give a factor near 1.", above=0.0)
 
     def driven(self, commands: FloatArray) -> FloatArray:
-        """Return the velocities (n, 3) [s, m/s, rad/s] that follow from commands (n, 3) of the same units."""
+        """Return the driven velocities (n, 3) [s, m/s, rad/s] of commands (n, 3) in the same units."""
         return np.asarray(commands * [1.0, self.speed, self.turn] + [self.delay, 0.0, 0.0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RobotSteps:
-    """One robot's readings, step by step.
+    """Readings of one robot, step by step.
 
     Attributes:
-        odometry: (T, 3) float64 [m, m, rad]. Motion since the step before, in the previous robot frame; the first is 0.
-        reckoned: (T, 3) float64 [m, m, rad]. Where the commands, taken at their word, would lead; own start frame.
-        measurements: T entries; None where it saw no landmark. Descriptors are one-hot, by the order of
+        odometry: (T, 3) float64 [m, m, rad]. Motion since the previous step, in the previous robot frame; the first is
+            zero.
+        reckoned: (T, 3) float64 [m, m, rad]. Dead reckoning of the commands, own start frame.
+        measurements: T entries; None for a step without landmarks. Descriptors are one-hot, in the order of
             `MrclamLog.subjects`.
     """
 
@@ -323,11 +324,11 @@ class RobotSteps:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MrclamSteps:
-    """A log as steps at common times.
+    """Log as steps at common times.
 
     Attributes:
-        times: (T,) float64 [s]. Evenly spaced.
-        robots: In the order of the log.
+        times: (T,) float64 [s]. Evenly spaced times.
+        robots: Steps of each robot, in the order of the log.
     """
 
     times: FloatArray
@@ -339,23 +340,23 @@ def to_filter_steps(
 ) -> MrclamSteps:
     """Resample a log at common times, from its earliest command to its last reading.
 
-    A sighting goes to the nearest step and is moved there by the odometry in between, so that it loses nothing to the
-    rounding of its time. Of several sightings of one landmark in one step the first counts: their errors are largely
-    the same. The default step is a little longer than the 0.23 s between two frames of these cameras.
+    A sighting is assigned to the nearest step and moved there by the odometry in between, so that rounding of its time
+    causes no error. Only the first of several sightings of one landmark in one step is used: their errors are strongly
+    correlated. The default step is slightly longer than the 0.23 s between two frames of these cameras.
 
     Args:
-        log: What `load_mrclam` returned.
+        log: Log from `load_mrclam`.
         dt: Time between steps [s].
-        noise: Errors assumed for each sighting. None: `SightingNoise()`.
-        drive: How the robots follow their commands. None: `Drive()`.
+        noise: Assumed errors of each sighting. None: `SightingNoise()`.
+        drive: Response of the robots to their commands. None: `Drive()`.
 
     Raises:
-        ValueError: If `dt` is not positive, or makes more than a million steps.
+        ValueError: If `dt` is not positive, or gives more than a million steps.
     """
     noise = SightingNoise() if noise is None else noise
     stamps = [robot.commands[:, 0] for robot in log.robots] + [robot.sightings[:, 0] for robot in log.robots]
     start = min(float(robot.commands[0, 0]) for robot in log.robots)
-    times = even_times(start, max(float(own[-1]) for own in stamps if len(own)), dt)
+    times = even_times(start, max(float(column[-1]) for column in stamps if len(column)), dt)
     drive = Drive() if drive is None else drive
     return MrclamSteps(times, tuple(_robot_steps(robot, times, log.subjects, noise, drive) for robot in log.robots))
 

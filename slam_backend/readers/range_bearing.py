@@ -1,4 +1,4 @@
-"""Odometry and range-bearing readings with times of their own become steps of a filter at common times."""
+"""Conversion of asynchronous odometry and range-bearing readings to steps of a filter at common times."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,12 +22,13 @@ class RangeBearingSteps:
     """One robot's log as steps at common times.
 
     Attributes:
-        times: (T,) float64 [s]. Evenly spaced.
-        odometry: (T, 3) float64 [m, m, rad]. Motion since the step before, in the previous robot frame; the first is 0.
-        measurements: T entries; None where nothing was seen. Points in the camera frame with covariances. Descriptors
-            are one-hot by `names`, or all the same where no identities were given.
-        names: (N,) Identities in ascending order, the columns of the descriptors; empty where none were given.
-        notes: Lines about what was done to the log: which rows were sorted by time.
+        times: (T,) float64 [s]. Evenly spaced times.
+        odometry: (T, 3) float64 [m, m, rad]. Motion since the previous step, in the previous robot frame; the first is
+            zero.
+        measurements: T entries; None for a step without sightings. Points in the camera frame with covariances.
+            Descriptors are one-hot by `names`, or all equal without identities.
+        names: (N,) Identities in ascending order, the columns of the descriptors; empty without identities.
+        notes: Lines about rows that were sorted by time.
     """
 
     times: FloatArray
@@ -48,27 +49,27 @@ def range_bearing_steps(
     dt: float = 0.25,
     hold: float = HOLD,
 ) -> RangeBearingSteps:
-    """Turn the log of one robot that moves in the plane into odometry and measurements.
+    """Convert the log of one robot in the plane to odometry and measurements.
 
-    Rows up to `MOST_JITTER` back in time are sorted. A sighting goes to the nearest step and is moved there by the
-    odometry in between. Of several sightings of one identity in one step the first counts.
+    Rows up to `MOST_JITTER` back in time are sorted. A sighting is assigned to the nearest step and moved there by the
+    odometry in between. Only the first of several sightings of one identity in one step is used.
 
     Args:
-        velocities: (n, 3) float64 [s, m/s, rad/s]. Time, forward and angular velocity; n >= 1. Of rows at one time the
-            last one holds.
+        velocities: (n, 3) float64 [s, m/s, rad/s]. Time, forward and angular velocity; n >= 1. The last of several rows
+            at one time applies.
         sightings: (m, 3) float64 [s, m, rad]. Time, range, bearing (positive to the left of straight ahead); m >= 1.
-        identities: (m,) numbers or names of the landmarks seen; None: unknown, positions alone tell landmarks apart.
+        identities: (m,) numbers or names of the landmarks; None: unknown, data association by position alone.
         sigma_range: Standard deviation of a range [m], one number or (m,).
         sigma_bearing: Standard deviation of a bearing [rad], one number or (m,).
-        sigma_height: Standard deviation of the height [m], one number or (m,): all landmarks are taken to stand at the
-            sensor's own.
+        sigma_height: Standard deviation of the landmarks' height relative to the sensor, assumed zero [m], one number
+            or (m,).
         dt: Time between steps [s].
-        hold: Longest time that a velocity moves the robot [s].
+        hold: Longest effect of a velocity [s].
 
     Raises:
-        ValueError: If an array is empty or of another shape, a number is not finite, a range is not positive, a time
+        ValueError: If an array is empty or has a wrong shape, a number is not finite, a range is not positive, a time
             lies more than `MOST_JITTER` back, no sighting lies between the first and the last velocity, a standard
-            deviation or `dt` is not positive, or there would be more than a million steps.
+            deviation or `dt` is not positive, or there are more than a million steps.
     """
     check_float("hold", hold, "Give seconds.", above=0.0)
     driven, _, driven_words = _table("velocities", velocities, "Give rows (time, velocity, angular velocity).")
@@ -87,9 +88,9 @@ def range_bearing_steps(
     sigmas = {"sigma_range": sigma_range, "sigma_bearing": sigma_bearing, "sigma_height": sigma_height}
     variances = np.stack([_variances(name, sigma, len(seen))[order] for name, sigma in sigmas.items()], axis=-1)
     if len(names):
-        descriptors, told_apart = np.eye(len(names), dtype=np.float32)[column], column
+        descriptors, labels = np.eye(len(names), dtype=np.float32)[column], column
     else:
-        descriptors, told_apart = np.ones((len(seen), 1), dtype=np.float32), np.arange(len(seen))
+        descriptors, labels = np.ones((len(seen), 1), dtype=np.float32), np.arange(len(seen))
 
     def pose_at(wanted: FloatArray) -> FloatArray:
         return integrate_commands(driven, wanted, hold)
@@ -97,30 +98,30 @@ def range_bearing_steps(
     return RangeBearingSteps(
         times,
         motions(pose_at(times)),
-        frames_at(times, pose_at, seen, variances, descriptors, told_apart),
+        frames_at(times, pose_at, seen, variances, descriptors, labels),
         names,
         sorted_note([driven_words, seen_words]),
     )
 
 
 def even_times(start: float, end: float, dt: float) -> FloatArray:
-    """Return times (T,) [s] from `start` on, `dt` [s] apart, until `end` is reached.
+    """Return times (T,) [s] from `start`, `dt` [s] apart, until `end` is reached.
 
     Raises:
-        ValueError: If `dt` is not positive, or makes more than a million steps.
+        ValueError: If `dt` is not positive, or gives more than a million steps.
 
     >>> even_times(1.0, 1.8, 0.5).tolist()
     [1.0, 1.5, 2.0]
     """
     dt = check_float("dt", dt, "Give seconds between steps.", above=0.0)
     if (end - start) / dt > MAX_STEPS:
-        cure = "Take longer steps, and give all times in seconds of one clock."
-        raise argument_error("dt", f"at most {MAX_STEPS:,} steps", (end - start) / dt, cure)
+        hint = "Take longer steps, and give all times in seconds of one clock."
+        raise argument_error("dt", f"at most {MAX_STEPS:,} steps", (end - start) / dt, hint)
     return np.asarray(start + dt * np.arange(int(np.ceil((end - start) / dt)) + 1, dtype=np.float64))
 
 
 def motions(path: FloatArray) -> FloatArray:
-    """Return the motion (T, 3) [m, m, rad] since the pose before, in its frame, of poses (T, 3); the first is 0.
+    """Return the motions (T, 3) [m, m, rad] of poses (T, 3) since and relative to the previous one; the first is zero.
 
     >>> motions(np.array([[1.0, 0.0, 0.0], [1.0, 2.0, 0.0]])).tolist()
     [[0.0, 0.0, 0.0], [0.0, 2.0, 0.0]]
@@ -138,66 +139,66 @@ def frames_at(
     descriptors: NDArray[np.float32],
     identities: IntArray,
 ) -> tuple[Measurements | None, ...]:
-    """Put sightings into the nearest of evenly spaced steps, moved there by the odometry in between.
+    """Assign sightings to the nearest of evenly spaced steps, moved there by the odometry in between.
 
     Args:
-        times: (T,) float64 [s]. Evenly spaced.
-        pose_at: Poses (k, 3) [m, m, rad] by dead reckoning at times (k,) [s].
+        times: (T,) float64 [s]. Evenly spaced times.
+        pose_at: Function that returns dead-reckoned poses (k, 3) [m, m, rad] at times (k,) [s].
         sightings: (m, 3) float64 [s, m, rad]. Time, range, bearing, ordered by time.
         variances: (m, 3) float64 [m^2, rad^2, m^2]. Errors of range, bearing and height.
         descriptors: (m, d) float32.
-        identities: (m,) int64 >= 0. Of several sightings of one identity in one step the first counts.
+        identities: (m,) int64 >= 0. Identities; only the first of several sightings of one in one step is used.
 
     Returns:
-        T frames; None where nothing was seen.
+        T frames; None for a step without sightings.
     """
     step = np.rint((sightings[:, 0] - times[0]) / (times[1] - times[0])).astype(np.int64) if len(times) > 1 else 0
     step = np.clip(np.broadcast_to(step, len(sightings)), 0, len(times) - 1)
     _, first = np.unique(step * (identities.max(initial=0) + 1) + identities, return_index=True)  # by step, identity
     chosen, step = sightings[first], step[first]
-    # The robot at the time of the sighting, seen from where it is at the step.
+    # Pose of the robot at the time of the sighting, relative to its pose at the step.
     offset = between(pose_at(times)[step], pose_at(chosen[:, 0]))
     points, covariances = points_from_polar(chosen[:, 1], chosen[:, 2], variances[first], offset)
-    looks = descriptors[first]
+    described = descriptors[first]
     bounds = np.searchsorted(step, np.arange(len(times) + 1))
     return tuple(
-        Measurements(points[a:b], looks[a:b], covariances[a:b]) if b > a else None for a, b in pairwise(bounds)
+        Measurements(points[a:b], described[a:b], covariances[a:b]) if b > a else None for a, b in pairwise(bounds)
     )
 
 
-def _table(name: str, value: ArrayLike, cure: str) -> tuple[FloatArray, IntArray, str]:
-    """Return rows (n, 3) in order of time, that order, and what `time_order` says."""
-    table: FloatArray = check_array(name, value, (None, 3), cure)
+def _table(name: str, value: ArrayLike, hint: str) -> tuple[FloatArray, IntArray, str]:
+    """Return rows (n, 3) in order of time, that order, and the remark of `time_order`."""
+    table: FloatArray = check_array(name, value, (None, 3), hint)
     if not len(table):
-        raise argument_error(name, "at least one row", "no row", cure)
+        raise argument_error(name, "at least one row", "no row", hint)
     late = np.flatnonzero(steps_back(table[:, 0]) > MOST_JITTER)
     if len(late):
         row = int(late[0])
         got = f"a time {table[row, 0]:.3f} s after {table[:row, 0].max():.3f} s in row {row}"
-        raise argument_error(name, f"times that go back by at most {MOST_JITTER:g} s", got, "Look at the log there.")
+        raise argument_error(name, f"times that go back by at most {MOST_JITTER:g} s", got, "Check the log there.")
     order, words = time_order(name, table[:, 0])
     return table[order], order, words
 
 
 def _variances(name: str, sigma: float | ArrayLike, count: int) -> FloatArray:
     """Return the variances (count,) of a standard deviation, or of one per sighting."""
-    cure = "Give a standard deviation, or one per sighting."
-    given: FloatArray = check_array(name, np.full(count, sigma) if np.ndim(sigma) == 0 else sigma, (count,), cure)
+    hint = "Give a standard deviation, or one per sighting."
+    given: FloatArray = check_array(name, np.full(count, sigma) if np.ndim(sigma) == 0 else sigma, (count,), hint)
     if (given <= 0.0).any():
-        raise argument_error(name, "standard deviations > 0", float(given.min()), cure)
+        raise argument_error(name, "standard deviations > 0", float(given.min()), hint)
     return given**2
 
 
 def _identities(identities: ArrayLike | None, count: int) -> tuple[NDArray[Any], IntArray]:
-    """Return the names (N,) and the place among them (count,) of each sighting; no names where none are given."""
+    """Return the names (N,) and the index of each sighting's name (count,); no names without identities."""
     if identities is None:
         return np.empty(0, dtype=np.int64), np.zeros(count, dtype=np.int64)
     given = np.asarray(identities)
-    cure = "Give one number or name per sighting, or None."
+    hint = "Give one number or name per sighting, or None."
     if given.shape != (count,) or given.dtype.kind not in "iufUS":
         got = f"an array of {given.dtype}, shape {given.shape}"
-        raise argument_error("identities", f"numbers or names of shape ({count},)", got, cure)
+        raise argument_error("identities", f"numbers or names of shape ({count},)", got, hint)
     if given.dtype.kind == "f" and not np.array_equal(given, np.round(given)):
-        raise argument_error("identities", "whole numbers or names", "NaN or fractions", cure)
+        raise argument_error("identities", "whole numbers or names", "NaN or fractions", hint)
     names, column = np.unique(given, return_inverse=True)
     return names, column.astype(np.int64)

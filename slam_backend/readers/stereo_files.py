@@ -1,4 +1,4 @@
-"""Stereo images in a folder of any layout: which files are of which eye, and the rig that took them."""
+"""Reader of stereo images in a folder of any layout, with their calibration."""
 
 import re
 from dataclasses import dataclass
@@ -19,13 +19,13 @@ class StereoFiles:
     """Names of the files of a stereo log, within its folder unless they are absolute paths.
 
     Attributes:
-        left: Images of the left eye: a pattern such as `cam0/*.png`, taken in order of the numbers in the names, or
-            names with commas between.
-        right: Images of the right eye, in the same way and order.
+        left: Images of the left camera: a pattern such as `cam0/*.png`, sorted by the numbers in the names, or names
+            separated by commas.
+        right: Images of the right camera, in the same format and order.
         calibration: One file of the projection matrices of rectified images (KITTI's `calib.txt`), or two files
-            `sensor.yaml` of EuRoC's raw cameras with a comma between, the left one first.
-        times: File of the seconds of the frames; None: 0.1 s apart.
-        truth: File of the true poses; None: not known.
+            `sensor.yaml` of EuRoC's raw cameras separated by a comma, the left one first.
+        times: File of the times of the frames [s]; None: 0.1 s apart.
+        truth: File of the true poses; None: unknown.
     """
 
     left: str = "left_img_*.png"
@@ -36,10 +36,10 @@ class StereoFiles:
 
 
 def find_pairs(folder: str | Path, files: StereoFiles) -> tuple[tuple[Path, ...], tuple[Path, ...]]:
-    """Return the images of the left and of the right eye, as many of each.
+    """Return the images of the left and of the right camera, the same number of each.
 
     Raises:
-        ValueError: If the folder or an image is missing, or there are not as many of both eyes, two at least.
+        ValueError: If the folder or an image is missing, the numbers differ, or there are fewer than two pairs.
     """
     root = Path(folder)
     if not root.is_dir():
@@ -47,9 +47,7 @@ def find_pairs(folder: str | Path, files: StereoFiles) -> tuple[tuple[Path, ...]
     left, right = (_images(root, option, getattr(files, option)) for option in ("left", "right"))
     if len(left) != len(right) or len(left) < LEAST_PAIRS:
         got = f"a folder with {len(left)} {files.left!r} and {len(right)} {files.right!r}"
-        raise argument_error(
-            "path", "two or more images, as many of both eyes", got, "Name them with --left and --right."
-        )
+        raise argument_error("path", "two or more pairs of images", got, "Name them with --left and --right.")
     return left, right
 
 
@@ -57,17 +55,17 @@ def load_rig(folder: str | Path, calibration: str, size: tuple[int, int]) -> Rec
     """Read the calibration of a rig.
 
     Args:
-        folder: In which the names are looked up.
-        calibration: As `StereoFiles` has it.
+        folder: Folder of the files.
+        calibration: Names of the files, see `StereoFiles.calibration`.
         size: Width and height of the images [px].
 
     Raises:
-        ValueError: If it names neither one file nor two, or they cannot be used.
+        ValueError: If there are not one or two names, or a file is invalid.
     """
     names = _words(calibration)
     if len(names) not in (1, 2):
-        cure = "Name calib.txt, or sensor.yaml of the left and of the right camera with a comma between."
-        raise argument_error("calibration", "one file or two", repr(calibration), cure)
+        hint = "Name calib.txt, or sensor.yaml of the left and of the right camera with a comma between."
+        raise argument_error("calibration", "one file or two", repr(calibration), hint)
     places = [Path(folder) / name for name in names]
     if len(places) == 2:
         return load_euroc_calibration(*places)
@@ -79,8 +77,8 @@ def load_stereo_images(folder: str | Path, files: StereoFiles, duration: float |
 
     Args:
         folder: Folder of the drive.
-        files: Names within it. `truth` has rows of a 3 x 4 matrix, as KITTI's poses.
-        duration: Keep this many seconds [s]. None: all.
+        files: Names of the files. `truth` has rows of a 3 x 4 matrix, as KITTI's poses.
+        duration: Length of the log [s]. None: the whole log.
 
     Raises:
         ValueError: If a file is missing or cannot be read.
@@ -99,16 +97,16 @@ def load_stereo_images(folder: str | Path, files: StereoFiles, duration: float |
 
 
 def truth_file(folder: str | Path, files: StereoFiles) -> Path | None:
-    """Return the file of true poses, None where none is named.
+    """Return the file of true poses, or None if none is named.
 
     Raises:
-        ValueError: If it is named and not there.
+        ValueError: If the named file does not exist.
     """
     return None if files.truth is None else _existing("truth", Path(folder), files.truth)
 
 
 def _images(folder: Path, option: str, names: str) -> tuple[Path, ...]:
-    """Return the images that a pattern or a list names; those of a pattern in order of the numbers in their names."""
+    """Return the images of a pattern, sorted by the numbers in their names, or of a list of names."""
     if any(sign in names for sign in "*?["):
         whole = Path(names)
         root, pattern = (
@@ -126,19 +124,19 @@ def _images(folder: Path, option: str, names: str) -> tuple[Path, ...]:
 
 
 def _by_numbers(file: Path) -> list[tuple[int, str]]:
-    """Return a key by which `img_2` comes before `img_10`."""
+    """Return a sort key that puts `img_2` before `img_10`."""
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"([0-9]+)", str(file))]
 
 
 def _words(names: str) -> list[str]:
-    """Return the names between the commas."""
+    """Return the names separated by commas."""
     return [name.strip() for name in names.split(",") if name.strip()]
 
 
 def _existing(option: str, folder: Path, name: str) -> Path:
-    """Return where a file is, and refuse one that is not there."""
+    """Return the path of an existing file, or raise."""
     place = folder / name
     if not place.is_file():
-        what = {"times": "a file of the seconds of the frames", "truth": "a file of true poses"}[option]
+        what = {"times": "a file of the times of the frames", "truth": "a file of true poses"}[option]
         raise argument_error(option, what, "no such file", f"Check {str(place)!r}.")
     return place

@@ -1,4 +1,4 @@
-"""Tables of numbers in text files: read with clear errors, put in order of time."""
+"""Tables of numbers in text files, and their order in time."""
 
 import csv
 import math
@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_choice
 
-MOST_JITTER = 1.0  # [s]; loggers that write from several threads swap rows by tenths of a second, no more
+MOST_JITTER = 1.0  # [s]; multi-threaded loggers swap rows by tenths of a second only
 
 
 def steps_back(times: FloatArray) -> FloatArray:
-    """Return how far each row lies before the latest row above it, 0 where it does not.
+    """Return the time of each row before the latest row above it, 0 for rows in order.
 
     Args:
         times: (n,) float64 [s], in the order of the file.
@@ -27,16 +27,15 @@ def steps_back(times: FloatArray) -> FloatArray:
 
 
 def time_order(name: str, times: FloatArray) -> tuple[IntArray, str]:
-    """Return the rows in order of time, and what was done in a few words.
+    """Return the rows in order of time, and a remark about the sorting.
 
     Args:
-        name: The file, as the words shall call it.
-        times: (n,) float64 [s], in the order of the file. `steps_back` is at most `MOST_JITTER` in each row; a reader
-            refuses the file before.
+        name: Name of the file in the remark.
+        times: (n,) float64 [s], in the order of the file. `steps_back` is at most `MOST_JITTER`, checked by the reader.
 
     Returns:
-        Rows (n,), earliest first; rows of one time keep the order of the file. The words are empty if that is the
-        order of the file.
+        Rows (n,), earliest first; rows of equal times keep the order of the file. The remark is empty if the file was
+        in order.
 
     >>> time_order("a.dat", np.array([1.0, 3.0, 2.5, 3.0]))
     (array([0, 2, 1, 3]), 'a.dat (1 row, up to 0.500 s back)')
@@ -48,24 +47,24 @@ def time_order(name: str, times: FloatArray) -> tuple[IntArray, str]:
 
 
 def sorted_note(words: list[str]) -> tuple[str, ...]:
-    """Return one line about all files that were sorted; no line if there are none.
+    """Return one line about all sorted files; no line if there are none.
 
     Args:
-        words: Remarks that `time_order` said of each file.
+        words: Remarks of `time_order` about each file.
     """
-    told = [word for word in words if word]
-    return (f"Sorted by time: {', '.join(told)}.",) if told else ()
+    remarks = [word for word in words if word]
+    return (f"Sorted by time: {', '.join(remarks)}.",) if remarks else ()
 
 
 DELIMITERS = (",", ";", "\t")
 
 
 class CsvTable(NamedTuple):
-    """The columns of a file that were asked for. n rows.
+    """Columns of a CSV file with n rows.
 
     Attributes:
-        numbers: (n, k) float64. All finite.
-        labels: (n, l) str. Words without the blanks around them, none empty.
+        numbers: (n, k) float64. Finite numbers.
+        labels: (n, l) str. Non-empty words without surrounding blanks.
     """
 
     numbers: FloatArray
@@ -75,19 +74,19 @@ class CsvTable(NamedTuple):
 def read_csv(
     path: str | Path, numbers: Sequence[str], labels: Sequence[str] = (), delimiter: str | None = None
 ) -> CsvTable:
-    """Read columns of a CSV file whose first line names them.
+    """Read columns of a CSV file with a header line.
 
-    Other columns and empty lines are skipped, as are lines that begin with `#` below the first one.
+    Other columns, empty lines and, below the header, lines that begin with `#` are skipped.
 
     Args:
-        path: The file, UTF-8; `#` before the first name is dropped.
+        path: UTF-8 file; `#` before the first name is dropped.
         numbers: Names of k columns of numbers.
-        labels: Names of l columns that are kept as words, such as a landmark's identity.
-        delimiter: ",", ";" or a tab; None: the one that the first line holds.
+        labels: Names of l columns of words, such as a landmark's identity.
+        delimiter: ",", ";" or a tab; None: the delimiter of the header line.
 
     Raises:
-        ValueError: If the file is missing, no text or has no rows, a column is missing or there twice, or an entry is
-            missing, no finite number or an empty label; the text names file, line and column.
+        ValueError: If the file is missing, not text or has no rows, a column is missing or repeated, or an entry is
+            missing, not a finite number or an empty label; the message names file, line and column.
     """
     file = Path(path)
     if not file.is_file():
@@ -96,7 +95,7 @@ def read_csv(
         lines = file.read_text(encoding="utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
         raise argument_error(
-            "path", f"{file.name} in UTF-8", "a file in another encoding", f"Save {file} so."
+            "path", f"{file.name} in UTF-8", "a file in another encoding", f"Save {file} in UTF-8."
         ) from error
     first = next((number for number, line in enumerate(lines) if line.strip()), None)
     if first is None:
@@ -127,18 +126,18 @@ def read_csv(
 
 
 def _place(file: Path, names: list[str], wanted: str) -> int:
-    """Return where a column stands."""
+    """Return the index of a column."""
     if names.count(wanted) != 1:
         got = f"a line of names {', '.join(names)!r}"
-        cure = f"Correct the first line of {file}, or ask for the name that the column has."
-        raise argument_error("path", f"{file.name} with one column {wanted!r}", got, cure)
+        hint = f"Correct the first line of {file}, or ask for the name that the column has."
+        raise argument_error("path", f"{file.name} with one column {wanted!r}", got, hint)
     return names.index(wanted)
 
 
 def _number(file: Path, number: int, name: str, word: str) -> float:
-    """Return the finite number that a word spells."""
+    """Return the finite number in a word."""
     try:
-        value = math.nan if "_" in word else float(word)  # Python reads 1_000 as a number, a log that holds it is odd
+        value = math.nan if "_" in word else float(word)  # Python accepts 1_000, which is damage in a log
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
@@ -147,5 +146,5 @@ def _number(file: Path, number: int, name: str, word: str) -> float:
 
 
 def _bad_entry(file: Path, number: int, name: str, expected: str, got: str) -> ValueError:
-    """Say what is wrong with an entry of a file."""
+    """Return the error of a wrong entry of a file."""
     return argument_error("path", f"{expected} in column {name!r}", got, f"Correct line {number} of {file}.")

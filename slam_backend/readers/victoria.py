@@ -1,7 +1,7 @@
-"""The log of the vehicle in Victoria Park: strict reading of its controls, the trees it saw, and its GPS fixes.
+"""Reader of the Victoria Park log: controls, trees and GPS fixes of a car-like vehicle.
 
-J. Guivant and E. Nebot, Australian Centre for Field Robotics, University of Sydney; the files and what they hold are
-described in the data set's `info.txt`.
+J. Guivant and E. Nebot, Australian Centre for Field Robotics, University of Sydney; the data set's `info.txt` describes
+the files.
 """
 
 import warnings
@@ -22,22 +22,21 @@ from slam_backend.readers.tables import MOST_JITTER, sorted_note, steps_back, ti
 CONTROLS_FILE = "aa3_dr.mat"
 TREES_FILE = "VictoriaParkSinSincronizar.mat"
 GPS_FILE = "aa3_gpsx.mat"
-MAX_STEERING = 1.0  # [rad], more than any car's wheels turn
-MILLISECONDS = 1000.0  # a second, the unit of time of the files of controls and GPS; that of trees counts seconds
+MAX_STEERING = 1.0  # [rad], beyond the steering angle of any car
+MILLISECONDS = 1000.0  # milliseconds per second, for the files of controls and GPS
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VictoriaLog:
-    """What a car-like vehicle recorded among trees. The arrays are read-only; times never go back, and share a clock.
+    """Log of a car-like vehicle among trees. The arrays are read-only, in order of time, with a common clock.
 
     Attributes:
         controls: (n, 3) float64 [s, m/s, rad]. Time, speed of the rear left wheel, steering angle (positive left).
-        scan_times: (T,) float64 [s]. One for each laser scan.
-        scans: T arrays (k, 3) float64 [m, rad, m]: range, bearing and diameter of each tree that was made out;
-            bearings are positive to the left of straight ahead.
-        gps: (g, 3) float64 [s, m, m]. Time, east, north of each fix; there are holes between them. None where the
-            folder has none.
-        notes: Lines about what the reader did to the files: which were sorted by time.
+        scan_times: (T,) float64 [s]. Times of the laser scans.
+        scans: T arrays (k, 3) float64 [m, rad, m]. Range, bearing and diameter of each detected tree; bearings are
+            positive to the left of straight ahead.
+        gps: (g, 3) float64 [s, m, m]. Time, east, north of each fix, with gaps; None without a file of fixes.
+        notes: Lines about files that were sorted by time.
     """
 
     controls: FloatArray
@@ -50,18 +49,18 @@ class VictoriaLog:
 def load_victoria(path: str | Path, duration: float | None = None) -> VictoriaLog:
     """Read a folder such as that of the Victoria Park data set.
 
-    Entries up to `MOST_JITTER` back in time are sorted; the notes of the log say so. Of controls at one time the last
-    one in the file holds, of scans at one time the first one counts.
+    Entries up to `MOST_JITTER` back in time are sorted, with a remark in the notes of the log. At equal times the last
+    control and the first scan of the file apply.
 
     Args:
         path: Folder with `aa3_dr.mat` (`time` [ms], `speed`, `steering`), `VictoriaParkSinSincronizar.mat` (`TLsr` [s],
-            `zt`: per scan rows of range, bearing from the right hand side, diameter) and, where there are fixes,
-            `aa3_gpsx.mat` (`timeGps` [ms], `Lo_m`, `La_m`).
-        duration: Keep this many seconds from the first control on [s]. None: all.
+            `zt`: per scan rows of range, bearing from the right hand side, diameter) and optionally `aa3_gpsx.mat`
+            (`timeGps` [ms], `Lo_m`, `La_m`).
+        duration: Length of the log from the first control [s]. None: the whole log.
 
     Raises:
-        ValueError: If the folder, a file or a variable in it is missing, a file cannot be read, numbers are not finite
-            or impossible, lengths disagree, or a time lies more than `MOST_JITTER` back; the text names the file.
+        ValueError: If the folder, a file or a variable is missing, a file cannot be read, numbers are not finite or
+            impossible, lengths disagree, or a time lies more than `MOST_JITTER` back; the message names the file.
     """
     folder = checked_path(path)
     if not folder.is_dir():
@@ -97,7 +96,7 @@ def load_victoria(path: str | Path, duration: float | None = None) -> VictoriaLo
 
 
 def _sorted(name: str, table: FloatArray) -> tuple[FloatArray, str]:
-    """Return rows (n, columns) that begin with a time in its order, and what `time_order` says of the file `name`."""
+    """Return rows (n, columns), time first, in order of time, and the remark of `time_order` about the file `name`."""
     order, words = time_order(name, table[:, 0])
     return table[order], words
 
@@ -108,9 +107,9 @@ def _read(file: Path, names: tuple[str, ...]) -> dict[str, Any]:
         raise argument_error("path", f"a folder with {file.name}", "no such file", f"Check {str(file)!r}.")
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("error")  # scipy warns of what it cannot make out
+            warnings.simplefilter("error")  # scipy warns of contents that it cannot read
             content = loadmat(file, variable_names=names)
-    except Exception as error:  # of any kind, on files that are cut, damaged, of another kind, or MATLAB's HDF5
+    except Exception as error:  # any type, for truncated, damaged or HDF5 files
         raise _bad(file, "a MATLAB file of version 5 to 7.2", "a broken file") from error
     missing = [name for name in names if name not in content]
     if missing:
@@ -119,7 +118,7 @@ def _read(file: Path, names: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _table(file: Path, content: dict[str, Any], names: tuple[str, ...], unit: float) -> FloatArray:
-    """Return variables as columns (n, names), the first one being times of which `unit` make a second."""
+    """Return variables as columns (n, names); the first one holds times with `unit` ticks per second."""
     columns = []
     for name in names:
         values = content[name]
@@ -158,25 +157,25 @@ def _trees(file: Path, number: int, cell: Any) -> FloatArray:
 
 
 def _bad(file: Path, expected: str, got: str) -> ValueError:
-    """Say what is wrong with a file."""
+    """Return the error of an invalid file."""
     return argument_error("path", f"{file.name} with {expected}", got, f"Get {str(file)!r} again.")
 
 
-# Where laser and GPS antenna are, from the middle of the rear axle [m], and the encoder's wheel: the vehicle model that
-# E. Nebot publishes with the data (acfr.usyd.edu.au, "Ute modeling info"): L = 2.83, H = 0.76, b = 0.5, a = L + 0.95.
+# Positions of laser and encoder relative to the middle of the rear axle [m], from the vehicle model that E. Nebot
+# publishes with the data (acfr.usyd.edu.au, "Ute modeling info"): L = 2.83, H = 0.76, b = 0.5, a = L + 0.95.
 WHEELBASE = 2.83  # L
-ENCODER = 0.76  # H, the rear left wheel from the middle of its axle, to the left
-SENSOR = (3.78, 0.5, 0.0)  # (a, b) and height; heights do not matter, all is seen in one plane
+ENCODER = 0.76  # H, distance of the rear left wheel from the middle of the axle
+SENSOR = (3.78, 0.5, 0.0)  # (a, b) and height, which is arbitrary for a planar sensor
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TreeNoise:
-    """Assumed errors of one tree's reading.
+    """Assumed errors of one reading of a tree.
 
-    From one scan to the next, trees keep their place to 0.03 m in range near the laser and 0.06 m at 60 m, and to 0.003
-    and 0.0015 rad in bearing. That is not what a filter may believe: a trunk is seen from all sides, and what is wrong
-    with its reading from one side stays so from scan to scan. The defaults are half of the median trunk's diameter
-    (0.42 m) and two of the laser's rays (half a degree each).
+    Between consecutive scans, readings of a tree vary by 0.03 m in range near the laser and 0.06 m at 60 m, and by
+    0.003 and 0.0015 rad in bearing. The errors that a filter must assume are larger: readings of a trunk depend on the
+    side from which it is seen, and their errors are correlated from scan to scan. The defaults are half of the median
+    trunk's diameter (0.42 m) and two of the laser's rays (half a degree each).
 
     Attributes:
         range: Standard deviation of a range [m].
@@ -195,13 +194,13 @@ class TreeNoise:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VictoriaSteps:
-    """A log as steps at the times of its scans.
+    """Log as steps at the times of its scans.
 
     Attributes:
         times: (T,) float64 [s].
-        odometry: (T, 3) float64 [m, m, rad]. Motion of the rear axle since the step before; the first is 0.
-        measurements: T entries; None where no tree was seen. Points are relative to the laser at `SENSOR`; all
-            descriptors are (1,): trees look alike.
+        odometry: (T, 3) float64 [m, m, rad]. Motion of the rear axle since the previous step; the first is zero.
+        measurements: T entries; None for a scan without trees. Points are relative to the laser at `SENSOR`; all
+            descriptors are equal.
     """
 
     times: FloatArray
@@ -210,11 +209,11 @@ class VictoriaSteps:
 
 
 def to_filter_steps(log: VictoriaLog, noise: TreeNoise | None = None) -> VictoriaSteps:
-    """Turn a log into odometry and measurements.
+    """Convert a log to odometry and measurements.
 
     Args:
-        log: What `load_victoria` returned.
-        noise: Errors assumed for each tree. None: `TreeNoise()`.
+        log: Log from `load_victoria`.
+        noise: Assumed errors of each tree. None: `TreeNoise()`.
     """
     noise = TreeNoise() if noise is None else noise
     path = integrate_commands(axle_velocities(log.controls), log.scan_times)
@@ -227,8 +226,8 @@ def to_filter_steps(log: VictoriaLog, noise: TreeNoise | None = None) -> Victori
 def axle_velocities(controls: FloatArray) -> FloatArray:
     """Return the velocities (n, 3) [s, m/s, rad/s] of the middle of the rear axle under controls (n, 3) [s, m/s, rad].
 
-    v_c = v_e / (1 - tan(alpha) H / L), omega = v_c tan(alpha) / L: the encoder sits on the left wheel, which is slower
-    than the middle of the axle in a turn to the left.
+    v_c = v_e / (1 - tan(alpha) H / L), omega = v_c tan(alpha) / L: the encoder measures the left wheel, which is slower
+    than the middle of the axle in a left turn.
 
     >>> axle_velocities(np.array([[0.0, 2.0, 0.0]])).tolist()
     [[0.0, 2.0, 0.0]]
@@ -239,7 +238,7 @@ def axle_velocities(controls: FloatArray) -> FloatArray:
 
 
 def _frame(trees: FloatArray, noise: TreeNoise) -> Measurements | None:
-    """Return the trees (n, 3) of a scan as measurements, which all look alike; None if there are none."""
+    """Return the trees (n, 3) of a scan as measurements with equal descriptors; None if there are none."""
     if not len(trees):
         return None
     variances = np.tile([noise.range**2, noise.bearing**2, noise.height**2], (len(trees), 1))

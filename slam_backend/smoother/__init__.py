@@ -1,4 +1,1 @@
-"""Rejuvenation: particles sampled from the posterior of whole paths.
-
-`docs/explanation/smoothing.md` has the equations (n).
-"""
+"""Rejuvenation of particles from the posterior of whole paths; equations (n) in `docs/explanation/smoothing.md`."""

@@ -1,4 +1,4 @@
-"""Landmarks that a smoothed path reveals to be one: they look alike, lie in one place, and were never seen together."""
+"""Detection of duplicate landmarks: similar descriptors, one position on the smoothed path, no common keyframe."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,23 +11,24 @@ from slam_backend.smoother.graph import SlamGraph
 from slam_backend.smoother.optimizer import MapEstimate
 from slam_backend.smoother.sampling import PathSamples
 
-REACH = 0.5  # [m]; no duplicates are sought farther apart
+REACH = 0.5  # [m]; largest distance of duplicates
 GATE = 7.81  # squared Mahalanobis distance, 95 % of 3 degrees of freedom
 
 
 def find_duplicates(
     graph: SlamGraph, mode: MapEstimate, draws: PathSamples, descriptors: NDArray[np.float32], descriptor_gate: float
 ) -> IntArray:
-    """Return rows (id to give up, id to keep), each landmark in at most one of them; the older id is kept.
+    """Return rows (id to drop, id to keep), each landmark in at most one of them; the older id is kept.
 
-    The difference of two landmarks scatters by their own covariances and by the paths: both are in the draws.
+    The covariance of a difference has two parts, both from the draws: the landmarks' own covariances and the scatter of
+    the paths.
 
     Args:
-        graph: What was seen from which key.
-        mode: Of it.
+        graph: Pose-landmark graph.
+        mode: MAP estimate of the graph.
         draws: Paths with their landmarks.
-        descriptors: (l, d) by row of `graph.landmark_ids`; NaN for a landmark that is not to be touched.
-        descriptor_gate: L2 distance beyond which two do not look alike.
+        descriptors: (l, d) by row of `graph.landmark_ids`; NaN for a landmark that must stay as it is.
+        descriptor_gate: Largest L2 distance of similar descriptors.
     """
     order, seen = mode.landmarks[:, 0].argsort(), mode.sightings
     pairs = similar_pairs(order, mode.landmarks, descriptors, seen.keys, seen.starts, REACH, descriptor_gate)
@@ -47,16 +48,16 @@ def similar_pairs(
     order: IntArray, landmarks: FloatArray, descriptors: NDArray[np.float32], keys: IntArray, starts: IntArray,
     reach: float, gate: float,
 ) -> IntArray:  # fmt: skip
-    """Return pairs (n, 2) of landmarks that lie near each other, look alike and have no key in common.
+    """Return pairs (n, 2) of landmarks that are near, have similar descriptors and have no key in common.
 
     Args:
-        order: (l,) int64. The landmarks by ascending x.
+        order: (l,) int64. Landmarks by ascending x.
         landmarks: (l, 3) float64 [m].
-        descriptors: (l, d) float32. Two do not look alike if any number is NaN.
-        keys, starts: (s,), (l + 1,) int64. Key of each sighting, ascending for each landmark; those of landmark i are
-            starts[i] to starts[i + 1]. One that has none is in no pair.
-        reach: [m]. How far apart they may lie.
-        gate: L2 distance beyond which two do not look alike.
+        descriptors: (l, d) float32. A descriptor with NaN is similar to none.
+        keys, starts: (s,), (l + 1,) int64. Key of each sighting, ascending for each landmark; landmark i has the rows
+            starts[i] to starts[i + 1]. A landmark without sightings is in no pair.
+        reach: Largest distance of a pair [m].
+        gate: Largest L2 distance of similar descriptors.
     """
     pairs, num = np.empty((16, 2), dtype=np.int64), 0
     for i in range(len(order)):
@@ -91,7 +92,7 @@ def similar_pairs(
 
 @single_threaded_blas
 def _together(draws: PathSamples, pairs: IntArray) -> list[tuple[float, int, int]]:
-    """Return those of the pairs (n, 2) that may lie in one place: squared distance, and which."""
+    """Return (squared Mahalanobis distance, a, b) of the pairs (n, 2) within the gate."""
     found = []
     for a, b in pairs.tolist():
         distance = _distance(_values(draws, a), _values(draws, b))
@@ -101,12 +102,12 @@ def _together(draws: PathSamples, pairs: IntArray) -> list[tuple[float, int, int
 
 
 def _values(draws: PathSamples, row: int) -> FloatArray:
-    """Return means and covariances (9, M) of one landmark."""
+    """Return the means and covariances (9, M) of one landmark."""
     return np.asarray(draws.tiles[row].transpose(1, 0, 2).reshape(9, -1)[:, : draws.poses.shape[2]])
 
 
 def _distance(a: FloatArray, b: FloatArray) -> float:
-    """Return the squared Mahalanobis distance of two landmarks (9, M), paths included, at the first path."""
+    """Return the squared Mahalanobis distance of two landmarks (9, M) at the first path, scatter of paths included."""
     apart = a[:3] - b[:3]
     scatter = apart[:, 1:] - apart[:, :1]
     covariance = (a[3:, 0] + b[3:, 0])[UNPACK_INDEX] + scatter @ scatter.T / max(scatter.shape[1], 1)
@@ -114,7 +115,7 @@ def _distance(a: FloatArray, b: FloatArray) -> float:
 
 
 def without_duplicates(graph: SlamGraph, duplicates: IntArray) -> SlamGraph:
-    """Return the graph in which each given-up landmark (rows of `find_duplicates`) is the one that is kept."""
+    """Return the graph with duplicate landmarks (rows of `find_duplicates`) joined."""
     if not len(duplicates):
         return graph
     row = {int(name): i for i, name in enumerate(graph.landmark_ids)}

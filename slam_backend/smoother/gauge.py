@@ -1,11 +1,11 @@
-"""The frame of new particles is held: what no measurement to come can tell apart is not left to chance.
+"""Gauge of new particles: the rigid motion of the whole map is fixed and kept as a covariance, not sampled.
 
-A path drawn from the posterior turns and shifts the whole map about its start by as much as its first steps leave open.
-Whatever a robot measures from now on says nothing of that. Resampling none the less leaves a few of these motions and
-in the end one: the mean over the particles wanders through all that was open, and is thrown back at the next draw. So
-each new particle is moved as a rigid whole to where the landmarks that the robots now see are in the most probable
-path, and what the motions scattered is kept as one covariance, of which any estimate in the map frame has its share
-(Rao and Blackwell: the motion, given all else, is integrated out and not sampled).
+A path drawn from the posterior is rotated and shifted about its start by an amount that its first steps leave
+uncertain. No later measurement determines this motion. Resampling would nevertheless select a few of its samples and
+finally one: the mean over the particles would drift within this uncertainty and jump back at the next rejuvenation.
+Therefore each new particle is moved rigidly so that the landmarks now in view match the MAP path. The covariance of the
+motions is stored once and added to any estimate in the map frame (Rao-Blackwellization: the motion is integrated out
+given all other variables).
 """
 
 import math
@@ -20,16 +20,16 @@ from slam_backend.smoother._kernels import LANES
 from slam_backend.smoother.graph import LEVER
 
 XX, YY = 3, 6  # rows of a tile: variances of a landmark in the plane
-MIN_SHARED = 2  # landmarks that say how a particle is turned
+MIN_SHARED = 2  # landmarks that determine the rotation of a particle
 
 
 class GaugeFix(NamedTuple):
-    """How particles are moved.
+    """Rigid motions of particles into a common gauge.
 
     Attributes:
         poses: (K, 3, M) float64 [m, m, rad], map frame. Newest poses of the particles, moved.
-        motions: (M, 3) float64 [m, m, rad], map frame. What moves each particle.
-        scatter: (3, 3) float64 [m, m, rad]. Covariance of their inverses, which the particles no longer show.
+        motions: (M, 3) float64 [m, m, rad], map frame. Rigid motion of each particle.
+        scatter: (3, 3) float64 [m, m, rad]. Covariance of the inverse motions, removed from the particles.
     """
 
     poses: FloatArray
@@ -40,20 +40,20 @@ class GaugeFix(NamedTuple):
 def fix_gauge(
     tiles: FloatArray, seen: IntArray, landmarks: FloatArray, poses: FloatArray, means: FloatArray, weights: FloatArray
 ) -> GaugeFix | None:
-    """Return the motions that bring each particle's landmarks to those of the most probable path.
+    """Return the rigid motions that align each particle's landmarks with those of the MAP path.
 
-    The fit of each particle is one of least squares, landmarks weighed by the inverse of how much they scatter.
+    Each fit is weighted least squares; a landmark's weight is the inverse of its scatter.
 
     Args:
         tiles: (l, P / LANES, 9, LANES) float64. Means and covariances of landmarks, by lanes.
-        seen: (n,) int64. Which of them are now seen.
-        landmarks: (l, 3) float64 [m]. All of them in the most probable path.
+        seen: (n,) int64. Rows of the landmarks now in view.
+        landmarks: (l, 3) float64 [m]. All landmarks of the MAP path.
         poses: (K, 3, M) float64 [m, m, rad], map frame. Newest poses of the particles.
-        means: (K, 3) Of the most probable path.
-        weights: (M,) summing to 1.
+        means: (K, 3) Newest poses of the MAP path.
+        weights: (M,) Normalised weights.
 
     Returns:
-        None where it does not help: too few landmarks, or the newest poses would scatter more than they do.
+        The motions; None if there are too few landmarks, or the scatter of the newest poses would increase.
     """
     if len(seen) < MIN_SHARED:
         return None
@@ -64,23 +64,22 @@ def fix_gauge(
 def fix_start(
     starts: FloatArray, poses: FloatArray, start: FloatArray, mean: FloatArray, weights: FloatArray
 ) -> FloatArray:
-    """Let all particles have the start of the most probable path, where their poses then agree better from there.
+    """Set all particles' starts to that of the MAP path, if this reduces the scatter of the newest poses seen from it.
 
-    A start in a map that is held is open as the map is in the frame of the first robot: what was measured long ago
-    decides it, and resampling would only choose one of the starts drawn.
+    In a map with fixed gauge an unknown start is determined by old measurements only; resampling would merely select
+    one of the sampled starts.
 
     Args:
-        starts: (3, M) float64 [m, m, rad], map frame. Where the robot started in each particle; written.
-        poses: (3, M) float64 [m, m, rad], map frame. Its newest poses.
-        start, mean: (3,) Its start and its newest pose in the most probable path.
-        weights: (M,) summing to 1.
+        starts: (3, M) float64 [m, m, rad], map frame. The robot's start in each particle; written.
+        poses: (3, M) float64 [m, m, rad], map frame. The robot's newest pose in each particle.
+        start, mean: (3,) Start and newest pose of the robot in the MAP path.
+        weights: (M,) Normalised weights.
 
     Returns:
-        (3, 3) Covariance [m, m, rad], in the start frame, of the start as particles no longer show it; 0 where they
-        keep theirs.
+        (3, 3) Covariance [m, m, rad], start frame, of the start, removed from the particles; 0 if they are unchanged.
     """
-    own, apart = between(start, mean), between(starts.T, start)
-    off = [between(origins, poses.T) - own for origins in (starts.T, start)]
+    motion, apart = between(start, mean), between(starts.T, start)
+    off = [between(origins, poses.T) - motion for origins in (starts.T, start)]
     squares = [
         weights @ (each * each) for each in (np.column_stack([d[:, :2], LEVER * wrap_angle(d[:, 2])]) for d in off)
     ]
@@ -95,11 +94,11 @@ def compute_gauge_fix(
     tiles: FloatArray, seen: IntArray, landmarks: FloatArray, poses: FloatArray, means: FloatArray,
     weights: FloatArray, lever: float,
 ) -> tuple[float, GaugeFix]:  # fmt: skip
-    """Fit the motions that hold particles; return by how much poses are then less far off, and what is held.
+    """Return the decrease of the poses' scatter by fixing the gauge, and the result.
 
     Args:
         tiles, seen, landmarks, poses, means, weights: See `fix_gauge`.
-        lever: [m] At which headings are felt.
+        lever: Lever arm of headings [m].
     """
     n, m, num_lanes = len(seen), len(weights), tiles.shape[3]
     points, shares = np.empty((n, 2, m)), np.empty(n)
@@ -144,7 +143,7 @@ def compute_gauge_fix(
 @device
 @in_place
 def fit_rigid_2d(points: FloatArray, targets: FloatArray, shares: FloatArray, motions: FloatArray) -> None:
-    """Write the rigid motions (M, 3) that bring points (n, 2, M) to targets (n, 2 or 3) best, weighed by (n,)."""
+    """Write the rigid motions (M, 3) that best align points (n, 2, M) with targets (n, 2 or 3), weighted by (n,)."""
     target_x, target_y = 0.0, 0.0
     for n in range(len(shares)):
         target_x += shares[n] * targets[n, 0]
@@ -169,7 +168,7 @@ def fit_rigid_2d(points: FloatArray, targets: FloatArray, shares: FloatArray, mo
 
 @in_place
 def move(poses: FloatArray, motions: FloatArray, moved: FloatArray) -> None:
-    """Write poses (K, 3, M) of each particle moved by its motion (M, 3); `moved` may be `poses`."""
+    """Write poses (K, 3, M) moved by each particle's motion (M, 3); `moved` may be `poses`."""
     for robot in range(len(poses)):
         for i in range(len(motions)):
             x, y, heading = poses[robot, 0, i], poses[robot, 1, i], poses[robot, 2, i]
@@ -190,7 +189,7 @@ def transformed_tiles(tiles: FloatArray, num_landmarks: int, num_blocks: int, mo
 
     Args:
         tiles: (num_landmarks * num_blocks * 9 * LANES,) x, y, z, xx, xy, xz, yy, yz, zz of each, by lanes.
-        num_landmarks, num_blocks: How many there are.
+        num_landmarks, num_blocks: Numbers of landmarks and of blocks.
         motions: (M, 3) [m, m, rad] of the particles.
     """
     cosine, sine, ahead, left = stack_array(LANES), stack_array(LANES), stack_array(LANES), stack_array(LANES)

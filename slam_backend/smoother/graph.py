@@ -1,4 +1,4 @@
-"""`SlamGraph`: key poses of all robots, the odometry between them, and what was measured there. It never changes."""
+"""Pose-landmark graph of all robots: keyframes, odometry between them, and measurements."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -14,59 +14,59 @@ from slam_backend.smoother._kernels import LEVER as LEVER
 from slam_backend.smoother._kernels import NONE as NONE
 from slam_backend.smoother._kernels import Condensed, Frames, Keys, Landmarks, Points
 
-UNINFORMATIVE = (1e4, 1e4, 10.0)  # variances [m^2, m^2, rad^2] of a start of which nothing is known
-RIGID = 1e-4  # [m, rad]; starts that scatter less against each other do not move
+UNINFORMATIVE = (1e4, 1e4, 10.0)  # variances [m^2, m^2, rad^2] of an unknown start
+RIGID = 1e-4  # [m, rad]; starts with a smaller relative scatter are rigidly connected
 
 Part = TypeVar("Part", Keys, Frames, Points, Condensed, Landmarks)  # columns of a graph that go together, row by row
 
 
 def mapped(part: Part, act: Callable[[Any], Any]) -> Part:
-    """Return a part with `act` done to each column."""
+    """Return a part with `act` applied to each column."""
     return type(part)(*map(act, part))
 
 
 def _empty(*shape: int) -> FloatArray:
-    """Return an array of its own with no rows."""
+    """Return a new array of zeros."""
     return np.zeros(shape)
 
 
 def _no_index() -> IntArray:
-    """Return an index of its own with no rows."""
+    """Return a new empty index."""
     return np.zeros(0, dtype=np.int64)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SlamGraph:
-    """What a smoother knows of a run.
+    """Immutable pose-landmark graph.
 
-    A *key* is a pose that is sought. A *frame* is where measurements were taken: it stands rigidly to its key. Raw
-    measurements of the newest keys are kept; those of older keys are condensed into frozen sightings.
+    A *key* (keyframe) is a pose that is an unknown of the graph. A *frame* is a pose with measurements, attached
+    rigidly to its key. Raw measurements of the newest keys are kept; those of older keys are condensed into frozen
+    sightings.
 
     Attributes:
-        robots: (k,) int64. Whose pose each key is, `NONE` for the origin; keys of a robot are in the order of time.
-        poses: (k, 3) float64 [m, m, rad], map frame. The last mode.
-        parents: (k,) int64. The key before, `NONE` where the pose is given: the origin, or a robot's start. A start
-            that is not known hangs on the origin, or on another robot's start.
+        robots: (k,) int64. Robot of each key, `NONE` for the origin; keys of a robot are in temporal order.
+        poses: (k, 3) float64 [m, m, rad], map frame. Poses of the last MAP estimate.
+        parents: (k,) int64. Previous key; `NONE` for a fixed pose: the origin, or a robot's start. The parent of an
+            unknown start is the origin or another robot's start.
         odometry: (k, 3) float64 [m, m, rad]. Odometry from the previous key, in its frame.
-        odometry_covariances: (k, 3, 3) float64. Covariances of that odometry.
-        transition_variances: (k,) float64 [m^2]. How far the motion from the previous key scattered when that was last
-            asked, or as far as odometry says before that; see `LEVER`.
-        rigid_variances: (k,) float64 [m^2]. How much those poses may move against each other that stand rigidly to the
-            key.
-        frame_keys, frame_offsets: (f,) int64, (f, 3) float64. Key of each frame, and the frame's pose seen from it.
+        odometry_covariances: (k, 3, 3) float64. Covariance of `odometry`, in the same frame.
+        transition_variances: (k,) float64 [m^2]. Variance of the motion from the previous key when last computed, that
+            of the odometry before; headings at `LEVER`.
+        rigid_variances: (k,) float64 [m^2]. Accumulated variance of the poses that are attached rigidly to the key.
+        frame_keys, frame_offsets: (f,) int64, (f, 3) float64. Key of each frame, and the frame's pose relative to it.
         points, point_noises, has_covariance: (n, 3), (n, 6), (n,) raw measurements, robot axes from the camera centre;
-            their covariances where the sensor gave them.
-        point_frames, point_landmarks: (n,) int64. Frame of each, and its row of `landmark_ids`.
-        condensed_keys, condensed_landmarks: (s,) int64. Of the frozen sightings.
-        linearisation_points, information, gradients: (s, 3), (s, 6), (s, 3) float64. Their quadratic forms, see
-            `_kernels`.
-        counts: (s,) int64. Measurements in each.
-        landmark_ids: (l,) int64. Names of the landmarks.
-        landmarks: (l, 3) float64 [m], map frame. The last mode.
-        merged_ids: (a, 2) int64. Rows (name, name it goes by): landmarks found to be one.
+            covariances where the sensor gave them.
+        point_frames, point_landmarks: (n,) int64. Frame of each measurement, and its row of `landmark_ids`.
+        condensed_keys, condensed_landmarks: (s,) int64. Key and landmark of each frozen sighting.
+        linearisation_points, information, gradients: (s, 3), (s, 6), (s, 3) float64. Quadratic forms of the frozen
+            sightings, see `_kernels`.
+        counts: (s,) int64. Measurements in each frozen sighting.
+        landmark_ids: (l,) int64. Ids of the landmarks.
+        landmarks: (l, 3) float64 [m], map frame. Landmarks of the last MAP estimate.
+        merged_ids: (a, 2) int64. Rows (old id, current id) of duplicate landmarks.
         first_keys: (K,) int64. Key at the start of each robot.
         last_keys: (K,) int64. Newest key of each robot.
-        latest: (K,) int64. Newest step of each robot's log that is taken in, -1 before the first.
+        latest: (K,) int64. Newest step of each robot's log in the graph, -1 before the first.
     """
 
     robots: IntArray = field(default_factory=_no_index)
@@ -101,20 +101,20 @@ class SlamGraph:
 
     @classmethod
     def at_starts(cls, starts: FloatArray) -> "SlamGraph":
-        """Return the graph of K robots that stand at `starts` (K, 3) [m, m, rad], map frame, and have seen nothing."""
+        """Return the graph of K robots at known `starts` (K, 3) [m, m, rad], map frame, without measurements."""
         return cls.at_uncertain_starts(np.asarray(starts, dtype=np.float64)[:, :, None])
 
     @classmethod
     def at_uncertain_starts(cls, starts: FloatArray, held: BoolArray | None = None) -> "SlamGraph":
-        """Return the graph of K robots whose starts particles may hold to be different, as after a merge.
+        """Return the graph of K robots whose starts may differ between particles, as after a merge.
 
-        A start on which all particles agree is given, unless it is held. Another is sought: nothing but measurements
-        shall say where it is, for what particles think of it stems from these. Where two robots' starts do not change
-        against each other, the second hangs on the first.
+        A start that is equal in all particles is fixed, unless it is in `held`. Any other start is an unknown with a
+        vague prior, so that measurements alone determine it: the particles' starts derive from the same measurements.
+        If the relative pose of two starts is the same in all particles, the first is the parent of the second.
 
         Args:
             starts: (K, 3, M) float64 [m, m, rad], map frame.
-            held: (K,) whether particles agree on a start that is open, see `fix_start`. None: they do on none.
+            held: (K,) bool. Unknown starts that are equal in all particles, see `fix_start`. None: no such start.
         """
         k = len(starts)
         held = np.zeros(k, dtype=np.bool_) if held is None else held
@@ -147,13 +147,13 @@ class SlamGraph:
 
     @classmethod
     def of_mapping(cls, columns: Mapping[str, NDArray[Any]]) -> "SlamGraph":
-        """Return the graph of which `to_mapping` returned the arrays; what can be written of them is copied."""
+        """Return the graph from the arrays of `to_mapping`; writable arrays are copied."""
         graph = object.__new__(cls)
         vars(graph).update(with_constants(columns))
         return graph
 
     def reordered(self, order: IntArray) -> "SlamGraph":
-        """Return the graph in which robot i is the one that was `order[i]`; (K,) a permutation."""
+        """Return the graph with robot `order[i]` as robot i; (K,) a permutation."""
         robots = self.robots.copy()
         robots[self.robots >= 0] = np.argsort(order)[self.robots[self.robots >= 0]]
         return self.with_columns(
@@ -161,10 +161,10 @@ class SlamGraph:
         )
 
     def with_columns(self, **columns: NDArray[Any]) -> "SlamGraph":
-        """Return the graph with read-only views of some columns in place of its own.
+        """Return the graph with some columns replaced by read-only views of these arrays.
 
-        As `dataclasses.replace`, but that those that stay are not looked at again. The caller must not write to the
-        arrays afterwards.
+        Unlike `dataclasses.replace`, it does not check the other columns again. The caller must not write to the arrays
+        afterwards.
         """
         assert columns.keys() <= vars(self).keys()
         other = object.__new__(SlamGraph)
@@ -172,7 +172,7 @@ class SlamGraph:
         return other
 
     def resolve_ids(self, ids: IntArray) -> IntArray:
-        """Return the names by which landmarks `ids` (n,) int64 go, `aliases` applied."""
+        """Return the current ids of landmarks `ids` (n,) int64, with `merged_ids` applied."""
         result = ids.copy()
         for name, other in self.merged_ids.tolist():
             result[result == name] = other
@@ -183,38 +183,38 @@ class SlamGraph:
         return kind(*map(vars(self).__getitem__, kind._fields))
 
     def to_mapping(self) -> dict[str, Any]:
-        """Return all arrays by name; they are read-only."""
+        """Return all arrays by name, read-only."""
         return dict(vars(self))
 
     @property
     def num_keys(self) -> int:
-        """Key poses, the starts included."""
+        """Number of keys, starts included."""
         return len(self.poses)
 
     @property
     def num_sightings(self) -> int:
-        """Frozen sightings, and raw measurements that may become some: what the effort of a rejuvenation grows with."""
+        """Number of frozen sightings and raw measurements, to which the effort of a rejuvenation is proportional."""
         return len(self.condensed_keys) + len(self.points)
 
     @property
     def nbytes(self) -> int:
-        """Bytes of all arrays."""
+        """Size of all arrays in bytes."""
         return sum(column.nbytes for column in vars(self).values())
 
 
 def mean_pose(poses: FloatArray) -> FloatArray:
-    """Return the mean (3,) of poses (3, n) [m, m, rad], headings by their mean direction."""
+    """Return the mean (3,) of poses (3, n) [m, m, rad], with the circular mean of the headings."""
     x, y, headings = poses
     return np.array([x.mean(), y.mean(), np.arctan2(np.sin(headings).mean(), np.cos(headings).mean())])
 
 
 def scattered(poses: FloatArray) -> FloatArray:
-    """Return the covariance (3, 3) of poses (3, n) [m, m, rad] about their mean, at least that of `RIGID`."""
+    """Return the covariance (3, 3) of poses (3, n) [m, m, rad] about their mean, plus a floor of `RIGID` squared."""
     off = poses - mean_pose(poses)[:, None]
     off[2] = wrap_angle(off[2])
     return np.asarray(off @ off.T / off.shape[1] + RIGID**2 * np.eye(3))
 
 
 def _turned(poses: FloatArray) -> FloatArray:
-    """Return differences of poses (n, 3) with headings in [-pi, pi)."""
+    """Return differences of poses (n, 3) with headings wrapped to [-pi, pi)."""
     return np.column_stack([poses[:, :2], wrap_angle(poses[:, 2])])

@@ -1,4 +1,4 @@
-"""Growth of the pose-landmark graph: new steps become keyframes, and the graphs of merged groups are joined."""
+"""Construction of the pose-landmark graph: new keyframes from logs, and joint graphs of merged groups."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -28,34 +28,34 @@ class InitialPoses(NamedTuple):
 
     @classmethod
     def empty(cls) -> "InitialPoses":
-        """Return guesses that say nothing."""
+        """Return no poses."""
         return cls(np.empty(0, dtype=np.int64), np.empty((0, 3)))
 
     def with_later(self, steps: IntArray, poses: FloatArray) -> "InitialPoses":
-        """Return these and others of later steps (m,), (m, 3)."""
+        """Return these poses and those of later steps (m,), (m, 3)."""
         return InitialPoses(np.concatenate([self.steps, steps]), np.concatenate([self.poses, poses]))
 
     def after(self, step: int) -> "InitialPoses":
-        """Return those of the steps after one; views."""
+        """Return the poses after the steps later than `step`, as views."""
         first = self.steps.searchsorted(step, side="right")
         return InitialPoses(self.steps[first:], self.poses[first:])
 
     def at(self, steps: IntArray) -> FloatArray:
-        """Return the poses (m, 3) after steps (m,), ascending; NaN where none is known."""
+        """Return the poses (m, 3) after steps (m,), ascending; NaN where unknown."""
         poses = np.full((len(steps), 3), np.nan)
-        _, rows, own = np.intersect1d(steps, self.steps, assume_unique=True, return_indices=True)
-        poses[rows] = self.poses[own]
+        _, rows, known = np.intersect1d(steps, self.steps, assume_unique=True, return_indices=True)
+        poses[rows] = self.poses[known]
         return poses
 
 
-MIN_NOISE = 1e-5  # [m, rad] of odometry in one step: where a part has none, as with no floors, nothing is singular
+MIN_NOISE = 1e-5  # [m, rad] of odometry in one step; keeps covariances regular if one component has no noise
 NO_COVARIANCES = np.empty((0, 6))
-NO_COVARIANCES.setflags(write=False)  # as those of logs are
+NO_COVARIANCES.setflags(write=False)  # same type as the covariances of logs
 NO_INITIAL_POSES = InitialPoses.empty()
 
 
 class LandmarkPositions(NamedTuple):
-    """Where a filter holds landmarks to be.
+    """Landmark positions estimated by a filter.
 
     Attributes:
         ids: (n,) int64, ascending.
@@ -78,25 +78,25 @@ def extend_graph(
     rigid_within: float = 0.0,
     places: LandmarkPositions | None = None,
 ) -> SlamGraph:
-    """Return the graph with what the robots did since.
+    """Return the graph extended by the robots' new steps.
 
-    Each step that measured something, and each robot's last, becomes a key, unless it is near enough to the key before
-    to stand rigidly to it. Odometry over steps without measurements is chained, and its noise to first order: those
-    poses are eliminated, not approximated.
+    Each step with measurements, and each robot's last step, becomes a key, unless it can be attached rigidly to the
+    previous key. Odometry over steps without measurements is chained, with its noise to first order: those poses are
+    eliminated, not approximated.
 
     Args:
-        graph: As it stood.
-        logs: Per robot, of the steps after `graph.latest`.
+        graph: Graph before these steps.
+        logs: One log per robot, with the steps after `graph.latest`.
         motion: Noise of the odometry.
-        mount: (3,) [m] of the camera on the robot.
-        guesses: Per robot where it may be after some of these steps; else odometry says.
-        rigid_within: [m]. See `SmoothingOptions`.
-        places: Where the filter holds landmarks to be: those start there of which most sightings are new, for their
-            first one may lie far off, and a robust kernel would then hold against the others that they contradict it.
-            None, or where poses start from odometry: where they were, or were first seen.
+        mount: (3,) [m]. Position of the camera on the robot.
+        guesses: Initial poses of each robot after some of these steps; all others come from odometry.
+        rigid_within: Limit [m], see `SmoothingOptions`.
+        places: Landmark positions from the filter, the initial estimates of landmarks with mostly new sightings: if a
+            first sighting is an outlier, a robust kernel would reject the later ones instead. None, or with initial
+            poses from odometry: the last estimates, or the first sightings.
 
     Raises:
-        ValueError: If a log holds a pose that was given as exact: there is nothing to smooth.
+        ValueError: If a log holds an exact pose.
     """
     steps, most = sum(map(len, logs)), sum(len(log.ids) for log in logs)
     keys, frames = _with_room(graph.part(Keys), steps), _with_room(graph.part(Frames), steps)
@@ -128,7 +128,7 @@ def extend_graph(
 
 
 def _with_room(part: Part, extra: int) -> Part:
-    """Return copies of columns (n, ...) with so many more rows, yet to be written."""
+    """Return copies of columns (n, ...) with `extra` uninitialised rows."""
 
     def longer(column: NDArray[Any]) -> NDArray[Any]:
         result = np.empty((len(column) + extra, *column.shape[1:]), column.dtype)
@@ -139,7 +139,7 @@ def _with_room(part: Part, extra: int) -> Part:
 
 
 def log_head(log: LogArrays, count: int) -> LogArrays:
-    """Return the first `count` steps of a log, all if it has no more; the arrays are views."""
+    """Return the first `count` steps of a log, or all if it is shorter; the arrays are views."""
     if count >= len(log):
         return log
     end = int(log.starts[count])
@@ -150,25 +150,25 @@ def log_head(log: LogArrays, count: int) -> LogArrays:
     )  # fmt: skip
 
 
-FIXES = 3  # landmarks in common from which measurements alone say how two groups lie
+FIXES = 3  # common landmarks above which measurements alone determine the relative pose of two groups
 
 
 def merge_graphs(
     a: SlamGraph, b: SlamGraph, motion: FloatArray, renamed: IntArray, uncertainty: FloatArray | None = None
 ) -> SlamGraph:
-    """Return the graph of both groups' robots, a's first, in a's frame.
+    """Return the joint graph of two groups in a's frame, with a's robots first.
 
-    Measurements and odometry are seen from key poses, so that they stay as they are. All keys and landmarks of b are
-    moved; what was given in b's frame is now sought, rigid among itself: its first start with a vague prior about where
-    the move puts it, the other starts by links to that one. So only landmarks in common say how the groups lie. Where
-    there are fewer than `FIXES` of them the motion is all that does, and counts as certain as it is.
+    Measurements and odometry are relative to keys and do not change. Keys and landmarks of b are moved. Fixed starts of
+    b become unknowns: the first has a vague prior about its moved pose, the others are linked rigidly to it. Common
+    landmarks thus determine the relative pose of the groups. With fewer than `FIXES` of them the motion does, with its
+    uncertainty.
 
     Args:
-        a: Whose frame, robots and landmark names stay.
-        b: The other.
-        motion: (3,) [m, m, rad] from b's frame to a's; a guess, from which the next descent starts.
-        renamed: (n, 2) int64 rows (name in b, name in the joint map), each name in b once. What else b saw is left out.
-        uncertainty: (3, 3) covariance of where b's first robot started [m, m, rad], a's frame. None: nothing is known.
+        a: Graph whose frame, robots and landmark ids stay.
+        b: Graph of the other group.
+        motion: (3,) [m, m, rad]. Motion from b's frame to a's, the initial estimate of the next descent.
+        renamed: (n, 2) int64 rows (id in b, id in the joint map), each id in b once. Other landmarks of b are dropped.
+        uncertainty: (3, 3) covariance of the start of b's first robot [m, m, rad], a's frame. None: unknown.
     """
     names = dict(zip(renamed[:, 0].tolist(), a.resolve_ids(renamed[:, 1]).tolist(), strict=True))
     b = _named(_moved(b, motion), names)
@@ -201,20 +201,20 @@ def merge_graphs(
         if name not in ("landmark_ids", "landmarks")
     }
     for name in ("point_landmarks", "condensed_landmarks"):
-        own = len(getattr(a, name))
-        both[name][:own] = rows[: len(a.landmark_ids)][both[name][:own]]
+        size_a = len(getattr(a, name))
+        both[name][:size_a] = rows[: len(a.landmark_ids)][both[name][:size_a]]
     return SlamGraph(**both, landmark_ids=ids, landmarks=landmarks)
 
 
 def _moved(graph: SlamGraph, motion: FloatArray) -> SlamGraph:
-    """Return the graph with poses and landmarks in another frame; links from the origin are as they were."""
+    """Return the graph with poses and landmarks moved to another frame; links from the origin are unchanged."""
     landmarks = graph.landmarks.copy()
     landmarks[:, :2] = landmarks[:, :2] @ rotation(motion[2]).T + motion[:2]
     return graph.with_columns(poses=compose(motion, graph.poses), landmarks=landmarks)
 
 
 def _named(graph: SlamGraph, names: Mapping[int, int]) -> SlamGraph:
-    """Return the graph with its landmarks under new names; those that have none, and what was seen of them, go."""
+    """Return the graph with new landmark ids; landmarks without one are dropped with their measurements."""
     new = np.array([names.get(name, NONE) for name in graph.landmark_ids.tolist()], dtype=np.int64)
     kept = new >= 0
     row = np.cumsum(kept) - 1
@@ -235,9 +235,9 @@ def _rows(part: Points | Condensed, kept: BoolArray, row: IntArray) -> dict[str,
 
 
 def _unpinned(graph: SlamGraph, prior: FloatArray) -> tuple[IntArray, SlamGraph]:
-    """Return the starts that hang on nothing of the group (n,), and the group without an origin, none of it given.
+    """Return the starts (n,) without a parent in the group, and the graph without an origin and without fixed poses.
 
-    These starts are where they are but for a prior covariance (3, 3).
+    These starts get the prior covariance (3, 3) about their poses.
     """
     origin = np.flatnonzero(graph.robots == NONE)
     given = np.flatnonzero((graph.parents == NONE) & (graph.robots >= 0))

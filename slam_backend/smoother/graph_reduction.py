@@ -1,8 +1,8 @@
-"""Fewer key poses: what is known best of a path becomes rigid, so that a long run needs no more room than a short one.
+"""Graph reduction: joining of keyframes with well-known relative poses, to bound the size of the graph.
 
-Where the newest keys end, measurements are condensed once for all; where a robot waits, sooner. If there are still more
-keys than allowed, those neighbours become one whose relative pose is known best: the second then stands rigidly to the
-first, what was measured from it is moved there, and the odometry between them is spent.
+Measurements of keys that are no longer recent are condensed into frozen sightings, and earlier where a robot waits. If
+too many keys remain, neighbours with the smallest variance of their relative pose are joined: the second is attached
+rigidly to the first, its measurements move there, and the odometry between them is dropped.
 """
 
 import numpy as np
@@ -14,24 +14,24 @@ from slam_backend.smoother.graph import SlamGraph, mapped
 from slam_backend.smoother.optimizer import MapEstimate, gathered, linearise
 from slam_backend.smoother.options import SmoothingOptions
 
-MAX_FRAMES = 100  # of a fresh key whose measurements stay raw: a robot that waits takes frames without end
-CONTRADICTION = 2.0  # times the kernel's squared distance: measurements farther off are dropped for good
+MAX_FRAMES = 100  # frames of a recent key with raw measurements: a robot that waits adds frames to the same key
+CONTRADICTION = 2.0  # factor on the kernel's squared distance: measurements beyond it are dropped
 
 
 def reduce_keyframes(
     graph: SlamGraph, camera: FloatArray, options: SmoothingOptions, sightings: LandmarkFactors | None = None
 ) -> SlamGraph:
-    """Return the graph with old keys condensed and at most `most_keys` of them, if the fresh ones allow.
+    """Return the graph with old keys condensed and at most `most_keys` keys, if the recent ones allow.
 
-    A fresh key's measurements stay raw unless more than `MAX_FRAMES` frames stand to it. Odometry is chained over old
-    keys from which nothing was measured; they go if they have a successor. Landmarks and frames that nothing is left of
-    go as well.
+    The measurements of a recent key stay raw unless it has more than `MAX_FRAMES` frames. Old keys without measurements
+    are dropped if they have a successor; the odometry is chained over them. Landmarks and frames without measurements
+    are dropped as well.
 
     Args:
-        graph: At its mode, with what is known there of its spreads; see `relinearise`.
-        camera: As in `optimize`.
-        options: How many keys, and how many of them fresh, of all robots together.
-        sightings: Sightings of the graph, which are linearised again; None: they are gathered.
+        graph: Graph at its MAP estimate, with the transition variances there; see `relinearise`.
+        camera: (7,) focal length, baseline, sigma_px, sigma_disparity, mount.
+        options: Limits on all keys and on recent keys of all robots together.
+        sightings: Sightings of the graph, which are linearised again; None: gathered here.
     """
     seen = gathered(graph) if sightings is None else sightings
     share = max(1, options.recent_keys // len(graph.last_keys))
@@ -54,18 +54,18 @@ def reduce_keyframes(
 
 
 def relinearise(graph: SlamGraph, mode: MapEstimate, spreads: FloatArray | None = None) -> SlamGraph:
-    """Return the graph with the poses and landmarks of the mode, and the spreads (k,) [m^2] of motions there."""
+    """Return the graph with the poses and landmarks of the mode, and the variances (k,) [m^2] of motions there."""
     spreads = graph.transition_variances if spreads is None else spreads
     return graph.with_columns(poses=mode.poses, landmarks=mode.landmarks, transition_variances=spreads)
 
 
 def without_unused_frames(graph: SlamGraph) -> SlamGraph:
-    """Return the graph without the frames from which, and the landmarks of which, nothing was measured."""
+    """Return the graph without frames and landmarks that have no measurements."""
     return _without_unused(graph, np.ones(len(graph.points), dtype=np.bool_))
 
 
 def _without_unused(graph: SlamGraph, kept: BoolArray) -> SlamGraph:
-    """Return the graph with the raw measurements that are `kept` (n,), and with what anything is left of."""
+    """Return the graph with the raw measurements of the mask `kept` (n,), without unused frames and landmarks."""
     raw = mapped(graph.part(Points), lambda column: column[kept])
     frames, frame_rows = _used(len(graph.frame_keys), raw.point_frames)
     landmarks, landmark_rows = _used(len(graph.landmark_ids), raw.point_landmarks, graph.condensed_landmarks)
@@ -81,10 +81,10 @@ def _without_unused(graph: SlamGraph, kept: BoolArray) -> SlamGraph:
 
 
 def _used(num: int, *rows: IntArray) -> tuple[BoolArray, IntArray]:
-    """Return which of `num` rows (num,) any of these name, and the number of each among them (num,)."""
+    """Return the mask (num,) of rows in any of these indices, and the new index (num,) of each used row."""
     used = np.zeros(num, dtype=np.bool_)
-    for named in rows:
-        used[named] = True
+    for indices in rows:
+        used[indices] = True
     return used, np.cumsum(used) - 1
 
 
@@ -94,11 +94,11 @@ def _consistent(
     """Return the graph without old measurements that the smoothed path contradicts, and its sightings, linearised.
 
     Args:
-        graph, seen: The graph, and its sightings.
-        raw: (k,) whether measurements from a key stay raw.
+        graph, seen: Graph and its sightings.
+        raw: (k,) bool. Mask of the keys whose measurements stay raw.
         camera, options: See `reduce_keyframes`.
     """
-    poses, landmarks = graph.poses.copy(), graph.landmarks.copy()  # arrays that can be written, as in a descent
+    poses, landmarks = graph.poses.copy(), graph.landmarks.copy()  # writable arrays, as in a descent
     linearise(seen, graph, poses, landmarks, camera, options)
     if options.kernel:
         lost = seen.squares > CONTRADICTION * options.kernel

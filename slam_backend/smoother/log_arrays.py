@@ -1,4 +1,4 @@
-"""`LogArrays`: steps of one robot's run as flat, read-only arrays, the form in which a smoother takes them."""
+"""Log of one robot's run as flat, read-only arrays, the input of a smoother."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -22,9 +22,9 @@ class LogStep(NamedTuple):
 
     Attributes:
         step: Index of the step in the run.
-        kind: STOOD, ODOMETRY or EXACT.
+        kind: STATIONARY, ODOMETRY or EXACT.
         motion: (3,) [m, m, rad]. ODOMETRY: motion since the last step, previous robot frame; EXACT: the pose, own start
-            frame; STOOD: zeros.
+            frame; STATIONARY: zeros.
         points: (n, 3) [m], robot axes, relative to the camera centre.
         covariances: (n, 6) [m^2] of the points, robot axes, upper triangles by rows; None: the camera model.
         ids: (n,) landmarks, -1 = rejected.
@@ -43,13 +43,13 @@ COLUMNS = ("steps", "kinds", "motions", "given", "starts", "points", "ids", "cov
 
 @dataclass(frozen=True, slots=True, weakref_slot=True, eq=False, kw_only=True)
 class LogArrays:
-    """T steps with n measurements in all. The arrays cannot be written; those that are shared are `with_read_only`.
+    """Log of T steps with n measurements in all, as read-only arrays; shared ones are `with_read_only`.
 
     Attributes:
-        steps: (T,) int64. Index of each step in the run, ascending; steps in which nothing happened may be left out.
-        kinds: (T,) int8. STOOD, ODOMETRY or EXACT.
+        steps: (T,) int64. Index of each step in the run, ascending; steps without events may be missing.
+        kinds: (T,) int8. STATIONARY, ODOMETRY or EXACT.
         motions: (T, 3) float64 [m, m, rad], by kind as in `LogStep`.
-        given: (T,) bool. Whether the measurements of a step came with covariances; else the camera model holds.
+        given: (T,) bool. Whether the measurements of a step came with covariances; else the camera model applies.
         starts: (T + 1,) int64. Measurements of row t are starts[t] to starts[t + 1].
         points: (n, 3) float64 [m], robot axes, relative to the camera centre.
         ids: (n,) int64. Landmarks by the most probable particle of that step, -1 = rejected.
@@ -78,17 +78,17 @@ class LogArrays:
         return with_constants(self)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _from_columns, (self._columns(),)  # a pickle alone would forget that the arrays are read-only
+        return _from_columns, (self._columns(),)  # plain pickling loses the read-only flags
 
     def with_arrays(self, act: Act) -> "LogArrays":
-        """Return the same with `act` done to each array; itself if that changes nothing."""
+        """Return the log with `act` applied to each array; itself if nothing changes."""
         before = self._columns()
         after = map_arrays(before, act)
         return self if after is before else LogArrays(**after)
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the arrays."""
+        """Size of the arrays in bytes."""
         return sum(array.nbytes for array in self._columns().values() if array is not None)
 
     def _columns(self) -> dict[str, Any]:
@@ -108,7 +108,7 @@ class LogArrays:
         )
 
     def since(self, step: int) -> "LogArrays":
-        """Return the rows whose index in the run is at least `step`; all but `starts` share memory with these."""
+        """Return the rows from index `step` of the run on; all arrays but `starts` are views."""
         t = int(np.searchsorted(self.steps, step))
         first = int(self.starts[t])
         return LogArrays(
@@ -123,12 +123,12 @@ class LogArrays:
         )
 
     def renamed(self, old_ids: IntArray, new_ids: IntArray, keep_others: bool) -> "LogArrays":
-        """Return the same with landmark `old_ids[i]` called `new_ids[i]`; all but `ids` is shared.
+        """Return the log with landmark id `old_ids[i]` replaced by `new_ids[i]`; all arrays but `ids` are shared.
 
         Args:
             old_ids: (k,) int64, strictly ascending.
             new_ids: (k,) int64.
-            keep_others: Whether landmarks that are not in `old_ids` keep their names; else they are rejected.
+            keep_others: Whether landmarks that are not in `old_ids` keep their ids; else they are rejected.
         """
         ids = self.ids.copy() if keep_others else np.full_like(self.ids, REJECTED)
         if len(old_ids):
@@ -142,23 +142,23 @@ _checked: WeakSet[LogArrays] = WeakSet()
 
 
 def has_been_checked(rows: Any) -> bool:
-    """Tell whether all of a log's arrays were looked at before, and nobody can have written to them since."""
+    """Return whether a log was checked before; its arrays are read-only, so the result is still valid."""
     return type(rows) is LogArrays and rows in _checked
 
 
 def note_checked(rows: LogArrays) -> None:
-    """Remember that all of a log's arrays were looked at, if they are read-only."""
+    """Mark a log as checked if its arrays are read-only."""
     if with_read_only(rows) is rows:
         _checked.add(rows)
 
 
 def _from_columns(columns: dict[str, Any]) -> LogArrays:
-    """Build a log from its arrays, as unpickling does."""
+    """Restore a log from its arrays after unpickling."""
     return with_read_only(LogArrays(**columns))
 
 
 def join(parts: Sequence[LogArrays]) -> LogArrays:
-    """Chain at least one part in the order given; covariances are NaN for parts that have none."""
+    """Concatenate one or more parts in the given order; covariances are NaN for parts without any."""
     if len(parts) == 1:
         return parts[0]
     ends = np.cumsum([len(part.ids) for part in parts])

@@ -1,4 +1,4 @@
-"""Maximum a posteriori paths and landmarks: Gauss-Newton over key poses and landmarks by sparse factorisation."""
+"""Maximum a posteriori estimation of paths and landmarks by damped Gauss-Newton with sparse Cholesky factorisation."""
 
 from typing import NamedTuple
 
@@ -33,9 +33,9 @@ def linearise(
 
     Args:
         seen: Sightings; the forms of raw measurements and `squares` are written.
-        graph: The graph of these.
-        poses: (k, 3) float64 [m, m, rad], map frame. Where to linearise.
-        landmarks: (l, 3) float64 [m], map frame. Where to linearise.
+        graph: Graph of these sightings.
+        poses: (k, 3) float64 [m, m, rad], map frame. Poses of the linearisation point.
+        landmarks: (l, 3) float64 [m], map frame. Landmarks of the linearisation point.
         camera: (7,) focal length, baseline, sigma_px, sigma_disparity, mount.
         options: Scale of the noise, and kernel.
     """
@@ -45,28 +45,26 @@ def linearise(
 
 
 FIRST_DAMPING, MAX_DAMPING = 1e-4, 1e8
-LARGEST_STEP = 1e3  # [m, rad]; nothing is sought so far away
-LONG_COLUMNS = 16  # blocks in a mean column, longer ones counting more: then draws are cheaper than the inverse
-NO_POSE = "no pose to seek"  # the reason where all poses are given
-SLOW_PROGRESS = (
-    10.0  # times the tolerance: so far from its end a descent may be that has used up the options' iterations
-)
+LARGEST_STEP = 1e3  # [m, rad]; larger steps count as divergence
+LONG_COLUMNS = 16  # mean blocks per column, weighted by length, above which draws are cheaper than the inverse
+NO_POSE = "no pose to seek"  # reason if all poses are fixed
+SLOW_PROGRESS = 10.0  # factor on the tolerance in the last iteration of the options
 
 
 class MapEstimate(NamedTuple):
-    """The most probable paths, and the Gaussian about them.
+    """Maximum a posteriori (MAP) paths and landmarks, and the Gaussian about them.
 
     Attributes:
-        poses: (k, 3) float64 [m, m, rad], map frame; headings are not wrapped against each other.
+        poses: (k, 3) float64 [m, m, rad], map frame; headings are not wrapped.
         landmarks: (l, 3) float64 [m], map frame.
-        columns: (k,) int64. First of each key's rows among those of the poses sought, `FREE` where it is given.
-        sightings: As linearised there.
-        odometry_infos: (k, 3, 3) float64. Information of the odometry from the key before; zeros where there is none.
+        columns: (k,) int64. First row of each key among the unknown poses, `FREE` for a fixed pose.
+        sightings: Sightings, linearised at the estimate.
+        odometry_infos: (k, 3, 3) float64. Information of the odometry from the previous key; zeros without odometry.
         cost: Half the sum of squared distances (robust, and up to a constant of the frozen sightings).
-        iterations: Systems solved.
-        damping: Of the last system; where a descent that was not given the time goes on.
-        reason: Why it is of no use; "" if it is of use. Poses and landmarks are then where the descent got to.
-        system: The last one, factored, if it is of use.
+        iterations: Number of systems solved.
+        damping: Damping of the last system, from which an unfinished descent continues.
+        reason: Reason of a failure, with the last poses and landmarks of the descent; "" on success.
+        system: Last system, factored, on success.
     """
 
     poses: FloatArray
@@ -82,32 +80,32 @@ class MapEstimate(NamedTuple):
 
     @property
     def unfinished(self) -> bool:
-        """Whether nothing is wrong with the descent but that it was given too few iterations."""
+        """Whether the descent failed only for lack of iterations."""
         return bool(self.reason) and np.isfinite(self.cost)
 
     def paths(self, num_paths: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-        """Draw paths from the Gaussian about the mode, if of use.
+        """Draw paths from the Gaussian about the mode of a successful estimate.
 
         Args:
             num_paths: M >= 1; the first is the mode.
             rng: Source of the draws.
 
         Returns:
-            (k, 3, M) float64 [m, m, rad], map frame, and the logarithm of the density of each (M,), up to a constant.
+            (k, 3, M) float64 [m, m, rad], map frame, and the log density of each (M,), up to a constant.
         """
         assert self.system is not None
         return self.system.draw(self.poses, num_paths, rng)
 
     def covariance(self, keys: IntArray) -> FloatArray:
-        """Return the joint covariance (3 r, 3 r) [m, m, rad] of r keys (r,) that are sought, if of use."""
+        """Return the joint covariance (3 r, 3 r) [m, m, rad] of r unknown keys (r,) of a successful estimate."""
         assert self.system is not None
         return self.system.covariance(self.columns[keys])
 
     @property
     def crowded(self) -> bool:
-        """Whether many paths are drawn sooner than `spreads` are found, for the factor's columns are long; if of use.
+        """Whether drawing many paths is faster than computing `spreads`, because the factor's columns are long.
 
-        The work of either grows with the sum of the columns' lengths, that of `spreads` with the sum of their squares.
+        The cost of draws grows with the sum of the columns' lengths, the cost of `spreads` with the sum of the squares.
         """
         assert self.system is not None
         pattern = self.system.pattern
@@ -123,21 +121,20 @@ def optimize(
     graph: SlamGraph, camera: FloatArray, options: SmoothingOptions, most: int | None = None, damping: float = 0.0,
     looseness: float = 1.0,
 ) -> MapEstimate:  # fmt: skip
-    """Descend from where the graph stands.
+    """Return the MAP estimate of a graph, by Levenberg-Marquardt from its poses and landmarks.
 
-    A step that does not lower the cost is tried again with more damping (Levenberg, Marquardt). Where measurements lie
-    at the edge of the kernel a descent may creep, each step promising what the one before did. So it ends in the last
-    iteration of the options, too, if it can fall by no more than `SLOW_PROGRESS` times the tolerance: by default half
-    of a
-    squared distance of two, in a space of hundreds of dimensions.
+    A step that does not lower the cost is repeated with more damping. With measurements at the edge of the robust
+    kernel convergence may be slow. Therefore the last iteration of the options also counts as converged if the expected
+    decrease is at most `SLOW_PROGRESS` times the tolerance, by default half a squared distance of 2 in a space of
+    hundreds of dimensions.
 
     Args:
-        graph: Key poses, odometry, measurements; its poses and landmarks are the start.
+        graph: Keys, odometry and measurements; its poses and landmarks are the initial estimate.
         camera: (7,) focal length, baseline, sigma_px, sigma_disparity, mount.
         options: Kernel, scale of the noise, tolerance, iterations.
-        most: Iterations; None: as in the options.
-        damping: Of the first one.
-        looseness: Times the tolerance of the options.
+        most: Maximum number of iterations; None: `options.max_iterations`.
+        damping: Damping of the first iteration.
+        looseness: Factor on the tolerance of the options.
     """
     columns, informations, size, is_noisy = _kernels.sum_pose_information(graph.parents, graph.odometry_covariances)
     sightings = gathered(graph)
@@ -163,7 +160,7 @@ def optimize(
         trial_poses, trial_landmarks, rise, largest = system.step(poses, landmarks)
         if not largest < LARGEST_STEP:
             return given_up("a descent that leaves the world", iteration)
-        expected = -0.5 * rise - system.eased  # if the cost were a parabola
+        expected = -0.5 * rise - system.eased  # under the quadratic approximation
         near = creep * tolerance if iteration == most else tolerance
         if expected <= near and damping == 0.0:
             return MapEstimate(
@@ -211,7 +208,7 @@ class NormalEquations:
         return loss + cost
 
     def factorise(self, damping: float) -> bool:
-        """Factor the equations, the diagonal of poses enlarged; return whether that is possible."""
+        """Factor the equations with a damped diagonal of poses; return whether they are positive definite."""
         return _kernels.factorise(self.equations, self.pattern, damping, self.num_poses, self.factor)
 
     def step(self, poses: FloatArray, landmarks: FloatArray) -> tuple[FloatArray, FloatArray, float, float]:
@@ -229,9 +226,9 @@ class NormalEquations:
         return _kernels.draw(normals, poses, self.columns, self.sightings, self.equations, self.factor, self.pattern)
 
     def covariance(self, columns: IntArray) -> FloatArray:
-        """Return the joint covariance (3 r, 3 r) of poses by their columns (r,)."""
+        """Return the joint covariance (3 r, 3 r) of poses given by their columns (r,)."""
         return _kernels.covariance(self.factor, self.pattern, columns // 3)
 
     def spreads(self, poses: FloatArray) -> FloatArray:
-        """Return how far motions to each pose (k, 3) scatter, see `MapEstimate.spreads`."""
+        """Return the variances of the motions to poses (k, 3), see `MapEstimate.spreads`."""
         return _kernels.scatter_of_links(poses, self.columns, self.graph.parents, self.factor, self.pattern)

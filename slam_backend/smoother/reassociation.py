@@ -1,8 +1,8 @@
-"""Refused measurements are taken up where they agree that a landmark lies elsewhere than its few sightings say.
+"""Repeated data association of rejected measurements that agree on another position of a landmark.
 
-A landmark whose first sighting lay far off blocks itself: what is seen of it later lies beyond the gate, but is too
-near to something that looks the same to be new, and would be refused for ever. One refused measurement says nothing, it
-may be false; several from different frames that agree with each other are no accident.
+A landmark with an outlier as its first sighting blocks itself: later measurements lie beyond its gate, but are too near
+to a similar landmark to start a new one, and would always be rejected. A single rejected measurement may be false;
+several from different frames that agree with each other are evidence.
 """
 
 import math
@@ -27,10 +27,10 @@ ROUNDING = 1e-12  # [m^2]; keeps covariances of sensors without noise invertible
 
 
 class RejectedMeasurements(NamedTuple):
-    """What of one robot's step was neither matched nor new.
+    """Measurements of one robot's step that neither matched a landmark nor started one.
 
     Attributes:
-        rows: (n,) int64. Among the step's logged measurements.
+        rows: (n,) int64. Rows among the step's logged measurements.
         descriptors: (n, d) float32.
     """
 
@@ -39,13 +39,13 @@ class RejectedMeasurements(NamedTuple):
 
 
 class LandmarkTable(NamedTuple):
-    """Landmarks of a map that no caller has named.
+    """Landmarks of a map whose ids come from data association.
 
     Attributes:
         ids: (l,) int64.
         means: (l, 3) float64 [m], map frame.
         covariances: (l, 6) float64 [m^2], upper triangles by rows.
-        counts: (l,) int. Sightings of each.
+        counts: (l,) int. Number of sightings.
         descriptors: (l, d) float32.
     """
 
@@ -57,7 +57,7 @@ class LandmarkTable(NamedTuple):
 
 
 class _Points(NamedTuple):
-    """Refused measurements where they lie: robot (n,), step (n,), row in the robot's log (n,), map frame, look."""
+    """Rejected measurements: robot (n,), step (n,), row in the robot's log (n,), position in the map, descriptor."""
 
     robots: IntArray
     steps: IntArray
@@ -69,25 +69,25 @@ class _Points(NamedTuple):
 
 def reassociate(
     logs: Sequence[LogArrays],
-    refused: Sequence[Mapping[int, RejectedMeasurements]],
+    rejected: Sequence[Mapping[int, RejectedMeasurements]],
     guesses: Sequence[InitialPoses],
     known: LandmarkTable,
     options: FilterOptions,
 ) -> list[LogArrays]:
-    """Return the logs in which refused measurements bear the name of the landmark that they must be of.
+    """Return the logs with rejected measurements associated to landmarks where they agree.
 
     A rejected measurement can belong to the only similar landmark within `new_landmark_radius`, if nothing else of its
     frame does. Measurements of one landmark that agree on its position, within `position_gate` of one from another
     frame, are associated if they outnumber its own sightings and their mean is within `new_landmark_gate` of it.
 
     Args:
-        logs: Per robot.
-        refused: Per robot by step; steps that its log does not hold are passed over.
-        guesses: Per robot where it was.
-        known: The map.
+        logs: One log per robot.
+        rejected: Rejected measurements of each robot by step; steps outside its log are ignored.
+        guesses: Initial poses of each robot.
+        known: Landmarks of the map.
         options: Gates and camera of the filter.
     """
-    points = _locate(logs, refused, guesses, options)
+    points = _locate(logs, rejected, guesses, options)
     if points is None or not len(known.ids):
         return list(logs)
     owners = _find_owners(points, logs, known, options)
@@ -105,18 +105,18 @@ def reassociate(
                 if ids[robot] is logs[robot].ids:
                     ids[robot] = logs[robot].ids.copy()
                 ids[robot][points.places[n]] = known.ids[owner]
-    return [replace(log, ids=own) for log, own in zip(logs, ids, strict=True)]
+    return [replace(log, ids=new_ids) for log, new_ids in zip(logs, ids, strict=True)]
 
 
 def _locate(
     logs: Sequence[LogArrays],
-    refused: Sequence[Mapping[int, RejectedMeasurements]],
+    rejected: Sequence[Mapping[int, RejectedMeasurements]],
     guesses: Sequence[InitialPoses],
     options: FilterOptions,
 ) -> _Points | None:
-    """Return where what was refused lies in the map, seen from the guessed poses; None if there is nothing."""
+    """Return the rejected measurements in the map frame, from the initial poses; None if there are none."""
     found = []
-    for robot, (log, of_steps, guessed) in enumerate(zip(logs, refused, guesses, strict=True)):
+    for robot, (log, of_steps, guessed) in enumerate(zip(logs, rejected, guesses, strict=True)):
         row_of = {step: t for t, step in enumerate(log.steps.tolist()) if step in of_steps}
         poses = guessed.at(log.steps)
         held = [(step, t) for step, t in row_of.items() if not np.isnan(poses[t, 0])]
@@ -124,13 +124,13 @@ def _locate(
             continue
         steps, t = np.repeat(held, [len(of_steps[step].rows) for step, _ in held], axis=0).T
         places = log.starts[t] + np.concatenate([of_steps[step].rows for step, _ in held])
-        own, turns = log.points[places], np.zeros((len(t), 3, 3))
+        points, turns = log.points[places], np.zeros((len(t), 3, 3))
         turns[:, :2, :2], turns[:, 2, 2] = rotation(poses[t, 2]), 1.0
-        spread = ROBOT_FROM_CAMERA @ options.camera.covariance(own @ ROBOT_FROM_CAMERA) @ ROBOT_FROM_CAMERA.T
+        spread = ROBOT_FROM_CAMERA @ options.camera.covariance(points @ ROBOT_FROM_CAMERA) @ ROBOT_FROM_CAMERA.T
         if log.covariances is not None:
             given = log.given[t]
             spread[given] = log.covariances[places[given]][:, UNPACK_INDEX]
-        means = (turns @ (own + np.asarray(options.camera.mount))[:, :, None])[:, :, 0]
+        means = (turns @ (points + np.asarray(options.camera.mount))[:, :, None])[:, :, 0]
         means[:, :2] += poses[t, :2]
         covariances = turns @ spread @ turns.transpose(0, 2, 1) + ROUNDING * np.eye(3)
         descriptors = np.concatenate([of_steps[step].descriptors for step, _ in held])
@@ -139,7 +139,7 @@ def _locate(
 
 
 def _find_owners(points: _Points, logs: Sequence[LogArrays], known: LandmarkTable, options: FilterOptions) -> IntArray:
-    """Return the row (n,) in `known` of the only landmark that each point can be of; `NO_ONE`: none, or several."""
+    """Return the row (n,) in `known` of the only possible landmark of each point; `NO_ONE`: none, or several."""
     owners = np.empty(len(points.means), dtype=np.int64)
     find_only(
         points.means, points.descriptors, np.ascontiguousarray(known.means), known.descriptors,
@@ -158,14 +158,14 @@ def find_only(
     means: FloatArray, descriptors: NDArray[np.float32], known_means: FloatArray,
     known_descriptors: NDArray[np.float32], radius: float, gate: float, owners: IntArray,
 ) -> None:  # fmt: skip
-    """Find the only landmark that lies near each point and looks like it.
+    """Find the only landmark within a radius of each point that has a similar descriptor.
 
     Args:
-        means, descriptors: (n, 3) [m], (n, d) of the points.
-        known_means, known_descriptors: (l, 3) [m], (l, d) of the landmarks.
-        radius: [m] Within which one is near.
-        gate: L2 distance within which two look alike.
-        owners: (n,), result: the landmark's row, `NO_ONE` where there is none or more than one.
+        means, descriptors: (n, 3) [m], (n, d). Positions and descriptors of the points.
+        known_means, known_descriptors: (l, 3) [m], (l, d). Positions and descriptors of the landmarks.
+        radius: Largest distance from the point [m].
+        gate: Largest L2 distance of similar descriptors.
+        owners: (n,), result. Row of the landmark, `NO_ONE` if there is none or more than one.
     """
     for n in range(len(means)):
         owners[n], fits = NO_ONE, 0
@@ -174,18 +174,18 @@ def find_only(
             dz = means[n, 2] - known_means[row, 2]
             if math.sqrt(dx * dx + dy * dy + dz * dz) > radius:
                 continue
-            unlike = 0.0
+            distance = 0.0
             for i in range(descriptors.shape[1]):
                 off = descriptors[n, i] - known_descriptors[row, i]
-                unlike += off * off
-            if math.sqrt(unlike) <= gate:
+                distance += off * off
+            if math.sqrt(distance) <= gate:
                 owners[n], fits = row, fits + 1
         if fits != 1:
             owners[n] = NO_ONE
 
 
 def _agreeing(points: _Points, members: IntArray, gate: float) -> BoolArray:
-    """Return which members (n,) lie where another one does that is of another frame."""
+    """Return the mask (n,) of members that lie within the gate of a member from another frame."""
     off = points.means[members][:, None] - points.means[members]
     joint = points.covariances[members][:, None] + points.covariances[members]
     squares = np.einsum("ijk,ijk->ij", off, np.linalg.solve(joint, off[..., None])[..., 0])
@@ -195,7 +195,7 @@ def _agreeing(points: _Points, members: IntArray, gate: float) -> BoolArray:
 
 
 def _mean(points: _Points, members: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Return the mean (3,) of the members, each by what it knows, and its covariance (3, 3)."""
+    """Return the information-weighted mean (3,) of the members, and its covariance (3, 3)."""
     infos = np.linalg.inv(points.covariances[members])
     covariance = np.linalg.inv(infos.sum(axis=0))
     return covariance @ np.einsum("nij,nj->i", infos, points.means[members]), covariance

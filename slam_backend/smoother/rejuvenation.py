@@ -1,9 +1,9 @@
-"""`rejuvenate`: new particles from the posterior of whole paths, in place of those that resampling has impoverished.
+"""Rejuvenation: replacement of depleted particles by samples from the posterior of whole paths.
 
-The work can be done in slices, each of them bounded, so that no step of a filter waits for more than one. A slice
-either takes in a few new steps and does two steps of Gauss-Newton; or does two more of these, until the descent has
-ended, and then joins surplus keys; or, when all is at its mode, takes in the very last keys, ends the descent and
-samples. Between slices there is nothing but a graph, and how damped its next step is.
+The work can be divided into bounded slices, at most one per step of the filter. A slice adds a few new steps to the
+graph and does two Gauss-Newton iterations; or does two more iterations and, if the descent has converged, joins surplus
+keys; or, if the graph is at its mode, adds the newest keys, completes the descent and samples. The state between slices
+is a graph and the damping of the next iteration.
 """
 
 from collections.abc import Sequence
@@ -28,16 +28,16 @@ from slam_backend.smoother.optimizer import NO_POSE, MapEstimate, optimize
 from slam_backend.smoother.options import SmoothingOptions
 from slam_backend.smoother.sampling import PathSamples, sample_paths, sample_transition_variances
 
-DRAFT_TOLERANCE = 10.0  # times the tolerance: a descent that is not followed by draws may end so much sooner
+DRAFT_TOLERANCE = 10.0  # factor on the tolerance of descents without draws
 
 
 class LandmarkDescriptors(NamedTuple):
-    """Appearance of landmarks that no caller has named.
+    """Descriptors of landmarks whose ids come from data association.
 
     Attributes:
         ids: (n,) int64, ascending.
         descriptors: (n, d) float32.
-        gate: L2 distance beyond which two do not look alike.
+        gate: Largest L2 distance of similar descriptors.
     """
 
     ids: IntArray
@@ -49,17 +49,18 @@ class Particles(NamedTuple):
     """M particles from the posterior of whole paths.
 
     Attributes:
-        poses, starts: (K, 3, M) float64 [m, m, rad], map frame. Newest pose and start of each robot. A start that is
-            given stays where it is; all else is held, see `fix_gauge`.
+        poses, starts: (K, 3, M) float64 [m, m, rad], map frame. Newest pose and start of each robot, in a fixed gauge
+            (see `fix_gauge`); known starts are unchanged.
         log_weights: (M,) float64, normalised.
-        log_densities: (M,) float64. Of the newest poses under the Gaussian about the mode, up to a constant: 0 for the
-            first particle, whose path is the mode, unless more than M were drawn.
-        ids: (l,) int64. Landmarks that have a sighting.
-        tiles: (l, P / LANES, 9, LANES) float64. Their means (3) and covariances (6), map frame, in blocks of lanes.
-        counts: (l,) int64. Measurements of each.
-        means, covariances: (K, 3), (K, 3, 3) float64. The newest poses under the Gaussian about the mode.
-        frame: (3, 3) float64 [m, m, rad]. Covariance of the motion of the whole map that the particles do not show.
-        start_scatters: (K, 3, 3) float64 [m, m, rad], start frames. Covariance of each start that they do not show.
+        log_densities: (M,) float64. Log densities of the newest poses under the Gaussian about the mode, up to a
+            constant: 0 for the first particle, whose path is the mode, unless more than M were drawn.
+        ids: (l,) int64. Landmarks with at least one sighting.
+        tiles: (l, P / LANES, 9, LANES) float64. Means (3) and covariances (6) of landmarks, map frame, in blocks of
+            lanes.
+        counts: (l,) int64. Number of measurements of each landmark.
+        means, covariances: (K, 3), (K, 3, 3) float64. Newest poses under the Gaussian about the mode.
+        frame: (3, 3) float64 [m, m, rad]. Covariance of the gauge, a motion of the whole map; not in the particles.
+        start_scatters: (K, 3, 3) float64 [m, m, rad], start frames. Covariance of each start; not in the particles.
     """
 
     poses: FloatArray
@@ -76,14 +77,14 @@ class Particles(NamedTuple):
 
 
 class Rejuvenation(NamedTuple):
-    """What came of an attempt.
+    """Result of an attempt.
 
     Attributes:
-        graph: To go on with next time.
-        reason: Why there are no new particles; "" if there are.
-        ess: Effective sample size of the importance weights of all draws, at most M; NaN if it did not come to that.
-        iterations: Of the last descent.
-        particles: The new ones, or None.
+        graph: Graph for the next attempt.
+        reason: Reason for the lack of new particles; "" on success.
+        ess: Effective sample size of the importance weights of all draws, at most M; NaN without draws.
+        iterations: Iterations of the last descent.
+        particles: New particles, or None.
     """
 
     graph: SlamGraph
@@ -102,28 +103,28 @@ def rejuvenate(
     rng: np.random.Generator,
     options: SmoothingOptions,
     guesses: Sequence[InitialPoses] | None = None,
-    looks: LandmarkDescriptors | None = None,
+    appearance: LandmarkDescriptors | None = None,
     places: LandmarkPositions | None = None,
 ) -> Rejuvenation:
-    """Take in what the robots did since, smooth, and draw particles.
+    """Add the robots' new steps to the graph, smooth, and draw particles.
 
-    A long log is taken in part by part, so that the effort stays that of `most_keys` poses each time. Nothing is raised
-    for what may happen in a run: the reason says why there are no new particles.
+    A long log is added in parts, each with an effort of about `most_keys` poses. Failures that can occur in a run raise
+    nothing; the result's `reason` names them.
 
     Args:
-        graph: As the last attempt left it, or `SlamGraph.at_starts`.
-        logs: Per robot, of the steps after `graph.latest`.
+        graph: Graph of the last attempt, or `SlamGraph.at_starts`.
+        logs: One log per robot, with the steps after `graph.latest`.
         motion: Noise of the odometry.
         camera: (7,) focal length, baseline, sigma_px, sigma_disparity, mount.
         num_particles: M.
         rng: Source of the draws.
-        options: What decides the rest.
-        guesses: Per robot where it may be after some of the new steps.
-        looks: For landmarks that turn out to be one. None: all are what they are called.
-        places: Where the filter holds landmarks to be, see `extend_graph`.
+        options: Options of the smoother.
+        guesses: Initial poses of each robot after some of the new steps.
+        appearance: Descriptors to detect duplicate landmarks. None: no detection.
+        places: Initial landmark positions from the filter, see `extend_graph`.
 
     Returns:
-        The graph to go on with, and M particles, or why there are none.
+        The graph for the next attempt, and M particles or the reason for their lack.
     """
     if any((log.kinds == EXACT).any() for log in logs):
         return Rejuvenation(graph, "poses that were given as exact", float("nan"), 0, None)
@@ -142,18 +143,18 @@ def rejuvenate(
         elif mode.reason:
             return Rejuvenation(graph, mode.reason, float("nan"), mode.iterations, None)
         elif last:
-            return sample_particles(grown, mode, camera, num_particles, rng, options, looks)
+            return sample_particles(grown, mode, camera, num_particles, rng, options, appearance)
         else:
             graph = relinearised_and_reduced(grown, mode, camera, options, rng)
         rest = [log.since(int(graph.latest[i]) + 1) for i, log in enumerate(rest)]
 
 
 def at_given_poses(graph: SlamGraph, camera: FloatArray, options: SmoothingOptions) -> Rejuvenation:
-    """Tell that there is no pose to seek yet; all that was measured is kept, for robots may move later.
+    """Return a refusal because no pose is unknown yet; all measurements are kept for later attempts.
 
     Args:
-        graph: With all that the logs hold; its landmarks are where the filter has them, which knows the poses as well.
-        camera, options: As of `rejuvenate`.
+        graph: Graph with all steps of the logs, and landmarks at the filter's positions.
+        camera, options: Same arguments as `rejuvenate`.
     """
     return Rejuvenation(reduce_keyframes(graph, camera, options), NO_POSE, float("nan"), 0, None)
 
@@ -161,13 +162,13 @@ def at_given_poses(graph: SlamGraph, camera: FloatArray, options: SmoothingOptio
 def relinearised_and_reduced(
     graph: SlamGraph, mode: MapEstimate, camera: FloatArray, options: SmoothingOptions, rng: np.random.Generator
 ) -> SlamGraph:
-    """Return the graph at its mode; if it has too many keys some are joined, those whose motions scatter least.
+    """Return the graph at its mode; if it has too many keys, those with the smallest relative variances are joined.
 
     Args:
-        graph: Which has the mode.
-        mode: Of use, with an empty `reason`.
-        camera, options: As of `rejuvenate`.
-        rng: Source of draws, where these are the cheaper way to see what scatters.
+        graph: Graph of the mode.
+        mode: MAP estimate with an empty `reason`.
+        camera, options: Same arguments as `rejuvenate`.
+        rng: Source of draws, where sampling the variances is cheaper than computing them.
     """
     if graph.num_keys <= options.most_keys(len(graph.last_keys)):
         return relinearise(graph, mode)
@@ -182,14 +183,14 @@ def sample_particles(
     num_particles: int,
     rng: np.random.Generator,
     options: SmoothingOptions,
-    looks: LandmarkDescriptors | None = None,
+    appearance: LandmarkDescriptors | None = None,
 ) -> Rejuvenation:
     """Draw particles about the mode of a graph.
 
     Args:
-        grown: The graph with all that the logs hold.
-        mode: Of it, of use.
-        camera, num_particles, rng, options, looks: As of `rejuvenate`.
+        grown: Graph with all steps of the logs.
+        mode: MAP estimate of the graph with an empty `reason`.
+        camera, num_particles, rng, options, appearance: Same arguments as `rejuvenate`.
     """
     draws = sample_paths(grown, mode, num_particles, rng)
     chosen, ess = draws, draws.sample_size
@@ -201,23 +202,23 @@ def sample_particles(
     graph = reduce_keyframes(relinearise(grown, mode, draws.spreads), camera, options, mode.sightings)
     if not ess >= needed:
         return Rejuvenation(graph, f"an effective sample size of {ess:.1f}", ess, mode.iterations, None)
-    if looks is not None and len(looks.ids):
-        duplicates = find_duplicates(grown, mode, draws, _descriptors(grown, looks), looks.gate)
+    if appearance is not None and len(appearance.ids):
+        duplicates = find_duplicates(grown, mode, draws, _descriptors(grown, appearance), appearance.gate)
         if len(duplicates):
             graph = without_unused_frames(without_duplicates(graph, duplicates))
     return Rejuvenation(graph, "", ess, mode.iterations, _particles(grown, mode, chosen))
 
 
-def _descriptors(graph: SlamGraph, looks: LandmarkDescriptors) -> NDArray[np.float32]:
-    """Return descriptors (l, d) by row of the graph's landmarks, NaN where there is none."""
-    at = np.minimum(np.searchsorted(looks.ids, graph.landmark_ids), len(looks.ids) - 1)
-    result = looks.descriptors[at]
-    result[looks.ids[at] != graph.landmark_ids] = np.nan
+def _descriptors(graph: SlamGraph, appearance: LandmarkDescriptors) -> NDArray[np.float32]:
+    """Return descriptors (l, d) by row of the graph's landmarks, NaN where unknown."""
+    at = np.minimum(np.searchsorted(appearance.ids, graph.landmark_ids), len(appearance.ids) - 1)
+    result = appearance.descriptors[at]
+    result[appearance.ids[at] != graph.landmark_ids] = np.nan
     return result
 
 
 def _particles(graph: SlamGraph, mode: MapEstimate, draws: PathSamples) -> Particles:
-    """Gather what particles hold."""
+    """Return the particles of draws, in a fixed gauge."""
     weights, tiles, ids, landmarks = draws.weights, draws.tiles, graph.landmark_ids, mode.landmarks
     counts, in_view = np.zeros(len(ids), dtype=np.int64), np.zeros(len(ids), dtype=np.bool_)
     np.add.at(counts, mode.sightings.landmarks, mode.sightings.counts)
@@ -228,10 +229,10 @@ def _particles(graph: SlamGraph, mode: MapEstimate, draws: PathSamples) -> Parti
     poses, starts = draws.poses[graph.last_keys], draws.poses[graph.first_keys]
     means = mode.poses[graph.last_keys]
     covariances = np.zeros((len(means), 3, 3))
-    (sought,) = (mode.columns[graph.last_keys] >= 0).nonzero()
-    joint = mode.covariance(graph.last_keys[sought])
-    off, densities = (poses - means[:, :, None])[sought].reshape(-1, poses.shape[2]), np.empty(len(weights))
-    for place, robot in enumerate(sought):
+    (free,) = (mode.columns[graph.last_keys] >= 0).nonzero()
+    joint = mode.covariance(graph.last_keys[free])
+    off, densities = (poses - means[:, :, None])[free].reshape(-1, poses.shape[2]), np.empty(len(weights))
+    for place, robot in enumerate(free):
         covariances[robot] = joint[3 * place : 3 * place + 3, 3 * place : 3 * place + 3]
     if not _kernels.weigh_deviations(joint, off, densities):
         raise np.linalg.LinAlgError("the joint covariance of the robots' poses is not positive definite")
@@ -242,11 +243,11 @@ def _particles(graph: SlamGraph, mode: MapEstimate, draws: PathSamples) -> Parti
         transform_tiles(tiles, held.motions)
         poses, frame = held.poses, held.scatter
     for index in (mode.columns[graph.first_keys] >= 0).nonzero()[0].tolist():
-        own = starts[index : index + 1]
+        start = starts[index : index + 1]
         if held is not None:
-            move(own, held.motions, own)
+            move(start, held.motions, start)
         at = mode.poses[graph.first_keys[index]], means[index]
-        start_scatters[index] = fix_start(own[0], poses[index], *at, weights)
+        start_scatters[index] = fix_start(start[0], poses[index], *at, weights)
     for array in (poses, starts, means):
         array[:, 2] = wrap_angle(array[:, 2])
     return Particles(
@@ -255,18 +256,18 @@ def _particles(graph: SlamGraph, mode: MapEstimate, draws: PathSamples) -> Parti
     )  # fmt: skip
 
 
-SLICE_TOLERANCE = 100.0  # times the tolerance: slices without draws need not end a descent that the next goes on with
-STEPS = 2  # of Gauss and Newton in a slice: the second as a rule tells that the first has ended the descent
-LAST_STEPS = 3  # of Gauss and Newton in the slice that draws: the graph was at its mode but for the last few keys
+SLICE_TOLERANCE = 100.0  # factor on the tolerance of slices without draws: the next slice continues the descent
+STEPS = 2  # Gauss-Newton iterations in a slice: the second usually confirms the convergence of the first
+LAST_STEPS = 3  # Gauss-Newton iterations in the slice that draws: only the last few keys are not at the mode
 
 
 class Draft(NamedTuple):
     """A graph in the middle of a descent.
 
     Attributes:
-        graph: Its poses and landmarks are where the descent has got to.
-        damping: Of the next step.
-        steps: Done so far.
+        graph: Graph with the current poses and landmarks of the descent.
+        damping: Damping of the next iteration.
+        steps: Number of iterations so far.
     """
 
     graph: SlamGraph
@@ -275,12 +276,12 @@ class Draft(NamedTuple):
 
 
 class Smoother(NamedTuple):
-    """What all slices need.
+    """Slice-wise rejuvenation with fixed models and options.
 
     Attributes:
         motion: Noise of the odometry.
         camera: (7,) focal length, baseline, sigma_px, sigma_disparity, mount.
-        options: What decides the rest.
+        options: Options of the smoother.
         rng: Source of the draws.
     """
 
@@ -292,28 +293,28 @@ class Smoother(NamedTuple):
     def add_logs(
         self, graph: SlamGraph, logs: Sequence[LogArrays], guesses: Sequence[InitialPoses], places: LandmarkPositions
     ) -> SlamGraph | Draft | str:
-        """Take in all rows of the logs, which are few, and do the first steps.
+        """Add all rows of short logs to the graph, and do the first iterations.
 
         Args:
-            graph: At its mode.
-            logs: Per robot, of the steps after `graph.latest`.
-            guesses: Per robot where it may be after some of these steps.
-            places: Where the filter holds landmarks to be, see `extend_graph`.
+            graph: Graph at its mode.
+            logs: One log per robot, with the steps after `graph.latest`.
+            guesses: Initial poses of each robot after some of these steps.
+            places: Initial landmark positions from the filter, see `extend_graph`.
 
         Returns:
-            As of `optimise_slice`.
+            Same result as `optimise_slice`.
         """
         grown = extend_graph(graph, logs, self.motion, self.camera[4:], guesses, self.options.rigid_within, places)
         return self.optimise_slice(Draft(graph=grown))
 
     def optimise_slice(self, draft: Draft) -> SlamGraph | Draft | str:
-        """Do the next steps of a descent.
+        """Do the next iterations of a descent.
 
         Args:
-            draft: How it stands.
+            draft: State of the descent.
 
         Returns:
-            The graph if that ended the descent, how it now stands if not, or what is wrong.
+            The graph on convergence, the new state before it, or the reason of a failure.
         """
         mode = optimize(draft.graph, self.camera, self.options, STEPS, draft.damping, SLICE_TOLERANCE)
         return self._after(draft, mode)
@@ -325,34 +326,34 @@ class Smoother(NamedTuple):
         guesses: Sequence[InitialPoses],
         places: LandmarkPositions,
         num_particles: int,
-        looks: LandmarkDescriptors,
+        appearance: LandmarkDescriptors,
     ) -> Rejuvenation | SlamGraph | Draft | str:
-        """Take in the logs' last rows, and draw particles, if so few steps end the descent.
+        """Add the logs' last rows to the graph, and draw particles if `LAST_STEPS` iterations reach convergence.
 
         Args:
-            graph, logs, guesses, places: As of `take_in`.
+            graph, logs, guesses, places: Same arguments as `add_logs`.
             num_particles: M.
-            looks: For landmarks that turn out to be one.
+            appearance: Descriptors to detect duplicate landmarks.
 
         Returns:
-            What came of the draws, or else as of `optimise_slice`.
+            The result of the draws, or without draws the same result as `optimise_slice`.
         """
         grown = extend_graph(graph, logs, self.motion, self.camera[4:], guesses, self.options.rigid_within, places)
         draft = Draft(graph=grown)
         mode = optimize(grown, self.camera, self.options, LAST_STEPS)
         if not mode.reason:
-            return sample_particles(grown, mode, self.camera, num_particles, self.rng, self.options, looks)
+            return sample_particles(grown, mode, self.camera, num_particles, self.rng, self.options, appearance)
         if mode.reason == NO_POSE:
             return at_given_poses(grown, self.camera, self.options)
         return self._after(draft, mode)
 
     def without_measurements(self, graph: SlamGraph, logs: Sequence[LogArrays]) -> SlamGraph:
-        """Return the graph after all rows of the logs, of which only the odometry is believed."""
+        """Return the graph extended by the odometry of the logs, without their measurements."""
         blind = [replace(log, ids=np.full_like(log.ids, REJECTED)) for log in logs]
         return extend_graph(graph, blind, self.motion, self.camera[4:], rigid_within=self.options.rigid_within)
 
     def _after(self, draft: Draft, mode: MapEstimate) -> SlamGraph | Draft | str:
-        """Return what a step came to, as of `optimise_slice`."""
+        """Return the result of `optimise_slice` after its iterations."""
         if not mode.reason:
             return relinearised_and_reduced(draft.graph, mode, self.camera, self.options, self.rng)
         if mode.reason == NO_POSE:

@@ -1,8 +1,8 @@
-"""Whole paths sampled from the posterior of a smoother, their landmarks, and their importance weights.
+"""Importance sampling of whole paths and their landmarks from the posterior of a smoother.
 
-Where headings are uncertain, the poses of a path scatter on a banana, which no Gaussian of coordinates is. What is
-nearly Gaussian are the motions between poses (Long et al., The Banana Distribution Is Gaussian, RSS 2012): paths are
-sampled about the mode and then bent motion by motion.
+Under heading uncertainty the poses of a path have a banana-shaped distribution, which is not Gaussian in coordinates.
+The motions between poses are nearly Gaussian (Long et al., The Banana Distribution Is Gaussian, RSS 2012): paths are
+sampled about the mode and then retracted motion by motion.
 """
 
 import math
@@ -20,17 +20,17 @@ from slam_backend.smoother.optimizer import MapEstimate
 
 @jit
 def retract_on_se2(mode: FloatArray, previous: IntArray, offsets: FloatArray) -> FloatArray:
-    """Return paths (k, 3, M) whose motions differ from those of the mode as offsets say to first order.
+    """Return paths (k, 3, M) whose motions differ from those of the mode by the first-order effect of offsets.
 
-    With r_b the first-order change of the motion from the previous pose a to b that the offsets of a and b make, and
-    m_b the motion of the mode, a path is x_b = x_a * (m_b + r_b). Both steps, offsets to r and r to x, are triangular
-    in the order of the keys with rotations on the diagonal: volumes, and so densities, stay as they are. Offsets of
-    zero give the mode.
+    Let r_b be the first-order change, by the offsets of a and b, of the motion from the previous pose a to b, and m_b
+    the motion of the mode. Then a path is x_b = x_a * (m_b + r_b). Both steps, offsets to r and r to x, are triangular
+    in the order of the keys with rotations on the diagonal, so they preserve volumes and densities. Zero offsets give
+    the mode.
 
     Args:
         mode: (k, 3) [m, m, rad], map frame.
-        previous: (k,) the key that each one's motion comes from, -1 where its pose is given. No circles.
-        offsets: (k, 3, M) [m, m, rad] from the mode, map frame; zeros where a pose is given.
+        previous: (k,) previous key of each key, -1 for a fixed pose. No cycles.
+        offsets: (k, 3, M) [m, m, rad] from the mode, map frame; zeros for fixed poses.
     """
     k, m = len(mode), offsets.shape[2]
     paths = np.empty(offsets.shape)
@@ -38,7 +38,7 @@ def retract_on_se2(mode: FloatArray, previous: IntArray, offsets: FloatArray) ->
     line = np.empty(k, dtype=np.int64)
     for key in range(k):
         top, at = 0, key
-        while at >= 0 and not is_done[at]:  # up to what is known, and back
+        while at >= 0 and not is_done[at]:  # up to a computed pose, and back
             is_done[at] = True
             line[top] = at
             top += 1
@@ -56,28 +56,28 @@ def retract_on_se2(mode: FloatArray, previous: IntArray, offsets: FloatArray) ->
             ahead, left = c * dx + s * dy, c * dy - s * dx
             for i in range(m):
                 ox, oy = offsets[b, 0, i] - offsets[a, 0, i], offsets[b, 1, i] - offsets[a, 1, i]
-                own_ahead = ahead + c * ox + s * oy + left * offsets[a, 2, i]
-                own_left = left + c * oy - s * ox - ahead * offsets[a, 2, i]
+                motion_x = ahead + c * ox + s * oy + left * offsets[a, 2, i]
+                motion_y = left + c * oy - s * ox - ahead * offsets[a, 2, i]
                 cos, sin = math.cos(paths[a, 2, i]), math.sin(paths[a, 2, i])
-                paths[b, 0, i] = paths[a, 0, i] + cos * own_ahead - sin * own_left  # (8), x
-                paths[b, 1, i] = paths[a, 1, i] + sin * own_ahead + cos * own_left  # (8), y
+                paths[b, 0, i] = paths[a, 0, i] + cos * motion_x - sin * motion_y  # (8), x
+                paths[b, 1, i] = paths[a, 1, i] + sin * motion_x + cos * motion_y  # (8), y
                 paths[b, 2, i] = paths[a, 2, i] + turn + offsets[b, 2, i] - offsets[a, 2, i]
     return paths
 
 
-BENT_BELOW = 0.5  # share of M: where the sample size of straight paths is less, bent ones are tried
+BENT_BELOW = 0.5  # share of M: below this sample size of the Gaussian draws, retracted ones are tried
 
 
 class PathSamples(NamedTuple):
-    """M paths with the landmarks that each of them asks for.
+    """M paths, each with its conditional landmarks.
 
     Attributes:
         poses: (k, 3, M) float64 [m, m, rad], map frame.
         tiles: (l, P / LANES, 9, LANES) float64. Means (3) and covariances (6) of the landmarks, map frame, by lanes.
         log_weights: (M,) float64. Importance weights, not normalised.
-        weights: (M,) float64. The same, summing to 1; NaN where one is not finite.
-        sample_size: Effective sample size of the weights; NaN where one is not finite.
-        spreads: (k,) float64 [m^2]. How far the motions from the keys before scatter, headings felt at `LEVER`.
+        weights: (M,) float64. Normalised importance weights; NaN if one is not finite.
+        sample_size: Effective sample size of the weights; NaN if one is not finite.
+        spreads: (k,) float64 [m^2]. Variances of the motions from the previous keys, headings at `LEVER`.
     """
 
     poses: FloatArray
@@ -89,20 +89,20 @@ class PathSamples(NamedTuple):
 
     @classmethod
     def weighed(cls, poses: FloatArray, tiles: FloatArray, log_weights: FloatArray, spreads: FloatArray) -> Self:
-        """Return paths with their weights normalised; arguments as the attributes."""
+        """Return paths with normalised weights; arguments as the attributes."""
         weights = np.empty(len(log_weights))
         sample_size = _kernels.normalise(log_weights, weights)
         return cls(poses, tiles, log_weights, weights, sample_size, spreads)
 
     @property
     def landmarks(self) -> FloatArray:
-        """(l, 9, M) float64. Means and covariances. A copy."""
+        """Means and covariances (l, 9, M) float64 of the landmarks, a copy."""
         count, blocks = self.tiles.shape[:2]
         rows = self.tiles.transpose(0, 2, 1, 3).reshape(count, 9, blocks * LANES)
         return np.ascontiguousarray(rows[:, :, : self.poses.shape[2]])
 
     def taken(self, ancestors: IntArray) -> "PathSamples":
-        """Return as many paths as there are ancestors (M',), each a copy of its ancestor, weighed alike."""
+        """Return copies of the paths with indices `ancestors` (M',), with equal weights."""
         m = len(ancestors)
         padded = np.concatenate([ancestors, np.repeat(ancestors[:1], -m % LANES)])  # surplus lanes are copies
         blocks = len(padded) // LANES
@@ -113,32 +113,32 @@ class PathSamples(NamedTuple):
 def sample_paths(graph: SlamGraph, mode: MapEstimate, num_particles: int, rng: np.random.Generator) -> PathSamples:
     """Draw x^(i) from the Gaussian about the mode, and replay each path.
 
-    log w = log p(path given odometry) + log p(measurements given path) - log q(path). The first path is the mode. Where
-    the weights of these say that the posterior is no such Gaussian, the same paths are bent (`bending`), and of both
-    those are returned whose effective sample size is larger.
+    log w = log p(path given odometry) + log p(measurements given path) - log q(path). The first path is the mode. If
+    their effective sample size is low, the same paths are also retracted on SE(2) (`retract_on_se2`), and the set with
+    the larger effective sample size is returned.
 
     Args:
         graph: Odometry and measurements.
-        mode: Of it, with the factor of its information.
+        mode: MAP estimate of the graph, with the factored information matrix.
         num_particles: M >= 1.
         rng: Source of the draws.
     """
     poses, log_proposals = mode.paths(num_particles, rng)
-    straight = _importance_weights(graph, mode, poses, log_proposals)
-    if straight.sample_size >= BENT_BELOW * num_particles:
-        return straight
-    bent = _importance_weights(
+    gaussian = _importance_weights(graph, mode, poses, log_proposals)
+    if gaussian.sample_size >= BENT_BELOW * num_particles:
+        return gaussian
+    retracted = _importance_weights(
         graph, mode, retract_on_se2(mode.poses, graph.parents, poses - mode.poses[:, :, None]), log_proposals
     )
-    return max(straight, bent, key=lambda draws: np.nan_to_num(draws.sample_size))
+    return max(gaussian, retracted, key=lambda draws: np.nan_to_num(draws.sample_size))
 
 
 def sample_transition_variances(graph: SlamGraph, mode: MapEstimate, rng: np.random.Generator) -> FloatArray:
-    """Return how far the motions from the keys before scatter (k,) [m^2] over `LANES` paths, each to 14 % or so.
+    """Return the variances (k,) [m^2] of motions from the previous keys over `LANES` paths, each to about 14 %.
 
     Args:
         graph: Odometry and measurements.
-        mode: Of it, with the factor of its information.
+        mode: MAP estimate of the graph, with the factored information matrix.
         rng: Source of the draws.
     """
     paths, _ = mode.paths(LANES, rng)
@@ -148,7 +148,7 @@ def sample_transition_variances(graph: SlamGraph, mode: MapEstimate, rng: np.ran
 def _importance_weights(
     graph: SlamGraph, mode: MapEstimate, poses: FloatArray, log_proposals: FloatArray
 ) -> PathSamples:
-    """Replay paths (k, 3, M) and weigh them."""
+    """Replay paths (k, 3, M) and compute their importance weights."""
     num_paths = poses.shape[2]
     rows = lane_rows(poses)
     tiles, log_likelihood = replay(mode, rows, num_paths)
@@ -157,7 +157,7 @@ def _importance_weights(
 
 
 def lane_rows(poses: FloatArray) -> FloatArray:
-    """Return paths as kernels take them, in blocks of lanes; surplus lanes are copies of the first path.
+    """Return paths in the kernels' layout, in blocks of lanes; surplus lanes are copies of the first path.
 
     Args:
         poses: (k, 3, M) float64 [m, m, rad], map frame.
@@ -192,7 +192,7 @@ def replay(mode: MapEstimate, rows: FloatArray, num_particles: int) -> tuple[Flo
 def odometry_log_density(
     graph: SlamGraph, mode: MapEstimate, rows: FloatArray, num_particles: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Weigh M paths by the odometry.
+    """Return the log density of M paths given the odometry, and the variances of their motions.
 
     Args:
         graph: The odometry between keys.

@@ -59,7 +59,7 @@ POSITIVE, COUNT, SHARE, SIGMA, OPTICS = "(0, inf)", "1..1e9", "[0, 1]", "[0, 100
 BOUNDED, FROM_ZERO = "(0, 1e9]", "[0, inf)"
 OPTIONS: dict[type[Any], tuple[str, dict[str, str | list[Any]]]] = {
     AlignmentOptions: ("options.", {
-        "descriptor_gate": BOUNDED, "descriptor_ratio": "(0, 1]", "look_alikes": "0..10000", "same_place": "[0, 1e9]",
+        "descriptor_gate": BOUNDED, "descriptor_ratio": "(0, 1]", "max_similar": "0..10000", "same_place": "[0, 1e9]",
         "position_gate": BOUNDED, "position_floor": BOUNDED, "min_inliers": "3..1e9", "max_ratio": "(0, 1]",
         "min_spread": "[0, 1e9]", "max_sigma_position": BOUNDED, "max_sigma_heading": BOUNDED,
         "success_probability": "(0, 1)", "max_samples": COUNT, "appearance": [1, None],

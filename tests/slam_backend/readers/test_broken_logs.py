@@ -200,8 +200,8 @@ CASES: dict[str, list[tuple[Read, str]]] = {
         (euroc("-1.0, 0.0, 0.1", "-2.0, 0.0, 0.1"), "sensor.yaml with a rigid motion T_BS"),
         (euroc("401,", "-401,"), "^calibration.intrinsics: expected a finite number > 0"),
         (euroc("400.5,", "x,"), "^calibration: expected numbers after 'intrinsics', got "),
-        (lambda _: Rectifier(eye_at(0.1), eye_at(0.0)), "^right: expected an eye to the right of the left one"),
-        (lambda _: Rectifier(eye_at(0.0), WIDE), "^right: expected an eye with images of the left one's size"),
+        (lambda _: Rectifier(eye_at(0.1), eye_at(0.0)), "^right: expected a camera to the right of the left one"),
+        (lambda _: Rectifier(eye_at(0.0), WIDE), "^right: expected a camera with images of the left one's size"),
         (lambda _: Rectifier(eye_at(0.0), eye_at(0.1)).rectify(*IMAGES), r"^right: expected an image of 320 x 240 px"),
     ],
     "CSV": [

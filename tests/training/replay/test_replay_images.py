@@ -152,10 +152,10 @@ def test_invalid_folders_are_refused(tmp_path: Path) -> None:
         for name in names:
             (tmp_path / eye / f"{name}.png").write_bytes(b"none")
     assert is_image_folder(tmp_path)
-    with pytest.raises(ValueError, match="path: expected two or more images of the same names in both eyes"):
+    with pytest.raises(ValueError, match="path: expected two or more images with the same names of both cameras"):
         load_kitti_images(tmp_path)
     (tmp_path / "image_r" / "2.png").rename(tmp_path / "image_r" / "1.png")
-    with pytest.raises(ValueError, match="path: expected an image file, got a file that is none"):
+    with pytest.raises(ValueError, match="path: expected an image file, got another file"):
         load_kitti_images(tmp_path)
     for file in tmp_path.glob("image_*/*.png"):
         cv2.imwrite(str(file), np.zeros((20, 30), np.uint8))

@@ -151,7 +151,7 @@ def test_missing_poses_are_reported(room: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (("--left", "left_img_0.png"), "path: expected two or more images, as many of both eyes, got a folder with 1 "),
+        (("--left", "left_img_0.png"), "path: expected two or more pairs of images, got a folder with 1 "),
         (("--right", "none*.png"), "path: expected an image file, got no such file. Check "),
         (("--calibration", "none.yaml,none.yaml"), "calibration: expected a readable file of a calibration"),
         (("--calibration", "a,b,c"), "calibration: expected one file or two, got 'a,b,c'"),
