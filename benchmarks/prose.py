@@ -15,8 +15,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 CHECKED = (
     *("README.md", "CONTRIBUTING.md", "CODE_OF_CONDUCT.md", "docs", ".github"),
-    *("agents", "training", "benchmarks", "examples"),
-    *("tests/agents", "tests/benchmarks", "tests/docs", "tests/examples", "tests/training"),
+    *("slam_backend", "vslam_env", "agents", "training", "benchmarks", "examples", "tests"),
 )
 EXEMPT = ("docs/lab/", "benchmarks/prose.py", "tests/benchmarks/test_prose.py")  # measurement logs; the list itself
 PHRASES = (

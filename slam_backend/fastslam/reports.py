@@ -58,22 +58,22 @@ class Associations(NamedTuple):
         return max(count, 0)
 
     def associated(self, row: int) -> IntArray:
-        """Return what the measurements (n_i,) of a robot were taken for; there are none of robot -1. A copy."""
+        """Return a copy of the landmark (n_i,) that each measurement of a robot was associated with; none for robot -1."""
         associated, _ = self.ids
         return self._per_measurement(row, associated)
 
     def created(self, row: int) -> IntArray:
-        """Return likewise which landmarks they created."""
+        """Return the landmark (n_i,) that each measurement of a robot created."""
         _, created = self.ids
         return self._per_measurement(row, created)
 
     def associated_ids(self, row: int) -> list[int]:
-        """Return the landmarks that measurements of a robot were taken for, in their order."""
+        """Return the landmarks that measurements of a robot were associated with, in their order."""
         associated, _ = self.ids
         return self._valid_ids(row, associated)
 
     def created_ids(self, row: int) -> list[int]:
-        """Return likewise the landmarks that they created."""
+        """Return the landmarks that measurements of a robot created, in their order."""
         _, created = self.ids
         return self._valid_ids(row, created)
 

@@ -86,7 +86,7 @@ def _align_patch(
         source: (H, W) uint8.
         target: (H, W) uint8.
         column, row: Centre of the patch [px].
-        start_x, start_y: Where to begin in `target` [px].
+        start_x, start_y: Initial position in `target` [px].
         iterations: Limit of their number.
         patches: (3, side, side) float32. Room for the template and its two slopes; the side is odd.
         sums: (6, side) float32. Room.
@@ -187,7 +187,7 @@ def refine(
         left_image: (H, W) uint8.
         right_image: (H, W) uint8.
         left: (n, 2) float64 [px]. Corners.
-        right: (n, 2) float64 [px]. Their partners.
+        right: (n, 2) float64 [px]. Matched corners of the right image.
         half: Patches are 2 `half` + 1 pixels wide.
         iterations: Limit of their number for each way.
 

@@ -150,8 +150,8 @@ def try_damaged(
     """Set a subject to damaged states, as they are and through bytes; return how many it refused and accepted.
 
     Args:
-        subject: With get_state and set_state.
-        seeds: Of the damages.
+        subject: Object with get_state and set_state.
+        seeds: Seeds of the damages.
         kinds: Classes of objects that its states hold.
         is_unchanged: Returns whether the subject is as before; asked after some refusals.
         go_on: Lets the subject go on from a state that it has accepted, which it gets.

@@ -55,7 +55,7 @@ def map_once(
         names: (n,) which of `LANDMARKS` the robot sees, in this order.
         start: (3,) the robot's start in a's start frame.
         sigma: True noise of each coordinate of a measurement [m].
-        rng: Of the true noise and the filter.
+        rng: Random stream of the true noise and the filter.
         num_particles: M.
         moves: The robot makes `MOVE` so often, with the noise of `WIDE_MOTION`, and sees an equal share of the
             landmarks after each; 0: it sees them all from its start.

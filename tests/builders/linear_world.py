@@ -51,7 +51,7 @@ class LinearRun:
     Attributes:
         odometry: Noisy motions (T, 3); the first frame is taken before them.
         frames: T + 1 frames of all landmarks.
-        noises: Their covariances (n, 3, 3), robot axes.
+        noises: Noise covariances (n, 3, 3), robot axes.
         poses: True poses (T + 1, 3).
     """
 

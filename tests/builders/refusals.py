@@ -35,7 +35,7 @@ def check_option(kind: type[Any], called: str, name: str, allowed: str | list[An
 
     Args:
         kind: Class of options.
-        called: What errors call an object of it, with a dot, or "".
+        called: Prefix of its names in errors, with a dot, or "".
         name: Option.
         allowed: Interval, or a list of values that are refused.
         beside: Other options that large numbers of this one need.

@@ -34,8 +34,8 @@ class SimulatedTeam:
 
     Attributes:
         num_robots: K.
-        seed: Of everything.
-        num_landmarks: Of each room.
+        seed: Seed of all random streams.
+        num_landmarks: Number of landmarks of each room.
         separate: Each robot has a room of its own, so that no map overlaps another.
         aliased: Separate rooms repeat the same appearances at other places.
     """
@@ -187,8 +187,8 @@ def check_snapshot(simulation: SimulatedTeam, team: TeamSlam, contacts: Iterable
 
     Args:
         simulation: Goes on by a step for each entry of `contacts`.
-        team: Whose snapshot is taken, pickled, and not changed by what happens afterwards.
-        contacts: Of each step.
+        team: Team whose snapshot is taken and pickled; later steps do not change it.
+        contacts: Contacts at each step.
     """
     state = pickle.loads(pickle.dumps(team.get_state()))
     kept, restored = copy.deepcopy(state), TeamSlam(simulation.num_robots, seed=99)

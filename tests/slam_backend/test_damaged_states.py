@@ -52,7 +52,7 @@ def team_with_forks() -> Subject:
 
 
 def team_in_a_replay() -> Subject:
-    """Return a team of which a robot has returned, and is not told all yet."""
+    """Return a team with a returned robot whose replay is not complete."""
     simulation, team = merged(rejuvenate_every=6)
     simulation.run(team, 30, FORKED)
     simulation.run(team, 1)

@@ -48,7 +48,7 @@ def test_continuous_actions_are_scaled(action: Any, command: Any) -> None:
         assert np.allclose(checked_actions({"robot_0": form}, ["robot_0"], "continuous"), [command])
 
 
-def test_robots_do_what_they_are_told() -> None:
+def test_robots_execute_their_actions() -> None:
     """In free space a robot ends where its command leads; discrete actions are stay, ahead, left, right."""
     env = small_env(action_type="discrete", num_robots=1)
     for action, (speed, turn) in enumerate(DISCRETE_COMMANDS):

@@ -61,8 +61,8 @@ def measure(
     later ones move up.
 
     Args:
-        ids: (K, B) int64. In each row the landmarks that a robot reports; -1 - j for false point j. Changed to those
-            behind the written points, -1 for a false point.
+        ids: (K, B) int64. Landmarks that each robot reports, -1 - j for false point j; changed to those of the
+            written points, -1 for a false point.
         counts: (K,) int64. Number of points that each robot reports; changed to where the written ones of each robot
             end.
         poses: (K, 3) float64 [m, m, rad], world frame. Robots.
@@ -76,7 +76,7 @@ def measure(
         looks: (n, d) float32, unit vectors. Written to.
 
     Returns:
-        How many are written.
+        Number of points written.
     """
     forward, aside, height, focal, baseline, sigma, sigma_disparity, farthest, descriptor_noise = optics
     size = looks.shape[1]

@@ -80,8 +80,8 @@ def landmarks_in_view(
     for slot in range(len(ids)):
         if ids[slot] < 0 or started[slot]:
             continue
-        is_told = matched[slot]
-        if not is_told:
+        is_included = matched[slot]
+        if not is_included:
             row = row_of[slot]
             places = maps.maps[map_of[slot]] if map_of[slot] > 0 else in_place
             place, m = np.int64(places[best]), 0
@@ -91,10 +91,10 @@ def landmarks_in_view(
             if counts[row, place] > 0:
                 dx = values[row, place // LANES, 0, place % LANES] - poses[0, best]
                 dy = values[row, place // LANES, 1, place % LANES] - poses[1, best]
-                is_told = dx * dx + dy * dy <= near * near and _is_expected(
+                is_included = dx * dx + dy * dy <= near * near and _is_expected(
                     places[:num_particles], values[row], counts[row], camera, view
                 )
-        if is_told:
+        if is_included:
             slots[num] = slot
             num += 1
     return slots[:num]
@@ -139,7 +139,7 @@ def count_expected(
         m: The particle.
         pose: (3,) pose of the robot in it [m, m, rad], map frame.
         mount: (3,) place of the camera on the robot [m].
-        view: Where landmarks are expected to be seen.
+        view: Field of view in which landmarks are expected to be detected.
     """
     c, s = np.cos(pose[2]), np.sin(pose[2])
     values = maps.values.reshape((-1, maps.counts.shape[1] // LANES, 9, LANES))

@@ -51,7 +51,7 @@ def _shared_mean(shares: FloatArray, tile: FloatArray) -> tuple[float, float, fl
 def _shared_spread(
     shares: FloatArray, tile: FloatArray, x: float, y: float, z: float
 ) -> tuple[float, float, float, float, float, float]:
-    """Return the weighted sums (6) of covariances, and of products of what means are off (x, y, z), likewise."""
+    """Return the weighted sums (6) of covariances, and of products of the deviations from (x, y, z)."""
     own_xx, own_xy, own_xz = stack_array(LANES), stack_array(LANES), stack_array(LANES)
     own_yy, own_yz, own_zz = stack_array(LANES), stack_array(LANES), stack_array(LANES)
     for i in range(LANES):

@@ -233,7 +233,7 @@ def relative_poses_from_starts(
     """Write each particle's pose estimate as seen from its own start pose.
 
     Args:
-        starts: (3, P) float64 [m, m, rad], map frame. Where the robot started in each particle.
+        starts: (3, P) float64 [m, m, rad], map frame. Start of the robot in each particle.
         means: (3, P) float64 [m, m, rad], map frame.
         covariances: (6, P) float64: xx, xy, xt, yy, yt, tt of each, map frame.
         count: Particles; the lanes beyond mean nothing.
@@ -287,10 +287,9 @@ def write_team_poses(
         weights: (M,) summing to 1; (0,) where all robots started at the origin in all particles.
         best: The most probable particle.
         estimates, spreads: (n, 3), (n, 3, 3) [m, m, rad] the robots' poses over all particles, map frame.
-        members: (2, n) int64. Which robots of the team they are, and which of them go by this filter: only these are
-            written of.
+        members: (2, n) int64. Robots of the team, and 1 below each that uses this filter; only these are written.
         ess: Effective sample size of the filter, as a share of M.
-        points: Standpoints of all robots of the team, written.
+        points: Poses of all robots of the team, written.
     """
     count = members.shape[1]
     starts, means = robots[STARTS], robots[MEANS]

@@ -125,7 +125,7 @@ def _colour(
     to work in.
 
     Returns:
-        How many were written.
+        Number of entries written.
     """
     words = len(vertices)
     found, colour = 0, 0

@@ -146,7 +146,7 @@ def add_sightings(
     Args:
         rows: (n,) which sightings, those of a landmark one after the other; reordered: by key in each landmark.
         seen: All sightings.
-        roots, numbers, offsets: As returned by `merge_keys`; keys of the sums are by their new numbers.
+        roots, numbers, offsets: Results of `merge_keys`; keys of the sums have their new numbers.
     """
     n, keys, landmarks, counts = len(rows), seen.keys, seen.landmarks, seen.counts
     centres, infos, slopes = seen.linearisation_points, seen.information, seen.gradients

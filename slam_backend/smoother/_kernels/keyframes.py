@@ -31,7 +31,7 @@ def close_keyframe(
         old_landmarks: (n,) landmark of each old raw measurement.
         frozen: Frozen sightings.
         known: Landmarks so far.
-        held: Where the filter holds landmarks to be.
+        held: Landmark positions of the filter.
         frames: Frames of the measurements.
         poses: (k, 3) of the keys, map frame.
         mount: (3,) [m] of the camera on the robot.
@@ -93,8 +93,8 @@ def add_log(
 
     Args:
         log: New steps.
-        guesses: Where the robot is thought to be after some of them; elsewhere odometry says.
-        robot: Whose log it is.
+        guesses: Poses of the robot after some of them; elsewhere odometry is chained.
+        robot: Robot of the log.
         rigid_within: [m]. A step that measured something becomes a key unless odometry since the last key scatters
             less; see `SmoothingOptions`.
         tips: (K,) newest key of each robot, changed.

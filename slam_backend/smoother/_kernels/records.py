@@ -84,7 +84,7 @@ class LandmarkFactors(NamedTuple):
 
     Attributes:
         keys, landmarks: (s,) int64.
-        starts: (l + 1,) int64. Those of landmark i are starts[i] to starts[i + 1].
+        starts: (l + 1,) int64. Offsets: factors of landmark i are starts[i] to starts[i + 1].
         frozen: (s,) bool.
         centres, infos, slopes: (s, 3), (s, 6), (s, 3) float64. See `_kernels.factors`.
         counts: (s,) int64. Measurements in each.
@@ -132,7 +132,7 @@ class SymbolicFactor(NamedTuple):
         link_places, cross_places: (k,), (s,) 1 + place of each block of `links` and `cross`, negative if it is
             transposed there, 0 if there is none.
         row_tops, row_columns, row_places: (N + 1,), (filled,), (filled,) the same blocks row by row.
-        drawn: How many nodes `draw` draws.
+        drawn: Number of nodes that `draw` samples.
         squares: Sum of the squares of the columns' lengths.
     """
 

@@ -40,7 +40,7 @@ def minimum_degree(near: Bits, order: IntArray) -> int:
         order: (N,), result: the nodes in the order of elimination.
 
     Returns:
-        How many blocks off the diagonal the factor has.
+        Number of off-diagonal blocks of the factor.
     """
     num, words = near.shape
     degrees, times = np.empty(num, dtype=np.int64), np.zeros(num + 1, dtype=np.int64)  # how often each degree occurs

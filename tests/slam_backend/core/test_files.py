@@ -186,7 +186,7 @@ def test_a_file_in_a_folder_that_takes_none_is_written_in_place(tmp_path: Path) 
                 write_file(folder / name, "new")
         assert (folder / "protected").read_text() == "old"
 
-    _as_nobody(try_all)
+    _as_unprivileged_user(try_all)
     folder.chmod(0o755)
 
 
@@ -203,12 +203,12 @@ def test_a_file_of_another_keeps_its_owner(tmp_path: Path) -> None:
     while here.parent != here:
         here.chmod(here.stat().st_mode | 0o055)
         here = here.parent
-    _as_nobody(lambda: write_file(folder / "file", "new"))
+    _as_unprivileged_user(lambda: write_file(folder / "file", "new"))
     assert ((folder / "file").read_text(), (folder / "file").stat().st_uid) == ("new", 0)
     assert [file.name for file in folder.iterdir()] == ["file"]
 
 
-def _as_nobody(work: Callable[[], object]) -> None:
+def _as_unprivileged_user(work: Callable[[], object]) -> None:
     """Call a function as a user without rights, if the tests run as root."""
     if os.geteuid() != 0:
         work()

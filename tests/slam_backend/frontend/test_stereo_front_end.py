@@ -129,7 +129,7 @@ def test_empty_and_saturated_images_show_nothing() -> None:
         assert found.descriptors.shape == (0, 64)
 
 
-def test_swapped_images_are_told(pair: tuple[np.ndarray, np.ndarray]) -> None:
+def test_swapped_images_raise_a_hint(pair: tuple[np.ndarray, np.ndarray]) -> None:
     """A pair the wrong way round has negative disparities, and the error says so."""
     expected = "left, right: expected the left image first, got a pair with [0-9]+ points at negative disparities"
     with pytest.raises(ValueError, match=expected):

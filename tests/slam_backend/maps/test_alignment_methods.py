@@ -248,12 +248,12 @@ def test_what_no_variance_explains_widens_the_covariance() -> None:
     rng = np.random.default_rng(22)
     table = np.zeros((400, 18))
     table[:, 3:6] = rng.uniform(0.0, 9.0, (400, 3))
-    everyone, nobody = np.ones(400, np.bool_), np.zeros(400, np.bool_)
+    everyone, none = np.ones(400, np.bool_), np.zeros(400, np.bool_)
     for factor, ratio in ((3.0, 9.0), (1.0, 1.0), (0.1, 1.0)):
         table[:, :3] = table[:, 3:6] + 0.1 * factor * rng.standard_normal((400, 3))
         # The median of 400 has a standard deviation of 6 %.
         assert unexplained(table, everyone, np.zeros(3), 0.01) == pytest.approx(ratio, rel=0.25)
-    assert unexplained(table, nobody, np.zeros(3), 0.01) == 1.0
+    assert unexplained(table, none, np.zeros(3), 0.01) == 1.0
 
 
 def test_members_without_extent_are_left_alone() -> None:
@@ -455,8 +455,8 @@ def maps_with_doubles(seed: int, doubles: int, scattered: bool = False) -> tuple
     """Return two maps with 24 landmarks in common, of which so many have a double in map a.
 
     Args:
-        seed: Of all draws.
-        doubles: How many have one; b has seen none of the doubles.
+        seed: Seed of all draws.
+        doubles: Number of landmarks with a double; b has seen no double.
         scattered: Each double hangs anywhere, at its own height; if not, all of them by one motion.
     """
     rng = np.random.default_rng([seed, 5])

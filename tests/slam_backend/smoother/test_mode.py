@@ -392,7 +392,7 @@ def test_exact_motions_and_poses_leave_nothing_to_smooth():
         extend_graph(start, [log.arrays()], OdometryModel(), np.zeros(3))
 
 
-def test_a_landmark_whose_sightings_say_nothing_stays_and_keeps_nobody():
+def test_a_landmark_with_uninformative_sightings_stays_and_does_not_block_others():
     """Frozen sightings that have lost their weight hold no landmark: it stays where it is, and poses are as without."""
     run = small_run()
     graph = graph_of(run)

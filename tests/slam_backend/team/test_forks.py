@@ -116,7 +116,7 @@ def test_a_filter_knows_its_members_only() -> None:
 
 
 def test_at_most_twenty_buffered_steps_are_taken_in_per_step() -> None:
-    """After 50 steps apart, the third step of contact has told all: 20, 20 and 12; the fork lasts until then."""
+    """After 50 steps apart, three steps of contact replay 20, 20 and 12 steps; the fork lasts until then."""
     simulation = SimulatedTeam(num_robots=2, seed=5)
     team = merged_team(simulation, merging=FINAL)
     live(team, readings_of(simulation, 50), links(2))

@@ -33,7 +33,7 @@ class Drive:
     """Three robots in a building, whose grids follow them.
 
     Args:
-        seed: Of where they drive.
+        seed: Seed of the drives.
     """
 
     def __init__(self, seed: int) -> None:

@@ -75,8 +75,7 @@ def update_grids(
         room: See `update_from_geometry`.
 
     Returns:
-        Whose grid and whose reading do not go together, as its pose or its ranges are bad; nothing was written then.
-        -1 if all are good.
+        Robot whose pose or ranges are invalid, in which case nothing is written; -1 if all are valid.
     """
     evidence, cells, changes, bounds = grids
     for robot in range(len(scans)):

@@ -84,7 +84,7 @@ def update_slots(
         cells: (300, 300) uint8. The grid.
         bounds: (4,) int32, of `known_bounds`.
         radius: Radius of the robot [m].
-        poses: (n, 3) [m, m, rad]. Of the robot and of teammates; NaN: the robot does not know.
+        poses: (n, 3) [m, m, rad]. Poses of the robot and its teammates; NaN: unknown to the robot.
         robot: Row of the robot in the poses.
         rows: (m, 5). Slots, see `FrontierColumns`; NaN in empty ones. Changed.
         visits: (m,) int64. Visits of each candidate so far; changed.

@@ -19,7 +19,7 @@ def shorten_path(weights: Any, cost: Any, parent: Any, row: int, col: int) -> An
         cost: (h, w) int32, of `wavefront`.
         parent: (h, w) int32, of `wavefront`.
         row: The goal, a reached cell.
-        col: See `row`.
+        col: Column of the first cell.
 
     Returns:
         (n, 2) int64 rows (row, column) of the corners, from the start to the goal.
@@ -81,12 +81,12 @@ def nearest_open(box: Any, weights: Any, row: int, col: int, reach: int) -> tupl
     Args:
         box: (h, w) uint8. Cells.
         weights: (h, w) uint8. 0 where a robot may not be.
-        row: Where to begin; this cell itself may be a wall's.
-        col: See `row`.
-        reach: How far to look, in cells.
+        row: Row of the first cell, which may be a wall.
+        col: Column of the first cell.
+        reach: Search radius in cells.
 
     Returns:
-        Its row and column, or (-1, -1).
+        Row and column of the cell, or (-1, -1).
     """
     height, width = box.shape
     if not (0 <= row < height and 0 <= col < width):
@@ -127,11 +127,11 @@ def wavefront(weights: Any, row: int, col: int) -> tuple[Any, Any]:
     Args:
         weights: (h, w) uint8, 0 = closed. The outermost cells must be closed.
         row: The first cell, open; -1 if there is none, and nothing is reached.
-        col: See `row`.
+        col: Column of the first cell.
 
     Returns:
-        Of each cell (h, w) int32: the cost, `UNREACHED` if there is no way; and the flat index of the cell before it on
-        its way, -1 at the first cell and where there is no way.
+        Cost (h, w) int32 of each cell, `UNREACHED` if there is no path; and the flat index (h, w) int32 of its parent on
+        the path, -1 at the first cell and where there is no path.
     """
     width = weights.shape[1]
     weight = weights.ravel()

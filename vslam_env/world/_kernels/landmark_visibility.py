@@ -44,7 +44,7 @@ def detect(
 
     Args:
         poses: (K, 3) float64 [m, m, rad], world frame. Robots.
-        sight: What decides which landmarks cameras see, wherever they are:
+        sight: Arrays that determine which landmarks cameras see from any pose:
             (5, N) float64, world frame. Positions [m] and normals [-] of the landmarks; by rows, for vector
             instructions.
             (N,) int64. Index of the wall that carries each landmark.
@@ -58,7 +58,7 @@ def detect(
         counts: (K,) int64. Written to: how many they are.
 
     Returns:
-        How many are chosen in all, and how many false points there are.
+        Number of chosen landmarks, and number of false points.
     """
     marks, own_walls, walls, robot_radius, limits = sight
     forward, aside, height, max_range, tan_half, tan_vertical, cos_incidence = limits

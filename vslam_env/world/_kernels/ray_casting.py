@@ -45,14 +45,14 @@ def walls_in_wedge(
         y: See `x`.
         cosine: Cosine of the direction of its axis.
         sine: Sine of the direction of its axis.
-        walls: (4, S) float64 [m], world frame. By rows, for vector instructions.
+        walls: (4, S) float64 [m], world frame. Walls as rows of coordinates, for vector instructions.
         tan_half: The wedge opens by +-atan of this around its axis; <= 0 stands for all round.
         reach: Length of the wedge [m].
         near: (S, 4) float64 [m], in the frame of the wedge. Written to: the ends of these walls, one after the other.
         rows: (S,) int64. Written to: their indices.
 
     Returns:
-        How many they are.
+        Number of these walls.
     """
     c, s = cosine, sine
     for i in range(walls.shape[1]):
@@ -110,10 +110,10 @@ def cast_scans(
 
     Args:
         poses: (K, 3) float64 [m, m, rad], world frame.
-        rays, tan_half: (2, R) float64 and float. As `ray_fan` returns them, the same for all robots.
+        rays, tan_half: (2, R) float64 and float. Results of `ray_fan`, the same for all robots.
         walls: (4, S) float64 [m], world frame. See `walls_in_wedge`.
         robot_radius: Radius of the other robots, which stop rays [m].
-        max_range: Where rays end [m]; what ends there is read without error.
+        max_range: Length of the rays [m]; a ray that hits nothing reads it without error.
         sigma: Standard deviation of a reading, as a share of the distance.
         ranges: (K, R) float64. Standard normal draws; the readings [m], from 0 to `max_range`, take their places.
     """
