@@ -59,7 +59,7 @@ class MapStore:
         padded: P, M rounded up to whole blocks of lanes.
         values: (rows * 9 * P,) float64 [m, m^2], map frame, each row
             [block][x, y, z, Sxx, Sxy, Sxz, Syy, Syz, Szz][lane].
-        counts: (rows, P) int32. Number of matches of the landmark in the particle, its creation included; 0: not present.
+        counts: (rows, P) int32. Matches of the landmark in the particle, its creation included; 0: not present.
         table: (6, slots) int64, see `Slots`.
         maps: (maps, P) int32. users: (maps,) int64, how many slots read by each.
         odds: (slots, P) float64. Log-odds that the landmark exists, read through its map as a row is; (0, P) without.

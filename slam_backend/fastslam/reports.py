@@ -58,7 +58,7 @@ class Associations(NamedTuple):
         return max(count, 0)
 
     def associated(self, row: int) -> IntArray:
-        """Return a copy of the landmark (n_i,) that each measurement of a robot was associated with; none for robot -1."""
+        """Return a copy of the landmark (n_i,) of each measurement of a robot, REJECTED: none; empty for robot -1."""
         associated, _ = self.ids
         return self._per_measurement(row, associated)
 

@@ -395,7 +395,7 @@ RESETS: dict[str, list[dict[str, Any]]] = {
     f"{STARTS}[1]: expected a place": [
         {"options": {"start_poses": bad}} for bad in ([[3, 3, 0], [0.1, 5, 0]], [MEETING[0], MEETING[0]])
     ],
-    f"{STARTS}[0]: expected a place": [{"seed": 2, "options": {"start_poses": [[-50.0, 0.0, 0.0], [4, 4, 0]]}}],
+    f"{STARTS}[0]: expected a reachable": [{"seed": 2, "options": {"start_poses": [[-50.0, 0.0, 0.0], [4, 4, 0]]}}],
 }  # fmt: skip
 
 

@@ -130,8 +130,8 @@ def wavefront(weights: Any, row: int, col: int) -> tuple[Any, Any]:
         col: Column of the first cell.
 
     Returns:
-        Cost (h, w) int32 of each cell, `UNREACHED` if there is no path; and the flat index (h, w) int32 of its parent on
-        the path, -1 at the first cell and where there is no path.
+        Cost (h, w) int32 of each cell, `UNREACHED` if there is no path; and the flat index (h, w) int32 of its parent,
+        -1 at the first cell and where there is no path.
     """
     width = weights.shape[1]
     weight = weights.ravel()
