@@ -106,7 +106,7 @@ def read_grey(file: Path) -> Image:
     """
     image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
     if image is None:
-        got = "another file" if file.is_file() else "no such file"
+        got = "a file of another kind" if file.is_file() else "no such file"
         raise argument_error("path", "an image file", got, f"Get {str(file)!r} again.")
     return np.asarray(image, dtype=np.uint8)
 

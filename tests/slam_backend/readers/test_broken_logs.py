@@ -160,8 +160,8 @@ CASES: dict[str, list[tuple[Read, str]]] = {
         (trees([1.0], [3.5], [0.1]), "bearings from 0 to pi in zt, got a bearing outside in cell 1"),
     ],
     "KITTI": [
-        (load_kitti, "path: expected an archive .* or a folder with one, got a folder with 0 of them"),
-        (two_archives, "got a folder with 2 of them"),
+        (load_kitti, "path: expected an archive .* or a folder with one, got a folder with 0 archives"),
+        (two_archives, "got a folder with 2 archives"),
         (within("none.npz", load_kitti), "a folder with one, got no such file"),
         (holding("a.npz", b"PK no archive", load_kitti), "a numpy archive, got a broken file"),
         (kitti(b=np.array([{}], object)), "a numpy archive, got a broken file"),

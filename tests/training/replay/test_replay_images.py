@@ -155,7 +155,7 @@ def test_invalid_folders_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="path: expected two or more images with the same names of both cameras"):
         load_kitti_images(tmp_path)
     (tmp_path / "image_r" / "2.png").rename(tmp_path / "image_r" / "1.png")
-    with pytest.raises(ValueError, match="path: expected an image file, got another file"):
+    with pytest.raises(ValueError, match="path: expected an image file, got a file of another kind"):
         load_kitti_images(tmp_path)
     for file in tmp_path.glob("image_*/*.png"):
         cv2.imwrite(str(file), np.zeros((20, 30), np.uint8))
