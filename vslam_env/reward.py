@@ -98,7 +98,7 @@ POTENTIALS: dict[str, RewardFunction] = {
     "recall": _rise_of("accurate_recalls"),
     "pose_uncertainty": _fall_of("pose_sigmas"),
     "coverage": _coverage,
-    "own_coverage": _rise_of("found"),
+    "own_coverage": _rise_of("discovered"),
 }
 RUNNING_COST = "running_cost"
 COSTS: dict[str, RewardFunction] = {

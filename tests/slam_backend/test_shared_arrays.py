@@ -55,7 +55,7 @@ def test_what_is_replaced_in_a_state_from_before_a_merge_is_refused_at_its_undo(
     maps["map_of"] = np.full_like(maps["map_of"], 2**31)
     trunk = team._groups[0].trunk
     with pytest.raises(ValueError, match=r"state\['filter'\]\['maps'\]\['map_of'\]: expected integers"):
-        MergeRollback.of(trunk, trunk.watches[0].number)
+        MergeRollback.of(trunk, trunk.monitors[0].number)
 
 
 def test_parts_of_trees_are_copied_only_where_they_can_be_written() -> None:

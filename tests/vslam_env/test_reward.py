@@ -26,7 +26,7 @@ FIGURES: dict[str, list[float]] = {
     "pose_errors": [0.0, 0.3],
     "heading_errors": [0.0, 0.04],
     "pose_sigmas": [0.02, 0.05],
-    "found": [0.2, 0.05],
+    "discovered": [0.2, 0.05],
     "distances": [1.0, 2.0],
     "error_integrals": [2.0, 1.5],
 }
@@ -36,7 +36,7 @@ def _standing(
     coverage: float = 0.25, collisions: tuple[int, int] = (0, 3), time: float = 3.0, **rows: Any
 ) -> TeamMetrics:
     return TeamMetrics(
-        table=RobotMetrics(**FIGURES | rows),
+        per_robot=RobotMetrics(**FIGURES | rows),
         counts=RobotCounts(collisions, (7, 8)),
         coverage=coverage,
         merges=0,

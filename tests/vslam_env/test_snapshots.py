@@ -298,7 +298,7 @@ def test_objects_of_the_caller_are_asked_for(tmp_path: Path) -> None:
         name, weight = "found", 2.0
 
         def __call__(self, before: Any, after: Any) -> Any:
-            return after.found - before.found
+            return after.discovered - before.discovered
 
     env = small_env(reward=[Found()])
     env.reset(seed=1)

@@ -21,7 +21,7 @@ class RobotMetrics(NamedTuple, Generic[Row]):
     pose_errors: Row
     heading_errors: Row
     pose_sigmas: Row
-    found: Row
+    discovered: Row
     distances: Row
     error_integrals: Row
 
@@ -93,7 +93,7 @@ class TeamMetrics(NamedTuple):
     @property
     def discovered(self) -> FloatArray:
         """(K,) float64. Share of the free floor that each robot was nearest to when the team first saw it."""
-        return np.array(self.per_robot.found)
+        return np.array(self.per_robot.discovered)
 
     @property
     def distances(self) -> FloatArray:

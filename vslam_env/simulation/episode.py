@@ -121,7 +121,7 @@ class Episode:
         self._collisions: tuple[int, ...] = (0,) * config.num_robots
         self._figures = np.zeros((len(RobotMetrics._fields), config.num_robots))  # distances accumulate
         rows: RobotMetrics[FloatArray] = RobotMetrics(*self._figures)
-        self._map_errors, self._found, self._distances = rows.map_errors, rows.found, rows.distances
+        self._map_errors, self._found, self._distances = rows.map_errors, rows.discovered, rows.distances
         self._error_integrals = rows.error_integrals
         self._integrates = RUNNING_COST in config.reward  # scoring every tick is slow
         self.true_path: list[FloatArray] = []

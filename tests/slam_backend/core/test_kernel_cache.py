@@ -244,11 +244,11 @@ def through(x):
     return answer(x)
 """
 CALLEE = """
-from slam_backend.core.jit import inlined
+from slam_backend.core.jit import inline
 
 NUMBER = {number}
 
-@inlined
+@inline
 def answer(x):
     return x + NUMBER
 """

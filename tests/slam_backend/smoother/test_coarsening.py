@@ -310,7 +310,7 @@ def test_measurements_with_names_are_taken(covered):
     assert frames.frame_keys.tolist() == [-7] * 5 + [0, 0, 0, -7]
     assert raw.point_landmarks.tolist() == [-7, -7, 4, 9, 4, 2, -7, -7]
     assert raw.point_frames.tolist() == [-7, -7, 5, 5, 6, 7, -7, -7]
-    assert raw.given.tolist() == [False, False, covered, covered, False, covered, False, False]
+    assert raw.has_covariance.tolist() == [False, False, covered, covered, False, covered, False, False]
     np.testing.assert_array_equal(raw.points[2:6], points[rows])
     np.testing.assert_array_equal(raw.point_noises[2:6], covariances[rows] if covered else np.zeros((4, 6)))
     assert (raw.points[[0, 1, 6, 7]] == -7.0).all()

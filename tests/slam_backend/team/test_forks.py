@@ -173,7 +173,7 @@ def test_a_return_is_counted_to_the_byte() -> None:
     assert team.bytes_sent[1] - sent[1] == told + POSE_BYTES  # the last one for the step in contact
     after = dict(zip(team.map(0).ids.tolist(), team.map(0).counts.tolist(), strict=True))
     changed = sum(before.get(name) != count for name, count in after.items())
-    own = {i for entry in report.entries if isinstance(entry, LandmarksCreated) for i in entry.ids.tolist()}
+    own = {i for entry in report.map_changes if isinstance(entry, LandmarksCreated) for i in entry.ids.tolist()}
     new = sum(name not in before and name not in own for name in after)
     assert team.bytes_sent[0] - sent[0] == changed * LANDMARK_BYTES + new * 4 * SIZE + POSE_BYTES
     assert new > 0

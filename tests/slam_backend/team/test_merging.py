@@ -235,7 +235,7 @@ def test_what_lay_in_the_memory_of_new_rows_is_never_read(monkeypatch: pytest.Mo
             array.view(np.uint8).fill(byte)
             return array
 
-        monkeypatch.setattr(_map_store, "aligned", filled)
+        monkeypatch.setattr(_map_store, "empty_aligned", filled)
         a, b = both()
         joint = merge_filters(a, b, known_alignment(), PAIRS, np.random.default_rng(5))[0]
         merged = joint.get_state()

@@ -129,7 +129,7 @@ def test_maps_that_agree_on_less_once_straight_are_not_merged(every: int, monkey
         assert maps is not None
         return maps[0].subset(np.flatnonzero(np.arange(len(maps[0])) % every)), maps[1]
 
-    monkeypatch.setattr(trying, "straightened", lost)
+    monkeypatch.setattr(trying, "smoothed_maps", lost)
     _, team = bent_team(112, AT_LAST)
     event = team.events[0]
     assert (len(team.events), event.alignment.reason) == (1, "too few inliers")

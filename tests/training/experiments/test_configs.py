@@ -29,7 +29,8 @@ CASES: dict[type[ExperimentConfig], dict[str, Any]] = {
     bench.EnvBenchConfig: {"worlds": ("fig5",)},
     bench.ExplorationBenchConfig: {"policies": ("frontier@discrete",), "worlds": ("maze",)},
     bench.FilterBenchConfig: {"proposals": ("fastslam1",), "large": True},
-    bench.StereoBenchConfig: {"descriptors": ("orb",)}, bench.TrainBenchConfig: {"workers": (0, 2)},
+    bench.StartBenchConfig: {"parts": ("import",), "repeats": 1}, bench.StereoBenchConfig: {"descriptors": ("orb",)},
+    bench.TrainBenchConfig: {"workers": (0, 2)},
     bench.MrclamPairsConfig: {"path": "log", "durations": (50.0,)},
     EvaluateConfig: {"model": str(Path("model.npz").resolve()), "policies": ("random_goals",)},
     TrainConfig: {"preset": "smoke", "learning_rate": 1e-4}, paper.Fig1Config: {"every": 2.5},
@@ -72,6 +73,7 @@ BAD: dict[type[ExperimentConfig], dict[str, dict[Any, str]]] = {
         "particles": {(5, 5): "at least one value, each once"}, "lookalikes": {0: AT_LEAST_1},
         "landmarks": {(9,): "an int >= 10"},
     },
+    bench.StartBenchConfig: {"repeats": {0: AT_LEAST_1}, "parts": {("none",): "one of"}},
     bench.StereoBenchConfig: {
         "sizes": {(32,): "an int >= 64"}, "walls": {(3,): "an int >= 4"}, "views": {0: AT_LEAST_1},
     },

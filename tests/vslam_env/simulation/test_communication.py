@@ -104,7 +104,7 @@ def test_beliefs_with_contact_now_and_then_follow_from_readings_alone(options: A
     observed = [env.reset(seed=5, options={"start_poses": MEETING})[0]]
     for _ in range(150):
         observed.append(env.step(turning(env.agents))[0])
-    apart = [not readings[0].heard.all() for readings in log]
+    apart = [not readings[0].contacts.all() for readings in log]
     assert 0.4 < np.mean(apart) < 0.8
     if options.get("oracle_merge"):
         assert env.events[-1].kind == "merge"

@@ -12,7 +12,6 @@ import numpy as np
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.team.team import TeamSlam
 from vslam_env import environment
-from vslam_env.belief import observation
 from vslam_env.belief.shared_grids import SharedGrids
 from vslam_env.belief.team_belief import TeamBelief
 from vslam_env.navigation import TeamSlots
@@ -38,7 +37,7 @@ PHASES = (
     Phase("filters", ((FastSlam, "step_checked"),)),
     Phase("team, alignment", ((TeamSlam, "step"),)),
     Phase("errors", ((Episode, "team_metrics"),)),
-    Phase("observations", ((observation, "observe_team"),)),
+    Phase("observations", ((environment, "observe_team"),)),
     Phase("candidates", ((TeamSlots, "update"),)),
     Phase(
         "beliefs, dictionaries",
