@@ -322,8 +322,11 @@ class FastSlam:
         weights = NO_WEIGHTS if state.starts_at_origin else np.exp(state.log_weights)
         _kernels.write_team_poses(
             state.pose_arrays, state.start_covariances, weights, state.best, *state.estimates,
-            membership_table(names, live), ess, _kernels.StandpointArrays(points.poses, points.beliefs),
+            membership_table(names, live), points.poses, points.beliefs,
         )  # fmt: skip
+        for robot in names:
+            if robot in live:
+                points.ess[robot] = ess
 
     def particles_from_start(self, robot: int = 0) -> FloatArray:
         """Return a robot's poses (M, 3) [m, m, rad], each relative to its start pose in the same particle."""

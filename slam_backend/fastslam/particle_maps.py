@@ -19,7 +19,7 @@ from slam_backend.core.packed_symmetric import UNPACK_INDEX
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.fastslam import _kernels
 from slam_backend.fastslam._kernels import LANES
-from slam_backend.fastslam._kernels.records import Slots
+from slam_backend.fastslam._kernels.records import SLOT
 from slam_backend.maps.landmark_map import MapSummaryRows
 
 
@@ -60,7 +60,7 @@ class MapStore:
         values: (rows * 9 * P,) float64 [m, m^2], map frame, each row
             [block][x, y, z, Sxx, Sxy, Sxz, Syy, Syz, Szz][lane].
         counts: (rows, P) int32. Matches of the landmark in the particle, its creation included; 0: not present.
-        table: (6, slots) int64, see `Slots`.
+        table: (6, slots) int64, see `SlotRows`.
         maps: (maps, P) int32. users: (maps,) int64, how many slots read by each.
         odds: (slots, P) float64. Log-odds that the landmark exists, read through its map as a row is; (0, P) without.
         descriptors: (slots, d) float32. heads: (h, slots) every (d / h)-th component of them, `FAR` where free.
@@ -90,32 +90,32 @@ class MapStore:
     @property
     def row_of(self) -> IntArray:
         """(slots,) row of each slot. A view, as the others."""
-        return Slots(*self.table).row_of
+        return np.asarray(self.table[SLOT.row_of])
 
     @property
     def map_of(self) -> IntArray:
         """(slots,) the ancestor map by which each is to be read."""
-        return Slots(*self.table).map_of
+        return np.asarray(self.table[SLOT.map_of])
 
     @property
     def ids(self) -> IntArray:
         """(slots,) stable names of the landmarks, -1 = free slot."""
-        return Slots(*self.table).ids
+        return np.asarray(self.table[SLOT.ids])
 
     @property
     def identities(self) -> IntArray:
         """(slots,) the caller's own names, -1 = none."""
-        return Slots(*self.table).identities
+        return np.asarray(self.table[SLOT.identities])
 
     @property
     def last_seen(self) -> IntArray:
         """(slots,) steps of the smoother in which the most probable particle matched landmarks last, 0 = never."""
-        return Slots(*self.table).last_seen
+        return np.asarray(self.table[SLOT.last_seen])
 
     @property
     def free_slots(self) -> IntArray:
         """(slots,) a stack of free slots."""
-        return Slots(*self.table).free_slots
+        return np.asarray(self.table[SLOT.free_slots])
 
     @property
     def next_id(self) -> int:
@@ -191,8 +191,7 @@ class MapStore:
         old = len(self.ids)
         table = np.zeros((len(self.table), old + extra), dtype=np.int64)
         table[:, :old] = self.table
-        slots = Slots(*table)
-        slots.ids[old:] = slots.identities[old:] = -1
+        table[SLOT.ids, old:] = table[SLOT.identities, old:] = -1
         descriptors = zeros_aligned((old + extra, descriptor_size), np.float32)
         if old and self.descriptors.shape[1]:
             descriptors[:old] = self.descriptors
@@ -208,8 +207,8 @@ class MapStore:
             self.odds = odds
         top = int(self.tops[1])
         # The lowest is taken first once the old ones are gone.
-        slots.free_slots[:extra] = np.arange(old + extra - 1, old - 1, -1)
-        slots.free_slots[extra : extra + top] = self.free_slots[:top]
+        table[SLOT.free_slots, :extra] = np.arange(old + extra - 1, old - 1, -1)
+        table[SLOT.free_slots, extra : extra + top] = self.free_slots[:top]
         self.table = table
         self.tops[1] = extra + top
 
@@ -294,7 +293,7 @@ class ParticleMaps(MapStore):
 
     def odds_of_particle(self, m: int, slots: IntArray) -> FloatArray:
         """Return the log-odds (n,) of the slots (n,) of particle m. A copy."""
-        return np.asarray(self.odds[slots, np.where(self.map_of[slots] > 0, self.maps[self.map_of[slots], m], m)])
+        return np.asarray(self.odds[slots, self.columns_of(m, slots)])
 
     def dense_odds(self, slots: IntArray) -> FloatArray | None:
         """Return the log-odds (n, M) of slots (n,) in all particles, None if existence is not estimated. A copy."""
@@ -309,12 +308,15 @@ class ParticleMaps(MapStore):
 
     # ------------------------------------------------------------------ reading and writing whole maps
 
+    def columns_of(self, m: int, slots: IntArray) -> IntArray:
+        """Return the places (n,) in their rows where the values of the slots (n,) of particle m stand."""
+        of = self.map_of[slots]
+        return np.where(of > 0, self.maps[of, m], m)
+
     def of_particle(self, m: int, slots: IntArray) -> tuple[FloatArray, NDArray[np.int32]]:
         """Return values (n, 9) and counts (n,) of the slots (n,) of particle m. Copies."""
-        places = np.where(self.map_of[slots] > 0, self.maps[self.map_of[slots], m], m)
-        rows = self.row_of[slots]
-        blocks = self.blocks
-        return blocks[rows, places // LANES, :, places % LANES], self.counts[rows, places]
+        places, rows = self.columns_of(m, slots), self.row_of[slots]
+        return self.blocks[rows, places // LANES, :, places % LANES], self.counts[rows, places]
 
     def dense(self, slots: IntArray) -> tuple[FloatArray, NDArray[np.int32]]:
         """Return values (n, 9, M) and counts (n, M) of slots (n,) in all particles. Copies."""
@@ -416,7 +418,7 @@ def write_summary(maps: ParticleMaps, m: int, min_count: int, rows: MapSummaryRo
 def present_slots(maps: ParticleMaps, m: int, min_count: int) -> IntArray:
     """Return the slots (n,) of `best_map`, which takes the same, by ascending id."""
     slots = maps.used_slots()
-    return slots[maps.of_particle(m, slots)[1] >= max(min_count, 1)]
+    return slots[maps.counts[maps.row_of[slots], maps.columns_of(m, slots)] >= max(min_count, 1)]
 
 
 def best_map(maps: ParticleMaps, m: int, min_count: int) -> tuple[FloatArray, FloatArray, Any, IntArray, IntArray]:

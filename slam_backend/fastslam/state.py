@@ -12,7 +12,7 @@ from slam_backend.core.state_checks import restore_generator
 from slam_backend.core.validation import BoolArray, FloatArray, Int32Array, IntArray, check_int, check_seed
 from slam_backend.fastslam import _kernels
 from slam_backend.fastslam._kernels import EXACT_POSE, NO_READING, NUM_MEASURED, NUM_NOTED, add_gauge_covariance
-from slam_backend.fastslam._kernels.records import WeightArrays, robot_arrays
+from slam_backend.fastslam._kernels.records import ROBOT, WEIGHT
 from slam_backend.fastslam._kernels.run_log import guesses_of
 from slam_backend.fastslam.consistency import ConsistencyTest
 from slam_backend.fastslam.estimates import pose_mixtures
@@ -193,37 +193,37 @@ class FilterState:
     @property
     def poses(self) -> FloatArray:
         """Poses x_t^[m] of the robots, (K, 3, P) [m, m, rad]."""
-        return robot_arrays(self.pose_arrays).poses
+        return np.asarray(self.pose_arrays[ROBOT.poses])
 
     @property
     def starts(self) -> FloatArray:
         """Start poses of the robots, (K, 3, P) [m, m, rad]; they spread at a merge."""
-        return robot_arrays(self.pose_arrays).starts
+        return np.asarray(self.pose_arrays[ROBOT.starts])
 
     @property
     def means(self) -> FloatArray:
         """Means of N(x^, P^), each particle's pose before sampling, (K, 3, P) [m, m, rad]."""
-        return robot_arrays(self.pose_arrays).means
+        return np.asarray(self.pose_arrays[ROBOT.means])
 
     @property
     def covariances(self) -> FloatArray:
         """Covariances of N(x^, P^), (K, 6, P), upper triangles."""
-        return robot_arrays(self.pose_arrays).covariances
+        return self.pose_arrays[ROBOT.covariances :].reshape(self.num_robots, 6, -1)
 
     @property
     def log_weights(self) -> FloatArray:
         """Log-weights since the last resampling, normalised, (M,)."""
-        return WeightArrays(*self.weight_arrays).log_weights[: self.num_particles]
+        return np.asarray(self.weight_arrays[WEIGHT.log_weights, : self.num_particles])
 
     @property
     def path_log_weights(self) -> FloatArray:
         """Log-weights accumulated along the ancestral line (Eq. 12), (M,)."""
-        return WeightArrays(*self.weight_arrays).path_log_weights[: self.num_particles]
+        return np.asarray(self.weight_arrays[WEIGHT.path_log_weights, : self.num_particles])
 
     @property
     def weights(self) -> FloatArray:
         """Weights after the last step, summing to 1, (M,)."""
-        return WeightArrays(*self.weight_arrays).weights[: self.num_particles]
+        return np.asarray(self.weight_arrays[WEIGHT.weights, : self.num_particles])
 
     @property
     def _held_starts(self) -> BoolArray:
@@ -272,7 +272,6 @@ class FilterState:
         now = 0 if self.rejuvenation is None else self.rejuvenation.steps + 1
         normals = self.rng.standard_normal((active, maps.num_particles, 3))
         means, covariances = self.estimates
-        _, started = associations  # by slot, until the step is over
         deleted: list[IntArray] = []
         fastslam1 = None if self.options.proposal == "fastslam2" else 1
         for low, high, is_over in self._batches:
@@ -287,6 +286,7 @@ class FilterState:
             if self.existence is not None and not is_over and (row := robots.rows[low]) >= 0:
                 _, begin, end, _, _, count = inputs.inputs[row]
                 if count >= 0:
+                    _, started = associations  # by slot, until the step is over
                     found, new_slots = self._associations[begin:end], started[begin:end]
                     deleted.append(self.existence.update(maps, self.poses[low], self.best, found, new_slots))
         self.best, long_unseen, created, new, matched, rejected, ess, nis, is_depleted = summary

@@ -35,7 +35,7 @@ from slam_backend.fastslam._kernels.layout import (
     STATIONARY,
 )
 from slam_backend.fastslam._kernels.map_storage import apply_resampling, map_summary, release, resample
-from slam_backend.fastslam._kernels.records import MapArrays, StandpointArrays
+from slam_backend.fastslam._kernels.records import MapArrays
 from slam_backend.fastslam._kernels.step import step_robots, write_sigmas
 from slam_backend.fastslam._kernels.weights import add_gauge_covariance, mixture, write_team_poses
 
@@ -52,7 +52,6 @@ __all__ = [
     "RELINEARISE_BELOW",
     "STATIONARY",
     "MapArrays",
-    "StandpointArrays",
     "add_gauge_covariance",
     "apply_resampling",
     "extent",

@@ -4,6 +4,8 @@ import math
 
 import numpy as np
 
+from slam_backend.fastslam._kernels.records import ROBOT, SLOT, WEIGHT
+
 # Whole vectors of four numbers; of the 50, 100, 200 or 1000 particles that people ask for no more than 4 % are surplus.
 LANES = 52
 REJECTED = -1
@@ -36,12 +38,9 @@ QJ00, QJ01, QJ02, QJ11, QJ12, QJ22, QG0, QG1, QG2 = (LANES * k for k in range(9)
 Q_SQUARE, Q_DET, Q_DET_POSE, Q_DEPTH, Q_METRES2, Q_D, Q_FIRST_D, Q_HELD = (LANES * k for k in range(9, 17))
 CANDIDATE_ROWS = 17
 
-# What robots have in all particles, (5, K, 3, P): samples, where they started, and N(x^, P^) before sampling, whose
-# covariances (K, 6, P) take the last two.
-POSES, STARTS, MEANS, COVARIANCES = range(4)
-# The weights of all particles, (4, P): as of the last resampling, along paths, as they are, and what a step adds.
-LOG_WEIGHTS, PATH_LOG_WEIGHTS, WEIGHTS, LOG_LIKELIHOOD = range(4)
-ROW_OF, MAP_OF, IDS, IDENTITIES, LAST_SEEN, FREE_SLOTS = range(6)  # of the table of a map's slots, (6, slots)
+POSES, STARTS, MEANS, COVARIANCES = ROBOT
+LOG_WEIGHTS, PATH_LOG_WEIGHTS, WEIGHTS, LOG_LIKELIHOOD = WEIGHT
+ROW_OF, MAP_OF, IDS, IDENTITIES, LAST_SEEN, FREE_SLOTS = SLOT
 MOTION_KIND, BEGIN, END, COVARIANCES_GIVEN, HAS_IDS, COUNT = range(6)  # of a robot's turn
 NO_READING, STATIONARY, MOVED, EXACT_POSE = (
     0,

@@ -69,13 +69,36 @@ def tile_of(padded: int, row: int, block: int) -> slice:
     return slice(start, start + TILE)
 
 
+@device
+@simd
+def _copy_row(
+    source: FloatArray, target: FloatArray, before: Int32Array, seen: Int32Array, ancestors: Int32Array
+) -> None:
+    """Copy a row of values and counts, each particle's from its ancestor's place.
+
+    Most particles are their own ancestors, and memory is fast where it is read and written in order: so first all of
+    the row is copied as it lies, then what moved.
+    """
+    for j in range(len(target)):
+        target[j] = source[j]
+    for m in range(len(seen)):
+        seen[m] = before[m]
+    for m in range(len(ancestors)):
+        ancestor = np.uint32(ancestors[m])  # unsigned: none counts from the end
+        if ancestor != m:
+            own = np.uint32(m)
+            at = np.int64(ancestor // BLOCK) * TILE + np.int64(ancestor % BLOCK)
+            to = np.int64(own // BLOCK) * TILE + np.int64(own % BLOCK)
+            seen[m] = before[ancestor]
+            for c in range(9):
+                target[to + c * LANES] = source[at + c * LANES]
+
+
 @simd
 def apply_resampling(slots: IntArray, maps: MapArrays) -> None:
     """Bring landmarks up to date: copy each particle's values from where its ancestor left them to its own place.
 
-    One free row is needed: the row that a landmark leaves is taken by the next, while it is still in the cache. Most
-    particles are their own ancestors, and memory is fast where it is read and written in order: so first all of a row
-    is copied as it lies, then what moved.
+    One free row is needed: the row that a landmark leaves is taken by the next, while it is still in the cache.
     """
     row_of, map_of, tops = maps.table[ROW_OF], maps.table[MAP_OF], maps.tops
     padded = maps.counts.shape[1]
@@ -89,26 +112,13 @@ def apply_resampling(slots: IntArray, maps: MapArrays) -> None:
         tops[0] -= 1
         free = maps.free_rows[tops[0]]
         source, target = maps.values[row * size : (row + 1) * size], maps.values[free * size : (free + 1) * size]
-        before, seen = maps.counts[row], maps.counts[free]
         if len(maps.odds) > 0:  # by way of the row that is about to be written
             odds = maps.odds[slot]
             for m in range(padded):
                 target[m] = odds[ancestors[m]]
             for m in range(padded):
                 odds[m] = target[m]
-        for j in range(len(target)):
-            target[j] = source[j]
-        for m in range(len(seen)):
-            seen[m] = before[m]
-        for m in range(len(ancestors)):
-            ancestor = np.uint32(ancestors[m])  # unsigned: none counts from the end
-            if ancestor != m:
-                own = np.uint32(m)
-                at = np.int64(ancestor // BLOCK) * TILE + np.int64(ancestor % BLOCK)
-                to = np.int64(own // BLOCK) * TILE + np.int64(own % BLOCK)
-                seen[m] = before[ancestor]
-                for c in range(9):
-                    target[to + c * LANES] = source[at + c * LANES]
+        _copy_row(source, target, maps.counts[row], maps.counts[free], ancestors)
         maps.free_rows[tops[0]] = row
         tops[0] += 1
         row_of[slot] = free

@@ -192,6 +192,7 @@ def evaluate(work: FloatArray, tile: FloatArray, record: FloatArray, seen: Int32
         record[Q_DEPTH + i] = depth
         record[Q_METRES2 + i] = metres2
         record[Q_D + i] = distance
+    for i in range(LANES):  # by itself: integers among the numbers above cost vectors
         record[Q_HELD + i] = 1.0 if seen[i] > 0 else 0.0
 
 

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.core.validation import BoolArray, Float32Array, FloatArray, Int32Array, IntArray
-from slam_backend.fastslam._kernels.layout import COVARIANCES, MEANS, POSES, STARTS
 
 
 class MapArrays(NamedTuple):
@@ -19,7 +18,7 @@ class MapArrays(NamedTuple):
         values: (rows * 9 * P,) [m, m^2], map frame, each row [block][x, y, z, Sxx, Sxy, Sxz, Syy, Syz, Szz][lane].
         counts: (rows, P). Number of matches of the landmark in the particle, its start included; 0: it lacks it.
         odds: (slots, P) log-odds of existence; (0, P) where existence is not kept.
-        table: (6, slots), see `Slots`.
+        table: (6, slots), see `SlotRows`.
         maps: (maps, P). Ancestor maps; map 0 stands for the identity.
         users: (maps,). Number of slots read by each map.
         free_rows: (rows,). Stack of free rows.
@@ -40,11 +39,11 @@ class MapArrays(NamedTuple):
     heads: Float32Array
 
 
-class Slots(NamedTuple):
-    """Rows of the table of a map's slots, in their order, each (slots,).
+class SlotRows(NamedTuple):
+    """Rows of the table (6, slots) of a map's slots.
 
     Attributes:
-        row_of: Row of each slot.
+        row_of: Row of each slot in the storage.
         map_of: Ancestor map by which it is to be read.
         ids: Stable name of the landmark, -1 = free slot.
         identities: The caller's own name, -1 = none.
@@ -52,16 +51,16 @@ class Slots(NamedTuple):
         free_slots: Stack of free slots.
     """
 
-    row_of: IntArray
-    map_of: IntArray
-    ids: IntArray
-    identities: IntArray
-    last_seen: IntArray
-    free_slots: IntArray
+    row_of: int = 0
+    map_of: int = 1
+    ids: int = 2
+    identities: int = 3
+    last_seen: int = 4
+    free_slots: int = 5
 
 
-class WeightArrays(NamedTuple):
-    """Rows of the weights of all particles, in their order, each (P,).
+class WeightRows(NamedTuple):
+    """Rows of the weights (4, P) of all particles.
 
     Attributes:
         log_weights: Log-weights since the last resampling, normalised.
@@ -70,32 +69,29 @@ class WeightArrays(NamedTuple):
         log_likelihood: Increments of a step.
     """
 
-    log_weights: FloatArray
-    path_log_weights: FloatArray
-    weights: FloatArray
-    log_likelihood: FloatArray
+    log_weights: int = 0
+    path_log_weights: int = 1
+    weights: int = 2
+    log_likelihood: int = 3
 
 
-class RobotArrays(NamedTuple):
-    """K robots in all particles, map frame [m, m, rad].
+class RobotParts(NamedTuple):
+    """Parts of the array (5, K, 3, P) of K robots in all particles, map frame [m, m, rad].
 
     Attributes:
-        poses: (K, 3, P) samples.
-        starts: (K, 3, P) where they started.
-        means: (K, 3, P) means x^ before sampling.
-        covariances: (K, 6, P) upper triangles of the covariances P^ before sampling.
+        poses: Samples.
+        starts: Start poses of the robots.
+        means: Means x^ before sampling.
+        covariances: First of the two parts that hold the covariances (K, 6, P) before sampling, upper triangles.
     """
 
-    poses: FloatArray
-    starts: FloatArray
-    means: FloatArray
-    covariances: FloatArray
+    poses: int = 0
+    starts: int = 1
+    means: int = 2
+    covariances: int = 3
 
 
-def robot_arrays(whole: FloatArray) -> RobotArrays:
-    """Return views of the one array (5, K, 3, P) that kernels take."""
-    covariances = whole[COVARIANCES:].reshape(whole.shape[1], 6, -1)
-    return RobotArrays(whole[POSES], whole[STARTS], whole[MEANS], covariances)
+SLOT, WEIGHT, ROBOT = SlotRows(), WeightRows(), RobotParts()
 
 
 class Poses(NamedTuple):
@@ -224,18 +220,6 @@ class Outcome(NamedTuple):
     distances: FloatArray
     new_slots: IntArray
     log_likelihood: FloatArray
-
-
-class StandpointArrays(NamedTuple):
-    """Arrays of the `TeamPoses` of n robots of a team of K.
-
-    Attributes:
-        poses: (n, K, 3) [m, m, rad].
-        beliefs: (n, 16 + K), see `relative_poses`.
-    """
-
-    poses: FloatArray
-    beliefs: FloatArray
 
 
 class LogColumns(NamedTuple):

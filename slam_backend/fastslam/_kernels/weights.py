@@ -26,8 +26,7 @@ from slam_backend.fastslam._kernels.layout import (
     STARTS,
     WEIGHTS,
 )
-from slam_backend.fastslam._kernels.records import StandpointArrays
-from slam_backend.fastslam.relative_poses import COVARIANCE, ESS, OWN, SIGMAS, START
+from slam_backend.fastslam.relative_poses import COVARIANCE, OWN, SIGMAS, START
 
 
 @device
@@ -273,7 +272,7 @@ def _relative_pose_of_self(
 @in_place
 def write_team_poses(
     robots: FloatArray, scatters: FloatArray, weights: FloatArray, best: int, estimates: FloatArray,
-    spreads: FloatArray, members: IntArray, ess: float, points: StandpointArrays,
+    spreads: FloatArray, members: IntArray, poses: FloatArray, beliefs: FloatArray,
 ) -> None:  # fmt: skip
     """Write where the robots of a filter stand, and where they see each other, in their own start frames.
 
@@ -288,8 +287,7 @@ def write_team_poses(
         best: The most probable particle.
         estimates, spreads: (n, 3), (n, 3, 3) [m, m, rad] the robots' poses over all particles, map frame.
         members: (2, n) int64. Robots of the team, and 1 below each that uses this filter; only these are written.
-        ess: Effective sample size of the filter, as a share of M.
-        points: Poses of all robots of the team, written.
+        poses, beliefs: Arrays of the `TeamPoses` of all robots of the team; written, without the sample sizes.
     """
     count = members.shape[1]
     starts, means = robots[STARTS], robots[MEANS]
@@ -298,11 +296,11 @@ def write_team_poses(
         if not members[1, i]:
             continue
         own = members[0, i]
-        seen, belief = points.poses[own], points.beliefs[own]
+        seen, belief = poses[own], beliefs[own]
         x, y, theta = starts[i, 0, best], starts[i, 1, best], starts[i, 2, best]
         c, s = math.cos(theta), math.sin(theta)
         to_x, to_y, turn = -c * x - s * y, s * x - c * y, (math.pi - theta) % (2.0 * math.pi) - math.pi
-        belief[START], belief[START + 1], belief[START + 2], belief[ESS] = to_x, to_y, turn, ess
+        belief[START], belief[START + 1], belief[START + 2] = to_x, to_y, turn
         for j in range(3):
             belief[OWN + j] = estimates[i, j]
             for k in range(3):

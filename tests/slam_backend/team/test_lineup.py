@@ -10,7 +10,7 @@ from builders.kernels import python_entry
 from builders.teams import NEVER, SimulatedTeam, false_alignment, links, true_alignment
 
 from slam_backend.core.packed_symmetric import UNPACK_INDEX
-from slam_backend.fastslam._kernels import LANES, StandpointArrays, add_gauge_covariance
+from slam_backend.fastslam._kernels import LANES, add_gauge_covariance
 from slam_backend.fastslam._kernels.weights import (
     AT_ORIGIN,
     KNOWN,
@@ -145,6 +145,14 @@ def _moved(seed: int) -> FastSlam:
     return slam
 
 
+def test_the_sample_size_is_noted_of_robots_that_go_by_the_filter() -> None:
+    """Of those of its robots that are live, and of no other."""
+    points = TeamPoses(4)
+    points.ess.fill(-1.0)
+    _moved(3).write_team_poses((3, 1), (0, 3), 0.5, points)
+    assert points.ess.tolist() == [-1.0, -1.0, -1.0, 0.5]
+
+
 def test_kinds_of_starts_are_distinguished() -> None:
     """All at the origin, all at one place, or spread: surplus lanes do not count."""
     starts = np.zeros((3, 8))
@@ -216,9 +224,8 @@ def test_own_frames_are_the_plain_definition() -> None:
     points.poses.fill(7.0)
     points.beliefs.fill(7.0)
     write_team_poses(
-        robots, np.zeros((4, 3, 3)), weights, best, *estimates, np.array([names, live]), 0.5,
-        StandpointArrays(points.poses, points.beliefs),
-    )  # fmt: skip
+        robots, np.zeros((4, 3, 3)), weights, best, *estimates, np.array([names, live]), points.poses, points.beliefs
+    )
 
     for field in (points.poses, points.beliefs):
         assert (field[[1, 4]] == 7.0).all()
@@ -228,7 +235,6 @@ def test_own_frames_are_the_plain_definition() -> None:
     np.testing.assert_array_equal(spreads[0], estimates.covariances[0])
     np.testing.assert_allclose(poses[1], between(STARTS[1], estimates.means[1]), atol=1e-12)
     np.testing.assert_allclose(spreads[1], rotate_covariances(-STARTS[1, 2], estimates.covariances[1]), atol=1e-12)
-    np.testing.assert_array_equal(points.ess[names[:3]], 0.5)
     for i, viewer in enumerate(names[:3]):
         for j, mate in enumerate(names):
             pose, spread = (
@@ -262,8 +268,7 @@ def test_a_held_start_widens_what_is_seen_from_it_and_the_frame_does_not() -> No
     estimates.covariances[:] += 7.0
     scatter = np.array([[0.04, 0.01, -0.02], [0.01, 0.09, 0.03], [-0.02, 0.03, 0.05]])
     points, members = TeamPoses(1), np.array([[0], [1]])
-    arrays = StandpointArrays(points.poses, points.beliefs)
-    write_team_poses(robots, scatter[None], weights, 4, *estimates, members, 0.5, arrays)
+    write_team_poses(robots, scatter[None], weights, 4, *estimates, members, points.poses, points.beliefs)
     expected = rotate_covariances(-start[2], shown.covariances)
     add_gauge_covariance(scatter, (own := between(start, shown.means)), expected)
     np.testing.assert_allclose(points.own, own, atol=1e-12)
