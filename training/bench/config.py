@@ -314,7 +314,7 @@ class StartBenchConfig(ExperimentConfig):
     )
     repeats: int = option(3, "Runs of each part.", ge=1, hint="Time at least one run.")
     wheel: str | None = option(None, "Wheel of kernels, which adds the part wheel.", shown="none", is_path=True)
-    seed: int = setting(0)
+    seed: int = setting(0, "Seed; the bench draws nothing.", ge=0)
 
     def with_wheel(self) -> "StartBenchConfig":
         """Return the configuration with the part `wheel`, if there is a wheel."""
