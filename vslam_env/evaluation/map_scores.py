@@ -45,9 +45,10 @@ def score_team(
             (N,) float64. Workspace.
         beliefs: (K, 16 + K). Array of `TeamPoses`.
         true_starts, true_poses: (K, 3) [m, m, rad], world frame. True start and current poses.
-        scores: (8 or more, K) float64. Output per robot: map error E [m]; RMSE [m] of the matched landmarks, or the
-            cutoff without a match; recall; precision; recall of landmarks with an error below 0.5 m; errors of position
-            [m] and heading [rad] in [0, pi]; estimated one sigma of the position [m].
+        scores: (8 or more, K) float64. Output per robot: map error E [m], see `slam_backend.metrics.map_error`; RMSE
+            [m] of the matched landmarks, or the cutoff without a match; recall; precision; recall of landmarks with an
+            error below 0.5 m; errors of position [m] and heading [rad] in [0, pi]; estimated one sigma of the position
+            [m].
     """
     books, book_of, truths, cutoff, least = claims
     for robot in range(len(beliefs)):

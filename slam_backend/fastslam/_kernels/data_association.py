@@ -245,7 +245,12 @@ def iterate_inflated(
 def associate_final(
     space: Space, block: int, maps: MapArrays, frame: Frame, candidates: Candidates, rules: Rules
 ) -> None:
-    """Decide on all measurements in one block, and sum what they say of the pose and of its likelihood (pass B)."""
+    """Decide on all measurements in one block, and sum what they say of the pose and of its likelihood (pass B).
+
+    The landmark of least cost D + log det + descriptor cost within the gate is matched. A measurement is rejected if
+    another landmark costs nearly as little, or if one is near but outside the gate; else it is new. The same in plain
+    Python: `slam_backend.reference.fastslam2.decide`.
+    """
     work, records, match = space.work, space.records, space.match
     starts, slots, row_of = candidates.starts, candidates.slots, maps.table[ROW_OF]
     padded, first, gate = maps.counts.shape[1], block * LANES, rules.position_gate

@@ -120,7 +120,7 @@ def step_robots(
         assumed: (27,) noise of the odometry, camera, and the rest, see `layout`.
         rows: (K,) row of each robot in `turns`; -1: it did nothing at all.
         turns: (N, 6) int64, see `layout`: act, begin and end of the measurements among all n, and whether these come
-            with covariances and with names. The pose of `PLACED` is already written.
+            with covariances and with names. The pose of `EXACT_POSE` is already written.
         moves: (N, 3) odometry [m, m, rad] of those that moved.
         normals: (k, M, 3) standard normal draws, for the k robots that are not idle.
         robots: (5, K, 3, P) samples, starts, and N(x^, P^) before sampling.

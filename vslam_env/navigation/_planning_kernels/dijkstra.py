@@ -189,8 +189,8 @@ def dijkstra(cells: Any, bounds: Any, x: float, y: float, radius: float) -> tupl
         radius: Radius of the robot [m].
 
     Returns:
-        The known box (h, w) uint8, with `PAD` cells before its bounds and after them; its weights, of `weigh`; costs
-        and parents, of `wavefront`; and the grid's row and column of the box's first cell.
+        The known box (h, w) uint8, with `PAD` cells before its bounds and after them; its weights, of `inflate_costs`;
+        costs and parents, of `wavefront`; and the grid's row and column of the box's first cell.
     """
     first_row, first_col = bounds[0] - PAD, bounds[1] - PAD
     box = np.full((bounds[2] + PAD - first_row, bounds[3] + PAD - first_col), OUTSIDE, np.uint8)
