@@ -205,7 +205,7 @@ for size in (1, 3, 9, 30, 30, 30):
     team.step([None, None], [Measurements(points[:size], looks[:size])] * 2)
 team.step(np.zeros((2, 3)), TeamMeasurements(np.tile(points, (2, 1)), np.tile(looks, (2, 1)), np.array([30, 60])))
 assert len(team.groups) == 1
-team.standpoints(), team.outlines()
+team.team_poses(), team.map_summaries()
 slices = SmoothingOptions(slice_steps=20, rigid_within=0.01, max_keys=12, further_keys=4, recent_keys=6)
 for smoothing in (slices, SmoothingOptions()):
     simulation = SimulatedTeam(2, seed=100)
