@@ -129,7 +129,7 @@ def test_a_wheel_is_tagged_and_pinned(wheel: Path) -> None:
     assert f"Requires-Dist: numba=={here['numba']}\n" in metadata
     assert f"Requires-Dist: llvmlite=={here['llvmlite']}\n" in metadata
     number = sum(map(len, recorded_signatures("slam_backend", "vslam_env").values()))
-    assert sum(name.startswith(f"vslam_env_kernels/{LEVEL}/") for name in names) == number > 100
+    assert sum(name.startswith(f"vslam_env_kernels/{LEVEL}/") for name in names) == number > 50
 
 
 @pytest.mark.slow
