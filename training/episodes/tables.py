@@ -174,15 +174,6 @@ def _verdict(row: Mapping[str, Any]) -> str:
     return "cautious" if is_cautious else "consistent"
 
 
-def group_name(robots: Sequence[int]) -> str:
-    """Return the name of a group for file names.
-
-    >>> group_name((2, 5))
-    '2-5'
-    """
-    return "-".join(map(str, robots))
-
-
 def write_maps(folder: "RunFolder", maps: "Mapping[str, LandmarkMap]") -> str:
     """Write each map as `map_<group>.npz` and `map_<group>.csv`, and return a line that lists them.
 

@@ -150,7 +150,7 @@ class SymbolicFactor(NamedTuple):
 
 
 class CholeskyFactor(NamedTuple):
-    """Blocks of a factor of N nodes, nine numbers row by row, where a `Pattern` says.
+    """Blocks of a factor of N nodes, nine numbers row by row, where a `SymbolicFactor` says.
 
     Attributes:
         pivots: (N, 6) lower triangles by rows, with the reciprocals of their diagonals.

@@ -1,6 +1,6 @@
 """Sparse Cholesky factorisation by blocks of 3 x 3: ordering, symbolic pattern, factor, solutions, inverse blocks.
 
-`Pattern` says where blocks are kept, `Factor` what they hold.
+`SymbolicFactor` says where blocks are kept, `Factor` what they hold.
 """
 
 import math
