@@ -85,8 +85,8 @@ class Figure:
 
 FIGURES: dict[str, tuple[Figure, ...]] = {
     "demo": (Figure("make demo from a fresh clone, after installation"),),
-    "kernels": (Figure("all kernels, one worker"), Figure("all kernels, two workers")),
-    "steps": (Figure("first reset and 10 steps of the default environment"),),
+    "kernels": (Figure("all kernels, one worker", goal=65.0), Figure("all kernels, two workers", goal=36.0)),
+    "steps": (Figure("first reset and 10 steps of the default environment", goal=30.0),),
     "wheel": (
         Figure("with the kernels' wheel: first picture of vslam run", goal=15.0),
         Figure("with the kernels' wheel: cache misses until then", "", 0.0),
@@ -94,7 +94,7 @@ FIGURES: dict[str, tuple[Figure, ...]] = {
     "import": (
         Figure("import vslam_env"), Figure(f"import {LIBRARIES}"), Figure("the former over the latter", "", 1.5),
     ),
-    "count": (Figure("kernels", ""), Figure(f"kernels with {MANY_PARAMETERS} or more parameters", "")),
+    "count": (Figure("kernels", "", 200.0), Figure(f"kernels with {MANY_PARAMETERS} or more parameters", "", 15.0)),
 }  # fmt: skip
 
 
