@@ -23,7 +23,7 @@ from numba.core.registry import CPUDispatcher
 from numba.core.serialize import dumps
 from numba.misc.appdirs import AppDirs
 
-from slam_backend.core.kernel_stamp import stamp_of
+from slam_backend.core.kernel_stamp import stamp_of, types_text
 from slam_backend.core.shipped_kernels import CONFIG, shipped_kernels, warn_once
 
 DIGEST = sha256().digest_size  # bytes at the end of each file
@@ -113,8 +113,8 @@ class KernelCache(NullCache):
         """Return the part of a file's name that does not depend on the stamp."""
         function = self._kernel.py_func
         name = f"{function.__module__}.{function.__qualname__}"
-        types = str(sigutils.normalize_signature(signature))  # type: ignore[no-untyped-call]
-        digest = sha256(repr((name, types, *target, PYTHON)).encode()).hexdigest()
+        arguments, _ = sigutils.normalize_signature(signature)  # type: ignore[no-untyped-call]
+        digest = sha256(repr((name, types_text(arguments), *target, PYTHON)).encode()).hexdigest()
         return f"{name.rpartition('.')[2].strip('<>')}-{digest[:32]}."
 
 

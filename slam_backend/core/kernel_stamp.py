@@ -5,7 +5,7 @@ stamp therefore covers the code of the kernel and of all functions that it reach
 values of their constants. A change of any of these changes the stamp; a change of a comment does not.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import cache
 from hashlib import sha256
 from types import BuiltinFunctionType, CodeType, EllipsisType, FunctionType, ModuleType, NoneType
@@ -38,6 +38,16 @@ def stamp_of(kernel: CPUDispatcher) -> str:
             seen[function], callees = _described(function, _options(function))
             todo += callees
     return sha256(repr([_tools(), *sorted(seen.values())]).encode()).hexdigest()
+
+
+def types_text(arguments: Iterable[Any]) -> str:
+    """Return argument types as a text with the fields of records, which numba's own text leaves out."""
+    parts = []
+    for each in arguments:
+        fields: Any = each
+        inner = types_text(fields.types) if isinstance(each, types.BaseTuple) else ""
+        parts.append((str(each), getattr(each, "fields", ()), inner))
+    return repr(parts)
 
 
 @cache
@@ -97,7 +107,9 @@ def _text(value: Any, callees: list[Any]) -> str:
         if not _is_library(python):
             callees.append(value)
         return _path(python)
-    if isinstance(value, (type, BuiltinFunctionType, np.ufunc)):
+    if isinstance(value, type):
+        return f"{_path(value)} {getattr(value, '_fields', ())}"  # a kernel finds a record's fields by their order
+    if isinstance(value, (BuiltinFunctionType, np.ufunc)):
         return _path(value)
     if isinstance(value, ModuleType) and _is_library(value):
         return value.__name__

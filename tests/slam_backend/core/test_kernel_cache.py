@@ -16,7 +16,7 @@ import pytest
 from slam_backend.core import jit as _jit
 from slam_backend.core import kernel_cache, shipped_kernels
 from slam_backend.core.compilation import watch_compilation
-from slam_backend.core.kernel_cache import cache_folder, is_private
+from slam_backend.core.kernel_cache import KernelCache, cache_folder, is_private
 from slam_backend.core.kernel_stamp import stamp_of
 
 ROOT = Path(__file__).parents[3]
@@ -293,6 +293,37 @@ def test_an_edit_of_something_else_recompiles_nothing(tmp_path: Path) -> None:
         exec(compile(text, "kernel_of_a_test.py", "exec"), scope)
         stamps.append(_stamp(scope["kernel"]))
     assert stamps[0] == stamps[1] != stamps[2]
+
+
+RECORD = """
+from typing import NamedTuple
+
+from slam_backend.core.jit import jit
+
+class Record(NamedTuple):
+    {fields}
+
+@jit
+def taken(record):
+    return record.x - record.y
+
+@jit
+def made(x, y):
+    return Record(x=x, y=y).x
+"""
+
+
+def test_other_fields_of_a_record_are_noticed() -> None:
+    """A kernel reads fields by their place: a record whose fields of one type are swapped is another argument."""
+    names, stamps = [], []
+    for fields in ("x: float\n    y: float", "y: float\n    x: float"):
+        scope: dict[str, Any] = {"__name__": "module_of_a_test"}
+        exec(compile(RECORD.format(fields=fields), "module_of_a_test.py", "exec"), scope)
+        signature = (numba.typeof(scope["Record"](1.0, 2.0)),)
+        names.append(KernelCache(scope["taken"]).file_name(signature, ("triple", "processor", "")))
+        stamps.append(_stamp(scope["made"]))
+    assert names[0] != names[1]
+    assert stamps[0] != stamps[1]
 
 
 def test_a_stamp_tells_apart_what_looks_alike() -> None:
