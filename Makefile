@@ -28,7 +28,7 @@ metrics: $(VENV)/.core  ## metrics of the code: sizes, folders, path of a measur
 	$(BIN)/python benchmarks/code_metrics.py
 
 kernels-wheel: $(VENV)/.core  ## build a wheel of kernels compiled for x86-64-v3 and v4 in dist/; takes minutes
-	$(BIN)/python -m slam_backend.core.kernel_wheel dist slam_backend vslam_env
+	$(BIN)/python -m slam_backend.core.compilation.wheel dist slam_backend vslam_env
 
 CLIENTS := torchrl rllib agilerl tianshou benchmarl
 

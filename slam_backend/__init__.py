@@ -3,7 +3,7 @@
 `FastSlam` is the filter, `TeamSlam` a team of filters that merges maps; `align_maps` and `fuse_maps` take any two maps.
 """
 
-from slam_backend.core.compilation import log_compilation
+from slam_backend.core.compilation.messages import log_compilation
 from slam_backend.fastslam.consistency import Consistency
 from slam_backend.fastslam.existence import ExistenceModel
 from slam_backend.fastslam.filter import FastSlam

@@ -6,8 +6,8 @@ from typing import Literal
 import numpy as np
 
 from slam_backend.core import state_checks
-from slam_backend.core.compilation import watch_compilation
-from slam_backend.core.kernel_compiler import Progress, Signatures, compile_kernels, recorded_signatures
+from slam_backend.core.compilation.compiler import Progress, Signatures, compile_kernels, recorded_signatures
+from slam_backend.core.compilation.messages import watch_compilation
 from slam_backend.fastslam.existence import ExistenceModel
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.options import FilterOptions

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from slam_backend.core.compilation import watch_compilation
-from slam_backend.core.kernel_compiler import Progress, compile_kernels, recorded_signatures
+from slam_backend.core.compilation.compiler import Progress, compile_kernels, recorded_signatures
+from slam_backend.core.compilation.messages import watch_compilation
 from slam_backend.warm_up import EXTRAS, extras_of, needed, run_all_paths
 from vslam_env.config import EnvConfig
 from vslam_env.environment import ExplorationEnv

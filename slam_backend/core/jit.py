@@ -14,8 +14,8 @@ from numba.extending import intrinsic
 from numba.np import arrayobj
 from numpy.typing import NDArray
 
-from slam_backend.core.kernel_cache import KernelCache
-from slam_backend.core.shipped_kernels import CONFIG
+from slam_backend.core.compilation.cache import KernelCache
+from slam_backend.core.compilation.shipped import CONFIG
 from slam_backend.core.validation import FloatArray
 
 LOGGER = logging.getLogger("slam_backend")

@@ -10,7 +10,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from slam_backend.core.kernel_compiler import SIGNATURES, compiled_signatures
+from slam_backend.core.compilation.compiler import SIGNATURES, compiled_signatures
 from vslam_env.warm_up import warm_up
 
 ROOT = Path(__file__).parents[2]

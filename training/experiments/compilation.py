@@ -20,7 +20,7 @@ def compilation_progress(console: Console) -> Iterator[Callable[[int, int, float
     Yields:
         Progress callback for `warm_up`.
     """
-    from slam_backend.core.compilation import MESSAGE, watch_compilation
+    from slam_backend.core.compilation.messages import MESSAGE, watch_compilation
 
     spinner = Spinner("dots", MESSAGE)
     begun: list[float] = []
@@ -52,7 +52,7 @@ def prepare(*first_steps: Callable[[], object]) -> None:
     Args:
         first_steps: Functions called in order before all kernels are compiled, so that bad input is reported early.
     """
-    from slam_backend.core.compilation import log_compilation
+    from slam_backend.core.compilation.messages import log_compilation
     from vslam_env.warm_up import warm_up
 
     with compilation_progress(Console(stderr=True)) as progress:

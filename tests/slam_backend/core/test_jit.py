@@ -16,7 +16,7 @@ from numba.core.errors import NumbaError
 import slam_backend
 from slam_backend import FastSlam, FilterOptions, StepReport, TeamReport, TeamSlam
 from slam_backend.core import jit as _jit
-from slam_backend.core.compilation import MESSAGE, watch_compilation
+from slam_backend.core.compilation.messages import MESSAGE, watch_compilation
 from slam_backend.warm_up import warm_up
 
 

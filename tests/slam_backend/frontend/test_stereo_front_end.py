@@ -10,7 +10,7 @@ from builders.images import draw_boxes, paint
 from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
-from slam_backend.core.compilation import watch_compilation
+from slam_backend.core.compilation.messages import watch_compilation
 from slam_backend.frontend import (
     DESCRIPTOR_TYPES,
     CornerOptions,

@@ -5,7 +5,7 @@ import numba
 import pytest
 from rich.console import Console
 
-from slam_backend.core.compilation import MESSAGE
+from slam_backend.core.compilation.messages import MESSAGE
 from training.experiments.compilation import compilation_progress, prepare
 
 

@@ -40,7 +40,7 @@ print(time.perf_counter() - begun)
 """
 FIRST_PICTURE = """
 import os, sys, time
-from slam_backend.core.compilation import watch_compilation
+from slam_backend.core.compilation.messages import watch_compilation
 from training.cli import app
 from training.episodes.video import VideoWriter
 
@@ -56,7 +56,7 @@ LIBRARIES = "numba, gymnasium, pettingzoo, pymunk"
 IMPORT = "import time; begun = time.perf_counter(); import {modules}; print(time.perf_counter() - begun)"
 COUNT = """
 import inspect, numba, vslam_env
-from slam_backend.core.kernel_compiler import find_kernel, recorded_signatures
+from slam_backend.core.compilation.compiler import find_kernel, recorded_signatures
 found, todo = {}, [find_kernel(name) for name in recorded_signatures("slam_backend", "vslam_env")]
 while todo:
     function = todo.pop().py_func

@@ -2,12 +2,12 @@
 
 Each input line names a kernel and a signature; it is printed when the kernel is compiled.
 
-python -m slam_backend.core.compile_kernels
+python -m slam_backend.core.compilation.worker
 """
 
 import sys
 
-from slam_backend.core.kernel_compiler import compile_lines
+from slam_backend.core.compilation.compiler import compile_lines
 
 if __name__ == "__main__":
     compile_lines(iter(sys.stdin.readline, ""), lambda line: print(line, flush=True))

@@ -23,8 +23,8 @@ from numba.core.registry import CPUDispatcher
 from numba.core.serialize import dumps
 from numba.misc.appdirs import AppDirs
 
-from slam_backend.core.kernel_stamp import stamp_of, types_text
-from slam_backend.core.shipped_kernels import CONFIG, shipped_kernels, warn_once
+from slam_backend.core.compilation.shipped import CONFIG, shipped_kernels, warn_once
+from slam_backend.core.compilation.stamp import stamp_of, types_text
 
 DIGEST = sha256().digest_size  # bytes at the end of each file
 SUFFIX = ".nbc"

@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 
 from slam_backend.core import jit as _jit
-from slam_backend.core import kernel_cache, shipped_kernels
-from slam_backend.core.compilation import watch_compilation
-from slam_backend.core.kernel_cache import KernelCache, cache_folder, is_private
-from slam_backend.core.kernel_stamp import stamp_of
+from slam_backend.core.compilation import cache, shipped
+from slam_backend.core.compilation.cache import KernelCache, cache_folder, is_private
+from slam_backend.core.compilation.messages import watch_compilation
+from slam_backend.core.compilation.stamp import stamp_of
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[4]
 KERNEL = """
 from slam_backend.core.jit import jit
 
@@ -46,7 +46,7 @@ DAMAGES: dict[str, Callable[[bytes], bytes]] = {
 @pytest.fixture(autouse=True)
 def fresh(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each test is warned as a new process would be, and looks for folders again."""
-    monkeypatch.setattr(shipped_kernels, "_warned", set())
+    monkeypatch.setattr(shipped, "_warned", set())
     cache_folder.cache_clear()
 
 
@@ -124,7 +124,7 @@ def test_a_cache_that_takes_nothing_stops_nothing(
         raise OSError("No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(kernel_cache.os, "replace", fail)
+        patch.setattr(cache.os, "replace", fail)
         assert (play(1), play(0.5)) == ((2, True), (1.5, True))
     told = "Compiled kernels are not kept (No space left on device): each process compiles them."
     assert [record.getMessage() for record in caplog.records] == [told]
@@ -137,7 +137,7 @@ def test_kernels_work_where_no_cache_can_be_written(
     play: Callable[[Any], tuple[Any, bool]], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """A folder that is only read, and no home: kernels are compiled again in each process, with the same results."""
-    monkeypatch.setattr(kernel_cache, "cache_folder", lambda *_: None)
+    monkeypatch.setattr(cache, "cache_folder", lambda *_: None)
     assert (play(1), play(1)) == ((2, True), (2, True))
     told = "Compiled kernels are not kept (no folder can be written): each process compiles them."
     assert [record.getMessage() for record in caplog.records] == [told]
@@ -147,7 +147,7 @@ def test_kernels_of_sources_that_are_only_read_are_kept_in_the_users_own_cache(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The folder is made for the user alone."""
-    monkeypatch.setattr(kernel_cache, "_user_cache", lambda: str(tmp_path / "home"))
+    monkeypatch.setattr(cache, "_user_cache", lambda: str(tmp_path / "home"))
     (tmp_path / "sources").touch()  # a folder in it cannot be made
     folder = cache_folder(tmp_path / "sources")
     assert folder is not None
@@ -160,7 +160,7 @@ def test_folders_to_which_others_may_write_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """What is kept there would be run; another folder is taken, and one line says so."""
-    monkeypatch.setattr(kernel_cache, "_user_cache", lambda: str(tmp_path / "home"))
+    monkeypatch.setattr(cache, "_user_cache", lambda: str(tmp_path / "home"))
     folder = cache_folder(tmp_path, str(tmp_path / "cache"))
     assert folder is not None
     folder.chmod(0o777)

@@ -26,13 +26,13 @@ from numba import from_dtype, types
 from numba.core.registry import CPUDispatcher
 from numpy import dtype
 
+from slam_backend.core.compilation.cache import KernelCache
 from slam_backend.core.jit import DeviceKernel
-from slam_backend.core.kernel_cache import KernelCache
 from slam_backend.core.validation import check_int
 
 LOGGER = logging.getLogger("slam_backend")
 SIGNATURES = "kernel_signatures.json"  # file in the folder of each package
-WORKER = "slam_backend.core.compile_kernels"  # run as `python -m`, so that user scripts need no main guard
+WORKER = "slam_backend.core.compilation.worker"  # run as `python -m`, so that user scripts need no main guard
 LOCK = "vslam-compile.lock"
 READ_ONLY = "r"  # suffix of the code of a read-only array
 WORD = re.compile(r"[^\s(]+(?:\([^)]*\))?")  # word of a signature; named tuples are not nested

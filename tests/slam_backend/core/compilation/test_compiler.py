@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import pytest
 from numba import types
 
-from slam_backend.core.kernel_compiler import (
+from slam_backend.core.compilation.compiler import (
     Task,
     compile_kernels,
     decode_signature,
@@ -20,7 +20,7 @@ from slam_backend.core.kernel_compiler import (
     recorded_signatures,
 )
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[4]
 
 
 class Row(NamedTuple):
@@ -45,7 +45,7 @@ def tuple_of(record: Any, *fields: types.Type) -> Any:
 SMALL = "slam_backend.smoother.reassociation.find_only"  # a kernel that calls few others
 PROGRAM = """
 import sys
-from slam_backend.core.kernel_compiler import compile_kernels, missing_tasks, recorded_signatures
+from slam_backend.core.compilation.compiler import compile_kernels, missing_tasks, recorded_signatures
 name = sys.argv[1]
 wanted = {name: recorded_signatures("slam_backend")[name]}
 counts = []

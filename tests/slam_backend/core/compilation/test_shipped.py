@@ -12,11 +12,11 @@ from zipfile import ZipFile
 
 import pytest
 
-from slam_backend.core.kernel_compiler import recorded_signatures
-from slam_backend.core.kernel_wheel import build_wheel
-from slam_backend.core.shipped_kernels import LEVELS, V3, host_features, reason_against, versions
+from slam_backend.core.compilation.compiler import recorded_signatures
+from slam_backend.core.compilation.shipped import LEVELS, V3, host_features, reason_against, versions
+from slam_backend.core.compilation.wheel import build_wheel
 
-ROOT = Path(__file__).parents[3]
+ROOT = Path(__file__).parents[4]
 LEVEL = "x86-64-v3"
 IS_LEVEL = LEVELS[LEVEL] <= host_features()
 # Plays an episode with merges; prints a digest of it, and how many kernels were compiled.
@@ -24,7 +24,7 @@ PLAY = """
 import hashlib, json
 import numpy as np
 from builders.environments import MEETING, small_env, turning
-from slam_backend.core.compilation import watch_compilation
+from slam_backend.core.compilation.messages import watch_compilation
 from vslam_env import warm_up
 
 with watch_compilation(lambda name: None) as watch:
@@ -47,8 +47,8 @@ ALIGN = """
 import json, sys
 import numpy as np
 from slam_backend import LandmarkMap, align_maps
-from slam_backend.core.compilation import watch_compilation
-from slam_backend.core.kernel_compiler import compile_kernels, compile_lines, recorded_signatures
+from slam_backend.core.compilation.messages import watch_compilation
+from slam_backend.core.compilation.compiler import compile_kernels, compile_lines, recorded_signatures
 
 some = {n: words for n, words in recorded_signatures("slam_backend").items() if n.startswith("slam_backend.maps.")}
 with watch_compilation(lambda name: None) as watch:
@@ -166,7 +166,7 @@ def test_the_order_of_compilation_and_the_number_of_processes_decide_nothing(tmp
 @pytest.mark.skipif(not IS_LEVEL, reason=f"this processor is below {LEVEL}")
 def test_stale_damaged_or_unwanted_kernels_are_not_used(site: Path, tmp_path: Path) -> None:
     """A file that is damaged and a manifest that does not fit are one line each; a chosen processor is obeyed."""
-    count = "import json, vslam_env; from slam_backend.core.kernel_compiler import *; "
+    count = "import json, vslam_env; from slam_backend.core.compilation.compiler import *; "
     count += "print(json.dumps(len(missing_tasks(recorded_signatures('slam_backend', 'vslam_env')))))"
     empty = {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
     assert python(count, site=site, **empty) == (0, "")

@@ -1,6 +1,6 @@
 """Builder of the wheel `vslam-env-kernels`, with all kernels compiled for portable levels of x86-64.
 
-    python -m slam_backend.core.kernel_wheel FOLDER PACKAGE ...   # packages whose kernels are compiled
+    python -m slam_backend.core.compilation.wheel FOLDER PACKAGE ...   # packages whose kernels are compiled
 
 The wheel holds files of the kernel cache and a manifest, and no program. It fits one minor version of Python and the
 exact versions of numba and llvmlite that built it; the name of a kernel's file includes its stamp.
@@ -21,12 +21,12 @@ from tempfile import TemporaryDirectory
 from typing import Any
 from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 
-from slam_backend.core.kernel_compiler import compile_kernels, decode_signature, find_kernel, recorded_signatures
-from slam_backend.core.shipped_kernels import LEVELS, MANIFEST, PACKAGE, versions
+from slam_backend.core.compilation.compiler import compile_kernels, decode_signature, find_kernel, recorded_signatures
+from slam_backend.core.compilation.shipped import LEVELS, MANIFEST, PACKAGE, versions
 
 DISTRIBUTION = "vslam-env"  # distribution with the sources of the kernels
-COMPILE = "import sys; from slam_backend.core.kernel_wheel import compile_into; compile_into(*sys.argv[1:])"
-INIT = '"""Compiled kernels of vslam_env: data only, read by `slam_backend.core.shipped_kernels`."""\n'
+COMPILE = "import sys; from slam_backend.core.compilation.wheel import compile_into; compile_into(*sys.argv[1:])"
+INIT = '"""Compiled kernels of vslam_env: data only, read by `slam_backend.core.compilation.shipped`."""\n'
 METADATA = """Metadata-Version: 2.4
 Name: vslam-env-kernels
 Version: {version}
@@ -36,7 +36,7 @@ Requires-Python: ~={python}.0
 Requires-Dist: numba=={numba}
 Requires-Dist: llvmlite=={llvmlite}
 """
-WHEEL = "Wheel-Version: 1.0\nGenerator: slam_backend.core.kernel_wheel\nRoot-Is-Purelib: false\nTag: {tag}\n"
+WHEEL = "Wheel-Version: 1.0\nGenerator: slam_backend.core.compilation.wheel\nRoot-Is-Purelib: false\nTag: {tag}\n"
 
 
 def build_wheel(

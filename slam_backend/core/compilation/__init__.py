@@ -1,0 +1,1 @@
+"""Compilation of kernels: disk cache, parallel workers, messages, and the wheel of compiled kernels."""
