@@ -95,16 +95,18 @@ class InputBuffer:
 
     @property
     def buffered(self) -> Mapping[int, StepInput]:
-        """Inputs of the buffered steps, by number; not to be changed."""
+        """Inputs of the buffered steps, by number; read-only."""
+        self._steps = {step: with_read_only(inputs) for step, inputs in self._steps.items()}  # rarer than `record`
         return self._steps
 
     def record(self, step: int, inputs: StepInput) -> None:
         """Add the inputs of a step, later than all before; the caller does not write to them afterwards."""
-        self._steps[step] = with_read_only(inputs)
+        self._steps[step] = inputs
 
     def read(self, step: int) -> StepInput:
         """Return the inputs of a buffered step; read-only."""
-        return self._steps[step]
+        self._steps[step] = inputs = with_read_only(self._steps[step])
+        return inputs
 
     def forget_before(self, step: int) -> None:
         """Remove the steps before this one."""
@@ -113,7 +115,7 @@ class InputBuffer:
 
     def get_state(self) -> dict[str, Any]:
         """Return the content; inputs are read-only and shared."""
-        return {"steps": dict(self._steps)}
+        return {"steps": dict(self.buffered)}
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Restore the content from `get_state`."""

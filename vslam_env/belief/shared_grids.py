@@ -195,7 +195,8 @@ class SharedGrids:
             self.share_on_contact(tick, mates, points.starts)
         self.team.update(self._shared, points.poses, scans, bumps, *self._hardware)
         if self._kept or self._oldest_parting is not None:
-            self._strokes.append(with_constants(GridUpdate(tick, self._shared_then, points.poses, scans, bumps)))
+            poses, scans, bumps = as_constant(points.poses), as_constant(scans), as_constant(bumps)
+            self._strokes.append(GridUpdate(tick, self._shared_then, poses, scans, bumps))
 
     def _apply_report(self, tick: int, report: TeamReport) -> None:
         """Save grids before merges, restore them at rollbacks, and drop data of merges that became final."""

@@ -118,8 +118,9 @@ class GroundTruthAssociation:
         Args:
             report: Report of the filters on the step.
             true_ids: Arrays (n_i or more,) int64 by robot. True landmark of each measurement; -1 for a false point.
+                They are kept; the caller does not write to them afterwards.
         """
-        self._seen[report.step] = with_read_only(true_ids)
+        self._seen[report.step] = true_ids
         for entry in report.map_changes:
             if isinstance(entry, LandmarksCreated):
                 self._enter(entry.number, entry.ids, self._seen[entry.step][entry.robot])
@@ -176,6 +177,7 @@ class GroundTruthAssociation:
 
     def get_state(self) -> dict[str, Any]:
         """Return a copy of the state; the true ids of measurements are shared and read-only."""
+        self._seen = {step: with_read_only(true_ids) for step, true_ids in self._seen.items()}
         return {
             "books": self._books.copy(),
             "row_of": dict(self._row_of),

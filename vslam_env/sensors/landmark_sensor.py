@@ -160,7 +160,8 @@ class LandmarkSensor:
         config, robots, (most, size) = self.config, len(poses), self._frame_shape
         num_false = rng.poisson(config.false_points, robots)
         keys = rng.random((robots, len(self._points)))
-        ids, ends = np.full((robots, most), -1), np.empty(robots, np.int64)
+        ids, ends = np.empty((robots, most), np.int64), np.empty(robots, np.int64)
+        ids.fill(-1)
         total, extra = detect(poses, self._sight, keys, config.detection_probability, num_false, ids, ends)
         false_points = self._no_false_points
         if extra:
