@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 
 from slam_backend.core import state_checks as check
-from slam_backend.fastslam._kernels.layout import COUNT
 from slam_backend.fastslam.reports import LandmarkIdMap, LandmarksCreated
 from slam_backend.fastslam.state_checks import check_descriptors
 from slam_backend.frontend import StereoFrame
@@ -249,7 +248,7 @@ class EpisodeCheck:
             self._check_names(f"{name}['seen']", names, len(scenario.observable_landmarks))
         for step, inputs in team["records"]["log"]["steps"].items():
             if step not in seen or any(
-                turn[COUNT] > len(names) for turn, names in zip(inputs.inputs, seen[step], strict=True)
+                count > len(names) for (*_, count), names in zip(inputs.inputs, seen[step], strict=True)
             ):
                 check.refuse(f"{name}['seen']", f"all identities of step {step}", "fewer")
         for entry in team["records"]["entries"]:

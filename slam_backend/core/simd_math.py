@@ -4,8 +4,8 @@ import math
 
 from slam_backend.core.jit import bits_float, float_bits, simd_inline
 from slam_backend.core.validation import FloatArray
-from slam_backend.fastslam._kernels.layout import LN2
 
+LN2 = math.log(2.0)
 HALF_PI_HIGH = 1.5707963267341256  # pi / 2 in two parts: the first has 33 bits, so that small multiples are exact
 HALF_PI_LOW = 6.077100506506192e-11
 # Number of terms that a sum adds in parallel. It is fixed, as with the width of the processor's vector registers the

@@ -9,7 +9,6 @@ from slam_backend.core import state_checks as check
 from slam_backend.core.validation import argument_error
 from slam_backend.fastslam import reports
 from slam_backend.fastslam._kernels import EXACT_POSE
-from slam_backend.fastslam._kernels.layout import BEGIN, COUNT, COVARIANCES_GIVEN, END, HAS_IDS, MOTION_KIND
 from slam_backend.fastslam.options import FilterOptions
 from slam_backend.fastslam.state_checks import check_descriptors, check_filter, check_landmarks, last_step
 from slam_backend.fastslam.step_input import StepInput
@@ -215,7 +214,7 @@ class TeamCheck:
         if n:
             self.descriptor_sizes.add(size)
         named = check.indices(f"{name}.names", inputs.names, (None,), -1)
-        if named != n and (named or table[:, HAS_IDS].any()):
+        if named != n and (named or any(has_ids for *_, has_ids, _ in inputs.inputs)):
             check.refuse(f"{name}.names", "one name per measurement, or none", named)
         for _, begin, end, given, _, _ in inputs.inputs:
             if given:
@@ -369,14 +368,11 @@ def check_turns(name: str, turns: Any, n: int, robots: int | None) -> None:
         for number in turn:
             if type(number) is not int and type(number) is not bool:
                 check.refuse(name, "ints", turn)
-        valid = (0 <= turn[MOTION_KIND] <= EXACT_POSE and last <= turn[BEGIN] <= turn[END] <= n) or turn[BEGIN] == turn[
-            END
-        ] == 0
-        if not valid or not (
-            0 <= turn[COVARIANCES_GIVEN] <= 1 and 0 <= turn[HAS_IDS] <= 1 and -1 <= turn[COUNT] <= check.MAX_LANDMARKS
-        ):
+        kind, begin, end, has_covariances, has_ids, count = turn
+        is_in_order = (0 <= kind <= EXACT_POSE and last <= begin <= end <= n) or begin == end == 0
+        if not is_in_order or {has_covariances, has_ids} - {0, 1} or not -1 <= count <= check.MAX_LANDMARKS:
             check.refuse(name, f"rows of {n} measurements in order", turn)
-        last = max(last, turn[END])
+        last = max(last, end)
 
 
 def check_masks(name: str, masks: Any, turns: Sequence[Sequence[int]]) -> None:
@@ -385,6 +381,7 @@ def check_masks(name: str, masks: Any, turns: Sequence[Sequence[int]]) -> None:
         check.refuse(name, "a dict", f"a {type(masks).__name__}")
     for robot, mask in masks.items():
         check.integer(name, robot, 0, len(turns) - 1)
-        check.array(name, mask, check.BOOL, (max(turns[robot][COUNT], 0),))
-        if np.count_nonzero(mask) != turns[robot][END] - turns[robot][BEGIN]:
+        _, begin, end, _, _, count = turns[robot]
+        check.array(name, mask, check.BOOL, (max(count, 0),))
+        if np.count_nonzero(mask) != end - begin:
             check.refuse(name, "as many True values as used measurements", int(np.count_nonzero(mask)))

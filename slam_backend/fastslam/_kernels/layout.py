@@ -1,4 +1,4 @@
-"""Where things lie in the workspace, and constants that kernels share."""
+"""Layout of the workspace and of packed records, and constants that kernels share."""
 
 import math
 
@@ -6,25 +6,24 @@ import numpy as np
 
 from slam_backend.fastslam._kernels.records import ROBOT, SLOT, WEIGHT
 
-# Whole vectors of four numbers; of the 50, 100, 200 or 1000 particles that people ask for no more than 4 % are surplus.
+# Lanes of a block: whole vectors of four numbers. At most 4 % are padding for 50, 100, 200 or 1000 particles.
 LANES = 52
 REJECTED = -1
-MIN_DEPTH = 0.05  # [m]; nothing is predicted nearer to the camera plane than this
-MAX_DISTANCE = float(np.finfo(np.float64).max)  # the largest squared distance that is not infinite
-FAR = np.float32(1e18)  # no descriptor comes near a free slot's
+MIN_DEPTH = 0.05  # [m]; smallest depth at which a landmark is predicted
+MAX_DISTANCE = float(np.finfo(np.float64).max)  # largest finite squared distance
+FAR = np.float32(1e18)  # entry of the descriptors of free slots, far from any descriptor
 LOG_2PI = math.log(2.0 * math.pi)
-LN2 = math.log(2.0)
 
 # Rows of the workspace.
-X, Y, T, COS, SIN = (LANES * k for k in range(5))  # the pose at which innovations are taken
-X0, Y0, T0 = (LANES * k for k in range(5, 8))  # the predicted pose
-C00, C10, C11, C20, C21, C22 = (LANES * k for k in range(8, 14))  # factor C of its covariance, with C01 below
+X, Y, T, COS, SIN = (LANES * k for k in range(5))  # linearisation point of the pose
+X0, Y0, T0 = (LANES * k for k in range(5, 8))  # predicted pose
+C00, C10, C11, C20, C21, C22 = (LANES * k for k in range(8, 14))  # factor C of its covariance; C01 is below
 XI0, XI1, XI2 = (LANES * k for k in range(14, 17))
 SPREAD00, SPREAD01, SPREAD02, SPREAD11, SPREAD12, SPREAD22 = (LANES * k for k in range(17, 23))  # covariance of xi
 R0, R1, R2 = (LANES * k for k in range(23, 26))  # innovation
 N00, N01, N02, N11, N12, N22, DEPTH = (LANES * k for k in range(26, 33))  # sensor noise in map axes, predicted depth
 J00, J01, J02, J11, J12, J22, G0, G1, G2 = (LANES * k for k in range(33, 42))  # sums over matches
-SUM_D, MATCHED, DET, DET_EXP, DEPTHS, DEPTHS_EXP = (LANES * k for k in range(42, 48))  # of the likelihood
+SUM_D, MATCHED, DET, DET_EXP, DEPTHS, DEPTHS_EXP = (LANES * k for k in range(42, 48))  # factors of the likelihood
 CLUTTER = LANES * 48  # log-likelihood of the measurements that are not matched
 BEST, SECOND, CHOSEN, DEAD, LOG_BEST = (LANES * k for k in range(49, 54))  # of one measurement
 LOST, SURE, CONTRADICT, WIDE = (LANES * k for k in range(54, 58))
@@ -33,7 +32,7 @@ KEPT00, KEPT10, KEPT11, KEPT20, KEPT21, KEPT22, KEPT01, KEPT_WIDE = (LANES * k f
 DRAW0, DRAW1, DRAW2 = (LANES * k for k in range(68, 71))  # standard normal
 WORK_SIZE, SPREAD_SIZE = LANES * 71, LANES * 6
 
-# Rows of one candidate's record.
+# Rows of the record of one candidate.
 QJ00, QJ01, QJ02, QJ11, QJ12, QJ22, QG0, QG1, QG2 = (LANES * k for k in range(9))
 Q_SQUARE, Q_DET, Q_DET_POSE, Q_DEPTH, Q_METRES2, Q_D, Q_FIRST_D, Q_HELD = (LANES * k for k in range(9, 17))
 CANDIDATE_ROWS = 17
@@ -41,19 +40,16 @@ CANDIDATE_ROWS = 17
 POSES, STARTS, MEANS, COVARIANCES = ROBOT
 LOG_WEIGHTS, PATH_LOG_WEIGHTS, WEIGHTS, LOG_LIKELIHOOD = WEIGHT
 ROW_OF, MAP_OF, IDS, IDENTITIES, LAST_SEEN, FREE_SLOTS = SLOT
-MOTION_KIND, BEGIN, END, COVARIANCES_GIVEN, HAS_IDS, COUNT = range(6)  # of a robot's turn
-NO_READING, STATIONARY, MOVED, EXACT_POSE = (
-    0,
-    1,
-    2,
-    3,
-)  # what a robot did: nothing at all, stood and looked, moved, was placed
-# What a journal holds of a robot's turn: whether it did or was given anything, what it did, whether its measurements
-# come with covariances, and how many were used; its odometry or pose (3), and where it was thought to be then (3).
+MOTION_KIND, BEGIN, END, COVARIANCES_GIVEN, HAS_IDS, COUNT = range(6)  # columns of `StepInput.inputs_table`
+NO_READING, STATIONARY, MOVED, EXACT_POSE = range(
+    4
+)  # kinds of motion: no input, frame without odometry, odometry, pose
+# Entry of the run log for one robot and step: whether the robot had input, its kind of motion, whether its measurements
+# have covariances, number of used measurements, odometry or exact pose (3), and estimated pose (3).
 LOGGED, LOGGED_KIND, HAS_COVARIANCES, USED, MOTION, ESTIMATE, NUM_NOTED = 0, 1, 2, 3, 4, 7, 10
-NAME, NUM_MEASURED = 9, 10  # of a measurement there, behind point and covariance: the landmark it was taken for
-ASSOCIATED, CREATED = range(2)  # what becomes of measurements, (2, n)
-# What a filter assumes: the first of six numbers, seven and three, and then one each.
+NAME, NUM_MEASURED = 9, 10  # columns of a logged measurement: associated landmark, behind point and covariance
+ASSOCIATED, CREATED = range(2)  # rows of the data association (2, n)
+# Packed options of a filter: odometry noise (6), camera (7), prior sigmas for recovery (3), then one number each.
 NOISE, CAMERA, RECOVERY = 0, 6, 13
 (
     DESCRIPTOR_GATE, DESCRIPTOR_VARIANCE, POSITION_GATE, NEW_LANDMARK_GATE, NEW_LANDMARK_RADIUS, AMBIGUITY_MARGIN,
@@ -61,4 +57,4 @@ NOISE, CAMERA, RECOVERY = 0, 6, 13
 ) = range(16, 27)  # fmt: skip
 
 TILE = 9 * LANES  # particle m is lane m % LANES of block m // LANES
-BLOCK = np.uint32(LANES)  # to divide by: unsigned numbers take half the instructions
+BLOCK = np.uint32(LANES)  # as divisor: unsigned division takes half the instructions

@@ -3,7 +3,7 @@
 import numpy as np
 
 from slam_backend.core.jit import device, simd, simd_inline
-from slam_backend.core.simd_math import log_of, mantissa_exponent
+from slam_backend.core.simd_math import LN2, log_of, mantissa_exponent
 from slam_backend.core.validation import FloatArray, Int32Array
 from slam_backend.fastslam._kernels.layout import (
     C00,
@@ -21,7 +21,6 @@ from slam_backend.fastslam._kernels.layout import (
     DET,
     DET_EXP,
     LANES,
-    LN2,
     LOG_2PI,
     MATCHED,
     MIN_DEPTH,
