@@ -211,7 +211,7 @@ def test_beliefs_are_in_the_own_start_frame() -> None:
 
 
 def test_beliefs_are_frozen() -> None:
-    """A policy can change neither a belief nor the grid behind it; their arrays are those of test_handed_out."""
+    """A policy can change neither a belief nor the grid behind it; their arrays are those of test_reproducibility."""
     env = small_env()
     env.reset(seed=0)
     belief = env.belief("robot_0")

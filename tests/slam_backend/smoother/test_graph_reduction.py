@@ -1,10 +1,10 @@
-"""Keys that are dropped, and keys that robots share."""
+"""Graph reduction: joining and dropping keyframes, and condensing their measurements."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from builders.plain_coarsening import chained, plainly_coarsened
+from builders.plain_graph_reduction import chained, plain_reduced
 from builders.runs import TIGHT, camera_of, graph_of, logs_of, small_run, upper
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -184,7 +184,7 @@ def test_keys_are_joined_as_by_the_plain_program(max_keys, kernel):
     for _ in range(2):
         mode = optimize(graph, camera_of(run), TIGHT)
         graph = relinearise(graph, mode, mode.spreads())
-        found, expected = (how(graph, camera_of(run), options) for how in (reduce_keyframes, plainly_coarsened))
+        found, expected = (how(graph, camera_of(run), options) for how in (reduce_keyframes, plain_reduced))
         assert found.num_keys <= max(options.most_keys(2), 8)
         for name in graph.__dataclass_fields__:
             one, other = getattr(found, name), getattr(expected, name)

@@ -1,4 +1,4 @@
-"""Where robots stand, and by which groups, filters and frames they go, at any time."""
+"""Topology of a team (groups, filters, frames), and the poses of its robots."""
 
 import copy
 import pickle

@@ -7,7 +7,7 @@ from vslam_env.navigation import GRID_SIZE, centre_of
 CENTRES = centre_of(np.stack(np.meshgrid(np.arange(GRID_SIZE), np.arange(GRID_SIZE), indexing="ij"), axis=-1))
 
 
-def painted_plainly(
+def plain_scan_update(
     evidence: np.ndarray, pose: np.ndarray, ranges: np.ndarray, angles: np.ndarray, max_range: float
 ) -> np.ndarray:
     """Return the evidence (300, 300) int8 of a grid after a scan; arguments as in `SeenGrid.update_from_scan`."""

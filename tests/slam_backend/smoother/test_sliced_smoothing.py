@@ -1,4 +1,4 @@
-"""The work of a smoother in slices: the same result, and a bound on what is done in one step."""
+"""Smoothing in slices, one per step: the result of smoothing at once, with bounded work per step."""
 
 from collections.abc import Mapping
 from dataclasses import replace

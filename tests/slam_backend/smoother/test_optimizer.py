@@ -1,10 +1,10 @@
-"""The graph of a run, and its mode."""
+"""The pose-landmark graph of a run, and its maximum a posteriori estimate."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from builders.plain_coarsening import chained
+from builders.plain_graph_reduction import chained
 from builders.runs import (
     TIGHT,
     camera_of,

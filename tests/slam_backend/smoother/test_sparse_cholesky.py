@@ -1,4 +1,4 @@
-"""The sparse factorisation against dense matrices: its order, solutions, covariances, spreads and draws."""
+"""Sparse Cholesky factorisation compared with dense matrices: ordering, solutions, covariances and samples."""
 
 from typing import NamedTuple
 

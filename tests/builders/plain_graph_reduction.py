@@ -1,4 +1,4 @@
-"""Keys joined with the arrays of numpy, one thing after the other: what the compiled kernels are compared with."""
+"""Graph reduction in plain numpy, the reference of the compiled kernels."""
 
 import heapq
 from dataclasses import replace
@@ -25,7 +25,7 @@ def chained(
     return compose(chain, move), by_first @ noise @ by_first.T + by_second @ move_noise @ by_second.T
 
 
-def plainly_coarsened(graph: SlamGraph, camera: FloatArray, options: SmoothingOptions) -> SlamGraph:
+def plain_reduced(graph: SlamGraph, camera: FloatArray, options: SmoothingOptions) -> SlamGraph:
     """Return what `reduce_keyframes` does."""
     share = max(1, options.recent_keys // len(graph.last_keys))
     fresh = np.zeros(graph.num_keys, dtype=np.bool_)
@@ -35,10 +35,10 @@ def plainly_coarsened(graph: SlamGraph, camera: FloatArray, options: SmoothingOp
     representatives, slack = _representatives(
         condensed, graph.transition_variances, fresh, options.most_keys(len(graph.last_keys))
     )
-    return plainly_compacted(_joined(replace(condensed, rigid_variances=slack), representatives))
+    return plain_compacted(_joined(replace(condensed, rigid_variances=slack), representatives))
 
 
-def plainly_compacted(graph: SlamGraph) -> SlamGraph:
+def plain_compacted(graph: SlamGraph) -> SlamGraph:
     """Return what `without_unused_frames` does."""
     frames, of_frames = _used(len(graph.frame_keys), graph.point_frames)
     landmarks, of_landmarks = _used(len(graph.landmark_ids), graph.point_landmarks, graph.condensed_landmarks)

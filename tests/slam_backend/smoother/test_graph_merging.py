@@ -1,4 +1,4 @@
-"""Graphs of groups that merge, and teams of rejuvenated filters."""
+"""Merging the graphs of two groups, and teams of rejuvenated filters."""
 
 import numpy as np
 import pytest

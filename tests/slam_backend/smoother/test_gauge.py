@@ -1,3 +1,5 @@
+"""Fixing the gauge of a map and the start poses of robots after a rejuvenation."""
+
 from itertools import pairwise
 
 import numpy as np

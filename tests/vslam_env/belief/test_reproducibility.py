@@ -1,4 +1,4 @@
-"""Episodes repeat from their seeds, leave nothing behind, and what they hand out is the caller's."""
+"""Episodes repeat from their seeds, free their memory, and share no writable arrays with the caller."""
 
 import copy
 import dataclasses
@@ -19,7 +19,7 @@ from vslam_env.belief.team_belief import TeamBelief
 STEPS = {"continuous": 130, "discrete": 130, "goal": 25}  # two robots meet, and their maps are merged
 
 
-def _handed_out(env: ExplorationEnv, results: Any) -> list[Any]:
+def _returned_arrays(env: ExplorationEnv, results: Any) -> list[Any]:
     """Return all that a caller can hold after a step; of beliefs all but the grid, which follows the robot."""
     agents = env.possible_agents
     beliefs = [env.belief(agent) for agent in agents]
@@ -56,7 +56,7 @@ def test_what_is_kept_stays_as_it_was(action_type: str) -> None:
     env = small_env(action_type=action_type, max_cycles=200)
     kept = []
     for results in _episode(env):
-        held = _handed_out(env, results)
+        held = _returned_arrays(env, results)
         kept.append((held, copy.deepcopy(held)))
     assert any(event.kind == "merge" for event in env.events)
     for held, then in kept:
@@ -93,7 +93,7 @@ def test_who_writes_to_what_is_returned_changes_nothing(kind: dict[str, Any]) ->
         env, said = small_env(max_cycles=200, **kind), hashlib.sha256()
         for results in _episode(env):
             digest(results, said)
-            for array in _arrays(_handed_out(env, results)) if writes else ():
+            for array in _arrays(_returned_arrays(env, results)) if writes else ():
                 if array.flags.writeable:
                     array.fill(1)
         digests.append(said.hexdigest())

@@ -1,4 +1,4 @@
-"""Errors of maps and poses, and how much of the floor is seen."""
+"""Map errors, pose errors and coverage."""
 
 from types import SimpleNamespace
 from typing import Any

@@ -1,4 +1,4 @@
-"""When groups try to merge, and what an exchange costs."""
+"""Which pairs of groups attempt a merge in which step, and how many bytes robots exchange."""
 
 import numpy as np
 import pytest

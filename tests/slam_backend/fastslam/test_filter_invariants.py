@@ -1,4 +1,4 @@
-"""Laws of the filter that hold exactly, whatever the noise draws, and readings at the edge of what it takes."""
+"""Properties of the filter that hold exactly for any noise, and extreme inputs."""
 
 from typing import Any
 

@@ -1,9 +1,9 @@
-"""Grids of what robots have seen: painted scan by scan, or for a whole team at once."""
+"""Occupancy grids, updated scan by scan or for a whole team at once."""
 
 import numpy as np
 import pytest
 from builders.environments import ANGLES, MAX_RANGE, scan
-from builders.painted_plainly import painted_plainly
+from builders.plain_scan_update import plain_scan_update
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -89,7 +89,7 @@ def test_a_scan_is_painted_as_it_is_defined(seed: int, fan: np.ndarray) -> None:
         )
         ranges[rng.random(len(fan)) < rng.choice([0.0, 0.5])] = MAX_RANGE
         grid.update_from_scan(pose, ranges, fan)
-        plain = painted_plainly(plain, pose, ranges, fan, MAX_RANGE)
+        plain = plain_scan_update(plain, pose, ranges, fan, MAX_RANGE)
         assert (grid.get_state()["evidence"] == plain).all()
         verdicts = np.where(plain == 0, UNKNOWN, np.where(plain > 0, OCCUPIED, FREE))
         assert (grid.cells == verdicts).all()

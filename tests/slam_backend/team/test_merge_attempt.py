@@ -1,4 +1,4 @@
-"""Attempts to merge: both maps are straightened and align once more, and pairs that are not sure merge on trial."""
+"""Merge attempts: smoothing both maps before they are aligned again, and trial merges of uncertain pairs."""
 
 import copy
 import math

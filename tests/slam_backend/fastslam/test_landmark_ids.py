@@ -1,4 +1,4 @@
-"""Where the caller names landmarks, no map holds two of one name: in a filter, after merges, undos and returns."""
+"""Ids given by the caller are unique in a map: in a filter, after merges, undos and returns."""
 
 from typing import Any
 
