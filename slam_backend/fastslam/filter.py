@@ -170,25 +170,32 @@ class FastSlam:
         return self.step_checked(inputs, rows_of(tuple(range(count))), *Associations.allocate(inputs))
 
     def step_checked(
-        self, inputs: StepInput, seats: RobotRows, findings: Associations, told: IntArray, step: int | None = None
+        self,
+        inputs: StepInput,
+        robot_rows: RobotRows,
+        associations: Associations,
+        associations_buffer: IntArray,
+        step: int | None = None,
     ) -> StepReport:
         """Do a step, as `step`, with inputs from `validate_step`.
 
         Args:
             inputs: Input of these robots, and perhaps of others; not changed.
-            seats: Rows of these robots in `inputs`.
-            findings: Data association of `inputs`.
-            told: Writable array of `findings`, see `Associations.allocate`; the association of these robots'
-                measurements is written there.
+            robot_rows: Rows of these robots in `inputs`.
+            associations: Data association of `inputs`.
+            associations_buffer: Writable array of `associations`, see `Associations.allocate`; the rows of these robots
+                are written.
             step: Number of the step in the logs; None: the next one.
         """
         state = self.state
         if step is not None:
             state.next_step = step
-        long_unseen, created, new, matched, rejected, ess, nis, is_depleted = state.update(inputs, seats, told)
+        long_unseen, created, new, matched, rejected, ess, nis, is_depleted = state.update(
+            inputs, robot_rows, associations_buffer
+        )
         if is_depleted:
             state.resample()
-        report = StepReport(findings, seats.rows, created, new, matched, rejected, ess, nis, is_depleted)
+        report = StepReport(associations, robot_rows.rows, created, new, matched, rejected, ess, nis, is_depleted)
         if (smoother := state.rejuvenation) is not None:
             smoother.record_step(new + matched, long_unseen)
             is_busy = self.may_smooth and not smoother.is_waiting(state.next_step - 1)
@@ -316,16 +323,18 @@ class FastSlam:
         self.write_team_poses(every, every, 1.0, points)
         return PoseEstimate(points.own[index].copy(), points.covariances[index].copy())
 
-    def write_team_poses(self, names: tuple[int, ...], live: tuple[int, ...], ess: float, points: TeamPoses) -> None:
-        """Write the poses of the robots in `live`; `names` are the team's indices of all, `ess` is copied."""
+    def write_team_poses(
+        self, names: tuple[int, ...], active_robots: tuple[int, ...], ess: float, points: TeamPoses
+    ) -> None:
+        """Write the poses of the robots in `active_robots`; `names` are the team's indices of all, `ess` is copied."""
         state = self.state
         weights = NO_WEIGHTS if state.starts_at_origin else np.exp(state.log_weights)
         _kernels.write_team_poses(
             state.pose_arrays, state.start_covariances, weights, state.best, *state.estimates,
-            membership_table(names, live), points.poses, points.beliefs,
+            membership_table(names, active_robots), points.poses, points.beliefs,
         )  # fmt: skip
         for robot in names:
-            if robot in live:
+            if robot in active_robots:
                 points.ess[robot] = ess
 
     def particles_from_start(self, robot: int = 0) -> FloatArray:

@@ -52,6 +52,6 @@ class TeamPoses:
 
 
 @lru_cache(maxsize=256)
-def membership_table(robots: tuple[int, ...], live: tuple[int, ...]) -> IntArray:
+def membership_table(robots: tuple[int, ...], active_robots: tuple[int, ...]) -> IntArray:
     """Return the robots (n,) of a filter, and below each whether it uses it (1) or not (0), for kernels; shared."""
-    return np.array([robots, [robot in live for robot in robots]], np.int64)
+    return np.array([robots, [robot in active_robots for robot in robots]], np.int64)

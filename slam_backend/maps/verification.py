@@ -14,7 +14,7 @@ from slam_backend.maps.landmark_map import LandmarkMap
 MOST_RECURRING = 0.2  # share of the shared landmarks, without the two that a motion can always fit
 NEEDLESS = 0.05  # rate of false refusals by a chance repetition; a later attempt may succeed
 MOST_LANDMARKS = 200  # landmarks of a constellation to test, evenly subsampled
-MOST_ALIKE = 50  # landmarks with more similar ones carry no information
+MAX_SIMILAR_LANDMARKS = 50  # landmarks with more similar ones carry no information
 SAMPLES = 4000  # number of minimal samples
 STRONGEST = 3  # number of refined motions
 
@@ -36,7 +36,7 @@ def has_perceptual_alias(landmarks: LandmarkMap, rows: IntArray, variance: float
     looks = landmarks.descriptors
     from scipy.special import bdtrc  # slow to import, and not always needed
 
-    pairs = similar_pairs(looks[rows], looks, options.descriptor_gate, MOST_ALIKE)
+    pairs = similar_pairs(looks[rows], looks, options.descriptor_gate, MAX_SIMILAR_LANDMARKS)
     matches = np.column_stack([rows[pairs[:, 0]], pairs[:, 1]])
     apart = points[matches[:, 0]] - points[matches[:, 1]]
     climb = landmarks.covariances[matches, 2, 2].sum(axis=1) + variance

@@ -13,7 +13,7 @@ from slam_backend.readers.calibration import Rectified, RectifiedPair, Rectifier
 from slam_backend.readers.kitti import read_truth
 from slam_backend.trajectory import Trajectory
 
-EYES = (("image_0", "image_1"), ("image_l", "image_r"))  # folders of the left and the right camera
+CAMERA_FOLDERS = (("image_0", "image_1"), ("image_l", "image_r"))  # folders of the left and the right camera
 PERIOD = 0.1  # [s] between frames without given times: KITTI's cameras run at 10 Hz
 
 
@@ -70,7 +70,7 @@ def load_kitti_images(path: str | Path, truth: str | Path | None = None, duratio
     folder = checked_path(path)
     folders = _eyes(folder)
     if folders is None:
-        names = " or ".join(f"{left} and {right}" for left, right in EYES)
+        names = " or ".join(f"{left} and {right}" for left, right in CAMERA_FOLDERS)
         raise argument_error("path", f"a folder with {names}", "a different one", f"Check {str(folder)!r}.")
     left, right = (sorted(place.glob("*.png")) for place in folders)
     if [file.name for file in left] != [file.name for file in right] or len(left) < 2:
@@ -113,7 +113,7 @@ def read_grey(file: Path) -> Image:
 
 def _eyes(folder: Path) -> tuple[Path, Path] | None:
     """Return the folders of the left and the right images, or None."""
-    for left, right in EYES:
+    for left, right in CAMERA_FOLDERS:
         if (folder / left).is_dir() and (folder / right).is_dir():
             return folder / left, folder / right
     return None

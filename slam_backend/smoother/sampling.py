@@ -65,7 +65,7 @@ def retract_on_se2(mode: FloatArray, previous: IntArray, offsets: FloatArray) ->
     return paths
 
 
-BENT_BELOW = 0.5  # share of M: below this sample size of the Gaussian draws, retracted ones are tried
+MIN_GAUSSIAN_SAMPLE_SIZE = 0.5  # share of M: below this sample size of the Gaussian draws, retracted ones are tried
 
 
 class PathSamples(NamedTuple):
@@ -125,7 +125,7 @@ def sample_paths(graph: SlamGraph, mode: MapEstimate, num_particles: int, rng: n
     """
     poses, log_proposals = mode.paths(num_particles, rng)
     gaussian = _importance_weights(graph, mode, poses, log_proposals)
-    if gaussian.sample_size >= BENT_BELOW * num_particles:
+    if gaussian.sample_size >= MIN_GAUSSIAN_SAMPLE_SIZE * num_particles:
         return gaussian
     retracted = _importance_weights(
         graph, mode, retract_on_se2(mode.poses, graph.parents, poses - mode.poses[:, :, None]), log_proposals

@@ -186,13 +186,13 @@ def _silent_report(branch: Branch, rows: RobotRows, associations: Associations) 
     return StepReport(associations, rows.rows, 0, 0, 0, 0, ess, float("nan"), False)
 
 
-def fork(branch: Branch, live: tuple[int, ...], number: int, rng: np.random.Generator) -> Branch:
+def fork(branch: Branch, active_robots: tuple[int, ...], number: int, rng: np.random.Generator) -> Branch:
     """Copy a branch for robots that lose contact with it; the copy has its own random stream."""
     stream = np.random.default_rng(rng.integers(2**63, size=4)).bit_generator.state
     slam = restored_filter(branch.filter.get_state() | {"rng": stream})
     return Branch(
         robots=branch.robots,
-        active_robots=live,
+        active_robots=active_robots,
         filter=slam,
         last_steps=dict(branch.last_steps),
         number=number,
@@ -204,10 +204,10 @@ def fork(branch: Branch, live: tuple[int, ...], number: int, rng: np.random.Gene
     )
 
 
-def split_by_component(live: Sequence[int], networks: IntArray) -> list[tuple[int, ...]]:
+def split_by_component(active_robots: Sequence[int], networks: IntArray) -> list[tuple[int, ...]]:
     """Divide robots by network: the largest part first, among equal ones that with the lowest robot."""
     by_network: dict[int, list[int]] = {}
-    for robot in live:
+    for robot in active_robots:
         by_network.setdefault(int(networks[robot]), []).append(robot)
     return sorted((tuple(part) for part in by_network.values()), key=lambda part: (-len(part), part[0]))
 

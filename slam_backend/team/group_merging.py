@@ -164,10 +164,10 @@ def merge_groups(
     joint, renamed = plan.joint or merge_filters(
         a.filter, b.filter, alignment, pairs, rng, merging.merged_particles, known, plan.pairing
     )
-    robots, live = a.robots + b.robots, a.active_robots + b.active_robots
+    robots, active = a.robots + b.robots, a.active_robots + b.active_robots
     joint.reorder(np.argsort(robots))
     number = records.new_number()
-    trunk = Branch(tuple(sorted(robots)), tuple(sorted(live)), joint, a.last_steps | b.last_steps, number, epoch)
+    trunk = Branch(tuple(sorted(robots)), tuple(sorted(active)), joint, a.last_steps | b.last_steps, number, epoch)
     if merging.watch_steps:
         new_ids = dict(renamed.tolist())
         older = [*(monitor.copy() for monitor in a.monitors), *(monitor.copy(new_ids) for monitor in b.monitors)]
@@ -185,13 +185,13 @@ def find_inconsistent_merge(trunk: Branch, merging: MergeOptions, options: Align
 
     To be undone, each of them needs robots of both sides in contact.
     """
-    watches = [
+    monitors = [
         w for w in trunk.monitors if w.steps <= merging.watch_steps and w.both_sides_connected(trunk.active_robots)
     ]
-    if not watches:
+    if not monitors:
         return None
     joint = trunk.filter.map("mixture")
-    for monitor in watches:
+    for monitor in monitors:
         above = [newer for newer in trunk.monitors if newer.number > monitor.number]
         if all(newer.both_sides_connected(trunk.active_robots) for newer in above) and monitor.is_inconsistent(
             joint, merging, options

@@ -113,8 +113,8 @@ class Group:
 
     def numbers(self) -> set[int]:
         """Return the numbers of all maps that the group uses or may restore."""
-        watches = [monitor for branch in self.branches for monitor in branch.monitors]
-        return {branch.number for branch in self.branches}.union(*map(_numbers, watches))
+        monitors = [monitor for branch in self.branches for monitor in branch.monitors]
+        return {branch.number for branch in self.branches}.union(*map(_numbers, monitors))
 
     def get_state(self) -> dict[str, Any]:
         """Return the complete state of the group."""
@@ -137,7 +137,7 @@ class Group:
 
 def _numbers(monitor: MergeMonitor) -> set[int]:
     """Return the numbers of the maps that an undo of a merge would restore."""
-    older = [_numbers(one) for side in monitor.sides for one in side.watches]
+    older = [_numbers(one) for side in monitor.sides for one in side.monitors]
     return {side.trunk["number"] for side in monitor.sides}.union(*older)
 
 

@@ -64,10 +64,10 @@ class PreMergeSnapshot:
         return robots
 
     @property
-    def watches(self) -> tuple["MergeMonitor", ...]:
+    def monitors(self) -> tuple["MergeMonitor", ...]:
         """Monitors of earlier merges in the group, as they were."""
-        watches: tuple[MergeMonitor, ...] = self.trunk["monitors"]
-        return watches
+        monitors: tuple[MergeMonitor, ...] = self.trunk["monitors"]
+        return monitors
 
 
 @dataclass(slots=True, eq=False)
@@ -108,9 +108,9 @@ class MergeMonitor:
                     report.all_associations.created_ids(row)
                 )
 
-    def both_sides_connected(self, live: Sequence[int]) -> bool:
-        """Return whether robots of both sides are among the active robots `live` of the joint filter."""
-        here = set(live)
+    def both_sides_connected(self, active_robots: Sequence[int]) -> bool:
+        """Return whether robots of both sides are among the active robots of the joint filter."""
+        here = set(active_robots)
         return not (here.isdisjoint(self.sides[0].robots) or here.isdisjoint(self.sides[1].robots))
 
     def is_inconsistent(self, joint: LandmarkMap, merging: MergeOptions, options: AlignmentOptions) -> bool:

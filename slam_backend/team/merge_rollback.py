@@ -85,14 +85,14 @@ def _down_to(monitor: MergeMonitor, number: int) -> Iterator[MergeMonitor]:
     """Yield a merge and those below it, down to the one that made map `number`."""
     yield monitor
     for side in monitor.sides:
-        if any(older.number == number for older in side.watches):
-            yield from _down_to(side.watches[-1], number)
+        if any(older.number == number for older in side.monitors):
+            yield from _down_to(side.monitors[-1], number)
 
 
 def _sides(monitor: MergeMonitor, number: int) -> Iterator[PreMergeSnapshot]:
     """Yield the groups that remain when a merge and those below it, down to map `number`, are undone."""
     for side in monitor.sides:
-        if any(older.number == number for older in side.watches):
-            yield from _sides(side.watches[-1], number)
+        if any(older.number == number for older in side.monitors):
+            yield from _sides(side.monitors[-1], number)
         else:
             yield side

@@ -94,16 +94,16 @@ class TeamCheck:
     # ------------------------------------------------------------------ groups
 
     def _check_group(self, name: str, group: Mapping[str, Any]) -> None:
-        live: list[int] = []
+        active_robots: list[int] = []
         for where, branch in check.named_items(f"{name}['branches']", group["branches"]):
             self._check_branch(where, branch)
             if not branch["active_robots"]:
                 check.refuse(f"{where}['active_robots']", "at least one robot", "no robot")
-            live += branch["active_robots"]
+            active_robots += branch["active_robots"]
             self._check_oldest(where, branch)
         trunk = group["branches"][0]
-        if sorted(live) != list(trunk["robots"]):
-            check.refuse(f"{name}['branches']", f"branches with each of {trunk['robots']} active in one", live)
+        if sorted(active_robots) != list(trunk["robots"]):
+            check.refuse(f"{name}['branches']", f"branches with each of {trunk['robots']} active in one", active_robots)
         if group["undoing"] is not None:
             self._check_undoing(f"{name}['undoing']", group["undoing"], trunk)
 
@@ -131,11 +131,11 @@ class TeamCheck:
     def _check_branch(self, name: str, branch: Any) -> None:
         """Refuse a value that is not a branch with a valid filter and monitors."""
         check.keys(name, branch, BRANCH)
-        robots, live, known = branch["robots"], branch["active_robots"], branch["last_steps"]
+        robots, active_robots, known = branch["robots"], branch["active_robots"], branch["last_steps"]
         check.robots(f"{name}['robots']", robots, self._count)
-        check.integers(f"{name}['active_robots']", live, 0, self._count - 1)
-        if list(live) != sorted(set(live)) or not set(live) <= set(robots):
-            check.refuse(f"{name}['active_robots']", f"some of {robots}, in ascending order", live)
+        check.integers(f"{name}['active_robots']", active_robots, 0, self._count - 1)
+        if list(active_robots) != sorted(set(active_robots)) or not set(active_robots) <= set(robots):
+            check.refuse(f"{name}['active_robots']", f"some of {robots}, in ascending order", active_robots)
         check.int_dict(f"{name}['last_steps']", known, (0, self._count), (-1, self._step - 1))
         if set(known) != set(robots):
             check.refuse(f"{name}['last_steps']", f"the last step of each of {robots}", known)
@@ -193,7 +193,7 @@ class TeamCheck:
             if id(side) not in self._done:
                 self._done.add(id(side))
                 self._check_branch(f"{where}.trunk", side.trunk)
-            earliest = [1 + min(side.trunk["last_steps"].values()), *(s.oldest for w in side.watches for s in w.sides)]
+            earliest = [1 + min(side.trunk["last_steps"].values()), *(s.oldest for w in side.monitors for s in w.sides)]
             check.integer(f"{where}.oldest", side.oldest, 0, min(earliest))
         one, two = (side.robots for side in monitor.sides)
         if set(one) & set(two) or not {*one, *two} <= set(robots):

@@ -110,7 +110,7 @@ class TeamSlam:
         self._together = contact_components(None, count)
         self._numbers = frozenset(range(count))
         self._refresh_topology()
-        self._last_lineup: TeamTopology | None = None
+        self._last_topology: TeamTopology | None = None
         self._step = 0
         self._epoch = 0
         self._size = 0
@@ -146,7 +146,7 @@ class TeamSlam:
         count, networks = self._num_robots, self._together
         if contacts is not None:
             networks = contact_components(check_contacts(contacts, count), count)
-        topology, size = self.lineup, self._size or self._descriptor_size()
+        topology, size = self.topology, self._size or self._descriptor_size()
         camera = topology.branches[0].filter.options.camera
         inputs = validate_step(count, size, camera, odometry, measurements, identities, poses)
         records, before = self._records, len(self._events)
@@ -160,9 +160,9 @@ class TeamSlam:
         id_maps = self._attempt(networks) if self._schedule.is_due(self._step) else ()
         if self._is_stale:
             self._refresh_topology()
-            topology = self.lineup
+            topology = self.topology
         oldest = self._step + 1 if topology.oldest is None else topology.oldest
-        if topology is not self._last_lineup:
+        if topology is not self._last_topology:
             self._note_dropped(topology)
             records.log.forget_before(oldest)
         events, entries = tuple(self._events[before:]), tuple(records.entries)
@@ -175,12 +175,12 @@ class TeamSlam:
 
     def _update_groups(self, networks: IntArray) -> TeamTopology:
         """Update the contacts of each group, and return the topology."""
-        was_split = self.lineup.is_split
+        was_split = self.topology.is_split
         for group in self._groups:
             group.update_connectivity(networks, self._records)
         if was_split or any(len(group.branches) > 1 for group in self._groups):
             self._refresh_topology()
-        return self.lineup
+        return self.topology
 
     def _advance(self, topology: TeamTopology, inputs: StepInput) -> tuple[Associations, tuple[Rejuvenation, ...]]:
         """Step all filters with the inputs of their robots; return data association and rejuvenations."""
@@ -292,16 +292,16 @@ class TeamSlam:
     def _note_dropped(self, topology: TeamTopology) -> None:
         """Record the maps that have ended since the last topology."""
         self._records.entries += [MapReleased(number) for number in sorted(self._numbers - topology.numbers)]
-        self._last_lineup, self._numbers = topology, topology.numbers
+        self._last_topology, self._numbers = topology, topology.numbers
 
     def _descriptor_size(self) -> int:
         """Return the length of the descriptors in use, 0 before the first one; it is constant from then on."""
-        self._size = max([branch.filter.descriptor_size for branch in self.lineup.branches])
+        self._size = max([branch.filter.descriptor_size for branch in self.topology.branches])
         return self._size
 
     def _refresh_topology(self) -> None:
         """Recompute the assignment of robots to filters."""
-        self.lineup, self._is_stale = TeamTopology.of(self._groups), False
+        self.topology, self._is_stale = TeamTopology.of(self._groups), False
 
     # ------------------------------------------------------------------ estimates
 
@@ -313,7 +313,7 @@ class TeamSlam:
     @property
     def groups(self) -> tuple[tuple[int, ...], ...]:
         """The groups, each in ascending order of robots, by ascending first robot."""
-        return self.lineup.groups
+        return self.topology.groups
 
     @property
     def events(self) -> tuple[MergeEvent, ...]:
@@ -338,7 +338,7 @@ class TeamSlam:
     @property
     def maps(self) -> tuple[int, ...]:
         """Number of each robot's map; see `TeamReport`."""
-        return self.lineup.maps
+        return self.topology.maps
 
     @property
     def diagnostics(self) -> tuple[dict[str, float], ...]:
@@ -471,7 +471,7 @@ class TeamSlam:
         """
         summaries = TeamMapSummaries.allocate(self._num_robots, 0) if into is None else into
         (rows, parts), last = summaries, 0
-        for branch in self.lineup.branches:
+        for branch in self.topology.branches:
             slam = branch.filter
             first, last = last, write_summary(slam.state.maps, slam.state.best, min_count, rows, last)
             for robot in branch.active_robots:
@@ -487,7 +487,7 @@ class TeamSlam:
             into: Earlier result, overwritten. None: fresh arrays.
         """
         points = TeamPoses(self._num_robots) if into is None else into
-        for branch in self.lineup.branches:
+        for branch in self.topology.branches:
             slam, report = branch.filter, branch.report
             ess = 1.0 if report is None else report.ess / slam.num_particles
             slam.write_team_poses(branch.robots, branch.active_robots, ess, points)
@@ -504,9 +504,9 @@ class TeamSlam:
     def _place(self, robot: int) -> tuple[Group, Branch, int]:
         """Return the robot's group, its branch, and its index in the branch."""
         if type(robot) is int and 0 <= robot < self._num_robots:
-            return self.lineup.places[robot]
+            return self.topology.places[robot]
         if isinstance(robot, (int, np.integer)) and not isinstance(robot, bool) and 0 <= robot < self._num_robots:
-            return self.lineup.places[robot]
+            return self.topology.places[robot]
         raise argument_error("robot", f"an index from 0 to {self.num_robots - 1}", robot, "Count robots from 0.")
 
     # ------------------------------------------------------------------ snapshots
@@ -557,7 +557,7 @@ class TeamSlam:
         at_hand = {group.robots: group.trunk.filter for group in self._groups}  # reuse is faster than construction
         self._groups = [Group.from_state(group, at_hand) for group in state["groups"]]
         self._refresh_topology()
-        self._last_lineup, self._size = None, 0
+        self._last_topology, self._size = None, 0
         self._numbers = frozenset(state["numbers"])
         self._alignment, self._merging = state["alignment"], state["merging"]
         self._schedule.set_state(state["schedule"])

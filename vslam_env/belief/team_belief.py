@@ -88,7 +88,7 @@ class TeamBelief:
     @property
     def groups(self) -> tuple[tuple[int, ...], ...]:
         """Groups, each in ascending order of robots."""
-        return self._lineup.groups
+        return self._topology.groups
 
     @property
     def events(self) -> tuple[MergeEvent, ...]:
@@ -127,7 +127,7 @@ class TeamBelief:
         self._tick += 1
         self._refresh_poses()
         points = self.points
-        self._grids.step(self._tick, report, self._lineup.same_filter, points, readings.scans, readings.bumps)
+        self._grids.step(self._tick, report, self._topology.same_filter, points, readings.scans, readings.bumps)
         for robot in self._turns[self._tick % len(self._turns)] if self._tick else range(len(self._robots)):
             self._candidates.update(robot, self.grids, points.poses)
         return report
@@ -137,7 +137,7 @@ class TeamBelief:
         id_map = self._team.merge(robot_a, robot_b, alignment, known)
         self._refresh_poses()
         self._grids.save_for_undo(self._tick + 1, id_map)
-        self._grids.share_on_contact(self._tick + 1, self._lineup.same_filter, self.points.starts)
+        self._grids.share_on_contact(self._tick + 1, self._topology.same_filter, self.points.starts)
         return id_map
 
     def representative(self, group: tuple[int, ...]) -> int:
@@ -154,7 +154,7 @@ class TeamBelief:
 
     def group_map(self, robot: int) -> LandmarkMap:
         """Return the confirmed landmarks of a robot's group, in the group's map frame."""
-        number = self._lineup.maps[robot]
+        number = self._topology.maps[robot]
         if number not in self._maps:
             self._maps[number] = self._team.map(robot, min_count=self._confirm_after)
         return self._maps[number]
@@ -216,8 +216,8 @@ class TeamBelief:
 
     def _refresh_poses(self) -> None:
         """Update groups and poses after a step or a merge, and clear cached beliefs and maps."""
-        self._lineup = self._team.lineup
-        self.known_groups = self._lineup.known_robots
+        self._topology = self._team.topology
+        self.known_groups = self._topology.known_robots
         self._team.team_poses(self.points)
         self._beliefs.clear()
         self._maps.clear()
@@ -225,7 +225,7 @@ class TeamBelief:
 
     def _others(self, robot: int) -> list[int]:
         """Return the other known members of a robot's group, ascending."""
-        return [mate for mate in self._lineup.known_robots[robot] if mate != robot]
+        return [mate for mate in self._topology.known_robots[robot] if mate != robot]
 
     def _teammate_positions(self, robot: int) -> FloatArray:
         """Return the estimated positions (n, 2) [m] of a robot's teammates in its own start frame."""
@@ -242,7 +242,7 @@ class TeamBelief:
 
     def _make_belief(self, robot: int) -> Belief:
         """Build the belief of a robot."""
-        points, slots, group = self.points, self._slots[robot], self._lineup.known_robots[robot]
+        points, slots, group = self.points, self._slots[robot], self._topology.known_robots[robot]
         return Belief(
             robot=robot,
             tick=self._tick,

@@ -113,8 +113,8 @@ def test_standpoints_of_all_robots_are_those_of_each() -> None:
         fresh = team.team_poses()
         assert_same((points.poses, points.beliefs), (fresh.poses, fresh.beliefs))
         for robot in range(3):
-            assert_same(team.lineup.known_robots[robot], team.known_robots(robot))
-            assert_same(team.lineup.same_filter[robot], team.same_filter(robot))
+            assert_same(team.topology.known_robots[robot], team.known_robots(robot))
+            assert_same(team.topology.same_filter[robot], team.same_filter(robot))
             assert_same(points.poses[robot, robot], points.own[robot])
             assert_same(PoseEstimate(points.own[robot], points.covariances[robot]), team.pose_from_start(robot))
             np.testing.assert_allclose(points.starts[robot], team.start_from_group(robot), atol=1e-15)

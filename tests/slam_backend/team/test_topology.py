@@ -38,20 +38,20 @@ def oldest_unknown(branch: Branch, now: int) -> int:
 
 
 def check(team: TeamSlam, report: TeamReport) -> None:
-    """Check that a team's lineup, and what its report says of that, are as the groups have it now."""
-    assert team.lineup == TeamTopology.of(team._groups)
-    assert team.lineup is team.lineup
+    """Check that a team's topology, and what its report says of that, are as the groups have it now."""
+    assert team.topology == TeamTopology.of(team._groups)
+    assert team.topology is team.topology
     branches = [branch for group in team._groups for branch in group.branches]
-    for robot, (group, branch, place) in enumerate(team.lineup.places):
+    for robot, (group, branch, place) in enumerate(team.topology.places):
         assert robot in branch.active_robots
         assert branch.robots[place] == robot
         assert branch in group.branches
-    assert (report.groups, report.maps) == (team.groups, tuple(branch.number for _, branch, _ in team.lineup.places))
+    assert (report.groups, report.maps) == (team.groups, tuple(branch.number for _, branch, _ in team.topology.places))
     assert report.oldest_step == min(oldest_unknown(branch, report.step) for branch in branches)
 
 
 def run(simulation: SimulatedTeam, team: TeamSlam, steps: int, contacts: object = None) -> list[str]:
-    """Drive, check the lineup after each step, and return what became of merges."""
+    """Drive, check the topology after each step, and return what became of merges."""
     before = len(team.events)
     for _ in range(steps):
         check(team, simulation.run(team, 1, contacts)[0])
@@ -59,42 +59,42 @@ def run(simulation: SimulatedTeam, team: TeamSlam, steps: int, contacts: object 
 
 
 def test_it_follows_merges_forks_returns_undos_and_the_end_of_a_watch() -> None:
-    """Each of these makes a new lineup; steps between them do not."""
+    """Each of these makes a new topology; steps between them do not."""
     simulation = SimulatedTeam(num_robots=3, seed=101)
     team = simulation.build(attempts=NEVER, merging=MergeOptions(watch_steps=60))
-    alone = team.lineup
+    alone = team.topology
     run(simulation, team, 80)
-    assert team.lineup is alone
+    assert team.topology is alone
     team.merge(0, 1, false_alignment(simulation, team, np.array([3.0, -2.0, 0.5])))
-    assert team.lineup == TeamTopology.of(team._groups)
+    assert team.topology == TeamTopology.of(team._groups)
     assert any("undo" in run(simulation, team, 1) for _ in range(100))
-    assert team.lineup.same_filter == ((0,), (1,), (2,))
+    assert team.topology.same_filter == ((0,), (1,), (2,))
     team.merge(0, 2, true_alignment(simulation, team, 0, 2))
     run(simulation, team, 10)
     run(simulation, team, 10, links(3, (0, 1)))
-    assert team.lineup.same_filter == ((0,), (1,), (2,))
-    assert team.lineup.known_robots == ((0, 2), (1,), (0, 2))
+    assert team.topology.same_filter == ((0,), (1,), (2,))
+    assert team.topology.known_robots == ((0, 2), (1,), (0, 2))
     run(simulation, team, 10)
-    assert team.lineup.same_filter == ((0, 2), (1,), (0, 2))
-    watched = team.lineup
+    assert team.topology.same_filter == ((0, 2), (1,), (0, 2))
+    watched = team.topology
     assert watched.oldest is not None
     run(simulation, team, 80)
-    assert team.lineup.oldest is None
-    assert len(team.lineup.numbers) < len(watched.numbers)
+    assert team.topology.oldest is None
+    assert len(team.topology.numbers) < len(watched.numbers)
 
 
-def test_the_lineup_of_a_restored_team_is_that_of_its_state() -> None:
+def test_a_restored_team_has_the_topology_of_its_state() -> None:
     """Be the team the same as before or another one."""
     simulation = SimulatedTeam(num_robots=3, seed=102)
     team, other = (simulation.build(attempts=NEVER) for _ in range(2))
     simulation.run(team, 60)
     state = team.get_state()
     team.merge(0, 1, true_alignment(simulation, team, 0, 1))
-    assert team.lineup.groups == ((0, 1), (2,))
+    assert team.topology.groups == ((0, 1), (2,))
     for one in (team, other):
         one.set_state(state)
-        assert one.lineup == TeamTopology.of(one._groups)
-        assert one.lineup.groups == ((0,), (1,), (2,))
+        assert one.topology == TeamTopology.of(one._groups)
+        assert one.topology.groups == ((0,), (1,), (2,))
 
 
 @pytest.mark.parametrize(("rows", "robots"), [(3, None), (1, 4)])
