@@ -131,7 +131,7 @@ class Follower:
 
     Args:
         team: Team whose merges are observed.
-        ledger: True landmark of each landmark in the maps.
+        ground_truth: True landmark of each landmark in the maps.
         starts: (K, 3) true start poses, world frame.
 
     Attributes:
@@ -141,8 +141,8 @@ class Follower:
         moved: Largest share of a side's landmarks that was out of place while the merge was monitored.
     """
 
-    def __init__(self, team: TeamSlam, ledger: GroundTruthAssociation, starts: FloatArray) -> None:
-        self._team, self._ledger, self._starts = team, ledger, starts
+    def __init__(self, team: TeamSlam, ground_truth: GroundTruthAssociation, starts: FloatArray) -> None:
+        self._team, self._ground_truth, self._starts = team, ground_truth, starts
         self.wrong_pairs: dict[int, float] = {}
         self.later: dict[int, tuple[float, float]] = {}
         self.last: dict[int, tuple[float, float]] = {}
@@ -191,7 +191,7 @@ class Follower:
         sides = next(watch.sides for watch in watches if watch.alignment is merge.alignment)
         claims = []
         for side, joined, rows in zip(sides, self._team.merged_maps(merge), merge.alignment.inliers.T, strict=True):
-            book = self._ledger._books[self._ledger._row_of[side.trunk["number"]]]
+            book = self._ground_truth._books[self._ground_truth._row_of[side.trunk["number"]]]
             claims.append(book[joined.ids[rows]])
         return float(np.mean((claims[0] != claims[1]) | (claims[0] == FALSE))) if len(claims[0]) else float("nan")
 

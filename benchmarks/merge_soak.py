@@ -119,7 +119,7 @@ def play_environment(seed: int, cycles: int, setting: Setting) -> Fates:
     rng = np.random.default_rng([seed, 18])
     policies = [make_policy("frontier", env.config.action_type) for _ in env.possible_agents]
     observations, _ = env.reset(seed=seed)
-    follower = Follower(env.episode.belief._team, env.episode.ledger, env.true_start_poses)
+    follower = Follower(env.episode.belief._team, env.episode.ground_truth, env.true_start_poses)
     while env.agents:
         if setting.forced and not env.events:
             force(env, rng, setting.shift)
@@ -143,7 +143,7 @@ def play_world(world: str, seed: int, setting: Setting) -> Fates:
     def note(progress: Progress) -> None:
         nonlocal follower
         if follower is None:
-            follower = Follower(env.episode.belief._team, env.episode.ledger, env.true_start_poses)
+            follower = Follower(env.episode.belief._team, env.episode.ground_truth, env.true_start_poses)
         else:
             follower.note(env.episode.tick - 1)
 
@@ -199,15 +199,17 @@ def play_aisles(seed: int, cycles: int, setting: Setting) -> Fates:
         **setting.filter,
     )  # fmt: skip
     starts = run.true_paths[:, 0]
-    ledger = GroundTruthAssociation(robots, run.landmarks, np.ones(len(run.landmarks), dtype=np.bool_), cutoff=1.0)
-    follower = Follower(team, ledger, starts)
+    ground_truth = GroundTruthAssociation(
+        robots, run.landmarks, np.ones(len(run.landmarks), dtype=np.bool_), cutoff=1.0
+    )
+    follower = Follower(team, ground_truth, starts)
     broken = not setting.forced and rng.random() < 0.5
     up = np.ones((robots, robots), dtype=np.bool_)
     for step, (reading, names) in enumerate(zip(run.readings(), run.names, strict=True)):
         if broken:
             change = np.triu(np.where(up, rng.random(up.shape) < LOSES, rng.random(up.shape) < FINDS), 1)
             up = up ^ (change | change.T)
-        ledger.record(team.step(reading["odometry"], reading["measurements"], up), names)
+        ground_truth.record(team.step(reading["odometry"], reading["measurements"], up), names)
         if setting.forced and not team.events and min(len(team.map(robot)) for robot in range(2)) >= ENOUGH:
             team.merge(0, 1, forced_alignment(starts, team.map(0), team.map(1), rng, setting.shift))
         follower.note(step)
@@ -216,11 +218,11 @@ def play_aisles(seed: int, cycles: int, setting: Setting) -> Fates:
 
 def force(env: ExplorationEnv, rng: np.random.Generator, shift: float | None) -> None:
     """Force a wrong merge of robots 0 and 1, if their maps are large enough."""
-    belief, ledger = env.episode.belief, env.episode.ledger
+    belief, ground_truth = env.episode.belief, env.episode.ground_truth
     map_a, map_b = belief.filter_map(0), belief.filter_map(1)
     if min(len(map_a), len(map_b)) < ENOUGH:
         return
-    ledger.merge(belief.merge(0, 1, forced_alignment(env.true_start_poses, map_a, map_b, rng, shift)))
+    ground_truth.merge(belief.merge(0, 1, forced_alignment(env.true_start_poses, map_a, map_b, rng, shift)))
 
 
 def forced_alignment(

@@ -92,7 +92,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         self._root: np.random.SeedSequence | None = None
         self._episode: Episode | None = None
         self._cycle = 0
-        self._standing: TeamMetrics  # set at a reset
+        self._team_metrics: TeamMetrics  # set at a reset
         self._window = Window(self.metadata["name"])
         self._objects = snapshot_objects(self._source, self._terms)
 
@@ -128,7 +128,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         scenario = sample_scenario(self.config, self._source, root.spawn(1)[0], world_seed, options.get("start_poses"))
         episode = Episode(self.config, scenario, self._tap)
         episode.begin()
-        self._standing = episode.team_metrics()
+        self._team_metrics = episode.team_metrics()
         self._root, self._episode, self._drivers = root, episode, ActionExecutor(self.config)
         self.agents = self.possible_agents[:]
         self._cycle = 0
@@ -162,13 +162,13 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         agents = self.agents
         chosen = checked_actions(actions, agents, self.config.action_type)
         invalid = self._drivers.execute(episode, chosen)
-        before = self._standing
-        self._standing = episode.team_metrics()
+        before = self._team_metrics
+        self._team_metrics = episode.team_metrics()
         self._cycle += 1
 
-        terms = evaluate(self._terms, before, self._standing, self.config.shared_reward)
+        terms = evaluate(self._terms, before, self._team_metrics, self.config.shared_reward)
         recall = self.config.stop_at_recall
-        terminated = recall is not None and bool(self._standing.map_recalls.min() >= recall)
+        terminated = recall is not None and bool(self._team_metrics.map_recalls.min() >= recall)
         truncated = not terminated and self._cycle >= self._max_cycles
         observations, infos = self._observe(episode, terms, invalid)
         results = (
@@ -192,7 +192,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         """
         if self.render_mode is None:
             return None
-        frame = draw_frame(build_scene(self._running_episode("render"), self._standing))
+        frame = draw_frame(build_scene(self._running_episode("render"), self._team_metrics))
         if self.render_mode == "rgb_array":
             return frame
         self._window.show(frame)
@@ -221,7 +221,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         episode = self._running_episode("state")
         both = episode.true_path[-1], episode.estimated_poses()
         rows = [np.column_stack([poses[:, :2], np.cos(poses[:, 2]), np.sin(poses[:, 2])]) for poses in both]
-        metrics = self._standing
+        metrics = self._team_metrics
         frames = [group[0] for group in episode.belief.known_groups]
         scores = np.column_stack([metrics.map_errors, metrics.map_recalls, metrics.heading_errors, frames])
         state = np.concatenate([np.hstack([*rows, scores]).ravel(), [metrics.coverage, metrics.merges]])
@@ -251,7 +251,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
     @property
     def true_landmarks(self) -> FloatArray:
         """(N, 3) float64 [m], world frame. Copy of the positions of the observable landmarks."""
-        return self._running_episode("true_landmarks").ledger.true_positions.copy()
+        return self._running_episode("true_landmarks").ground_truth.true_positions.copy()
 
     @property
     def true_poses(self) -> FloatArray:
@@ -290,7 +290,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
 
     def scene(self) -> Scene:
         """Return the content of a picture of the current tick."""
-        return build_scene(self._running_episode("scene"), self._standing)
+        return build_scene(self._running_episode("scene"), self._team_metrics)
 
     # ------------------------------------------------------------------ snapshots
 
@@ -311,7 +311,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
             "cycle": 0 if episode is None else self._cycle,
             "episode": None if episode is None else episode.get_state(),
             "drivers": [] if episode is None else self._drivers.get_state(),
-            "standing": None if episode is None else self._standing,
+            "standing": None if episode is None else self._team_metrics,
         }
 
     def set_state(self, state: Mapping[str, Any]) -> None:
@@ -336,7 +336,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         self._episode.set_state(state["episode"], scenario)
         self._drivers = ActionExecutor(self.config)
         self._drivers.set_state(state["drivers"])
-        self._standing, self._cycle, self.agents = state["standing"], state["cycle"], list(state["agents"])
+        self._team_metrics, self._cycle, self.agents = state["standing"], state["cycle"], list(state["agents"])
 
     def clone(self) -> "ExplorationEnv":
         """Return an independent environment in the same state, without window and recorder."""
@@ -361,7 +361,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         """Return observations and infos by agent after the last tick; `terms` are the reward terms of the step."""
         agents, belief = self.possible_agents, episode.belief
         observations = build_observations(agents, belief, episode.readings, *self._shown_as)
-        return observations, build_infos(agents, belief.known_groups, self._standing, terms, invalid)
+        return observations, build_infos(agents, belief.known_groups, self._team_metrics, terms, invalid)
 
     def _running_episode(self, name: str) -> Episode:
         if self._episode is None:

@@ -19,7 +19,7 @@ from vslam_env.config import EnvConfig
 from vslam_env.reward import RewardTerm, is_named
 from vslam_env.simulation.episode import Episode
 from vslam_env.simulation.scenario import Scenario
-from vslam_env.state_checks import EpisodeCheck, check_drivers, check_standing
+from vslam_env.state_checks import EpisodeCheck, check_drivers, check_team_metrics
 from vslam_env.state_kinds import ENV_KINDS
 from vslam_env.world import WorldSource
 
@@ -101,9 +101,9 @@ def check_parts(
         return root, None
     episode = EpisodeCheck(config, own)
     episode.check("state['episode']", state["episode"])
-    check_standing("state['standing']", state["standing"], config.num_robots)
+    check_team_metrics("state['standing']", state["standing"], config.num_robots)
     check_drivers("state['drivers']", state["drivers"], config.num_robots)
-    return root, episode.setting
+    return root, episode.scenario
 
 
 def save_state(state: Mapping[str, Any], path: str | Path) -> None:

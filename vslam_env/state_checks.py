@@ -41,14 +41,14 @@ class EpisodeCheck:
         own: Running episode of the environment, if any. Objects that it shares with the state are not checked again.
 
     Attributes:
-        setting: Scenario to restore, set by `check`. A foreign scenario is rebuilt from its parts, so that its sensors
+        scenario: Scenario to restore, set by `check`. A foreign scenario is rebuilt from its parts, so that its sensors
             need not be trusted.
     """
 
     def __init__(self, config: EnvConfig, own: Episode | None) -> None:
         self._config, self._own, self._count = config, own, config.num_robots
         self._tick = 0
-        self.setting: Scenario | None = None if own is None else own.setting
+        self.scenario: Scenario | None = None if own is None else own.scenario
 
     def check(self, name: str, state: Any) -> None:
         """Raise unless a value is a state of an episode.
@@ -60,11 +60,11 @@ class EpisodeCheck:
         check.keys(name, state, EPISODE)
         scenario = state["setting"]
         if own is not None and scenario is own.given_scenario:
-            scenario = own.setting
-        elif own is None or scenario is not own.setting:
-            self._check_setting(f"{name}['setting']", scenario)
+            scenario = own.scenario
+        elif own is None or scenario is not own.scenario:
+            self._check_scenario(f"{name}['setting']", scenario)
             try:
-                self.setting = scenario = Scenario.from_parts(*scenario.to_parts())
+                self.scenario = scenario = Scenario.from_parts(*scenario.to_parts())
             except Exception as error:  # any error of a constructor
                 check.refuse(f"{name}['setting']", "parts that fit together", f"'{error}'")
         check.integer(f"{name}['tick']", state["tick"])
@@ -74,7 +74,7 @@ class EpisodeCheck:
         check.array(f"{name}['simulator']['bumped']", state["simulator"]["bumped"], check.BOOL, (count,))
         check_streams(f"{name}['streams']", state["streams"])
         self._check_belief(f"{name}['belief']", state["belief"], scenario)
-        self._check_ledger(f"{name}['ledger']", state["ledger"], scenario, state["belief"]["team"])
+        self._check_ground_truth(f"{name}['ledger']", state["ledger"], scenario, state["belief"]["team"])
         cells = len(scenario.coverage.cells)
         check.keys(f"{name}['coverage']", state["coverage"], ("ever", "found"))
         check.array(f"{name}['coverage']['ever']", state["coverage"]["ever"], check.BOOL, (cells,))
@@ -109,7 +109,7 @@ class EpisodeCheck:
         if ((poses[:, :2] < low) | (poses[:, :2] > high)).any():
             check.refuse(name, "positions inside the world", "others")
 
-    def _check_setting(self, name: str, scenario: Any) -> None:
+    def _check_scenario(self, name: str, scenario: Any) -> None:
         """Raise unless a value is a scenario of this configuration."""
         config, count = self._config, self._count
         check.instance(name, scenario, Scenario)
@@ -218,18 +218,18 @@ class EpisodeCheck:
 
     # ------------------------------------------------------------------ ground-truth association
 
-    def _check_ledger(self, name: str, ledger: Any, scenario: Scenario, team: Mapping[str, Any]) -> None:
+    def _check_ground_truth(self, name: str, state: Any, scenario: Scenario, team: Mapping[str, Any]) -> None:
         """Raise unless a value is the ground-truth association of a team's maps, whose rows kernels index unchecked."""
-        check.keys(name, ledger, ("books", "row_of", "map_of", "seen"))
-        books, row_of, count = ledger["books"], ledger["row_of"], self._count
+        check.keys(name, state, ("books", "row_of", "map_of", "seen"))
+        books, row_of, count = state["books"], state["row_of"], self._count
         check.indices(
             f"{name}['books']", books, (None, None), UNUSED, int(np.count_nonzero(scenario.observable_landmarks)) - 1
         )
         check.int_dict(f"{name}['row_of']", row_of, check.LANDMARK, (0, len(books) - 1))
         if len(set(row_of.values())) < len(row_of):
             check.refuse(f"{name}['row_of']", "a row for each map", row_of)
-        check.integers(f"{name}['map_of']", ledger["map_of"])
-        check.sequence(f"{name}['map_of']", ledger["map_of"], count)
+        check.integers(f"{name}['map_of']", state["map_of"])
+        check.sequence(f"{name}['map_of']", state["map_of"], count)
         numbers: set[int] = set(team["numbers"])
         for branch in branches_of(team):
             numbers.add(branch["number"])
@@ -239,9 +239,9 @@ class EpisodeCheck:
             needed = max(1 + maps["ids"].max(initial=-1), maps["next_id"] - MOST_MEASURED * self._tick)
             if needed > books.shape[1]:
                 check.refuse(f"{name}['books']", f"entries for {needed} landmarks", f"shape {books.shape}")
-        if lacking := numbers.union(ledger["map_of"]) - set(row_of):
+        if lacking := numbers.union(state["map_of"]) - set(row_of):
             check.refuse(f"{name}['row_of']", f"a row for map {min(lacking)}", "none")
-        seen = ledger["seen"]
+        seen = state["seen"]
         check.instance(f"{name}['seen']", seen, dict)
         check.integers(f"{name}['seen']", tuple(seen), 0, self._tick)
         for names in seen.values():
@@ -372,7 +372,7 @@ def check_slots(name: str, slots: Any) -> None:
     check.array(f"{name}['given_up']", slots["given_up"], check.BOOL, GRID)
 
 
-def check_standing(name: str, metrics: Any, count: int) -> None:
+def check_team_metrics(name: str, metrics: Any, count: int) -> None:
     """Raise unless a value is the metrics of a team of K robots."""
     check.instance(name, metrics, TeamMetrics)
     check.instance(f"{name}.per_robot", metrics.per_robot, RobotMetrics)

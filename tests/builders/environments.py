@@ -62,7 +62,7 @@ def standing_at(starts: FloatArray) -> TeamPoses:
 
 
 def scored(
-    ledger: GroundTruthAssociation,
+    ground_truth: GroundTruthAssociation,
     outlines: TeamMapSummaries,
     points: TeamPoses,
     true_starts: FloatArray,
@@ -71,7 +71,7 @@ def scored(
     """Return how a team stands of which nothing else is known."""
     robots = len(true_poses)
     figures, nothing = np.full((len(RobotMetrics._fields), robots), np.nan), (0,) * robots
-    ledger.score(outlines, points, true_starts, true_poses, figures)
+    ground_truth.score(outlines, points, true_starts, true_poses, figures)
     return TeamMetrics(RobotMetrics(*figures.tolist()), RobotCounts(nothing, nothing), 0.0, 0, 0.0)
 
 

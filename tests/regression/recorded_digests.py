@@ -132,7 +132,7 @@ def merge_falsely(env: Any) -> None:
     """Merge the first two robots by a transform that is 1 m off, which the team finds out and undoes."""
     start = between(*env.true_start_poses[:2]) + np.array([1.0, 0.0, 0.0])
     found = Alignment(True, "", *start, 1e-3 * np.eye(3), np.empty((0, 2), dtype=np.int64), 0.0)
-    env.episode.ledger.merge(env.episode.belief.merge(0, 1, found))
+    env.episode.ground_truth.merge(env.episode.belief.merge(0, 1, found))
 
 
 def align_and_fuse() -> str:

@@ -139,7 +139,7 @@ def test_files_are_checked_as_states_are(way: list[Any], index: float, says: str
 
 
 def test_nothing_within_the_sensors_of_a_copied_state_is_believed() -> None:
-    """Numbers by which kernels look up walls and landmarks are derived again from the setting's parts."""
+    """Numbers by which kernels look up walls and landmarks are derived again from the scenario's parts."""
     env = begun()
     state = copy.deepcopy(env.get_state())
     expected = go_on(env)

@@ -84,16 +84,16 @@ def test_what_is_written_into_a_state_moves_no_environment(name: str) -> None:
         assert go_on(twins[2], 25) == reference
 
 
-def test_the_floor_of_a_setting_cannot_be_written() -> None:
+def test_the_coverage_cells_of_a_scenario_cannot_be_written() -> None:
     """A kernel goes by it unchecked; an environment that is set to its own state does not look at it again."""
     env = merged()
     state = env.get_state()
-    setting = state["episode"]["setting"]
+    scenario = state["episode"]["setting"]
     with pytest.raises(ValueError, match="read-only"):
-        setting.coverage.laid[:] = 2**31 - 1
+        scenario.coverage.laid[:] = 2**31 - 1
     with pytest.raises(ValueError, match="cannot set WRITEABLE flag"):
-        setting.coverage.laid.setflags(write=True)
-    assert not any(array.size and can_be_written(array) for _, array in arrays_in(setting))
+        scenario.coverage.laid.setflags(write=True)
+    assert not any(array.size and can_be_written(array) for _, array in arrays_in(scenario))
     twin = env.clone()
     env.set_state(state)
     assert go_on(env, 5) == go_on(twin, 5)

@@ -32,7 +32,7 @@ FIGURES: dict[str, list[float]] = {
 }
 
 
-def _standing(
+def _team_metrics(
     coverage: float = 0.25, collisions: tuple[int, int] = (0, 3), time: float = 3.0, **rows: Any
 ) -> TeamMetrics:
     return TeamMetrics(
@@ -46,11 +46,11 @@ def _standing(
 
 def test_figures_go_by_their_names() -> None:
     """Each row of the table is what its name says."""
-    standing = _standing()
+    metrics = _team_metrics()
     for name, figures in FIGURES.items():
-        assert getattr(standing, name).tolist() == figures
-    assert (standing.collisions.tolist(), standing.bytes_sent.tolist()) == ([0, 3], [7, 8])
-    assert standing.collisions.dtype == standing.bytes_sent.dtype == np.int64
+        assert getattr(metrics, name).tolist() == figures
+    assert (metrics.collisions.tolist(), metrics.bytes_sent.tolist()) == ([0, 3], [7, 8])
+    assert metrics.collisions.dtype == metrics.bytes_sent.dtype == np.int64
 
 
 def _rewards(env: ExplorationEnv, actions: dict[str, Any]) -> tuple[dict[str, float], dict[str, dict[str, Any]]]:
@@ -61,7 +61,7 @@ def _rewards(env: ExplorationEnv, actions: dict[str, Any]) -> tuple[dict[str, fl
 
 def test_named_terms() -> None:
     """Each named term is what its name says, times its weight."""
-    after = _standing(
+    after = _team_metrics(
         map_errors=[0.5, 0.65],
         accurate_recalls=[0.3, 0.1],
         pose_sigmas=[0.03, 0.01],
@@ -73,7 +73,7 @@ def test_named_terms() -> None:
         time=3.5,
     )
     weights = {name: float(weight) for weight, name in enumerate(TERMS, start=2)}
-    rewards = evaluate(make_terms(weights), _standing(), after)
+    rewards = evaluate(make_terms(weights), _team_metrics(), after)
     expected = {
         "map_error": [0.2, -0.05],
         "map_error_squared": [0.7**2 - 0.5**2, 0.6**2 - 0.65**2],
@@ -168,12 +168,12 @@ def test_a_map_that_is_placed_wrong_has_no_recall() -> None:
 def _merge(env: ExplorationEnv, shift: list[float]) -> None:
     """Merge the maps of two robots with the true transform, moved by a shift (3,)."""
     episode = env.episode
-    claims = [episode.ledger.true_ids(r, episode.belief.filter_map(r).ids) for r in range(2)]
+    claims = [episode.ground_truth.true_ids(r, episode.belief.filter_map(r).ids) for r in range(2)]
     true = true_alignment(*claims, *episode.true_starts)
     assert true is not None
     inliers = np.empty((0, 2), np.int64) if any(shift) else true.inliers
     used = Alignment(True, "", *(true.transform + shift).tolist(), true.covariance, inliers, 0.0)
-    episode.ledger.merge(episode.belief.merge(0, 1, used))
+    episode.ground_truth.merge(episode.belief.merge(0, 1, used))
 
 
 def test_a_wrong_merge_costs() -> None:
@@ -262,7 +262,7 @@ def test_a_worse_map_costs_more(gamma: float) -> None:
         return float(sum(gamma**t * reward for t, reward in enumerate(rewards)))
 
     held = env.belief("robot_0").map.ids
-    true_one = int(env.episode.ledger.true_ids(0, held[:1])[0])
+    true_one = int(env.episode.ground_truth.true_ids(0, held[:1])[0])
     assert true_one >= 0
 
     def claiming(claim: int) -> ExplorationEnv:

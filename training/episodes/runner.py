@@ -168,6 +168,7 @@ class _Log:
         ticks = np.array(self._ticks)
         reckoned = [dead_reckoning(np.zeros(3), odometry[1:, robot])[ticks] for robot in range(len(self._agents))]
         last = {robot: self._env.belief(agent) for robot, agent in enumerate(self._agents)}
+        ground_truth = self._env.episode.ground_truth
         maps = {**self._maps, **{r: belief.map for r, belief in last.items() if r not in self._alone_until}}
         return EpisodeRecord(
             times=ticks * TICK, true_poses=np.stack(self._true, axis=1), estimated=np.stack(self._estimated, axis=1),
@@ -177,7 +178,7 @@ class _Log:
             infos=tuple(dict(self._infos[agent]) for agent in self._agents),
             own_maps=tuple(maps[robot] for robot in range(len(self._agents))),
             alone_until=tuple(self._alone_until.get(robot) for robot in range(len(self._agents))),
-            map_claims=tuple(self._env.episode.ledger.true_ids(robot, own.map.ids) for robot, own in last.items()),
+            map_claims=tuple(ground_truth.true_ids(robot, own.map.ids) for robot, own in last.items()),
             maps=tuple(own.map for own in last.values()), true_landmarks=self._env.true_landmarks,
             consistency=tuple(map(self._env.episode.belief.consistency, last)), scene=self._env.scene(),
             complete=not self._env.agents,

@@ -39,14 +39,14 @@ def survey(world: str, world_seed: int, robots: int = 3) -> WorldFigures:
     """
     check_int("seed", world_seed, 0, "Use 0 or a positive number.")
     config = EnvConfig(world=world, num_robots=robots)
-    setting = sample_scenario(config, world, np.random.SeedSequence(world_seed), world_seed)
-    x_min, y_min, x_max, y_max = setting.world.bounds
-    starts = setting.true_starts[:, :2]
+    scenario = sample_scenario(config, world, np.random.SeedSequence(world_seed), world_seed)
+    x_min, y_min, x_max, y_max = scenario.world.bounds
+    starts = scenario.true_starts[:, :2]
     gaps = np.linalg.norm(starts[:, None] - starts, axis=2)[~np.eye(robots, dtype=bool)]
-    squares = FreeSpace(setting.world, config.robot_radius).free_area_cells
+    squares = FreeSpace(scenario.world, config.robot_radius).free_area_cells
     return WorldFigures(
-        name=setting.world.name, walls=len(setting.world.walls),
-        landmarks=int(np.count_nonzero(setting.observable_landmarks)),
+        name=scenario.world.name, walls=len(scenario.world.walls),
+        landmarks=int(np.count_nonzero(scenario.observable_landmarks)),
         floor_m2=0.04 * len(squares), width_m=x_max - x_min, height_m=y_max - y_min,
         start_gap_m=float(gaps.min(initial=np.inf)),
     )  # fmt: skip

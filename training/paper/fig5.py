@@ -90,7 +90,7 @@ def _visibility(env: ExplorationEnv) -> Fig5:
     episode, sight = env.episode, env.config.landmark_sensor
     marks, poses = env.world.landmarks, env.true_poses
     assert marks is not None
-    assert isinstance(episode.setting.sensor, LandmarkSensor)
+    assert isinstance(episode.scenario.sensor, LandmarkSensor)
     nowhere = np.array([[1e6, 1e6, 1e6 + 1.0, 1e6]])  # a wall that hides nothing
     view, radius = view_limits(sight.camera, sight.max_incidence), env.config.robot_radius
     in_view = np.vstack([visible_landmarks(pose[None], marks, nowhere, radius, view) for pose in poses])
@@ -100,7 +100,7 @@ def _visibility(env: ExplorationEnv) -> Fig5:
     return Fig5(
         walls=env.world.walls, landmarks=marks.positions, poses=poses,
         paths=np.array(episode.true_path)[:, :, :2].transpose(1, 0, 2), half_fov=sight.camera.half_fov,
-        max_range=sight.camera.max_range, in_view=in_view, seen=episode.setting.sensor.visible(poses),
+        max_range=sight.camera.max_range, in_view=in_view, seen=episode.scenario.sensor.visible(poses),
         measured=measured,
     )  # fmt: skip
 

@@ -99,7 +99,7 @@ def replay_team(
     flat = np.zeros((len(log.subjects), 3))
     if log.positions is not None:
         flat[:, :2] = log.positions
-    ledger = GroundTruthAssociation(len(robots), flat, np.ones(len(flat), dtype=np.bool_), cutoff=1.0)
+    ground_truth = GroundTruthAssociation(len(robots), flat, np.ones(len(flat), dtype=np.bool_), cutoff=1.0)
     paths = np.zeros((len(robots), num_steps, 3))
     merges: list[Merge] = []
     attempts, seconds, rejuvenations = 0, 0.0, RejuvenationCount()
@@ -123,12 +123,12 @@ def replay_team(
                 joined = [
                     _common_landmarks(new, maps[side]) for side, new in zip(sides, team.merged_maps(event), strict=True)
                 ]
-                claims = [ledger.true_ids(side[0], own.ids) for side, own in zip(sides, joined, strict=True)]
+                claims = [ground_truth.true_ids(side[0], own.ids) for side, own in zip(sides, joined, strict=True)]
                 merges.append(Merge(since, event, joined[0], joined[1], claims[0], claims[1]))
             if event.kind == "undo":
                 when = float(readings.times[step] - readings.times[0])
                 merges = [replace(m, undone=when) if m.event.alignment is event.alignment else m for m in merges]
-        ledger.record(report, rows)
+        ground_truth.record(report, rows)
         for robot in robots:
             paths[robot, step] = team.pose_from_start(robot).mean
         on_step((step + 1) / num_steps, report)
@@ -137,7 +137,7 @@ def replay_team(
     return Replay(
         times=readings.times, paths=paths, reckoned=np.array([own.reckoned for own in readings.robots]),
         maps=tuple(own.moved(frame) for own, frame in zip(maps_of, frames, strict=True)),
-        claims=tuple(ledger.true_ids(robot, maps_of[robot].ids) for robot in robots), start_from_group=frames,
+        claims=tuple(ground_truth.true_ids(robot, maps_of[robot].ids) for robot in robots), start_from_group=frames,
         groups=team.groups, merges=tuple(merges), attempts=attempts, pairs=None if config.alone else team.pair_attempts,
         rejuvenations=rejuvenations.to_mapping(), consistency=tuple(map(team.consistency, robots)), seconds=seconds,
     )  # fmt: skip

@@ -84,13 +84,13 @@ class Episode:
         hook: Hook whose recorder receives the readings of each tick, including the reset.
 
     Attributes:
-        setting: Scenario of the episode.
+        scenario: Scenario of the episode.
         world: Walls and landmarks.
         true_starts: (K, 3) float64 [m, m, rad], world frame. Start poses.
         belief_seed: Seed of the team's beliefs.
         body: Hardware of the robots.
         belief: Beliefs of the team.
-        ledger: Ground-truth association of the estimated landmarks.
+        ground_truth: Ground-truth association of the estimated landmarks.
         tick: Ticks since the reset.
         readings: Readings of the last tick; unset before `begin`.
         true_path: True poses (K, 3) after each tick, world frame; read-only.
@@ -132,10 +132,10 @@ class Episode:
 
     def _load_scenario(self, scenario: Scenario) -> None:
         """Initialise the simulator, the ground truth and the random streams from a scenario."""
-        self.setting = scenario
+        self.scenario = scenario
         self.world, self.true_starts, self.belief_seed = scenario.world, scenario.true_starts, scenario.belief_seed
         self._simulator = Simulator(scenario.world, scenario.true_starts, self._config.robot_radius, TICK)
-        self.ledger = scenario.new_ground_truth(self._config.map_error_cutoff)
+        self.ground_truth = scenario.new_ground_truth(self._config.map_error_cutoff)
         self._coverage = CoverageTracker(scenario.coverage)
         for name, state in scenario.stream_states.items():
             self._streams[name].bit_generator.state = state
@@ -148,7 +148,7 @@ class Episode:
     def given_scenario(self) -> Scenario | None:
         """Scenario object of the last restored state, for recognising it again; None if it no longer exists.
 
-        The episode itself uses `setting`, which may be a rebuilt copy.
+        The episode itself uses `scenario`, which may be a rebuilt copy.
         """
         return self._given()
 
@@ -173,7 +173,7 @@ class Episode:
         if simulator.step(commands):
             self._collisions = tuple(map(add, self._collisions, simulator.bumped.tolist()))
         self.tick += 1
-        self._perceive(read_odometry(before, simulator.poses, self.setting.bias, noise, stream, self._distances))
+        self._perceive(read_odometry(before, simulator.poses, self.scenario.bias, noise, stream, self._distances))
         if self._integrates:
             self._score(simulator.poses)
             self._error_integrals += self._map_errors * TICK
@@ -198,12 +198,12 @@ class Episode:
     def get_state(self) -> dict[str, Any]:
         """Return the complete state of the episode; shared arrays are read-only."""
         return {
-            "setting": self.setting,
+            "setting": self.scenario,
             "tick": self.tick,
             "simulator": self._simulator.get_state(),
             "streams": {name: stream.bit_generator.state for name, stream in self._streams.items()},
             "belief": self.belief.get_state(),
-            "ledger": self.ledger.get_state(),
+            "ledger": self.ground_truth.get_state(),
             "coverage": self._coverage.get_state(),
             "counts": (self._collisions, self._distances.copy(), self._error_integrals.copy()),
             "last": with_read_only((self.readings, self._frames)),
@@ -213,13 +213,13 @@ class Episode:
     def set_state(self, state: Mapping[str, Any], scenario: Scenario) -> None:
         """Restore a validated state of `get_state` and its scenario."""
         self._given = ref(state["setting"])
-        if scenario is not self.setting:
+        if scenario is not self.scenario:
             self._load_scenario(scenario)
         self._simulator.set_state(state["simulator"])
         for name, stream in state["streams"].items():
             self._streams[name].bit_generator.state = stream
         self.belief.set_state(state["belief"])
-        self.ledger.set_state(state["ledger"])
+        self.ground_truth.set_state(state["ledger"])
         self._coverage.set_state(state["coverage"])
         self.tick = state["tick"]
         self._collisions, self._distances[:], self._error_integrals[:] = state["counts"]
@@ -234,13 +234,13 @@ class Episode:
     def _score(self, poses: FloatArray) -> None:
         """Score all maps and poses, given the true poses (K, 3), into the first rows of the metrics."""
         belief = self.belief
-        self.ledger.score(belief.map_summaries, belief.points, self.true_starts, poses, self._figures)
+        self.ground_truth.score(belief.map_summaries, belief.points, self.true_starts, poses, self._figures)
 
     def _perceive(self, odometry: FloatArray | None) -> None:
         """Read the sensors at the true poses and update the beliefs and the ground-truth association."""
         config, poses = self._config, self._simulator.poses
-        self._frames = frames = self.setting.sensor.measure(poses, self._streams["sensor"])
-        scans = self.setting.scan.measure(poses, self._streams["scan"])
+        self._frames = frames = self.scenario.sensor.measure(poses, self._streams["sensor"])
+        scans = self.scenario.scan.measure(poses, self._streams["scan"])
         in_contact = None if self._all_hear_all else self._contacts(poses)
         self.readings = TeamReadings(
             odometry,
@@ -255,7 +255,7 @@ class Episode:
         if self._tap.recorder is not None:
             self._tap.recorder(self.readings.per_robot())
         report = self.belief.step(self.readings)
-        self.ledger.record(report, frames.names)
+        self.ground_truth.record(report, frames.names)
         for id_map in report.id_maps:
             self.merge_ticks.append((self.tick, id_map.robots_a, id_map.robots_b))
         if config.oracle_merge:
@@ -282,7 +282,7 @@ class Episode:
                     self._true_ids(a), self._true_ids(b), self.true_starts[a[0]], self.true_starts[b[0]]
                 )
                 if alignment is not None:
-                    self.ledger.merge(self.belief.merge(*robots, alignment, known=True))
+                    self.ground_truth.merge(self.belief.merge(*robots, alignment, known=True))
                     self.merge_ticks.append((self.tick, a, b))
                     merged = True
                     break
@@ -290,4 +290,4 @@ class Episode:
     def _true_ids(self, group: tuple[int, ...]) -> IntArray:
         """Return the true landmark of each row of a group's filter map."""
         robot = self.belief.representative(group)
-        return self.ledger.true_ids(robot, self.belief.filter_map(robot).ids)
+        return self.ground_truth.true_ids(robot, self.belief.filter_map(robot).ids)

@@ -26,7 +26,16 @@ def _returned_arrays(env: ExplorationEnv, results: Any) -> list[Any]:
     rows = [{f.name: getattr(b, f.name) for f in dataclasses.fields(b) if f.name != "grid"} for b in beliefs]
     truth = [env.true_poses, env.true_start_poses, env.true_landmarks, env.state(), env.episode.true_path[-1]]
     episode = [env.episode.readings, env.episode.frames, env.episode.true_poses]
-    return [results, rows, [belief.map for belief in beliefs], truth, episode, env.readings, env.events, env._standing]
+    return [
+        results,
+        rows,
+        [belief.map for belief in beliefs],
+        truth,
+        episode,
+        env.readings,
+        env.events,
+        env._team_metrics,
+    ]
 
 
 def _arrays(nest: Any) -> Iterator[np.ndarray]:

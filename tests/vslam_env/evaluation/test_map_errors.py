@@ -35,44 +35,44 @@ def _ids(*values: int) -> IntArray:
 def _report(created: tuple[IntArray, ...], renamings: tuple[LandmarkIdMap, ...] = ()) -> TeamReport:
     robots = tuple(range(len(created)))
     entries = (*(LandmarksCreated(r, r, 0, ids) for r, ids in enumerate(created) if len(ids)), *renamings)
-    findings = Associations.from_arrays(created, created)
-    return TeamReport(0, findings, tuple((r,) for r in robots), (), renamings, robots, entries, 1)
+    associations = Associations.from_arrays(created, created)
+    return TeamReport(0, associations, tuple((r,) for r in robots), (), renamings, robots, entries, 1)
 
 
 def _map(means: np.ndarray, ids: IntArray) -> LandmarkMap:
     return LandmarkMap(means, np.tile(np.eye(3), (len(means), 1, 1)), np.zeros((len(means), 2)), ids=ids)
 
 
-def _ledger() -> GroundTruthAssociation:
+def _ground_truth() -> GroundTruthAssociation:
     """Return books of two robots: the first holds 0, 1 and a false point, the second 1, 3 and what does not count."""
-    ledger = GroundTruthAssociation(2, TRUTHS, COUNTABLE, 1.0)
-    ledger.record(_report((_ids(0, 1, -1, 2), _ids(0, 1, 2))), [_ids(0, 1, 3, -1), _ids(1, 3, 2)])
-    return ledger
+    ground_truth = GroundTruthAssociation(2, TRUTHS, COUNTABLE, 1.0)
+    ground_truth.record(_report((_ids(0, 1, -1, 2), _ids(0, 1, 2))), [_ids(0, 1, 3, -1), _ids(1, 3, 2)])
+    return ground_truth
 
 
 def _score(
-    ledger: GroundTruthAssociation, robot: int, held: LandmarkMap, world_from_group: np.ndarray
+    ground_truth: GroundTruthAssociation, robot: int, held: LandmarkMap, world_from_group: np.ndarray
 ) -> SimpleNamespace:
     """Score one robot's map, the others having none."""
-    robots = len(ledger.get_state()["map_of"])
+    robots = len(ground_truth.get_state()["map_of"])
     maps, poses = [LandmarkMap.empty(2)] * robots, np.zeros((robots, 3))
     maps[robot], poses[robot] = held, world_from_group
     outlines = TeamMapSummaries.from_maps([each.summary for each in maps])
-    standing = scored(ledger, outlines, standing_at(poses), np.zeros((robots, 3)), np.zeros((robots, 3)))
-    return SimpleNamespace(**{name: getattr(standing, name)[robot] for name in MAP_SCORES})
+    scores = scored(ground_truth, outlines, standing_at(poses), np.zeros((robots, 3)), np.zeros((robots, 3)))
+    return SimpleNamespace(**{name: getattr(scores, name)[robot] for name in MAP_SCORES})
 
 
 def test_claims_follow_creation() -> None:
     """A landmark claims the true one whose measurement created it: -1 if that was false, -2 if it does not count."""
-    ledger = _ledger()
-    assert ledger.true_ids(0, _ids(0, 1, 2)).tolist() == [0, 1, -1]
-    assert ledger.true_ids(1, _ids(2, 1, 0)).tolist() == [-2, 2, 1]  # of the four that count, 3 is the third
+    ground_truth = _ground_truth()
+    assert ground_truth.true_ids(0, _ids(0, 1, 2)).tolist() == [0, 1, -1]
+    assert ground_truth.true_ids(1, _ids(2, 1, 0)).tolist() == [-2, 2, 1]  # of the four that count, 3 is the third
 
 
 def test_maps_are_scored_where_robots_believe_them_to_be() -> None:
     """From the true start on; whatever the order of the parts, and whether robots share one."""
     rng = np.random.default_rng(100)
-    ledger = _ledger()
+    ground_truth = _ground_truth()
     starts, true_starts = rng.uniform(-2.0, 2.0, (2, 2, 3))
     held = [_map(rng.normal(TRUTHS[:3], 0.1), np.arange(3)), _map(rng.normal(TRUTHS[:2], 0.1), np.arange(2))]
     there = inverse(compose(true_starts, starts))
@@ -81,15 +81,15 @@ def test_maps_are_scored_where_robots_believe_them_to_be() -> None:
     ]
     rows, parts = TeamMapSummaries.from_maps(outlines[::-1])
     nowhere = np.zeros((2, 3))
-    scores = scored(ledger, TeamMapSummaries(rows, parts[::-1].copy()), standing_at(starts), true_starts, nowhere)
+    scores = scored(ground_truth, TeamMapSummaries(rows, parts[::-1].copy()), standing_at(starts), true_starts, nowhere)
     for robot in range(2):
-        expected = vars(_score(ledger, robot, held[robot], np.zeros(3)))
+        expected = vars(_score(ground_truth, robot, held[robot], np.zeros(3)))
         for name in MAP_SCORES:
             np.testing.assert_allclose(getattr(scores, name)[robot], expected[name], atol=1e-12)
-    ledger.merge(LandmarkIdMap((0,), (1,), np.array([[0, 1], [1, 3], [2, 4]]), (0, 1, 2)))
+    ground_truth.merge(LandmarkIdMap((0,), (1,), np.array([[0, 1], [1, 3], [2, 4]]), (0, 1, 2)))
     joint = TeamMapSummaries(rows, np.array([parts[1], parts[1]]))
-    scores = scored(ledger, joint, standing_at(starts[[0, 0]]), true_starts[[0, 0]], nowhere)
-    expected = vars(_score(ledger, 0, held[0], np.zeros(3)))
+    scores = scored(ground_truth, joint, standing_at(starts[[0, 0]]), true_starts[[0, 0]], nowhere)
+    expected = vars(_score(ground_truth, 0, held[0], np.zeros(3)))
     for robot in range(2):
         for name in MAP_SCORES:
             np.testing.assert_allclose(getattr(scores, name)[robot], expected[name], atol=1e-12)
@@ -97,15 +97,15 @@ def test_maps_are_scored_where_robots_believe_them_to_be() -> None:
 
 def test_claims_follow_a_merge() -> None:
     """At a merge landmarks of a keep their claims, fused ones too, and those of b bring theirs under their new ids."""
-    ledger = _ledger()
-    ledger.merge(LandmarkIdMap((0,), (1,), np.array([[0, 1], [1, 3], [2, 4]]), (0, 1, 2)))
-    assert ledger.true_ids(0, _ids(0, 1, 2, 3, 4)).tolist() == [0, 1, -1, 2, -2]
+    ground_truth = _ground_truth()
+    ground_truth.merge(LandmarkIdMap((0,), (1,), np.array([[0, 1], [1, 3], [2, 4]]), (0, 1, 2)))
+    assert ground_truth.true_ids(0, _ids(0, 1, 2, 3, 4)).tolist() == [0, 1, -1, 2, -2]
 
 
 def test_books_follow_their_maps() -> None:
     """Whatever is copied, dropped or filled, a map claims what its landmarks were created as; so from a snapshot on."""
     rng = np.random.default_rng(8)
-    ledger, numbers = GroundTruthAssociation(2, TRUTHS, COUNTABLE, 1.0), [0, 1]
+    ground_truth, numbers = GroundTruthAssociation(2, TRUTHS, COUNTABLE, 1.0), [0, 1]
     plain: dict[int, dict[int, int]] = {0: {}, 1: {}}
     for turn in range(2, 200):
         into, step = int(rng.choice(numbers)), 2 * turn
@@ -121,22 +121,22 @@ def test_books_follow_their_maps() -> None:
         if len(numbers) > 4:
             entries.append(MapReleased(numbers.pop(0)))
         maps = tuple(rng.choice(numbers, 2).tolist())
-        findings = Associations.from_arrays([ids, _ids()], [ids, _ids()])
-        report = TeamReport(step, findings, ((0,), (1,)), (), (), maps, tuple(entries), step + 1)
-        ledger.record(report, [true_ids, _ids()])
+        associations = Associations.from_arrays([ids, _ids()], [ids, _ids()])
+        report = TeamReport(step, associations, ((0,), (1,)), (), (), maps, tuple(entries), step + 1)
+        ground_truth.record(report, [true_ids, _ids()])
         if turn % 50 == 0:
-            state, ledger = ledger.get_state(), GroundTruthAssociation(2, TRUTHS, COUNTABLE, 1.0)
-            ledger.set_state(state)
+            state, ground_truth = ground_truth.get_state(), GroundTruthAssociation(2, TRUTHS, COUNTABLE, 1.0)
+            ground_truth.set_state(state)
         for robot, number in enumerate(maps):
             expected = plain[number]
-            assert ledger.true_ids(robot, np.array([*expected], np.int64)).tolist() == [*expected.values()]
+            assert ground_truth.true_ids(robot, np.array([*expected], np.int64)).tolist() == [*expected.values()]
 
 
 def test_a_fused_false_landmark_stays_false() -> None:
     """What a false point created is false, even if the other map's landmark fused into it was a true one."""
-    ledger = _ledger()
-    ledger.merge(LandmarkIdMap((0,), (1,), np.array([[0, 2], [1, 3], [2, 4]]), (0, 1, 2)))
-    assert ledger.true_ids(0, _ids(2)).tolist() == [-1]
+    ground_truth = _ground_truth()
+    ground_truth.merge(LandmarkIdMap((0,), (1,), np.array([[0, 2], [1, 3], [2, 4]]), (0, 1, 2)))
+    assert ground_truth.true_ids(0, _ids(2)).tolist() == [-1]
 
 
 def test_scores_agree_with_the_metrics() -> None:
@@ -145,24 +145,26 @@ def test_scores_agree_with_the_metrics() -> None:
     for _ in range(50):
         truths, countable = rng.uniform(-5.0, 5.0, (9, 3)), rng.random(9) < 0.8
         countable[0] = True
-        ledger = GroundTruthAssociation(1, truths, countable, 0.8)
+        ground_truth = GroundTruthAssociation(1, truths, countable, 0.8)
         held = rng.integers(-1, 9, 13)
         ids = np.arange(13)
-        ledger.record(_report((ids,)), [held])
+        ground_truth.record(_report((ids,)), [held])
         pose = rng.uniform(-3.0, 3.0, 3)
         means = transform_points(pose, truths[held] + rng.normal(0.0, 0.4, (13, 3)))
-        claims = ledger.true_ids(0, ids)
-        score = _score(ledger, 0, _map(means, ids), inverse(pose))
+        claims = ground_truth.true_ids(0, ids)
+        score = _score(ground_truth, 0, _map(means, ids), inverse(pose))
         placed = transform_points(inverse(pose), means)
-        matched = map_rmse(placed, ledger.true_positions, claims=claims)
-        assert np.isclose(score.map_errors, map_error(placed, claims, ledger.true_positions, 0.8))
+        matched = map_rmse(placed, ground_truth.true_positions, claims=claims)
+        assert np.isclose(score.map_errors, map_error(placed, claims, ground_truth.true_positions, 0.8))
         assert np.isclose(score.map_rmses, matched.rmse if len(matched.matched) else 0.8)
         assert np.allclose((score.map_recalls, score.map_precisions), (matched.recall, matched.precision))
-        nothing = _score(ledger, 0, LandmarkMap.empty(2), STAY)
+        nothing = _score(ground_truth, 0, LandmarkMap.empty(2), STAY)
         assert np.isclose(nothing.map_errors, 0.8 * np.sqrt(0.5))
         assert (nothing.map_rmses, nothing.map_recalls, nothing.map_precisions) == (0.8, 0.0, 0.0)
-        errors = np.linalg.norm(placed[matched.matched[:, 0]] - ledger.true_positions[matched.matched[:, 1]], axis=1)
-        assert np.isclose(score.accurate_recalls, np.count_nonzero(errors < 0.5) / len(ledger.true_positions))
+        errors = np.linalg.norm(
+            placed[matched.matched[:, 0]] - ground_truth.true_positions[matched.matched[:, 1]], axis=1
+        )
+        assert np.isclose(score.accurate_recalls, np.count_nonzero(errors < 0.5) / len(ground_truth.true_positions))
 
 
 def test_pose_errors_are_differences_of_placed_poses() -> None:
@@ -171,9 +173,9 @@ def test_pose_errors_are_differences_of_placed_poses() -> None:
     starts, estimated, true = rng.uniform(-4.0, 4.0, (3, 20, 3))
     points = standing_at(np.zeros((20, 3)))
     points.own[:], points.sigmas[:] = estimated, rng.random((20, 20))
-    ledger = GroundTruthAssociation(20, TRUTHS, COUNTABLE, 1.0)
+    ground_truth = GroundTruthAssociation(20, TRUTHS, COUNTABLE, 1.0)
     outlines = TeamMapSummaries.from_maps([LandmarkMap.empty(2).summary] * 20)
-    scores = scored(ledger, outlines, points, starts, true)
+    scores = scored(ground_truth, outlines, points, starts, true)
     placed = compose(starts, estimated)
     np.testing.assert_allclose(scores.pose_errors, np.linalg.norm(placed[:, :2] - true[:, :2], axis=1))
     np.testing.assert_allclose(scores.heading_errors, np.abs(wrap_angle(placed[:, 2] - true[:, 2])))
@@ -188,9 +190,9 @@ def test_infos_agree_with_the_own_start_frame() -> None:
         infos = env.step(turning(env.agents))[4]
         if step % 40 == 39:
             for robot, agent in enumerate(env.agents):
-                belief, ledger = env.belief(agent), env.episode.ledger
+                belief, ground_truth = env.belief(agent), env.episode.ground_truth
                 placed = belief.map.moved(env.true_start_poses[robot])
-                score = _score(ledger, robot, placed, STAY)
+                score = _score(ground_truth, robot, placed, STAY)
                 assert np.isclose(infos[agent]["map_error"], score.map_errors)
     assert any(event.kind == "merge" for event in env.events)
 

@@ -158,7 +158,7 @@ def test_robots_that_see_build_maps_of_the_walls() -> None:
         assert infos[agent]["map_rmse"] < 0.25
         assert infos[agent]["map_precision"] > 0.3
         assert infos[agent]["pose_error"] < 0.2
-    assert isinstance(env.episode.setting.sensor, StereoSensor)
+    assert isinstance(env.episode.scenario.sensor, StereoSensor)
     assert len(env.true_landmarks) > 100
 
 
@@ -206,7 +206,7 @@ def test_textures_follow_the_world_seed() -> None:
     for seed in (1, 2):
         env = _env()
         env.reset(seed=seed, options={"world_seed": 9})
-        sensor = env.episode.setting.sensor
+        sensor = env.episode.scenario.sensor
         assert isinstance(sensor, StereoSensor)
         pictures.append(np.array(sensor.textures.sums))
     np.testing.assert_array_equal(*pictures)

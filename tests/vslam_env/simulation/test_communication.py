@@ -129,7 +129,7 @@ def test_claims_are_right_through_forks_and_replays(comm_loss: float) -> None:
     episode = env.episode
     for robot, agent in enumerate(env.possible_agents):
         held = env.belief(agent).map.moved(env.true_start_poses[robot])
-        claims = episode.ledger.true_ids(robot, held.ids)
+        claims = episode.ground_truth.true_ids(robot, held.ids)
         real = claims >= 0
         distances = np.linalg.norm(held.means[real] - env.true_landmarks[claims[real]], axis=1)
         assert np.count_nonzero(real) > 15
@@ -144,7 +144,7 @@ def merged_wrongly(env: ExplorationEnv) -> MergeEvent:
     episode = env.episode
     x, y, theta = true_start_motion(env) + np.array([1.0, -0.7, 0.2])
     wrong = Alignment(True, "", x, y, theta, 1e-3 * np.eye(3), np.empty((0, 2), np.int64), 0.0)
-    episode.ledger.merge(episode.belief.merge(0, 1, wrong))
+    episode.ground_truth.merge(episode.belief.merge(0, 1, wrong))
     return env.events[-1]
 
 

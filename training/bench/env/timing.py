@@ -96,8 +96,8 @@ def play_env(env: ExplorationEnv, seed: int, steps: int) -> Play:
 
 def time_simulator(config: EnvConfig, seed: int, steps: int, warm_up: int) -> dict[str, float]:
     """Time ticks of the simulator: physics, odometry, landmark sensor and scans, without filter and observations."""
-    setting = sample_scenario(config, config.world, np.random.SeedSequence(seed).spawn(1)[0])
-    simulator = Simulator(setting.world, setting.true_starts, config.robot_radius, TICK)
+    scenario = sample_scenario(config, config.world, np.random.SeedSequence(seed).spawn(1)[0])
+    simulator = Simulator(scenario.world, scenario.true_starts, config.robot_radius, TICK)
     odometry, sensor, scan = (np.random.default_rng(seed + i) for i in range(3))
     rng = np.random.default_rng(seed)
 
@@ -105,9 +105,9 @@ def time_simulator(config: EnvConfig, seed: int, steps: int, warm_up: int) -> di
         before = simulator.poses
         simulator.step(commands)
         after = simulator.poses
-        read_odometry(before, after, setting.bias, config.odometry, odometry)
-        setting.sensor.measure(after, sensor)
-        setting.scan.measure(after, scan)
+        read_odometry(before, after, scenario.bias, config.odometry, odometry)
+        scenario.sensor.measure(after, sensor)
+        scenario.scan.measure(after, scan)
 
     commands, turn = [], np.zeros(config.num_robots)
     for _ in range(warm_up + steps):  # random drives with occasional wall contacts
