@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from agents.nearest_frontier import NearestFrontier, NearestFrontierGoals
-from agents.own import ACTION_TYPES, is_plugin, load_plugin, plugin_action_type
+from agents.plugins import ACTION_TYPES, is_plugin, load_plugin, plugin_action_type
 from agents.policy import Policy
 from agents.random_goals import RandomGoals
 from agents.random_walk import RandomWalk

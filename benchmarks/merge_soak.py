@@ -11,9 +11,9 @@ Runs are stereo runs through offices of aisles, 100 m per robot, with classes of
 points and wrong descriptors; or episodes of the environment in all world families, in which up to all landmarks have a
 twin. Numbers of robots and contacts vary between runs. A merge is false if its error exceeds 0.5 m or 5 degrees; it
 counts if it persists for 200 steps or until the end. The error of the team's estimate at that time, and the share of
-wrong pairs, are reported as well, see `merge_fates`. With `--forced` robots do not merge by themselves: once two maps
-are large enough they are merged with the wrong transform that fits them best, and the question is how many of these
-merges the team undoes, and when; `--shift 0.6` instead shifts the true transform by this distance in metres.
+wrong pairs, are reported as well, see `merge_outcomes`. With `--forced` robots do not merge by themselves: once two
+maps are large enough they are merged with the wrong transform that fits them best, and the question is how many of
+these merges the team undoes, and when; `--shift 0.6` instead shifts the true transform by this distance in metres.
 With `--world` the runs are those of `vslam run --world WORLD --seed SEED`, for all given worlds, where a folder stands
 for the floor plans in it, with `--seeds` seeds each, starting at `--first-seed`; `--minutes` ends them early.
 """
@@ -32,7 +32,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
-from merge_fates import Delay, Fates, Follower, MergeFate, RunEnd, fates, summarise
+from merge_outcomes import Delay, Follower, MergeOutcome, RunEnd, RunOutcomes, collect_outcomes, summarise
 from rich.console import Console
 
 from agents.registry import make_policy
@@ -59,7 +59,7 @@ RADIOS: tuple[dict[str, Any], ...] = ({}, {"comm_range": 8.0}, {"comm_line_of_si
 LOSES, FINDS = 0.02, 0.05  # probabilities per step that a link is lost, and restored
 ENOUGH = 20  # minimum landmarks of each map for a forced merge
 HYPOTHESES, COINCIDENCE = 2000, 0.25  # number of hypotheses and inlier distance of forced merges [-, m]
-Runs = tuple[Fates, int]  # outcomes of a run, and its number of steps
+Runs = tuple[RunOutcomes, int]  # outcomes of a run, and its number of steps
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -113,7 +113,7 @@ def make_env(seed: int, cycles: int, setting: Setting) -> ExplorationEnv:
     return ExplorationEnv(config)
 
 
-def play_environment(seed: int, cycles: int, setting: Setting) -> Fates:
+def play_environment(seed: int, cycles: int, setting: Setting) -> RunOutcomes:
     """Run one episode and return the outcomes of its merges."""
     env = make_env(seed, cycles, setting)
     rng = np.random.default_rng([seed, 18])
@@ -130,10 +130,10 @@ def play_environment(seed: int, cycles: int, setting: Setting) -> Fates:
         observations = env.step(actions)[0]
         follower.note(env.episode.tick - 1)
     alike = f"{env.config.landmarks.repeated:.0%} with a twin"
-    return fates(env.events, env.true_start_poses, seed, env.config.world, alike, env.episode.tick, follower)
+    return collect_outcomes(env.events, env.true_start_poses, seed, env.config.world, alike, env.episode.tick, follower)
 
 
-def play_world(world: str, seed: int, setting: Setting) -> Fates:
+def play_world(world: str, seed: int, setting: Setting) -> RunOutcomes:
     """Run the episode of `vslam run` in one world and return the outcomes of its merges."""
     run = RunConfig(world=world, seed=seed)
     belief = {"merging": setting.merging, "filter": setting.filter}
@@ -150,7 +150,7 @@ def play_world(world: str, seed: int, setting: Setting) -> Fates:
     record = run_episode(env, run.make_policies(env), seed, note)
     assert follower is not None
     name = Path(world).stem
-    found, late, end = fates(env.events, env.true_start_poses, seed, name, "", env.episode.tick, follower)
+    found, late, end = collect_outcomes(env.events, env.true_start_poses, seed, name, "", env.episode.tick, follower)
     return found, late, replace(end, ate_m=score_episode(record)["team"]["ate_aligned_m"])
 
 
@@ -183,7 +183,7 @@ def play_named(minutes: float, first_seed: int, worlds: Sequence[str], seeds: in
                 yield play_world(world, seed, setting), RunConfig().num_steps
 
 
-def play_aisles(seed: int, cycles: int, setting: Setting) -> Fates:
+def play_aisles(seed: int, cycles: int, setting: Setting) -> RunOutcomes:
     """Run a team on one stereo run of `cycles` steps and return the outcomes of its merges."""
     rng = np.random.default_rng([seed, 17])
     robots, look_alikes = int(rng.integers(2, 5)), int(rng.integers(1, 4))
@@ -213,7 +213,7 @@ def play_aisles(seed: int, cycles: int, setting: Setting) -> Fates:
         if setting.forced and not team.events and min(len(team.map(robot)) for robot in range(2)) >= ENOUGH:
             team.merge(0, 1, forced_alignment(starts, team.map(0), team.map(1), rng, setting.shift))
         follower.note(step)
-    return fates(team.events, starts, seed, "aisles", f"classes of {look_alikes}", run.num_steps, follower)
+    return collect_outcomes(team.events, starts, seed, "aisles", f"classes of {look_alikes}", run.num_steps, follower)
 
 
 def force(env: ExplorationEnv, rng: np.random.Generator, shift: float | None) -> None:
@@ -283,22 +283,22 @@ def coinciding(points_a: FloatArray, points_b: FloatArray, motion: FloatArray) -
     return np.column_stack([rows, nearest])[mutual]
 
 
-def described(merge: MergeFate) -> str:
+def describe_merge(merge: MergeOutcome) -> str:
     """Return a line about a merge."""
     if merge.undone_after is None:
-        fate = (
+        outcome = (
             f"in force, error {merge.later_m:.2f} m {merge.later_deg:.1f} deg later, {merge.end_m:.2f} m "
             f"{merge.end_deg:.1f} deg at the end"
         )
     else:
-        fate = (
+        outcome = (
             f"undone after {merge.undone_after} steps, {'correctly' if merge.is_rightly_undone else 'WRONGLY'}, "
             f"error {merge.undone_m:.2f} m {merge.undone_deg:.1f} deg then"
         )
     return (
         f"seed {merge.seed} {merge.world} ({merge.alike}): {merge.robots_a} + {merge.robots_b} at "
         f"{merge.step}, error {merge.error_m:.2f} m {merge.error_deg:.1f} deg"
-        f"{', FALSE' if merge.is_false else ''}, uncertainty {merge.doubt:.2f}, {merge.moved:.0%} moved, {fate}"
+        f"{', FALSE' if merge.is_false else ''}, uncertainty {merge.doubt:.2f}, {merge.moved:.0%} moved, {outcome}"
     )
 
 
@@ -344,7 +344,7 @@ def main(
         min_sigmas_on_trial=min_sigmas_on_trial,
     )  # fmt: skip
     console = Console(highlight=False, soft_wrap=True)
-    merges: list[MergeFate] = []
+    merges: list[MergeOutcome] = []
     late: list[Delay] = []
     ends: list[RunEnd] = []
     steps = 0
@@ -355,7 +355,7 @@ def main(
     for (found, delayed, end), length in runs:
         merges, late, ends, steps = merges + found, late + delayed, [*ends, end], steps + length
         for merge in found:
-            console.print(described(merge))
+            console.print(describe_merge(merge))
         if len(end.groups) > 1:
             console.print(f"seed {end.seed} {end.world}: groups {end.groups} at the end")
     summary = summarise(merges, late, ends, steps)

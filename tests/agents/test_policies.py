@@ -10,7 +10,7 @@ import pytest
 
 from agents import POLICIES, make_policy
 from agents.nearest_frontier import choose_slot, patrol_goal
-from agents.own import is_plugin
+from agents.plugins import is_plugin
 from agents.registry import action_types
 from slam_backend.geometry import compose
 from vslam_env import ExplorationEnv, World, vslam_v0

@@ -41,7 +41,7 @@ def test_a_forced_false_merge_is_undone(soak: Any) -> None:
     assert math.isnan(merge.doubt)
     assert merge.undone_after is not None
     assert merge.is_rightly_undone
-    assert "correctly" in soak.described(merge)
+    assert "correctly" in soak.describe_merge(merge)
     assert (end.seed, end.world, end.last_merge, late) == (9000, "aisles", None, [])
     assert len(end.groups) > 1
     summary = soak.summarise(merges, late, [end], 120)

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.console import Console
 
-from agents.own import is_plugin
+from agents.plugins import is_plugin
 from agents.trained import MODEL_FILE
 from training.bench.config import NO_ORACLE
 from training.bench.exploration.trials import CURVES, TEAM

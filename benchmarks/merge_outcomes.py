@@ -23,7 +23,7 @@ WINDOW = 200  # steps after which a false merge counts
 
 
 @dataclass(slots=True)
-class MergeFate:
+class MergeOutcome:
     """Outcome of a merge.
 
     Attributes:
@@ -123,7 +123,7 @@ class RunEnd:
     ate_m: float = float("nan")
 
 
-Fates = tuple[list[MergeFate], list[Delay], RunEnd]
+RunOutcomes = tuple[list[MergeOutcome], list[Delay], RunEnd]
 
 
 class Follower:
@@ -202,9 +202,9 @@ def transform_error(starts: FloatArray, event: MergeEvent, motion: FloatArray) -
     return float(np.hypot(*error[:2])), float(abs(np.degrees(error[2])))
 
 
-def fates(
+def collect_outcomes(
     events: Sequence[MergeEvent], starts: FloatArray, seed: int, world: str, alike: str, steps: int, follower: Follower
-) -> Fates:
+) -> RunOutcomes:
     """Return the outcomes of the merges of a finished run, its late merges and its final state.
 
     Args:
@@ -220,7 +220,7 @@ def fates(
             undone = undone_in(events, event)
             soon = undone is not None and undone - event.step <= WINDOW
             found.append(
-                MergeFate(
+                MergeOutcome(
                     seed, world, alike, event.step, event.robots_a, event.robots_b,
                     *transform_error(starts, event, event.alignment.transform),
                     *unsmoothed_error(starts, events[:i], event),
@@ -232,7 +232,7 @@ def fates(
                 )
             )  # fmt: skip
     kept = [e.step for e in events if e.kind == "merge" and undone_in(events, e) is None]
-    return found, delays(events, seed), RunEnd(seed, world, follower.groups, max(kept, default=None))
+    return found, collect_delays(events, seed), RunEnd(seed, world, follower.groups, max(kept, default=None))
 
 
 def undone_in(events: Sequence[MergeEvent], merge: MergeEvent) -> int | None:
@@ -262,7 +262,7 @@ def unsmoothed_error(starts: FloatArray, before: Sequence[MergeEvent], merge: Me
     )
 
 
-def delays(events: Sequence[MergeEvent], seed: int) -> list[Delay]:
+def collect_delays(events: Sequence[MergeEvent], seed: int) -> list[Delay]:
     """Return the attempts of a run that were refused only because maps were smoothed."""
     found = []
     for i, event in enumerate(events):
@@ -274,7 +274,7 @@ def delays(events: Sequence[MergeEvent], seed: int) -> list[Delay]:
     return found
 
 
-def summarise(merges: list[MergeFate], late: list[Delay], ends: list[RunEnd], steps: int) -> dict[str, Any]:
+def summarise(merges: list[MergeOutcome], late: list[Delay], ends: list[RunEnd], steps: int) -> dict[str, Any]:
     """Return the summary of all runs."""
     whole = [end.last_merge for end in ends if len(end.groups) == 1 and end.last_merge is not None]
     false = [merge for merge in merges if merge.is_false]
