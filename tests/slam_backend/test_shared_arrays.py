@@ -17,7 +17,7 @@ from slam_backend.team.options import MergeOptions
 
 
 @pytest.mark.parametrize("name", SUBJECTS)
-def test_what_a_state_shares_cannot_be_written(name: str) -> None:
+def test_arrays_shared_by_a_state_are_read_only(name: str) -> None:
     """That holds for states of filters and teams, among each other as well, and for those that they are set to."""
     subject, _ = SUBJECTS[name]()
     state = subject.get_state()

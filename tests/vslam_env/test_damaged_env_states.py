@@ -138,7 +138,7 @@ def test_files_are_checked_as_states_are(way: list[Any], index: float, says: str
     assert load_state(tmp_path / "state")["version"] == state_version()
 
 
-def test_nothing_within_the_sensors_of_a_copied_state_is_believed() -> None:
+def test_arrays_of_sensors_in_a_copied_state_are_rebuilt() -> None:
     """Numbers by which kernels look up walls and landmarks are derived again from the scenario's parts."""
     env = begun()
     state = copy.deepcopy(env.get_state())
@@ -179,7 +179,7 @@ FOUND = {
 
 
 @pytest.mark.parametrize("case", FOUND.values(), ids=FOUND)
-def test_what_once_broke_plays(case: Case) -> None:
+def test_formerly_failing_environments_run(case: Case) -> None:
     """Environments in which an episode once broke, found by trials."""
     assert check(case)
 
@@ -190,13 +190,13 @@ def played(seeds: Iterable[int]) -> float:
     return sum(checked) / len(checked)
 
 
-def test_random_environments_play() -> None:
+def test_random_environments_run() -> None:
     """Nothing is raised in a step, nothing is NaN or outside its space, and all bytes repeat; most cases are played."""
     assert played(range(40)) > 0.5
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("first", range(1000, 1400, 50))
-def test_many_random_environments_play(first: int) -> None:
+def test_many_random_environments_run(first: int) -> None:
     """The same holds of many more, of which some fifty can be refused more often than played."""
     assert played(range(first, first + 50)) > 0.3

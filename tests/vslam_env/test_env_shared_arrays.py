@@ -56,7 +56,7 @@ ENVS: dict[str, Callable[[], ExplorationEnv]] = {
 
 
 @pytest.mark.parametrize("name", ENVS)
-def test_what_a_state_shares_cannot_be_written(name: str, tmp_path: Path) -> None:
+def test_arrays_shared_by_a_state_are_read_only(name: str, tmp_path: Path) -> None:
     """That holds for states of the environment, among each other as well, and for those that it is set to."""
     env = ENVS[name]()
     state = env.get_state()
@@ -70,7 +70,7 @@ def test_what_a_state_shares_cannot_be_written(name: str, tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("name", ENVS)
-def test_what_is_written_into_a_state_moves_no_environment(name: str) -> None:
+def test_writing_into_a_state_changes_no_environment(name: str) -> None:
     """An environment goes on alike when all that can be written of its state, or of one it was set to, is spoilt."""
     env = ENVS[name]()
     twins = [env.clone() for _ in range(3)]

@@ -14,7 +14,7 @@ from vslam_env.actions import DISCRETE_COMMANDS, checked_actions
 BARE = World("bare", [[0, 0, 9, 0], [9, 0, 9, 7], [9, 7, 0, 7], [0, 7, 0, 0]])
 
 
-def test_everybody_is_truncated_together() -> None:
+def test_all_agents_are_truncated_together() -> None:
     """After `max_cycles` steps, which may be assigned, all agents are truncated, none terminated, and gone."""
     env = small_env()
     env.max_cycles = 3
@@ -27,7 +27,7 @@ def test_everybody_is_truncated_together() -> None:
     assert env.agents == []
 
 
-def test_stop_at_recall_terminates_everybody() -> None:
+def test_stop_at_recall_terminates_all_agents() -> None:
     """With `stop_at_recall` all agents terminate in the step in which the poorest map holds that share."""
     env = small_env(stop_at_recall=0.03, max_cycles=300)
     env.reset(seed=1)
@@ -267,7 +267,7 @@ def test_state_holds_the_truth() -> None:
     assert np.allclose(state[12:14], [x, y], atol=1e-5)
 
 
-def test_what_is_shown_depends_on_mode_and_screen(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rendering_depends_on_mode_and_screen(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing without a mode; without a screen `human` warns once and goes on; with a (dummy) one it shows frames."""
     pytest.importorskip("pygame")
     assert small_env().render() is None
@@ -303,7 +303,7 @@ def test_scene_shows_the_truth_and_the_estimates() -> None:
         assert view.group == robot
 
 
-def test_an_environment_goes_with_its_last_name() -> None:
+def test_a_dropped_environment_is_freed_at_once() -> None:
     """Nothing keeps a dropped environment, its filters and its grids, alive until the garbage collector comes."""
     env = small_env()
     env.recorder = lambda readings: None

@@ -92,7 +92,7 @@ def test_rendering(suite: Any) -> None:
     suite.render_test(_turns)
 
 
-def test_there_and_back() -> None:
+def test_aec_and_parallel_conversions_agree() -> None:
     """The turn-based environment made parallel again gives what the parallel one gives."""
     there, back = _parallel(), aec_to_parallel(vslam_v0.raw_env(**BASE))
     seen, also = there.reset(seed=4)[0], back.reset(seed=4)[0]
@@ -104,7 +104,7 @@ def test_there_and_back() -> None:
         seen, also = there.step(actions)[0], back.step(actions)[0]
 
 
-def test_the_whole_suite_is_here(suite: Any) -> None:
+def test_the_whole_pettingzoo_suite_is_used(suite: Any) -> None:
     """What `pettingzoo.test` offers is either used above or left out for the reason at the top."""
     offered = {name for name, _ in inspect.getmembers(suite, inspect.isfunction) if name.endswith("_test")}
     used = {"api_test", "parallel_api_test", "seed_test", "parallel_seed_test", "state_test", "max_cycles_test"}

@@ -44,7 +44,7 @@ def _team_metrics(
     )
 
 
-def test_figures_go_by_their_names() -> None:
+def test_metrics_have_their_named_rows() -> None:
     """Each row of the table is what its name says."""
     metrics = _team_metrics()
     for name, figures in FIGURES.items():
@@ -109,7 +109,7 @@ def test_a_shared_reward_is_the_mean() -> None:
     assert own_infos["robot_0"]["collisions"] + own_infos["robot_1"]["collisions"] > 0
 
 
-def test_terms_of_ones_own() -> None:
+def test_custom_reward_terms() -> None:
     """An object with name, weight and a call is a term: it is added and reported under its name."""
 
     class Frugal:
@@ -231,7 +231,7 @@ def test_the_running_cost_charges_every_tick() -> None:
     assert any(event.kind == "merge" for event in many.events)
 
 
-def test_idling_costs_its_time() -> None:
+def test_idle_ticks_are_charged() -> None:
     """200 idle ticks cost the map error times 20 s where nothing is seen: c / sqrt(2) for a map of no landmarks."""
     blind = {"detection_probability": 0.0, "false_points": 0.0}
     config = small_env().config.replace(landmark_sensor=blind)

@@ -90,7 +90,7 @@ def test_a_state_goes_on_bit_by_bit(way: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("action_type", ["goal", "discrete"])
-def test_all_actions_go_on(action_type: str) -> None:
+def test_all_action_types_continue(action_type: str) -> None:
     """Ways to candidates that are under way, and discrete actions, go on bit by bit."""
     env = _begun(action_type, 6)
     twin = env.clone()
@@ -154,7 +154,7 @@ def test_a_clone_is_independent() -> None:
 
 
 @pytest.mark.slow
-def test_another_process_goes_on(tmp_path: Path) -> None:
+def test_a_state_continues_in_another_process(tmp_path: Path) -> None:
     """A state on disk goes on in another process, with other hashes and threads of BLAS, with the same bytes."""
     env = _begun()
     save_state(env.get_state(), tmp_path / "state")
@@ -291,7 +291,7 @@ def test_a_pickle_in_the_place_of_a_state_is_not_run(number: int, tmp_path: Path
     assert proof.exists()
 
 
-def test_objects_of_the_caller_are_asked_for(tmp_path: Path) -> None:
+def test_custom_objects_are_required_at_restore(tmp_path: Path) -> None:
     """A state of an environment with a world and a reward term of the caller's says which ones it needs."""
 
     class Found:
@@ -313,7 +313,7 @@ def test_objects_of_the_caller_are_asked_for(tmp_path: Path) -> None:
     assert _go_on(other, 5) == _go_on(env, 5)
 
 
-def test_what_a_file_holds_is_what_was_saved(tmp_path: Path) -> None:
+def test_a_file_restores_sharing_and_write_protection(tmp_path: Path) -> None:
     """Shared parts are shared, and arrays that cannot be written still cannot, so that no kernel is compiled again."""
     env = _begun(steps=150)
     state = env.get_state()
@@ -348,7 +348,7 @@ def test_files_are_whole_or_not_there(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(os.name != "posix", reason="modes of files are POSIX")
-def test_files_are_those_that_open_makes(tmp_path: Path) -> None:
+def test_file_permissions_follow_the_umask(tmp_path: Path) -> None:
     """Who may read the file follows from the process' umask; a pipe, a device or a folder is not replaced."""
     state = _begun(steps=1).get_state()
     pipe = tmp_path / "pipe"
@@ -374,7 +374,7 @@ def test_files_are_those_that_open_makes(tmp_path: Path) -> None:
         pytest.param({"sensor": "stereo"}, 8, marks=pytest.mark.slow),
     ],
 )
-def test_radios_eyes_and_running_costs_go_on(changes: dict[str, Any], steps: int) -> None:
+def test_lossy_radios_rendered_cameras_and_running_costs_continue(changes: dict[str, Any], steps: int) -> None:
     """Robots that lose contact, see with rendered eyes or are charged tick by tick go on bit by bit as well."""
     env = _env(**changes)
     env.reset(seed=5, options={"start_poses": MEETING})

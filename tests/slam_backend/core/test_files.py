@@ -77,7 +77,7 @@ def test_links_are_followed(write: Writer, there: bool, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("write", WRITERS)
-def test_a_fifo_stays_one(write: Writer, tmp_path: Path) -> None:
+def test_a_fifo_is_written_and_not_replaced(write: Writer, tmp_path: Path) -> None:
     """What reads a FIFO reads all that was written; it may come a little later."""
     path = tmp_path / "fifo"
     os.mkfifo(path)
@@ -103,8 +103,8 @@ def test_a_fifo_that_nothing_reads_is_refused(tmp_path: Path, monkeypatch: pytes
 
 @pytest.mark.skipif(sys.platform != "linux" or os.geteuid() != 0, reason="only root makes devices")
 @pytest.mark.parametrize("write", WRITERS)
-def test_devices_stay_devices(write: Writer, tmp_path: Path) -> None:
-    """Into a device, or a link to one, is written; a full one is refused with the reason."""
+def test_devices_are_written_and_not_replaced(write: Writer, tmp_path: Path) -> None:
+    """A device, or a link to one, is written; a full one is refused with the reason."""
     null, full, link = tmp_path / "null", tmp_path / "full", tmp_path / "link"
     try:
         os.mknod(null, 0o666 | stat.S_IFCHR, os.makedev(1, 3))
@@ -127,7 +127,7 @@ def test_devices_stay_devices(write: Writer, tmp_path: Path) -> None:
 @pytest.mark.skipif(sys.platform != "linux", reason="descriptors have names in /proc")
 @pytest.mark.parametrize("redirection", ["all.txt", "file", "pipe"])
 @pytest.mark.parametrize("name", ["/proc/self/fd/1", "/dev/fd/1", "link"])
-def test_descriptors_go_on_where_they_are(redirection: str, name: str, tmp_path: Path) -> None:
+def test_file_descriptors_are_written_at_their_offset(redirection: str, name: str, tmp_path: Path) -> None:
     """What a command writes to its own output by name stands between what it prints before and after."""
     (tmp_path / "link").symlink_to("/proc/self/fd/1")
     code = (
@@ -190,7 +190,7 @@ def test_a_file_in_a_folder_that_takes_none_is_written_in_place(tmp_path: Path) 
     folder.chmod(0o755)
 
 
-def test_a_file_of_another_keeps_its_owner(tmp_path: Path) -> None:
+def test_a_file_of_another_user_keeps_its_owner(tmp_path: Path) -> None:
     """A file that may be written, and whose owner a rename would change, is written in place."""
     if os.geteuid() != 0:
         pytest.skip("only root makes files of others")
@@ -276,7 +276,9 @@ def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path) -> None:
         ("none/file", r"path: expected a file that can be written, .* says: No such file or directory\."),
     ],
 )
-def test_what_is_no_file_is_refused(path: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_path_that_is_not_a_file_is_refused(
+    path: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """One line says what cannot be written and why; nothing is changed."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "loop").symlink_to("loop")

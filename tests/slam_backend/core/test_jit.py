@@ -38,8 +38,8 @@ def test_kernels_that_work_in_place_can_make_no_array(compiled: Callable[[Any], 
         python_entry(compiled(makes_one))(1.0)
 
 
-def test_kernels_that_count_may_call_those_that_do_not_and_the_other_way_round() -> None:
-    """What is not counted by one is none of the other's business."""
+def test_reference_counting_and_non_counting_kernels_may_call_each_other() -> None:
+    """Reference counts of one kernel do not depend on the other."""
 
     def add_one(row: Any) -> None:
         for i in range(len(row)):
@@ -59,8 +59,8 @@ def test_kernels_that_count_may_call_those_that_do_not_and_the_other_way_round()
     assert row.tolist() == [8.0, 8.0]
 
 
-def test_references_are_counted_everywhere_where_numba_does_not_know_better(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Kernels then work as before, and may do more."""
+def test_references_are_counted_if_numba_lacks_the_option(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Kernels then give the same results, and may allocate arrays."""
     monkeypatch.setattr(_jit, "HAS_NRT_OPTION", False)
 
     def makes_one(x: float) -> float:
@@ -69,8 +69,8 @@ def test_references_are_counted_everywhere_where_numba_does_not_know_better(monk
     assert _jit.in_place(makes_one)(2.0) == 6.0
 
 
-def test_rooms_of_a_kernel_are_apart_and_stay_through_its_loops() -> None:
-    """A loop does not take more room in each turn, and what it wrote last time is still there."""
+def test_stack_arrays_of_a_kernel_are_distinct_and_persist_through_loops() -> None:
+    """A loop allocates its array once, and keeps its content between iterations."""
 
     def fill(out: Any) -> None:
         one, other = _jit.stack_array(5), _jit.stack_array(3)
@@ -89,8 +89,8 @@ def test_rooms_of_a_kernel_are_apart_and_stay_through_its_loops() -> None:
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.int32, np.int64, np.float32, np.float64])
-def test_rooms_hold_numbers_of_any_type(dtype: Any) -> None:
-    """They are laid out one behind the other, and wrap around as numbers of that type do."""
+def test_stack_arrays_hold_numbers_of_any_type(dtype: Any) -> None:
+    """Elements are contiguous, and overflow as numbers of their type do."""
 
     def fill(out: Any) -> None:
         row = _jit.stack_array_of(7, dtype)
@@ -105,8 +105,8 @@ def test_rooms_hold_numbers_of_any_type(dtype: Any) -> None:
     assert out.tolist() == expected.tolist()
 
 
-def test_the_size_of_a_room_is_a_constant() -> None:
-    """The stack has no room of a size that compilation does not know."""
+def test_the_size_of_a_stack_array_is_a_constant() -> None:
+    """A size that is unknown when the kernel is compiled is refused."""
 
     def fill(size: int) -> float:
         return float(_jit.stack_array(size)[0])
@@ -115,7 +115,7 @@ def test_the_size_of_a_room_is_a_constant() -> None:
         _jit.in_place(fill)(3)
 
 
-def test_the_result_of_a_kernel_does_not_depend_on_which_kernel_asks_for_it_first() -> None:
+def test_the_result_of_a_kernel_does_not_depend_on_its_first_caller() -> None:
     """A division by zero raises in a strict kernel, even if a lane kernel, where it gives inf, called it first."""
 
     def quotient(x: float, y: float) -> float:
@@ -252,7 +252,7 @@ def test_a_second_warm_up_finds_everything_compiled() -> None:
     assert warm_up(everything=True) == 0.0
 
 
-def test_a_watch_hears_of_our_kernels_only() -> None:
+def test_compilation_progress_reports_only_kernels_of_this_project() -> None:
     """A kernel of this project is announced once, with its parts; those of others, and what is compiled, are not."""
     told: list[str] = []
     kernel, foreign = _kernel("slam_backend.somewhere"), _kernel("somebody.else")
@@ -267,7 +267,7 @@ def test_a_watch_hears_of_our_kernels_only() -> None:
     assert once == watch.seconds > 0.0
 
 
-def test_users_of_the_library_read_of_it_in_the_log() -> None:
+def test_compilations_are_logged() -> None:
     """The first compilation of a process is logged with level INFO, each one with DEBUG; nothing is printed."""
     code = """
 import logging, numba, slam_backend
@@ -294,19 +294,19 @@ def classes_of(hint: Any) -> set[type]:
     "described",
     [FastSlam.__init__, FastSlam.step, FastSlam.rejuvenate, FilterOptions, StepReport, TeamSlam.__init__],
 )
-def test_what_a_filter_takes_and_tells_needs_no_inner_module(described: Any) -> None:
-    """Whatever is to be built, or comes back, is a name of `slam_backend`."""
+def test_arguments_and_results_of_a_filter_are_public_names(described: Any) -> None:
+    """Every argument and result type is a name of `slam_backend`."""
     found = set().union(*(classes_of(hint) for hint in get_type_hints(described).values()))
     assert found
     assert {kind.__name__ for kind in found} <= set(slam_backend.__all__)
 
 
-def test_all_public_names_are_there() -> None:
-    """Nothing is promised that is missing, and the list is in order."""
+def test_all_public_names_exist_in_order() -> None:
+    """Each name in `__all__` exists, and the list is sorted."""
     assert all(hasattr(slam_backend, name) for name in slam_backend.__all__)
     assert slam_backend.__all__ == sorted(slam_backend.__all__)
 
 
-def test_a_team_report_holds_reports_by_their_public_name() -> None:
-    """What a team tells of rejuvenations is the class that the package names."""
+def test_a_team_report_holds_the_public_rejuvenation_report() -> None:
+    """The rejuvenations of a team report are of the class that the package exports."""
     assert slam_backend.RejuvenationReport in classes_of(get_type_hints(TeamReport)["rejuvenations"])

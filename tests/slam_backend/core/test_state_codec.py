@@ -84,12 +84,12 @@ def plain_values() -> st.SearchStrategy[Any]:
 
 
 @given(plain_values())
-def test_trees_come_back_bit_for_bit(tree: Any) -> None:
-    """Whatever a tree is made of comes back with its types, its order and all bits of its numbers."""
+def test_trees_round_trip_bit_for_bit(tree: Any) -> None:
+    """Containers, types, order and all bits of the numbers are preserved."""
     same(decode(encode(tree, KINDS), KINDS), tree)
 
 
-def test_what_is_shared_stays_shared() -> None:
+def test_shared_parts_stay_shared() -> None:
     """A part that stands in two places is one part afterwards; a tree that doubles at each level stays small."""
     shared = np.arange(3.0)
     first, second = decode(encode([shared, Point(shared, None)], KINDS), KINDS)
@@ -110,7 +110,7 @@ def test_arrays_keep_their_layout_and_whether_they_can_be_written() -> None:
     assert not back.flags.writeable
 
 
-def test_seed_sequences_go_on() -> None:
+def test_seed_sequences_continue() -> None:
     """A seed sequence spawns the same children afterwards, those that it has spawned before included."""
     sequence = np.random.SeedSequence(10**50, spawn_key=(1, 2))
     sequence.spawn(3)
@@ -132,14 +132,14 @@ class Stranger:
         (type("Longer", (dict,), {})(), r"Longer"),
     ],
 )
-def test_what_is_no_data_is_not_written(tree: Any, says: str) -> None:
-    """An object of another class is refused when it is written, with its place."""
+def test_objects_of_other_classes_are_refused(tree: Any, says: str) -> None:
+    """The error names the place of the object."""
     with pytest.raises(ForeignObjectError, match=says):
         encode(tree, KINDS)
 
 
-def test_a_part_that_holds_itself_is_not_written() -> None:
-    """There is no end to it."""
+def test_cyclic_containers_are_refused() -> None:
+    """A container that contains itself cannot be written."""
     loop: list[Any] = []
     loop.append(loop)
     with pytest.raises(ForeignObjectError, match="a part that holds itself"):
@@ -209,7 +209,7 @@ def test_flipped_bytes_are_refused_or_read() -> None:
             decode(content[:cut], BACKEND_KINDS)
 
 
-def test_states_of_teams_go_on_from_bytes() -> None:
+def test_states_of_teams_round_trip_through_bytes() -> None:
     """A team that is set to what bytes hold gives the same state again."""
     team = TeamSlam(2, num_particles=4)
     content = encode(team.get_state(), BACKEND_KINDS)

@@ -22,7 +22,7 @@ def tell(answers: Any, share: FloatArray) -> bool:
     return bool(test.report().warnings)
 
 
-def test_honest_filters_are_warned_of_no_more_often_than_stated() -> None:
+def test_false_alarm_rate_is_below_the_stated_bound() -> None:
     """Of 400 lives of 3,000 frames that show each sign as often as an honest filter may, at most 1 % are warned of.
 
     By Ville's inequality 4 are expected at most; more than 10 have a probability below 0.003.
@@ -37,7 +37,7 @@ def test_honest_filters_are_warned_of_no_more_often_than_stated() -> None:
 
 @pytest.mark.parametrize("sign", [0, 2, 3])
 @pytest.mark.parametrize("begins", [0, 2000])
-def test_a_filter_that_fails_is_warned_of_whenever_it_begins_to(sign: int, begins: int) -> None:
+def test_an_inconsistent_filter_is_detected_whenever_it_begins(sign: int, begins: int) -> None:
     """A sign in three frames of ten, six times the usual share, is found within 200 frames, early or late."""
     rng = np.random.default_rng(sign)
     share = np.tile(np.array(USUAL) / 2.0, (begins + 200, 1))
@@ -79,14 +79,14 @@ def test_mismatched_odometry_is_found(changes: dict[str, Any]) -> None:
     assert told[0].to_mapping()["warnings"][0]["text"] == told[0].warnings[0].text
 
 
-def test_a_cautious_filter_is_not_warned_of() -> None:
+def test_an_underconfident_filter_gives_no_warning() -> None:
     """Twice the true noise of odometry and camera is assumed: the mean NIS is far below 3, and nothing is said."""
     told = life(0, assumed=2.0).consistency
     assert told.nis_mean < 3.0
     assert told.warnings == ()
 
 
-def test_the_test_goes_on_from_a_state_and_changes_nothing_else() -> None:
+def test_the_consistency_test_continues_from_a_state() -> None:
     """A restored filter tells the same as the one that went on, and its state holds the running sums."""
     slam = life(1)
     twin = FastSlam(num_particles=3)
@@ -101,7 +101,7 @@ def test_the_test_goes_on_from_a_state_and_changes_nothing_else() -> None:
     assert twin.get_state()["consistency"] == slam.get_state()["consistency"]
 
 
-def test_what_the_caller_rejects_and_frames_without_measurements_do_not_count() -> None:
+def test_rejected_measurements_and_empty_frames_do_not_count() -> None:
     """Measurements named -1 are none, and a step without any is no frame."""
     simulation = SimulatedTeam(1, 0)
     slam = FastSlam(num_particles=7)
@@ -112,7 +112,7 @@ def test_what_the_caller_rejects_and_frames_without_measurements_do_not_count() 
     assert slam.consistency.frames == 0
 
 
-def test_diagnostics_tell_of_each_robot_and_a_merge_remembers_warnings() -> None:
+def test_diagnostics_are_per_robot_and_a_merge_keeps_warnings() -> None:
     """A team's figures are those of the filter that a robot goes by; a joint filter keeps both sides' warnings."""
     simulation = SimulatedTeam(2, 0)
     wrong = OdometryModel(**{name: sigma / 5.0 for name, sigma in asdict(MOTION).items()})

@@ -58,7 +58,7 @@ def test_log_odds_are_bayes_rule(model: ExistenceModel, sightings: list[bool]) -
     assert probability(log_odds) == pytest.approx(joint / (joint + (1.0 - model.prior) * likelihood_false), rel=1e-9)
 
 
-def test_what_was_not_expected_tells_nothing_unless_it_is_seen() -> None:
+def test_landmarks_not_expected_in_view_change_only_when_seen() -> None:
     """A miss counts in view only, a sighting anywhere, and the cap holds."""
     for before in (-1.0, 0.5):
         assert updated_log_odds(before, False, False, 2.0, -1.5, 6.0) == before
@@ -69,7 +69,7 @@ def test_what_was_not_expected_tells_nothing_unless_it_is_seen() -> None:
 
 
 @EVERY_MODEL
-def test_a_landmark_that_is_not_there_dies_after_the_stated_number_of_misses(model: ExistenceModel) -> None:
+def test_a_false_landmark_is_deleted_after_the_stated_number_of_misses(model: ExistenceModel) -> None:
     """From the prior, from the cap and from levels between, that many misses delete it and one fewer does not."""
     sighting, miss = model.increments()
     for start in (model.log_odds_prior, 0.5 * (model.log_odds_prior + model.log_odds_cap), model.log_odds_cap):
@@ -97,21 +97,21 @@ def lives(model: ExistenceModel, seen_with: float, looks: int, runs: int, seed: 
 
 @EVERY_MODEL
 @pytest.mark.parametrize("looks", [10, 200])
-def test_a_right_landmark_survives_with_the_stated_probability(model: ExistenceModel, looks: int) -> None:
+def test_a_true_landmark_survives_with_the_stated_probability(model: ExistenceModel, looks: int) -> None:
     """Seen with probability `detection`, no more than the stated share is ever deleted; false alarm 1e-3."""
     died, _ = lives(model, model.detection, looks, 20_000, seed=100)
     assert 0 < died <= stats.binom.isf(1e-3, 20_000, model.deletion_bound(looks))
 
 
 @EVERY_MODEL
-def test_a_false_landmark_rarely_becomes_certain_and_always_dies(model: ExistenceModel) -> None:
+def test_a_false_landmark_rarely_becomes_certain_and_is_always_deleted(model: ExistenceModel) -> None:
     """Seen with probability `false_alarm`, at most the share exp(prior - cap) is ever sure, and all die; alarm 1e-3."""
     died, capped = lives(model, model.false_alarm, 300, 20_000, seed=101)
     assert capped <= stats.binom.isf(1e-3, 20_000, np.exp(model.log_odds_prior - model.log_odds_cap))
     assert died == 20_000
 
 
-def test_a_sensor_that_reports_few_points_makes_a_miss_say_less() -> None:
+def test_a_limited_number_of_measurements_weakens_a_miss() -> None:
     """With E landmarks in view and at most L reported, each is seen with d L / E; beyond use nothing is learnt."""
     model = ExistenceModel(detection=0.8, false_alarm=0.05, frame_limit=5)
     assert model.increments(5) == model.increments() == ExistenceModel().increments(1000)
@@ -146,7 +146,7 @@ def test_expected_in_view_is_what_a_smaller_camera_sees() -> None:
     assert np.any(camera.sees(camera_points) & ~expected)
 
 
-def test_a_frame_tells_of_what_some_particle_matched_or_expects_in_view() -> None:
+def test_a_frame_lists_landmarks_that_a_particle_matched_or_expects() -> None:
     """Landmarks are read through their ancestor maps, in all blocks of lanes; those just started are left out."""
     rng, count, num, best = np.random.default_rng(11), LANES + 9, 60, 3
     maps, model = ParticleMaps(count, 0.0), ExistenceModel()
@@ -226,7 +226,7 @@ def aligned() -> Alignment:
 
 @PROPOSALS
 @pytest.mark.parametrize("model", [ExistenceModel(), ExistenceModel(detection=0.4, false_alarm=0.1), HASTY])
-def test_a_landmark_that_is_never_confirmed_is_forgotten_after_so_many_misses(
+def test_an_unconfirmed_landmark_is_deleted_after_the_stated_number_of_misses(
     model: ExistenceModel, proposal: Any
 ) -> None:
     """It is held through one miss less than the model says, and nothing remains of it after that miss."""
@@ -272,7 +272,7 @@ def test_probabilities_of_existence_are_those_of_the_model() -> None:
     assert slam.existence()[1][0] == pytest.approx(model.cap)
 
 
-def test_a_sensor_that_reports_few_of_many_makes_a_miss_say_little() -> None:
+def test_a_filter_with_a_measurement_limit_keeps_unreported_landmarks() -> None:
     """Of three landmarks a sensor reports one at a time: the model that knows keeps them, the other loses one."""
     knows, does_not = standing(ExistenceModel(frame_limit=1)), standing(ExistenceModel())
     for slam in (knows, does_not):
@@ -283,7 +283,7 @@ def test_a_sensor_that_reports_few_of_many_makes_a_miss_say_little() -> None:
     assert 2 not in does_not.map().ids
 
 
-def test_a_landmark_given_up_within_a_step_keeps_its_name_in_the_report() -> None:
+def test_a_landmark_deleted_within_a_step_keeps_its_id_in_the_report() -> None:
     """The first robot starts a landmark, the second misses and the filter deletes it: the report is of what was."""
     slam = standing(HASTY, robots=3)
     report = slam.step([None] * 3, [frame(0), frame(), frame(1)])
@@ -293,8 +293,8 @@ def test_a_landmark_given_up_within_a_step_keeps_its_name_in_the_report() -> Non
     np.testing.assert_array_equal(slam.map().ids, [1])
 
 
-def test_a_filter_that_has_given_up_all_landmarks_goes_on_from_its_state() -> None:
-    """Nothing is left but what descriptors look like and the name of the next landmark."""
+def test_a_filter_without_landmarks_continues_from_its_state() -> None:
+    """Only the descriptor size and the next landmark id are left."""
     slam, twin = (standing(ExistenceModel(), resample_threshold=0.0) for _ in range(2))
     slam.step([None], [Measurements(POINTS[:1], np.eye(5, dtype=np.float32)[:1])])
     while slam.num_landmarks:
@@ -307,7 +307,7 @@ def test_a_filter_that_has_given_up_all_landmarks_goes_on_from_its_state() -> No
 
 
 @PROPOSALS
-def test_what_is_given_up_leaves_its_memory_to_others(proposal: Any) -> None:
+def test_memory_of_deleted_landmarks_is_reused(proposal: Any) -> None:
     """Two hundred landmarks, one after the other and each seen once, never need more room than a few."""
     slam = standing(ExistenceModel(), proposal=proposal, resample_threshold=0.0)
     looks = np.eye(200, dtype=np.float32)
@@ -323,7 +323,7 @@ def test_what_is_given_up_leaves_its_memory_to_others(proposal: Any) -> None:
 
 
 @pytest.mark.parametrize("delete_below", [0.01, 0.05])
-def test_landmarks_that_exist_survive_as_the_model_promises(delete_below: float) -> None:
+def test_true_landmarks_survive_as_the_model_predicts(delete_below: float) -> None:
     """Of right landmarks seen with probability d, no more are ever deleted than the bound's binomial law allows."""
     model = ExistenceModel(delete_below=delete_below)
     rng = np.random.default_rng(11)
@@ -361,7 +361,7 @@ def test_a_model_that_deletes_nothing_changes_nothing(proposal: Any) -> None:
 
 
 @pytest.mark.parametrize("particles", [(4, 4), (3, 40)])
-def test_a_merge_adds_what_both_filters_know_of_a_landmark(particles: tuple[int, int]) -> None:
+def test_a_merge_adds_the_log_odds_of_a_landmark(particles: tuple[int, int]) -> None:
     """Log-odds of landmarks in common add up, their prior counting once, up to the cap; the others stay as they are."""
     model = ExistenceModel(detection=0.6, false_alarm=0.2, prior=0.4)
     a, b = (
@@ -385,7 +385,7 @@ def test_a_merge_adds_what_both_filters_know_of_a_landmark(particles: tuple[int,
     np.testing.assert_allclose(joint.existence()[1], model.cap)
 
 
-def test_what_two_filters_together_doubt_goes_with_the_next_miss_after_their_merge() -> None:
+def test_landmarks_doubted_by_both_filters_are_deleted_at_the_next_miss() -> None:
     """A merge deletes nothing, as its ids are handed on: what both have missed is left with the least probability."""
     model = ExistenceModel()
     a, b = standing(model), standing(model)

@@ -33,7 +33,7 @@ def drive(slam: FastSlam, world: StereoWorld, steps: int, noise: float = 1.0) ->
 
 
 @PROPOSALS
-def test_moving_the_start_moves_the_answer(proposal: Any) -> None:
+def test_moving_the_start_moves_path_and_map(proposal: Any) -> None:
     """A start pose turned and shifted turns and shifts path and map, covariances included; decisions stay."""
     start = np.array([3.0, -7.0, 2.5])
     results = []
@@ -55,7 +55,7 @@ def test_moving_the_start_moves_the_answer(proposal: Any) -> None:
 @PROPOSALS
 @pytest.mark.parametrize("num_robots", [1, 2])
 @pytest.mark.parametrize("sigma", [None, 1e-6, 0.1])
-def test_no_noise_no_error(proposal: Any, num_robots: int, sigma: float | None) -> None:
+def test_no_noise_means_no_error(proposal: Any, num_robots: int, sigma: float | None) -> None:
     """Exact odometry and exact measurements give exact poses and an exact map, associations unknown.
 
     However large the noise is said to be, by the camera or by covariances of the size `sigma` [m].
@@ -164,7 +164,7 @@ def test_weights_multiply_over_the_measurements_of_a_frame(proposal: Any) -> Non
 
 
 @PROPOSALS
-def test_what_k_robots_see_together_is_what_one_sees(proposal: Any) -> None:
+def test_k_robots_make_the_map_of_one_robot_with_their_measurements(proposal: Any) -> None:
     """At equal total measurements and known poses, three robots make exactly the map of one."""
     world = StereoWorld(np.random.default_rng(2))
     together, alone = FastSlam(3, 2, world.camera, proposal=proposal), FastSlam(1, 2, world.camera, proposal=proposal)
@@ -353,7 +353,7 @@ def test_a_landmark_at_the_camera_centre_cannot_be_seen_by_the_camera(proposal: 
         ([0.1, 0.2, 3.0], 0.01, [100.0, -100.0, 3000.0]),
     ],
 )
-def test_extreme_readings_do_no_harm(proposal: Any, point: Any, noise: float | None, move: Any) -> None:
+def test_extreme_readings_leave_the_filter_valid(proposal: Any, point: Any, noise: float | None, move: Any) -> None:
     """Far points, tiny and huge covariances and long jumps, among ordinary readings, leave the filter sound."""
     covariances = None if noise is None else noise * np.eye(3)[None]
     extreme = Measurements([point], np.eye(1, 5), covariances)

@@ -92,7 +92,7 @@ def watch_one_landmark(
 
 
 @PROPOSALS
-def test_a_landmark_that_may_walk_keeps_the_variance_at_which_riccatis_recursion_stays(proposal: Any) -> None:
+def test_landmark_process_noise_gives_the_variance_of_the_riccati_recursion(proposal: Any) -> None:
     """Sightings of variance r, and q^2 added after each: P = P r / (P + r) + q^2 from r + q^2 on, and P stays."""
     sigma, q = 0.1, 0.02
     r, variance = sigma**2, sigma**2 + q**2
@@ -107,7 +107,7 @@ def test_a_landmark_that_may_walk_keeps_the_variance_at_which_riccatis_recursion
 
 
 @PROPOSALS
-def test_landmarks_stand_still_unless_a_filter_is_rejuvenated(proposal: Any) -> None:
+def test_landmark_process_noise_is_added_only_with_rejuvenation(proposal: Any) -> None:
     """By default nothing is added, to the last bit; with rejuvenation the calibrated noise is, unless another is."""
     still, default = (watch_one_landmark(proposal, 0.1, noise, 9).map().covariances for noise in (0.0, None))
     np.testing.assert_array_equal(still, default)

@@ -281,8 +281,8 @@ def test_a_landmark_that_only_the_refined_pose_can_see_is_matched() -> None:
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.7], ids=["straight", "turning"])
-def test_a_robot_without_sight_is_predicted_alike_in_a_degenerate_way(turn: float) -> None:
-    """Both filters agree after many steps without sight in which some directions, but not all, are noisy."""
+def test_a_robot_without_measurements_has_the_same_singular_covariance_in_both_filters(turn: float) -> None:
+    """Both filters agree after many steps without measurements in which some directions, but not all, are noisy."""
     motion = OdometryModel(
         sigma_along=0.1, sigma_across=0.0, sigma_heading=0.0, sigma_turn=0.05, floor_position=0.0, floor_heading=0.0
     )

@@ -73,7 +73,7 @@ def test_accumulated_weights_follow_the_ancestral_line(proposal: Any) -> None:
 
 
 @pytest.mark.parametrize("scheme", list(RESAMPLING))
-def test_a_resampled_particle_brings_along_all_that_its_parent_holds(scheme: str) -> None:
+def test_a_resampled_particle_copies_all_of_its_parent(scheme: str) -> None:
     """Poses, starts, N(x^, P^), maps and counts are those of one and the same parent, in blocks of particles or not.
 
     Robot 1 sees nothing: its Gaussians are not sampled, and go along too.
@@ -149,7 +149,7 @@ def test_weights_are_kept_until_the_particles_are_resampled() -> None:
 @PROPOSALS
 @pytest.mark.parametrize("scheme", list(RESAMPLING))
 @pytest.mark.parametrize("num_particles", [11, 70])
-def test_what_a_particle_writes_reaches_no_other(proposal: Any, scheme: str, num_particles: int) -> None:
+def test_writing_a_particle_changes_no_other_particle(proposal: Any, scheme: str, num_particles: int) -> None:
     """Where one of two siblings stands elsewhere, a step changes that particle alone, and no snapshot."""
     slam = filter_after(8, num_particles, resampling=scheme, resample_threshold=1.0, proposal=proposal)
     poses = slam.particles()[0]
@@ -199,7 +199,7 @@ def test_a_landmark_is_updated_in_the_particle_that_holds_it_only(proposal: Any,
     np.testing.assert_array_equal(slam.particles()[0], poses)
 
 
-def test_what_is_handed_out_is_the_callers() -> None:
+def test_returned_arrays_are_copies() -> None:
     """Particles, weights, poses and start poses are copies."""
     slam = filter_after(2)
     for array in (*slam.particles(), slam.weights, slam.start_pose(), *slam.pose(), *slam.pose_from_start()):
@@ -272,7 +272,7 @@ def arrays_in(nest: Any) -> list[Any]:
 
 
 @PROPOSALS
-def test_a_snapshot_shares_nothing_that_can_be_written(proposal: Any) -> None:
+def test_a_snapshot_shares_no_writable_array(proposal: Any) -> None:
     """Neither steps of the filter or of one restored from it, nor writing to what they hand out, reach a snapshot."""
     slam, other = filter_after(5, proposal=proposal), FastSlam()
     state = slam.get_state()
@@ -304,7 +304,7 @@ def test_a_restored_filter_draws_from_a_stream_of_its_own(stream: Any) -> None:
         assert_same(contents(restored), expected)
 
 
-def test_landmarks_that_no_survivor_holds_are_forgotten() -> None:
+def test_landmarks_that_no_survivor_holds_are_deleted() -> None:
     """Ids are never used twice, and only landmarks that a particle holds are counted."""
     slam = filter_after(20, proposal="fastslam1", resample_threshold=1.0)
     held, _, _, counts = dense(slam)

@@ -57,7 +57,7 @@ def test_innovations_and_map_at_known_poses(proposal: Any) -> None:
     assert low < total < high
 
 
-def test_information_in_place_of_a_covariance_is_seen_at_once() -> None:
+def test_information_in_place_of_a_covariance_is_detected() -> None:
     """Algorithm 1, l. 31 *: G^-1 R G^-T is an honest covariance of a new landmark, the printed G^T R^-1 G is not.
 
     NEES of 400 new landmarks, ideal 3; false alarm 1e-3.
@@ -107,7 +107,7 @@ def test_the_reported_nis_is_the_innovation_under_its_whole_covariance(
         assert report.nis == pytest.approx(innovation @ np.linalg.solve(whole, innovation), abs=tolerance)
 
 
-def test_mixture_covariances_hold_what_the_path_may_be() -> None:
+def test_mixture_covariances_include_the_path_uncertainty() -> None:
     """Sec. 3.2 *: covariances of the best particle are conditioned on its path; those of the mixture are honest.
 
     Landmarks first seen after a long blind motion, 120 runs: mean NEES of "best" far above its dimension 3, that of

@@ -75,7 +75,7 @@ def build(num_robots: int, seed: int, **options: object) -> TeamSlam:
 @pytest.mark.parametrize("existence", [None, ExistenceModel()])
 @given(seed=st.integers(0, 10_000), data=st.data())
 @settings(max_examples=12)
-def test_a_name_is_held_once_after_every_merge_undo_and_return(
+def test_ids_are_unique_after_every_merge_undo_and_return(
     existence: ExistenceModel | None, seed: int, data: st.DataObject
 ) -> None:
     """Robots lose and find each other, merge with right or wrong pairs, and merges are undone: names stay unique."""
@@ -99,7 +99,7 @@ def test_a_name_is_held_once_after_every_merge_undo_and_return(
                 check_unique(branch.filter)
 
 
-def test_a_false_merge_of_named_landmarks_is_undone_with_all_names_unique() -> None:
+def test_a_false_merge_of_landmarks_with_ids_is_undone_with_all_ids_unique() -> None:
     """Maps merged three metres off hold each name once, while the merge stands and when it is undone."""
     hall = Hall(2, 0)
     undone_soon = MergeOptions(watch_every=5, max_deformed=0.0)
@@ -136,7 +136,7 @@ def test_a_named_landmark_predicted_behind_the_camera_starts_no_second_one(kind:
 
 @pytest.mark.parametrize("proposal", ["fastslam1", "fastslam2"])
 @pytest.mark.parametrize("kind", [FastSlam, ReferenceFastSlam])
-def test_a_name_given_twice_in_a_frame_starts_one_landmark(kind: Any, proposal: str) -> None:
+def test_an_id_given_twice_in_a_frame_starts_one_landmark(kind: Any, proposal: str) -> None:
     """Of two measurements of one name that no landmark has yet, the first begins it and the other is rejected."""
     slam = filter_of(kind, proposal)
     frame = Measurements([[0.0, 0.0, 2.0], [0.5, 0.0, 3.0]], np.eye(2, 4, dtype=np.float32))

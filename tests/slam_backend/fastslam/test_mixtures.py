@@ -60,7 +60,7 @@ def test_the_kernel_agrees_with_plain_sums() -> None:
             assert len(plain) > (7 if least == 1 else 0)
 
 
-def test_to_ask_for_a_mixture_changes_nothing() -> None:
+def test_computing_a_mixture_changes_nothing() -> None:
     """Maps that wait to be brought up to date still wait afterwards."""
     slam = filter_with_gaps(33, 8)
     before = slam.state.maps.get_state()
@@ -71,8 +71,8 @@ def test_to_ask_for_a_mixture_changes_nothing() -> None:
         np.testing.assert_array_equal(after[name], before[name])
 
 
-def test_what_no_particle_holds_is_not_read() -> None:
-    """Places that no count vouches for may hold anything at all."""
+def test_slots_that_no_particle_holds_are_not_read() -> None:
+    """Slots with a count of zero may hold any values."""
     slam = filter_with_gaps(33, 9)
     asked = slam.state.maps, slam.best_particle, slam.state.log_weights, SCATTER, 1
     before = map_mixture(*asked)
@@ -112,7 +112,7 @@ def test_the_gather_agrees_with_fancy_indexing() -> None:
             np.testing.assert_array_equal(ids, maps.ids[slots[held]])
 
 
-def test_an_outline_is_that_of_the_map() -> None:
+def test_a_map_summary_agrees_with_the_map() -> None:
     """It has the map's landmarks in the map's order, with the same bits, whatever the least count."""
     slam = _filter_after_some_steps()
     for least in (0, 1, 3, 9):
@@ -122,8 +122,8 @@ def test_an_outline_is_that_of_the_map() -> None:
 
 
 @pytest.mark.parametrize("room", [0, 5, 9, 100])
-def test_an_outline_tells_how_much_room_it_takes(room: int) -> None:
-    """Behind rows that are taken, and where there are too few: then none but those that there are is written."""
+def test_a_map_summary_reports_its_number_of_rows(room: int) -> None:
+    """It returns the number of rows that are needed, and writes none beyond those of the map."""
     slam = _filter_after_some_steps()
     expected = slam.map_summary(2)
     size = len(expected.ids)
@@ -280,7 +280,7 @@ def test_the_fit_agrees_with_matrices(count: int, pairs: int) -> None:
         assert found[4].min() < MIN_PAIRS <= found[4].max()
 
 
-def test_what_is_unexplained_agrees_with_newtons_method() -> None:
+def test_unexplained_variance_agrees_with_newtons_method() -> None:
     """tau^2 of each pair is what the plain rounds come to; where it is not 0, chi^2 is its degrees of freedom then."""
     common = common_landmarks(3, 15, WIDTH + 5)
     extra, shared = reduced_chi2(*common, START, 8)
@@ -299,7 +299,7 @@ def test_what_is_unexplained_agrees_with_newtons_method() -> None:
     assert not reduced_chi2(*exact, np.zeros(3), 8)[0].any()  # a map agrees with itself
 
 
-def test_landmarks_at_one_place_turn_nothing() -> None:
+def test_landmarks_at_one_place_do_not_change_the_rotation() -> None:
     """Where all that is shared lies at one place the rotation stays as it began, and nothing is infinite."""
     values, held = np.zeros((5, 9, 1)), np.ones((5, 1), np.bool_)
     values[:, [3, 6, 8]] = 0.01

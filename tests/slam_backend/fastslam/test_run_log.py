@@ -55,7 +55,7 @@ def log_of(steps: list[Step]) -> RobotLog:
 
 
 @pytest.mark.parametrize(("count", "most", "optional"), [(0, 5, 0.0), (1, 5, 1.0), (700, 5, 0.0), (300, 90, 0.02)])
-def test_what_is_logged_comes_back(count: int, most: int, optional: float) -> None:
+def test_logged_steps_are_read_back(count: int, most: int, optional: float) -> None:
     """The loop over a log yields the very steps that were appended, over chunks and empty frames, in order."""
     steps = random_steps(count, 3, most, optional)
     log = log_of(steps)
@@ -91,7 +91,7 @@ def test_flat_arrays_hold_the_same_as_the_loop(optional: float) -> None:
         np.testing.assert_array_equal(np.isnan(arrays.covariances).all(axis=1), ~by_measurement)
 
 
-def test_the_end_of_a_run_alone() -> None:
+def test_arrays_since_a_step_are_the_tail_of_all_arrays() -> None:
     """`arrays(since)` is the tail of `arrays()`, whatever the index: before, within, between steps and behind all."""
     log = log_of(random_steps(600, 6, 30))
     whole = log.arrays()
@@ -147,7 +147,7 @@ def test_finished_chunks_are_shared_and_cannot_be_written() -> None:
             array[:1] = 0
 
 
-def test_what_is_appended_is_copied() -> None:
+def test_appended_steps_are_copied() -> None:
     """The caller may use its buffers again, and a log that goes on leaves its snapshots alone."""
     points, ids, motion = np.ones((2, 3)), np.array([4, 5]), np.ones(3)
     log = RobotLog()
@@ -197,7 +197,7 @@ def test_a_frame_larger_than_a_chunk(before: int) -> None:
 
 
 @pytest.mark.parametrize(("most", "optional", "together"), [(5, 0.0, 32), (90, 0.0, 7), (300, 0.0, 32), (5, 0.1, 3)])
-def test_steps_of_a_journal_are_as_one_by_one(most: int, optional: float, together: int) -> None:
+def test_steps_of_a_journal_equal_steps_appended_one_by_one(most: int, optional: float, together: int) -> None:
     """A log that takes many robots' steps, some at a time, holds those of its own, as if they were appended."""
     count, own, rng = 3, 1, np.random.default_rng(6)
     log, expected = RobotLog(), RobotLog()
@@ -257,7 +257,7 @@ def test_a_journal_holds_what_robots_of_a_filter_did_and_measured(steps: list[li
         assert (*seen[: len(known) - 1], seen[NAME]) == known
 
 
-def test_a_filter_logs_all_that_it_was_given() -> None:
+def test_a_filter_logs_all_of_its_input() -> None:
     """Far more than a journal has room for at first, in more steps than wait; distances say which points they are."""
     slam, rng, size = FastSlam(num_particles=2), np.random.default_rng(5), ROOM // 8
     points = rng.uniform(1.0, 9.0, (LONGEST + 8, size, 3))

@@ -58,7 +58,7 @@ def said(report: StepReport) -> tuple[Any, ...]:
 
 
 @given(seeds=st.lists(st.integers(0, 10_000), min_size=1, max_size=4))
-def test_each_robot_finds_what_it_read(seeds: list[int]) -> None:
+def test_each_robot_has_its_input_in_the_table(seeds: list[int]) -> None:
     """Points are turned into robot axes, with descriptors and names beside; what is named -1 is left out."""
     readings = list(map(reading, seeds))
     inputs = checked(readings)
@@ -92,7 +92,9 @@ def test_each_robot_finds_what_it_read(seeds: list[int]) -> None:
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda inputs: pickle.loads(pickle.dumps(inputs))])
 @pytest.mark.parametrize("readings", [[NOTHING], [reading(0), reading(3), NOTHING, reading(8)]])
-def test_copies_are_as_kernels_take_them(readings: list[Reading], copied: Callable[[StepInput], StepInput]) -> None:
+def test_copies_have_the_array_types_of_the_original(
+    readings: list[Reading], copied: Callable[[StepInput], StepInput]
+) -> None:
     """A copy holds the same, and all can be written to, as in the original: kernels are compiled for such arrays."""
     inputs = checked(readings)
     twin = copied(inputs)
@@ -103,7 +105,7 @@ def test_copies_are_as_kernels_take_them(readings: list[Reading], copied: Callab
 
 
 @given(counts=st.lists(st.integers(0, 4), min_size=1, max_size=4), spoilt=st.booleans(), seed=st.integers(0, 99))
-def test_frames_in_one_piece_are_as_cut_out(counts: list[int], spoilt: bool, seed: int) -> None:
+def test_team_frames_equal_frames_per_robot(counts: list[int], spoilt: bool, seed: int) -> None:
     """A team's frames give the same table, or the same refusal, in one piece or robot by robot."""
     rng = np.random.default_rng(seed)
     points, ends = rng.uniform(1.0, 3.0, (sum(counts), 3)), np.cumsum(counts)
@@ -123,7 +125,7 @@ def test_frames_in_one_piece_are_as_cut_out(counts: list[int], spoilt: bool, see
 
 
 @pytest.mark.parametrize("proposal", ["fastslam2", "fastslam1"])
-def test_robots_beside_change_nothing(proposal: Any) -> None:
+def test_other_robots_in_the_table_change_nothing(proposal: Any) -> None:
     """A filter makes the same of what its robots read, bit for bit, whether others stand in the table or not."""
     alone, beside = (FastSlam(2, 12, proposal=proposal, seed=4, rejuvenate_every=7) for _ in range(2))
     for step in range(25):
@@ -135,7 +137,7 @@ def test_robots_beside_change_nothing(proposal: Any) -> None:
     assert_same(contents(alone), contents(beside))
 
 
-def test_logs_do_not_depend_on_who_looks() -> None:
+def test_logs_do_not_depend_on_when_they_are_read() -> None:
     """What a filter did is the same whether it is asked after each step or once in the end, and stays as it was.
 
     In some steps one of its robots is not heard, and in others there is one more robot in the table.
@@ -161,7 +163,7 @@ rows_of_ids = st.lists(st.lists(st.integers(-1, 9), max_size=4), min_size=1, max
 
 
 @given(ids=rows_of_ids, offset=st.integers(0, 5))
-def test_each_robot_finds_what_became_of_what_it_measured(ids: list[list[int]], offset: int) -> None:
+def test_each_robot_has_its_associations_in_the_table(ids: list[list[int]], offset: int) -> None:
     """What was gathered robot by robot is cut out as it was, or only the names in it; robot -1 has nothing."""
     found, made = ([np.array(row, np.int64) + k for row in ids] for k in (0, offset))
     findings = Associations.from_arrays(found, made)
@@ -194,8 +196,8 @@ def test_measurements_that_were_not_used_are_rejected(seeds: list[int]) -> None:
             np.testing.assert_array_equal(cut[~mask], -1)
 
 
-def test_what_reports_and_journals_share_is_read_only() -> None:
-    """Else a caller could change what a smoother makes of the run."""
+def test_arrays_shared_by_reports_and_journals_are_read_only() -> None:
+    """Otherwise a caller could change the input of the smoother."""
     frame = Measurements(np.array([[0.0, 0.0, 3.0]]), np.eye(1, 8))
     for slam in (FastSlam(num_particles=3), TeamSlam(1, num_particles=3)):
         report = slam.step([None], [frame])

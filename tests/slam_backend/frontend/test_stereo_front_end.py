@@ -112,7 +112,7 @@ def test_the_window_option_sets_the_scale_by_depth(pair: tuple[np.ndarray, np.nd
     np.testing.assert_array_equal(frame.measurements.descriptors, expected)
 
 
-def test_the_best_few_are_the_front_of_all(pair: tuple[np.ndarray, np.ndarray]) -> None:
+def test_a_measurement_limit_keeps_the_first_measurements(pair: tuple[np.ndarray, np.ndarray]) -> None:
     """`max_measurements` keeps the first of what is measured without it."""
     all_of_them = StereoFrontEnd(CAMERA).measure(*pair)
     few = StereoFrontEnd(CAMERA, FrontEndOptions(max_measurements=7)).measure(*pair)
@@ -136,7 +136,7 @@ def test_swapped_images_raise_a_hint(pair: tuple[np.ndarray, np.ndarray]) -> Non
         StereoFrontEnd(CAMERA).measure(pair[1], pair[0])
 
 
-def test_read_only_images_need_no_other_kernels(pair: tuple[np.ndarray, np.ndarray]) -> None:
+def test_read_only_images_compile_no_further_kernels(pair: tuple[np.ndarray, np.ndarray]) -> None:
     """Images that cannot be written are measured by the kernels that are there, and stay as they are."""
     eye = StereoFrontEnd(CAMERA)
     expected = eye.measure(*pair)
@@ -286,7 +286,7 @@ def test_exact_pairs_give_the_exact_motion(seed: int) -> None:
         assert np.linalg.det(found_turn) == pytest.approx(1.0)
 
 
-def test_it_agrees_with_scipy_on_noisy_points() -> None:
+def test_the_motion_agrees_with_scipy_on_noisy_points() -> None:
     """About their weighted means, the rotation is that of scipy's `Rotation.align_vectors`."""
     rng = np.random.default_rng(6)
     turn, shift = _motion(6)
@@ -367,7 +367,7 @@ def test_without_noise_the_motion_is_exact() -> None:
     assert motion.planar[2] == pytest.approx(-0.15, abs=0.01)  # Y points down: a turn about it is one to the right
 
 
-def test_reprojection_beats_points() -> None:
+def test_reprojection_errors_give_a_better_motion_than_point_distances() -> None:
     """Weighing pixels and disparities by their noise, the motion is better than that of equally weighed points."""
     ours, theirs = [], []
     for seed in range(12):
@@ -395,7 +395,7 @@ def test_frames_that_share_nothing_have_no_motion() -> None:
     assert camera_motion(few, later, WIDE_CAMERA, 0.5, np.random.default_rng(0)) is None
 
 
-def test_partners_are_each_others_nearest() -> None:
+def test_matches_are_mutual_nearest_neighbours() -> None:
     """A pair counts if it is mutual and within the gate; checked against all distances."""
     rng = np.random.default_rng(4)
     a, b = (Measurements(rng.normal(size=(n, 3)), rng.normal(size=(n, 6))) for n in (20, 17))

@@ -46,7 +46,7 @@ def test_the_compiled_form_agrees_with_the_definition() -> None:
     np.testing.assert_allclose(found, expected, atol=2e-6)
 
 
-def test_it_agrees_with_the_reference_descriptors(data_dir: Path) -> None:
+def test_descriptors_agree_with_the_reference(data_dir: Path) -> None:
     """Conformance: on real and synthetic images the median cosine is at least .9995, the 5th percentile .995."""
     folder, cosines = data_dir / "usurf_reference", []
     for name in REFERENCE:
@@ -62,7 +62,7 @@ def test_it_agrees_with_the_reference_descriptors(data_dir: Path) -> None:
     assert np.percentile(together, 5) >= 0.995
 
 
-def test_what_has_no_contrast_has_the_zero_vector() -> None:
+def test_patches_without_contrast_have_zero_descriptors() -> None:
     """Empty and saturated patches are described by zeros, not by noise of the arithmetic."""
     for level in (0, 117, 255):
         image = np.full((64, 64), level, dtype=np.uint8)

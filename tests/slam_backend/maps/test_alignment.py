@@ -296,7 +296,7 @@ def test_candidates_are_mutual_and_one_to_one() -> None:
     assert len(expected) > 200
 
 
-def test_duplicates_do_not_kill_a_match_but_look_alikes_elsewhere_do() -> None:
+def test_the_ratio_test_ignores_duplicates_at_the_same_place() -> None:
     """The ratio test is against the best landmark of ANOTHER place, in either map."""
     copied = RICH.descriptors[:1] + 0.01
 
@@ -317,7 +317,7 @@ def test_duplicates_do_not_kill_a_match_but_look_alikes_elsewhere_do() -> None:
 
 
 @given(st.integers(0, 2**32), st.integers(0, 12), st.integers(0, 12), st.integers(0, 4), st.booleans())
-def test_looks_show_which_maps_cannot_have_enough_candidates(
+def test_descriptors_show_which_maps_cannot_have_enough_candidates(
     seed: int, common: int, others: int, look_alikes: int, appearance: bool
 ) -> None:
     """Where looks alone say no, the maps have too few candidates; where enough landmarks are common they say yes."""

@@ -65,7 +65,7 @@ def largest_clique_plainly(agrees: np.ndarray) -> int:
 
 
 @given(n=st.integers(0, 90), density=st.floats(0.0, 1.0), seed=st.integers(0, 9999))
-def test_what_the_search_returns_is_a_clique(n: int, density: float, seed: int) -> None:
+def test_the_search_returns_a_clique(n: int, density: float, seed: int) -> None:
     """Whatever the graph and however early the search stops, members agree pairwise; one vertex is always found."""
     upper = np.triu(np.random.default_rng(seed).random((n, n)) < density, 1)
     agrees = upper | upper.T
@@ -243,7 +243,7 @@ def test_a_motion_that_hangs_on_one_match_is_not_believed() -> None:
     assert align_maps(wide, b, options=lax).reason == "too uncertain"
 
 
-def test_what_no_variance_explains_widens_the_covariance() -> None:
+def test_unexplained_residuals_widen_the_covariance() -> None:
     """Residuals three times as large as may be explained have a Birge ratio of nine; those of chance have one."""
     rng = np.random.default_rng(22)
     table = np.zeros((400, 18))
@@ -323,8 +323,8 @@ def test_pairs_of_look_alikes_are_those_within_the_gate() -> None:
 
 @pytest.mark.parametrize("size", [1, 6, 40, 46, 64])
 @pytest.mark.parametrize("length", [1.0, 10.0])
-def test_what_is_near_is_found_whatever_the_heads_say(size: int, length: float) -> None:
-    """Of descriptors of any size and length, near each other by their heads, their tails or both, none is lost."""
+def test_near_descriptors_are_found_whatever_their_first_components(size: int, length: float) -> None:
+    """Descriptors of any size and length within the gate are found, whichever components differ."""
     rng = np.random.default_rng(size)
     a = length * rng.normal(size=(70, size)) / np.sqrt(size)
     shift = rng.normal(size=(300, size)) * (rng.random((300, size)) < rng.random((300, 1)))
@@ -337,7 +337,7 @@ def test_what_is_near_is_found_whatever_the_heads_say(size: int, length: float) 
 
 
 @pytest.mark.parametrize("method", ["ransac", "clique", "gnc"])
-def test_geometry_tells_look_alikes_apart(method: str) -> None:
+def test_geometry_distinguishes_similar_landmarks(method: str) -> None:
     """Where three of all landmarks look the same hardly any stands out, and yet nearly all common ones are found."""
     a, b = threefold(np.random.default_rng(17), 120, 50)
     assert align_maps(a, b, method, options=AlignmentOptions(max_similar=0)).reason == "too few candidates"
@@ -485,7 +485,7 @@ def test_what_two_maps_share_must_not_occur_elsewhere_in_one_of_them(seed: int) 
 
 @pytest.mark.parametrize(("doubles", "scattered"), [(0, False), (4, False), (24, True)])
 @pytest.mark.parametrize("seed", range(5))
-def test_single_doubles_do_not_refuse_an_alignment(seed: int, doubles: int, scattered: bool) -> None:
+def test_single_duplicates_do_not_refuse_an_alignment(seed: int, doubles: int, scattered: bool) -> None:
     """A sixth of the landmarks may recur as a group, and all of them each for itself: the motion is found."""
     found = align_maps(*maps_with_doubles(seed, doubles, scattered))
     assert found.success
@@ -502,7 +502,7 @@ def test_whether_a_constellation_recurs_is_the_same_in_any_frame() -> None:
         assert not has_perceptual_alias(landmarks, np.arange(12, SHARED), SIGMA**2, options)
 
 
-def test_a_map_in_which_all_looks_alike_tells_nothing() -> None:
+def test_a_map_of_identical_descriptors_has_no_recurring_constellation() -> None:
     """Among a hundred landmarks of one look at random places no constellation is said to recur."""
     rng = np.random.default_rng(3)
     points = rng.uniform(0.0, [20.0, 20.0, 1.5], (100, 3))

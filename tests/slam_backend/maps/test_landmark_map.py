@@ -188,7 +188,7 @@ def test_copies_cannot_be_written_either() -> None:
                 assert own is None or not own.flags.writeable
 
 
-def test_nothing_seen_is_a_frame_too() -> None:
+def test_an_empty_frame_is_valid() -> None:
     """An empty frame has no rows and its descriptor size."""
     frame = Measurements.empty(11)
     assert (len(frame), frame.points.shape, frame.descriptors.shape) == (0, (0, 3), (0, 11))
@@ -229,7 +229,7 @@ def archive(file: Path, content: bytes, compressed: bool = False) -> Path:
     return file
 
 
-def test_archives_come_back(tmp_path: Path) -> None:
+def test_archives_round_trip(tmp_path: Path) -> None:
     """Plain and compressed archives of numbers and texts are read, all of them or some."""
     arrays = {
         "a": np.asfortranarray(np.arange(6.0).reshape(2, 3)),

@@ -45,7 +45,7 @@ def test_each_pair_has_its_attempts_and_the_last_refusal() -> None:
     assert {len(row) for row in rows} == {1 + len(REASONS)}
 
 
-def test_every_reason_says_what_helps() -> None:
+def test_every_refusal_reason_has_a_hint() -> None:
     """Each reason of the closed list has a hint, and nothing else has."""
     assert set(HINTS) == set(REASONS)
 
@@ -76,7 +76,7 @@ def test_an_alignment_that_is_too_uncertain_says_which_bound_it_misses(limits: d
     assert align_maps(*maps, options=AlignmentOptions(**{name: 0.99 * found.excess * limit})).missed == missed
 
 
-def test_a_team_says_that_paths_leave_a_merge_open() -> None:
+def test_a_refusal_for_path_uncertainty_names_the_paths() -> None:
     """Where the particles of a merge differ too much the refusal names the paths, and the event bears the doubt."""
     _, team = driven(2, 112, 100, attempts=AttemptOptions(every=10), merging=MergeOptions(min_sigmas=1e4))
     event = next(event for event in team.events if event.alignment.reason == "too uncertain")
@@ -109,7 +109,7 @@ def watched(joined: int, turned: int = 0) -> tuple[MergeMonitor, LandmarkMap]:
 
 
 @pytest.mark.parametrize(("joined", "contradicted"), [(0, True), (7, True), (8, False), (60, False)])
-def test_a_merge_stands_that_rests_on_more_than_tells_against_it(joined: int, contradicted: bool) -> None:
+def test_a_merge_with_more_evidence_than_contradictions_stands(joined: int, contradicted: bool) -> None:
     """Landmarks mapped twice undo a merge only if the pairs that it joined are no more than 0.6 times as many."""
     watch, joint = watched(joined)
     assert watch.is_inconsistent(joint, MergeOptions(), AlignmentOptions(max_ratio=0.6)) == contradicted

@@ -99,7 +99,7 @@ poses = st.tuples(st.floats(-30.0, 30.0), st.floats(-30.0, 30.0), st.floats(-3.1
 
 
 @given(pose=poses, seed=st.integers(0, 1000))
-def test_aligning_exact_points_gives_the_motion_back(pose: np.ndarray, seed: int) -> None:
+def test_aligning_exact_points_recovers_the_motion(pose: np.ndarray, seed: int) -> None:
     """Points moved by any motion are aligned by it, with any weights, and then have no error left."""
     rng = np.random.default_rng(seed)
     b = rng.uniform(-10.0, 10.0, (7, 2))

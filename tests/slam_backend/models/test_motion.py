@@ -49,7 +49,7 @@ def test_samples_have_the_stated_moments() -> None:
     assert np.all(np.abs(correlations) * np.sqrt(n) < stats.norm.isf(0.5e-4))
 
 
-def test_each_particle_moves_from_its_own_past() -> None:
+def test_each_particle_moves_from_its_own_pose() -> None:
     """Eq. 4 conditions on the particle's own pose: without noise, particle m ends at x^[m] composed with u."""
     poses = np.random.default_rng(0).normal(size=(7, 3))
     np.testing.assert_array_equal(EXACT_MOTION.sample(poses, MOVE, np.random.default_rng(1)), compose(poses, MOVE))

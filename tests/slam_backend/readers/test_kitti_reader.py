@@ -31,7 +31,7 @@ def test_frames_hold_the_tracks_they_show(tmp_path: Path) -> None:
     assert len(load_kitti(tmp_path, duration=0.15).times) == 2
 
 
-def test_tracks_that_were_held_where_they_stood_are_new_ones(tmp_path: Path) -> None:
+def test_tracks_repeated_at_the_same_pixels_are_new_tracks(tmp_path: Path) -> None:
     """Only where others begin and all stand, to the last bit; if one moves, or none begins, all keep their numbers."""
     features = np.full((4, 4, FRAMES), ABSENT)
     features[:, :2, :] = 100.0 + np.arange(FRAMES)

@@ -173,7 +173,7 @@ def test_a_sighting_is_moved_to_its_step_by_the_odometry() -> None:
         np.testing.assert_allclose(point, landmark, atol=1e-9)
 
 
-def test_of_two_sightings_of_one_landmark_in_a_step_the_first_counts() -> None:
+def test_the_first_of_two_sightings_of_a_landmark_in_a_step_counts() -> None:
     """Repeated sightings in a step are not independent: the earliest is kept, other landmarks stay."""
     log = _log([(0.0, 7, 2.0, 0.0), (0.05, 7, 2.5, 0.0), (0.05, 6, 1.0, 0.0)], [[0.0, 0.0, 0.0]])
     frame = to_filter_steps(log, dt=0.2).robots[0].measurements[0]
@@ -182,7 +182,7 @@ def test_of_two_sightings_of_one_landmark_in_a_step_the_first_counts() -> None:
 
 
 @pytest.mark.slow
-def test_dead_reckoning_of_the_real_log_is_off_by_what_is_known(data_dir: Path) -> None:
+def test_dead_reckoning_of_the_real_log_has_the_known_errors(data_dir: Path) -> None:
     """From the true start poses the five robots' odometry is off by 4.0, 2.0, 2.9, 3.0 and 2.9 m RMS."""
     log = load_mrclam(data_dir / "mrclam" / "MRCLAM_Dataset7")
     assert [len(own.sightings) for own in log.robots] == [2578, 3818, 4425, 1822, 3424]

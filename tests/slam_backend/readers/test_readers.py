@@ -145,7 +145,7 @@ def test_covariances_lie_along_and_across_the_ray() -> None:
         np.testing.assert_allclose(frame.covariances[0], expected, atol=1e-12)
 
 
-def test_without_identities_all_look_alike() -> None:
+def test_without_identities_all_descriptors_are_equal() -> None:
     """Every sighting of a step is kept, under one descriptor."""
     seen = [(10.0, 2.0, 0.0), (10.0, 2.0, 0.1), (10.0, 3.0, 0.0)]
     steps = range_bearing_steps(DRIVEN, seen, **SIGMAS)
@@ -214,7 +214,7 @@ def test_euroc_files_are_read_with_their_remarks(tmp_path: Path) -> None:
     assert eye.body_from_camera[1].tolist() == [1.0, 0.0, 0.0, 0.2]
 
 
-def test_a_rolled_eye_is_turned_back() -> None:
+def test_a_rolled_camera_is_rectified() -> None:
     """Rows of a rectified pair agree, and depths are right, though one eye was mounted with a roll of 3 degrees."""
     depth, baseline, roll = 2.0, 0.1, np.radians(3.0)
     left, straight = draw_boxes(320, 240, 0.0), draw_boxes(320, 240, 300.0 * baseline / depth)

@@ -157,7 +157,7 @@ def test_evidence_is_the_integral_over_all_poses(seed: int, is_given: bool) -> N
 
 
 @pytest.mark.parametrize("seed", range(100, 105))
-def test_one_false_match_hardly_bends_the_refined_pose(seed: int) -> None:
+def test_one_false_match_hardly_moves_the_refined_pose(seed: int) -> None:
     """Beside seven right matches, one that is metres off moves the refined pose by less than its own doubt."""
     predicted, landmarks, frame = random_scene(seed, is_given=True, num=8)
     matches = {b: b for b in landmarks}
@@ -207,7 +207,7 @@ def blind_walk(seed: int, num_particles: int) -> tuple[ReferenceFastSlam, Stereo
     return slam, world, pose
 
 
-def test_what_a_robot_walks_blind_is_predicted_and_not_sampled() -> None:
+def test_motion_without_measurements_is_predicted_and_not_sampled() -> None:
     """Without sight the estimate is one propagated Gaussian, the same for all seeds; the particles scatter as it says.
 
     The sum of the particles' squared distances is chi-square; false alarm 1e-3.
@@ -226,7 +226,7 @@ def test_what_a_robot_walks_blind_is_predicted_and_not_sampled() -> None:
     assert low < squares < high
 
 
-def test_a_sighting_corrects_what_was_walked_blind_as_one_gaussian() -> None:
+def test_a_measurement_corrects_unsampled_motion_as_one_gaussian() -> None:
     """A sighting tells all particles the same of the way, whatever the seed, and only then do they part."""
     estimates = []
     for seed in (100, 101):
@@ -246,7 +246,7 @@ def test_a_sighting_corrects_what_was_walked_blind_as_one_gaussian() -> None:
     np.testing.assert_allclose(estimates[0].covariance, estimates[1].covariance, rtol=1e-9, atol=1e-15)
 
 
-def test_a_given_pose_ends_blindness() -> None:
+def test_a_given_pose_ends_unsampled_motion() -> None:
     """A pose that the caller gives is known exactly, whatever was walked blind before, and so is what follows it."""
     slam, _, pose = blind_walk(100, 3)
     slam.step([None], [None], poses=[pose])

@@ -103,7 +103,7 @@ def fitted_plainly(points: FloatArray, targets: FloatArray, shares: FloatArray) 
 
 
 @pytest.mark.parametrize("spread", [0.01, 1.0])
-def test_what_is_held_is_as_by_arrays(spread: float):
+def test_the_gauge_fix_agrees_with_plain_arrays(spread: float):
     """Least squares one particle at a time, landmarks weighed by their scatter; poses moved; scatter by its sum."""
     rng = np.random.default_rng(4)
     count, seen = LANES + 9, np.array([4, 0, 3])
@@ -160,7 +160,7 @@ def test_particles_that_differ_by_a_motion_alone_are_brought_together():
 
 
 @pytest.mark.parametrize("apart", [0.0, 0.01])
-def test_what_says_nothing_of_the_turn_holds_nothing(apart: float):
+def test_landmarks_that_do_not_determine_the_rotation_fix_no_gauge(apart: float):
     """Landmarks in one place would turn particles at random, by which poses scatter more; one landmark says nothing."""
     rng = np.random.default_rng(4)
     values = random_maps(2, 80, rng)
@@ -174,7 +174,7 @@ def test_what_says_nothing_of_the_turn_holds_nothing(apart: float):
         assert fix_gauge(laned(values), rows, landmarks, poses, pose[None], weights) is None
 
 
-def test_a_start_is_held_where_the_pose_is_known_in_the_map():
+def test_a_start_is_fixed_if_the_pose_is_known_in_the_map():
     """All particles get that of the most probable path; what they differed by, seen from there, is the covariance."""
     rng = np.random.default_rng(5)
     start, pose, weights = np.array([2.0, -1.0, 2.5]), np.array([1.0, 2.0, 0.5]), rng.dirichlet(np.ones(40))
@@ -185,7 +185,7 @@ def test_a_start_is_held_where_the_pose_is_known_in_the_map():
     np.testing.assert_allclose(scatter, (weights * apart.T) @ apart, atol=1e-12)
 
 
-def test_a_start_is_not_held_where_the_path_from_it_is_known_better_than_the_map():
+def test_a_start_is_not_fixed_if_the_path_from_it_is_known_better_than_the_map():
     """Of a robot that nothing but odometry knows, near its start, particles keep start and pose together."""
     rng = np.random.default_rng(6)
     start, way = np.array([2.0, -1.0, 2.5]), np.array([0.5, 0.1, 0.2])
@@ -196,7 +196,7 @@ def test_a_start_is_not_held_where_the_path_from_it_is_known_better_than_the_map
     assert not scatter.any()
 
 
-def test_what_particles_no_longer_show_is_claimed_all_the_same():
+def test_reported_covariances_include_the_gauge_covariance():
     """Right after new particles their scatter and the frame's share are together what the smoother says of the pose."""
     run = small_run(length=8.0)
     slam = run.build_filter(2000, "fastslam2", 1)
@@ -224,7 +224,7 @@ def test_starts_that_are_given_stay_and_an_exact_pose_needs_no_share():
     np.testing.assert_allclose(slam.pose().covariance, 0.0, atol=1e-12)
 
 
-def test_groups_that_share_too_little_doubt_both_frames():
+def test_groups_with_few_common_landmarks_add_both_gauge_covariances():
     """Where one group started in the other's map is as uncertain as both frames are, however alike the particles."""
     options = FilterOptions(rejuvenate_every=10)
     a, b, joint = (RejuvenationScheduler(options, robots) for robots in (1, 1, 2))
@@ -242,7 +242,7 @@ def test_groups_that_share_too_little_doubt_both_frames():
     np.testing.assert_allclose(graph.poses[graph.first_keys[1]], motion, atol=1e-12)
 
 
-def test_maps_of_all_particles_claim_their_share():
+def test_mixture_maps_include_the_gauge_covariance():
     """Of the same particles a mixture claims more of each landmark by what the frame adds; its means are the same."""
     slam, _, _ = open_run()
     widened = slam.map("mixture")
@@ -257,7 +257,7 @@ def test_maps_of_all_particles_claim_their_share():
     assert (np.trace(share, axis1=1, axis2=2) > 0.0).all()
 
 
-def test_without_it_the_frame_wanders_between_two_draws(monkeypatch: pytest.MonkeyPatch):
+def test_without_the_gauge_fix_the_frame_drifts_between_rejuvenations(monkeypatch: pytest.MonkeyPatch):
     """Poses are thrown back less at each draw where the frame is held than where survivors carry it along."""
 
     def thrown() -> float:

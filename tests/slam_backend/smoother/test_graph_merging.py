@@ -111,7 +111,7 @@ def test_landmarks_without_a_new_name_are_left_out():
     assert np.unique(both.landmark_ids).size == both.landmark_ids.size
 
 
-def test_words_for_one_landmark_follow_it():
+def test_aliases_of_a_landmark_follow_it():
     """Names that a group has given up go on standing for the landmark that was kept, under the joint map's names."""
     run = small_run(2, seed=104)
     (a, _), (b, renamed) = group_graph(run, [0]), group_graph(run, [1], OFFSET)
@@ -122,7 +122,7 @@ def test_words_for_one_landmark_follow_it():
 
 
 @pytest.mark.parametrize("common", [0, 2])
-def test_groups_without_landmarks_that_fix_the_motion_lie_as_the_merge_said(common):
+def test_groups_with_few_common_landmarks_keep_the_motion_of_the_merge(common):
     """Two groups that share too few landmarks are as uncertain against each other as the motion was, not lost."""
     run = small_run(2)
     (a, _), (b, renamed) = group_graph(run, [0]), group_graph(run, [1], OFFSET)
@@ -178,7 +178,7 @@ def test_a_merged_team_is_rejuvenated_and_knows_where_it_started(slice_steps):
     assert simulation.position_errors(team).max() < 0.2
 
 
-def test_starts_stay_where_they_are_between_two_draws():
+def test_starts_are_constant_between_rejuvenations():
     """Resampling does not choose among the starts that a merged filter has drawn: they are held until the next draw."""
     simulation = SimulatedTeam(seed=101)
     team = build(simulation, every=25)
@@ -204,7 +204,7 @@ def test_a_snapshot_of_a_team_goes_on_through_merges_and_rejuvenations(every, sl
     assert any(report.id_maps for report in reports)
 
 
-def test_a_merge_goes_on_from_what_both_groups_have_smoothed():
+def test_a_merge_continues_from_the_smoothed_graphs_of_both_groups():
     """Just after a merge the joint smoother has all that the groups' smoothers had: nothing is done again."""
     simulation = SimulatedTeam(seed=101)
     team = build(simulation, slice_steps=12)

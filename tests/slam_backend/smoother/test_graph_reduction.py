@@ -44,7 +44,7 @@ def test_condensed_sightings_of_single_poses_change_nothing():
     np.testing.assert_allclose(one.T @ one, same.T @ same, rtol=1e-6, atol=1e-3)
 
 
-def test_frames_taken_while_standing_belong_to_one_key():
+def test_frames_of_a_stationary_robot_share_one_keyframe():
     """A robot that stands still has one pose: its frames add up to one sighting of each landmark."""
     run = small_run()
     log = RobotLog()
@@ -60,7 +60,7 @@ def test_frames_taken_while_standing_belong_to_one_key():
     assert mode.sightings.counts.tolist() == [2, 1] * len(points)
 
 
-def test_rigid_neighbours_keep_what_they_see():
+def test_joining_rigid_keyframes_keeps_the_estimate():
     """Keys that are joined at the mode leave landmarks, newest pose and likelihood at the mode where they were."""
     run = small_run()
     graph = graph_of(run)
@@ -76,7 +76,7 @@ def test_rigid_neighbours_keep_what_they_see():
     np.testing.assert_allclose(again.poses[fewer.last_keys][:, :2], mode.poses[graph.last_keys][:, :2], atol=0.01)
 
 
-def test_odometry_is_carried_to_the_joined_keys():
+def test_odometry_is_transferred_to_joined_keyframes():
     """Composed with the links that are left, the start leads to the newest pose by measured and smoothed motion."""
     run = small_run()
     graph = graph_of(run)
@@ -93,7 +93,7 @@ def test_odometry_is_carried_to_the_joined_keys():
         )
 
 
-def test_unseen_keys_vanish_without_loss():
+def test_keyframes_without_measurements_are_removed_without_loss():
     """A key from which nothing was measured, and which is no longer the newest, is chained away: same mode without."""
     run = small_run()
     logs = logs_of(run, skip=(7, 8))
@@ -138,7 +138,7 @@ def test_a_long_run_stays_bounded():
     assert sizes[-1][2] < 1.5 * sizes[5][2]
 
 
-def test_further_robots_have_further_keys():
+def test_the_keyframe_limit_grows_with_the_number_of_robots():
     """Two robots may have more keys than one, and have them; without further ones they share those of one."""
     run = small_run(robots=2, length=10.0)
     for further, most in ((0, 20), (6, 26)):
@@ -152,7 +152,7 @@ def test_further_robots_have_further_keys():
         assert result.graph.num_keys == most
 
 
-def test_a_graph_is_not_changed_by_what_is_made_of_it():
+def test_using_a_graph_does_not_change_it():
     """Snapshots may share graphs: extending, solving, drawing and coarsening leave every array as it was."""
     run = small_run()
     graph = graph_of(run)
@@ -295,7 +295,7 @@ def test_the_compiled_walk_is_the_plain_one(steps, rigid_within, seed):
 
 
 @pytest.mark.parametrize("covered", [False, True])
-def test_measurements_with_names_are_taken(covered):
+def test_measurements_with_ids_are_selected(covered):
     """Which rows bear a name, and of which frame they are if each step with such a row makes one; others stay."""
     ids, starts = np.array([4, REJECTED, 9, REJECTED, 4, 2]), np.array([0, 0, 3, 4, 5, 6])
     rng, rows = np.random.default_rng(3), [0, 2, 4, 5]
@@ -342,7 +342,7 @@ def settled(known, names, aliases=NO_ALIASES, old=(), frozen=((), ()), held=NO_L
 
 
 @given(st.lists(st.integers(0, 9), unique=True, max_size=8), st.lists(st.integers(0, 12), max_size=20))
-def test_landmarks_are_numbered_as_they_come(known, names):
+def test_landmarks_are_numbered_in_order_of_appearance(known, names):
     """A known landmark keeps row and place, a new one gets the next row and the place of its first measurement.
 
     A point is placed as composed of the key, the frame seen from it and the camera on the robot.
@@ -387,7 +387,7 @@ def test_variances_are_squared_sigmas():
     np.testing.assert_allclose(model.variances(motions), [model.sigmas(motion) ** 2 for motion in motions])
 
 
-def test_frames_stand_where_odometry_says():
+def test_frames_are_placed_by_odometry():
     """A frame seen from its key is where the odometry between puts it, and the newest pose is always a key."""
     run = small_run()
     start, [log] = SlamGraph.at_starts(run.true_paths[:, 0]), logs_of(run)
@@ -422,7 +422,7 @@ def test_steps_in_one_place_share_its_key(rigid_within):
 
 
 @pytest.mark.parametrize("seed", [101, 102])
-def test_shared_keys_cost_little_truth(seed):
+def test_sharing_keyframes_changes_the_newest_pose_little(seed):
     """Where keys share less than measurements err, the newest pose agrees with that of a key at each step."""
     run = simulate_run(RunSpec(length=15.0, landmarks=120, measurements=7, preset="paper"), seed)
     log, motion, camera = logs_of(run)[0].arrays(), run.spec.noise.motion, camera_of(run)

@@ -128,7 +128,7 @@ def test_starts_on_which_particles_agree_are_given():
     assert graph.odometry_covariances[2, 0, 0] < 1e-6
 
 
-def test_a_held_start_is_sought_though_particles_agree_on_it():
+def test_a_fixed_start_is_estimated_although_particles_agree_on_it():
     """It hangs on the origin by a vague prior, and on no other start, though none of them changes against another."""
     starts = np.repeat(np.array([[0.0, 0.0, 0.0], [5.0, 1.0, 3.1], [2.0, -1.0, 0.4]])[:, :, None], 30, axis=2)
     graph = SlamGraph.at_uncertain_starts(starts, np.array([False, True, True]))
@@ -137,7 +137,7 @@ def test_a_held_start_is_sought_though_particles_agree_on_it():
     np.testing.assert_allclose(graph.poses[:3], starts[:, :, 0], atol=1e-12)
 
 
-def test_a_start_that_is_not_known_is_found_by_shared_landmarks():
+def test_an_unknown_start_is_estimated_from_shared_landmarks():
     """Robot 1's start, off by 20 cm and 3 degrees in the particles, is where the landmarks that both saw put it."""
     run = small_run(2, seed=104, length=8.0)
     true = run.true_paths[:, 0]
@@ -161,7 +161,7 @@ def test_a_start_that_is_not_known_is_found_by_shared_landmarks():
     assert not claimed[0].any()
 
 
-def test_robots_are_renumbered_with_all_that_is_theirs():
+def test_robots_are_renumbered_with_their_keyframes():
     """Exchanged twice, a graph is as before; once, each robot has the other's keys."""
     graph = graph_of(small_run(2))
     order = np.array([1, 0])
@@ -251,7 +251,7 @@ def test_without_noise_there_is_no_error():
     np.testing.assert_allclose(mode.landmarks, run.landmarks[graph.landmark_ids], atol=1e-8)
 
 
-def test_a_descent_that_creeps_has_ended_in_the_last_iteration():
+def test_a_slowly_converging_descent_ends_with_the_last_iteration():
     """What can fall by five tolerances is a mode in the options' last iteration, but not where a slice ends.
 
     What can fall by twenty is none.
@@ -341,7 +341,7 @@ def test_small_matrices_are_inverted_as_by_lapack():
         assert not sum_pose_information(previous, matrices)[3]
 
 
-def test_only_poses_with_odometry_from_another_are_sought():
+def test_only_poses_with_odometry_from_another_are_estimated():
     """They get three rows each, in their order; poses that are given get none."""
     previous, noises = np.array([-1, 0, -1, 1, 2]), np.zeros((5, 3, 3))
     columns, _, size, is_noisy = sum_pose_information(previous, noises)
@@ -353,7 +353,7 @@ def test_only_poses_with_odometry_from_another_are_sought():
     np.testing.assert_array_equal(informations, 4.0 * noises)
 
 
-def test_a_change_leads_where_it_says():
+def test_an_increment_moves_poses_as_stated():
     """Poses that are given stay; the slope is taken along all of it, and no change that is not finite looks small."""
     rng = np.random.default_rng(8)
     change, poses, landmarks = (rng.normal(size=(n, 3)) for n in (5, 4, 2))

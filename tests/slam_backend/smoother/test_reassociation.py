@@ -27,7 +27,7 @@ PLACE = np.array([5.0, 0.6, 1.2])
 LOOK, OTHER_LOOK = np.eye(4, dtype=np.float32)[:2]
 
 
-def test_the_only_one_that_is_near_and_looks_alike_is_found_as_by_arrays():
+def test_unique_matches_agree_with_plain_arrays():
     """Where none is, or several are, there is no one."""
     rng = np.random.default_rng(8)
     means, known_means = rng.uniform(0.0, 3.0, (60, 3)), rng.uniform(0.0, 3.0, (25, 3))
@@ -78,7 +78,7 @@ def names(places, held, looks=None, poses=POSES):
     return found.ids[1::2].tolist()
 
 
-def test_what_agrees_is_taken_up():
+def test_agreeing_rejected_measurements_are_associated():
     """Three measurements of one place outnumber a landmark's only sighting 2.5 sigma off, and are its."""
     assert names([PLACE] * 3, known()) == [9, 9, 9]
 
@@ -94,12 +94,12 @@ def test_what_agrees_is_taken_up():
         (known()._replace(descriptors=np.array([LOOK, LOOK]), means=np.array([PLACE, PLACE])), "two may be it"),
     ],
 )
-def test_what_need_not_be_its_is_left(held, why):
+def test_ambiguous_rejected_measurements_are_left(held, why):
     """Nothing has a name for it that could be another's."""
     assert names([PLACE] * 3, held) == [REJECTED] * 3, why
 
 
-def test_one_that_nothing_agrees_with_is_left():
+def test_a_single_disagreeing_measurement_is_left():
     """Of two that agree and one elsewhere the two are taken up; of three that lie apart none is."""
     apart = list(PLACE + np.array([[0.0, 0.0, 0.0], [0.0, 0.3, 0.0], [0.0, -0.3, 0.1]]))
     assert names([PLACE, PLACE, apart[2]], known()) == [9, 9, REJECTED]
@@ -108,7 +108,7 @@ def test_one_that_nothing_agrees_with_is_left():
     assert names([PLACE] * 3, known(), poses={4: POSES[4]}) == [REJECTED] * 3
 
 
-def test_covariances_of_the_sensor_say_what_agrees():
+def test_agreement_follows_the_covariances_of_the_sensor():
     """Places 0.3 m apart agree where the sensor says that it sees to 0.2 m, and do not where it says to 0.05 m."""
     apart = list(PLACE + np.array([[0.0, 0.0, 0.0], [0.0, 0.3, 0.0], [0.0, -0.3, 0.1]]))
     for sigma, found in ((0.2, [9, 9, 9]), (0.05, [REJECTED] * 3)):
@@ -117,7 +117,7 @@ def test_covariances_of_the_sensor_say_what_agrees():
         assert reassociate(logs, refused, guesses_of(POSES), known(), OPTIONS)[0].ids[1::2].tolist() == found
 
 
-def test_nothing_refused_changes_no_log():
+def test_without_rejected_measurements_logs_are_unchanged():
     """Without anything refused, or without a map, the logs are the same arrays."""
     logs, refused = logs_and_refused([PLACE] * 3)
     nothing = LandmarkTable(*(array[:0] for array in known()))
@@ -145,7 +145,7 @@ def error_of_one_first_seen_far_off(every):
     return np.linalg.norm(own[0] - marks[0]), refused
 
 
-def test_a_landmark_that_blocks_itself_is_put_right():
+def test_a_landmark_with_a_false_first_sighting_is_corrected():
     """All but its first sighting are refused and it stays off for ever; or until new particles are drawn."""
     off, refused = error_of_one_first_seen_far_off(None)
     assert off > 0.5
@@ -187,14 +187,14 @@ def found(run, graph, descriptors):
     return find_duplicates(graph, mode, sample_paths(graph, mode, 40, np.random.default_rng(1)), descriptors, 0.45)
 
 
-def test_one_landmark_under_two_names_is_found():
+def test_a_duplicate_landmark_is_found():
     """The smoothed path shows that both lie in one place; the older name stays."""
     run, graph, often = renamed_run()
     assert found(run, graph, looks(graph, (often, NEW_NAME))).tolist() == [[NEW_NAME, often]]
 
 
 @given(st.integers(0, 40), st.integers(0, 2**32 - 1))
-def test_pairs_are_those_of_the_tree(num, seed):
+def test_duplicate_candidates_agree_with_a_kd_tree(num, seed):
     """The compiled sweep finds what a tree, norms and sets say: nearness, looks, and keys that both were seen from."""
     rng = np.random.default_rng(seed)
     landmarks, descriptors = rng.uniform(0.0, 2.0, (num, 3)), rng.normal(size=(num, 2)).astype(np.float32)

@@ -26,7 +26,7 @@ def rejuvenated(run, seed=1, every=EVERY, **options):
     return run.build_filter(30, "fastslam2", seed, rejuvenate_every=every, **options)
 
 
-def test_new_particles_are_drawn_when_it_is_due():
+def test_particles_are_rejuvenated_at_the_interval():
     """In every eighth step, and no other, the report tells of new particles, with a sound sample size."""
     run = small_run(2)
     slam = rejuvenated(run)
@@ -39,7 +39,7 @@ def test_new_particles_are_drawn_when_it_is_due():
             assert np.ptp(slam.particles(0)[0], axis=0).min() > 0.0
 
 
-def test_a_rejuvenation_waits_for_enough_to_read():
+def test_a_rejuvenation_waits_for_enough_measurements():
     """With little effort allowed it comes later than asked: only when enough was measured for what there is to redo."""
     run = small_run()
     slam = rejuvenated(run, every=2, smoothing=SmoothingOptions(effort=0.5, free_sightings=0))
@@ -50,7 +50,7 @@ def test_a_rejuvenation_waits_for_enough_to_read():
     assert len(graph["points"]) > 0
 
 
-def test_a_closed_loop_is_smoothed_sooner():
+def test_a_loop_closure_brings_the_rejuvenation_forward():
     """Landmarks matched that were not seen for long bring the next rejuvenation forward, once."""
     run = small_run()
     readings = list(run.readings())
@@ -98,7 +98,7 @@ def test_the_reports_say_when_a_landmark_was_seen_last():
     assert taken_over > 5
 
 
-def test_all_particles_then_hold_the_same_landmarks_and_names_stay():
+def test_after_a_rejuvenation_all_particles_hold_the_same_landmarks():
     """After a rejuvenation each particle holds each landmark, under the caller's own name, as often as it was seen."""
     run = small_run()
     slam = rejuvenated(run, every=21)
@@ -114,7 +114,7 @@ def test_all_particles_then_hold_the_same_landmarks_and_names_stay():
 
 
 @pytest.mark.parametrize("left", [0, 2])
-def test_landmarks_that_no_sighting_supports_are_given_up(left, monkeypatch):
+def test_landmarks_without_sightings_are_deleted(left, monkeypatch):
     """Of those that the filter held only those stay that the new particles have, be it none."""
     run = small_run(2)
     slam, kept = rejuvenated(run), []
@@ -178,7 +178,7 @@ def test_robots_can_be_renumbered():
         assert np.hypot(error[0], error[1]) < 0.2
 
 
-def test_where_there_is_nothing_to_smooth_the_filter_goes_on():
+def test_without_anything_to_smooth_the_filter_continues():
     """A robot that stands, exact odometry or poses, or a descent that fails: the old particles stay, with a reason."""
     run = small_run()
     hasty = SmoothingOptions(max_iterations=1)
@@ -201,7 +201,7 @@ def test_where_there_is_nothing_to_smooth_the_filter_goes_on():
 
 
 @pytest.mark.parametrize("slice_steps", [None, 4])
-def test_a_filter_that_is_asked_once_knows_that_its_poses_were_given(slice_steps):
+def test_a_requested_rejuvenation_with_given_poses_is_refused(slice_steps):
     """Asked for new particles, in slices or not, a filter that is never rejuvenated says why there can be none."""
     run = small_run()
     slam = rejuvenated(run, every=None, smoothing=SmoothingOptions(slice_steps=slice_steps))
@@ -222,7 +222,7 @@ def test_too_small_a_sample_size_is_refused():
     assert all(reason.startswith("an effective sample size of ") for reason in reasons)
 
 
-def test_more_paths_are_drawn_where_that_helps():
+def test_more_paths_are_sampled_if_the_sample_size_is_too_small():
     """Where M paths miss the sample size asked for, M of eight times as many reach it, and have the same mean."""
     run = small_run()
     many = rejuvenated(run, every=20, smoothing=SmoothingOptions(least_ess=1.0))
@@ -239,7 +239,7 @@ def test_more_paths_are_drawn_where_that_helps():
 
 
 @pytest.mark.slow
-def test_a_rejuvenated_filter_maps_better_and_says_so():
+def test_a_rejuvenated_filter_has_smaller_map_errors_and_nees():
     """After 80 m with 30 particles, map errors are below two thirds of the plain filter's, and NEES below a fifth."""
     maps, nees = np.zeros((2, 3)), np.zeros((2, 3))
     for i, seed in enumerate(range(121, 124)):
@@ -268,7 +268,7 @@ def rejuvenated_map(landmark_noise: float) -> LandmarkMap:
     return slam.map()
 
 
-def test_landmarks_may_walk_after_a_rejuvenation_as_after_a_sighting() -> None:
+def test_landmark_process_noise_is_added_after_a_rejuvenation() -> None:
     """To the smoother they stand still; what it leaves is widened by the variance of one walk along each axis."""
     still, walking = rejuvenated_map(0.0), rejuvenated_map(NOISE)
     wider = walking.covariances - still.covariances

@@ -60,7 +60,7 @@ def linear_toy(steps: int = 6) -> tuple[SlamGraph, MapEstimate]:
     return graph, optimize(graph, CAMERA, TIGHT)
 
 
-def test_paths_of_a_run_that_saw_nothing_can_be_chosen_from():
+def test_paths_of_a_run_without_landmarks_can_be_sampled():
     """Draws without a landmark are taken as any others; they have none then, either."""
     tiles = np.empty((0, 1, 9, LANES))
     draws = PathSamples.weighed(np.zeros((2, 3, 40)), tiles, np.zeros(40), np.zeros(2))
@@ -149,7 +149,7 @@ def test_replayed_landmarks_are_those_of_kalman_filters_along_the_path():
     np.testing.assert_allclose(differences, np.array(expected) - expected[0], atol=1e-6)
 
 
-def test_stereo_paths_are_weighed_evenly():
+def test_stereo_paths_have_nearly_equal_weights():
     """With real headings and a stereo camera the Gaussian still fits: nine tenths of the paths count."""
     run = small_run()
     graph = graph_of(run)
@@ -175,8 +175,8 @@ def test_deviations_have_their_gaussian_density(size):
 
 
 @pytest.mark.parametrize("least", [0.0, -1.0, np.nan])
-def test_what_is_no_covariance_has_no_density(least):
-    """The kernel says so, and makes no numbers of it."""
+def test_an_indefinite_covariance_has_no_density(least):
+    """The kernel reports it instead of returning a number."""
     assert not weigh_deviations(np.diag([1.0, 2.0, least]), np.ones((3, 4)), np.empty(4))
 
 
@@ -241,7 +241,7 @@ def test_lanes_are_filled_up_with_the_first_path():
     np.testing.assert_array_equal(lanes[:, :, 70:], np.repeat(lanes[:, :, :1], 2 * LANES - 70, axis=2))
 
 
-def test_tiles_fit_the_filters_maps():
+def test_tiles_of_the_smoother_and_the_filter_have_equal_size():
     """The filter takes the smoother's tiles as they are, so both have as many lanes."""
     assert LANES == FILTER_LANES
 
@@ -281,7 +281,7 @@ def test_motions_change_as_the_offsets_say_to_first_order():
     np.testing.assert_allclose(still, mode, atol=1e-12)
 
 
-def test_volumes_stay_as_they_are():
+def test_the_retraction_preserves_volume():
     """The determinant of the derivative of paths by offsets is 1, so that log q is that of the Gaussian."""
     mode, offsets = tree(0.4)
     sought = [key for key in range(6) if key != 3]
@@ -295,7 +295,7 @@ def test_volumes_stay_as_they_are():
     assert np.linalg.det(np.array(columns).T) == pytest.approx(1.0, abs=1e-6)
 
 
-def test_small_offsets_are_taken_as_they_are():
+def test_retracted_and_straight_paths_agree_to_first_order():
     """Straight and bent paths differ to second order only."""
     mode, offsets = tree(1e-4)
     np.testing.assert_allclose(retract_on_se2(mode, PREVIOUS, offsets), mode[:, :, None] + offsets, atol=1e-6)
@@ -314,7 +314,7 @@ def wandering(turn: float) -> tuple[SlamGraph, Any]:
     return graph, optimize(graph, FLAT_CAMERA, TIGHT)
 
 
-def test_where_only_odometry_knows_the_path_bent_paths_are_drawn_from_the_posterior_itself():
+def test_dead_reckoned_paths_are_sampled_exactly_by_retraction():
     """Headings uncertain by half a radian in the end: straight paths are nearly all refused, bent ones weigh alike."""
     graph, mode = wandering(turn=0.1)
     poses, log_proposals = mode.paths(200, np.random.default_rng(1))
@@ -325,7 +325,7 @@ def test_where_only_odometry_knows_the_path_bent_paths_are_drawn_from_the_poster
     np.testing.assert_allclose(draws.poses[:, :, 0], mode.poses, atol=1e-12)
 
 
-def test_straight_paths_stay_where_they_serve():
+def test_gaussian_paths_are_kept_if_their_sample_size_suffices():
     """With landmarks seen again and again the Gaussian of poses is good: it is drawn from, to the bit."""
     run = small_run()
     graph = graph_of(run)

@@ -31,7 +31,7 @@ IN_SLICES = SmoothingOptions(slice_steps=8, max_keys=20, recent_keys=8)
 IN_MANY = replace(IN_SLICES, tolerance=1e-9)  # no descent ends in the slice in which it begins
 
 
-def test_slices_end_where_all_at_once_does():
+def test_slices_give_the_result_of_one_optimisation():
     """Taken in four keys at a time, one Gauss-Newton step a slice, a run has the mode of the whole graph."""
     run = small_run(2)
     smoother = Smoother(run.spec.noise.motion, camera_of(run), TIGHT, np.random.default_rng(1))
@@ -56,7 +56,7 @@ def test_slices_end_where_all_at_once_does():
     np.testing.assert_allclose(graph.landmarks[order], mode.landmarks[same], atol=1e-6)
 
 
-def test_no_step_does_more_than_its_slice(monkeypatch):
+def test_the_work_per_step_is_bounded(monkeypatch):
     """However long the run, no step solves for more keys than the limit and two slices, nor more than three times."""
     run = small_run(length=30.0)
     slam = run.build_filter(30, "fastslam2", 1, rejuvenate_every=25, smoothing=IN_SLICES)
@@ -79,7 +79,7 @@ def test_no_step_does_more_than_its_slice(monkeypatch):
     assert set(drawn) == {""}
 
 
-def test_particles_drawn_in_slices_are_as_good():
+def test_particles_sampled_in_slices_are_as_accurate():
     """In slices or at once, in the same step, the newest poses agree to a part of their doubt."""
     run = small_run(length=8.0)
     sliced = run.build_filter(200, "fastslam2", 1, rejuvenate_every=26, smoothing=SmoothingOptions(slice_steps=8))
@@ -96,7 +96,7 @@ def test_particles_drawn_in_slices_are_as_good():
 
 
 @pytest.mark.parametrize("taken", range(8, 13))
-def test_a_snapshot_between_slices_goes_on_bit_for_bit(taken):
+def test_a_snapshot_between_slices_continues_bit_for_bit(taken):
     """Taken in the middle of a descent or not, a snapshot goes on as the filter does."""
     run = small_run(2)
     readings = list(run.readings())
@@ -111,7 +111,7 @@ def test_a_snapshot_between_slices_goes_on_bit_for_bit(taken):
     assert_same(slam.get_state(), other.get_state())
 
 
-def test_snapshots_catch_a_descent_in_the_middle():
+def test_snapshots_hold_an_unfinished_descent():
     """Some steps leave a descent unfinished: the state says how far it is."""
     run = small_run(2)
     slam = run.build_filter(20, "fastslam2", 1, rejuvenate_every=18, smoothing=IN_MANY)
@@ -124,7 +124,7 @@ def test_snapshots_catch_a_descent_in_the_middle():
 
 
 @pytest.mark.parametrize("slice_steps", [None, 8])
-def test_a_descent_that_keeps_failing_blocks_nothing(slice_steps):
+def test_a_failing_descent_does_not_block_the_smoother(slice_steps):
     """What cannot be smoothed is left out, the report says so, and the smoother goes on with what comes next."""
     run = small_run(length=8.0)
     smoothing = SmoothingOptions(max_iterations=1, tolerance=1e-5, slice_steps=slice_steps)
@@ -137,7 +137,7 @@ def test_a_descent_that_keeps_failing_blocks_nothing(slice_steps):
     assert len(slam.get_state()["rejuvenation"]["guesses"][0][0]) <= 2 * 6
 
 
-def test_where_there_is_nothing_to_smooth_slices_wait():
+def test_slices_wait_if_there_is_nothing_to_smooth():
     """Odometry without noise is found out once per interval, not in each step."""
     run = small_run()
     slam = run.build_filter(20, "fastslam2", 1, rejuvenate_every=8, smoothing=IN_SLICES, motion=EXACT_MOTION)
@@ -182,7 +182,7 @@ def test_a_robot_that_waits_is_rejuvenated_once_it_moves(slice_steps: int | None
 
 
 @pytest.mark.parametrize("before", [0, 8])
-def test_a_wait_of_any_length_needs_no_more_room(before: int) -> None:
+def test_memory_is_bounded_while_a_robot_waits(before: int) -> None:
     """At the start or on the way, what is to be worked through never exceeds what `MAX_FRAMES` frames hold."""
     run = small_run()
     slam, held = filter_of(run), []
@@ -258,7 +258,7 @@ STEPS = st.lists(st.integers(0, 30), unique=True).map(sorted)
 
 
 @given(STEPS, STEPS, st.integers(-1, 31))
-def test_guesses_are_looked_up_and_forgotten_by_step(known, asked, last):
+def test_initial_poses_are_looked_up_and_dropped_by_step(known, asked, last):
     """What was said of a step comes back, NaN of any other; after a step only later ones are known."""
     by_step = {step: np.random.default_rng(step).normal(size=3) for step in known}
     guesses, half = InitialPoses.empty(), len(known) // 2

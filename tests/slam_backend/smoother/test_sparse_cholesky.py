@@ -112,8 +112,8 @@ def test_the_solution_is_the_dense_one(posed, damping):
     np.testing.assert_allclose(new_landmarks - landmarks, found[system.num_poses :], rtol=1e-6, atol=1e-12)
 
 
-def test_what_is_not_positive_definite_has_no_factor(posed):
-    """A node of negative information is reported wherever it stands."""
+def test_a_matrix_that_is_not_positive_definite_has_no_factor(posed):
+    """A pivot of negative information is reported wherever it is."""
     system = posed.mode.system
     assert system is not None
     blocks = system.equations.blocks
@@ -151,7 +151,7 @@ def test_blocks_of_the_inverse_are_the_solutions_for_unit_vectors(posed):
     np.testing.assert_array_equal(found, 0.5 * (expected + expected.T))
 
 
-def test_spreads_are_those_of_the_dense_covariance(posed):
+def test_relative_pose_covariances_agree_with_the_dense_covariance(posed):
     """Derivatives of motions by differences, and the dense inverse, give how far each motion scatters."""
     graph, mode = posed.graph, posed.mode
     covariance, found = np.linalg.inv(information(posed)), mode.spreads()
@@ -172,7 +172,7 @@ def test_spreads_are_those_of_the_dense_covariance(posed):
         assert found[b] == pytest.approx(scatter[0] + scatter[1] + LEVER**2 * scatter[2], rel=1e-5)
 
 
-def test_a_graph_is_crowded_where_all_poses_see_all_landmarks(posed):
+def test_a_graph_is_dense_if_all_poses_see_all_landmarks(posed):
     """Then the columns of the factor are long, other than in a run past landmarks that come and go."""
     assert not posed.mode.crowded
     rng, points = np.random.default_rng(5), np.random.default_rng(6).uniform(2.0, 4.0, (40, 3))
@@ -186,7 +186,7 @@ def test_a_graph_is_crowded_where_all_poses_see_all_landmarks(posed):
     assert mode.crowded
 
 
-def test_a_pattern_tells_what_is_drawn_and_how_long_its_columns_are(posed):
+def test_a_symbolic_factor_lists_sampled_nodes_and_column_lengths(posed):
     """Poses are drawn, and landmarks for which a pose waits; lengths are those of the columns."""
     assert posed.mode.system is not None
     p, num_poses = posed.mode.system.pattern, posed.mode.system.num_poses

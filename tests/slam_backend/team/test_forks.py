@@ -45,7 +45,7 @@ def branches(team: TeamSlam) -> set[tuple[int, ...]]:
 # ---------------------------------------------------------------------- who is in contact
 
 
-def test_robots_pass_on_what_they_hear() -> None:
+def test_robots_relay_messages() -> None:
     """A chain a-b-c-d is one network; without its middle link it is two; the diagonal means nothing."""
     chain = links(4, (0, 1), (1, 2), (2, 3))
     assert contact_components(chain, 4).tolist() == [0, 0, 0, 0]
@@ -74,7 +74,7 @@ def test_a_group_in_a_chain_goes_by_one_filter() -> None:
     ("gap", "options"),
     [(1, {}), (20, {}), (45, {}), (45, {"existence": ExistenceModel()}), (45, {"rejuvenate_every": 25})],
 )
-def test_a_replay_gives_what_unbroken_contact_would_have_given(gap: int, options: dict[str, Any]) -> None:
+def test_a_replay_gives_the_result_of_unbroken_contact(gap: int, options: dict[str, Any]) -> None:
     """Where only the robot out of contact reads something, the joint filter ends bit for bit as if never broken.
 
     Particles, maps, weights, random stream and logs agree: what is read is taken in once, in order, later.
@@ -158,7 +158,7 @@ def test_a_replay_has_the_distribution_of_unbroken_contact() -> None:
 # ---------------------------------------------------------------------- bytes
 
 
-def test_a_return_is_counted_to_the_byte() -> None:
+def test_bytes_of_a_return_are_counted() -> None:
     """The returning robot sends its odometry and measurements, and receives what has changed since it left."""
     simulation = SimulatedTeam(num_robots=2, seed=5)
     team = merged_team(simulation, merging=FINAL)
@@ -238,7 +238,7 @@ def test_a_robot_that_meets_another_group_can_merge_with_it() -> None:
     assert simulation.position_errors(team).max() < 0.3
 
 
-def test_only_those_who_keep_the_joint_filter_merge() -> None:
+def test_only_robots_with_the_joint_filter_merge() -> None:
     """A merge through a robot with an outdated fork is refused."""
     simulation, team = driven(3, 3, 10, num_particles=13)
     team.merge(0, 1, true_alignment(simulation, team, 0, 1))
@@ -252,7 +252,7 @@ def test_only_those_who_keep_the_joint_filter_merge() -> None:
 
 
 @pytest.mark.parametrize("steps_before", [45, 62])
-def test_a_team_with_forks_goes_on_from_a_snapshot_bit_for_bit(steps_before: int) -> None:
+def test_a_team_with_forks_continues_from_a_snapshot_bit_for_bit(steps_before: int) -> None:
     """Before the return, and in the midst of a replay, a restored team does the same as the one that went on."""
     simulation = SimulatedTeam(seed=4)
     team = merged_team(simulation, 20)

@@ -66,7 +66,7 @@ def test_a_filter_that_never_rejuvenates_by_itself_can_be_rejuvenated() -> None:
     np.testing.assert_allclose(maps[0].means, maps[1].means, atol=1e-3)
 
 
-def test_a_merge_is_that_of_straightened_maps() -> None:
+def test_a_merge_uses_the_smoothed_maps() -> None:
     """What is merged, and by which motion, is what both filters are after a rejuvenation."""
     _, alone = bent_team(112, NEVER)
     _, team = bent_team(112, AT_LAST)
@@ -85,7 +85,7 @@ def test_a_merge_is_that_of_straightened_maps() -> None:
 
 
 @pytest.mark.slow
-def test_straight_maps_are_merged_more_truly() -> None:
+def test_smoothed_maps_give_more_accurate_merges() -> None:
     """Over twelve pairs of bent maps the motions by which they are merged are off by less than 0.8 of the distance."""
     errors = []
     for merging in (AS_IT_IS, MergeOptions()):
@@ -119,7 +119,7 @@ def test_maps_that_no_longer_fit_are_not_merged() -> None:
 
 
 @pytest.mark.parametrize("every", [4, 2])
-def test_maps_that_agree_on_less_once_straight_are_not_merged(every: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_maps_that_agree_less_after_smoothing_are_not_merged(every: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """A smoother that has lost its way is not believed: the attempt is refused, and the filters are as they were."""
     _, alone = bent_team(112, NEVER)
     original = trying.smoothed_maps
@@ -138,7 +138,7 @@ def test_maps_that_agree_on_less_once_straight_are_not_merged(every: int, monkey
         assert_same(contents(team._find(robot)[0].filter), contents(alone._find(robot)[0].filter))
 
 
-def test_what_cannot_be_bent_is_merged_as_it_is() -> None:
+def test_maps_with_exact_poses_are_merged_unsmoothed() -> None:
     """Poses that are given as exact leave nothing to smooth: the merge is that without `smooth_first`, bit for bit."""
     states = []
     for merging in (AS_IT_IS, MergeOptions()):
@@ -154,7 +154,7 @@ def test_what_cannot_be_bent_is_merged_as_it_is() -> None:
     assert_same(states[0], states[1])
 
 
-def test_straightened_maps_are_sent_once_more() -> None:
+def test_smoothed_maps_are_sent_again() -> None:
     """Both speakers send all their landmarks again, without descriptors."""
     sent = []
     for merging in (AS_IT_IS, MergeOptions()):
@@ -164,7 +164,7 @@ def test_straightened_maps_are_sent_once_more() -> None:
     assert (sent[1] - sent[0]).tolist() == again
 
 
-def test_the_spread_of_motions_is_that_of_the_particles_that_a_merge_makes() -> None:
+def test_the_predicted_scatter_of_motions_is_that_of_the_merged_particles() -> None:
     """It is the scatter of where the joint filter's particles let the other robot start, told before the merge."""
     _, team = bent_team(112, NEVER)
     a, b = (team._find(robot)[0].filter for robot in range(2))
@@ -194,7 +194,7 @@ def test_a_pair_too_uncertain_to_merge_waits_and_merges_later() -> None:
 
 
 @pytest.mark.parametrize("how", [{}, {"merged_particles": 5}])
-def test_being_sure_leaves_no_trace(how: dict[str, Any]) -> None:
+def test_checking_the_uncertainty_of_a_merge_changes_nothing(how: dict[str, Any]) -> None:
     """Whether particles agree is only looked at: the merge is bit for bit that of a team which does not ask."""
     states = [
         bent_team(112, AT_LAST, merging=MergeOptions(min_sigmas=sure, **how))[1].get_state() for sure in (0.0, 1e-6)
@@ -202,7 +202,7 @@ def test_being_sure_leaves_no_trace(how: dict[str, Any]) -> None:
     assert_same(*({"filter": state["groups"], "rng": state["rng"]} for state in states))
 
 
-def test_maps_of_a_merge_that_is_not_watched_are_not_at_hand() -> None:
+def test_maps_of_an_unmonitored_merge_are_not_available() -> None:
     """Where merges are final, or nothing was merged, asking for the maps that were joined is refused."""
     _, team = bent_team(112, AT_LAST, merging=MergeOptions(watch_steps=0))
     for event in team.events:
@@ -224,7 +224,7 @@ def attempt_begun(seed: int) -> tuple[SimulatedTeam, TeamSlam]:
     return simulation, team
 
 
-def test_an_attempt_goes_on_when_both_maps_are_straight() -> None:
+def test_an_attempt_continues_once_both_maps_are_smoothed() -> None:
     """In the step after the second filter has drawn new particles the maps align again, and merge by that."""
     simulation, team = attempt_begun(112)
     bent = team._schedule.straightening
@@ -246,7 +246,7 @@ def test_an_attempt_goes_on_when_both_maps_are_straight() -> None:
     assert team._schedule.straightening is None
 
 
-def test_an_attempt_goes_on_from_a_snapshot() -> None:
+def test_an_attempt_continues_from_a_snapshot() -> None:
     """A team restored between two slices does the same, bit for bit, as the one that went on."""
     simulation, team = attempt_begun(115)
     simulation.run(team, 1)
@@ -255,7 +255,7 @@ def test_an_attempt_goes_on_from_a_snapshot() -> None:
 
 
 @pytest.mark.parametrize("apart", [MOST_STEPS // 2, MOST_STEPS])
-def test_an_attempt_outlives_contact_lost_for_a_while(apart: int) -> None:
+def test_an_attempt_survives_a_temporary_loss_of_contact(apart: int) -> None:
     """Maps are straightened without contact; they align in the first step with it, unless that comes too late."""
     simulation, team = attempt_begun(112)
     simulation.run(team, apart, links(2))
@@ -267,7 +267,7 @@ def test_an_attempt_outlives_contact_lost_for_a_while(apart: int) -> None:
     assert [event.kind for event in team.events] == ["attempt", "merge"]
 
 
-def test_an_attempt_waits_for_straight_maps_no_longer_than_it_may() -> None:
+def test_an_attempt_waits_for_smoothed_maps_for_a_bounded_time() -> None:
     """Filters that read nothing do not smooth: their maps are taken as they are, and no other robot waits for ever."""
     _, team = attempt_begun(112)
     for _ in range(MOST_STEPS + 1):
@@ -329,7 +329,7 @@ def test_a_trial_whose_merge_would_be_undone_is_refused(monkeypatch: pytest.Monk
         assert np.isfinite(trial[1]) == bounded
 
 
-def test_a_refused_trial_leaves_no_trace() -> None:
+def test_a_refused_trial_changes_nothing() -> None:
     """Groups and random streams are bit for bit those of a team that makes no trials."""
     at_last = AttemptOptions(every=FEW_STEPS)
     states = [
@@ -365,7 +365,7 @@ def test_a_pair_merges_by_the_motion_of_its_trial_when_two_agree() -> None:
     np.testing.assert_allclose(merge.alignment.transform, mean_pose(starts), atol=1e-12)
 
 
-def test_what_held_frames_leave_open_is_doubted_as_well() -> None:
+def test_the_uncertainty_of_a_trial_includes_the_gauge_covariance() -> None:
     """The doubt is that of the motion between the groups' starts: by the particles, and by draws of both frames."""
     simulation, team = driven(2, 3, 60, num_particles=13)
     alignment = false_alignment(simulation, team, np.zeros(3))

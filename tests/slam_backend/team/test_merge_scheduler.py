@@ -34,7 +34,7 @@ def pair_of(names: list[int]) -> tuple[LandmarkMap, LandmarkMap]:
     return map_of([*names, 12]), map_of([11, *names])
 
 
-def test_one_step_in_so_many_is_due() -> None:
+def test_one_step_per_interval_is_due() -> None:
     """With every = 25, the last step of each 25 is due, and no other but while an attempt goes on."""
     plan = schedule()
     assert [step for step in range(100) if plan.is_due(step)] == [24, 49, 74, 99]
@@ -77,14 +77,14 @@ def test_smoothing_for_a_pair_that_is_always_refused_costs_a_multiple_of_the_log
         assert total < 10 * end
 
 
-def test_a_doubtful_pair_waits_as_long_as_that_helps() -> None:
+def test_an_uncertain_pair_waits_while_its_uncertainty_falls() -> None:
     """It waits where it is not sure enough, the first time and while the doubt falls by three tenths each time."""
     plan = schedule()
     assert [plan.should_defer(FIRST, doubt) for doubt in (4.0, 2.7, 1.8, 1.3)] == [True, True, True, False]
     assert [plan.should_defer(SECOND, doubt) for doubt in (4.0, 0.9, 4.0)] == [True, False, False]
 
 
-def test_what_a_pair_has_waited_counts_in_larger_groups() -> None:
+def test_waiting_times_carry_over_to_larger_groups() -> None:
     """Robots that waited for each other go on waiting in other company, others begin; a snapshot knows it, too."""
     plan = schedule()
     assert plan.should_defer(((0,), (2,)), 4.0)
@@ -120,7 +120,7 @@ def test_a_refused_pair_needs_new_candidates() -> None:
     assert plan.choose({FIRST: pair_of([*names, 5, 6, 7])}, 49) == FIRST
 
 
-def test_old_evidence_may_be_tried_again() -> None:
+def test_candidates_count_as_new_after_the_longest_wait() -> None:
     """After `longest_wait` steps the same candidates count as new: their landmarks are known better by then."""
     plan = schedule(longest_wait=200)
     same = {FIRST: pair_of([0, 1, 2, 3])}
@@ -130,7 +130,7 @@ def test_old_evidence_may_be_tried_again() -> None:
     assert plan.choose(same, 225) == FIRST
 
 
-def test_too_few_candidates_are_no_attempt() -> None:
+def test_too_few_candidates_make_no_attempt() -> None:
     """A pair with fewer candidates than an alignment needs does not try."""
     assert schedule().choose({FIRST: pair_of([0, 1, 2])}, 49) is None
     assert schedule().choose({FIRST: pair_of([0, 1, 2, 3])}, 49) == FIRST
@@ -149,7 +149,7 @@ def test_the_pair_with_the_most_new_candidates_tries() -> None:
     assert plan.choose({FIRST: few, SECOND: many}, 49) == FIRST
 
 
-def test_a_merge_forgets_the_attempts_of_the_groups_that_are_gone() -> None:
+def test_a_merge_drops_the_records_of_the_merged_groups() -> None:
     """After a success, no record names a robot of the merged groups; others keep waiting."""
     plan = schedule()
     third: PairKey = ((1, 3), (2,))
@@ -163,7 +163,7 @@ def test_a_merge_forgets_the_attempts_of_the_groups_that_are_gone() -> None:
     assert not plan.may_try(other, 25)
 
 
-def test_a_schedule_goes_on_from_its_state() -> None:
+def test_a_schedule_continues_from_its_state() -> None:
     """A restored schedule has the same waits, memory and options, and shares nothing with the first."""
     plan, twin = schedule(every=10), schedule()
     plan.choose({FIRST: pair_of([0, 1, 2, 3])}, 49)
@@ -215,7 +215,7 @@ def test_one_contact_between_two_groups_is_enough() -> None:
     assert team.groups == ((0, 1, 2),)
 
 
-def test_a_pair_too_doubtful_to_take_waits_however_long() -> None:
+def test_a_pair_above_the_uncertainty_limit_always_waits() -> None:
     """Beyond the most that can be taken it waits though waiting does not help; below it only as long as that helps."""
     plan = schedule()
     assert [plan.should_defer(FIRST, 4.0, limit=1.25) for _ in range(5)] == [True] * 5
@@ -237,7 +237,7 @@ def test_trials_of_two_frames_are_compared() -> None:
         assert known.change(((1,), (3,)), turned) == np.inf
 
 
-def test_maps_with_too_many_pairs_for_geometry_alone_do_not_try() -> None:
+def test_maps_without_appearance_and_with_too_many_pairs_make_no_attempt() -> None:
     """Without appearance, a pair of maps with more than 10,000 pairs of landmarks is passed over; others still try."""
     plan = MergeScheduler(AttemptOptions(), AlignmentOptions(min_inliers=4, appearance=False))
     means = np.column_stack([np.arange(101.0), np.zeros((101, 2))])
@@ -301,8 +301,8 @@ def test_a_robot_that_has_left_does_not_send() -> None:
     assert ledger.sent == [POSE_BYTES + LANDMARK_BYTES + LOOK, 0, POSE_BYTES + LANDMARK_BYTES]
 
 
-def test_a_ledger_goes_on_from_its_state() -> None:
-    """A restored ledger counts on as the first one did, and shares nothing with it."""
+def test_a_traffic_counter_continues_from_its_state() -> None:
+    """A restored counter continues like the original, and shares nothing with it."""
     ledger, twin = TrafficCounter(2), TrafficCounter(2)
     ledger.record_maps(0, 1, counted_map({1: 4}), counted_map({2: 1}))
     twin.set_state(ledger.get_state())

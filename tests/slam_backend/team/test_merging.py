@@ -113,7 +113,7 @@ def test_ids_of_a_stay_and_those_of_b_are_renamed_one_to_one() -> None:
     assert report.created[0][0] == max(used) + 1
 
 
-def test_a_landmark_keeps_the_caller_s_name_that_either_robot_was_given() -> None:
+def test_a_fused_landmark_keeps_the_callers_id() -> None:
     """Where a's landmark has no name of the caller's, the fused one takes that of b."""
     a, b = both()
     a.state.maps.identities[a.state.maps.ids == 2] = -1
@@ -225,7 +225,7 @@ def test_a_filter_without_landmarks_joins_by_the_alignment_alone(empty_first: bo
     assert report.num_new == 1
 
 
-def test_what_lay_in_the_memory_of_new_rows_is_never_read(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_uninitialised_rows_are_never_read(monkeypatch: pytest.MonkeyPatch) -> None:
     """Rows are made without being written: whatever was there, a run and a merge come to the same bits."""
     states, make = [], _map_store.empty_aligned
     for byte in (0, 255):  # 0.0, or NaN and -1
@@ -290,7 +290,7 @@ def test_the_uncertainty_of_b_s_pose_is_turned_with_its_map() -> None:
     np.testing.assert_allclose(joint.pose(1).covariance[position], expected[position], atol=largest / 3)
 
 
-def test_a_robot_that_was_blind_when_it_merged_still_is() -> None:
+def test_a_merge_does_not_sample_unsampled_motion() -> None:
     """Its Gaussians go on as they would have without the merge, turned: a merge is no sighting, and samples nothing."""
     names = np.array([4])
     a, b = (FastSlam(1, 7, motion=WIDE_MOTION, seed=seed) for seed in range(2))
@@ -306,7 +306,7 @@ def test_a_robot_that_was_blind_when_it_merged_still_is() -> None:
     np.testing.assert_allclose(joint.pose(1).mean, compose(A_FROM_B, b.pose().mean), atol=1e-5)
 
 
-def test_the_most_probable_particle_takes_both_pasts_into_account() -> None:
+def test_accumulated_weights_of_both_filters_add_up() -> None:
     """Accumulated log-weights add (Eq. 12), up to the evidence, which is equal for pairs whose maps fit equally."""
     rng = np.random.default_rng(2)
     a = map_once(NAMES_A, np.zeros(3), 0.05, rng, 50, moves=1)

@@ -109,7 +109,7 @@ def test_a_particle_level_merge_keeps_the_path_uncertainty_and_a_naive_one_loses
 
 
 @pytest.mark.slow
-def test_maps_that_can_bend_do_not_make_a_merge_over_confident() -> None:
+def test_path_uncertainty_does_not_make_a_merge_overconfident() -> None:
     """Where paths between frames are uncertain too, NEES stays below its dimension (and above a third of it).
 
     Mean over 60 trials, one-sided 99.9 % bound 3 + 3.1 sqrt(6 / 60), plus 5 % for the 150 draws.

@@ -81,7 +81,7 @@ def test_a_merge_gives_the_same_whichever_robot_is_named_first(robot_a: int, rob
     np.testing.assert_allclose(team.map(robot_a).means, other.map(robot_a).means, atol=10 * SIGMA)
 
 
-def test_a_renaming_names_every_landmark_of_b_s_map() -> None:
+def test_an_id_map_covers_every_landmark_of_map_b() -> None:
     """A landmark of b's map before the merge, renamed, looks the same in the joint map; a's keep id and look."""
     team = standing_team()
     before = [team.map(robot) for robot in range(3)]
@@ -96,7 +96,7 @@ def test_a_renaming_names_every_landmark_of_b_s_map() -> None:
         assert looks[landmark] == look
 
 
-def test_standpoints_of_all_robots_are_those_of_each() -> None:
+def test_team_poses_agree_with_the_poses_of_each_robot() -> None:
     """Before, while and after two of three robots merge, one of which then loses contact; in the same arrays or not."""
     simulation = SimulatedTeam(num_robots=3, seed=5)
     team = simulation.build(num_particles=20, attempts=AttemptOptions(enabled=False))

@@ -58,7 +58,7 @@ def run(simulation: SimulatedTeam, team: TeamSlam, steps: int, contacts: object 
     return [event.kind for event in team.events[before:]]
 
 
-def test_it_follows_merges_forks_returns_undos_and_the_end_of_a_watch() -> None:
+def test_merges_forks_returns_undos_and_ends_of_monitoring_change_the_topology() -> None:
     """Each of these makes a new topology; steps between them do not."""
     simulation = SimulatedTeam(num_robots=3, seed=101)
     team = simulation.build(attempts=NEVER, merging=MergeOptions(watch_steps=60))
@@ -98,7 +98,7 @@ def test_a_restored_team_has_the_topology_of_its_state() -> None:
 
 
 @pytest.mark.parametrize(("rows", "robots"), [(3, None), (1, 4)])
-def test_all_that_is_believed_lies_in_one_array(rows: int, robots: int | None) -> None:
+def test_all_beliefs_are_views_of_one_array(rows: int, robots: int | None) -> None:
     """What is written by name is in the rows that kernels take, once, and nothing else is."""
     points = TeamPoses(rows, robots)
     points.beliefs.fill(-1.0)
@@ -115,7 +115,7 @@ def test_all_that_is_believed_lies_in_one_array(rows: int, robots: int | None) -
 
 
 @pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, lambda points: pickle.loads(pickle.dumps(points))])
-def test_the_views_of_a_copy_are_of_its_own_beliefs(copied: Callable[[TeamPoses], TeamPoses]) -> None:
+def test_a_copy_has_views_of_its_own_array(copied: Callable[[TeamPoses], TeamPoses]) -> None:
     """What kernels write into a copy is what it tells."""
     points = TeamPoses(2)
     points.beliefs[:], points.poses[:] = 1.0, 2.0
@@ -126,7 +126,7 @@ def test_the_views_of_a_copy_are_of_its_own_beliefs(copied: Callable[[TeamPoses]
         assert (array == 5.0).all()
 
 
-def test_members_say_who_goes_by_a_filter() -> None:
+def test_the_membership_table_lists_active_robots() -> None:
     """The robots of the filter, and of each whether it does."""
     assert membership_table((1, 2, 4), (4, 1)).tolist() == [[1, 2, 4], [1, 0, 1]]
 
@@ -145,7 +145,7 @@ def _moved(seed: int) -> FastSlam:
     return slam
 
 
-def test_the_sample_size_is_noted_of_robots_that_go_by_the_filter() -> None:
+def test_the_sample_size_is_written_for_active_robots() -> None:
     """Of those of its robots that are live, and of no other."""
     points = TeamPoses(4)
     points.ess.fill(-1.0)
@@ -164,7 +164,7 @@ def test_kinds_of_starts_are_distinguished() -> None:
     assert start_kind(starts, 5) == SPREAD
 
 
-def test_unknown_starts_do_not_blur_the_pose() -> None:
+def test_uncertain_starts_do_not_widen_the_pose_in_the_start_frame() -> None:
     """Moving robot and start of each particle alike, as a merge does, leaves the pose in the start frame as it was."""
     slam = _moved(2)
     before, particles = slam.pose_from_start(1), slam.particles_from_start(1)
@@ -203,7 +203,7 @@ def test_the_change_of_frame_is_that_of_matrices() -> None:
     assert not spread[:, 9:].any()
 
 
-def test_own_frames_are_the_plain_definition() -> None:
+def test_poses_in_own_start_frames_agree_with_the_plain_definition() -> None:
     """Of robots that start at the origin, at a known place and at an unknown one; surplus lanes do not count.
 
     The team calls them 3, 0 and 2; robot 1 goes by another filter, and so does one that this filter knows as 4.

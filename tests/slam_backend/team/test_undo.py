@@ -56,7 +56,7 @@ def test_a_forced_false_merge_is_found_and_undone(offset: Any, seed: int) -> Non
     assert simulation.position_errors(team).max() < 0.3
 
 
-def test_after_an_undo_it_is_as_if_the_merge_had_never_been() -> None:
+def test_after_an_undo_the_team_equals_one_that_never_merged() -> None:
     """Filters, their random streams and logs are bit for bit those of a team that never merged, and stay so."""
     simulation, team = driven(2, 101)
     other, twin = driven(2, 101)
@@ -77,7 +77,7 @@ def test_after_an_undo_it_is_as_if_the_merge_had_never_been() -> None:
     assert MapReleased(2) in last.map_changes
 
 
-def test_a_merge_on_top_of_a_false_one_goes_with_it() -> None:
+def test_a_later_merge_is_undone_with_an_earlier_false_one() -> None:
     """Of two merges in the window the first was false: both are undone, the last first; the false pair is barred."""
     simulation, team = driven(3, 104)
     other, twin = copy.deepcopy(simulation), simulation.build(attempts=NEVER)
@@ -99,7 +99,7 @@ def test_a_merge_on_top_of_a_false_one_goes_with_it() -> None:
     assert team._schedule.may_try(((0, 1), (2,)), step)
 
 
-def test_a_false_merge_on_top_of_a_right_one_goes_alone() -> None:
+def test_a_false_merge_is_undone_without_an_earlier_right_one() -> None:
     """The last merge of a group is undone, and the earlier one, which was right, stays in force."""
     simulation, team = driven(3, 104)
     team.merge(1, 2, align_maps(team.map(1, "mixture"), team.map(2, "mixture")))
@@ -131,7 +131,7 @@ def test_a_pair_whose_merge_was_undone_is_barred_for_a_while() -> None:
 # ---------------------------------------------------------------------- with robots out of contact
 
 
-def test_doubts_wait_until_both_sides_are_in_contact() -> None:
+def test_an_undo_needs_contact_between_both_sides() -> None:
     """Robots that part right after a false merge keep its snapshot, and undo it when they meet again."""
     simulation, team = driven(2, 101)
     team.merge(0, 1, false_alignment(simulation, team, FAR))
@@ -143,7 +143,7 @@ def test_doubts_wait_until_both_sides_are_in_contact() -> None:
     assert simulation.position_errors(team).max() < 0.4
 
 
-def test_a_robot_that_was_away_hears_of_the_undo_on_its_return() -> None:
+def test_a_robot_out_of_contact_follows_an_undo_on_its_return() -> None:
     """Until then it goes by its fork of the false map; then its readings are taken in by its old group's filter."""
     simulation, team = driven(3, 106)
     team.merge(0, 1, align_maps(team.map(0, "mixture"), team.map(1, "mixture")))
@@ -169,7 +169,7 @@ def false_alignment_of_group(simulation: SimulatedTeam, team: TeamSlam) -> Any:
 # ---------------------------------------------------------------------- right merges
 
 
-def test_a_right_merge_is_never_in_doubt_and_then_forgotten() -> None:
+def test_a_right_merge_is_not_undone_and_its_snapshot_is_dropped() -> None:
     """After the window nothing of what it took to undo it is left: no snapshot, no readings, no number of a map."""
     simulation, team = driven(2, 110, merging=MergeOptions(watch_steps=40))
     team.merge(0, 1, align_maps(team.map(0, "mixture"), team.map(1, "mixture")))
@@ -210,7 +210,7 @@ def test_merges_can_be_final() -> None:
 # ---------------------------------------------------------------------- the shape of a map
 
 
-def test_only_what_moves_among_the_others_has_moved() -> None:
+def test_only_deformation_counts_as_motion_of_landmarks() -> None:
     """A map moved as a whole has kept its shape; of one with a third of it shifted by a metre that third has moved."""
     rng = np.random.default_rng(3)
     means = rng.uniform(-9.0, 9.0, (30, 3))
@@ -299,7 +299,7 @@ def test_an_undo_waits_for_contact_and_goes_on_from_a_snapshot() -> None:
     assert simulation.position_errors(team).max() < 0.4
 
 
-def test_a_group_in_doubt_does_not_merge() -> None:
+def test_a_group_with_a_rollback_in_progress_does_not_merge() -> None:
     """While an undo is under way its group makes no attempts; a merge by hand makes a new group, doubted in turn."""
     simulation = SimulatedTeam(num_robots=3, seed=104)
     team = simulation.build(attempts=AttemptOptions(every=1), merging=UNWATCHED)
@@ -317,7 +317,7 @@ def test_a_group_in_doubt_does_not_merge() -> None:
     assert [event.robots_a for event in team.events[:4]] == [(0,), (0, 1), (0, 1), (0,)]
 
 
-def test_a_doubt_ends_with_the_watch_of_the_filter_that_goes_on() -> None:
+def test_an_undo_ends_with_the_monitoring_of_the_merge() -> None:
     """A joint filter that does not watch the merge any more does not take it back."""
     simulation, team = driven(2, 101, merging=UNWATCHED)
     team.merge(0, 1, false_alignment(simulation, team, FAR))

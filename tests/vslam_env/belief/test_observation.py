@@ -69,7 +69,7 @@ def test_readings_of_a_team_are_those_of_its_robots() -> None:
                 np.testing.assert_array_equal(value, same, err_msg=field)
 
 
-def test_every_kind_of_element_varies() -> None:
+def test_every_part_of_an_observation_varies() -> None:
     """Over an episode with a merge each part of the observation carries information: none is constant."""
     _, observations = _record(small_env(max_cycles=400), 300)
     for name in KEYS:

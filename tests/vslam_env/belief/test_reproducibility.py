@@ -60,8 +60,8 @@ def _episode(env: ExplorationEnv) -> Iterator[Any]:
 
 
 @pytest.mark.parametrize("action_type", ["continuous", "goal"])
-def test_what_is_kept_stays_as_it_was(action_type: str) -> None:
-    """Nothing that was handed out lies in memory that later steps write to."""
+def test_returned_arrays_do_not_change_later(action_type: str) -> None:
+    """No returned array is in memory that later steps write to."""
     env = small_env(action_type=action_type, max_cycles=200)
     kept = []
     for results in _episode(env):
@@ -74,8 +74,8 @@ def test_what_is_kept_stays_as_it_was(action_type: str) -> None:
         assert held[0][-1] == then[0][-1]  # infos
 
 
-def test_what_is_read_only_cannot_be_made_writable() -> None:
-    """No array of a belief, a map, an event, a frame or the world lets who holds it lift the protection."""
+def test_read_only_arrays_cannot_be_made_writable() -> None:
+    """No array of a belief, a map, an event, a frame or the world can be made writable by its holder."""
     env = small_env(max_cycles=200)
     for _ in _episode(env):
         pass
@@ -95,7 +95,7 @@ def test_what_is_read_only_cannot_be_made_writable() -> None:
 
 
 @pytest.mark.parametrize("kind", [{}, {"observation_type": "flat"}, {"action_type": "goal"}])
-def test_who_writes_to_what_is_returned_changes_nothing(kind: dict[str, Any]) -> None:
+def test_writing_to_returned_arrays_changes_nothing(kind: dict[str, Any]) -> None:
     """An episode goes on with the same bytes though all arrays that can be written were filled with ones."""
     digests = []
     for writes in (False, True):
@@ -109,7 +109,7 @@ def test_who_writes_to_what_is_returned_changes_nothing(kind: dict[str, Any]) ->
     assert digests[0] == digests[1]
 
 
-def test_a_belief_keeps_nothing_that_the_caller_may_write_to() -> None:
+def test_a_belief_keeps_no_array_of_the_caller() -> None:
     """Who reuses the arrays of a tick's readings changes nothing, though scans are kept for merges to be taken back."""
     states = []
     for writes in (False, True):
@@ -129,7 +129,7 @@ def test_a_belief_keeps_nothing_that_the_caller_may_write_to() -> None:
         np.testing.assert_array_equal(one, other)
 
 
-def test_true_ids_are_not_those_of_the_books() -> None:
+def test_true_ids_in_frames_are_copies() -> None:
     """The simulator looks at those again when robots return; who writes to frames changes nothing there."""
     env = small_env()
     env.reset(seed=5, options={"start_poses": MEETING})
@@ -168,7 +168,7 @@ def test_one_seed_gives_the_same_bytes(action_type: str, steps: int) -> None:
     assert _run(second, 12, steps) != reference
 
 
-def test_resets_without_a_seed_go_on() -> None:
+def test_resets_without_a_seed_continue_the_sequence() -> None:
     """Resets without a seed give new worlds; the sequence of them repeats from the seed; zero is a seed."""
     env = small_env(world="fig5")
     walls = []
@@ -191,7 +191,7 @@ def test_a_first_reset_without_a_seed_is_random() -> None:
     assert not np.array_equal(*starts)
 
 
-def test_streams_are_apart() -> None:
+def test_random_streams_are_independent() -> None:
     """Neither more measurements a frame, nor another number of particles, nor an oracle shift odometry or scans."""
     logs = []
     eager = small_env().config.replace(landmark_sensor={"max_measurements": 9})
@@ -232,7 +232,7 @@ KIB = 1024
 
 
 @pytest.mark.slow
-def test_an_episode_leaves_nothing_behind() -> None:
+def test_an_episode_leaks_no_memory() -> None:
     """An episode with a merge, played again in the same environment and in a new one, leaves no more than before.
 
     Less than a grid of one robot, that is: caches of the interpreter take some kilobytes.

@@ -64,7 +64,7 @@ def parted(rng: np.random.Generator) -> Mates:
 
 
 @pytest.mark.parametrize("seed", range(100, 104))
-def test_robots_that_return_hold_what_those_hold_that_never_parted(seed: int) -> None:
+def test_returning_robots_have_the_grids_of_unbroken_contact(seed: int) -> None:
     """But for the order of what was painted: each scan went into each grid once, by whichever way it came."""
     rng, lossy, steady = np.random.default_rng(seed), Drive(seed), Drive(seed)
     for drive, patterns in ((steady, [ALL] * 150), (lossy, [ALL] + [parted(rng) for _ in range(148)] + [ALL])):
@@ -88,7 +88,7 @@ def test_meeting_again_without_having_read_anything_new_changes_nothing() -> Non
     assert (drive.cells() == before).all()
 
 
-def test_a_robot_long_away_receives_one_piece_and_nothing_is_kept_for_longer() -> None:
+def test_the_history_of_scans_is_bounded() -> None:
     """What is kept of the time apart is bounded; after it they absorb each other's grids."""
     drive = Drive(100)
     drive.on(ALL)
@@ -102,7 +102,7 @@ def test_a_robot_long_away_receives_one_piece_and_nothing_is_kept_for_longer() -
     assert (known.sum(axis=(1, 2)) > (alone != UNKNOWN).sum(axis=(1, 2)))[2]
 
 
-def test_restored_grids_know_what_was_missed() -> None:
+def test_restored_grids_continue_with_missed_scans() -> None:
     """A state taken while robots are apart goes on to the same cells."""
     rng, drive = np.random.default_rng(100), Drive(100)
     for mates in [ALL] * 3 + [parted(rng) for _ in range(20)]:
@@ -119,7 +119,7 @@ def test_restored_grids_know_what_was_missed() -> None:
         assert (drive.grids[robot].cells == other[robot].cells).all()
 
 
-def test_what_was_sent_is_not_sent_again() -> None:
+def test_scans_are_sent_once() -> None:
     """Of two that hold the same, one sends it; what is known is noted, not sent; others hand on what they received."""
     shared = np.array([[1, 1, 0], [1, 1, 0], [0, 0, 1]])
     strokes = GridUpdate(7, shared, np.zeros((3, 3, 3)), np.ones((3, 2)), np.zeros(3, np.bool_))
@@ -146,7 +146,7 @@ UNDONE = MergeUndone(MERGED.maps)
 PAIR, WITHOUT = ((0, 2), (1,), (0, 2)), ((0, 1), (0, 1), (2,))
 
 
-def test_nothing_of_an_undone_merge_reaches_who_was_away() -> None:
+def test_scans_of_an_undone_merge_do_not_reach_absent_robots() -> None:
     """A robot away when a merge was made and undone receives what its mates scanned, as if it had never been."""
     drives = Drive(100), Drive(100)
     for drive, was_merged in zip(drives, (True, False), strict=True):
@@ -160,7 +160,7 @@ def test_nothing_of_an_undone_merge_reaches_who_was_away() -> None:
     assert (drives[0].cells() == drives[1].cells()).all()
 
 
-def test_what_was_sent_within_a_side_outlives_an_undo() -> None:
+def test_scans_shared_within_a_side_survive_an_undo() -> None:
     """What robots of a side told each other of the time before the merge is painted again after its undo."""
     drives = Drive(101), Drive(101)
     for drive, was_merged in zip(drives, (True, False), strict=True):
@@ -177,7 +177,7 @@ def test_what_was_sent_within_a_side_outlives_an_undo() -> None:
     assert (ours != theirs).sum() < 0.01 * (theirs != UNKNOWN).sum()
 
 
-def test_a_history_keeps_nothing_but_itself() -> None:
+def test_a_scan_history_owns_its_arrays() -> None:
     """Strokes that were added to own their arrays: views would keep the whole history of each meeting alive."""
     rng, drive = np.random.default_rng(100), Drive(100)
     for mates in [ALL] * 2 + [((0,), (1,), (2,)), ((0, 1), (0, 1), (2,))] * 20 + [parted(rng) for _ in range(20)]:

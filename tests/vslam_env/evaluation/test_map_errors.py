@@ -102,7 +102,7 @@ def test_claims_follow_a_merge() -> None:
     assert ground_truth.true_ids(0, _ids(0, 1, 2, 3, 4)).tolist() == [0, 1, -1, 2, -2]
 
 
-def test_books_follow_their_maps() -> None:
+def test_claims_follow_copies_deletions_and_snapshots() -> None:
     """Whatever is copied, dropped or filled, a map claims what its landmarks were created as; so from a snapshot on."""
     rng = np.random.default_rng(8)
     ground_truth, numbers = GroundTruthAssociation(2, TRUTHS, COUNTABLE, 1.0), [0, 1]
@@ -239,7 +239,7 @@ def test_coverage_is_a_union() -> None:
 SQUARES = np.stack(np.meshgrid(np.arange(0.1, 8.0, 0.2), np.arange(0.1, 4.0, 0.2)), -1).reshape(-1, 2)
 
 
-def test_finds_are_those_of_a_plain_count() -> None:
+def test_newly_covered_cells_agree_with_a_plain_count() -> None:
     """However grids change, each cell counts once for the nearest robot, as a look at all cells every time says."""
     rng = np.random.default_rng(2)
     starts = rng.uniform(0.0, 6.0, (3, 3))
@@ -263,7 +263,7 @@ def test_finds_are_those_of_a_plain_count() -> None:
     assert ever.mean() > 0.3
 
 
-def test_parts_sum_up_and_snapshots_keep_them() -> None:
+def test_own_coverage_sums_to_team_coverage_and_survives_snapshots() -> None:
     """Own coverage is never negative, sums over the robots to all that was covered, and goes on after a restore."""
     weights = {"own_coverage": 1.0, "coverage": 1.0}
     env, fresh = (small_env(max_cycles=60, reward=weights) for _ in range(2))

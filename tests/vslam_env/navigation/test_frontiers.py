@@ -145,7 +145,7 @@ def test_features_are_seen_from_the_robot() -> None:
     assert (slots.features(pose)[:2, 4] == 60.0).all()
 
 
-def test_what_cannot_be_seen_is_given_up_after_looking_at_it() -> None:
+def test_a_frontier_that_stays_after_a_look_is_dropped() -> None:
     """A frontier that stays when the robot looks at it from its goal dies after four updates, and does not return."""
     cells = room((-4.0, 4.4))
     slots = CandidateSlots()
@@ -174,7 +174,7 @@ def test_visits_without_a_look_take_longer() -> None:
     assert not slots.valid.any()
 
 
-def test_a_robot_that_passes_by_gives_nothing_up() -> None:
+def test_passing_robots_drop_no_frontier() -> None:
     """Updates away from the goals do not count as visits."""
     cells = room((-4.0, 4.4))
     slots = CandidateSlots()
@@ -261,7 +261,7 @@ def test_frontiers_are_made_of_unknown_cells_beside_free_ones(corner: tuple[int,
     assert found.tolist() == np.argwhere((cells == UNKNOWN) & beside & ~ignored).tolist()
 
 
-def test_pairs_that_are_clear_are_those_of_the_least_total() -> None:
+def test_unambiguous_pairs_are_those_of_the_optimal_assignment() -> None:
     """Whatever lies how close together; what is not clear is left to the search over all pairs."""
     rng = np.random.default_rng(11)
     found = {True: 0, False: 0}

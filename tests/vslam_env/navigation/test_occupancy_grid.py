@@ -75,7 +75,7 @@ def test_a_wall_is_marked_without_holes(distance: float) -> None:
 
 
 @pytest.mark.parametrize(("seed", "fan"), [(1, ANGLES), (2, np.linspace(-1.5, 1.5, 40)), (3, np.array([-0.3, 0.4]))])
-def test_a_scan_is_painted_as_it_is_defined(seed: int, fan: np.ndarray) -> None:
+def test_a_scan_update_agrees_with_the_plain_definition(seed: int, fan: np.ndarray) -> None:
     """Scans of walls, gaps and nothing, wherever the robot stands and looks, change the evidence as the plain form."""
     rng = np.random.default_rng(seed)
     grid, plain = SeenGrid(), np.zeros((GRID_SIZE, GRID_SIZE), np.int8)
@@ -95,7 +95,7 @@ def test_a_scan_is_painted_as_it_is_defined(seed: int, fan: np.ndarray) -> None:
         assert (grid.cells == verdicts).all()
 
 
-def test_a_grid_tells_which_verdicts_changed() -> None:
+def test_a_grid_reports_changed_cells() -> None:
     """It reports all that changed since the last question, and after a restore that anything may have changed."""
     rng = np.random.default_rng(4)
     team = TeamGrids(1)
@@ -166,7 +166,7 @@ def test_grazing_rays_do_not_eat_thin_walls() -> None:
     assert (cells_at(grid, np.stack([along, np.zeros(400)], axis=-1)) == FREE).all()
 
 
-def test_one_stray_reading_does_not_block_a_way() -> None:
+def test_one_outlier_does_not_block_a_path() -> None:
     """A hit where ten scans passed changes nothing; a wall that stays is believed."""
     grid = SeenGrid()
     for _ in range(10):
@@ -178,7 +178,7 @@ def test_one_stray_reading_does_not_block_a_way() -> None:
     assert cells_at(grid, np.array([[3.1, 0.05]])) == [OCCUPIED]
 
 
-def test_what_has_gone_is_forgotten() -> None:
+def test_moved_obstacles_are_cleared() -> None:
     """A robot that stood in view for long leaves no wall behind once rays pass again for two seconds."""
     grid = SeenGrid()
     for distance, ticks in ((3.1, 100), (6.0, 20)):
@@ -273,7 +273,7 @@ RADIUS = 0.2
 HARDWARE = ray_directions(ANGLES), MAX_RANGE, RADIUS
 
 
-def test_readings_are_painted_as_their_parts() -> None:
+def test_a_combined_update_equals_its_parts() -> None:
     """Each grid holds, and tells as changed, what scan, disc and bump leave one after the other, in ascending order."""
     rng = np.random.default_rng(4)
     team, apart = TeamGrids(3), [TeamGrids(1) for _ in range(3)]

@@ -148,7 +148,7 @@ def test_only_the_grouping_counts_not_its_labels() -> None:
 
 
 @given(st.floats(20.0, 40.0), st.floats(20.0, 40.0), st.floats(1.5, 9.0), st.floats(0.1, 0.9))
-def test_a_veil_covers_its_area(x: float, y: float, radius: float, opacity: float) -> None:
+def test_a_translucent_disc_covers_its_area(x: float, y: float, radius: float, opacity: float) -> None:
     """A translucent disc takes away, summed over pixels, its area times its opacity, wherever it lies."""
     image = np.full((61, 67, 3), 200, np.uint8)
     translucent_fill(image, np.array([[x, y]]), radius, (0, 0, 0), opacity)
@@ -156,7 +156,7 @@ def test_a_veil_covers_its_area(x: float, y: float, radius: float, opacity: floa
     assert taken == pytest.approx(np.pi * radius**2 * opacity, rel=0.08, abs=1.5)
 
 
-def test_veils_add_up_and_are_cut_off() -> None:
+def test_translucent_discs_add_up_and_are_clipped() -> None:
     """Two veils on one spot let through the square of what one does; those outside the image leave it alone."""
     once, twice, outside = (np.full((31, 37, 3), 250, np.uint8) for _ in range(3))
     translucent_fill(once, np.array([[15.0, 15.0]]), 4.0, (0, 0, 0), 0.4)
@@ -168,7 +168,7 @@ def test_veils_add_up_and_are_cut_off() -> None:
     assert 0 < (outside[..., 0] < 250).sum() < 60
 
 
-def test_dots_are_as_large_as_asked_for() -> None:
+def test_dots_have_the_requested_size() -> None:
     """The ink of a dot is about its area."""
     for radius in (1.5, 2.2, 5.0):
         image = np.full((40, 40, 3), 255, np.uint8)

@@ -255,7 +255,7 @@ def test_an_empty_view_gives_an_empty_frame() -> None:
     assert frame.measurements.descriptors.shape == (0, 11)
 
 
-def test_all_that_is_measured_can_be_taken_in() -> None:
+def test_all_measurements_are_accepted_by_a_filter() -> None:
     """Filters take no depth below theirs, none is measured there; nor are there points at the end of the world."""
     assert NEAREST == MIN_DEPTH
     camera = StereoCamera(sigma_px=10.0, sigma_disparity_px=200.0, max_range=4.5)

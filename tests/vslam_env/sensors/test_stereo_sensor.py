@@ -286,7 +286,7 @@ def test_it_agrees_with_following_many_rays(eye: StereoRenderer, shift: float) -
     assert abs((rendered - plain).mean()) < 0.3
 
 
-def test_columns_know_what_they_see(eye: StereoRenderer) -> None:
+def test_columns_report_wall_face_and_depth(eye: StereoRenderer) -> None:
     """Traced rays meet the wall, face and depth that a rendered column shows; a robot is distinguished from a wall."""
     columns = np.arange(0.0, 90.0, 0.5)
     traced = eye.trace(VIEWS, 0, columns)

@@ -79,7 +79,7 @@ def drive(env: ExplorationEnv, ticks: int, seed: int = 5) -> list[dict[str, Any]
     return infos + [env.step(turning(env.agents))[4] for _ in range(ticks)]
 
 
-def test_deaf_robots_never_merge_and_send_nothing() -> None:
+def test_robots_without_range_never_merge_and_send_nothing() -> None:
     """With a range of zero two robots that map the same corner stay alone; with any range they merge."""
     deaf, near = (small_env(comm_range=comm_range, max_cycles=400) for comm_range in (0.0, None))
     for env, groups in ((deaf, {0, 1}), (near, {0})):

@@ -75,7 +75,7 @@ def test_no_robot_enters_a_wall_or_another(seed: int) -> None:
     assert bumps > 20
 
 
-def test_a_robot_against_a_wall_rests_there() -> None:
+def test_a_robot_pressing_against_a_wall_rests() -> None:
     """A robot that presses straight into a wall stands still beside it, reports bumps, and leaves when it backs up."""
     simulator = Simulator(MAZE, [[6.0, 2.0, 0.0]])
     for _ in range(20):

@@ -128,7 +128,7 @@ FAMILIES = sorted(WORLD_FAMILIES)
 
 
 @pytest.mark.parametrize("family", FAMILIES)
-def test_all_floor_hangs_together(family: str) -> None:
+def test_all_floor_is_connected(family: str) -> None:
     """In 15 buildings of a family the reachable part is nearly all floor in which a robot fits."""
     for seed in range(15):
         world = make_world(family, np.random.default_rng(seed))
@@ -155,7 +155,7 @@ def test_starts_are_free_reachable_and_apart(family: str) -> None:
 
 
 @pytest.mark.parametrize("family", ["maze", "loops"])
-def test_there_are_ways_round(family: str) -> None:
+def test_mazes_and_loops_have_cycles(family: str) -> None:
     """Free floor has a hole in most mazes, and in all loops one around each block: walls that touch no outer wall."""
     with_loops = 0
     for seed in range(10):
@@ -167,7 +167,7 @@ def test_there_are_ways_round(family: str) -> None:
     assert with_loops >= 7
 
 
-def test_a_hall_hides_something_from_everywhere() -> None:
+def test_pillars_of_a_hall_stand_apart() -> None:
     """Pillars stand apart: each is passed on all sides by a robot, as the free floor goes around it."""
     world = make_world("hall", np.random.default_rng(5))
     pillars = world.walls[4:].reshape(-1, 4, 4)
@@ -177,7 +177,7 @@ def test_a_hall_hides_something_from_everywhere() -> None:
     assert gaps.min() > 1.4
 
 
-def test_splits_do_not_meet() -> None:
+def test_splits_are_disjoint() -> None:
     """The seeds of the splits are apart, and each draw stays in its own range."""
     ranges = sorted(SPLITS.values())
     assert all(end <= begin for (_, end), (begin, _) in pairwise(ranges))
@@ -213,7 +213,7 @@ def test_a_split_environment_draws_from_its_seeds() -> None:
     assert seen[3] not in possible
 
 
-def test_files_take_turns(tmp_path: Path) -> None:
+def test_files_are_split_by_turns(tmp_path: Path) -> None:
     """Of twelve files the first and the eleventh are for tests, the second and the twelfth for validation."""
     files = [tmp_path / f"{index:02d}.json" for index in range(12)]
     for file in files:
