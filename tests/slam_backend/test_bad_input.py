@@ -141,7 +141,7 @@ def test_unknown_options_are_refused_with_those_that_there_are(kind: type[Any]) 
         kind(foo=1)
 
 
-def test_what_is_known_goes_through() -> None:
+def test_valid_values_pass() -> None:
     """Names, places and defaults are as without the check."""
 
     @known_names
@@ -433,7 +433,7 @@ def test_the_first_frames_of_two_robots_have_to_agree_on_descriptors() -> None:
     )
 
 
-def test_nothing_to_do_is_no_error() -> None:
+def test_empty_input_is_no_error() -> None:
     """Robots that neither moved nor saw anything, frames without points, and frames rejected whole, are accepted."""
     slam = FastSlam(2, 3)
     for frames, names in (

@@ -400,7 +400,7 @@ RESETS: dict[str, list[dict[str, Any]]] = {
 
 
 def test_a_refused_reset_changes_nothing() -> None:
-    """The running episode goes on, and the next reset draws what it would have drawn; before the first is none."""
+    """The running episode continues, and the next reset draws what it would have drawn without the refusal."""
     env, untouched = small_env(), small_env()
     refused(partial(env.reset, seed=0, options={"start_poses": [[-50.0, 0.0, 0.0]] * 2}), STARTS)
     assert env.agents == []

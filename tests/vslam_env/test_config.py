@@ -51,7 +51,7 @@ def test_nested_changes_keep_the_rest() -> None:
     assert config.landmark_sensor.detection_probability == 0.9
 
 
-def test_what_toml_writes_otherwise_is_accepted() -> None:
+def test_toml_number_and_list_types_are_accepted() -> None:
     """Whole numbers do for floats, lists for tuples, and numbers of numpy for those of Python."""
     config = EnvConfig().replace(
         robot_radius=1, stop_at_recall=1, num_robots=np.int64(2), landmark_sensor={"camera": {"mount": [0, 0, 1]}}
@@ -67,7 +67,7 @@ def test_default_decision_ticks(action_type: str, ticks: int) -> None:
     assert EnvConfig().replace(action_type=action_type, decision_ticks=4).ticks_per_step == 4
 
 
-def test_a_file_changes_what_it_names(tmp_path: Path) -> None:
+def test_a_file_changes_the_fields_that_it_names(tmp_path: Path) -> None:
     """What a file leaves out of a nested table is that of the standard preset, as with `replace`."""
     path = tmp_path / "config.toml"
     path.write_text("num_robots = 2\n[belief.filter]\nnum_particles = 7\n", encoding="utf-8")
@@ -85,7 +85,7 @@ def test_none_against_a_standard_value_is_written(tmp_path: Path) -> None:
 
 
 def test_keywords_override_the_file(tmp_path: Path) -> None:
-    """Arguments of `parallel_env` go before what a configuration file says; the environment tells the result."""
+    """Arguments of `parallel_env` override the configuration file; `env.config` is the result."""
     path = tmp_path / "config.toml"
     path.write_text(EnvConfig(num_robots=2, max_cycles=55).to_toml(), encoding="utf-8")
     env = vslam_v0.parallel_env(config=path, num_particles=7, num_robots=4)

@@ -71,7 +71,7 @@ def test_arrays_shared_by_a_state_are_read_only(name: str, tmp_path: Path) -> No
 
 @pytest.mark.parametrize("name", ENVS)
 def test_writing_into_a_state_changes_no_environment(name: str) -> None:
-    """An environment goes on alike when all that can be written of its state, or of one it was set to, is spoilt."""
+    """An environment continues unchanged when all writable arrays of a state are overwritten."""
     env = ENVS[name]()
     twins = [env.clone() for _ in range(3)]
     reference = go_on(twins[0], 25)

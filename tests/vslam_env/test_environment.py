@@ -244,7 +244,7 @@ def test_grids_are_joined_at_a_merge() -> None:
 
 
 def test_collisions_and_distance() -> None:
-    """A robot that drives into a wall reads its bumps; its way ends at the wall."""
+    """A robot that drives into a wall reads its bumps; its distance ends at the wall."""
     env = small_env(num_robots=1, world=BARE)
     env.reset(seed=1, options={"start_poses": [[8.0, 3.0, 0.0]]})
     for _ in range(20):

@@ -71,7 +71,7 @@ WAYS: dict[str, Callable[[ExplorationEnv, Path], ExplorationEnv]] = {
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_a_state_goes_on_bit_by_bit(way: str, tmp_path: Path) -> None:
+def test_a_state_continues_bit_for_bit(way: str, tmp_path: Path) -> None:
     """300 steps after a snapshot, bumps and a merge among them, return the same bytes wherever it is restored."""
     env = _begun()
     assert env.belief("robot_0").group == (0,)
@@ -91,14 +91,14 @@ def test_a_state_goes_on_bit_by_bit(way: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("action_type", ["goal", "discrete"])
 def test_all_action_types_continue(action_type: str) -> None:
-    """Ways to candidates that are under way, and discrete actions, go on bit by bit."""
+    """Paths to candidates in progress, and discrete actions, continue bit for bit."""
     env = _begun(action_type, 6)
     twin = env.clone()
     assert _go_on(twin, 30) == _go_on(env, 30)
 
 
 def test_before_and_after_a_merge() -> None:
-    """One state of two groups and one of a merged team are restored by turns, and each goes on as it did."""
+    """States from before and after a merge are restored by turns, and each continues as before."""
     env = _begun()
     apart = env.get_state()
     first = _go_on(env, 150)
@@ -114,7 +114,7 @@ def test_before_and_after_a_merge() -> None:
 
 
 def test_taking_a_state_changes_nothing() -> None:
-    """An environment goes on as without a look at it, and a state stays as it was while the environment moves."""
+    """An environment continues as without `get_state`, and a state does not change while the environment moves."""
     env, quiet = _begun(), _begun()
     state = env.get_state()
     before = pickle.dumps(state)
@@ -155,7 +155,7 @@ def test_a_clone_is_independent() -> None:
 
 @pytest.mark.slow
 def test_a_state_continues_in_another_process(tmp_path: Path) -> None:
-    """A state on disk goes on in another process, with other hashes and threads of BLAS, with the same bytes."""
+    """A state on disk continues with the same bytes in a process with other hashes and BLAS threads."""
     env = _begun()
     save_state(env.get_state(), tmp_path / "state")
     code = (
@@ -375,7 +375,7 @@ def test_file_permissions_follow_the_umask(tmp_path: Path) -> None:
     ],
 )
 def test_lossy_radios_rendered_cameras_and_running_costs_continue(changes: dict[str, Any], steps: int) -> None:
-    """Robots that lose contact, see with rendered eyes or are charged tick by tick go on bit by bit as well."""
+    """Robots that lose contact, see with rendered cameras or are charged per tick continue bit for bit."""
     env = _env(**changes)
     env.reset(seed=5, options={"start_poses": MEETING})
     _go_on(env, steps // 2)

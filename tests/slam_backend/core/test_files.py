@@ -92,7 +92,7 @@ def test_a_fifo_is_written_and_not_replaced(write: Writer, tmp_path: Path) -> No
 
 
 def test_a_fifo_that_nothing_reads_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing waits for a reader for ever."""
+    """Writing does not wait for a reader."""
     monkeypatch.setattr(files, "READER_S", 0.05)
     path = tmp_path / "fifo"
     os.mkfifo(path)

@@ -21,7 +21,7 @@ from slam_backend.warm_up import warm_up
 
 
 def test_this_version_of_numba_can_leave_references_uncounted() -> None:
-    """The option is numba's own: where it has gone, all works as before, but slower."""
+    """The option is internal to numba: without it all works, but slower."""
     assert _jit.HAS_NRT_OPTION
 
 

@@ -194,7 +194,7 @@ def test_forged_bytes_are_refused(forged: bytes) -> None:
 
 
 def test_flipped_bytes_are_refused_or_read() -> None:
-    """Of the bytes of a filter's state each flip is a ValueError, or a tree that the filter refuses or goes on from."""
+    """Each flipped byte of a filter's state raises a ValueError, or gives a state that is refused or accepted."""
     content = encode(FastSlam(1, num_particles=4).get_state(), BACKEND_KINDS)
     rng = np.random.default_rng(0)
     for _ in range(300):

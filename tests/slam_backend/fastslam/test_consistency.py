@@ -87,7 +87,7 @@ def test_an_underconfident_filter_gives_no_warning() -> None:
 
 
 def test_the_consistency_test_continues_from_a_state() -> None:
-    """A restored filter tells the same as the one that went on, and its state holds the running sums."""
+    """A restored filter reports the same as the original, and its state holds the running sums."""
     slam = life(1)
     twin = FastSlam(num_particles=3)
     twin.set_state(slam.get_state())

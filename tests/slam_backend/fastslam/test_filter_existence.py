@@ -243,7 +243,7 @@ def test_an_unconfirmed_landmark_is_deleted_after_the_stated_number_of_misses(
 
 
 def test_only_a_frame_in_which_a_landmark_is_expected_is_a_miss() -> None:
-    """A step without a frame, and frames in which it lies behind, beside or too far away, tell nothing of it."""
+    """A step without a frame, and frames in which it is behind, beside or too far away, do not count."""
     slam = standing(ExistenceModel())
     slam.step([None], [frame(0)])
     _, before = slam.existence()

@@ -237,7 +237,7 @@ def test_compiled_filter_equals_the_plain_one(happened: Counter[str]) -> None:
 
 @pytest.mark.slow
 def test_compiled_filter_equals_the_plain_one_in_many_worlds(happened: Counter[str]) -> None:
-    """The same over some thousand steps, with all combinations of options and of what the caller tells."""
+    """The same over some thousand steps, with all combinations of options and of arguments."""
     happened.update(run_worlds(range(2000, 2120), (1, 2, 3, 5, 7), 7, 14))
     assert min(happened[kind] for kind in KINDS) > 50, happened
     assert happened["steps"] == 120 * 14

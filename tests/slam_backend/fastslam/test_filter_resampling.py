@@ -214,7 +214,7 @@ def test_returned_arrays_are_copies() -> None:
 
 @PROPOSALS
 @pytest.mark.parametrize("scheme", list(RESAMPLING))
-def test_a_restored_filter_goes_on_bit_for_bit(proposal: Any, scheme: str) -> None:
+def test_a_restored_filter_continues_bit_for_bit(proposal: Any, scheme: str) -> None:
     """From a snapshot, pickled or not, the same inputs give the same bytes, whatever the filter did in between."""
     existence = ExistenceModel(delete_below=0.2) if scheme == "residual" else None
     slam = filter_after(5, proposal=proposal, resampling=scheme, resample_threshold=0.8, existence=existence)
@@ -231,7 +231,7 @@ def test_a_restored_filter_goes_on_bit_for_bit(proposal: Any, scheme: str) -> No
 
 
 @PROPOSALS
-def test_a_filter_goes_on_bit_for_bit_through_many_snapshots(proposal: Any) -> None:
+def test_a_filter_continues_bit_for_bit_through_many_snapshots(proposal: Any) -> None:
     """Restored at each step, and asked for its maps, a filter does what one does that is left alone.
 
     Noise beyond the gates lets landmarks come and go in several blocks of particles, one robot is blind at times and

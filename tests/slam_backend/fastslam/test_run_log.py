@@ -108,7 +108,7 @@ def test_arrays_since_a_step_are_the_tail_of_all_arrays() -> None:
 
 
 @given(seed=st.integers(0, 2**32 - 1), cut=st.integers(0, 60), most=st.sampled_from([3, 90, 400]))
-def test_a_restored_log_goes_on_bit_for_bit(seed: int, cut: int, most: int) -> None:
+def test_a_restored_log_continues_bit_for_bit(seed: int, cut: int, most: int) -> None:
     """From a snapshot, pickled or not, and from any kind of copy, the same steps give the same bytes."""
     steps = random_steps(60, seed, most)
     log = log_of(steps[:cut])
@@ -148,7 +148,7 @@ def test_finished_chunks_are_shared_and_cannot_be_written() -> None:
 
 
 def test_appended_steps_are_copied() -> None:
-    """The caller may use its buffers again, and a log that goes on leaves its snapshots alone."""
+    """The caller may reuse its buffers, and appending to a log does not change its snapshots."""
     points, ids, motion = np.ones((2, 3)), np.array([4, 5]), np.ones(3)
     log = RobotLog()
     log.append(0, odometry=motion, points=points, ids=ids)

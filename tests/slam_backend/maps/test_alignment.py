@@ -320,7 +320,7 @@ def test_the_ratio_test_ignores_duplicates_at_the_same_place() -> None:
 def test_descriptors_show_which_maps_cannot_have_enough_candidates(
     seed: int, common: int, others: int, look_alikes: int, appearance: bool
 ) -> None:
-    """Where looks alone say no, the maps have too few candidates; where enough landmarks are common they say yes."""
+    """Maps that fail the test have too few candidates; maps with enough common landmarks pass it."""
     rng = np.random.default_rng(seed)
     shared, own = unit(rng, common), [unit(rng, others) for _ in range(2)]
     a, b = (

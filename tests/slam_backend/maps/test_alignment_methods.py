@@ -228,8 +228,8 @@ def test_the_influence_of_a_match_is_what_leaving_it_out_does() -> None:
     assert kernels.largest_influence(np.tile(table[:1], (3, 1)), np.ones(3, np.bool_), pose, 1e-8) == (np.inf, np.inf)
 
 
-def test_a_motion_that_hangs_on_one_match_is_not_believed() -> None:
-    """Where leaving out one match would move the result by half of what makes it false, it is refused."""
+def test_a_motion_that_depends_on_one_match_is_refused() -> None:
+    """Where leaving out one match would move the result by half of what makes an alignment false, it is refused."""
     rng = np.random.default_rng(20)
     points = rng.uniform([12.0, 0.0, 0.0], [15.0, 3.0, 1.5], (12, 3))
     points[0, :2] = [17.0, 1.5]
@@ -308,7 +308,7 @@ def threefold(rng: np.random.Generator, n: int, shared: int) -> tuple[LandmarkMa
     return a, seen_from(b, TURNED, 0, rng)
 
 
-def test_pairs_of_look_alikes_are_those_within_the_gate() -> None:
+def test_similar_pairs_are_those_within_the_gate() -> None:
     """All pairs within the gate, but none of a landmark with more of them than are allowed: as a plain search says."""
     rng = np.random.default_rng(16)
     a, b = threefold(rng, 90, 45)
@@ -348,8 +348,8 @@ def test_geometry_distinguishes_similar_landmarks(method: str) -> None:
     assert len(np.unique(found.inliers[:, 0])) == len(np.unique(found.inliers[:, 1])) == len(found.inliers)
 
 
-def test_look_alikes_elsewhere_are_not_taken_for_the_place() -> None:
-    """Without a common landmark look-alikes come together only by chance, and that is known for what it is."""
+def test_similar_landmarks_elsewhere_are_not_matched() -> None:
+    """Without a common landmark similar ones agree only by chance, and the alignment is refused."""
     for seed in range(20):
         a, b = threefold(np.random.default_rng([18, seed]), 150, 0)
         assert len(candidate_matches(a, b, AlignmentOptions())) > 40
@@ -396,7 +396,7 @@ POOR_MAPS = {
 @pytest.mark.parametrize("name", POOR_MAPS)
 @pytest.mark.parametrize("method", METHODS)
 def test_poor_maps_are_refused_or_aligned_rightly(method: str, name: str) -> None:
-    """Whatever the method, looks and covariances, degenerate maps raise nothing; what is accepted is right."""
+    """For any method, descriptors and covariances, degenerate maps raise no error; accepted alignments are right."""
     rng = np.random.default_rng(21)
     points = POOR_MAPS[name]
     for looks in (None, np.ones((len(points), 3))):
@@ -474,7 +474,7 @@ def maps_with_doubles(seed: int, doubles: int, scattered: bool = False) -> tuple
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_what_two_maps_share_must_not_occur_elsewhere_in_one_of_them(seed: int) -> None:
+def test_a_shared_constellation_that_recurs_in_one_map_is_refused(seed: int) -> None:
     """Half of the shared landmarks hang a second time in one map, as a group: refused, from either side."""
     map_a, map_b = maps_with_doubles(seed, doubles=12)
     for pair in ((map_a, map_b), (map_b, map_a)):
@@ -492,7 +492,7 @@ def test_single_duplicates_do_not_refuse_an_alignment(seed: int, doubles: int, s
     np.testing.assert_allclose(found.transform, A_FROM_B, atol=0.1)
 
 
-def test_whether_a_constellation_recurs_is_the_same_in_any_frame() -> None:
+def test_recurrence_does_not_depend_on_the_frame() -> None:
     """Moving the map changes nothing, and the double recurs as the original does."""
     options, rows = AlignmentOptions(), np.arange(12)
     map_a, _ = maps_with_doubles(7, doubles=12)

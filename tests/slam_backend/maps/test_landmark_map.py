@@ -176,7 +176,7 @@ def test_frames_share_no_memory_and_cannot_be_written() -> None:
 
 
 def test_copies_cannot_be_written_either() -> None:
-    """Be they deep or from a file, of a frame or of one cut out of a team's: what was found of them stays so."""
+    """Deep copies and loaded copies, of frames and of parts of a team's frames, are read-only."""
     frame = Measurements(POINTS, LOOKS, np.tile(np.eye(3), (2, 1, 1)))
     team = TeamMeasurements(np.array(POINTS), LOOKS.copy(), np.array([1, 2]))
     for one in (frame, team.per_robot()[1]):

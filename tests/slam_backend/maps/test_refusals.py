@@ -77,7 +77,7 @@ def test_an_alignment_that_is_too_uncertain_says_which_bound_it_misses(limits: d
 
 
 def test_a_refusal_for_path_uncertainty_names_the_paths() -> None:
-    """Where the particles of a merge differ too much the refusal names the paths, and the event bears the doubt."""
+    """If the particles of a merge differ too much, the refusal names the paths, and the event has the uncertainty."""
     _, team = driven(2, 112, 100, attempts=AttemptOptions(every=10), merging=MergeOptions(min_sigmas=1e4))
     event = next(event for event in team.events if event.alignment.reason == "too uncertain")
     assert event.alignment.missed == "paths"
@@ -158,7 +158,7 @@ def covariances(rng: np.random.Generator, count: int) -> FloatArray:
 
 
 def test_the_kernel_agrees_with_matrices() -> None:
-    """Of maps bent anyhow, some landmarks lost and renumbered, the same share has moved."""
+    """For deformed maps with lost and renumbered landmarks, the deformed share is that of plain numpy."""
     shares = []
     for seed in range(8):
         rng = np.random.default_rng(seed)

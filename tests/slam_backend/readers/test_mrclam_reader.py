@@ -21,7 +21,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_log_holds_what_the_files_say(folder: Path) -> None:
+def test_log_agrees_with_the_files(folder: Path) -> None:
     """Landmarks are sorted by subject; sightings of robots and of unknown barcodes are left out."""
     log = load_mrclam(folder)
     assert [own.robot for own in log.robots] == [2, 4]

@@ -82,7 +82,7 @@ def test_the_vehicle_turns_about_a_point_on_its_rear_axle(steering: float) -> No
     np.testing.assert_allclose(np.hypot(poses[:, 0], poses[:, 1] - radius), abs(radius))
 
 
-def test_trees_stand_where_the_laser_saw_them(tmp_path: Path) -> None:
+def test_trees_have_the_range_and_bearing_of_the_laser(tmp_path: Path) -> None:
     """A reading, put through the camera model at the laser's place, is at its range and bearing from the laser."""
     write_victoria(tmp_path)
     readings = to_filter_steps(load_victoria(tmp_path))
@@ -111,7 +111,7 @@ def _sighting(time: float, landmark: tuple[float, float]) -> tuple[float, float,
     return time, float(np.hypot(x, y)), float(np.arctan2(y, x))
 
 
-def test_exact_readings_put_landmarks_where_they_stand() -> None:
+def test_exact_readings_give_exact_landmarks() -> None:
     """From the steps' own dead reckoning every point leads to its landmark, at whatever time it was seen."""
     stand = {"left": (4.0, 3.0), "right": (5.0, -2.0)}
     names = ["right", "left", "left", "right"]

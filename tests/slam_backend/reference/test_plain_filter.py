@@ -77,7 +77,7 @@ def test_motion_is_predicted_to_first_order(pose: FloatArray, move: FloatArray, 
 def test_samples_do_not_depend_on_how_the_map_is_turned(
     pose: FloatArray, factor: FloatArray, normals: FloatArray
 ) -> None:
-    """The same doubt in a map that is turned and shifted, and the same random numbers, draw the same place."""
+    """In a rotated and shifted map the same uncertainty and random numbers give the same sample."""
     start = np.array([3.0, -7.0, 2.5])
     turn = turn_about_vertical(start[2])
     covariance = factor @ factor.T + 0.1 * np.eye(3)
@@ -158,7 +158,7 @@ def test_evidence_is_the_integral_over_all_poses(seed: int, is_given: bool) -> N
 
 @pytest.mark.parametrize("seed", range(100, 105))
 def test_one_false_match_hardly_moves_the_refined_pose(seed: int) -> None:
-    """Beside seven right matches, one that is metres off moves the refined pose by less than its own doubt."""
+    """Beside seven right matches, one with an error of metres moves the refined pose by less than its uncertainty."""
     predicted, landmarks, frame = random_scene(seed, is_given=True, num=8)
     matches = {b: b for b in landmarks}
     right = refine(predicted, landmarks, frame, {b: b for b in range(7)}, 4, 11.34)
@@ -227,7 +227,7 @@ def test_motion_without_measurements_is_predicted_and_not_sampled() -> None:
 
 
 def test_a_measurement_corrects_unsampled_motion_as_one_gaussian() -> None:
-    """A sighting tells all particles the same of the way, whatever the seed, and only then do they part."""
+    """The first measurement corrects all particles equally, for any seed; only then do they differ."""
     estimates = []
     for seed in (100, 101):
         slam, world, pose = blind_walk(seed, 3)

@@ -214,7 +214,7 @@ def test_reported_covariances_include_the_gauge_covariance():
 
 
 def test_starts_that_are_given_stay_and_an_exact_pose_needs_no_share():
-    """All particles keep the start that they were given; once told where the robot is, the filter is sure of it."""
+    """All particles keep given starts; once a pose is given as exact, the gauge covariance is zero."""
     slam, _, drawn = open_run()
     assert drawn
     assert slam.state.gauge_covariance.any()

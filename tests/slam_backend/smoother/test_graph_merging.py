@@ -112,7 +112,7 @@ def test_landmarks_without_a_new_name_are_left_out():
 
 
 def test_aliases_of_a_landmark_follow_it():
-    """Names that a group has given up go on standing for the landmark that was kept, under the joint map's names."""
+    """Former ids of a group remain aliases of the landmark that was kept, under its id in the joint map."""
     run = small_run(2, seed=104)
     (a, _), (b, renamed) = group_graph(run, [0]), group_graph(run, [1], OFFSET)
     old, kept = renamed[0], renamed[1]
@@ -195,8 +195,8 @@ def test_starts_are_constant_between_rejuvenations():
 
 
 @pytest.mark.parametrize(("every", "slice_steps"), [(None, None), (20, None), (20, 12)])
-def test_a_snapshot_of_a_team_goes_on_through_merges_and_rejuvenations(every, slice_steps):
-    """A restored team does, bit for bit, the same as the one that went on, its smoothers included."""
+def test_a_snapshot_of_a_team_continues_through_merges_and_rejuvenations(every, slice_steps):
+    """A restored team gives, bit for bit, the results of the original, its smoothers included."""
     simulation = SimulatedTeam(seed=101)
     team = build(simulation, every, slice_steps)
     simulation.run(team, 50)

@@ -360,7 +360,7 @@ def test_landmarks_are_numbered_in_order_of_appearance(known, names):
 
 @given(st.lists(st.integers(0, 5), max_size=8), st.lists(st.tuples(st.integers(0, 5), st.integers(0, 5)), max_size=4))
 def test_names_are_changed_in_the_order_in_which_landmarks_were_found_to_be_one(names, aliases):
-    """Each pair is applied to all names before the next one is, in a graph as where measurements are taken in."""
+    """Each pair is applied to all ids before the next one, in a graph as in new measurements."""
     given_aliases = np.array(aliases, dtype=np.int64).reshape(-1, 2)
     graph = replace(SlamGraph.at_starts(np.zeros((1, 3))), merged_ids=given_aliases)
     found, expected = graph.resolve_ids(np.array(names, dtype=np.int64)), list(names)

@@ -94,7 +94,7 @@ def test_a_landmark_with_mostly_new_sightings_starts_where_the_filter_has_it():
 
 
 def test_a_long_log_taken_in_at_once_ends_where_short_ones_do():
-    """Part by part inside one call, or in many calls: the newest poses agree to a part of their doubt."""
+    """Added in parts within one call, or in many calls: the newest poses agree within a share of their uncertainty."""
     run = small_run(length=15.0)
     log = logs_of(run)[0].arrays()
     options = SmoothingOptions(max_keys=40, recent_keys=20)
@@ -113,7 +113,7 @@ def test_a_long_log_taken_in_at_once_ends_where_short_ones_do():
 
 
 def test_starts_on_which_particles_agree_are_given():
-    """After a merge the own group's starts stay fixed; the others' are sought, and stay rigid among themselves."""
+    """After a merge the starts of the own group are fixed; those of the other are estimated, rigid among themselves."""
     rng = np.random.default_rng(2)
     starts = np.zeros((3, 3, 30))
     starts[0] = [[1.0], [2.0], [0.3]]
@@ -354,7 +354,7 @@ def test_only_poses_with_odometry_from_another_are_estimated():
 
 
 def test_an_increment_moves_poses_as_stated():
-    """Poses that are given stay; the slope is taken along all of it, and no change that is not finite looks small."""
+    """Given poses stay; the slope is taken along the whole increment; one that is not finite is never small."""
     rng = np.random.default_rng(8)
     change, poses, landmarks = (rng.normal(size=(n, 3)) for n in (5, 4, 2))
     columns, order, none = np.array([FREE, 0, 3, 6]), np.arange(5), np.zeros(0, dtype=np.int64)
@@ -382,7 +382,7 @@ def test_an_increment_moves_poses_as_stated():
 
 
 def test_exact_motions_and_poses_leave_nothing_to_smooth():
-    """Exact odometry has no information matrix, and a pose that was given as exact is not sought."""
+    """Exact odometry has no information matrix, and a pose that was given as exact is not estimated."""
     start = SlamGraph.at_starts(np.zeros((1, 3)))
     graph = extend_graph(start, [moving_log(4).arrays()], EXACT_MOTION, np.zeros(3))
     assert optimize(graph, camera_of(small_run()), TIGHT).reason == "odometry without noise"

@@ -146,7 +146,7 @@ def error_of_one_first_seen_far_off(every):
 
 
 def test_a_landmark_with_a_false_first_sighting_is_corrected():
-    """All but its first sighting are refused and it stays off for ever; or until new particles are drawn."""
+    """It rejects all later measurements, until new particles are sampled with these associated."""
     off, refused = error_of_one_first_seen_far_off(None)
     assert off > 0.5
     assert refused == 13
@@ -195,7 +195,7 @@ def test_a_duplicate_landmark_is_found():
 
 @given(st.integers(0, 40), st.integers(0, 2**32 - 1))
 def test_duplicate_candidates_agree_with_a_kd_tree(num, seed):
-    """The compiled sweep finds what a tree, norms and sets say: nearness, looks, and keys that both were seen from."""
+    """The compiled search agrees with a tree, norms and sets: distance, descriptors, and common keyframes."""
     rng = np.random.default_rng(seed)
     landmarks, descriptors = rng.uniform(0.0, 2.0, (num, 3)), rng.normal(size=(num, 2)).astype(np.float32)
     descriptors[rng.random(num) < 0.1, 1] = np.nan
@@ -214,8 +214,8 @@ def test_duplicate_candidates_agree_with_a_kd_tree(num, seed):
     assert {tuple(pair) for pair in found.tolist()} == expected
 
 
-def test_a_duplicate_given_up_leaves_one_landmark():
-    """The mode is then that of the run without the duplicate, and one name stands for the other."""
+def test_a_deleted_duplicate_leaves_one_landmark():
+    """The mode is that of the run without the duplicate, and one id is an alias of the other."""
     run, graph, often = renamed_run()
     healed = without_duplicates(graph, np.array([[NEW_NAME, often]]))
     mode, right = optimize(healed, camera_of(run), TIGHT), optimize(graph_of(run), camera_of(run), TIGHT)

@@ -27,7 +27,7 @@ def rejuvenated(run, seed=1, every=EVERY, **options):
 
 
 def test_particles_are_rejuvenated_at_the_interval():
-    """In every eighth step, and no other, the report tells of new particles, with a sound sample size."""
+    """In every eighth step, and no other, the report has a rejuvenation with a sufficient sample size."""
     run = small_run(2)
     slam = rejuvenated(run)
     for step, reading in enumerate(run.readings(), start=1):
@@ -132,7 +132,7 @@ def test_landmarks_without_sightings_are_deleted(left, monkeypatch):
 
 
 @pytest.mark.parametrize(("robots", "least"), [(2, None), (1, 0), (1, solving.LONG_COLUMNS)])
-def test_a_snapshot_goes_on_bit_for_bit(robots, least, monkeypatch):
+def test_a_snapshot_continues_bit_for_bit(robots, least, monkeypatch):
     """Taken between two rejuvenations, a snapshot goes on as the filter does, through the next two, twice.
 
     What is rigid is seen from draws where the factor's columns are long, and only there; either is restored.
@@ -163,7 +163,7 @@ def test_a_snapshot_goes_on_bit_for_bit(robots, least, monkeypatch):
 
 
 def test_robots_can_be_renumbered():
-    """A filter whose robots are exchanged goes on like the one whose readings are exchanged."""
+    """A filter with renumbered robots continues like one with renumbered input."""
     run = small_run(2)
     slam = rejuvenated(run)
     for step, reading in enumerate(run.readings()):

@@ -296,7 +296,7 @@ def test_the_retraction_preserves_volume():
 
 
 def test_retracted_and_straight_paths_agree_to_first_order():
-    """Straight and bent paths differ to second order only."""
+    """The two kinds of paths differ to second order only."""
     mode, offsets = tree(1e-4)
     np.testing.assert_allclose(retract_on_se2(mode, PREVIOUS, offsets), mode[:, :, None] + offsets, atol=1e-6)
 
@@ -315,7 +315,7 @@ def wandering(turn: float) -> tuple[SlamGraph, Any]:
 
 
 def test_dead_reckoned_paths_are_sampled_exactly_by_retraction():
-    """Headings uncertain by half a radian in the end: straight paths are nearly all refused, bent ones weigh alike."""
+    """With a heading uncertainty of 0.5 rad nearly all Gaussian paths lose their weight; retracted ones keep it."""
     graph, mode = wandering(turn=0.1)
     poses, log_proposals = mode.paths(200, np.random.default_rng(1))
     assert _importance_weights(graph, mode, poses, log_proposals).sample_size < 20.0

@@ -80,7 +80,7 @@ def test_the_work_per_step_is_bounded(monkeypatch):
 
 
 def test_particles_sampled_in_slices_are_as_accurate():
-    """In slices or at once, in the same step, the newest poses agree to a part of their doubt."""
+    """In slices or at once, in the same step, the newest poses agree within a share of their uncertainty."""
     run = small_run(length=8.0)
     sliced = run.build_filter(200, "fastslam2", 1, rejuvenate_every=26, smoothing=SmoothingOptions(slice_steps=8))
     readings = iter(run.readings())
@@ -97,7 +97,7 @@ def test_particles_sampled_in_slices_are_as_accurate():
 
 @pytest.mark.parametrize("taken", range(8, 13))
 def test_a_snapshot_between_slices_continues_bit_for_bit(taken):
-    """Taken in the middle of a descent or not, a snapshot goes on as the filter does."""
+    """Taken in the middle of a descent or not, a restored filter continues like the original."""
     run = small_run(2)
     readings = list(run.readings())
     slam = run.build_filter(20, "fastslam2", 1, rejuvenate_every=18, smoothing=IN_MANY)
@@ -125,7 +125,7 @@ def test_snapshots_hold_an_unfinished_descent():
 
 @pytest.mark.parametrize("slice_steps", [None, 8])
 def test_a_failing_descent_does_not_block_the_smoother(slice_steps):
-    """What cannot be smoothed is left out, the report says so, and the smoother goes on with what comes next."""
+    """What cannot be smoothed is left out, the report says so, and the smoother continues with new input."""
     run = small_run(length=8.0)
     smoothing = SmoothingOptions(max_iterations=1, tolerance=1e-5, slice_steps=slice_steps)
     slam = run.build_filter(20, "fastslam2", 1, landmark_noise=0.0, rejuvenate_every=6, smoothing=smoothing)
@@ -167,8 +167,8 @@ def filter_of(run: StereoRun, **options: Any) -> FastSlam:
 
 
 @pytest.mark.parametrize("slice_steps", [None, 4])
-def test_a_robot_that_waits_is_rejuvenated_once_it_moves(slice_steps: int | None) -> None:
-    """However long it stands at its start there is no pose to seek, told once per interval; then there are poses."""
+def test_a_stationary_robot_is_rejuvenated_once_it_moves(slice_steps: int | None) -> None:
+    """Without motion there is no pose to estimate, which is reported once per interval."""
     run = small_run()
     slam = filter_of(run, smoothing=SmoothingOptions(slice_steps=slice_steps, **FEW_KEYS))
     waited = [slam.step(**reading).rejuvenation for reading in at_rest(run, 0, 60)]
@@ -183,7 +183,7 @@ def test_a_robot_that_waits_is_rejuvenated_once_it_moves(slice_steps: int | None
 
 @pytest.mark.parametrize("before", [0, 8])
 def test_memory_is_bounded_while_a_robot_waits(before: int) -> None:
-    """At the start or on the way, what is to be worked through never exceeds what `MAX_FRAMES` frames hold."""
+    """At the start or later, the pending input never exceeds that of `MAX_FRAMES` frames."""
     run = small_run()
     slam, held = filter_of(run), []
     for reading in list(run.readings())[: before + 1]:
@@ -221,8 +221,8 @@ def test_many_frames_of_one_key_are_condensed_at_the_mode() -> None:
 
 
 @pytest.mark.parametrize("slice_steps", [None, 4])
-def test_a_filter_restored_while_it_waits_goes_on_bit_for_bit(slice_steps: int | None) -> None:
-    """What a robot saw at rest is in snapshots, condensed or not."""
+def test_a_filter_restored_while_it_waits_continues_bit_for_bit(slice_steps: int | None) -> None:
+    """A snapshot holds the measurements made at rest, condensed or not."""
     run = small_run()
     slam = filter_of(run, smoothing=SmoothingOptions(slice_steps=slice_steps, **FEW_KEYS))
     for reading in at_rest(run, 0, 47):

@@ -132,7 +132,7 @@ def test_covariances_of_poses_are_the_dense_ones(posed):
 
 
 def test_blocks_of_the_inverse_are_the_solutions_for_unit_vectors(posed):
-    """Columns that are left out on the way to a few nodes would have added nothing: the same bits, made symmetric."""
+    """Skipped columns would have added zero: the results have the same bits, made symmetric."""
     system = posed.mode.system
     assert system is not None
     nodes = np.array([system.num_poses - 1, 2])

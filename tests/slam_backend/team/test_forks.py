@@ -97,7 +97,7 @@ def test_a_replay_gives_the_result_of_unbroken_contact(gap: int, options: dict[s
         assert_same(one.associations, other.associations)
 
 
-def test_the_joint_filter_holds_the_pose_and_the_fork_goes_on() -> None:
+def test_the_joint_filter_holds_the_pose_and_the_fork_follows_the_robot() -> None:
     """Without contact the joint filter leaves the absent robot where it was, and the robot's fork follows it."""
     simulation = SimulatedTeam(num_robots=2, seed=5)
     team = merged_team(simulation)

@@ -51,7 +51,7 @@ def straightened(slam: FastSlam) -> FastSlam:
 
 
 def test_a_filter_that_never_rejuvenates_by_itself_can_be_rejuvenated() -> None:
-    """It finds the map that another one finds, which keeps a smoother, but for where it begins to seek."""
+    """It finds the same map as a filter that keeps a smoother, but for the initial estimate."""
     maps = []
     for every in (None, 1000):
         slam = bent_team(111, NEVER, rejuvenate_every=every)[1]._find(0)[0].filter
@@ -86,7 +86,7 @@ def test_a_merge_uses_the_smoothed_maps() -> None:
 
 @pytest.mark.slow
 def test_smoothed_maps_give_more_accurate_merges() -> None:
-    """Over twelve pairs of bent maps the motions by which they are merged are off by less than 0.8 of the distance."""
+    """Over twelve pairs of deformed maps the error of the transforms is below 0.8 of that without smoothing."""
     errors = []
     for merging in (AS_IT_IS, MergeOptions()):
         found = []
@@ -101,7 +101,7 @@ def test_smoothed_maps_give_more_accurate_merges() -> None:
 
 
 def test_maps_that_no_longer_fit_are_not_merged() -> None:
-    """Where only the bent maps are believed the attempt is refused, with the reason of the second alignment."""
+    """If only the unsmoothed maps can be aligned, the attempt is refused with the reason of the second alignment."""
     sigmas = []
     for merging in (AS_IT_IS, MergeOptions()):
         covariance = bent_team(113, AT_LAST, merging=merging)[1].events[-1].alignment.covariance
@@ -120,7 +120,7 @@ def test_maps_that_no_longer_fit_are_not_merged() -> None:
 
 @pytest.mark.parametrize("every", [4, 2])
 def test_maps_that_agree_less_after_smoothing_are_not_merged(every: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A smoother that has lost its way is not believed: the attempt is refused, and the filters are as they were."""
+    """A diverged smoother is not trusted: the attempt is refused, and the filters are unchanged."""
     _, alone = bent_team(112, NEVER)
     original = trying.smoothed_maps
 
@@ -165,7 +165,7 @@ def test_smoothed_maps_are_sent_again() -> None:
 
 
 def test_the_predicted_scatter_of_motions_is_that_of_the_merged_particles() -> None:
-    """It is the scatter of where the joint filter's particles let the other robot start, told before the merge."""
+    """It is the scatter of the other robot's start over the joint filter's particles, known before the merge."""
     _, team = bent_team(112, NEVER)
     a, b = (team._find(robot)[0].filter for robot in range(2))
     alignment = align_maps(*both_maps(team), rng=np.random.default_rng(1))
@@ -256,7 +256,7 @@ def test_an_attempt_continues_from_a_snapshot() -> None:
 
 @pytest.mark.parametrize("apart", [MOST_STEPS // 2, MOST_STEPS])
 def test_an_attempt_survives_a_temporary_loss_of_contact(apart: int) -> None:
-    """Maps are straightened without contact; they align in the first step with it, unless that comes too late."""
+    """Maps are smoothed without contact, and aligned in the first step with it unless a time limit has passed."""
     simulation, team = attempt_begun(112)
     simulation.run(team, apart, links(2))
     assert team.events == ()
@@ -268,7 +268,7 @@ def test_an_attempt_survives_a_temporary_loss_of_contact(apart: int) -> None:
 
 
 def test_an_attempt_waits_for_smoothed_maps_for_a_bounded_time() -> None:
-    """Filters that read nothing do not smooth: their maps are taken as they are, and no other robot waits for ever."""
+    """Filters without input are not smoothed: their maps are used as they are, and other robots do not wait."""
     _, team = attempt_begun(112)
     for _ in range(MOST_STEPS + 1):
         assert team.events == ()
@@ -302,7 +302,7 @@ def planned(team: TeamSlam) -> MergePlan:
 
 
 def test_a_trial_leaves_both_filters_as_they_are() -> None:
-    """It makes a joint filter of its own, and tells the motion and the doubt that this one has."""
+    """It makes a joint filter of its own, and returns its motion and uncertainty."""
     _, team = driven(2, 112, FEW_STEPS, num_particles=8)
     plan = planned(team)
     before = [contents(slam) for slam in plan.filters]
@@ -319,7 +319,7 @@ def test_a_trial_leaves_both_filters_as_they_are() -> None:
 
 
 def test_a_trial_whose_merge_would_be_undone_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where more landmarks have moved among each other than a merge may move, the doubt has no bound."""
+    """If more landmarks are deformed than a merge may deform, the uncertainty is infinite."""
     _, team = driven(2, 112, FEW_STEPS, num_particles=8)
     plan = planned(team)
     for share, bounded in ((0.2, True), (0.21, False)):
@@ -366,7 +366,7 @@ def test_a_pair_merges_by_the_motion_of_its_trial_when_two_agree() -> None:
 
 
 def test_the_uncertainty_of_a_trial_includes_the_gauge_covariance() -> None:
-    """The doubt is that of the motion between the groups' starts: by the particles, and by draws of both frames."""
+    """It is that of the motion between the groups' starts: of the particles, and of samples of both gauges."""
     simulation, team = driven(2, 3, 60, num_particles=13)
     alignment = false_alignment(simulation, team, np.zeros(3))
     a, b = (group.trunk.filter for group in team._groups)

@@ -35,7 +35,7 @@ def pair_of(names: list[int]) -> tuple[LandmarkMap, LandmarkMap]:
 
 
 def test_one_step_per_interval_is_due() -> None:
-    """With every = 25, the last step of each 25 is due, and no other but while an attempt goes on."""
+    """With every = 25, the last step of each 25 is due, and no other unless an attempt is in progress."""
     plan = schedule()
     assert [step for step in range(100) if plan.is_due(step)] == [24, 49, 74, 99]
     plan.straightening = PendingAttempt(((0,), (1,)), (0, 1), Alignment.refused("too few inliers"), 24)
@@ -78,14 +78,14 @@ def test_smoothing_for_a_pair_that_is_always_refused_costs_a_multiple_of_the_log
 
 
 def test_an_uncertain_pair_waits_while_its_uncertainty_falls() -> None:
-    """It waits where it is not sure enough, the first time and while the doubt falls by three tenths each time."""
+    """It waits the first time, and as long as its uncertainty falls by three tenths each time."""
     plan = schedule()
     assert [plan.should_defer(FIRST, doubt) for doubt in (4.0, 2.7, 1.8, 1.3)] == [True, True, True, False]
     assert [plan.should_defer(SECOND, doubt) for doubt in (4.0, 0.9, 4.0)] == [True, False, False]
 
 
 def test_waiting_times_carry_over_to_larger_groups() -> None:
-    """Robots that waited for each other go on waiting in other company, others begin; a snapshot knows it, too."""
+    """Robots that waited for each other keep waiting in larger groups, also after a restore; others start at zero."""
     plan = schedule()
     assert plan.should_defer(((0,), (2,)), 4.0)
     other = schedule()
@@ -295,7 +295,7 @@ def test_members_of_a_group_send_poses_and_the_landmarks_they_touched() -> None:
 
 
 def test_a_robot_that_has_left_does_not_send() -> None:
-    """The joint filter goes on with those that hear each other."""
+    """The joint filter continues with the robots in contact."""
     ledger = TrafficCounter(3)
     ledger.record_step(report_of((0, -1, 2), [[4], [7], [2]], [[4], [-1], [-1]]), 13)
     assert ledger.sent == [POSE_BYTES + LANDMARK_BYTES + LOOK, 0, POSE_BYTES + LANDMARK_BYTES]

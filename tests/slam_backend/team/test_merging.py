@@ -291,7 +291,7 @@ def test_the_uncertainty_of_b_s_pose_is_turned_with_its_map() -> None:
 
 
 def test_a_merge_does_not_sample_unsampled_motion() -> None:
-    """Its Gaussians go on as they would have without the merge, turned: a merge is no sighting, and samples nothing."""
+    """Its Gaussians are those without the merge, rotated: a merge is no measurement, and samples nothing."""
     names = np.array([4])
     a, b = (FastSlam(1, 7, motion=WIDE_MOTION, seed=seed) for seed in range(2))
     for slam in (a, b):

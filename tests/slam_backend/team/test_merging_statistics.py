@@ -148,7 +148,7 @@ def test_contradicting_maps_are_widened_by_what_their_covariances_do_not_explain
 
 
 @pytest.mark.parametrize(("sigma", "claimed"), [(0.02, 0.004), (0.3, 0.01)])
-def test_what_maps_contradict_each_other_by_is_added_first_and_scales_only_beyond(sigma: float, claimed: float) -> None:
+def test_contradictions_add_variance_up_to_a_bound_and_scale_beyond(sigma: float, claimed: float) -> None:
     """A landmark known thirty times worse is widened by the same variance, up to 2 x (5 cm / 2)^2, and not by its own.
 
     The added variance solves chi^2(tau^2) = 12, found here by bracketing with the motion fitted again by a general

@@ -266,7 +266,7 @@ def test_three_robots_become_one_group_without_a_false_merge(run: Run) -> None:
         assert abs(wrap_angle(error[2])) < np.deg2rad(5.0)
 
 
-def test_the_joint_filter_goes_on_with_small_errors(run: Run) -> None:
+def test_the_joint_filter_has_small_errors(run: Run) -> None:
     """At the end of 32 m each, every robot knows its place in its own start frame to 0.3 m, and the map is as good."""
     simulation, team, _ = run
     assert simulation.position_errors(team).max() < 0.3
@@ -318,7 +318,7 @@ def test_diagnostics_count_the_last_frame(run: Run) -> None:
 
 @pytest.mark.parametrize(("aliased", "seed"), [(False, 5), (True, 6), (True, 7)])
 def test_robots_without_overlap_never_merge(aliased: bool, seed: int) -> None:
-    """Robots in separate rooms stay alone, whether or not the rooms repeat the same looks at other places."""
+    """Robots in separate rooms stay alone, whether or not the rooms repeat descriptors at other places."""
     simulation = SimulatedTeam(num_robots=2, seed=seed, separate=True, aliased=aliased)
     team = simulation.build()
     simulation.run(team, 150)

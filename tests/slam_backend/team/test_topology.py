@@ -84,7 +84,7 @@ def test_merges_forks_returns_undos_and_ends_of_monitoring_change_the_topology()
 
 
 def test_a_restored_team_has_the_topology_of_its_state() -> None:
-    """Be the team the same as before or another one."""
+    """It does whether the team is the same or another one."""
     simulation = SimulatedTeam(num_robots=3, seed=102)
     team, other = (simulation.build(attempts=NEVER) for _ in range(2))
     simulation.run(team, 60)
@@ -116,7 +116,7 @@ def test_all_beliefs_are_views_of_one_array(rows: int, robots: int | None) -> No
 
 @pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, lambda points: pickle.loads(pickle.dumps(points))])
 def test_a_copy_has_views_of_its_own_array(copied: Callable[[TeamPoses], TeamPoses]) -> None:
-    """What kernels write into a copy is what it tells."""
+    """What kernels write into a copy is visible in its fields, and not in the original."""
     points = TeamPoses(2)
     points.beliefs[:], points.poses[:] = 1.0, 2.0
     other = copied(points)

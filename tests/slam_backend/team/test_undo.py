@@ -144,7 +144,7 @@ def test_an_undo_needs_contact_between_both_sides() -> None:
 
 
 def test_a_robot_out_of_contact_follows_an_undo_on_its_return() -> None:
-    """Until then it goes by its fork of the false map; then its readings are taken in by its old group's filter."""
+    """Until then it uses its fork of the false map; then the filter of its old group processes its input."""
     simulation, team = driven(3, 106)
     team.merge(0, 1, align_maps(team.map(0, "mixture"), team.map(1, "mixture")))
     team.merge(0, 2, false_alignment_of_group(simulation, team))
@@ -227,8 +227,8 @@ def test_only_deformation_counts_as_motion_of_landmarks() -> None:
 # ---------------------------------------------------------------------- snapshots
 
 
-def test_a_team_goes_on_from_a_snapshot_bit_for_bit_through_an_undo() -> None:
-    """A team restored while two merges are in doubt, one of them false, does the same as the one that went on."""
+def test_a_team_continues_from_a_snapshot_bit_for_bit_through_an_undo() -> None:
+    """A team restored while two merges are monitored, one of them false, continues like the original."""
     simulation, team = driven(3, 104)
     team.merge(0, 1, false_alignment(simulation, team, FAR))
     team.merge(0, 2, true_alignment(simulation, team, 0, 2))
@@ -286,7 +286,7 @@ def test_an_undo_takes_in_few_steps_at_a_time(monkeypatch: pytest.MonkeyPatch) -
         assert_same(contents(team._find(robot)[0].filter), contents(twin._find(robot)[0].filter))
 
 
-def test_an_undo_waits_for_contact_and_goes_on_from_a_snapshot() -> None:
+def test_an_undo_waits_for_contact_and_continues_from_a_snapshot() -> None:
     """Sides out of contact during an undo stay as they are until they meet; a restored team does the same."""
     simulation, team = driven(2, 101, merging=UNWATCHED)
     team.merge(0, 1, false_alignment(simulation, team, FAR))
@@ -300,7 +300,7 @@ def test_an_undo_waits_for_contact_and_goes_on_from_a_snapshot() -> None:
 
 
 def test_a_group_with_a_rollback_in_progress_does_not_merge() -> None:
-    """While an undo is under way its group makes no attempts; a merge by hand makes a new group, doubted in turn."""
+    """It makes no attempts; a merge by the caller makes a new group, which is monitored in turn."""
     simulation = SimulatedTeam(num_robots=3, seed=104)
     team = simulation.build(attempts=AttemptOptions(every=1), merging=UNWATCHED)
     simulation.run(team, 80, links(3))

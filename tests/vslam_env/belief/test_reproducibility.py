@@ -96,7 +96,7 @@ def test_read_only_arrays_cannot_be_made_writable() -> None:
 
 @pytest.mark.parametrize("kind", [{}, {"observation_type": "flat"}, {"action_type": "goal"}])
 def test_writing_to_returned_arrays_changes_nothing(kind: dict[str, Any]) -> None:
-    """An episode goes on with the same bytes though all arrays that can be written were filled with ones."""
+    """An episode gives the same bytes when all writable arrays that it returned are filled with ones."""
     digests = []
     for writes in (False, True):
         env, said = small_env(max_cycles=200, **kind), hashlib.sha256()
@@ -130,7 +130,7 @@ def test_a_belief_keeps_no_array_of_the_caller() -> None:
 
 
 def test_true_ids_in_frames_are_copies() -> None:
-    """The simulator looks at those again when robots return; who writes to frames changes nothing there."""
+    """The simulator reads its own again when robots return; writing to frames does not change them."""
     env = small_env()
     env.reset(seed=5, options={"start_poses": MEETING})
     names = env.episode._frames.names

@@ -75,7 +75,7 @@ def test_returning_robots_have_the_grids_of_unbroken_contact(seed: int) -> None:
     assert (ours != theirs).sum() < 0.01 * (theirs != UNKNOWN).sum()
 
 
-def test_meeting_again_without_having_read_anything_new_changes_nothing() -> None:
+def test_meeting_again_without_new_scans_changes_nothing() -> None:
     """However often, in whatever frames."""
     drive = Drive(100)
     for _ in range(20):
@@ -103,7 +103,7 @@ def test_the_history_of_scans_is_bounded() -> None:
 
 
 def test_restored_grids_continue_with_missed_scans() -> None:
-    """A state taken while robots are apart goes on to the same cells."""
+    """A state taken while robots are out of contact leads to the same cells."""
     rng, drive = np.random.default_rng(100), Drive(100)
     for mates in [ALL] * 3 + [parted(rng) for _ in range(20)]:
         drive.on(mates)
@@ -147,7 +147,7 @@ PAIR, WITHOUT = ((0, 2), (1,), (0, 2)), ((0, 1), (0, 1), (2,))
 
 
 def test_scans_of_an_undone_merge_do_not_reach_absent_robots() -> None:
-    """A robot away when a merge was made and undone receives what its mates scanned, as if it had never been."""
+    """A robot that was away during merge and undo receives the scans of its own group only."""
     drives = Drive(100), Drive(100)
     for drive, was_merged in zip(drives, (True, False), strict=True):
         for mates in [PAIR] * 5 + [NONE] * 5:
@@ -161,7 +161,7 @@ def test_scans_of_an_undone_merge_do_not_reach_absent_robots() -> None:
 
 
 def test_scans_shared_within_a_side_survive_an_undo() -> None:
-    """What robots of a side told each other of the time before the merge is painted again after its undo."""
+    """Scans from before the merge that robots of a side exchanged are applied again after the undo."""
     drives = Drive(101), Drive(101)
     for drive, was_merged in zip(drives, (True, False), strict=True):
         for mates in [PAIR] * 5 + [NONE] * 20:

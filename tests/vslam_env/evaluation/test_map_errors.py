@@ -69,7 +69,7 @@ def test_claims_follow_creation() -> None:
     assert ground_truth.true_ids(1, _ids(2, 1, 0)).tolist() == [-2, 2, 1]  # of the four that count, 3 is the third
 
 
-def test_maps_are_scored_where_robots_believe_them_to_be() -> None:
+def test_maps_are_scored_at_the_true_start() -> None:
     """From the true start on; whatever the order of the parts, and whether robots share one."""
     rng = np.random.default_rng(100)
     ground_truth = _ground_truth()

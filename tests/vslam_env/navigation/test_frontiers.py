@@ -183,7 +183,7 @@ def test_passing_robots_drop_no_frontier() -> None:
     assert slots.valid.sum() == 2
 
 
-def test_restored_slots_go_on_bit_by_bit() -> None:
+def test_restored_slots_continue_bit_for_bit() -> None:
     """After set_state, the same updates lead to the same candidates, visits included."""
     cells = room((-4.0, 4.4))
     slots, again = CandidateSlots(), CandidateSlots()

@@ -274,7 +274,7 @@ HARDWARE = ray_directions(ANGLES), MAX_RANGE, RADIUS
 
 
 def test_a_combined_update_equals_its_parts() -> None:
-    """Each grid holds, and tells as changed, what scan, disc and bump leave one after the other, in ascending order."""
+    """Each grid holds, and reports as changed, the result of scan, disc and bump in ascending order of robots."""
     rng = np.random.default_rng(4)
     team, apart = TeamGrids(3), [TeamGrids(1) for _ in range(3)]
     parts = [single.grids[0] for single in apart]

@@ -322,7 +322,7 @@ def test_means_over_boxes_survive_distance() -> None:
     assert rows.mean() == pytest.approx(picture[:, int(u0) : int(u1)].mean(), abs=1.5)
 
 
-def test_front_end_measures_what_was_rendered() -> None:
+def test_measured_disparities_agree_with_the_rendered_depth() -> None:
     """Disparities of rendered pairs are f b / Z to less than a tenth of a pixel, and hardly any is off by a pixel."""
     camera = StereoCamera(mount=(0.0, 0.0, 0.1))
     eye = StereoRenderer(camera, ImagingConfig(), WALLS, draw_textures(WALLS, np.random.default_rng(5)))
@@ -354,7 +354,7 @@ def test_noise_is_that_of_the_configuration(eye: StereoRenderer) -> None:
     np.testing.assert_array_equal(quiet.take(VIEWS, 0, rng)[0], np.floor(clean[0] + 0.5).astype(np.uint8))
 
 
-def test_exposure_and_blur_do_what_they_say(eye: StereoRenderer) -> None:
+def test_exposure_and_blur_have_the_stated_effect(eye: StereoRenderer) -> None:
     """A gain scales the image, and blur makes it smoother without changing its mean."""
     still = {"noise": 0.0, "gain_sigma": 0.0, "eye_gain_sigma": 0.0}
     gains = []
