@@ -54,19 +54,21 @@ def run_attempt(
     Returns:
         The attempt that ends in this step, or None; its groups are to be merged if its alignment succeeded.
     """
-    pending = schedule.straightening
+    pending = schedule.pending_attempt
     if pending is None:
         return _start(groups, networks, step, schedule, alignment, merging, records, rng)
     pair = next((pair for pair in _pairs(groups) if _is_pending(pending, pair)), None)
     late = step - pending.since >= MOST_STEPS
     if pair is None or (late and not _are_connected(pair, networks)):
-        schedule.straightening = None
+        schedule.pending_attempt = None
         return None
     if not pending.ready or not _are_connected(pair, networks):
         ready = pending.ready or late or not any(group.trunk.filter.rejuvenation_requested for group in pair)
-        schedule.straightening = replace(pending, ready=ready)  # continued in the next step to limit the work per step
+        schedule.pending_attempt = replace(
+            pending, ready=ready
+        )  # continued in the next step to limit the work per step
         return None
-    schedule.straightening = None
+    schedule.pending_attempt = None
     maps = _mixtures(pair)
     outcome = _realign(pair, pending.alignment, maps, alignment, records, rng)
     return _finish(MergePlan(pair, maps, outcome), step, pending.alignment, schedule, alignment, merging, rng)
@@ -96,7 +98,7 @@ def _start(
     if all(group.trunk.filter.smooths_incrementally for group in pair):
         for group in pair:
             group.trunk.filter.request_rejuvenation()
-        schedule.straightening = PendingAttempt(chosen, _numbers(pair), unsmoothed, step)
+        schedule.pending_attempt = PendingAttempt(chosen, _numbers(pair), unsmoothed, step)
         return None
     before = [group.trunk.filter.get_state() for group in pair]
     smoothed = smoothed_maps(*pair)

@@ -88,7 +88,7 @@ class MergeScheduler:
         alignment: Options of alignments, with the gate of candidate matches and the least number of inliers.
 
     Attributes:
-        straightening: Pending attempt, or None.
+        pending_attempt: Attempt that waits for smoothed maps, or None.
     """
 
     def __init__(self, options: AttemptOptions, alignment: AlignmentOptions) -> None:
@@ -99,12 +99,12 @@ class MergeScheduler:
         self._bars: list[tuple[PairKey, int]] = []  # blocked pairs, and the step when the block ends
         self._uncertainties: dict[tuple[int, int], float] = {}  # least uncertainty by robots of both sides
         self._trials: dict[tuple[int, int], FloatArray] = {}  # last motion by the robots that define the frames
-        self.straightening: PendingAttempt | None = None
+        self.pending_attempt: PendingAttempt | None = None
 
     def is_due(self, step: int) -> bool:
         """Return whether a pair may try at this step, or an attempt is pending."""
         options = self._options
-        return self.straightening is not None or (options.enabled and step % options.every == options.every - 1)
+        return self.pending_attempt is not None or (options.enabled and step % options.every == options.every - 1)
 
     def may_try(self, pair: PairKey, step: int) -> bool:
         """Return whether the pair's wait is over, and no block applies."""
@@ -201,13 +201,13 @@ class MergeScheduler:
         """Return the options and a copy of the memory; arrays are read-only."""
         memory: dict[str, Any] = {"records": copy.deepcopy(self._records), "bars": tuple(self._bars)}
         memory |= {"uncertainties": dict(self._uncertainties), "trials": dict(self._trials)}
-        fixed = {"options": self._options, "alignment": self._alignment, "straightening": self.straightening}
+        fixed = {"options": self._options, "alignment": self._alignment, "straightening": self.pending_attempt}
         return fixed | memory
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Restore options and memory from `get_state`."""
         self._options, self._alignment = state["options"], state["alignment"]
-        self.straightening = state["straightening"]
+        self.pending_attempt = state["straightening"]
         self._records = copy.deepcopy(state["records"])
         self._bars = list(state["bars"])
         self._uncertainties, self._trials = dict(state["uncertainties"]), dict(with_constants(state["trials"]))

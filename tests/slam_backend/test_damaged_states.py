@@ -70,12 +70,12 @@ def team_in_an_undo() -> Subject:
 
 
 def team_in_an_attempt() -> Subject:
-    """Return a team that straightens two maps to align them once more."""
+    """Return a team that smooths two maps to align them again."""
     simulation = SimulatedTeam(3, seed=101)
     smoothing = SmoothingOptions(slice_steps=12)
     attempts = AttemptOptions(every=5)
     team = simulation.build(num_particles=10, rejuvenate_every=20, smoothing=smoothing, attempts=attempts)
-    while team._schedule.straightening is None:
+    while team._schedule.pending_attempt is None:
         simulation.run(team, 1)
     return team, [simulation.read() for _ in range(8)]
 

@@ -9,7 +9,7 @@ from builders.teams import NEVER, SimulatedTeam, check_snapshot, false_alignment
 
 from slam_backend.geometry import between, compose
 from slam_backend.maps.alignment import AlignmentOptions
-from slam_backend.smoother import rejuvenation as slices
+from slam_backend.smoother import rejuvenation
 from slam_backend.smoother.graph import NONE, SlamGraph, scattered
 from slam_backend.smoother.graph_building import extend_graph, merge_graphs
 from slam_backend.smoother.optimizer import optimize
@@ -238,7 +238,7 @@ def test_no_two_filters_work_on_their_smoothers_in_one_step(monkeypatch):
         worked.append(team._step)
         return optimize(*arguments)
 
-    monkeypatch.setattr(slices, "optimize", noted)
+    monkeypatch.setattr(rejuvenation, "optimize", noted)
     simulation.run(team, 60)
     assert len(worked) > 10
     assert len(set(worked)) == len(worked)

@@ -17,7 +17,7 @@ from slam_backend.fastslam.run_log import RobotLog
 from slam_backend.geometry import wrap_angle
 from slam_backend.models.measurements import Measurements
 from slam_backend.models.odometry import OdometryModel
-from slam_backend.smoother import rejuvenation as slices
+from slam_backend.smoother import rejuvenation
 from slam_backend.smoother.graph import SlamGraph
 from slam_backend.smoother.graph_building import InitialPoses, LandmarkPositions, extend_graph, log_head
 from slam_backend.smoother.graph_reduction import MAX_FRAMES, reduce_keyframes, relinearise
@@ -67,13 +67,13 @@ def test_the_work_per_step_is_bounded(monkeypatch):
         solved.append((graph.num_keys, mode.iterations))
         return mode
 
-    monkeypatch.setattr(slices, "optimize", noted)
+    monkeypatch.setattr(rejuvenation, "optimize", noted)
     drawn = []
     for reading in run.readings():
         solved.clear()
         report = slam.step(**reading).rejuvenation
         assert len(solved) <= 1
-        assert all(keys <= 20 + 2 * 8 and steps <= slices.LAST_STEPS for keys, steps in solved)
+        assert all(keys <= 20 + 2 * 8 and steps <= rejuvenation.LAST_STEPS for keys, steps in solved)
         drawn += [] if report is None else [report.reason]
     assert len(drawn) >= 3
     assert set(drawn) == {""}

@@ -16,8 +16,7 @@ from slam_backend.maps.alignment import DISTINCT_ROTATION, DISTINCT_TRANSLATION,
 from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.smoother.graph import mean_pose
 from slam_backend.smoother.options import SmoothingOptions
-from slam_backend.team import group_merging as group_changes
-from slam_backend.team import merge_attempt as trying
+from slam_backend.team import group_merging, merge_attempt
 from slam_backend.team.branches import restored_filter
 from slam_backend.team.communication import LANDMARK_BYTES
 from slam_backend.team.filter_merging.merging import merge_filters, pair_filters, transform_covariance
@@ -33,8 +32,8 @@ AT_LAST = AttemptOptions(every=STEPS)  # the only attempt comes with the last st
 AS_IT_IS = MergeOptions(smooth_first=False)
 
 
-def bent_team(seed: int, attempts: AttemptOptions, **options: object) -> tuple[SimulatedTeam, TeamSlam]:
-    """Return two robots with few particles, whose maps are bent, after `STEPS` steps."""
+def team_with_deformed_maps(seed: int, attempts: AttemptOptions, **options: object) -> tuple[SimulatedTeam, TeamSlam]:
+    """Return two robots with few particles, whose maps are deformed, after `STEPS` steps."""
     return driven(2, seed, STEPS, attempts=attempts, num_particles=8, **options)
 
 
@@ -43,8 +42,8 @@ def both_maps(team: TeamSlam) -> tuple[LandmarkMap, LandmarkMap]:
     return team.map(0, "mixture"), team.map(1, "mixture")
 
 
-def straightened(slam: FastSlam) -> FastSlam:
-    """Return a copy that is straightened."""
+def smoothed(slam: FastSlam) -> FastSlam:
+    """Return a copy with smoothed paths."""
     copied = restored_filter(slam.get_state())
     assert copied.rejuvenate().reason == ""
     return copied
@@ -54,7 +53,7 @@ def test_a_filter_that_never_rejuvenates_by_itself_can_be_rejuvenated() -> None:
     """It finds the same map as a filter that keeps a smoother, but for the initial estimate."""
     maps = []
     for every in (None, 1000):
-        slam = bent_team(111, NEVER, rejuvenate_every=every)[1]._find(0)[0].filter
+        slam = team_with_deformed_maps(111, NEVER, rejuvenate_every=every)[1]._find(0)[0].filter
         before = slam.map()
         assert slam.rejuvenate().reason == ""
         assert (slam.state.rejuvenation is None) == (every is None)
@@ -68,14 +67,14 @@ def test_a_filter_that_never_rejuvenates_by_itself_can_be_rejuvenated() -> None:
 
 def test_a_merge_uses_the_smoothed_maps() -> None:
     """What is merged, and by which motion, is what both filters are after a rejuvenation."""
-    _, alone = bent_team(112, NEVER)
-    _, team = bent_team(112, AT_LAST)
-    sides = [straightened(alone._find(robot)[0].filter) for robot in range(2)]
+    _, alone = team_with_deformed_maps(112, NEVER)
+    _, team = team_with_deformed_maps(112, AT_LAST)
+    sides = [smoothed(alone._find(robot)[0].filter) for robot in range(2)]
     rng = alone._rng
-    bent = align_maps(*both_maps(alone), rng=rng)
+    unsmoothed = align_maps(*both_maps(alone), rng=rng)
     found = align_maps(sides[0].map("mixture"), sides[1].map("mixture"), rng=rng)
     assert [event.kind for event in team.events] == ["attempt", "merge"]
-    assert_same(team.events[0].unsmoothed_alignment, bent)
+    assert_same(team.events[0].unsmoothed_alignment, unsmoothed)
     assert_same(team.events[1].alignment, found)
     assert_same(team.merged_maps(team.events[1]), tuple(side.map() for side in sides))
     watch = team._find(0)[0].monitors[0]
@@ -91,7 +90,7 @@ def test_smoothed_maps_give_more_accurate_merges() -> None:
     for merging in (AS_IT_IS, MergeOptions()):
         found = []
         for seed in range(120, 132):
-            simulation, team = bent_team(seed, AT_LAST, merging=merging)
+            simulation, team = team_with_deformed_maps(seed, AT_LAST, merging=merging)
             off = team.events[-1].alignment.transform - simulation.true_motion(0, 1)
             found.append(np.hypot(*off[:2]))
         errors.append(np.array(found))
@@ -104,11 +103,11 @@ def test_maps_that_no_longer_fit_are_not_merged() -> None:
     """If only the unsmoothed maps can be aligned, the attempt is refused with the reason of the second alignment."""
     sigmas = []
     for merging in (AS_IT_IS, MergeOptions()):
-        covariance = bent_team(113, AT_LAST, merging=merging)[1].events[-1].alignment.covariance
+        covariance = team_with_deformed_maps(113, AT_LAST, merging=merging)[1].events[-1].alignment.covariance
         sigmas.append(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1]))
     assert sigmas[0] < sigmas[1]
     strict = AlignmentOptions(max_sigma_position=float(np.mean(sigmas)))
-    _, team = bent_team(113, AT_LAST, alignment=strict)
+    _, team = team_with_deformed_maps(113, AT_LAST, alignment=strict)
     event = team.events[0]
     assert (event.kind, event.alignment.reason) == ("attempt", "too uncertain")
     assert event.unsmoothed_alignment is not None
@@ -121,16 +120,16 @@ def test_maps_that_no_longer_fit_are_not_merged() -> None:
 @pytest.mark.parametrize("every", [4, 2])
 def test_maps_that_agree_less_after_smoothing_are_not_merged(every: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """A diverged smoother is not trusted: the attempt is refused, and the filters are unchanged."""
-    _, alone = bent_team(112, NEVER)
-    original = trying.smoothed_maps
+    _, alone = team_with_deformed_maps(112, NEVER)
+    original = merge_attempt.smoothed_maps
 
     def lost(a: Group, b: Group) -> tuple[LandmarkMap, LandmarkMap]:
         maps = original(a, b)
         assert maps is not None
         return maps[0].subset(np.flatnonzero(np.arange(len(maps[0])) % every)), maps[1]
 
-    monkeypatch.setattr(trying, "smoothed_maps", lost)
-    _, team = bent_team(112, AT_LAST)
+    monkeypatch.setattr(merge_attempt, "smoothed_maps", lost)
+    _, team = team_with_deformed_maps(112, AT_LAST)
     event = team.events[0]
     assert (len(team.events), event.alignment.reason) == (1, "too few inliers")
     assert event.unsmoothed_alignment is not None
@@ -158,7 +157,7 @@ def test_smoothed_maps_are_sent_again() -> None:
     """Both speakers send all their landmarks again, without descriptors."""
     sent = []
     for merging in (AS_IT_IS, MergeOptions()):
-        _, team = bent_team(112, AT_LAST, merging=merging)
+        _, team = team_with_deformed_maps(112, AT_LAST, merging=merging)
         sent.append(team.bytes_sent)
     again = [len(before) * LANDMARK_BYTES for before in team._find(0)[0].monitors[0].pre_merge_maps]
     assert (sent[1] - sent[0]).tolist() == again
@@ -166,7 +165,7 @@ def test_smoothed_maps_are_sent_again() -> None:
 
 def test_the_predicted_scatter_of_motions_is_that_of_the_merged_particles() -> None:
     """It is the scatter of the other robot's start over the joint filter's particles, known before the merge."""
-    _, team = bent_team(112, NEVER)
+    _, team = team_with_deformed_maps(112, NEVER)
     a, b = (team._find(robot)[0].filter for robot in range(2))
     alignment = align_maps(*both_maps(team), rng=np.random.default_rng(1))
     pairs = np.column_stack([a.map().ids[alignment.inliers[:, 0]], b.map().ids[alignment.inliers[:, 1]]])
@@ -180,9 +179,9 @@ def test_the_predicted_scatter_of_motions_is_that_of_the_merged_particles() -> N
 def test_a_pair_too_uncertain_to_merge_waits_and_merges_later() -> None:
     """Where particles differ in the motion by more than is sure the attempt is refused, until waiting helps no more."""
     rhythm = AttemptOptions(every=20)
-    _, team = bent_team(112, rhythm, merging=MergeOptions(min_sigmas=0.0))
+    _, team = team_with_deformed_maps(112, rhythm, merging=MergeOptions(min_sigmas=0.0))
     assert [event.kind for event in team.events] == ["attempt", "merge"]
-    simulation, team = bent_team(112, rhythm, merging=MergeOptions(min_sigmas=1e4))  # 0.05 mm
+    simulation, team = team_with_deformed_maps(112, rhythm, merging=MergeOptions(min_sigmas=1e4))  # 0.05 mm
     assert team.events[0].alignment.reason == "too uncertain"
     simulation.run(team, STEPS)
     *attempts, merge = team.events
@@ -197,14 +196,15 @@ def test_a_pair_too_uncertain_to_merge_waits_and_merges_later() -> None:
 def test_checking_the_uncertainty_of_a_merge_changes_nothing(how: dict[str, Any]) -> None:
     """Whether particles agree is only looked at: the merge is bit for bit that of a team which does not ask."""
     states = [
-        bent_team(112, AT_LAST, merging=MergeOptions(min_sigmas=sure, **how))[1].get_state() for sure in (0.0, 1e-6)
+        team_with_deformed_maps(112, AT_LAST, merging=MergeOptions(min_sigmas=sure, **how))[1].get_state()
+        for sure in (0.0, 1e-6)
     ]
     assert_same(*({"filter": state["groups"], "rng": state["rng"]} for state in states))
 
 
 def test_maps_of_an_unmonitored_merge_are_not_available() -> None:
     """Where merges are final, or nothing was merged, asking for the maps that were joined is refused."""
-    _, team = bent_team(112, AT_LAST, merging=MergeOptions(watch_steps=0))
+    _, team = team_with_deformed_maps(112, AT_LAST, merging=MergeOptions(watch_steps=0))
     for event in team.events:
         with pytest.raises(ValueError, match=r"merge: expected a merge still monitored, got 'the (attempt|merge) of"):
             team.merged_maps(event)
@@ -219,7 +219,7 @@ def attempt_begun(seed: int) -> tuple[SimulatedTeam, TeamSlam]:
     simulation, team = driven(
         2, seed, STEPS, attempts=AT_LAST, num_particles=8, rejuvenate_every=1000, smoothing=smoothing
     )
-    assert team._schedule.straightening is not None
+    assert team._schedule.pending_attempt is not None
     assert team.events == ()
     return simulation, team
 
@@ -227,8 +227,8 @@ def attempt_begun(seed: int) -> tuple[SimulatedTeam, TeamSlam]:
 def test_an_attempt_continues_once_both_maps_are_smoothed() -> None:
     """In the step after the second filter has drawn new particles the maps align again, and merge by that."""
     simulation, team = attempt_begun(112)
-    bent = team._schedule.straightening
-    assert bent is not None
+    pending = team._schedule.pending_attempt
+    assert pending is not None
     drawn: dict[int, int] = {}
     for step in range(STEPS, STEPS + SOON):
         rng = copy.deepcopy(team._rng)
@@ -240,10 +240,10 @@ def test_an_attempt_continues_once_both_maps_are_smoothed() -> None:
     assert [attempt.kind, merge.kind] == ["attempt", "merge"]
     assert attempt.step == merge.step == 1 + max(drawn.values())
     assert sorted(drawn) == [0, 1]
-    assert_same(attempt.unsmoothed_alignment, bent.alignment)
+    assert_same(attempt.unsmoothed_alignment, pending.alignment)
     watch = team._find(0)[0].monitors[0]
     assert_same(align_maps(*watch.pre_merge_maps, rng=rng), merge.alignment)
-    assert team._schedule.straightening is None
+    assert team._schedule.pending_attempt is None
 
 
 def test_an_attempt_continues_from_a_snapshot() -> None:
@@ -260,7 +260,7 @@ def test_an_attempt_survives_a_temporary_loss_of_contact(apart: int) -> None:
     simulation, team = attempt_begun(112)
     simulation.run(team, apart, links(2))
     assert team.events == ()
-    assert (team._schedule.straightening is None) == (apart == MOST_STEPS)
+    assert (team._schedule.pending_attempt is None) == (apart == MOST_STEPS)
     simulation.run(team, 1)
     assert [event.kind for event in team.events] == ([] if apart == MOST_STEPS else ["attempt", "merge"])
     simulation.run(team, STEPS + SOON - apart)
@@ -323,7 +323,7 @@ def test_a_trial_whose_merge_would_be_undone_is_refused(monkeypatch: pytest.Monk
     _, team = driven(2, 112, FEW_STEPS, num_particles=8)
     plan = planned(team)
     for share, bounded in ((0.2, True), (0.21, False)):
-        monkeypatch.setattr(group_changes, "deformed_fraction", lambda *_, share=share: share)
+        monkeypatch.setattr(group_merging, "deformed_fraction", lambda *_, share=share: share)
         trial = plan.on_trial(MergeOptions(), AlignmentOptions(), np.random.default_rng(2))
         assert trial is not None
         assert np.isfinite(trial[1]) == bounded

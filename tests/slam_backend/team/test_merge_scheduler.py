@@ -38,7 +38,7 @@ def test_one_step_per_interval_is_due() -> None:
     """With every = 25, the last step of each 25 is due, and no other unless an attempt is in progress."""
     plan = schedule()
     assert [step for step in range(100) if plan.is_due(step)] == [24, 49, 74, 99]
-    plan.straightening = PendingAttempt(((0,), (1,)), (0, 1), Alignment.refused("too few inliers"), 24)
+    plan.pending_attempt = PendingAttempt(((0,), (1,)), (0, 1), Alignment.refused("too few inliers"), 24)
     assert all(plan.is_due(step) for step in range(25, 49))
 
 
@@ -268,47 +268,47 @@ def report_of(rows: tuple[int, ...], associations: list[list[int]], created: lis
 
 def test_new_landmarks_are_sent_with_descriptors_and_changed_ones_without() -> None:
     """A first exchange costs whole landmarks; a second only what is new, and what changed without its descriptor."""
-    ledger = TrafficCounter(3)
-    ledger.record_maps(0, 2, counted_map({1: 4, 5: 2}), counted_map({7: 1}))
-    assert ledger.sent == [2 * (LANDMARK_BYTES + LOOK), 0, LANDMARK_BYTES + LOOK]
-    ledger.record_maps(0, 2, counted_map({1: 4, 5: 3, 6: 1}), counted_map({7: 1}))
-    assert ledger.sent == [3 * (LANDMARK_BYTES + LOOK) + LANDMARK_BYTES, 0, LANDMARK_BYTES + LOOK]
+    counter = TrafficCounter(3)
+    counter.record_maps(0, 2, counted_map({1: 4, 5: 2}), counted_map({7: 1}))
+    assert counter.sent == [2 * (LANDMARK_BYTES + LOOK), 0, LANDMARK_BYTES + LOOK]
+    counter.record_maps(0, 2, counted_map({1: 4, 5: 3, 6: 1}), counted_map({7: 1}))
+    assert counter.sent == [3 * (LANDMARK_BYTES + LOOK) + LANDMARK_BYTES, 0, LANDMARK_BYTES + LOOK]
 
 
 def test_each_pair_of_robots_has_its_own_record_of_what_was_sent() -> None:
     """Each pair of robots has its own record of what was sent."""
-    ledger = TrafficCounter(3)
-    ledger.record_maps(0, 1, counted_map({1: 4}), counted_map({2: 1}))
-    ledger.record_maps(0, 2, counted_map({1: 4}), counted_map({2: 1}))
-    assert ledger.sent == [2 * (LANDMARK_BYTES + LOOK), LANDMARK_BYTES + LOOK, LANDMARK_BYTES + LOOK]
+    counter = TrafficCounter(3)
+    counter.record_maps(0, 1, counted_map({1: 4}), counted_map({2: 1}))
+    counter.record_maps(0, 2, counted_map({1: 4}), counted_map({2: 1}))
+    assert counter.sent == [2 * (LANDMARK_BYTES + LOOK), LANDMARK_BYTES + LOOK, LANDMARK_BYTES + LOOK]
 
 
 def test_members_of_a_group_send_poses_and_the_landmarks_they_touched() -> None:
     """Per step a robot sends its pose, each landmark it matched or made, and descriptors of those it made."""
-    ledger = TrafficCounter(4)
-    ledger.record_step(report_of((1, 3), [[8], [4, -1, 9], [], [2]], [[8], [-1, -1, 9], [], [-1]]), 13)
+    counter = TrafficCounter(4)
+    counter.record_step(report_of((1, 3), [[8], [4, -1, 9], [], [2]], [[8], [-1, -1, 9], [], [-1]]), 13)
     sent = np.array([0, POSE_BYTES + 2 * LANDMARK_BYTES + LOOK, 0, POSE_BYTES + LANDMARK_BYTES])
-    np.testing.assert_array_equal(ledger.sent, sent)
-    ledger.record_step(report_of((1, 3), [[8], [4, 9], [], [2]], [[8], [-1, -1], [], [-1]]), 13)
+    np.testing.assert_array_equal(counter.sent, sent)
+    counter.record_step(report_of((1, 3), [[8], [4, 9], [], [2]], [[8], [-1, -1], [], [-1]]), 13)
     sent += [0, POSE_BYTES + 2 * LANDMARK_BYTES, 0, POSE_BYTES + LANDMARK_BYTES]
-    np.testing.assert_array_equal(ledger.sent, sent)
+    np.testing.assert_array_equal(counter.sent, sent)
 
 
 def test_a_robot_that_has_left_does_not_send() -> None:
     """The joint filter continues with the robots in contact."""
-    ledger = TrafficCounter(3)
-    ledger.record_step(report_of((0, -1, 2), [[4], [7], [2]], [[4], [-1], [-1]]), 13)
-    assert ledger.sent == [POSE_BYTES + LANDMARK_BYTES + LOOK, 0, POSE_BYTES + LANDMARK_BYTES]
+    counter = TrafficCounter(3)
+    counter.record_step(report_of((0, -1, 2), [[4], [7], [2]], [[4], [-1], [-1]]), 13)
+    assert counter.sent == [POSE_BYTES + LANDMARK_BYTES + LOOK, 0, POSE_BYTES + LANDMARK_BYTES]
 
 
 def test_a_traffic_counter_continues_from_its_state() -> None:
     """A restored counter continues like the original, and shares nothing with it."""
-    ledger, twin = TrafficCounter(2), TrafficCounter(2)
-    ledger.record_maps(0, 1, counted_map({1: 4}), counted_map({2: 1}))
-    twin.set_state(ledger.get_state())
-    for one in (ledger, twin):
+    counter, twin = TrafficCounter(2), TrafficCounter(2)
+    counter.record_maps(0, 1, counted_map({1: 4}), counted_map({2: 1}))
+    twin.set_state(counter.get_state())
+    for one in (counter, twin):
         one.record_maps(0, 1, counted_map({1: 5}), counted_map({2: 1}))
-    assert twin.sent == ledger.sent == [2 * LANDMARK_BYTES + LOOK, LANDMARK_BYTES + LOOK]
+    assert twin.sent == counter.sent == [2 * LANDMARK_BYTES + LOOK, LANDMARK_BYTES + LOOK]
 
 
 def test_robots_that_merge_send_maps_and_then_a_few_hundred_bytes_a_step() -> None:
