@@ -6,14 +6,16 @@ from slam_backend.core.jit import device, jit_fma, simd, simd_inline, stack_arra
 from slam_backend.core.simd_math import WIDE, added_up, log_of
 from slam_backend.core.validation import Float32Array, FloatArray, IntArray
 from slam_backend.fastslam._kernels.layout import (
-    BEST,
+    BEST_D,
     CHOSEN,
-    DEAD,
     IDENTITIES,
     IDS,
     LANES,
     LOG_2PI,
     LOG_BEST,
+    NEAR,
+    NEW_LANDMARK,
+    NO_MATCH,
     Q_D,
     Q_DEPTH,
     Q_DET_POSE,
@@ -21,7 +23,7 @@ from slam_backend.fastslam._kernels.layout import (
     Q_METRES2,
     REJECTED,
     ROW_OF,
-    SECOND,
+    SECOND_D,
     TAKEN,
 )
 from slam_backend.fastslam._kernels.records import Candidates, Frame, MapArrays, Outcome
@@ -169,10 +171,10 @@ def find_candidates(frame: Frame, maps: MapArrays, gate: float) -> tuple[Candida
 def begin_choice(work: FloatArray) -> None:
     """Clear the rows by which candidates compete for one measurement."""
     for i in range(LANES):
-        work[BEST + i] = np.inf
-        work[SECOND + i] = np.inf
-        work[CHOSEN + i] = -1.0
-        work[DEAD + i] = 0.0
+        work[BEST_D + i] = np.inf
+        work[SECOND_D + i] = np.inf
+        work[CHOSEN + i] = NO_MATCH
+        work[NEAR + i] = 0.0
         work[LOG_BEST + i] = 0.0
         work[TAKEN + i] = 0.0
 
@@ -214,14 +216,14 @@ def consider(
         distance = cap if distance > cap else distance
         near = front & ((distance <= new_landmark_gate) | (record[Q_METRES2 + i] <= radius2))
         ok = front & (distance <= reach) & (work[TAKEN + i] == 0.0)
-        work[DEAD + i] = 1.0 if near else work[DEAD + i]
+        work[NEAR + i] = 1.0 if near else work[NEAR + i]
         depth = record[Q_DEPTH + i]
         log_det = log_of(record[Q_DET_POSE + i] if ok else 1.0) - 8.0 * log_of(depth if ok else 1.0)
         cost = distance + log_det + look if ok else np.inf
-        best, second = work[BEST + i], work[SECOND + i]
+        best, second = work[BEST_D + i], work[SECOND_D + i]
         better = cost < best
-        work[SECOND + i] = best if better else (cost if cost < second else second)
-        work[BEST + i] = cost if better else best
+        work[SECOND_D + i] = best if better else (cost if cost < second else second)
+        work[BEST_D + i] = cost if better else best
         work[CHOSEN + i] = q if better else work[CHOSEN + i]
         work[LOG_BEST + i] = -0.5 * (distance + log_det + 3.0 * LOG_2PI) if better else work[LOG_BEST + i]
 
@@ -252,12 +254,12 @@ def create_once(
     for q in range(candidates.starts[b], candidates.starts[b + 1]):
         seen = maps.counts[row_of[candidates.slots[q]], first : first + LANES]
         for i in range(len(chosen)):
-            chosen[i] = -1.0 if chosen[i] == -2.0 and seen[i] > 0 else chosen[i]
+            chosen[i] = NO_MATCH if chosen[i] == NEW_LANDMARK and seen[i] > 0 else chosen[i]
     for a in range(b):
         if names[a] == names[b]:
             earlier = match[a]
             for i in range(len(chosen)):
-                chosen[i] = -1.0 if chosen[i] == -2.0 and earlier[i] == -2.0 else chosen[i]
+                chosen[i] = NO_MATCH if chosen[i] == NEW_LANDMARK and earlier[i] == NEW_LANDMARK else chosen[i]
 
 
 @device
@@ -273,7 +275,7 @@ def write_associations(
         own, chosen, new_slot = outcome.found[b, first : first + LANES], match[b], outcome.new_slots[b]
         squares = outcome.distances[b, first : first + LANES]
         for i in range(LANES):
-            own[i] = new_slot if chosen[i] == -2.0 else REJECTED
+            own[i] = new_slot if chosen[i] == NEW_LANDMARK else REJECTED
             squares[i] = np.nan
         for q in range(candidates.starts[b], candidates.starts[b + 1]):
             of_candidate, slot, code = records[q, row : row + LANES], candidates.slots[q], float(q)

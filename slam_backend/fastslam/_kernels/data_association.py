@@ -13,7 +13,7 @@ from slam_backend.core.jit import device, simd
 from slam_backend.core.validation import FloatArray, Int32Array
 from slam_backend.fastslam._kernels.candidates import begin_choice, consider, mark_assigned, mask_of
 from slam_backend.fastslam._kernels.layout import (
-    BEST,
+    BEST_D,
     C00,
     C01,
     C10,
@@ -25,7 +25,6 @@ from slam_backend.fastslam._kernels.layout import (
     CLUTTER,
     CONTRADICT,
     COS,
-    DEAD,
     KEPT00,
     KEPT01,
     KEPT10,
@@ -38,6 +37,9 @@ from slam_backend.fastslam._kernels.layout import (
     LOG_BEST,
     LOST,
     MAX_DISTANCE,
+    NEAR,
+    NEW_LANDMARK,
+    NO_MATCH,
     Q_D,
     Q_DEPTH,
     Q_DET,
@@ -45,7 +47,7 @@ from slam_backend.fastslam._kernels.layout import (
     Q_HELD,
     Q_SQUARE,
     ROW_OF,
-    SECOND,
+    SECOND_D,
     SIN,
     SURE,
     TAKEN,
@@ -74,12 +76,12 @@ MIN_CONTRADICTIONS = 3.0  # three points fix a pose with one to spare
 @device
 @simd
 def _judge_nearest(work: FloatArray, record: FloatArray, begin: bool) -> None:
-    """Fold candidate after candidate: BEST = least D at hand of those held, SECOND = least of the D kept before."""
+    """Fold candidate after candidate: BEST_D = least D at hand of those held, SECOND_D = least of the D kept before."""
     for i in range(LANES):
         held = record[Q_HELD + i] > 0.0
         now, before = record[Q_D + i] if held else np.inf, record[Q_FIRST_D + i] if held else np.inf
-        work[BEST + i] = now if begin or now < work[BEST + i] else work[BEST + i]
-        work[SECOND + i] = before if begin or before < work[SECOND + i] else work[SECOND + i]
+        work[BEST_D + i] = now if begin or now < work[BEST_D + i] else work[BEST_D + i]
+        work[SECOND_D + i] = before if begin or before < work[SECOND_D + i] else work[SECOND_D + i]
         work[CHOSEN + i] = 1.0 if held else (0.0 if begin else work[CHOSEN + i])
 
 
@@ -118,23 +120,23 @@ def associate_initial(
             evaluate(work, tile, records[q], seen, False)
             consider(work, records[q], float(q), candidates.looks[q], MAX_DISTANCE, reach, 0.0, 0.0)
         for i in range(LANES):  # the best candidate, if no other comes near
-            second = work[SECOND + i]
-            clear = second == np.inf or second - work[BEST + i] >= rules.ambiguity
-            chosen[i] = work[CHOSEN + i] if clear else -1.0
+            second = work[SECOND_D + i]
+            clear = second == np.inf or second - work[BEST_D + i] >= rules.ambiguity
+            chosen[i] = work[CHOSEN + i] if clear else NO_MATCH
         for q in range(low, high):
             record, code = records[q], float(q)
             if rules.one_to_one and same[q] >= 0:
                 mark_assigned(work, match, candidates, q, True)
                 for i in range(LANES):
-                    chosen[i] = -1.0 if chosen[i] == code and work[TAKEN + i] > 0.0 else chosen[i]
+                    chosen[i] = NO_MATCH if chosen[i] == code and work[TAKEN + i] > 0.0 else chosen[i]
             sum_matches(work, record, chosen, code, gate)
             for i in range(LANES):  # D at the predicted pose is the NIS
                 record[Q_FIRST_D + i] = record[Q_D + i]
-        for q in range(low, high):  # the choice is made: rows BEST and CHOSEN are free
+        for q in range(low, high):  # the choice is made: rows BEST_D and CHOSEN are free
             _judge_nearest(work, records[q], q == low)
         if low < high:
             for i in range(LANES):
-                work[CONTRADICT + i] += 1.0 if work[CHOSEN + i] > 0.0 and not work[BEST + i] <= gate else 0.0
+                work[CONTRADICT + i] += 1.0 if work[CHOSEN + i] > 0.0 and not work[BEST_D + i] <= gate else 0.0
     suspects = 0
     for i in range(LANES):
         suspects += 1 if work[CONTRADICT + i] >= MIN_CONTRADICTIONS else 0
@@ -156,7 +158,7 @@ def _match_alone(
         held = seen[i] > 0
         inside = distance <= gate
         ok = held and distance <= reach
-        chosen[i] = q if ok else -1.0
+        chosen[i] = q if ok else NO_MATCH
         add_terms(work, i, ok, gate / (gate + distance), terms)
         record[Q_FIRST_D + i] = distance
         work[CONTRADICT + i] += 1.0 if held and not inside else 0.0
@@ -201,9 +203,9 @@ def try_inflated_prior(
             _judge_nearest(work, record, q == starts[b])
         if starts[b] < starts[b + 1]:  # whether the wide prior explains the measurement, and the narrow one did not
             for i in range(LANES):
-                sure = work[BEST + i] <= gate
+                sure = work[BEST_D + i] <= gate
                 work[SURE + i] += 1.0 if sure else 0.0
-                work[CONTRADICT + i] += 1.0 if sure and not work[SECOND + i] <= gate else 0.0
+                work[CONTRADICT + i] += 1.0 if sure and not work[SECOND_D + i] <= gate else 0.0
     for i in range(LANES):  # suspects that are not lost after all get back what they had
         lost = work[CONTRADICT + i] >= MIN_CONTRADICTIONS and 2.0 * work[CONTRADICT + i] > work[SURE + i]
         back = work[LOST + i] > 0.0 and not lost
@@ -287,11 +289,11 @@ def associate_final(
                 rules.new_landmark_radius,
             )
         for i in range(LANES):
-            best, second = work[BEST + i], work[SECOND + i]
+            best, second = work[BEST_D + i], work[SECOND_D + i]
             matched = work[CHOSEN + i] >= 0.0
             held_back = matched and second < np.inf and second - best < rules.ambiguity
-            new = -1.0 if work[DEAD + i] > 0.0 else -2.0
-            chosen[i] = (-1.0 if held_back else work[CHOSEN + i]) if matched else new
+            new = NO_MATCH if work[NEAR + i] > 0.0 else NEW_LANDMARK
+            chosen[i] = (NO_MATCH if held_back else work[CHOSEN + i]) if matched else new
             work[CLUTTER + i] += (work[LOG_BEST + i] if held_back else 0.0) if matched else log_clutter
         for q in range(low, high):
             record = records[q]
@@ -317,7 +319,7 @@ def _decide_alone(
         front = (seen[i] > 0) & (distance < np.inf)  # "and" would make a branch of it, and of all that follows
         near = front & ((distance <= new_landmark_gate) | (metres2 <= radius2))
         ok = front & (distance <= reach) & (work[TAKEN + i] == 0.0)
-        chosen[i] = q if ok else (-1.0 if near else -2.0)
+        chosen[i] = q if ok else (NO_MATCH if near else NEW_LANDMARK)
         work[CLUTTER + i] += 0.0 if ok else log_clutter
         add_terms(work, i, ok, 1.0, terms)
         accumulate_likelihood(work, i, ok, square, det, depth)

@@ -20,6 +20,8 @@ from slam_backend.fastslam._kernels.layout import (
     CLUTTER,
     COS,
     LANES,
+    NEW_LANDMARK,
+    NO_MATCH,
     Q_D,
     REJECTED,
     ROW_OF,
@@ -71,7 +73,7 @@ def update_fastslam1(
         for b in range(num):
             chosen = match[b]
             for i in range(LANES):
-                chosen[i] = -2.0 if i < real else -1.0
+                chosen[i] = NEW_LANDMARK if i < real else NO_MATCH
             for q in range(starts[b], starts[b + 1]):  # l. 15-24: the nearest descriptor inside the gate
                 row, record = row_of[slots[q]], space.records[q]
                 tile, seen = maps.values[tile_of(padded, row, block)], maps.counts[row, first : first + LANES]
@@ -79,12 +81,12 @@ def update_fastslam1(
                 innovate(work, tile, frame, b)
                 gate_and_update(work, tile, record, chosen, seen, float(q), gate, rules.walk)  # l. 33-37, 39
             log_clutter = rules.log_p0 + (0.0 if frame.given else 4.0 * math.log(frame.points[b, 0]))
-            unmatched = mask_of(chosen, -2.0, mask)
+            unmatched = mask_of(chosen, NEW_LANDMARK, mask)
             for i in range(LANES):
                 work[CLUTTER + i] += log_clutter if mask[i] > 0.0 else 0.0
             if frame.named:
                 create_once(match, b, first, maps, candidates, frame.names)
-                unmatched = mask_of(chosen, -2.0, mask)
+                unmatched = mask_of(chosen, NEW_LANDMARK, mask)
             if unmatched > 0:  # l. 28-32
                 new_landmark(space, block, maps, frame, b, new_slots, rules.walk)
         write_associations(outcome, first, match, candidates, space.records, Q_D)

@@ -12,7 +12,17 @@ from slam_backend.fastslam._kernels.data_association import (
     try_inflated_prior,
 )
 from slam_backend.fastslam._kernels.landmark_ekf import new_landmark, update_matched
-from slam_backend.fastslam._kernels.layout import CANDIDATE_ROWS, LANES, Q_FIRST_D, REJECTED, SPREAD00, X0, X
+from slam_backend.fastslam._kernels.layout import (
+    CANDIDATE_ROWS,
+    LANES,
+    NEW_LANDMARK,
+    NO_MATCH,
+    Q_FIRST_D,
+    REJECTED,
+    SPREAD00,
+    X0,
+    X,
+)
 from slam_backend.fastslam._kernels.map_storage import apply_resampling
 from slam_backend.fastslam._kernels.motion_model import predict, store_rows, take_draws
 from slam_backend.fastslam._kernels.pose_posterior import gauss_newton_step, posterior, set_linearisation_point
@@ -67,7 +77,7 @@ def update_fastslam2(
 
         # Pass B: decide at the refined pose.
         associate_final(space, block, maps, frame, candidates, rules)
-        match[:, len(motion.normals) - first :] = -1.0  # surplus lanes start no landmark
+        match[:, len(motion.normals) - first :] = NO_MATCH  # surplus lanes start no landmark
         if frame.named:
             for b in range(num):
                 create_once(match, b, first, maps, candidates, frame.names)
@@ -82,6 +92,6 @@ def update_fastslam2(
         # The landmarks, at the sampled pose.
         update_matched(space, block, maps, frame, candidates, rules.walk)
         for b in range(num):
-            if mask_of(match[b], -2.0, mask) > 0:
+            if mask_of(match[b], NEW_LANDMARK, mask) > 0:
                 new_landmark(space, block, maps, frame, b, new_slots, rules.walk)
         write_associations(outcome, first, match, candidates, space.records, Q_FIRST_D)

@@ -35,22 +35,22 @@ def extent(points: FloatArray) -> tuple[float, float]:
 
 
 @in_place
-def to_robot_axes(points: FloatArray, covariances: FloatArray | None, sightings: FloatArray) -> None:
+def to_robot_axes(points: FloatArray, covariances: FloatArray | None, measurements: FloatArray) -> None:
     """Turn measured points from camera axes to the robot's: x ahead, y left, z up.
 
     Args:
         points: (n, 3) [m], camera frame.
         covariances: (n, 3, 3) [m^2], camera frame, or None.
-        sightings: (n, 9), written: the points relative to the camera centre, and the upper triangles of their
+        measurements: (n, 9), written: the points relative to the camera centre, and the upper triangles of their
             covariances by rows, or zeros.
     """
     for i in range(len(points)):
-        sightings[i, 0], sightings[i, 1], sightings[i, 2] = points[i, 2], -points[i, 0], -points[i, 1]
+        measurements[i, 0], measurements[i, 1], measurements[i, 2] = points[i, 2], -points[i, 0], -points[i, 1]
         for c in range(3, 9):
-            sightings[i, c] = 0.0
+            measurements[i, c] = 0.0
     if covariances is not None:
         for i in range(len(points)):
-            own, noise = covariances[i], sightings[i, 3:]
+            own, noise = covariances[i], measurements[i, 3:]
             noise[0], noise[1], noise[2] = own[2, 2], -own[2, 0], -own[2, 1]
             noise[3], noise[4], noise[5] = own[0, 0], own[0, 1], own[1, 1]
 
@@ -58,7 +58,7 @@ def to_robot_axes(points: FloatArray, covariances: FloatArray | None, sightings:
 @in_place
 def read_team(
     moves: FloatArray, points: FloatArray, looks: Float32Array, ends: IntArray, farthest_move: float,
-    farthest_point: float, largest_look: float, table: IntArray, sightings: FloatArray,
+    farthest_point: float, largest_entry: float, table: IntArray, measurements: FloatArray,
 ) -> bool:  # fmt: skip
     """Write what N robots read that have all moved and looked, without covariances and names, if nothing is amiss.
 
@@ -69,8 +69,8 @@ def read_team(
         ends: (N,) where the points of each end.
         farthest_move: [m, rad] limit to the odometry.
         farthest_point: [m] limit to coordinates.
-        largest_look: Limit to components of descriptors.
-        table, sightings: (N, 6), (n, 9), written as in `StepInput`.
+        largest_entry: Limit to components of descriptors.
+        table, measurements: (N, 6), (n, 9), written as in `StepInput`.
 
     Returns:
         Whether ends rise up to n, numbers are within their limits, and depths begin at `MIN_DEPTH`. If not, what is
@@ -81,10 +81,10 @@ def read_team(
         for c in range(3):
             if not abs(moves[robot, c]) <= farthest_move:  # NaN is not
                 return False
-        end, turn = ends[robot], table[robot]
+        end, entry = ends[robot], table[robot]
         if end < begin:
             return False
-        turn[MOTION_KIND], turn[BEGIN], turn[END], turn[COVARIANCES_GIVEN], turn[HAS_IDS], turn[COUNT] = (
+        entry[MOTION_KIND], entry[BEGIN], entry[END], entry[COVARIANCES_GIVEN], entry[HAS_IDS], entry[COUNT] = (
             MOVED,
             begin,
             end,
@@ -93,10 +93,10 @@ def read_team(
             end - begin,
         )
         begin = end
-    to_robot_axes(points, None, sightings)
+    to_robot_axes(points, None, measurements)
     nearest, farthest = extent(points)
     fine = begin == len(points) and nearest >= MIN_DEPTH and farthest <= farthest_point
-    largest = np.float32(largest_look)
+    largest = np.float32(largest_entry)
     for i in range(len(looks)):
         for j in range(looks.shape[1]):
             fine &= abs(looks[i, j]) <= largest

@@ -19,6 +19,7 @@ from slam_backend.fastslam._kernels.layout import (
     N11,
     N12,
     N22,
+    NEW_LANDMARK,
     Q_D,
     R0,
     R1,
@@ -167,7 +168,7 @@ def _gate_and_update(
         inverse, det = inverted_by_parts(s) if flat else inverted(s)
         distance = quadratic_form(inverse, work[R0 + i], work[R1 + i], work[R2 + i])
         depth = work[DEPTH + i]
-        admitted = chosen[i] == -2.0 and seen[i] > 0 and work[TAKEN + i] == 0.0
+        admitted = chosen[i] == NEW_LANDMARK and seen[i] > 0 and work[TAKEN + i] == 0.0
         match = admitted and distance <= gate and depth >= MIN_DEPTH
         _updated(work, tile, i, inverse, match, walk, flat)
         accumulate_likelihood(work, i, match, distance, det, depth)

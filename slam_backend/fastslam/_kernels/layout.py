@@ -8,7 +8,9 @@ from slam_backend.fastslam._kernels.records import ROBOT, SLOT, WEIGHT
 
 # Lanes of a block: whole vectors of four numbers. At most 4 % are padding for 50, 100, 200 or 1000 particles.
 LANES = 52
-REJECTED = -1
+REJECTED = -1  # in place of a slot or id
+# In place of a matched candidate: the measurement is rejected, or starts a landmark.
+NO_MATCH, NEW_LANDMARK = -1.0, -2.0
 MIN_DEPTH = 0.05  # [m]; smallest depth at which a landmark is predicted
 MAX_DISTANCE = float(np.finfo(np.float64).max)  # largest finite squared distance
 FAR = np.float32(1e18)  # entry of the descriptors of free slots, far from any descriptor
@@ -25,7 +27,9 @@ N00, N01, N02, N11, N12, N22, DEPTH = (LANES * k for k in range(26, 33))  # sens
 J00, J01, J02, J11, J12, J22, G0, G1, G2 = (LANES * k for k in range(33, 42))  # sums over matches
 SUM_D, MATCHED, DET, DET_EXP, DEPTHS, DEPTHS_EXP = (LANES * k for k in range(42, 48))  # factors of the likelihood
 CLUTTER = LANES * 48  # log-likelihood of the measurements that are not matched
-BEST, SECOND, CHOSEN, DEAD, LOG_BEST = (LANES * k for k in range(49, 54))  # of one measurement
+# Of one measurement: smallest and second smallest squared distance, matched candidate, whether another landmark is too
+# near to start one, and log-likelihood of the best candidate.
+BEST_D, SECOND_D, CHOSEN, NEAR, LOG_BEST = (LANES * k for k in range(49, 54))
 LOST, SURE, CONTRADICT, WIDE = (LANES * k for k in range(54, 58))
 TAKEN, C01 = LANES * 58, LANES * 59
 KEPT00, KEPT10, KEPT11, KEPT20, KEPT21, KEPT22, KEPT01, KEPT_WIDE = (LANES * k for k in range(60, 68))  # of C

@@ -196,7 +196,7 @@ class Space(NamedTuple):
     Attributes:
         work: (WORK_SIZE,) rows of the block, see `layout`.
         records: (C, CANDIDATE_ROWS * LANES) rows of each candidate.
-        match: (B, LANES) candidate matched, -1 for rejected, -2 for new.
+        match: (B, LANES) candidate matched, or NO_MATCH or NEW_LANDMARK.
         mask: (LANES,) 1 where a lane takes part.
     """
 

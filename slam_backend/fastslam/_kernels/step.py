@@ -1,4 +1,4 @@
-"""One step of the filter: each robot in turn moves and matches its measurements; what happened is noted for its log."""
+"""One step of the filter: robot by robot motion, data association and update, and an entry of the run log."""
 
 import math
 
@@ -56,17 +56,17 @@ from slam_backend.fastslam._kernels.weights import add_gauge_covariance, mixture
 @device
 @in_place
 def log_step(
-    rows: IntArray, turns: IntArray, moves: FloatArray, sightings: FloatArray, told: IntArray, means: FloatArray,
-    noted: FloatArray, measured: FloatArray, first: int,
+    rows: IntArray, inputs_table: IntArray, moves: FloatArray, measurements: FloatArray, associations: IntArray,
+    means: FloatArray, noted: FloatArray, measured: FloatArray, first: int,
 ) -> None:  # fmt: skip
-    """Note the turns of a step.
+    """Write the entries of a step into the run log.
 
     Args:
-        rows, turns, moves, sightings: See `step_robots`.
-        told: (2, n) results of the measurements, see `Associations`.
+        rows, inputs_table, moves, measurements: See `step_robots`.
+        associations: (2, n) results of the measurements, see `Associations`.
         means: (K, 3) [m, m, rad] poses over all particles.
         noted: (K, 10) notes of the step, see `layout`, written.
-        measured: (>= first + used, 10) sightings, and the landmarks that they were taken for, written from `first` on.
+        measured: (>= first + used, 10) measurements and their landmarks, written from `first` on.
         first: Number of measurements that were noted before.
     """
     for robot in range(len(rows)):
@@ -74,16 +74,16 @@ def log_step(
         note[:] = 0.0
         if row < 0:
             continue
-        turn = turns[row]
-        note[LOGGED] = 1.0 if turn[MOTION_KIND] != NO_READING or turn[COUNT] > 0 else 0.0
-        note[HAS_COVARIANCES] = 1.0 if turn[COVARIANCES_GIVEN] > 0 and turn[COUNT] > 0 else 0.0
-        note[LOGGED_KIND], note[USED] = turn[MOTION_KIND], turn[END] - turn[BEGIN]
+        entry = inputs_table[row]
+        note[LOGGED] = 1.0 if entry[MOTION_KIND] != NO_READING or entry[COUNT] > 0 else 0.0
+        note[HAS_COVARIANCES] = 1.0 if entry[COVARIANCES_GIVEN] > 0 and entry[COUNT] > 0 else 0.0
+        note[LOGGED_KIND], note[USED] = entry[MOTION_KIND], entry[END] - entry[BEGIN]
         for axis in range(3):
             note[MOTION + axis], note[ESTIMATE + axis] = moves[row, axis], means[robot, axis]
-        for b in range(turn[BEGIN], turn[END]):
-            for c in range(NAME if turn[COVARIANCES_GIVEN] > 0 else 3):
-                measured[first, c] = sightings[b, c]
-            measured[first, NAME] = told[ASSOCIATED, b]
+        for b in range(entry[BEGIN], entry[END]):
+            for c in range(NAME if entry[COVARIANCES_GIVEN] > 0 else 3):
+                measured[first, c] = measurements[b, c]
+            measured[first, NAME] = associations[ASSOCIATED, b]
             first += 1
 
 
@@ -100,12 +100,12 @@ def write_sigmas(noise: FloatArray, move: FloatArray, sigmas: FloatArray) -> Non
 @in_place
 def step_robots(
     low: int, high: int, is_over: bool, now: int, assumed: FloatArray,
-    rows: IntArray, turns: IntArray, moves: FloatArray, normals: FloatArray,
+    rows: IntArray, inputs_table: IntArray, moves: FloatArray, normals: FloatArray,
     robots: FloatArray, blind: IntArray, weights: FloatArray, gauge: FloatArray,
     values: FloatArray, counts: Int32Array, odds: FloatArray, table: IntArray, ancestors: Int32Array, users: IntArray,
     free_rows: IntArray, tops: IntArray, stored: Float32Array, heads: Float32Array,
-    sightings: FloatArray, descriptors: Float32Array, names: IntArray,
-    found: Int32Array, distances: FloatArray, told: IntArray,
+    measurements: FloatArray, descriptors: Float32Array, names: IntArray,
+    found: Int32Array, distances: FloatArray, associations: IntArray,
     mean: FloatArray, covariance: FloatArray, noted: FloatArray, measured: FloatArray, num_measured: int,
     fastslam1: int | None,
 ) -> tuple[int, int, int, int, int, int, float, float, bool]:  # fmt: skip
@@ -114,13 +114,13 @@ def step_robots(
     What belongs together comes in one array, whose rows `layout` names: a call from Python pays for each array.
 
     Args:
-        low, high: Robots whose turns are taken; the step begins with the first robot.
-        is_over: Whether these are the last turns, and the step is concluded.
+        low, high: Range of the robots to process; the step begins with the first robot.
+        is_over: Whether these are the last robots, and the step is concluded.
         now: Number of the step, above 0 if anyone asks when landmarks were seen last.
         assumed: (27,) noise of the odometry, camera, and the rest, see `layout`.
-        rows: (K,) row of each robot in `turns`; -1: it did nothing at all.
-        turns: (N, 6) int64, see `layout`: act, begin and end of the measurements among all n, and whether these come
-            with covariances and with names. The pose of `EXACT_POSE` is already written.
+        rows: (K,) row of each robot in `inputs_table`; -1: it did nothing at all.
+        inputs_table: (N, 6) int64, see `layout`: kind of motion, first and last row of the measurements among all n,
+            whether these have covariances and names, and the number given. Exact poses are already in `robots`.
         moves: (N, 3) odometry [m, m, rad] of those that moved.
         normals: (k, M, 3) standard normal draws, for the k robots that are not idle.
         robots: (5, K, 3, P) samples, starts, and N(x^, P^) before sampling.
@@ -128,13 +128,13 @@ def step_robots(
         weights: (4, P), see `layout`, read and written up to M.
         gauge: (3, 3) covariance of a motion of the whole map that particles do not show, or zeros.
         values, ..., heads: Landmarks, see `MapArrays`. n + 1 rows and n slots are free.
-        sightings: (n, 9) [m, m^2] points and, of the robots that have them, covariances, as in `to_robot_axes`.
+        measurements: (n, 9) [m, m^2] points and, of the robots that have them, covariances, as in `to_robot_axes`.
         descriptors: (n, d).
         names: (n,) the caller's names, of the robots that have them; or (0,).
         found, distances: (n, P), written, see `Outcome`.
-        told: (2, n), written: the slots of the landmarks that were started, -1 = none; in the end as in `summarise`.
+        associations: (2, n), written: slots of new landmarks, -1 = none; at the end as in `summarise`.
         mean, covariance: (K, 3), (K, 3, 3), written in the end: each robot's pose over all particles.
-        noted, measured, num_measured: Journal, written in the end, see `log_step`.
+        noted, measured, num_measured: Entries of the run log, written in the end, see `log_step`.
         fastslam1: None: the proposal of FastSLAM 2.0; a filter that has it never compiles the other one. Any number:
             that of FastSLAM 1.0.
 
@@ -147,22 +147,22 @@ def step_robots(
     covariances = robots[COVARIANCES:].reshape((num_robots, 6, robots.shape[3]))
     maps = MapArrays(values, counts, odds, table, ancestors, users, free_rows, tops, stored, heads)
     camera, recovery = assumed[CAMERA : CAMERA + 7], assumed[RECOVERY : RECOVERY + 3]
-    points, noises = sightings[:, :3], sightings[:, 3:]
+    points, noises = measurements[:, :3], measurements[:, 3:]
     work, still, move, sigmas, drawn = stack_array(WORK_SIZE), stack_array(3), stack_array(3), stack_array(3), -1
     still[:] = 0.0
     if low == 0:
         weights[LOG_LIKELIHOOD][:] = 0.0
     for robot in range(high):
         row = rows[robot]
-        act = turns[row, MOTION_KIND] if row >= 0 else NO_READING
-        drawn += act != NO_READING
-        if robot < low or act == NO_READING:
+        kind = inputs_table[row, MOTION_KIND] if row >= 0 else NO_READING
+        drawn += kind != NO_READING
+        if robot < low or kind == NO_READING:
             continue
-        a, b = turns[row, BEGIN], turns[row, END]
-        placed = act == EXACT_POSE
+        a, b = inputs_table[row, BEGIN], inputs_table[row, END]
+        placed = kind == EXACT_POSE
         move[:] = 0.0
         sigmas[:] = 0.0
-        if act == MOVED:
+        if kind == MOVED:
             move[0], move[1], move[2] = moves[row, 0], moves[row, 1], moves[row, 2]
             write_sigmas(assumed[NOISE : NOISE + 6], move, sigmas)
         own = Poses(poses[robot], means[robot], covariances[robot])
@@ -170,11 +170,11 @@ def step_robots(
         frame = Frame(
             points[a:b],
             noises[a:b],
-            turns[row, COVARIANCES_GIVEN] > 0,
+            inputs_table[row, COVARIANCES_GIVEN] > 0,
             camera,
             descriptors[a:b],
             names[a:b],
-            turns[row, HAS_IDS] > 0,
+            inputs_table[row, HAS_IDS] > 0,
         )
         rules = Rules(
             assumed[DESCRIPTOR_GATE], assumed[DESCRIPTOR_VARIANCE], assumed[POSITION_GATE], assumed[NEW_LANDMARK_GATE],
@@ -182,7 +182,7 @@ def step_robots(
             still if placed else recovery, assumed[LOG_P0], assumed[WALK],
             assumed[IS_ONE_TO_ONE] > 0.0,
         )  # fmt: skip
-        outcome = Outcome(found[a:b], distances[a:b], told[CREATED, a:b], weights[LOG_LIKELIHOOD])
+        outcome = Outcome(found[a:b], distances[a:b], associations[CREATED, a:b], weights[LOG_LIKELIHOOD])
         was_blind = blind[robot] > 0 and not placed
         if fastslam1 is not None:
             update_fastslam1(own, not placed, motion, maps, frame, rules, work, outcome)
@@ -203,14 +203,14 @@ def step_robots(
     ess, used = weigh(weights, num_particles), 0
     for robot in range(num_robots):
         mixture(means[robot], covariances[robot], own_weights, mean[robot], covariance[robot])
-        used += turns[rows[robot], END] - turns[rows[robot], BEGIN] if rows[robot] >= 0 else 0
+        used += inputs_table[rows[robot], END] - inputs_table[rows[robot], BEGIN] if rows[robot] >= 0 else 0
     if gauge[0, 0] != 0.0 or gauge[2, 2] != 0.0:
         add_gauge_covariance(gauge, mean, covariance)
     best = int(path_log_weights.argmax())
     long_unseen, created, new, matched, rejected, nis = summarise(
-        rows, turns, found, distances, told, best, table, now, assumed[LONG]
+        rows, inputs_table, found, distances, associations, best, table, now, assumed[LONG]
     )
-    log_step(rows, turns, moves, sightings, told, mean, noted, measured, num_measured)
+    log_step(rows, inputs_table, moves, measurements, associations, mean, noted, measured, num_measured)
     least = assumed[RESAMPLE_THRESHOLD] * num_particles * (1.0 + 1e-9)  # rounding must not decide
     is_depleted = used > 0 and ess <= least
     return best, long_unseen, created, new, matched, rejected, ess, nis, is_depleted

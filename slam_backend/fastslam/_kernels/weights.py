@@ -141,17 +141,18 @@ def add_gauge_covariance(scatter: FloatArray, poses: FloatArray, covariances: Fl
 @device
 @in_place
 def summarise(
-    rows: IntArray, turns: IntArray, found: Int32Array, distances: FloatArray, told: IntArray, best: int,
+    rows: IntArray, inputs_table: IntArray, found: Int32Array, distances: FloatArray, associations: IntArray, best: int,
     table: IntArray, now: int, long: float,
 ) -> tuple[int, int, int, int, int, float]:  # fmt: skip
     """Count what became of the robots' measurements.
 
     Args:
-        rows, turns: Robots and their turns, see `step_robots`; measurements of other robots are passed over.
+        rows, inputs_table: Robots and their inputs, see `step_robots`; measurements of other robots are passed over.
         found: (n, P) slots to which the particles gave the measurements, -1 = rejected.
         distances: (n, P) squared distances of matches.
-        told: (2, n), written: the id to which the most probable particle gave each measurement, -1 = rejected; and the
-            id of the landmark that it created in any particle, -1 = none. There the slots of these landmarks stand.
+        associations: (2, n), written: id of the landmark with which the most probable particle associated each
+            measurement, -1 = rejected; and id of the landmark that it created in any particle, -1 = none. The latter
+            row holds the slots of these landmarks before.
         best: The most probable particle.
         table: (6, slots), see `layout`; `LAST_SEEN` is written.
         now: Number of the step.
@@ -163,13 +164,13 @@ def summarise(
         and made nothing of, unused ones included; and the mean of its squared distances, without what it predicted
         behind the camera, NaN if there is none.
     """
-    associated, created, ids, last_seen = told[ASSOCIATED], told[CREATED], table[IDS], table[LAST_SEEN]
+    associated, created, ids, last_seen = associations[ASSOCIATED], associations[CREATED], table[IDS], table[LAST_SEEN]
     num_measurements, num_created, num_new, num_matched, num_long_unseen, squares, judged = 0, 0, 0, 0, 0, 0.0, 0
     for row in rows:
         if row < 0:
             continue
-        num_measurements += max(turns[row, COUNT], 0)
-        for b in range(turns[row, BEGIN], turns[row, END]):
+        num_measurements += max(inputs_table[row, COUNT], 0)
+        for b in range(inputs_table[row, BEGIN], inputs_table[row, END]):
             slot, new = found[b, best], created[b]
             associated[b] = ids[slot] if slot >= 0 else REJECTED
             created[b] = ids[new] if new >= 0 else REJECTED
