@@ -5,7 +5,7 @@ from operator import is_
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy import asarray, ndarray
+from numpy import ndarray
 from numpy.typing import NDArray
 
 Scalar = TypeVar("Scalar", bound=np.generic)
@@ -40,12 +40,12 @@ def as_read_only(array: NDArray[Scalar]) -> NDArray[Scalar]:
     Traceback (most recent call last):
     ValueError: cannot set WRITEABLE flag to True of this array
     """
-    return asarray(array.data.toreadonly()) if array.base is None or not is_read_only(array) else array
+    return array if is_read_only(array) else np.asarray(array.data.toreadonly())
 
 
 def as_constant(array: NDArray[Scalar]) -> NDArray[Scalar]:
     """Return an array with the same numbers that cannot change: a copy unless it is read-only already."""
-    return asarray(array.copy().data.toreadonly()) if array.base is None or not is_read_only(array) else array
+    return array if is_read_only(array) else as_read_only(array.copy())
 
 
 def with_read_only(tree: Tree) -> Tree:
@@ -74,7 +74,7 @@ def map_arrays(tree: Any, act: Act) -> Any:
     if hasattr(cls, "with_arrays"):
         return tree.with_arrays(act)
     if isinstance(tree, tuple) or cls is list:
-        parts = [act(part) if type(part) is ndarray else map_arrays(part, act) for part in tree]
+        parts = [map_arrays(part, act) for part in tree]
         if all(map(is_, parts, tree)):
             return tree
         return parts if cls is list else tuple.__new__(cls, parts)
