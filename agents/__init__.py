@@ -1,6 +1,7 @@
 """Exploration policies; they use only observations and beliefs of the robots."""
 
 from agents.policy import Policy
-from agents.registry import POLICIES, make_policy
+from agents.registry import POLICIES, make_policy, make_team_policy
+from agents.team import TeamPolicy
 
-__all__ = ["POLICIES", "Policy", "make_policy"]
+__all__ = ["POLICIES", "Policy", "TeamPolicy", "make_policy", "make_team_policy"]

@@ -1,50 +1,29 @@
-"""`NearestFrontier`: policy that drives to the nearest frontier to which no teammate is nearer."""
+"""`NearestFrontier`: planner that goes to the nearest frontier to which no teammate is nearer; the baseline.
 
-from typing import Any
+Yamauchi, "Frontier-based exploration using multiple robots", Agents 1998, with goals shared by distance as in MinPos
+(Bautin, Simonin and Charpillet, "MinPos: a novel frontier allocation algorithm", 2012), in its simplest form.
+"""
 
 import numpy as np
-from numpy.typing import NDArray
 
-from slam_backend.core.validation import FloatArray
+from agents.goal_choice import frontier_slots, nearest_slot, own_share
 from vslam_env.belief.team_belief import Belief
-from vslam_env.navigation import centre_of, distance_map, follow_path, plan_path
-
-SWITCH_RATIO = 0.5  # switch goals if the path is shorter than this share of the remaining path
-REPLAN_TICKS = 10
-FAR_SHARE = 0.3  # share of the reachable cells, farthest first, from which patrol goals are drawn
-ARRIVED = 0.5  # [m]
-MAX_SPEED, MAX_TURN = 1.0, 1.5  # [m/s], [rad/s]: speeds of a continuous action of 1
-UNREACHABLE = np.iinfo(np.int32).max  # unreachable, in `DistanceMap.cost`
-STAY, AHEAD, LEFT, RIGHT = 0, 1, 2, 3  # discrete actions
-TURN_FIRST = 0.5  # [rad/s] desired turn rate from which a discrete action turns
 
 
 def choose_slot(belief: Belief, held: int | None = None) -> int | None:
-    """Return the slot of the nearest candidate by path length, or None if there is none.
+    """Return the slot of the nearest frontier by path length, or None if there is none.
 
-    Candidates to which a teammate is nearer, in a straight line, are left to the teammate unless there are no others.
+    Frontiers to which a teammate is nearer, in a straight line, are left to the teammate unless there are no others.
 
     Args:
         belief: Belief of the robot.
         held: Slot of the previous goal; it is kept unless the candidate is gone or another is much nearer.
     """
-    candidates = belief.candidates
-    slots = np.flatnonzero(candidates.valid)
-    if not len(slots):
-        return None
-    mates = np.array([mate.pose[:2] for mate in belief.teammates]).reshape(-1, 2)
-    gaps = np.linalg.norm(candidates.goals[slots, None] - mates[None], axis=-1)
-    own = slots[(gaps >= candidates.lengths[slots, None]).all(axis=1)]
-    choices = own if len(own) else slots
-    nearest = int(choices[np.argmin(candidates.lengths[choices])])
-    if held is not None and held in choices:
-        turns_off = candidates.lengths[nearest] < SWITCH_RATIO * candidates.lengths[held]
-        return nearest if turns_off else held
-    return nearest
+    return nearest_slot(belief.candidates, own_share(belief, frontier_slots(belief.candidates)), held)
 
 
-class NearestFrontierGoals:
-    """Nearest-frontier policy for `goal` actions; stays where nothing is left to explore."""
+class NearestFrontier:
+    """Planner that chooses the nearest frontier to which no teammate is nearer, and none where all is explored."""
 
     def __init__(self) -> None:
         self.reset()
@@ -53,75 +32,7 @@ class NearestFrontierGoals:
         """Clear the state of the last episode."""
         self._held: int | None = None
 
-    def act(self, observation: Any, belief: Belief, rng: np.random.Generator) -> int:
-        """Return 1 + the slot of the chosen candidate, or 0."""
+    def choose(self, belief: Belief, rng: np.random.Generator) -> int | None:
+        """Return the slot to go to; the previous one is kept unless another frontier is much nearer."""
         self._held = choose_slot(belief, self._held)
-        return 0 if self._held is None else 1 + self._held
-
-
-class NearestFrontier:
-    """Nearest-frontier policy for `continuous` and `discrete` actions; plans on the robot's grid and follows the path.
-
-    If nothing is left to explore, the robot patrols to far places, so that groups whose maps are not aligned yet meet.
-
-    Args:
-        discrete: Whether actions are `discrete`; otherwise they are `continuous`.
-    """
-
-    def __init__(self, discrete: bool = False) -> None:
-        self._discrete = discrete
-        self.reset()
-
-    def reset(self) -> None:
-        """Clear the state of the last episode."""
-        self._held: int | None = None
-        self._patrol: FloatArray | None = None
-        self._path: FloatArray | None = None
-        self._heading: float | None = None
-        self._age = REPLAN_TICKS
-
-    def act(self, observation: Any, belief: Belief, rng: np.random.Generator) -> int | NDArray[np.float32]:
-        """Return the action that drives towards the goal."""
-        self._age += 1
-        if self._path is None or self._age >= REPLAN_TICKS:
-            self._plan(belief, rng)
-        if self._path is None:
-            speed, turn = 0.0, MAX_TURN  # turn on the spot until free floor is seen
-        else:
-            speed, turn = follow_path(belief.pose, self._path, MAX_SPEED, MAX_TURN, self._heading)
-        if self._discrete:
-            if abs(turn) >= TURN_FIRST or (speed == 0.0 and turn != 0.0):
-                return LEFT if turn > 0.0 else RIGHT
-            return AHEAD if speed > 0.0 else STAY
-        return np.array([speed / MAX_SPEED, turn / MAX_TURN], dtype=np.float32)
-
-    def _plan(self, belief: Belief, rng: np.random.Generator) -> None:
-        """Choose a goal and a path to it."""
-        self._age = 0
-        self._held = choose_slot(belief, self._held)
-        if self._held is not None:
-            goal, self._heading = belief.candidates.goals[self._held], float(belief.candidates.headings[self._held])
-        else:
-            here = belief.pose[:2]
-            if self._patrol is None or np.linalg.norm(self._patrol - here) < ARRIVED:
-                self._patrol = patrol_goal(belief, rng)
-            goal, self._heading = self._patrol, None
-        self._path = plan_path(belief.grid.cells, belief.pose[:2], goal)
-        if self._path is None:
-            self._patrol = None
-        elif self._held is None:
-            self._patrol = self._path[-1]  # the nearest reachable point, if a wall was discovered at the goal
-
-
-def patrol_goal(belief: Belief, rng: np.random.Generator) -> FloatArray:
-    """Draw one of the farthest points (2,) [m], start frame, that the robot can reach over known floor.
-
-    If nothing is reachable, return the robot's position.
-    """
-    ways = distance_map(belief.grid.cells, belief.pose[:2])
-    rows, cols = np.nonzero(ways.cost < UNREACHABLE)
-    if not len(rows):
-        return np.array(belief.pose[:2])
-    costs = ways.cost[rows, cols]
-    place = int(rng.choice(np.flatnonzero(costs >= np.quantile(costs, 1.0 - FAR_SHARE))))
-    return centre_of(np.array([rows[place], cols[place]]) + ways.corner)
+        return self._held

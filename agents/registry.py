@@ -1,19 +1,43 @@
 """Registry of policies: built-in ones by name, trained ones by file, custom ones by module."""
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
-from agents.nearest_frontier import NearestFrontier, NearestFrontierGoals
+from agents.distance_advantage import distance_advantage
+from agents.goal_choice import DrivingPolicy, GoalPolicy, Planner
+from agents.hungarian import hungarian
+from agents.independent_frontier import IndependentFrontier
+from agents.mtsp import mtsp
+from agents.nearest_frontier import NearestFrontier
 from agents.plugins import ACTION_TYPES, is_plugin, load_plugin, plugin_action_type
 from agents.policy import Policy
 from agents.random_goals import RandomGoals
 from agents.random_walk import RandomWalk
+from agents.tare import tare
+from agents.team import Assign, Assigned, CentralPolicy, SeparatePolicies, TeamPolicy
 from agents.trained import SUFFIX, TrainedGoalPolicy, load_model
+from agents.utility_cost import utility_cost
 from slam_backend.core.validation import argument_error, check_choice
 
-POLICIES = {  # with the action types that each supports; comparisons of policies use the first one
+# Planners that divide the frontiers of a group among its robots, and planners of a single robot
+ASSIGNMENTS: dict[str, Assign] = {
+    "utility_cost": utility_cost,
+    "hungarian": hungarian,
+    "mtsp": mtsp,
+    "distance_advantage": distance_advantage,
+    "tare": tare,
+}
+PLANNERS: dict[str, Callable[[], Planner]] = {
+    "frontier": NearestFrontier,
+    "independent_frontier": IndependentFrontier,
+    **{name: partial(Assigned, assign) for name, assign in ASSIGNMENTS.items()},
+}
+POLICIES: dict[str, tuple[str, ...]] = {  # with supported action types; comparisons of policies use the first one
     "frontier": ("goal", "continuous", "discrete"),
     "random_goals": ("goal",),
     "random_walk": ("continuous", "discrete"),
+    **dict.fromkeys(PLANNERS, ("goal", "continuous", "discrete")),
 }
 
 
@@ -38,30 +62,52 @@ def make_policy(name: str, action_type: str) -> Policy:
     """Make a policy for one robot.
 
     Args:
-        name: Name of the policy. `"frontier"`: nearest frontier, for all action types. `"random_goals"`: random
-            candidates, for `goal`. `"random_walk"`: random walk, for `continuous` and `discrete`. Path of a model of
-            `vslam train`, or of its run folder: trained policy, for `goal` actions and dict observations.
-            `"module:Name"`: custom policy, made by calling `Name` without arguments, for its attribute `action_type`,
-            or else for `goal`.
+        name: Name of the policy: one of `POLICIES`, with the action types given there; the planners among them are
+            described in docs/how-to/exploration.md. Path of a model of `vslam train`, or of its run folder: trained
+            policy, for `goal` actions and dict observations. `"module:Name"`: custom policy, made by calling `Name`
+            without arguments, for its attribute `action_type`, or else for `goal`.
         action_type: Action type of the environment.
 
     Raises:
         ValueError: If there is no such policy, it does not support the action type, or a model cannot be read.
     """
-    known = action_types(name)
-    if check_choice("action_type", action_type, ACTION_TYPES) not in known:
-        expected = f"{' or '.join(map(repr, known))} for policy {name!r}"
-        raise argument_error("action_type", expected, action_type, "Change one of the two.")
+    _check_action_type(name, action_type)
     if is_model(name):
         return TrainedGoalPolicy(load_model(name)[0])
     if is_plugin(name):
         return load_plugin(name)
-    discrete = action_type == "discrete"
-    if name == "frontier":
-        return NearestFrontierGoals() if action_type == "goal" else NearestFrontier(discrete)
-    return RandomGoals() if name == "random_goals" else RandomWalk(discrete)
+    if name in PLANNERS:
+        planner = PLANNERS[name]()
+        return GoalPolicy(planner) if action_type == "goal" else DrivingPolicy(planner, action_type == "discrete")
+    return RandomGoals() if name == "random_goals" else RandomWalk(action_type == "discrete")
+
+
+def make_team_policy(name: str, action_type: str) -> TeamPolicy:
+    """Make a policy for all robots, which sees all observations and beliefs, as a team with perfect radio would.
+
+    Planners that divide frontiers (`utility_cost`, `hungarian`, `mtsp`, `distance_advantage`, `tare`) do so centrally
+    with `goal` actions, for each group of robots that share a map. All others ask one policy for each robot.
+
+    Args:
+        name: Name of the policy, see `make_policy`.
+        action_type: Action type of the environment.
+
+    Raises:
+        ValueError: As in `make_policy`.
+    """
+    _check_action_type(name, action_type)
+    if name in ASSIGNMENTS and action_type == "goal":
+        return CentralPolicy(ASSIGNMENTS[name])
+    return SeparatePolicies(partial(make_policy, name, action_type))
 
 
 def is_model(name: str) -> bool:
     """Return whether a name is the path of a model or of its run folder."""
     return isinstance(name, str) and name not in POLICIES and (name.endswith(SUFFIX) or Path(name).is_dir())
+
+
+def _check_action_type(name: str, action_type: str) -> None:
+    known = action_types(name)
+    if check_choice("action_type", action_type, ACTION_TYPES) not in known:
+        expected = f"{' or '.join(map(repr, known))} for policy {name!r}"
+        raise argument_error("action_type", expected, action_type, "Change one of the two.")

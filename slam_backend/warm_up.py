@@ -32,6 +32,7 @@ EXTRAS = {
     "existence": ("slam_backend.fastslam._kernels.existence.",),
     "clique": ("slam_backend.maps._kernels.max_clique.",),
     "images": ("slam_backend.frontend.",),
+    "planners": ("vslam_env.navigation.tours.", "vslam_env.navigation._planning_kernels.path_lengths."),
 }
 STEP = "slam_backend.fastslam._kernels.step.step_robots"  # kernel of the filter's step
 FASTSLAM2 = "none"  # end of its signature without FastSLAM 1.0

@@ -7,6 +7,7 @@ from slam_backend.core.compilation.messages import watch_compilation
 from slam_backend.warm_up import EXTRAS, extras_of, needed, run_all_paths
 from vslam_env.config import EnvConfig
 from vslam_env.environment import ExplorationEnv
+from vslam_env.navigation import cells_of, distance_map, lengths_between, open_tour, sees, share_places, tour_length
 from vslam_env.sensors import LandmarkSensorConfig
 from vslam_env.world import World
 
@@ -50,4 +51,11 @@ def warm_up(
         for _ in range(STEPS):
             valid = {agent: env.belief(agent).candidates.valid for agent in env.agents}
             env.step({agent: 1 + int(slots.argmax()) if slots.any() else 0 for agent, slots in valid.items()})
+        if "planners" in extras:
+            belief = env.belief("robot_0")
+            ways, places = distance_map(belief.grid.cells, belief.pose[:2]), np.zeros((2, 2))
+            between = lengths_between(ways, places, places)
+            tour_length(open_tour(between[0], between), between[0], between)
+            share_places(between, between)
+            sees(ways, places, cells_of(ways, places), 1.0)
     return seconds + watch.seconds

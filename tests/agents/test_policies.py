@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from agents import POLICIES, make_policy
-from agents.nearest_frontier import choose_slot, patrol_goal
+from agents.goal_choice import patrol_goal
+from agents.nearest_frontier import choose_slot
 from agents.plugins import is_plugin
 from agents.registry import action_types
 from slam_backend.geometry import compose
@@ -18,12 +19,7 @@ from vslam_env.belief.team_belief import Belief, Teammate
 from vslam_env.navigation import SeenGrid, cell_of, plan_path
 
 ROOM = World("room", [[0, 0, 11, 0], [11, 0, 11, 9], [11, 9, 0, 9], [0, 9, 0, 0], [5, 0, 5, 5]])
-MATCHES = [
-    (name, action_type)
-    for name in POLICIES
-    for action_type in ("continuous", "discrete", "goal")
-    if name == "frontier" or (name == "random_goals") == (action_type == "goal")
-]
+MATCHES = [(name, action_type) for name, known in POLICIES.items() for action_type in known]
 
 
 def _env(action_type: str, **kwargs: Any) -> ExplorationEnv:

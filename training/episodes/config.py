@@ -19,7 +19,7 @@ class RunConfig(ExperimentConfig):
     world: str = option("office", "World family or path; see vslam worlds list.")
     robots: int = option(3, "Number of robots, 1 to 8.", ge=1, le=8, hint="Use 1 to 8 robots.")
     policy: str = option(
-        "frontier", "Policy: frontier, random_goals, random_walk, path of a trained model, or MODULE:NAME."
+        "frontier", "Policy by name (docs/how-to/exploration.md lists them), path of a trained model, or MODULE:NAME."
     )
     action_type: ActionType = option(
         "continuous", "Action type: continuous, discrete or goal.", shown="continuous, if the policy supports it"

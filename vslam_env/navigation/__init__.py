@@ -3,7 +3,9 @@
 from vslam_env.navigation.candidate_slots import CandidateSlots, TeamSlots
 from vslam_env.navigation.occupancy_grid import CELL, FREE, GRID_SIZE, OCCUPIED, UNKNOWN, SeenGrid, cell_of, centre_of
 from vslam_env.navigation.planning import DistanceMap, Frontiers, distance_map, find_frontiers, follow_path, plan_path
+from vslam_env.navigation.relations import cells_of, frontier_cells, lengths_between, rooms_of, sees
 from vslam_env.navigation.team_grids import TeamGrids
+from vslam_env.navigation.tours import open_tour, share_places, tour_length
 from vslam_env.navigation.validation import ray_directions
 
 __all__ = [
@@ -19,10 +21,18 @@ __all__ = [
     "TeamGrids",
     "TeamSlots",
     "cell_of",
+    "cells_of",
     "centre_of",
     "distance_map",
     "find_frontiers",
     "follow_path",
+    "frontier_cells",
+    "lengths_between",
+    "open_tour",
     "plan_path",
     "ray_directions",
+    "rooms_of",
+    "sees",
+    "share_places",
+    "tour_length",
 ]

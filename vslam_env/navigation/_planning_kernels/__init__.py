@@ -9,6 +9,7 @@ from vslam_env.navigation._planning_kernels.candidates import (
 )
 from vslam_env.navigation._planning_kernels.dijkstra import UNREACHED, dijkstra, nearest_open, shorten_path
 from vslam_env.navigation._planning_kernels.frontiers import FrontierColumns, compute_frontiers
+from vslam_env.navigation._planning_kernels.path_lengths import lines_of_sight, path_lengths
 
 __all__ = [
     "FRONTIER_SIZE",
@@ -19,7 +20,9 @@ __all__ = [
     "describe",
     "dijkstra",
     "fill_slots",
+    "lines_of_sight",
     "nearest_open",
+    "path_lengths",
     "shorten_path",
     "update_slots",
 ]  # fmt: skip

@@ -1,0 +1,25 @@
+"""Distance advantage: frontiers near the robot and far from all others come first, since a later visit is a detour.
+
+Ericson, Pedro and Jensfelt, "Information gain is not all you need", arXiv 2504.01980. Deviations: robots leave
+frontiers to which a teammate has a shorter path (the paper has one robot), and remoteness is the mean path length to
+the other frontiers with the weight `REMOTENESS`.
+"""
+
+import numpy as np
+
+from agents.targets import Targets
+from slam_backend.core.validation import IntArray
+
+REMOTENESS = 0.5  # weight of the mean path length to the other frontiers
+
+
+def distance_advantage(targets: Targets, rng: np.random.Generator) -> IntArray:
+    """Return the target (K,) of each robot."""
+    n = len(targets.places)
+    remoteness = targets.between.sum(axis=1) / max(1, n - 1)
+    assigned = np.zeros(len(targets.lengths), np.int64)
+    for robot, ways in enumerate(targets.lengths):
+        own = targets.share(robot)
+        if len(own):
+            assigned[robot] = own[np.argmin(ways[own] - REMOTENESS * remoteness[own])]
+    return assigned

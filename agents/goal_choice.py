@@ -1,0 +1,152 @@
+"""Policies that choose among candidates: for `goal` actions, or driving to the chosen one themselves.
+
+A planner decides by its `choose` only; `GoalPolicy` and `DrivingPolicy` turn its choice into actions.
+"""
+
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_backend.core.validation import FloatArray, IntArray
+from vslam_env.belief.team_belief import Belief, Candidates
+from vslam_env.navigation import centre_of, distance_map, follow_path, plan_path
+
+SWITCH_RATIO = 0.5  # switch goals if the path is shorter than this share of the remaining path
+REPLAN_TICKS = 10
+FAR_SHARE = 0.3  # share of the reachable cells, farthest first, from which patrol goals are drawn
+ARRIVED = 0.5  # [m]
+MAX_SPEED, MAX_TURN = 1.0, 1.5  # [m/s], [rad/s]: speeds of a continuous action of 1
+UNREACHABLE = np.iinfo(np.int32).max  # unreachable, in `DistanceMap.cost`
+STAY, AHEAD, LEFT, RIGHT = 0, 1, 2, 3  # discrete actions
+TURN_FIRST = 0.5  # [rad/s] desired turn rate from which a discrete action turns
+
+
+class Planner(Protocol):
+    """Choice among the candidates of one robot. Each robot needs a planner of its own."""
+
+    def reset(self) -> None:
+        """Clear the state of the last episode."""
+
+    def choose(self, belief: Belief, rng: np.random.Generator) -> int | None:
+        """Return the slot of the candidate to go to, or None to stay."""
+
+
+class GoalPolicy:
+    """Policy for `goal` actions that goes where a planner chooses, and stays where it chooses nothing.
+
+    Args:
+        planner: Planner of this robot.
+    """
+
+    def __init__(self, planner: Planner) -> None:
+        self._planner = planner
+
+    def reset(self) -> None:
+        """Clear the state of the last episode."""
+        self._planner.reset()
+
+    def act(self, observation: Any, belief: Belief, rng: np.random.Generator) -> int:
+        """Return 1 + the slot of the chosen candidate, or 0."""
+        slot = self._planner.choose(belief, rng)
+        return 0 if slot is None else 1 + slot
+
+
+class DrivingPolicy:
+    """Policy for `continuous` and `discrete` actions that plans on the robot's grid and follows the path to its goal.
+
+    If the planner chooses nothing, the robot patrols to far places, so that groups whose maps are not aligned yet meet.
+
+    Args:
+        planner: Planner of this robot.
+        discrete: Whether actions are `discrete`; otherwise they are `continuous`.
+    """
+
+    def __init__(self, planner: Planner, discrete: bool = False) -> None:
+        self._planner, self._discrete = planner, discrete
+        self.reset()
+
+    def reset(self) -> None:
+        """Clear the state of the last episode."""
+        self._planner.reset()
+        self._patrol: FloatArray | None = None
+        self._path: FloatArray | None = None
+        self._heading: float | None = None
+        self._age = REPLAN_TICKS
+
+    def act(self, observation: Any, belief: Belief, rng: np.random.Generator) -> int | NDArray[np.float32]:
+        """Return the action that drives towards the goal."""
+        self._age += 1
+        if self._path is None or self._age >= REPLAN_TICKS:
+            self._plan(belief, rng)
+        if self._path is None:
+            speed, turn = 0.0, MAX_TURN  # turn on the spot until free floor is seen
+        else:
+            speed, turn = follow_path(belief.pose, self._path, MAX_SPEED, MAX_TURN, self._heading)
+        if self._discrete:
+            if abs(turn) >= TURN_FIRST or (speed == 0.0 and turn != 0.0):
+                return LEFT if turn > 0.0 else RIGHT
+            return AHEAD if speed > 0.0 else STAY
+        return np.array([speed / MAX_SPEED, turn / MAX_TURN], dtype=np.float32)
+
+    def _plan(self, belief: Belief, rng: np.random.Generator) -> None:
+        """Choose a goal and a path to it."""
+        self._age = 0
+        slot = self._planner.choose(belief, rng)
+        if slot is not None:
+            goal, self._heading = belief.candidates.goals[slot], float(belief.candidates.headings[slot])
+        else:
+            here = belief.pose[:2]
+            if self._patrol is None or np.linalg.norm(self._patrol - here) < ARRIVED:
+                self._patrol = patrol_goal(belief, rng)
+            goal, self._heading = self._patrol, None
+        self._path = plan_path(belief.grid.cells, belief.pose[:2], goal)
+        if self._path is None:
+            self._patrol = None
+        elif slot is None:
+            self._patrol = self._path[-1]  # the nearest reachable point, if a wall was discovered at the goal
+
+
+def frontier_slots(candidates: Candidates) -> IntArray:
+    """Return the slots (n,) int64 that hold frontiers."""
+    return np.flatnonzero(candidates.valid)
+
+
+def own_share(belief: Belief, slots: IntArray) -> IntArray:
+    """Return those of the slots to which no teammate is nearer, in a straight line; all of them if there are none."""
+    candidates = belief.candidates
+    mates = np.array([mate.pose[:2] for mate in belief.teammates]).reshape(-1, 2)
+    gaps = np.linalg.norm(candidates.goals[slots, None] - mates[None], axis=-1)
+    own = slots[(gaps >= candidates.lengths[slots, None]).all(axis=1)]
+    return own if len(own) else slots
+
+
+def nearest_slot(candidates: Candidates, slots: IntArray, held: int | None) -> int | None:
+    """Return the slot with the shortest path, or None if there are no slots.
+
+    Args:
+        candidates: Candidates of the robot.
+        slots: (n,) int64. Slots to choose from.
+        held: Slot of the previous goal; it is kept unless it is not among the slots or another is much nearer.
+    """
+    if not len(slots):
+        return None
+    nearest = int(slots[np.argmin(candidates.lengths[slots])])
+    if held is not None and held in slots:
+        turns_off = candidates.lengths[nearest] < SWITCH_RATIO * candidates.lengths[held]
+        return nearest if turns_off else held
+    return nearest
+
+
+def patrol_goal(belief: Belief, rng: np.random.Generator) -> FloatArray:
+    """Draw one of the farthest points (2,) [m], start frame, that the robot can reach over known floor.
+
+    If nothing is reachable, return the robot's position.
+    """
+    ways = distance_map(belief.grid.cells, belief.pose[:2])
+    rows, cols = np.nonzero(ways.cost < UNREACHABLE)
+    if not len(rows):
+        return np.array(belief.pose[:2])
+    costs = ways.cost[rows, cols]
+    place = int(rng.choice(np.flatnonzero(costs >= np.quantile(costs, 1.0 - FAR_SHARE))))
+    return centre_of(np.array([rows[place], cols[place]]) + ways.corner)

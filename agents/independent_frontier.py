@@ -1,0 +1,26 @@
+"""`IndependentFrontier`: planner that goes to the nearest frontier, whatever its teammates do.
+
+Yamauchi, "Frontier-based exploration using multiple robots", Agents 1998: robots share maps, but not goals. Compared
+with `NearestFrontier` it shows what coordination is worth.
+"""
+
+import numpy as np
+
+from agents.goal_choice import frontier_slots, nearest_slot
+from vslam_env.belief.team_belief import Belief
+
+
+class IndependentFrontier:
+    """Planner that chooses the nearest frontier, and none where all is explored."""
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Clear the state of the last episode."""
+        self._held: int | None = None
+
+    def choose(self, belief: Belief, rng: np.random.Generator) -> int | None:
+        """Return the slot to go to; the previous one is kept unless another frontier is much nearer."""
+        self._held = nearest_slot(belief.candidates, frontier_slots(belief.candidates), self._held)
+        return self._held

@@ -1,0 +1,23 @@
+"""Multiple travelling salesmen: each robot starts a tour through its share of all frontiers.
+
+Faigl, Kulich and Preucil, "Goal assignment using distance cost in multi-robot exploration", IROS 2012: the cost
+of a frontier is the length of a tour that starts with it and visits all other frontiers of the robot. Deviation:
+instead of K-means clusters, frontiers move between the tours until the longest is short (`share_places`).
+"""
+
+import numpy as np
+
+from agents.targets import Targets
+from slam_backend.core.validation import IntArray
+from vslam_env.navigation import open_tour, share_places
+
+
+def mtsp(targets: Targets, rng: np.random.Generator) -> IntArray:
+    """Return the target (K,) of each robot: the first of its tour, or the nearest if it has no share."""
+    owners = share_places(targets.lengths, targets.between)
+    assigned: IntArray = targets.lengths.argmin(axis=1)
+    for robot, ways in enumerate(targets.lengths):
+        own = np.flatnonzero(owners == robot)
+        if len(own):
+            assigned[robot] = own[open_tour(ways[own], targets.between[np.ix_(own, own)])[0]]
+    return assigned
