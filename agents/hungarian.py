@@ -34,7 +34,7 @@ def assign_all(costs: FloatArray) -> IntArray:
         costs: (K, n) float64, n >= 1.
 
     >>> assign_all(np.array([[1.0, 2.0], [1.5, 9.0], [0.0, 0.0]])).tolist()
-    [1, 0, 0]
+    [0, 0, 1]
     """
     from scipy.optimize import linear_sum_assignment  # slow import, not always needed
 
