@@ -45,7 +45,7 @@ def load_kernels(config: EnvConfig) -> None:
     """Load or compile the kernels that an environment needs, those of the first steps first."""
     env = vslam_v0.parallel_env(config=config)
     env.reset(seed=0)
-    for _ in range(min(2, config.max_cycles)):
+    for _ in range(min(2, config.num_cycles)):
         env.step({agent: env.action_space(agent).sample() for agent in env.agents})
     warm_up()
 

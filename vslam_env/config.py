@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -88,6 +89,15 @@ def with_none(values: Any) -> Any:
     return None if values == NONE else values
 
 
+def num_cycles(max_seconds: float, step_s: float) -> int:
+    """Return how many steps of `step_s` [s] take `max_seconds` [s], rounded up, at least one.
+
+    >>> num_cycles(100.0, 0.1), num_cycles(100.0, 1.0), num_cycles(1.1, 0.1), num_cycles(100.0, 0.3)
+    (1000, 100, 11, 334)
+    """
+    return max(1, math.ceil(round(max_seconds / step_s, 6)))  # 1.1 / 0.1 is slightly more than 11
+
+
 FORMAT = 1  # version of TOML files; raised when the meaning of a field changes
 ACTION_TYPES = ("continuous", "discrete", "goal")
 OBSERVATION_TYPES = ("dict", "flat")
@@ -96,6 +106,7 @@ MAX_ROBOTS = 8
 TICK = 0.1  # [s]
 GOAL_DECISION_TICKS = 10
 MAX_TICKS = 10**9  # per step; three years of simulated time
+MAX_SECONDS = 100.0  # [s] default length of an episode
 NESTED_CONFIGS = {
     "landmarks": LandmarkConfig,
     "odometry": OdometryNoise,
@@ -104,6 +115,22 @@ NESTED_CONFIGS = {
     "scan": ScanConfig,
     "belief": BeliefConfig,
 }
+
+
+LIMITS = ("max_cycles", "max_seconds")
+
+
+def check_one_limit(max_cycles: Any, max_seconds: Any) -> None:
+    """Raise if both limits of an episode are given."""
+    if max_cycles is not None and max_seconds is not None:
+        hint = "Give one of the two, steps or seconds."
+        raise argument_error("max_seconds", "None together with max_cycles", max_seconds, hint)
+
+
+def replace_limit(changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return changes of a configuration in which a given limit of an episode removes the other one."""
+    given = [name for name in LIMITS if changes.get(name) is not None]
+    return (dict.fromkeys(LIMITS) if len(given) == 1 else {}) | dict(changes)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -119,7 +146,10 @@ class EnvConfig:
         action_type: `"continuous"`: (speed, turn) in [-1, 1]. `"discrete"`: stay, ahead, left, right. `"goal"`: one of
             the candidates of the last observation.
         decision_ticks: Ticks of 0.1 s per `env.step`; None: 1, or 10 with `goal` actions.
-        max_cycles: Number of calls of `env.step` after which the episode is truncated.
+        max_cycles: Number of calls of `env.step` after which the episode is truncated; None: as many as `max_seconds`
+            takes.
+        max_seconds: Simulated time after which the episode is truncated [s], rounded up to whole steps; None: 100 s,
+            unless `max_cycles` is given. At most one of the two can be given.
         stop_at_recall: Map recall of all robots at which the episode terminates; None: never.
         observation_type: `"dict"`: named arrays. `"flat"`: one float32 vector.
         observe_images: Whether a robot observes its left image, `"image"` (H, W, 1) uint8; with `sensor="stereo"` only.
@@ -152,7 +182,8 @@ class EnvConfig:
     sensor: Literal["landmark", "stereo"] = "landmark"
     action_type: Literal["continuous", "discrete", "goal"] = "continuous"
     decision_ticks: int | None = None
-    max_cycles: int = 1000
+    max_cycles: int | None = None
+    max_seconds: float | None = None
     stop_at_recall: float | None = None
     observation_type: Literal["dict", "flat"] = "dict"
     observe_images: bool = False
@@ -188,7 +219,11 @@ class EnvConfig:
         check_choice("observation_type", self.observation_type, OBSERVATION_TYPES)
         if self.decision_ticks is not None:
             check_int("decision_ticks", self.decision_ticks, 1, "Give a number of ticks of 0.1 s.", MAX_TICKS)
-        check_int("max_cycles", self.max_cycles, 1, "Give a number of steps.")
+        if self.max_cycles is not None:
+            check_int("max_cycles", self.max_cycles, 1, "Give a number of steps.")
+        if self.max_seconds is not None:
+            check_float("max_seconds", self.max_seconds, "Give seconds.", above=0.0, at_most=MAX_TICKS * TICK)
+        check_one_limit(self.max_cycles, self.max_seconds)
         if self.stop_at_recall is not None:
             check_float("stop_at_recall", self.stop_at_recall, "Give a share or None.", above=0.0, at_most=1.0)
         switches = ("oracle_pose", "oracle_association", "oracle_merge", "shared_start_view", "shared_reward")
@@ -234,6 +269,14 @@ class EnvConfig:
         return GOAL_DECISION_TICKS if self.action_type == "goal" else 1
 
     @property
+    def num_cycles(self) -> int:
+        """Number of calls of `env.step` after which the episode is truncated."""
+        if self.max_cycles is not None:
+            return self.max_cycles
+        seconds = MAX_SECONDS if self.max_seconds is None else self.max_seconds
+        return num_cycles(seconds, self.ticks_per_step * TICK)
+
+    @property
     def agents(self) -> list[str]:
         """Names of the agents: `robot_0`, `robot_1`, ..."""
         return [f"robot_{robot}" for robot in range(self.num_robots)]
@@ -243,12 +286,12 @@ class EnvConfig:
 
         Args:
             **changes: New values of fields. A nested configuration can be an object, or a dict of the nested fields to
-                change.
+                change. `max_cycles` replaces `max_seconds`, and the reverse.
 
         Raises:
             ValueError: If a field is unknown or a value is invalid; the message names it.
         """
-        return validate(type(self), merge(to_plain(self), changes))
+        return validate(type(self), merge(to_plain(self), replace_limit(changes)))
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:

@@ -22,7 +22,7 @@ from vslam_env.evaluation.team_metrics import TeamMetrics
 from vslam_env.rendering import Scene, draw_frame
 from vslam_env.rendering.from_episode import build_scene
 from vslam_env.rendering.window import Window
-from vslam_env.reward import RewardSpec, evaluate, make_terms, totals
+from vslam_env.reward import RewardSpec, evaluate, make_terms, reads_beliefs, totals
 from vslam_env.simulation.controllers import ActionExecutor
 from vslam_env.simulation.episode import Episode, ReadingsHook, Recorder
 from vslam_env.simulation.scenario import sample_scenario
@@ -67,7 +67,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         if render_mode is not None:
             check_choice("render_mode", render_mode, RENDER_MODES, "Choose one of these, or None.")
         self.render_mode = render_mode
-        self.max_cycles = config.max_cycles
+        self.max_cycles = config.num_cycles
         self._tap = ReadingsHook()  # separate object, so that an episode does not keep its environment alive
         self._source: WorldSource = config.world if world is None else world
         check_source(self._source)
@@ -89,6 +89,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         size = STATE_PER_ROBOT * config.num_robots + 2
         self.state_space = spaces.Box(-np.inf, np.inf, (size,), np.float32)
         self._nothing = [0.0] * config.num_robots
+        self._reads_beliefs = any(map(reads_beliefs, self._terms))
         self._root: np.random.SeedSequence | None = None
         self._episode: Episode | None = None
         self._cycle = 0
@@ -128,7 +129,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         scenario = sample_scenario(self.config, self._source, root.spawn(1)[0], world_seed, options.get("start_poses"))
         episode = Episode(self.config, scenario, self._tap)
         episode.begin()
-        self._team_metrics = episode.team_metrics()
+        self._team_metrics = episode.team_metrics(self._reads_beliefs)
         self._root, self._episode, self._drivers = root, episode, ActionExecutor(self.config)
         self.agents = self.possible_agents[:]
         self._cycle = 0
@@ -163,7 +164,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         chosen = checked_actions(actions, agents, self.config.action_type)
         invalid = self._drivers.execute(episode, chosen)
         before = self._team_metrics
-        self._team_metrics = episode.team_metrics()
+        self._team_metrics = episode.team_metrics(self._reads_beliefs)
         self._cycle += 1
 
         terms = evaluate(self._terms, before, self._team_metrics, self.config.shared_reward)

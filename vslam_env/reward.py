@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from slam_backend.core.validation import argument_error, check_array, check_float
+from vslam_env.evaluation.information import information
 from vslam_env.evaluation.team_metrics import RobotMetrics, TeamMetrics
 
 __all__ = [
@@ -25,7 +26,10 @@ __all__ = [
 
 @runtime_checkable
 class RewardTerm(Protocol):
-    """One part of the reward; a custom term is any object with these three members."""
+    """One part of the reward; a custom term is any object with these three members.
+
+    With an attribute `reads_beliefs = True` its metrics contain the beliefs of the robots, `TeamMetrics.beliefs`.
+    """
 
     @property
     def name(self) -> str:
@@ -46,6 +50,10 @@ RewardFunction = Callable[[TeamMetrics, TeamMetrics], list[float]]
 class _NamedTerm:
     name: str
     weight: float
+
+    @property
+    def reads_beliefs(self) -> bool:
+        return self.name == INFORMATION
 
     def __call__(self, before: TeamMetrics, after: TeamMetrics) -> list[float]:
         return TERMS[self.name](before, after)
@@ -76,6 +84,10 @@ def _coverage(before: TeamMetrics, after: TeamMetrics) -> list[float]:
     return _shared_by_all(after.coverage - before.coverage, after)
 
 
+def _information(before: TeamMetrics, after: TeamMetrics) -> list[float]:
+    return list(map(sub, map(information, after.beliefs), map(information, before.beliefs)))
+
+
 def _collisions(before: TeamMetrics, after: TeamMetrics) -> list[float]:
     return list(map(float, map(sub, before.counts.collisions, after.counts.collisions)))
 
@@ -91,6 +103,7 @@ def _shared_by_all(reward: float, after: TeamMetrics) -> list[float]:
 
 # Potentials telescope: their sum over an episode is the final value minus the initial one, so that oscillation gains
 # nothing. Costs are never positive.
+OWN_RECALL, INFORMATION = "own_recall", "information"
 POTENTIALS: dict[str, RewardFunction] = {
     "map_error": _fall_of("map_errors"),
     "map_error_squared": _map_error_squared,
@@ -99,6 +112,8 @@ POTENTIALS: dict[str, RewardFunction] = {
     "pose_uncertainty": _fall_of("pose_sigmas"),
     "coverage": _coverage,
     "own_coverage": _rise_of("discovered"),
+    OWN_RECALL: _rise_of("own_recalls"),
+    INFORMATION: _information,
 }
 RUNNING_COST = "running_cost"
 COSTS: dict[str, RewardFunction] = {
@@ -147,6 +162,11 @@ def make_terms(reward: RewardSpec) -> tuple[RewardTerm, ...]:
 def is_named(term: RewardTerm) -> bool:
     """Return whether a term is a built-in one, defined by its name and weight."""
     return isinstance(term, _NamedTerm)
+
+
+def reads_beliefs(term: RewardTerm) -> bool:
+    """Return whether a term reads `TeamMetrics.beliefs`."""
+    return bool(getattr(term, "reads_beliefs", False))
 
 
 def evaluate(

@@ -16,14 +16,14 @@ from slam_backend.core.files import os_errors_as_argument_errors, write_file
 from slam_backend.core.state_codec import ForeignObjectError, decode, encode, read_file, sequence_of
 from slam_backend.core.validation import argument_error
 from vslam_env.config import EnvConfig
-from vslam_env.reward import RewardTerm, is_named
+from vslam_env.reward import INFORMATION, RewardTerm, is_named
 from vslam_env.simulation.episode import Episode
 from vslam_env.simulation.scenario import Scenario
 from vslam_env.state_checks import EpisodeCheck, check_drivers, check_team_metrics
 from vslam_env.state_kinds import ENV_KINDS
 from vslam_env.world import WorldSource
 
-STATE_FORMAT = 30  # raised when the content of states changes; exact continuation needs the same version
+STATE_FORMAT = 31  # raised when the content of states changes; exact continuation needs the same version
 MAGIC = b"vslam_env state "
 KEYS = ("version", "config", "objects", "root", "agents", "cycle", "episode", "drivers", "standing")
 
@@ -101,7 +101,7 @@ def check_parts(
         return root, None
     episode = EpisodeCheck(config, own)
     episode.check("state['episode']", state["episode"])
-    check_team_metrics("state['standing']", state["standing"], config.num_robots)
+    check_team_metrics("state['standing']", state["standing"], config.num_robots, INFORMATION in config.reward)
     check_drivers("state['drivers']", state["drivers"], config.num_robots)
     return root, episode.scenario
 

@@ -17,7 +17,7 @@ from vslam_env.belief.team_belief import merge_options
 from vslam_env.config import EnvConfig
 from vslam_env.evaluation.coverage import CoverageCells
 from vslam_env.evaluation.map_scores import UNUSED
-from vslam_env.evaluation.team_metrics import RobotCounts, RobotMetrics, TeamMetrics
+from vslam_env.evaluation.team_metrics import BeliefSummary, RobotCounts, RobotMetrics, TeamMetrics
 from vslam_env.navigation import GRID_SIZE
 from vslam_env.navigation._grid_kernels import HALF_WIDTH
 from vslam_env.navigation.candidate_slots import NUM_SLOTS
@@ -30,7 +30,9 @@ GRID = (GRID_SIZE, GRID_SIZE)
 SLOT_COLUMNS = 5
 AROUND = 1.0  # [m] tolerated distance of a robot outside the bounds of the walls
 STREAMS = ("odometry", "sensor", "scan", "radio")
-EPISODE = ("setting", "tick", "simulator", "streams", "belief", "ledger", "coverage", "counts", "last", "paths")
+EPISODE = (
+    "setting", "tick", "simulator", "streams", "belief", "ledger", "coverage", "credits", "counts", "last", "paths",
+)  # fmt: skip
 
 
 class EpisodeCheck:
@@ -79,6 +81,11 @@ class EpisodeCheck:
         check.keys(f"{name}['coverage']", state["coverage"], ("ever", "found"))
         check.array(f"{name}['coverage']['ever']", state["coverage"]["ever"], check.BOOL, (cells,))
         check.indices(f"{name}['coverage']['found']", state["coverage"]["found"], (count,), 0, cells)
+        landmarks = int(np.count_nonzero(scenario.observable_landmarks))
+        check.keys(f"{name}['credits']", state["credits"], ("shares", "credited", "measured"))
+        check.floats(f"{name}['credits']['shares']", state["credits"]["shares"], (count,), 0.0, 1.0)
+        check.array(f"{name}['credits']['credited']", state["credits"]["credited"], check.BOOL, (landmarks,))
+        check.array(f"{name}['credits']['measured']", state["credits"]["measured"], check.BOOL, (count, landmarks))
         (of_collisions, collisions), *others = check.named_items(f"{name}['counts']", state["counts"], 3)
         check.integers(of_collisions, collisions)
         check.sequence(of_collisions, collisions, count)
@@ -372,8 +379,8 @@ def check_slots(name: str, slots: Any) -> None:
     check.array(f"{name}['given_up']", slots["given_up"], check.BOOL, GRID)
 
 
-def check_team_metrics(name: str, metrics: Any, count: int) -> None:
-    """Raise unless a value is the metrics of a team of K robots."""
+def check_team_metrics(name: str, metrics: Any, count: int, with_beliefs: bool) -> None:
+    """Raise unless a value is the metrics of a team of K robots, with their beliefs if these are needed."""
     check.instance(name, metrics, TeamMetrics)
     check.instance(f"{name}.per_robot", metrics.per_robot, RobotMetrics)
     for figure, row in metrics.per_robot._asdict().items():
@@ -386,6 +393,13 @@ def check_team_metrics(name: str, metrics: Any, count: int) -> None:
     check.number(f"{name}.coverage", metrics.coverage, 0.0, 1.0)
     check.integer(f"{name}.merges", metrics.merges)
     check.number(f"{name}.time", metrics.time, 0.0)
+    if with_beliefs or metrics.beliefs != ():
+        for where, belief in check.named_items(f"{name}.beliefs", metrics.beliefs, count):
+            check.instance(where, belief, BeliefSummary)
+            check.floats(f"{where}.pose_covariance", belief.pose_covariance, (3, 3))
+            landmarks = check.indices(f"{where}.landmark_counts", belief.landmark_counts, (None,))
+            check.floats(f"{where}.landmark_covariances", belief.landmark_covariances, (landmarks, 3, 3))
+            check.array(f"{where}.landmark_claims", belief.landmark_claims, check.INT64, (landmarks,))
 
 
 def check_drivers(name: str, drivers: Any, count: int) -> None:

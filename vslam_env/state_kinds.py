@@ -8,7 +8,7 @@ from vslam_env.belief.belief import BeliefConfig
 from vslam_env.belief.readings import TeamReadings
 from vslam_env.belief.shared_grids import GridSnapshot, GridUpdate
 from vslam_env.config import EnvConfig
-from vslam_env.evaluation.team_metrics import RobotCounts, RobotMetrics, TeamMetrics
+from vslam_env.evaluation.team_metrics import BeliefSummary, RobotCounts, RobotMetrics, TeamMetrics
 from vslam_env.sensors import LandmarkSensorConfig, ScanConfig, StereoSensorConfig, TeamRenderedFrames, TeamSensorFrames
 from vslam_env.sensors.stereo.cameras import ImagingConfig
 from vslam_env.sensors.stereo.textures import TextureConfig, WallTextures
@@ -20,8 +20,8 @@ CONFIGURATIONS = (
     OdometryNoise, ScanConfig, StereoSensorConfig, TextureConfig,
 )  # fmt: skip
 RECORDS = (
-    RobotCounts, RobotMetrics, GridSnapshot, GridUpdate, Landmarks, StereoFrame, StereoMatches, TeamMetrics,
-    TeamReadings, TeamRenderedFrames, TeamSensorFrames, WallTextures, World,
+    BeliefSummary, RobotCounts, RobotMetrics, GridSnapshot, GridUpdate, Landmarks, StereoFrame, StereoMatches,
+    TeamMetrics, TeamReadings, TeamRenderedFrames, TeamSensorFrames, WallTextures, World,
 )  # fmt: skip
 
 

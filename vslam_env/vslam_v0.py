@@ -24,6 +24,7 @@ def parallel_env(
     decision_ticks: int | None = None,
     num_particles: int | None = None,
     max_cycles: int | None = None,
+    max_seconds: float | None = None,
     preset: str | None = None,
     reward: RewardSpec | None = None,
     observation_type: str | None = None,
@@ -53,7 +54,8 @@ def parallel_env(
             left, right. `"goal"`: 0 to stay, 1 to 16 to drive to a candidate of the last observation.
         decision_ticks: Ticks of 0.1 s per step; default 1, or 10 with `goal`.
         num_particles: Number of particles of each filter; default 100.
-        max_cycles: Number of steps after which the episode is truncated; default 1000.
+        max_cycles: Number of steps after which the episode is truncated; default: as many as `max_seconds` takes.
+        max_seconds: Simulated time after which the episode is truncated [s]; default 100. Give one of the two.
         preset: `"easy"`, `"standard"` (default) or `"hard"`; see `preset_config`.
         reward: Weights of terms by name (default `{"map_error": 1.0}`), or a list of custom terms. Learners should use
             a discount of at least 0.999 per tick: `gamma ** decision_ticks` per step.
@@ -91,6 +93,7 @@ def parallel_env(
         "action_type": action_type,
         "decision_ticks": decision_ticks,
         "max_cycles": max_cycles,
+        "max_seconds": max_seconds,
         "observation_type": observation_type,
         "observe_images": observe_images,
         "shared_reward": shared_reward,

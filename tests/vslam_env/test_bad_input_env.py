@@ -52,7 +52,8 @@ COUNT, SHARE, FROM_ZERO, CHORD = "1..1e9", "[0, 1]", "[0, inf)", "(0, 1.41421]"
 SIGMA = "[0, 100]"
 OPTIONS: dict[type[Any], tuple[str, dict[str, str | list[Any]]]] = {
     EnvConfig: ("", {
-        "num_robots": "1..8", "decision_ticks": COUNT, "max_cycles": [0, True, "9", 2.0], "stop_at_recall": "(0, 1]",
+        "num_robots": "1..8", "decision_ticks": COUNT, "max_cycles": [0, True, "9", 2.0], "max_seconds": "(0, 1e8]",
+        "stop_at_recall": "(0, 1]",
         "comm_range": FROM_ZERO, "comm_loss": SHARE, "robot_radius": "(0, 200]", "min_start_distance": FROM_ZERO,
         "map_error_cutoff": "[1e-6, 1e6]", "comm_line_of_sight": [1], "oracle_pose": ["yes", 1], "oracle_merge": [1],
         "shared_start_view": [0.0], "shared_reward": ["yes"], "sensor": ["sonar"], "action_type": ["jump"],
@@ -266,6 +267,10 @@ CALLS: dict[str, list[Callable[[], Any]]] = {
     "config: expected TOML": [partial(EnvConfig.from_toml_text, bad) for bad in ("[x", 3)],
     "max_cycles: expected an int >= 1": [
         partial(lambda bad: setattr(small_env(), "max_cycles", bad), bad) for bad in ("x", None)
+    ],
+    "max_seconds: expected None together with max_cycles": [
+        partial(small_env, max_seconds=3.0), partial(EnvConfig, max_cycles=3, max_seconds=3.0),
+        lambda: EnvConfig().replace(max_cycles=3, max_seconds=3.0),
     ],
     "recorder: expected a function or None": [lambda: setattr(small_env(), "recorder", 5)],
     "reward: expected": [

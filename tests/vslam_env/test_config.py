@@ -67,6 +67,28 @@ def test_default_decision_ticks(action_type: str, ticks: int) -> None:
     assert EnvConfig().replace(action_type=action_type, decision_ticks=4).ticks_per_step == 4
 
 
+@pytest.mark.parametrize(("action_type", "steps"), [("continuous", 1000), ("discrete", 1000), ("goal", 100)])
+def test_episodes_last_100_seconds(action_type: str, steps: int) -> None:
+    """Without a limit an episode has the steps of 100 s, else those of `max_seconds` rounded up, or `max_cycles`."""
+    assert vslam_v0.parallel_env(action_type=action_type).max_cycles == steps
+    config = EnvConfig().replace(action_type=action_type)
+    assert config.num_cycles == steps
+    assert config.replace(max_seconds=12.0).num_cycles == 12 * steps // 100
+    assert config.replace(max_cycles=7).num_cycles == 7
+    assert config.replace(max_seconds=3.5, decision_ticks=10).num_cycles == 4
+    assert vslam_v0.parallel_env(config=config, decision_ticks=4).max_cycles == 250
+
+
+def test_a_given_limit_replaces_the_other_one(tmp_path: Path) -> None:
+    """Steps given as an argument win over the seconds of a configuration, and the reverse, also from a file."""
+    path = tmp_path / "config.toml"
+    path.write_text(EnvConfig(max_seconds=30.0).to_toml(), encoding="utf-8")
+    assert EnvConfig.from_toml(path).num_cycles == 300
+    env = vslam_v0.parallel_env(config=path, max_cycles=5)
+    assert (env.max_cycles, env.config.max_cycles, env.config.max_seconds) == (5, 5, None)
+    assert vslam_v0.parallel_env(config=env.config, max_seconds=2.0).max_cycles == 20
+
+
 def test_a_file_changes_the_fields_that_it_names(tmp_path: Path) -> None:
     """What a file leaves out of a nested table is that of the standard preset, as with `replace`."""
     path = tmp_path / "config.toml"

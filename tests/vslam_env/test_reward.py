@@ -12,8 +12,10 @@ from slam_backend.maps.alignment import Alignment
 from slam_backend.maps.landmark_map import LandmarkMap, TeamMapSummaries
 from vslam_env import ExplorationEnv, vslam_v0
 from vslam_env.config import TICK
+from vslam_env.evaluation.information import MOST, information
 from vslam_env.evaluation.map_scores import FALSE, GroundTruthAssociation
-from vslam_env.evaluation.team_metrics import RobotCounts, RobotMetrics
+from vslam_env.evaluation.recall_credits import RecallCredits
+from vslam_env.evaluation.team_metrics import BeliefSummary, RobotCounts, RobotMetrics
 from vslam_env.reward import POTENTIALS, RUNNING_COST, TERMS, TeamMetrics, evaluate, make_terms
 from vslam_env.simulation.episode import true_alignment
 
@@ -29,11 +31,25 @@ FIGURES: dict[str, list[float]] = {
     "discovered": [0.2, 0.05],
     "distances": [1.0, 2.0],
     "error_integrals": [2.0, 1.5],
+    "own_recalls": [0.08, 0.05],
 }
 
 
+def _summary(sigma: float, counts: list[int], claims: list[int], pose: float = 0.0) -> BeliefSummary:
+    """Return a belief in which all landmarks have one sigma [m] in each direction, and the pose one too [m, m, rad]."""
+    covariances = np.tile(sigma**2 * np.eye(3), (len(counts), 1, 1))
+    return BeliefSummary(pose**2 * np.eye(3), np.array(counts, np.int64), covariances, np.array(claims, np.int64))
+
+
+BELIEFS = (_summary(0.5, [2, 3], [4, 9]), _summary(1.0, [2], [4]))
+
+
 def _team_metrics(
-    coverage: float = 0.25, collisions: tuple[int, int] = (0, 3), time: float = 3.0, **rows: Any
+    coverage: float = 0.25,
+    collisions: tuple[int, int] = (0, 3),
+    time: float = 3.0,
+    beliefs: tuple[BeliefSummary, ...] = BELIEFS,
+    **rows: Any,
 ) -> TeamMetrics:
     return TeamMetrics(
         per_robot=RobotMetrics(**FIGURES | rows),
@@ -41,6 +57,7 @@ def _team_metrics(
         coverage=coverage,
         merges=0,
         time=time,
+        beliefs=beliefs,
     )
 
 
@@ -70,6 +87,8 @@ def test_named_terms() -> None:
         collisions=(2, 3),
         distances=[1.25, 2.0],
         error_integrals=[2.25, 1.75],
+        own_recalls=[0.08, 0.075],
+        beliefs=(_summary(0.5, [2, 3, 2], [4, 9, 6]), _summary(1.0, [4], [4], pose=0.02)),
         time=3.5,
     )
     weights = {name: float(weight) for weight, name in enumerate(TERMS, start=2)}
@@ -82,6 +101,8 @@ def test_named_terms() -> None:
         "pose_uncertainty": [-0.01, 0.04],
         "coverage": [0.25, 0.25],
         "own_coverage": [0.05, 0.2],
+        "own_recall": [0.0, 0.025],
+        "information": [3.0 * np.log(2.0), -np.log(1.0 + 0.4**2) - 0.5 * np.log(2.0)],
         "collisions": [-2.0, 0.0],
         "distance": [-0.25, 0.0],
         "time": [-0.5, -0.5],
@@ -133,7 +154,7 @@ def test_potentials_telescope() -> None:
     """What each potential pays in an episode is where it ends minus where it began, a merge included."""
     env = small_env(max_cycles=120, reward=dict.fromkeys(POTENTIALS, 1.0))
     first_infos = env.reset(seed=5, options={"start_poses": MEETING})[1]
-    first = env.episode.team_metrics()
+    first = env.episode.team_metrics(with_beliefs=True)
     totals = {agent: dict.fromkeys(POTENTIALS, 0.0) for agent in env.agents}
     while env.agents:
         _, rewards, _, _, infos = env.step(turning(env.agents))
@@ -141,13 +162,95 @@ def test_potentials_telescope() -> None:
             assert np.isclose(reward, sum(infos[agent][f"reward/{name}"] for name in POTENTIALS))
             for name in POTENTIALS:
                 totals[agent][name] += infos[agent][f"reward/{name}"]
-    last = env.episode.team_metrics()
+    last = env.episode.team_metrics(with_beliefs=True)
     assert any(event.kind == "merge" for event in env.events)
     for robot, agent in enumerate(env.possible_agents):
         for name, term in POTENTIALS.items():
             assert np.isclose(totals[agent][name], term(first, last)[robot], atol=1e-12), name
         lost = first_infos[agent]["map_error"] - infos[agent]["map_error"]
         assert np.isclose(totals[agent]["map_error"], lost, atol=1e-12)
+
+
+def test_information_counts_true_landmarks_once() -> None:
+    """A duplicate, a false point or a landmark measured once adds no information; no landmark exceeds the cap."""
+    held = information(_summary(0.5, [2, 3], [4, 9]))
+    assert held == pytest.approx(6.0 * np.log(2.0))
+    assert information(_summary(0.5, [2, 3, 7], [4, 9, 9])) == pytest.approx(held)
+    assert information(_summary(0.5, [2, 3, 7, 7], [4, 9, -1, -2])) == pytest.approx(held)
+    assert information(_summary(0.5, [2, 3, 1], [4, 9, 5])) == pytest.approx(held)
+    assert information(_summary(1e-3, [90, 3], [4, 9])) == pytest.approx(2.0 * MOST)
+    assert information(_summary(2.0, [2, 3], [4, 9])) == 0.0
+    assert information(_summary(1.0, [], [], pose=0.1)) < information(_summary(1.0, [], [])) == 0.0
+
+
+def test_a_landmark_is_credited_once() -> None:
+    """The robot whose map holds a landmark well at the score after its own measurement gets the credit, once."""
+    credits = RecallCredits(2, 4)
+    nothing = np.zeros((2, 4), np.bool_)
+    credits.record(0, np.array([1, -1, -2, 3]))
+    credits.update(nothing)  # measured, but not held well: the measurement is forgotten
+    held = nothing.copy()
+    held[:, 1] = True
+    credits.update(held)
+    assert credits.shares.tolist() == [0.0, 0.0]
+    credits.record(1, np.array([1, 1]))
+    credits.update(held)
+    assert credits.shares.tolist() == [0.0, 0.25]
+    held[:, 2] = True
+    for robot in range(2):
+        credits.record(robot, np.array([1, 2]))
+    credits.update(held)
+    assert credits.shares.tolist() == [0.125, 0.375]
+    state = credits.get_state()
+    other = RecallCredits(2, 4)
+    other.set_state(state)
+    for each in (credits, other):
+        each.record(0, np.array([0, 1, 2]))
+        each.update(np.ones((2, 4), np.bool_))
+    assert credits.shares.tolist() == other.shares.tolist() == [0.375, 0.375]
+    assert state["shares"].tolist() == [0.125, 0.375]
+
+
+def test_robots_share_the_credits() -> None:
+    """Both robots are credited with a part of the landmarks, and a snapshot continues with the same credits."""
+    env = small_env(max_cycles=120, reward={"own_recall": 1.0})
+    env.reset(seed=5, options={"start_poses": MEETING})
+    twin = None
+    while env.agents:
+        env.step(turning(env.agents))
+        if twin is not None:
+            twin.step(turning(twin.agents))
+        elif len(env.episode.true_path) == 60:
+            twin = env.clone()
+    metrics = env.episode.team_metrics()
+    assert 0.1 < metrics.own_recalls.sum() <= 1.0
+    assert metrics.own_recalls.min() > 0.0
+    assert twin is not None
+    assert twin.episode.team_metrics().own_recalls.tolist() == metrics.own_recalls.tolist()
+
+
+def test_custom_terms_may_read_beliefs() -> None:
+    """A term that says so is given the beliefs before and after the step; other terms find none."""
+    lengths = []
+
+    class Counting:
+        name, weight, reads_beliefs = "counting", 1.0, True
+
+        def __call__(self, before: TeamMetrics, after: TeamMetrics) -> Any:
+            lengths.append((len(before.beliefs), len(after.beliefs)))
+            gained = [len(new.landmark_counts) for new in after.beliefs]
+            return [n - len(old.landmark_counts) for n, old in zip(gained, before.beliefs, strict=True)]
+
+    env, plain = small_env(reward=[Counting()]), small_env()
+    env.reset(seed=5)
+    plain.reset(seed=5)
+    total = 0.0
+    for _ in range(20):
+        total += env.step(turning(env.agents))[1]["robot_0"]
+        plain.step(turning(plain.agents))
+    assert total == len(env.belief("robot_0").map.counts) > 0
+    assert set(lengths) == {(2, 2)}
+    assert plain.episode.team_metrics().beliefs == ()
 
 
 def test_a_map_that_is_placed_wrong_has_no_recall() -> None:

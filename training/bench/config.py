@@ -243,7 +243,7 @@ class ExplorationBenchConfig(ExperimentConfig):
             "particles": self.particles, "rejuvenate_every": self.rejuvenate_every, "preset": self.preset,
             "sensor": self.sensor, "seed": trial.seed,
         }  # fmt: skip
-        return RunConfig(**shared, max_cycles=max(1, round(self.duration / RunConfig(**shared).step_s)))
+        return RunConfig(**shared, max_seconds=self.duration)
 
     def environment(self, trial: ExplorationTrial) -> "EnvConfig":
         """Return the environment of a trial: all policies have the same world for one seed and combination."""

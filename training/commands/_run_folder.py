@@ -60,7 +60,7 @@ class Call(Generic[ConfigT]):
         values: dict[str, Any] = {}
         if self.file is not None:
             values, values["seed"] = read_config(self.file, self.command)
-        values |= {**self.quick, **self.given}
+        values = self.kind.merged(values, {**self.quick, **self.given})
         if self.log is not None:
             values["path"] = find_log(values.get("path"), *self.log)
         return values

@@ -8,6 +8,8 @@ from rich.console import Console
 
 from training.experiments.compilation import prepare
 
+EPISODE_S = 600.0  # [s]
+
 
 def drive_by_hand(
     world: Annotated[str, typer.Option(help="World family or path; see vslam worlds list.")] = "office",
@@ -15,7 +17,12 @@ def drive_by_hand(
     policy: Annotated[str, typer.Option(help="Policy of the other robots, or none.")] = "frontier",
     seed: Annotated[int, typer.Option(help="Seed of the episode.")] = 0,
     preset: Annotated[str, typer.Option(help="Noise preset: easy, standard or hard.")] = "standard",
-    max_cycles: Annotated[int, typer.Option(help="Length of the episode in ticks of 0.1 s.")] = 6000,
+    max_cycles: Annotated[
+        int | None, typer.Option(help="Length of the episode in ticks of 0.1 s.", show_default="600 s")
+    ] = None,
+    max_seconds: Annotated[
+        float | None, typer.Option(help="Length of the episode [s], instead of max_cycles.", show_default="600")
+    ] = None,
     record: Annotated[Path | None, typer.Option(help="Record a video to this .mp4 file.", show_default=False)] = None,
 ) -> None:
     """Drive a robot with the arrow keys or WASD; Tab selects the next robot, Escape or Q quits."""
@@ -29,7 +36,11 @@ def drive_by_hand(
     from vslam_env import vslam_v0
     from vslam_env.rendering.window import Window, display_unavailable_reason
 
-    env = vslam_v0.parallel_env(world=world, num_robots=robots, preset=preset, max_cycles=max_cycles)
+    if max_cycles is None and max_seconds is None:
+        max_seconds = EPISODE_S
+    env = vslam_v0.parallel_env(
+        world=world, num_robots=robots, preset=preset, max_cycles=max_cycles, max_seconds=max_seconds
+    )
     policies = {} if policy == "none" else {a: make_policy(policy, "continuous") for a in env.possible_agents}
     env.reset(seed=seed)  # detects a world that cannot be built first
     reason = display_unavailable_reason()

@@ -1,5 +1,6 @@
 """`RunConfig`: configuration of a run, with its environment and policies."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +28,9 @@ class RunConfig(ExperimentConfig):
     max_cycles: int | None = option(
         None, "Number of steps of the episode.", shown="180 s", ge=1, hint="Give a number of steps."
     )
+    max_seconds: float | None = option(
+        None, "Simulated time of the episode [s], instead of max_cycles.", shown="180", gt=0.0, hint="Give seconds."
+    )
     particles: int = option(100, "Number of particles per filter.", ge=1, hint=ONE_PARTICLE)
     rejuvenate_every: int | None = option(
         None, "Ticks between rejuvenations of the particles; 0: never.", shown="100", ge=0,
@@ -35,12 +39,25 @@ class RunConfig(ExperimentConfig):
     preset: NoisePreset = option("standard", "Noise preset: easy, standard or hard.")
     sensor: Sensor = option("landmark", "Sensor: landmark, or stereo (rendered images).")
 
+    def check(self) -> None:
+        """Refuse two limits of the episode."""
+        from vslam_env.config import check_one_limit
+
+        check_one_limit(self.max_cycles, self.max_seconds)
+
+    @classmethod
+    def merged(cls, earlier: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+        """Return plain values in which a given limit of the episode removes the other one of an earlier run."""
+        from vslam_env.config import replace_limit
+
+        return {**earlier, **replace_limit(given)}
+
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values that repeat this run from any folder, except the seed."""
         from agents.registry import is_model
         from vslam_env.world import WORLD_FAMILIES
 
-        changed: dict[str, Any] = {"max_cycles": self.num_steps}
+        changed: dict[str, Any] = self._limit
         if self.world not in WORLD_FAMILIES:
             changed["world"] = str(Path(self.world).resolve())
         if is_model(self.policy):
@@ -71,7 +88,17 @@ class RunConfig(ExperimentConfig):
     @property
     def num_steps(self) -> int:
         """Number of steps of the episode."""
-        return round(EPISODE_S / self.step_s) if self.max_cycles is None else self.max_cycles
+        from vslam_env.config import num_cycles
+
+        limit = self._limit
+        return limit["max_cycles"] if "max_cycles" in limit else num_cycles(limit["max_seconds"], self.step_s)
+
+    @property
+    def _limit(self) -> dict[str, Any]:
+        """The limit of the episode, steps or seconds."""
+        if self.max_cycles is not None:
+            return {"max_cycles": self.max_cycles}
+        return {"max_seconds": EPISODE_S if self.max_seconds is None else self.max_seconds}
 
     def environment(self) -> "EnvConfig":
         """Return the configuration of the environment."""
@@ -82,7 +109,7 @@ class RunConfig(ExperimentConfig):
             assumed["rejuvenate_every"] = self.rejuvenate_every or None
         return preset_config(self.preset, self.sensor).replace(
             belief={"filter": assumed}, world=self.world, num_robots=self.robots, action_type=self.action_type,
-            decision_ticks=self.decision_ticks, max_cycles=self.num_steps,
+            decision_ticks=self.decision_ticks, **self._limit,
         )  # fmt: skip
 
     def make_env(self) -> "ExplorationEnv":

@@ -132,6 +132,11 @@ class ExperimentConfig(Checked):
         """Return plain values with omitted values filled in, where these depend on other values."""
         return values
 
+    @classmethod
+    def merged(cls, earlier: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the plain values of an earlier run, overridden by given ones."""
+        return {**earlier, **given}
+
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values that repeat the command, except the seed."""
         return self.model_dump(exclude={"seed"})

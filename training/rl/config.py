@@ -120,14 +120,19 @@ class EvaluateConfig(ExperimentConfig):
     world: str | None = option(None, "World family or path.", shown="as in the training")
     robots: int | None = option(None, "Number of robots, 1 to 8.", shown="as in the training")
     max_cycles: int | None = option(None, "Number of decisions per episode.", shown="as in the training")
+    max_seconds: float | None = option(
+        None, "Simulated time of an episode [s], instead of max_cycles.", shown="as in the training"
+    )
     greedy: bool = option(False, "Take the model's best action instead of sampling from its distribution.")
     seeds: int = option(20, "Number of episodes of each policy.", ge=2, hint="A confidence interval needs two or more.")
     seed: int = first_seed()
 
     def check(self) -> None:
-        """Refuse policies that do not exist or do not support `goal` actions."""
+        """Refuse policies that do not exist or do not support `goal` actions, and two limits of the episode."""
         from agents.registry import make_policy
+        from vslam_env.config import check_one_limit
 
+        check_one_limit(self.max_cycles, self.max_seconds)
         for name in self.policies:
             make_policy(name, "goal")
 
@@ -139,6 +144,13 @@ class EvaluateConfig(ExperimentConfig):
         if "model" not in values:
             raise argument_error("model", "a model that vslam train wrote", "no model", "Name it, or its run folder.")
         return values
+
+    @classmethod
+    def merged(cls, earlier: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+        """Return plain values in which a given limit of the episode removes the other one of an earlier run."""
+        from vslam_env.config import replace_limit
+
+        return {**earlier, **replace_limit(given)}
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values that repeat this evaluation from any folder, except the seed."""
@@ -155,7 +167,10 @@ class EvaluateConfig(ExperimentConfig):
         from vslam_env.world import is_single_layout
 
         config = EnvConfig.from_toml_text(load_model(self.model)[1]["environment"])
-        given = {"world": self.world, "num_robots": self.robots, "max_cycles": self.max_cycles}
+        given = {
+            "world": self.world, "num_robots": self.robots, "max_cycles": self.max_cycles,
+            "max_seconds": self.max_seconds,
+        }  # fmt: skip
         changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
         changes["world_split"] = None if is_single_layout(changes.get("world", config.world)) else self.split
         return config.replace(**changes, reward={"map_error": 1.0}, shared_reward=False)

@@ -9,7 +9,7 @@ import numpy as np
 
 from slam_backend.core.jit import in_place
 from slam_backend.core.read_only import with_constants, with_read_only
-from slam_backend.core.validation import FloatArray, IntArray, check_float
+from slam_backend.core.validation import BoolArray, FloatArray, IntArray, check_float
 from slam_backend.fastslam.relative_poses import OWN, SIGMAS, START, TeamPoses
 from slam_backend.fastslam.reports import LandmarkIdMap, LandmarksCreated, MapForked, MapReleased, TeamReport
 from slam_backend.maps.landmark_map import TeamMapSummaries
@@ -42,7 +42,8 @@ def score_team(
             (K,) int64. Row of each robot's map in these claims.
             (N, 3) float64 [m], world frame. True positions of the observable landmarks, N >= 1.
             Cutoff c of the map error [m].
-            (N,) float64. Workspace.
+            (K, N) float64. Output: least squared error [m^2] of the landmarks that claim each true one in each robot's
+            map; inf without any.
         beliefs: (K, 16 + K). Array of `TeamPoses`.
         true_starts, true_poses: (K, 3) [m, m, rad], world frame. True start and current poses.
         scores: (8 or more, K) float64. Output per robot: map error E [m], see `slam_backend.metrics.map_error`; RMSE
@@ -50,9 +51,10 @@ def score_team(
             error below 0.5 m; errors of position [m] and heading [rad] in [0, pi]; estimated one sigma of the position
             [m].
     """
-    books, book_of, truths, cutoff, least = claims
+    books, book_of, truths, cutoff, least_errors = claims
     for robot in range(len(beliefs)):
         belief, start, true, score = beliefs[robot], true_starts[robot], true_poses[robot], scores[:, robot]
+        least = least_errors[robot]
         c, s = math.cos(start[2]), math.sin(start[2])
         dx = start[0] + c * belief[OWN] - s * belief[OWN + 1] - true[0]
         dy = start[1] + s * belief[OWN] + c * belief[OWN + 1] - true[1]
@@ -63,7 +65,7 @@ def score_team(
         x0 = start[0] + c * belief[START] - s * belief[START + 1]
         y0 = start[1] + s * belief[START] + c * belief[START + 1]
         c, s = math.cos(start[2] + belief[START + 2]), math.sin(start[2] + belief[START + 2])
-        least[:] = np.inf  # least squared error of the landmarks that claim each true one
+        least[:] = np.inf
         estimated = surplus = 0
         for i in range(parts[robot, 0], parts[robot, 1]):
             claim = books[book_of[robot], names[i, 1]]
@@ -105,7 +107,7 @@ class GroundTruthAssociation:
     def __init__(self, num_robots: int, true_positions: FloatArray, observable: np.ndarray, cutoff: float) -> None:
         self.cutoff = check_float("map_error_cutoff", cutoff, "Give metres.", above=0.0)
         self.true_positions = np.ascontiguousarray(true_positions[observable])
-        self._least = np.empty(len(self.true_positions))  # workspace
+        self._least = np.full((num_robots, len(self.true_positions)), np.inf)  # squared errors of the last score
         self._claim_of = np.where(observable, np.cumsum(observable) - 1, UNCOUNTED)
         self._books = np.empty((num_robots, 0), np.int64)  # row: claims of the ids of one map
         self._row_of = {number: number for number in range(num_robots)}
@@ -153,6 +155,15 @@ class GroundTruthAssociation:
     def true_ids(self, robot: int, ids: IntArray) -> IntArray:
         """Return the claims (n,) int64 of landmarks in a robot's map: true index, -1 false, -2 not scored."""
         return np.asarray(self._books[self._book_of[robot], ids])
+
+    def rows_of(self, true_ids: IntArray) -> IntArray:
+        """Return the rows (n,) int64 of `true_positions` for true ids (n,), -1: false point; negative if not scored."""
+        return np.where(true_ids >= 0, self._claim_of[true_ids], FALSE)
+
+    @property
+    def accurate(self) -> BoolArray:
+        """(K, N) bool. Which true landmarks the map of each robot held within 0.5 m at the last score."""
+        return self._least < PLACED * PLACED
 
     def score(
         self,

@@ -1,4 +1,4 @@
-"""Metrics of a team at one tick, computed from ground truth."""
+"""Metrics of a team at one tick, computed from ground truth, and what rewards may read of its beliefs."""
 
 from collections.abc import Sequence
 from typing import Generic, NamedTuple, TypeVar
@@ -24,6 +24,7 @@ class RobotMetrics(NamedTuple, Generic[Row]):
     discovered: Row
     distances: Row
     error_integrals: Row
+    own_recalls: Row
 
 
 class RobotCounts(NamedTuple):
@@ -31,6 +32,23 @@ class RobotCounts(NamedTuple):
 
     collisions: tuple[int, ...]
     bytes_sent: tuple[int, ...]
+
+
+class BeliefSummary(NamedTuple):
+    """Belief of a robot as far as reward terms may read it, with the true landmarks that it refers to; read-only.
+
+    Attributes:
+        pose_covariance: (3, 3) float64 [m, m, rad], own start frame. Covariance of the robot's pose.
+        landmark_counts: (n,) int64. Number of measurements of each confirmed landmark of the robot's map.
+        landmark_covariances: (n, 3, 3) float64 [m^2], map frame of the group. Covariances of the landmarks.
+        landmark_claims: (n,) int64. True landmark that each one stands for, equal for duplicates; -1: a false point,
+            -2: a landmark that is not scored.
+    """
+
+    pose_covariance: FloatArray
+    landmark_counts: IntArray
+    landmark_covariances: FloatArray
+    landmark_claims: IntArray
 
 
 class TeamMetrics(NamedTuple):
@@ -42,6 +60,7 @@ class TeamMetrics(NamedTuple):
         coverage: Share of the free floor seen by the team.
         merges: Number of merges since the reset.
         time: Simulated time since the reset [s].
+        beliefs: Belief of each robot; empty unless a reward term reads beliefs, see `vslam_env.reward.RewardTerm`.
     """
 
     per_robot: RobotMetrics[Sequence[float]]
@@ -49,6 +68,7 @@ class TeamMetrics(NamedTuple):
     coverage: float
     merges: int
     time: float
+    beliefs: tuple[BeliefSummary, ...] = ()
 
     @property
     def map_errors(self) -> FloatArray:
@@ -107,6 +127,14 @@ class TeamMetrics(NamedTuple):
         Zeros unless the reward has the term `running_cost`, which requires scores at every tick.
         """
         return np.array(self.per_robot.error_integrals)
+
+    @property
+    def own_recalls(self) -> FloatArray:
+        """(K,) float64. Share of the true landmarks that each robot was the first to hold well by its own measurement.
+
+        See `RecallCredits`. Zeros unless the reward has the term `own_recall`.
+        """
+        return np.array(self.per_robot.own_recalls)
 
     @property
     def collisions(self) -> IntArray:

@@ -18,8 +18,9 @@ from vslam_env.belief.readings import Readings, TeamReadings
 from vslam_env.belief.team_belief import RobotHardware, TeamBelief
 from vslam_env.config import TICK, EnvConfig
 from vslam_env.evaluation.coverage import CoverageTracker
-from vslam_env.evaluation.team_metrics import RobotCounts, RobotMetrics, TeamMetrics
-from vslam_env.reward import RUNNING_COST
+from vslam_env.evaluation.recall_credits import RecallCredits
+from vslam_env.evaluation.team_metrics import BeliefSummary, RobotCounts, RobotMetrics, TeamMetrics
+from vslam_env.reward import OWN_RECALL, RUNNING_COST
 from vslam_env.sensors import RenderedFrame, SensorFrame, TeamRenderedFrames, TeamSensorFrames
 from vslam_env.simulation.communication import contacts
 from vslam_env.simulation.scenario import Scenario
@@ -122,8 +123,9 @@ class Episode:
         self._figures = np.zeros((len(RobotMetrics._fields), config.num_robots))  # distances accumulate
         rows: RobotMetrics[FloatArray] = RobotMetrics(*self._figures)
         self._map_errors, self._found, self._distances = rows.map_errors, rows.discovered, rows.distances
-        self._error_integrals = rows.error_integrals
+        self._error_integrals, self._own_recalls = rows.error_integrals, rows.own_recalls
         self._integrates = RUNNING_COST in config.reward  # scoring every tick is slow
+        self._gives_credit = OWN_RECALL in config.reward
         self.true_path: list[FloatArray] = []
         self.estimated_path: list[FloatArray] = []
         self.merge_ticks: list[tuple[int, tuple[int, ...], tuple[int, ...]]] = []
@@ -137,6 +139,7 @@ class Episode:
         self._simulator = Simulator(scenario.world, scenario.true_starts, self._config.robot_radius, TICK)
         self.ground_truth = scenario.new_ground_truth(self._config.map_error_cutoff)
         self._coverage = CoverageTracker(scenario.coverage)
+        self._credits = RecallCredits(self._config.num_robots, len(self.ground_truth.true_positions))
         for name, state in scenario.stream_states.items():
             self._streams[name].bit_generator.state = state
 
@@ -182,16 +185,24 @@ class Episode:
         """Return the estimated poses (K, 3) [m, m, rad], moved by the true start poses to the world frame."""
         return compose(self.true_starts, self.estimated_path[-1])
 
-    def team_metrics(self) -> TeamMetrics:
-        """Return the current metrics of the team."""
+    def team_metrics(self, with_beliefs: bool = False) -> TeamMetrics:
+        """Return the current metrics of the team.
+
+        Args:
+            with_beliefs: Whether they include the beliefs, which takes longer.
+        """
         belief, poses = self.belief, self._simulator.poses
         self._score(poses)
+        if self._gives_credit:
+            self._credits.update(self.ground_truth.accurate)
+            self._own_recalls[:] = self._credits.shares
         coverage = self._coverage.update(belief.grids, poses, self._found)
         counts, figures = (
             RobotCounts(self._collisions, tuple(belief.exchange.sent)),
             RobotMetrics(*self._figures.tolist()),
         )
-        return TeamMetrics(figures, counts, coverage, len(self.merge_ticks), self.tick * TICK)
+        beliefs = tuple(map(self._summary, range(len(poses)))) if with_beliefs else ()
+        return TeamMetrics(figures, counts, coverage, len(self.merge_ticks), self.tick * TICK, beliefs)
 
     # ------------------------------------------------------------------ snapshots
 
@@ -205,6 +216,7 @@ class Episode:
             "belief": self.belief.get_state(),
             "ledger": self.ground_truth.get_state(),
             "coverage": self._coverage.get_state(),
+            "credits": self._credits.get_state(),
             "counts": (self._collisions, self._distances.copy(), self._error_integrals.copy()),
             "last": with_read_only((self.readings, self._frames)),
             "paths": (tuple(self.true_path), tuple(self.estimated_path), tuple(self.merge_ticks)),
@@ -221,6 +233,7 @@ class Episode:
         self.belief.set_state(state["belief"])
         self.ground_truth.set_state(state["ledger"])
         self._coverage.set_state(state["coverage"])
+        self._credits.set_state(state["credits"])
         self.tick = state["tick"]
         self._collisions, self._distances[:], self._error_integrals[:] = state["counts"]
         self.readings, self._frames = with_constants(state["last"])
@@ -235,6 +248,12 @@ class Episode:
         """Score all maps and poses, given the true poses (K, 3), into the first rows of the metrics."""
         belief = self.belief
         self.ground_truth.score(belief.map_summaries, belief.points, self.true_starts, poses, self._figures)
+
+    def _summary(self, robot: int) -> BeliefSummary:
+        """Return what reward terms may read of a robot's belief."""
+        group_map, truth = self.belief.group_map(robot), self.ground_truth
+        covariance, claims = self.belief.points.covariances[robot], truth.true_ids(robot, group_map.ids)
+        return BeliefSummary(as_constant(covariance), group_map.counts, group_map.covariances, as_constant(claims))
 
     def _perceive(self, odometry: FloatArray | None) -> None:
         """Read the sensors at the true poses and update the beliefs and the ground-truth association."""
@@ -256,6 +275,11 @@ class Episode:
             self._tap.recorder(self.readings.per_robot())
         report = self.belief.step(self.readings)
         self.ground_truth.record(report, frames.names)
+        if self._gives_credit:
+            for robot, (associated, created) in enumerate(zip(report.associations, report.created, strict=True)):
+                true_ids = frames.names[robot][: len(associated)]
+                used = np.maximum(associated, created) >= 0
+                self._credits.record(robot, self.ground_truth.rows_of(true_ids[used]))
         for id_map in report.id_maps:
             self.merge_ticks.append((self.tick, id_map.robots_a, id_map.robots_b))
         if config.oracle_merge:

@@ -268,7 +268,19 @@ def test_episode_duration_does_not_depend_on_the_action_type(action_type: str, s
     config = RunConfig(action_type=action_type)
     assert config.step_s == pytest.approx(step_s)
     assert config.num_steps * config.step_s == pytest.approx(EPISODE_S)
-    assert RunConfig.from_mapping(config.to_mapping()) == config.replace(max_cycles=config.num_steps)
+    assert RunConfig.from_mapping(config.to_mapping()) == config.replace(max_seconds=EPISODE_S)
+    assert config.replace(max_seconds=7.0).num_steps * step_s == pytest.approx(7.0)
+    assert config.replace(max_cycles=7).make_env().max_cycles == 7
+    assert config.replace(max_seconds=7.0).make_env().max_cycles == config.replace(max_seconds=7.0).num_steps
+
+
+def test_a_given_limit_replaces_that_of_the_repeated_run() -> None:
+    """An option for the length of the episode overrides the steps or seconds of the repeated run; two are refused."""
+    earlier = RunConfig(max_cycles=5).to_mapping()
+    assert RunConfig.from_mapping(RunConfig.merged(earlier, {"max_seconds": 3.0})) == RunConfig(max_seconds=3.0)
+    assert RunConfig.from_mapping(RunConfig.merged(earlier, {"robots": 2})) == RunConfig(max_cycles=5, robots=2)
+    with pytest.raises(ValueError, match="max_seconds: expected None together with max_cycles, got 3"):
+        RunConfig(max_cycles=5, max_seconds=3.0)
 
 
 def test_a_config_repeats_a_run_from_any_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -110,7 +110,7 @@ BAD: dict[type[ExperimentConfig], dict[str, dict[Any, str]]] = {
     RunConfig: {
         "robots": {0: ROBOTS, 9: ROBOTS}, "sensor": {"sonar": "one of 'landmark', 'stereo'"},
         "action_type": {"jump": "one of 'continuous', 'discrete', 'goal'"}, "max_cycles": {0: AT_LEAST_1},
-        "rejuvenate_every": {-1: AT_LEAST_0},
+        "rejuvenate_every": {-1: AT_LEAST_0}, "max_seconds": {0.0: ABOVE_0},
     },
 }  # fmt: skip
 # Fields whose options have other names, which errors use.
