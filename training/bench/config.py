@@ -183,8 +183,8 @@ class ExplorationBenchConfig(ExperimentConfig):
 
     policies: tuple[str, ...] = option(
         ("frontier", "random_goals", "random_walk"),
-        "Policies by name, path of a model, or MODULE:NAME; NAME@discrete selects the action type. The others are "
-        "compared with the first.",
+        "Policies by name, path of a model, or MODULE:NAME; NAME@discrete selects the action type, NAME@team the "
+        "central team policy, oracles@bound and rollout@bound are bounds. The others are compared with the first.",
     )
     worlds: tuple[str, ...] = option(("office", "maze", "loops", "hall"), "World families or paths.")
     split: Literal["train", "validation", "test", "any"] = option(
@@ -201,12 +201,18 @@ class ExplorationBenchConfig(ExperimentConfig):
     )
     preset: NoisePreset = option("standard", "Noise preset: easy, standard or hard.")
     sensor: Sensor = option("landmark", "Sensor: landmark, or stereo (rendered images).")
+    decision_limit: float = option(
+        2.0,
+        "Longest time of a decision [s]; a slower policy fails. Bounds have no limit.",
+        gt=0.0,
+        hint="Give seconds.",
+    )
     seeds: int = option(10, "Number of episodes of each policy.", ge=1, hint="Use at least one episode.")
     seed: int = first_seed()
 
     def check(self) -> None:
         """Refuse policies and worlds that do not exist."""
-        from training.bench.exploration.trials import parted
+        from training.bench.exploration.players import parted
 
         for policy in self.policies:
             parted(policy)
@@ -234,12 +240,12 @@ class ExplorationBenchConfig(ExperimentConfig):
 
     def run(self, trial: ExplorationTrial) -> "RunConfig":
         """Return the configuration of a trial's run."""
-        from training.bench.exploration.trials import parted
+        from training.bench.exploration.players import parted
         from training.episodes.config import RunConfig
 
-        policy, action_type = parted(trial.policy)
+        player = parted(trial.policy)
         shared: dict[str, Any] = {
-            "world": trial.world, "robots": trial.robots, "policy": policy, "action_type": action_type,
+            "world": trial.world, "robots": trial.robots, "policy": player.policy, "action_type": player.action_type,
             "particles": self.particles, "rejuvenate_every": self.rejuvenate_every, "preset": self.preset,
             "sensor": self.sensor, "seed": trial.seed,
         }  # fmt: skip
@@ -247,10 +253,12 @@ class ExplorationBenchConfig(ExperimentConfig):
 
     def environment(self, trial: ExplorationTrial) -> "EnvConfig":
         """Return the environment of a trial: all policies have the same world for one seed and combination."""
+        from training.bench.exploration.players import parted
         from vslam_env.world import is_single_layout
 
         split = None if self.split == ANY_SPLIT or is_single_layout(trial.world) else self.split
-        oracles = {f"oracle_{name}": trial.oracle in (name, ALL_ORACLES) for name in ORACLES}
+        has_all = trial.oracle == ALL_ORACLES or parted(trial.policy).needs_oracles
+        oracles = {f"oracle_{name}": has_all or trial.oracle == name for name in ORACLES}
         return self.run(trial).environment().replace(world_split=split, **oracles)
 
 

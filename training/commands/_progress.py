@@ -3,10 +3,11 @@
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 if TYPE_CHECKING:  # numerical modules are imported when a command runs, so that --help is fast
@@ -67,6 +68,7 @@ class TrialSet:
     tell: Callable[[dict[str, Any]], str]  # Short description of a row
     cost: Callable[[Any], int] = lambda trial: 1  # Approximate cost of a trial, in an arbitrary unit
     processes: int = 1  # Number of parallel processes; 1: this process
+    failures: list[str] = field(default_factory=list)  # Errors of failed trials, appended as they end
 
 
 def run_trial_sets(
@@ -77,7 +79,7 @@ def run_trial_sets(
     Returns:
         Rows of all finished trials of each part, in the order of the trials.
     """
-    from training.experiments.trial_store import finished_trials, run_trials, trial_of
+    from training.experiments.trial_store import FAILED, finished_trials, run_trials, trial_of
 
     kept = [finished_trials(folder, part.file, part.kind) for part in parts]
     total = sum(part.cost(trial) for part in parts for trial in part.trials)
@@ -87,6 +89,12 @@ def run_trial_sets(
 
             def on_trial(row: dict[str, Any], part: TrialSet = part, found: dict[Any, Any] = found) -> None:
                 trial = trial_of(row, part.kind)
+                if FAILED in row:
+                    if row[FAILED] not in part.failures:  # once, even if it fails in each trial
+                        console.print(f"[red]error[/] {escape(row[FAILED])}", soft_wrap=True, highlight=False)
+                    part.failures.append(row[FAILED])
+                    advance("failed", part.cost(trial))
+                    return
                 found[trial] = row
                 advance(part.tell(row), part.cost(trial))
 
@@ -94,7 +102,11 @@ def run_trial_sets(
             run_trials(folder, part.file, part.play, left, part.processes, interrupted, on_trial)
     rows = [[found[t] for t in part.trials if t in found] for part, found in zip(parts, kept, strict=True)]
     finished, wanted = sum(map(len, rows)), sum(len(part.trials) for part in parts)
-    if finished < wanted:
+    failed = sum(len(part.failures) for part in parts)
+    if failed:
+        text = f"{failed} of {wanted} trials failed; the same command with --out {folder.path} repeats them."
+        console.print(text, soft_wrap=True)
+    if finished + failed < wanted:
         text = f"Stopped after {finished} of {wanted} trials; resume with --out {folder.path}."
         console.print(text, soft_wrap=True)
     return rows

@@ -170,6 +170,7 @@ def bench_exploration(call: Call[ExplorationBenchConfig], processes: Processes =
 
     All policies of a seed have the same worlds, starts and noise. Options in the plural take comma-separated values;
     all combinations are run. Robots with known poses, landmark names and merges show the cost of estimation.
+    Episodes of a policy that raises, returns no valid action or takes too long are left out, with status 2 at the end.
     Ctrl-C finishes the current episode; the same command with --out FOLDER resumes the run.
     """
     from training.bench.exploration import report
@@ -195,16 +196,29 @@ def bench_exploration(call: Call[ExplorationBenchConfig], processes: Processes =
     if over_time:
         report.draw_exploration(folder.path / "exploration.png", over_time)
     call.finish()
+    if part.failures:
+        raise typer.Exit(2)
 
 
 def _first_steps(config: ExplorationBenchConfig, trial: ExplorationTrial) -> None:
-    """Run the first two steps of a trial, to detect worlds that cannot be built and policies that fail."""
+    """Run the first two steps of a trial, to detect worlds that cannot be built, and compile what its policy needs.
+
+    The trial itself reports a policy that fails.
+    """
+    from contextlib import suppress
+
+    from training.bench.exploration.players import BOUND, parted
+    from training.episodes.guard import PolicyError
     from training.episodes.runner import run_episode
     from vslam_env import vslam_v0
 
-    steps = iter(range(2))
+    steps, player = iter(range(2)), parted(trial.policy)
+    if player.role == BOUND:
+        return
     env = vslam_v0.parallel_env(config=config.environment(trial))
-    run_episode(env, config.run(trial).make_policies(env), trial.seed, should_stop=lambda: next(steps, None) is None)
+    with suppress(PolicyError):
+        team = player.make(env, config.decision_limit)
+        run_episode(env, team, trial.seed, should_stop=lambda: next(steps, None) is None)
     env.close()
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from training.experiments.config import ONE_PARTICLE, ActionType, ExperimentConfig, NoisePreset, Sensor, option
 
 if TYPE_CHECKING:  # numerical modules are imported when a command runs, so that --help is fast
-    from agents.policy import Policy
+    from training.episodes.guard import GuardedTeam
     from vslam_env.config import EnvConfig
     from vslam_env.environment import ExplorationEnv
 
@@ -118,8 +118,10 @@ class RunConfig(ExperimentConfig):
 
         return vslam_v0.parallel_env(config=self.environment())
 
-    def make_policies(self, env: "ExplorationEnv") -> dict[str, "Policy"]:
+    def make_policies(self, env: "ExplorationEnv") -> "GuardedTeam":
         """Build one policy for each agent."""
         from agents.registry import make_policy
+        from training.episodes.guard import GuardedTeam
 
-        return {agent: make_policy(self.policy, self.action_type) for agent in env.possible_agents}
+        policies = {agent: make_policy(self.policy, self.action_type) for agent in env.possible_agents}
+        return GuardedTeam(policies, self.policy, self.action_type)

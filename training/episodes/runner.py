@@ -14,6 +14,7 @@ from slam_backend.geometry import between
 from slam_backend.maps.alignment_types import PairAttempts, count_attempts
 from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.trajectory import dead_reckoning
+from training.episodes.guard import GuardedTeam
 from vslam_env.config import TICK
 from vslam_env.environment import ExplorationEnv
 from vslam_env.rendering import Scene
@@ -84,36 +85,40 @@ class Progress:
 
 
 def run_episode(
-    env: ExplorationEnv, policies: Mapping[str, Policy], seed: int,
+    env: ExplorationEnv, policies: Mapping[str, Policy] | GuardedTeam, seed: int,
     on_step: Callable[[Progress], None] = lambda progress: None, should_stop: Callable[[], bool] = lambda: False,
 ) -> EpisodeRecord:  # fmt: skip
     """Run one episode to its end, or until `should_stop`.
 
     Args:
-        policies: Policy of each agent; policies see observations and beliefs, never infos.
+        policies: Policy of each agent, or all of them; policies see observations and beliefs, never infos.
         seed: Seed of the reset and of the policies' random draws, which are independent streams.
         on_step: Function called after the reset and after each step; it may inspect the environment.
 
     Raises:
-        ValueError: If an agent has no policy.
+        ValueError: If an agent has no policy, or a policy fails (`PolicyError`).
     """
     agents = list(env.possible_agents)
-    missing = [agent for agent in agents if agent not in policies]
-    if missing:
-        raise argument_error("policies", "a policy for each agent", f"no policy for {missing}", "Add them.")
-    streams = np.random.SeedSequence([seed, len(agents)]).spawn(len(agents))
+    if isinstance(policies, GuardedTeam):
+        team = policies
+    else:
+        missing = [agent for agent in agents if agent not in policies]
+        if missing:
+            raise argument_error("policies", "a policy for each agent", f"no policy for {missing}", "Add them.")
+        team = GuardedTeam(policies, type(policies[agents[0]]).__name__, env.config.action_type)
+    *streams, team_stream = np.random.SeedSequence([seed, len(agents)]).spawn(len(agents) + 1)
     rngs = {agent: np.random.default_rng(stream) for agent, stream in zip(agents, streams, strict=True)}
+    team_rng = np.random.default_rng(team_stream)
     odometry: list[FloatArray] = []
     env.recorder = lambda readings: odometry.append(
         np.stack([np.zeros(3) if r.odometry is None else r.odometry for r in readings])
     )
     observations, infos = env.reset(seed=seed)
-    for policy in policies.values():
-        policy.reset()
+    team.reset()
     log = _Log(env, infos)
     on_step(Progress(0, 0.0, infos, ()))
     while env.agents and not should_stop():
-        actions = {a: policies[a].act(observations[a], env.belief(a), rngs[a]) for a in env.agents}
+        actions = team.act_all(observations, {agent: env.belief(agent) for agent in env.agents}, rngs, team_rng)
         log.before_step()
         observations, rewards, _, _, infos = env.step(actions)
         on_step(replace(log.after_step(infos, len(odometry) - 1), rewards=rewards))

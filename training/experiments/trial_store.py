@@ -14,6 +14,7 @@ from slam_backend.core.validation import argument_error
 from training.experiments.interrupt import begin_worker, signals_held
 from training.experiments.run_folder import CONFIG_FILE, RunFolder, installed_versions, plain, read_config
 
+FAILED = "failed"  # field of the row of a trial without a result: the error, in one line
 SINGLE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 TrialT = TypeVar("TrialT")
@@ -80,6 +81,8 @@ def run_trials(
 ) -> None:  # fmt: skip
     """Run trials and append each to the folder as it ends; after an interrupt, running trials are finished.
 
+    Rows with the field `FAILED` are not kept, so that a resumed run repeats their trials.
+
     Args:
         play: Function that runs a trial and returns its row; importable by other processes.
         processes: Number of parallel processes; 1: this process.
@@ -91,7 +94,8 @@ def run_trials(
     with closing(_in_turn(play, going) if processes == 1 else _spread(play, going, processes)) as rows:
         for row in rows:
             kept = plain(row)
-            append_text(folder.path / name, json.dumps(kept, allow_nan=False) + "\n", "out")
+            if FAILED not in kept:
+                append_text(folder.path / name, json.dumps(kept, allow_nan=False) + "\n", "out")
             on_trial(kept)
 
 

@@ -41,6 +41,25 @@ class Stubborn:
 
     def act(self, observation, belief, rng):
         return int((observation["action_mask"] == 0).argmax())
+
+
+class Failing(Stubborn):
+    def act(self, observation, belief, rng):
+        if belief.tick > 20:
+            raise ValueError("gone\\nfor good")
+        return 0
+
+
+class Nonsense(Stubborn):
+    def act(self, observation, belief, rng):
+        return "left" if belief.tick > 20 else 0
+
+
+class Slow(Stubborn):
+    def act(self, observation, belief, rng):
+        while belief.tick > 40:
+            pass
+        return 0
 """
 
 
@@ -97,8 +116,8 @@ def test_oracles_remove_pose_errors(rows: list[dict[str, Any]]) -> None:
 
 def test_a_trial_repeats_itself(rows: list[dict[str, Any]]) -> None:
     """A repeated trial has the same metrics, except decision times."""
-    again = play(SMALL, SMALL.trials()[0])
-    assert {**again, "decision_ms": 0.0, "curves": 0} == {**rows[0], "decision_ms": 0.0, "curves": 0}
+    again, untimed = play(SMALL, SMALL.trials()[0]), {"decision_ms": 0.0, "decision_p99_ms": 0.0, "curves": 0}
+    assert {**again, **untimed} == {**rows[0], **untimed}
     for name in ("time_s", *CURVES):
         np.testing.assert_array_equal(again["curves"][name], rows[0]["curves"][name])
 
@@ -109,6 +128,54 @@ def test_custom_policies_can_be_compared(own_policy: str) -> None:
     row = play(config, config.trials()[0])
     assert row["invalid_actions"] == 2 * 4  # two robots, one decision per second
     assert row["way_m"] == 0.0
+
+
+def test_team_policies_and_bounds_are_marked() -> None:
+    """Team policies and bounds run by their labels, which stay in the rows; the bound `oracles` has all oracles."""
+    labels = ("mtsp@team", "oracles@bound", "rollout@bound")
+    config = ExplorationBenchConfig(policies=labels, worlds=("fig5",), robots=(2,), duration=3.0, particles=10)
+    rows = [play(config, trial) for trial in config.trials() if trial.oracle == "none" and trial.seed == config.seed]
+    assert [row["policy"] for row in rows] == list(labels)
+    assert rows[1]["pose_error"] < TOLD_M < rows[0]["pose_error"]
+    assert all(row["decision_p99_ms"] >= row["decision_ms"] > 0.0 for row in rows)
+
+
+@pytest.mark.parametrize(
+    ("label", "says"),
+    [
+        ("mtsp@flight", "mtsp@: expected one of 'goal', 'continuous', 'discrete', 'team', got 'flight'"),
+        ("frontier@bound", "bound: expected one of 'oracles', 'rollout', got 'frontier'"),
+        ("best@team", "policy: expected one of 'frontier', .* got 'best'"),
+        ("rollout", "policy: expected one of 'frontier', .* got 'rollout'"),
+    ],
+)
+def test_unknown_labels_are_refused(label: str, says: str) -> None:
+    """Unknown policies, bounds and action types are refused with the known ones."""
+    with pytest.raises(ValueError, match=says):
+        ExplorationBenchConfig(policies=(label,))
+
+
+def test_policies_that_fail_do_not_stop_the_others(vslam: Any, own_policy: str, tmp_path: Path) -> None:
+    """A policy that raises, returns nonsense or never returns costs one line each; all other episodes are kept."""
+    out, module = tmp_path / "run", own_policy.split(":")[0]
+    names = ["frontier", *(f"{module}:{name}" for name in ("Failing", "Nonsense", "Slow"))]
+    done = vslam(
+        "bench", "exploration", "--policies", ",".join(names), "--worlds", "fig5", "--robots", "2", "--oracles", "none",
+        "--duration", "6", "--particles", "10", "--seeds", "2", "--decision-limit", "0.5", "--out", str(out),
+    )  # fmt: skip
+    assert done.status == 2
+    lines = [line for line in done.out.splitlines() if line.startswith("error")]
+    for name, says in (
+        ("Failing", "expected act() to return, got ValueError: gone for good (a_users_policies.py, line"),
+        ("Nonsense", "actions['robot_0']: expected an int from 0 to"),
+        ("Slow", "expected decisions within 0.5 s, got one of at least 0.5 s"),
+    ):
+        assert [line for line in lines if f"policy '{module}:{name}'" in line and says in line], (says, done.out)
+    assert len(lines) == 3
+    assert "6 of 8 trials failed" in done.out
+    kept = [json.loads(line)["policy"] for line in (out / TRIALS_FILE).read_text().splitlines()]
+    assert kept == ["frontier", "frontier"]
+    assert (out / "tables.md").read_text().startswith("### fig5, K=2, 2 seeds")
 
 
 def _merge(time: float, error_m: float, undone: float | None = None) -> MergeRecord:
@@ -210,7 +277,8 @@ def test_stored_trials_are_not_run_again(
     assert [(trial.policy, trial.seed) for trial in played] == [(own_policy, 201)]
     assert (out / TRIALS_FILE).read_text().splitlines()[:3] == kept[:3]
     again = json.loads((out / "metrics.json").read_text())["trials"]
-    assert [row | {"decision_ms": 0} for row in again] == [row | {"decision_ms": 0} for row in first["trials"]]
+    untimed = {"decision_ms": 0.0, "decision_p99_ms": 0.0}
+    assert [row | untimed for row in again] == [row | untimed for row in first["trials"]]
 
 
 def test_paths_are_stored_absolute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -23,15 +23,15 @@ CONDITION = (*PLACE, "policy")
 FIGURES = (
     "coverage", "mean_coverage", "below_90_s", "reached_90", *TEAM, "pose_error", "way_m", "right_merges",
     "false_merges", "undone_merges", "first_merge_s", "last_merge_s", "one_group", "attempts", "collisions",
-    "invalid_actions", "decision_ms",
+    "invalid_actions", "decision_ms", "decision_p99_ms",
 )  # fmt: skip
 # Metrics for the comparison of policies: whether larger is better, heading, and factor.
 COMPARED = {
     "mean_coverage": (True, "over time [%]", 100.0), "below_90_s": (False, "below 90 % [s]", 1.0),
-    "map_error": (False, "E [cm]", 100.0), "map_rmse_m": (False, "RMSE [cm]", 100.0),
-    "pose_error": (False, "pose [cm]", 100.0),
+    "map_error": (False, "E [cm]", 100.0), "map_recall": (True, "recall [%]", 100.0),
+    "map_rmse_m": (False, "RMSE [cm]", 100.0), "pose_error": (False, "pose [cm]", 100.0),
 }  # fmt: skip
-COMPARED_HEADINGS = [heading for _, heading, _ in COMPARED.values()]
+PRINTED = ("mean_coverage", "below_90_s", "map_error", "map_recall", "pose_error")  # fit into 80 columns
 BELOW = "\n  "  # separator that puts the oracle on its own line
 CURVE_PANELS = {
     "coverage": ("floor seen [%]", 100.0), "map_error": ("map error E [m]", 1.0), "pose_error": ("pose error [m]", 1.0),
@@ -76,7 +76,7 @@ PARTS: dict[str, tuple[Column, ...]] = {
         Column("right", "right_merges", 2), Column("false", "false_merges", 2), Column("undone", "undone_merges", 2),
         Column("first [s]", "first_merge_s", 0), Column("last [s]", "last_merge_s", 0),
         Column("all in one group [%]", "one_group", 0, 100.0), Column("collisions [s]", "collisions", 1, 0.1),
-        Column("decision [ms]", "decision_ms", 2),
+        Column("decision [ms]", "decision_ms", 2), Column("99th percentile [ms]", "decision_p99_ms", 2),
     ),
 }  # fmt: skip
 
@@ -162,8 +162,9 @@ def print_tables(console: Console, lines: Rows, policies: Rows, oracles: Rows) -
         rows = [[who, *(column.cell(line, True) for column in IN_SHORT)] for who, line in _named(own, BELOW)]
         console.print(console_table(title, _stacked(column.heading for column in IN_SHORT), rows))
         for heading, differences in comparisons:
-            cells = _difference_rows(differences, True)
-            console.print(console_table(f"{title}: {heading}", _stacked(COMPARED_HEADINGS), cells))
+            cells = _difference_rows(differences, PRINTED, True)
+            headings = _stacked(COMPARED[name][1] for name in PRINTED)
+            console.print(console_table(f"{title}: {heading}", headings, cells))
 
 
 def markdown(lines: Rows, policies: Rows, oracles: Rows) -> str:
@@ -175,7 +176,8 @@ def markdown(lines: Rows, policies: Rows, oracles: Rows) -> str:
             rows = [[who, *(column.cell(line) for column in columns)] for who, line in _named(own)]
             parts.append(markdown_table([title, *(column.heading for column in columns)], rows))
         for heading, differences in comparisons:
-            parts.append(markdown_table([heading, *COMPARED_HEADINGS], _difference_rows(differences, False)))
+            headings = [heading, *(text for _, text, _ in COMPARED.values())]
+            parts.append(markdown_table(headings, _difference_rows(differences, tuple(COMPARED), False)))
     return "\n".join(parts)
 
 
@@ -217,18 +219,15 @@ def _places(lines: Rows, policies: Rows, oracles: Rows) -> Iterator[tuple[str, R
         yield f"{label(world)}, K={robots}, {count}", own, comparisons
 
 
-def _difference_rows(differences: Rows, stacked: bool) -> list[list[str]]:
-    """Return the differences of each policy and oracle as text, after their labels."""
+def _difference_rows(differences: Rows, names: Sequence[str], stacked: bool) -> list[list[str]]:
+    """Return the differences of each policy and oracle in some metrics as text, after their labels."""
     by_name: dict[str, dict[str, Mapping[str, Any]]] = {}
     for line in differences:
         by_name.setdefault(policy_label(line, BELOW if stacked else ", "), {})[line["figure"]] = line
     return [
         [
             who,
-            *(
-                format_ci(own[n], "more", 1, factor, stacked) if n in own else "-"
-                for n, (_, _, factor) in COMPARED.items()
-            ),
+            *(format_ci(own[name], "more", 1, COMPARED[name][2], stacked) if name in own else "-" for name in names),
         ]
         for who, own in by_name.items()
     ]

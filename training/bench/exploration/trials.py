@@ -1,21 +1,20 @@
 """Trial of `vslam bench exploration`: an episode, and its metrics for the comparison of policies."""
 
-import time
 from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
-from agents.policy import Policy
-from agents.registry import action_types
-from slam_backend.core.validation import FloatArray, check_choice
+from slam_backend.core.validation import FloatArray
 from slam_backend.geometry import compose
 from training.bench.config import ExplorationBenchConfig, ExplorationTrial
+from training.bench.exploration.players import parted
+from training.episodes.guard import PolicyError
 from training.episodes.metrics import score_episode
 from training.episodes.runner import EpisodeRecord, MergeRecord, run_episode
+from training.experiments.trial_store import FAILED
 from vslam_env import vslam_v0
-from vslam_env.belief.team_belief import Belief
 
 TRIALS_FILE = "trials.jsonl"
 NEARLY_ALL = 0.9  # share of the floor
@@ -34,19 +33,27 @@ def play(config: ExplorationBenchConfig, trial: ExplorationTrial) -> dict[str, A
     - For the team: `right_merges`, `false_merges`, `undone_merges`, `first_merge_s`, `last_merge_s`, see
       `count_merges`; `one_group`: whether all share a map at the end; `attempts`, `collisions` (ticks),
       `invalid_actions`.
-    - `decision_ms`: median processor time of a decision of the policy.
+    - `decision_ms`, `decision_p99_ms`: median and 99th percentile of the processor time of a decision of the policy, of
+      a team policy for all robots.
     - `curves`: `time_s` and the values of `CURVES` at these times.
+
+    If the policy fails, the trial is returned with the error as `failed`, and no metrics.
     """
     env = vslam_v0.parallel_env(config=config.environment(trial))
-    timed = {agent: _Timed(policy) for agent, policy in config.run(trial).make_policies(env).items()}
+    team = parted(trial.policy).make(env, config.decision_limit)
     invalid = 0
 
     def count(progress: Any) -> None:
         nonlocal invalid
         invalid += sum(info["invalid_action"] for info in progress.infos.values())
 
-    record = run_episode(env, timed, trial.seed, count)
-    env.close()
+    try:
+        record = run_episode(env, team, trial.seed, count)
+    except PolicyError as error:
+        return {**asdict(trial), FAILED: str(error)}
+    finally:
+        env.close()
+    taken = 1e3 * np.array(team.seconds)
     scores = score_episode(record)
     seconds = np.arange(np.floor(record.times[-1]) + 1.0)
     covered = _at(record.times, record.coverage, seconds)
@@ -62,22 +69,9 @@ def play(config: ExplorationBenchConfig, trial: ExplorationTrial) -> dict[str, A
         "way_m": scores["team"]["path_m"], **count_merges(record.merges), "one_group": len(record.groups) == 1,
         "attempts": record.attempts, "collisions": sum(int(info["collisions"]) for info in record.infos),
         "invalid_actions": invalid,
-        "decision_ms": 1e3 * float(np.median([taken for policy in timed.values() for taken in policy.seconds])),
+        "decision_ms": float(np.median(taken)), "decision_p99_ms": float(np.quantile(taken, 0.99)),
         "curves": {"time_s": points} | {n: _at(record.times, v, points) for n, v in zip(CURVES, lines, strict=True)},
     }  # fmt: skip
-
-
-def parted(policy: str) -> tuple[str, str]:
-    """Return the name and action type of a policy: `goal` if the policy supports it, unless `@` selects another.
-
-    Raises:
-        ValueError: If there is no such policy, or it does not support the action type.
-    """
-    name, at, wanted = policy.rpartition("@") if "@" in policy else (policy, "", "")
-    known = action_types(name)
-    return name, check_choice(
-        f"{name}@", wanted, known, "Choose an action type that the policy supports."
-    ) if at else known[0]
 
 
 def count_merges(merges: Sequence[MergeRecord]) -> dict[str, Any]:
@@ -93,23 +87,6 @@ def count_merges(merges: Sequence[MergeRecord]) -> dict[str, Any]:
         "undone_merges": sum(merge.undone is not None for merge in merges), "first_merge_s": min(right, default=None),
         "last_merge_s": max(right, default=None),
     }  # fmt: skip
-
-
-class _Timed:
-    """Policy with a record of the processor time [s] of each decision."""
-
-    def __init__(self, policy: Policy) -> None:
-        self._policy = policy
-        self.seconds: list[float] = []
-
-    def reset(self) -> None:
-        self._policy.reset()
-
-    def act(self, observation: Any, belief: Belief, rng: np.random.Generator) -> Any:
-        begin = time.thread_time()
-        action = self._policy.act(observation, belief, rng)
-        self.seconds.append(time.thread_time() - begin)
-        return action
 
 
 def _at(times: FloatArray, values: FloatArray, when: FloatArray) -> FloatArray:

@@ -1,0 +1,76 @@
+"""Policies of the exploration benchmark: of each robot, of the team, and bounds, by their names on the command line."""
+
+from typing import NamedTuple
+
+from agents.bounds import BOUNDS, make_bound
+from agents.registry import action_types, make_policy, make_team_policy
+from slam_backend.core.validation import check_choice
+from training.episodes.guard import GuardedTeam
+from vslam_env.environment import ExplorationEnv
+
+ROBOT, TEAM, BOUND = "robot", "team", "bound"
+BASE = "frontier"  # base policy of the bounds
+
+
+class Player(NamedTuple):
+    """Policy of a trial.
+
+    Attributes:
+        label: Name on the command line and in results, which marks team policies and bounds.
+        name: Name of the policy or the bound.
+        action_type: Action type.
+        role: `robot`, `team` or `bound`.
+    """
+
+    label: str
+    name: str
+    action_type: str
+    role: str
+
+    @property
+    def policy(self) -> str:
+        """Name of a policy: that of the base policy for a bound."""
+        return BASE if self.role == BOUND else self.name
+
+    @property
+    def needs_oracles(self) -> bool:
+        """Whether the environment must tell the robots the truth."""
+        return self.role == BOUND and self.name == "oracles"
+
+    def make(self, env: ExplorationEnv, limit: float) -> GuardedTeam:
+        """Make the policies of an environment's robots.
+
+        Args:
+            env: Environment of the episode.
+            limit: Longest time of a decision [s]; bounds have none.
+        """
+        if self.role == BOUND:
+            return GuardedTeam(make_bound(self.name, env, BASE), self.label, self.action_type)
+        if self.role == TEAM:
+            return GuardedTeam(make_team_policy(self.name, self.action_type), self.label, self.action_type, limit)
+        policies = {agent: make_policy(self.name, self.action_type) for agent in env.possible_agents}
+        return GuardedTeam(policies, self.label, self.action_type, limit)
+
+
+def parted(label: str) -> Player:
+    """Return the policy of a label: `goal` if the policy supports it, unless `@` selects another action type.
+
+    `NAME@team` is the central team policy, `NAME@bound` a bound.
+
+    Raises:
+        ValueError: If there is no such policy, or it does not support the action type.
+
+    >>> parted("mtsp@team").role, parted("frontier@discrete").action_type, parted("random_walk").action_type
+    ('team', 'discrete', 'continuous')
+    """
+    name, at, wanted = label.rpartition("@") if "@" in label else (label, "", "")
+    if wanted == BOUND:
+        hint = "Choose one of these; policies have no @bound."
+        return Player(label, check_choice("bound", name, BOUNDS, hint), "goal", BOUND)
+    known = action_types(name)
+    if not at:
+        return Player(label, name, known[0], ROBOT)
+    choices = (*known, TEAM)
+    hint = "Choose an action type that the policy supports, or team."
+    check_choice(f"{name}@", wanted, choices, hint)
+    return Player(label, name, known[0], TEAM) if wanted == TEAM else Player(label, name, wanted, ROBOT)
