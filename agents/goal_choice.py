@@ -112,6 +112,11 @@ def frontier_slots(candidates: Candidates) -> IntArray:
     return np.flatnonzero(candidates.valid)
 
 
+def unknown_area(candidates: Candidates, slots: IntArray) -> FloatArray:
+    """Return the unknown area (n,) [m^2] that is expected behind frontiers: their length times a depth of 2 m."""
+    return np.asarray(2.0 * candidates.features[slots, 3], dtype=np.float64)
+
+
 def own_share(belief: Belief, slots: IntArray) -> IntArray:
     """Return those of the slots to which no teammate is nearer, in a straight line; all of them if there are none."""
     candidates = belief.candidates

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+from agents.d_optimality import DOptimality
 from agents.distance_advantage import distance_advantage
 from agents.goal_choice import DrivingPolicy, GoalPolicy, Planner
 from agents.hungarian import hungarian
@@ -14,6 +15,7 @@ from agents.plugins import ACTION_TYPES, is_plugin, load_plugin, plugin_action_t
 from agents.policy import Policy
 from agents.random_goals import RandomGoals
 from agents.random_walk import RandomWalk
+from agents.rbpf_gain import RbpfGain
 from agents.tare import tare
 from agents.team import Assign, Assigned, CentralPolicy, SeparatePolicies, TeamPolicy
 from agents.trained import SUFFIX, TrainedGoalPolicy, load_model
@@ -31,6 +33,8 @@ ASSIGNMENTS: dict[str, Assign] = {
 PLANNERS: dict[str, Callable[[], Planner]] = {
     "frontier": NearestFrontier,
     "independent_frontier": IndependentFrontier,
+    "rbpf_gain": RbpfGain,
+    "d_optimality": DOptimality,
     **{name: partial(Assigned, assign) for name, assign in ASSIGNMENTS.items()},
 }
 POLICIES: dict[str, tuple[str, ...]] = {  # with supported action types; comparisons of policies use the first one

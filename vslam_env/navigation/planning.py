@@ -98,6 +98,7 @@ class DistanceMap:
     The arrays cover the known part of the grid and a margin.
 
     Attributes:
+        start: Position (2,) [m], start frame, where all paths begin.
         corner: Row and column in the grid of the first cell of the arrays.
         box: (h, w) uint8. Cells of the grid; 3 outside the grid.
         weights: (h, w) uint8. Cost per length; 0 for impassable cells.
@@ -105,6 +106,7 @@ class DistanceMap:
         parent: (h, w) int32. Flat index of the previous cell on that path; -1 at the start and if unreachable.
     """
 
+    start: tuple[float, float]
     corner: tuple[int, int]
     box: NDArray[np.uint8]
     weights: NDArray[np.uint8]
@@ -117,6 +119,22 @@ class DistanceMap:
         x, y = (min(max(coordinate, -limit), limit) for coordinate in point_floats(xy, "xy"))
         row, col = math.floor((y + HALF_WIDTH) / CELL), math.floor((x + HALF_WIDTH) / CELL)
         return row - self.corner[0], col - self.corner[1]
+
+    def path_to(self, goal_xy: ArrayLike) -> FloatArray | None:
+        """Return the path from the start to a goal, as `plan_path` does.
+
+        Args:
+            goal_xy: (2,) float64 [m], start frame.
+        """
+        goal = point_floats(goal_xy, "goal_xy")
+        goal_cell = self.cell_of(goal)
+        end_cell = nearest_open(self.box, self.weights, *goal_cell, GOAL_CELLS)
+        if end_cell[0] < 0 or self.cost[end_cell] == UNREACHED:
+            return None
+        corners = shorten_path(self.weights, self.cost, self.parent, *end_cell)
+        centres = centre_of(corners + np.array(self.corner))
+        between = centres[1:-1] if tuple(corners[0]) == self.cell_of(self.start) else centres[:-1]
+        return np.vstack([self.start, between, goal if end_cell == goal_cell else centres[-1]])
 
 
 def distance_map(cells: NDArray[np.uint8], start_xy: ArrayLike, radius: float = 0.2) -> DistanceMap:
@@ -137,7 +155,7 @@ def distance_map(cells: NDArray[np.uint8], start_xy: ArrayLike, radius: float = 
     check_cells(cells)
     start = _checked_start(start_xy, radius)
     box, weights, cost, parent, row, col = dijkstra(cells, known_bounds(cells), *start)
-    return DistanceMap(corner=(row, col), box=box, weights=weights, cost=cost, parent=parent)
+    return DistanceMap(start=start[:2], corner=(row, col), box=box, weights=weights, cost=cost, parent=parent)
 
 
 def _checked_start(start_xy: ArrayLike, radius: float) -> tuple[float, float, float]:
@@ -165,16 +183,7 @@ def plan_path(
     Raises:
         ValueError: If the cells are not a grid's, or a number is not finite.
     """
-    start, goal = point_floats(start_xy, "start_xy"), point_floats(goal_xy, "goal_xy")
-    paths = distance_map(cells, start, radius)
-    goal_cell = paths.cell_of(goal)
-    end_cell = nearest_open(paths.box, paths.weights, *goal_cell, GOAL_CELLS)
-    if end_cell[0] < 0 or paths.cost[end_cell] == UNREACHED:
-        return None
-    corners = shorten_path(paths.weights, paths.cost, paths.parent, *end_cell)
-    centres = centre_of(corners + np.array(paths.corner))
-    between = centres[1:-1] if tuple(corners[0]) == paths.cell_of(start) else centres[:-1]
-    return np.vstack([start, between, goal if end_cell == goal_cell else centres[-1]])
+    return distance_map(cells, start_xy, radius).path_to(goal_xy)
 
 
 @in_place

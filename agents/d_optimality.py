@@ -1,0 +1,45 @@
+"""`DOptimality`: planner that explores where the pose stays well known.
+
+Carrillo, Reid and Castellanos, "On the comparison of uncertainty criteria for active SLAM", ICRA 2012: of the paths to
+the candidates the one with the least D-optimality of the predicted covariances is taken, since only this criterion is
+monotonic. Placed et al., "A survey on active simultaneous localization and mapping", T-RO 2023, weigh it against what
+the path discovers: here unknown area in view per metre of path, divided by the ratio of the mean D-optimality along
+the path to that of now. Robots leave frontiers to which a teammate is nearer.
+"""
+
+import numpy as np
+
+from agents.goal_choice import SWITCH_RATIO, frontier_slots, own_share, unknown_area
+from agents.predicted_pose import PosePredictor, d_optimality
+from vslam_env.belief.team_belief import Belief
+
+LEAST = 1e-3  # D-optimality below which the pose counts as known: .02 m and .001 rad or so
+REACH = 3.0  # [m] added to the length of a path
+MOST_PREDICTED = 8  # nearest candidates whose poses are predicted
+
+
+class DOptimality:
+    """Planner that chooses the frontier with the most unknown area for path length and uncertainty of the pose."""
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Clear the state of the last episode."""
+        self._held: int | None = None
+
+    def choose(self, belief: Belief, rng: np.random.Generator) -> int | None:
+        """Return the slot to go to; the path to the previous one counts half."""
+        candidates = belief.candidates
+        slots = own_share(belief, frontier_slots(candidates))
+        slots = slots[np.argsort(candidates.lengths[slots], kind="stable")][:MOST_PREDICTED]
+        if not len(slots):
+            self._held = None
+            return None
+        predictor = PosePredictor(belief)
+        now = LEAST + float(d_optimality(belief.covariance + 1e-12 * np.eye(3)))
+        ahead = np.array([LEAST + d_optimality(predictor.along(int(slot))).mean() for slot in slots])
+        lengths = np.where(slots == self._held, SWITCH_RATIO, 1.0) * candidates.lengths[slots]
+        values = (0.5 + unknown_area(candidates, slots)) / (REACH + lengths) * now / ahead
+        self._held = int(slots[np.argmax(values)])
+        return self._held
