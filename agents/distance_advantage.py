@@ -18,7 +18,7 @@ def distance_advantage(targets: Targets, rng: np.random.Generator) -> IntArray:
     n = len(targets.places)
     remoteness = targets.between.sum(axis=1) / max(1, n - 1)
     assigned = np.zeros(len(targets.lengths), np.int64)
-    for robot, ways in enumerate(targets.lengths):
+    for robot, ways in enumerate(targets.lengths[: targets.num_deciding]):
         own = targets.share(robot)
         if len(own):
             assigned[robot] = own[np.argmin(ways[own] - REMOTENESS * remoteness[own])]

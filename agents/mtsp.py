@@ -16,7 +16,7 @@ def mtsp(targets: Targets, rng: np.random.Generator) -> IntArray:
     """Return the target (K,) of each robot: the first of its tour, or the nearest if it has no share."""
     owners = share_places(targets.lengths, targets.between)
     assigned: IntArray = targets.lengths.argmin(axis=1)
-    for robot, ways in enumerate(targets.lengths):
+    for robot, ways in enumerate(targets.lengths[: targets.num_deciding]):
         own = np.flatnonzero(owners == robot)
         if len(own):
             assigned[robot] = own[open_tour(ways[own], targets.between[np.ix_(own, own)])[0]]

@@ -14,7 +14,7 @@ from slam_backend.core.validation import BoolArray, IntArray
 from vslam_env.navigation import frontier_cells, open_tour, sees, tour_length
 
 COVER_RANGE = 4.0  # [m] range from which frontier cells count as covered
-DRAWS = 8  # sets of viewpoints that are tried
+DRAWS = 5  # sets of viewpoints that are tried
 LEFT_OVER = 2  # frontier cells that a viewpoint must newly cover
 
 
@@ -22,7 +22,7 @@ def tare(targets: Targets, rng: np.random.Generator) -> IntArray:
     """Return the target (K,) of each robot: the first viewpoint of its tour."""
     covers = sees(targets.ways, targets.places, frontier_cells(targets.ways), COVER_RANGE)
     assigned: IntArray = targets.lengths.argmin(axis=1)
-    for robot, ways in enumerate(targets.lengths):
+    for robot, ways in enumerate(targets.lengths[: targets.num_deciding]):
         own = targets.share(robot)
         if not len(own):
             continue

@@ -29,6 +29,7 @@ class Targets:
         lengths: (K, n) float64 [m]. Lengths of the paths from the robots to the goals; `NO_PATH`: none is known.
             The length to a goal that a robot holds is halved, so that it is kept unless another is much better.
         slots: (K, n) int64. Slots of the frontiers among the candidates of each robot; -1: none.
+        num_deciding: Number of robots, the first ones, whose targets are asked for; those of the others may be any.
     """
 
     ways: DistanceMap
@@ -36,6 +37,7 @@ class Targets:
     places: FloatArray
     lengths: FloatArray
     slots: IntArray
+    num_deciding: int
 
     @cached_property
     def between(self) -> FloatArray:
@@ -89,7 +91,7 @@ def own_targets(belief: Belief, held: int | None) -> Targets | None:
         lengths[0, slots == held] *= SWITCH_RATIO
     own = np.full(lengths.shape, -1)
     own[0] = slots
-    return Targets(ways, positions, places, lengths, own)
+    return Targets(ways, positions, places, lengths, own, 1)
 
 
 def team_targets(beliefs: Sequence[Belief], held: Mapping[int, int | None]) -> Targets | None:
@@ -124,7 +126,7 @@ def team_targets(beliefs: Sequence[Belief], held: Mapping[int, int | None]) -> T
     for row, target, slot, length in entries:
         lengths[row, target], own[row, target] = length, slot
     ways = distance_map(first.grid.cells, first.pose[:2])
-    return Targets(ways, np.array(positions), np.array(places), lengths, own)
+    return Targets(ways, np.array(positions), np.array(places), lengths, own, len(beliefs))
 
 
 def _nearest(belief: Belief) -> IntArray:

@@ -33,7 +33,7 @@ def _targets(positions: list[tuple[float, float]], places: list[tuple[float, flo
     robots, goals = np.array(positions), np.array(places)
     lengths = np.linalg.norm(robots[:, None] - goals[None], axis=-1)
     slots = np.tile(np.arange(len(goals)), (len(robots), 1))
-    return Targets(distance_map(grid.cells, robots[0]), robots, goals, lengths, slots)
+    return Targets(distance_map(grid.cells, robots[0]), robots, goals, lengths, slots, len(robots))
 
 
 def test_assignments_agree_with_brute_force() -> None:
