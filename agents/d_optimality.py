@@ -10,12 +10,12 @@ the path to that of now. Robots leave frontiers to which a teammate is nearer.
 import numpy as np
 
 from agents.goal_choice import SWITCH_RATIO, frontier_slots, own_share, unknown_area
-from agents.predicted_pose import PosePredictor, d_optimality
+from agents.predicted_pose import d_optimality, predict_covariances
 from vslam_env.belief.team_belief import Belief
 
 LEAST = 1e-3  # D-optimality below which the pose counts as known: .02 m and .001 rad or so
 REACH = 3.0  # [m] added to the length of a path
-MOST_PREDICTED = 8  # nearest candidates whose poses are predicted
+MOST_PREDICTED = 6  # nearest candidates whose poses are predicted
 
 
 class DOptimality:
@@ -36,9 +36,8 @@ class DOptimality:
         if not len(slots):
             self._held = None
             return None
-        predictor = PosePredictor(belief)
         now = LEAST + float(d_optimality(belief.covariance + 1e-12 * np.eye(3)))
-        ahead = np.array([LEAST + d_optimality(predictor.along(int(slot))).mean() for slot in slots])
+        ahead = np.array([LEAST + d_optimality(found).mean() for found in predict_covariances(belief, slots)])
         lengths = np.where(slots == self._held, SWITCH_RATIO, 1.0) * candidates.lengths[slots]
         values = (0.5 + unknown_area(candidates, slots)) / (REACH + lengths) * now / ahead
         self._held = int(slots[np.argmax(values)])

@@ -2,7 +2,7 @@
 
 The covariance grows with the motion, as the filter's odometry model assumes, and shrinks by the landmarks of the own
 map that come into view (extended Kalman filter without noise in the mean). Readings are idealised: every landmark in
-view within `SIGHT` and not behind a wall is measured once per metre.
+view within `SIGHT` and not behind a wall is measured once every `STEP`.
 """
 
 import math
@@ -15,73 +15,69 @@ from vslam_env.belief.team_belief import Belief
 from vslam_env.navigation import DistanceMap, cells_of, distance_map, sees
 
 SIGHT, HALF_VIEW = 6.0, 0.46  # [m], [rad] range and half the angle of view
-STEP = 1.0  # [m] between predicted measurements
+STEP = 1.5  # [m] between predicted measurements
 ALONG, ACROSS, TURN = 0.05, 0.02, math.pi / 90.0  # [m/m], [m/m], [rad/m]: assumed noise of the odometry
 RANGE_SIGMA, SIDE_SIGMA = 0.01, 0.01  # [1/m] times the squared range, [m/m] times the range
-MOST_LANDMARKS = 60  # nearest to a viewpoint
+LEAST_COVARIANCE = np.diag([1e-8, 1e-8, 1e-8])  # [m^2, m^2, rad^2] of a step, so that covariances are invertible
 
 
-class PosePredictor:
-    """Predictor for one robot at one time.
+def predict_covariances(belief: Belief, slots: IntArray) -> list[FloatArray]:
+    """Return the predicted covariances (n_i, 3, 3) of the pose on the way to each candidate, the last one at its goal.
 
     Args:
         belief: Belief of the robot.
+        slots: (k,) int64. Slots of candidates. Without a known path the present covariance is returned.
     """
+    ways, candidates = distance_map(belief.grid.cells, belief.pose[:2]), belief.candidates
+    paths = [ways.path_to(candidates.goals[slot]) for slot in slots]
+    poses = [
+        belief.pose[None] if path is None else _poses_along(path, float(candidates.headings[slot]))
+        for slot, path in zip(slots, paths, strict=True)
+    ]
+    held = belief.map
+    information = _information(np.concatenate(poses), ways, held.means[:, :2], held.covariances[:, :2, :2])
+    # All paths advance together; shorter ones stay at their goals.
+    longest = max(map(len, poses))
+    all_poses = np.stack([np.vstack([own, np.repeat(own[-1:], longest - len(own), axis=0)]) for own in poses])
+    gained = np.zeros((len(poses), longest, 3, 3))
+    starts = np.cumsum([0, *map(len, poses)])
+    for k, own in enumerate(poses):
+        gained[k, : len(own)] = information[starts[k] : starts[k + 1]]
+    covariance = np.repeat(belief.covariance[None] + LEAST_COVARIANCE, len(poses), axis=0)
+    before, found = np.repeat(belief.pose[None], len(poses), axis=0), []
+    for step in range(longest):
+        covariance = _moved(covariance, before, all_poses[:, step])
+        covariance = np.asarray(np.linalg.inv(np.linalg.inv(covariance) + gained[:, step]), dtype=np.float64)
+        covariance = np.asarray(0.5 * (covariance + covariance.transpose(0, 2, 1)), dtype=np.float64)
+        found.append(covariance)
+        before = all_poses[:, step]
+    together = np.stack(found, axis=1)
+    return [together[k, : len(own)] for k, own in enumerate(poses)]
 
-    def __init__(self, belief: Belief) -> None:
-        self._belief = belief
-        self._ways: DistanceMap = distance_map(belief.grid.cells, belief.pose[:2])
-        held = belief.map
-        self._landmarks, self._covariances = held.means[:, :2], held.covariances[:, :2, :2]
-        self._cells: IntArray = cells_of(self._ways, self._landmarks)
 
-    def along(self, slot: int) -> FloatArray:
-        """Return the predicted covariances (n, 3, 3) of the pose on the way to a candidate, the last one at its goal.
+def _information(poses: FloatArray, ways: DistanceMap, landmarks: FloatArray, covariances: FloatArray) -> FloatArray:
+    """Return the information (P, 3, 3) about poses (P, 3) from one measurement of each landmark in view.
 
-        Args:
-            slot: Slot of a candidate.
-        """
-        candidates = self._belief.candidates
-        path = self._ways.path_to(candidates.goals[slot])
-        if path is None:
-            return self._belief.covariance[None].copy()
-        poses = _poses_along(path, float(candidates.headings[slot]))
-        covariance, found = self._belief.covariance.copy(), []
-        visible = self._in_view(poses)
-        before = self._belief.pose
-        for pose, seen in zip(poses, visible, strict=True):
-            covariance = _moved(covariance, before, pose)
-            information = np.linalg.inv(covariance) + self._information(pose, np.flatnonzero(seen))
-            covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
-            covariance = np.asarray(0.5 * (covariance + covariance.T), dtype=np.float64)
-            found.append(covariance)
-            before = pose
-        return np.array(found)
-
-    def _in_view(self, poses: FloatArray) -> FloatArray:
-        """Return which landmarks are in view from which poses, (n, N) bool."""
-        gaps = self._landmarks[None] - poses[:, None, :2]
-        bearings = np.arctan2(gaps[..., 1], gaps[..., 0]) - poses[:, None, 2]
-        ahead = np.abs((bearings + math.pi) % (2.0 * math.pi) - math.pi) < HALF_VIEW
-        near = np.linalg.norm(gaps, axis=-1) < SIGHT
-        return np.asarray(ahead & near & sees(self._ways, poses[:, :2], self._cells, SIGHT))
-
-    def _information(self, pose: FloatArray, seen: IntArray) -> FloatArray:
-        """Return the information (3, 3) about a pose from one measurement of each of some landmarks."""
-        gaps = self._landmarks[seen] - pose[:2]
-        ranges = np.linalg.norm(gaps, axis=1)
-        nearest = np.argsort(ranges, kind="stable")[:MOST_LANDMARKS]
-        gaps, ranges, seen = gaps[nearest], np.maximum(ranges[nearest], 0.5), seen[nearest]
-        # World frame: measured offset = landmark - position, turned by the heading's error
-        jacobian = np.zeros((len(seen), 2, 3))
-        jacobian[:, 0, 0] = jacobian[:, 1, 1] = -1.0
-        jacobian[:, 0, 2], jacobian[:, 1, 2] = gaps[:, 1], -gaps[:, 0]
-        along = gaps / ranges[:, None]
-        outer = along[:, :, None] * along[:, None, :]
-        noise = (RANGE_SIGMA * ranges**2)[:, None, None] ** 2 * outer
-        noise = noise + (SIDE_SIGMA * ranges)[:, None, None] ** 2 * (np.eye(2) - outer) + self._covariances[seen]
-        solved = np.linalg.solve(noise, jacobian)
-        return np.asarray(np.einsum("kij,kil->jl", jacobian, solved))
+    The jacobian is that of the offset from the robot to the landmark, rotated to the world's axes.
+    """
+    gaps = landmarks[None] - poses[:, None, :2]
+    bearings = np.arctan2(gaps[..., 1], gaps[..., 0]) - poses[:, None, 2]
+    in_view = np.abs((bearings + math.pi) % (2.0 * math.pi) - math.pi) < HALF_VIEW
+    in_view &= (gaps**2).sum(axis=-1) < SIGHT**2
+    in_view &= sees(ways, poses[:, :2], cells_of(ways, landmarks), SIGHT)
+    pose, landmark = np.nonzero(in_view)
+    offsets = gaps[pose, landmark]
+    ranges = np.maximum(np.hypot(offsets[:, 0], offsets[:, 1]), 0.5)
+    along = offsets / ranges[:, None]
+    outer = along[:, :, None] * along[:, None, :]
+    noise = (SIDE_SIGMA * ranges)[:, None, None] ** 2 * (np.eye(2) - outer) + covariances[landmark]
+    noise = noise + (RANGE_SIGMA * ranges**2)[:, None, None] ** 2 * outer
+    jacobians = np.zeros((len(pose), 2, 3))
+    jacobians[:, 0, 0] = jacobians[:, 1, 1] = -1.0
+    jacobians[:, 0, 2], jacobians[:, 1, 2] = offsets[:, 1], -offsets[:, 0]
+    summed = np.zeros((len(poses), 3, 3))
+    np.add.at(summed, pose, jacobians.transpose(0, 2, 1) @ np.linalg.solve(noise, jacobians))
+    return summed
 
 
 def d_optimality(covariances: FloatArray | Sequence[FloatArray]) -> FloatArray:
@@ -100,14 +96,15 @@ def _poses_along(path: FloatArray, final_heading: float) -> FloatArray:
     return np.column_stack([np.vstack([points, points[-1:]]), [*headings, final_heading]])
 
 
-def _moved(covariance: FloatArray, before: FloatArray, after: FloatArray) -> FloatArray:
-    """Return the covariance (3, 3) after a motion between two poses (3,)."""
-    dx, dy = after[:2] - before[:2]
-    distance = math.hypot(dx, dy)
-    jacobian = np.eye(3)
-    jacobian[0, 2], jacobian[1, 2] = -dy, dx
-    c, s = (dx / distance, dy / distance) if distance > 0.0 else (1.0, 0.0)
-    turned = np.array([[c, -s], [s, c]])
-    noise = np.diag([1e-8, 1e-8, (TURN * distance) ** 2 + 1e-8])
-    noise[:2, :2] += turned @ np.diag([(ALONG * distance) ** 2, (ACROSS * distance) ** 2]) @ turned.T
-    return np.asarray(jacobian @ covariance @ jacobian.T + noise)
+def _moved(covariances: FloatArray, before: FloatArray, after: FloatArray) -> FloatArray:
+    """Return covariances (k, 3, 3) after motions between poses (k, 3)."""
+    moves = after[:, :2] - before[:, :2]
+    distances = np.hypot(moves[:, 0], moves[:, 1])
+    jacobians = np.tile(np.eye(3), (len(moves), 1, 1))
+    jacobians[:, 0, 2], jacobians[:, 1, 2] = -moves[:, 1], moves[:, 0]
+    outer = moves[:, :, None] * moves[:, None, :]  # squared distance along the motion
+    across = distances[:, None, None] ** 2 * np.eye(2) - outer
+    noise = np.tile(LEAST_COVARIANCE, (len(moves), 1, 1))
+    noise[:, :2, :2] += ALONG**2 * outer + ACROSS**2 * across
+    noise[:, 2, 2] += (TURN * distances) ** 2
+    return np.asarray(jacobians @ covariances @ jacobians.transpose(0, 2, 1) + noise)

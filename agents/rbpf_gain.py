@@ -3,8 +3,8 @@
 Stachniss, Grisetti and Burgard, "Information gain-based exploration using Rao-Blackwellized particle filters", RSS
 2005: the entropy of the posterior over paths and maps is that of the paths plus the expected one of the map; an action
 is simulated and its expected gain weighed against its cost. Deviations: the entropy of paths is that of the Gaussian
-with the particles' covariance, predicted by `PosePredictor` instead of sampled readings, and the unknown area in view
-stands for the simulated scans. Robots leave frontiers to which a teammate is nearer.
+with the particles' covariance, predicted by `predict_covariances` instead of sampled readings, and unknown area stands
+for the simulated scans. Robots leave frontiers to which a teammate is nearer.
 """
 
 import math
@@ -12,14 +12,14 @@ import math
 import numpy as np
 
 from agents.goal_choice import SWITCH_RATIO, frontier_slots, own_share, unknown_area
-from agents.predicted_pose import PosePredictor
+from agents.predicted_pose import predict_covariances
 from vslam_env.belief.team_belief import Belief
 from vslam_env.navigation import CELL
 
 AREA_NATS = math.log(2.0) / CELL**2  # [1/m^2] entropy of the unknown cells of a square metre
 MAP_WEIGHT = 0.02  # cells of a grid are not independent: weight of their entropy beside that of the pose
 COST = 0.5  # [nats/m] of path
-MOST_PREDICTED = 8  # nearest candidates whose poses are predicted
+MOST_PREDICTED = 6  # nearest candidates whose poses are predicted
 
 
 class RbpfGain:
@@ -40,9 +40,8 @@ class RbpfGain:
         if not len(slots):
             self._held = None
             return None
-        predictor = PosePredictor(belief)
         before = np.linalg.slogdet(belief.covariance + 1e-12 * np.eye(3))[1]
-        after = np.array([np.linalg.slogdet(predictor.along(int(slot))[-1])[1] for slot in slots])
+        after = np.linalg.slogdet([found[-1] for found in predict_covariances(belief, slots)])[1]
         lengths = np.where(slots == self._held, SWITCH_RATIO, 1.0) * candidates.lengths[slots]
         gains = MAP_WEIGHT * AREA_NATS * unknown_area(candidates, slots) + 0.5 * (before - after)
         self._held = int(slots[np.argmax(gains - COST * lengths)])
