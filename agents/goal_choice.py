@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from slam_backend.core.validation import FloatArray, IntArray
 from vslam_env.belief.team_belief import Belief, Candidates
-from vslam_env.navigation import centre_of, distance_map, follow_path, plan_path
+from vslam_env.navigation import distance_map, follow_path, plan_path
 
 SWITCH_RATIO = 0.5  # switch goals if the path is shorter than this share of the remaining path
 REPLAN_TICKS = 10
@@ -100,7 +100,7 @@ class DrivingPolicy:
             if self._patrol is None or np.linalg.norm(self._patrol - here) < ARRIVED:
                 self._patrol = patrol_goal(belief, rng)
             goal, self._heading = self._patrol, None
-        self._path = plan_path(belief.grid.cells, belief.pose[:2], goal)
+        self._path = plan_path(belief.grid, belief.pose[:2], goal)
         if self._path is None:
             self._patrol = None
         elif slot is None:
@@ -148,10 +148,10 @@ def patrol_goal(belief: Belief, rng: np.random.Generator) -> FloatArray:
 
     If nothing is reachable, return the robot's position.
     """
-    ways = distance_map(belief.grid.cells, belief.pose[:2])
+    ways = distance_map(belief.grid, belief.pose[:2])
     rows, cols = np.nonzero(ways.cost < UNREACHABLE)
     if not len(rows):
         return np.array(belief.pose[:2])
     costs = ways.cost[rows, cols]
     place = int(rng.choice(np.flatnonzero(costs >= np.quantile(costs, 1.0 - FAR_SHARE))))
-    return centre_of(np.array([rows[place], cols[place]]) + ways.corner)
+    return ways.centre_of([rows[place], cols[place]])

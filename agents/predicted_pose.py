@@ -28,7 +28,7 @@ def predict_covariances(belief: Belief, slots: IntArray) -> list[FloatArray]:
         belief: Belief of the robot.
         slots: (k,) int64. Slots of candidates. Without a known path the present covariance is returned.
     """
-    ways, candidates = distance_map(belief.grid.cells, belief.pose[:2]), belief.candidates
+    ways, candidates = distance_map(belief.grid, belief.pose[:2]), belief.candidates
     paths = [ways.path_to(candidates.goals[slot]) for slot in slots]
     poses = [
         belief.pose[None] if path is None else _poses_along(path, float(candidates.headings[slot]))

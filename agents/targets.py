@@ -81,7 +81,7 @@ def own_targets(belief: Belief, held: int | None) -> Targets | None:
         return None
     places = candidates.goals[slots]
     positions = np.array([belief.pose[:2], *(mate.pose[:2] for mate in belief.teammates)])
-    ways = distance_map(belief.grid.cells, belief.pose[:2])
+    ways = distance_map(belief.grid, belief.pose[:2])
     lengths = np.empty((len(positions), len(slots)))
     lengths[0] = candidates.lengths[slots]
     lengths[1:] = lengths_between(ways, positions[1:], places)
@@ -125,7 +125,7 @@ def team_targets(beliefs: Sequence[Belief], held: Mapping[int, int | None]) -> T
     own = np.full(lengths.shape, -1)
     for row, target, slot, length in entries:
         lengths[row, target], own[row, target] = length, slot
-    ways = distance_map(first.grid.cells, first.pose[:2])
+    ways = distance_map(first.grid, first.pose[:2])
     return Targets(ways, np.array(positions), np.array(places), lengths, own, len(beliefs))
 
 

@@ -18,15 +18,14 @@ from vslam_env.config import EnvConfig
 from vslam_env.evaluation.coverage import CoverageCells
 from vslam_env.evaluation.map_scores import UNUSED
 from vslam_env.evaluation.team_metrics import BeliefSummary, RobotCounts, RobotMetrics, TeamMetrics
-from vslam_env.navigation import GRID_SIZE
-from vslam_env.navigation._grid_kernels import HALF_WIDTH
+from vslam_env.navigation._grid_kernels import LARGEST_HALF_WIDTH as HALF_WIDTH
 from vslam_env.navigation.candidate_slots import NUM_SLOTS
+from vslam_env.navigation.occupancy_grid import check_grid
 from vslam_env.sensors import LandmarkSensor, RangeFinder, StereoSensor, TeamRenderedFrames, TeamSensorFrames
 from vslam_env.simulation.episode import Episode, num_shared
 from vslam_env.simulation.scenario import Scenario
 from vslam_env.world import World
 
-GRID = (GRID_SIZE, GRID_SIZE)
 SLOT_COLUMNS = 5
 AROUND = 1.0  # [m] tolerated distance of a robot outside the bounds of the walls
 STREAMS = ("odometry", "sensor", "scan", "radio")
@@ -359,12 +358,6 @@ def check_streams(name: str, streams: Any) -> None:
             check.refuse(f"{name}[{stream!r}]", "a stream of PCG64", state["bit_generator"])
 
 
-def check_grid(name: str, grid: Any) -> None:
-    """Raise unless a value is a state of a `SeenGrid`."""
-    check.keys(name, grid, ("evidence",))
-    check.array(f"{name}['evidence']", grid["evidence"], check.INT8, GRID)
-
-
 def check_slots(name: str, slots: Any) -> None:
     """Raise unless a value is a state of `CandidateSlots`."""
     check.keys(name, slots, ("rows", "visits", "given_up"))
@@ -376,7 +369,7 @@ def check_slots(name: str, slots: Any) -> None:
     if (empty != empty[:, :1]).any() or (held.size and np.abs(held[:, :2]).max() > HALF_WIDTH):
         check.refuse(f"{name}['rows']", "positions in the grid, or NaN", "others")
     check.indices(f"{name}['visits']", slots["visits"], (NUM_SLOTS,))
-    check.array(f"{name}['given_up']", slots["given_up"], check.BOOL, GRID)
+    check.floats(f"{name}['given_up']", slots["given_up"], (None, 2), -HALF_WIDTH, HALF_WIDTH)
 
 
 def check_team_metrics(name: str, metrics: Any, count: int, with_beliefs: bool) -> None:

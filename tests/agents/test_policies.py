@@ -16,7 +16,7 @@ from agents.registry import action_types
 from slam_backend.geometry import compose
 from vslam_env import ExplorationEnv, World, vslam_v0
 from vslam_env.belief.team_belief import Belief, Teammate
-from vslam_env.navigation import SeenGrid, cell_of, plan_path
+from vslam_env.navigation import OccupancyGrid, cell_of, plan_path
 
 ROOM = World("room", [[0, 0, 11, 0], [11, 0, 11, 9], [11, 9, 0, 9], [0, 9, 0, 0], [5, 0, 5, 5]])
 MATCHES = [(name, action_type) for name, known in POLICIES.items() for action_type in known]
@@ -117,7 +117,7 @@ def test_blocked_patrol_goals_are_replaced() -> None:
     """A robot that cannot come closer to a patrol goal because of a newly seen wall gets another goal."""
     env = _env("continuous")
     env.reset(seed=0)
-    grid = SeenGrid()
+    grid = OccupancyGrid()
     grid.clear_disc([0.0, 0.0, 0.0], 4.0)
     policy, pose, way = make_policy("frontier", "continuous"), np.zeros(3), []
     belief = _belief(env, pose=pose, candidates=_candidates(env, {}), grid=grid.read_only_view())
@@ -129,7 +129,8 @@ def test_blocked_patrol_goals_are_replaced() -> None:
         speed, turn = policy.act(None, belief, rng)
         if tick == 0:
             state = grid.get_state()
-            state["evidence"][row + np.arange(-4, 5), col - np.arange(-4, 5)] = 1  # across the path to it
+            top, left = state["corner"]
+            state["evidence"][row - top + np.arange(-4, 5), col - left - np.arange(-4, 5)] = 1  # across the path to it
             grid.set_state(state)
         pose = compose(pose, [0.1 * speed, 0.0, 0.15 * turn])
         way.append(pose[:2])

@@ -11,7 +11,7 @@ from slam_backend.maps.landmark_map import LandmarkMap
 from tests.agents.test_policies import ROOM
 from vslam_env import vslam_v0
 from vslam_env.belief.team_belief import Belief
-from vslam_env.navigation import SeenGrid, distance_map
+from vslam_env.navigation import OccupancyGrid, distance_map
 
 
 def _belief(landmarks: list[tuple[float, float]], goal: tuple[float, float]) -> Belief:
@@ -19,7 +19,7 @@ def _belief(landmarks: list[tuple[float, float]], goal: tuple[float, float]) -> 
     env = vslam_v0.parallel_env(world=ROOM, num_robots=1, num_particles=5, action_type="goal", max_cycles=5)
     env.reset(seed=0)
     given = env.belief("robot_0")
-    grid = SeenGrid()
+    grid = OccupancyGrid()
     grid.clear_disc([0.0, 0.0, 0.0], 9.0)
     slots = given.candidates
     values: dict[str, Any] = {name: getattr(slots, name).copy() for name in slots.__slots__}

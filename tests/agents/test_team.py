@@ -16,15 +16,15 @@ from agents.utility_cost import COST, utility_cost
 from slam_backend.geometry import compose, inverse
 from tests.agents.test_policies import ROOM
 from vslam_env import ExplorationEnv, vslam_v0
-from vslam_env.navigation import SeenGrid, distance_map
+from vslam_env.navigation import OccupancyGrid, distance_map
 
 RNG = np.random.default_rng(0)
 
 
 def _targets(positions: list[tuple[float, float]], places: list[tuple[float, float]], wall: bool = False) -> Targets:
     """Return targets on free floor of 18 x 18 m, all lengths straight; with a wall along x = 0 but for a door."""
-    grid = SeenGrid()
-    state = grid.get_state()
+    grid = OccupancyGrid()
+    state = {"evidence": np.zeros((300, 300), np.int8), "corner": (0, 0)}
     state["evidence"][105:195, 105:195] = -10
     if wall:
         state["evidence"][105:195, 150] = 10

@@ -2,15 +2,17 @@
 
 import numpy as np
 
-from vslam_env.navigation import GRID_SIZE, centre_of
+from vslam_env.navigation import centre_of
 
-CENTRES = centre_of(np.stack(np.meshgrid(np.arange(GRID_SIZE), np.arange(GRID_SIZE), indexing="ij"), axis=-1))
+PLAIN_SIZE = 600  # cells along a side
+INDICES = np.stack(np.meshgrid(np.arange(PLAIN_SIZE), np.arange(PLAIN_SIZE), indexing="ij"), axis=-1)
+CENTRES = centre_of(INDICES, PLAIN_SIZE)
 
 
 def plain_scan_update(
     evidence: np.ndarray, pose: np.ndarray, ranges: np.ndarray, angles: np.ndarray, max_range: float
 ) -> np.ndarray:
-    """Return the evidence (300, 300) int8 of a grid after a scan; arguments as in `SeenGrid.update_from_scan`."""
+    """Return the evidence (600, 600) int8 of a grid after a scan; arguments as in `OccupancyGrid.update_from_scan`."""
     u, v = CENTRES[..., 0] - pose[0], CENTRES[..., 1] - pose[1]
     rays = np.stack([np.cos(pose[2] + angles), np.sin(pose[2] + angles)], axis=1)
     left = [c * v >= s * u for c, s in rays]  # of a ray or on it

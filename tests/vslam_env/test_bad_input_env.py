@@ -19,7 +19,7 @@ from vslam_env.belief.team_belief import BeliefConfig, TeamBelief
 from vslam_env.navigation import (
     UNKNOWN,
     CandidateSlots,
-    SeenGrid,
+    OccupancyGrid,
     TeamGrids,
     distance_map,
     find_frontiers,
@@ -149,7 +149,7 @@ BOX = World("box", [[0, 0, 0.5, 0], [0.5, 0, 0.5, 0.5], [0.5, 0.5, 0, 0.5], [0, 
 MARKS: dict[str, Any] = {
     "positions": [[1, 0, 0.2], [2, 0, -0.3]], "normals": [[0, 1], [0, 1]], "walls": [0, 0], "descriptors": np.eye(2, 7),
 }  # fmt: skip
-CELLS = SeenGrid().cells
+CELLS = OccupancyGrid().cells
 POSE = (0.0, 0.0, 0.0)
 
 
@@ -295,7 +295,7 @@ CALLS: dict[str, list[Callable[[], Any]]] = {
     "size: expected a pair": [partial(draw_frame, None, bad) for bad in ((960,), 960)],
     "size[0]: expected an int >= 160": [partial(draw_frame, None, (100, 720))],
     "size[1]: expected an int >= 120": [partial(draw_frame, None, (960, 7.5))],
-    "cells: expected an array": [
+    "cells: expected the grid, or its cells": [
         *(partial(plan_path, bad, (0, 0), (1, 1)) for bad in (CELLS[:7], CELLS.astype(float), [[1]])),
         lambda: CandidateSlots().update(CELLS[1:], POSE),
     ],
@@ -316,7 +316,7 @@ CALLS: dict[str, list[Callable[[], Any]]] = {
         partial(CandidateSlots().update, CELLS, POSE, [1.0, 2.0]),
         partial(CandidateSlots().features, POSE, [[NAN, 2.0]]),
     ],
-    "ignored: expected an array": [partial(find_frontiers, CELLS, (0, 0), ignored=np.zeros(3, bool))],
+    "ignored: expected finite numbers in an array": [partial(find_frontiers, CELLS, (0, 0), ignored=np.zeros(3, bool))],
     "angles: expected": [partial(ray_directions, bad) for bad in (ANGLES[::-1], ANGLES[:0], np.array([-1.6, 1.6]))],
 }  # fmt: skip
 
@@ -480,7 +480,7 @@ def test_refused_readings_leave_beliefs_as_they_are() -> None:
 
 
 RANGES = np.full(32, 2.0)
-PAINTED: dict[str, list[Callable[[SeenGrid], Any]]] = {
+PAINTED: dict[str, list[Callable[[OccupancyGrid], Any]]] = {
     "pose: expected": [
         lambda grid: grid.update_from_scan((0.0, 0.0), RANGES, ANGLES), lambda grid: grid.clear_disc((INF, 0.0, 0.0)),
         lambda grid: grid.update_from_scan((NAN, 0.0, 0.0), RANGES, ANGLES),
@@ -496,14 +496,19 @@ PAINTED: dict[str, list[Callable[[SeenGrid], Any]]] = {
         lambda grid: grid.update_from_scan(POSE, RANGES, ANGLES * NAN),
     ],
     "radius: expected a finite number > 0": [lambda grid: grid.clear_disc(POSE, radius=0.0)],
-    "self_from_other: expected finite numbers": [lambda grid: grid.merge(SeenGrid(), (0.0, NAN, 0.0))],
-    "evidence: expected an array of shape": [lambda grid: grid.set_state({"evidence": np.zeros((2, 3))})],
+    "self_from_other: expected finite numbers": [lambda grid: grid.merge(OccupancyGrid(), (0.0, NAN, 0.0))],
+    "state['evidence']: expected an array of int8": [
+        lambda grid: grid.set_state({"evidence": np.zeros((2, 3)), "corner": (0, 0)})
+    ],
+    "state['corner'][1]: expected an int from -1850 to 2147": [
+        lambda grid: grid.set_state({"evidence": np.zeros((2, 3), np.int8), "corner": (0, 2148)})
+    ],
 }  # fmt: skip
 
 
 def test_refused_scans_paint_nothing() -> None:
     """Not even what is good, beside a reading at no place or of negative ranges."""
-    grid = SeenGrid()
+    grid = OccupancyGrid()
     for begins, calls in PAINTED.items():
         for call in calls:
             refused(partial(call, grid), begins)

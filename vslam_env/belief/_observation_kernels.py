@@ -8,10 +8,11 @@ import numpy as np
 from slam_backend.core.jit import device, in_place, stack_array_of
 from slam_backend.fastslam.relative_poses import COVARIANCE, ESS, OWN, SIGMAS, START
 from vslam_env.navigation import CELL, FREE, GRID_SIZE, OCCUPIED, UNKNOWN
+from vslam_env.navigation._grid_kernels import LARGEST_HALF_WIDTH, margin_of
 
 MAX_TEAMMATES = 7
-POSE_LIMIT = np.array([30.0, 30.0, np.pi])
-MAX_POSITION = 90.0  # [m] more than the diagonal of the seen grid
+POSE_LIMIT = np.array([LARGEST_HALF_WIDTH, LARGEST_HALF_WIDTH, np.pi])
+MAX_POSITION = LARGEST_HALF_WIDTH  # [m]
 MAP_STATS_LIMIT = np.array([10_000.0, 10.0, 10.0, 10_000.0, 1.0, 1.0 + MAX_TEAMMATES])
 
 
@@ -31,13 +32,13 @@ REACH = 0.75 * SIZE  # [cells] more than from the robot to a corner of its pictu
 @device
 @in_place
 def paint(cells: Any, belief: Any, places: Any, local: Any) -> None:
-    """Sample the seen grid at the centres of the local cells, and mark the cells that hold landmarks.
+    """Sample the occupancy grid at the centres of the local cells, and mark the cells that hold landmarks.
 
     Rows go from 4.8 m ahead to 4.8 m behind, columns from 4.8 m to the left to 4.8 m to the right. Each row is written
     in short loops without branches, which become vector instructions but for the look-up itself.
 
     Args:
-        cells: (300, 300) uint8. Seen grid.
+        cells: (S, S) uint8. Occupancy grid.
         belief: (16 or more,). Pose of the robot, and the motion of landmarks to its frame; see `TeamPoses`.
         places: (n, 4). Landmarks, see `MapSummaryRows`.
         local: (3, 48, 48) uint8. Channels free, occupied, landmarks, of cells of 0.2 m, 0 or 255. Written to.
@@ -45,8 +46,9 @@ def paint(cells: Any, belief: Any, places: Any, local: Any) -> None:
     x, y = belief[OWN], belief[OWN + 1]
     c, s = math.cos(belief[OWN + 2]), math.sin(belief[OWN + 2])
     middle = 0.5 * SIZE
-    flat = cells.reshape(cells.size)
-    low, high = REACH - 0.5 * GRID_SIZE, 0.5 * GRID_SIZE - REACH
+    flat, size = cells.reshape(cells.size), len(cells)
+    margin = np.int32(margin_of(size))
+    low, high = REACH - 0.5 * size, 0.5 * size - REACH
     surely_inside = low < x / CELL < high and low < y / CELL < high
     place, seen = stack_array_of(SIZE, np.int32), stack_array_of(SIZE, np.uint8)
     for row in range(SIZE):
@@ -55,15 +57,17 @@ def paint(cells: Any, belief: Any, places: Any, local: Any) -> None:
         if surely_inside:
             for col in range(SIZE):
                 left = middle - 0.5 - col
-                place[col] = np.int32(first_i + c * left) * GRID_SIZE + np.int32(first_j - s * left)
+                i, j = np.int32(np.floor(first_i + c * left)), np.int32(np.floor(first_j - s * left))
+                place[col] = (i + margin) * np.int32(size) + j + margin
             for col in range(SIZE):
                 seen[col] = flat[np.uint32(place[col])]
         else:
             for col in range(SIZE):
                 left = middle - 0.5 - col
                 i, j = first_i + c * left, first_j - s * left
-                inside = 0.0 <= i < GRID_SIZE and 0.0 <= j < GRID_SIZE
-                seen[col] = cells[int(i), int(j)] if inside else UNKNOWN
+                row_in, col_in = math.floor(i) + margin, math.floor(j) + margin
+                inside = 0 <= row_in < size and 0 <= col_in < size
+                seen[col] = cells[row_in, col_in] if inside else UNKNOWN
         free, occupied, landmarks = local[0, row], local[1, row], local[2, row]
         for col in range(SIZE):
             free[col] = GRID_ON if seen[col] == FREE else 0
@@ -92,7 +96,7 @@ def write_observations(
         poses, beliefs: (n, K, 3), (n, 16 + K). See `TeamPoses`.
         places, names, parts: (N, 4), (N, 2) int64, (n, 2) int64. Landmarks of all maps, and the part of each robot; see
             `TeamMapSummaries`.
-        cells: (n, 300, 300) uint8. Seen grids.
+        cells: (n, S, S) uint8. Occupancy grids.
         scans: (n, R) float64 [m].
         observed: Written to, in the order of the table of `observation`: (n, 3), (n, 3) and (n, 6) float32;
             (n, 3, 48, 48) uint8; (n, R), (n, 16, 5) and (n, 7, 5) float32; (n, 7) int8. The candidates hold their

@@ -18,7 +18,7 @@ from slam_backend.models.camera import StereoCamera
 from slam_backend.smoother.options import SmoothingOptions
 from slam_backend.team.merge_scheduler import AttemptOptions
 from slam_backend.team.options import MergeOptions
-from vslam_env.navigation import SeenGrid
+from vslam_env.navigation import OccupancyGrid
 
 
 def default_filter_options() -> FilterOptions:
@@ -153,7 +153,7 @@ class Belief:
     particles: FloatArray
     log_weights: FloatArray
     ess: float
-    grid: SeenGrid
+    grid: OccupancyGrid
     candidates: Candidates
     teammates: tuple[Teammate, ...]
     start_from_group: FloatArray
@@ -175,7 +175,7 @@ class BeliefBatch(NamedTuple):
         robots: (n,) int64. Indices of the robots.
         points: Poses, with one row per robot and columns for the team up to the last known robot.
         map_summaries: Summaries of the confirmed landmarks in the map frames.
-        cells: (n, 300, 300) uint8. Cells of the occupancy grids.
+        cells: (n, S, S) uint8. Cells of the occupancy grids.
         features: (n, 16, 5) float32 [m], robot frames. Features of the candidates; a new array.
     """
 

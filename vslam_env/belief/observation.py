@@ -2,13 +2,13 @@
 
 | key | shape | content, in estimated frames | bounds |
 |---|---|---|---|
-| `pose` | (3,) | x, y [m], theta [rad], start frame | +-30, pi |
-| `pose_std` | (3,) | one sigma of each [m, m, rad] | 30, pi |
+| `pose` | (3,) | x, y [m], theta [rad], start frame | +-400, pi |
+| `pose_std` | (3,) | one sigma of each [m, m, rad] | 400, pi |
 | `map_stats` | (6,) | landmarks; mean and largest one sigma [m]; mean count; ESS / M; group size | `MAP_STATS_LIMIT` |
 | `local_grid` | (3, 48, 48) uint8 | free, occupied, landmarks; cells of 0.2 m, robot heading up | 0, 255 |
 | `scan` | (R,) | ranges from right to left [m] | range of the scan |
-| `candidates` | (16, 5) | see `CandidateSlots.features` [m] | +-90 |
-| `teammates` | (7, 5) | x, y [m], cos and sin of the heading, robot frame; one sigma of the position [m] | +-90 |
+| `candidates` | (16, 5) | see `CandidateSlots.features` [m] | +-400 |
+| `teammates` | (7, 5) | x, y [m], cos and sin of the heading, robot frame; one sigma of the position [m] | +-400 |
 | `teammates_mask` | (7,) int8 | which rows hold a robot of the same group | 0, 1 |
 | `action_mask` | (17,) int8 | `goal` actions only: which actions are valid | 0, 1 |
 

@@ -13,7 +13,7 @@ from slam_backend.fastslam.relative_poses import TeamPoses
 from slam_backend.fastslam.reports import LandmarkIdMap, MapReleased, MergeUndone, TeamReport
 from slam_backend.geometry import compose, inverse
 from vslam_env.belief.belief import RobotHardware
-from vslam_env.navigation import SeenGrid, TeamGrids, ray_directions
+from vslam_env.navigation import OccupancyGrid, TeamGrids, ray_directions
 
 
 class GridUpdate(NamedTuple):
@@ -153,7 +153,7 @@ class SharedGrids:
         self._kept: list[GridSnapshot] = []
         self._strokes: deque[GridUpdate] = deque()
 
-    def __getitem__(self, robot: int) -> SeenGrid:
+    def __getitem__(self, robot: int) -> OccupancyGrid:
         return self._grids[robot]
 
     def save_for_undo(self, tick: int, id_map: LandmarkIdMap) -> None:

@@ -5,7 +5,6 @@ from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam_backend.core.validation import FloatArray, argument_error
 from slam_backend.fastslam.consistency import Consistency
@@ -22,7 +21,7 @@ from slam_backend.team.team import TeamSlam
 from vslam_env.belief.belief import Belief, BeliefBatch, BeliefConfig, Candidates, RobotHardware, Teammate
 from vslam_env.belief.readings import Readings, TeamReadings
 from vslam_env.belief.shared_grids import GridUpdate, SharedGrids
-from vslam_env.navigation import TeamSlots
+from vslam_env.navigation import OccupancyGrid, TeamSlots
 
 __all__ = ["Belief", "BeliefConfig", "Candidates", "RobotHardware", "TeamBelief", "Teammate"]
 
@@ -167,9 +166,9 @@ class TeamBelief:
             self._has_outlines = True
         return self._outlines
 
-    def cells(self, robot: int) -> NDArray[np.uint8]:
-        """Return the cells (300, 300) uint8 of a robot's occupancy grid; a read-only view, updated in later ticks."""
-        return self._grids[robot].cells
+    def grid(self, robot: int) -> OccupancyGrid:
+        """Return the occupancy grid of a robot, updated in later ticks."""
+        return self._grids[robot]
 
     def candidate(self, robot: int, slot: int) -> tuple[FloatArray, float] | None:
         """Return goal (2,) [m] and heading [rad] of the candidate in a robot's slot; None if the slot is empty."""

@@ -10,7 +10,8 @@ from slam_backend.core.jit import device, in_place
 from slam_backend.core.read_only import as_constant, as_read_only
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.geometry import inverse, transform_points
-from vslam_env.navigation import FREE, GRID_SIZE, TeamGrids, cell_of
+from vslam_env.navigation import FREE, TeamGrids, cell_of
+from vslam_env.navigation._grid_kernels import LARGEST_SIZE
 
 
 class Tally(NamedTuple):
@@ -37,8 +38,8 @@ def _recount(changes: Any, cells: Any, laid: Any, first: int, last: int, tally: 
     """Update the floor cells seen by one robot.
 
     Args:
-        changes: (1 + n,) int32. Changes of the robot's grid, see `TeamGrids`.
-        cells: (300, 300) uint8. Cells of the robot's grid.
+        changes: (1 + n,) int32. Changes of the robot's grid, see `GridStorage`.
+        cells: (S, S) uint8. Cells of the robot's grid.
         laid: (2, m) int32. Floor cells in the grids, see `CoverageCells`.
         first: First entry of the robot in `laid`.
         last: One past its last entry.
@@ -48,13 +49,16 @@ def _recount(changes: Any, cells: Any, laid: Any, first: int, last: int, tally: 
         Increase in the number of floor cells seen by any robot.
     """
     seen, seers, fresh = tally.seen, tally.seers, tally.fresh
-    places, more, flat, all_may_have = laid[0, :last], 0, cells.reshape(cells.size), changes[0] < 0
+    places, more, all_may_have = laid[0, :last], 0, changes[0] < 0
+    size, inset = len(cells), (LARGEST_SIZE - len(cells)) // 2
     for k in range(1 if all_may_have else changes[0]):
         begin = first if all_may_have else first + np.searchsorted(places[first:], changes[1 + k])
         for i in range(begin, last):
             if not all_may_have and places[i] != changes[1 + k]:
                 break
-            now, cell = flat[places[i]] == FREE, laid[1, i]
+            row, col = places[i] // LARGEST_SIZE - inset, places[i] % LARGEST_SIZE - inset
+            is_inside = 0 <= row < size and 0 <= col < size
+            now, cell = is_inside and cells[row, col] == FREE, laid[1, i]
             if now != seen[i]:
                 seen[i] = now
                 seers[cell] += 1 if now else -1
@@ -77,7 +81,7 @@ def _update(
 
     Args:
         changes: (K, 1 + n) int32. Changes of the grids, see `TeamGrids`; cleared.
-        cells: (K, 300, 300) uint8. Cells of the grids.
+        cells: (K, S, S) uint8. Cells of the grids.
         laid, bounds: Floor cells in the grids, see `CoverageCells`.
         area: (N, 2) float64 [m], world frame. Centres of the floor cells.
         positions: (K, 2 or 3) float64 [m], world frame. Positions of the robots.
@@ -117,8 +121,8 @@ class CoverageCells:
 
     Attributes:
         cells: (n, 2) float64 [m], world frame. Centres of the cells of the free floor.
-        laid: (2, m) int32. Flat grid indices of the floor cells, ascending for each robot, and the indices of these
-            floor cells.
+        laid: (2, m) int32. Flat indices of the floor cells in a grid of the largest size, ascending for each robot,
+            and the indices of these floor cells.
         bounds: (K + 1,) int64. Start of each robot's columns in `laid`, and the end of the last.
     """
 
@@ -185,9 +189,12 @@ class CoverageTracker:
 
 
 def _flat_cells(points: FloatArray) -> NDArray[np.int32]:
-    """Return the flat grid indices of points (n, 2), start frame, ascending, and the indices of these points."""
-    rows, cols = cell_of(points).T
-    inside = np.flatnonzero((rows >= 0) & (rows < GRID_SIZE) & (cols >= 0) & (cols < GRID_SIZE))
-    places = (rows * GRID_SIZE + cols)[inside]
+    """Return the flat indices of points (n, 2), start frame, in the largest grid, ascending, and which points they are.
+
+    Points outside that grid are left out.
+    """
+    rows, cols = cell_of(points, LARGEST_SIZE).T
+    inside = np.flatnonzero((rows >= 0) & (rows < LARGEST_SIZE) & (cols >= 0) & (cols < LARGEST_SIZE))
+    places = (rows * LARGEST_SIZE + cols)[inside]
     order = np.argsort(places, kind="stable")
     return np.array([places[order], inside[order]], np.int32)

@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slam_backend.core.validation import BoolArray, FloatArray
-from vslam_env.navigation._grid_kernels import GRID_SIZE
 from vslam_env.navigation._planning_kernels import (
     FRONTIER_SIZE,
     SAME_GOAL,
@@ -16,9 +15,10 @@ from vslam_env.navigation._planning_kernels import (
     fill_slots,
     update_slots,
 )
-from vslam_env.navigation.occupancy_grid import known_bounds
+from vslam_env.navigation.occupancy_grid import OccupancyGrid
+from vslam_env.navigation.planning import known_part
 from vslam_env.navigation.team_grids import TeamGrids
-from vslam_env.navigation.validation import check_cells, pose_floats, positions_array
+from vslam_env.navigation.validation import pose_floats, positions_array
 
 __all__ = ["FRONTIER_SIZE", "NUM_FEATURES", "NUM_SLOTS", "CandidateSlots", "TeamSlots"]
 
@@ -54,7 +54,7 @@ class CandidateSlots:
         """Initialise the state with rows of NaN."""
         self._rows = rows
         self._visits = np.zeros(NUM_SLOTS, np.int64)
-        self._given_up = np.zeros((GRID_SIZE, GRID_SIZE), np.bool_)
+        self._given_up = np.empty((0, 2))  # goals around which unknown cells are ignored
 
     @property
     def valid(self) -> BoolArray:
@@ -90,11 +90,11 @@ class CandidateSlots:
         x, y, heading, _, _ = self._rows[slot].tolist()
         return None if math.isnan(x) else (np.array([x, y]), heading)
 
-    def update(self, cells: NDArray[np.uint8], pose: ArrayLike, teammates: ArrayLike = ()) -> None:
+    def update(self, cells: OccupancyGrid | NDArray[np.uint8], pose: ArrayLike, teammates: ArrayLike = ()) -> None:
         """Update the candidates; intended once a second.
 
         Args:
-            cells: (300, 300) uint8. Cells of the robot's `SeenGrid`.
+            cells: Grid of the robot, or its cells (S, S) uint8.
             pose: (3,) float64 [m, m, rad], start frame. Pose of the robot.
             teammates: (k, 2) float64 [m], start frame. Positions of its teammates, whose visits also count.
 
@@ -102,20 +102,21 @@ class CandidateSlots:
             ValueError: If an array has the wrong shape or is not finite.
         """
         poses = _together(pose, teammates)
-        check_cells(cells)
-        self.renew(cells, known_bounds(cells), poses, 0)
+        self.renew(*known_part(cells), poses, 0)
 
     def renew(self, cells: NDArray[np.uint8], bounds: NDArray[np.int32], poses: FloatArray, robot: int) -> None:
         """Update the candidates of a robot without checks.
 
         Args:
-            cells: (300, 300) uint8. Cells of the robot's grid.
-            bounds: (4,) int32. Bounds of the known part of the grid, see `TeamGrids`.
+            cells: (S, S) uint8. Cells of the robot's grid.
+            bounds: (4,) int32. Bounds of the known part of the grid, see `GridStorage`.
             poses: (n, 3) float64 [m, m, rad], start frame. Poses of the robot and its teammates; NaN: unknown.
             robot: Row of the robot in `poses`.
         """
         slots = self._rows, self._visits
-        found, costs, is_clear = update_slots(cells, bounds, ROBOT_RADIUS, poses, robot, *slots, self._given_up)
+        found, costs, is_clear, self._given_up = update_slots(
+            cells, bounds, ROBOT_RADIUS, poses, robot, *slots, self._given_up
+        )
         if not is_clear:
             fill_slots(_assign(costs), found, *slots)
 

@@ -5,40 +5,45 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from slam_backend.core.read_only import as_read_only
-from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_array, check_float
+from slam_backend.core import state_checks as check
+from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_float
 from vslam_env.navigation import _grid_kernels as _painting
-from vslam_env.navigation._grid_kernels import CELL, FREE, GRID_SIZE, HALF_WIDTH, OCCUPIED, UNKNOWN, Grid
+from vslam_env.navigation._grid_kernels import CELL, FREE, GRID_SIZE, HALF_WIDTH, LARGEST_SIZE, OCCUPIED, UNKNOWN, Grid
+from vslam_env.navigation.grid_storage import GridStorage, known_bounds, margin
 from vslam_env.navigation.validation import check_ranges, pose_floats, ray_directions
 
 # State of a cell by its evidence, as an unsigned byte.
 _CELL_STATES = np.where(np.arange(256) == 0, UNKNOWN, np.where(np.arange(256) < 128, OCCUPIED, FREE)).astype(np.uint8)
 
-__all__ = ["CELL", "FREE", "GRID_SIZE", "OCCUPIED", "UNKNOWN", "SeenGrid", "cell_of", "centre_of"]
+__all__ = ["CELL", "FREE", "GRID_SIZE", "OCCUPIED", "UNKNOWN", "OccupancyGrid", "cell_of", "centre_of"]
 
 
-def cell_of(points: ArrayLike) -> IntArray:
+def cell_of(points: ArrayLike, size: int = GRID_SIZE) -> IntArray:
     """Return the cells that contain points.
 
     Args:
         points: (..., 2) float64 [m], start frame, rows (x, y).
+        size: Cells along a side of the grid, `len(grid.cells)`; a new grid's by default.
 
     Returns:
-        (..., 2) int64 rows (row, column), to index `SeenGrid.cells`. Below 0 or at least `GRID_SIZE` for points
-        outside the grid.
+        (..., 2) int64 rows (row, column), to index `OccupancyGrid.cells`. Below 0 or at least `size` for points outside
+        the grid.
 
     >>> cell_of([0.1, -29.9]).tolist()
     [0, 150]
+    >>> cell_of([0.1, -29.9], size=600).tolist()
+    [150, 300]
     """
     points = np.asarray(points, dtype=np.float64)
-    return np.asarray(np.floor((points[..., ::-1] + HALF_WIDTH) / CELL), dtype=np.int64)
+    return np.asarray(np.floor((points[..., ::-1] + HALF_WIDTH) / CELL), dtype=np.int64) + margin(size)
 
 
-def centre_of(cells: ArrayLike) -> FloatArray:
+def centre_of(cells: ArrayLike, size: int = GRID_SIZE) -> FloatArray:
     """Return the centres of cells.
 
     Args:
         cells: (..., 2) int64 rows (row, column).
+        size: Cells along a side of the grid, see `cell_of`.
 
     Returns:
         (..., 2) float64 [m], start frame, rows (x, y).
@@ -46,43 +51,46 @@ def centre_of(cells: ArrayLike) -> FloatArray:
     >>> centre_of([0, 150]).round(6).tolist()
     [0.1, -29.9]
     """
-    return np.asarray((np.asarray(cells)[..., ::-1] + 0.5) * CELL - HALF_WIDTH, dtype=np.float64)
+    indices = np.asarray(cells)[..., ::-1] - margin(size)
+    return np.asarray((indices + 0.5) * CELL - HALF_WIDTH, dtype=np.float64)
 
 
-def known_bounds(cells: NDArray[np.uint8]) -> NDArray[np.int32]:
-    """Return the bounds (4,) of the known part of cells (300, 300), see `TeamGrids`."""
-    rows, cols = np.flatnonzero(cells.any(axis=1)), np.flatnonzero(cells.any(axis=0))
-    return np.array([rows[0], cols[0], rows[-1] + 1, cols[-1] + 1] if len(rows) else [0, 0, 0, 0], np.int32)
-
-
-class SeenGrid:
-    """Occupancy grid of 60 x 60 m around a robot's start pose; its size is independent of the world.
+class OccupancyGrid:
+    """Occupancy grid around a robot's start pose that grows with what was seen, up to 400 m in each direction.
 
     Each cell counts evidence (hits minus passes) within bounds, so that a single wrong reading neither closes a door
-    nor opens a wall; `cells` holds the resulting states. Readings outside the grid are ignored.
-
-    Attributes:
-        cells: (300, 300) uint8, read-only, indexed [row, column] with row = y upwards and column = x: `UNKNOWN`,
-            `FREE` or `OCCUPIED`. It shares memory with the grid.
+    nor opens a wall; `cells` holds the resulting states. A new grid covers 60 x 60 m; it doubles when something is seen
+    beyond. Readings farther than 400 m from the start are ignored.
     """
 
-    __slots__ = ("_grid", "_read_only", "cells")
+    __slots__ = ("_read_only", "_row", "_storage")
 
     def __init__(self) -> None:
-        shape = (GRID_SIZE, GRID_SIZE)
-        bounds = np.zeros(4, np.int32)
-        self._adopt(Grid(np.zeros(shape, np.int8), np.full(shape, UNKNOWN, np.uint8), _no_changes(), bounds))
-
-    def _adopt(self, grid: Grid, *, read_only: bool = False) -> "SeenGrid":
-        """Use given arrays as the memory of this grid."""
-        self._grid, self._read_only = grid, read_only
-        self.cells = as_read_only(grid.cells)
-        return self
+        self._storage, self._row, self._read_only = GridStorage(1), 0, False
 
     @classmethod
-    def over(cls, *arrays: NDArray[Any], read_only: bool = False) -> "SeenGrid":
-        """Return a grid that uses the arrays of a `Grid`."""
-        return cls.__new__(cls)._adopt(Grid(*arrays), read_only=read_only)
+    def over(cls, storage: GridStorage, row: int, *, read_only: bool = False) -> "OccupancyGrid":
+        """Return the grid in a row of a storage."""
+        grid = cls.__new__(cls)
+        grid._storage, grid._row, grid._read_only = storage, row, read_only
+        return grid
+
+    @property
+    def _grid(self) -> Grid:
+        return self._storage.views[self._row]
+
+    @property
+    def cells(self) -> NDArray[np.uint8]:
+        """(S, S) uint8. `UNKNOWN`, `FREE` or `OCCUPIED`, indexed [row, column] with row = y upwards and column = x.
+
+        Read-only; it shares memory with the grid until the grid grows. The start pose is in the middle; see `cell_of`.
+        """
+        return self._storage.read_only_cells[self._row]
+
+    @property
+    def bounds(self) -> NDArray[np.int32]:
+        """(4,) int32. First row and column of the known part, and one past the last ones; zeros if nothing is known."""
+        return self._grid.bounds.copy()
 
     def update_from_scan(self, pose: ArrayLike, ranges: ArrayLike, angles: ArrayLike, max_range: float = 8.0) -> None:
         """Paint a range scan: cells before the first hit are free, cells at the hit are occupied.
@@ -109,8 +117,9 @@ class SeenGrid:
                 "Give one range per ray.",
             )
         check_ranges(ranges)
-        directions = ray_directions(angles)
-        _painting.update_from_scan(self._grid, x, y, theta, ranges, directions, float(max_range))
+        directions, max_range = ray_directions(angles), float(max_range)
+        self._reserve(max(abs(x), abs(y)) + min(float(ranges.max()), max_range))
+        _painting.update_from_scan(self._grid, x, y, theta, ranges, directions, max_range)
 
     def clear_disc(self, pose: ArrayLike, radius: float = 0.2) -> None:
         """Mark the cells under a robot's body as free.
@@ -122,6 +131,7 @@ class SeenGrid:
         self._refuse_if_read_only()
         x, y, _ = pose_floats(pose)
         radius = check_float("radius", radius, "Give the robot's radius in metres.", above=0.0)
+        self._reserve(max(abs(x), abs(y)) + radius)
         _painting.clear_disc(self._grid, x, y, radius)
 
     def bump(self, pose: ArrayLike, radius: float = 0.2) -> None:
@@ -135,9 +145,10 @@ class SeenGrid:
         """
         self._refuse_if_read_only()
         x, y, theta = pose_floats(pose)
+        self._reserve(max(abs(x), abs(y)) + radius + CELL)
         _painting.mark_bump(self._grid, x, y, theta, radius)
 
-    def merge(self, other: "SeenGrid", self_from_other: ArrayLike) -> None:
+    def merge(self, other: "OccupancyGrid", self_from_other: ArrayLike) -> None:
         """Add the evidence of another robot's grid.
 
         Args:
@@ -146,38 +157,68 @@ class SeenGrid:
         """
         self._refuse_if_read_only()
         x, y, theta = pose_floats(self_from_other, "self_from_other")
-        _painting.merge_grid(self._grid, other._grid.evidence.copy(), other._grid.bounds.copy(), x, y, theta)
+        self._storage.reserve(_painting.reach_of_merge(other.bounds, len(other.cells), x, y, theta))
+        source = other.copy() if other._grid is self._grid else other
+        _painting.merge_grid(self._grid, source._grid.evidence, source.bounds, x, y, theta)
 
-    def copy(self) -> "SeenGrid":
+    def copy(self) -> "OccupancyGrid":
         """Return an independent, writable grid with the same content."""
-        evidence, cells, _, bounds = self._grid
-        return SeenGrid.over(evidence.copy(), cells.copy(), _no_changes(), bounds.copy())
+        grid = OccupancyGrid()
+        grid.set_state(self.get_state())
+        return grid
 
-    def read_only_view(self) -> "SeenGrid":
-        """Return a read-only view that shares memory with this grid."""
-        return SeenGrid.over(*self._grid, read_only=True)
+    def read_only_view(self) -> "OccupancyGrid":
+        """Return a read-only view of this grid, which follows its changes."""
+        return OccupancyGrid.over(self._storage, self._row, read_only=True)
 
     def get_state(self) -> dict[str, Any]:
-        """Return a copy of the complete state."""
-        return {"evidence": self._grid.evidence.copy()}
+        """Return a copy of the complete state: the evidence of the known part, and its first row and column.
+
+        Row and column are those of a grid of the first size, so they may be negative.
+        """
+        top, left, bottom, right = self._grid.bounds.tolist()
+        shift = margin(self._storage.size) if bottom else 0
+        return {"evidence": self._grid.evidence[top:bottom, left:right].copy(), "corner": (top - shift, left - shift)}
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Restore a state of `get_state` in place; views of the grid remain valid."""
+        """Restore a state of `get_state` in place; views of the grid remain valid.
+
+        Raises:
+            ValueError: If it is not a state of a grid.
+        """
         self._refuse_if_read_only()
-        shape = (GRID_SIZE, GRID_SIZE)
-        evidence = state["evidence"]
-        if not (isinstance(evidence, np.ndarray) and evidence.dtype == np.int8 and evidence.shape == shape):
-            evidence = check_array("evidence", evidence, shape, "Pass what get_state returned.", dtype=np.int8)
-        self._grid.evidence[:] = evidence
-        np.take(_CELL_STATES, evidence.view(np.uint8), out=self._grid.cells, mode="wrap")
-        self._grid.changes[0] = -1
-        self._grid.bounds[:] = known_bounds(self.cells)
+        check_grid("state", state)
+        evidence, (row, col) = state["evidence"], state["corner"]
+        height, width = evidence.shape
+        needed = max(GRID_SIZE // 2 - min(row, col), max(row + height, col + width) - GRID_SIZE // 2)
+        self._storage.reserve(needed)
+        grid, shift = self._grid, margin(self._storage.size)
+        top, left, bottom, right = grid.bounds.tolist()
+        grid.evidence[top:bottom, left:right] = grid.cells[top:bottom, left:right] = 0
+        top, left = row + shift, col + shift
+        there = slice(top, top + height), slice(left, left + width)
+        grid.evidence[there] = evidence
+        grid.cells[there] = _CELL_STATES[evidence.view(np.uint8)]
+        grid.changes[0] = -1
+        known = known_bounds(grid.cells[there])
+        grid.bounds[:] = known + np.array([top, left, top, left], np.int32) if known[2] else 0
+
+    def _reserve(self, distance: float) -> None:
+        """Grow the grid so that it holds what is at most so far from the start [m] along x and y."""
+        self._storage.reserve(_painting.cells_to_middle(distance))
 
     def _refuse_if_read_only(self) -> None:
         if self._read_only:
-            raise RuntimeError("SeenGrid: this is a read-only view. Make a copy() to write to.")
+            raise RuntimeError("OccupancyGrid: this is a read-only view. Make a copy() to write to.")
 
 
-def _no_changes() -> NDArray[np.int32]:
-    """Return the record of a grid whose changes are unknown."""
-    return np.full(1 + _painting.MOST_CHANGES, -1, np.int32)
+def check_grid(name: str, state: Any) -> None:
+    """Raise unless a value is a state of an `OccupancyGrid`; the message begins with its name."""
+    check.keys(name, state, ("evidence", "corner"))
+    check.array(f"{name}['evidence']", state["evidence"], check.INT8, (None, None))
+    check.instance(f"{name}['corner']", state["corner"], tuple)
+    least = (GRID_SIZE - LARGEST_SIZE) // 2
+    for (where, first), count in zip(
+        check.named_items(f"{name}['corner']", state["corner"], 2), state["evidence"].shape, strict=True
+    ):
+        check.integer(where, first, least, least + LARGEST_SIZE - count)

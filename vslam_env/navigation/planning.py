@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slam_backend.core.jit import in_place
-from slam_backend.core.validation import BoolArray, FloatArray, argument_error, check_array, check_float
-from vslam_env.navigation._grid_kernels import CELL, GRID_SIZE, HALF_WIDTH
+from slam_backend.core.validation import FloatArray, argument_error, check_float
+from vslam_env.navigation._grid_kernels import LARGEST_HALF_WIDTH
 from vslam_env.navigation._planning_kernels import (
     UNREACHED,
     FrontierColumns,
@@ -27,8 +27,23 @@ from vslam_env.navigation._planning_kernels import (
     nearest_open,
     shorten_path,
 )
-from vslam_env.navigation.occupancy_grid import centre_of, known_bounds
-from vslam_env.navigation.validation import check_cells, point_floats, pose_floats
+from vslam_env.navigation.grid_storage import known_bounds
+from vslam_env.navigation.occupancy_grid import OccupancyGrid, cell_of, centre_of
+from vslam_env.navigation.validation import check_cells, point_floats, pose_floats, positions_array
+
+Cells = OccupancyGrid | NDArray[np.uint8]
+
+
+def known_part(cells: Cells) -> tuple[NDArray[np.uint8], NDArray[np.int32]]:
+    """Return the cells (S, S) of a grid and the bounds (4,) of their known part, which a grid knows and cells do not.
+
+    Raises:
+        ValueError: If the cells are not a grid's.
+    """
+    if isinstance(cells, OccupancyGrid):
+        return cells.cells, cells.bounds
+    check_cells(cells)
+    return cells, known_bounds(cells)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,19 +63,17 @@ class Frontiers:
     lengths: FloatArray
 
 
-def find_frontiers(
-    cells: NDArray[np.uint8], start_xy: ArrayLike, radius: float = 0.2, ignored: BoolArray | None = None
-) -> Frontiers:
+def find_frontiers(cells: Cells, start_xy: ArrayLike, radius: float = 0.2, ignored: ArrayLike = ()) -> Frontiers:
     """Find the frontiers that a robot can reach.
 
     A frontier is a connected set of unknown cells next to free ones, at least 0.6 m long, with a reachable open cell
     within 1 m. Frontiers longer than 4 m are split into equal parts.
 
     Args:
-        cells: (300, 300) uint8. Cells of a `SeenGrid`.
+        cells: Grid, or its cells (S, S) uint8.
         start_xy: (2,) float64 [m], start frame. Position of the robot.
         radius: Radius of the robot [m].
-        ignored: (300, 300) bool. Unknown cells to ignore; None: none.
+        ignored: (n, 2) float64 [m], start frame. Points within 0.8 m of which unknown cells are ignored.
 
     Returns:
         Frontiers, nearest first; none if exploration is complete.
@@ -68,11 +81,8 @@ def find_frontiers(
     Raises:
         ValueError: If an array has the wrong shape, or a number is not finite.
     """
-    if ignored is None:
-        ignored = np.zeros((GRID_SIZE, GRID_SIZE), np.bool_)
-    mask = check_array("ignored", ignored, (GRID_SIZE, GRID_SIZE), "Mark cells of the grid.", dtype=np.bool_)
-    check_cells(cells)
-    rows = compute_frontiers(cells, known_bounds(cells), *_checked_start(start_xy, radius), mask)
+    points = positions_array(ignored, "ignored")
+    rows = compute_frontiers(*known_part(cells), *_checked_start(start_xy, radius), points)
     found = FrontierColumns.of(rows)
     return Frontiers(
         goals=found.goals, headings=found.heading.copy(), sizes=found.size.copy(), lengths=found.length.copy()
@@ -100,6 +110,7 @@ class DistanceMap:
     Attributes:
         start: Position (2,) [m], start frame, where all paths begin.
         corner: Row and column in the grid of the first cell of the arrays.
+        size: Number of cells S along a side of the grid.
         box: (h, w) uint8. Cells of the grid; 3 outside the grid.
         weights: (h, w) uint8. Cost per length; 0 for impassable cells.
         cost: (h, w) int32. Cost of the cheapest path; 2^31 - 1 if unreachable.
@@ -108,6 +119,7 @@ class DistanceMap:
 
     start: tuple[float, float]
     corner: tuple[int, int]
+    size: int
     box: NDArray[np.uint8]
     weights: NDArray[np.uint8]
     cost: NDArray[np.int32]
@@ -115,10 +127,14 @@ class DistanceMap:
 
     def cell_of(self, xy: ArrayLike) -> tuple[int, int]:
         """Return the (row, column) of a point (2,) [m] in the arrays; it may lie outside."""
-        limit = 2.0 * HALF_WIDTH  # outside the grid
-        x, y = (min(max(coordinate, -limit), limit) for coordinate in point_floats(xy, "xy"))
-        row, col = math.floor((y + HALF_WIDTH) / CELL), math.floor((x + HALF_WIDTH) / CELL)
-        return row - self.corner[0], col - self.corner[1]
+        limit = 2.0 * LARGEST_HALF_WIDTH  # outside the grid
+        point = [min(max(coordinate, -limit), limit) for coordinate in point_floats(xy, "xy")]
+        row, col = (cell_of(point, self.size) - self.corner).tolist()
+        return row, col
+
+    def centre_of(self, cells: ArrayLike) -> FloatArray:
+        """Return the centres (..., 2) [m], start frame, of cells (..., 2) of the arrays, rows (row, column)."""
+        return centre_of(np.asarray(cells) + self.corner, self.size)
 
     def path_to(self, goal_xy: ArrayLike) -> FloatArray | None:
         """Return the path from the start to a goal, as `plan_path` does.
@@ -132,16 +148,16 @@ class DistanceMap:
         if end_cell[0] < 0 or self.cost[end_cell] == UNREACHED:
             return None
         corners = shorten_path(self.weights, self.cost, self.parent, *end_cell)
-        centres = centre_of(corners + np.array(self.corner))
+        centres = self.centre_of(corners)
         between = centres[1:-1] if tuple(corners[0]) == self.cell_of(self.start) else centres[:-1]
         return np.vstack([self.start, between, goal if end_cell == goal_cell else centres[-1]])
 
 
-def distance_map(cells: NDArray[np.uint8], start_xy: ArrayLike, radius: float = 0.2) -> DistanceMap:
+def distance_map(cells: Cells, start_xy: ArrayLike, radius: float = 0.2) -> DistanceMap:
     """Find the cheapest paths from a position to all known free floor.
 
     Args:
-        cells: (300, 300) uint8. Cells of a `SeenGrid`.
+        cells: Grid, or its cells (S, S) uint8.
         start_xy: (2,) float64 [m], start frame. If its cell is impassable, the search starts from the nearest open cell
             within 1 m that is not behind a wall.
         radius: Radius of the robot [m], at least 0.11.
@@ -152,10 +168,11 @@ def distance_map(cells: NDArray[np.uint8], start_xy: ArrayLike, radius: float = 
     Raises:
         ValueError: If the cells are not a grid's, or a number is not finite.
     """
-    check_cells(cells)
-    start = _checked_start(start_xy, radius)
-    box, weights, cost, parent, row, col = dijkstra(cells, known_bounds(cells), *start)
-    return DistanceMap(start=start[:2], corner=(row, col), box=box, weights=weights, cost=cost, parent=parent)
+    (states, bounds), start = known_part(cells), _checked_start(start_xy, radius)
+    box, weights, cost, parent, row, col = dijkstra(states, bounds, *start)
+    return DistanceMap(
+        start=start[:2], corner=(row, col), size=len(states), box=box, weights=weights, cost=cost, parent=parent
+    )
 
 
 def _checked_start(start_xy: ArrayLike, radius: float) -> tuple[float, float, float]:
@@ -165,13 +182,11 @@ def _checked_start(start_xy: ArrayLike, radius: float) -> tuple[float, float, fl
     return x, y, radius
 
 
-def plan_path(
-    cells: NDArray[np.uint8], start_xy: ArrayLike, goal_xy: ArrayLike, radius: float = 0.2
-) -> FloatArray | None:
+def plan_path(cells: Cells, start_xy: ArrayLike, goal_xy: ArrayLike, radius: float = 0.2) -> FloatArray | None:
     """Plan a short path over known free floor that keeps away from walls where possible.
 
     Args:
-        cells: (300, 300) uint8. Cells of a `SeenGrid`.
+        cells: Grid, or its cells (S, S) uint8.
         start_xy: (2,) float64 [m], start frame. If it lies in an inflated wall, the path first leaves it.
         goal_xy: (2,) float64 [m], start frame. If it lies in an inflated wall, the path ends up to 0.4 m away from it.
         radius: Radius of the robot [m].

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slam_backend.core.validation import FloatArray, argument_error
-from vslam_env.navigation._grid_kernels import GRID_SIZE
+from vslam_env.navigation.grid_storage import GRID_SIZES
 
 
 def pose_floats(pose: ArrayLike, name: str = "pose") -> tuple[float, float, float]:
@@ -38,7 +38,7 @@ def positions_array(positions: ArrayLike, name: str) -> FloatArray:
         return np.empty((0, 2))
     if values.ndim != 2 or values.shape[1] != 2 or not np.isfinite(values).all():
         got = "NaN or infinity" if values.ndim == 2 and values.shape[1] == 2 else f"shape {values.shape}"
-        raise argument_error(name, "finite numbers in an array of shape (k, 2)", got, "Give one (x, y) per robot.")
+        raise argument_error(name, "finite numbers in an array of shape (k, 2)", got, "Give rows (x, y).")
     return values
 
 
@@ -58,7 +58,8 @@ def ray_directions(angles: FloatArray) -> FloatArray:
 
 
 def check_cells(cells: NDArray[np.uint8]) -> None:
-    """Raise unless an array has shape and dtype of `SeenGrid.cells`."""
-    if not isinstance(cells, np.ndarray) or cells.shape != (GRID_SIZE, GRID_SIZE) or cells.dtype != np.uint8:
+    """Raise unless an array has shape and dtype of `OccupancyGrid.cells`."""
+    is_grid = isinstance(cells, np.ndarray) and cells.dtype == np.uint8 and cells.ndim == 2
+    if not (is_grid and cells.shape[0] == cells.shape[1] and len(cells) in GRID_SIZES):
         got = f"shape {cells.shape} of {cells.dtype}" if isinstance(cells, np.ndarray) else cells
-        raise argument_error("cells", "an array of shape (300, 300) of uint8", got, "Pass SeenGrid.cells.")
+        raise argument_error("cells", "the grid, or its cells (S, S) of uint8", got, "Pass belief.grid.")

@@ -4,13 +4,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam_backend.core.read_only import as_read_only
 from slam_backend.core.validation import FloatArray
 from vslam_env.actions import MAX_SPEED, MAX_TURN
 from vslam_env.config import EnvConfig
-from vslam_env.navigation import follow_path, plan_path
+from vslam_env.navigation import OccupancyGrid, follow_path, plan_path
 from vslam_env.simulation.episode import Episode
 
 
@@ -25,31 +24,31 @@ class GoalController:
         self._heading = 0.0
         self._path: FloatArray | None = None
 
-    def set_goal(self, candidate: tuple[FloatArray, float] | None, pose: FloatArray, cells: NDArray[np.uint8]) -> None:
+    def set_goal(self, candidate: tuple[FloatArray, float] | None, pose: FloatArray, grid: OccupancyGrid) -> None:
         """Set the goal and plan a path to it.
 
         Args:
             candidate: Goal (2,) [m] and heading at the goal [rad], start frame; None: stay.
-            pose, cells: Pose and grid, see `command`.
+            pose, grid: Pose and grid, see `command`.
         """
         if candidate is None:
             self._goal = None
         else:
             self._goal, self._heading = candidate
-            self._path = plan_path(cells, pose[:2], self._goal)
+            self._path = plan_path(grid, pose[:2], self._goal)
 
-    def command(self, pose: FloatArray, cells: NDArray[np.uint8], bumped: bool) -> FloatArray:
+    def command(self, pose: FloatArray, grid: OccupancyGrid, bumped: bool) -> FloatArray:
         """Return the velocity command (2,) [m/s, rad/s] for the next tick.
 
         Args:
             pose: (3,) float64 [m, m, rad], start frame. Pose estimate of the robot.
-            cells: (300, 300) uint8. Cells of its occupancy grid.
+            grid: Occupancy grid of the robot.
             bumped: Whether the robot bumped into an obstacle in the last tick.
         """
         if self._goal is None:
             return np.zeros(2)
         if bumped:
-            self._path = plan_path(cells, pose[:2], self._goal)
+            self._path = plan_path(grid, pose[:2], self._goal)
         if self._path is None:
             return np.zeros(2)
         return np.array(follow_path(pose, self._path, MAX_SPEED, MAX_TURN, self._heading))
@@ -94,11 +93,11 @@ class ActionExecutor:
         candidates = [beliefs.candidate(robot, action - 1) if action else None for robot, action in enumerate(chosen)]
         poses = beliefs.poses
         for robot, (driver, candidate) in enumerate(zip(self._drivers, candidates, strict=True)):
-            driver.set_goal(candidate, poses[robot], beliefs.cells(robot))
+            driver.set_goal(candidate, poses[robot], beliefs.grid(robot))
         for _ in range(self._ticks):
             poses, bumps = beliefs.poses, episode.readings.bumps.tolist()
             commands = [
-                driver.command(poses[robot], beliefs.cells(robot), bumps[robot])
+                driver.command(poses[robot], beliefs.grid(robot), bumps[robot])
                 for robot, driver in enumerate(self._drivers)
             ]
             episode.advance(np.array(commands))

@@ -16,7 +16,7 @@ from vslam_env import EnvConfig, ExplorationEnv, preset_config, vslam_v0
 from vslam_env.belief.observation import flatten, observe
 from vslam_env.belief.readings import Readings, TeamReadings
 from vslam_env.belief.team_belief import Belief, TeamBelief
-from vslam_env.navigation import CELL, FREE, GRID_SIZE, OCCUPIED, UNKNOWN, cell_of
+from vslam_env.navigation import CELL, FREE, OCCUPIED, UNKNOWN, cell_of
 from vslam_env.reward import TERMS
 
 KEYS = ["pose", "pose_std", "map_stats", "local_grid", "scan", "candidates", "teammates", "teammates_mask"]
@@ -85,8 +85,9 @@ def _plain_local_grid(belief: Belief) -> np.ndarray:
     steps = (23.5 - np.arange(48)) * CELL
     ahead, left = np.meshgrid(steps, steps, indexing="ij")
     centres = transform_points(belief.pose, np.stack([ahead, left], axis=-1))
-    rows, cols = np.moveaxis(cell_of(centres), -1, 0)
-    inside = (rows >= 0) & (rows < GRID_SIZE) & (cols >= 0) & (cols < GRID_SIZE)
+    size = len(belief.grid.cells)
+    rows, cols = np.moveaxis(cell_of(centres, size), -1, 0)
+    inside = (rows >= 0) & (rows < size) & (cols >= 0) & (cols < size)
     seen = np.where(inside, belief.grid.cells[np.where(inside, rows, 0), np.where(inside, cols, 0)], UNKNOWN)
     picture = np.zeros((3, 48, 48), np.uint8)
     picture[0], picture[1] = 255 * (seen == FREE), 255 * (seen == OCCUPIED)

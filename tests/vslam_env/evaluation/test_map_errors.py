@@ -20,7 +20,7 @@ from slam_backend.maps.landmark_map import LandmarkMap, TeamMapSummaries
 from slam_backend.metrics import map_error, map_rmse
 from vslam_env.evaluation.coverage import CoverageCells, CoverageTracker
 from vslam_env.evaluation.map_scores import GroundTruthAssociation
-from vslam_env.navigation import FREE, SeenGrid, TeamGrids, cell_of
+from vslam_env.navigation import FREE, OccupancyGrid, TeamGrids, cell_of
 
 TRUTHS = np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 0.3], [0.0, 6.0, -0.2], [7.0, 7.0, 0.0], [9.0, 1.0, 0.0]])
 COUNTABLE = np.array([True, True, False, True, True])
@@ -197,12 +197,13 @@ def test_infos_agree_with_the_own_start_frame() -> None:
     assert any(event.kind == "merge" for event in env.events)
 
 
-def _plain_share(centres: np.ndarray, starts: np.ndarray, grids: list[SeenGrid]) -> float:
+def _plain_share(centres: np.ndarray, starts: np.ndarray, grids: list[OccupancyGrid]) -> float:
     """Return the coverage by looking up each place in each grid."""
     seen = np.zeros(len(centres), np.bool_)
     for start, grid in zip(starts, grids, strict=True):
-        cells = cell_of(transform_points(inverse(start), centres))
-        inside = ((cells >= 0) & (cells < 300)).all(axis=1)
+        size = len(grid.cells)
+        cells = cell_of(transform_points(inverse(start), centres), size)
+        inside = ((cells >= 0) & (cells < size)).all(axis=1)
         seen[inside] |= grid.cells[tuple(cells[inside].T)] == FREE
     return float(seen.mean())
 

@@ -15,7 +15,7 @@ from vslam_env.navigation import (
     OCCUPIED,
     UNKNOWN,
     CandidateSlots,
-    SeenGrid,
+    OccupancyGrid,
     cell_of,
     find_frontiers,
     follow_path,
@@ -25,7 +25,7 @@ from vslam_env.navigation._planning_kernels.candidates import SAME_GOAL, pair_di
 from vslam_env.navigation._planning_kernels.costmap import OUTSIDE, PAD
 from vslam_env.navigation._planning_kernels.frontiers import _unseen_edges
 from vslam_env.navigation.candidate_slots import NUM_SLOTS, _assign
-from vslam_env.navigation.occupancy_grid import known_bounds
+from vslam_env.navigation.grid_storage import known_bounds
 
 _unseen_edges, pair_distances = map(python_entry, (_unseen_edges, pair_distances))
 
@@ -85,9 +85,8 @@ def test_specks_and_what_is_out_of_reach_are_no_frontiers() -> None:
     assert len(find_frontiers(cells, (-3.0, 0.0)).goals) == 0
     cells[row, col + 2] = UNKNOWN
     assert len(find_frontiers(cells, (-3.0, 0.0)).goals) == 1
-    ignored = np.zeros(cells.shape, bool)
-    ignored[row, col] = True
-    assert len(find_frontiers(cells, (-3.0, 0.0), ignored=ignored).goals) == 0
+    assert len(find_frontiers(cells, (-3.0, 0.0), ignored=[(-2.0, 0.1), (1.9, 0.1)]).goals) == 0
+    assert len(find_frontiers(cells, (-3.0, 0.0), ignored=[(-2.0, 0.1), (2.4, 0.1)]).goals) == 1
 
 
 def test_a_gap_too_narrow_for_the_robot_is_no_frontier() -> None:
@@ -199,11 +198,11 @@ def test_restored_slots_continue_bit_for_bit() -> None:
         assert np.array_equal(value, again.get_state()[name], equal_nan=True)
 
 
-def explore(seed: int, start: FloatArray, max_ticks: int = 2000) -> tuple[SeenGrid, CandidateSlots, FloatArray]:
+def explore(seed: int, start: FloatArray, max_ticks: int = 2000) -> tuple[OccupancyGrid, CandidateSlots, FloatArray]:
     """Drive an ideal robot to the nearest candidate until none is left; return grid, slots and true path (n, 3)."""
     rng = np.random.default_rng(seed)
     walls = building()
-    grid, slots = SeenGrid(), CandidateSlots()
+    grid, slots = OccupancyGrid(), CandidateSlots()
     pose, path, heading = start, None, 0.0
     track = [pose]
     for tick in range(max_ticks):
@@ -245,20 +244,19 @@ def test_the_nearest_frontier_explores_a_building_and_ends(seed: int, start: tup
 
 @pytest.mark.parametrize("corner", [(0, 0), (GRID_SIZE - 12, 40), (100, GRID_SIZE - 15)])
 def test_frontiers_are_made_of_unknown_cells_beside_free_ones(corner: tuple[int, int]) -> None:
-    """Also at the border of the grid; what is ignored counts nowhere."""
+    """Also at the border of the grid."""
     rng = np.random.default_rng(3)
     cells = np.full((GRID_SIZE, GRID_SIZE), UNKNOWN, np.uint8)
     row, col = corner
     cells[row : row + 12, col : col + 15] = rng.integers(0, 3, (12, 15))
-    ignored = rng.random(cells.shape) < 0.2
     padded = np.pad(cells, 1, constant_values=OUTSIDE) == FREE
     beside = padded[:-2, 1:-1] | padded[2:, 1:-1] | padded[1:-1, :-2] | padded[1:-1, 2:]
     bounds = known_bounds(cells)
     around = np.pad(cells, PAD, constant_values=OUTSIDE)
     box = np.ascontiguousarray(around[bounds[0] : bounds[2] + 2 * PAD, bounds[1] : bounds[3] + 2 * PAD])
-    edges = _unseen_edges(box, ignored, bounds[0] - PAD, bounds[1] - PAD)
+    edges = _unseen_edges(box, bounds[0] - PAD, bounds[1] - PAD, GRID_SIZE)
     found = np.argwhere(edges) + bounds[:2] - PAD
-    assert found.tolist() == np.argwhere((cells == UNKNOWN) & beside & ~ignored).tolist()
+    assert found.tolist() == np.argwhere((cells == UNKNOWN) & beside).tolist()
 
 
 def test_unambiguous_pairs_are_those_of_the_optimal_assignment() -> None:

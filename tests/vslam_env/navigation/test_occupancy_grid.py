@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from builders.environments import ANGLES, MAX_RANGE, scan
-from builders.plain_scan_update import plain_scan_update
+from builders.plain_scan_update import PLAIN_SIZE, plain_scan_update
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -14,12 +14,17 @@ from vslam_env.navigation import (
     GRID_SIZE,
     OCCUPIED,
     UNKNOWN,
-    SeenGrid,
+    OccupancyGrid,
     TeamGrids,
     cell_of,
     centre_of,
+    distance_map,
+    find_frontiers,
+    plan_path,
     ray_directions,
 )
+from vslam_env.navigation._grid_kernels import LARGEST_SIZE
+from vslam_env.navigation.grid_storage import GRID_SIZES
 
 ALL_CENTRES = centre_of(np.stack(np.meshgrid(np.arange(GRID_SIZE), np.arange(GRID_SIZE), indexing="ij"), axis=-1))
 
@@ -29,10 +34,18 @@ def wall_ranges(distance: float) -> np.ndarray:
     return np.minimum(distance / np.cos(ANGLES), MAX_RANGE)
 
 
-def cells_at(grid: SeenGrid, points: np.ndarray) -> np.ndarray:
+def cells_at(grid: OccupancyGrid, points: np.ndarray) -> np.ndarray:
     """Return the verdicts at points (n, 2)."""
-    rows, cols = cell_of(points).T
+    rows, cols = cell_of(points, len(grid.cells)).T
     return grid.cells[rows, cols]
+
+
+def evidence_of(grid: OccupancyGrid, size: int) -> np.ndarray:
+    """Return the evidence (size, size) of a grid."""
+    evidence, (row, col) = grid.get_state().values()
+    shift, whole = (size - GRID_SIZE) // 2, np.zeros((size, size), np.int8)
+    whole[row + shift : row + shift + len(evidence), col + shift : col + shift + evidence.shape[1]] = evidence
+    return whole
 
 
 @given(st.integers(0, GRID_SIZE - 1), st.integers(0, GRID_SIZE - 1))
@@ -48,7 +61,7 @@ def test_a_cell_holds_its_own_centre(row: int, col: int) -> None:
 )
 def test_an_open_view_leaves_no_speckles(pose: tuple[float, float, float]) -> None:
     """All cells in view of a scan that hits nothing are free, and no other cell is touched."""
-    grid = SeenGrid()
+    grid = OccupancyGrid()
     grid.update_from_scan(pose, np.full(32, MAX_RANGE), ANGLES)
     offset = ALL_CENTRES - np.array(pose[:2])
     bearing = (np.arctan2(offset[..., 1], offset[..., 0]) - pose[2] + np.pi) % (2 * np.pi) - np.pi
@@ -63,7 +76,7 @@ def test_an_open_view_leaves_no_speckles(pose: tuple[float, float, float]) -> No
 @pytest.mark.parametrize("distance", [0.9, 2.3, 3.05, 5.5, 6.97])
 def test_a_wall_is_marked_without_holes(distance: float) -> None:
     """Before a wall all is free, on it occupied, behind it unknown."""
-    grid = SeenGrid()
+    grid = OccupancyGrid()
     grid.update_from_scan((0.0, 0.0, 0.0), wall_ranges(distance), ANGLES)
     across = np.linspace(-0.4, 0.4, 41) * distance
     before = np.stack([np.full(41, distance - 0.3), across * 0.8], axis=-1)
@@ -78,10 +91,10 @@ def test_a_wall_is_marked_without_holes(distance: float) -> None:
 def test_a_scan_update_agrees_with_the_plain_definition(seed: int, fan: np.ndarray) -> None:
     """Scans of walls, gaps and nothing, wherever the robot stands and looks, change the evidence as the plain form."""
     rng = np.random.default_rng(seed)
-    grid, plain = SeenGrid(), np.zeros((GRID_SIZE, GRID_SIZE), np.int8)
+    grid, plain = OccupancyGrid(), np.zeros((PLAIN_SIZE, PLAIN_SIZE), np.int8)
     for k in range(40):
         pose = np.append(
-            rng.uniform(-29.0, 29.0, 2) if k % 4 == 0 else rng.uniform(-2.0, 2.0, 2), rng.uniform(-7.0, 7.0)
+            rng.uniform(-45.0, 45.0, 2) if k % 4 == 3 else rng.uniform(-2.0, 2.0, 2), rng.uniform(-7.0, 7.0)
         )
         ranges = rng.uniform(0.5, 7.0) / np.cos(fan - rng.uniform(-0.2, 0.2)) + rng.normal(0.0, 0.02, len(fan))
         ranges = np.abs(
@@ -90,9 +103,11 @@ def test_a_scan_update_agrees_with_the_plain_definition(seed: int, fan: np.ndarr
         ranges[rng.random(len(fan)) < rng.choice([0.0, 0.5])] = MAX_RANGE
         grid.update_from_scan(pose, ranges, fan)
         plain = plain_scan_update(plain, pose, ranges, fan, MAX_RANGE)
-        assert (grid.get_state()["evidence"] == plain).all()
+        assert (evidence_of(grid, PLAIN_SIZE) == plain).all()
         verdicts = np.where(plain == 0, UNKNOWN, np.where(plain > 0, OCCUPIED, FREE))
-        assert (grid.cells == verdicts).all()
+        inset = (PLAIN_SIZE - len(grid.cells)) // 2
+        assert (grid.cells == verdicts[inset : PLAIN_SIZE - inset, inset : PLAIN_SIZE - inset]).all()
+    assert len(grid.cells) == PLAIN_SIZE
 
 
 def test_a_grid_reports_changed_cells() -> None:
@@ -108,7 +123,8 @@ def test_a_grid_reports_changed_cells() -> None:
         grid.clear_disc(pose)
         if k % 3 == 0:
             grid.bump(pose)
-        assert set(np.flatnonzero(grid.cells != before).tolist()) <= set(changes[1 : 1 + changes[0]].tolist())
+        changed = np.argwhere(grid.cells != before) + (LARGEST_SIZE - GRID_SIZE) // 2
+        assert set((changed @ [LARGEST_SIZE, 1]).tolist()) <= set(changes[1 : 1 + changes[0]].tolist())
     assert 0 <= changes[0] < 200
     grid.set_state(grid.get_state())
     assert changes[0] == -1
@@ -117,7 +133,7 @@ def test_a_grid_reports_changed_cells() -> None:
 def test_a_grid_keeps_the_bounds_of_what_it_knows() -> None:
     """However it is painted, joined and restored, they are the least and largest row and column of it."""
     rng = np.random.default_rng(5)
-    team, other = TeamGrids(1), SeenGrid()
+    team, other = TeamGrids(1), OccupancyGrid()
     (grid,), (bounds,) = team.grids, team.bounds
     assert bounds.tolist() == [0, 0, 0, 0]
     other.update_from_scan((3.0, -2.0, 1.0), wall_ranges(4.0), ANGLES)
@@ -139,7 +155,7 @@ def test_a_grid_keeps_the_bounds_of_what_it_knows() -> None:
 
 def test_a_doorway_between_two_rays_is_not_walled_up() -> None:
     """Two hits beside an opening that a robot fits through leave it open."""
-    grid = SeenGrid()
+    grid = OccupancyGrid()
     ranges = wall_ranges(3.0)
     ranges[12:20] = MAX_RANGE  # 0.8 m wide
     grid.update_from_scan((0.0, 0.0, 0.0), ranges, ANGLES)
@@ -154,7 +170,7 @@ def test_grazing_rays_do_not_eat_thin_walls() -> None:
     """
     rng = np.random.default_rng(3)
     walls = np.array([[-20.0, 0.35, 20.0, 0.35], [-20.0, -1.4, 20.0, -1.4]])
-    grid = SeenGrid()
+    grid = OccupancyGrid()
     for x in np.arange(-5.0, 5.0, 0.05):
         pose = np.array([x, 0.0, 0.0])
         grid.update_from_scan(pose, scan(walls, pose, rng), ANGLES)
@@ -168,7 +184,7 @@ def test_grazing_rays_do_not_eat_thin_walls() -> None:
 
 def test_one_outlier_does_not_block_a_path() -> None:
     """A hit where ten scans passed changes nothing; a wall that stays is believed."""
-    grid = SeenGrid()
+    grid = OccupancyGrid()
     for _ in range(10):
         grid.update_from_scan((0.0, 0.0, 0.0), wall_ranges(6.0), ANGLES)
     grid.update_from_scan((0.0, 0.0, 0.0), wall_ranges(3.1), ANGLES)
@@ -180,7 +196,7 @@ def test_one_outlier_does_not_block_a_path() -> None:
 
 def test_moved_obstacles_are_cleared() -> None:
     """A robot that stood in view for long leaves no wall behind once rays pass again for two seconds."""
-    grid = SeenGrid()
+    grid = OccupancyGrid()
     for distance, ticks in ((3.1, 100), (6.0, 20)):
         for _ in range(ticks):
             grid.update_from_scan((0.0, 0.0, 0.0), wall_ranges(distance), ANGLES)
@@ -189,7 +205,7 @@ def test_moved_obstacles_are_cleared() -> None:
 
 def test_the_robots_place_is_free_but_the_wall_it_touches_stays() -> None:
     """A disc frees unknown cells and what lies wholly inside it, not the wall at its rim."""
-    grid = SeenGrid()
+    grid = OccupancyGrid()
     grid.update_from_scan((0.05, 0.1, 0.0), wall_ranges(0.95), ANGLES)
     assert cells_at(grid, np.array([[1.0, 0.1]])) == [OCCUPIED]
     grid.clear_disc((0.75, 0.1, 0.0), radius=0.3)
@@ -201,7 +217,7 @@ def test_the_robots_place_is_free_but_the_wall_it_touches_stays() -> None:
 
 def test_a_bump_marks_what_is_ahead() -> None:
     """After a bump the cell ahead is occupied, until rays pass through it for a second."""
-    grid = SeenGrid()
+    grid = OccupancyGrid()
     pose = (1.0, -2.0, np.pi / 2)
     grid.clear_disc(pose)
     grid.bump(pose)
@@ -211,22 +227,76 @@ def test_a_bump_marks_what_is_ahead() -> None:
     assert cells_at(grid, np.array([[1.01, -1.7]])) == [FREE]
 
 
-@pytest.mark.parametrize("pose", [(31.0, 3.0, np.pi), (29.9, -29.9, 0.3), (1e300, -1e300, 0.0), (0.0, 30.1, -1.5)])
-def test_what_lies_outside_the_grid_is_ignored(pose: tuple[float, float, float]) -> None:
+@pytest.mark.parametrize("pose", [(401.0, 3.0, np.pi), (399.9, -399.9, 0.3), (1e300, -1e300, 0.0), (0.0, 400.1, -1.5)])
+def test_what_lies_outside_the_largest_grid_is_ignored(pose: tuple[float, float, float]) -> None:
     """Near and beyond the edge, all ways of painting work and touch only the cells that exist."""
-    grid, other = SeenGrid(), SeenGrid()
+    grid, other = OccupancyGrid(), OccupancyGrid()
     other.clear_disc((0.0, 0.0, 0.0), radius=2.0)
     grid.update_from_scan(pose, wall_ranges(3.0), ANGLES)
     grid.clear_disc(pose)
     grid.bump(pose)
     grid.merge(other, pose)
-    assert grid.cells.shape == (GRID_SIZE, GRID_SIZE)
+    assert grid.cells.shape == (LARGEST_SIZE, LARGEST_SIZE)
+
+
+def test_a_grid_grows_with_what_was_seen_and_stays_the_same() -> None:
+    """Content, frontiers, paths and merges of a grid that grew are those of one that was large from the beginning."""
+    rng = np.random.default_rng(7)
+    small, large, other = OccupancyGrid(), OccupancyGrid(), OccupancyGrid()
+    large.clear_disc((250.0, 0.0, 0.0))
+    assert len(large.cells) == GRID_SIZES[-1]
+    large.set_state(small.get_state())
+    other.update_from_scan((25.0, 4.0, 0.0), wall_ranges(5.0), ANGLES)
+    sizes = set()
+    for x in np.arange(0.0, 130.0, 2.0):
+        pose, ranges = np.array([x, -0.3 * x, rng.uniform(-3.0, 3.0)]), rng.uniform(3.0, 9.0, 32)
+        for grid in (small, large):
+            grid.update_from_scan(pose, ranges, ANGLES)
+            grid.clear_disc(pose, 1.0)
+            grid.bump(pose)
+            if x % 40 == 0:
+                grid.merge(other, pose)
+        state, expected = small.get_state(), large.get_state()
+        assert state["corner"] == expected["corner"]
+        assert (state["evidence"] == expected["evidence"]).all()
+        sizes.add(len(small.cells))
+    assert sizes == set(GRID_SIZES[:4])
+    for x in np.arange(0.0, 130.0, 0.5):  # a way through what the scans drew
+        for grid in (small, large):
+            grid.clear_disc((x, -0.3 * x, 0.0), 1.0)
+    here, there = pose[:2], np.zeros(2)
+    for make in (find_frontiers, distance_map):
+        found, wanted = make(small, here), make(large, here)
+        for name in ("goals", "headings", "sizes", "lengths") if make is find_frontiers else ("box", "cost", "parent"):
+            assert (getattr(found, name) == getattr(wanted, name)).all()
+    assert len(find_frontiers(small, here).goals) > 10
+    assert (plan_path(small, here, there) == plan_path(large, here, there)).all()
+    assert (plan_path(small, here, there) == plan_path(small.cells, here, there)).all()
+    points = rng.uniform(-140.0, 140.0, (500, 2))
+    assert (cells_at(small, points) == cells_at(large, points)).all()
+
+
+def test_views_and_states_follow_a_grid_that_grows() -> None:
+    """A view that was taken before a grid grew shows what it holds now, and an old state is restored exactly."""
+    team = TeamGrids(2)
+    grid, view = team.grids[0], team.grids[0].read_only_view()
+    grid.update_from_scan((0.0, 0.0, 0.0), wall_ranges(3.0), ANGLES)
+    before, known = grid.get_state(), cells_at(grid, ALL_CENTRES.reshape(-1, 2))
+    grid.update_from_scan((60.0, 0.0, 0.0), wall_ranges(3.0), ANGLES)
+    assert (view.cells == grid.cells).all()
+    assert cells_at(view, np.array([[60.5, 0.1]])) == [FREE]
+    assert len(team.cells[1]) == len(view.cells) > GRID_SIZE
+    assert not team.cells[1].any()
+    grid.set_state(before)
+    assert (cells_at(view, ALL_CENTRES.reshape(-1, 2)) == known).all()
+    assert np.count_nonzero(view.cells) == np.count_nonzero(known)
+    assert len(grid.get_state()["evidence"]) < 60
 
 
 @given(st.tuples(st.floats(-8, 8), st.floats(-8, 8), st.floats(-4, 4)))
 def test_absorbed_walls_stand_where_they_are_and_stay_closed(self_from_other: tuple[float, float, float]) -> None:
     """What another robot saw appears at its place in the own frame, its walls without holes."""
-    grid, other = SeenGrid(), SeenGrid()
+    grid, other = OccupancyGrid(), OccupancyGrid()
     for _ in range(4):
         other.update_from_scan((0.0, 0.0, 0.0), wall_ranges(4.1), ANGLES)
     grid.merge(other, self_from_other)
@@ -241,7 +311,7 @@ def test_absorbed_walls_stand_where_they_are_and_stay_closed(self_from_other: tu
 
 def test_absorbing_without_a_move_copies_and_keeps_the_other() -> None:
     """An empty grid that absorbs another one in the same frame knows the same floor, and the other stays as it was."""
-    grid, other = SeenGrid(), SeenGrid()
+    grid, other = OccupancyGrid(), OccupancyGrid()
     other.update_from_scan((1.0, 2.0, 0.4), wall_ranges(4.1), ANGLES)
     before = other.cells.copy()
     grid.merge(other, (0.0, 0.0, 0.0))
@@ -251,7 +321,7 @@ def test_absorbing_without_a_move_copies_and_keeps_the_other() -> None:
 
 def test_copies_are_independent_and_views_follow() -> None:
     """A copy keeps its content when the grid changes; a frozen view follows it and refuses changes."""
-    grid = SeenGrid()
+    grid = OccupancyGrid()
     copy, view = grid.copy(), grid.read_only_view()
     grid.clear_disc((0.1, 0.1, 0.0))
     assert not copy.cells.any()
@@ -292,7 +362,7 @@ def test_a_combined_update_equals_its_parts() -> None:
             if bumps[robot]:
                 parts[owner].bump(pose, RADIUS)
         for robot, (whole, part) in enumerate(zip(team.grids, parts, strict=True)):
-            assert (whole.get_state()["evidence"] == part.get_state()["evidence"]).all()
+            assert (evidence_of(whole, GRID_SIZE) == evidence_of(part, GRID_SIZE)).all()
             assert (whole.cells == part.cells).all()
             assert (team.cells[robot] == part.cells).all()
             count = 1 + apart[robot].changes[0, 0]

@@ -25,7 +25,7 @@ from vslam_env.navigation import (
 )
 from vslam_env.navigation._planning_kernels.costmap import CLOSE, NEAR, OPEN, OUTSIDE, PAD, inflate_costs
 from vslam_env.navigation._planning_kernels.dijkstra import UNREACHED, wavefront
-from vslam_env.navigation.occupancy_grid import known_bounds
+from vslam_env.navigation.grid_storage import known_bounds
 
 wavefront, inflate_costs = map(python_entry, (wavefront, inflate_costs))
 

@@ -5,7 +5,7 @@ import pytest
 
 from vslam_env.navigation import (
     DistanceMap,
-    SeenGrid,
+    OccupancyGrid,
     cells_of,
     distance_map,
     frontier_cells,
@@ -19,10 +19,10 @@ LEFT, RIGHT, DOOR = (-3.0, 1.0), (3.0, -1.0), (0.1, 0.1)  # two rooms of about 6
 
 
 @pytest.fixture(scope="module")
-def grid() -> SeenGrid:
+def grid() -> OccupancyGrid:
     """Two rooms side by side, with a door of 1 m between them; an unknown corner in the right one."""
-    grid = SeenGrid()
-    state = grid.get_state()
+    grid = OccupancyGrid()
+    state = {"evidence": np.zeros((300, 300), np.int8), "corner": (0, 0)}
     evidence = state["evidence"]
     evidence[140:161, 120:181] = -10
     for walls in (
@@ -40,12 +40,12 @@ def grid() -> SeenGrid:
 
 
 @pytest.fixture(scope="module")
-def ways(grid: SeenGrid) -> DistanceMap:
+def ways(grid: OccupancyGrid) -> DistanceMap:
     """Distance map from the left room."""
     return distance_map(grid.cells, LEFT)
 
 
-def test_lengths_agree_with_planned_paths(grid: SeenGrid, ways: DistanceMap) -> None:
+def test_lengths_agree_with_planned_paths(grid: OccupancyGrid, ways: DistanceMap) -> None:
     """Lengths are symmetric within a cell, at least the straight distance, and near those of planned paths."""
     places = np.array([LEFT, RIGHT, DOOR, (4.0, 1.0)])
     lengths = lengths_between(ways, places, places)
@@ -77,7 +77,7 @@ def test_walls_block_the_view(ways: DistanceMap) -> None:
     assert not sees(ways, places, cells_of(ways, places), 1.0)[2, 3]
 
 
-def test_frontier_cells_border_on_free_ones(grid: SeenGrid, ways: DistanceMap) -> None:
+def test_frontier_cells_border_on_free_ones(grid: OccupancyGrid, ways: DistanceMap) -> None:
     """Frontier cells are the seven unknown cells of the corner that touch free ones; plain loops find the same."""
     found = {tuple(cell) for cell in frontier_cells(ways) + ways.corner}
     plain = {

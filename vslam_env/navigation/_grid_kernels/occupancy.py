@@ -8,11 +8,15 @@ from numpy.typing import NDArray
 
 from slam_backend.core.jit import device, in_place, inline
 
-GRID_SIZE = 300
 CELL = 0.2
 UNKNOWN, FREE, OCCUPIED = 0, 1, 2
 
-HALF_WIDTH = 0.5 * GRID_SIZE * CELL  # [m]; the start pose is the middle of the grid
+# Cells along a side of a new grid and of the largest one. The start pose is the middle of both. Indices of cells are
+# floored in the new grid and then moved by a whole number of cells (`margin_of`), so that the size of a grid changes no
+# rounding. What is recorded for longer than a grid keeps its size is the flat index in the largest grid (`place_of`).
+GRID_SIZE, LARGEST_SIZE = 300, 4000
+HALF_WIDTH = 0.5 * GRID_SIZE * CELL  # [m]
+LARGEST_HALF_WIDTH = 0.5 * LARGEST_SIZE * CELL  # [m]
 
 # Evidence per cell: 0 never touched, negative free, positive occupied. A hit outweighs three passes, so that a wall of
 # no thickness survives rays that graze its cell; the bounds let a few seconds of new readings overrule any old ones.
@@ -23,15 +27,15 @@ MOST_CHANGES = 4096  # a grid keeps so many; a scan makes a hundred at most
 
 
 class Grid(NamedTuple):
-    """The arrays of a seen grid; those of a team's grids have one dimension more.
+    """The arrays of an occupancy grid; those of a team's grids have one dimension more.
 
     Rows go with y and columns with x. The start pose is the middle.
 
     Attributes:
-        evidence: (300, 300) int8. Hits against passes.
-        cells: (300, 300) uint8. Verdict on each cell.
-        changes: (1 + n,) int32. Number of changed verdicts, -1 if it is not known; then the places of these cells in
-            the flat grid.
+        evidence: (S, S) int8. Hits against passes.
+        cells: (S, S) uint8. Verdict on each cell.
+        changes: (1 + n,) int32. Number of changed verdicts, -1 if it is not known; then the places of these cells, see
+            `place_of`.
         bounds: (4,) int32. First row and column of what is known, and one past the last ones; zeros if nothing is.
     """
 
@@ -39,6 +43,19 @@ class Grid(NamedTuple):
     cells: NDArray[np.uint8]
     changes: NDArray[np.int32]
     bounds: NDArray[np.int32]
+
+
+@inline
+def margin_of(size: int) -> int:
+    """Return how many rows a grid of a size has before the first row of a new grid."""
+    return (size - GRID_SIZE) // 2
+
+
+@inline
+def place_of(row: int, col: int, size: int) -> int:
+    """Return the flat index in the largest grid of a cell of a grid of a size."""
+    inset = (LARGEST_SIZE - size) // 2
+    return (row + inset) * LARGEST_SIZE + col + inset
 
 
 @inline
@@ -62,17 +79,73 @@ def set_state(grid: Grid, row: int, col: int, verdict: int) -> None:
         cells[row, col] = verdict
         if 0 <= changes[0] < len(changes) - 1:
             changes[0] += 1
-            changes[changes[0]] = row * GRID_SIZE + col
+            changes[changes[0]] = place_of(row, col, len(cells))
         else:
             changes[0] = -1
 
 
 @inline
-def cell_range(low: float, high: float) -> tuple[int, int]:
-    """Return the first and the one-past-last index of the cells between two coordinates [m], inside the grid."""
-    first = min(max((low + HALF_WIDTH) / CELL, 0.0), float(GRID_SIZE))
-    last = min(max((high + HALF_WIDTH) / CELL + 1.0, 0.0), float(GRID_SIZE))
-    return int(first), int(last)
+def cell_index(coordinate: float, margin: int) -> int:
+    """Return the row or column of a coordinate [m] in a grid with a margin."""
+    return math.floor((coordinate + HALF_WIDTH) / CELL) + margin
+
+
+EDGE = 4  # cells around what is known that a grid keeps unknown, so that its size changes no frontier
+
+
+@in_place
+def cells_to_middle(distance: float) -> int:
+    """Return how many cells a grid needs on each side of its middle to hold what is at most so far away [m]."""
+    return min(math.ceil(min(distance, LARGEST_HALF_WIDTH) / CELL) + EDGE, LARGEST_SIZE // 2)
+
+
+@inline
+def cell_range(low: float, high: float, size: int) -> tuple[int, int]:
+    """Return the first and the one-past-last index of the cells between two coordinates [m], inside a grid."""
+    margin = margin_of(size)
+    least, most = float(-margin), float(GRID_SIZE + margin)
+    first = min(max((low + HALF_WIDTH) / CELL, least), most)
+    last = min(max((high + HALF_WIDTH) / CELL + 1.0, least), most)
+    return math.floor(first) + margin, math.floor(last) + margin
+
+
+@device
+@in_place
+def bounds_seen_from(known: Any, margin: int, x: float, y: float, theta: float) -> tuple[float, float, float, float]:
+    """Return the least and greatest x, and the least and greatest y, of the known part of another grid [m].
+
+    Args:
+        known: (4,) int32. Bounds of the other grid.
+        margin: Margin of the other grid, see `margin_of`.
+        x: Place of the other's start pose [m].
+        y: See `x`.
+        theta: Heading of the other's start pose [rad].
+    """
+    c, s = math.cos(theta), math.sin(theta)
+    low_x, high_x, low_y, high_y = math.inf, -math.inf, math.inf, -math.inf
+    for row in (known[0] - margin, known[2] - margin):
+        for col in (known[1] - margin, known[3] - margin):
+            u, v = col * CELL - HALF_WIDTH, row * CELL - HALF_WIDTH
+            low_x, high_x = min(low_x, x + c * u - s * v), max(high_x, x + c * u - s * v)
+            low_y, high_y = min(low_y, y + s * u + c * v), max(high_y, y + s * u + c * v)
+    return low_x, high_x, low_y, high_y
+
+
+@in_place
+def reach_of_merge(known: Any, size: int, x: float, y: float, theta: float) -> int:
+    """Return how many cells a grid needs on each side of its middle to hold another one; arguments as in `merge_grid`.
+
+    Args:
+        known: (4,) int32. Bounds of the other grid.
+        size: Size of the other grid.
+        x: Place of the other's start pose [m].
+        y: See `x`.
+        theta: Heading of the other's start pose [rad].
+    """
+    if known[2] == 0:
+        return 0
+    low_x, high_x, low_y, high_y = bounds_seen_from(known, margin_of(size), x, y, theta)
+    return cells_to_middle(max(max(-low_x, high_x), max(-low_y, high_y)))
 
 
 @in_place
@@ -84,7 +157,7 @@ def merge_grid(grid: Grid, other: Any, known: Any, x: float, y: float, theta: fl
 
     Args:
         grid: Changed.
-        other: (300, 300) int8. Evidence of the other grid.
+        other: (S', S') int8. Evidence of the other grid.
         known: (4,) int32. Bounds of the other grid.
         x: Place of the other's start pose [m].
         y: See `x`.
@@ -93,26 +166,22 @@ def merge_grid(grid: Grid, other: Any, known: Any, x: float, y: float, theta: fl
     if known[2] == 0:
         return
     c, s = math.cos(theta), math.sin(theta)
-    low_x, high_x, low_y, high_y = math.inf, -math.inf, math.inf, -math.inf
-    for row in (known[0], known[2]):
-        for col in (known[1], known[3]):
-            u, v = col * CELL - HALF_WIDTH, row * CELL - HALF_WIDTH
-            low_x, high_x = min(low_x, x + c * u - s * v), max(high_x, x + c * u - s * v)
-            low_y, high_y = min(low_y, y + s * u + c * v), max(high_y, y + s * u + c * v)
-    first_row, last_row = cell_range(low_y, high_y)
-    first_col, last_col = cell_range(low_x, high_x)
+    margin, others = margin_of(len(grid.cells)), margin_of(len(other))
+    low_x, high_x, low_y, high_y = bounds_seen_from(known, others, x, y, theta)
+    first_row, last_row = cell_range(low_y, high_y, len(grid.cells))
+    first_col, last_col = cell_range(low_x, high_x, len(grid.cells))
     for row in range(first_row, last_row):
         for col in range(first_col, last_col):
-            u = (col + 0.5) * CELL - HALF_WIDTH - x
-            v = (row + 0.5) * CELL - HALF_WIDTH - y
+            u = (col - margin + 0.5) * CELL - HALF_WIDTH - x
+            v = (row - margin + 0.5) * CELL - HALF_WIDTH - y
             other_x, other_y = (c * u + s * v + HALF_WIDTH) / CELL, (-s * u + c * v + HALF_WIDTH) / CELL
             found = 0
             for point in range(5):
                 shift = 0.0 if point == 0 else 0.25
                 px = other_x + (shift if point % 2 else -shift)
                 py = other_y + (shift if point > 2 else -shift)
-                if 0.0 <= px < GRID_SIZE and 0.0 <= py < GRID_SIZE:
-                    value = other[int(py), int(px)]
+                if -others <= px < GRID_SIZE + others and -others <= py < GRID_SIZE + others:
+                    value = other[math.floor(py) + others, math.floor(px) + others]
                     if point == 0 or value > max(found, 0):
                         found = value
             if found != 0:

@@ -10,13 +10,14 @@ from slam_backend.core.validation import FloatArray
 from vslam_env.navigation._grid_kernels.occupancy import (
     CELL,
     FREE,
-    GRID_SIZE,
     HALF_WIDTH,
     HIT,
+    LARGEST_SIZE,
     OCCUPIED,
     Grid,
     cell_range,
     clamp_evidence,
+    margin_of,
     set_state,
 )
 
@@ -134,7 +135,7 @@ def scan_geometry(ranges: FloatArray, directions: FloatArray, max_range: float, 
 
 
 NONE_PASSED: Any = np.uint32(0)  # unsigned, as are other places of arrays below, so that none counts from the end
-MOST_PLACES = GRID_SIZE + 1  # before the cells of a row, and after the last one
+MOST_PLACES = LARGEST_SIZE + 1  # before the cells of a row, and after the last one
 LEAST_HEIGHT = 1e-9  # [m] that a row is taken to be from the robot, so that no ray crosses it nowhere
 
 
@@ -191,10 +192,14 @@ def update_from_geometry(grid: Grid, x: float, y: float, theta: float, room: Flo
         end_x, end_y = told[REACH, i] * seen[ALONG_X, i], told[REACH, i] * seen[ALONG_Y, i]
         low_x, high_x = min(low_x, end_x), max(high_x, end_x)
         low_y, high_y = min(low_y, end_y), max(high_y, end_y)
-    first_row, last_row = cell_range(y + low_y - CELL, y + high_y + CELL)
-    first_col, last_col = cell_range(x + low_x - CELL, x + high_x + CELL)
+    size = len(grid.cells)
+    margin = margin_of(size)
+    to_centre = 0.5 - margin  # of a cell, from its index in this grid to its place in a new one
+    first_row, last_row = cell_range(y + low_y - CELL, y + high_y + CELL, size)
+    first_col, last_col = cell_range(x + low_x - CELL, x + high_x + CELL, size)
     width = last_col - first_col
-    own_row = int(min(max((y + HALF_WIDTH) / CELL + 0.5, float(first_row)), float(last_row)))
+    nearest_row = (y + HALF_WIDTH) / CELL + 0.5
+    own_row = math.floor(min(max(nearest_row, float(first_row - margin)), float(last_row - margin))) + margin
     passed, tops = all_passed[: width + 1], seen[TOP]
     for side in (-1, 1):
         aside = -ASIDE  # all cells are left of what comes before the rays that lead there, none of what comes after
@@ -205,10 +210,10 @@ def update_from_geometry(grid: Grid, x: float, y: float, theta: float, room: Flo
             tops[i] = side * told[OBSERVED, i] * up + 0.5 * CELL if leads_there else -1.0
             aside = ASIDE if leads_there else aside
         right = first_col if side < 0 else last_col - 1  # seen by the robot that looks to these rows
-        beside = side * (right + 0.5 - (x + HALF_WIDTH) / CELL)
+        beside = side * (right + to_centre - (x + HALF_WIDTH) / CELL)
         first, last = 0, count - 1
         for row in range(own_row, last_row) if side > 0 else range(own_row - 1, first_row - 1, -1):
-            v = (row + 0.5) * CELL - HALF_WIDTH - y
+            v = (row + to_centre) * CELL - HALF_WIDTH - y
             while first <= last and tops[first] < side * v:
                 first += 1
             while first <= last and tops[last] < side * v:
@@ -221,7 +226,7 @@ def update_from_geometry(grid: Grid, x: float, y: float, theta: float, room: Flo
             for j in range(start, stop):
                 k = max(k, passed[np.uint32(j)])
                 col: Any = np.uint32(right - side * j)
-                u = (col + 0.5) * CELL - HALF_WIDTH - x
+                u = (col + to_centre) * CELL - HALF_WIDTH - x
                 before, change = seen[NORMAL_X, k] * u + seen[NORMAL_Y, k] * v + told[OFFSET, k], 0
                 if (before > WALL_HALF_THICKNESS) & (u * u + v * v < told[FREE_BELOW, k]):
                     change = -1

@@ -8,12 +8,14 @@ from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from vslam_env.navigation._grid_kernels.occupancy import (
     CELL,
     FREE,
-    GRID_SIZE,
     HALF_WIDTH,
     HIT,
     OCCUPIED,
     Grid,
+    cell_index,
     cell_range,
+    cells_to_middle,
+    margin_of,
     set_state,
 )
 from vslam_env.navigation._grid_kernels.scan_update import NUM_ROWS, scan_geometry, update_from_geometry
@@ -22,15 +24,16 @@ from vslam_env.navigation._grid_kernels.scan_update import NUM_ROWS, scan_geomet
 @in_place
 def clear_disc(grid: Grid, x: float, y: float, radius: float) -> None:
     """Free what a robot covers: unknown cells centred in its disc, and occupied ones that lie wholly inside."""
-    evidence = grid.evidence
-    first_row, last_row = cell_range(y - radius, y + radius)
-    first_col, last_col = cell_range(x - radius, x + radius)
+    evidence, size = grid.evidence, len(grid.cells)
+    margin = margin_of(size)
+    first_row, last_row = cell_range(y - radius, y + radius, size)
+    first_col, last_col = cell_range(x - radius, x + radius, size)
     for row in range(first_row, last_row):
         for col in range(first_col, last_col):
             if evidence[row, col] < 0:
                 continue
-            v = (row + 0.5) * CELL - HALF_WIDTH - y
-            u = (col + 0.5) * CELL - HALF_WIDTH - x
+            v = (row - margin + 0.5) * CELL - HALF_WIDTH - y
+            u = (col - margin + 0.5) * CELL - HALF_WIDTH - x
             distance = math.hypot(u, v)
             inside = distance <= max(radius - 0.5 * CELL, 0.0)
             if inside or (evidence[row, col] == 0 and distance <= radius):
@@ -41,10 +44,10 @@ def clear_disc(grid: Grid, x: float, y: float, radius: float) -> None:
 @in_place
 def mark_bump(grid: Grid, x: float, y: float, theta: float, radius: float) -> None:
     """Mark the cell just ahead of a robot's rim as occupied, no firmer than two hits."""
-    ahead = radius + 0.5 * CELL
-    row = math.floor((y + ahead * math.sin(theta) + HALF_WIDTH) / CELL)
-    col = math.floor((x + ahead * math.cos(theta) + HALF_WIDTH) / CELL)
-    if 0 <= row < GRID_SIZE and 0 <= col < GRID_SIZE:
+    ahead, size = radius + 0.5 * CELL, len(grid.cells)
+    row = cell_index(y + ahead * math.sin(theta), margin_of(size))
+    col = cell_index(x + ahead * math.cos(theta), margin_of(size))
+    if 0 <= row < size and 0 <= col < size:
         grid.evidence[row, col] = max(grid.evidence[row, col], 2 * HIT)
         set_state(grid, row, col, OCCUPIED)
 
@@ -60,7 +63,7 @@ def update_grids(
     max_range: float,
     radius: float,
     room: FloatArray,
-) -> tuple[int, int]:
+) -> tuple[int, int, int]:
     """Write what robots read in a tick: their scans, the floor that they cover, and their bumps.
 
     Args:
@@ -75,19 +78,27 @@ def update_grids(
         room: See `update_from_geometry`.
 
     Returns:
-        Robot whose pose or ranges are invalid, in which case nothing is written; -1 if all are valid.
+        Owner and robot of a pose or a scan that is invalid, -1 if all are valid; and the number of cells that a grid
+        needs on each side of its middle. If something is invalid or the grids are smaller, nothing is written.
     """
     evidence, cells, changes, bounds = grids
+    farthest = 0.0
     for robot in range(len(scans)):
-        good = True
+        good, longest = True, 0.0
         for i in range(scans.shape[1]):
             good &= scans[robot, i] >= 0.0  # no NaN is
+            longest = max(longest, scans[robot, i])
         if not good:
-            return robot, robot
+            return robot, robot, 0
         for owner in range(len(shared)):
             x, y, theta = poses[owner, robot]
-            if shared[owner, robot] and not math.isfinite(x + y + theta):
-                return owner, robot
+            if shared[owner, robot]:
+                if not math.isfinite(x + y + theta):
+                    return owner, robot, 0
+                farthest = max(farthest, max(abs(x), abs(y)) + min(longest, max_range))
+    needed = cells_to_middle(farthest + radius)
+    if needed > cells.shape[1] // 2:
+        return -1, -1, needed
     for robot in range(len(scans)):
         scan_geometry(scans[robot], directions, max_range, room[:NUM_ROWS])
         for owner in range(len(shared)):
@@ -98,4 +109,4 @@ def update_grids(
                 clear_disc(grid, x, y, radius)
                 if bumps[robot]:
                     mark_bump(grid, x, y, theta, radius)
-    return -1, -1
+    return -1, -1, needed

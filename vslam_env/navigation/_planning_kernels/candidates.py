@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 
 from slam_backend.core.jit import device, in_place, jit
-from vslam_env.navigation._grid_kernels import CELL, GRID_SIZE, HALF_WIDTH
 from vslam_env.navigation._planning_kernels.frontiers import HEADING, LENGTH, NUM_COLUMNS, SIZE, compute_frontiers
 
 SAME_GOAL = 1.0  # [m] between updates the goal of a living candidate moves less than this
@@ -14,7 +13,6 @@ AT_GOAL = 0.5  # [m]
 LOOKING = 0.6  # [rad] a robot whose heading is this near to a candidate's looks at the unknown
 LOOK_COUNTS = 4  # times as much as a visit without a look, for a teammate's direction is not told
 PATIENCE = 16  # visits, after which what is still unseen there never will be seen
-GIVEN_UP = 0.8  # [m] radius of what is then left out
 
 FRONTIER_SIZE = 3  # the feature that is above 0 where there is a candidate
 NO_TEAMMATE = 60.0  # [m] stands for the distance of a teammate when there is none
@@ -75,24 +73,24 @@ def fill_slots(costs: Any, found: Any, rows: Any, visits: Any) -> None:
 @jit
 def update_slots(
     cells: Any, bounds: Any, radius: float, poses: Any, robot: int, rows: Any, visits: Any, given_up: Any
-) -> tuple[Any, Any, bool]:
+) -> tuple[Any, Any, bool, Any]:
     """Bring a robot's candidates up to date, if it is clear which of them are found again.
 
     The robot and its teammates visit candidates; where patience runs out, a candidate is given up.
 
     Args:
-        cells: (300, 300) uint8. The grid.
+        cells: (S, S) uint8. The grid.
         bounds: (4,) int32, of `known_bounds`.
         radius: Radius of the robot [m].
         poses: (n, 3) [m, m, rad]. Poses of the robot and its teammates; NaN: unknown to the robot.
         robot: Row of the robot in the poses.
         rows: (m, 5). Slots, see `FrontierColumns`; NaN in empty ones. Changed.
         visits: (m,) int64. Visits of each candidate so far; changed.
-        given_up: (300, 300) bool. Cells of the grid that no longer count; added to.
+        given_up: (g, 2) [m]. Goals that no longer count.
 
     Returns:
-        The frontiers (n, 5); the distances (m, n), of `pair_distances`; and whether the slots are filled: if not, the
-        pairs are to be chosen, and `fill_slots` called.
+        The frontiers (n, 5); the distances (m, n), of `pair_distances`; whether the slots are filled: if not, the pairs
+        are to be chosen, and `fill_slots` called; and the goals that no longer count now.
     """
     x, y, theta = poses[robot]
     for i in range(len(rows)):
@@ -104,17 +102,16 @@ def update_slots(
         visits[i] += (1 if at_goal else 0) + (LOOK_COUNTS - 1 if looked else 0)
         if visits[i] >= PATIENCE:
             visits[i] = 0
-            for r in range(GRID_SIZE):
-                for c in range(GRID_SIZE):
-                    cell_x, cell_y = (c + 0.5) * CELL - HALF_WIDTH, (r + 0.5) * CELL - HALF_WIDTH
-                    given_up[r, c] |= (cell_x - goal_x) ** 2 + (cell_y - goal_y) ** 2 <= GIVEN_UP**2
+            before, given_up = given_up, np.empty((len(given_up) + 1, 2))
+            given_up[: len(before)] = before
+            given_up[-1, 0], given_up[-1, 1] = goal_x, goal_y
 
     found = compute_frontiers(cells, bounds, x, y, radius, given_up)
     costs = np.empty((len(rows), len(found)))
     is_clear = pair_distances(rows, found, costs)
     if is_clear:
         fill_slots(costs, found, rows, visits)
-    return found, costs, is_clear
+    return found, costs, is_clear, given_up
 
 
 @in_place

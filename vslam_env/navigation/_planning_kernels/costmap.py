@@ -9,7 +9,7 @@ from slam_backend.core.jit import device, in_place, jit
 from vslam_env.navigation._grid_kernels import FREE, OCCUPIED, UNKNOWN
 
 PAD = 2  # cells around the known box, so that loops over frontiers and neighbours need no bounds
-OUTSIDE = 3  # beyond the 60 x 60 m: neither known nor worth exploring
+OUTSIDE = 3  # beyond the grid: neither known nor worth exploring
 
 
 CLOSE, NEAR, OPEN = 4, 2, 1  # weights of cells by their distance from walls

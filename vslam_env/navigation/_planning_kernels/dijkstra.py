@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from slam_backend.core.jit import device, jit
-from vslam_env.navigation._grid_kernels import CELL, GRID_SIZE, HALF_WIDTH, OCCUPIED
+from vslam_env.navigation._grid_kernels import CELL, LARGEST_HALF_WIDTH, OCCUPIED, cell_index, margin_of
 from vslam_env.navigation._planning_kernels.costmap import OUTSIDE, PAD, inflate_costs
 
 
@@ -182,7 +182,7 @@ def dijkstra(cells: Any, bounds: Any, x: float, y: float, radius: float) -> tupl
     """Find the cheapest ways over the known floor of a grid.
 
     Args:
-        cells: (300, 300) uint8. The grid.
+        cells: (S, S) uint8. The grid.
         bounds: (4,) int32, of `known_bounds`.
         x: Place where the ways begin [m]. If a robot may not be there, they begin at the nearest open cell.
         y: See `x`.
@@ -194,16 +194,17 @@ def dijkstra(cells: Any, bounds: Any, x: float, y: float, radius: float) -> tupl
     """
     first_row, first_col = bounds[0] - PAD, bounds[1] - PAD
     box = np.full((bounds[2] + PAD - first_row, bounds[3] + PAD - first_col), OUTSIDE, np.uint8)
-    first, last = max(first_col, 0), min(bounds[3] + PAD, GRID_SIZE)
-    for grid_row in range(max(first_row, 0), min(bounds[2] + PAD, GRID_SIZE)):
+    size = len(cells)
+    first, last = max(first_col, 0), min(bounds[3] + PAD, size)
+    for grid_row in range(max(first_row, 0), min(bounds[2] + PAD, size)):
         here, there = box[grid_row - first_row, first - first_col :], cells[grid_row, first:last]
         for i in range(len(there)):  # an assignment of slices would take ten times as long
             here[i] = there[i]
 
     weights = inflate_costs(box, radius / CELL + 0.5)
-    far = 2.0 * HALF_WIDTH  # as good as anywhere outside
-    row = math.floor((min(max(y, -far), far) + HALF_WIDTH) / CELL) - first_row
-    col = math.floor((min(max(x, -far), far) + HALF_WIDTH) / CELL) - first_col
+    far = 2.0 * LARGEST_HALF_WIDTH  # as good as anywhere outside
+    row = cell_index(min(max(y, -far), far), margin_of(size)) - first_row
+    col = cell_index(min(max(x, -far), far), margin_of(size)) - first_col
     start_row, start_col = nearest_open(box, weights, row, col, ESCAPE_CELLS)
     cost, parents = wavefront(weights, start_row, start_col)
     return box, weights, cost, parents, first_row, first_col

@@ -7,7 +7,7 @@ import numpy as np
 
 from slam_backend.core.jit import device, in_place, jit
 from slam_backend.core.validation import FloatArray
-from vslam_env.navigation._grid_kernels import CELL, FREE, GRID_SIZE, HALF_WIDTH, UNKNOWN
+from vslam_env.navigation._grid_kernels import CELL, FREE, HALF_WIDTH, UNKNOWN, margin_of
 from vslam_env.navigation._planning_kernels.dijkstra import UNREACHED, dijkstra
 
 MIN_CELLS = 3  # a robot needs 0.4 m; what is smaller is a speck or the corner of a wall
@@ -112,20 +112,35 @@ def _goal_near(members: Any, box: Any, cost: Any, mark: Any) -> tuple[int, int]:
 
 @device
 @jit
-def _unseen_edges(box: Any, ignored: Any, row: int, col: int) -> Any:
-    """Return (h, w) int8, 1 for unknown cells beside free ones that are not to be ignored."""
+def _unseen_edges(box: Any, row: int, col: int, size: int) -> Any:
+    """Return (h, w) int8, 1 for unknown cells beside free ones in a box that begins at a cell of a grid of a size."""
     height, width = box.shape
     edges = np.zeros((height, width), np.int8)
-    for r in range(max(1, -row), min(height - 1, GRID_SIZE - row)):
-        first, last = max(1, -col), min(width - 1, GRID_SIZE - col)
-        left_out = ignored[row + r, col + first : col + last]
+    for r in range(max(1, -row), min(height - 1, size - row)):
+        first, last = max(1, -col), min(width - 1, size - col)
         here, edge = box[r, first:last], edges[r, first:last]
         below, above = box[r - 1, first:last], box[r + 1, first:last]
         right, left = box[r, first - 1 : last - 1], box[r, first + 1 : last + 1]
         for i in range(len(here)):  # without branches, it becomes vector code
             beside = (below[i] == FREE) | (above[i] == FREE) | (right[i] == FREE) | (left[i] == FREE)
-            edge[i] = beside & (here[i] == UNKNOWN) & ~left_out[i]
+            edge[i] = beside & (here[i] == UNKNOWN)
     return edges
+
+
+GIVEN_UP = 0.8  # [m] radius of what is left out around a goal that shows nothing new
+
+
+@device
+@in_place
+def _leave_out(mark: Any, x: float, y: float, row_centre: float, col_centre: float) -> None:
+    """Clear the marks (h, w) within `GIVEN_UP` of a point [m]; the centre of a cell is its index plus the offset."""
+    row, col = math.floor((y + HALF_WIDTH) / CELL - row_centre), math.floor((x + HALF_WIDTH) / CELL - col_centre)
+    span = math.ceil(GIVEN_UP / CELL) + 1
+    for r in range(max(row - span, 0), min(row + span + 1, mark.shape[0])):
+        for c in range(max(col - span, 0), min(col + span + 1, mark.shape[1])):
+            cell_x, cell_y = (c + col_centre) * CELL - HALF_WIDTH, (r + row_centre) * CELL - HALF_WIDTH
+            if (cell_x - x) ** 2 + (cell_y - y) ** 2 <= GIVEN_UP**2:
+                mark[r, c] = 0
 
 
 @jit
@@ -133,20 +148,23 @@ def compute_frontiers(cells: Any, bounds: Any, x: float, y: float, radius: float
     """Collect the frontiers to which a way is known.
 
     Args:
-        cells: (300, 300) uint8. The grid; see `dijkstra` for the next arguments.
+        cells: (S, S) uint8. The grid; see `dijkstra` for the next arguments.
         bounds: (4,) int32.
         x: Place where the ways begin [m].
         y: See `x`.
         radius: Radius of the robot [m].
-        ignored: (300, 300) bool. Unknown cells that do not count.
+        ignored: (n, 2) float64 [m]. Points around which, within `GIVEN_UP`, unknown cells do not count.
 
     Returns:
         (n, 5) float64 rows (x, y, heading, size, length), see `FrontierColumns`, by increasing length.
     """
     box, _, cost, parents, first_row, first_col = dijkstra(cells, bounds, x, y, radius)
     height, width = box.shape
-    before = parents.ravel()
-    mark = _unseen_edges(box, ignored, first_row, first_col)  # 1: such an edge; 2: its component known; 3: in a piece
+    before, to_centre = parents.ravel(), 0.5 - margin_of(len(cells))
+    # 1: such an edge; 2: its component known; 3: in a piece
+    mark = _unseen_edges(box, first_row, first_col, len(cells))
+    for i in range(len(ignored)):
+        _leave_out(mark, ignored[i, 0], ignored[i, 1], first_row + to_centre, first_col + to_centre)
 
     found = np.empty((height * width // MIN_CELLS + 1, NUM_COLUMNS))
     count = 0
@@ -185,8 +203,8 @@ def compute_frontiers(cells: Any, bounds: Any, x: float, y: float, radius: float
                 while at > 0 and found[at - 1, LENGTH] > length:
                     found[at] = found[at - 1]
                     at -= 1
-                found[at, 0] = (first_col + col + 0.5) * CELL - HALF_WIDTH
-                found[at, 1] = (first_row + row + 0.5) * CELL - HALF_WIDTH
+                found[at, 0] = (first_col + col + to_centre) * CELL - HALF_WIDTH
+                found[at, 1] = (first_row + row + to_centre) * CELL - HALF_WIDTH
                 found[at, HEADING] = math.atan2(up, right)
                 found[at, SIZE] = num * CELL
                 found[at, LENGTH] = length

@@ -1,0 +1,95 @@
+"""Memory of occupancy grids that grow with what was seen."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_backend.core.read_only import as_read_only
+from vslam_env.navigation._grid_kernels import CELL, GRID_SIZE, LARGEST_SIZE, MOST_CHANGES, Grid
+
+GRID_SIZES = (GRID_SIZE, 600, 1200, 2400, LARGEST_SIZE)  # by doubling, up to 400 m on each side of the start
+
+
+class GridStorage:
+    """Arrays of the occupancy grids of K robots, in the middle of which lie the start poses.
+
+    All grids have the same size S, one of `GRID_SIZES`, which grows when a robot sees beyond it. The size says nothing
+    about the world except how far any robot of the team has seen, and no result depends on it.
+
+    Args:
+        num_grids: Number of grids K.
+
+    Attributes:
+        evidence: (K, S, S) int8. Hits minus passes of each cell.
+        cells: (K, S, S) uint8. State of each cell.
+        changes: (K, 1 + n) int32. Number of cells of each grid that changed state since the reader last set this number
+            to 0, followed by their places (flat indices in a grid of the largest size), possibly with duplicates. -1 if
+            any cell may have changed, as initially.
+        bounds: (K, 4) int32. First row and column of the known part of each grid, and one past the last ones; zeros if
+            nothing is known.
+        views: Arrays of each grid.
+        read_only_cells: Read-only views (S, S) of the cells of each grid.
+    """
+
+    def __init__(self, num_grids: int) -> None:
+        self.changes = np.full((num_grids, 1 + MOST_CHANGES), -1, np.int32)
+        self.bounds = np.zeros((num_grids, 4), np.int32)
+        self._adopt(*_empty(num_grids, GRID_SIZE))
+
+    def _adopt(self, evidence: NDArray[np.int8], cells: NDArray[np.uint8]) -> None:
+        """Use given arrays for evidence and cells."""
+        self.evidence, self.cells = evidence, cells
+        self.views = list(map(Grid, evidence, cells, self.changes, self.bounds))
+        self.read_only_cells = [as_read_only(view.cells) for view in self.views]
+
+    @property
+    def size(self) -> int:
+        """Number of cells S along a side of each grid."""
+        return int(self.cells.shape[1])
+
+    @property
+    def arrays(self) -> Grid:
+        """The arrays of all grids."""
+        return Grid(self.evidence, self.cells, self.changes, self.bounds)
+
+    def reserve(self, needed: int) -> None:
+        """Grow until the grids reach a number of cells from their middle in each direction, or are the largest ones.
+
+        Views of the cells that were taken before keep their content but are no longer updated.
+        """
+        if 2 * needed <= self.size or self.size == LARGEST_SIZE:
+            return
+        before, old = self.evidence, self.cells
+        size = next((size for size in GRID_SIZES if size >= 2 * needed), LARGEST_SIZE)
+        evidence, cells = _empty(len(before), size)
+        shift = (size - self.size) // 2
+        for k, (top, left, bottom, right) in enumerate(self.bounds.tolist()):
+            there = (k, slice(top + shift, bottom + shift), slice(left + shift, right + shift))
+            here = (k, slice(top, bottom), slice(left, right))
+            evidence[there], cells[there] = before[here], old[here]
+            if bottom:
+                self.bounds[k] += shift
+        self._adopt(evidence, cells)
+
+
+def _empty(num_grids: int, size: int) -> tuple[NDArray[np.int8], NDArray[np.uint8]]:
+    """Return evidence and cells of empty grids; the system provides the memory of what is written to only."""
+    shape = (num_grids, size, size)
+    try:
+        return np.zeros(shape, np.int8), np.zeros(shape, np.uint8)  # 0 is `UNKNOWN`
+    except MemoryError as error:
+        side, needed = size * CELL, 2 * num_grids * size**2 / 2**20
+        raise MemoryError(
+            f"occupancy grids: {num_grids} grids of {side:g} x {side:g} m need {needed:.0f} MiB, which the system "
+            "refused. Use fewer robots or environments."
+        ) from error
+
+
+def known_bounds(cells: NDArray[np.uint8]) -> NDArray[np.int32]:
+    """Return the bounds (4,) of the known part of cells (S, S), see `GridStorage`."""
+    rows, cols = np.flatnonzero(cells.any(axis=1)), np.flatnonzero(cells.any(axis=0))
+    return np.array([rows[0], cols[0], rows[-1] + 1, cols[-1] + 1] if len(rows) else [0, 0, 0, 0], np.int32)
+
+
+def margin(size: int) -> int:
+    """Return how many rows a grid of a size has before the first row of a new grid."""
+    return (size - GRID_SIZE) // 2
