@@ -10,6 +10,7 @@ from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.options import FilterOptions
 from slam_backend.fastslam.reports import (
     Associations,
+    BiasEstimate,
     LandmarkIdMap,
     MergeEvent,
     PoseEstimate,
@@ -35,6 +36,7 @@ __all__ = [
     "AlignmentOptions",
     "Associations",
     "AttemptOptions",
+    "BiasEstimate",
     "Consistency",
     "ExistenceModel",
     "FastSlam",

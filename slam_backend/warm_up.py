@@ -18,6 +18,7 @@ from slam_backend.maps.alignment import align_maps
 from slam_backend.metrics.maps import map_error
 from slam_backend.models.camera import StereoCamera
 from slam_backend.models.measurements import Measurements, TeamMeasurements
+from slam_backend.models.odometry import OdometryModel
 from slam_backend.smoother import gauge
 from slam_backend.smoother.options import SmoothingOptions
 from slam_backend.smoother.reassociation import find_only
@@ -109,7 +110,8 @@ def run_all_paths(extras: Collection[str]) -> float:
                 slam.step([None, None], [frame, frame], [ids, some_ids], [still, None])
                 slam.step([move, move], [None, None])
         few_keys = SmoothingOptions(max_keys=2, recent_keys=1)  # logs are added in parts, between which keys are joined
-        smoothing = FastSlam(num_particles=4, rejuvenate_every=STEPS + 1, smoothing=few_keys)
+        biased = OdometryModel(bias_scale=0.02)
+        smoothing = FastSlam(num_particles=4, motion=biased, rejuvenate_every=STEPS + 1, smoothing=few_keys)
         for _ in range(2 * (STEPS + 1)):
             smoothing.step([move], [plain])
         smoothing.set_state(smoothing.get_state())

@@ -6,7 +6,6 @@ from typing import Any
 from slam_backend.core.validation import check_choice
 from slam_backend.fastslam.existence import ExistenceModel
 from slam_backend.frontend import DESCRIPTOR_TYPES
-from slam_backend.models.odometry import OdometryModel
 from vslam_env.belief.belief import BeliefConfig
 from vslam_env.config import SENSORS, EnvConfig
 from vslam_env.sensors import StereoSensorConfig
@@ -38,12 +37,14 @@ def preset_config(name: str, sensor: str = "landmark") -> EnvConfig:
     if name == "standard":
         return EnvConfig()
     scale, max_range = (0.5, 12.0) if name == "easy" else (2.0, 5.0)
-    standard, motion = EnvConfig(), OdometryModel()
+    standard = EnvConfig()
+    motion = standard.belief.filter.motion
     sensors = {
         "easy": {"max_measurements": 10, "detection_probability": 0.95, "false_points": 0.0, "descriptor_noise": 0.1},
         "hard": {"max_measurements": 3, "detection_probability": 0.8, "false_points": 0.1, "descriptor_noise": 0.25},
     }
-    assumed = {part: scale * getattr(motion, part) for part in ("sigma_along", "sigma_across", "sigma_heading")}
+    scaled = ("sigma_along", "sigma_across", "sigma_heading", "bias_scale", "bias_heading")
+    assumed = {part: scale * getattr(motion, part) for part in scaled}
     camera = {"max_range": max_range}
     return standard.replace(
         odometry={f.name: scale * getattr(standard.odometry, f.name) for f in dataclasses.fields(standard.odometry)},

@@ -158,7 +158,8 @@ class _Writer:
                 row += (self._at(key, key), self._at(key, part))
             return row
         if cls in SEQUENCES:
-            return [SEQUENCES[cls][0], *(self._at(place, part) for place, part in enumerate(value))]
+            parts = sorted(value, key=repr) if cls in (set, frozenset) else value  # equal sets have the same bytes
+            return [SEQUENCES[cls][0], *(self._at(place, part) for place, part in enumerate(parts))]
         if cls is bytes:
             self.blobs.append(value)
             return ["bytes", len(value)]

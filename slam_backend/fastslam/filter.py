@@ -22,7 +22,7 @@ from slam_backend.fastslam.options import FilterOptions
 from slam_backend.fastslam.particle_maps import best_map, present_slots, write_summary
 from slam_backend.fastslam.rejuvenation import RejuvenationScheduler
 from slam_backend.fastslam.relative_poses import TeamPoses, membership_table
-from slam_backend.fastslam.reports import Associations, PoseEstimate, RejuvenationReport, StepReport
+from slam_backend.fastslam.reports import Associations, BiasEstimate, PoseEstimate, RejuvenationReport, StepReport
 from slam_backend.fastslam.run_log import RobotLog
 from slam_backend.fastslam.state import FilterState
 from slam_backend.fastslam.state_checks import check_filter, last_step
@@ -345,6 +345,14 @@ class FastSlam:
     def _columns(self, rows: FloatArray) -> FloatArray:
         """Return (M, c) of padded rows (c, P). A copy."""
         return rows[:, : self.state.num_particles].T.copy()
+
+    def odometry_bias(self, robot: int = 0) -> BiasEstimate:
+        """Return mean and covariance of a robot's odometry bias over all particles, zeros if the model has none."""
+        index, count = self._check_robot(robot), self.num_particles
+        means = self.state.biases[index, :, :count]
+        mean = means @ self.weights
+        off = means - mean[:, None]
+        return BiasEstimate(mean, (off * self.weights) @ off.T + self.state.bias_covariances[0, index])
 
     def map(self, estimate: Literal["best", "mixture"] = "best", min_count: int = 1) -> LandmarkMap:
         """Return the map [m, m^2] in the map frame, landmarks by ascending id. A copy.

@@ -142,9 +142,9 @@ def packed_camera(camera: StereoCamera) -> FloatArray:
 
 
 def pack_options(options: FilterOptions) -> FloatArray:
-    """Return the options of a filter as numbers, (27,) float64, named in `_kernels.layout`.
+    """Return the options of a filter as numbers, (30,) float64, named in `_kernels.layout`.
 
-    These are the noise of the odometry (6,), see `OdometryModel`; of the camera (7,) the focal length [px], the
+    These are the noise of the odometry (9,), see `OdometryModel`; of the camera (7,) the focal length [px], the
     baseline [m], the sigmas of image coordinates and of the disparity [px], and the mount [m]; the sigmas (3,)
     [m, m, rad] of the prior for recovery; then one number each.
     """

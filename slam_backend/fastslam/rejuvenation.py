@@ -132,7 +132,8 @@ def joint_graph(
         options: Options of the smoother. With slices and too many keyframes, each graph is first reduced to its share.
     """
     robots = len(starts[2])
-    if options.slice_steps is not None and graph_a.num_keys + graph_b.num_keys > options.most_keys(robots):
+    most_keys = options.most_keys(robots) + graph_a.num_biases + graph_b.num_biases
+    if options.slice_steps is not None and graph_a.num_keys + graph_b.num_keys > most_keys:
         graph_a, graph_b = (_thinned(graph, robots, camera, options) for graph in (graph_a, graph_b))
     robot = int(np.flatnonzero(graph_b.parents[graph_b.first_keys] < 0)[0])  # one that defines b's frame
     start = starts[2][len(starts[0]) + robot]
@@ -284,7 +285,7 @@ class RejuvenationScheduler:
             rng: Source of the draws.
         """
         options = self._options
-        graph = SlamGraph.at_uncertain_starts(starts, held) if self._graph is None else self._graph
+        graph = SlamGraph.at_uncertain_starts(starts, held, options.motion) if self._graph is None else self._graph
         if self._exact or (self._graph is None and any(log.has_exact_poses for log in logs)):
             self._exact = True  # not recorded yet by the temporary scheduler of a filter without rejuvenation
         if reason := self._why_disabled:
@@ -341,7 +342,7 @@ class RejuvenationScheduler:
             camera: (7,) as kernels take it.
         """
         graph_a, graph_b = (
-            SlamGraph.at_uncertain_starts(where, fixed) if step._graph is None else step._graph
+            SlamGraph.at_uncertain_starts(where, fixed, self._options.motion) if step._graph is None else step._graph
             for step, where, fixed in zip((a, b), starts[:2], held, strict=True)
         )
         options = self._options.smoothing

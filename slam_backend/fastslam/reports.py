@@ -110,6 +110,18 @@ class PoseEstimate(NamedTuple):
     covariance: FloatArray
 
 
+class BiasEstimate(NamedTuple):
+    """Gaussian summary of a robot's odometry bias, see `OdometryModel`.
+
+    Attributes:
+        mean: (3,) float64 [m/m, rad/m, rad/rad]. Scale, turn per metre and turn per radian.
+        covariance: (3, 3) float64.
+    """
+
+    mean: FloatArray
+    covariance: FloatArray
+
+
 class PoseEstimates(NamedTuple):
     """Gaussian summaries of the poses of several robots, all in one frame or each in its own.
 

@@ -125,8 +125,10 @@ class FilterState:
     Attributes:
         options: Options of the filter.
         num_particles: M.
-        pose_arrays: (5, K, 3, P) float64: `poses`, `starts`, `means`, and in the last two `covariances`.
+        pose_arrays: (6, K, 3, P) float64: `poses`, `starts`, `means`, `biases`, and in the last two `covariances`.
         weight_arrays: (4, P) float64: `log_weights`, `path_log_weights`, `weights`, and the increments of a step.
+        bias_covariances: (2, K, 3, 3) float64. Covariance of each robot's odometry bias given its path, the same in all
+            particles; and covariance of pose (rows, robot axes) and bias where N(x^, P^) was only propagated.
         propagated_only: (K,) int64. 1 where N(x^, P^) was only propagated since the last match, else 0.
         gauge_covariance: (3, 3) float64 [m, m, rad]. Covariance of a motion of the whole map that the particles do not
             represent, as their frame was fixed when they were sampled from smoothed paths; estimates include it.
@@ -159,10 +161,12 @@ class FilterState:
         self.rejuvenation = None if options.rejuvenate_every is None else RejuvenationScheduler(options, k)
         self.maps = ParticleMaps(m, None if existence is None else existence.log_odds_prior)
         padded = self.maps.padded
-        self.pose_arrays: FloatArray = zeros_aligned((5, k, 3, padded), np.float64)
+        self.pose_arrays: FloatArray = zeros_aligned((6, k, 3, padded), np.float64)
         self.weight_arrays: FloatArray = zeros_aligned((4, padded), np.float64)
         self.log_weights[:] = -np.log(m)
         self.weights[:] = 1.0 / m
+        self.bias_covariances: FloatArray = np.zeros((2, k, 3, 3))
+        self.bias_covariances[0] = options.motion.bias_covariance
         self.propagated_only: IntArray = np.zeros(k, np.int64)
         self.gauge_covariance: FloatArray = np.zeros((3, 3))
         self.start_covariances: FloatArray = np.zeros((k, 3, 3))
@@ -204,6 +208,11 @@ class FilterState:
     def means(self) -> FloatArray:
         """Means of N(x^, P^), each particle's pose before sampling, (K, 3, P) [m, m, rad]."""
         return np.asarray(self.pose_arrays[ROBOT.means])
+
+    @property
+    def biases(self) -> FloatArray:
+        """Means of the robots' odometry biases given the paths, (K, 3, P) [m/m, rad/m, rad/rad]."""
+        return np.asarray(self.pose_arrays[ROBOT.biases])
 
     @property
     def covariances(self) -> FloatArray:
@@ -277,9 +286,10 @@ class FilterState:
         for low, high, is_over in self._batches:
             summary = _kernels.step_robots(
                 low, high, is_over, now, self.packed_options, robots.array, inputs.inputs_table, inputs.moves, normals,
-                self.pose_arrays, self.propagated_only, self.weight_arrays, self.gauge_covariance,
-                maps.values, maps.counts, maps.odds, maps.table, maps.maps, maps.users, maps.free_rows, maps.tops,
-                maps.descriptors, maps.heads, inputs.measurements, inputs.descriptors, inputs.names,
+                self.pose_arrays, self.bias_covariances, self.propagated_only, self.weight_arrays,
+                self.gauge_covariance, maps.values, maps.counts, maps.odds, maps.table, maps.maps, maps.users,
+                maps.free_rows, maps.tops, maps.descriptors, maps.heads, inputs.measurements, inputs.descriptors,
+                inputs.names,
                 self._associations, self._mahalanobis_sq, associations, means, covariances,
                 pending.noted[len(pending.steps)], pending.measured, pending.num_measured, fastslam1,
             )  # fmt: skip
@@ -331,7 +341,8 @@ class FilterState:
         """Replace the M particles by samples of smoothed paths, with landmarks of the most probable particle so far."""
         m = self.num_particles
         write_maps(self.maps, self.best, new, self.options.landmark_walk)
-        self.poses[:, :, :m], self.starts[:, :, :m] = new.poses, new.starts
+        self.poses[:, :, :m], self.starts[:, :, :m], self.biases[:, :, :m] = new.poses, new.starts, new.biases
+        self.bias_covariances[0], self.bias_covariances[1] = new.bias_covariances, 0.0
         self._refresh_starts()
         self.means[:] = self.poses
         self.covariances.fill(0.0)
@@ -357,7 +368,9 @@ class FilterState:
             self.poses,
             self.starts,
             self.means,
+            self.biases,
             self.covariances,
+            *self.bias_covariances,
             self.start_covariances,
             self.propagated_only,
         ):
@@ -395,6 +408,8 @@ class FilterState:
         moved = turn @ spread_b @ turn.transpose(0, 2, 1)
         joint.covariances[:k, :, :count] = a.covariances[:, :, from_a]
         joint.covariances[k:, :, :count] = moved[..., *UPPER].transpose(0, 2, 1)
+        joint.biases[:k, :, :count], joint.biases[k:, :, :count] = a.biases[:, :, from_a], b.biases[:, :, from_b]
+        joint.bias_covariances[:] = np.concatenate([a.bias_covariances, b.bias_covariances], axis=1)
         joint.propagated_only[:] = np.concatenate([a.propagated_only, b.propagated_only])
         joint.gauge_covariance[:] = a.gauge_covariance
         joint.start_covariances[:] = np.concatenate([a.start_covariances, b.start_covariances])

@@ -20,15 +20,17 @@ from slam_backend.fastslam.reports import PoseEstimates
 from slam_backend.fastslam.run_log import ROWS
 from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.models.measurements import LARGEST_DESCRIPTOR
+from slam_backend.smoother._kernels import BIAS
 from slam_backend.smoother.graph import NONE, SlamGraph
 from slam_backend.smoother.log_arrays import EXACT, REJECTED, STATIONARY, LogArrays, has_been_checked, note_checked
 from slam_backend.smoother.reassociation import RejectedMeasurements
 
-POSE_FIELDS = ("poses", "starts", "means", "covariances")  # (K, 3 or 6, P)
+POSE_FIELDS = ("poses", "starts", "means", "biases", "covariances")  # (K, 3 or 6, P)
 KEPT = (
     *POSE_FIELDS,
     "gauge_covariance",
     "start_covariances",
+    "bias_covariances",
     "propagated_only",
     "log_weights",
     "path_log_weights",
@@ -64,11 +66,12 @@ def check_filter(name: str, state: Any, known: Sequence[FilterOptions] = ()) -> 
     k = check.array(f"{name}['poses']", state["poses"], check.FLOAT64, (None, 3, padded))
     if not 1 <= k <= MAX_ROBOTS or m < 1 or not abs(float(state["weights"].sum()) - 1.0) < 1e-6:
         check.refuse(name, "robots, particles, and weights that sum to 1", f"{k} robots, weights of {m} particles")
-    for part in POSE_FIELDS[:3]:
+    for part in POSE_FIELDS[:4]:
         check.positions(f"{name}[{part!r}]", state[part], (k, 3, padded), m)
     check.floats(f"{name}['covariances']", state["covariances"], (k, 6, padded), columns=m)
     check.floats(f"{name}['gauge_covariance']", state["gauge_covariance"], (3, 3))
     check.floats(f"{name}['start_covariances']", state["start_covariances"], (k, 3, 3))
+    check.floats(f"{name}['bias_covariances']", state["bias_covariances"], (2, k, 3, 3))
     check.indices(f"{name}['propagated_only']", state["propagated_only"], (k,), 0, 1)
     for part in ("log_weights", "path_log_weights"):
         check.floats(f"{name}[{part!r}]", state[part], (m,), LEAST)
@@ -281,9 +284,10 @@ def check_graph(name: str, graph: Any, k: int) -> None:
     def indices(column: str, rows: int | None, last: int, low: int = 0) -> int:
         return check.indices(where[column], graph[column], (rows,), low, last)
 
-    keys, robots = indices("robots", None, k - 1, NONE), graph["robots"]
+    keys, robots = indices("robots", None, k - 1, BIAS), graph["robots"]
     indices("parents", keys, keys - 1, NONE)
     check.floats(where["odometry_covariances"], graph["odometry_covariances"], (keys, 3, 3))
+    check.floats(where["bias_jacobians"], graph["bias_jacobians"], (keys, 3, 3))
     for column in ("transition_variances", "rigid_variances"):
         check.floats(where[column], graph[column], (keys,), 0.0)
     frames, landmarks = indices("frame_keys", None, keys - 1), indices("landmark_ids", None, check.MAX_LANDMARKS)
@@ -304,6 +308,12 @@ def check_graph(name: str, graph: Any, k: int) -> None:
         indices(column, k, keys - 1)
         if (robots[graph[column]] != np.arange(k)).any():
             check.refuse(where[column], "a key of each robot", "a key of another robot")
+    indices("bias_keys", k, keys - 1, NONE)
+    held = graph["bias_keys"][graph["bias_keys"] >= 0]
+    if len(held) not in (0, k) or sorted(held) != np.flatnonzero(robots == BIAS).tolist():
+        check.refuse(where["bias_keys"], "each key of a bias once, or no keys", "other keys")
+    if (graph["parents"][held] < 0).any() or (robots[graph["parents"][held]] != NONE).any():
+        check.refuse(where["parents"], "the origin before each bias", "another key")
     indices("latest", k, check.MAX_INT, -1)
     if not are_linked(graph["parents"], robots):
         check.refuse(where["parents"], "keys that lead back to a start", "a key that does not")

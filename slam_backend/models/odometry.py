@@ -19,6 +19,10 @@ class OdometryModel:
     The three components are independent; the variance of each is the sum of a floor and a part that grows with the
     motion.
 
+    A *bias* b = (scale of the translation, turn per metre travelled, turn per radian turned) is constant in a run and
+    differs between robots, such as that of wheels of unequal size. It has a zero-mean Gaussian prior of the given
+    standard deviations and is estimated with the path; the motion is u - J b to first order, see `bias_jacobians`.
+
     Attributes:
         sigma_along: Standard deviation of dx per metre travelled [m/m].
         sigma_across: Standard deviation of dy per metre travelled [m/m].
@@ -26,6 +30,9 @@ class OdometryModel:
         sigma_turn: Standard deviation of dtheta per radian turned [rad/rad].
         floor_position: Constant standard deviation of dx and dy [m].
         floor_heading: Constant standard deviation of dtheta [rad].
+        bias_scale: Standard deviation of the relative error of dx and dy that is constant in a run [m/m].
+        bias_heading: Standard deviation of the constant error of dtheta per metre travelled [rad/m].
+        bias_turn: Standard deviation of the constant error of dtheta per radian turned [rad/rad].
     """
 
     sigma_along: float = 0.05
@@ -34,10 +41,13 @@ class OdometryModel:
     sigma_turn: float = 0.02
     floor_position: float = 3e-4
     floor_heading: float = 3e-4
+    bias_scale: float = 0.0
+    bias_heading: float = 0.0
+    bias_turn: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("sigma_along", "sigma_across", "sigma_heading", "sigma_turn", "floor_position", "floor_heading"):
-            hint = "Give a standard deviation."
+        for name in self.__slots__:
+            hint = "Give a standard deviation; 0 for no such bias." if "bias" in name else "Give a standard deviation."
             check_float(f"motion.{name}", getattr(self, name), hint, at_least=0.0, at_most=LARGEST_SIGMA)
 
     @property
@@ -45,6 +55,16 @@ class OdometryModel:
         """Whether all standard deviations are zero."""
         of_motion = self.sigma_along, self.sigma_across, self.sigma_heading, self.sigma_turn
         return not any((*of_motion, self.floor_position, self.floor_heading))
+
+    @property
+    def bias_covariance(self) -> FloatArray:
+        """Prior covariance (3, 3) [m/m, rad/m, rad/rad] of the bias, diagonal; zeros without a bias."""
+        return np.diag(np.square([self.bias_scale, self.bias_heading, self.bias_turn]))
+
+    @property
+    def is_biased(self) -> bool:
+        """Whether a bias is estimated."""
+        return self.bias_scale > 0.0 or self.bias_heading > 0.0 or self.bias_turn > 0.0
 
     def sigmas(self, odometry: FloatArray) -> FloatArray:
         """Return the standard deviations (3,) [m, m, rad] of an odometry reading (3,) [m, m, rad]."""
@@ -66,6 +86,22 @@ class OdometryModel:
         result[:, 0] = self.sigma_along**2 * square + self.floor_position**2
         result[:, 1] = self.sigma_across**2 * square + self.floor_position**2
         result[:, 2] = self.sigma_heading**2 * square + turn * turn + self.floor_heading**2
+        return result
+
+    @staticmethod
+    def bias_jacobians(odometry: FloatArray) -> FloatArray:
+        """Return the derivatives J (n, 3, 3) of readings u by the bias b: the motion is u - J b.
+
+        Half of an error of the turn arises before the midpoint of the motion, and rotates its direction.
+
+        Args:
+            odometry: (n, 3) [m, m, rad]. Readings, previous robot frames.
+        """
+        result = np.zeros((len(odometry), 3, 3))
+        dx, dy, turn = odometry.T
+        result[:, 2, 1], result[:, 2, 2] = np.hypot(dx, dy), turn
+        result[:, 0], result[:, 1] = -0.5 * dy[:, None] * result[:, 2], 0.5 * dx[:, None] * result[:, 2]
+        result[:, 0, 0], result[:, 1, 0] = dx, dy
         return result
 
     def sample(self, poses: FloatArray, odometry: FloatArray, rng: np.random.Generator) -> FloatArray:

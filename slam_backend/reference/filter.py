@@ -29,6 +29,7 @@ from slam_backend.reference.existence import update_existence
 from slam_backend.reference.fastslam1 import update_fastslam1
 from slam_backend.reference.fastslam2 import update_fastslam2
 from slam_backend.reference.measurement_model import Frame, Landmark
+from slam_backend.reference.odometry_bias import OdometryBias
 from slam_backend.reference.particles import NEW, Candidates, Particle, RobotStep, RobotUpdate, descendants, report_of
 from slam_backend.reference.pose_gaussian import GaussianPose, wrapped
 from slam_backend.resampling import RESAMPLING
@@ -69,9 +70,10 @@ class ReferenceFastSlam:
         self.rng = np.random.default_rng(check_seed(seed))
         weight = -np.log(options.num_particles)
         self.particles = [
-            Particle(list(poses), [GaussianPose.known(pose) for pose in poses], list(poses), weight)
+            Particle(list(poses), [GaussianPose.known(pose) for pose in poses], list(poses), [np.zeros(3)] * k, weight)
             for _ in range(options.num_particles)
         ]
+        self.biases = [OdometryBias.prior(options.motion.bias_covariance) for _ in range(k)]
         self.is_blind = [False] * k  # whether each robot moved without measuring since its pose was last sampled
         self.descriptors: dict[int, FloatArray] = {}  # by landmark, from its first measurement
         self.identities: dict[int, int] = {}
@@ -172,8 +174,9 @@ class ReferenceFastSlam:
         frame = Frame(seen, kept, None if names is None else [int(names[b]) for b in kept], self.options.camera)
         possible = self._candidates(frame)
         normals = self.rng.standard_normal((len(self.particles), 3))
+        bias = self._move_bias(robot, move, exact)
         turns = [  # l. 13
-            self._turn(particle, robot, frame, possible, move, exact, normals[m])
+            self._turn(particle, robot, frame, possible, move, exact, normals[m], bias)
             for m, particle in enumerate(self.particles)
         ]
         lasting = self._name_new(turns, frame)
@@ -182,6 +185,7 @@ class ReferenceFastSlam:
             record.distances[kept, m] = turn.distances
             record.log_likelihoods[m] = turn.log_likelihood
         record.created[kept] = [lasting.get(NEW - b, -1) for b in range(len(kept))]
+        self._correct_biases(robot, turns, normals, bias)
         self.is_blind[robot] = self.options.proposal == "fastslam2" and not kept and exact is None
         if kept:
             self._descriptor_size = frame.descriptors.shape[1]
@@ -213,6 +217,7 @@ class ReferenceFastSlam:
         move: FloatArray | None,
         exact: FloatArray | None,
         normals: FloatArray,
+        bias: OdometryBias | None,
     ) -> RobotUpdate:
         """Process one robot's step in one particle."""
         options = self.options
@@ -223,8 +228,14 @@ class ReferenceFastSlam:
             prior = GaussianPose.known(sampled)
         elif move is not None:
             sigmas = options.motion.sigmas(move)
-            sampled = compose(sampled, move + sigmas * normals)  # l. 14, Eq. 4
-            prior = prior.moved(move, sigmas)
+            if bias is not None:
+                move = move - bias.jacobian @ particle.biases[robot]
+                sampled = compose(sampled, move + bias.root @ normals)
+                prior = prior.moved(move, sigmas, bias.spread)
+            else:
+                sampled = compose(sampled, move + sigmas * normals)  # l. 14, Eq. 4
+                prior = prior.moved(move, sigmas)
+        particle.predicted = prior
         candidates = [[one for one in every if one[1] in particle.landmarks] for every in possible]
         if options.proposal == "fastslam1":
             turn = update_fastslam1(particle.landmarks, sampled, frame, candidates, options)
@@ -235,6 +246,35 @@ class ReferenceFastSlam:
             turn = RobotUpdate(prior, sampled, [], [], 0.0)
         particle.posteriors[robot], particle.poses[robot] = turn.posterior, turn.pose
         return turn
+
+    def _move_bias(self, robot: int, move: FloatArray | None, exact: FloatArray | None) -> OdometryBias | None:
+        """Predict a robot's odometry bias over its motion; return None if it has none, or its pose is exact."""
+        bias = self.biases[robot]
+        if not self.is_blind[robot] or exact is not None:
+            bias.cross = np.zeros((3, 3))
+        if not self.options.motion.is_biased or exact is not None:
+            return None
+        moved, sigmas = np.zeros(3) if move is None else move, np.zeros(3)
+        if move is not None:
+            sigmas = self.options.motion.sigmas(move)
+        bias.move(moved, self.options.motion.bias_jacobians(moved[None])[0], sigmas)
+        return bias
+
+    def _correct_biases(
+        self, robot: int, turns: list[RobotUpdate], normals: FloatArray, bias: OdometryBias | None
+    ) -> None:
+        """Correct the biases of all particles by the poses or motions that were sampled."""
+        if bias is None or (self.options.proposal == "fastslam2" and not turns[0].chosen):
+            return
+        if self.options.proposal == "fastslam1":
+            bias.learn_from_draws()
+            for particle, draws in zip(self.particles, normals, strict=True):
+                particle.biases[robot] = particle.biases[robot] + bias.gain @ draws
+            return
+        information = bias.learn_from_pose(self.particles[0].predicted)
+        for particle, turn in zip(self.particles, turns, strict=True):
+            step = bias.correction(particle.predicted, turn.pose, information)
+            particle.biases[robot] = particle.biases[robot] + step
 
     def _name_new(self, turns: list[RobotUpdate], frame: Frame) -> dict[int, int]:
         """Give permanent names to the landmarks that at least one particle has started, one per measurement."""

@@ -110,17 +110,21 @@ class Particle:
         poses: Pose of each robot (3,) [m, m, rad], map frame.
         posteriors: Distributions from which these poses were sampled.
         starts: Start pose of each robot (3,) [m, m, rad], map frame.
+        biases: Mean of each robot's odometry bias (3,) [m/m, rad/m, rad/rad], given the path.
         log_weight: Log-weight since the last resampling, normalised.
         path_log_weight: Log-weight accumulated along the ancestral line (Eq. 12).
         landmarks: Map, by name.
+        predicted: Pose of the robot that moved last, before its measurements.
     """
 
     poses: list[FloatArray]
     posteriors: list[GaussianPose]
     starts: list[FloatArray]
+    biases: list[FloatArray]
     log_weight: float
     path_log_weight: float = 0.0
     landmarks: Landmarks = field(default_factory=dict)
+    predicted: GaussianPose = field(default_factory=lambda: GaussianPose.known(np.zeros(3)))
 
 
 def keep_survivors_in_place(ancestors: IntArray) -> IntArray:

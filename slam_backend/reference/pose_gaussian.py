@@ -46,18 +46,23 @@ class GaussianPose:
         """Return an exact pose."""
         return cls(pose, np.zeros((3, 3)))
 
-    def moved(self, odometry: FloatArray, sigmas: FloatArray) -> "GaussianPose":
+    def moved(self, odometry: FloatArray, sigmas: FloatArray, spread: FloatArray | None = None) -> "GaussianPose":
         """Predict the pose after a motion: F P F^T + T diag(sigmas^2) T^T, to first order.
 
         Args:
             odometry: (3,) [m, m, rad], in the robot's frame before the motion (u).
             sigmas: (3,) [m, m, rad], its standard deviations in the same frame.
+            spread: (3, 3) covariance to add, in the robot's frame after the motion. None: nothing.
         """
         turn = turn_about_vertical(self.mean[2])
         x, y, _ = turn @ odometry
         by_previous = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])  # F = d(mean o u) / d mean
         carried = by_previous @ self.covariance @ by_previous.T
-        return GaussianPose(self.mean + turn @ odometry, carried + turn @ np.diag(sigmas**2) @ turn.T)
+        mean, covariance = self.mean + turn @ odometry, carried + turn @ np.diag(sigmas**2) @ turn.T
+        if spread is not None:
+            turn = turn_about_vertical(mean[2])
+            covariance = covariance + turn @ spread @ turn.T
+        return GaussianPose(mean, covariance)
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,16 @@ from numpy.typing import NDArray
 from slam_backend.core.read_only import as_read_only, with_constants
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.geometry import between, wrap_angle
+from slam_backend.models.odometry import OdometryModel
+from slam_backend.smoother._kernels import BIAS, Condensed, Frames, Keys, Landmarks, Points
 from slam_backend.smoother._kernels import LEVER as LEVER
 from slam_backend.smoother._kernels import NONE as NONE
-from slam_backend.smoother._kernels import Condensed, Frames, Keys, Landmarks, Points
 
 UNINFORMATIVE = (1e4, 1e4, 10.0)  # variances [m^2, m^2, rad^2] of an unknown start
+MIN_BIAS = 1e-6  # standard deviation [m/m, rad/m, rad/rad] of a part of the bias that is said to be none
 RIGID = 1e-4  # [m, rad]; starts with a smaller relative scatter are rigidly connected
+
+NO_BIASES: IntArray = np.zeros(0, dtype=np.int64)
 
 Part = TypeVar("Part", Keys, Frames, Points, Condensed, Landmarks)  # columns of a graph that go together, row by row
 
@@ -41,15 +45,19 @@ class SlamGraph:
 
     A *key* (keyframe) is a pose that is an unknown of the graph. A *frame* is a pose with measurements, attached
     rigidly to its key. Raw measurements of the newest keys are kept; those of older keys are condensed into frozen
-    sightings.
+    sightings. The odometry bias of a robot is an unknown with three components as well: it takes the place of the pose
+    in a key of its own, whose "odometry" from the origin is the mean of its prior.
 
     Attributes:
-        robots: (k,) int64. Robot of each key, `NONE` for the origin; keys of a robot are in temporal order.
+        robots: (k,) int64. Robot of each key, `NONE` for the origin, `BIAS` for a bias; keys of a robot are in temporal
+            order.
         poses: (k, 3) float64 [m, m, rad], map frame. Poses of the last MAP estimate.
         parents: (k,) int64. Previous key; `NONE` for a fixed pose: the origin, or a robot's start. The parent of an
             unknown start is the origin or another robot's start.
-        odometry: (k, 3) float64 [m, m, rad]. Odometry from the previous key, in its frame.
+        odometry: (k, 3) float64 [m, m, rad]. Odometry u from the previous key, in its frame; under a bias b it measures
+            the motion u - J b.
         odometry_covariances: (k, 3, 3) float64. Covariance of `odometry`, in the same frame.
+        bias_jacobians: (k, 3, 3) float64. Derivative J of `odometry` by the bias of the robot; zeros without a bias.
         transition_variances: (k,) float64 [m^2]. Variance of the motion from the previous key when last computed, that
             of the odometry before; headings at `LEVER`.
         rigid_variances: (k,) float64 [m^2]. Accumulated variance of the poses that are attached rigidly to the key.
@@ -65,6 +73,7 @@ class SlamGraph:
         landmarks: (l, 3) float64 [m], map frame. Landmarks of the last MAP estimate.
         merged_ids: (a, 2) int64. Rows (old id, current id) of duplicate landmarks.
         first_keys: (K,) int64. Key at the start of each robot.
+        bias_keys: (K,) int64. Key of the odometry bias of each robot, `NONE` if it has none.
         last_keys: (K,) int64. Newest key of each robot.
         latest: (K,) int64. Newest step of each robot's log in the graph, -1 before the first.
     """
@@ -74,6 +83,7 @@ class SlamGraph:
     parents: IntArray = field(default_factory=_no_index)
     odometry: FloatArray = field(default_factory=lambda: _empty(0, 3))
     odometry_covariances: FloatArray = field(default_factory=lambda: _empty(0, 3, 3))
+    bias_jacobians: FloatArray = field(default_factory=lambda: _empty(0, 3, 3))
     transition_variances: FloatArray = field(default_factory=lambda: _empty(0))
     rigid_variances: FloatArray = field(default_factory=lambda: _empty(0))
     frame_keys: IntArray = field(default_factory=_no_index)
@@ -93,6 +103,7 @@ class SlamGraph:
     landmarks: FloatArray = field(default_factory=lambda: _empty(0, 3))
     merged_ids: IntArray = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
     first_keys: IntArray
+    bias_keys: IntArray
     last_keys: IntArray
     latest: IntArray
 
@@ -100,12 +111,17 @@ class SlamGraph:
         vars(self).update({name: as_read_only(column) for name, column in vars(self).items()})
 
     @classmethod
-    def at_starts(cls, starts: FloatArray) -> "SlamGraph":
-        """Return the graph of K robots at known `starts` (K, 3) [m, m, rad], map frame, without measurements."""
-        return cls.at_uncertain_starts(np.asarray(starts, dtype=np.float64)[:, :, None])
+    def at_starts(cls, starts: FloatArray, motion: OdometryModel | None = None) -> "SlamGraph":
+        """Return the graph of K robots at known `starts` (K, 3) [m, m, rad], map frame, without measurements.
+
+        `motion` has the prior of the robots' odometry biases; None: there are none.
+        """
+        return cls.at_uncertain_starts(np.asarray(starts, dtype=np.float64)[:, :, None], motion=motion)
 
     @classmethod
-    def at_uncertain_starts(cls, starts: FloatArray, held: BoolArray | None = None) -> "SlamGraph":
+    def at_uncertain_starts(
+        cls, starts: FloatArray, held: BoolArray | None = None, motion: OdometryModel | None = None
+    ) -> "SlamGraph":
         """Return the graph of K robots whose starts may differ between particles, as after a merge.
 
         A start that is equal in all particles is fixed, unless it is in `held`. Any other start is an unknown with a
@@ -115,6 +131,7 @@ class SlamGraph:
         Args:
             starts: (K, 3, M) float64 [m, m, rad], map frame.
             held: (K,) bool. Unknown starts that are equal in all particles, see `fix_start`. None: no such start.
+            motion: Model with the prior of the robots' odometry biases. None: no biases.
         """
         k = len(starts)
         held = np.zeros(k, dtype=np.bool_) if held is None else held
@@ -130,17 +147,27 @@ class SlamGraph:
                 if np.abs(_turned(apart - apart[0])).max() < RIGID:
                     previous[i], motions[i], noises[i] = other, apart[0], RIGID**2 * np.eye(3)
                     break
-        extra = 1 if loose else 0
-        robots = np.concatenate([np.arange(k), np.full(extra, NONE)])
+        biased = k if motion is not None and motion.is_biased else 0
+        extra = 1 if loose or biased else 0
+        robots = np.concatenate([np.arange(k), np.full(extra, NONE), np.full(biased, BIAS)])
+        if motion is not None and biased:
+            prior = np.maximum(motion.bias_covariance, MIN_BIAS**2 * np.eye(3))
+            poses, motions = [*poses, np.zeros(3), *np.zeros((k, 3))], [*motions, np.zeros(3), *np.zeros((k, 3))]
+            previous, noises = [*previous, NONE, *[k] * k], [*noises, np.zeros((3, 3)), *[prior] * k]
+        elif extra:
+            poses, motions = [*poses, np.zeros(3)], [*motions, np.zeros(3)]
+            previous, noises = [*previous, NONE], [*noises, np.zeros((3, 3))]
         return cls(
             robots=robots,
-            poses=np.array([*poses, *np.zeros((extra, 3))]),
-            parents=np.array([*previous, *[NONE] * extra], dtype=np.int64),
-            odometry=np.array([*motions, *np.zeros((extra, 3))]),
-            odometry_covariances=np.array([*noises, *np.zeros((extra, 3, 3))]),
-            transition_variances=np.zeros(k + extra),
-            rigid_variances=np.zeros(k + extra),
+            poses=np.array(poses),
+            parents=np.array(previous, dtype=np.int64),
+            odometry=np.array(motions),
+            odometry_covariances=np.array(noises),
+            bias_jacobians=np.zeros((len(robots), 3, 3)),
+            transition_variances=np.zeros(len(robots)),
+            rigid_variances=np.zeros(len(robots)),
             first_keys=np.arange(k),
+            bias_keys=k + 1 + np.arange(k) if biased else np.full(k, NONE),
             last_keys=np.arange(k),
             latest=np.full(k, -1),
         )
@@ -157,7 +184,8 @@ class SlamGraph:
         robots = self.robots.copy()
         robots[self.robots >= 0] = np.argsort(order)[self.robots[self.robots >= 0]]
         return self.with_columns(
-            robots=robots, first_keys=self.first_keys[order], last_keys=self.last_keys[order], latest=self.latest[order]
+            robots=robots,
+            **{name: getattr(self, name)[order] for name in ("first_keys", "bias_keys", "last_keys", "latest")},
         )
 
     def with_columns(self, **columns: NDArray[Any]) -> "SlamGraph":
@@ -190,6 +218,19 @@ class SlamGraph:
     def num_keys(self) -> int:
         """Number of keys, starts included."""
         return len(self.poses)
+
+    @property
+    def num_biases(self) -> int:
+        """Number of keys that hold an odometry bias."""
+        return int(np.count_nonzero(self.bias_keys >= 0))
+
+    def biases_of_odometry(self) -> IntArray:
+        """Return the key (k,) of the bias of each key's odometry, `NONE` if it has none; (0,) without biases."""
+        if not self.num_biases:
+            return NO_BIASES
+        robots, before = self.robots, self.robots[self.parents]
+        linked = (self.parents >= 0) & (robots >= 0) & (before == robots)
+        return np.where(linked, self.bias_keys[np.maximum(robots, 0)], NONE)
 
     @property
     def num_sightings(self) -> int:

@@ -10,7 +10,7 @@ from slam_backend.core.validation import BoolArray, FloatArray, IntArray, argume
 from slam_backend.geometry import between, compose, rotation
 from slam_backend.models.odometry import OdometryModel
 from slam_backend.smoother import _kernels
-from slam_backend.smoother._kernels import Condensed, Frames, Keys, Landmarks, Log, Points
+from slam_backend.smoother._kernels import BIAS, Condensed, Frames, Keys, Landmarks, Log, Points
 from slam_backend.smoother.graph import NONE, RIGID, UNINFORMATIVE, Part, SlamGraph, mapped
 from slam_backend.smoother.log_arrays import EXACT, LogArrays
 
@@ -51,6 +51,7 @@ class InitialPoses(NamedTuple):
 MIN_NOISE = 1e-5  # [m, rad] of odometry in one step; keeps covariances regular if one component has no noise
 NO_COVARIANCES = np.empty((0, 6))
 NO_COVARIANCES.setflags(write=False)  # same type as the covariances of logs
+NO_JACOBIANS, NO_BIAS = np.empty((0, 3, 3)), np.zeros(3)
 NO_INITIAL_POSES = InitialPoses.empty()
 
 
@@ -110,9 +111,12 @@ def extend_graph(
         if not motion.is_noiseless:
             variances = np.maximum(variances, MIN_NOISE**2)
         covariances = NO_COVARIANCES if log.covariances is None else log.covariances
+        bias = int(graph.bias_keys[robot])
+        jacobians = motion.bias_jacobians(log.motions) if bias >= 0 else NO_JACOBIANS
         arrays = Log(
-            log.steps, log.kinds, log.motions, log.given, log.starts, log.points, log.ids, covariances, variances
-        )
+            log.steps, log.kinds, log.motions, log.given, log.starts, log.points, log.ids, covariances, variances,
+            jacobians, graph.poses[bias].copy() if bias >= 0 else NO_BIAS,
+        )  # fmt: skip
         guessed = NO_INITIAL_POSES if guesses is None else guesses[robot]
         is_guided &= _kernels.add_log(arrays, guessed, robot, rigid_within, tips, ends, keys, frames, raw)
     num_keys, num_frames, num_points = ends.tolist()
@@ -179,13 +183,14 @@ def merge_graphs(
         a, origin = _with_origin(a), np.array([a.num_keys])
     keys, frames = a.num_keys, len(a.frame_keys)
     previous = np.where(b.parents >= 0, b.parents + keys, NONE)
-    previous[loose] = origin[0]
+    previous[loose] = previous[b.robots == BIAS] = origin[0]
     ids, rows = np.unique(np.concatenate([a.landmark_ids, b.landmark_ids]), return_inverse=True)
     landmarks = np.empty((len(ids), 3))
     of_b = rows[len(a.landmark_ids) :]
     landmarks[of_b], landmarks[rows[: len(a.landmark_ids)]] = b.landmarks, a.landmarks
     shifted = {
-        "robots": b.robots + len(a.last_keys),
+        "robots": np.where(b.robots >= 0, b.robots + len(a.last_keys), b.robots),
+        "bias_keys": np.where(b.bias_keys >= 0, b.bias_keys + keys, NONE),
         "parents": previous,
         "frame_keys": b.frame_keys + keys,
         "point_frames": b.point_frames + frames,
@@ -210,7 +215,9 @@ def _moved(graph: SlamGraph, motion: FloatArray) -> SlamGraph:
     """Return the graph with poses and landmarks moved to another frame; links from the origin are unchanged."""
     landmarks = graph.landmarks.copy()
     landmarks[:, :2] = landmarks[:, :2] @ rotation(motion[2]).T + motion[:2]
-    return graph.with_columns(poses=compose(motion, graph.poses), landmarks=landmarks)
+    poses = compose(motion, graph.poses)
+    poses[graph.robots == BIAS] = graph.poses[graph.robots == BIAS]
+    return graph.with_columns(poses=poses, landmarks=landmarks)
 
 
 def _named(graph: SlamGraph, names: Mapping[int, int]) -> SlamGraph:
@@ -251,11 +258,12 @@ def _unpinned(graph: SlamGraph, prior: FloatArray) -> tuple[IntArray, SlamGraph]
     graph = graph.with_columns(parents=previous, odometry=motions, odometry_covariances=noises)
     if not len(origin):
         return free, graph
-    kept = graph.robots >= 0
+    kept = graph.robots != NONE
+    previous[graph.robots == BIAS] = NONE
     number = np.cumsum(kept) - 1
-    per_key = ("robots", "poses", "odometry", "odometry_covariances", "transition_variances", "rigid_variances")
     return number[free], graph.with_columns(
-        **{name: getattr(graph, name)[kept] for name in per_key},
+        **{name: getattr(graph, name)[kept] for name in Keys._fields if name != "parents"},
+        bias_keys=np.where(graph.bias_keys >= 0, number[graph.bias_keys], NONE),
         parents=np.where(previous >= 0, number[previous], NONE)[kept],
         **{name: number[getattr(graph, name)] for name in ("frame_keys", "condensed_keys", "first_keys", "last_keys")},
     )
@@ -269,6 +277,7 @@ def _with_origin(graph: SlamGraph) -> SlamGraph:
         parents=np.append(graph.parents, NONE),
         odometry=np.concatenate([graph.odometry, np.zeros((1, 3))]),
         odometry_covariances=np.concatenate([graph.odometry_covariances, np.zeros((1, 3, 3))]),
+        bias_jacobians=np.concatenate([graph.bias_jacobians, np.zeros((1, 3, 3))]),
         transition_variances=np.append(graph.transition_variances, 0.0),
         rigid_variances=np.append(graph.rigid_variances, 0.0),
     )

@@ -9,7 +9,7 @@ import numpy as np
 
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.smoother import _kernels
-from slam_backend.smoother._kernels import Keys, LandmarkFactors, Points
+from slam_backend.smoother._kernels import NONE, Keys, LandmarkFactors, Points
 from slam_backend.smoother.graph import SlamGraph, mapped
 from slam_backend.smoother.optimizer import MapEstimate, gathered, linearise
 from slam_backend.smoother.options import SmoothingOptions
@@ -43,11 +43,13 @@ def reduce_keyframes(
     rows, sighted = np.flatnonzero(seen.condensed | ~raw[seen.keys]), np.zeros(graph.num_keys, dtype=np.bool_)
     sighted[seen.keys[rows]] = True
     keys = mapped(graph.part(Keys), np.copy)
-    left, roots, numbers, offsets = _kernels.merge_keys(fresh, sighted, options.most_keys(len(graph.last_keys)), keys)
+    most_keys = options.most_keys(len(graph.last_keys)) + graph.num_biases
+    left, roots, numbers, offsets = _kernels.merge_keys(fresh, sighted, most_keys, keys, graph.biases_of_odometry())
     frozen = _kernels.add_sightings(rows, seen, roots, numbers, offsets)
     fewer = graph.with_columns(
         **{name: column[:left] for name, column in keys._asdict().items()},
         **frozen._asdict(),
+        bias_keys=np.where(graph.bias_keys >= 0, numbers[graph.bias_keys], NONE),
         **{name: numbers[getattr(graph, name)] for name in ("frame_keys", "first_keys", "last_keys")},
     )
     return _without_unused(fewer, raw[graph.frame_keys[graph.point_frames]])

@@ -146,7 +146,7 @@ def optimize(
     def given_up(reason: str, iterations: int = 0, cost: float = np.inf) -> MapEstimate:
         return MapEstimate(poses, landmarks, columns, sightings, informations, cost, iterations, damping, reason)
 
-    if not size:
+    if size == graph.num_biases:
         return given_up(NO_POSE)
     if not is_noisy:
         return given_up("odometry without noise")
@@ -190,11 +190,13 @@ class NormalEquations:
         self.informations, self.camera, self.options = informations, camera, options
         num, k = size + len(graph.landmark_ids), graph.num_keys
         self.num_poses = size
-        self.pattern = _kernels.lay_out(columns, graph.parents, sightings, num)
+        self.biases = graph.biases_of_odometry()
+        self.pattern = _kernels.lay_out(columns, graph.parents, self.biases, sightings, num)
         cross = np.empty((len(sightings.keys), 3, 3))
         self.equations = EquationBlocks(
-            np.empty((k, 2)), np.empty((num, 6)), np.empty((k, 3, 3)), cross, np.empty((num, 3))
-        )
+            np.empty((k, 2)), np.empty((num, 6)), np.empty((k, 3, 3)), cross, np.empty((len(self.biases), 3, 3)),
+            np.empty((num, 3)),
+        )  # fmt: skip
         values = np.empty((len(self.pattern.rows), 9))
         self.factor = CholeskyFactor(np.empty((num, 6)), values, np.empty(num, dtype=np.int64))
         self.eased = 0.0  # by so much the cost would fall if landmarks alone moved
@@ -203,8 +205,9 @@ class NormalEquations:
         """Form the equations at poses (k, 3) and landmarks (l, 3), map frame; return the cost there."""
         loss = linearise(self.sightings, self.graph, poses, landmarks, self.camera, self.options)
         cost, self.eased = _kernels.form(
-            poses, landmarks, self.graph.part(Keys), self.columns, self.informations, self.sightings, self.equations
-        )
+            poses, landmarks, self.graph.part(Keys), self.biases, self.columns, self.informations, self.sightings,
+            self.equations,
+        )  # fmt: skip
         return loss + cost
 
     def factorise(self, damping: float) -> bool:

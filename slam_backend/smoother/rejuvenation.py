@@ -18,6 +18,7 @@ from slam_backend.geometry import wrap_angle
 from slam_backend.models.odometry import OdometryModel
 from slam_backend.resampling import systematic
 from slam_backend.smoother import _kernels
+from slam_backend.smoother._kernels import Keys
 from slam_backend.smoother.duplicates import find_duplicates, without_duplicates
 from slam_backend.smoother.gauge import fix_gauge, fix_start, move, transform_tiles
 from slam_backend.smoother.graph import SlamGraph
@@ -59,6 +60,8 @@ class Particles(NamedTuple):
             lanes.
         counts: (l,) int64. Number of measurements of each landmark.
         means, covariances: (K, 3), (K, 3, 3) float64. Newest poses under the Gaussian about the mode.
+        biases: (K, 3, M) float64 [m/m, rad/m, rad/rad]. Mean of each robot's odometry bias, given the path.
+        bias_covariances: (K, 3, 3) float64. Covariance of each bias given the path; zeros where there is none.
         frame: (3, 3) float64 [m, m, rad]. Covariance of the gauge, a motion of the whole map; not in the particles.
         start_scatters: (K, 3, 3) float64 [m, m, rad], start frames. Covariance of each start; not in the particles.
     """
@@ -72,6 +75,8 @@ class Particles(NamedTuple):
     counts: IntArray
     means: FloatArray
     covariances: FloatArray
+    biases: FloatArray
+    bias_covariances: FloatArray
     frame: FloatArray
     start_scatters: FloatArray
 
@@ -170,7 +175,7 @@ def relinearised_and_reduced(
         camera, options: Same arguments as `rejuvenate`.
         rng: Source of draws, where sampling the variances is cheaper than computing them.
     """
-    if graph.num_keys <= options.most_keys(len(graph.last_keys)):
+    if graph.num_keys <= options.most_keys(len(graph.last_keys)) + graph.num_biases:
         return relinearise(graph, mode)
     spreads = sample_transition_variances(graph, mode, rng) if mode.crowded else mode.spreads()
     return reduce_keyframes(relinearise(graph, mode, spreads), camera, options, mode.sightings)
@@ -236,6 +241,12 @@ def _particles(graph: SlamGraph, mode: MapEstimate, draws: PathSamples) -> Parti
         covariances[robot] = joint[3 * place : 3 * place + 3, 3 * place : 3 * place + 3]
     if not _kernels.weigh_deviations(joint, off, densities):
         raise np.linalg.LinAlgError("the joint covariance of the robots' poses is not positive definite")
+    biases, bias_covariances = np.zeros(poses.shape), np.zeros(covariances.shape)
+    for owner, key in enumerate(graph.bias_keys.tolist()):
+        if key >= 0:
+            biases[owner], bias_covariances[owner] = _kernels.condition_bias(
+                draws.poses, graph.part(Keys), graph.biases_of_odometry(), mode.odometry_infos, key
+            )
     frame, start_scatters = np.zeros((3, 3)), np.zeros((len(means), 3, 3))
     (in_sight,) = in_view.nonzero()
     held = fix_gauge(tiles, in_sight, landmarks, poses, means, weights)
@@ -251,8 +262,8 @@ def _particles(graph: SlamGraph, mode: MapEstimate, draws: PathSamples) -> Parti
     for array in (poses, starts, means):
         array[:, 2] = wrap_angle(array[:, 2])
     return Particles(
-        poses, starts, np.log(np.maximum(weights, 1e-300)), densities, ids, tiles, counts, means, covariances, frame,
-        start_scatters,
+        poses, starts, np.log(np.maximum(weights, 1e-300)), densities, ids, tiles, counts, means, covariances, biases,
+        bias_covariances, frame, start_scatters,
     )  # fmt: skip
 
 

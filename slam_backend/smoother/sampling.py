@@ -207,7 +207,7 @@ def odometry_log_density(
     blocks, k = rows.shape[:2]
     log_density, spreads = np.empty(blocks * LANES), np.empty(k)
     _kernels.odometry_log_density(
-        rows.reshape(-1), k, blocks, num_particles, graph.part(Keys), mode.odometry_infos, mode.poses, log_density,
-        spreads,
+        rows.reshape(-1), k, blocks, num_particles, graph.part(Keys), graph.biases_of_odometry(), mode.odometry_infos,
+        mode.poses, log_density, spreads,
     )  # fmt: skip
     return log_density[:num_particles], spreads

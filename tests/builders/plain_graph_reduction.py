@@ -167,6 +167,7 @@ def _joined(graph: SlamGraph, representative: IntArray) -> SlamGraph:
         parents=np.where(graph.parents >= 0, number[root[before]], NONE)[kept],
         odometry=compose(offsets[before], graph.odometry)[kept],
         odometry_covariances=(turn @ graph.odometry_covariances @ turn.transpose(0, 2, 1))[kept],
+        bias_jacobians=graph.bias_jacobians[kept],
         transition_variances=graph.transition_variances[kept],
         rigid_variances=graph.rigid_variances[kept],
         frame_keys=number[root[graph.frame_keys]],

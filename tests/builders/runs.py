@@ -7,6 +7,7 @@ import numpy as np
 from slam_backend.core.validation import FloatArray
 from slam_backend.fastslam.run_log import RobotLog
 from slam_backend.geometry import between, inverse, transform_points, wrap_angle
+from slam_backend.models.odometry import OdometryModel
 from slam_backend.smoother.graph import SlamGraph
 from slam_backend.smoother.graph_building import extend_graph
 from slam_backend.smoother.optimizer import MapEstimate
@@ -46,11 +47,15 @@ def logs_of(run: StereoRun, skip: tuple[int, ...] = ()) -> list[RobotLog]:
     return logs
 
 
-def graph_of(run: StereoRun, skip: tuple[int, ...] = ()) -> SlamGraph:
-    """Return the graph of a whole run, each step a key unless it is skipped."""
-    start = SlamGraph.at_starts(run.true_paths[:, 0])
+def graph_of(run: StereoRun, skip: tuple[int, ...] = (), motion: OdometryModel | None = None) -> SlamGraph:
+    """Return the graph of a whole run, each step a key unless it is skipped; `motion` replaces the run's own noise."""
+    motion = run.spec.noise.motion if motion is None else motion
+    start = SlamGraph.at_starts(run.true_paths[:, 0], motion)
     logs = [log.arrays() for log in logs_of(run, skip)]
-    return extend_graph(start, logs, run.spec.noise.motion, np.array(run.spec.noise.camera.mount))
+    return extend_graph(start, logs, motion, np.array(run.spec.noise.camera.mount))
+
+
+BIASED = OdometryModel(bias_scale=0.03, bias_heading=0.02, bias_turn=0.05)  # assumed noise with a bias
 
 
 def upper(mode: MapEstimate) -> FloatArray:

@@ -123,3 +123,13 @@ def test_a_configuration_of_another_format_is_refused(number: str, tmp_path: Pat
     (tmp_path / "env.toml").write_text(text.replace("format = 1", f"format = {number}", 1), encoding="utf-8")
     with pytest.raises(ValueError, match="config: expected one of format 1, got a configuration of format"):
         EnvConfig.from_toml(tmp_path / "env.toml")
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_filters_assume_the_prior_of_the_true_odometry_bias(name: str) -> None:
+    """In each preset the assumed standard deviations of the bias are those from which it is drawn."""
+    config = preset_config(name)
+    assumed, true = config.belief.filter.motion, config.odometry
+    assert assumed.bias_scale == pytest.approx(true.bias_distance)
+    assert assumed.bias_heading == pytest.approx(true.bias_heading_per_metre)
+    assert assumed.bias_turn == 0.0

@@ -172,7 +172,7 @@ FOUND = {
         seed=2, preset="standard", sensor="landmark", world="fig5", steps=12,
         changes={
             "num_robots": 1, "action_type": "goal", "odometry": {"bias_distance": 0.5},
-            "belief": {"filter": {"rejuvenate_every": 5, "camera": {"sigma_disparity_px": 50.0}}},
+            "belief": {"filter": {"rejuvenate_every": 5, "camera": {"sigma_px": 0.4, "sigma_disparity_px": 50.0}}},
         },
     ),
 }  # fmt: skip

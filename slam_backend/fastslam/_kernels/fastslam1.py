@@ -32,6 +32,7 @@ from slam_backend.fastslam._kernels.layout import (
 from slam_backend.fastslam._kernels.map_storage import apply_resampling, tile_of
 from slam_backend.fastslam._kernels.measurement_model import clear_likelihood, innovate, total_log_likelihood
 from slam_backend.fastslam._kernels.motion_model import load_rows, sample_motion, set_exact
+from slam_backend.fastslam._kernels.odometry_bias import correct_bias_by_draws
 from slam_backend.fastslam._kernels.records import Frame, MapArrays, Motion, Outcome, Poses, Rules, Space
 
 
@@ -65,7 +66,9 @@ def update_fastslam1(
         first = block * LANES
         real = min(LANES, len(motion.normals) - first)
         if moved:
-            sample_motion(work, robot.samples, motion, first)
+            sample_motion(work, robot.samples, robot.biases, motion, first)
+            if motion.biased:
+                correct_bias_by_draws(work, robot.biases, motion, first)
         load_rows(work, X, robot.samples, first)
         for i in range(LANES):
             work[SIN + i], work[COS + i] = sine_cosine(work[T + i])

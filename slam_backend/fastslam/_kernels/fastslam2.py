@@ -25,6 +25,7 @@ from slam_backend.fastslam._kernels.layout import (
 )
 from slam_backend.fastslam._kernels.map_storage import apply_resampling
 from slam_backend.fastslam._kernels.motion_model import predict, store_rows, take_draws
+from slam_backend.fastslam._kernels.odometry_bias import correct_bias, set_bias_gain
 from slam_backend.fastslam._kernels.pose_posterior import gauss_newton_step, posterior, set_linearisation_point
 from slam_backend.fastslam._kernels.records import Frame, MapArrays, Motion, Outcome, Poses, Rules, Space
 
@@ -32,8 +33,8 @@ from slam_backend.fastslam._kernels.records import Frame, MapArrays, Motion, Out
 @device
 @jit_fma
 def update_fastslam2(
-    robot: Poses, blind: bool, motion: Motion, maps: MapArrays, frame: Frame, rules: Rules, work: FloatArray,
-    outcome: Outcome,
+    robot: Poses, blind: bool, motion: Motion, bias: FloatArray, maps: MapArrays, frame: Frame, rules: Rules,
+    work: FloatArray, outcome: Outcome,
 ) -> None:  # fmt: skip
     """Integrate one robot's motion and frame, the measurements shaping the sampled pose (FastSLAM 2.0, Laplace form).
 
@@ -46,6 +47,7 @@ def update_fastslam2(
         robot: Poses before the motion, written: the new samples, and N(x^, P^) of each particle before sampling.
         blind: Whether the robot has not been sampled at a sighting since N(x^, P^) was propagated.
         motion: Motion of the robot.
+        bias: (2, 3, 3) covariance of the odometry bias and cross-covariance, see `step_robots`; changed.
         maps: Landmarks. B + 1 rows and B slots are free.
         frame: Measurements of the robot.
         rules: Thresholds.
@@ -63,6 +65,8 @@ def update_fastslam2(
     for block in range(robot.samples.shape[1] // LANES):
         first = block * LANES
         predict(work, robot, motion, blind, first)
+        if motion.biased and first == 0:
+            set_bias_gain(work, motion, bias[0], bias[1])
         set_linearisation_point(work)
 
         # Pass A: refine the pose with what is beyond doubt.
@@ -88,6 +92,8 @@ def update_fastslam2(
         store_rows(work, X0, robot.means, first)
         store_rows(work, SPREAD00, robot.covariances, first)
         store_rows(work, X, robot.samples, first)
+        if motion.biased:
+            correct_bias(work, robot.biases, motion, first)
 
         # The landmarks, at the sampled pose.
         update_matched(space, block, maps, frame, candidates, rules.walk)

@@ -34,14 +34,16 @@ LOST, SURE, CONTRADICT, WIDE = (LANES * k for k in range(54, 58))
 TAKEN, C01 = LANES * 58, LANES * 59
 KEPT00, KEPT10, KEPT11, KEPT20, KEPT21, KEPT22, KEPT01, KEPT_WIDE = (LANES * k for k in range(60, 68))  # of C
 DRAW0, DRAW1, DRAW2 = (LANES * k for k in range(68, 71))  # standard normal
-WORK_SIZE, SPREAD_SIZE = LANES * 71, LANES * 6
+BIAS0, BIAS1, BIAS2 = (LANES * k for k in range(71, 74))  # odometry bias
+BEFORE0, BEFORE1, BEFORE2 = (LANES * k for k in range(74, 77))  # predicted pose, while X0 .. T0 hold the posterior mean
+WORK_SIZE, SPREAD_SIZE = LANES * 77, LANES * 6
 
 # Rows of the record of one candidate.
 QJ00, QJ01, QJ02, QJ11, QJ12, QJ22, QG0, QG1, QG2 = (LANES * k for k in range(9))
 Q_SQUARE, Q_DET, Q_DET_POSE, Q_DEPTH, Q_METRES2, Q_D, Q_FIRST_D, Q_HELD = (LANES * k for k in range(9, 17))
 CANDIDATE_ROWS = 17
 
-POSES, STARTS, MEANS, COVARIANCES = ROBOT
+POSES, STARTS, MEANS, BIASES, COVARIANCES = ROBOT
 LOG_WEIGHTS, PATH_LOG_WEIGHTS, WEIGHTS, LOG_LIKELIHOOD = WEIGHT
 ROW_OF, MAP_OF, IDS, IDENTITIES, LAST_SEEN, FREE_SLOTS = SLOT
 MOTION_KIND, BEGIN, END, COVARIANCES_GIVEN, HAS_IDS, COUNT = range(6)  # columns of `StepInput.inputs_table`
@@ -53,12 +55,13 @@ NO_READING, STATIONARY, MOVED, EXACT_POSE = range(
 LOGGED, LOGGED_KIND, HAS_COVARIANCES, USED, MOTION, ESTIMATE, NUM_NOTED = 0, 1, 2, 3, 4, 7, 10
 NAME, NUM_MEASURED = 9, 10  # columns of a logged measurement: associated landmark, behind point and covariance
 ASSOCIATED, CREATED = range(2)  # rows of the data association (2, n)
-# Packed options of a filter: odometry noise (6), camera (7), prior sigmas for recovery (3), then one number each.
-NOISE, CAMERA, RECOVERY = 0, 6, 13
+# Packed options of a filter: odometry noise (6), sigmas of its bias (3), camera (7), prior sigmas for recovery (3);
+# then one number each.
+NOISE, BIAS, CAMERA, RECOVERY = 0, 6, 9, 16
 (
     DESCRIPTOR_GATE, DESCRIPTOR_VARIANCE, POSITION_GATE, NEW_LANDMARK_GATE, NEW_LANDMARK_RADIUS, AMBIGUITY_MARGIN,
     LOG_P0, WALK, IS_ONE_TO_ONE, LONG, RESAMPLE_THRESHOLD,
-) = range(16, 27)  # fmt: skip
+) = range(19, 30)  # fmt: skip
 
 TILE = 9 * LANES  # particle m is lane m % LANES of block m // LANES
 BLOCK = np.uint32(LANES)  # as divisor: unsigned division takes half the instructions

@@ -2,10 +2,13 @@
 
 import math
 
-from slam_backend.core.jit import device, simd
+from slam_backend.core.jit import device, simd, simd_inline
 from slam_backend.core.simd_math import sine_cosine, wrapped
 from slam_backend.core.validation import FloatArray
 from slam_backend.fastslam._kernels.layout import (
+    BIAS0,
+    BIAS1,
+    BIAS2,
     C00,
     C01,
     C10,
@@ -36,6 +39,7 @@ from slam_backend.fastslam._kernels.layout import (
     X,
     Y,
 )
+from slam_backend.fastslam._kernels.odometry_bias import add_bias_spread
 from slam_backend.fastslam._kernels.records import Motion, Poses
 
 WIDE_HEADING = 0.03  # [rad]; where the heading is less sure, one step of Gauss-Newton is not enough
@@ -62,6 +66,33 @@ def store_rows(work: FloatArray, low: int, rows: FloatArray, first: int) -> None
             target[i] = source[i]
 
 
+@simd_inline
+def advance(work: FloatArray, i: int, dx: float, dy: float, turn: float, v0: float, v1: float, v2: float) -> None:
+    """Move one lane by (dx, dy, turn) of independent variances, and turn its covariance into the robot's axes."""
+    s, c = sine_cosine(work[T0 + i])
+    ox, oy = c * dx - s * dy, s * dx + c * dy
+    work[X0 + i] += ox
+    work[Y0 + i] += oy
+    work[T0 + i] += turn
+    p00, p01, p02 = work[N00 + i], work[N01 + i], work[N02 + i]
+    p11, p12, p22 = work[N11 + i], work[N12 + i], work[N22 + i]
+    # F = [[1, 0, -oy], [0, 1, ox], [0, 0, 1]]
+    q00 = p00 - 2.0 * oy * p02 + oy * oy * p22 + c * c * v0 + s * s * v1
+    q01 = p01 + ox * p02 - oy * p12 - ox * oy * p22 + c * s * (v0 - v1)
+    q02 = p02 - oy * p22
+    q11 = p11 + 2.0 * ox * p12 + ox * ox * p22 + s * s * v0 + c * c * v1
+    q12 = p12 + ox * p22
+    s, c = sine_cosine(work[T0 + i])
+    work[N00 + i] = c * c * q00 + 2.0 * c * s * q01 + s * s * q11
+    work[N01 + i] = c * s * (q11 - q00) + (c * c - s * s) * q01
+    work[N02 + i] = c * q02 + s * q12
+    work[N11 + i] = s * s * q00 - 2.0 * c * s * q01 + c * c * q11
+    work[N12 + i] = c * q12 - s * q02
+    work[N22 + i] = p22 + v2
+    work[COS + i], work[SIN + i] = c, s
+    work[XI0 + i], work[XI1 + i], work[XI2 + i] = 0.0, 0.0, 0.0
+
+
 @device
 @simd
 def predict(work: FloatArray, robot: Poses, motion: Motion, blind: bool, first: int) -> None:
@@ -74,7 +105,7 @@ def predict(work: FloatArray, robot: Poses, motion: Motion, blind: bool, first: 
     Args:
         work: Rows of the block.
         robot: Poses before the motion: N(x^, P^) if `blind`, else the samples, exact.
-        motion: Odometry and its standard deviations.
+        motion: Odometry, its standard deviations and its bias.
         blind: Whether the robot has not been sampled at a sighting since N(x^, P^) was propagated.
         first: First particle of the block.
     """
@@ -87,30 +118,22 @@ def predict(work: FloatArray, robot: Poses, motion: Motion, blind: bool, first: 
             work[j] = 0.0
     dx, dy, turn = motion.odometry[0], motion.odometry[1], motion.odometry[2]
     v0, v1, v2 = motion.sigmas[0] ** 2, motion.sigmas[1] ** 2, motion.sigmas[2] ** 2
+    if motion.biased:
+        load_rows(work, BIAS0, robot.biases, first)
+        by_bias = motion.jacobian
+        j00, j01, j02 = by_bias[0, 0], by_bias[0, 1], by_bias[0, 2]
+        j10, j11, j12 = by_bias[1, 0], by_bias[1, 1], by_bias[1, 2]
+        j21, j22 = by_bias[2, 1], by_bias[2, 2]
+        for i in range(LANES):
+            b0, b1, b2 = work[BIAS0 + i], work[BIAS1 + i], work[BIAS2 + i]
+            x, y = dx - (j00 * b0 + j01 * b1 + j02 * b2), dy - (j10 * b0 + j11 * b1 + j12 * b2)
+            advance(work, i, x, y, turn - (j21 * b1 + j22 * b2), v0, v1, v2)
+        add_bias_spread(work, motion)
+    else:
+        for i in range(LANES):
+            advance(work, i, dx, dy, turn, v0, v1, v2)
     for i in range(LANES):
-        s, c = sine_cosine(work[T0 + i])
-        ox, oy = c * dx - s * dy, s * dx + c * dy
-        work[X0 + i] += ox
-        work[Y0 + i] += oy
-        work[T0 + i] += turn
-        p00, p01, p02 = work[N00 + i], work[N01 + i], work[N02 + i]
-        p11, p12, p22 = work[N11 + i], work[N12 + i], work[N22 + i]
-        # F = [[1, 0, -oy], [0, 1, ox], [0, 0, 1]]
-        q00 = p00 - 2.0 * oy * p02 + oy * oy * p22 + c * c * v0 + s * s * v1
-        q01 = p01 + ox * p02 - oy * p12 - ox * oy * p22 + c * s * (v0 - v1)
-        q02 = p02 - oy * p22
-        q11 = p11 + 2.0 * ox * p12 + ox * ox * p22 + s * s * v0 + c * c * v1
-        q12 = p12 + ox * p22
-        s, c = sine_cosine(work[T0 + i])
-        work[N00 + i] = c * c * q00 + 2.0 * c * s * q01 + s * s * q11
-        work[N01 + i] = c * s * (q11 - q00) + (c * c - s * s) * q01
-        work[N02 + i] = c * q02 + s * q12
-        work[N11 + i] = s * s * q00 - 2.0 * c * s * q01 + c * c * q11
-        work[N12 + i] = c * q12 - s * q02
-        work[N22 + i] = p22 + v2
-        work[COS + i], work[SIN + i] = c, s
-        work[WIDE + i] = 1.0 if p22 + v2 > WIDE_HEADING**2 else 0.0
-        work[XI0 + i], work[XI1 + i], work[XI2 + i] = 0.0, 0.0, 0.0
+        work[WIDE + i] = 1.0 if work[N22 + i] > WIDE_HEADING**2 else 0.0
     for i in range(LANES):
         q00, q11, q22 = work[N00 + i], work[N11 + i], work[N22 + i]
         c, s = work[COS + i], work[SIN + i]
@@ -141,13 +164,27 @@ def take_draws(work: FloatArray, normals: FloatArray, first: int) -> None:
 
 @device
 @simd
-def sample_motion(work: FloatArray, samples: FloatArray, motion: Motion, first: int) -> None:
-    """Replace poses (3, P) by draws from p(x_t | x_{t-1}, u_t), each particle from its own past (Eq. 4)."""
+def sample_motion(work: FloatArray, samples: FloatArray, biases: FloatArray, motion: Motion, first: int) -> None:
+    """Replace poses (3, P) by draws from p(x_t | x_{t-1}, u_t), each particle from its own past and bias (Eq. 4)."""
     odometry, sigmas = motion.odometry, motion.sigmas
     take_draws(work, motion.normals, first)
     load_rows(work, X, samples, first)
     for i in range(LANES):
         work[SIN + i], work[COS + i] = sine_cosine(work[T + i])
+    if motion.biased:
+        j, f = motion.jacobian, motion.factor
+        load_rows(work, BIAS0, biases, first)
+        for i in range(LANES):
+            b0, b1, b2 = work[BIAS0 + i], work[BIAS1 + i], work[BIAS2 + i]
+            n0, n1, n2 = work[DRAW0 + i], work[DRAW1 + i], work[DRAW2 + i]
+            dx = odometry[0] - (j[0, 0] * b0 + j[0, 1] * b1 + j[0, 2] * b2) + f[0, 0] * n0
+            dy = odometry[1] - (j[1, 0] * b0 + j[1, 1] * b1 + j[1, 2] * b2) + f[1, 0] * n0 + f[1, 1] * n1
+            turn = odometry[2] - (j[2, 1] * b1 + j[2, 2] * b2) + f[2, 0] * n0 + f[2, 1] * n1 + f[2, 2] * n2
+            c, s = work[COS + i], work[SIN + i]
+            samples[0, first + i] = work[X + i] + (c * dx - s * dy)
+            samples[1, first + i] = work[Y + i] + (s * dx + c * dy)
+            samples[2, first + i] = wrapped(work[T + i] + turn)
+        return
     for i in range(LANES):
         dx = odometry[0] + work[DRAW0 + i] * sigmas[0]
         dy = odometry[1] + work[DRAW1 + i] * sigmas[1]
@@ -192,4 +229,4 @@ def propagate(robot: Poses, motion: Motion, blind: bool, work: FloatArray) -> No
             work[N12 + i] = s * r02 + c * r12
         store_rows(work, X0, robot.means, first)
         store_rows(work, N00, robot.covariances, first)
-        sample_motion(work, robot.samples, motion, first)
+        sample_motion(work, robot.samples, robot.biases, motion, first)

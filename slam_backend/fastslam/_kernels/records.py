@@ -76,19 +76,21 @@ class WeightRows(NamedTuple):
 
 
 class RobotParts(NamedTuple):
-    """Parts of the array (5, K, 3, P) of K robots in all particles, map frame [m, m, rad].
+    """Parts of the array (6, K, 3, P) of K robots in all particles, map frame [m, m, rad].
 
     Attributes:
         poses: Samples.
         starts: Start poses of the robots.
         means: Means x^ before sampling.
+        biases: Means of the odometry biases, given the path [m/m, rad/m, rad/rad].
         covariances: First of the two parts that hold the covariances (K, 6, P) before sampling, upper triangles.
     """
 
     poses: int = 0
     starts: int = 1
     means: int = 2
-    covariances: int = 3
+    biases: int = 3
+    covariances: int = 4
 
 
 SLOT, WEIGHT, ROBOT = SlotRows(), WeightRows(), RobotParts()
@@ -101,11 +103,13 @@ class Poses(NamedTuple):
         samples: (3, P) rows x, y, theta [m, m, rad], map frame.
         means: (3, P) means x^ before sampling.
         covariances: (6, P) upper triangles of the covariances P^ before sampling.
+        biases: (3, P) means of the odometry bias, given the path [m/m, rad/m, rad/rad].
     """
 
     samples: FloatArray
     means: FloatArray
     covariances: FloatArray
+    biases: FloatArray
 
 
 class Motion(NamedTuple):
@@ -115,11 +119,23 @@ class Motion(NamedTuple):
         odometry: (3,) u [m, m, rad], previous robot frame.
         sigmas: (3,) standard deviations of u.
         normals: (M, 3) standard normal draws.
+        biased: Whether the bias of the odometry is estimated; all that follows is unused otherwise.
+        jacobian: (3, 3) derivative J of u by the bias.
+        spread: (6,) what the bias adds to the covariance of the predicted pose, robot axes, upper triangle.
+        factor: (3, 3) lower Cholesky factor of the covariance of u given the pose before, bias included.
+        gain: (3, 3) correction of the bias per deviation of the sampled pose, robot axes, or per normal draw.
+        information: (6,) inverse of the covariance of the predicted pose, robot axes, upper triangle.
     """
 
     odometry: FloatArray
     sigmas: FloatArray
     normals: FloatArray
+    biased: bool
+    jacobian: FloatArray
+    spread: FloatArray
+    factor: FloatArray
+    gain: FloatArray
+    information: FloatArray
 
 
 class Frame(NamedTuple):

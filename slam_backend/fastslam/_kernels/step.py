@@ -10,6 +10,8 @@ from slam_backend.fastslam._kernels.layout import (
     AMBIGUITY_MARGIN,
     ASSOCIATED,
     BEGIN,
+    BIAS,
+    BIASES,
     CAMERA,
     COUNT,
     COVARIANCES,
@@ -49,6 +51,7 @@ from slam_backend.fastslam._kernels.layout import (
 )
 from slam_backend.fastslam._kernels.map_storage import register_new
 from slam_backend.fastslam._kernels.motion_model import propagate, set_exact
+from slam_backend.fastslam._kernels.odometry_bias import prepare_bias, set_draw_gain
 from slam_backend.fastslam._kernels.records import Frame, MapArrays, Motion, Outcome, Poses, Rules
 from slam_backend.fastslam._kernels.weights import add_gauge_covariance, mixture, summarise, weigh
 
@@ -101,7 +104,7 @@ def write_sigmas(noise: FloatArray, move: FloatArray, sigmas: FloatArray) -> Non
 def step_robots(
     low: int, high: int, is_over: bool, now: int, assumed: FloatArray,
     rows: IntArray, inputs_table: IntArray, moves: FloatArray, normals: FloatArray,
-    robots: FloatArray, blind: IntArray, weights: FloatArray, gauge: FloatArray,
+    robots: FloatArray, biases: FloatArray, blind: IntArray, weights: FloatArray, gauge: FloatArray,
     values: FloatArray, counts: Int32Array, odds: FloatArray, table: IntArray, ancestors: Int32Array, users: IntArray,
     free_rows: IntArray, tops: IntArray, stored: Float32Array, heads: Float32Array,
     measurements: FloatArray, descriptors: Float32Array, names: IntArray,
@@ -117,13 +120,15 @@ def step_robots(
         low, high: Range of the robots to process; the step begins with the first robot.
         is_over: Whether these are the last robots, and the step is concluded.
         now: Number of the step, above 0 if anyone asks when landmarks were seen last.
-        assumed: (27,) noise of the odometry, camera, and the rest, see `layout`.
+        assumed: (30,) noise of the odometry, camera, and the rest, see `layout`.
         rows: (K,) row of each robot in `inputs_table`; -1: it did nothing at all.
         inputs_table: (N, 6) int64, see `layout`: kind of motion, first and last row of the measurements among all n,
             whether these have covariances and names, and the number given. Exact poses are already in `robots`.
         moves: (N, 3) odometry [m, m, rad] of those that moved.
         normals: (k, M, 3) standard normal draws, for the k robots that are not idle.
-        robots: (5, K, 3, P) samples, starts, and N(x^, P^) before sampling.
+        robots: (6, K, 3, P) samples, starts, N(x^, P^) before sampling, and means of the odometry bias.
+        biases: (2, K, 3, 3) covariance of each robot's bias given its path; and, where N(x^, P^) was propagated, that
+            of its pose (rows, robot axes) and bias.
         blind: (K,) 1 where that was propagated since the last sighting, else 0.
         weights: (4, P), see `layout`, read and written up to M.
         gauge: (3, 3) covariance of a motion of the whole map that particles do not show, or zeros.
@@ -150,6 +155,9 @@ def step_robots(
     points, noises = measurements[:, :3], measurements[:, 3:]
     work, still, move, sigmas, drawn = stack_array(WORK_SIZE), stack_array(3), stack_array(3), stack_array(3), -1
     still[:] = 0.0
+    jacobian, factor = stack_array(9).reshape(3, 3), stack_array(9).reshape(3, 3)
+    gain, spread, information = stack_array(9).reshape(3, 3), stack_array(6), stack_array(6)
+    biased = assumed[BIAS] > 0.0 or assumed[BIAS + 1] > 0.0 or assumed[BIAS + 2] > 0.0
     if low == 0:
         weights[LOG_LIKELIHOOD][:] = 0.0
     for robot in range(high):
@@ -165,8 +173,10 @@ def step_robots(
         if kind == MOVED:
             move[0], move[1], move[2] = moves[row, 0], moves[row, 1], moves[row, 2]
             write_sigmas(assumed[NOISE : NOISE + 6], move, sigmas)
-        own = Poses(poses[robot], means[robot], covariances[robot])
-        motion = Motion(move, sigmas, normals[drawn])
+        own = Poses(poses[robot], means[robot], covariances[robot], robots[BIASES, robot])
+        motion = Motion(
+            move, sigmas, normals[drawn], biased and not placed, jacobian, spread, factor, gain, information
+        )
         frame = Frame(
             points[a:b],
             noises[a:b],
@@ -184,11 +194,18 @@ def step_robots(
         )  # fmt: skip
         outcome = Outcome(found[a:b], distances[a:b], associations[CREATED, a:b], weights[LOG_LIKELIHOOD])
         was_blind = blind[robot] > 0 and not placed
+        if not was_blind:
+            biases[1, robot] = 0.0
+        if motion.biased:
+            prepare_bias(motion, biases[0, robot], biases[1, robot])
         if fastslam1 is not None:
+            if motion.biased:
+                set_draw_gain(motion, biases[0, robot])
+                biases[1, robot] = 0.0
             update_fastslam1(own, not placed, motion, maps, frame, rules, work, outcome)
             register_new(outcome.new_slots, frame, maps)
         elif b > a:
-            update_fastslam2(own, was_blind, motion, maps, frame, rules, work, outcome)
+            update_fastslam2(own, was_blind, motion, biases[:, robot], maps, frame, rules, work, outcome)
             register_new(outcome.new_slots, frame, maps)
             was_blind = False
         elif placed:

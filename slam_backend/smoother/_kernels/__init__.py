@@ -5,7 +5,9 @@ from slam_backend.smoother._kernels.graph_reduction import add_sightings, merge_
 from slam_backend.smoother._kernels.keyframes import add_log, close_keyframe
 from slam_backend.smoother._kernels.marginal_covariances import scatter_of_links
 from slam_backend.smoother._kernels.normal_equations import form, gather, step
+from slam_backend.smoother._kernels.odometry_bias import condition_bias
 from slam_backend.smoother._kernels.records import (
+    BIAS,
     FREE,
     LEVER,
     NONE,
@@ -33,6 +35,7 @@ from slam_backend.smoother._kernels.sampling import (
 from slam_backend.smoother._kernels.sparse_cholesky import covariance, factorise, lay_out
 
 __all__ = [
+    "BIAS",
     "FREE",
     "LANES",
     "LEVER",
@@ -52,6 +55,7 @@ __all__ = [
     "add_sightings",
     "close_keyframe",
     "condense",
+    "condition_bias",
     "covariance",
     "draw",
     "factorise",

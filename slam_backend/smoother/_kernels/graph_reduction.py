@@ -48,9 +48,39 @@ def chain(first: FloatArray, first_noise: FloatArray, motion: FloatArray, noise:
     noise[1, 0], noise[2, 0], noise[2, 1] = noise[0, 1], noise[0, 2], noise[1, 2]
 
 
+@inline
+def chain_biased(
+    first: FloatArray, first_noise: FloatArray, first_jacobian: FloatArray, bias: FloatArray, motion: FloatArray,
+    noise: FloatArray, jacobian: FloatArray,
+) -> None:  # fmt: skip
+    """Put odometry before other odometry of the same robot, in place, linearised about its bias b.
+
+    Args:
+        first, first_noise, first_jacobian: (3,), (3, 3), (3, 3) odometry u, its covariance, and its derivative J by
+            the bias: it measures the motion u - J b.
+        bias: (3,) b.
+        motion, noise, jacobian: Odometry that follows, its covariance and derivative; changed to those of both.
+    """
+    o0, o1, o2 = first[0], first[1], first[2]
+    for i in range(3):
+        first[i] -= first_jacobian[i, 0] * bias[0] + first_jacobian[i, 1] * bias[1] + first_jacobian[i, 2] * bias[2]
+        motion[i] -= jacobian[i, 0] * bias[0] + jacobian[i, 1] * bias[1] + jacobian[i, 2] * bias[2]
+    c, s = math.cos(first[2]), math.sin(first[2])
+    dx, dy = c * motion[0] - s * motion[1], s * motion[0] + c * motion[1]
+    for i in range(3):
+        x, y, turn = jacobian[0, i], jacobian[1, i], first_jacobian[2, i]
+        jacobian[0, i] = first_jacobian[0, i] - dy * turn + c * x - s * y
+        jacobian[1, i] = first_jacobian[1, i] + dx * turn + s * x + c * y
+        jacobian[2, i] += turn
+    chain(first, first_noise, motion, noise)
+    first[0], first[1], first[2] = o0, o1, o2
+    for i in range(3):
+        motion[i] += jacobian[i, 0] * bias[0] + jacobian[i, 1] * bias[1] + jacobian[i, 2] * bias[2]
+
+
 @jit
 def merge_keys(
-    fresh: BoolArray, sighted: BoolArray, most_keys: int, keys: Keys
+    fresh: BoolArray, sighted: BoolArray, most_keys: int, keys: Keys, biases: IntArray
 ) -> tuple[int, IntArray, IntArray, FloatArray]:
     """Leave few enough keys, and say where the others stand to them; odometry is carried there.
 
@@ -65,13 +95,16 @@ def merge_keys(
         keys: Keys of the graph in the order of time; `spreads` [m^2] is what joining a key to the one before costs,
             `slack` what each has cost. Changed: the first rows are those of the keys that are left, whose odometry
             begins at another one that is left, by its new number.
+        biases: (k,) key of the bias of each key's odometry, `NONE` if it has none; (0,) without biases. Odometry under
+            a bias is kept whole: where a key has gone, that of the key after it begins with the odometry of the key
+            that went, not with its rigid pose, because the rigid pose says no more of the bias.
 
     Returns:
         Number of keys that are left; (k,) the key to which each stands rigidly, itself if it is left, `NONE` if it was
         chained away; (k,) new number of each that is left, `NONE` of the others; (k, 3) pose of each seen from the key
         to which it stands.
     """
-    robots, poses, previous, motions, noises, costs, slack = keys
+    robots, poses, previous, motions, noises, jacobians, costs, slack = keys
     k = len(robots)
     roots, numbers, offsets = np.empty(k, np.int64), np.full(k, NONE), np.zeros((k, 3))
     following = np.full(k, NONE)
@@ -82,7 +115,11 @@ def merge_keys(
         if linked[b]:
             a = previous[b]
             while linked[a] and not sighted[a] and not fresh[a]:
-                chain(motions[a], noises[a], motions[b], noises[b])
+                if len(biases) > 0 and biases[b] >= 0:
+                    value = poses[biases[b]]
+                    chain_biased(motions[a], noises[a], jacobians[a], value, motions[b], noises[b], jacobians[b])
+                else:
+                    chain(motions[a], noises[a], motions[b], noises[b])
                 a = previous[a]
             previous[b] = a
             following[a] = b
@@ -121,17 +158,29 @@ def merge_keys(
         dx, dy = poses[b, 0] - poses[a, 0], poses[b, 1] - poses[a, 1]
         offsets[b, 0], offsets[b, 1] = c * dx + s * dy, -s * dx + c * dy
         offsets[b, 2] = (poses[b, 2] - poses[a, 2] + math.pi) % (2.0 * math.pi) - math.pi
+    for b in range(len(biases)):
+        if roots[b] == b and biases[b] >= 0:
+            a, value = previous[b], poses[biases[b]]
+            while roots[a] != a:
+                chain_biased(motions[a], noises[a], jacobians[a], value, motions[b], noises[b], jacobians[b])
+                a = previous[a]
     for b in range(k):
         if roots[b] != b:
             continue
         a = previous[b]
         if a >= 0:
             previous[b] = numbers[roots[a]]
-            if roots[a] != a:
+            if roots[a] != a and (len(biases) == 0 or biases[b] < 0):
                 put_before(offsets[a], motions[b], noises[b])
         n = numbers[b]
         robots[n], poses[n], previous[n] = robots[b], poses[b], previous[b]
-        motions[n], noises[n], costs[n], slack[n] = motions[b], noises[b], costs[b], slack[b]
+        motions[n], noises[n], jacobians[n], costs[n], slack[n] = (
+            motions[b],
+            noises[b],
+            jacobians[b],
+            costs[b],
+            slack[b],
+        )
     return number, roots, numbers, offsets
 
 

@@ -108,6 +108,7 @@ def add_log(
     starts, ids = log.starts, log.ids
     key, frame, num, tip, guess = ends[0], ends[1], ends[2], tips[robot], 0
     pose, chain, noise = keys.poses[tip].copy(), np.zeros(3), np.zeros((3, 3))
+    jacobian, move, bias, biased = np.zeros((3, 3)), np.zeros(3), log.bias, len(log.jacobians) > 0
     moved, measured, is_guided = False, False, True
     for t in range(len(log.steps)):
         first = num
@@ -121,7 +122,11 @@ def add_log(
                     raw.point_noises[num] = 0.0
                 num += 1
         if log.kinds[t] == ODOMETRY:
-            move, variances = log.motions[t], log.variances[t]
+            move[:], variances = log.motions[t], log.variances[t]
+            if biased:
+                j = log.jacobians[t]
+                for axis in range(3):
+                    move[axis] -= j[axis, 0] * bias[0] + j[axis, 1] * bias[1] + j[axis, 2] * bias[2]
             c, s = math.cos(chain[2]), math.sin(chain[2])  # the covariance of the chain grows to first order
             dx, dy = c * move[0] - s * move[1], s * move[0] + c * move[1]
             n02, n12, n22 = noise[0, 2], noise[1, 2], noise[2, 2]
@@ -132,6 +137,12 @@ def add_log(
             noise[1, 2] += dx * n22
             noise[2, 2] += variances[2]
             noise[1, 0], noise[2, 0], noise[2, 1] = noise[0, 1], noise[0, 2], noise[1, 2]
+            if biased:
+                for axis in range(3):
+                    turn = jacobian[2, axis]
+                    jacobian[0, axis] += c * j[0, axis] - s * j[1, axis] - dy * turn
+                    jacobian[1, axis] += s * j[0, axis] + c * j[1, axis] + dx * turn
+                    jacobian[2, axis] += j[2, axis]
             chain[0] += dx
             chain[1] += dy
             chain[2] = (chain[2] + move[2] + math.pi) % (2.0 * math.pi) - math.pi
@@ -154,6 +165,12 @@ def add_log(
         if moved and (far or t == len(log.steps) - 1):
             keys.robots[key], keys.parents[key], keys.poses[key] = robot, tip, pose
             keys.odometry[key], keys.odometry_covariances[key], keys.transition_variances[key] = chain, noise, scatter
+            keys.bias_jacobians[key] = jacobian
+            if biased:
+                for axis in range(3):
+                    own = jacobian[axis]
+                    keys.odometry[key, axis] += own[0] * bias[0] + own[1] * bias[1] + own[2] * bias[2]
+                jacobian[:] = 0.0
             chain[:] = 0.0
             noise[:] = 0.0
             scatter, moved = 0.0, False

@@ -14,6 +14,7 @@ from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.smoother._kernels.factors import _inverse, _rotate_in_plane
 from slam_backend.smoother._kernels.records import (
     FREE,
+    NONE,
     CholeskyFactor,
     Condensed,
     EquationBlocks,
@@ -97,14 +98,15 @@ WEAK = 1e-6
 
 @in_place
 def form(
-    poses: FloatArray, landmarks: FloatArray, graph_keys: Keys, columns: IntArray, link_infos: FloatArray,
-    seen: LandmarkFactors, equations: EquationBlocks,
+    poses: FloatArray, landmarks: FloatArray, graph_keys: Keys, biases: IntArray, columns: IntArray,
+    link_infos: FloatArray, seen: LandmarkFactors, equations: EquationBlocks,
 ) -> tuple[float, float]:  # fmt: skip
     """Write the normal equations of n poses and l landmarks.
 
     Args:
         poses, landmarks: (k, 3), (l, 3) where to linearise.
         graph_keys: Keys of the graph, of which the odometry is used.
+        biases: (k,) key of the bias of each key's odometry, `NONE` if it has none; (0,) without biases.
         columns: (k,) first row of each pose among those sought, `FREE` if it is given.
         link_infos: (k, 3, 3) information of the odometry, in the frame of the previous key.
         seen: Sightings, linearised there.
@@ -116,8 +118,9 @@ def form(
     """
     previous, motions, keys, starts = graph_keys.parents, graph_keys.odometry, seen.keys, seen.starts
     centres, infos, slopes = seen.linearisation_points, seen.information, seen.gradients
-    turns, blocks, links, cross, vector = equations
+    turns, blocks, links, cross, bias_links, vector = equations
     blocks[:] = 0.0
+    bias_links[:] = 0.0
     vector[:] = 0.0
     cost = 0.0
     for b in range(len(poses)):
@@ -134,6 +137,11 @@ def form(
         r[0], r[1] = mx - motions[b, 0], my - motions[b, 1]
         turn = poses[b, 2] - poses[a, 2] - motions[b, 2]
         r[2] = turn - 2.0 * math.pi * math.floor((turn + math.pi) / (2.0 * math.pi))
+        bias = biases[b] if len(biases) > 0 else NONE
+        if bias >= 0:
+            jacobian, value = graph_keys.bias_jacobians[b], poses[bias]
+            for i in range(3):
+                r[i] += jacobian[i, 0] * value[0] + jacobian[i, 1] * value[1] + jacobian[i, 2] * value[2]
         g[:] = 0.0
         g[0, 0], g[0, 1], g[1, 0], g[1, 1], g[2, 2] = c, s, -s, c, 1.0
         f[:] = 0.0
@@ -155,10 +163,25 @@ def form(
                 for j in range(i, 3):
                     blocks[own, at] += h[i, 0] * left[0, j] + h[i, 1] * left[1, j] + h[i, 2] * left[2, j]
                     at += 1
+            if bias >= 0:
+                block = bias_links[b if side else a]
+                for i in range(3):
+                    for j in range(3):
+                        block[i, j] += h[i, 0] * jacobian[0, j] + h[i, 1] * jacobian[1, j] + h[i, 2] * jacobian[2, j]
             if side and columns[a] >= 0:
                 for i in range(3):
                     for j in range(3):
                         links[b, i, j] = h[i, 0] * f[0, j] + h[i, 1] * f[1, j] + h[i, 2] * f[2, j]
+        if bias >= 0:
+            own, at = columns[bias] // 3, 0
+            for i in range(3):
+                for j in range(3):
+                    h[i, j] = jacobian[0, i] * w[0, j] + jacobian[1, i] * w[1, j] + jacobian[2, i] * w[2, j]
+            for i in range(3):
+                vector[own, i] += h[i, 0] * r[0] + h[i, 1] * r[1] + h[i, 2] * r[2]
+                for j in range(i, 3):
+                    blocks[own, at] += h[i, 0] * jacobian[0, j] + h[i, 1] * jacobian[1, j] + h[i, 2] * jacobian[2, j]
+                    at += 1
         for i in range(3):
             for j in range(3):
                 cost += 0.5 * r[i] * w[i, j] * r[j]

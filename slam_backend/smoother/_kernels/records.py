@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 
 NONE: Final = -1  # no key, no robot
+BIAS: Final = -2  # in place of the robot of a key that holds an odometry bias
 FREE: Final = -1  # column of a pose that is given, not sought
 LEVER: Final = 3.0  # [m]; where an error of the heading between two keys is felt
 
@@ -20,6 +21,7 @@ class Keys(NamedTuple):
     parents: IntArray
     odometry: FloatArray
     odometry_covariances: FloatArray
+    bias_jacobians: FloatArray
     transition_variances: FloatArray
     rigid_variances: FloatArray
 
@@ -66,6 +68,8 @@ class Log(NamedTuple):
         steps, kinds, motions, given, starts, points, ids: Columns of `LogArrays`.
         covariances: (n, 6) [m^2] of the measured points, (0, 6) where there are none at all.
         variances: (T, 3) [m^2, m^2, rad^2] of the parts of each motion.
+        jacobians: (T, 3, 3) derivative of each motion by the robot's odometry bias; (0, 3, 3) without a bias.
+        bias: (3,) [m/m, rad/m, rad/rad] bias about which odometry is chained.
     """
 
     steps: IntArray
@@ -77,6 +81,8 @@ class Log(NamedTuple):
     ids: IntArray
     covariances: FloatArray
     variances: FloatArray
+    jacobians: FloatArray
+    bias: FloatArray
 
 
 class LandmarkFactors(NamedTuple):
@@ -112,6 +118,7 @@ class EquationBlocks(NamedTuple):
         blocks: (n + l, 6) second derivatives by each node.
         links: (k, 3, 3) by a key (rows) and the one before (columns), where both are sought.
         cross: (s, 3, 3) by pose (rows) and landmark (columns) of each sighting, where the pose is sought.
+        bias_links: (k, 3, 3) by a key (rows) and the odometry bias of its robot (columns); (0, 3, 3) without biases.
         vector: (n + l, 3) slope of the cost.
     """
 
@@ -119,6 +126,7 @@ class EquationBlocks(NamedTuple):
     blocks: FloatArray
     links: FloatArray
     cross: FloatArray
+    bias_links: FloatArray
     vector: FloatArray
 
 
@@ -129,8 +137,8 @@ class SymbolicFactor(NamedTuple):
         order: (N,) nodes in the order of elimination.
         ranks: (N,) place of each node in that order.
         tops, rows: (N + 1,), (filled,) blocks of column j are tops[j] to tops[j + 1], and their rows.
-        link_places, cross_places: (k,), (s,) 1 + place of each block of `links` and `cross`, negative if it is
-            transposed there, 0 if there is none.
+        link_places, cross_places, bias_places: (k,), (s,), (k,) 1 + place of each block of `links`, `cross` and
+            `bias_links`, negative if it is transposed there, 0 if there is none.
         row_tops, row_columns, row_places: (N + 1,), (filled,), (filled,) the same blocks row by row.
         drawn: Number of nodes that `draw` samples.
         squares: Sum of the squares of the columns' lengths.
@@ -142,6 +150,7 @@ class SymbolicFactor(NamedTuple):
     rows: IntArray
     link_places: IntArray
     cross_places: IntArray
+    bias_places: IntArray
     row_tops: IntArray
     row_columns: IntArray
     row_places: IntArray

@@ -11,6 +11,7 @@ from slam_backend.smoother._kernels.factors import _inverse
 from slam_backend.smoother._kernels.normal_equations import WEAK
 from slam_backend.smoother._kernels.records import (
     LEVER,
+    NONE,
     CholeskyFactor,
     EquationBlocks,
     Keys,
@@ -285,7 +286,7 @@ def replay(
 
 @simd
 def odometry_log_density(
-    poses: FloatArray, num_keys: int, num_blocks: int, num_paths: int, keys: Keys, infos: FloatArray,
+    poses: FloatArray, num_keys: int, num_blocks: int, num_paths: int, keys: Keys, biases: IntArray, infos: FloatArray,
     mode: FloatArray, log_density: FloatArray, spreads: FloatArray,
 ) -> None:  # fmt: skip
     """Weigh paths by odometry, and say how rigid they are from each key to the next.
@@ -294,13 +295,17 @@ def odometry_log_density(
         poses, num_keys, num_blocks: Paths in blocks of lanes, as `replay` takes them.
         num_paths: M; the lanes after these are copies.
         keys, infos: Keys of the graph, of which the odometry is used, and the information (k, 3, 3) of that.
+        biases: (k,) key of the bias of each key's odometry, `NONE` if it has none; (0,) without biases.
         mode: (k, 3) [m, m, rad] the most probable path.
         log_density: (num_blocks * LANES,), result: log p(path given odometry) up to a constant.
         spreads: (k,), result [m^2]: mean square of what the motion from the previous key differs from that of the mode.
     """
     previous, motions = keys.parents, keys.odometry
     log_density[:] = 0.0
-    squares = stack_array(LANES)
+    squares, e0, e1, e2 = stack_array(LANES), stack_array(LANES), stack_array(LANES), stack_array(LANES)
+    e0[:] = 0.0
+    e1[:] = 0.0
+    e2[:] = 0.0
     for b in range(num_keys):
         a = previous[b]
         spreads[b] = 0.0
@@ -312,8 +317,17 @@ def odometry_log_density(
         d0, d1, d2 = c * dx + s * dy - u0, c * dy - s * dx - u1, mode[b, 2] - mode[a, 2] - u2
         w = infos[b]
         w00, w01, w02, w11, w12, w22 = w[0, 0], w[0, 1], w[0, 2], w[1, 1], w[1, 2], w[2, 2]
-        total = 0.0
+        total, bias = 0.0, biases[b] if len(biases) > 0 else NONE
         for block in range(num_blocks):
+            if bias >= 0:  # J b of each path
+                j = keys.bias_jacobians[b]
+                base_a = (block * num_keys + bias) * POSE_ROWS * LANES
+                value = poses[base_a : base_a + POSE_ROWS * LANES]
+                for i in range(LANES):
+                    b0, b1, b2 = value[PX + i], value[PY + i], value[HEADING + i]
+                    e0[i] = j[0, 0] * b0 + j[0, 1] * b1 + j[0, 2] * b2
+                    e1[i] = j[1, 0] * b0 + j[1, 1] * b1 + j[1, 2] * b2
+                    e2[i] = j[2, 0] * b0 + j[2, 1] * b1 + j[2, 2] * b2
             base_a, base_b = (block * num_keys + a) * POSE_ROWS * LANES, (block * num_keys + b) * POSE_ROWS * LANES
             first = poses[base_a : base_a + POSE_ROWS * LANES]
             second = poses[base_b : base_b + POSE_ROWS * LANES]
@@ -324,12 +338,17 @@ def odometry_log_density(
                 r0, r1 = c * dx + s * dy - u0, c * dy - s * dx - u1
                 turn = second[HEADING + i] - first[HEADING + i] - u2
                 r2 = turn - 2.0 * math.pi * math.floor((turn + math.pi) / (2.0 * math.pi))
+                r0, r1, r2 = r0 + e0[i], r1 + e1[i], r2 + e2[i]
                 out[i] -= 0.5 * (w00 * r0 * r0 + w11 * r1 * r1 + w22 * r2 * r2) + (
                     w01 * r0 * r1 + w02 * r0 * r2 + w12 * r1 * r2
                 )
-                r0, r1, r2 = r0 - d0, r1 - d1, turn - d2
+                r0, r1, r2 = r0 - e0[i] - d0, r1 - e1[i] - d1, turn - d2
                 r2 = r2 - 2.0 * math.pi * math.floor((r2 + math.pi) / (2.0 * math.pi))
                 squares[i] = r0 * r0 + r1 * r1 + LEVER * LEVER * r2 * r2
             for i in range(min(LANES, num_paths - block * LANES)):
                 total += squares[i]
+        if bias >= 0:
+            e0[:] = 0.0
+            e1[:] = 0.0
+            e2[:] = 0.0
         spreads[b] = total / num_paths

@@ -101,11 +101,14 @@ def _place(tops: IntArray, rows: IntArray, a: int, b: int) -> int:
 
 
 @jit
-def lay_out(columns: IntArray, previous: IntArray, seen: LandmarkFactors, num: int) -> SymbolicFactor:
+def lay_out(
+    columns: IntArray, previous: IntArray, biases: IntArray, seen: LandmarkFactors, num: int
+) -> SymbolicFactor:  # fmt: skip
     """Choose the order in which `num` poses and landmarks are eliminated, and lay out the blocks of the factor.
 
     Args:
         columns, previous: (k,) first column of each pose, and its previous key.
+        biases: (k,) key of the bias of the odometry from the previous key, `NONE` if it has none; (0,) without biases.
         seen: Sightings.
         num: Poses that are sought, and landmarks.
     """
@@ -118,6 +121,14 @@ def lay_out(columns: IntArray, previous: IntArray, seen: LandmarkFactors, num: i
             one, two = columns[a] // 3, columns[b] // 3
             near[one, two >> 6] |= ONE << np.uint64(two & 63)
             near[two, one >> 6] |= ONE << np.uint64(one & 63)
+    for b in range(len(biases)):
+        if biases[b] >= 0:
+            two = columns[biases[b]] // 3
+            for key in (previous[b], b):
+                if columns[key] >= 0:
+                    one = columns[key] // 3
+                    near[one, two >> 6] |= ONE << np.uint64(two & 63)
+                    near[two, one >> 6] |= ONE << np.uint64(one & 63)
     for landmark in range(len(starts) - 1):
         for q in range(starts[landmark], starts[landmark + 1]):
             if columns[keys[q]] >= 0:
@@ -161,6 +172,12 @@ def lay_out(columns: IntArray, previous: IntArray, seen: LandmarkFactors, num: i
         a = previous[b]
         if a >= 0 and columns[a] >= 0 and columns[b] >= 0:
             link_places[b] = _place(tops, rows, ranks[columns[b] // 3], ranks[columns[a] // 3])
+    bias_places = np.zeros(len(biases), np.int64)
+    for b in range(len(biases)):
+        if biases[b] >= 0:
+            for key in (previous[b], b):
+                if columns[key] >= 0:
+                    bias_places[key] = _place(tops, rows, ranks[columns[key] // 3], ranks[columns[biases[b]] // 3])
     for landmark in range(len(starts) - 1):
         for q in range(starts[landmark], starts[landmark + 1]):
             own = columns[keys[q]]
@@ -171,7 +188,18 @@ def lay_out(columns: IntArray, previous: IntArray, seen: LandmarkFactors, num: i
         drawn += order[j] < first_landmark or row_tops[j] < row_tops[j + 1]
         squares += (tops[j + 1] - tops[j]) * (tops[j + 1] - tops[j])
     return SymbolicFactor(
-        order, ranks, tops, rows, link_places, cross_places, row_tops, row_columns, row_places, drawn, squares
+        order,
+        ranks,
+        tops,
+        rows,
+        link_places,
+        cross_places,
+        bias_places,
+        row_tops,
+        row_columns,
+        row_places,
+        drawn,
+        squares,
     )
 
 
@@ -192,7 +220,10 @@ def factorise(
     pivots, values, where = factor
     num = len(order)
     values[:] = 0.0
-    for places, parts in ((pattern.link_places, equations.links), (pattern.cross_places, equations.cross)):
+    for places, parts in (
+        (pattern.link_places, equations.links), (pattern.cross_places, equations.cross),
+        (pattern.bias_places, equations.bias_links),
+    ):  # fmt: skip
         for n in range(len(places)):
             if places[n] == 0:
                 continue

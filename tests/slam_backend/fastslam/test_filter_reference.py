@@ -1,6 +1,7 @@
 """The compiled filter and the plain one take the same decisions and compute the same numbers."""
 
 from collections import Counter
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from slam_backend.resampling import RESAMPLING
 
 CLOSE = {"rtol": 1e-8, "atol": 1e-8}  # ill-conditioned updates amplify the rounding of either
 UPPER = np.triu_indices(3)
+BIASES: tuple[dict[str, float], ...] = ({}, {"bias_scale": 0.1, "bias_heading": 0.05, "bias_turn": 0.1})
 
 
 def assert_same_pose(found: FloatArray, expected: FloatArray, close: dict[str, float] = CLOSE) -> None:
@@ -115,6 +117,10 @@ def assert_same(slam: FastSlam, plain: ReferenceFastSlam) -> None:
         assert_same_pose(poses, np.array([particle.poses[robot] for particle in plain.particles]))
         np.testing.assert_allclose(log_weights, [particle.log_weight for particle in plain.particles], **weighted)
         assert_same_pose(slam.pose(robot).mean, plain.pose(robot).mean, weighted)
+        biases = slam.state.biases[robot, :, : slam.num_particles].T
+        np.testing.assert_allclose(biases, [particle.biases[robot] for particle in plain.particles], **CLOSE)
+        bias = plain.biases[robot]
+        np.testing.assert_allclose(slam.state.bias_covariances[:, robot], [bias.covariance, bias.cross], **CLOSE)
         np.testing.assert_allclose(slam.pose(robot).covariance, plain.pose(robot).covariance, **weighted)
     best = slam.best_particle
     assert best in plain.equally_probable()
@@ -183,7 +189,7 @@ def run_both(seed: int, num_particles: int, most: int, steps: int, proposal: str
         world.start_poses,
         num_particles=num_particles,
         camera=world.camera,
-        motion=world.motion,
+        motion=replace(world.motion, **BIASES[seed // 2 % 2]),
         proposal=proposal,
         resampling=str(rng.choice(list(RESAMPLING))),
         resample_threshold=float(rng.choice([0.0, 0.5, 1.0])),

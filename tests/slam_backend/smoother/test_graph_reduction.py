@@ -203,7 +203,7 @@ def log_of(kinds, motions, variances, counts):
     n = int(counts.sum())
     return Log(
         np.arange(len(kinds)), kinds, motions, np.zeros(len(kinds), dtype=np.bool_), np.append(0, np.cumsum(counts)),
-        np.ones((n, 3)), np.arange(n), np.empty((0, 6)), variances,
+        np.ones((n, 3)), np.arange(n), np.empty((0, 6)), variances, np.empty((0, 3, 3)), np.zeros(3),
     )  # fmt: skip
 
 
@@ -212,7 +212,7 @@ def room_for(keys, frames, points):
     return (
         Keys(
             np.full(keys, -7), np.empty((keys, 3)), np.full(keys, -7), np.empty((keys, 3)), np.empty((keys, 3, 3)),
-            np.empty(keys), np.zeros(keys),
+            np.empty((keys, 3, 3)), np.empty(keys), np.zeros(keys),
         ),
         Frames(np.full(frames, -7), np.empty((frames, 3))),
         Points(
@@ -304,7 +304,8 @@ def test_measurements_with_ids_are_selected(covered):
     keys, frames, raw = room_for(3, 9, 8)
     keys.poses[0] = 0.0
     kinds, still, ends = np.full(5, STATIONARY, dtype=np.int8), np.zeros((5, 3)), np.array([1, 5, 2])
-    log = Log(np.arange(5), kinds, still, given_steps, starts, points, ids, covariances, still)
+    no_bias = np.empty((0, 3, 3)), np.zeros(3)
+    log = Log(np.arange(5), kinds, still, given_steps, starts, points, ids, covariances, still, *no_bias)
     assert not add_log(log, InitialPoses.empty(), 0, 0.0, np.zeros(1, dtype=np.int64), ends, keys, frames, raw)
     assert ends.tolist() == [1, 8, 6]
     assert frames.frame_keys.tolist() == [-7] * 5 + [0, 0, 0, -7]

@@ -359,13 +359,13 @@ def test_an_increment_moves_poses_as_stated():
     change, poses, landmarks = (rng.normal(size=(n, 3)) for n in (5, 4, 2))
     columns, order, none = np.array([FREE, 0, 3, 6]), np.arange(5), np.zeros(0, dtype=np.int64)
     tops, empty = np.zeros(6, dtype=np.int64), np.zeros((0, 3))
-    pattern = SymbolicFactor(order, order, tops, none, none, none, tops, none, none, 5, 0)
+    pattern = SymbolicFactor(order, order, tops, none, none, none, none, tops, none, none, 5, 0)
     factor = CholeskyFactor(
         np.tile([1.0, 0.0, 1.0, 0.0, 0.0, 1.0], (5, 1)), np.zeros((0, 9)), order
     )  # of unit matrices
 
     def solved(vector):
-        blocks = np.zeros((5, 6)), np.zeros((0, 3, 3)), np.zeros((0, 3, 3))
+        blocks = np.zeros((5, 6)), *(np.zeros((0, 3, 3)) for _ in range(3))
         return _kernels.step(
             EquationBlocks(empty[:, :2].copy(), *blocks, vector), factor, pattern, columns, poses, landmarks
         )

@@ -4,14 +4,14 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from builders.runs import TIGHT, camera_of, graph_of, small_run
+from builders.runs import BIASED, TIGHT, camera_of, graph_of, small_run
 
 from slam_backend.core.validation import FloatArray
 from slam_backend.fastslam.run_log import RobotLog
 from slam_backend.geometry import between
 from slam_backend.models.odometry import OdometryModel
 from slam_backend.smoother import _kernels
-from slam_backend.smoother.graph import LEVER, SlamGraph
+from slam_backend.smoother.graph import LEVER, NONE, SlamGraph
 from slam_backend.smoother.graph_building import extend_graph
 from slam_backend.smoother.graph_reduction import reduce_keyframes, relinearise
 from slam_backend.smoother.optimizer import MapEstimate, gathered, optimize
@@ -26,12 +26,12 @@ class Problem(NamedTuple):
     dense: FloatArray
 
 
-def problem(robots: int, max_keys: int) -> Problem:
+def problem(robots: int, max_keys: int, motion: OdometryModel | None = None) -> Problem:
     """Return one of each kind: raw and frozen sightings, poses that are given, landmarks that poses share."""
     run = small_run(robots)
     camera = camera_of(run)
     options = SmoothingOptions(max_keys=max_keys, further_keys=0, recent_keys=6, kernel=0.0)
-    graph = graph_of(run)
+    graph = graph_of(run, motion=motion)
     mode = optimize(graph, camera, TIGHT)
     graph = reduce_keyframes(relinearise(graph, mode, mode.spreads()), camera, options)
     mode = optimize(graph, camera, TIGHT)
@@ -46,6 +46,12 @@ def problem(robots: int, max_keys: int) -> Problem:
         if a >= 0 and min(mode.columns[a], mode.columns[b]) >= 0:
             i, j = mode.columns[[b, a]] // 3
             dense[i, :, j], dense[j, :, i] = system.equations.links[b], system.equations.links[b].T
+    for b, bias in enumerate(graph.biases_of_odometry()):
+        for key in {b, int(graph.parents[b])} if bias >= 0 else ():
+            if mode.columns[key] >= 0:
+                i, j = mode.columns[[key, bias]] // 3
+                dense[i, :, j] = system.equations.bias_links[key]
+                dense[j, :, i] = system.equations.bias_links[key].T
     for q, (key, landmark) in enumerate(zip(seen.keys, seen.landmarks, strict=True)):
         if mode.columns[key] >= 0:
             i, j = mode.columns[key] // 3, n + landmark
@@ -54,7 +60,12 @@ def problem(robots: int, max_keys: int) -> Problem:
     return Problem(graph, mode, dense)
 
 
-PROBLEMS = {"one robot": problem(1, 12), "two robots": problem(2, 1000)}
+PROBLEMS = {
+    "one robot": problem(1, 12),
+    "two robots": problem(2, 1000),
+    "one biased robot": problem(1, 12, BIASED),
+    "two biased robots": problem(2, 1000, BIASED),
+}
 
 
 @pytest.fixture(params=PROBLEMS)
@@ -213,6 +224,7 @@ def test_sightings_are_gathered_as_by_sorting():
     graph = SlamGraph(
         robots=np.zeros(keys, dtype=np.int64), poses=np.zeros((keys, 3)), landmarks=np.zeros((landmarks, 3)),
         landmark_ids=np.arange(landmarks), first_keys=np.zeros(1, dtype=np.int64),
+        bias_keys=np.full(1, NONE),
         last_keys=np.zeros(1, dtype=np.int64),
         latest=np.zeros(1, dtype=np.int64), condensed_keys=frozen % keys, condensed_landmarks=frozen // keys,
         linearisation_points=rng.normal(size=(8, 3)), information=rng.normal(size=(8, 6)),

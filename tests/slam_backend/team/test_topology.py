@@ -218,6 +218,7 @@ def test_poses_in_own_start_frames_agree_with_the_plain_definition() -> None:
     weights = rng.dirichlet(np.ones(count))
     of_four = [np.concatenate([rows, rows[:1]]) for rows in (starts, means, covariances)]
     estimates = pose_mixtures(*of_four[1:], weights)
+    of_four.insert(2, np.zeros((4, 3, LANES)))  # biases
     robots = np.concatenate([rows.reshape(-1, 4, 3, LANES) for rows in (np.zeros((4, 3, LANES)), *of_four)])
     names, live = np.array([3, 0, 2, 4]), np.array([1, 1, 1, 0])
     points = TeamPoses(5)
@@ -261,7 +262,7 @@ def test_a_held_start_widens_what_is_seen_from_it_and_the_frame_does_not() -> No
     starts, means = np.repeat(start[:, None], LANES, axis=1)[None], rng.uniform(-3.0, 3.0, (1, 3, LANES))
     covariances = np.repeat(np.array([0.2, 0.05, 0.0, 0.3, 0.0, 0.01])[:, None], LANES, axis=1)[None]
     weights = rng.dirichlet(np.ones(count))
-    parts = np.zeros((3, LANES)), starts, means, covariances
+    parts = np.zeros((3, LANES)), starts, means, np.zeros((3, LANES)), covariances
     robots = np.concatenate([rows.reshape(-1, 1, 3, LANES) for rows in parts])
     shown = pose_mixtures(means, covariances, weights)
     estimates = shown.copy()
