@@ -89,7 +89,11 @@ def print_evaluation(console: Console, lines: Rows, ahead: Rows, split: str | No
     ]
     worlds = "One building" if split is None else f"Worlds of the {split} split"
     title = f"{worlds}, {episodes} episodes of each policy"
-    console.print(console_table(title, ["policy", *SHOWN.values()], rows))
+    table = console_table(title, ["policy", *SHOWN.values()], rows)
+    table.columns[0].min_width = 12  # long names are folded, figures are not
+    for column in table.columns[1:]:
+        column.no_wrap = True
+    console.print(table)
     for lead in ahead:
         console.print(
             f"model - {lead['over']}: {format_ci(lead, 'lead')} m of return, ahead in {100.0 * lead['won']:.0f} % "

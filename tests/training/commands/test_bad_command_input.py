@@ -16,7 +16,7 @@ BAD: dict[str, dict[str, str]] = {
     "run": {
         "--world nowhere": "world: expected one of 'office', 'maze', 'loops', 'hall', 'fig5', or a path",
         "--world broken.json": "world: expected",
-        "--policy unknown": "policy: expected one of 'frontier', 'random_goals', 'random_walk', got 'unknown'.",
+        "--policy unknown": "policy: expected one of 'frontier', 'random_goals', 'random_walk', 'independent_frontier',",
         "--policy random_walk --action-type goal": "action_type: expected 'continuous' or 'discrete'",
         "--robots 9": f"{ROBOTS} 9. Use 1 to 8 robots.", "--robots 0 --json -": f"{ROBOTS} 0.",
         "--action-type fly": "action_type: expected one of 'continuous', 'discrete', 'goal', got 'fly'.",
@@ -78,9 +78,9 @@ BAD: dict[str, dict[str, str]] = {
         "--envs 1 --workers 2": "workers: expected at most one per environment, 1, got 2",
     },
     "bench exploration": {
-        "--policies unknown": "policy: expected one of 'frontier', 'random_goals', 'random_walk', got 'unknown'.",
+        "--policies unknown": "policy: expected one of 'frontier', 'random_goals', 'random_walk', 'independent_frontier',",
         "--policies no_module:Missing": "policy: expected MODULE:NAME of a policy, got no module 'no_module'.",
-        "--policies random_walk@goal": "random_walk@: expected one of 'continuous', 'discrete', got 'goal'.",
+        "--policies random_walk@goal": "random_walk@: expected one of 'continuous', 'discrete', 'team', got 'goal'.",
         "--policies none.npz": "model: expected a model that vslam train wrote, got no such file.",
         "--worlds nowhere": "world: expected",
         "--robots 9": f"{ROBOTS} 9.",

@@ -108,7 +108,7 @@ def test_options_of_a_run_reach_its_filters(sensor: str) -> None:
     config = RunConfig(world="fig5", particles=17, rejuvenate_every=9, preset="hard", sensor=sensor)
     chosen = config.make_env().config
     assert (chosen.belief.filter.num_particles, chosen.belief.filter.rejuvenate_every) == (17, 9)
-    expected = preset_config("hard", sensor).replace(world="fig5", max_cycles=1800)
+    expected = preset_config("hard", sensor).replace(world="fig5", max_seconds=180.0)
     usual = {"filter": {"num_particles": 100, "rejuvenate_every": expected.belief.filter.rejuvenate_every}}
     assert chosen.replace(belief=usual) == expected
 
