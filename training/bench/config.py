@@ -20,6 +20,7 @@ from training.experiments.config import (
     Sensor,
     first_seed,
     option,
+    option_arguments,
     setting,
 )
 from training.replay.config import MRCLAM, log_path
@@ -46,55 +47,203 @@ NO_ORACLE, ALL_ORACLES = "none", "all"
 ANY_SPLIT = "any"
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EpisodeTrial:
+    """One episode whose losses of accuracy are measured."""
+
+    world: str  # Family or path
+    robots: int  # K
+    policy: str  # Name, path or `module:name`, optionally with `@` and the action type
+    preset: str  # Noise preset of the environment
+    max_range: float | None  # Range of the camera [m]; None: that of the preset
+    baseline: float | None  # Baseline of the camera [m]; None: that of the preset
+    measurements: int | None  # Largest number of measurements of a frame; None: that of the preset
+    particles: int  # M
+    seed: int  # Seed of the episode
+
+
+STEREO_RUNS_ONLY = ("associations", "lengths", "methods", "noise_factor", "landmark_noise")
+EPISODES_ONLY = ("split", "policies", "duration", "rejuvenate_every", "max_ranges", "baselines", "measurements")
+STEREO_PRESETS, ENV_PRESETS = ("good", "coarse", "paper"), ("easy", "standard", "hard")
+
+
 class AccuracyConfig(ExperimentConfig):
-    """Accuracy benchmark: all combinations of the lists, for each seed."""
+    """Accuracy benchmark: all combinations of the lists, for each seed.
+
+    Without `worlds`, filters run on simulated stereo runs through an office. With `worlds`, robots explore them, and
+    the losses between the information in their readings and the errors of their filters are measured.
+    """
 
     seeds: int = option(16, "Number of seeds.", ge=1, hint="Use at least one seed.")
     seed: int = first_seed()
-    presets: tuple[Literal["good", "coarse", "paper"], ...] = option(
-        ("good",), "Noise presets: good, coarse, paper.", name="preset"
+    worlds: tuple[str, ...] | None = option(
+        None, "World families or paths to explore; without it, stereo runs through a simulated office.", name="world"
+    )
+    presets: tuple[str, ...] | None = option(
+        None, "Noise presets: good, coarse, paper; with --world easy, standard, hard.", name="preset",
+        shown="good; standard with --world",
+    )  # fmt: skip
+    robots: tuple[Positive, ...] = option((1,), "Numbers of robots; of stereo runs, they share a map.")
+    particles: tuple[Positive, ...] | None = option(
+        None, "Numbers of particles per filter.", hint=ONE_PARTICLE, shown="10,30,100,300,1000; 100 with --world"
+    )
+    split: Literal["train", "validation", "test", "any"] = option(
+        "validation", "Split of the worlds in --world: train, validation, test, or any."
+    )
+    policies: tuple[str, ...] = option(
+        ("frontier",), "Policies of the robots in --world: name, path of a model, or MODULE:NAME; @discrete selects "
+        "the action type.", name="policy",
+    )  # fmt: skip
+    duration: float = option(120.0, "Duration of an episode in --world [s].", ge=1.0, hint="Give seconds.")
+    rejuvenate_every: int | None = option(
+        None, "Ticks between rejuvenations of the particles in --world; 0: never.", shown="100", ge=0
+    )
+    max_ranges: tuple[Annotated[float, Field(gt=0.0)], ...] | None = option(
+        None, "Ranges of the camera in --world [m].", name="max_range", shown="8", hint="Give metres."
+    )
+    baselines: tuple[Annotated[float, Field(gt=0.0)], ...] | None = option(
+        None, "Baselines of the camera in --world [m].", name="baseline", shown="0.12", hint="Give metres."
+    )
+    measurements: tuple[Positive, ...] | None = option(
+        None, "Largest numbers of measurements of a frame in --world.", shown="5"
     )
     associations: tuple[Literal["known", "unknown"], ...] = option(
-        ("known",), "Data association: known or unknown.", name="association"
+        ("known",), "Data association of stereo runs: known or unknown.", name="association"
     )
-    robots: tuple[Positive, ...] = option((1,), "Numbers of robots that share a map.")
-    lengths: tuple[float, ...] = option((100.0,), "Lengths of each robot's path [m].", name="length")
+    lengths: tuple[float, ...] = option((100.0,), "Lengths of each robot's path in stereo runs [m].", name="length")
     methods: tuple[Method, ...] = option(
         ("dead_reckoning", "batch_ml", "ideal_online", "fastslam1", "fastslam2"),
-        "Methods: dead_reckoning, batch_ml, ideal_online, fastslam1, fastslam2, fastslam2+existence, "
+        "Methods on stereo runs: dead_reckoning, batch_ml, ideal_online, fastslam1, fastslam2, fastslam2+existence, "
         "fastslam2+rejuvenation.",
         shown="all but the last two",
     )
-    particles: tuple[Positive, ...] = option(
-        (10, 30, 100, 300, 1000), "Numbers of particles per filter.", hint=ONE_PARTICLE
-    )
     noise_factor: float = option(
-        1.0, "Factor of the assumed measurement variance over the true one.", gt=0.0,
+        1.0, "Factor of the assumed measurement variance over the true one in stereo runs.", gt=0.0,
         hint="Use 1 for the true noise.",
     )  # fmt: skip
     landmark_noise: float | None = option(
-        None, "Standard deviation of the landmarks' random walk [m].", shown="0; 0.005 with rejuvenation", ge=0.0
-    )
+        None, "Standard deviation of the landmarks' random walk [m] in stereo runs.",
+        shown="0; 0.005 with rejuvenation", ge=0.0,
+    )  # fmt: skip
 
     def check(self) -> None:
-        """Refuse combinations without a valid trial."""
-        self.trials()
+        """Refuse combinations without a valid trial, and options that have no effect."""
+        from slam_backend.core.validation import argument_error
+
+        idle: tuple[str, ...] = EPISODES_ONLY
+        hint = "Give --world, too."
+        if self.worlds is not None:
+            idle, hint = STEREO_RUNS_ONLY, "Omit --world."
+        for name in idle:
+            field = type(self).model_fields[name]
+            if getattr(self, name) != field.default:
+                about = option_arguments(field) or {}
+                raise argument_error(
+                    str(about["option"] or name), f"no value {'without' if self.worlds is None else 'with'} --world",
+                    getattr(self, name), hint,
+                )  # fmt: skip
+        known = STEREO_PRESETS if self.worlds is None else ENV_PRESETS
+        for preset in self.presets or ():
+            if preset not in known:
+                raise argument_error(
+                    "preset", f"one of {', '.join(map(repr, known))}", preset, "Choose one of these names."
+                )  # fmt: skip
+        if self.worlds is None:
+            self.trials()
+            return
+        from training.bench.exploration.players import BOUND, parted
+        from vslam_env.world.registry import check_source
+
+        for policy in self.policies:
+            if parted(policy).role == BOUND:
+                hint = "Bounds know the truth, which readings alone do not tell."
+                raise argument_error("policy", "a policy of robots or of the team", policy, hint)
+        for world in self.worlds:
+            check_source(world)
+        for trial in self.episodes()[: len(self.episodes()) // self.seeds]:
+            self.environment(trial)
+
+    @classmethod
+    def completed(cls, values: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Make paths absolute, so that a configuration and its trials can be repeated from any folder."""
+        return with_absolute_paths(values)
 
     def trials(self) -> list["AccuracyTrial"]:
-        """Return all trials, with trials of the same run in succession."""
+        """Return all trials on stereo runs, with trials of the same run in succession."""
         from training.bench.accuracy.trials import FILTERS, Trial
 
         seeds = range(self.seed, self.seed + self.seeds)
         return [
             Trial(
-                preset=preset, association=association, robots=robots, length=length, method=method,
+                preset=preset, association=association, robots=robots, length=length, method=method,  # type: ignore[arg-type]
                 particles=particles, seed=seed, noise_factor=self.noise_factor, landmark_noise=self.landmark_noise,
             )
             for seed, preset, association, robots, length, method in product(
-                seeds, self.presets, self.associations, self.robots, self.lengths, self.methods
+                seeds, self.presets or ("good",), self.associations, self.robots, self.lengths, self.methods
             )
-            for particles in (self.particles if method in FILTERS else (0,))
+            for particles in (self.particles or (10, 30, 100, 300, 1000) if method in FILTERS else (0,))
         ]  # fmt: skip
+
+    def episodes(self) -> list[EpisodeTrial]:
+        """Return all episodes, ordered by seed, then by combination."""
+        combined = product(
+            range(self.seed, self.seed + self.seeds), self.worlds or (), self.robots, self.policies,
+            self.presets or ("standard",), self.max_ranges or (None,), self.baselines or (None,),
+            self.measurements or (None,), self.particles or (100,),
+        )  # fmt: skip
+        return [
+            EpisodeTrial(
+                world=world, robots=robots, policy=policy, preset=preset, max_range=max_range, baseline=baseline,
+                measurements=measurements, particles=particles, seed=seed,
+            )
+            for seed, world, robots, policy, preset, max_range, baseline, measurements, particles in combined
+        ]  # fmt: skip
+
+    def run(self, trial: EpisodeTrial) -> "RunConfig":
+        """Return the configuration of an episode's run."""
+        from training.bench.exploration.players import parted
+        from training.episodes.config import RunConfig
+
+        player = parted(trial.policy)
+        return RunConfig(
+            world=trial.world, robots=trial.robots, policy=player.policy,
+            action_type=player.action_type,  # type: ignore[arg-type]
+            particles=trial.particles, rejuvenate_every=self.rejuvenate_every,
+            preset=trial.preset,  # type: ignore[arg-type]
+            seed=trial.seed, max_seconds=self.duration,
+        )  # fmt: skip
+
+    def environment(self, trial: EpisodeTrial) -> "EnvConfig":
+        """Return the environment of an episode; true and assumed camera have the same geometry."""
+        given = {"max_range": trial.max_range, "baseline": trial.baseline}
+        camera = {name: value for name, value in given.items() if value is not None}
+        sensor: dict[str, Any] = {"camera": camera}
+        if trial.measurements is not None:
+            sensor["max_measurements"] = trial.measurements
+        return self.run(trial).environment().replace(
+            world_split=world_split(self.split, trial.world), landmark_sensor=sensor,
+            belief={"filter": {"camera": camera}},
+        )  # fmt: skip
+
+
+def world_split(split: str, world: str) -> str | None:
+    """Return the split of an environment, None where a world is not drawn or any will do."""
+    from vslam_env.world import is_single_layout
+
+    return None if split == ANY_SPLIT or is_single_layout(world) else split
+
+
+def with_absolute_paths(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return plain values of a configuration with absolute paths of worlds and of models."""
+    from agents.registry import is_model
+    from vslam_env.world import WORLD_FAMILIES
+
+    found = dict(values)
+    if isinstance(found.get("worlds"), list | tuple):
+        found["worlds"] = [w if w in WORLD_FAMILIES else str(Path(str(w)).resolve()) for w in found["worlds"]]
+    if isinstance(found.get("policies"), list | tuple):
+        found["policies"] = [str(Path(p).resolve()) if is_model(p) else p for p in found["policies"]]
+    return found
 
 
 class AlignmentBenchConfig(ExperimentConfig):
@@ -222,15 +371,7 @@ class ExplorationBenchConfig(ExperimentConfig):
     @classmethod
     def completed(cls, values: Mapping[str, Any]) -> Mapping[str, Any]:
         """Make paths absolute, so that a configuration and its trials can be repeated from any folder."""
-        from agents.registry import is_model
-        from vslam_env.world import WORLD_FAMILIES
-
-        found = dict(values)
-        if isinstance(found.get("worlds"), list | tuple):
-            found["worlds"] = [w if w in WORLD_FAMILIES else str(Path(str(w)).resolve()) for w in found["worlds"]]
-        if isinstance(found.get("policies"), list | tuple):
-            found["policies"] = [str(Path(p).resolve()) if is_model(p) else p for p in found["policies"]]
-        return found
+        return with_absolute_paths(values)
 
     def trials(self) -> list[ExplorationTrial]:
         """Return all trials, ordered by seed, then by combination."""
@@ -254,11 +395,10 @@ class ExplorationBenchConfig(ExperimentConfig):
     def environment(self, trial: ExplorationTrial) -> "EnvConfig":
         """Return the environment of a trial: all policies have the same world for one seed and combination."""
         from training.bench.exploration.players import parted
-        from vslam_env.world import is_single_layout
 
-        split = None if self.split == ANY_SPLIT or is_single_layout(trial.world) else self.split
         has_all = trial.oracle == ALL_ORACLES or parted(trial.policy).needs_oracles
         oracles = {f"oracle_{name}": has_all or trial.oracle == name for name in ORACLES}
+        split = world_split(self.split, trial.world)
         return self.run(trial).environment().replace(world_split=split, **oracles)
 
 

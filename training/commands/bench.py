@@ -13,6 +13,7 @@ from training.bench.config import (
     AccuracyConfig,
     AlignmentBenchConfig,
     EnvBenchConfig,
+    EpisodeTrial,
     ExplorationBenchConfig,
     ExplorationTrial,
     FilterBenchConfig,
@@ -28,19 +29,35 @@ from training.commands.replay import MRCLAM_LOG
 from training.rl.config import require_extra
 
 if TYPE_CHECKING:  # numerical modules are imported when the command runs, so that --help is fast
+    from training.bench.exploration.players import Player
     from training.bench.stereo.real_images import RealPart
+    from vslam_env.config import EnvConfig
 
 bench = typer.Typer(help="Measure accuracy and speed of filters, environments and training.", no_args_is_help=True)
 
 
 @bench.command("accuracy")
-@options(AccuracyConfig, "bench accuracy", continues=True)
+@options(
+    AccuracyConfig, "bench accuracy", continues=True, quick={"seeds": 2, "particles": (30,)},
+    quick_help="2 seeds, 30 particles.",
+)  # fmt: skip
 def bench_accuracy(call: Call[AccuracyConfig], processes: Processes = 1) -> None:
-    """Measure filter accuracy on simulated stereo runs, against dead reckoning and lower bounds of the error.
+    """Measure filter accuracy against lower bounds of the error, and name the losses in between.
 
-    Options that accept several values take them comma-separated; all combinations are run. Ctrl-C finishes the
+    Without --world: filters on simulated stereo runs, against dead reckoning, batch maximum likelihood and the ideal
+    online estimate. With --world: episodes of robots that explore these worlds, and the factors between the information
+    in their readings and the error of their filters. Options that accept several values take them comma-separated; all
+    combinations are run. Episodes of a policy that fails are left out, with status 2 at the end. Ctrl-C finishes the
     current trial and summarises the finished ones; the same command with --out FOLDER resumes the run.
     """
+    if call.config.worlds is None:
+        _accuracy_of_stereo_runs(call, processes)
+    else:
+        _losses_in_worlds(call, processes)
+
+
+def _accuracy_of_stereo_runs(call: Call[AccuracyConfig], processes: int) -> None:
+    """Run filters on simulated stereo runs."""
     from training.bench.accuracy.report import draw_accuracy, markdown, print_tables, summarise
     from training.bench.accuracy.trials import TRIALS_FILE, Trial, play
     from training.experiments.run_folder import plain
@@ -60,6 +77,34 @@ def bench_accuracy(call: Call[AccuracyConfig], processes: Processes = 1) -> None
     if lines:
         draw_accuracy(folder.path / "accuracy.png", lines)
     call.finish()
+
+
+def _losses_in_worlds(call: Call[AccuracyConfig], processes: int) -> None:
+    """Run episodes and split the errors of their filters into losses."""
+    from training.bench.accuracy.losses import EPISODES_FILE, LONGEST_DECISION, play
+    from training.bench.accuracy.losses_report import draw_losses, markdown, print_tables, summarise
+    from training.bench.exploration.players import parted
+    from training.experiments.run_folder import plain
+
+    config = call.config
+    trials = config.episodes()
+    firsts = {(t.policy, t.world, t.robots): t for t in reversed(trials)}.values()
+    checks = (partial(_first_steps, config.environment(t), parted(t.policy), t.seed, LONGEST_DECISION) for t in firsts)
+    console, folder = call.begin(*checks)
+    part = TrialSet(
+        file=EPISODES_FILE, kind=EpisodeTrial, play=partial(play, config), trials=trials, processes=processes,
+        tell=lambda row: f"{row['world']}, seed {row['seed']}: {row['position_rms_m']['filter']:.3f} m",
+    )  # fmt: skip
+    (rows,) = run_trial_sets(console, folder, part)
+    lines = plain(summarise(rows))
+    print_tables(console, lines)
+    call.write({"summary": lines, "trials": rows})
+    folder.write_text("tables.md", markdown(lines))
+    if lines:
+        draw_losses(folder.path / "losses.png", lines)
+    call.finish()
+    if part.failures:
+        raise typer.Exit(2)
 
 
 @bench.command("filter")
@@ -174,12 +219,17 @@ def bench_exploration(call: Call[ExplorationBenchConfig], processes: Processes =
     Ctrl-C finishes the current episode; the same command with --out FOLDER resumes the run.
     """
     from training.bench.exploration import report
+    from training.bench.exploration.players import parted
     from training.bench.exploration.trials import TRIALS_FILE, play
     from training.experiments.run_folder import plain
 
     trials = call.config.trials()
     firsts = {(t.policy, t.world, t.robots): t for t in reversed(trials)}.values()
-    console, folder = call.begin(*(partial(_first_steps, call.config, trial) for trial in firsts))
+    config = call.config
+    checks = (
+        partial(_first_steps, config.environment(t), parted(t.policy), t.seed, config.decision_limit) for t in firsts
+    )  # fmt: skip
+    console, folder = call.begin(*checks)
     part = TrialSet(
         file=TRIALS_FILE, kind=ExplorationTrial, play=partial(play, call.config), trials=trials, processes=processes,
         tell=lambda row: f"{row['world']}, {row['policy']}, seed {row['seed']}: {row['coverage']:.0%} seen",
@@ -200,25 +250,25 @@ def bench_exploration(call: Call[ExplorationBenchConfig], processes: Processes =
         raise typer.Exit(2)
 
 
-def _first_steps(config: ExplorationBenchConfig, trial: ExplorationTrial) -> None:
-    """Run the first two steps of a trial, to detect worlds that cannot be built, and compile what its policy needs.
+def _first_steps(environment: "EnvConfig", player: "Player", seed: int, decision_limit: float) -> None:
+    """Run the first two steps of an episode, to detect worlds that cannot be built, and compile what its policy needs.
 
     The trial itself reports a policy that fails.
     """
     from contextlib import suppress
 
-    from training.bench.exploration.players import BOUND, parted
+    from training.bench.exploration.players import BOUND
     from training.episodes.guard import PolicyError
     from training.episodes.runner import run_episode
     from vslam_env import vslam_v0
 
-    steps, player = iter(range(2)), parted(trial.policy)
+    steps = iter(range(2))
     if player.role == BOUND:
         return
-    env = vslam_v0.parallel_env(config=config.environment(trial))
+    env = vslam_v0.parallel_env(config=environment)
     with suppress(PolicyError):
-        team = player.make(env, config.decision_limit)
-        run_episode(env, team, trial.seed, should_stop=lambda: next(steps, None) is None)
+        team = player.make(env, decision_limit)
+        run_episode(env, team, seed, should_stop=lambda: next(steps, None) is None)
     env.close()
 
 

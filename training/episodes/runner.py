@@ -15,6 +15,7 @@ from slam_backend.maps.alignment_types import PairAttempts, count_attempts
 from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.trajectory import dead_reckoning
 from training.episodes.guard import GuardedTeam
+from vslam_env.belief.readings import Readings
 from vslam_env.config import TICK
 from vslam_env.environment import ExplorationEnv
 from vslam_env.rendering import Scene
@@ -91,6 +92,7 @@ def run_episode(
     """Run one episode to its end, or until `should_stop`.
 
     Args:
+        env: Environment. A recorder that it already has also receives the readings.
         policies: Policy of each agent, or all of them; policies see observations and beliefs, never infos.
         seed: Seed of the reset and of the policies' random draws, which are independent streams.
         on_step: Function called after the reset and after each step; it may inspect the environment.
@@ -110,9 +112,14 @@ def run_episode(
     rngs = {agent: np.random.default_rng(stream) for agent, stream in zip(agents, streams, strict=True)}
     team_rng = np.random.default_rng(team_stream)
     odometry: list[FloatArray] = []
-    env.recorder = lambda readings: odometry.append(
-        np.stack([np.zeros(3) if r.odometry is None else r.odometry for r in readings])
-    )
+    other = env.recorder
+
+    def record(readings: tuple[Readings, ...]) -> None:
+        odometry.append(np.stack([np.zeros(3) if r.odometry is None else r.odometry for r in readings]))
+        if other is not None:
+            other(readings)
+
+    env.recorder = record
     observations, infos = env.reset(seed=seed)
     team.reset()
     log = _Log(env, infos)

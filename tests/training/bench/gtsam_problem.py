@@ -30,7 +30,7 @@ def solve_with_gtsam(gtsam: ModuleType, problem: BatchProblem, start: Estimate) 
         graph.add(gtsam.PriorFactorPose2(pose_key(robot, 0), gtsam.Pose2(*problem.starts[robot]), exact))
         for step in range(1, problem.num_steps):
             keys = [pose_key(robot, step - 1), pose_key(robot, step)]
-            noise = gtsam.noiseModel.Diagonal.Sigmas(problem.odometry_sigmas[robot, step - 1])
+            noise = gtsam.noiseModel.Gaussian.Covariance(problem.odometry_covariances[robot, step - 1])
             graph.add(gtsam.CustomFactor(noise, keys, _odometry_error(gtsam, problem.odometry[robot, step - 1])))
     for row, landmark in enumerate(start.landmarks):
         values.insert(landmark_key(row), landmark)

@@ -16,7 +16,7 @@ BAD: dict[str, dict[str, str]] = {
     "run": {
         "--world nowhere": "world: expected one of 'office', 'maze', 'loops', 'hall', 'fig5', or a path",
         "--world broken.json": "world: expected",
-        "--policy unknown": "policy: expected one of 'frontier', 'random_goals', 'random_walk', 'independent_frontier',",
+        "--policy unknown": "policy: expected one of 'frontier', 'random_goals', 'random_walk',",
         "--policy random_walk --action-type goal": "action_type: expected 'continuous' or 'discrete'",
         "--robots 9": f"{ROBOTS} 9. Use 1 to 8 robots.", "--robots 0 --json -": f"{ROBOTS} 0.",
         "--action-type fly": "action_type: expected one of 'continuous', 'discrete', 'goal', got 'fly'.",
@@ -55,6 +55,9 @@ BAD: dict[str, dict[str, str]] = {
         "--particles ten": f"particles: {LIST} 'ten'. Write them like 10,100.",
         "--particles 9,9": "particles: expected at least one value, each once, got [9, 9].",
         "--length 0": "length: expected a finite number >= 0.25, got 0.0.",
+        "--duration 9": "duration: expected no value without --world, got 9.0. Give --world, too.",
+        "--world office --length 9": "length: expected no value with --world, got (9.0,). Omit --world.",
+        "--world castle": "world: expected one of 'office'",
         "--processes 0": "processes: expected an int >= 1, got 0.",
     },
     "bench alignment": {"--first-seed -1": "first_seed: expected an int >= 0, got -1."},
@@ -78,7 +81,7 @@ BAD: dict[str, dict[str, str]] = {
         "--envs 1 --workers 2": "workers: expected at most one per environment, 1, got 2",
     },
     "bench exploration": {
-        "--policies unknown": "policy: expected one of 'frontier', 'random_goals', 'random_walk', 'independent_frontier',",
+        "--policies unknown": "policy: expected one of 'frontier', 'random_goals', 'random_walk',",
         "--policies no_module:Missing": "policy: expected MODULE:NAME of a policy, got no module 'no_module'.",
         "--policies random_walk@goal": "random_walk@: expected one of 'continuous', 'discrete', 'team', got 'goal'.",
         "--policies none.npz": "model: expected a model that vslam train wrote, got no such file.",

@@ -3,7 +3,7 @@
 Levenberg-Marquardt on the sum of squared whitened residuals. In the normal equations
 
     [ A   B  ] [dp]   [a]        A: poses, block-tridiagonal by odometry, one chain per robot
-    [ B^T C  ] [dl] = [c]        C: landmarks, block-diagonal; B: one block per measurement
+    [ B^T C  ] [dl] = [c]        C: landmarks, then unknown path frames and odometry biases
 
 the poses are eliminated by a banded Cholesky factor: (C - B^T A^-1 B) dl = c - B^T A^-1 a is dense, but its size is
 that of the map, so that the cost grows linearly with the length of the run.
@@ -17,11 +17,12 @@ import scipy.sparse
 
 from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_float
 from slam_backend.geometry import wrap_angle
-from training.bench.accuracy.batch_problem import BatchProblem, Estimate, Moves, Sights
+from training.bench.accuracy.batch_problem import START_SIGMAS, BatchProblem, Estimate, Sights
 
 BAND = 5  # super-diagonals of a block-tridiagonal matrix with blocks of 3
 MAX_ITERATIONS = 100
-FIRST_DAMPING = 1e-3
+FIRST_DAMPING = 1e-3  # from dead reckoning
+GIVEN_DAMPING = 1e-6  # from a given initial estimate
 MAX_DAMPING = 1e12
 LEAST_DECREASE = 1e-12  # relative decrease of the cost at convergence
 
@@ -44,7 +45,7 @@ class BatchEstimate:
 
 
 def batch_ml(problem: BatchProblem, start: Estimate | None = None, robust: float | None = None) -> BatchEstimate:
-    """Compute the maximum likelihood paths and landmarks.
+    """Compute the maximum likelihood paths and landmarks, with their covariances.
 
     Args:
         problem: Odometry and measurements; K >= 1, T >= 2.
@@ -55,125 +56,163 @@ def batch_ml(problem: BatchProblem, start: Estimate | None = None, robust: float
     Raises:
         ValueError: If there is nothing to estimate.
     """
+    best, system, iterations = _optimise(problem, start, robust)
+    path_covariances, landmark_covariances = system.covariances()
+    unknowns = problem.odometry.size + best.landmarks.size + system.num_shared
+    return BatchEstimate(
+        paths=best.paths, landmarks=best.landmarks, names=problem.names, path_covariances=path_covariances,
+        landmark_covariances=landmark_covariances, cost=system.cost, freedom=len(system.residuals) - unknowns,
+        gradient=system.largest_slope(), iterations=iterations,
+    )  # fmt: skip
+
+
+def most_likely(problem: BatchProblem, start: Estimate | None = None, robust: float | None = None) -> Estimate:
+    """Return the estimate of `batch_ml`, path frames and biases included, without covariances, which cost the most.
+
+    Without measurements that is dead reckoning.
+    """
+    return _optimise(problem, start, robust)[0] if len(problem.points) else problem.dead_reckoning()
+
+
+def _optimise(
+    problem: BatchProblem, start: Estimate | None, robust: float | None
+) -> tuple[Estimate, "_System", int]:  # fmt: skip
+    """Return the estimate, its normal equations and the number of iterations."""
     if problem.num_steps < 2 or not len(problem.points):
         raise argument_error("problem", "two steps and a measurement", "a run without them", "Give a longer run.")
     if robust is not None:
         check_float("robust", robust, "Give it in standard deviations.", above=0.0)
-    iterations = 0
-    if start is None:
-        start, iterations = _descend(problem, problem.dead_reckoning(), robust, metric=True)
-    best, more = _descend(problem, start, robust, metric=False)
-    system = _System(problem, problem.sights(best), problem.moves(best), robust)
-    path_covariances, landmark_covariances = system.covariances()
-    residuals = 3 * len(problem.points) + problem.odometry.size
-    return BatchEstimate(
-        paths=best.paths, landmarks=best.landmarks, names=problem.names, path_covariances=path_covariances,
-        landmark_covariances=landmark_covariances, cost=system.cost,
-        freedom=residuals - problem.odometry.size - best.landmarks.size, gradient=system.largest_slope(),
-        iterations=iterations + more,
-    )  # fmt: skip
+    if start is not None:
+        return _descend(problem, start, robust, metric=False, damping=GIVEN_DAMPING)
+    near, _, iterations = _descend(problem, problem.dead_reckoning(), robust, metric=True, damping=FIRST_DAMPING)
+    best, system, more = _descend(problem, near, robust, metric=False, damping=FIRST_DAMPING)
+    return best, system, iterations + more
 
 
-def _descend(problem: BatchProblem, at: Estimate, robust: float | None, metric: bool) -> tuple[Estimate, int]:
-    """Return the nearest minimum and the number of iterations (Levenberg-Marquardt, Nocedal and Wright, ch. 10)."""
-    damping = FIRST_DAMPING
-    system = _System(problem, problem.sights(at, metric), problem.moves(at), robust)
+def _descend(
+    problem: BatchProblem, at: Estimate, robust: float | None, metric: bool, damping: float
+) -> tuple[Estimate, "_System", int]:
+    """Return the nearest minimum, its normal equations and the number of iterations.
+
+    Levenberg-Marquardt, Nocedal and Wright, chapter 10.
+    """
+    system = _System(problem, at, problem.sights(at, metric), robust)
     for iteration in range(MAX_ITERATIONS):
-        trial = _moved(at, *system.solve(damping))
+        trial = system.moved(at, *system.solve(damping))
         sights = problem.sights(trial, metric)
-        changed = _System(problem, sights, problem.moves(trial), robust)
+        changed = _System(problem, trial, sights, robust)
         if changed.cost <= system.cost and (metric or sights.in_front):
             decrease = system.cost - changed.cost
-            at, system, damping = trial, changed, damping / 10.0
-            if decrease <= LEAST_DECREASE * (1.0 + system.cost):
-                return at, iteration + 1
+            at, system = trial, changed
+            if decrease > LEAST_DECREASE * (1.0 + system.cost):
+                damping /= 10.0
+            elif damping:  # damped steps in directions with little information are short: the last ones are undamped
+                damping = 0.0
+            else:
+                return at, system, iteration + 1
         else:
             damping = max(10.0 * damping, 1e-9)
             if damping > MAX_DAMPING:
                 break
-    return at, iteration + 1
+    return at, system, iteration + 1
 
 
-def _moved(at: Estimate, poses: FloatArray, landmarks: FloatArray) -> Estimate:
-    """Add changes to the poses after the first (K, T - 1, 3) and to the landmarks (L, 3)."""
-    paths = at.paths.copy()
-    paths[:, 1:] += poses
-    paths[..., 2] = wrap_angle(paths[..., 2])
-    return Estimate(paths, at.landmarks + landmarks)
+def robust_weights(squares: FloatArray, scale: float | None) -> FloatArray:
+    """Return the weights (n,) of the Cauchy kernel for squared distances (n,); 1 without a kernel."""
+    return np.ones(len(squares)) if scale is None else 1.0 / (1.0 + squares / scale**2)
 
 
 class _System:
-    """Normal equations at one estimate."""
+    """Normal equations at one estimate: poses after the first, then landmarks, path frames and biases."""
 
-    def __init__(self, problem: BatchProblem, sights: Sights, moves: Moves, robust: float | None) -> None:
+    def __init__(self, problem: BatchProblem, at: Estimate, sights: Sights, robust: float | None) -> None:
+        self.problem = problem
+        moves = problem.moves(at)
         squares = np.einsum("ni,ni->n", sights.residuals, sights.residuals)
-        weights = np.ones(len(squares)) if robust is None else 1.0 / (1.0 + squares / robust**2)
+        root = np.sqrt(robust_weights(squares, robust))
         loss = squares if robust is None else robust**2 * np.log1p(squares / robust**2)
+        priors, prior_residuals = prior_terms(problem, at)
         self.cost = float(loss.sum() + np.einsum("kti,kti->", moves.residuals, moves.residuals))
-        self.shape = problem.odometry.shape
-        num_poses, num_landmarks = self.shape[0] * self.shape[1], len(problem.names)
-        # First poses are known: measurements from them give no information on unknown poses.
-        pose = problem.robots * self.shape[1] + problem.steps - 1
-        later = problem.steps > 0
-        by_pose = sights.by_pose * weights[:, None, None]
-        by_landmark = sights.by_landmark * weights[:, None, None]
-
-        self.diagonal = np.zeros((num_poses, 3, 3))
-        self.slope_poses = np.zeros((num_poses, 3))
-        self.landmarks = np.zeros((num_landmarks, 3, 3))
-        self.slope_landmarks = np.zeros((num_landmarks, 3))
-        transposed = by_pose.transpose(0, 2, 1)
-        np.add.at(self.diagonal, pose[later], transposed[later] @ sights.by_pose[later])
-        np.add.at(self.slope_poses, pose[later], np.einsum("nij,nj->ni", transposed[later], sights.residuals[later]))
-        transposed = by_landmark.transpose(0, 2, 1)
-        np.add.at(self.landmarks, problem.landmarks, transposed @ sights.by_landmark)
-        np.add.at(self.slope_landmarks, problem.landmarks, np.einsum("nij,nj->ni", transposed, sights.residuals))
-        self.cross = _block_matrix(
-            by_pose[later].transpose(0, 2, 1) @ sights.by_landmark[later],
-            pose[later], problem.landmarks[later], (num_poses, num_landmarks),
+        self.cost += float(prior_residuals @ prior_residuals)
+        self.residuals = np.concatenate(
+            [(root[:, None] * sights.residuals).ravel(), moves.residuals.ravel(), prior_residuals]
         )  # fmt: skip
+        self.shape = problem.odometry.shape
+        robots, steps, _ = self.shape
+        num_sights, num_moves, self.num_landmarks = len(squares), robots * steps, 3 * len(problem.names)
+        self.num_shared = len(prior_residuals)
+        loose, biased = problem.loose_robots, problem.biased
+        rows, row_blocks = 3 * num_sights, np.arange(num_sights)
+        # First poses are known: measurements from them give no information on unknown poses.
+        later = problem.steps > 0
+        weight = root[:, None, None]
+        pose = problem.robots * steps + problem.steps - 1
+        moved = np.arange(num_moves)
+        follows = moved % steps > 0
+        self.by_poses = _stacked(
+            (len(self.residuals), 3 * num_moves),
+            (weight[later] * sights.by_pose[later], 3 * row_blocks[later], 3 * pose[later]),
+            (moves.by_second.reshape(-1, 3, 3), rows + 3 * moved, 3 * moved),
+            (moves.by_first.reshape(-1, 3, 3)[follows], rows + 3 * moved[follows], 3 * moved[follows] - 3),
+        )
+        columns = self.num_landmarks + 3 * np.searchsorted(loose, problem.robots)
+        seen = np.isin(problem.robots, loose)
+        first_bias = self.num_landmarks + 3 * len(loose)
+        biases = first_bias + len(biased) * np.repeat(np.arange(robots), steps)
+        shared = rows + 3 * num_moves + np.arange(self.num_shared)
+        self.by_others = _stacked(
+            (len(self.residuals), self.num_landmarks + self.num_shared),
+            (weight * sights.by_landmark, 3 * row_blocks, 3 * problem.landmarks),
+            (weight[seen] * sights.by_base[seen], 3 * row_blocks[seen], columns[seen]),
+            (moves.by_bias.reshape(-1, 3, 3)[:, :, biased], rows + 3 * moved, biases),
+            (priors[:, None, None], shared, self.num_landmarks + np.arange(self.num_shared)),
+        )
+        self.cross = self.by_poses.T @ self.by_others
+        self.others = (self.by_others.T @ self.by_others).toarray()
+        self.slope_poses = self.by_poses.T @ self.residuals
+        self.slope_others = self.by_others.T @ self.residuals
+        among = scipy.sparse.csr_array(self.by_poses.T @ self.by_poses)
+        self.bands = np.zeros((BAND + 1, 3 * num_moves))
+        for k in range(BAND + 1):
+            self.bands[BAND - k, k:] = among.diagonal(k)
 
-        first, second = moves.by_first[:, 1:], moves.by_second
-        diagonal, slope = self.diagonal.reshape(*self.shape, 3), self.slope_poses.reshape(self.shape)
-        diagonal += second.swapaxes(2, 3) @ second
-        diagonal[:, :-1] += first.swapaxes(2, 3) @ first
-        slope += np.einsum("ktji,ktj->kti", second, moves.residuals)
-        slope[:, :-1] += np.einsum("ktji,ktj->kti", first, moves.residuals[:, 1:])
-        self.upper = np.zeros((*self.shape, 3))
-        self.upper[:, :-1] = first.swapaxes(2, 3) @ second[:, 1:]
+    def moved(self, at: Estimate, poses: FloatArray, others: FloatArray) -> Estimate:
+        """Add changes to the poses after the first (K, T - 1, 3) and to all other unknowns."""
+        problem, paths = self.problem, at.paths.copy()
+        paths[:, 1:] += poses
+        paths[..., 2] = wrap_angle(paths[..., 2])
+        bases, biases, loose, biased = at.bases, at.biases, problem.loose_robots, problem.biased
+        shared = others[self.num_landmarks :]
+        if bases is not None and len(loose):
+            bases = bases.copy()
+            bases[loose] += shared[: 3 * len(loose)].reshape(-1, 3)
+        if biases is not None and len(biased):
+            biases = biases.copy()
+            biases[:, biased] += shared[3 * len(loose) :].reshape(-1, len(biased))
+        return Estimate(paths, at.landmarks + others[: self.num_landmarks].reshape(-1, 3), bases, biases)
 
-    def _banded(self, damping: float) -> FloatArray:
+    def _factor(self, damping: float) -> FloatArray:
         """Return the Cholesky factor of A with enlarged diagonal, in the format of `scipy.linalg.cholesky_banded`."""
-        size = 3 * len(self.diagonal)
-        bands = np.zeros((BAND + 1, size))
-        upper = self.upper.reshape(-1, 3, 3)
-        for i in range(3):
-            for j in range(3):
-                if j >= i:
-                    bands[BAND + i - j, j::3] = self.diagonal[:, i, j]
-                bands[BAND + i - j - 3, j + 3 :: 3] = upper[:-1, i, j]
+        bands = self.bands.copy()
         bands[BAND] *= 1.0 + damping
-        return np.asarray(scipy.linalg.cholesky_banded(bands))
+        return np.asarray(scipy.linalg.cholesky_banded(bands, overwrite_ab=True, check_finite=False))
 
     def _reduced(self, factor: FloatArray, damping: float) -> tuple[FloatArray, FloatArray]:
         """Return A^-1 B and the lower Cholesky factor of the Schur complement C - B^T A^-1 B."""
-        solved = np.asarray(scipy.linalg.cho_solve_banded((factor, False), self.cross.toarray()))
-        schur = -(self.cross.T @ solved)
-        size = len(self.landmarks)
-        blocks = schur.reshape(size, 3, size, 3)
-        diagonal = self.landmarks.copy()
-        diagonal[:, range(3), range(3)] *= 1.0 + damping
-        blocks[np.arange(size), :, np.arange(size), :] += diagonal
+        solved = np.asarray(
+            scipy.linalg.cho_solve_banded((factor, False), self.cross.toarray(order="F"), overwrite_b=True)
+        )
+        schur = self.others - self.cross.T @ solved
+        schur[np.diag_indices(len(schur))] += damping * np.diagonal(self.others)
         return solved, np.linalg.cholesky(0.5 * (schur + schur.T))
 
     def solve(self, damping: float) -> tuple[FloatArray, FloatArray]:
-        """Return the solution: changes of the poses (K, T - 1, 3) and landmarks (L, 3)."""
-        factor = self._banded(damping)
+        """Return the solution: changes of the poses (K, T - 1, 3) and of all other unknowns."""
+        factor = self._factor(damping)
         solved, lower = self._reduced(factor, damping)
-        slope = self.slope_poses.ravel()
-        landmarks = scipy.linalg.cho_solve((lower, True), solved.T @ slope - self.slope_landmarks.ravel())
-        poses = -scipy.linalg.cho_solve_banded((factor, False), slope) - solved @ landmarks
-        return poses.reshape(self.shape), landmarks.reshape(-1, 3)
+        others = scipy.linalg.cho_solve((lower, True), solved.T @ self.slope_poses - self.slope_others)
+        poses = -scipy.linalg.cho_solve_banded((factor, False), self.slope_poses) - solved @ others
+        return poses.reshape(self.shape), np.asarray(others)
 
     def covariances(self) -> tuple[FloatArray, FloatArray]:
         """Return the marginal covariances of all poses (K, T, 3, 3) and of the landmarks (L, 3, 3).
@@ -181,7 +220,7 @@ class _System:
         They are the diagonal blocks of the inverse; those of the poses are of A^-1 + (A^-1 B) S^-1 (A^-1 B)^T with the
         Schur complement S = C - B^T A^-1 B.
         """
-        factor = self._banded(0.0)
+        factor = self._factor(0.0)
         solved, lower = self._reduced(factor, 0.0)
         spread = scipy.linalg.solve_triangular(lower, solved.T, lower=True).reshape(len(lower), -1, 3)
         robots, steps, _ = self.shape
@@ -191,22 +230,39 @@ class _System:
             chain = factor[:, 3 * steps * robot : 3 * steps * (robot + 1)]
             inverse = scipy.linalg.cho_solve_banded((chain, False), np.eye(3 * steps)).reshape(steps, 3, steps, 3)
             paths[robot, 1:] += inverse[np.arange(steps), :, np.arange(steps), :]
-        halves = scipy.linalg.solve_triangular(lower, np.eye(len(lower)), lower=True).reshape(len(lower), -1, 3)
+        inverse_lower = scipy.linalg.solve_triangular(lower, np.eye(len(lower), self.num_landmarks), lower=True)
+        halves = inverse_lower.reshape(len(lower), -1, 3)
         return paths, np.einsum("kli,klj->lij", halves, halves)
 
     def largest_slope(self) -> float:
         """Return the largest gradient of half the cost over the square root of the unknown's own curvature."""
-        poses = np.abs(self.slope_poses) / np.sqrt(np.diagonal(self.diagonal, axis1=1, axis2=2))
-        landmarks = np.abs(self.slope_landmarks) / np.sqrt(np.diagonal(self.landmarks, axis1=1, axis2=2))
-        return float(max(poses.max(), landmarks.max()))
+        poses = np.abs(self.slope_poses) / np.sqrt(self.bands[BAND])
+        others = np.abs(self.slope_others) / np.sqrt(np.diagonal(self.others))
+        return float(max(poses.max(), others.max()))
 
 
-def _block_matrix(
-    blocks: FloatArray, rows: IntArray, columns: IntArray, size: tuple[int, int]
-) -> scipy.sparse.csr_array:
-    """Return the sparse block matrix of `size` blocks with the sums of `blocks` (n, 3, 3) at block rows and columns."""
-    inner = np.arange(3)
-    i = np.broadcast_to((3 * rows)[:, None, None] + inner[:, None], blocks.shape)
-    j = np.broadcast_to((3 * columns)[:, None, None] + inner, blocks.shape)
-    shape = 3 * size[0], 3 * size[1]
-    return scipy.sparse.csr_array(scipy.sparse.coo_array((blocks.ravel(), (i.ravel(), j.ravel())), shape=shape))
+def prior_terms(problem: BatchProblem, at: Estimate) -> tuple[FloatArray, FloatArray]:
+    """Return the inverse standard deviations and residuals of the priors of unknown path frames and biases."""
+    scales, residuals = [np.empty(0)], [np.empty(0)]
+    loose, biased = problem.loose_robots, problem.biased
+    if len(loose) and at.bases is not None and problem.bases is not None:
+        away = at.bases[loose] - problem.bases[loose]
+        away[:, 2] = wrap_angle(away[:, 2])
+        scales.append(np.tile(1.0 / np.array(START_SIGMAS), len(loose)))
+        residuals.append(scales[-1] * away.ravel())
+    if len(biased) and at.biases is not None:
+        scales.append(np.tile(1.0 / np.array(problem.bias_sigmas)[biased], len(at.paths)))
+        residuals.append(scales[-1] * at.biases[:, biased].ravel())
+    return np.concatenate(scales), np.concatenate(residuals)
+
+
+def _stacked(shape: tuple[int, int], *parts: tuple[FloatArray, IntArray, IntArray]) -> scipy.sparse.csr_array:
+    """Return the sparse matrix of `shape` with blocks (n, r, c), each at its first row (n,) and column (n,)."""
+    values, rows, columns = [], [], []
+    for blocks, first_rows, first_columns in parts:
+        _, height, width = blocks.shape
+        values.append(blocks.ravel())
+        rows.append(np.broadcast_to((first_rows[:, None] + np.arange(height))[:, :, None], blocks.shape).ravel())
+        columns.append(np.broadcast_to((first_columns[:, None] + np.arange(width))[:, None, :], blocks.shape).ravel())
+    place = np.concatenate(rows), np.concatenate(columns)
+    return scipy.sparse.csr_array(scipy.sparse.coo_array((np.concatenate(values), place), shape=shape))
