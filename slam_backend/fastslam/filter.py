@@ -190,12 +190,12 @@ class FastSlam:
         state = self.state
         if step is not None:
             state.next_step = step
-        long_unseen, created, new, matched, rejected, ess, nis, is_depleted = state.update(
+        long_unseen, created, new, matched, rejected, ess, nis, needs_resampling = state.update(
             inputs, robot_rows, associations_buffer
         )
-        if is_depleted:
+        if needs_resampling:
             state.resample()
-        report = StepReport(associations, robot_rows.rows, created, new, matched, rejected, ess, nis, is_depleted)
+        report = StepReport(associations, robot_rows.rows, created, new, matched, rejected, ess, nis, needs_resampling)
         if (smoother := state.rejuvenation) is not None:
             smoother.record_step(new + matched, long_unseen)
             is_busy = self.may_smooth and not smoother.is_waiting(state.next_step - 1)

@@ -54,7 +54,7 @@ class FilterOptions:
             best candidate; below it a measurement is ambiguous and rejected (`fastslam2`) [-].
         new_landmark_density: p0, density of measurements that match nothing [1/m^3].
         one_to_one: Match a landmark at most once in a frame; False: measurements choose independently, as in the paper.
-        landmark_noise: Standard deviation q [m] along each axis of a landmark's random walk between two sightings:
+        landmark_noise: Standard deviation q [m] along each axis of a landmark's random walk between two measurements:
             Sigma + q^2 I after each update, the first included. The variance then never falls below the fixed point of
             the Riccati recursion. 0: static landmarks. None: `CALIBRATED_NOISE` if particles are rejuvenated, where it
             keeps the covariances consistent in between, else 0: without a smoother the filter would only forget.

@@ -97,7 +97,7 @@ class StepSummary(NamedTuple):
     Attributes:
         long_unseen: Number of measurements matched to landmarks not seen for long.
         created, new, matched, rejected, ess, nis: See `StepReport`.
-        is_depleted: Whether the effective sample size fell below the threshold of resampling.
+        needs_resampling: Whether the effective sample size fell below the threshold of resampling.
     """
 
     long_unseen: int
@@ -107,7 +107,7 @@ class StepSummary(NamedTuple):
     rejected: int
     ess: float
     nis: float
-    is_depleted: bool
+    needs_resampling: bool
 
 
 class FilterState:
@@ -299,7 +299,7 @@ class FilterState:
                     _, started = associations  # by slot, until the step is over
                     found, new_slots = self._associations[begin:end], started[begin:end]
                     deleted.append(self.existence.update(maps, self.poses[low], self.best, found, new_slots))
-        self.best, long_unseen, created, new, matched, rejected, ess, nis, is_depleted = summary
+        self.best, long_unseen, created, new, matched, rejected, ess, nis, needs_resampling = summary
         pending.steps.append(self.next_step)
         pending.num_measured += used
         if used:
@@ -309,7 +309,7 @@ class FilterState:
         self.next_step += 1
         for slots in deleted:  # last, as the ids are needed until here
             maps.release(slots)
-        return StepSummary(long_unseen, created, new, matched, rejected, ess, nis, is_depleted)
+        return StepSummary(long_unseen, created, new, matched, rejected, ess, nis, needs_resampling)
 
     def _set_exact_pose(self, robot: int, pose: FloatArray) -> None:
         """Set a robot's pose in all particles to an exact one (3,) [m, m, rad] in its own start frame."""

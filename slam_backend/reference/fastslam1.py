@@ -34,11 +34,11 @@ def update_fastslam1(
             if options.one_to_one and name in chosen:
                 continue
             gate = frame.compare(pose, landmarks[name], b)
-            if gate is not None and (frame.names is not None or gate.distance <= options.position_gate):
+            if gate is not None and (frame.identities is not None or gate.distance <= options.position_gate):
                 match, distance, log_likelihood = name, gate.distance, gate.log_density  # l. 39, before the update
                 break
         if match == REJECTED:  # l. 28-32
-            if frame.names is None or not is_held(b, possible, chosen, frame.names):
+            if frame.identities is None or not is_held(b, possible, chosen, frame.identities):
                 match = NEW - b
                 landmarks[match] = frame.new_landmark(pose, b, options.landmark_walk)
         else:  # l. 33-37

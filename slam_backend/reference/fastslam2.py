@@ -45,7 +45,7 @@ def update_fastslam2(
     """
     predicted = WhitenedPose.of(prior)
     iterations = 1 + MORE_ITERATIONS * bool(prior.covariance[2, 2] > WIDE_HEADING**2)
-    gates = gates_at(predicted, landmarks, frame, candidates)  # pass A
+    gates = gates_at(predicted, landmarks, frame, candidates)  # first pass
     if options.recovery_position > 0.0 and not is_exact:
         wide = np.diag([options.recovery_position, options.recovery_position, options.recovery_heading]) ** 2
         inflated = WhitenedPose.of(GaussianPose(prior.mean, wide))
@@ -54,7 +54,7 @@ def update_fastslam2(
             predicted, gates, iterations = inflated, wide_gates, 1 + MORE_ITERATIONS
     tentative = unambiguous_matches(gates, frame, candidates, options)
     refined = refine(predicted, landmarks, frame, tentative, iterations, options.position_gate)
-    chosen, log_unmatched = decide(refined, landmarks, frame, candidates, options)  # pass B
+    chosen, log_unmatched = decide(refined, landmarks, frame, candidates, options)  # second pass
     matches = {b: name for b, name in enumerate(chosen) if name >= 0}
     posterior, log_evidence = pose_given(refined, landmarks, frame, matches)
     pose = posterior.sample(normals)
@@ -129,7 +129,7 @@ def unambiguous_matches(gates: Gates, frame: Frame, candidates: Candidates, opti
         costs = []
         for e, name in possible:
             gate = gates.get((b, name))
-            if gate is not None and (frame.names is not None or gate.distance <= options.position_gate):
+            if gate is not None and (frame.identities is not None or gate.distance <= options.position_gate):
                 costs.append((gate.distance + gate.log_det + e / options.descriptor_sigma**2, name))
         costs.sort()
         if not costs or (len(costs) > 1 and costs[1][0] - costs[0][0] < options.ambiguity_margin):
@@ -192,13 +192,13 @@ def decide(
     chosen: list[int] = []
     total = 0.0
     for b, possible in enumerate(candidates):
-        is_dead = frame.names is not None and is_held(b, possible, chosen, frame.names)
+        is_dead = frame.identities is not None and is_held(b, possible, chosen, frame.identities)
         costs = []
         for e, name in possible:
             gate = gates.get((b, name))
             if gate is None:
                 continue
-            distance = gate.distance if frame.names is None else min(gate.distance, options.position_gate)
+            distance = gate.distance if frame.identities is None else min(gate.distance, options.position_gate)
             is_dead |= distance <= options.new_landmark_gate
             is_dead |= frame.metres(refined.pose, landmarks[name], b) <= options.new_landmark_radius
             if distance <= options.position_gate and not (options.one_to_one and name in chosen):

@@ -201,10 +201,10 @@ class ReferenceFastSlam:
         result: Candidates = []
         for b in range(len(frame)):
             squares = np.sum((descriptors - frame.descriptors[b]) ** 2, axis=1)
-            if frame.names is None:
+            if frame.identities is None:
                 possible = [e <= self.options.descriptor_gate**2 for e in squares]
             else:
-                possible = [self.identities[name] == frame.names[b] for name in held]
+                possible = [self.identities[name] == frame.identities[b] for name in held]
             result.append(sorted((float(e), name) for e, name, ok in zip(squares, held, possible, strict=True) if ok))
         return result
 
@@ -283,7 +283,7 @@ class ReferenceFastSlam:
             if any(turn.chosen[b] == NEW - b for turn in turns):
                 lasting[NEW - b] = self.next_id
                 self.descriptors[self.next_id] = frame.descriptors[b]
-                self.identities[self.next_id] = -1 if frame.names is None else frame.names[b]
+                self.identities[self.next_id] = -1 if frame.identities is None else frame.identities[b]
                 self.next_id += 1
         for particle in self.particles:
             particle.landmarks = {lasting.get(name, name): one for name, one in particle.landmarks.items()}

@@ -102,7 +102,7 @@ class Frame:
     Args:
         measurements: Measurements of the camera; None: none.
         kept: Indices of the measurements in use.
-        names: Caller's names of the measured landmarks; None: unknown.
+        identities: Caller's identities of the measured landmarks; None: unknown.
         camera: Assumed model of the camera.
 
     Attributes:
@@ -118,13 +118,13 @@ class Frame:
         self,
         measurements: Measurements | None,
         kept: Sequence[int],
-        names: Sequence[int] | None,
+        identities: Sequence[int] | None,
         camera: StereoCamera,
     ) -> None:
         seen = Measurements.empty() if measurements is None else measurements
         rows = list(kept)
         self.camera = camera
-        self.names = names
+        self.identities = identities
         self.points = seen.points[rows]
         self.descriptors = seen.descriptors[rows].astype(np.float64)
         self.in_image = seen.covariances is None

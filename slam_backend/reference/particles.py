@@ -39,16 +39,16 @@ class RobotUpdate:
     log_likelihood: float
 
 
-def is_held(b: int, possible: Sequence[tuple[float, int]], chosen: Sequence[int], names: Sequence[int]) -> bool:
-    """Return whether a particle has a landmark with the name of a measurement, which then starts no other.
+def is_held(b: int, possible: Sequence[tuple[float, int]], chosen: Sequence[int], identities: Sequence[int]) -> bool:
+    """Return whether a particle has a landmark with the identity of a measurement, which then starts no other.
 
     Args:
         b: Number of the measurement.
-        possible: Landmarks of the particle with this name.
+        possible: Landmarks of the particle with this identity.
         chosen: Associations of the measurements before it.
-        names: The caller's names of all measurements of the frame.
+        identities: The caller's identities of all measurements of the frame.
     """
-    return bool(possible) or any(chosen[a] == NEW - a and names[a] == names[b] for a in range(b))
+    return bool(possible) or any(chosen[a] == NEW - a and identities[a] == identities[b] for a in range(b))
 
 
 class RobotStep:

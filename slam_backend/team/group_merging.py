@@ -200,7 +200,7 @@ def find_inconsistent_merge(trunk: Branch, merging: MergeOptions, options: Align
     return None
 
 
-def restore_groups(group: Group, undoing: MergeRollback, records: SharedRecords, epoch: int) -> list[Group]:
+def separate_groups(group: Group, undoing: MergeRollback, records: SharedRecords, epoch: int) -> list[Group]:
     """Undo a merge of a group, and those on top of it: all sides continue as if they had never merged.
 
     Robots out of contact keep their forks until they return.
@@ -209,25 +209,25 @@ def restore_groups(group: Group, undoing: MergeRollback, records: SharedRecords,
         group: The group; not to be used afterwards.
         undoing: Rollback of the group's merge; its sides have caught up with the group's joint filter.
         records: Records of the team.
-        epoch: Epoch of the restored filters.
+        epoch: Epoch of the separated filters.
     """
     now = group.trunk
     for monitor in undoing.merges(now):
         number_a, number_b = (side.trunk["number"] for side in monitor.sides)
         records.entries.append(MergeUndone((number_a, number_b, monitor.number)))
-    restored = []
+    separated = []
     for trunk, replayed in zip(undoing.sides, undoing.replayed, strict=True):
         trunk.active_robots, trunk.epoch = tuple(robot for robot in trunk.robots if robot in now.active_robots), epoch
         records.note_replay(trunk.number, replayed)
-        restored.append(Group(trunk))
+        separated.append(Group(trunk))
     for branch in group.branches[1:]:
-        _reassign_branch(branch, restored, records)
-    return restored
+        _reassign_branch(branch, separated, records)
+    return separated
 
 
-def _reassign_branch(branch: Branch, restored: list[Group], records: SharedRecords) -> None:
-    """Assign a fork to the restored group of its robots; a fork needed by several is copied."""
-    homes = [group for group in restored if any(robot in group.robots for robot in branch.active_robots)]
+def _reassign_branch(branch: Branch, separated: list[Group], records: SharedRecords) -> None:
+    """Assign a fork to the group of its robots; a fork needed by several is copied."""
+    homes = [group for group in separated if any(robot in group.robots for robot in branch.active_robots)]
     for group in homes[1:]:
         members = tuple(robot for robot in branch.active_robots if robot in group.robots)
         copied = fork(branch, members, records.new_number(), records.rng)

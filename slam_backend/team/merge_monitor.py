@@ -9,10 +9,9 @@ sum of both covariances and the noise floor of alignments). Information from the
 its own uncertainty, so that hardly any lie beyond the gate; in maps deformed to agree, many do.
 
 *Place.* The landmarks that only one side found are aligned with those of the other, by the test that every merge has to
-pass. If another motion than the present one fits them (0.5 m or 5 degrees off), the merge was false, unless it has more
-support: the pairs of similar landmarks that it joined count as a rival of that test, and may be no more than
-`max_ratio` of the new inliers. Thus a robot that gets lost after a correct merge, and maps landmarks twice, does not
-undo it.
+pass. If another motion fits them, 0.5 m or 5 degrees from the present one, the merge was false, unless the pairs of
+similar landmarks that it joined outnumber `max_ratio` times the inliers of the new motion. Thus a robot that gets lost
+after a correct merge, and maps landmarks twice, does not undo it.
 """
 
 from collections.abc import Mapping, Sequence

@@ -15,7 +15,7 @@ from slam_backend.fastslam.step_input import InputBuffer
 from slam_backend.team.branches import MAX_REPLAYED, Branch, ReplayedStep, replay
 from slam_backend.team.merge_monitor import MergeMonitor, PreMergeSnapshot
 
-LEAST_REPLAYED = 2  # steps per tick and side: each tick adds one
+LEAST_REPLAYED = 2  # input steps replayed per side and step of the team, which itself adds one
 
 
 @dataclass(slots=True, eq=False)

@@ -17,8 +17,9 @@ class MergeOptions:
         smooth_first: Whether both sides are rejuvenated from the posterior of whole paths before a merge
             (`FastSlam.rejuvenate`; over several steps, if smoothers work in slices), and their maps must align again.
             False: maps are used without smoothing.
-        min_sigmas: Least distance of 0.5 m and 5 degrees in standard deviations of the motion between the maps, over
-            the particles of the merge. An attempt below it is refused, as long as waiting helps. 0: no such refusal.
+        min_sigmas: A merge needs 0.5 m and 5 degrees to be at least this many standard deviations of the motion between
+            the maps, taken over the particles of the merge. Otherwise the attempt is refused as too uncertain,
+            as long as waiting helps. 0: no such refusal.
         min_sigmas_on_trial: Reduced limit after a trial. Above 0 a pair below `min_sigmas` merges on trial: the joint
             filter is smoothed, and kept if its motion passes twice in a row; where waiting does not help, this limit
             suffices. 0: no trials, and where waiting does not help the pair merges with any uncertainty, as is right if

@@ -41,7 +41,7 @@ from slam_backend.models.measurements import Measurements, TeamMeasurements
 from slam_backend.team.branches import Branch, process_step, restored_filter
 from slam_backend.team.communication import TrafficCounter, check_contacts, contact_components
 from slam_backend.team.filter_merging.merging import inverse_alignment
-from slam_backend.team.group_merging import MergePlan, find_inconsistent_merge, merge_groups, restore_groups
+from slam_backend.team.group_merging import MergePlan, find_inconsistent_merge, merge_groups, separate_groups
 from slam_backend.team.groups import Group, TeamTopology
 from slam_backend.team.merge_attempt import run_attempt
 from slam_backend.team.merge_rollback import MergeRollback
@@ -254,8 +254,8 @@ class TeamSlam:
         due = self._step % self._merging.watch_every == 0
         for group in list(self._groups):
             if due and group.undoing is None:
-                false = find_inconsistent_merge(group.trunk, self._merging, self._alignment)
-                group.undoing = None if false is None else MergeRollback.of(group.trunk, false.number)
+                found = find_inconsistent_merge(group.trunk, self._merging, self._alignment)
+                group.undoing = None if found is None else MergeRollback.of(group.trunk, found.number)
             if group.undoing is not None:
                 self._undo(group, group.undoing)
                 continue
@@ -274,7 +274,7 @@ class TeamSlam:
         if not caught_up or not all(monitor.both_sides_connected(group.trunk.active_robots) for monitor in merges):
             return
         self._epoch += 1
-        self._replace([group], restore_groups(group, undoing, self._records, self._epoch))
+        self._replace([group], separate_groups(group, undoing, self._records, self._epoch))
         for monitor in merges:
             pair = (monitor.sides[0].robots, monitor.sides[1].robots)
             self._events.append(MergeEvent(self._step, "undo", *pair, monitor.alignment))

@@ -15,7 +15,7 @@ from slam_backend.fastslam.reports import LandmarkIdMap, LandmarksCreated, MapFo
 from slam_backend.maps.landmark_map import TeamMapSummaries
 
 FALSE, UNCOUNTED = -1, -2  # claims of false landmarks, and of true ones that are not scored
-PLACED = 0.5  # [m] error below which a landmark counts as accurate
+ACCURATE_WITHIN = 0.5  # [m] error below which a landmark counts as accurate
 
 
 UNUSED = -3  # claim of an unused landmark id
@@ -83,7 +83,7 @@ def score_team(
         for square in least:
             if square < np.inf:
                 matched += 1
-                accurate += square < PLACED * PLACED
+                accurate += square < ACCURATE_WITHIN * ACCURATE_WITHIN
                 squares += square
                 total += min(square, cutoff * cutoff)
             else:

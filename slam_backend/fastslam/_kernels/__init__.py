@@ -16,8 +16,9 @@ predicted point, and the density of the image coordinates is that of r times Z_p
 camera). Where the caller gives covariances, k = 1 and there is no such factor.
 
 The pose. x = x0 + C xi with xi ~ N(0, I) before the frame: nothing is inverted, so a motion without noise needs no
-special case. With A = (dr/dx) C and S = Sigma + R, a match adds J = A^T S^-1 A to the information of xi and
-g = A^T S^-1 r to the gradient. A gate takes S + A P A^T, with P the covariance of xi.
+special case. With A = (dr/dx) C and S = Sigma + R, a match adds A^T S^-1 A to the information matrix of xi
+(rows `INFO..`) and A^T S^-1 r to the gradient (`GRAD..`). A gate takes S + A P A^T, with P the covariance of xi
+(`COV_XI..`). The turn into map axes is by (`COS`, `SIN`); R above is that turn, R in S the measurement noise.
 """
 
 from slam_backend.fastslam._kernels.inputs import extent, read_team, to_robot_axes

@@ -6,14 +6,14 @@ from slam_backend.core.jit import device, jit_fma, simd, simd_inline, stack_arra
 from slam_backend.core.simd_math import WIDE, added_up, log_of
 from slam_backend.core.validation import Float32Array, FloatArray, IntArray
 from slam_backend.fastslam._kernels.layout import (
-    BEST_D,
+    BEST_COST,
     CHOSEN,
+    DEAD_ZONE,
     IDENTITIES,
     IDS,
     LANES,
     LOG_2PI,
     LOG_BEST,
-    NEAR,
     NEW_LANDMARK,
     NO_MATCH,
     Q_D,
@@ -23,12 +23,12 @@ from slam_backend.fastslam._kernels.layout import (
     Q_METRES2,
     REJECTED,
     ROW_OF,
-    SECOND_D,
+    SECOND_COST,
     TAKEN,
 )
 from slam_backend.fastslam._kernels.records import Candidates, Frame, MapArrays, Outcome
 
-RUN = 64  # descriptors looked at together
+RUN = 64  # descriptors compared in one run
 
 
 @device
@@ -113,7 +113,12 @@ def find_candidates(frame: Frame, maps: MapArrays, gate: float) -> tuple[Candida
     Returns:
         The candidates, and the slots among them, each once.
     """
-    measured, names, identities, ids = frame.descriptors, frame.names, maps.table[IDENTITIES], maps.table[IDS]
+    measured, measured_ids, identities, ids = (
+        frame.descriptors,
+        frame.identities,
+        maps.table[IDENTITIES],
+        maps.table[IDS],
+    )
     num, n = measured.shape[0], len(ids)
     while n > 0 and ids[n - 1] < 0:
         n -= 1
@@ -127,10 +132,10 @@ def find_candidates(frame: Frame, maps: MapArrays, gate: float) -> tuple[Candida
     total = 0
     for b in range(num):
         starts[b] = total
-        if frame.named:
+        if frame.identified:
             count = 0
             for slot in range(n):
-                if identities[slot] == names[b] and ids[slot] >= 0:
+                if identities[slot] == measured_ids[b] and ids[slot] >= 0:
                     hits[count] = slot
                     count += 1
         else:
@@ -140,7 +145,7 @@ def find_candidates(frame: Frame, maps: MapArrays, gate: float) -> tuple[Candida
             if ids[slot] < 0:
                 continue
             e = _squared_distance(measured, b, maps.descriptors, slot)
-            if e > gate and not frame.named:
+            if e > gate and not frame.identified:
                 continue
             at = total
             while at > starts[b] and (squares[at - 1] > e or (squares[at - 1] == e and ids[slots[at - 1]] > ids[slot])):
@@ -171,10 +176,10 @@ def find_candidates(frame: Frame, maps: MapArrays, gate: float) -> tuple[Candida
 def begin_choice(work: FloatArray) -> None:
     """Clear the rows by which candidates compete for one measurement."""
     for i in range(LANES):
-        work[BEST_D + i] = np.inf
-        work[SECOND_D + i] = np.inf
+        work[BEST_COST + i] = np.inf
+        work[SECOND_COST + i] = np.inf
         work[CHOSEN + i] = NO_MATCH
-        work[NEAR + i] = 0.0
+        work[DEAD_ZONE + i] = 0.0
         work[LOG_BEST + i] = 0.0
         work[TAKEN + i] = 0.0
 
@@ -196,16 +201,19 @@ def mark_assigned(work: FloatArray, match: FloatArray, candidates: Candidates, q
 @device
 @simd
 def consider(
-    work: FloatArray, record: FloatArray, q: float, look: float, cap: float, reach: float, new_landmark_gate: float,
-    new_landmark_radius: float,
+    work: FloatArray, record: FloatArray, q: float, descriptor_cost: float, cap: float, reach: float,
+    new_landmark_gate: float, new_landmark_radius: float,
 ) -> None:  # fmt: skip
     """Let candidate q compete for the measurement, unless row TAKEN says that its landmark is taken.
+
+    Its cost is D + log |S| + descriptor cost, -2 times the log-likelihood of image coordinates and descriptor up to a
+    constant. Of two that cost the same the first, whose descriptor is nearer, wins.
 
     Args:
         work, record: Rows of the block and of the candidate.
         q: Number of the candidate.
-        look: Cost of its descriptor.
-        cap: Largest D that is counted: the gate where the caller names the landmarks and names decide.
+        descriptor_cost: Squared distance of its descriptor in units of the descriptor variance.
+        cap: Largest D that is counted: the gate where the caller identifies the landmarks and identities decide.
         reach: Largest D that may match.
         new_landmark_gate, new_landmark_radius: See `Rules`.
     """
@@ -216,14 +224,15 @@ def consider(
         distance = cap if distance > cap else distance
         near = front & ((distance <= new_landmark_gate) | (record[Q_METRES2 + i] <= radius2))
         ok = front & (distance <= reach) & (work[TAKEN + i] == 0.0)
-        work[NEAR + i] = 1.0 if near else work[NEAR + i]
+        work[DEAD_ZONE + i] = 1.0 if near else work[DEAD_ZONE + i]
         depth = record[Q_DEPTH + i]
+        # |S| of image coordinates: that of metres over Z^8, see the package docstring
         log_det = log_of(record[Q_DET_POSE + i] if ok else 1.0) - 8.0 * log_of(depth if ok else 1.0)
-        cost = distance + log_det + look if ok else np.inf
-        best, second = work[BEST_D + i], work[SECOND_D + i]
+        cost = distance + log_det + descriptor_cost if ok else np.inf
+        best, second = work[BEST_COST + i], work[SECOND_COST + i]
         better = cost < best
-        work[SECOND_D + i] = best if better else (cost if cost < second else second)
-        work[BEST_D + i] = cost if better else best
+        work[SECOND_COST + i] = best if better else (cost if cost < second else second)
+        work[BEST_COST + i] = cost if better else best
         work[CHOSEN + i] = q if better else work[CHOSEN + i]
         work[LOG_BEST + i] = -0.5 * (distance + log_det + 3.0 * LOG_2PI) if better else work[LOG_BEST + i]
 
@@ -243,12 +252,12 @@ def mask_of(match: FloatArray, code: float, mask: FloatArray) -> int:
 @device
 @simd
 def create_once(
-    match: FloatArray, b: int, first: int, maps: MapArrays, candidates: Candidates, names: IntArray
+    match: FloatArray, b: int, first: int, maps: MapArrays, candidates: Candidates, identities: IntArray
 ) -> None:
-    """Let no lane of a block, of particles from `first` on, hold two landmarks of the name of measurement b.
+    """Keep the identity of measurement b unique in each lane of a block, of particles from `first` on.
 
-    It starts none in lanes that hold the landmark of its name, wherever they predict it, and none in lanes in which an
-    earlier measurement of its name starts one.
+    The measurement starts no landmark in lanes that hold the landmark of its identity, wherever they predict it, nor in
+    lanes in which an earlier measurement of that identity starts one.
     """
     row_of, chosen = maps.table[ROW_OF], match[b]
     for q in range(candidates.starts[b], candidates.starts[b + 1]):
@@ -256,7 +265,7 @@ def create_once(
         for i in range(len(chosen)):
             chosen[i] = NO_MATCH if chosen[i] == NEW_LANDMARK and seen[i] > 0 else chosen[i]
     for a in range(b):
-        if names[a] == names[b]:
+        if identities[a] == identities[b]:
             earlier = match[a]
             for i in range(len(chosen)):
                 chosen[i] = NO_MATCH if chosen[i] == NEW_LANDMARK and earlier[i] == NEW_LANDMARK else chosen[i]

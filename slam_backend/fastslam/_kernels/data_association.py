@@ -1,8 +1,9 @@
-"""Data association of one robot's measurements, for all particles at once.
+"""Data association of one robot's measurements with FastSLAM 2.0, for all particles at once.
 
-The first pass of FastSLAM 2.0 matches, at the predicted pose, what is unambiguous; the second matches at the refined
-pose, rejects, or starts new landmarks. Between them lost particles are detected, where measurements contradict the
-pose, and re-localised with a wide prior.
+The first pass, `associate_unambiguous`, matches at the predicted pose what is unambiguous, which refines the pose. The
+second, `associate_all`, matches, rejects or starts a landmark at the refined pose. In between, particles whose
+measurements contradict their pose are re-localised with a wide prior. The same in plain Python, which is the oracle of
+`tests/slam_backend/fastslam/test_filter_reference.py`: `slam_backend.reference.fastslam2`.
 """
 
 import math
@@ -13,7 +14,7 @@ from slam_backend.core.jit import device, simd
 from slam_backend.core.validation import FloatArray, Int32Array
 from slam_backend.fastslam._kernels.candidates import begin_choice, consider, mark_assigned, mask_of
 from slam_backend.fastslam._kernels.layout import (
-    BEST_D,
+    BEST_COST,
     C00,
     C01,
     C10,
@@ -25,6 +26,7 @@ from slam_backend.fastslam._kernels.layout import (
     CLUTTER,
     CONTRADICT,
     COS,
+    DEAD_ZONE,
     KEPT00,
     KEPT01,
     KEPT10,
@@ -34,10 +36,11 @@ from slam_backend.fastslam._kernels.layout import (
     KEPT22,
     KEPT_WIDE,
     LANES,
+    LEAST_D,
+    LEAST_FIRST_D,
     LOG_BEST,
     LOST,
     MAX_DISTANCE,
-    NEAR,
     NEW_LANDMARK,
     NO_MATCH,
     Q_D,
@@ -47,7 +50,7 @@ from slam_backend.fastslam._kernels.layout import (
     Q_HELD,
     Q_SQUARE,
     ROW_OF,
-    SECOND_D,
+    SECOND_COST,
     SIN,
     SURE,
     TAKEN,
@@ -69,31 +72,33 @@ from slam_backend.fastslam._kernels.pose_posterior import (
 )
 from slam_backend.fastslam._kernels.records import Candidates, Frame, MapArrays, Rules, Space
 
-MORE_STEPS = 3  # a wide prior is a long way for one iteration
+MORE_STEPS = 3  # further Gauss-Newton iterations where the prior is wide
 MIN_CONTRADICTIONS = 3.0  # three points fix a pose with one to spare
 
 
 @device
 @simd
 def _judge_nearest(work: FloatArray, record: FloatArray, begin: bool) -> None:
-    """Fold candidate after candidate: BEST_D = least D at hand of those held, SECOND_D = least of the D kept before."""
+    """Fold in one candidate: LEAST_D = least D of landmarks held, LEAST_FIRST_D = least D of the evaluation before."""
     for i in range(LANES):
         held = record[Q_HELD + i] > 0.0
         now, before = record[Q_D + i] if held else np.inf, record[Q_FIRST_D + i] if held else np.inf
-        work[BEST_D + i] = now if begin or now < work[BEST_D + i] else work[BEST_D + i]
-        work[SECOND_D + i] = before if begin or before < work[SECOND_D + i] else work[SECOND_D + i]
+        work[LEAST_D + i] = now if begin or now < work[LEAST_D + i] else work[LEAST_D + i]
+        work[LEAST_FIRST_D + i] = before if begin or before < work[LEAST_FIRST_D + i] else work[LEAST_FIRST_D + i]
         work[CHOSEN + i] = 1.0 if held else (0.0 if begin else work[CHOSEN + i])
 
 
 @device
 @simd
-def associate_initial(
+def associate_unambiguous(
     space: Space, block: int, maps: MapArrays, frame: Frame, candidates: Candidates, rules: Rules
 ) -> int:
-    """Match in one block, at the predicted pose, what is beyond doubt, and sum it (pass A).
+    """Match unambiguous measurements of one block at the predicted pose, and sum their information (first pass).
 
-    A match is weighed by Cauchy's 1 / (1 + D / gate); where the caller names the landmarks, any D may match. A
-    measurement that has candidates, none of which explains it at the predicted pose, contradicts the pose.
+    A measurement is matched to its candidate of least cost (see `consider`) within the gate if the second best costs
+    at least `Rules.ambiguity` more and no earlier measurement of the frame has taken the landmark. A match has Cauchy's
+    weight 1 / (1 + D / gate). Where the caller identifies the landmarks, any D may match. A measurement that has
+    candidates, none of which explains it at the predicted pose, contradicts the pose.
 
     Returns:
         The number of suspects: lanes in which enough contradicts the pose.
@@ -101,7 +106,7 @@ def associate_initial(
     work, records, match = space.work, space.records, space.match
     starts, slots, same, row_of = candidates.starts, candidates.slots, candidates.same, maps.table[ROW_OF]
     padded, first, gate = maps.counts.shape[1], block * LANES, rules.position_gate
-    reach = MAX_DISTANCE if frame.named else gate
+    reach = MAX_DISTANCE if frame.identified else gate
     for i in range(LANES):
         work[CONTRADICT + i] = 0.0
     for b in range(len(starts) - 1):
@@ -118,10 +123,10 @@ def associate_initial(
             tile, seen = maps.values[tile_of(padded, row, block)], maps.counts[row, first : first + LANES]
             innovate(work, tile, frame, b)
             evaluate(work, tile, records[q], seen, False)
-            consider(work, records[q], float(q), candidates.looks[q], MAX_DISTANCE, reach, 0.0, 0.0)
+            consider(work, records[q], float(q), candidates.descriptor_costs[q], MAX_DISTANCE, reach, 0.0, 0.0)
         for i in range(LANES):  # the best candidate, if no other comes near
-            second = work[SECOND_D + i]
-            clear = second == np.inf or second - work[BEST_D + i] >= rules.ambiguity
+            second = work[SECOND_COST + i]
+            clear = second == np.inf or second - work[BEST_COST + i] >= rules.ambiguity
             chosen[i] = work[CHOSEN + i] if clear else NO_MATCH
         for q in range(low, high):
             record, code = records[q], float(q)
@@ -132,11 +137,11 @@ def associate_initial(
             sum_matches(work, record, chosen, code, gate)
             for i in range(LANES):  # D at the predicted pose is the NIS
                 record[Q_FIRST_D + i] = record[Q_D + i]
-        for q in range(low, high):  # the choice is made: rows BEST_D and CHOSEN are free
+        for q in range(low, high):  # the choice is made: rows LEAST_D and CHOSEN are free
             _judge_nearest(work, records[q], q == low)
         if low < high:
             for i in range(LANES):
-                work[CONTRADICT + i] += 1.0 if work[CHOSEN + i] > 0.0 and not work[BEST_D + i] <= gate else 0.0
+                work[CONTRADICT + i] += 1.0 if work[CHOSEN + i] > 0.0 and not work[LEAST_D + i] <= gate else 0.0
     suspects = 0
     for i in range(LANES):
         suspects += 1 if work[CONTRADICT + i] >= MIN_CONTRADICTIONS else 0
@@ -149,7 +154,7 @@ def _match_alone(
     work: FloatArray, tile: FloatArray, record: FloatArray, seen: Int32Array, chosen: FloatArray, q: float,
     reach: float, gate: float,
 ) -> None:  # fmt: skip
-    """Match a measurement that has the one candidate q in pass A: weigh, sum, and judge.
+    """Match a measurement whose only candidate is q (first pass): weigh, sum, and judge.
 
     The largest D that may match is `reach`.
     """
@@ -203,9 +208,9 @@ def try_inflated_prior(
             _judge_nearest(work, record, q == starts[b])
         if starts[b] < starts[b + 1]:  # whether the wide prior explains the measurement, and the narrow one did not
             for i in range(LANES):
-                sure = work[BEST_D + i] <= gate
+                sure = work[LEAST_D + i] <= gate
                 work[SURE + i] += 1.0 if sure else 0.0
-                work[CONTRADICT + i] += 1.0 if sure and not work[SECOND_D + i] <= gate else 0.0
+                work[CONTRADICT + i] += 1.0 if sure and not work[LEAST_FIRST_D + i] <= gate else 0.0
     for i in range(LANES):  # suspects that are not lost after all get back what they had
         lost = work[CONTRADICT + i] >= MIN_CONTRADICTIONS and 2.0 * work[CONTRADICT + i] > work[SURE + i]
         back = work[LOST + i] > 0.0 and not lost
@@ -244,23 +249,27 @@ def iterate_inflated(
 
 @device
 @simd
-def associate_final(
+def associate_all(
     space: Space, block: int, maps: MapArrays, frame: Frame, candidates: Candidates, rules: Rules
 ) -> None:
-    """Decide on all measurements in one block, and sum what they say of the pose and of its likelihood (pass B).
+    """Match, reject or start a landmark for each measurement of one block at the refined pose (second pass).
 
-    The landmark of least cost D + log det + descriptor cost within the gate is matched. A measurement is rejected if
-    another landmark costs nearly as little, or if one is near but outside the gate; else it is new. The same in plain
-    Python: `slam_backend.reference.fastslam2.decide`.
+    Measurements are decided in their order; a landmark that an earlier one of the frame has taken cannot be matched
+    again (`Rules.one_to_one`). The free landmark of least cost (see `consider`) with D <= `position_gate` is matched,
+    unless the second best costs less than `ambiguity` more: then the measurement is rejected. Without a match it is
+    rejected as well if a candidate, taken or not, lies in the dead zone: D <= `new_landmark_gate`, or closer than
+    `new_landmark_radius`. Otherwise it starts a landmark. Sums the information on the pose and its likelihood. The same
+    in plain Python: `slam_backend.reference.fastslam2.decide`.
     """
     work, records, match = space.work, space.records, space.match
     starts, slots, row_of = candidates.starts, candidates.slots, maps.table[ROW_OF]
     padded, first, gate = maps.counts.shape[1], block * LANES, rules.position_gate
-    reach, cap = (MAX_DISTANCE, gate) if frame.named else (gate, MAX_DISTANCE)
-    new_landmark_gate = MAX_DISTANCE if frame.named else rules.new_landmark_gate
+    reach, cap = (MAX_DISTANCE, gate) if frame.identified else (gate, MAX_DISTANCE)
+    new_landmark_gate = MAX_DISTANCE if frame.identified else rules.new_landmark_gate
     clear_likelihood(work)
     for b in range(len(starts) - 1):
         low, high, chosen = starts[b], starts[b + 1], match[b]
+        # A density [1/m^3] becomes one of image coordinates by the factor Z^4, see the package docstring.
         log_clutter = rules.log_p0 + (0.0 if frame.given else 4.0 * math.log(frame.points[b, 0]))
         if high - low == 1:
             row = row_of[slots[low]]
@@ -282,19 +291,19 @@ def associate_final(
                 work,
                 record,
                 float(q),
-                candidates.looks[q],
+                candidates.descriptor_costs[q],
                 cap,
                 gate,
                 rules.new_landmark_gate,
                 rules.new_landmark_radius,
             )
         for i in range(LANES):
-            best, second = work[BEST_D + i], work[SECOND_D + i]
+            best, second = work[BEST_COST + i], work[SECOND_COST + i]
             matched = work[CHOSEN + i] >= 0.0
-            held_back = matched and second < np.inf and second - best < rules.ambiguity
-            new = NO_MATCH if work[NEAR + i] > 0.0 else NEW_LANDMARK
-            chosen[i] = (NO_MATCH if held_back else work[CHOSEN + i]) if matched else new
-            work[CLUTTER + i] += (work[LOG_BEST + i] if held_back else 0.0) if matched else log_clutter
+            ambiguous = matched and second < np.inf and second - best < rules.ambiguity
+            new = NO_MATCH if work[DEAD_ZONE + i] > 0.0 else NEW_LANDMARK
+            chosen[i] = (NO_MATCH if ambiguous else work[CHOSEN + i]) if matched else new
+            work[CLUTTER + i] += (work[LOG_BEST + i] if ambiguous else 0.0) if matched else log_clutter
         for q in range(low, high):
             record = records[q]
             if sum_matches(work, record, chosen, float(q), np.inf) > 0:
@@ -309,7 +318,7 @@ def _decide_alone(
     work: FloatArray, tile: FloatArray, seen: Int32Array, chosen: FloatArray, q: float,
     reach: float, new_landmark_gate: float, new_landmark_radius: float, log_clutter: float,
 ) -> None:  # fmt: skip
-    """Match, reject or start a measurement that has the one candidate q in pass B, and sum.
+    """Decide on a measurement whose only candidate is q (second pass), and sum.
 
     Row TAKEN says where an earlier measurement has taken the landmark; the largest D that may match is `reach`.
     """

@@ -60,7 +60,7 @@ def update_fastslam1(
     starts, slots, row_of = candidates.starts, candidates.slots, maps.table[ROW_OF]
     match, mask = np.empty((num, LANES)), stack_array(LANES)
     space = Space(work, np.empty((len(slots), CANDIDATE_ROWS * LANES)), match, mask)
-    gate = np.inf if frame.named else rules.position_gate
+    gate = np.inf if frame.identified else rules.position_gate
     new_slots[:] = REJECTED
     for block in range(padded // LANES):
         first = block * LANES
@@ -87,8 +87,8 @@ def update_fastslam1(
             unmatched = mask_of(chosen, NEW_LANDMARK, mask)
             for i in range(LANES):
                 work[CLUTTER + i] += log_clutter if mask[i] > 0.0 else 0.0
-            if frame.named:
-                create_once(match, b, first, maps, candidates, frame.names)
+            if frame.identified:
+                create_once(match, b, first, maps, candidates, frame.identities)
                 unmatched = mask_of(chosen, NEW_LANDMARK, mask)
             if unmatched > 0:  # l. 28-32
                 new_landmark(space, block, maps, frame, b, new_slots, rules.walk)

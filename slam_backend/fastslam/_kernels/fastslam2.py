@@ -6,20 +6,20 @@ from slam_backend.core.jit import device, jit_fma, stack_array
 from slam_backend.core.validation import FloatArray
 from slam_backend.fastslam._kernels.candidates import create_once, find_candidates, mask_of, write_associations
 from slam_backend.fastslam._kernels.data_association import (
-    associate_final,
-    associate_initial,
+    associate_all,
+    associate_unambiguous,
     iterate_inflated,
     try_inflated_prior,
 )
 from slam_backend.fastslam._kernels.landmark_ekf import new_landmark, update_matched
 from slam_backend.fastslam._kernels.layout import (
     CANDIDATE_ROWS,
+    COV_XI00,
     LANES,
     NEW_LANDMARK,
     NO_MATCH,
     Q_FIRST_D,
     REJECTED,
-    SPREAD00,
     X0,
     X,
 )
@@ -33,19 +33,19 @@ from slam_backend.fastslam._kernels.records import Frame, MapArrays, Motion, Out
 @device
 @jit_fma
 def update_fastslam2(
-    robot: Poses, blind: bool, motion: Motion, bias: FloatArray, maps: MapArrays, frame: Frame, rules: Rules,
+    robot: Poses, propagated_only: bool, motion: Motion, bias: FloatArray, maps: MapArrays, frame: Frame, rules: Rules,
     work: FloatArray, outcome: Outcome,
 ) -> None:  # fmt: skip
     """Integrate one robot's motion and frame, the measurements shaping the sampled pose (FastSLAM 2.0, Laplace form).
 
-    Association takes two passes: unambiguous candidates first refine the pose robustly, then all decisions are taken at
-    the refined pose. A particle filter forgets how wrong its pose may be; where a wide prior explains three or more
-    measurements, and most of all it can explain, that the stated uncertainty does not, this is not believed, and the
-    wide prior takes its place. Written out, step by step, in `slam_backend.reference`.
+    Data association takes two passes: unambiguous matches first refine the pose robustly, then all measurements are
+    decided on at the refined pose. If a wide prior explains at least three measurements that the particle's own
+    covariance does not, and these are most of those it explains, the particle is lost and the wide prior replaces its
+    covariance. `slam_backend.reference.fastslam2` is the same in plain Python, step by step.
 
     Args:
         robot: Poses before the motion, written: the new samples, and N(x^, P^) of each particle before sampling.
-        blind: Whether the robot has not been sampled at a sighting since N(x^, P^) was propagated.
+        propagated_only: Whether the robot has not been sampled at a sighting since N(x^, P^) was propagated.
         motion: Motion of the robot.
         bias: (2, 3, 3) covariance of the odometry bias and cross-covariance, see `step_robots`; changed.
         maps: Landmarks. B + 1 rows and B slots are free.
@@ -56,41 +56,41 @@ def update_fastslam2(
     """
     num, new_slots = len(frame.points), outcome.new_slots
     candidates, unique = find_candidates(frame, maps, rules.descriptor_gate)
-    for q in range(len(candidates.looks)):
-        candidates.looks[q] /= rules.descriptor_variance
+    for q in range(len(candidates.descriptor_costs)):
+        candidates.descriptor_costs[q] /= rules.descriptor_variance
     apply_resampling(unique, maps)
     match, mask = np.empty((num, LANES)), stack_array(LANES)
     space = Space(work, np.empty((len(candidates.slots), CANDIDATE_ROWS * LANES)), match, mask)
     new_slots[:] = REJECTED
     for block in range(robot.samples.shape[1] // LANES):
         first = block * LANES
-        predict(work, robot, motion, blind, first)
+        predict(work, robot, motion, propagated_only, first)
         if motion.biased and first == 0:
             set_bias_gain(work, motion, bias[0], bias[1])
         set_linearisation_point(work)
 
-        # Pass A: refine the pose with what is beyond doubt.
-        suspects = associate_initial(space, block, maps, frame, candidates, rules)
+        # First pass: refine the pose with unambiguous matches.
+        suspects = associate_unambiguous(space, block, maps, frame, candidates, rules)
         if suspects > 0 and rules.recovery[0] > 0.0:
             try_inflated_prior(space, block, maps, frame, candidates, rules)
             set_linearisation_point(work)
-            associate_initial(space, block, maps, frame, candidates, rules)
+            associate_unambiguous(space, block, maps, frame, candidates, rules)
         gauss_newton_step(work, False)
         iterate_inflated(space, block, maps, frame, candidates, rules.position_gate)
         set_linearisation_point(work)
 
-        # Pass B: decide at the refined pose.
-        associate_final(space, block, maps, frame, candidates, rules)
+        # Second pass: decide at the refined pose.
+        associate_all(space, block, maps, frame, candidates, rules)
         match[:, len(motion.normals) - first :] = NO_MATCH  # surplus lanes start no landmark
-        if frame.named:
+        if frame.identified:
             for b in range(num):
-                create_once(match, b, first, maps, candidates, frame.names)
+                create_once(match, b, first, maps, candidates, frame.identities)
 
         # The pose: N(x^, P^) from all matches; weigh by the predictive likelihood; sample once.
         take_draws(work, motion.normals, first)
         posterior(work, outcome.log_likelihood, first)
         store_rows(work, X0, robot.means, first)
-        store_rows(work, SPREAD00, robot.covariances, first)
+        store_rows(work, COV_XI00, robot.covariances, first)
         store_rows(work, X, robot.samples, first)
         if motion.biased:
             correct_bias(work, robot.biases, motion, first)

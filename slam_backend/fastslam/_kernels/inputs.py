@@ -57,7 +57,7 @@ def to_robot_axes(points: FloatArray, covariances: FloatArray | None, measuremen
 
 @in_place
 def read_team(
-    moves: FloatArray, points: FloatArray, looks: Float32Array, ends: IntArray, farthest_move: float,
+    moves: FloatArray, points: FloatArray, descriptors: Float32Array, ends: IntArray, farthest_move: float,
     farthest_point: float, largest_entry: float, table: IntArray, measurements: FloatArray,
 ) -> bool:  # fmt: skip
     """Write what N robots read that have all moved and looked, without covariances and names, if nothing is amiss.
@@ -65,7 +65,7 @@ def read_team(
     Args:
         moves: (N, 3) [m, m, rad] odometry.
         points: (n, 3) [m], camera frames, one robot's after the other's.
-        looks: (n, d) their descriptors.
+        descriptors: (n, d) their descriptors.
         ends: (N,) where the points of each end.
         farthest_move: [m, rad] limit to the odometry.
         farthest_point: [m] limit to coordinates.
@@ -97,7 +97,7 @@ def read_team(
     nearest, farthest = extent(points)
     fine = begin == len(points) and nearest >= MIN_DEPTH and farthest <= farthest_point
     largest = np.float32(largest_entry)
-    for i in range(len(looks)):
-        for j in range(looks.shape[1]):
-            fine &= abs(looks[i, j]) <= largest
+    for i in range(len(descriptors)):
+        for j in range(descriptors.shape[1]):
+            fine &= abs(descriptors[i, j]) <= largest
     return fine

@@ -1,4 +1,7 @@
-"""The landmarks' own EKFs at a known pose, for all lanes of a block (Eqs. 5-10; Algorithm 1, l. 30-37)."""
+"""The landmarks' own EKFs at a known pose, for all lanes of a block (Eqs. 5-10; Algorithm 1, l. 30-37).
+
+`tests/slam_backend/fastslam/test_filter_known_path.py` compares them with textbook EKFs.
+"""
 
 import numpy as np
 
@@ -10,6 +13,9 @@ from slam_backend.fastslam._kernels.layout import (
     COS,
     DEPTH,
     FREE_SLOTS,
+    INNOV0,
+    INNOV1,
+    INNOV2,
     LANES,
     MAP_OF,
     MIN_DEPTH,
@@ -21,9 +27,6 @@ from slam_backend.fastslam._kernels.layout import (
     N22,
     NEW_LANDMARK,
     Q_D,
-    R0,
-    R1,
-    R2,
     REJECTED,
     ROW_OF,
     SIN,
@@ -75,7 +78,7 @@ def _updated(
     p11, p12, p22 = tile[6 * LANES + i], tile[7 * LANES + i], tile[8 * LANES + i]
     n00, n01, n02 = work[N00 + i], work[N01 + i], work[N02 + i]
     n11, n12, n22 = work[N11 + i], work[N12 + i], work[N22 + i]
-    rx, ry, rz = work[R0 + i], work[R1 + i], work[R2 + i]
+    rx, ry, rz = work[INNOV0 + i], work[INNOV1 + i], work[INNOV2 + i]
     k00, k01, k02 = p00 * i00 + p01 * i01 + p02 * i02, p00 * i01 + p01 * i11 + p02 * i12, (
         p00 * i02 + p01 * i12 + p02 * i22
     )  # Eq. 8  # fmt: skip
@@ -166,7 +169,7 @@ def _gate_and_update(
     for i in range(LANES):
         s = _sum(work, tile, i)
         inverse, det = inverted_by_parts(s) if flat else inverted(s)
-        distance = quadratic_form(inverse, work[R0 + i], work[R1 + i], work[R2 + i])
+        distance = quadratic_form(inverse, work[INNOV0 + i], work[INNOV1 + i], work[INNOV2 + i])
         depth = work[DEPTH + i]
         admitted = chosen[i] == NEW_LANDMARK and seen[i] > 0 and work[TAKEN + i] == 0.0
         match = admitted and distance <= gate and depth >= MIN_DEPTH
@@ -233,9 +236,9 @@ def update_matched(
                 update(work, tile, young, 0.0)
                 innovate(work, tile, frame, b)
                 for i in range(LANES):  # the innovation at the new means is referred to those before
-                    work[R0 + i] += tile[i] - before[i]
-                    work[R1 + i] += tile[LANES + i] - before[LANES + i]
-                    work[R2 + i] += tile[2 * LANES + i] - before[2 * LANES + i]
+                    work[INNOV0 + i] += tile[i] - before[i]
+                    work[INNOV1 + i] += tile[LANES + i] - before[LANES + i]
+                    work[INNOV2 + i] += tile[2 * LANES + i] - before[2 * LANES + i]
                 for j in range(TILE):
                     tile[j] = before[j]
             update(work, tile, mask, walk)

@@ -21,25 +21,29 @@ X, Y, T, COS, SIN = (LANES * k for k in range(5))  # linearisation point of the 
 X0, Y0, T0 = (LANES * k for k in range(5, 8))  # predicted pose
 C00, C10, C11, C20, C21, C22 = (LANES * k for k in range(8, 14))  # factor C of its covariance; C01 is below
 XI0, XI1, XI2 = (LANES * k for k in range(14, 17))
-SPREAD00, SPREAD01, SPREAD02, SPREAD11, SPREAD12, SPREAD22 = (LANES * k for k in range(17, 23))  # covariance of xi
-R0, R1, R2 = (LANES * k for k in range(23, 26))  # innovation
+COV_XI00, COV_XI01, COV_XI02, COV_XI11, COV_XI12, COV_XI22 = (LANES * k for k in range(17, 23))  # covariance of xi
+INNOV0, INNOV1, INNOV2 = (LANES * k for k in range(23, 26))  # innovation
 N00, N01, N02, N11, N12, N22, DEPTH = (LANES * k for k in range(26, 33))  # sensor noise in map axes, predicted depth
-J00, J01, J02, J11, J12, J22, G0, G1, G2 = (LANES * k for k in range(33, 42))  # sums over matches
+INFO00, INFO01, INFO02, INFO11, INFO12, INFO22, GRAD0, GRAD1, GRAD2 = (
+    LANES * k for k in range(33, 42)
+)  # sums over matches
 SUM_D, MATCHED, DET, DET_EXP, DEPTHS, DEPTHS_EXP = (LANES * k for k in range(42, 48))  # factors of the likelihood
 CLUTTER = LANES * 48  # log-likelihood of the measurements that are not matched
-# Of one measurement: smallest and second smallest squared distance, matched candidate, whether another landmark is too
-# near to start one, and log-likelihood of the best candidate.
-BEST_D, SECOND_D, CHOSEN, NEAR, LOG_BEST = (LANES * k for k in range(49, 54))
+# Of one measurement: least and second least cost, matched candidate, whether a landmark in the dead zone forbids a new
+# one, and log-likelihood of the best candidate. Once the choice is made, the first two rows hold the least D of any
+# candidate now and in the evaluation before.
+BEST_COST, SECOND_COST, CHOSEN, DEAD_ZONE, LOG_BEST = (LANES * k for k in range(49, 54))
+LEAST_D, LEAST_FIRST_D = BEST_COST, SECOND_COST
 LOST, SURE, CONTRADICT, WIDE = (LANES * k for k in range(54, 58))
 TAKEN, C01 = LANES * 58, LANES * 59
 KEPT00, KEPT10, KEPT11, KEPT20, KEPT21, KEPT22, KEPT01, KEPT_WIDE = (LANES * k for k in range(60, 68))  # of C
 DRAW0, DRAW1, DRAW2 = (LANES * k for k in range(68, 71))  # standard normal
 BIAS0, BIAS1, BIAS2 = (LANES * k for k in range(71, 74))  # odometry bias
-BEFORE0, BEFORE1, BEFORE2 = (LANES * k for k in range(74, 77))  # predicted pose, while X0 .. T0 hold the posterior mean
-WORK_SIZE, SPREAD_SIZE = LANES * 77, LANES * 6
+PREDICTED0, PREDICTED1, PREDICTED2 = (LANES * k for k in range(74, 77))  # predicted pose, while X0 .. T0 hold the posterior mean
+WORK_SIZE, COV_XI_SIZE = LANES * 77, LANES * 6
 
 # Rows of the record of one candidate.
-QJ00, QJ01, QJ02, QJ11, QJ12, QJ22, QG0, QG1, QG2 = (LANES * k for k in range(9))
+Q_INFO00, Q_INFO01, Q_INFO02, Q_INFO11, Q_INFO12, Q_INFO22, Q_GRAD0, Q_GRAD1, Q_GRAD2 = (LANES * k for k in range(9))
 Q_SQUARE, Q_DET, Q_DET_POSE, Q_DEPTH, Q_METRES2, Q_D, Q_FIRST_D, Q_HELD = (LANES * k for k in range(9, 17))
 CANDIDATE_ROWS = 17
 

@@ -145,7 +145,7 @@ def register_new(new_slots: IntArray, frame: Frame, maps: MapArrays) -> None:
             continue
         ids[slot] = maps.tops[2]
         maps.tops[2] += 1
-        identities[slot] = frame.names[b] if frame.named else -1
+        identities[slot] = frame.identities[b] if frame.identified else -1
         size = frame.descriptors.shape[1]
         for j in range(size):
             maps.descriptors[slot, j] = frame.descriptors[b, j]

@@ -15,11 +15,20 @@ from slam_backend.fastslam._kernels.layout import (
     C22,
     CLUTTER,
     COS,
+    COV_XI00,
+    COV_XI01,
+    COV_XI02,
+    COV_XI11,
+    COV_XI12,
+    COV_XI22,
     DEPTH,
     DEPTHS,
     DEPTHS_EXP,
     DET,
     DET_EXP,
+    INNOV0,
+    INNOV1,
+    INNOV2,
     LANES,
     LOG_2PI,
     MATCHED,
@@ -34,28 +43,19 @@ from slam_backend.fastslam._kernels.layout import (
     Q_DEPTH,
     Q_DET,
     Q_DET_POSE,
+    Q_GRAD0,
+    Q_GRAD1,
+    Q_GRAD2,
     Q_HELD,
+    Q_INFO00,
+    Q_INFO01,
+    Q_INFO02,
+    Q_INFO11,
+    Q_INFO12,
+    Q_INFO22,
     Q_METRES2,
     Q_SQUARE,
-    QG0,
-    QG1,
-    QG2,
-    QJ00,
-    QJ01,
-    QJ02,
-    QJ11,
-    QJ12,
-    QJ22,
-    R0,
-    R1,
-    R2,
     SIN,
-    SPREAD00,
-    SPREAD01,
-    SPREAD02,
-    SPREAD11,
-    SPREAD12,
-    SPREAD22,
     SUM_D,
     X,
     Y,
@@ -88,9 +88,9 @@ def innovate(work: FloatArray, tile: FloatArray, frame: Frame, n: int) -> None:
     for i in range(LANES):
         c, s = work[COS + i], work[SIN + i]
         if given:
-            work[R0 + i] = c * (v0 + m0) - s * (v1 + m1) + work[X + i] - tile[i]
-            work[R1 + i] = s * (v0 + m0) + c * (v1 + m1) + work[Y + i] - tile[LANES + i]
-            work[R2 + i] = v2 + m2 - tile[2 * LANES + i]
+            work[INNOV0 + i] = c * (v0 + m0) - s * (v1 + m1) + work[X + i] - tile[i]
+            work[INNOV1 + i] = s * (v0 + m0) + c * (v1 + m1) + work[Y + i] - tile[LANES + i]
+            work[INNOV2 + i] = v2 + m2 - tile[2 * LANES + i]
             work[N00 + i] = c * c * a - 2.0 * c * s * b + s * s * e
             work[N01 + i] = c * s * (a - e) + (c * c - s * s) * b
             work[N02 + i] = c * d - s * f
@@ -104,9 +104,9 @@ def innovate(work: FloatArray, tile: FloatArray, frame: Frame, n: int) -> None:
             ez = tile[2 * LANES + i] - m2
             depth = c * ex + s * ey
             k = depth * per_depth
-            work[R0 + i] = k * (c * v0 - s * v1 - ex)
-            work[R1 + i] = k * (s * v0 + c * v1 - ey)
-            work[R2 + i] = k * (v2 - ez)
+            work[INNOV0 + i] = k * (c * v0 - s * v1 - ex)
+            work[INNOV1 + i] = k * (s * v0 + c * v1 - ey)
+            work[INNOV2 + i] = k * (v2 - ez)
             across, along = pixel * depth * depth, disparity * depth * depth
             work[N00 + i] = across * s * s + along * ex * ex
             work[N01 + i] = along * ex * ey - across * c * s
@@ -131,13 +131,13 @@ def match_terms(
         work: Rows of the block.
         tile: Values of the landmark there.
         i: The lane.
-        refined: Whether the covariance P of xi is that of the rows SPREAD00 ..; else it is the identity.
+        refined: Whether the covariance P of xi is that of the rows COV_XI00 ..; else it is the identity.
 
     Returns:
         J and g, r^T S^-1 r, |S|, |S + A P A^T|, the predicted depth, r^T r, and the squared distance of the gate,
         infinite behind the camera.
     """
-    rx, ry, rz = work[R0 + i], work[R1 + i], work[R2 + i]
+    rx, ry, rz = work[INNOV0 + i], work[INNOV1 + i], work[INNOV2 + i]
     depth = work[DEPTH + i]
     s00, s01 = tile[3 * LANES + i] + work[N00 + i], tile[4 * LANES + i] + work[N01 + i]
     s02, s11 = tile[5 * LANES + i] + work[N02 + i], tile[6 * LANES + i] + work[N11 + i]
@@ -157,8 +157,8 @@ def match_terms(
     u0, u1, u2 = i00 * a0 + i01 * b0, i00 * a1 + i01 * b1, i00 * a2 + i01 * b2
     w0, w1, w2 = i01 * a0 + i11 * b0, i01 * a1 + i11 * b1, i01 * a2 + i11 * b2
     if refined:
-        q00, q01, q02 = work[SPREAD00 + i], work[SPREAD01 + i], work[SPREAD02 + i]
-        q11, q12, q22 = work[SPREAD11 + i], work[SPREAD12 + i], work[SPREAD22 + i]
+        q00, q01, q02 = work[COV_XI00 + i], work[COV_XI01 + i], work[COV_XI02 + i]
+        q11, q12, q22 = work[COV_XI11 + i], work[COV_XI12 + i], work[COV_XI22 + i]
         e0, e1, e2 = q00 * a0 + q01 * a1 + q02 * a2, q01 * a0 + q11 * a1 + q12 * a2, q02 * a0 + q12 * a1 + q22 * a2
         f0, f1, f2 = q00 * b0 + q01 * b1 + q02 * b2, q01 * b0 + q11 * b1 + q12 * b2, q02 * b0 + q12 * b1 + q22 * b2
     else:
@@ -182,9 +182,9 @@ def evaluate(work: FloatArray, tile: FloatArray, record: FloatArray, seen: Int32
     """Write the record of a candidate: the terms of a match, see `match_terms`, and whether the lanes hold it."""
     for i in range(LANES):
         terms, square, det, det_pose, depth, metres2, distance = match_terms(work, tile, i, refined)
-        record[QJ00 + i], record[QJ01 + i], record[QJ02 + i] = terms[0], terms[1], terms[2]
-        record[QJ11 + i], record[QJ12 + i], record[QJ22 + i] = terms[3], terms[4], terms[5]
-        record[QG0 + i], record[QG1 + i], record[QG2 + i] = terms[6], terms[7], terms[8]
+        record[Q_INFO00 + i], record[Q_INFO01 + i], record[Q_INFO02 + i] = terms[0], terms[1], terms[2]
+        record[Q_INFO11 + i], record[Q_INFO12 + i], record[Q_INFO22 + i] = terms[3], terms[4], terms[5]
+        record[Q_GRAD0 + i], record[Q_GRAD1 + i], record[Q_GRAD2 + i] = terms[6], terms[7], terms[8]
         record[Q_SQUARE + i] = square
         record[Q_DET + i] = det
         record[Q_DET_POSE + i] = det_pose

@@ -95,7 +95,7 @@ def advance(work: FloatArray, i: int, dx: float, dy: float, turn: float, v0: flo
 
 @device
 @simd
-def predict(work: FloatArray, robot: Poses, motion: Motion, blind: bool, first: int) -> None:
+def predict(work: FloatArray, robot: Poses, motion: Motion, propagated_only: bool, first: int) -> None:
     """Predict the poses of a block, of particles from `first` on, and write a factor C of their covariance P0 (Eq. 4).
 
     C = T L with L the lower Cholesky factor of T^T P0 T, where T is the turn by the predicted heading: factorised in
@@ -104,12 +104,12 @@ def predict(work: FloatArray, robot: Poses, motion: Motion, blind: bool, first: 
 
     Args:
         work: Rows of the block.
-        robot: Poses before the motion: N(x^, P^) if `blind`, else the samples, exact.
+        robot: Poses before the motion: N(x^, P^) if `propagated_only`, else the samples, exact.
         motion: Odometry, its standard deviations and its bias.
-        blind: Whether the robot has not been sampled at a sighting since N(x^, P^) was propagated.
+        propagated_only: Whether the robot has not been sampled at a sighting since N(x^, P^) was propagated.
         first: First particle of the block.
     """
-    if blind:
+    if propagated_only:
         load_rows(work, X0, robot.means, first)
         load_rows(work, N00, robot.covariances, first)
     else:
@@ -206,18 +206,18 @@ def set_exact(robot: Poses) -> None:
 
 @device
 @simd
-def propagate(robot: Poses, motion: Motion, blind: bool, work: FloatArray) -> None:
+def propagate(robot: Poses, motion: Motion, propagated_only: bool, work: FloatArray) -> None:
     """Move a robot that sees nothing: each particle's N(x^, P^) is propagated, and its sample moves by itself.
 
     Args:
-        robot: Poses, written; N(x^, P^) is read if `blind`, else particles start from their samples.
+        robot: Poses, written; N(x^, P^) is read if `propagated_only`, else particles start from their samples.
         motion: Motion of the robot.
-        blind: See `predict`.
+        propagated_only: See `predict`.
         work: Working space.
     """
     for block in range(robot.samples.shape[1] // LANES):
         first = block * LANES
-        predict(work, robot, motion, blind, first)
+        predict(work, robot, motion, propagated_only, first)
         for i in range(LANES):  # the covariance is turned from the robot's axes to the map's: T P T^T
             c, s = work[COS + i], work[SIN + i]
             r00, r01, r02 = work[N00 + i], work[N01 + i], work[N02 + i]

@@ -12,9 +12,9 @@ from slam_backend.core.jit import device, in_place, simd, stack_array
 from slam_backend.core.simd_math import sine_cosine, wrapped
 from slam_backend.core.validation import FloatArray
 from slam_backend.fastslam._kernels.layout import (
-    BEFORE0,
-    BEFORE1,
-    BEFORE2,
+    PREDICTED0,
+    PREDICTED1,
+    PREDICTED2,
     BIAS0,
     BIAS1,
     BIAS2,
@@ -110,7 +110,7 @@ def add_bias_spread(work: FloatArray, motion: Motion) -> None:
         work[N11 + i] += e3
         work[N12 + i] += e4
         work[N22 + i] += e5
-        work[BEFORE0 + i], work[BEFORE1 + i], work[BEFORE2 + i] = work[X0 + i], work[Y0 + i], work[T0 + i]
+        work[PREDICTED0 + i], work[PREDICTED1 + i], work[PREDICTED2 + i] = work[X0 + i], work[Y0 + i], work[T0 + i]
 
 
 @device
@@ -154,9 +154,9 @@ def correct_bias(work: FloatArray, biases: FloatArray, motion: Motion, first: in
     g, w = motion.gain, motion.information
     w0, w1, w2, w3, w4, w5 = w[0], w[1], w[2], w[3], w[4], w[5]
     for i in range(LANES):
-        s, c = sine_cosine(work[BEFORE2 + i])
-        dx, dy = work[X + i] - work[BEFORE0 + i], work[Y + i] - work[BEFORE1 + i]
-        d0, d1, d2 = c * dx + s * dy, c * dy - s * dx, wrapped(work[T + i] - work[BEFORE2 + i])
+        s, c = sine_cosine(work[PREDICTED2 + i])
+        dx, dy = work[X + i] - work[PREDICTED0 + i], work[Y + i] - work[PREDICTED1 + i]
+        d0, d1, d2 = c * dx + s * dy, c * dy - s * dx, wrapped(work[T + i] - work[PREDICTED2 + i])
         square = d0 * (w0 * d0 + 2.0 * (w1 * d1 + w2 * d2)) + d1 * (w3 * d1 + 2.0 * w4 * d2) + w5 * d2 * d2
         on = square <= LARGEST_INNOVATION
         work[BIAS0 + i] = d0 if on else 0.0

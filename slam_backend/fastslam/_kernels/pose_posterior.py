@@ -14,36 +14,36 @@ from slam_backend.fastslam._kernels.layout import (
     C21,
     C22,
     COS,
+    COV_XI00,
+    COV_XI01,
+    COV_XI02,
+    COV_XI11,
+    COV_XI12,
+    COV_XI22,
     DRAW0,
     DRAW1,
     DRAW2,
-    G0,
-    G1,
-    G2,
-    J00,
-    J01,
-    J02,
-    J11,
-    J12,
-    J22,
+    GRAD0,
+    GRAD1,
+    GRAD2,
+    INFO00,
+    INFO01,
+    INFO02,
+    INFO11,
+    INFO12,
+    INFO22,
     LANES,
     Q_D,
-    QG0,
-    QG1,
-    QG2,
-    QJ00,
-    QJ01,
-    QJ02,
-    QJ11,
-    QJ12,
-    QJ22,
+    Q_GRAD0,
+    Q_GRAD1,
+    Q_GRAD2,
+    Q_INFO00,
+    Q_INFO01,
+    Q_INFO02,
+    Q_INFO11,
+    Q_INFO12,
+    Q_INFO22,
     SIN,
-    SPREAD00,
-    SPREAD01,
-    SPREAD02,
-    SPREAD11,
-    SPREAD12,
-    SPREAD22,
     T0,
     WIDE,
     X0,
@@ -70,29 +70,29 @@ def set_linearisation_point(work: FloatArray) -> None:
         work[T + i] = theta
         work[SIN + i], work[COS + i] = sine_cosine(theta)
     for i in range(LANES):
-        work[J00 + i] = 1.0
-        work[J01 + i] = 0.0
-        work[J02 + i] = 0.0
-        work[J11 + i] = 1.0
-        work[J12 + i] = 0.0
-        work[J22 + i] = 1.0
-        work[G0 + i] = work[XI0 + i]
-        work[G1 + i] = work[XI1 + i]
-        work[G2 + i] = work[XI2 + i]
+        work[INFO00 + i] = 1.0
+        work[INFO01 + i] = 0.0
+        work[INFO02 + i] = 0.0
+        work[INFO11 + i] = 1.0
+        work[INFO12 + i] = 0.0
+        work[INFO22 + i] = 1.0
+        work[GRAD0 + i] = work[XI0 + i]
+        work[GRAD1 + i] = work[XI1 + i]
+        work[GRAD2 + i] = work[XI2 + i]
 
 
 @simd_inline
 def add_terms(work: FloatArray, i: int, on: bool, w: float, terms: Terms) -> None:
     """Where `on`, add a match's share of the Gauss-Newton system, times w; elsewhere it may be NaN."""
-    work[J00 + i] += w * terms[0] if on else 0.0
-    work[J01 + i] += w * terms[1] if on else 0.0
-    work[J02 + i] += w * terms[2] if on else 0.0
-    work[J11 + i] += w * terms[3] if on else 0.0
-    work[J12 + i] += w * terms[4] if on else 0.0
-    work[J22 + i] += w * terms[5] if on else 0.0
-    work[G0 + i] += w * terms[6] if on else 0.0
-    work[G1 + i] += w * terms[7] if on else 0.0
-    work[G2 + i] += w * terms[8] if on else 0.0
+    work[INFO00 + i] += w * terms[0] if on else 0.0
+    work[INFO01 + i] += w * terms[1] if on else 0.0
+    work[INFO02 + i] += w * terms[2] if on else 0.0
+    work[INFO11 + i] += w * terms[3] if on else 0.0
+    work[INFO12 + i] += w * terms[4] if on else 0.0
+    work[INFO22 + i] += w * terms[5] if on else 0.0
+    work[GRAD0 + i] += w * terms[6] if on else 0.0
+    work[GRAD1 + i] += w * terms[7] if on else 0.0
+    work[GRAD2 + i] += w * terms[8] if on else 0.0
 
 
 @device
@@ -110,8 +110,9 @@ def sum_matches(work: FloatArray, record: FloatArray, chosen: FloatArray, q: flo
     if count > 0:
         for i in range(LANES):
             terms = (
-                record[QJ00 + i], record[QJ01 + i], record[QJ02 + i], record[QJ11 + i], record[QJ12 + i],
-                record[QJ22 + i], record[QG0 + i], record[QG1 + i], record[QG2 + i],
+                record[Q_INFO00 + i], record[Q_INFO01 + i], record[Q_INFO02 + i], record[Q_INFO11 + i],
+                record[Q_INFO12 + i], record[Q_INFO22 + i],
+                record[Q_GRAD0 + i], record[Q_GRAD1 + i], record[Q_GRAD2 + i],
             )  # fmt: skip
             add_terms(work, i, weights[i] > 0.0, weights[i], terms)
     return count
@@ -124,27 +125,27 @@ def gauss_newton_step(work: FloatArray, only_wide: bool) -> None:
     for i in range(LANES):
         go = work[WIDE + i] > 0.0 or not only_wide
         inverse, _ = inverted(
-            (work[J00 + i], work[J01 + i], work[J02 + i], work[J11 + i], work[J12 + i], work[J22 + i])
+            (work[INFO00 + i], work[INFO01 + i], work[INFO02 + i], work[INFO11 + i], work[INFO12 + i], work[INFO22 + i])
         )
         i00, i01, i02, i11, i12, i22 = inverse
-        g0, g1, g2 = work[G0 + i], work[G1 + i], work[G2 + i]
+        g0, g1, g2 = work[GRAD0 + i], work[GRAD1 + i], work[GRAD2 + i]
         work[XI0 + i] -= i00 * g0 + i01 * g1 + i02 * g2 if go else 0.0
         work[XI1 + i] -= i01 * g0 + i11 * g1 + i12 * g2 if go else 0.0
         work[XI2 + i] -= i02 * g0 + i12 * g1 + i22 * g2 if go else 0.0
-        work[SPREAD00 + i] = i00 if go else work[SPREAD00 + i]
-        work[SPREAD01 + i] = i01 if go else work[SPREAD01 + i]
-        work[SPREAD02 + i] = i02 if go else work[SPREAD02 + i]
-        work[SPREAD11 + i] = i11 if go else work[SPREAD11 + i]
-        work[SPREAD12 + i] = i12 if go else work[SPREAD12 + i]
-        work[SPREAD22 + i] = i22 if go else work[SPREAD22 + i]
+        work[COV_XI00 + i] = i00 if go else work[COV_XI00 + i]
+        work[COV_XI01 + i] = i01 if go else work[COV_XI01 + i]
+        work[COV_XI02 + i] = i02 if go else work[COV_XI02 + i]
+        work[COV_XI11 + i] = i11 if go else work[COV_XI11 + i]
+        work[COV_XI12 + i] = i12 if go else work[COV_XI12 + i]
+        work[COV_XI22 + i] = i22 if go else work[COV_XI22 + i]
 
 
 @device
 @simd
 def posterior(work: FloatArray, log_likelihood: FloatArray, first: int) -> None:
-    """Weigh by the predictive likelihood and sample the pose, from the sums of pass B (Laplace's formula).
+    """Weigh by the predictive likelihood and sample the pose, from the sums of the second pass (Laplace's formula).
 
-    Rows DRAW0 .. DRAW2 hold what is drawn. Rows X0 .. T0 then hold the mean x^, SPREAD00 .. SPREAD22 the covariance
+    Rows DRAW0 .. DRAW2 hold what is drawn. Rows X0 .. T0 then hold the mean x^, COV_XI00 .. COV_XI22 the covariance
     P^, X .. SIN the sample, theta wrapped.
 
     Args:
@@ -155,10 +156,10 @@ def posterior(work: FloatArray, log_likelihood: FloatArray, first: int) -> None:
     own = log_likelihood[first : first + LANES]
     for i in range(LANES):
         inverse, det = inverted(
-            (work[J00 + i], work[J01 + i], work[J02 + i], work[J11 + i], work[J12 + i], work[J22 + i])
+            (work[INFO00 + i], work[INFO01 + i], work[INFO02 + i], work[INFO11 + i], work[INFO12 + i], work[INFO22 + i])
         )
         i00, i01, i02, i11, i12, i22 = inverse
-        g0, g1, g2 = work[G0 + i], work[G1 + i], work[G2 + i]
+        g0, g1, g2 = work[GRAD0 + i], work[GRAD1 + i], work[GRAD2 + i]
         xi0, xi1, xi2 = work[XI0 + i], work[XI1 + i], work[XI2 + i]
         gain = quadratic_form(inverse, g0, g1, g2)
         own[i] += total_log_likelihood(work, i) - 0.5 * (xi0 * xi0 + xi1 * xi1 + xi2 * xi2 - gain + log_of(det))
@@ -177,12 +178,12 @@ def posterior(work: FloatArray, log_likelihood: FloatArray, first: int) -> None:
         h20, h21, h22 = (
             c20 * i00 + c21 * i01 + c22 * i02, c20 * i01 + c21 * i11 + c22 * i12, c20 * i02 + c21 * i12 + c22 * i22
         )  # fmt: skip
-        work[SPREAD00 + i] = h00 * c00 + h01 * c01
-        work[SPREAD01 + i] = h10 * c00 + h11 * c01
-        work[SPREAD02 + i] = h20 * c00 + h21 * c01
-        work[SPREAD11 + i] = h10 * c10 + h11 * c11
-        work[SPREAD12 + i] = h20 * c10 + h21 * c11
-        work[SPREAD22 + i] = h20 * c20 + h21 * c21 + h22 * c22
+        work[COV_XI00 + i] = h00 * c00 + h01 * c01
+        work[COV_XI01 + i] = h10 * c00 + h11 * c01
+        work[COV_XI02 + i] = h20 * c00 + h21 * c01
+        work[COV_XI11 + i] = h10 * c10 + h11 * c11
+        work[COV_XI12 + i] = h20 * c10 + h21 * c11
+        work[COV_XI22 + i] = h20 * c20 + h21 * c21 + h22 * c22
         n0, n1, n2 = work[DRAW0 + i], work[DRAW1 + i], work[DRAW2 + i]
         l00 = math.sqrt(i00)
         l10, l20 = i01 / l00, i02 / l00

@@ -22,7 +22,7 @@ class MapArrays(NamedTuple):
         maps: (maps, P). Ancestor maps; map 0 stands for the identity.
         users: (maps,). Number of slots read by each map.
         free_rows: (rows,). Stack of free rows.
-        tops: (3,). Heights of the stacks of free rows and of free slots, and the name of the next landmark.
+        tops: (3,). Heights of the stacks of free rows and of free slots, and the id of the next landmark.
         descriptors: (slots, d).
         heads: (h, slots). Every (d / h)-th component of the descriptors, `FAR` where the slot is free.
     """
@@ -45,8 +45,8 @@ class SlotRows(NamedTuple):
     Attributes:
         row_of: Row of each slot in the storage.
         map_of: Ancestor map by which it is to be read.
-        ids: Stable name of the landmark, -1 = free slot.
-        identities: The caller's own name, -1 = none.
+        ids: Stable id of the landmark, -1 = free slot.
+        identities: The caller's identity of the landmark, -1 = none.
         last_seen: Step of the smoother in which the most probable particle last matched the landmark, 0 = never.
         free_slots: Stack of free slots.
     """
@@ -147,8 +147,8 @@ class Frame(NamedTuple):
         given: Whether the covariances come with the measurements.
         camera: (7,) focal length, baseline, sigma of image coordinates, sigma of the disparity [px], mount (3) [m].
         descriptors: (B, d).
-        names: (B,) the caller's names of the landmarks measured, if `named`; gates then play no part.
-        named: Whether names decide instead of descriptors.
+        identities: (B,) the caller's identities of the landmarks measured, if `identified`; gates then play no part.
+        identified: Whether identities decide instead of descriptors.
     """
 
     points: FloatArray
@@ -156,8 +156,8 @@ class Frame(NamedTuple):
     given: bool
     camera: FloatArray
     descriptors: Float32Array
-    names: IntArray
-    named: bool
+    identities: IntArray
+    identified: bool
 
 
 class Rules(NamedTuple):
@@ -167,12 +167,12 @@ class Rules(NamedTuple):
         descriptor_gate: Largest admitted squared distance E0 of descriptors.
         descriptor_variance: Divisor of squared distances between descriptors that are weighed against D.
         position_gate: D0.
-        new_landmark_gate: Largest D at which a measurement that is not matched is not new either.
-        new_landmark_radius: Distance [m] from a landmark of the same looks up to which a measurement is not new.
-        ambiguity: Cost within which a runner-up makes a measurement ambiguous: it is held back.
-        recovery: (3,) standard deviations [m, m, rad] of the pose where most matches contradict it; zeros: never.
+        new_landmark_gate: Upper end of the dead zone, the largest D at which an unmatched measurement is not new.
+        new_landmark_radius: Distance [m] from a landmark of similar descriptor up to which a measurement is not new.
+        ambiguity: Cost within which a runner-up makes a measurement ambiguous: it is rejected.
+        recovery: (3,) prior sigmas [m, m, rad] of the pose of a lost particle, see `FilterOptions`; zeros: no recovery.
         log_p0: Log-density of a measurement that starts a new landmark.
-        walk: Variance [m^2] along each axis by which a landmark may have moved between two sightings.
+        walk: Variance [m^2] along each axis by which a landmark may have moved between two measurements.
         one_to_one: Whether a landmark is matched at most once in a frame.
     """
 
@@ -194,14 +194,14 @@ class Candidates(NamedTuple):
     Attributes:
         starts: (B + 1,) where the candidates of each measurement begin among all C.
         slots: (C,) slots of the landmarks.
-        looks: (C,) squared distances E of the descriptors.
+        descriptor_costs: (C,) squared distances E of descriptors [-], which `fastslam2` divides by their variance.
         owners: (C,) measurements.
         same: (C,) previous candidate of the same slot, -1 if there is none.
     """
 
     starts: IntArray
     slots: IntArray
-    looks: FloatArray
+    descriptor_costs: FloatArray
     owners: IntArray
     same: IntArray
 

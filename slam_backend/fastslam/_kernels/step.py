@@ -104,7 +104,7 @@ def write_sigmas(noise: FloatArray, move: FloatArray, sigmas: FloatArray) -> Non
 def step_robots(
     low: int, high: int, is_over: bool, now: int, assumed: FloatArray,
     rows: IntArray, inputs_table: IntArray, moves: FloatArray, normals: FloatArray,
-    robots: FloatArray, biases: FloatArray, blind: IntArray, weights: FloatArray, gauge: FloatArray,
+    robots: FloatArray, biases: FloatArray, propagated_only: IntArray, weights: FloatArray, gauge: FloatArray,
     values: FloatArray, counts: Int32Array, odds: FloatArray, table: IntArray, ancestors: Int32Array, users: IntArray,
     free_rows: IntArray, tops: IntArray, stored: Float32Array, heads: Float32Array,
     measurements: FloatArray, descriptors: Float32Array, names: IntArray,
@@ -119,7 +119,7 @@ def step_robots(
     Args:
         low, high: Range of the robots to process; the step begins with the first robot.
         is_over: Whether these are the last robots, and the step is concluded.
-        now: Number of the step, above 0 if anyone asks when landmarks were seen last.
+        now: Number of the step; 0 if there is no smoother, which alone needs when landmarks were last seen.
         assumed: (30,) noise of the odometry, camera, and the rest, see `layout`.
         rows: (K,) row of each robot in `inputs_table`; -1: it did nothing at all.
         inputs_table: (N, 6) int64, see `layout`: kind of motion, first and last row of the measurements among all n,
@@ -129,7 +129,7 @@ def step_robots(
         robots: (6, K, 3, P) samples, starts, N(x^, P^) before sampling, and means of the odometry bias.
         biases: (2, K, 3, 3) covariance of each robot's bias given its path; and, where N(x^, P^) was propagated, that
             of its pose (rows, robot axes) and bias.
-        blind: (K,) 1 where that was propagated since the last sighting, else 0.
+        propagated_only: (K,) 1 where that was propagated since the last sighting, else 0.
         weights: (4, P), see `layout`, read and written up to M.
         gauge: (3, 3) covariance of a motion of the whole map that particles do not show, or zeros.
         values, ..., heads: Landmarks, see `MapArrays`. n + 1 rows and n slots are free.
@@ -193,8 +193,8 @@ def step_robots(
             assumed[IS_ONE_TO_ONE] > 0.0,
         )  # fmt: skip
         outcome = Outcome(found[a:b], distances[a:b], associations[CREATED, a:b], weights[LOG_LIKELIHOOD])
-        was_blind = blind[robot] > 0 and not placed
-        if not was_blind:
+        was_propagated_only = propagated_only[robot] > 0 and not placed
+        if not was_propagated_only:
             biases[1, robot] = 0.0
         if motion.biased:
             prepare_bias(motion, biases[0, robot], biases[1, robot])
@@ -205,15 +205,15 @@ def step_robots(
             update_fastslam1(own, not placed, motion, maps, frame, rules, work, outcome)
             register_new(outcome.new_slots, frame, maps)
         elif b > a:
-            update_fastslam2(own, was_blind, motion, biases[:, robot], maps, frame, rules, work, outcome)
+            update_fastslam2(own, was_propagated_only, motion, biases[:, robot], maps, frame, rules, work, outcome)
             register_new(outcome.new_slots, frame, maps)
-            was_blind = False
+            was_propagated_only = False
         elif placed:
             set_exact(own)
         else:
-            propagate(own, motion, was_blind, work)
-            was_blind = True
-        blind[robot] = was_blind
+            propagate(own, motion, was_propagated_only, work)
+            was_propagated_only = True
+        propagated_only[robot] = was_propagated_only
     if not is_over:
         return 0, 0, 0, 0, 0, 0, 0.0, 0.0, False
     own_weights, path_log_weights = weights[WEIGHTS][:num_particles], weights[PATH_LOG_WEIGHTS][:num_particles]
@@ -229,5 +229,5 @@ def step_robots(
     )
     log_step(rows, inputs_table, moves, measurements, associations, mean, noted, measured, num_measured)
     least = assumed[RESAMPLE_THRESHOLD] * num_particles * (1.0 + 1e-9)  # rounding must not decide
-    is_depleted = used > 0 and ess <= least
-    return best, long_unseen, created, new, matched, rejected, ess, nis, is_depleted
+    needs_resampling = used > 0 and ess <= least
+    return best, long_unseen, created, new, matched, rejected, ess, nis, needs_resampling

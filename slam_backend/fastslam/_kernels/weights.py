@@ -11,6 +11,7 @@ from slam_backend.fastslam._kernels.layout import (
     ASSOCIATED,
     BEGIN,
     COUNT,
+    COV_XI_SIZE,
     COVARIANCES,
     CREATED,
     END,
@@ -22,7 +23,6 @@ from slam_backend.fastslam._kernels.layout import (
     MEANS,
     PATH_LOG_WEIGHTS,
     REJECTED,
-    SPREAD_SIZE,
     STARTS,
     WEIGHTS,
 )
@@ -80,7 +80,7 @@ def mixture(
         covariances: (6, P), upper triangles.
         weights: (M,), summing to 1.
     """
-    w, sums, share = stack_array(LANES), stack_array(6), stack_array(SPREAD_SIZE)
+    w, sums, share = stack_array(LANES), stack_array(6), stack_array(COV_XI_SIZE)
     share[:] = 0.0
     for first in range(0, len(weights), LANES):
         for i in range(LANES):  # zeros for surplus lanes
@@ -161,7 +161,7 @@ def summarise(
     Returns:
         The number of landmarks not seen for long that the most probable particle matched; the number of measurements
         that started a landmark in any particle; the numbers of those that the most probable particle started, matched,
-        and made nothing of, unused ones included; and the mean of its squared distances, without what it predicted
+        and rejected, unused ones included; and the mean of its squared distances, without what it predicted
         behind the camera, NaN if there is none.
     """
     associated, created, ids, last_seen = associations[ASSOCIATED], associations[CREATED], table[IDS], table[LAST_SEEN]

@@ -1,4 +1,8 @@
-"""How far motions between keys scatter: blocks of the inverse, from the factor, without the whole of it."""
+"""Marginal variances of the relative poses of neighbouring keyframes.
+
+They need selected blocks of the inverse of the information matrix, which follow from its sparse Cholesky factor without
+the whole inverse (Takahashi, Fagan, Chin 1973).
+"""
 
 import math
 

@@ -79,7 +79,7 @@ def assert_same_report(found: StepReport, plain: WatchedPlainFastSlam) -> None:
 
 
 def assert_same_particles(slam: FastSlam, plain: ReferenceFastSlam) -> None:
-    """Compare each landmark of each particle: which decided alike if and only if they hold the same."""
+    """Compare each landmark of each particle; particles that hold the same landmarks made the same decisions."""
     ids, means, covariances, counts = dense(slam)
     expected_counts = np.zeros_like(counts)
     expected_means, expected_covariances = np.zeros_like(means), np.zeros_like(covariances)
@@ -136,7 +136,7 @@ def both(num_robots: int, seed: int, starts: Any = None, **choices: Any) -> tupl
 
 @pytest.fixture
 def happened(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
-    """Count what the plain filter goes through, of what its answers do not show."""
+    """Count events inside the plain filter that its reports do not show."""
     counts: Counter[str] = Counter()
     is_lost, refine, update_existence = fastslam2.is_lost, fastslam2.refine, plain_filter.update_existence
 

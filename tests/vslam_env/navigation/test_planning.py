@@ -86,7 +86,7 @@ def test_the_wavefront_agrees_with_scipys_dijkstra(inner: np.ndarray, data: st.D
 
 @given(arrays(np.uint8, (11, 17), elements=st.sampled_from([FREE] * 7 + [UNKNOWN, OCCUPIED])), st.floats(0.6, 3.2))
 def test_weights_follow_the_distance_from_walls(box: np.ndarray, reach: float) -> None:
-    """A cell is closed below the reach of a wall, dear within one cell more, less dear within two or at the unknown."""
+    """A cell is closed within reach of a wall, expensive within one more cell, less so within two or at the unknown."""
     distance = distance_transform_edt(box != OCCUPIED) if (box == OCCUPIED).any() else np.full(box.shape, np.inf)
     weights = inflate_costs(box, reach)[1:-1, 1:-1]
     inner = (slice(1, -1), slice(1, -1))
