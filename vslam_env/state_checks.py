@@ -30,7 +30,8 @@ SLOT_COLUMNS = 5
 AROUND = 1.0  # [m] tolerated distance of a robot outside the bounds of the walls
 STREAMS = ("odometry", "sensor", "scan", "radio")
 EPISODE = (
-    "setting", "tick", "simulator", "streams", "belief", "ledger", "coverage", "credits", "counts", "last", "paths",
+    "scenario", "tick", "simulator", "streams", "belief", "ground_truth", "coverage", "credits", "counts", "last",
+    "paths",
 )  # fmt: skip
 
 
@@ -59,7 +60,7 @@ class EpisodeCheck:
         """
         own, count = self._own, self._count
         check.keys(name, state, EPISODE)
-        scenario = state["setting"]
+        scenario = state["scenario"]
         if own is not None and scenario is own.given_scenario:
             scenario = own.scenario
         elif own is None or scenario is not own.scenario:
@@ -75,7 +76,7 @@ class EpisodeCheck:
         check.array(f"{name}['simulator']['bumped']", state["simulator"]["bumped"], check.BOOL, (count,))
         check_streams(f"{name}['streams']", state["streams"])
         self._check_belief(f"{name}['belief']", state["belief"], scenario)
-        self._check_ground_truth(f"{name}['ledger']", state["ledger"], scenario, state["belief"]["team"])
+        self._check_ground_truth(f"{name}['ground_truth']", state["ground_truth"], scenario, state["belief"]["team"])
         cells = len(scenario.coverage.cells)
         check.keys(f"{name}['coverage']", state["coverage"], ("ever", "found"))
         check.array(f"{name}['coverage']['ever']", state["coverage"]["ever"], check.BOOL, (cells,))
@@ -226,12 +227,12 @@ class EpisodeCheck:
 
     def _check_ground_truth(self, name: str, state: Any, scenario: Scenario, team: Mapping[str, Any]) -> None:
         """Raise unless a value is the ground-truth association of a team's maps, whose rows kernels index unchecked."""
-        check.keys(name, state, ("books", "row_of", "map_of", "seen"))
-        books, row_of, count = state["books"], state["row_of"], self._count
+        check.keys(name, state, ("claims", "row_of", "map_of", "seen"))
+        claims, row_of, count = state["claims"], state["row_of"], self._count
         check.indices(
-            f"{name}['books']", books, (None, None), UNUSED, int(np.count_nonzero(scenario.observable_landmarks)) - 1
+            f"{name}['claims']", claims, (None, None), UNUSED, int(np.count_nonzero(scenario.observable_landmarks)) - 1
         )
-        check.int_dict(f"{name}['row_of']", row_of, check.LANDMARK, (0, len(books) - 1))
+        check.int_dict(f"{name}['row_of']", row_of, check.LANDMARK, (0, len(claims) - 1))
         if len(set(row_of.values())) < len(row_of):
             check.refuse(f"{name}['row_of']", "a row for each map", row_of)
         check.integers(f"{name}['map_of']", state["map_of"])
@@ -243,8 +244,8 @@ class EpisodeCheck:
                 numbers.add(branch["split_from"])
             maps = branch["filter"]["maps"]
             needed = max(1 + maps["ids"].max(initial=-1), maps["next_id"] - MOST_MEASURED * self._tick)
-            if needed > books.shape[1]:
-                check.refuse(f"{name}['books']", f"entries for {needed} landmarks", f"shape {books.shape}")
+            if needed > claims.shape[1]:
+                check.refuse(f"{name}['claims']", f"entries for {needed} landmarks", f"shape {claims.shape}")
         if lacking := numbers.union(state["map_of"]) - set(row_of):
             check.refuse(f"{name}['row_of']", f"a row for map {min(lacking)}", "none")
         seen = state["seen"]
@@ -262,8 +263,8 @@ class EpisodeCheck:
                 entry.step not in seen or len(entry.ids) > len(seen[entry.step][entry.robot])
             ):
                 check.refuse(f"{name}['seen']", f"all identities of step {entry.step}", "fewer")
-            if isinstance(entry, LandmarkIdMap) and len(entry.ids_b) and entry.ids_b.max() >= books.shape[1]:
-                check.refuse(f"{name}['books']", "an entry for each landmark", f"shape {books.shape}")
+            if isinstance(entry, LandmarkIdMap) and len(entry.ids_b) and entry.ids_b.max() >= claims.shape[1]:
+                check.refuse(f"{name}['claims']", "an entry for each landmark", f"shape {claims.shape}")
 
     def _check_names(self, name: str, names: Any, landmarks: int) -> None:
         """Raise unless a value holds the true landmarks seen by each robot."""

@@ -118,10 +118,10 @@ def extend_graph(
             jacobians, graph.poses[bias].copy() if bias >= 0 else NO_BIAS,
         )  # fmt: skip
         guessed = NO_INITIAL_POSES if guesses is None else guesses[robot]
-        is_guided &= _kernels.add_log(arrays, guessed, robot, rigid_within, tips, ends, keys, frames, raw)
+        is_guided &= _kernels.add_keyframes(arrays, guessed, robot, rigid_within, tips, ends, keys, frames, raw)
     num_keys, num_frames, num_points = ends.tolist()
     held = places if is_guided and places is not None else NO_LANDMARK_POSITIONS
-    landmarks = _kernels.close_keyframe(
+    landmarks = _kernels.number_landmarks(
         graph.merged_ids, mapped(raw, lambda column: column[len(graph.points) : num_points]), graph.point_landmarks,
         graph.part(Condensed), graph.part(Landmarks), held, frames, keys.poses, mount,
     )  # fmt: skip

@@ -55,10 +55,10 @@ def reduce_keyframes(
     return _without_unused(fewer, raw[graph.frame_keys[graph.point_frames]])
 
 
-def relinearise(graph: SlamGraph, mode: MapEstimate, spreads: FloatArray | None = None) -> SlamGraph:
-    """Return the graph with the poses and landmarks of the mode, and the variances (k,) [m^2] of motions there."""
-    spreads = graph.transition_variances if spreads is None else spreads
-    return graph.with_columns(poses=mode.poses, landmarks=mode.landmarks, transition_variances=spreads)
+def relinearise(graph: SlamGraph, mode: MapEstimate, variances: FloatArray | None = None) -> SlamGraph:
+    """Return the graph with the poses and landmarks of the mode, and the transition variances (k,) [m^2] there."""
+    variances = graph.transition_variances if variances is None else variances
+    return graph.with_columns(poses=mode.poses, landmarks=mode.landmarks, transition_variances=variances)
 
 
 def without_unused_frames(graph: SlamGraph) -> SlamGraph:

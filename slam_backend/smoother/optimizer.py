@@ -103,18 +103,19 @@ class MapEstimate(NamedTuple):
 
     @property
     def crowded(self) -> bool:
-        """Whether drawing many paths is faster than computing `spreads`, because the factor's columns are long.
+        """Whether drawing paths is faster than computing `transition_variances`, because the factor's columns are long.
 
-        The cost of draws grows with the sum of the columns' lengths, the cost of `spreads` with the sum of the squares.
+        The cost of draws grows with the sum of the columns' lengths, that of `transition_variances` with the sum of
+        their squares.
         """
         assert self.system is not None
         pattern = self.system.pattern
         return pattern.squares > LONG_COLUMNS * len(pattern.rows)
 
-    def spreads(self) -> FloatArray:
-        """Return how far the motions from the keys before scatter (k,) [m^2], headings felt at `LEVER`; if of use."""
+    def transition_variances(self) -> FloatArray:
+        """Return the variances (k,) [m^2] of the motions from the previous keys, headings weighted by `LEVER`."""
         assert self.system is not None
-        return self.system.spreads(self.poses)
+        return self.system.transition_variances(self.poses)
 
 
 def optimize(
@@ -232,6 +233,6 @@ class NormalEquations:
         """Return the joint covariance (3 r, 3 r) of poses given by their columns (r,)."""
         return _kernels.covariance(self.factor, self.pattern, columns // 3)
 
-    def spreads(self, poses: FloatArray) -> FloatArray:
-        """Return the variances of the motions to poses (k, 3), see `MapEstimate.spreads`."""
-        return _kernels.scatter_of_links(poses, self.columns, self.graph.parents, self.factor, self.pattern)
+    def transition_variances(self, poses: FloatArray) -> FloatArray:
+        """Return the variances of the motions to poses (k, 3), see `MapEstimate.transition_variances`."""
+        return _kernels.transition_variances(poses, self.columns, self.graph.parents, self.factor, self.pattern)

@@ -177,8 +177,10 @@ def relinearised_and_reduced(
     """
     if graph.num_keys <= options.most_keys(len(graph.last_keys)) + graph.num_biases:
         return relinearise(graph, mode)
-    spreads = sample_transition_variances(graph, mode, rng) if mode.crowded else mode.spreads()
-    return reduce_keyframes(relinearise(graph, mode, spreads), camera, options, mode.sightings)
+    transition_variances = (
+        sample_transition_variances(graph, mode, rng) if mode.crowded else mode.transition_variances()
+    )
+    return reduce_keyframes(relinearise(graph, mode, transition_variances), camera, options, mode.sightings)
 
 
 def sample_particles(
@@ -204,7 +206,7 @@ def sample_particles(
         many = sample_paths(grown, mode, options.more_draws * num_particles, rng)
         chosen = many.taken(systematic(many.weights, rng, num_particles))
         ess = min(many.sample_size, float(num_particles))
-    graph = reduce_keyframes(relinearise(grown, mode, draws.spreads), camera, options, mode.sightings)
+    graph = reduce_keyframes(relinearise(grown, mode, draws.transition_variances), camera, options, mode.sightings)
     if not ess >= needed:
         return Rejuvenation(graph, f"an effective sample size of {ess:.1f}", ess, mode.iterations, None)
     if appearance is not None and len(appearance.ids):

@@ -77,7 +77,7 @@ class PathSamples(NamedTuple):
         log_weights: (M,) float64. Importance weights, not normalised.
         weights: (M,) float64. Normalised importance weights; NaN if one is not finite.
         sample_size: Effective sample size of the weights; NaN if one is not finite.
-        spreads: (k,) float64 [m^2]. Variances of the motions from the previous keys, headings at `LEVER`.
+        transition_variances: (k,) float64 [m^2]. Variances of the motions from the previous keys, headings at `LEVER`.
     """
 
     poses: FloatArray
@@ -85,14 +85,16 @@ class PathSamples(NamedTuple):
     log_weights: FloatArray
     weights: FloatArray
     sample_size: float
-    spreads: FloatArray
+    transition_variances: FloatArray
 
     @classmethod
-    def weighed(cls, poses: FloatArray, tiles: FloatArray, log_weights: FloatArray, spreads: FloatArray) -> Self:
+    def weighed(
+        cls, poses: FloatArray, tiles: FloatArray, log_weights: FloatArray, transition_variances: FloatArray
+    ) -> Self:
         """Return paths with normalised weights; arguments as the attributes."""
         weights = np.empty(len(log_weights))
         sample_size = _kernels.normalise(log_weights, weights)
-        return cls(poses, tiles, log_weights, weights, sample_size, spreads)
+        return cls(poses, tiles, log_weights, weights, sample_size, transition_variances)
 
     @property
     def landmarks(self) -> FloatArray:
@@ -107,7 +109,9 @@ class PathSamples(NamedTuple):
         padded = np.concatenate([ancestors, np.repeat(ancestors[:1], -m % LANES)])  # surplus lanes are copies
         blocks = len(padded) // LANES
         tiles = self.landmarks[:, :, padded].reshape(len(self.tiles), 9, blocks, LANES).transpose(0, 2, 1, 3)
-        return PathSamples.weighed(self.poses[:, :, ancestors], np.ascontiguousarray(tiles), np.zeros(m), self.spreads)
+        return PathSamples.weighed(
+            self.poses[:, :, ancestors], np.ascontiguousarray(tiles), np.zeros(m), self.transition_variances
+        )
 
 
 def sample_paths(graph: SlamGraph, mode: MapEstimate, num_particles: int, rng: np.random.Generator) -> PathSamples:
@@ -152,8 +156,8 @@ def _importance_weights(
     num_paths = poses.shape[2]
     rows = lane_rows(poses)
     tiles, log_likelihood = replay(mode, rows, num_paths)
-    log_odometry, spreads = odometry_log_density(graph, mode, rows, num_paths)
-    return PathSamples.weighed(poses, tiles, log_likelihood + log_odometry - log_proposals, spreads)  # (2)
+    log_odometry, transition_variances = odometry_log_density(graph, mode, rows, num_paths)
+    return PathSamples.weighed(poses, tiles, log_likelihood + log_odometry - log_proposals, transition_variances)  # (2)
 
 
 def lane_rows(poses: FloatArray) -> FloatArray:
@@ -205,9 +209,9 @@ def odometry_log_density(
         scatter, headings felt at `LEVER`.
     """
     blocks, k = rows.shape[:2]
-    log_density, spreads = np.empty(blocks * LANES), np.empty(k)
+    log_density, transition_variances = np.empty(blocks * LANES), np.empty(k)
     _kernels.odometry_log_density(
         rows.reshape(-1), k, blocks, num_particles, graph.part(Keys), graph.biases_of_odometry(), mode.odometry_infos,
-        mode.poses, log_density, spreads,
+        mode.poses, log_density, transition_variances,
     )  # fmt: skip
-    return log_density[:num_particles], spreads
+    return log_density[:num_particles], transition_variances

@@ -96,7 +96,7 @@ class MergeScheduler:
         self._alignment = alignment
         self._records: dict[PairKey, AttemptRecord] = {}
         self._proposed: dict[PairKey, set[tuple[int, int]]] = {}
-        self._bars: list[tuple[PairKey, int]] = []  # blocked pairs, and the step when the block ends
+        self._blocks: list[tuple[PairKey, int]] = []  # blocked pairs, and the step when the block ends
         self._uncertainties: dict[tuple[int, int], float] = {}  # least uncertainty by robots of both sides
         self._trials: dict[tuple[int, int], FloatArray] = {}  # last motion by the robots that define the frames
         self.pending_attempt: PendingAttempt | None = None
@@ -108,7 +108,7 @@ class MergeScheduler:
 
     def may_try(self, pair: PairKey, step: int) -> bool:
         """Return whether the pair's wait is over, and no block applies."""
-        if any(step < until and _touches(pair, barred) for barred, until in self._bars):
+        if any(step < until and _touches(pair, blocked) for blocked, until in self._blocks):
             return False
         return pair not in self._records or step >= self._records[pair].next_step
 
@@ -195,25 +195,25 @@ class MergeScheduler:
 
     def block(self, pair: PairKey, until: int) -> None:
         """Block all pairs of groups with a robot of each side of a pair before a step."""
-        self._bars = [*(bar for bar in self._bars if bar[0] != pair), (pair, until)]
+        self._blocks = [*(block for block in self._blocks if block[0] != pair), (pair, until)]
 
     def get_state(self) -> dict[str, Any]:
         """Return the options and a copy of the memory; arrays are read-only."""
-        memory: dict[str, Any] = {"records": copy.deepcopy(self._records), "bars": tuple(self._bars)}
+        memory: dict[str, Any] = {"records": copy.deepcopy(self._records), "blocks": tuple(self._blocks)}
         memory |= {"uncertainties": dict(self._uncertainties), "trials": dict(self._trials)}
-        fixed = {"options": self._options, "alignment": self._alignment, "straightening": self.pending_attempt}
+        fixed = {"options": self._options, "alignment": self._alignment, "pending_attempt": self.pending_attempt}
         return fixed | memory
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Restore options and memory from `get_state`."""
         self._options, self._alignment = state["options"], state["alignment"]
-        self.pending_attempt = state["straightening"]
+        self.pending_attempt = state["pending_attempt"]
         self._records = copy.deepcopy(state["records"])
-        self._bars = list(state["bars"])
+        self._blocks = list(state["blocks"])
         self._uncertainties, self._trials = dict(state["uncertainties"]), dict(with_constants(state["trials"]))
 
 
-def _touches(pair: PairKey, barred: PairKey) -> bool:
+def _touches(pair: PairKey, blocked: PairKey) -> bool:
     """Return whether a pair has robots of both sides of a blocked pair, one side in each group."""
     one, other = set(pair[0]), set(pair[1])
-    return any(one & set(a) and other & set(b) for a, b in (barred, barred[::-1]))
+    return any(one & set(a) and other & set(b) for a, b in (blocked, blocked[::-1]))

@@ -314,10 +314,10 @@ class TeamCheck:
             check.instance(f"{name}.unsmoothed_alignment", event.unsmoothed_alignment, Alignment)
 
     def _check_schedule(self, name: str, schedule: Any) -> None:
-        check.keys(name, schedule, ("options", "alignment", "straightening", "records", "bars", *BY_ROBOTS))
+        check.keys(name, schedule, ("options", "alignment", "pending_attempt", "records", "blocks", *BY_ROBOTS))
         check.options(f"{name}['options']", schedule["options"], AttemptOptions)
         check.options(f"{name}['alignment']", schedule["alignment"], AlignmentOptions)
-        pending, where = schedule["straightening"], f"{name}['straightening']"
+        pending, where = schedule["pending_attempt"], f"{name}['pending_attempt']"
         if pending is not None:
             check.instance(where, pending, PendingAttempt)
             self._check_pair(f"{where}.pair", pending.pair)
@@ -335,10 +335,10 @@ class TeamCheck:
             check.instance(f"{name}['records'].tried", record.tried, set)
             for match in record.tried:
                 check.integers(f"{name}['records'].tried", match, *check.LANDMARK)
-        for where, bar in check.named_items(f"{name}['bars']", schedule["bars"]):
-            check.sequence(where, bar, 2)
-            self._check_pair(where, bar[0])
-            check.integer(where, bar[1])
+        for where, block in check.named_items(f"{name}['blocks']", schedule["blocks"]):
+            check.sequence(where, block, 2)
+            self._check_pair(where, block[0])
+            check.integer(where, block[1])
         for part in BY_ROBOTS:
             where = f"{name}[{part!r}]"
             check.instance(where, schedule[part], dict)

@@ -118,7 +118,7 @@ def test_damaged_states_are_refused_or_harmless(kind: str, seeds: range) -> None
             r"\['map_of'\]: expected int",
         ),
         (["belief", "grids", "parted"], 10**9, r"\['grids'\]\['parted'\]: expected integers from -2 to"),
-        (["ledger", "books"], 10**9, r"\['ledger'\]\['books'\]: expected integers from -3 to"),
+        (["ground_truth", "claims"], 10**9, r"\['ground_truth'\]\['claims'\]: expected integers from -3 to"),
         (["coverage", "found"], -3, r"\['coverage'\]\['found'\]: expected integers from 0 to"),
         (["simulator", "poses"], 1e300, r"\['simulator'\]\['poses'\]: expected numbers from"),
         (["simulator", "poses"], 1e5, r"\['simulator'\]\['poses'\]: expected positions inside the world"),
@@ -143,8 +143,8 @@ def test_arrays_of_sensors_in_a_copied_state_are_rebuilt() -> None:
     env = begun()
     state = copy.deepcopy(env.get_state())
     expected = go_on(env)
-    sensor, scan = state["episode"]["setting"].sensor, state["episode"]["setting"].scan
-    inner = (*sensor._sight, *scan._sight, state["episode"]["setting"].coverage.laid)
+    sensor, scan = state["episode"]["scenario"].sensor, state["episode"]["scenario"].scan
+    inner = (*sensor._sight, *scan._sight, state["episode"]["scenario"].coverage.laid)
     for array in (part for part in inner if isinstance(part, np.ndarray)):
         array[:] = np.iinfo(np.int32).max if array.dtype.kind == "i" else np.nan
     env.set_state(state)

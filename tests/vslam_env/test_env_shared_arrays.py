@@ -88,7 +88,7 @@ def test_the_coverage_cells_of_a_scenario_cannot_be_written() -> None:
     """A kernel goes by it unchecked; an environment that is set to its own state does not look at it again."""
     env = merged()
     state = env.get_state()
-    scenario = state["episode"]["setting"]
+    scenario = state["episode"]["scenario"]
     with pytest.raises(ValueError, match="read-only"):
         scenario.coverage.laid[:] = 2**31 - 1
     with pytest.raises(ValueError, match="cannot set WRITEABLE flag"):

@@ -371,7 +371,7 @@ def test_a_worse_map_costs_more(gamma: float) -> None:
     def claiming(claim: int) -> ExplorationEnv:
         """Return a twin in which more landmarks of the first robot's map claim the same."""
         twin, state = env.clone(), env.get_state()
-        state["episode"]["ledger"]["books"][0, held[1:4]] = claim
+        state["episode"]["ground_truth"]["claims"][0, held[1:4]] = claim
         twin.set_state(state)
         return twin
 

@@ -226,7 +226,7 @@ def test_bad_states_are_refused(act: Callable[[], Any], says: str) -> None:
 
 
 PARTS = ["episode", "drivers", "root", "agents", "standing", "cycle", "objects"]
-PARTS += [f"episode.{part}" for part in ("tick", "streams", "simulator", "belief", "ledger", "coverage", "paths")]
+PARTS += [f"episode.{part}" for part in ("tick", "streams", "simulator", "belief", "ground_truth", "coverage", "paths")]
 
 
 def test_a_state_of_which_a_part_is_damaged_is_refused() -> None:
@@ -235,7 +235,7 @@ def test_a_state_of_which_a_part_is_damaged_is_refused() -> None:
     state = env.get_state()
     for part in PARTS:
         outer, _, inner = part.partition(".")
-        damaged = state["episode"] | {inner: {}} if inner else {"setting": 3}
+        damaged = state["episode"] | {inner: {}} if inner else {"scenario": 3}
         name = rf"\['{outer}'\]" + (rf"\['{inner}'\]" if inner else "")
         with pytest.raises(ValueError, match=rf"state({name}|: expected one made with world \(World\) objects)"):
             env.set_state(state | {outer: damaged})

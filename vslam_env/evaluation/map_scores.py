@@ -23,10 +23,10 @@ UNUSED = -3  # claim of an unused landmark id
 
 @in_place
 def score_team(
-    places: Any,
-    names: Any,
-    parts: Any,
-    claims: tuple[Any, ...],
+    positions: Any,
+    ids: Any,
+    map_rows: Any,
+    ground_truth: tuple[Any, ...],
     beliefs: Any,
     true_starts: Any,
     true_poses: Any,
@@ -35,15 +35,15 @@ def score_team(
     """Write the errors of the robots' maps and poses, in their own start frames and without a fit.
 
     Args:
-        places, names, parts: (n, 4), (n, 2) int64, (K, 2) int64. Landmarks of all maps, and the part of each robot; see
-            `TeamMapSummaries`.
-        claims: Claims of the landmarks, and the data to score them:
+        positions, ids, map_rows: (n, 4), (n, 2) int64, (K, 2) int64. Landmarks of all maps, and first and last row of
+            each robot's map; see `TeamMapSummaries`.
+        ground_truth: Claims of the landmarks, and the data to score them:
             (B, n) int64. Claim of each landmark id, map by map: a row of the true positions, `FALSE` or `UNCOUNTED`.
             (K,) int64. Row of each robot's map in these claims.
             (N, 3) float64 [m], world frame. True positions of the observable landmarks, N >= 1.
             Cutoff c of the map error [m].
-            (K, N) float64. Output: least squared error [m^2] of the landmarks that claim each true one in each robot's
-            map; inf without any.
+            (K, N) float64. Output: smallest squared error [m^2] of the landmarks that claim each true one in each
+            robot's map; inf without any.
         beliefs: (K, 16 + K). Array of `TeamPoses`.
         true_starts, true_poses: (K, 3) [m, m, rad], world frame. True start and current poses.
         scores: (8 or more, K) float64. Output per robot: map error E [m], see `slam_backend.metrics.map_error`; RMSE
@@ -51,10 +51,10 @@ def score_team(
             error below 0.5 m; errors of position [m] and heading [rad] in [0, pi]; estimated one sigma of the position
             [m].
     """
-    books, book_of, truths, cutoff, least_errors = claims
+    claims, claims_row, truths, cutoff, smallest_errors = ground_truth
     for robot in range(len(beliefs)):
         belief, start, true, score = beliefs[robot], true_starts[robot], true_poses[robot], scores[:, robot]
-        least = least_errors[robot]
+        smallest = smallest_errors[robot]
         c, s = math.cos(start[2]), math.sin(start[2])
         dx = start[0] + c * belief[OWN] - s * belief[OWN + 1] - true[0]
         dy = start[1] + s * belief[OWN] + c * belief[OWN + 1] - true[1]
@@ -65,22 +65,22 @@ def score_team(
         x0 = start[0] + c * belief[START] - s * belief[START + 1]
         y0 = start[1] + s * belief[START] + c * belief[START + 1]
         c, s = math.cos(start[2] + belief[START + 2]), math.sin(start[2] + belief[START + 2])
-        least[:] = np.inf
+        smallest[:] = np.inf
         estimated = surplus = 0
-        for i in range(parts[robot, 0], parts[robot, 1]):
-            claim = books[book_of[robot], names[i, 1]]
+        for i in range(map_rows[robot, 0], map_rows[robot, 1]):
+            claim = claims[claims_row[robot], ids[i, 1]]
             estimated += claim != UNCOUNTED
             if claim == FALSE:
                 surplus += 1
             elif claim >= 0:
-                x = x0 + c * places[i, 0] - s * places[i, 1] - truths[claim, 0]
-                y = y0 + s * places[i, 0] + c * places[i, 1] - truths[claim, 1]
-                z = places[i, 2] - truths[claim, 2]
-                surplus += least[claim] < np.inf
-                least[claim] = min(least[claim], x * x + y * y + z * z)
+                x = x0 + c * positions[i, 0] - s * positions[i, 1] - truths[claim, 0]
+                y = y0 + s * positions[i, 0] + c * positions[i, 1] - truths[claim, 1]
+                z = positions[i, 2] - truths[claim, 2]
+                surplus += smallest[claim] < np.inf
+                smallest[claim] = min(smallest[claim], x * x + y * y + z * z)
         matched = accurate = 0
         squares, total = 0.0, 0.5 * cutoff * cutoff * surplus
-        for square in least:
+        for square in smallest:
             if square < np.inf:
                 matched += 1
                 accurate += square < ACCURATE_WITHIN * ACCURATE_WITHIN
@@ -107,9 +107,9 @@ class GroundTruthAssociation:
     def __init__(self, num_robots: int, true_positions: FloatArray, observable: np.ndarray, cutoff: float) -> None:
         self.cutoff = check_float("map_error_cutoff", cutoff, "Give metres.", above=0.0)
         self.true_positions = np.ascontiguousarray(true_positions[observable])
-        self._least = np.full((num_robots, len(self.true_positions)), np.inf)  # squared errors of the last score
+        self._smallest = np.full((num_robots, len(self.true_positions)), np.inf)  # squared errors of the last score
         self._claim_of = np.where(observable, np.cumsum(observable) - 1, UNCOUNTED)
-        self._books = np.empty((num_robots, 0), np.int64)  # row: claims of the ids of one map
+        self._claims = np.empty((num_robots, 0), np.int64)  # row: claims of the ids of one map
         self._row_of = {number: number for number in range(num_robots)}
         self._use_maps(tuple(range(num_robots)))
         self._seen: dict[int, Sequence[IntArray] | IntArray] = {}  # true ids of the measurements by step and robot
@@ -149,12 +149,12 @@ class GroundTruthAssociation:
         self._use_maps(tuple([joint if number in (map_a, map_b) else number for number in self._map_of]))
         old, new = id_map.ids_b.T
         self._reserve(int(new.max(initial=-1)) + 1)
-        added = self._books[self._row_of[joint], new] == UNUSED  # the others were fused with landmarks of a
-        self._books[self._row_of[joint], new[added]] = self._books[self._row_of[map_b], old[added]]
+        added = self._claims[self._row_of[joint], new] == UNUSED  # the others were fused with landmarks of a
+        self._claims[self._row_of[joint], new[added]] = self._claims[self._row_of[map_b], old[added]]
 
     def true_ids(self, robot: int, ids: IntArray) -> IntArray:
         """Return the claims (n,) int64 of landmarks in a robot's map: true index, -1 false, -2 not scored."""
-        return np.asarray(self._books[self._book_of[robot], ids])
+        return np.asarray(self._claims[self._claims_row[robot], ids])
 
     def rows_of(self, true_ids: IntArray) -> IntArray:
         """Return the rows (n,) int64 of `true_positions` for true ids (n,), -1: false point; negative if not scored."""
@@ -163,7 +163,7 @@ class GroundTruthAssociation:
     @property
     def accurate(self) -> BoolArray:
         """(K, N) bool. Which true landmarks the map of each robot held within 0.5 m at the last score."""
-        return self._least < PLACED * PLACED
+        return self._smallest < ACCURATE_WITHIN * ACCURATE_WITHIN
 
     def score(
         self,
@@ -182,15 +182,15 @@ class GroundTruthAssociation:
             true_poses: (K, 3) [m, m, rad], world frame. True current poses.
             scores: (8 or more, K) float64. Output: first rows of `TeamMetrics.per_robot`.
         """
-        (places, names), parts = map_summaries
-        claims = self._books, self._book_of, self.true_positions, self.cutoff, self._least
-        score_team(places, names, parts, claims, points.beliefs, true_starts, true_poses, scores)
+        (positions, ids), map_rows = map_summaries
+        ground_truth = self._claims, self._claims_row, self.true_positions, self.cutoff, self._smallest
+        score_team(positions, ids, map_rows, ground_truth, points.beliefs, true_starts, true_poses, scores)
 
     def get_state(self) -> dict[str, Any]:
         """Return a copy of the state; the true ids of measurements are shared and read-only."""
         self._seen = {step: with_read_only(true_ids) for step, true_ids in self._seen.items()}
         return {
-            "books": self._books.copy(),
+            "claims": self._claims.copy(),
             "row_of": dict(self._row_of),
             "map_of": self._map_of,
             "seen": dict(self._seen),
@@ -198,36 +198,36 @@ class GroundTruthAssociation:
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Restore a state of `get_state`."""
-        self._books, self._row_of = state["books"].copy(), dict(state["row_of"])
+        self._claims, self._row_of = state["claims"].copy(), dict(state["row_of"])
         self._seen = dict(with_constants(state["seen"]))
         self._use_maps(state["map_of"])
 
     def _use_maps(self, map_of: tuple[int, ...]) -> None:
         """Set the map number of each robot."""
         self._map_of = map_of
-        self._book_of = np.array([self._row_of[number] for number in map_of])
+        self._claims_row = np.array([self._row_of[number] for number in map_of])
 
     def _copy(self, source: int, copy: int) -> None:
         """Copy the claims of a map to a new map."""
         taken = set(self._row_of.values())
         row = next(row for row in count() if row not in taken)
-        if row == len(self._books):
-            self._books = np.vstack([self._books, self._books])
-        self._books[row] = self._books[self._row_of[source]]
+        if row == len(self._claims):
+            self._claims = np.vstack([self._claims, self._claims])
+        self._claims[row] = self._claims[self._row_of[source]]
         self._row_of[copy] = row
 
     def _reserve(self, needed: int) -> None:
-        """Extend books that are too short to the needed length, at least doubling them."""
-        length = self._books.shape[1]
+        """Extend claims that are too short to the needed length, at least doubling them."""
+        length = self._claims.shape[1]
         if needed > length:
             more = max(needed - length, length)
-            self._books = np.pad(self._books, ((0, 0), (0, more)), constant_values=UNUSED)
+            self._claims = np.pad(self._claims, ((0, 0), (0, more)), constant_values=UNUSED)
 
     def _enter(self, number: int, ids: IntArray, true_ids: IntArray) -> None:
         """Record the claims of the landmarks with `ids` (m,), -1: none, created by measurements of `true_ids` (m,)."""
-        names = ids.tolist()  # few: a Python loop is faster than numpy calls
-        self._reserve(max(names, default=-1) + 1)
-        book = self._books[self._row_of[number]]
-        for name, true_id in zip(names, true_ids.tolist(), strict=False):
-            if name >= 0:
-                book[name] = self._claim_of[true_id] if true_id >= 0 else FALSE
+        numbers = ids.tolist()  # few: a Python loop is faster than numpy calls
+        self._reserve(max(numbers, default=-1) + 1)
+        claims = self._claims[self._row_of[number]]
+        for landmark, true_id in zip(numbers, true_ids.tolist(), strict=False):
+            if landmark >= 0:
+                claims[landmark] = self._claim_of[true_id] if true_id >= 0 else FALSE

@@ -209,12 +209,12 @@ class Episode:
     def get_state(self) -> dict[str, Any]:
         """Return the complete state of the episode; shared arrays are read-only."""
         return {
-            "setting": self.scenario,
+            "scenario": self.scenario,
             "tick": self.tick,
             "simulator": self._simulator.get_state(),
             "streams": {name: stream.bit_generator.state for name, stream in self._streams.items()},
             "belief": self.belief.get_state(),
-            "ledger": self.ground_truth.get_state(),
+            "ground_truth": self.ground_truth.get_state(),
             "coverage": self._coverage.get_state(),
             "credits": self._credits.get_state(),
             "counts": (self._collisions, self._distances.copy(), self._error_integrals.copy()),
@@ -224,14 +224,14 @@ class Episode:
 
     def set_state(self, state: Mapping[str, Any], scenario: Scenario) -> None:
         """Restore a validated state of `get_state` and its scenario."""
-        self._given = ref(state["setting"])
+        self._given = ref(state["scenario"])
         if scenario is not self.scenario:
             self._load_scenario(scenario)
         self._simulator.set_state(state["simulator"])
         for name, stream in state["streams"].items():
             self._streams[name].bit_generator.state = stream
         self.belief.set_state(state["belief"])
-        self.ground_truth.set_state(state["ledger"])
+        self.ground_truth.set_state(state["ground_truth"])
         self._coverage.set_state(state["coverage"])
         self._credits.set_state(state["credits"])
         self.tick = state["tick"]

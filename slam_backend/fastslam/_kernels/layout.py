@@ -39,7 +39,9 @@ TAKEN, C01 = LANES * 58, LANES * 59
 KEPT00, KEPT10, KEPT11, KEPT20, KEPT21, KEPT22, KEPT01, KEPT_WIDE = (LANES * k for k in range(60, 68))  # of C
 DRAW0, DRAW1, DRAW2 = (LANES * k for k in range(68, 71))  # standard normal
 BIAS0, BIAS1, BIAS2 = (LANES * k for k in range(71, 74))  # odometry bias
-PREDICTED0, PREDICTED1, PREDICTED2 = (LANES * k for k in range(74, 77))  # predicted pose, while X0 .. T0 hold the posterior mean
+PREDICTED0, PREDICTED1, PREDICTED2 = (
+    LANES * k for k in range(74, 77)
+)  # predicted pose, while X0 .. T0 hold the posterior mean
 WORK_SIZE, COV_XI_SIZE = LANES * 77, LANES * 6
 
 # Rows of the record of one candidate.

@@ -12,9 +12,6 @@ from slam_backend.core.jit import device, in_place, simd, stack_array
 from slam_backend.core.simd_math import sine_cosine, wrapped
 from slam_backend.core.validation import FloatArray
 from slam_backend.fastslam._kernels.layout import (
-    PREDICTED0,
-    PREDICTED1,
-    PREDICTED2,
     BIAS0,
     BIAS1,
     BIAS2,
@@ -28,6 +25,9 @@ from slam_backend.fastslam._kernels.layout import (
     N11,
     N12,
     N22,
+    PREDICTED0,
+    PREDICTED1,
+    PREDICTED2,
     T0,
     X0,
     Y0,

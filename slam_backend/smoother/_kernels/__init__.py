@@ -2,8 +2,8 @@
 
 from slam_backend.smoother._kernels.factors import condense, sum_pose_information
 from slam_backend.smoother._kernels.graph_reduction import add_sightings, merge_keys
-from slam_backend.smoother._kernels.keyframes import add_log, close_keyframe
-from slam_backend.smoother._kernels.marginal_covariances import scatter_of_links
+from slam_backend.smoother._kernels.keyframes import add_keyframes, number_landmarks
+from slam_backend.smoother._kernels.marginal_covariances import transition_variances
 from slam_backend.smoother._kernels.normal_equations import form, gather, step
 from slam_backend.smoother._kernels.odometry_bias import condition_bias
 from slam_backend.smoother._kernels.records import (
@@ -51,9 +51,8 @@ __all__ = [
     "Log",
     "Points",
     "SymbolicFactor",
-    "add_log",
+    "add_keyframes",
     "add_sightings",
-    "close_keyframe",
     "condense",
     "condition_bias",
     "covariance",
@@ -64,11 +63,12 @@ __all__ = [
     "lay_out",
     "merge_keys",
     "normalise",
+    "number_landmarks",
     "odometry_log_density",
     "replay",
-    "scatter_of_links",
     "step",
     "sum_pose_information",
     "to_lanes",
+    "transition_variances",
     "weigh_deviations",
 ]  # fmt: skip

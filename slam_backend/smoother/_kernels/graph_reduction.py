@@ -92,9 +92,9 @@ def merge_keys(
         fresh: (k,) whether a key stays in any case.
         sighted: (k,) whether anything was measured from it.
         most_keys: Limit of their number.
-        keys: Keys of the graph in the order of time; `spreads` [m^2] is what joining a key to the one before costs,
-            `slack` what each has cost. Changed: the first rows are those of the keys that are left, whose odometry
-            begins at another one that is left, by its new number.
+        keys: Keys of the graph in the order of time; `transition_variances` [m^2] is what joining a key to the one
+            before costs, `rigid_variances` what each has cost. Changed: the first rows are those of the keys that are
+            left, whose odometry begins at another one that is left, by its new number.
         biases: (k,) key of the bias of each key's odometry, `NONE` if it has none; (0,) without biases. Odometry under
             a bias is kept whole: where a key has gone, that of the key after it begins with the odometry of the key
             that went, not with its rigid pose, because the rigid pose says no more of the bias.
@@ -104,7 +104,7 @@ def merge_keys(
         chained away; (k,) new number of each that is left, `NONE` of the others; (k, 3) pose of each seen from the key
         to which it stands.
     """
-    robots, poses, previous, motions, noises, jacobians, costs, slack = keys
+    robots, poses, previous, motions, noises, jacobians, costs, rigid = keys
     k = len(robots)
     roots, numbers, offsets = np.empty(k, np.int64), np.full(k, NONE), np.zeros((k, 3))
     following = np.full(k, NONE)
@@ -131,14 +131,14 @@ def merge_keys(
         best, least = NONE, np.inf
         for b in range(k):
             if linked[b] and roots[b] == b and not fresh[b]:
-                price = costs[b] + slack[before[b]] + slack[b]
+                price = costs[b] + rigid[before[b]] + rigid[b]
                 if price < least:
                     best, least = b, price
         if best == NONE:
             break
         a, after = before[best], following[best]
         roots[best] = a
-        slack[a] += slack[best] + costs[best]
+        rigid[a] += rigid[best] + costs[best]
         following[a] = after
         if after >= 0:
             before[after] = a
@@ -174,12 +174,12 @@ def merge_keys(
                 put_before(offsets[a], motions[b], noises[b])
         n = numbers[b]
         robots[n], poses[n], previous[n] = robots[b], poses[b], previous[b]
-        motions[n], noises[n], jacobians[n], costs[n], slack[n] = (
+        motions[n], noises[n], jacobians[n], costs[n], rigid[n] = (
             motions[b],
             noises[b],
             jacobians[b],
             costs[b],
-            slack[b],
+            rigid[b],
         )
     return number, roots, numbers, offsets
 

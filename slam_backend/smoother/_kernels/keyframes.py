@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 @jit
-def close_keyframe(
+def number_landmarks(
     aliases: IntArray, new: Points, old_landmarks: IntArray, frozen: Condensed, known: Landmarks,
     held: "LandmarkPositions",
     frames: Frames, poses: FloatArray, mount: FloatArray,
@@ -85,7 +85,7 @@ def close_keyframe(
 
 
 @jit
-def add_log(
+def add_keyframes(
     log: Log, guesses: "InitialPoses", robot: int, rigid_within: float, tips: IntArray, ends: IntArray, keys: Keys,
     frames: Frames, raw: Points,
 ) -> bool:  # fmt: skip
@@ -100,7 +100,7 @@ def add_log(
         tips: (K,) newest key of each robot, changed.
         ends: (3,) numbers of keys, frames and raw measurements, changed.
         keys, frames, raw: Columns of the graph with room for new rows, which are written, with names of landmarks in
-            place of their rows. The slack of the newest old key is changed where frames are attached to it.
+            place of their rows. The rigid variance of the newest old key is changed where frames are attached to it.
 
     Returns:
         Whether there is a guess for the first step that measured something, or no such step.

@@ -14,7 +14,7 @@ from slam_backend.smoother._kernels.records import LEVER, CholeskyFactor, Symbol
 
 
 @jit_fma
-def scatter_of_links(
+def transition_variances(
     poses: FloatArray, columns: IntArray, previous: IntArray, factor: CholeskyFactor, pattern: SymbolicFactor
 ) -> FloatArray:
     """Return the mean square (k,) [m^2] by which the motion from the previous key scatters about that of the mode.
@@ -86,7 +86,7 @@ def scatter_of_links(
                 for c in range(i, 3):
                     own[3 * i + c] += m[i] * z[c] + m[3 + i] * z[3 + c] + m[6 + i] * z[6 + c]
         own[3], own[6], own[7] = own[1], own[2], own[5]
-    spreads = np.zeros(len(columns))
+    transition_variances = np.zeros(len(columns))
     joint = np.empty((3, 3))
     f, g = np.zeros((3, 3)), np.zeros((3, 3))
     for b in range(len(columns)):
@@ -115,5 +115,5 @@ def scatter_of_links(
                     total += weight * g[i, e] * of_b[3 * e + n] * g[i, n]
                     total += weight * f[i, e] * of_a[3 * e + n] * f[i, n]
                     total += 2.0 * weight * g[i, e] * joint[e, n] * f[i, n]
-        spreads[b] = total
-    return spreads
+        transition_variances[b] = total
+    return transition_variances

@@ -287,7 +287,7 @@ def replay(
 @simd
 def odometry_log_density(
     poses: FloatArray, num_keys: int, num_blocks: int, num_paths: int, keys: Keys, biases: IntArray, infos: FloatArray,
-    mode: FloatArray, log_density: FloatArray, spreads: FloatArray,
+    mode: FloatArray, log_density: FloatArray, transition_variances: FloatArray,
 ) -> None:  # fmt: skip
     """Weigh paths by odometry, and say how rigid they are from each key to the next.
 
@@ -298,7 +298,8 @@ def odometry_log_density(
         biases: (k,) key of the bias of each key's odometry, `NONE` if it has none; (0,) without biases.
         mode: (k, 3) [m, m, rad] the most probable path.
         log_density: (num_blocks * LANES,), result: log p(path given odometry) up to a constant.
-        spreads: (k,), result [m^2]: mean square of what the motion from the previous key differs from that of the mode.
+        transition_variances: (k,), result [m^2]: mean square by which the motion from the previous key differs from
+            that of the mode.
     """
     previous, motions = keys.parents, keys.odometry
     log_density[:] = 0.0
@@ -308,7 +309,7 @@ def odometry_log_density(
     e2[:] = 0.0
     for b in range(num_keys):
         a = previous[b]
-        spreads[b] = 0.0
+        transition_variances[b] = 0.0
         if a < 0:
             continue
         u0, u1, u2 = motions[b, 0], motions[b, 1], motions[b, 2]
@@ -351,4 +352,4 @@ def odometry_log_density(
             e0[:] = 0.0
             e1[:] = 0.0
             e2[:] = 0.0
-        spreads[b] = total / num_paths
+        transition_variances[b] = total / num_paths

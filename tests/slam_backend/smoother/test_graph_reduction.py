@@ -12,7 +12,16 @@ from hypothesis import strategies as st
 from slam_backend.fastslam.run_log import RobotLog
 from slam_backend.geometry import between, compose, transform_points, wrap_angle
 from slam_backend.models.odometry import OdometryModel
-from slam_backend.smoother._kernels import Condensed, Frames, Keys, Landmarks, Log, Points, add_log, close_keyframe
+from slam_backend.smoother._kernels import (
+    Condensed,
+    Frames,
+    Keys,
+    Landmarks,
+    Log,
+    Points,
+    add_keyframes,
+    number_landmarks,
+)
 from slam_backend.smoother.graph import LEVER, SlamGraph
 from slam_backend.smoother.graph_building import NO_LANDMARK_POSITIONS, InitialPoses, LandmarkPositions, extend_graph
 from slam_backend.smoother.graph_reduction import reduce_keyframes, relinearise
@@ -65,8 +74,8 @@ def test_joining_rigid_keyframes_keeps_the_estimate():
     run = small_run()
     graph = graph_of(run)
     mode = optimize(graph, camera_of(run), TIGHT)
-    spreads = sample_paths(graph, mode, 50, np.random.default_rng(1)).spreads
-    fewer = reduce_keyframes(relinearise(graph, mode, spreads), camera_of(run), limits(9, 3))
+    transition_variances = sample_paths(graph, mode, 50, np.random.default_rng(1)).transition_variances
+    fewer = reduce_keyframes(relinearise(graph, mode, transition_variances), camera_of(run), limits(9, 3))
     assert fewer.num_keys == 9
     np.testing.assert_allclose(fewer.poses[fewer.last_keys], mode.poses[graph.last_keys])
     again = optimize(fewer, camera_of(run), TIGHT)
@@ -159,7 +168,7 @@ def test_using_a_graph_does_not_change_it():
     before = {name: getattr(graph, name).copy() for name in graph.__dataclass_fields__}
     mode = optimize(graph, camera_of(run), TIGHT)
     draws = sample_paths(graph, mode, 9, np.random.default_rng(1))
-    fewer = reduce_keyframes(relinearise(graph, mode, draws.spreads), camera_of(run), limits(7, 3))
+    fewer = reduce_keyframes(relinearise(graph, mode, draws.transition_variances), camera_of(run), limits(7, 3))
     kept = {name: getattr(fewer, name).copy() for name in fewer.__dataclass_fields__}
     reduce_keyframes(
         relinearise(fewer, optimize(fewer, camera_of(run), TIGHT), np.ones(7)), camera_of(run), limits(4, 2)
@@ -183,7 +192,7 @@ def test_keys_are_joined_as_by_the_plain_program(max_keys, kernel):
     graph = replace(graph, **{name: getattr(graph, name)[~blind] for name in names})
     for _ in range(2):
         mode = optimize(graph, camera_of(run), TIGHT)
-        graph = relinearise(graph, mode, mode.spreads())
+        graph = relinearise(graph, mode, mode.transition_variances())
         found, expected = (how(graph, camera_of(run), options) for how in (reduce_keyframes, plain_reduced))
         assert found.num_keys <= max(options.most_keys(2), 8)
         for name in graph.__dataclass_fields__:
@@ -228,7 +237,7 @@ def walked(kinds, motions, variances, counts, guesses, start, rigid_within):
     keys.poses[TIP] = start
     tips, ends, known = np.array([0, TIP, 3]), np.array([OLD, OLD, 0]), np.flatnonzero(np.isfinite(guesses[:, 0]))
     log = log_of(kinds, motions, variances, counts)
-    is_guided = add_log(log, InitialPoses(known, guesses[known]), 1, rigid_within, tips, ends, keys, frames, raw)
+    is_guided = add_keyframes(log, InitialPoses(known, guesses[known]), 1, rigid_within, tips, ends, keys, frames, raw)
     first = np.flatnonzero(counts)[:1]
     assert is_guided == np.isfinite(guesses[first, 0]).all()
     num_keys, num_frames, num_points = ends
@@ -306,7 +315,7 @@ def test_measurements_with_ids_are_selected(covered):
     kinds, still, ends = np.full(5, STATIONARY, dtype=np.int8), np.zeros((5, 3)), np.array([1, 5, 2])
     no_bias = np.empty((0, 3, 3)), np.zeros(3)
     log = Log(np.arange(5), kinds, still, given_steps, starts, points, ids, covariances, still, *no_bias)
-    assert not add_log(log, InitialPoses.empty(), 0, 0.0, np.zeros(1, dtype=np.int64), ends, keys, frames, raw)
+    assert not add_keyframes(log, InitialPoses.empty(), 0, 0.0, np.zeros(1, dtype=np.int64), ends, keys, frames, raw)
     assert ends.tolist() == [1, 8, 6]
     assert frames.frame_keys.tolist() == [-7] * 5 + [0, 0, 0, -7]
     assert raw.point_landmarks.tolist() == [-7, -7, 4, 9, 4, 2, -7, -7]
@@ -330,7 +339,7 @@ def settled(known, names, aliases=NO_ALIASES, old=(), frozen=((), ()), held=NO_L
     at = compose(poses[frame_keys[frames]], offsets[frames])
     expected = [transform_points(pose, point + mount) for pose, point in zip(at, raw.points, strict=True)]
     s = len(frozen[0])
-    landmarks = close_keyframe(
+    landmarks = number_landmarks(
         aliases, raw, np.array(old, dtype=np.int64),
         Condensed(
             np.zeros(s, dtype=np.int64), np.array(frozen[0], dtype=np.int64), np.zeros((s, 3)), np.zeros((s, 6)),

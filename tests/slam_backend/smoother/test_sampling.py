@@ -186,7 +186,7 @@ def test_odometry_of_paths_has_its_gaussian_density():
     graph = graph_of(run)
     mode = optimize(graph, camera_of(run), TIGHT)
     poses = sample_paths(graph, mode, 65, np.random.default_rng(7)).poses
-    found, spreads = odometry_log_density(graph, mode, lane_rows(poses), 65)
+    found, transition_variances = odometry_log_density(graph, mode, lane_rows(poses), 65)
     linked = np.flatnonzero(graph.parents >= 0)
     expected, motions = np.zeros(65), []
     for b in linked:
@@ -200,7 +200,7 @@ def test_odometry_of_paths_has_its_gaussian_density():
         motions.append(motion)
     np.testing.assert_allclose(found - found[0], expected - expected[0], atol=1e-7)
     scatter = [((m - m[:, :1])[0] ** 2 + (m - m[:, :1])[1] ** 2 + 9.0 * (m - m[:, :1])[2] ** 2).mean() for m in motions]
-    np.testing.assert_allclose(spreads[linked], scatter, rtol=1e-6)
+    np.testing.assert_allclose(transition_variances[linked], scatter, rtol=1e-6)
 
 
 def test_drawn_spreads_are_those_of_the_inverse():
@@ -211,7 +211,7 @@ def test_drawn_spreads_are_those_of_the_inverse():
     rng = np.random.default_rng(8)
     found = np.array([sample_transition_variances(graph, mode, rng) for _ in range(60)])
     linked = graph.parents >= 0
-    ratios = found[:, linked] / mode.spreads()[linked]
+    ratios = found[:, linked] / mode.transition_variances()[linked]
     assert not found[:, ~linked].any()
     np.testing.assert_allclose(ratios.mean(axis=0), 1.0, atol=0.12)
     assert ratios.mean() == pytest.approx(1.0, abs=0.025)

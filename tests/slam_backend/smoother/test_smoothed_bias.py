@@ -177,7 +177,7 @@ def test_joined_keys_keep_their_odometry_whole():
     graph, camera = graph_of(run, motion=BIASED), camera_of(run)
     mode = optimize(graph, camera, TIGHT)
     options = SmoothingOptions(max_keys=10, further_keys=0, recent_keys=4, kernel=0.0)
-    before = relinearise(graph, mode, mode.spreads())
+    before = relinearise(graph, mode, mode.transition_variances())
     after = reduce_keyframes(before, camera, options)
     assert after.num_keys <= 10 + 1
     assert (after.robots[after.bias_keys] == BIAS).all()

@@ -33,7 +33,7 @@ def problem(robots: int, max_keys: int, motion: OdometryModel | None = None) -> 
     options = SmoothingOptions(max_keys=max_keys, further_keys=0, recent_keys=6, kernel=0.0)
     graph = graph_of(run, motion=motion)
     mode = optimize(graph, camera, TIGHT)
-    graph = reduce_keyframes(relinearise(graph, mode, mode.spreads()), camera, options)
+    graph = reduce_keyframes(relinearise(graph, mode, mode.transition_variances()), camera, options)
     mode = optimize(graph, camera, TIGHT)
     system, seen = mode.system, mode.sightings
     assert system is not None
@@ -165,7 +165,7 @@ def test_blocks_of_the_inverse_are_the_solutions_for_unit_vectors(posed):
 def test_relative_pose_covariances_agree_with_the_dense_covariance(posed):
     """Derivatives of motions by differences, and the dense inverse, give how far each motion scatters."""
     graph, mode = posed.graph, posed.mode
-    covariance, found = np.linalg.inv(information(posed)), mode.spreads()
+    covariance, found = np.linalg.inv(information(posed)), mode.transition_variances()
     for b, a in enumerate(graph.parents):
         if a < 0:
             assert found[b] == 0.0
