@@ -14,10 +14,16 @@ from training.rl.slots import MASK, WHOLE, MakeEnv, StepResult, SyncEnvs
 from training.rl.workers import ProcessEnvs
 from vslam_env import vslam_v0, warm_up
 from vslam_env.config import EnvConfig
+from vslam_env.reward import RewardSpec
 
 
 def make_vec_env(
-    config: EnvConfig, num_envs: int, workers: int = 0, seed: int | None = None, render_mode: str | None = None
+    config: EnvConfig,
+    num_envs: int,
+    workers: int = 0,
+    seed: int | None = None,
+    render_mode: str | None = None,
+    reward: RewardSpec | None = None,
 ) -> "ExplorationVecEnv":
     """Make environments of one configuration.
 
@@ -26,12 +32,14 @@ def make_vec_env(
         workers: Number of worker processes; 0: this process. Results do not depend on it. A script that uses workers
             needs the guard `if __name__ == "__main__":`, because each worker imports it.
         seed: Seed of all environments; None: the learner's own `seed` decides.
+        reward: Reward in place of that of `config`, such as a list with custom terms, see `vslam_v0.parallel_env`. The
+            environments of a process share these terms, which must keep no state.
 
     Raises:
         ValueError: If a number is out of range.
     """
     check_int("num_envs", num_envs, 1, "Use at least one environment.")
-    make = partial(vslam_v0.parallel_env, config=config, render_mode=render_mode)
+    make = partial(vslam_v0.parallel_env, config=config, render_mode=render_mode, reward=reward)
     load = partial(load_kernels, config)
     if workers > 0:
         prepare(load)  # compiles once, with a message; workers then load from the cache

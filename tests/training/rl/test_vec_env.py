@@ -20,6 +20,7 @@ from stable_baselines3 import PPO
 from training.vec_env import ExplorationVecEnv, env_seeds, make_vec_env
 from vslam_env import vslam_v0
 from vslam_env.config import EnvConfig
+from vslam_env.reward import TeamMetrics, make_terms
 
 GOALS = EnvConfig().replace(
     world="fig5", num_robots=2, action_type="goal", max_cycles=4, belief={"filter": {"num_particles": 10}}
@@ -272,6 +273,27 @@ def test_pictures() -> None:
     tiled = env.render()
     assert tiled.dtype == np.uint8
     assert tiled.size >= 2 * 720 * 960 * 3
+
+
+class _Merges:
+    """Custom reward term, known to workers by value."""
+
+    name, weight = "merges", 0.5
+
+    def __call__(self, before: TeamMetrics, after: TeamMetrics) -> NDArray[np.float64]:
+        return np.full(len(after.map_errors), 1.0 + after.merges - before.merges)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", [0, 2])
+def test_custom_rewards_reach_all_environments(workers: int) -> None:
+    """Terms given as objects replace the rewards of the configuration, in this process and in workers."""
+    env = make_vec_env(GOALS, 2, workers, reward=[*make_terms({"time": 1.0}), _Merges()])
+    env.reset()
+    _, rewards, _, infos = env.step(np.zeros(4, np.int64))
+    env.close()
+    assert all(info["reward/merges"] == 0.5 for info in infos)
+    np.testing.assert_allclose(rewards, [0.5 + info["reward/time"] for info in infos])
 
 
 def test_differing_robots_are_refused() -> None:
