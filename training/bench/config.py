@@ -236,11 +236,11 @@ def world_split(split: str, world: str) -> str | None:
 def with_absolute_paths(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return plain values of a configuration with absolute paths of worlds and of models."""
     from agents.registry import is_model
-    from vslam_env.world import WORLD_FAMILIES
+    from vslam_env.world import portable_source
 
     found = dict(values)
     if isinstance(found.get("worlds"), list | tuple):
-        found["worlds"] = [w if w in WORLD_FAMILIES else str(Path(str(w)).resolve()) for w in found["worlds"]]
+        found["worlds"] = [portable_source(str(world)) for world in found["worlds"]]
     if isinstance(found.get("policies"), list | tuple):
         found["policies"] = [str(Path(p).resolve()) if is_model(p) else p for p in found["policies"]]
     return found

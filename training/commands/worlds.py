@@ -9,7 +9,12 @@ from rich.console import Console
 
 worlds = typer.Typer(help="List, preview, check and import worlds.", no_args_is_help=True)
 
-Source = Annotated[str, typer.Argument(help="World family, or path of a floor plan, ROS map, .json file or folder.")]
+Source = Annotated[
+    str,
+    typer.Argument(
+        help="World family, or path of a floor plan, ROS map, .json file or folder; options follow: rooms:extent=120."
+    ),
+]
 FirstSeed = Annotated[int, typer.Option(help="First world seed.")]
 Seeds = Annotated[int, typer.Option(help="Number of world seeds.")]
 Robots = Annotated[int, typer.Option(help="Number of robots to place.")]
@@ -38,6 +43,7 @@ def list_worlds(seeds: Annotated[int, typer.Option(help="Number of worlds measur
     console.print(table)
     for split, (first, end) in SPLITS.items():
         console.print(f"{split}: world seeds {first} to {end - 1}")
+    console.print("Options follow the name: rooms:extent=120:room=8, office:extent=100, campus:extent=200.")
     console.print("Paths work too: .png .jpg .pgm .yaml (ROS) .json, or a folder of these.")
 
 

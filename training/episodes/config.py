@@ -55,11 +55,9 @@ class RunConfig(ExperimentConfig):
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values that repeat this run from any folder, except the seed."""
         from agents.registry import is_model
-        from vslam_env.world import WORLD_FAMILIES
+        from vslam_env.world import portable_source
 
-        changed: dict[str, Any] = self._limit
-        if self.world not in WORLD_FAMILIES:
-            changed["world"] = str(Path(self.world).resolve())
+        changed: dict[str, Any] = self._limit | {"world": portable_source(self.world)}
         if is_model(self.policy):
             changed["policy"] = str(Path(self.policy).resolve())
         return super().to_mapping() | changed

@@ -72,10 +72,9 @@ class TrainConfig(ExperimentConfig):
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values that repeat this training from any folder, except the seed."""
-        from vslam_env.world import WORLD_FAMILIES
+        from vslam_env.world import portable_source
 
-        world = self.world if self.world in WORLD_FAMILIES else str(Path(self.world).resolve())
-        return super().to_mapping() | {"world": world}
+        return super().to_mapping() | {"world": portable_source(self.world)}
 
     @property
     def rollout(self) -> int:

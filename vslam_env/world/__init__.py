@@ -10,7 +10,14 @@ from vslam_env.world.loaders.floorplan import load_floorplan, load_walls_json, s
 from vslam_env.world.loaders.ros_map import load_ros_map
 from vslam_env.world.loaders.splits import SPLITS, draw_world_seed
 from vslam_env.world.odometry import OdometryNoise, draw_bias, read_odometry
-from vslam_env.world.registry import WORLD_FAMILIES, WorldSource, check_source, is_single_layout, make_world
+from vslam_env.world.registry import (
+    WORLD_FAMILIES,
+    WorldSource,
+    check_source,
+    is_single_layout,
+    make_world,
+    portable_source,
+)
 from vslam_env.world.simulator import Simulator
 from vslam_env.world.spec import Landmarks, World
 
@@ -33,6 +40,7 @@ __all__ = [
     "load_walls_json",
     "make_world",
     "place_landmarks",
+    "portable_source",
     "read_odometry",
     "save_walls_json",
 ]

@@ -1,6 +1,7 @@
 """Construction of worlds from names, paths and functions."""
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Mapping
 from functools import lru_cache
 from inspect import signature
 from pathlib import Path
@@ -9,11 +10,13 @@ from typing import Any
 import numpy as np
 
 from slam_backend.core.validation import argument_error, is_built_in
+from vslam_env.world.generators.campus import campus
 from vslam_env.world.generators.fig5 import fig5
 from vslam_env.world.generators.hall import hall
 from vslam_env.world.generators.loops import loops
 from vslam_env.world.generators.maze import maze
 from vslam_env.world.generators.office import office
+from vslam_env.world.generators.rooms import rooms
 from vslam_env.world.loaders.floorplan import existing, load_floorplan, load_walls_json
 from vslam_env.world.loaders.ros_map import load_ros_map
 from vslam_env.world.loaders.splits import files_of_split
@@ -22,9 +25,19 @@ from vslam_env.world.spec import World
 WorldMaker = Callable[[np.random.Generator], World]
 WorldSource = str | Path | World | WorldMaker
 
-WORLD_FAMILIES: dict[str, WorldMaker] = {"office": office, "maze": maze, "loops": loops, "hall": hall, "fig5": fig5}
+WORLD_FAMILIES: dict[str, Callable[..., World]] = {
+    "office": office,
+    "maze": maze,
+    "loops": loops,
+    "hall": hall,
+    "fig5": fig5,
+    "rooms": rooms,
+    "campus": campus,
+}
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm")
 MAP_SUFFIXES = (".yaml", ".yml")
+PLAN_OPTIONS = ("metres_per_pixel", "tolerance_px")
+NAME_AND_OPTIONS = re.compile(r"(.*?)((?::[a-z_]+=[^:=]*)*)", re.DOTALL)
 FILE_SUFFIXES = (*IMAGE_SUFFIXES, *MAP_SUFFIXES, ".json")
 
 
@@ -34,20 +47,21 @@ def make_world(world: WorldSource, rng: np.random.Generator, split: str | None =
     Args:
         world: Family name (see `WORLD_FAMILIES`); path of a floor plan (.png, .jpg, .pgm), of a ROS map (.yaml), of a
             .json file of walls, or of a folder of such files to draw from; `World`; or a function of `rng` that returns
-            a `World`.
+            a `World`. Options follow the name of a family or the path of floor plans:
+            `"rooms:extent=120:room=10"`, `"plan.png:metres_per_pixel=0.1"`.
         rng: Source of all draws.
         split: Split of the files in a folder, see `splits`; ignored for other sources.
 
     Raises:
-        ValueError: If the family or file does not exist, or the function does not return a `World`.
+        ValueError: If the family or file does not exist, an option is unknown or out of range, or the function does not
+            return a `World`.
     """
     check_source(world)
     if isinstance(world, World):
         return world
-    if isinstance(world, str) and world in WORLD_FAMILIES:
-        return WORLD_FAMILIES[world](rng)
     if isinstance(world, (str, Path)):
-        return _load(world, rng, split)
+        name, options = _parted(str(world))
+        return WORLD_FAMILIES[name](rng, **options) if name in WORLD_FAMILIES else _load(name, options, rng, split)
     made = world(rng)
     if not isinstance(made, World):
         raise argument_error("world", "a function that returns a World", made, "Return World(name, walls).")
@@ -58,11 +72,16 @@ def check_source(world: object) -> None:
     """Validate a source of worlds without making a world.
 
     Raises:
-        ValueError: If the family or file does not exist, a folder has no suitable file, or the type is wrong.
+        ValueError: If the family or file does not exist, an option is unknown or not a number, a folder has no suitable
+            file, or the type is wrong.
     """
     if isinstance(world, (str, Path)):
-        if not (isinstance(world, str) and world in WORLD_FAMILIES):
-            _files(world)
+        name, options = _parted(str(world))
+        if name not in WORLD_FAMILIES:
+            files = _files(name)
+            if options and not any(file.suffix.lower() in IMAGE_SUFFIXES for file in files):
+                hint = "ROS maps and files of walls contain their scale."
+                raise argument_error("world", "no options for a path without a floor plan", str(world), hint)
     elif isinstance(world, World):
         return
     elif callable(world):
@@ -89,34 +108,63 @@ def _check_maker(maker: Callable[..., Any]) -> None:
 
 def is_single_layout(world: WorldSource) -> bool:
     """Return whether a source always has the same walls, so that it cannot be split."""
-    is_path = isinstance(world, (str, Path)) and not (isinstance(world, str) and world in WORLD_FAMILIES)
-    return isinstance(world, World) or (is_path and not Path(world).is_dir())  # type: ignore[arg-type]
+    if not isinstance(world, (str, Path)):
+        return isinstance(world, World)
+    name, _ = _parted(str(world))
+    return name not in WORLD_FAMILIES and not Path(name).is_dir()
 
 
-def _load(world: str | Path, rng: np.random.Generator, split: str | None) -> World:
+def portable_source(world: str) -> str:
+    """Return a family as it is, and a path, with its options, made absolute so that it holds in any folder."""
+    return world if _parted(world)[0] in WORLD_FAMILIES else str(Path(world).resolve())
+
+
+def _parted(world: str) -> tuple[str, dict[str, float]]:
+    """Part a family or path from its options, such as `:extent=120:room=10`.
+
+    Raises:
+        ValueError: If an option is unknown, repeated or not a number.
+    """
+    found = NAME_AND_OPTIONS.fullmatch(world)
+    name, text = found.groups() if found else (world, "")
+    known = PLAN_OPTIONS if name not in WORLD_FAMILIES else tuple(signature(WORLD_FAMILIES[name]).parameters)[1:]
+    options: dict[str, float] = {}
+    for option in text.split(":")[1:]:
+        key, value = option.split("=")
+        if key not in known or key in options:
+            hint = f"Options: {', '.join(known)}, each once." if known else "This family has no options."
+            raise argument_error("world", f"options that {name!r} has", world, hint)
+        try:
+            options[key] = float(value)
+        except ValueError as error:
+            raise argument_error("world", f"a number for {key!r}", world, f"Write {name}:{key}=...") from error
+    return name, options
+
+
+def _load(world: str, options: Mapping[str, float], rng: np.random.Generator, split: str | None) -> World:
     """Load the world at a path, or a random one of a folder."""
     files = _files(world)
     if Path(world).is_dir() and split is not None:
         files = files_of_split(files, split)
     path = files[int(rng.integers(len(files)))] if Path(world).is_dir() else files[0]
-    return _read(path, path.stat().st_mtime_ns)
+    return _read(path, path.stat().st_mtime_ns, tuple(options.items()))
 
 
 @lru_cache(maxsize=64)
-def _read(path: Path, changed: int) -> World:
-    """Load a file, cached by path and time of change; errors name the file."""
+def _read(path: Path, changed: int, options: tuple[tuple[str, float], ...]) -> World:
+    """Load a file, cached by path, time of change and options of floor plans; errors name the file."""
     suffix = path.suffix.lower()
     try:
         if suffix in MAP_SUFFIXES:
             return load_ros_map(path)
-        return load_walls_json(path) if suffix == ".json" else load_floorplan(path)
+        return load_walls_json(path) if suffix == ".json" else load_floorplan(path, **dict(options))
     except ValueError as error:
         if str(path) in str(error):
             raise
         raise ValueError(f"{error} The file is {path}.") from error
 
 
-def _files(world: str | Path) -> list[Path]:
+def _files(world: str) -> list[Path]:
     """Return the file at a path, or the files of a folder, at least one; images with a YAML file are omitted."""
     path = Path(world)
     try:

@@ -14,7 +14,7 @@ LIST = "expected comma-separated numbers, got"
 # Bad arguments of each command, with the beginning of the error. Ranges: tests/training/experiments/test_configs.py.
 BAD: dict[str, dict[str, str]] = {
     "run": {
-        "--world nowhere": "world: expected one of 'office', 'maze', 'loops', 'hall', 'fig5', or a path",
+        "--world nowhere": "world: expected one of 'office', 'maze', 'loops', 'hall', 'fig5', 'rooms', 'campus', or",
         "--world broken.json": "world: expected",
         "--policy unknown": "policy: expected one of 'frontier', 'random_goals', 'random_walk',",
         "--policy random_walk --action-type goal": "action_type: expected 'continuous' or 'discrete'",

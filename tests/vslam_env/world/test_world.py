@@ -24,8 +24,10 @@ from vslam_env.world import (
     Landmarks,
     World,
     draw_world_seed,
+    is_single_layout,
     make_world,
     place_landmarks,
+    portable_source,
     save_walls_json,
 )
 from vslam_env.world.clearance import distances_to_walls
@@ -72,7 +74,11 @@ def test_make_world_takes_names_worlds_functions_and_paths(tmp_path: Path) -> No
         assert loaded.name == "hall"
 
 
-@pytest.mark.parametrize("family", ["office", "fig5", "maze", "loops", "hall"])
+# Each family once, large ones as small as they come, and floors of the sizes for which office has a second layout.
+FAMILIES = sorted({*WORLD_FAMILIES, "rooms:extent=40", "campus:extent=70", "office:extent=30"} - {"rooms", "campus"})
+
+
+@pytest.mark.parametrize("family", FAMILIES)
 def test_landmarks_sit_on_faces_that_can_be_looked_at(family: str) -> None:
     """Each landmark lies on its wall, off its corners, spaced from its neighbours, and faces the free space."""
     rng = np.random.default_rng(11)
@@ -124,13 +130,10 @@ def test_a_share_of_descriptors_is_repeated() -> None:
     assert abs(1.0 - len(np.unique(vectors, axis=0)) / 500 - 0.4) < 0.09
 
 
-FAMILIES = sorted(WORLD_FAMILIES)
-
-
 @pytest.mark.parametrize("family", FAMILIES)
 def test_all_floor_is_connected(family: str) -> None:
-    """In 15 buildings of a family the reachable part is nearly all floor in which a robot fits."""
-    for seed in range(15):
+    """In 15 buildings of a family, 4 of large ones, the reachable part is nearly all floor in which a robot fits."""
+    for seed in range(4 if "extent" in family else 15):
         world = make_world(family, np.random.default_rng(seed))
         space = FreeSpace(world)
         alone = FreeSpace(world, 0.05)  # a robot so small that it fits almost wherever there is floor
@@ -138,7 +141,7 @@ def test_all_floor_is_connected(family: str) -> None:
         assert len(space.free_area_cells) == len(alone.free_area_cells)
         assert 0.04 * len(space.free_area_cells) > 0.35 * (x_max - x_min) * (y_max - y_min)
         assert space.reachable.sum() > 0.4 * space.open_space.sum()
-        assert 10 <= len(world.walls) <= 100
+        assert 10 <= len(world.walls) <= (100 if "extent" not in family else 0.3 * (x_max - x_min) * (y_max - y_min))
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -175,6 +178,91 @@ def test_pillars_of_a_hall_stand_apart() -> None:
     gaps = np.linalg.norm(middles[:, None] - middles, axis=2)[~np.eye(len(middles), dtype=bool)]
     assert len(pillars) >= 8
     assert gaps.min() > 1.4
+
+
+@pytest.mark.parametrize(
+    ("source", "size"),
+    [
+        ("rooms:extent=47:room=9", (47.0, 47.0)),
+        ("rooms:room=2.5:extent=200", (200.0, 200.0)),
+        ("office:extent=150", (150.0, 105.0)),
+        ("campus:extent=200", (200.0, 160.0)),
+    ],
+)
+def test_options_of_a_family_set_its_size(source: str, size: tuple[float, float]) -> None:
+    """A large world has the extent that its options give, up to the largest, all its floor connected."""
+    world = make_world(source, np.random.default_rng(3))
+    assert world.bounds == pytest.approx((0.0, 0.0, *size))
+    large, small = (FreeSpace(world, radius) for radius in (0.2, 0.05))
+    assert len(large.free_area_cells) == len(small.free_area_cells)
+    assert 0.04 * len(large.free_area_cells) > 0.8 * size[0] * size[1]
+
+
+def test_rooms_have_the_size_of_the_option() -> None:
+    """Walls between rooms lie on the grid of whole rooms, at least as large as asked: 5 of 9.4 m in 47 m."""
+    walls = make_world("rooms:extent=47:room=9", np.random.default_rng(3)).walls
+    long = walls[np.hypot(walls[:, 2] - walls[:, 0], walls[:, 3] - walls[:, 1]) > 5.2]  # furniture is shorter
+    upright = long[:, 0] == long[:, 2]
+    places = np.concatenate([long[upright, 0], long[~upright, 1]]) / 9.4
+    assert set(places.round(6)) == {0.0, 1.0, 2.0, 3.0, 4.0, 5.0}
+
+
+def test_paths_of_a_campus_lead_around_and_into_buildings() -> None:
+    """Robots can go round along the fence, and into the buildings, which fill most of the campus."""
+    space = FreeSpace(make_world("campus:extent=70", np.random.default_rng(4)))
+    along, at = np.arange(1.2, 54.8, 0.1), np.full(536, 1.2)
+    fence = [np.column_stack(pair) for pair in ((at, along), (70.0 - at, along), (along, at), (along, 56.0 - at))]
+    assert space.contains(np.vstack(fence)).all()
+    inner = space.free_area_cells[(np.abs(space.free_area_cells - [17.5, 28.0]) < 14.0).all(axis=1)]
+    assert 0.04 * len(inner) > 0.75 * 28.0 * 28.0
+
+
+def test_options_of_a_plan_set_its_scale(tmp_path: Path) -> None:
+    """The scale of plans follows the path of a file or folder; a path made absolute keeps its options."""
+    image = np.zeros((140, 180), np.uint8)
+    image[10:130, 10:170] = 255
+    cv2.imwrite(str(tmp_path / "plan.png"), image)
+    rng = np.random.default_rng(0)
+    for source in (f"{tmp_path}/plan.png", str(tmp_path)):
+        world = make_world(f"{source}:metres_per_pixel=0.5", rng)
+        assert world.bounds == pytest.approx((5.0, 5.0, 85.0, 65.0))
+    assert portable_source(f"{tmp_path}/../{tmp_path.name}/plan.png:tolerance_px=2").endswith("plan.png:tolerance_px=2")
+    assert portable_source("rooms:extent=30") == "rooms:extent=30"
+    assert is_single_layout(f"{tmp_path}/plan.png:metres_per_pixel=0.5")
+    assert not is_single_layout("rooms:extent=30")
+    assert not is_single_layout(f"{tmp_path}:metres_per_pixel=0.5")
+
+
+@pytest.mark.parametrize(
+    ("source", "says"),
+    [
+        ("rooms:extent=201", r"^extent: expected a finite number > 0 and <= 200, got 201"),
+        ("rooms:extent=15:room=10", r"^extent: expected at least 20 m for rooms of 10 m, got 15"),
+        ("rooms:room=1000", r"^room: expected a finite number"),
+        ("office:extent=20", r"^extent: expected a finite number >= 30 and <= 200, got 20.*leave it out"),
+        ("campus:extent=nan", r"^extent: expected a finite number"),
+        ("rooms:side=3", r"^world: expected options that 'rooms' has, got 'rooms:side=3'\. Options: extent, room"),
+        ("rooms:extent=40:extent=50", r"^world: expected options that 'rooms' has"),
+        ("maze:extent=40", r"This family has no options"),
+        ("rooms:extent=wide", r"^world: expected a number for 'extent', got 'rooms:extent=wide'"),
+        (
+            "plan.png:metres_per_pixel=10",
+            r"^world: expected a plan of at most 200 m, got '1600 x 1200 m in plan.png'. Lower",
+        ),
+        ("plan.png:metres_per_pixel=-1", r"^metres_per_pixel: expected a finite number > 0"),
+        ("plan.png:extent=60", r"Options: metres_per_pixel, tolerance_px"),
+        ("room.json:metres_per_pixel=1", r"^world: expected no options for a path without a floor plan"),
+    ],
+)
+def test_bad_sizes_and_scales_are_refused(source: str, says: str, tmp_path: Path, monkeypatch: Any) -> None:
+    """Worlds that are too large, plans of kilometres and unknown options give one error, at the reset at the latest."""
+    monkeypatch.chdir(tmp_path)
+    image = np.zeros((140, 180), np.uint8)
+    image[10:130, 10:170] = 255
+    cv2.imwrite("plan.png", image)
+    save_walls_json(World("room", ROOM), "room.json")
+    with pytest.raises(ValueError, match=says):
+        small_env(world=source).reset(seed=0)
 
 
 def test_splits_are_disjoint() -> None:

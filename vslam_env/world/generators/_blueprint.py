@@ -77,12 +77,23 @@ class Blueprint:
         for a, b in zip(cuts[0::2], cuts[1::2], strict=True):
             self.segments.append((x0, a, x0, b) if upright else (a, y0, b, y0))
 
+    def shell(self, x0: float, y0: float, x1: float, y1: float) -> None:
+        """Add the four outer walls of a rectangle [m]."""
+        self.wall(x0, y0, x1, y0)
+        self.wall(x1, y0, x1, y1)
+        self.wall(x0, y1, x1, y1)
+        self.wall(x0, y0, x0, y1)
+
+    def block(self, x0: float, y0: float, x1: float, y1: float) -> None:
+        """Add the outline of a solid box [m]."""
+        self.segments += _chain([(x0, y0), (x1, y0), (x1, y1), (x0, y1), (x0, y0)])
+
     def split(self, begin: float, end: float, parts: int) -> list[float]:
         """Divide [begin, end] [m] at random into parts of similar length; return all boundaries [m]."""
         shares = self.rng.uniform(0.75, 1.25, parts)
         return [begin, *(begin + (end - begin) * np.cumsum(shares)[:-1] / shares.sum()).tolist(), end]
 
-    def pilasters(self, begin: float, end: float, low: float, high: float) -> None:
+    def pilasters(self, begin: float, end: float, low: float, high: float, upright: bool = False) -> None:
         """Add pilasters alternately to both walls of a corridor along x, away from doors.
 
         Landmarks on corridor walls are invisible at oblique angles; pilasters face along the corridor.
@@ -90,13 +101,15 @@ class Blueprint:
         Args:
             begin, end: Range of the corridor along x [m], world frame.
             low, high: Positions y of its walls [m].
+            upright: Whether the corridor runs along y, with x and y exchanged.
         """
         x = begin + self.rng.uniform(1.0, 3.0)
         upper = self.rng.random() < 0.5
         while x < end - 0.5:
             y, inward = (high, -1.0) if upper else (low, 1.0)
-            if self._clear_of_doors(x, y, x, y):
-                self.segments.append((x, y, x, y + inward * self.rng.uniform(*PILASTER)))
+            if self._clear_of_doors(*((y, x, y, x) if upright else (x, y, x, y))):
+                tip = y + inward * self.rng.uniform(*PILASTER)
+                self.segments.append((y, x, tip, x) if upright else (x, y, x, tip))
                 upper = not upper
                 x += self.rng.uniform(2.5, 4.0)
             x += 0.4
@@ -157,7 +170,9 @@ class Blueprint:
 
     def _clear_of_doors(self, x0: float, y0: float, x1: float, y1: float) -> bool:
         """Return whether no door is close to a box."""
-        return all(np.hypot(max(x0 - x, 0.0, x - x1), max(y0 - y, 0.0, y - y1)) > DOOR_CLEARANCE for x, y in self.doors)
+        gap = DOOR_CLEARANCE
+        near = ((x, y) for x, y in self.doors if x0 - gap < x < x1 + gap and y0 - gap < y < y1 + gap)
+        return all(np.hypot(max(x0 - x, 0.0, x - x1), max(y0 - y, 0.0, y - y1)) > gap for x, y in near)
 
     def finished(self) -> FloatArray:
         """Return the walls (S, 4) [m], randomly mirrored."""

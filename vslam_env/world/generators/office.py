@@ -4,22 +4,37 @@ from itertools import pairwise
 
 import numpy as np
 
+from slam_backend.core.validation import check_float
 from vslam_env.world.generators._blueprint import Blueprint, Room
-from vslam_env.world.spec import World
+from vslam_env.world.generators._wings import add_wings
+from vslam_env.world.spec import LARGEST_EXTENT, World
 
+LEAST_EXTENT = 30.0  # [m] of a floor with wings
+DEPTH = 0.7  # depth of such a floor over its width
 ENOUGH_WALLS = 58  # number of walls above which no more rooms are furnished
 
 
-def office(rng: np.random.Generator) -> World:
-    """Build a furnished office floor of about 20 x 14 m with 7 to 10 rooms.
+def office(rng: np.random.Generator, extent: float | None = None) -> World:
+    """Build a furnished office floor.
 
     Args:
         rng: Source of the layout.
+        extent: Width of a floor of wings along crossing corridors, 0.7 times as deep [m], 30 to 200; None: a floor of
+            about 20 x 14 m with 7 to 10 rooms and 45 to 65 walls.
 
     Returns:
-        Closed world with about 45 to 65 walls, without landmarks. A robot of radius 0.2 m can reach every room. There
-        is always a loop: the ring of corridors, or neighbouring rooms with a door between them.
+        Closed world without landmarks. A robot of radius 0.2 m can reach every room. There is always a loop: the ring
+        of corridors, crossing corridors, or neighbouring rooms with a door between them.
+
+    Raises:
+        ValueError: If the extent is out of range.
     """
+    if extent is not None:
+        hint = "Give metres, or leave it out for a floor of 20 x 14 m."
+        extent = check_float("extent", extent, hint, at_least=LEAST_EXTENT, at_most=LARGEST_EXTENT)
+        wings = Blueprint(rng)
+        add_wings(wings, Room(0.0, 0.0, extent, DEPTH * extent))
+        return World("office", wings.finished())
     plan = Blueprint(rng)
     rooms = _ring(plan) if rng.random() < 0.6 else _spine(plan)
     for index in rng.permutation(len(rooms)):
@@ -33,7 +48,7 @@ def _ring(plan: Blueprint) -> list[Room]:
     rng = plan.rng
     width, height, corridor = rng.uniform(19.5, 21.0), rng.uniform(14.0, 15.0), rng.uniform(1.7, 1.95)
     bottom, top = rng.uniform(3.4, 3.9), height - rng.uniform(3.4, 3.9)
-    _shell(plan, width, height)
+    plan.shell(0.0, 0.0, width, height)
     west = rng.uniform(3.0, 3.8) if rng.random() < 0.6 else 0.0
     east = width - (rng.uniform(3.0, 3.8) if rng.random() < 0.4 else 0.0)
     rooms = _row(plan, plan.split(0.0, width, 3), 0.0, bottom, bottom)
@@ -62,7 +77,7 @@ def _spine(plan: Blueprint) -> list[Room]:
     rng = plan.rng
     width, height, corridor = rng.uniform(19.0, 21.0), rng.uniform(13.0, 14.5), rng.uniform(1.8, 2.2)
     low = 0.5 * (height - corridor) + rng.uniform(-0.6, 0.6)
-    _shell(plan, width, height)
+    plan.shell(0.0, 0.0, width, height)
     rooms = []
     for y0, y1, corridor_wall, parts in (
         (0.0, low, low, 4),
@@ -72,14 +87,6 @@ def _spine(plan: Blueprint) -> list[Room]:
         rooms += _row(plan, ends, y0, y1, corridor_wall, door_between=int(rng.integers(1, len(ends) - 1)))
     plan.pilasters(0.0, width, low, low + corridor)
     return rooms
-
-
-def _shell(plan: Blueprint, width: float, height: float) -> None:
-    """Add the four outer walls."""
-    plan.wall(0.0, 0.0, width, 0.0)
-    plan.wall(width, 0.0, width, height)
-    plan.wall(0.0, height, width, height)
-    plan.wall(0.0, 0.0, 0.0, height)
 
 
 def _row(

@@ -10,7 +10,7 @@ import numpy as np
 
 from slam_backend.core.files import write_file
 from slam_backend.core.validation import FloatArray, argument_error, check_float
-from vslam_env.world.spec import World
+from vslam_env.world.spec import LARGEST_EXTENT, World
 
 BRIGHT_SHARE = 0.85  # separates grey 195 from 128, white from black, and 254 from "unknown" 205 in ROS maps
 COLOURED = 60  # least range of the channels of a coloured marker such as a yellow start cell
@@ -30,7 +30,7 @@ def load_floorplan(
     Args:
         path: PNG, JPEG, PGM or any other format that OpenCV reads.
         metres_per_pixel: Side of a pixel [m]. With 0.045, corridors of 640 x 480 dungeon plans (32 px) are 1.4 m wide,
-            and the largest distance (665 px) is 30 m: a robot's 60 x 60 m grid covers them from any start.
+            and the plans 29 x 22 m.
         tolerance_px: Largest deviation of the walls from the traced outlines [px].
         robot_radius: Radius of a robot that must fit into the free space [m].
 
@@ -58,9 +58,16 @@ def trace(free: Any, metres_per_pixel: float, tolerance_px: float, robot_radius:
         Walls (S, 4) float64 [m], origin at the lower left corner of the image, y upwards.
 
     Raises:
-        ValueError: If no robot fits, or the tolerance leaves no outline.
+        ValueError: If no robot fits, the plan is too large, or the tolerance leaves no outline.
     """
     x, y, width, height = cv2.boundingRect(free)
+    if max(width, height) * metres_per_pixel > LARGEST_EXTENT:
+        raise argument_error(
+            "world",
+            f"a plan of at most {LARGEST_EXTENT:g} m",
+            f"{width * metres_per_pixel:.6g} x {height * metres_per_pixel:.6g} m in {path}",
+            f"Lower metres_per_pixel, the resolution of a ROS map: it is {metres_per_pixel:g}.",
+        )
     cropped = np.pad(free[y : y + height, x : x + width], 1)
     widest = 2.0 * metres_per_pixel * float(cv2.distanceTransform(cropped, cv2.DIST_L2, 3).max())
     if widest < 2.5 * robot_radius:
