@@ -35,7 +35,7 @@ def default_filter_options() -> FilterOptions:
         motion=OdometryModel(bias_scale=0.02, bias_heading=math.radians(0.5)),
         camera=StereoCamera(sigma_px=1.5 * true.sigma_px, sigma_disparity_px=1.5 * true.sigma_disparity_px),
         rejuvenate_every=100,
-        smoothing=SmoothingOptions(max_keys=90, further_keys=0, slice_steps=90, rigid_within=0.007),
+        smoothing=SmoothingOptions(max_keys=180, further_keys=0, slice_steps=90, rigid_within=0.007),
     )
 
 
