@@ -191,8 +191,7 @@ class Follower:
         sides = next(watch.sides for watch in watches if watch.alignment is merge.alignment)
         claims = []
         for side, joined, rows in zip(sides, self._team.merged_maps(merge), merge.alignment.inliers.T, strict=True):
-            book = self._ground_truth._books[self._ground_truth._row_of[side.trunk["number"]]]
-            claims.append(book[joined.ids[rows]])
+            claims.append(self._ground_truth.claims_of(side.trunk["number"], joined.ids[rows]))
         return float(np.mean((claims[0] != claims[1]) | (claims[0] == FALSE))) if len(claims[0]) else float("nan")
 
 

@@ -156,6 +156,10 @@ class GroundTruthAssociation:
         """Return the claims (n,) int64 of landmarks in a robot's map: true index, -1 false, -2 not scored."""
         return np.asarray(self._claims[self._claims_row[robot], ids])
 
+    def claims_of(self, number: int, ids: IntArray) -> IntArray:
+        """Return the claims (n,) int64 of landmarks in the map of that number, see `true_ids`."""
+        return np.asarray(self._claims[self._row_of[number], ids])
+
     def rows_of(self, true_ids: IntArray) -> IntArray:
         """Return the rows (n,) int64 of `true_positions` for true ids (n,), -1: false point; negative if not scored."""
         return np.where(true_ids >= 0, self._claim_of[true_ids], FALSE)
