@@ -9,13 +9,15 @@ import numpy as np
 
 from agents.registry import make_policy
 from agents.team import SeparatePolicies, TeamPolicy
-from slam_backend.core.validation import argument_error, check_choice
-from vslam_env.belief.team_belief import Belief
+from slam_backend.core.validation import IntArray, argument_error, check_choice
+from vslam_env.belief.team_belief import Belief, Candidates
+from vslam_env.navigation import CandidateKind
 
 BOUNDS = ("oracles", "rollout")
 ORACLES = ("oracle_pose", "oracle_association", "oracle_merge")
 HORIZON = 8  # decisions that are tried in a twin
-CHOICES = 4  # nearest candidates of a robot that are tried, beside the choice of the base policy
+# Nearest candidates of a robot that are tried, beside the choice of the base policy.
+CHOICES = ((CandidateKind.FRONTIER, 4), (CandidateKind.REVISIT, 2))
 KEEP = 4  # decisions for which the choice is kept
 
 
@@ -82,8 +84,7 @@ class Rollout:
         state, plan = self._env.get_state(), dict.fromkeys(beliefs, 0)
         best = self._value(state, plan, observations, rng)
         for agent, belief in beliefs.items():
-            slots = np.flatnonzero(belief.candidates.valid)
-            for slot in slots[np.argsort(belief.candidates.lengths[slots], kind="stable")][:CHOICES]:
+            for slot in _nearest(belief.candidates):
                 trial = plan | {agent: 1 + int(slot)}
                 value = self._value(state, trial, observations, rng)
                 if value > best:
@@ -112,3 +113,9 @@ class Rollout:
         """Return the planned action of an agent while its candidate lives, otherwise 0."""
         action = plan.get(agent, 0)
         return action if action and belief.candidates.valid[action - 1] else 0
+
+
+def _nearest(candidates: Candidates) -> IntArray:
+    """Return the slots of the candidates that are tried, `CHOICES` of each kind."""
+    kinds = [(candidates.of_kind(kind), most) for kind, most in CHOICES]
+    return np.concatenate([slots[np.argsort(candidates.lengths[slots], kind="stable")][:most] for slots, most in kinds])

@@ -9,9 +9,10 @@ the path to that of now. Robots leave frontiers to which a teammate is nearer.
 
 import numpy as np
 
-from agents.goal_choice import SWITCH_RATIO, frontier_slots, own_share, unknown_area
+from agents.goal_choice import SWITCH_RATIO, own_share
 from agents.predicted_pose import d_optimality, predict_covariances
 from vslam_env.belief.team_belief import Belief
+from vslam_env.navigation import CandidateKind
 
 LEAST = 1e-3  # D-optimality below which the pose counts as known: .02 m and .001 rad or so
 REACH = 3.0  # [m] added to the length of a path
@@ -31,7 +32,7 @@ class DOptimality:
     def choose(self, belief: Belief, rng: np.random.Generator) -> int | None:
         """Return the slot to go to; the path to the previous one counts half."""
         candidates = belief.candidates
-        slots = own_share(belief, frontier_slots(candidates))
+        slots = own_share(belief, candidates.of_kind(CandidateKind.FRONTIER))
         slots = slots[np.argsort(candidates.lengths[slots], kind="stable")][:MOST_PREDICTED]
         if not len(slots):
             self._held = None
@@ -39,6 +40,6 @@ class DOptimality:
         now = LEAST + float(d_optimality(belief.covariance + 1e-12 * np.eye(3)))
         ahead = np.array([LEAST + d_optimality(found).mean() for found in predict_covariances(belief, slots)])
         lengths = np.where(slots == self._held, SWITCH_RATIO, 1.0) * candidates.lengths[slots]
-        values = (0.5 + unknown_area(candidates, slots)) / (REACH + lengths) * now / ahead
+        values = (0.5 + candidates.gains.unknown_area[slots]) / (REACH + lengths) * now / ahead
         self._held = int(slots[np.argmax(values)])
         return self._held

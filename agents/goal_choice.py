@@ -107,16 +107,6 @@ class DrivingPolicy:
             self._patrol = self._path[-1]  # the nearest reachable point, if a wall was discovered at the goal
 
 
-def frontier_slots(candidates: Candidates) -> IntArray:
-    """Return the slots (n,) int64 that hold frontiers."""
-    return np.flatnonzero(candidates.valid)
-
-
-def unknown_area(candidates: Candidates, slots: IntArray) -> FloatArray:
-    """Return the unknown area (n,) [m^2] that is expected behind frontiers: their length times a depth of 2 m."""
-    return np.asarray(2.0 * candidates.features[slots, 3], dtype=np.float64)
-
-
 def own_share(belief: Belief, slots: IntArray) -> IntArray:
     """Return those of the slots to which no teammate is nearer, in a straight line; all of them if there are none."""
     candidates = belief.candidates

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.core.validation import Float32Array
+from vslam_env.navigation import CANDIDATE_FEATURES, NUM_CANDIDATES
 
 Weights = Mapping[str, Float32Array]
 
@@ -17,8 +18,10 @@ SHAPES: dict[str, tuple[int, ...]] = {
     "scan": (32,),
     "teammates": (7, 5),
     "teammates_mask": (7,),
-    "candidates": (16, 5),
-    "action_mask": (17,),
+    "landmark_counts": (5,),
+    "time_left": (1,),
+    "candidates": (NUM_CANDIDATES, len(CANDIDATE_FEATURES)),
+    "action_mask": (1 + NUM_CANDIDATES,),
 }
 NAMES = tuple(SHAPES)
 # Factors that scale the input vectors to the order of one.
@@ -28,8 +31,22 @@ VECTORS: dict[str, tuple[float, ...]] = {
     "scan": (0.125,),
     "teammates": (0.1, 0.1, 1.0, 1.0, 2.0),
     "teammates_mask": (1.0,),
+    "landmark_counts": (0.02,),
+    "time_left": (0.01,),
 }
-CANDIDATE_SCALE = (0.1, 0.1, 0.1, 0.25, 1.0 / 60.0)
+FEATURE_SCALES: dict[str, float] = {
+    "x": 0.1,
+    "y": 0.1,
+    "path_length": 0.1,
+    "size": 0.25,
+    "teammate_path_length": 1.0 / 60.0,
+    "unknown_area": 0.05,
+    "unseen_wall": 0.25,
+    "weak_landmarks": 0.25,
+    "uncertain_length": 0.1,
+    "nearest_candidate": 0.1,
+}  # 1 for the others
+CANDIDATE_SCALE = tuple(FEATURE_SCALES.get(name, 1.0) for name in CANDIDATE_FEATURES)
 GRID_SCALE = 1.0 / 255.0
 PATCHES = (4, 3)  # sides of the non-overlapping patches of each convolution
 CHANNELS = (16, 32)
@@ -39,7 +56,7 @@ PICTURE_SIZE = CHANNELS[1] * (48 // (PATCHES[0] * PATCHES[1])) ** 2
 
 
 def logits(weights: Weights, observations: Mapping[str, NDArray[Any]]) -> Float32Array:
-    """Return the logit of each action, (n, 17) float32, for valid and invalid actions.
+    """Return the logit of each action, (n, 1 + C) float32, for valid and invalid actions.
 
     A convolution of the local grid and the vectors give a context. One small network with shared weights scores each
     candidate from this context and the candidate's features, so that the result does not depend on the slot.

@@ -6,8 +6,9 @@ with `NearestFrontier` it shows what coordination is worth.
 
 import numpy as np
 
-from agents.goal_choice import frontier_slots, nearest_slot
+from agents.goal_choice import nearest_slot
 from vslam_env.belief.team_belief import Belief
+from vslam_env.navigation import CandidateKind
 
 
 class IndependentFrontier:
@@ -22,5 +23,5 @@ class IndependentFrontier:
 
     def choose(self, belief: Belief, rng: np.random.Generator) -> int | None:
         """Return the slot to go to; the previous one is kept unless another frontier is much nearer."""
-        self._held = nearest_slot(belief.candidates, frontier_slots(belief.candidates), self._held)
+        self._held = nearest_slot(belief.candidates, belief.candidates.of_kind(CandidateKind.FRONTIER), self._held)
         return self._held

@@ -6,8 +6,9 @@ Yamauchi, "Frontier-based exploration using multiple robots", Agents 1998, with 
 
 import numpy as np
 
-from agents.goal_choice import frontier_slots, nearest_slot, own_share
+from agents.goal_choice import nearest_slot, own_share
 from vslam_env.belief.team_belief import Belief
+from vslam_env.navigation import CandidateKind
 
 
 def choose_slot(belief: Belief, held: int | None = None) -> int | None:
@@ -19,7 +20,8 @@ def choose_slot(belief: Belief, held: int | None = None) -> int | None:
         belief: Belief of the robot.
         held: Slot of the previous goal; it is kept unless the candidate is gone or another is much nearer.
     """
-    return nearest_slot(belief.candidates, own_share(belief, frontier_slots(belief.candidates)), held)
+    candidates = belief.candidates
+    return nearest_slot(candidates, own_share(belief, candidates.of_kind(CandidateKind.FRONTIER)), held)
 
 
 class NearestFrontier:

@@ -11,10 +11,10 @@ import math
 
 import numpy as np
 
-from agents.goal_choice import SWITCH_RATIO, frontier_slots, own_share, unknown_area
+from agents.goal_choice import SWITCH_RATIO, own_share
 from agents.predicted_pose import predict_covariances
 from vslam_env.belief.team_belief import Belief
-from vslam_env.navigation import CELL
+from vslam_env.navigation import CELL, CandidateKind
 
 AREA_NATS = math.log(2.0) / CELL**2  # [1/m^2] entropy of the unknown cells of a square metre
 MAP_WEIGHT = 0.02  # cells of a grid are not independent: weight of their entropy beside that of the pose
@@ -35,7 +35,7 @@ class RbpfGain:
     def choose(self, belief: Belief, rng: np.random.Generator) -> int | None:
         """Return the slot to go to; the path to the previous one counts half."""
         candidates = belief.candidates
-        slots = own_share(belief, frontier_slots(candidates))
+        slots = own_share(belief, candidates.of_kind(CandidateKind.FRONTIER))
         slots = slots[np.argsort(candidates.lengths[slots], kind="stable")][:MOST_PREDICTED]
         if not len(slots):
             self._held = None
@@ -43,6 +43,6 @@ class RbpfGain:
         before = np.linalg.slogdet(belief.covariance + 1e-12 * np.eye(3))[1]
         after = np.linalg.slogdet([found[-1] for found in predict_covariances(belief, slots)])[1]
         lengths = np.where(slots == self._held, SWITCH_RATIO, 1.0) * candidates.lengths[slots]
-        gains = MAP_WEIGHT * AREA_NATS * unknown_area(candidates, slots) + 0.5 * (before - after)
+        gains = MAP_WEIGHT * AREA_NATS * candidates.gains.unknown_area[slots] + 0.5 * (before - after)
         self._held = int(slots[np.argmax(gains - COST * lengths)])
         return self._held

@@ -6,11 +6,19 @@ from functools import cached_property
 
 import numpy as np
 
-from agents.goal_choice import SWITCH_RATIO, frontier_slots
+from agents.goal_choice import SWITCH_RATIO
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.geometry import compose, inverse, transform_points
 from vslam_env.belief.team_belief import Belief
-from vslam_env.navigation import DistanceMap, cells_of, distance_map, lengths_between, rooms_of, sees
+from vslam_env.navigation import (
+    CandidateKind,
+    DistanceMap,
+    cells_of,
+    distance_map,
+    lengths_between,
+    rooms_of,
+    sees,
+)
 
 MOST_TARGETS = 12  # per robot, nearest first: each costs a search of paths
 SAME_TARGET = 1.0  # [m] frontiers of two robots nearer than this are the same
@@ -131,5 +139,5 @@ def team_targets(beliefs: Sequence[Belief], held: Mapping[int, int | None]) -> T
 
 def _nearest(belief: Belief) -> IntArray:
     """Return the slots of a robot's nearest frontiers, at most `MOST_TARGETS`, in the order of their path lengths."""
-    slots = frontier_slots(belief.candidates)
+    slots = belief.candidates.of_kind(CandidateKind.FRONTIER)
     return slots[np.argsort(belief.candidates.lengths[slots], kind="stable")][:MOST_TARGETS]

@@ -38,7 +38,7 @@ from training.episodes.runner import Progress, run_episode
 from training.experiments.statistics import format_ci, mean_ci
 from training.experiments.tables import markdown_table
 from training.rl.config import SPLIT_TRAIN, TrainConfig
-from vslam_env import ExplorationEnv, vslam_v0
+from vslam_env import CANDIDATE_FEATURES, NUM_CANDIDATES, ExplorationEnv, vslam_v0
 from vslam_env.belief.team_belief import Belief
 from vslam_env.reward import RUNNING_COST
 
@@ -49,6 +49,7 @@ REWARDS: tuple[dict[str, float], ...] = (
     {"map_error": 3.0, "own_coverage": 10.0},
 )
 TRACES = (0.95, 0.9, 0.5, 0.0)
+COLUMNS = ("path_length", "size", "teammate_path_length")
 CHOICES = ("shorter path", "longer frontier", "no teammate nearer")
 RIDGE = 1e-2
 WIDTH = 120
@@ -113,7 +114,8 @@ def play(env: ExplorationEnv, seed: int) -> tuple[FloatArray, FloatArray, FloatA
 
 def described(observation: Mapping[str, Any]) -> FloatArray:
     """Return the features `CHOICES` of each valid candidate (n, 3)."""
-    _, _, length, size, mate = observation["candidates"][observation["action_mask"][1:] != 0].T.astype(np.float64)
+    rows = observation["candidates"][observation["action_mask"][1:] != 0].astype(np.float64)
+    length, size, mate = (rows[:, CANDIDATE_FEATURES.index(name)] for name in COLUMNS)
     return np.column_stack([-np.log1p(length), np.log1p(size), mate >= length])
 
 
@@ -135,7 +137,7 @@ def value_features(observation: Mapping[str, Any], progress: float) -> FloatArra
     mean = rows.mean(axis=0) if len(rows) else np.zeros(3)
     around = observation["local_grid"].mean(axis=(1, 2)) / 255.0
     scalars = (1.0, progress, progress**2, progress * group, count / 100, 5 * sigma, group, observation["pose_std"][0])
-    return np.array([*scalars, len(rows) / 16, *best, *mean, *around])
+    return np.array([*scalars, len(rows) / NUM_CANDIDATES, *best, *mean, *around])
 
 
 def advantages(rewards: FloatArray, seen: FloatArray, gamma: float, trace: float) -> tuple[FloatArray, float]:

@@ -135,7 +135,7 @@ class ExplorationVecEnv(VecEnv):  # type: ignore[misc]   # its types are not che
         return self._split_masks(stepped.observations), stepped.rewards, stepped.dones, stepped.infos
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
-        """Call a method of the environment of each slot; `action_masks` returns (17,) bool per slot."""
+        """Call a method of the environment of each slot; `action_masks` returns (33,) bool per slot."""
         slots = self._indices(indices)
         if method_name == "action_masks" and self._masks is not None:
             return [self._masks[slot].copy() for slot in slots]

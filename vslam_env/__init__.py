@@ -10,13 +10,17 @@ import pettingzoo
 from vslam_env.belief.team_belief import Belief
 from vslam_env.config import EnvConfig
 from vslam_env.environment import ExplorationEnv
+from vslam_env.navigation import CANDIDATE_FEATURES, NUM_CANDIDATES, CandidateKind
 from vslam_env.presets import preset_config, stereo_belief
 from vslam_env.snapshots import load_state, save_state
 from vslam_env.warm_up import warm_up
 from vslam_env.world import World
 
 __all__ = [
+    "CANDIDATE_FEATURES",
+    "NUM_CANDIDATES",
     "Belief",
+    "CandidateKind",
     "EnvConfig",
     "ExplorationEnv",
     "World",

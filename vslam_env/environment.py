@@ -17,7 +17,7 @@ from vslam_env.actions import action_space, checked_actions
 from vslam_env.belief.observation import flatten, observation_space, observe_team
 from vslam_env.belief.readings import Readings, TeamReadings
 from vslam_env.belief.team_belief import Belief, TeamBelief
-from vslam_env.config import EnvConfig
+from vslam_env.config import TICK, EnvConfig
 from vslam_env.evaluation.team_metrics import TeamMetrics
 from vslam_env.rendering import Scene, draw_frame
 from vslam_env.rendering.from_episode import build_scene
@@ -232,7 +232,9 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
 
     def belief(self, agent: AgentID) -> Belief:
         """Return the belief of an agent's robot, which contains no ground truth."""
-        return self._running_episode("belief").belief.belief(self._index(agent))
+        beliefs = self._running_episode("belief").belief
+        beliefs.set_seconds_left(self._seconds_left)
+        return beliefs.belief(self._index(agent))
 
     @property
     def events(self) -> tuple[MergeEvent, ...]:
@@ -361,8 +363,14 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
     ) -> tuple[dict[AgentID, Any], dict[AgentID, dict[str, Any]]]:
         """Return observations and infos by agent after the last tick; `terms` are the reward terms of the step."""
         agents, belief = self.possible_agents, episode.belief
+        belief.set_seconds_left(self._seconds_left)
         observations = build_observations(agents, belief, episode.readings, *self._shown_as)
         return observations, build_infos(agents, belief.known_groups, self._team_metrics, terms, invalid)
+
+    @property
+    def _seconds_left(self) -> float:
+        """Time until the episode is truncated [s]."""
+        return max(self._max_cycles - self._cycle, 0) * self.config.ticks_per_step * TICK
 
     def _running_episode(self, name: str) -> Episode:
         if self._episode is None:

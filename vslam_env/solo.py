@@ -71,7 +71,7 @@ class SoloExplorationEnv(gymnasium.Env[Any, Any]):
         return self.parallel.belief(AGENT)
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """Return which `goal` actions are valid (17,) bool; sb3-contrib's MaskablePPO calls this method."""
+        """Return which `goal` actions are valid (33,) bool; sb3-contrib's MaskablePPO calls this method."""
         valid = self.belief().candidates.valid
         return np.concatenate([[True], valid])
 

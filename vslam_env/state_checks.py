@@ -19,7 +19,10 @@ from vslam_env.evaluation.coverage import CoverageCells
 from vslam_env.evaluation.map_scores import UNUSED
 from vslam_env.evaluation.team_metrics import BeliefSummary, RobotCounts, RobotMetrics, TeamMetrics
 from vslam_env.navigation._grid_kernels import LARGEST_HALF_WIDTH as HALF_WIDTH
+from vslam_env.navigation._view_kernels import NUM_GAINS
 from vslam_env.navigation.candidate_slots import NUM_SLOTS
+from vslam_env.navigation.candidates import NUM_CANDIDATES, NUM_REVISITS
+from vslam_env.navigation.looks import check_looks
 from vslam_env.navigation.occupancy_grid import check_grid
 from vslam_env.sensors import LandmarkSensor, RangeFinder, StereoSensor, TeamRenderedFrames, TeamSensorFrames
 from vslam_env.simulation.episode import Episode, num_shared
@@ -151,7 +154,7 @@ class EpisodeCheck:
     # ------------------------------------------------------------------ beliefs
 
     def _check_belief(self, name: str, belief: Any, scenario: Scenario) -> None:
-        check.keys(name, belief, ("tick", "team", "grids", "slots"))
+        check.keys(name, belief, ("tick", "team", "grids", "candidates", "rendezvous", "goals"))
         if belief["tick"] != self._tick or type(belief["tick"]) is not int:
             check.refuse(f"{name}['tick']", f"{self._tick}, the tick of the episode", belief["tick"])
         own = None if self._own is None else self._own.belief
@@ -172,12 +175,17 @@ class EpisodeCheck:
             check.refuse(f"{name}['team']", "options of the environment's configuration", "others")
         updates = {} if own is None else own.grid_updates
         self._check_grids(f"{name}['grids']", belief["grids"], updates)
-        for where, slots in check.named_items(f"{name}['slots']", belief["slots"], self._count):
-            check_slots(where, slots)
+        check_candidates(f"{name}['candidates']", belief["candidates"], self._count)
+        check.keys(f"{name}['rendezvous']", belief["rendezvous"], ("visited",))
+        visited = belief["rendezvous"]["visited"]
+        check.array(f"{name}['rendezvous']['visited']", visited, check.BOOL, (self._count, self._count))
+        check_goals(f"{name}['goals']", belief["goals"], self._count)
 
     def _check_grids(self, name: str, grids: Any, known: Mapping[int, GridUpdate]) -> None:
         count = self._count
-        check.keys(name, grids, ("grids", "mates", "parted", "kept", "strokes"))
+        check.keys(name, grids, ("grids", "looks", "mates", "parted", "kept", "strokes"))
+        for where, looks in check.named_items(f"{name}['looks']", grids["looks"], count):
+            check_looks(where, looks)
         for where, grid in check.named_items(f"{name}['grids']", grids["grids"], count):
             check_grid(where, grid)
         mates = grids["mates"]
@@ -198,6 +206,11 @@ class EpisodeCheck:
             robots = [*snapshot.sides[0], *snapshot.sides[1]]
             if set(snapshot.grids) != set(robots) or len(set(robots)) < len(robots):
                 check.refuse(f"{where}.grids", f"the grid of each of {robots}", list(snapshot.grids))
+            check.instance(f"{where}.looks", snapshot.looks, dict)
+            if set(snapshot.looks) != set(robots):
+                check.refuse(f"{where}.looks", f"the looks of each of {robots}", list(snapshot.looks))
+            for robot, looks in snapshot.looks.items():
+                check_looks(f"{where}.looks[{robot}]", looks)
             for grid in snapshot.grids.values():
                 check_grid(f"{where}.grids", grid)
             self._check_strokes(f"{where}.updates", snapshot.updates, known)
@@ -293,6 +306,8 @@ class EpisodeCheck:
             check.array(f"{name}.contacts", readings.contacts, check.BOOL, (count, count))
         if readings.images is not None:
             self._check_images(f"{name}.images", readings.images)
+        if readings.goals is not None:
+            check_goals(f"{name}.goals", readings.goals, count)
 
     def _check_measurements(self, name: str, frames: Any) -> None:
         if not isinstance(frames, TeamMeasurements):
@@ -362,15 +377,46 @@ def check_streams(name: str, streams: Any) -> None:
 def check_slots(name: str, slots: Any) -> None:
     """Raise unless a value is a state of `CandidateSlots`."""
     check.keys(name, slots, ("rows", "visits", "given_up"))
-    rows = slots["rows"]
-    check.array(f"{name}['rows']", rows, check.FLOAT64, (NUM_SLOTS, SLOT_COLUMNS))
-    empty = np.isnan(rows)
-    held = rows[~empty[:, 0]]
-    check.floats(f"{name}['rows']", held, (len(held), SLOT_COLUMNS))
-    if (empty != empty[:, :1]).any() or (held.size and np.abs(held[:, :2]).max() > HALF_WIDTH):
-        check.refuse(f"{name}['rows']", "positions in the grid, or NaN", "others")
+    check_rows(f"{name}['rows']", slots["rows"], (NUM_SLOTS,))
     check.indices(f"{name}['visits']", slots["visits"], (NUM_SLOTS,))
     check.floats(f"{name}['given_up']", slots["given_up"], (None, 2), -HALF_WIDTH, HALF_WIDTH)
+
+
+def check_candidates(name: str, candidates: Any, count: int) -> None:
+    """Raise unless a value is a state of the `TeamCandidates` of K robots."""
+    check.keys(name, candidates, ("frontiers", "rows", "gains", "views", "lengths", "visits", "updates"))
+    for where, slots in check.named_items(f"{name}['frontiers']", candidates["frontiers"], count):
+        check_slots(where, slots)
+    check_rows(f"{name}['rows']", candidates["rows"], (count, NUM_CANDIDATES - NUM_SLOTS))
+    check.floats(f"{name}['gains']", candidates["gains"], (count, NUM_CANDIDATES, NUM_GAINS), 0.0)
+    views = candidates["views"]
+    check.array(f"{name}['views']", views, check.FLOAT64, (count, NUM_CANDIDATES, 3))
+    if np.isinf(views).any():
+        check.refuse(f"{name}['views']", "finite poses, or NaN", "others")
+    lengths = candidates["lengths"]
+    check.array(f"{name}['lengths']", lengths, check.FLOAT64, (count, NUM_CANDIDATES, count))
+    if not (lengths >= 0.0).all():
+        check.refuse(f"{name}['lengths']", "lengths >= 0", "others")
+    check.indices(f"{name}['visits']", candidates["visits"], (count, NUM_REVISITS))
+    check.integers(f"{name}['updates']", candidates["updates"])
+    check.sequence(f"{name}['updates']", candidates["updates"], count)
+
+
+def check_rows(name: str, rows: Any, shape: tuple[int, ...]) -> None:
+    """Raise unless a value is rows of candidates, NaN in empty slots."""
+    check.array(name, rows, check.FLOAT64, (*shape, SLOT_COLUMNS))
+    empty = np.isnan(rows)
+    held = rows[~empty[..., 0]]
+    check.floats(name, held, (len(held), SLOT_COLUMNS))
+    if (empty != empty[..., :1]).any() or (held.size and np.abs(held[:, :2]).max() > HALF_WIDTH):
+        check.refuse(name, "positions in the grid, or NaN", "others")
+
+
+def check_goals(name: str, goals: Any, count: int) -> None:
+    """Raise unless a value is the goals (K, 2) of K robots, NaN where they have none."""
+    check.array(name, goals, check.FLOAT64, (count, 2))
+    held = goals[~np.isnan(goals[:, 0])]
+    check.floats(name, held, (len(held), 2), -HALF_WIDTH, HALF_WIDTH)
 
 
 def check_team_metrics(name: str, metrics: Any, count: int, with_beliefs: bool) -> None:

@@ -51,7 +51,7 @@ def parallel_env(
         sensor: `"landmark"` (default): simulated measurements. `"stereo"`: rendered images of textured walls, measured
             by the stereo front end.
         action_type: `"continuous"` (default): (speed, turn) in [-1, 1], zeros stop. `"discrete"`: stay, ahead,
-            left, right. `"goal"`: 0 to stay, 1 to 16 to drive to a candidate of the last observation.
+            left, right. `"goal"`: 0 to stay, 1 to 32 to drive to a candidate of the last observation.
         decision_ticks: Ticks of 0.1 s per step; default 1, or 10 with `goal`.
         num_particles: Number of particles of each filter; default 100.
         max_cycles: Number of steps after which the episode is truncated; default: as many as `max_seconds` takes.

@@ -15,7 +15,7 @@ from agents.targets import NO_PATH, Targets, own_targets, team_targets
 from agents.utility_cost import COST, utility_cost
 from slam_backend.geometry import compose, inverse
 from tests.agents.test_policies import ROOM
-from vslam_env import ExplorationEnv, vslam_v0
+from vslam_env import CandidateKind, ExplorationEnv, vslam_v0
 from vslam_env.navigation import OccupancyGrid, distance_map
 
 RNG = np.random.default_rng(0)
@@ -126,7 +126,7 @@ def test_targets_of_a_team_are_the_robots_own() -> None:
     group = [belief for belief in beliefs if belief.group == beliefs[0].group]
     targets = team_targets(group, {})
     assert targets is not None
-    assert len(targets.places) >= max((belief.candidates.valid.sum() for belief in group), default=0)
+    assert len(targets.places) >= max(len(belief.candidates.of_kind(CandidateKind.FRONTIER)) for belief in group)
     for row, belief in enumerate(group):
         first_from_own = compose(group[0].start_from_group, inverse(belief.start_from_group))
         for target in np.flatnonzero(targets.slots[row] >= 0):
@@ -141,7 +141,7 @@ def test_a_held_goal_counts_as_nearer() -> None:
     """The path to the held goal counts half."""
     env = _explored(2, 2)
     belief = env.belief("robot_0")
-    free, slot = own_targets(belief, None), int(np.flatnonzero(belief.candidates.valid)[0])
+    free, slot = own_targets(belief, None), int(belief.candidates.of_kind(CandidateKind.FRONTIER)[0])
     held = own_targets(belief, slot)
     assert free is not None
     assert held is not None

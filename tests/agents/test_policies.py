@@ -1,5 +1,6 @@
 """Built-in and custom policies."""
 
+import dataclasses
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,7 +15,7 @@ from agents.nearest_frontier import choose_slot
 from agents.plugins import is_plugin
 from agents.registry import action_types
 from slam_backend.geometry import compose
-from vslam_env import ExplorationEnv, World, vslam_v0
+from vslam_env import NUM_CANDIDATES, CandidateKind, ExplorationEnv, World, vslam_v0
 from vslam_env.belief.team_belief import Belief, Teammate
 from vslam_env.navigation import OccupancyGrid, cell_of, plan_path
 
@@ -69,10 +70,12 @@ def _belief(env: ExplorationEnv, **changes: Any) -> Belief:
 def _candidates(env: ExplorationEnv, goals: dict[int, tuple[float, float, float]]) -> Any:
     """Return candidates with a goal (x, y) and a path length in some slots."""
     given = env.belief("robot_0").candidates
-    places, lengths, valid = np.full((16, 2), np.nan), np.zeros(16), np.zeros(16, np.bool_)
+    count = NUM_CANDIDATES
+    places, lengths, valid = np.full((count, 2), np.nan), np.zeros(count), np.zeros(count, np.bool_)
     for slot, (x, y, length) in goals.items():
         places[slot], lengths[slot], valid[slot] = (x, y), length, True
-    return type(given)(places, np.zeros(16), lengths, valid, np.zeros((16, 5), np.float32))
+    kinds = np.where(valid, CandidateKind.FRONTIER, CandidateKind.NONE)
+    return dataclasses.replace(given, goals=places, headings=np.zeros(count), lengths=lengths, valid=valid, kinds=kinds)
 
 
 def test_the_nearest_slot_is_chosen_and_kept() -> None:
@@ -92,7 +95,7 @@ def test_candidates_with_a_nearer_teammate_are_left_to_it() -> None:
     """A candidate next to a teammate is avoided, unless there is no other."""
     env = _env("goal")
     env.reset(seed=0)
-    mates = (Teammate(1, np.array([-1.5, 2.0, 0.0]), np.eye(3)),)
+    mates = (Teammate(1, np.array([-1.5, 2.0, 0.0]), np.eye(3), np.full(2, np.nan)),)
     two = _candidates(env, {2: (7.0, 0.0, 7.5), 9: (0.0, 2.0, 3.0)})
     assert choose_slot(_belief(env, candidates=two, teammates=mates)) == 2
     one = _candidates(env, {9: (0.0, 2.0, 3.0)})

@@ -1,5 +1,6 @@
 """Predicted pose covariances: laws of the prediction, and the choices made with it."""
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ from agents.predicted_pose import _information, _poses_along, d_optimality, pred
 from slam_backend.core.validation import FloatArray
 from slam_backend.maps.landmark_map import LandmarkMap
 from tests.agents.test_policies import ROOM
-from vslam_env import vslam_v0
+from vslam_env import CandidateKind, vslam_v0
 from vslam_env.belief.team_belief import Belief
 from vslam_env.navigation import OccupancyGrid, distance_map
 
@@ -22,13 +23,15 @@ def _belief(landmarks: list[tuple[float, float]], goal: tuple[float, float]) -> 
     grid = OccupancyGrid()
     grid.clear_disc([0.0, 0.0, 0.0], 9.0)
     slots = given.candidates
-    values: dict[str, Any] = {name: getattr(slots, name).copy() for name in slots.__slots__}
+    names = "goals", "headings", "lengths", "valid", "kinds"
+    values: dict[str, Any] = {name: getattr(slots, name).copy() for name in names}
     values["goals"][0], values["headings"][0], values["lengths"][0], values["valid"][0] = goal, 0.0, 5.0, True
+    values["kinds"][0] = CandidateKind.FRONTIER
     points = np.array([(*point, 0.0) for point in landmarks]).reshape(-1, 3)
     held = LandmarkMap(points, np.tile(1e-6 * np.eye(3), (len(points), 1, 1)), np.eye(len(points), 4, dtype=np.float32))
     changes = {
         "pose": np.zeros(3), "covariance": 1e-6 * np.eye(3), "grid": grid.read_only_view(), "group_map": held,
-        "start_from_group": np.zeros(3), "candidates": type(slots)(**values),
+        "start_from_group": np.zeros(3), "candidates": dataclasses.replace(slots, **values),
     }  # fmt: skip
     return Belief(**{name: getattr(given, name) for name in given.__dataclass_fields__} | changes)
 

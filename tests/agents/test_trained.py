@@ -12,7 +12,7 @@ import pytest
 from agents import make_policy
 from agents.goal_network import CHANNELS, CONTEXT, PATCHES, PICTURE_SIZE, SHAPES, VECTOR_SIZE, logits
 from agents.trained import FORMAT, TrainedGoalPolicy, check_observation, load_model, save_model
-from vslam_env import vslam_v0
+from vslam_env import CANDIDATE_FEATURES, NUM_CANDIDATES, vslam_v0
 from vslam_env.belief.observation import observation_space
 
 SPACE = observation_space(32, 8.0, True, False)
@@ -26,7 +26,7 @@ def _weights(seed: int = 0) -> dict[str, Any]:
         "picture.2": (CHANNELS[1], CHANNELS[0], PATCHES[1], PATCHES[1]),
         "picture_out": (CONTEXT, PICTURE_SIZE),
         "context": (CONTEXT, CONTEXT + VECTOR_SIZE),
-        "slot": (CONTEXT, 5),
+        "slot": (CONTEXT, len(CANDIDATE_FEATURES)),
         "slot_hidden": (CONTEXT, CONTEXT),
         "slot_score": (1, CONTEXT),
         "stay_score": (1, CONTEXT),
@@ -42,15 +42,16 @@ def _weights(seed: int = 0) -> dict[str, Any]:
 def _observation(seed: int = 0) -> dict[str, Any]:
     SPACE.seed(seed)
     observation = SPACE.sample()
-    observation["candidates"] = np.random.default_rng(seed).uniform(-5.0, 5.0, (16, 5)).astype(np.float32)
+    observation["candidates"] = np.random.default_rng(seed).uniform(-5.0, 5.0, SHAPES["candidates"]).astype(np.float32)
+    observation["landmark_counts"], observation["time_left"] = np.arange(5.0, dtype=np.float32), np.float32([30.0])
     observation["map_stats"] = np.array([40.0, 0.1, 0.3, 8.0, 0.5, 2.0], np.float32)
-    observation["action_mask"][:] = [1, *([1, 0, 1, 1] * 4)]
+    observation["action_mask"][:] = [1, *([1, 0, 1, 1] * (NUM_CANDIDATES // 4))]
     return observation
 
 
 def test_logits_do_not_depend_on_slots() -> None:
     """Permuting candidates permutes their logits, and keeps the logit of staying."""
-    observation, order = _observation(), np.random.default_rng(5).permutation(16)
+    observation, order = _observation(), np.random.default_rng(5).permutation(NUM_CANDIDATES)
     moved = observation | {"candidates": observation["candidates"][order]}
     before, after = (logits(_weights(), {k: v[None] for k, v in o.items()})[0] for o in (observation, moved))
     np.testing.assert_allclose(after[1:], before[1:][order], atol=1e-5)
@@ -76,7 +77,7 @@ def test_actions_are_drawn_from_the_softmax_of_the_valid_ones() -> None:
     policy, rng = TrainedGoalPolicy(weights), np.random.default_rng(0)
     policy.reset()
     belief: Any = None  # only the observation matters
-    counts = np.bincount([policy.act(observation, belief, rng) for _ in range(2000)], minlength=17)
+    counts = np.bincount([policy.act(observation, belief, rng) for _ in range(2000)], minlength=1 + NUM_CANDIDATES)
     assert (counts[~valid] == 0).all()
     spread = np.sqrt(2000.0 * chances * (1.0 - chances))
     assert (np.abs(counts - 2000.0 * chances) <= 4.5 * spread + 1e-9).all()
@@ -151,7 +152,7 @@ def test_damaged_models_are_refused(tmp_path: Path) -> None:
         load_model(file)
     about = json.loads(str(arrays["about"])) | {"format": FORMAT + 1, "version": "9.9"}
     np.savez(file, **arrays | {"about": np.array(json.dumps(about))})
-    with pytest.raises(ValueError, match=r"expected one of format 1, got a model of format 2. .* wrote it, 9.9"):
+    with pytest.raises(ValueError, match=r"expected one of format 2, got a model of format 3. .* wrote it, 9.9"):
         load_model(file)
 
 

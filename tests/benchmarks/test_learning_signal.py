@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vslam_env import vslam_v0
+from vslam_env import CANDIDATE_FEATURES, NUM_CANDIDATES, vslam_v0
 from vslam_env.config import TICK
 
 PATH = Path(__file__).parents[2] / "benchmarks" / "learning_signal.py"
@@ -20,8 +20,10 @@ SPEC.loader.exec_module(learning_signal)
 
 def _seen(candidates: list[list[float]]) -> dict[str, Any]:
     """Return an observation with candidates (length, size, distance of a teammate) in all first slots but one."""
-    rows, mask = np.zeros((16, 5), np.float32), np.zeros(17, np.int8)
-    rows[1 : 1 + len(candidates), 2:] = candidates
+    rows = np.zeros((NUM_CANDIDATES, len(CANDIDATE_FEATURES)), np.float32)
+    mask = np.zeros(1 + NUM_CANDIDATES, np.int8)
+    columns = [CANDIDATE_FEATURES.index(name) for name in ("path_length", "size", "teammate_path_length")]
+    rows[1 : 1 + len(candidates), columns] = candidates
     mask[[0, *range(2, 2 + len(candidates))]] = 1
     return {"candidates": rows, "action_mask": mask}
 

@@ -89,7 +89,7 @@ def play(name: str) -> dict[str, str]:
     """Play an episode; return digests of what the environment returns, of its events and maps, and of its snapshots."""
     returned, learned, snapshots = hashlib.sha256(), hashlib.sha256(), hashlib.sha256()
     options, changes = EPISODES[name]
-    env = vslam_v0.parallel_env(config=vslam_v0.parallel_env(**options).config.replace(**changes))
+    env = vslam_v0.parallel_env(config=vslam_v0.parallel_env(**options).config.replace(**changes, max_cycles=1000))
     observations, infos = env.reset(seed=11)
     rng = np.random.default_rng(5)
     add_ordered(returned, [observations, infos, env.state()])

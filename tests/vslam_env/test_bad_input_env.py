@@ -314,7 +314,7 @@ CALLS: dict[str, list[Callable[[], Any]]] = {
     ],
     "teammates: expected finite": [
         partial(CandidateSlots().update, CELLS, POSE, [1.0, 2.0]),
-        partial(CandidateSlots().features, POSE, [[NAN, 2.0]]),
+        partial(CandidateSlots().update, CELLS, POSE, [[NAN, 2.0]]),
     ],
     "ignored: expected finite numbers in an array": [partial(find_frontiers, CELLS, (0, 0), ignored=np.zeros(3, bool))],
     "angles: expected": [partial(ray_directions, bad) for bad in (ANGLES[::-1], ANGLES[:0], np.array([-1.6, 1.6]))],
@@ -369,7 +369,7 @@ ACTIONS: dict[str, dict[str, list[Any]]] = {
         "actions['robot_1']: expected two numbers in [-1, 1]": [{"robot_0": [1, 0], "robot_1": [0, 9]}],
     },
     "discrete": {"actions['robot_0']: expected an int from 0 to 3": [{"robot_0": 4, "robot_1": 0}]},
-    "goal": {"actions['robot_1']: expected an int from 0 to 16": [{"robot_0": 0, "robot_1": bad} for bad in (-1, 1.5)]},
+    "goal": {"actions['robot_1']: expected an int from 0 to 32": [{"robot_0": 0, "robot_1": bad} for bad in (-1, 1.5)]},
 }  # fmt: skip
 
 

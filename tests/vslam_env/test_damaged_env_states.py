@@ -122,7 +122,8 @@ def test_damaged_states_are_refused_or_harmless(kind: str, seeds: range) -> None
         (["coverage", "found"], -3, r"\['coverage'\]\['found'\]: expected integers from 0 to"),
         (["simulator", "poses"], 1e300, r"\['simulator'\]\['poses'\]: expected numbers from"),
         (["simulator", "poses"], 1e5, r"\['simulator'\]\['poses'\]: expected positions inside the world"),
-        (["belief", "slots", 0, "rows"], 1e9, r"\['slots'\]\[0\]\['rows'\]: expected"),
+        (["belief", "candidates", "rows"], 1e9, r"\['candidates'\]\['rows'\]: expected"),
+        (["belief", "candidates", "frontiers", 0, "rows"], 1e9, r"\['frontiers'\]\[0\]\['rows'\]: expected"),
     ],
 )
 def test_files_are_checked_as_states_are(way: list[Any], index: float, says: str, tmp_path: Path) -> None:

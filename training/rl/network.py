@@ -11,14 +11,14 @@ from torch import nn
 
 from agents.goal_network import CANDIDATE_SCALE, CHANNELS, CONTEXT, PATCHES, PICTURE_SIZE, SHAPES, VECTOR_SIZE, VECTORS
 
-NUM_SLOTS = SHAPES["candidates"][0]
+NUM_SLOTS, NUM_FEATURES = SHAPES["candidates"]
 
 
 class GoalFeatures(BaseFeaturesExtractor):  # type: ignore[misc]   # its types are not checked
     """Context of the robot, scaled candidates, and the mask of valid candidates."""
 
     def __init__(self, observation_space: Any) -> None:
-        super().__init__(observation_space, CONTEXT + 6 * NUM_SLOTS)
+        super().__init__(observation_space, CONTEXT + (NUM_FEATURES + 1) * NUM_SLOTS)
         first, second = PATCHES
         self.picture = nn.Sequential(
             nn.Conv2d(3, CHANNELS[0], first, first), nn.ReLU(), nn.Conv2d(CHANNELS[0], CHANNELS[1], second, second),
@@ -30,7 +30,7 @@ class GoalFeatures(BaseFeaturesExtractor):  # type: ignore[misc]   # its types a
             self.register_buffer(f"{name}_scale", torch.tensor(scale), persistent=False)
 
     def forward(self, observations: dict[str, Any]) -> Any:
-        """Return (n, 64 + 16 x 5 + 16): context, candidates row by row, mask of valid candidates."""
+        """Return (n, 64 + C x F + C): context, candidates row by row, mask of valid candidates."""
         seen = torch.relu(self.picture_out(self.picture(observations["local_grid"]).flatten(1)))
         vectors = [(observations[name] * getattr(self, f"{name}_scale")).flatten(1) for name in VECTORS]
         context = torch.tanh(self.context(torch.cat([seen, *vectors], dim=1)))
@@ -54,7 +54,7 @@ class SlotScorer(nn.Module):  # type: ignore[misc]
         self.value_hidden = nn.Linear(2 * CONTEXT, CONTEXT)
 
     def forward(self, features: Any) -> tuple[Any, Any]:
-        """Return logits (n, 17) and features of the value head (n, 64)."""
+        """Return logits (n, 1 + C) and features of the value head (n, 64)."""
         context, hidden, valid = self._look(features)
         return self._logits(context, hidden), self._value(context, hidden, valid)
 
@@ -68,8 +68,8 @@ class SlotScorer(nn.Module):  # type: ignore[misc]
         return self._value(*self._look(features))
 
     def _look(self, features: Any) -> tuple[Any, Any, Any]:
-        context, candidates, valid = features.split([CONTEXT, 5 * NUM_SLOTS, NUM_SLOTS], dim=1)
-        beside = self.slot(candidates.unflatten(1, (NUM_SLOTS, 5))) + self.slot_context(context).unsqueeze(1)
+        context, candidates, valid = features.split([CONTEXT, NUM_FEATURES * NUM_SLOTS, NUM_SLOTS], dim=1)
+        beside = self.slot(candidates.unflatten(1, (NUM_SLOTS, NUM_FEATURES))) + self.slot_context(context).unsqueeze(1)
         return context, torch.tanh(self.slot_hidden(torch.tanh(beside))), valid
 
     def _logits(self, context: Any, hidden: Any) -> Any:

@@ -84,10 +84,14 @@ def paint(cells: Any, belief: Any, places: Any, local: Any) -> None:
             local[2, row, col] = GRID_ON
 
 
+COUNT_BINS = np.array([1, 3, 5, 9, 17])  # least numbers of measurements of the bins of `landmark_counts`
+MAX_SECONDS_LEFT = 1e6
+
+
 @in_place
 def write_observations(
     robots: Any, poses: Any, beliefs: Any, places: Any, names: Any, parts: Any, cells: Any, scans: Any,
-    observed: tuple[Any, Any, Any, Any, Any, Any, Any, Any],
+    observed: tuple[Any, Any, Any, Any, Any, Any, Any, Any, Any],
 ) -> None:  # fmt: skip
     """Write what robots observe.
 
@@ -99,10 +103,10 @@ def write_observations(
         cells: (n, S, S) uint8. Occupancy grids.
         scans: (n, R) float64 [m].
         observed: Written to, in the order of the table of `observation`: (n, 3), (n, 3) and (n, 6) float32;
-            (n, 3, 48, 48) uint8; (n, R), (n, 16, 5) and (n, 7, 5) float32; (n, 7) int8. The candidates hold their
-            features without bounds before.
+            (n, 3, 48, 48) uint8; (n, R), (n, C, F) and (n, 7, 5) float32; (n, 7) int8; (n, 5) float32. The candidates
+            hold their features without bounds before.
     """
-    pose, pose_std, map_stats, local_grid, scan, features, teammates, present = observed
+    pose, pose_std, map_stats, local_grid, scan, features, teammates, present, landmark_counts = observed
     for k in range(len(robots)):
         for r in range(scans.shape[1]):
             scan[k, r] = scans[k, r]
@@ -135,11 +139,16 @@ def write_observations(
 
         total = largest = 0.0
         times = 0
+        landmark_counts[k] = 0.0
         for landmark in range(parts[k, 0], parts[k, 1]):
             sigma = math.sqrt(places[landmark, 3] / 3.0)
             total += sigma
             largest = max(largest, sigma)
             times += names[landmark, 0]
+            count_bin = 0
+            while count_bin + 1 < len(COUNT_BINS) and names[landmark, 0] >= COUNT_BINS[count_bin + 1]:
+                count_bin += 1
+            landmark_counts[k, count_bin] += 1.0
         held, stats = parts[k, 1] - parts[k, 0], map_stats[k]
         stats[0] = _clip(held, 0.0, MAP_STATS_LIMIT[0])
         stats[1] = _clip(total / max(held, 1), 0.0, MAP_STATS_LIMIT[1])
@@ -148,4 +157,6 @@ def write_observations(
         stats[4] = _clip(belief[ESS], 0.0, MAP_STATS_LIMIT[4])
         stats[5] = _clip(group_size, 0.0, MAP_STATS_LIMIT[5])
 
+        for i in range(landmark_counts.shape[1]):
+            landmark_counts[k, i] = _clip(landmark_counts[k, i], 0.0, MAP_STATS_LIMIT[0])
         paint(cells[k], belief, places[parts[k, 0] : parts[k, 1]], local_grid[k])

@@ -19,7 +19,7 @@ from slam_backend.models.odometry import OdometryModel
 from slam_backend.smoother.options import SmoothingOptions
 from slam_backend.team.merge_scheduler import AttemptOptions
 from slam_backend.team.options import MergeOptions
-from vslam_env.navigation import OccupancyGrid
+from vslam_env.navigation import CandidateGains, CandidateKind, OccupancyGrid
 
 
 def default_filter_options() -> FilterOptions:
@@ -86,11 +86,13 @@ class Teammate:
         robot: Index of the teammate.
         pose: (3,) float64 [m, m, rad]. Pose estimate.
         covariance: (3, 3) float64 [m, m, rad]. Covariance of the pose.
+        goal: (2,) float64 [m]. Goal to which it drives, as it says; NaN: none, or not known.
     """
 
     robot: int
     pose: FloatArray
     covariance: FloatArray
+    goal: FloatArray
 
     def __post_init__(self) -> None:
         _freeze_arrays(self)
@@ -103,24 +105,42 @@ class Teammate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidates:
-    """Sixteen slots with candidate places to explore; see `CandidateSlots`.
+    """C slots with places to go to, see `TeamCandidates`; renewed once a second, with `goal` actions at decisions.
 
     Attributes:
-        goals: (16, 2) float64 [m], start frame. Goal positions; NaN in empty slots.
-        headings: (16,) float64 [rad], start frame. Headings at the goals; NaN in empty slots.
-        lengths: (16,) float64 [m]. Lengths of the paths to the goals at the last update.
-        valid: (16,) bool. True where a slot holds a candidate.
-        features: (16, 5) float32 [m], robot frame. Features, see `CandidateSlots.features`.
+        goals: (C, 2) float64 [m], start frame. Goal positions; NaN in empty slots.
+        headings: (C,) float64 [rad], start frame. Headings at the goals; NaN in empty slots.
+        lengths: (C,) float64 [m]. Lengths of the paths to the goals at the last update; NaN in empty slots.
+        valid: (C,) bool. True where a slot holds a candidate.
+        kinds: (C,) int64. `CandidateKind` of each candidate; -1 in empty slots.
+        sizes: (C,) float64 [m]. Length of a frontier; value of what is seen again, walls [m] plus 0.6 m per landmark;
+            0 for rendezvous; NaN in empty slots.
+        gains: Gains at each candidate.
+        teammate_lengths: (C, T) float64 [m]. Lengths of the paths of the teammates, in the order of
+            `Belief.teammates`, over the floor that this robot knows; inf: none known.
+        own_goal: (C,) bool. True for the goal to which the robot drives.
+        teammate_goal: (C,) bool. True within 1 m of the goal of a teammate.
+        features: (C, F) float32, robot frame. Columns `CANDIDATE_FEATURES`.
     """
 
     goals: FloatArray
     headings: FloatArray
     lengths: FloatArray
     valid: BoolArray
+    kinds: IntArray
+    sizes: FloatArray
+    gains: CandidateGains
+    teammate_lengths: FloatArray
+    own_goal: BoolArray
+    teammate_goal: BoolArray
     features: NDArray[np.float32]
 
     def __post_init__(self) -> None:
         _freeze_arrays(self)
+
+    def of_kind(self, kind: CandidateKind) -> IntArray:
+        """Return the slots (n,) int64 that hold candidates of a kind, ascending."""
+        return np.flatnonzero(self.kinds == kind)
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,6 +162,8 @@ class Belief:
         grid: Read-only view of the occupancy grid, updated in later ticks; use `copy()` to keep its content.
         candidates: Candidate places to explore.
         teammates: Other robots of the group; for those out of contact, the last estimate before contact was lost.
+        looks: (S, S) uint8. Looks at walls by cell of the grid, see `TeamLooks`; a read-only view, as `grid.cells`.
+        seconds_left: Time until the episode is truncated [s]; inf if the belief is not used by an environment.
         start_from_group: (3,) float64 [m, m, rad]. Motion from the group's map frame to the own start frame.
         group_map: Confirmed landmarks in the group's map frame; see `map` for the own start frame.
     """
@@ -158,6 +180,8 @@ class Belief:
     grid: OccupancyGrid
     candidates: Candidates
     teammates: tuple[Teammate, ...]
+    looks: NDArray[np.uint8]
+    seconds_left: float
     start_from_group: FloatArray
     group_map: LandmarkMap
 
@@ -178,14 +202,20 @@ class BeliefBatch(NamedTuple):
         points: Poses, with one row per robot and columns for the team up to the last known robot.
         map_summaries: Summaries of the confirmed landmarks in the map frames.
         cells: (n, S, S) uint8. Cells of the occupancy grids.
-        features: (n, 16, 5) float32 [m], robot frames. Features of the candidates; a new array.
+        looks: (n, S, S) uint8. Looks of the robots at walls.
+        bounds: (n, 4) int32. Bounds of the known parts of the grids, see `GridStorage`.
+        features: (n, C, F) float32, robot frames. Features of the candidates; a new array.
+        seconds_left: Time until the episode is truncated [s].
     """
 
     robots: IntArray
     points: TeamPoses
     map_summaries: TeamMapSummaries
     cells: NDArray[np.uint8]
+    looks: NDArray[np.uint8]
+    bounds: NDArray[np.int32]
     features: NDArray[np.float32]
+    seconds_left: float
 
     @classmethod
     def of(cls, belief: Belief) -> "BeliefBatch":
@@ -204,7 +234,10 @@ class BeliefBatch(NamedTuple):
             points=points,
             map_summaries=TeamMapSummaries.from_maps([belief.group_map.summary]),
             cells=belief.grid.cells[None],
+            looks=belief.looks[None],
+            bounds=belief.grid.bounds[None],
             features=belief.candidates.features[None].copy(),
+            seconds_left=belief.seconds_left,
         )
 
 
@@ -219,3 +252,5 @@ def _freeze_arrays(record: Any) -> None:
         value = getattr(record, item.name)
         if isinstance(value, np.ndarray):
             object.__setattr__(record, item.name, as_read_only(value.copy()))
+        elif isinstance(value, CandidateGains):
+            object.__setattr__(record, item.name, CandidateGains(*(as_read_only(gain.copy()) for gain in value)))

@@ -7,10 +7,14 @@
 | `map_stats` | (6,) | landmarks; mean and largest one sigma [m]; mean count; ESS / M; group size | `MAP_STATS_LIMIT` |
 | `local_grid` | (3, 48, 48) uint8 | free, occupied, landmarks; cells of 0.2 m, robot heading up | 0, 255 |
 | `scan` | (R,) | ranges from right to left [m] | range of the scan |
-| `candidates` | (16, 5) | see `CandidateSlots.features` [m] | +-400 |
+| `candidates` | (32, 17) | columns `CANDIDATE_FEATURES`, robot frame | +-400 |
 | `teammates` | (7, 5) | x, y [m], cos and sin of the heading, robot frame; one sigma of the position [m] | +-400 |
 | `teammates_mask` | (7,) int8 | which rows hold a robot of the same group | 0, 1 |
-| `action_mask` | (17,) int8 | `goal` actions only: which actions are valid | 0, 1 |
+| `landmark_counts` | (5,) | landmarks measured up to 2, 4, 8, 16, and more times | 0, 10000 |
+| `time_left` | (1,) | until the episode is truncated [s] | 0, 1e6 |
+| `global_grid` | (3, 48, 48) uint8 | shares of free, occupied and looked-at cells of all that was seen | 0, 255 |
+| `global_grid_frame` | (3,) | x, y of its middle, start frame, and size of its cells [m] | +-400 |
+| `action_mask` | (33,) int8 | `goal` actions only: which actions are valid | 0, 1 |
 
 Rows of `teammates` belong to the other robots in ascending order, whatever their group; rows of robots outside the
 group are zero. One sigma of a landmark is the root of its mean variance. Values are clipped to the bounds.
@@ -25,18 +29,22 @@ from numpy.typing import NDArray
 from slam_backend.core.validation import FloatArray
 from vslam_env.belief._observation_kernels import (
     CHANNELS,
+    COUNT_BINS,
     GRID_ON,
     MAP_STATS_LIMIT,
     MAX_POSITION,
+    MAX_SECONDS_LEFT,
     MAX_TEAMMATES,
     POSE_LIMIT,
     SIZE,
     write_observations,
 )
 from vslam_env.belief.belief import Belief, BeliefBatch
-from vslam_env.navigation.candidate_slots import FRONTIER_SIZE, NUM_FEATURES, NUM_SLOTS
+from vslam_env.navigation._view_kernels import COARSE, NUM_COARSE, write_global_grid
+from vslam_env.navigation.candidates import CANDIDATE_FEATURES, FIRST_KIND, NUM_CANDIDATES
 
-NUM_ACTIONS = 1 + NUM_SLOTS
+NUM_ACTIONS = 1 + NUM_CANDIDATES
+GRIDS = "local_grid", "global_grid"
 
 Observation = dict[str, NDArray[Any]]
 
@@ -72,7 +80,11 @@ def observe_team(view: BeliefBatch, scans: FloatArray, goal_actions: bool) -> li
     teammates, present = np.empty((count, MAX_TEAMMATES, 5), np.float32), np.empty((count, MAX_TEAMMATES), np.int8)
     pictures = np.empty((count, len(CHANNELS), SIZE, SIZE), np.uint8)
     points, ((places, names), parts) = view.points, view.map_summaries
-    arrays = poses, deviations, stats, pictures, ranges, candidates, teammates, present
+    counts, time_left = np.empty((count, len(COUNT_BINS)), np.float32), min(view.seconds_left, MAX_SECONDS_LEFT)
+    overviews, frames = np.empty((count, NUM_COARSE, COARSE, COARSE), np.uint8), np.empty((count, 3), np.float32)
+    for i in range(count):
+        write_global_grid(view.cells[i], view.looks[i], view.bounds[i], overviews[i], frames[i])
+    arrays = poses, deviations, stats, pictures, ranges, candidates, teammates, present, counts
     write_observations(view.robots, points.poses, points.beliefs, places, names, parts, view.cells, scans, arrays)
     observations: list[Observation] = []
     for i in range(count):  # by index: iterating over arrays costs microseconds
@@ -85,6 +97,10 @@ def observe_team(view: BeliefBatch, scans: FloatArray, goal_actions: bool) -> li
             "candidates": candidates[i],
             "teammates": teammates[i],
             "teammates_mask": present[i],
+            "landmark_counts": counts[i],
+            "time_left": np.array([time_left], np.float32),
+            "global_grid": overviews[i],
+            "global_grid_frame": frames[i],
         }
         if goal_actions:
             observation["action_mask"] = action_mask(candidates[i])
@@ -93,16 +109,16 @@ def observe_team(view: BeliefBatch, scans: FloatArray, goal_actions: bool) -> li
 
 
 def action_mask(candidates: NDArray[np.float32]) -> NDArray[np.int8]:
-    """Return which `goal` actions are valid (17,) int8: staying, and the slots with a candidate."""
+    """Return which `goal` actions are valid (33,) int8: staying, and the slots with a candidate."""
     mask = np.ones(NUM_ACTIONS, np.int8)
-    mask[1:] = candidates[:, FRONTIER_SIZE] > 0.0
+    mask[1:] = candidates[:, FIRST_KIND:].any(axis=1)
     return mask
 
 
 def flatten(observation: Observation) -> NDArray[np.float32]:
-    """Return an observation without its action mask as one float32 vector in table order, the grid as 0 and 1."""
+    """Return an observation without its action mask as one float32 vector in table order, grids from 0 to 1."""
     parts = [
-        (value / np.float32(GRID_ON) if name == "local_grid" else value).ravel()
+        (value / np.float32(GRID_ON) if name in GRIDS else value).ravel()
         for name, value in observation.items()
         if name != "action_mask"
     ]
@@ -128,10 +144,15 @@ def observation_space(num_rays: int, scan_range: float, goal_actions: bool, flat
         "local_grid": spaces.Box(0, GRID_ON, (len(CHANNELS), SIZE, SIZE), np.uint8),
         "scan": _box(np.zeros(num_rays), np.full(num_rays, scan_range)),
         "candidates": _box(
-            np.full((NUM_SLOTS, NUM_FEATURES), -MAX_POSITION), np.full((NUM_SLOTS, NUM_FEATURES), MAX_POSITION)
+            np.full((NUM_CANDIDATES, len(CANDIDATE_FEATURES)), -MAX_POSITION),
+            np.full((NUM_CANDIDATES, len(CANDIDATE_FEATURES)), MAX_POSITION),
         ),
         "teammates": _box(np.full((MAX_TEAMMATES, 5), -MAX_POSITION), np.full((MAX_TEAMMATES, 5), MAX_POSITION)),
         "teammates_mask": spaces.Box(0, 1, (MAX_TEAMMATES,), np.int8),
+        "landmark_counts": _box(np.zeros(len(COUNT_BINS)), np.full(len(COUNT_BINS), MAP_STATS_LIMIT[0])),
+        "time_left": _box(np.zeros(1), np.full(1, MAX_SECONDS_LEFT)),
+        "global_grid": spaces.Box(0, GRID_ON, (NUM_COARSE, COARSE, COARSE), np.uint8),
+        "global_grid_frame": _box(np.full(3, -MAX_POSITION), np.full(3, MAX_POSITION)),
     }
     mask = spaces.Box(0, 1, (NUM_ACTIONS,), np.int8)
     if not flat:

@@ -23,6 +23,8 @@ class Readings(NamedTuple):
             `oracle_association` is on, else None.
         contacts: (K,) bool. Robots in contact, itself included; None: always all.
         image: (H, W) uint8. The left image, if `observe_images` is on, else None.
+        goal: (2,) float64 [m], own start frame. Goal to which the robot drives, NaN if it stays; None without `goal`
+            actions. Robots of its group receive it while in contact.
     """
 
     odometry: FloatArray | None
@@ -33,6 +35,7 @@ class Readings(NamedTuple):
     identities: IntArray | None = None
     contacts: BoolArray | None = None
     image: NDArray[np.uint8] | None = None
+    goal: FloatArray | None = None
 
 
 class TeamReadings(NamedTuple):
@@ -49,6 +52,7 @@ class TeamReadings(NamedTuple):
         identities: True landmarks of each robot's measurements, or None.
         contacts: (K, K) bool, or None.
         images: Left image of each robot, or None.
+        goals: (K, 2) float64 [m], or None.
     """
 
     odometry: FloatArray | None
@@ -59,6 +63,7 @@ class TeamReadings(NamedTuple):
     identities: Sequence[IntArray] | None = None
     contacts: BoolArray | None = None
     images: Sequence[NDArray[np.uint8]] | None = None
+    goals: FloatArray | None = None
 
     def per_robot(self) -> tuple[Readings, ...]:
         """Return the readings of each robot; writable arrays are copied."""
@@ -75,6 +80,7 @@ class TeamReadings(NamedTuple):
                 nothing if self.identities is None else [names.copy() for names in self.identities],
                 nothing if self.contacts is None else self.contacts.copy(),
                 nothing if self.images is None else [image.copy() for image in self.images],
+                nothing if self.goals is None else self.goals.copy(),
             )
         )
 
@@ -93,7 +99,7 @@ class TeamReadings(NamedTuple):
             if any(missing) and not all(missing):
                 hint = "Give this reading for all robots or for none."
                 raise argument_error(f"readings[{missing.index(True)}].{name}", "an array", None, hint)
-        odometry, measurements, scans, bumps, poses, identities, contacts, images = columns
+        odometry, measurements, scans, bumps, poses, identities, contacts, images, goals = columns
         each = (len(readings),)
         return cls(
             odometry=None if odometry[0] is None else _stacked("odometry", odometry, (3,)),
@@ -104,6 +110,7 @@ class TeamReadings(NamedTuple):
             identities=None if identities[0] is None else identities,
             contacts=None if contacts[0] is None else _stacked("contacts", contacts, each, dtype=None, finite=False),
             images=None if images[0] is None else images,
+            goals=None if goals[0] is None else _stacked("goal", goals, (2,), finite=False),
         )
 
 

@@ -12,8 +12,10 @@ from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.fastslam.relative_poses import TeamPoses
 from slam_backend.fastslam.reports import LandmarkIdMap, MapReleased, MergeUndone, TeamReport
 from slam_backend.geometry import compose, inverse
+from slam_backend.models.camera import StereoCamera
 from vslam_env.belief.belief import RobotHardware
-from vslam_env.navigation import OccupancyGrid, TeamGrids, ray_directions
+from vslam_env.navigation import OccupancyGrid, TeamGrids, TeamLooks, ray_directions
+from vslam_env.navigation.looks import looks_reach
 
 
 class GridUpdate(NamedTuple):
@@ -118,6 +120,7 @@ class GridSnapshot(NamedTuple):
         sides: Robots of either group.
         maps: Numbers of map a, map b and the joint map.
         grids: State of each robot's grid.
+        looks: State of each robot's looks.
         updates: Buffered updates at that time.
     """
 
@@ -125,11 +128,12 @@ class GridSnapshot(NamedTuple):
     sides: tuple[tuple[int, ...], tuple[int, ...]]
     maps: tuple[int, int, int]
     grids: dict[int, dict[str, Any]]
+    looks: dict[int, dict[str, Any]]
     updates: tuple[GridUpdate, ...]
 
 
 class SharedGrids:
-    """Occupancy grids of a team, each in the start frame of its robot.
+    """Occupancy grids and looks of a team, each in the start frame of its robot.
 
     The scans of robots that share a filter are painted into all their grids. At their first merge robots merge their
     whole grids. Robots that regain contact paint only the updates that their grids lack, because merging whole grids
@@ -139,19 +143,28 @@ class SharedGrids:
     Args:
         num_robots: Number of robots K.
         body: Hardware of the robots.
+        camera: Camera that measures the landmarks.
 
     Attributes:
         team: Grids of all robots.
+        looks: Looks of all robots at walls; they follow the grids.
     """
 
-    def __init__(self, num_robots: int, body: RobotHardware) -> None:
+    def __init__(self, num_robots: int, body: RobotHardware, camera: StereoCamera) -> None:
         self.team = TeamGrids(num_robots)
+        reach = min(float(body.scan_range), camera.max_range)
+        self.looks = TeamLooks(num_robots, body.ray_angles, camera.half_fov, reach)
         self._grids = self.team.grids
         self._hardware = ray_directions(body.ray_angles), float(body.scan_range), float(body.radius)
         self._parted = np.full((num_robots, num_robots), NEVER_MET)  # tick since which two robots share no scans
         self._settle(0, [(robot,) for robot in range(num_robots)])
         self._kept: list[GridSnapshot] = []
         self._strokes: deque[GridUpdate] = deque()
+
+    @property
+    def shared(self) -> IntArray:
+        """(K, K) int64. 1 where two robots are on the same filter, so that they share their scans."""
+        return self._shared
 
     def __getitem__(self, robot: int) -> OccupancyGrid:
         return self._grids[robot]
@@ -164,8 +177,10 @@ class SharedGrids:
             id_map: Landmark ids of the merge.
         """
         sides = id_map.robots_a, id_map.robots_b
-        grids = with_read_only({robot: self._grids[robot].get_state() for robot in sides[0] + sides[1]})
-        self._kept.append(GridSnapshot(tick, sides, id_map.maps, grids, tuple(self._strokes)))
+        robots = sides[0] + sides[1]
+        grids = with_read_only({robot: self._grids[robot].get_state() for robot in robots})
+        looks = with_read_only({robot: self.looks.get_state(robot) for robot in robots})
+        self._kept.append(GridSnapshot(tick, sides, id_map.maps, grids, looks, tuple(self._strokes)))
 
     def step(
         self,
@@ -194,6 +209,7 @@ class SharedGrids:
         if mates != self._mates:
             self.share_on_contact(tick, mates, points.starts)
         self.team.update(self._shared, points.poses, scans, bumps, *self._hardware)
+        self.looks.update(self._shared, points.poses, scans, self.team.size)
         if self._kept or self._oldest_parting is not None:
             poses, scans, bumps = as_constant(points.poses), as_constant(scans), as_constant(bumps)
             self._strokes.append(GridUpdate(tick, self._shared_then, poses, scans, bumps))
@@ -225,6 +241,7 @@ class SharedGrids:
         self._kept.remove(snapshot)
         for robot in snapshot.sides[0] + snapshot.sides[1]:
             self._grids[robot].set_state(snapshot.grids[robot])
+            self.looks.set_state(robot, snapshot.looks[robot])
         self._strokes, replayed = map(deque, split_history(self._strokes, snapshot.updates, snapshot.sides))
         for update in replayed:
             self._replay(update)
@@ -247,10 +264,14 @@ class SharedGrids:
         """
         transfers = [transfer for now in sorted(set(mates)) for transfer in self._plan_transfers(now, starts)]
         if transfers:
-            grids = {each.source: self._grids[each.source].copy() for each in transfers if each.is_whole}
+            sources = {each.source for each in transfers if each.is_whole}
+            grids = {robot: (self._grids[robot].copy(), self.looks.counts[robot].copy()) for robot in sources}
             for transfer in transfers:
                 if transfer.is_whole:
-                    self._grids[transfer.target].merge(grids[transfer.source], transfer.motion)
+                    grid, looks = grids[transfer.source]
+                    self._grids[transfer.target].merge(grid, transfer.motion)
+                    self.looks.reserve(self.team.size)
+                    self.looks.merge(transfer.target, looks, transfer.motion)
             first = max(0, len(self._strokes) - max(tick - transfer.since for transfer in transfers))
             after, missing = plan_catch_up(list(islice(self._strokes, first, None)), transfers)
             for row, update in enumerate(after, first):
@@ -273,7 +294,9 @@ class SharedGrids:
         """Paint the readings of an earlier tick."""
         _, shared, poses, scans, bumps = update
         # Copies: kernels are compiled for writable arrays, except for read-only bumps.
-        self.team.update(shared.copy(), poses.copy(), scans.copy(), bumps, *self._hardware)
+        copies = shared.copy(), poses.copy(), scans.copy()
+        self.team.update(*copies, bumps, *self._hardware)
+        self.looks.update(*copies, self.team.size)
 
     def _settle(self, tick: int, mates: Sequence[tuple[int, ...]]) -> None:
         """Record which robots share a filter from a tick on."""
@@ -301,6 +324,7 @@ class SharedGrids:
         """Return the complete state of the grids; shared arrays are read-only."""
         return {
             "grids": [grid.get_state() for grid in self._grids],
+            "looks": [self.looks.get_state(robot) for robot in range(len(self._grids))],
             "mates": self._mates,
             "parted": self._parted.copy(),
             "kept": tuple(self._kept),
@@ -311,6 +335,10 @@ class SharedGrids:
         """Restore a state of `get_state` in place; views of the grids remain valid."""
         for grid, grid_state in zip(self._grids, state["grids"], strict=True):
             grid.set_state(grid_state)
+        self.team.reserve(max(map(looks_reach, state["looks"])))
+        self.looks.reserve(self.team.size)
+        for robot, looks in enumerate(state["looks"]):
+            self.looks.set_state(robot, looks)
         self._parted[:] = state["parted"]
         self._settle(0, state["mates"])
         self._kept, self._strokes = with_constants(list(state["kept"])), deque(with_constants(state["strokes"]))

@@ -1,12 +1,14 @@
 """Beliefs of a team: its filters, occupancy grids and candidates."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
 
-from slam_backend.core.validation import FloatArray, argument_error
+from slam_backend.core.read_only import as_read_only
+from slam_backend.core.validation import Float32Array, FloatArray, argument_error
 from slam_backend.fastslam.consistency import Consistency
 from slam_backend.fastslam.options import FilterOptions
 from slam_backend.fastslam.relative_poses import TeamPoses
@@ -20,8 +22,12 @@ from slam_backend.team.options import MergeOptions
 from slam_backend.team.team import TeamSlam
 from vslam_env.belief.belief import Belief, BeliefBatch, BeliefConfig, Candidates, RobotHardware, Teammate
 from vslam_env.belief.readings import Readings, TeamReadings
+from vslam_env.belief.rendezvous import Rendezvous
 from vslam_env.belief.shared_grids import GridUpdate, SharedGrids
-from vslam_env.navigation import OccupancyGrid, TeamSlots
+from vslam_env.navigation import CANDIDATE_FEATURES, CandidateKind, OccupancyGrid, TeamCandidates
+from vslam_env.navigation._planning_kernels import FrontierColumns
+from vslam_env.navigation._view_kernels import write_goals
+from vslam_env.navigation.candidates import SLOT_KINDS
 
 __all__ = ["Belief", "BeliefConfig", "Candidates", "RobotHardware", "TeamBelief", "Teammate"]
 
@@ -63,10 +69,13 @@ class TeamBelief:
         schedule, merging = merge_options(config, attempts)
         self._team = TeamSlam(num_robots, config.alignment, seed, schedule, merging, **options)
         self.exchange = self._team.exchange
-        self._grids = SharedGrids(num_robots, body)
+        camera = config.filter.camera
+        self._grids = SharedGrids(num_robots, body, camera)
         self.grids = self._grids.team
-        self._candidates = TeamSlots(num_robots)
-        self._slots = self._candidates.slots
+        self._candidates = TeamCandidates(num_robots, (camera.half_fov, camera.max_range, body.radius))
+        self._rendezvous = Rendezvous(num_robots)
+        self._goals = np.full((num_robots, 2), np.nan)  # of each robot in its own start frame
+        self._seconds_left = math.inf
         self._robots = np.arange(num_robots)
         self._scanned = num_robots, len(body.ray_angles)  # shape of a tick's scans
         self._turns = _candidate_schedule(num_robots, decision_ticks)
@@ -77,6 +86,7 @@ class TeamBelief:
         self.points = TeamPoses(num_robots)
         self._outlines = TeamMapSummaries.allocate(num_robots, 0)  # of this tick, filled on demand
         self._has_outlines = False
+        self._all_outlines = TeamMapSummaries.allocate(num_robots, 0)  # with unconfirmed landmarks
         self._refresh_poses()
 
     @property
@@ -127,8 +137,19 @@ class TeamBelief:
         self._refresh_poses()
         points = self.points
         self._grids.step(self._tick, report, self._topology.same_filter, points, readings.scans, readings.bumps)
-        for robot in self._turns[self._tick % len(self._turns)] if self._tick else range(len(self._robots)):
-            self._candidates.update(robot, self.grids, points.poses)
+        if readings.goals is not None:
+            self._goals = readings.goals
+        turns = self._turns[self._tick % len(self._turns)] if self._tick else range(len(self._robots))
+        if len(turns):
+            self._all_outlines = self._team.map_summaries(1, self._all_outlines)
+        for robot in turns:
+            first, last = self._all_outlines.parts[robot]
+            rows = self._all_outlines.rows
+            landmarks = rows.positions[first:last], rows.counts_and_ids[first:last], points.starts[robot]
+            known, shared = self._topology.known_robots[robot], self._grids.shared[robot]
+            places = self._rendezvous.update(robot, points, known, shared, landmarks)
+            looks = self._grids.looks.counts[robot]
+            self._candidates.update(robot, self.grids, looks, points.poses, landmarks, places)
         return report
 
     def merge(self, robot_a: int, robot_b: int, alignment: Alignment, known: bool = False) -> LandmarkIdMap:
@@ -170,9 +191,16 @@ class TeamBelief:
         """Return the occupancy grid of a robot, updated in later ticks."""
         return self._grids[robot]
 
+    def set_seconds_left(self, seconds: float) -> None:
+        """Set the time until the episode is truncated [s], which beliefs and observations contain."""
+        if seconds != self._seconds_left:
+            self._seconds_left = seconds
+            self._beliefs.clear()
+
     def candidate(self, robot: int, slot: int) -> tuple[FloatArray, float] | None:
         """Return goal (2,) [m] and heading [rad] of the candidate in a robot's slot; None if the slot is empty."""
-        return self._slots[robot].candidate(slot)
+        x, y, heading, _, _ = self._candidates.rows(robot)[slot].tolist()
+        return None if math.isnan(x) else (np.array([x, y]), heading)
 
     def belief(self, robot: int) -> Belief:
         """Return the belief of a robot after the last tick."""
@@ -182,8 +210,11 @@ class TeamBelief:
 
     def view(self) -> BeliefBatch:
         """Return the observable part of all robots' beliefs, sharing memory with the grids."""
-        features = self._candidates.features(self.points.poses)
-        return BeliefBatch(self._robots, self.points, self.map_summaries, self.grids.cells, features)
+        grids = self.grids
+        of_grids = grids.cells, self._grids.looks.counts, grids.bounds
+        return BeliefBatch(
+            self._robots, self.points, self.map_summaries, *of_grids, self._features(), self._seconds_left
+        )
 
     @property
     def buffered_inputs(self) -> Mapping[int, StepInput]:
@@ -201,7 +232,9 @@ class TeamBelief:
             "tick": self._tick,
             "team": self._team.get_state(),
             "grids": self._grids.get_state(),
-            "slots": [slots.get_state() for slots in self._slots],
+            "candidates": self._candidates.get_state(),
+            "rendezvous": self._rendezvous.get_state(),
+            "goals": self._goals.copy(),
         }
 
     def set_state(self, state: Mapping[str, Any]) -> None:
@@ -209,8 +242,9 @@ class TeamBelief:
         self._team.restore_checked(state["team"])
         self._tick = state["tick"]
         self._grids.set_state(state["grids"])
-        for slots, slot_state in zip(self._slots, state["slots"], strict=True):
-            slots.set_state(slot_state)
+        self._candidates.set_state(state["candidates"])
+        self._rendezvous.set_state(state["rendezvous"])
+        self._goals = state["goals"].copy()
         self._refresh_poses()
 
     def _refresh_poses(self) -> None:
@@ -226,22 +260,48 @@ class TeamBelief:
         """Return the other known members of a robot's group, ascending."""
         return [mate for mate in self._topology.known_robots[robot] if mate != robot]
 
-    def _teammate_positions(self, robot: int) -> FloatArray:
-        """Return the estimated positions (n, 2) [m] of a robot's teammates in its own start frame."""
-        return self.points.poses[robot, self._others(robot), :2]
+    def _known_goals(self) -> FloatArray:
+        """Return the current goal (K, K, 2) [m] of robot j in the start frame of robot i; NaN: none, or not known."""
+        goals = np.empty((len(self._robots), len(self._robots), 2))
+        write_goals(self.points.starts, self._goals, self._grids.shared, goals)
+        return goals
 
     def _teammates(self, robot: int) -> tuple[Teammate, ...]:
         """Return a robot's teammates; those out of contact with their last known pose."""
         points, team = self.points, self._team
-        turn = float(points.starts[robot, 2])
+        turn, goals = float(points.starts[robot, 2]), self._known_goals()[robot]
+        others = self._others(robot)
+        covariances = [rotate_covariances(turn, team.pose(mate, robot).covariance) for mate in others]
         return tuple(
-            Teammate(mate, points.poses[robot, mate], rotate_covariances(turn, team.pose(mate, robot).covariance))
-            for mate in self._others(robot)
+            Teammate(mate, points.poses[robot, mate], covariance, goals[mate])
+            for mate, covariance in zip(others, covariances, strict=True)
         )
+
+    def _make_candidates(self, robot: int) -> Candidates:
+        """Build the candidates of a robot."""
+        rows, features = FrontierColumns.of(self._candidates.rows(robot)), self._features()[robot]
+        valid = ~np.isnan(rows.x)
+        return Candidates(
+            goals=rows.goals,
+            headings=rows.heading,
+            lengths=rows.length,
+            valid=valid,
+            kinds=np.where(valid, SLOT_KINDS, CandidateKind.NONE),
+            sizes=rows.size,
+            gains=self._candidates.gains(robot),
+            teammate_lengths=self._candidates.lengths(robot)[:, self._others(robot)],
+            own_goal=features[:, CANDIDATE_FEATURES.index("own_goal")] > 0.0,
+            teammate_goal=features[:, CANDIDATE_FEATURES.index("teammate_goal")] > 0.0,
+            features=features,
+        )
+
+    def _features(self) -> Float32Array:
+        """Return the features (K, C, F) float32 of all robots' candidates; a new array."""
+        return self._candidates.features(self.points.poses, self._known_goals())
 
     def _make_belief(self, robot: int) -> Belief:
         """Build the belief of a robot."""
-        points, slots, group = self.points, self._slots[robot], self._topology.known_robots[robot]
+        points, group = self.points, self._topology.known_robots[robot]
         return Belief(
             robot=robot,
             tick=self._tick,
@@ -253,14 +313,10 @@ class TeamBelief:
             log_weights=self._team.particles(robot)[1],
             ess=float(points.ess[robot]),
             grid=self._grids[robot].read_only_view(),
-            candidates=Candidates(
-                goals=slots.goals,
-                headings=slots.headings,
-                lengths=slots.lengths,
-                valid=slots.valid,
-                features=slots.features(points.own[robot], self._teammate_positions(robot)),
-            ),
+            candidates=self._make_candidates(robot),
             teammates=self._teammates(robot),
+            looks=as_read_only(self._grids.looks.counts[robot]),
+            seconds_left=self._seconds_left,
             start_from_group=points.starts[robot],
             group_map=self.group_map(robot),
         )

@@ -1,6 +1,14 @@
 """Navigation: occupancy grids, frontiers, candidates and path planning, independent of simulator and sensors."""
 
-from vslam_env.navigation.candidate_slots import CandidateSlots, TeamSlots
+from vslam_env.navigation.candidate_slots import CandidateSlots
+from vslam_env.navigation.candidates import (
+    CANDIDATE_FEATURES,
+    NUM_CANDIDATES,
+    CandidateGains,
+    CandidateKind,
+    TeamCandidates,
+)
+from vslam_env.navigation.looks import TeamLooks
 from vslam_env.navigation.occupancy_grid import (
     CELL,
     FREE,
@@ -20,18 +28,23 @@ from vslam_env.navigation.validation import ray_directions
 SeenGrid = OccupancyGrid  # its former name
 
 __all__ = [
+    "CANDIDATE_FEATURES",
     "CELL",
     "FREE",
     "GRID_SIZE",
+    "NUM_CANDIDATES",
     "OCCUPIED",
     "UNKNOWN",
+    "CandidateGains",
+    "CandidateKind",
     "CandidateSlots",
     "DistanceMap",
     "Frontiers",
     "OccupancyGrid",
     "SeenGrid",
+    "TeamCandidates",
     "TeamGrids",
-    "TeamSlots",
+    "TeamLooks",
     "cell_of",
     "cells_of",
     "centre_of",

@@ -8,21 +8,19 @@ from numpy.typing import ArrayLike, NDArray
 
 from slam_backend.core.validation import BoolArray, FloatArray
 from vslam_env.navigation._planning_kernels import (
-    FRONTIER_SIZE,
     SAME_GOAL,
     FrontierColumns,
-    describe,
     fill_slots,
     update_slots,
 )
 from vslam_env.navigation.occupancy_grid import OccupancyGrid
 from vslam_env.navigation.planning import known_part
-from vslam_env.navigation.team_grids import TeamGrids
 from vslam_env.navigation.validation import pose_floats, positions_array
 
-__all__ = ["FRONTIER_SIZE", "NUM_FEATURES", "NUM_SLOTS", "CandidateSlots", "TeamSlots"]
+__all__ = ["NUM_SLOTS", "CandidateSlots"]
 
-NUM_SLOTS, NUM_FEATURES = 16, 5
+NUM_SLOTS = 16
+Ways = tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.int32], NDArray[np.int32], int, int]
 NUM_COLUMNS = len(FrontierColumns._fields)
 ROBOT_RADIUS = 0.2  # [m]
 
@@ -104,8 +102,8 @@ class CandidateSlots:
         poses = _together(pose, teammates)
         self.renew(*known_part(cells), poses, 0)
 
-    def renew(self, cells: NDArray[np.uint8], bounds: NDArray[np.int32], poses: FloatArray, robot: int) -> None:
-        """Update the candidates of a robot without checks.
+    def renew(self, cells: NDArray[np.uint8], bounds: NDArray[np.int32], poses: FloatArray, robot: int) -> Ways:
+        """Update the candidates of a robot without checks; return the paths from it, of `dijkstra`.
 
         Args:
             cells: (S, S) uint8. Cells of the robot's grid.
@@ -114,27 +112,12 @@ class CandidateSlots:
             robot: Row of the robot in `poses`.
         """
         slots = self._rows, self._visits
-        found, costs, is_clear, self._given_up = update_slots(
+        found, costs, is_clear, self._given_up, ways = update_slots(
             cells, bounds, ROBOT_RADIUS, poses, robot, *slots, self._given_up
         )
         if not is_clear:
             fill_slots(_assign(costs), found, *slots)
-
-    def features(self, pose: ArrayLike, teammates: ArrayLike = ()) -> NDArray[np.float32]:
-        """Return the features of the candidates for a policy.
-
-        Args:
-            pose: (3,) float64 [m, m, rad], start frame. Pose of the robot.
-            teammates: (k, 2) float64 [m], start frame. Positions of its teammates.
-
-        Returns:
-            (16, 5) float32 [m]. x and y of the goal in the robot frame, length of the path at the last update, length
-            of the frontier, and distance from the goal to the nearest teammate, 60 without teammates. Zeros in empty
-            slots.
-        """
-        features = np.empty((1, NUM_SLOTS, NUM_FEATURES), np.float32)
-        describe(self._rows[None], _together(pose, teammates)[None], features)
-        return np.asarray(features[0])
+        return ways
 
     def get_state(self) -> dict[str, Any]:
         """Return a copy of the complete state."""
@@ -145,44 +128,6 @@ class CandidateSlots:
         self._rows[:] = state["rows"]
         self._visits = state["visits"].copy()
         self._given_up = state["given_up"].copy()
-
-
-class TeamSlots:
-    """Candidate slots of all robots of a team, stored in one array.
-
-    Args:
-        num_robots: Number of robots K.
-
-    Attributes:
-        slots: Slots of each robot.
-    """
-
-    def __init__(self, num_robots: int) -> None:
-        self._rows = np.empty((num_robots, NUM_SLOTS, NUM_COLUMNS))
-        self.slots = list(map(CandidateSlots.over, self._rows))
-
-    def update(self, robot: int, grids: TeamGrids, poses: FloatArray) -> None:
-        """Update a robot's candidates without checks; see `CandidateSlots.update`.
-
-        Args:
-            robot: Index of the robot.
-            grids: Occupancy grids of the robots.
-            poses: (K, K, 3) float64 [m, m, rad]. Estimated poses, see `features`.
-        """
-        self.slots[robot].renew(grids.grids[robot].cells, grids.bounds[robot], poses[robot], robot)
-
-    def features(self, poses: FloatArray) -> NDArray[np.float32]:
-        """Return the features of all robots' candidates without checks.
-
-        Args:
-            poses: (K, K, 3) float64 [m, m, rad]. Estimated pose of robot j in the start frame of robot i; NaN: unknown.
-
-        Returns:
-            (K, 16, 5) float32 [m]. New array, see `CandidateSlots.features`.
-        """
-        features = np.empty((len(self._rows), NUM_SLOTS, NUM_FEATURES), np.float32)
-        describe(self._rows, poses, features)
-        return features
 
 
 def _together(pose: ArrayLike, teammates: ArrayLike) -> FloatArray:

@@ -1,8 +1,11 @@
 """Memory of occupancy grids that grow with what was seen."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
+from slam_backend.core import state_checks as check
 from slam_backend.core.read_only import as_read_only
 from vslam_env.navigation._grid_kernels import CELL, GRID_SIZE, LARGEST_SIZE, MOST_CHANGES, Grid
 
@@ -93,3 +96,10 @@ def known_bounds(cells: NDArray[np.uint8]) -> NDArray[np.int32]:
 def margin(size: int) -> int:
     """Return how many rows a grid of a size has before the first row of a new grid."""
     return (size - GRID_SIZE) // 2
+
+
+def check_corner(name: str, corner: Any, shape: tuple[int, ...]) -> None:
+    """Raise unless a value is the first row and column, counted in a new grid, of a part of the largest grid."""
+    check.instance(name, corner, tuple)
+    for (where, first), count in zip(check.named_items(name, corner, 2), shape, strict=True):
+        check.integer(where, first, -margin(LARGEST_SIZE), LARGEST_SIZE - margin(LARGEST_SIZE) - count)

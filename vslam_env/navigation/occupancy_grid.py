@@ -8,8 +8,8 @@ from numpy.typing import ArrayLike, NDArray
 from slam_backend.core import state_checks as check
 from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_float
 from vslam_env.navigation import _grid_kernels as _painting
-from vslam_env.navigation._grid_kernels import CELL, FREE, GRID_SIZE, HALF_WIDTH, LARGEST_SIZE, OCCUPIED, UNKNOWN, Grid
-from vslam_env.navigation.grid_storage import GridStorage, known_bounds, margin
+from vslam_env.navigation._grid_kernels import CELL, FREE, GRID_SIZE, HALF_WIDTH, OCCUPIED, UNKNOWN, Grid
+from vslam_env.navigation.grid_storage import GridStorage, check_corner, known_bounds, margin
 from vslam_env.navigation.validation import check_ranges, pose_floats, ray_directions
 
 # State of a cell by its evidence, as an unsigned byte.
@@ -216,9 +216,4 @@ def check_grid(name: str, state: Any) -> None:
     """Raise unless a value is a state of an `OccupancyGrid`; the message begins with its name."""
     check.keys(name, state, ("evidence", "corner"))
     check.array(f"{name}['evidence']", state["evidence"], check.INT8, (None, None))
-    check.instance(f"{name}['corner']", state["corner"], tuple)
-    least = (GRID_SIZE - LARGEST_SIZE) // 2
-    for (where, first), count in zip(
-        check.named_items(f"{name}['corner']", state["corner"], 2), state["evidence"].shape, strict=True
-    ):
-        check.integer(where, first, least, least + LARGEST_SIZE - count)
+    check_corner(f"{name}['corner']", state["corner"], state["evidence"].shape)

@@ -12,6 +12,8 @@ from vslam_env.config import EnvConfig
 from vslam_env.navigation import OccupancyGrid, follow_path, plan_path
 from vslam_env.simulation.episode import Episode
 
+NOWHERE = np.full(2, np.nan)
+
 
 class GoalController:
     """Controller that drives one robot to a chosen candidate over its own occupancy grid.
@@ -92,6 +94,7 @@ class ActionExecutor:
         beliefs = episode.belief
         candidates = [beliefs.candidate(robot, action - 1) if action else None for robot, action in enumerate(chosen)]
         poses = beliefs.poses
+        goals = np.array([NOWHERE if candidate is None else candidate[0] for candidate in candidates])
         for robot, (driver, candidate) in enumerate(zip(self._drivers, candidates, strict=True)):
             driver.set_goal(candidate, poses[robot], beliefs.grid(robot))
         for _ in range(self._ticks):
@@ -100,7 +103,7 @@ class ActionExecutor:
                 driver.command(poses[robot], beliefs.grid(robot), bumps[robot])
                 for robot, driver in enumerate(self._drivers)
             ]
-            episode.advance(np.array(commands))
+            episode.advance(np.array(commands), goals)
         return [int(action != 0 and candidate is None) for action, candidate in zip(chosen, candidates, strict=True)]
 
     def get_state(self) -> list[dict[str, Any]]:

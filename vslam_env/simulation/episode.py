@@ -145,7 +145,8 @@ class Episode:
 
     def begin(self) -> None:
         """Take the first measurements."""
-        self._perceive(None)
+        no_goals = np.full((len(self.true_starts), 2), np.nan)
+        self._perceive(None, no_goals if self._config.action_type == "goal" else None)
 
     @property
     def given_scenario(self) -> Scenario | None:
@@ -165,8 +166,12 @@ class Episode:
         """Frames of all robots in the last tick, with the true landmarks of their measurements."""
         return self._frames.per_robot()
 
-    def advance(self, commands: FloatArray) -> None:
+    def advance(self, commands: FloatArray, goals: FloatArray | None = None) -> None:
         """Execute velocity commands (K, 2) [m/s, rad/s] for a tick, read the sensors and update the beliefs.
+
+        Args:
+            commands: (K, 2) [m/s, rad/s]. Speed and turn rate of each robot.
+            goals: (K, 2) [m], own start frames. Goals to which the robots drive, NaN: none; None: not `goal` actions.
 
         Raises:
             ValueError: If `Simulator.step` rejects the commands; the episode is then unchanged.
@@ -176,7 +181,8 @@ class Episode:
         if simulator.step(commands):
             self._collisions = tuple(map(add, self._collisions, simulator.bumped.tolist()))
         self.tick += 1
-        self._perceive(read_odometry(before, simulator.poses, self.scenario.bias, noise, stream, self._distances))
+        odometry = read_odometry(before, simulator.poses, self.scenario.bias, noise, stream, self._distances)
+        self._perceive(odometry, goals)
         if self._integrates:
             self._score(simulator.poses)
             self._error_integrals += self._map_errors * TICK
@@ -255,7 +261,7 @@ class Episode:
         covariance, claims = self.belief.points.covariances[robot], truth.true_ids(robot, group_map.ids)
         return BeliefSummary(as_constant(covariance), group_map.counts, group_map.covariances, as_constant(claims))
 
-    def _perceive(self, odometry: FloatArray | None) -> None:
+    def _perceive(self, odometry: FloatArray | None, goals: FloatArray | None = None) -> None:
         """Read the sensors at the true poses and update the beliefs and the ground-truth association."""
         config, poses = self._config, self._simulator.poses
         self._frames = frames = self.scenario.sensor.measure(poses, self._streams["sensor"])
@@ -270,6 +276,7 @@ class Episode:
             frames.true_ids if config.oracle_association else None,
             in_contact,
             frames.left if config.observe_images and isinstance(frames, TeamRenderedFrames) else None,
+            goals,
         )
         if self._tap.recorder is not None:
             self._tap.recorder(self.readings.per_robot())

@@ -33,6 +33,7 @@ from training.rl.config import TrainConfig
 from training.rl.network import GoalPolicy
 from training.rl.trainer import Training, as_arrays, as_tensors, check_device, stored_checkpoint
 from training.vec_env import ExplorationVecEnv
+from vslam_env import NUM_CANDIDATES
 from vslam_env.belief.observation import observation_space
 from vslam_env.state_kinds import ENV_KINDS
 
@@ -51,7 +52,7 @@ class _NearIsGood(ParallelEnv):  # type: ignore[misc]
         return SPACE
 
     def action_space(self, agent: str) -> Any:
-        return spaces.Discrete(17)
+        return spaces.Discrete(1 + NUM_CANDIDATES)
 
     def reset(self, seed: int | None = None, options: Any = None) -> tuple[Any, Any]:
         self.rng = np.random.default_rng(seed)
@@ -101,7 +102,7 @@ def _assert_same(ours: dict[str, Any], theirs: dict[str, Any]) -> None:
 def test_both_forms_of_the_network_agree() -> None:
     """Torch and numpy give the same logits for the same weights and observations."""
     torch.manual_seed(3)
-    policy = GoalPolicy(SPACE, spaces.Discrete(17), lambda left: 1e-3)
+    policy = GoalPolicy(SPACE, spaces.Discrete(1 + NUM_CANDIDATES), lambda left: 1e-3)
     with torch.no_grad():
         for tensor in policy.parameters():
             tensor.add_(0.1 * torch.randn_like(tensor))  # biases, initially zero, matter too

@@ -19,7 +19,10 @@ from vslam_env.belief.team_belief import Belief, TeamBelief
 from vslam_env.navigation import CELL, FREE, OCCUPIED, UNKNOWN, cell_of
 from vslam_env.reward import TERMS
 
-KEYS = ["pose", "pose_std", "map_stats", "local_grid", "scan", "candidates", "teammates", "teammates_mask"]
+KEYS = [
+    "pose", "pose_std", "map_stats", "local_grid", "scan", "candidates", "teammates", "teammates_mask",
+    "landmark_counts", "time_left", "global_grid", "global_grid_frame",
+]  # fmt: skip
 
 
 def _record(env: ExplorationEnv, steps: int) -> tuple[list[tuple[Readings, ...]], list[dict[str, Any]]]:
@@ -50,6 +53,7 @@ def test_observations_are_rebuilt_from_readings_alone(action_type: str, steps: i
         belief.step(now)
         if tick % ticks:
             continue
+        belief.set_seconds_left(0.1 * (400 * ticks - tick))
         for robot, agent in enumerate(env.possible_agents):
             rebuilt = observe(belief.belief(robot), now[robot].scan, goal)
             expected = recorded[tick // ticks][agent]
@@ -131,7 +135,7 @@ def test_flat_is_the_dict_in_order() -> None:
     assert np.array_equal(flat["action_mask"], named["action_mask"])
     assert np.array_equal(flat["observation"], flatten(named))
     assert np.array_equal(flat["observation"][6:12], named["map_stats"])
-    assert flat["observation"].shape == (3 + 3 + 6 + 3 * 48 * 48 + 32 + 80 + 35 + 7,)
+    assert flat["observation"].shape == (3 + 3 + 6 + 3 * 48 * 48 + 32 + 32 * 17 + 35 + 7 + 5 + 1 + 3 * 48 * 48 + 3,)
 
 
 def test_teammates_appear_with_the_merge() -> None:

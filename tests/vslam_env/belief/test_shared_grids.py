@@ -7,6 +7,7 @@ from builders.environments import ANGLES, MAX_RANGE, MEETING, building, cast, sm
 from slam_backend.fastslam.relative_poses import TeamPoses
 from slam_backend.fastslam.reports import Associations, LandmarkIdMap, MergeUndone, TeamReport
 from slam_backend.geometry import between, compose, inverse
+from slam_backend.models.camera import StereoCamera
 from vslam_env.belief.belief import RobotHardware
 from vslam_env.belief.shared_grids import MAX_ABSENCE, GridTransfer, GridUpdate, SharedGrids, plan_catch_up
 from vslam_env.navigation import OCCUPIED, UNKNOWN
@@ -37,7 +38,7 @@ class Drive:
     """
 
     def __init__(self, seed: int) -> None:
-        self.grids, self.tick = SharedGrids(3, BODY), 0
+        self.grids, self.tick = SharedGrids(3, BODY, StereoCamera()), 0
         self._rng, self._path = np.random.default_rng(seed), STARTS.copy()
 
     def on(self, mates: Mates, *entries: LandmarkIdMap | MergeUndone, off: np.ndarray = NO_MOTION) -> None:
@@ -73,6 +74,9 @@ def test_returning_robots_have_the_grids_of_unbroken_contact(seed: int) -> None:
     ours, theirs = lossy.cells(), steady.cells()
     assert ((ours == UNKNOWN) == (theirs == UNKNOWN)).all()
     assert (ours != theirs).sum() < 0.01 * (theirs != UNKNOWN).sum()
+    ours, theirs = (drive.grids.looks.counts.astype(int) for drive in (lossy, steady))
+    assert theirs.sum() > 1000
+    assert np.abs(ours - theirs).sum() < 0.02 * theirs.sum()
 
 
 def test_meeting_again_without_new_scans_changes_nothing() -> None:
@@ -80,12 +84,13 @@ def test_meeting_again_without_new_scans_changes_nothing() -> None:
     drive = Drive(100)
     for _ in range(20):
         drive.on(ALL)
-    before = drive.cells()
+    before, looks = drive.cells(), drive.grids.looks.counts.copy()
     points = stand(STARTS)
     for tick in range(drive.tick, drive.tick + 50):
         drive.grids.share_on_contact(tick, NONE, points.starts)
         drive.grids.share_on_contact(tick, ALL, points.starts)
     assert (drive.cells() == before).all()
+    assert (drive.grids.looks.counts == looks).all()
 
 
 def test_the_history_of_scans_is_bounded() -> None:
@@ -107,7 +112,7 @@ def test_restored_grids_continue_with_missed_scans() -> None:
     rng, drive = np.random.default_rng(100), Drive(100)
     for mates in [ALL] * 3 + [parted(rng) for _ in range(20)]:
         drive.on(mates)
-    other = SharedGrids(3, BODY)
+    other = SharedGrids(3, BODY, StereoCamera())
     other.set_state(drive.grids.get_state())
     points, nothing = stand(STARTS), np.full((3, len(ANGLES)), MAX_RANGE)
     report = TeamReport(
@@ -117,6 +122,7 @@ def test_restored_grids_continue_with_missed_scans() -> None:
         grids.step(drive.tick, report, ALL, points, nothing, np.zeros(3, np.bool_))
     for robot in range(3):
         assert (drive.grids[robot].cells == other[robot].cells).all()
+    assert (drive.grids.looks.counts == other.looks.counts).all()
 
 
 def test_scans_are_sent_once() -> None:
@@ -175,6 +181,9 @@ def test_scans_shared_within_a_side_survive_an_undo() -> None:
     ours, theirs = (drive.cells() for drive in drives)
     assert ((ours == UNKNOWN) == (theirs == UNKNOWN)).all()
     assert (ours != theirs).sum() < 0.01 * (theirs != UNKNOWN).sum()
+    ours, theirs = (drive.grids.looks.counts.astype(int) for drive in drives)
+    assert theirs.sum() > 1000
+    assert np.abs(ours - theirs).sum() < 0.02 * theirs.sum()
 
 
 def test_a_scan_history_owns_its_arrays() -> None:

@@ -125,25 +125,6 @@ def test_sixteen_slots_take_the_nearest_of_more_candidates() -> None:
     assert (slots.goals == found.goals[:16]).all()
 
 
-def test_features_are_seen_from_the_robot() -> None:
-    """Goals are given in the robot frame, with path length, size and the nearest teammate's distance; else zeros."""
-    slots = CandidateSlots()
-    pose = np.array([3.1, -0.9, 0.7])
-    slots.update(room((-4.0, 4.4)), pose)
-    teammates = np.array([[4.4, 0.5], [-4.0, -1.0], [0.0, 9.0]])
-    features = slots.features(pose, teammates)
-    assert features.dtype == np.float32
-    assert features.shape == (16, 5)
-    back = transform_points(pose, features[:2, :2].astype(float))
-    assert back == pytest.approx(slots.goals[:2], abs=1e-5)
-    assert features[:2, 2] == pytest.approx(slots.lengths[:2])
-    assert features[:2, 3] == pytest.approx(slots.sizes[:2])
-    distances = np.linalg.norm(slots.goals[:2, None] - teammates, axis=-1).min(axis=1)
-    assert features[:2, 4] == pytest.approx(distances)
-    assert (features[2:] == 0).all()
-    assert (slots.features(pose)[:2, 4] == 60.0).all()
-
-
 def test_a_frontier_that_stays_after_a_look_is_dropped() -> None:
     """A frontier that stays when the robot looks at it from its goal dies after four updates, and does not return."""
     cells = room((-4.0, 4.4))

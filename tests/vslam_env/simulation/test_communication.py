@@ -112,8 +112,9 @@ def test_beliefs_with_contact_now_and_then_follow_from_readings_alone(options: A
     episode = env.episode
     assert [event.kind for event in env.events if event.kind != "attempt"] == ["merge"]
     belief = TeamBelief(env.config.belief, 2, episode.belief_seed, episode.body)
-    for readings, expected in zip(log, observed, strict=True):
+    for tick, (readings, expected) in enumerate(zip(log, observed, strict=True)):
         belief.step(readings)
+        belief.set_seconds_left(0.1 * (400 - tick))
         for robot, agent in enumerate(env.possible_agents):
             again = observe(belief.belief(robot), readings[robot].scan, False)
             for name, value in expected[agent].items():

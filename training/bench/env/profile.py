@@ -14,7 +14,7 @@ from slam_backend.team.team import TeamSlam
 from vslam_env import environment
 from vslam_env.belief.shared_grids import SharedGrids
 from vslam_env.belief.team_belief import TeamBelief
-from vslam_env.navigation import TeamSlots
+from vslam_env.navigation import TeamCandidates
 from vslam_env.sensors import LandmarkSensor, RangeFinder
 from vslam_env.simulation.episode import Episode
 from vslam_env.world import Simulator
@@ -38,7 +38,7 @@ PHASES = (
     Phase("team, alignment", ((TeamSlam, "step"),)),
     Phase("errors", ((Episode, "team_metrics"),)),
     Phase("observations", ((environment, "observe_team"),)),
-    Phase("candidates", ((TeamSlots, "update"),)),
+    Phase("candidates", ((TeamCandidates, "update"),)),
     Phase(
         "beliefs, dictionaries",
         ((TeamBelief, "step"), (environment, "build_observations"), (environment, "build_infos")),

@@ -1,9 +1,7 @@
 """The compiled searches over the known part of a grid: where a disc fits, the cheapest ways, frontiers, candidates."""
 
 from vslam_env.navigation._planning_kernels.candidates import (
-    FRONTIER_SIZE,
     SAME_GOAL,
-    describe,
     fill_slots,
     update_slots,
 )
@@ -12,12 +10,10 @@ from vslam_env.navigation._planning_kernels.frontiers import FrontierColumns, co
 from vslam_env.navigation._planning_kernels.path_lengths import lines_of_sight, path_lengths
 
 __all__ = [
-    "FRONTIER_SIZE",
     "SAME_GOAL",
     "UNREACHED",
     "FrontierColumns",
     "compute_frontiers",
-    "describe",
     "dijkstra",
     "fill_slots",
     "lines_of_sight",

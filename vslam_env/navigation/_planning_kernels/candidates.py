@@ -6,16 +6,14 @@ from typing import Any
 import numpy as np
 
 from slam_backend.core.jit import device, in_place, jit
-from vslam_env.navigation._planning_kernels.frontiers import HEADING, LENGTH, NUM_COLUMNS, SIZE, compute_frontiers
+from vslam_env.navigation._planning_kernels.dijkstra import dijkstra
+from vslam_env.navigation._planning_kernels.frontiers import HEADING, NUM_COLUMNS, frontiers_reached
 
 SAME_GOAL = 1.0  # [m] between updates the goal of a living candidate moves less than this
 AT_GOAL = 0.5  # [m]
 LOOKING = 0.6  # [rad] a robot whose heading is this near to a candidate's looks at the unknown
 LOOK_COUNTS = 4  # times as much as a visit without a look, for a teammate's direction is not told
 PATIENCE = 16  # visits, after which what is still unseen there never will be seen
-
-FRONTIER_SIZE = 3  # the feature that is above 0 where there is a candidate
-NO_TEAMMATE = 60.0  # [m] stands for the distance of a teammate when there is none
 
 
 @device
@@ -73,7 +71,7 @@ def fill_slots(costs: Any, found: Any, rows: Any, visits: Any) -> None:
 @jit
 def update_slots(
     cells: Any, bounds: Any, radius: float, poses: Any, robot: int, rows: Any, visits: Any, given_up: Any
-) -> tuple[Any, Any, bool, Any]:
+) -> tuple[Any, Any, bool, Any, tuple[Any, Any, Any, Any, int, int]]:
     """Bring a robot's candidates up to date, if it is clear which of them are found again.
 
     The robot and its teammates visit candidates; where patience runs out, a candidate is given up.
@@ -90,7 +88,8 @@ def update_slots(
 
     Returns:
         The frontiers (n, 5); the distances (m, n), of `pair_distances`; whether the slots are filled: if not, the pairs
-        are to be chosen, and `fill_slots` called; and the goals that no longer count now.
+        are to be chosen, and `fill_slots` called; the goals that no longer count now; and the paths from the robot, of
+        `dijkstra`.
     """
     x, y, theta = poses[robot]
     for i in range(len(rows)):
@@ -106,33 +105,10 @@ def update_slots(
             given_up[: len(before)] = before
             given_up[-1, 0], given_up[-1, 1] = goal_x, goal_y
 
-    found = compute_frontiers(cells, bounds, x, y, radius, given_up)
+    ways = dijkstra(cells, bounds, x, y, radius)
+    found = frontiers_reached(ways, len(cells), given_up)
     costs = np.empty((len(rows), len(found)))
     is_clear = pair_distances(rows, found, costs)
     if is_clear:
         fill_slots(costs, found, rows, visits)
-    return found, costs, is_clear, given_up
-
-
-@in_place
-def describe(slots: Any, poses: Any, features: Any) -> None:
-    """Write `CandidateSlots.features` (K, 16, 5) of the rows of all slots (K, 16, 5).
-
-    Poses (K, n, 3), n >= K, are as in `TeamSlots.features`.
-    """
-    for robot in range(len(slots)):
-        x, y, theta = poses[robot, robot]
-        c, s = math.cos(theta), math.sin(theta)
-        for i in range(slots.shape[1]):
-            goal_x, goal_y = slots[robot, i, 0], slots[robot, i, 1]
-            if np.isnan(goal_x):
-                features[robot, i] = 0.0
-                continue
-            u, v = goal_x - x, goal_y - y
-            nearest = NO_TEAMMATE
-            for mate in range(poses.shape[1]):
-                if mate != robot and not np.isnan(poses[robot, mate, 0]):
-                    nearest = min(nearest, np.hypot(goal_x - poses[robot, mate, 0], goal_y - poses[robot, mate, 1]))
-            features[robot, i, 0], features[robot, i, 1] = c * u + s * v, c * v - s * u
-            features[robot, i, 2], features[robot, i, FRONTIER_SIZE] = slots[robot, i, LENGTH], slots[robot, i, SIZE]
-            features[robot, i, 4] = nearest
+    return found, costs, is_clear, given_up, ways

@@ -158,11 +158,17 @@ def compute_frontiers(cells: Any, bounds: Any, x: float, y: float, radius: float
     Returns:
         (n, 5) float64 rows (x, y, heading, size, length), see `FrontierColumns`, by increasing length.
     """
-    box, _, cost, parents, first_row, first_col = dijkstra(cells, bounds, x, y, radius)
+    return frontiers_reached(dijkstra(cells, bounds, x, y, radius), len(cells), ignored)
+
+
+@jit
+def frontiers_reached(ways: tuple[Any, Any, Any, Any, int, int], grid_size: int, ignored: Any) -> Any:
+    """Collect the frontiers that paths of `dijkstra` over a grid of a size lead to; see `compute_frontiers`."""
+    box, _, cost, parents, first_row, first_col = ways
     height, width = box.shape
-    before, to_centre = parents.ravel(), 0.5 - margin_of(len(cells))
+    before, to_centre = parents.ravel(), 0.5 - margin_of(grid_size)
     # 1: such an edge; 2: its component known; 3: in a piece
-    mark = _unseen_edges(box, first_row, first_col, len(cells))
+    mark = _unseen_edges(box, first_row, first_col, grid_size)
     for i in range(len(ignored)):
         _leave_out(mark, ignored[i, 0], ignored[i, 1], first_row + to_centre, first_col + to_centre)
 

@@ -1,0 +1,173 @@
+"""Candidates of three kinds, in slots with stable numbers: frontiers, places to look from again, and rendezvous."""
+
+from collections.abc import Mapping, Sequence
+from enum import IntEnum
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam_backend.core.validation import FloatArray, IntArray
+from vslam_env.navigation._view_kernels import (
+    NUM_DESCRIBED,
+    NUM_GAINS,
+    describe_candidates,
+    renew_candidates,
+)
+from vslam_env.navigation.candidate_slots import NUM_COLUMNS, NUM_SLOTS, CandidateSlots
+from vslam_env.navigation.team_grids import TeamGrids
+
+__all__ = ["CANDIDATE_FEATURES", "NUM_CANDIDATES", "CandidateGains", "CandidateKind", "TeamCandidates"]
+
+NUM_REVISITS, NUM_RENDEZVOUS = 12, 4
+NUM_CANDIDATES = NUM_SLOTS + NUM_REVISITS + NUM_RENDEZVOUS
+CANDIDATE_FEATURES = (
+    "x",
+    "y",
+    "heading_cos",
+    "heading_sin",
+    "path_length",
+    "size",
+    "teammate_path_length",
+    "own_goal",
+    "teammate_goal",
+    "unknown_area",
+    "unseen_wall",
+    "weak_landmarks",
+    "uncertain_length",
+    "nearest_candidate",
+    "is_frontier",
+    "is_revisit",
+    "is_rendezvous",
+)
+"""Names of the columns of the candidates in observations."""
+
+FIRST_KIND = NUM_DESCRIBED  # column of the first kind
+
+
+class CandidateKind(IntEnum):
+    """Kind of a candidate."""
+
+    NONE = -1
+    FRONTIER = 0
+    REVISIT = 1
+    RENDEZVOUS = 2
+
+
+SLOT_KINDS: IntArray = np.repeat(
+    [int(CandidateKind.FRONTIER), int(CandidateKind.REVISIT), int(CandidateKind.RENDEZVOUS)],
+    [NUM_SLOTS, NUM_REVISITS, NUM_RENDEZVOUS],
+).astype(np.int64)
+
+
+class CandidateGains(NamedTuple):
+    """What there is to gain at candidates, each (C,) float64; zeros in empty slots.
+
+    Attributes:
+        unknown_area: Unknown area in view from the goal [m^2], looking through what is unknown up to the next wall.
+        unseen_wall: Length of walls in view that were looked at too little [m].
+        weak_landmarks: Number of landmarks in view with fewer than three measurements.
+        uncertain_length: Length of the path over floor without well-known landmarks nearby [m].
+    """
+
+    unknown_area: FloatArray
+    unseen_wall: FloatArray
+    weak_landmarks: FloatArray
+    uncertain_length: FloatArray
+
+
+LandmarkRows = tuple[FloatArray, IntArray, FloatArray]
+
+
+class TeamCandidates:
+    """Candidates of all robots of a team.
+
+    Slots 0 to 15 hold frontiers (`CandidateSlots`), 16 to 27 places to look from again, 28 to 31 rendezvous. A
+    candidate keeps its slot while it lives: a place to look from again, while something is left to gain there.
+
+    Args:
+        num_robots: Number of robots K.
+        camera: Half the field of view [rad], range [m], and radius of the robots [m].
+
+    Attributes:
+        frontiers: Frontier slots of each robot.
+    """
+
+    def __init__(self, num_robots: int, camera: tuple[float, float, float]) -> None:
+        self._camera = np.array(camera)
+        self._rows = np.full((num_robots, NUM_CANDIDATES, NUM_COLUMNS), np.nan)
+        self._gains = np.zeros((num_robots, NUM_CANDIDATES, NUM_GAINS))
+        self._views = np.full((num_robots, NUM_CANDIDATES, 3), np.nan)
+        self._lengths = np.full((num_robots, NUM_CANDIDATES, num_robots), np.inf)
+        self._visits = np.zeros((num_robots, NUM_REVISITS), np.int64)
+        self._updates = [0] * num_robots
+        self.frontiers = [CandidateSlots.over(rows[:NUM_SLOTS]) for rows in self._rows]
+
+    def update(
+        self, robot: int, grids: TeamGrids, looks: NDArray[np.uint8], poses: FloatArray, landmarks: LandmarkRows,
+        places: FloatArray,
+    ) -> None:  # fmt: skip
+        """Update a robot's candidates without checks.
+
+        Args:
+            robot: Index of the robot.
+            grids: Occupancy grids of the robots.
+            looks: (S, S) uint8. Looks of the robot; those at walls that cannot be seen are changed.
+            poses: (K, K, 3) float64 [m, m, rad]. Pose of robot j in the start frame of robot i; NaN: unknown.
+            landmarks: All landmarks of the robot's map (n, 4), their counts (n, 2), see `MapSummaryRows`, and the
+                motion (3,) from the map frame to the start frame.
+            places: (4, 3) float64 [m, m, rad], start frame. Places for rendezvous; NaN: none.
+        """
+        cells, bounds = grids.grids[robot].cells, grids.bounds[robot]
+        ways = self.frontiers[robot].renew(cells, bounds, poses[robot], robot)
+        self._updates[robot] += 1
+        gains = self._gains[robot], self._views[robot]
+        slots = self._rows[robot], self._visits[robot], *gains, self._lengths[robot], robot, self._updates[robot]
+        renew_candidates(cells, bounds, looks, ways, landmarks, poses[robot], self._camera, places, slots)
+
+    def rows(self, robot: int) -> FloatArray:
+        """Return the candidates (32, 5) of a robot, columns as in `FrontierColumns`; NaN in empty slots. A view."""
+        return np.asarray(self._rows[robot])
+
+    def gains(self, robot: int) -> CandidateGains:
+        """Return the gains of a robot's candidates; views."""
+        return CandidateGains(*self._gains[robot].T)
+
+    def lengths(self, robot: int) -> FloatArray:
+        """Return the lengths (32, K) [m] of all robots' paths to a robot's candidates; inf: unknown. A view."""
+        return np.asarray(self._lengths[robot])
+
+    def features(self, poses: FloatArray, goals: FloatArray) -> NDArray[np.float32]:
+        """Return the features of all robots' candidates without checks.
+
+        Args:
+            poses: (K, K, 3) float64 [m, m, rad]. Pose of robot j in the start frame of robot i; NaN: unknown.
+            goals: (K, K, 2) float64 [m]. Current goal of robot j in the start frame of robot i; NaN: unknown.
+
+        Returns:
+            (K, 32, 17) float32. New array, columns `CANDIDATE_FEATURES`.
+        """
+        features = np.empty((len(self._rows), NUM_CANDIDATES, len(CANDIDATE_FEATURES)), np.float32)
+        describe_candidates(self._rows, self._gains, self._lengths, poses, goals, SLOT_KINDS, features)
+        return features
+
+    def get_state(self) -> dict[str, Any]:
+        """Return a copy of the complete state."""
+        return {
+            "frontiers": [slots.get_state() for slots in self.frontiers],
+            "rows": self._rows[:, NUM_SLOTS:].copy(),
+            "gains": self._gains.copy(),
+            "views": self._views.copy(),
+            "lengths": self._lengths.copy(),
+            "visits": self._visits.copy(),
+            "updates": tuple(self._updates),
+        }
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Restore a state of `get_state`."""
+        slot_states: Sequence[dict[str, Any]] = state["frontiers"]
+        for slots, slot_state in zip(self.frontiers, slot_states, strict=True):
+            slots.set_state(slot_state)
+        self._rows[:, NUM_SLOTS:], self._gains[:] = state["rows"], state["gains"]
+        self._lengths[:], self._visits[:] = state["lengths"], state["visits"]
+        self._views[:], self._updates = state["views"], list(state["updates"])

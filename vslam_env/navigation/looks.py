@@ -1,0 +1,89 @@
+"""Looks at walls: how often the camera saw each wall stretch so that its landmarks could be measured."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from slam_backend.core import state_checks as check
+from slam_backend.core.validation import FloatArray, IntArray
+from vslam_env.navigation._grid_kernels import GRID_SIZE
+from vslam_env.navigation._view_kernels import merge_looks, paint_looks
+from vslam_env.navigation.grid_storage import check_corner, known_bounds, margin
+from vslam_env.navigation.validation import pose_floats, ray_directions
+
+__all__ = ["TeamLooks"]
+
+SLACK = 1e-6  # [rad] so that the outermost rays of a scan over the field of view count
+
+
+class TeamLooks:
+    """Looks of each robot at walls, in the frame and with the cells of its occupancy grid.
+
+    Each ray of a scan that meets a wall within the range of the camera, at an incidence below 60 degrees, is a look. It
+    is counted on the free cell just before the wall, so that the two sides of a wall differ, once a tick and cell.
+    Looks follow the grids when these grow and when robots merge, part and meet again.
+
+    Args:
+        num_robots: Number of robots K.
+        angles: (R,) float64 [rad], robot frame. Directions of the rays.
+        half_fov: Half the field of view of the camera [rad].
+        reach: Range below which landmarks are measured [m].
+
+    Attributes:
+        counts: (K, S, S) uint8. Looks at each cell; a new array when the looks grow.
+    """
+
+    def __init__(self, num_robots: int, angles: FloatArray, half_fov: float, reach: float) -> None:
+        self._directions, self._reach = ray_directions(angles), reach
+        self._points = np.empty((len(angles), 2))
+        self._directions[:, np.abs(angles) > half_fov + SLACK] = 0.0
+        self.counts: NDArray[np.uint8] = np.zeros((num_robots, GRID_SIZE, GRID_SIZE), np.uint8)
+
+    def update(self, shared: IntArray, poses: FloatArray, scans: FloatArray, size: int) -> None:
+        """Count the looks of a tick; see `TeamGrids.update` for the arguments.
+
+        Args:
+            size: Number of cells S along a side of the grids, to which the looks grow.
+        """
+        self.reserve(size)
+        paint_looks(self.counts, shared, poses, scans, self._directions, self._reach, self._points)
+
+    def merge(self, robot: int, other: NDArray[np.uint8], self_from_other: ArrayLike) -> None:
+        """Add another robot's looks (S', S') uint8; its start pose in this robot's frame is (3,) [m, m, rad]."""
+        merge_looks(self.counts[robot], other, known_bounds(other), *pose_floats(self_from_other, "self_from_other"))
+
+    def reserve(self, size: int) -> None:
+        """Grow to the size S of the grids, unless the looks have it; views taken before are no longer updated."""
+        if size > self.counts.shape[1]:
+            before, shift = self.counts, (size - self.counts.shape[1]) // 2
+            self.counts = np.zeros((len(before), size, size), np.uint8)
+            self.counts[:, shift:-shift, shift:-shift] = before
+
+    def get_state(self, robot: int) -> dict[str, Any]:
+        """Return the looks of a robot: the part that is not zero, and its first row and column in a new grid."""
+        looks = self.counts[robot]
+        top, left, bottom, right = known_bounds(looks).tolist()
+        shift = margin(len(looks)) if bottom else 0
+        return {"counts": looks[top:bottom, left:right].copy(), "corner": (top - shift, left - shift)}
+
+    def set_state(self, robot: int, state: Mapping[str, Any]) -> None:
+        """Restore a state of `get_state` into looks that have the size of the grids."""
+        shift, (row, col) = margin(self.counts.shape[1]), state["corner"]
+        height, width = state["counts"].shape
+        self.counts[robot] = 0
+        self.counts[robot, row + shift : row + shift + height, col + shift : col + shift + width] = state["counts"]
+
+
+def looks_reach(state: Mapping[str, Any]) -> int:
+    """Return how many cells a grid needs on each side of its middle to hold a state of looks."""
+    (row, col), (height, width) = state["corner"], state["counts"].shape
+    return int(max(GRID_SIZE // 2 - min(row, col), max(row + height, col + width) - GRID_SIZE // 2))
+
+
+def check_looks(name: str, state: Any) -> None:
+    """Raise unless a value is a state of the looks of a robot; the message begins with its name."""
+    check.keys(name, state, ("counts", "corner"))
+    check.array(f"{name}['counts']", state["counts"], check.UINT8, (None, None))
+    check_corner(f"{name}['corner']", state["corner"], state["counts"].shape)
