@@ -11,11 +11,13 @@ from agents.hungarian import hungarian
 from agents.independent_frontier import IndependentFrontier
 from agents.mtsp import mtsp
 from agents.nearest_frontier import NearestFrontier
+from agents.next_best_view import NextBestView
 from agents.plugins import ACTION_TYPES, is_plugin, load_plugin, plugin_action_type
 from agents.policy import Policy
 from agents.random_goals import RandomGoals
 from agents.random_walk import RandomWalk
 from agents.rbpf_gain import RbpfGain
+from agents.rendezvous import Rendezvous
 from agents.tare import tare
 from agents.team import Assign, Assigned, CentralPolicy, SeparatePolicies, TeamPolicy
 from agents.trained import SUFFIX, TrainedGoalPolicy, load_model
@@ -33,6 +35,8 @@ ASSIGNMENTS: dict[str, Assign] = {
 PLANNERS: dict[str, Callable[[], Planner]] = {
     "frontier": NearestFrontier,
     "independent_frontier": IndependentFrontier,
+    "next_best_view": NextBestView,
+    "rendezvous": Rendezvous,
     "rbpf_gain": RbpfGain,
     "d_optimality": DOptimality,
     **{name: partial(Assigned, assign) for name, assign in ASSIGNMENTS.items()},
