@@ -3,7 +3,11 @@
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+from agents import make_policy
+from vslam_env import vslam_v0
 
 DOCS = Path(__file__).parents[2] / "docs"
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
@@ -33,5 +37,20 @@ def test_programs_run_as_written(
     for program in programs:
         lines = [line for line in program.splitlines() if line.strip() and not line.startswith(("import", "from"))]
         assert len(lines) <= 26
-        exec(compile(program, page, "exec"), {"__name__": "__page__"})
+        exec(compile(program, page, "exec"), {"__name__": "__main__"})
     assert re.search(EXPECTED[page], capsys.readouterr().out)
+
+
+def test_the_planner_of_a_page_is_found_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The planner of the page, saved under the name that the page gives, is a policy of the command line."""
+    (tmp_path / "look_again.py").write_text(_programs("how-to/own_policy.md")[0], encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    policy = make_policy("look_again:LookAgain", "goal")
+    env = vslam_v0.parallel_env(world="office", num_robots=1, action_type="goal", max_cycles=3)
+    observations, _ = env.reset(seed=0)
+    for _ in range(2):
+        action = policy.act(observations["robot_0"], env.belief("robot_0"), np.random.default_rng(0))
+        observations = env.step({"robot_0": action})[0]
+    candidates = env.belief("robot_0").candidates
+    nearest = int(np.nanargmin(np.where(candidates.kinds == 0, candidates.lengths, np.nan)))
+    assert policy.act(observations["robot_0"], env.belief("robot_0"), np.random.default_rng(0)) == 1 + nearest
