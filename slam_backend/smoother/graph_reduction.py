@@ -2,7 +2,8 @@
 
 Measurements of keys that are no longer recent are condensed into frozen sightings, and earlier where a robot waits. If
 too many keys remain, neighbours with the smallest variance of their relative pose are joined: the second is attached
-rigidly to the first, its measurements move there, and the odometry between them is dropped.
+rigidly to the first, its measurements move there, and of the odometry between them only what it says about the bias is
+kept, in the prior of the bias.
 """
 
 import numpy as np

@@ -6,8 +6,8 @@ import numpy as np
 
 from slam_backend.core.jit import inline, jit, stack_array
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
-from slam_backend.smoother._kernels.factors import _rotate_in_plane
-from slam_backend.smoother._kernels.records import NONE, Condensed, Keys, LandmarkFactors
+from slam_backend.smoother._kernels.factors import _inverse, _rotate_in_plane
+from slam_backend.smoother._kernels.records import LEVER, NONE, Condensed, Keys, LandmarkFactors
 
 
 @inline
@@ -78,6 +78,63 @@ def chain_biased(
         motion[i] += jacobian[i, 0] * bias[0] + jacobian[i, 1] * bias[1] + jacobian[i, 2] * bias[2]
 
 
+@inline
+def invert(matrix: FloatArray, inverse: FloatArray) -> None:
+    """Write the inverse (3, 3) of a symmetric matrix (3, 3)."""
+    upper, result, at = stack_array(6), stack_array(6), 0
+    for r in range(3):
+        for c in range(r, 3):
+            upper[at] = matrix[r, c]
+            at += 1
+    _inverse(upper, result)
+    at = 0
+    for r in range(3):
+        for c in range(r, 3):
+            inverse[r, c] = inverse[c, r] = result[at]
+            at += 1
+
+
+@jit
+def absorb_odometry(
+    off: FloatArray, noise: FloatArray, jacobian: FloatArray, variance: float, bias: FloatArray, prior: FloatArray,
+    prior_noise: FloatArray,
+) -> None:  # fmt: skip
+    """Add what odometry says of its bias to the prior of the bias, in place, before the motion becomes rigid.
+
+    The slope of the cost by the bias stays as it is, so that the mode does. Of the information the share 1 - v / q
+    counts, q the variance of the motion by odometry alone and v the one by all measurements: where odometry alone tells
+    the motion, it tells nothing of its own bias.
+
+    Args:
+        off: (3,) residual of the odometry at the mode.
+        noise, jacobian: (3, 3), (3, 3) its covariance, and its derivative by the bias.
+        variance: v [m^2].
+        bias: (3,) bias at the mode.
+        prior, prior_noise: (3,), (3, 3) mean and covariance of the bias.
+    """
+    weight, information, slope, total = np.empty((3, 3)), np.empty((3, 3)), stack_array(3), np.empty((3, 3))
+    whole = noise[0, 0] + noise[1, 1] + LEVER**2 * noise[2, 2]
+    if whole <= 0.0:
+        return
+    share = max(1.0 - variance / whole, 0.0)
+    invert(noise, weight)
+    invert(prior_noise, information)
+    for r in range(3):
+        slope[r] = 0.0
+        for c in range(3):
+            slope[r] += information[r, c] * (bias[c] - prior[c])
+            total[r, c] = information[r, c]
+            for i in range(3):
+                slope[r] += jacobian[c, r] * weight[c, i] * off[i]
+                for n in range(3):
+                    total[r, c] += share * jacobian[i, r] * weight[i, n] * jacobian[n, c]
+    invert(total, prior_noise)
+    for r in range(3):
+        prior[r] = bias[r]
+        for c in range(3):
+            prior[r] -= prior_noise[r, c] * slope[c]
+
+
 @jit
 def merge_keys(
     fresh: BoolArray, sighted: BoolArray, most_keys: int, keys: Keys, biases: IntArray
@@ -95,9 +152,8 @@ def merge_keys(
         keys: Keys of the graph in the order of time; `transition_variances` [m^2] is what joining a key to the one
             before costs, `rigid_variances` what each has cost. Changed: the first rows are those of the keys that are
             left, whose odometry begins at another one that is left, by its new number.
-        biases: (k,) key of the bias of each key's odometry, `NONE` if it has none; (0,) without biases. Odometry under
-            a bias is kept whole: where a key has gone, that of the key after it begins with the odometry of the key
-            that went, not with its rigid pose, because the rigid pose says no more of the bias.
+        biases: (k,) key of the bias of each key's odometry, `NONE` if it has none; (0,) without biases. The
+            information of a removed key's odometry about its bias is added to the prior of the bias.
 
     Returns:
         Number of keys that are left; (k,) the key to which each stands rigidly, itself if it is left, `NONE` if it was
@@ -158,20 +214,30 @@ def merge_keys(
         dx, dy = poses[b, 0] - poses[a, 0], poses[b, 1] - poses[a, 1]
         offsets[b, 0], offsets[b, 1] = c * dx + s * dy, -s * dx + c * dy
         offsets[b, 2] = (poses[b, 2] - poses[a, 2] + math.pi) % (2.0 * math.pi) - math.pi
+    off = stack_array(3)
     for b in range(len(biases)):
-        if roots[b] == b and biases[b] >= 0:
-            a, value = previous[b], poses[biases[b]]
-            while roots[a] != a:
-                chain_biased(motions[a], noises[a], jacobians[a], value, motions[b], noises[b], jacobians[b])
-                a = previous[a]
+        if biases[b] >= 0 and roots[b] != b and roots[b] != NONE:
+            a, value = previous[b], biases[b]
+            c, s = math.cos(poses[a, 2]), math.sin(poses[a, 2])
+            dx, dy = poses[b, 0] - poses[a, 0], poses[b, 1] - poses[a, 1]
+            off[0], off[1] = c * dx + s * dy - motions[b, 0], -s * dx + c * dy - motions[b, 1]
+            off[2] = (poses[b, 2] - poses[a, 2] - motions[b, 2] + math.pi) % (2.0 * math.pi) - math.pi
+            for i in range(3):
+                for n in range(3):
+                    off[i] += jacobians[b, i, n] * poses[value, n]
+            absorb_odometry(off, noises[b], jacobians[b], costs[b], poses[value], motions[value], noises[value])
     for b in range(k):
         if roots[b] != b:
             continue
         a = previous[b]
         if a >= 0:
             previous[b] = numbers[roots[a]]
-            if roots[a] != a and (len(biases) == 0 or biases[b] < 0):
+            if roots[a] != a:
                 put_before(offsets[a], motions[b], noises[b])
+                c, s = math.cos(offsets[a, 2]), math.sin(offsets[a, 2])
+                for i in range(3):
+                    x, y = jacobians[b, 0, i], jacobians[b, 1, i]
+                    jacobians[b, 0, i], jacobians[b, 1, i] = c * x - s * y, s * x + c * y
         n = numbers[b]
         robots[n], poses[n], previous[n] = robots[b], poses[b], previous[b]
         motions[n], noises[n], jacobians[n], costs[n], rigid[n] = (

@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from slam_backend.geometry import between, compose, wrap_angle
 from slam_backend.models.odometry import OdometryModel
 from slam_backend.smoother import _kernels
-from slam_backend.smoother._kernels import BIAS, NONE, Keys
+from slam_backend.smoother._kernels import BIAS, LEVER, NONE, Keys
 from slam_backend.smoother.graph import SlamGraph
 from slam_backend.smoother.graph_building import extend_graph, merge_graphs
 from slam_backend.smoother.graph_reduction import reduce_keyframes, relinearise
@@ -17,6 +17,7 @@ from slam_backend.smoother.options import SmoothingOptions
 from slam_backend.smoother.sampling import lane_rows, odometry_log_density, sample_paths
 
 MOUNT = np.zeros(3)
+CAMERA = camera_of(small_run())
 
 
 def smoothed(robots: int = 1, length: float = 5.0) -> tuple[SlamGraph, MapEstimate]:
@@ -171,30 +172,74 @@ def test_a_known_bias_is_found():
     assert (np.diag(covariance)[:2] < 0.5 * np.diag(BIASED.bias_covariance)[:2]).all()
 
 
-def test_joined_keys_keep_their_odometry_whole():
-    """What odometry says of the bias survives a reduction: the chain over joined keys is that of their odometry."""
-    run = small_run(1, length=10.0)
-    graph, camera = graph_of(run, motion=BIASED), camera_of(run)
-    mode = optimize(graph, camera, TIGHT)
+def reduced(graph: SlamGraph, mode: MapEstimate, variances: np.ndarray) -> SlamGraph:
+    """Return the graph at its mode with ten keys, and those of the biases."""
     options = SmoothingOptions(max_keys=10, further_keys=0, recent_keys=4, kernel=0.0)
-    before = relinearise(graph, mode, mode.transition_variances())
-    after = reduce_keyframes(before, camera, options)
+    return reduce_keyframes(relinearise(graph, mode, variances), CAMERA, options)
+
+
+def test_joining_keys_keeps_the_mode_of_paths_and_biases() -> None:
+    """The reduced graph has the mode of the whole one, biases included, and its own odometry from key to key."""
+    graph, mode = smoothed(length=10.0)
+    after = reduced(graph, mode, mode.transition_variances())
     assert after.num_keys <= 10 + 1
     assert (after.robots[after.bias_keys] == BIAS).all()
+    again = optimize(after, CAMERA, TIGHT)
+    whole = mode.poses[graph.bias_keys[0]]
+    assert_allclose(again.poses[after.bias_keys[0]], whole, atol=2e-3)
+    assert_allclose(again.poses[after.last_keys], mode.poses[graph.last_keys], atol=0.01)
+
+
+def test_joining_keys_keeps_the_slope_of_the_cost_by_the_bias() -> None:
+    """Prior and odometry pull the bias at the mode as strongly after the reduction as before, whatever is joined."""
+    graph, mode = smoothed(length=10.0)
+    poses = (
+        mode.poses + 1e-3 * np.random.default_rng(2).standard_normal(mode.poses.shape) * (graph.robots >= 0)[:, None]
+    )
+
+    def slope(one: SlamGraph, at: np.ndarray) -> np.ndarray:
+        key = int(one.bias_keys[0])
+        total = np.linalg.solve(one.odometry_covariances[key], at[key] - one.odometry[key])
+        for b in np.flatnonzero(one.biases_of_odometry() == key):
+            off = between(at[one.parents[b]], at[b]) - one.odometry[b] + one.bias_jacobians[b] @ at[key]
+            off[2] = wrap_angle(off[2])
+            total = total + one.bias_jacobians[b].T @ np.linalg.solve(one.odometry_covariances[b], off)
+        return np.asarray(total)
+
+    before = graph.with_columns(poses=poses, transition_variances=mode.transition_variances())
+    options = SmoothingOptions(max_keys=10, further_keys=0, recent_keys=4, kernel=0.0)
+    after = reduce_keyframes(before, CAMERA, options)
+    assert_allclose(slope(after, after.poses), slope(before, poses), rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_rigid_motions_tell_of_the_bias_what_landmarks_tell_of_them(known: bool) -> None:
+    """A motion that landmarks tell exactly informs of its bias wholly, one that odometry alone tells not at all."""
+    graph, mode = smoothed(length=10.0)
+    noises = graph.odometry_covariances
+    alone = noises[:, 0, 0] + noises[:, 1, 1] + LEVER**2 * noises[:, 2, 2]
+    after = reduced(graph, mode, np.zeros(graph.num_keys) if known else alone)
+    key = graph.bias_keys[0]
+    prior = np.linalg.inv(after.odometry_covariances[after.bias_keys[0]])
+    expected = np.linalg.inv(BIASED.bias_covariance)
+    if known:
+        for b in np.flatnonzero(graph.biases_of_odometry() == key):
+            if not (np.abs(after.poses - mode.poses[b]).max(axis=1) < 1e-12).any():  # joined
+                jacobian = graph.bias_jacobians[b]
+                expected = expected + jacobian.T @ np.linalg.solve(graph.odometry_covariances[b], jacobian)
+    assert_allclose(prior, expected, rtol=1e-6)
+
+
+def test_odometry_after_joined_keys_begins_with_their_rigid_motion() -> None:
+    """From each key that is left, the corrected odometry leads where it led from the key that went."""
+    graph, mode = smoothed(length=10.0)
+    after = reduced(graph, mode, mode.transition_variances())
     bias = mode.poses[graph.bias_keys[0]]
-    assert_array_equal(after.poses[after.bias_keys[0]], bias)
-
-    def whole(one: SlamGraph) -> np.ndarray:
-        line, key = [], int(one.last_keys[0])
-        while one.parents[key] >= 0:
-            line.append(key)
-            key = int(one.parents[key])
-        motion = np.zeros(3)
-        for key in reversed(line):
-            motion = compose(motion, one.odometry[key] - one.bias_jacobians[key] @ bias)
-        return motion
-
-    assert_allclose(whole(after), whole(before), atol=1e-9)
+    for b in np.flatnonzero(after.biases_of_odometry() >= 0):
+        old = np.flatnonzero(np.abs(mode.poses - after.poses[b]).max(axis=1) < 1e-12)[0]
+        expected = compose(mode.poses[graph.parents[old]], graph.odometry[old] - graph.bias_jacobians[old] @ bias)
+        found = compose(after.poses[after.parents[b]], after.odometry[b] - after.bias_jacobians[b] @ bias)
+        assert_allclose(found, expected, atol=1e-9)
 
 
 def test_merged_groups_keep_their_biases():
