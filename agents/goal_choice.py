@@ -93,6 +93,7 @@ class DrivingPolicy:
         """Choose a goal and a path to it."""
         self._age = 0
         slot = self._planner.choose(belief, rng)
+        goal: FloatArray | None
         if slot is not None:
             goal, self._heading = belief.candidates.goals[slot], float(belief.candidates.headings[slot])
         else:
@@ -100,7 +101,7 @@ class DrivingPolicy:
             if self._patrol is None or np.linalg.norm(self._patrol - here) < ARRIVED:
                 self._patrol = patrol_goal(belief, rng)
             goal, self._heading = self._patrol, None
-        self._path = plan_path(belief.grid, belief.pose[:2], goal)
+        self._path = None if goal is None else plan_path(belief.grid, belief.pose[:2], goal)
         if self._path is None:
             self._patrol = None
         elif slot is None:
@@ -133,15 +134,15 @@ def nearest_slot(candidates: Candidates, slots: IntArray, held: int | None) -> i
     return nearest
 
 
-def patrol_goal(belief: Belief, rng: np.random.Generator) -> FloatArray:
+def patrol_goal(belief: Belief, rng: np.random.Generator) -> FloatArray | None:
     """Draw one of the farthest points (2,) [m], start frame, that the robot can reach over known floor.
 
-    If nothing is reachable, return the robot's position.
+    If nothing is reachable, return None.
     """
     ways = distance_map(belief.grid, belief.pose[:2])
     rows, cols = np.nonzero(ways.cost < UNREACHABLE)
     if not len(rows):
-        return np.array(belief.pose[:2])
+        return None
     costs = ways.cost[rows, cols]
     place = int(rng.choice(np.flatnonzero(costs >= np.quantile(costs, 1.0 - FAR_SHARE))))
     return ways.centre_of([rows[place], cols[place]])

@@ -12,6 +12,7 @@ from slam_backend.maps.alignment_types import AlignmentOptions
 from slam_backend.maps.landmark_map import LandmarkMap
 
 MAX_PAIRS = 10_000  # candidates without appearance
+ALL = 2**62  # as good as no limit to a number of pairs
 
 
 def too_many(map_a: LandmarkMap, map_b: LandmarkMap, options: AlignmentOptions) -> bool:
@@ -62,7 +63,8 @@ def has_enough_candidates(descriptors_a: Float32Array, descriptors_b: Float32Arr
     """
     if not options.appearance or descriptors_a.shape[1] != descriptors_b.shape[1]:
         return True
-    return count_similar(descriptors_a, descriptors_b, options.descriptor_gate) >= options.min_inliers
+    least = options.min_inliers
+    return count_similar(descriptors_a, descriptors_b, options.descriptor_gate, least) >= least
 
 
 def match_table(map_a: LandmarkMap, map_b: LandmarkMap, matches: IntArray) -> FloatArray:
@@ -96,12 +98,12 @@ def similar_pairs(a: Float32Array, b: Float32Array, gate: float, most: int) -> I
     """
     if not len(a) or not len(b):
         return np.empty((0, 2), np.int64)
-    return descriptor_matching.alike(_fresh(a), _fresh(b.T), gate * gate, most)[0]
+    return descriptor_matching.alike(_fresh(a), _fresh(b.T), gate * gate, most, ALL)[0]
 
 
-def count_similar(a: Float32Array, b: Float32Array, gate: float) -> int:
-    """Return the number of pairs of descriptors (n, d) and (m, d) within `gate`."""
-    return descriptor_matching.alike(_fresh(a), _fresh(b.T), gate * gate, 0)[1] if len(a) and len(b) else 0
+def count_similar(a: Float32Array, b: Float32Array, gate: float, enough: int = ALL) -> int:
+    """Return the number of pairs of descriptors (n, d) and (m, d) within `gate`, or some number >= `enough`."""
+    return descriptor_matching.alike(_fresh(a), _fresh(b.T), gate * gate, 0, enough)[1] if len(a) and len(b) else 0
 
 
 def mutual_nearest(a: Float32Array, b: Float32Array, gate: float) -> IntArray:

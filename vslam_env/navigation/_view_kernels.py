@@ -590,7 +590,7 @@ def measure_teammates(
         start_row, start_col = nearest_open(box, weights, row, col, ESCAPE_CELLS)
         if start_row < 0:
             continue
-        cost, parents = wavefront(wide, start_row // 2, start_col // 2)
+        cost, parents = wavefront(wide, start_row // 2, start_col // 2, -1)
         flat = parents.ravel()
         for i in range(len(rows)):
             if np.isnan(rows[i, X]):

@@ -20,11 +20,13 @@ from slam_backend.core.jit import in_place
 from slam_backend.core.validation import FloatArray, argument_error, check_float
 from vslam_env.navigation._grid_kernels import LARGEST_HALF_WIDTH
 from vslam_env.navigation._planning_kernels import (
+    GOAL_CELLS,
     UNREACHED,
     FrontierColumns,
     compute_frontiers,
     dijkstra,
     nearest_open,
+    part_within,
     shorten_path,
 )
 from vslam_env.navigation.grid_storage import known_bounds
@@ -89,8 +91,7 @@ def find_frontiers(cells: Cells, start_xy: ArrayLike, radius: float = 0.2, ignor
     )
 
 
-GOAL_CELLS = 2  # search radius for an open cell if the goal lies in an inflated wall
-
+DETOUR = 30.0  # [m] paths to a goal first pass the known floor this near to start and goal, along x and y
 MIN_RADIUS = 0.11  # [m] below, diagonal steps could cross inflated walls
 
 LOOKAHEAD = 0.4  # [m]
@@ -159,7 +160,7 @@ def distance_map(cells: Cells, start_xy: ArrayLike, radius: float = 0.2) -> Dist
     Args:
         cells: Grid, or its cells (S, S) uint8.
         start_xy: (2,) float64 [m], start frame. If its cell is impassable, the search starts from the nearest open cell
-            within 1 m that is not behind a wall.
+            within 5 m that is not behind a wall.
         radius: Radius of the robot [m], at least 0.11.
 
     Returns:
@@ -168,8 +169,16 @@ def distance_map(cells: Cells, start_xy: ArrayLike, radius: float = 0.2) -> Dist
     Raises:
         ValueError: If the cells are not a grid's, or a number is not finite.
     """
-    (states, bounds), start = known_part(cells), _checked_start(start_xy, radius)
-    box, weights, cost, parent, row, col = dijkstra(states, bounds, *start)
+    return _search(known_part(cells), _checked_start(start_xy, radius), (math.nan, math.nan), math.inf)
+
+
+def _search(
+    known: tuple[NDArray[np.uint8], NDArray[np.int32]], start: tuple[float, float, float], goal: tuple[float, float],
+    reach: float,
+) -> DistanceMap:  # fmt: skip
+    """Return the distance map of a validated start, as `distance_map`, or as far as the path to a goal needs it."""
+    states, bounds = known
+    box, weights, cost, parent, row, col = dijkstra(states, bounds, *start, *goal, reach)
     return DistanceMap(
         start=start[:2], corner=(row, col), size=len(states), box=box, weights=weights, cost=cost, parent=parent
     )
@@ -185,6 +194,8 @@ def _checked_start(start_xy: ArrayLike, radius: float) -> tuple[float, float, fl
 def plan_path(cells: Cells, start_xy: ArrayLike, goal_xy: ArrayLike, radius: float = 0.2) -> FloatArray | None:
     """Plan a short path over known free floor that keeps away from walls where possible.
 
+    Floor more than 30 m from both start and goal, along x or y, is used only if there is no other path.
+
     Args:
         cells: Grid, or its cells (S, S) uint8.
         start_xy: (2,) float64 [m], start frame. If it lies in an inflated wall, the path first leaves it.
@@ -198,7 +209,11 @@ def plan_path(cells: Cells, start_xy: ArrayLike, goal_xy: ArrayLike, radius: flo
     Raises:
         ValueError: If the cells are not a grid's, or a number is not finite.
     """
-    return distance_map(cells, start_xy, radius).path_to(goal_xy)
+    known, start, goal = known_part(cells), _checked_start(start_xy, radius), point_floats(goal_xy, "goal_xy")
+    path = _search(known, start, goal, DETOUR).path_to(goal)
+    if path is None and part_within(known[1], len(known[0]), *start[:2], *goal, DETOUR) != tuple(known[1].tolist()):
+        return _search(known, start, goal, math.inf).path_to(goal)
+    return path
 
 
 @in_place

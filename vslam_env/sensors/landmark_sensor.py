@@ -21,7 +21,13 @@ from slam_backend.models.measurements import Measurements, TeamMeasurements
 from vslam_env.sensors._landmark_kernels import BEYOND, FARTHEST, measure, sample_clutter
 from vslam_env.world._kernels import detect
 from vslam_env.world.spec import Landmarks
-from vslam_env.world.visibility import as_coordinate_rows, landmark_geometry, view_limits, visible_landmarks
+from vslam_env.world.visibility import (
+    as_coordinate_rows,
+    group_bounds,
+    landmark_geometry,
+    view_limits,
+    visible_landmarks,
+)
 
 MAX_POINTS = 10_000  # limit per frame
 
@@ -128,6 +134,7 @@ class LandmarkSensor:
         self._view = view_limits(camera, config.max_incidence)
         self._sight = (
             landmark_geometry(landmarks),
+            group_bounds(landmarks),
             landmarks.walls,
             as_coordinate_rows(self._walls),
             self.robot_radius,

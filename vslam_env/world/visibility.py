@@ -7,7 +7,7 @@ import numpy as np
 from slam_backend.core.read_only import as_read_only
 from slam_backend.core.validation import BoolArray, FloatArray
 from slam_backend.models.camera import StereoCamera
-from vslam_env.world._kernels import EPSILON, detect
+from vslam_env.world._kernels import EPSILON, GROUP, detect
 from vslam_env.world.spec import Landmarks
 
 
@@ -29,6 +29,14 @@ def view_limits(camera: StereoCamera, max_incidence: float) -> FloatArray:
 def landmark_geometry(landmarks: Landmarks) -> FloatArray:
     """Return positions [m] and normals of landmarks as coordinate rows (5, N), world frame; read-only."""
     return as_read_only(np.vstack([landmarks.positions.T, landmarks.normals.T]))
+
+
+def group_bounds(landmarks: Landmarks) -> FloatArray:
+    """Return the bounds x, y, x, y [m] of each `GROUP` successive landmarks (n, 4), world frame; read-only."""
+    firsts, places = np.arange(0, len(landmarks), GROUP), landmarks.positions[:, :2]
+    if not len(firsts):
+        return as_read_only(np.empty((0, 4)))
+    return as_read_only(np.hstack([np.minimum.reduceat(places, firsts), np.maximum.reduceat(places, firsts)]))
 
 
 def as_coordinate_rows(walls: FloatArray) -> FloatArray:
@@ -59,7 +67,8 @@ def visible_landmarks(
         view: Limits of view from `view_limits`.
     """
     shape = len(poses), len(landmarks)
-    sight = landmark_geometry(landmarks), landmarks.walls, as_coordinate_rows(walls), robot_radius, view
+    marks, bounds = landmark_geometry(landmarks), group_bounds(landmarks)
+    sight = marks, bounds, landmarks.walls, as_coordinate_rows(walls), robot_radius, view
     chosen, counts, seen = np.empty(shape, np.int64), np.empty(len(poses), np.int64), np.zeros(shape, np.bool_)
     detect(poses, sight, np.zeros(shape), 1.0, np.zeros(len(poses), np.int64), chosen, counts)
     for row, names, count in zip(seen, chosen, counts, strict=True):

@@ -59,13 +59,59 @@ def _squared_distances(
         out[j] = length + lengths_b[start + j] - np.float32(2.0) * out[j]
 
 
+@device
+@jit
+def _products_if_near(
+    row: Float32Array, head: int, b_columns: Float32Array, lengths: Float32Array, tails: Float32Array, start: int,
+    stop: int, limit: np.float32, out: Float32Array,
+) -> np.float32:  # fmt: skip
+    """Write row . b to `out` for the columns b from `start` to `stop`, unless all are farther than `limit`, squared.
+
+    The heads alone rule out most pairs: a . b is at most that of the heads plus the product of the lengths of the
+    tails, and the tails are not multiplied where no b can be near. `SLACK` of the squared lengths allows for rounding.
+
+    Args:
+        row: (d,).
+        head: Length of the heads.
+        b_columns: (d, m).
+        lengths: (stop - start,) squared lengths of the columns.
+        tails: (stop - start,) lengths of their tails.
+        start, stop: Range of columns.
+        limit: Largest squared distance.
+        out: (>= stop - start,), written.
+
+    Returns:
+        Squared length of the row; -1 if no b is near, and `out` is not complete.
+    """
+    length, tail = np.float32(0.0), np.float32(0.0)
+    for k in range(len(row)):
+        length += row[k] * row[k]
+    for k in range(head, len(row)):
+        tail += row[k] * row[k]
+    tail = np.sqrt(tail)
+    out[: stop - start] = np.float32(0.0)
+    _add_products(row, 0, head, b_columns, start, stop, out)
+    near = 0
+    for j in range(len(lengths)):
+        whole = length + lengths[j]
+        near += whole - np.float32(2.0) * (out[j] + tail * tails[j]) <= limit + SLACK * whole
+    if near == 0:
+        return np.float32(-1.0)
+    _add_products(row, head, len(row), b_columns, start, stop, out)
+    return length
+
+
 @jit
 def mutual_pairs(a: Float32Array, b_columns: Float32Array, limit: float) -> IntArray:
     """Return the pairs (k, 2) that are each other's nearest, up to a squared distance `limit`, by rising a.
 
-    Of several that are equally near the first one counts.
+    Of several that are equally near the first one counts. Pairs beyond the limit do not: the heads alone rule most of
+    them out, as in `alike`.
     """
-    n, m = len(a), b_columns.shape[1]
+    n, m, size = len(a), b_columns.shape[1], a.shape[1]
+    head = min(HEAD, size)
+    tails_b = np.sqrt(_squared_lengths(b_columns[head:]))
+    bound = np.float32(limit)
     nearest_b, nearest_a = np.zeros(n, np.int64), np.zeros(m, np.int64)
     least_a, least_b = np.full(n, np.float32(np.inf)), np.full(m, np.float32(np.inf))
     lengths_b = _squared_lengths(b_columns)
@@ -73,10 +119,13 @@ def mutual_pairs(a: Float32Array, b_columns: Float32Array, limit: float) -> IntA
     for start in range(0, m, BLOCK):
         stop = min(start + BLOCK, m)
         least, nearest = least_b[start:stop], nearest_a[start:stop]
+        lengths, tails = lengths_b[start:stop], tails_b[start:stop]
         for i in range(n):
-            _squared_distances(a[i], b_columns, lengths_b, start, stop, squares)
+            length = _products_if_near(a[i], head, b_columns, lengths, tails, start, stop, bound, squares)
+            if length < 0.0:
+                continue
             for j in range(stop - start):
-                square = squares[j]
+                square = length + lengths[j] - np.float32(2.0) * squares[j]
                 if square < least_a[i]:
                     least_a[i], nearest_b[i] = square, start + j
                 if square < least[j]:
@@ -123,11 +172,8 @@ def ratio_test_mask(
 
 
 @jit
-def alike(a: Float32Array, b_columns: Float32Array, limit: float, most: int) -> tuple[IntArray, int]:
-    """Pair descriptors within a squared distance `limit`.
-
-    The heads alone rule out most pairs: a . b is at most that of the heads plus the product of the lengths of the
-    tails, and the tails are not multiplied where no b can be near. `SLACK` of the squared lengths allows for rounding.
+def alike(a: Float32Array, b_columns: Float32Array, limit: float, most: int, enough: int) -> tuple[IntArray, int]:
+    """Pair descriptors within a squared distance `limit`, until `enough` pairs are found.
 
     Returns:
         The pairs (k, 2) of which neither has more than `most`, by rising a; and the number of all pairs.
@@ -138,32 +184,23 @@ def alike(a: Float32Array, b_columns: Float32Array, limit: float, most: int) -> 
     head = min(HEAD, size)
     lengths_b, tails_b = _squared_lengths(b_columns), np.sqrt(_squared_lengths(b_columns[head:]))
     squares = np.empty(BLOCK, np.float32)
-    bound = np.float32(limit)
+    bound, total = np.float32(limit), 0
     for start in range(0, m, BLOCK):
         stop = min(start + BLOCK, m)
         lengths, tails = lengths_b[start:stop], tails_b[start:stop]
         for i in range(n):
-            length, tail = np.float32(0.0), np.float32(0.0)
-            for k in range(size):
-                length += a[i, k] * a[i, k]
-            for k in range(head, size):
-                tail += a[i, k] * a[i, k]
-            tail = np.sqrt(tail)
-            squares[: stop - start] = np.float32(0.0)
-            _add_products(a[i], 0, head, b_columns, start, stop, squares)
-            near = 0
-            for j in range(len(lengths)):
-                whole = length + lengths[j]
-                near += whole - np.float32(2.0) * (squares[j] + tail * tails[j]) <= bound + SLACK * whole
-            if near == 0:
+            if total >= enough:
+                break
+            length = _products_if_near(a[i], head, b_columns, lengths, tails, start, stop, bound, squares)
+            if length < 0.0:
                 continue
-            _add_products(a[i], head, size, b_columns, start, stop, squares)
             for j in range(stop - start):
                 if length + lengths[j] - np.float32(2.0) * squares[j] <= limit:
                     if of_a[i] < most:
                         found[i, of_a[i]] = start + j
                     of_a[i] += 1
                     of_b[start + j] += 1
+                    total += 1
     pairs = np.empty((found.size, 2), np.int64)
     k = 0
     for i in range(n):
@@ -172,4 +209,4 @@ def alike(a: Float32Array, b_columns: Float32Array, limit: float, most: int) -> 
                 if of_b[j] <= most:
                     pairs[k, 0], pairs[k, 1] = i, j
                     k += 1
-    return pairs[:k], int(of_a.sum())
+    return pairs[:k], total

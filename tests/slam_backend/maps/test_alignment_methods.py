@@ -333,6 +333,7 @@ def test_near_descriptors_are_found_whatever_their_first_components(size: int, l
     distances = np.linalg.norm(a[:, None].astype(float) - b[None].astype(float), axis=2)
     surely, maybe = (np.count_nonzero(distances <= 0.45 + off) for off in (-2e-5 * length**2, 2e-5 * length**2))
     assert surely <= count_similar(a, b, 0.45) <= maybe
+    assert (count_similar(a, b, 0.45, 3) >= 3) == (count_similar(a, b, 0.45) >= 3)
     assert surely > 100
 
 

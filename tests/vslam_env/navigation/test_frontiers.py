@@ -263,3 +263,35 @@ def test_unambiguous_pairs_are_those_of_the_optimal_assignment() -> None:
         assert is_clear == all(is_alone)
         found[is_clear] += 1
     assert min(found.values()) > 40
+
+
+LARGE = 1200  # cells along a side of a grown grid
+
+
+def corridor(doors: list[float]) -> np.ndarray:
+    """Return cells (S, S) of a corridor, x from -5 to 95, y from 0 to 3, with doors of 1.2 m at the given x."""
+    cells = np.full((LARGE, LARGE), UNKNOWN, np.uint8)
+    (r1, c1), (r2, c2) = cell_of((-4.9, 0.1), LARGE), cell_of((94.9, 2.9), LARGE)
+    cells[r1 - 1 : r2 + 2, c1 - 1 : c2 + 2] = OCCUPIED
+    cells[r1 : r2 + 1, c1 : c2 + 1] = FREE
+    for x in doors:
+        first = cell_of((x - 0.5, 3.1), LARGE)[1]
+        cells[r2 + 1, first : first + 6] = FREE
+    return cells
+
+
+def test_a_path_makes_a_detour_of_any_length() -> None:
+    """A path that leaves the surroundings of start and goal is found where there is no other, and only then."""
+    cells = corridor([2.0, 90.0])
+    (row, first), (end, last) = cell_of((1.6, 3.1), LARGE), cell_of((90.4, 9.9), LARGE)
+    cells[row : end + 1, first : last + 1] = OCCUPIED
+    inner, between = slice(first + 1, last), cell_of((90.0, 3.1), LARGE)
+    cells[row + 10 : end, inner] = FREE  # a second corridor above, joined at its far end
+    cells[row : row + 10, between[1] - 4 : between[1] + 2] = FREE
+    path = plan_path(cells, (3.0, 1.5), (3.0, 8.0))
+    assert path is not None
+    assert path[:, 0].max() > 88.0
+    cells[row : row + 10, first + 1 : first + 9] = FREE
+    nearer = plan_path(cells, (3.0, 1.5), (3.0, 8.0))
+    assert nearer is not None
+    assert nearer[:, 0].max() < 10.0

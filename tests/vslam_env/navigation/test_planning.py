@@ -64,7 +64,7 @@ def test_the_wavefront_agrees_with_scipys_dijkstra(inner: np.ndarray, data: st.D
     weights = np.pad(inner, 1)
     width = weights.shape[1]
     start = tuple(int(i) for i in np.argwhere(weights)[data.draw(st.integers(0, int((weights > 0).sum()) - 1))])
-    cost, parent = wavefront(weights, *start)
+    cost, parent = wavefront(weights, *start, -1)
 
     edges = {}
     for r, c in np.argwhere(weights):
@@ -119,6 +119,35 @@ def test_no_path_touches_a_wall(posts: list[tuple[float, float]], goal_y: float)
     assert (path[0] == start).all()
     assert np.hypot(*(path[-1] - goal)) < 0.6
     assert gap_to_walls(cells, samples(path)).min() > 0.2 - 1e-9
+
+
+@given(
+    st.lists(st.tuples(st.floats(-2.9, 4.9), st.floats(-1.9, 2.9)), max_size=25),
+    st.tuples(st.floats(-4.0, 6.0), st.floats(-3.0, 4.0)),
+)
+def test_a_search_that_ends_at_the_goal_finds_the_path_of_the_whole_search(
+    posts: list[tuple[float, float]], goal: tuple[float, float]
+) -> None:
+    """The path to a goal is the one in the map of all distances, whether the goal is free, in a wall or outside."""
+    cells = TWO_ROOMS.copy()
+    for row, col in cell_of(np.array(posts).reshape(-1, 2)):
+        cells[row, col] = OCCUPIED
+    start = (-2.0, -1.0)
+    path, expected = plan_path(cells, start, goal), distance_map(cells, start).path_to(goal)
+    assert (path is None) == (expected is None)
+    if path is not None and expected is not None:
+        np.testing.assert_array_equal(path, expected)
+
+
+def test_a_robot_among_walls_that_drift_drew_finds_open_floor() -> None:
+    """Where walls were drawn over a robot for 2 m around it, its ways begin at the nearest floor beyond the unknown."""
+    cells = floor((-6.0, -5.0), (7.0, 8.1), [])
+    centres = centre_of(np.argwhere(cells == FREE))
+    for row, col in np.argwhere(cells == FREE)[np.hypot(*centres.T) < 2.0]:
+        cells[row, col] = UNKNOWN
+    path = plan_path(cells, (0.0, 0.0), (5.0, 5.0))
+    assert path is not None
+    assert 2.0 < np.hypot(*path[1]) < 2.6
 
 
 def test_a_path_in_an_open_room_is_one_straight_line() -> None:

@@ -16,7 +16,7 @@ from vslam_env.sensors._landmark_kernels import NEAREST, measure, sample_clutter
 from vslam_env.sensors.landmark_sensor import shuffle_clutter
 from vslam_env.world import FreeSpace, Landmarks, World, make_world, place_landmarks
 from vslam_env.world._kernels import detect
-from vslam_env.world.visibility import landmark_geometry, view_limits, visible_landmarks
+from vslam_env.world.visibility import group_bounds, landmark_geometry, view_limits, visible_landmarks
 
 SHARP = StereoCamera(sigma_px=1e-9, sigma_disparity_px=1e-9)
 PERFECT = LandmarkSensorConfig(
@@ -182,7 +182,7 @@ def test_each_robot_detects_what_it_sees_as_false_points_leave_places(size: int)
     """Of what is visible and detected the smallest keys are taken, in their order, as many as there are places."""
     marks, view = on_wall([[0.2 * i - 2.8, 0.0] for i in range(29)], 29), view_limits(StereoCamera(), 1.0)
     poses, rng = np.array([[0.0, y, 0.0] for y in (-1.5, -0.5, 0.5, 1.5)]), np.random.default_rng(12)
-    sight = landmark_geometry(marks), marks.walls, WALL.T.copy(), 0.2, view
+    sight = landmark_geometry(marks), group_bounds(marks), marks.walls, WALL.T.copy(), 0.2, view
     visible = visible_landmarks(poses, marks, WALL, 0.2, view)
     assert 8 < visible.sum(axis=1).min() < 29
     for _ in range(5):

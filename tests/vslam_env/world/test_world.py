@@ -418,3 +418,32 @@ def test_what_a_robot_sees_can_be_seen() -> None:
     assert seen.sum() > 100
     assert countable.mean() > 0.9
     assert (seen & ~countable).sum() == 0
+
+
+def test_sight_does_not_depend_on_the_order_of_landmarks() -> None:
+    """Neighbours are skipped together where they are out of range: scattered landmarks are seen as ordered ones are."""
+    rng = np.random.default_rng(5)
+    world = make_world("office:extent=60", rng)
+    space = FreeSpace(world)
+    marks = place_landmarks(world, rng, None, space)
+    order = rng.permutation(len(marks))
+    scattered = Landmarks(*(getattr(marks, name)[order] for name in marks.__slots__))
+    poses = space.draw_starts(8, rng, min_distance=2.0)
+    seen, again = (
+        LandmarkSensor(LandmarkSensorConfig(), world.walls, each).visible(poses) for each in (marks, scattered)
+    )
+    assert seen.sum(axis=1).min() >= 1
+    np.testing.assert_array_equal(seen[:, order], again)
+
+
+def test_distant_walls_hide_nothing_from_observable_landmarks() -> None:
+    """Landmarks of a room count the same alone and beside a hundred rooms out of range."""
+    grid = np.array([[x, y, x, y] for x in range(0, 100, 20) for y in range(20, 100, 20)])
+    beside = np.vstack([np.array(ROOM) + corner for corner in grid])
+    marks = place_landmarks(World("room", ROOM), np.random.default_rng(1))
+    alone, among = (
+        FreeSpace(World("rooms", walls, start_poses=[[1, 1, 0]])).visible_landmarks(marks, StereoCamera())
+        for walls in (ROOM, np.vstack([ROOM, beside]))
+    )
+    assert alone.any()
+    np.testing.assert_array_equal(alone, among)

@@ -5,11 +5,19 @@ from vslam_env.navigation._planning_kernels.candidates import (
     fill_slots,
     update_slots,
 )
-from vslam_env.navigation._planning_kernels.dijkstra import UNREACHED, dijkstra, nearest_open, shorten_path
+from vslam_env.navigation._planning_kernels.dijkstra import (
+    GOAL_CELLS,
+    UNREACHED,
+    dijkstra,
+    nearest_open,
+    part_within,
+    shorten_path,
+)
 from vslam_env.navigation._planning_kernels.frontiers import FrontierColumns, compute_frontiers
 from vslam_env.navigation._planning_kernels.path_lengths import lines_of_sight, path_lengths
 
 __all__ = [
+    "GOAL_CELLS",
     "SAME_GOAL",
     "UNREACHED",
     "FrontierColumns",
@@ -18,6 +26,7 @@ __all__ = [
     "fill_slots",
     "lines_of_sight",
     "nearest_open",
+    "part_within",
     "path_lengths",
     "shorten_path",
     "update_slots",

@@ -105,7 +105,7 @@ def update_slots(
             given_up[: len(before)] = before
             given_up[-1, 0], given_up[-1, 1] = goal_x, goal_y
 
-    ways = dijkstra(cells, bounds, x, y, radius)
+    ways = dijkstra(cells, bounds, x, y, radius, np.nan, np.nan, np.inf)
     found = frontiers_reached(ways, len(cells), given_up)
     costs = np.empty((len(rows), len(found)))
     is_clear = pair_distances(rows, found, costs)

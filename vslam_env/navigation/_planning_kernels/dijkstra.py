@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.core.jit import device, jit
+from slam_backend.core.jit import device, in_place, jit
 from vslam_env.navigation._grid_kernels import CELL, LARGEST_HALF_WIDTH, OCCUPIED, cell_index, margin_of
 from vslam_env.navigation._planning_kernels.costmap import OUTSIDE, PAD, inflate_costs
 
@@ -69,7 +69,8 @@ def shorten_path(weights: Any, cost: Any, parent: Any, row: int, col: int) -> An
 
 STRAIGHT, DIAGONAL = 5, 7  # length of a step in fifths of a cell; 7/5 is 1 % short of the diagonal
 NUM_STRAIGHT = 4  # of the eight directions, the first ones
-ESCAPE_CELLS = 5  # a robot that drift or a bump put into a wall's margin looks this far for open floor
+ESCAPE_CELLS = 25  # a robot that a bump put into a wall's margin, or drift among walls, looks this far for open floor
+GOAL_CELLS = 2  # search radius for an open cell if the goal lies in an inflated wall
 NUM_BUCKETS = 64  # a power of two above the dearest step, DIAGONAL * (CLOSE + CLOSE)
 UNREACHED = np.iinfo(np.int32).max
 
@@ -116,8 +117,8 @@ def nearest_open(box: Any, weights: Any, row: int, col: int, reach: int) -> tupl
 
 @device
 @jit
-def wavefront(weights: Any, row: int, col: int) -> tuple[Any, Any]:
-    """Find the cheapest ways from one cell to all others (Dijkstra's algorithm with Dial's buckets).
+def wavefront(weights: Any, row: int, col: int, goal: int) -> tuple[Any, Any]:
+    """Find the cheapest ways from one cell to all others, or to one of them (Dijkstra's algorithm with Dial's buckets).
 
     A step to one of the eight neighbours costs its length times the sum of the weights of its two cells. Diagonal
     steps need no look at the cells beside them, since walls have been widened by more than a cell. Costs are small
@@ -128,10 +129,11 @@ def wavefront(weights: Any, row: int, col: int) -> tuple[Any, Any]:
         weights: (h, w) uint8, 0 = closed. The outermost cells must be closed.
         row: The first cell, open; -1 if there is none, and nothing is reached.
         col: Column of the first cell.
+        goal: Flat index of the only cell whose way is wanted; -1: the ways to all cells are.
 
     Returns:
         Cost (h, w) int32 of each cell, `UNREACHED` if there is no path; and the flat index (h, w) int32 of its parent,
-        -1 at the first cell and where there is no path.
+        -1 at the first cell and where there is no path. With a goal they hold along the way to it.
     """
     width = weights.shape[1]
     weight = weights.ravel()
@@ -161,6 +163,9 @@ def wavefront(weights: Any, row: int, col: int) -> tuple[Any, Any]:
             taken += 1
             if cost[cell] != current:
                 continue
+            if np.int64(cell) == goal:
+                taken = used  # ways to dearer cells are not wanted
+                break
             here = np.int32(weight[cell])
             for k in range(8):
                 neighbour = np.uint32(np.int64(cell) + steps[k])
@@ -177,8 +182,33 @@ def wavefront(weights: Any, row: int, col: int) -> tuple[Any, Any]:
     return cost.reshape(weights.shape), parents.reshape(weights.shape)
 
 
+@in_place
+def part_within(
+    bounds: Any, size: int, x: float, y: float, goal_x: float, goal_y: float, reach: float
+) -> tuple[int, int, int, int]:
+    """Return the rows and columns, first and end, of the known part within reach of a place and a goal, or of all.
+
+    See `dijkstra` for the arguments. It is all where nothing is known within reach.
+    """
+    low_row, low_col, high_row, high_col = bounds[0], bounds[1], bounds[2], bounds[3]
+    far = 2.0 * LARGEST_HALF_WIDTH
+    if reach < far:
+        low_x, high_x = (x, x) if np.isnan(goal_x) else (min(x, goal_x), max(x, goal_x))
+        low_y, high_y = (y, y) if np.isnan(goal_y) else (min(y, goal_y), max(y, goal_y))
+        margin = margin_of(size)
+        row, col = cell_index(max(low_y - reach, -far), margin), cell_index(max(low_x - reach, -far), margin)
+        end_row, end_col = cell_index(min(high_y + reach, far), margin), cell_index(min(high_x + reach, far), margin)
+        row, col = max(row, low_row), max(col, low_col)
+        end_row, end_col = min(end_row + 1, high_row), min(end_col + 1, high_col)
+        if row < end_row and col < end_col:
+            return row, col, end_row, end_col
+    return low_row, low_col, high_row, high_col
+
+
 @jit
-def dijkstra(cells: Any, bounds: Any, x: float, y: float, radius: float) -> tuple[Any, Any, Any, Any, int, int]:
+def dijkstra(
+    cells: Any, bounds: Any, x: float, y: float, radius: float, goal_x: float, goal_y: float, reach: float
+) -> tuple[Any, Any, Any, Any, int, int]:
     """Find the cheapest ways over the known floor of a grid.
 
     Args:
@@ -187,16 +217,21 @@ def dijkstra(cells: Any, bounds: Any, x: float, y: float, radius: float) -> tupl
         x: Place where the ways begin [m]. If a robot may not be there, they begin at the nearest open cell.
         y: See `x`.
         radius: Radius of the robot [m].
+        goal_x: Place of the only goal [m], so that the search ends there; NaN: all places are.
+        goal_y: See `goal_x`.
+        reach: Distance [m] from both along x and y beyond which the floor is left out, so that a search near the robot
+            takes the same time however much is known; infinity: all known floor counts.
 
     Returns:
         The known box (h, w) uint8, with `PAD` cells before its bounds and after them; its weights, of `inflate_costs`;
         costs and parents, of `wavefront`; and the grid's row and column of the box's first cell.
     """
-    first_row, first_col = bounds[0] - PAD, bounds[1] - PAD
-    box = np.full((bounds[2] + PAD - first_row, bounds[3] + PAD - first_col), OUTSIDE, np.uint8)
     size = len(cells)
-    first, last = max(first_col, 0), min(bounds[3] + PAD, size)
-    for grid_row in range(max(first_row, 0), min(bounds[2] + PAD, size)):
+    low_row, low_col, high_row, high_col = part_within(bounds, size, x, y, goal_x, goal_y, reach)
+    first_row, first_col = low_row - PAD, low_col - PAD
+    box = np.full((high_row + PAD - first_row, high_col + PAD - first_col), OUTSIDE, np.uint8)
+    first, last = max(first_col, 0), min(high_col + PAD, size)
+    for grid_row in range(max(first_row, 0), min(high_row + PAD, size)):
         here, there = box[grid_row - first_row, first - first_col :], cells[grid_row, first:last]
         for i in range(len(there)):  # an assignment of slices would take ten times as long
             here[i] = there[i]
@@ -206,5 +241,12 @@ def dijkstra(cells: Any, bounds: Any, x: float, y: float, radius: float) -> tupl
     row = cell_index(min(max(y, -far), far), margin_of(size)) - first_row
     col = cell_index(min(max(x, -far), far), margin_of(size)) - first_col
     start_row, start_col = nearest_open(box, weights, row, col, ESCAPE_CELLS)
-    cost, parents = wavefront(weights, start_row, start_col)
+    goal = -1
+    if not np.isnan(goal_x):
+        row = cell_index(min(max(goal_y, -far), far), margin_of(size)) - first_row
+        col = cell_index(min(max(goal_x, -far), far), margin_of(size)) - first_col
+        goal_row, goal_col = nearest_open(box, weights, row, col, GOAL_CELLS)
+        goal = goal_row * box.shape[1] + goal_col if goal_row >= 0 else -1
+        start_row = start_row if goal >= 0 else -1  # nowhere to go
+    cost, parents = wavefront(weights, start_row, start_col, goal)
     return box, weights, cost, parents, first_row, first_col

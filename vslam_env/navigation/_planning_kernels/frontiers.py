@@ -158,7 +158,7 @@ def compute_frontiers(cells: Any, bounds: Any, x: float, y: float, radius: float
     Returns:
         (n, 5) float64 rows (x, y, heading, size, length), see `FrontierColumns`, by increasing length.
     """
-    return frontiers_reached(dijkstra(cells, bounds, x, y, radius), len(cells), ignored)
+    return frontiers_reached(dijkstra(cells, bounds, x, y, radius, np.nan, np.nan, np.inf), len(cells), ignored)
 
 
 @jit

@@ -24,7 +24,7 @@ def path_lengths(weights: Any, starts: Any, goals: Any) -> Any:
     for i in range(len(starts)):
         if starts[i, 0] < 0:
             continue
-        cost, parents = wavefront(weights, starts[i, 0], starts[i, 1])
+        cost, parents = wavefront(weights, starts[i, 0], starts[i, 1], -1)
         before = parents.ravel()
         for j in range(len(goals)):
             row, col = goals[j]

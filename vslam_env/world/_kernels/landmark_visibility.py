@@ -7,8 +7,9 @@ import numpy as np
 
 from slam_backend.core.jit import device, in_place, jit
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
-from vslam_env.world._kernels.ray_casting import EPSILON, indices_of_set, ray_to_disc, ray_to_wall, walls_in_wedge
+from vslam_env.world._kernels.ray_casting import EPSILON, ray_to_disc, ray_to_wall, walls_in_wedge
 
+GROUP = 64  # successive landmarks, which lie on few walls, whose bounds are compared with the range at once
 TOUCH = 1e-6  # [m] what a ray meets this close to its target does not hide the target
 
 
@@ -28,7 +29,7 @@ def _hidden(x: float, y: float, dx: float, dy: float, own_wall: int, walls: Floa
 @jit
 def detect(
     poses: FloatArray,
-    sight: tuple[FloatArray, IntArray, FloatArray, float, FloatArray],
+    sight: tuple[FloatArray, FloatArray, IntArray, FloatArray, float, FloatArray],
     keys: FloatArray,
     detection_probability: float,
     num_false: IntArray,
@@ -47,6 +48,7 @@ def detect(
         sight: Arrays that determine which landmarks cameras see from any pose:
             (5, N) float64, world frame. Positions [m] and normals [-] of the landmarks; by rows, for vector
             instructions.
+            (n, 4) float64 [m]. Bounds x, y, x, y of each `GROUP` successive landmarks; distant ones are skipped.
             (N,) int64. Index of the wall that carries each landmark.
             (4, S) float64 [m], world frame. Walls, by rows as well.
             Radius of the robots [m]; they are as tall as their cameras.
@@ -60,7 +62,7 @@ def detect(
     Returns:
         Number of chosen landmarks, and number of false points.
     """
-    marks, own_walls, walls, robot_radius, limits = sight
+    marks, bounds, own_walls, walls, robot_radius, limits = sight
     forward, aside, height, max_range, tan_half, tan_vertical, cos_incidence = limits
     near, near_rows = np.empty((walls.shape[1], 4)), np.empty(walls.shape[1], np.int64)
     rows = np.empty(marks.shape[1], np.int64)
@@ -69,14 +71,25 @@ def detect(
         c, s = np.cos(poses[k, 2]), np.sin(poses[k, 2])
         eye_x, eye_y = poses[k, 0] + c * forward - s * aside, poses[k, 1] + s * forward + c * aside
         num_near = walls_in_wedge(eye_x, eye_y, c, s, walls, tan_half + EPSILON, max_range, near, near_rows)
-        for n in range(marks.shape[1]):
-            dx, dy, dz = marks[0, n] - eye_x, marks[1, n] - eye_y, marks[2, n] - height
-            ahead, left = c * dx + s * dy, c * dy - s * dx
-            rows[n] = (ahead > TOUCH) & (abs(left) <= tan_half * ahead) & (abs(dz) <= tan_vertical * ahead)
+        num_rows = 0
+        for group in range(len(bounds)):
+            low_x, low_y, high_x, high_y = bounds[group]
+            apart = max(low_x - eye_x, eye_x - high_x, low_y - eye_y, eye_y - high_y)
+            if apart > max_range:
+                continue
+            first, end = group * GROUP, min((group + 1) * GROUP, marks.shape[1])
+            for n in range(first, end):
+                dx, dy, dz = marks[0, n] - eye_x, marks[1, n] - eye_y, marks[2, n] - height
+                ahead, left = c * dx + s * dy, c * dy - s * dx
+                rows[n] = (ahead > TOUCH) & (abs(left) <= tan_half * ahead) & (abs(dz) <= tan_vertical * ahead)
+            for n in range(first, end):  # without branches, for none could be foreseen
+                flag = rows[n]
+                rows[num_rows] = n
+                num_rows += flag
 
         num_false[k] = min(num_false[k], chosen.shape[1])
         places, count, own_keys, own = chosen.shape[1] - num_false[k], 0, keys[k], chosen[k]
-        for n in rows[: indices_of_set(rows)]:
+        for n in rows[:num_rows]:
             is_worse = count == places and (count == 0 or own_keys[n] >= own_keys[own[count - 1]])
             if own_keys[n] >= detection_probability or is_worse:
                 continue
@@ -103,6 +116,22 @@ def detect(
         counts[k] = count
         total, extra = total + count, extra + num_false[k]
     return total, extra
+
+
+@device
+@in_place
+def _walls_around(x: float, y: float, walls: FloatArray, reach: float, near: FloatArray, rows: IntArray) -> int:
+    """Copy the walls (S, 4) that may come within reach of (x, y) and their indices; return their number."""
+    count = 0
+    for i in range(len(walls)):
+        x1, y1, x2, y2 = walls[i]
+        if max(x1, x2) < x - reach or min(x1, x2) > x + reach or max(y1, y2) < y - reach or min(y1, y2) > y + reach:
+            continue
+        for k in range(4):
+            near[count, k] = walls[i, k]
+        rows[count] = i
+        count += 1
+    return count
 
 
 @jit
@@ -137,8 +166,9 @@ def observable_anywhere(
     spacing = 0.2
     _, _, height, max_range, _, tan_vertical, cos_incidence = view
     seen = np.zeros(len(positions), dtype=np.bool_)
-    indices = np.arange(len(walls))
+    near, near_rows = np.empty((len(walls), 4)), np.empty(len(walls), np.int64)
     for n in range(len(positions)):
+        count = _walls_around(positions[n, 0], positions[n, 1], walls, max_range + spacing, near, near_rows)
         dz = abs(positions[n, 2] - height)
         facing = np.arctan2(normals[n, 1], normals[n, 0])
         radius = spacing
@@ -155,7 +185,9 @@ def observable_anywhere(
                     if row < 0 or column < 0 or row >= reachable.shape[0] or column >= reachable.shape[1]:
                         continue
                     x, y = positions[n, 0], positions[n, 1]
-                    if reachable[row, column] and not _hidden(x + dx, y + dy, -dx, -dy, own_walls[n], walls, indices):
+                    if not reachable[row, column]:
+                        continue
+                    if not _hidden(x + dx, y + dy, -dx, -dy, own_walls[n], near[:count], near_rows):
                         seen[n] = True
                         break
             radius += spacing
