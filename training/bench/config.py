@@ -471,6 +471,69 @@ class StartBenchConfig(ExperimentConfig):
         return self.model_copy(update={"parts": (*self.parts, "wheel")})
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScaleTrial:
+    """One timed episode."""
+
+    family: str  # World family
+    extent: float  # Width of the world [m]
+    robots: int  # K
+    seed: int  # Seed of the episode
+
+
+class ScaleBenchConfig(ExperimentConfig):
+    """Scale benchmark: all combinations of extents and numbers of robots, with one policy."""
+
+    family: Literal["rooms", "office", "campus"] = option("rooms", "World family: rooms, office, or campus.")
+    extents: tuple[Annotated[float, Field(gt=0.0)], ...] = option(
+        (30.0, 60.0, 120.0, 200.0), "Widths of the worlds [m].", hint="Give metres."
+    )
+    robots: tuple[RobotCount, ...] = option((1, 3, 8), "Numbers of robots in a team.", hint="Use 1 to 8 robots.")
+    policy: str = option("frontier", "Policy by name, path of a model, or MODULE:NAME; @team selects the central one.")
+    duration: float = option(600.0, "Duration of an episode [s].", ge=1.0, hint="Give seconds.")
+    particles: int = option(100, "Number of particles per filter.", ge=1, hint=ONE_PARTICLE)
+    split: Literal["train", "validation", "test", "any"] = option(
+        "validation", "Split of the worlds: train, validation, test, or any."
+    )
+    preset: NoisePreset = option("standard", "Noise preset: easy, standard or hard.")
+    seeds: int = option(2, "Number of episodes of each combination.", ge=1, hint="Use at least one episode.")
+    seed: int = first_seed()
+
+    def check(self) -> None:
+        """Refuse a policy that does not exist."""
+        from training.bench.exploration.players import parted
+
+        parted(self.policy)
+
+    @classmethod
+    def completed(cls, values: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Make the path of a model absolute, so that a configuration can be repeated from any folder."""
+        from agents.registry import is_model
+
+        found = dict(values)
+        if "policy" in found and is_model(str(found["policy"])):
+            found["policy"] = str(Path(found["policy"]).resolve())
+        return found
+
+    def trials(self) -> list[ScaleTrial]:
+        """Return all trials, ordered by seed, then from small to large worlds as given."""
+        combined = product(range(self.seed, self.seed + self.seeds), self.extents, self.robots)
+        return [ScaleTrial(family=self.family, extent=e, robots=k, seed=seed) for seed, e, k in combined]
+
+    def environment(self, trial: ScaleTrial) -> "EnvConfig":
+        """Return the environment of a trial."""
+        from training.bench.exploration.players import parted
+        from training.episodes.config import RunConfig
+
+        player = parted(self.policy)
+        shared: dict[str, Any] = {
+            "world": f"{trial.family}:extent={trial.extent:g}", "robots": trial.robots, "policy": player.policy,
+            "action_type": player.action_type, "particles": self.particles, "preset": self.preset, "seed": trial.seed,
+        }  # fmt: skip
+        environment = RunConfig(**shared, max_seconds=self.duration).environment()
+        return environment.replace(world_split=None if self.split == ANY_SPLIT else self.split)
+
+
 class TrainBenchConfig(ExperimentConfig):
     """Training benchmark; its environments are those of the preset `quick` of `vslam train`."""
 

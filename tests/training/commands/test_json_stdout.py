@@ -36,6 +36,9 @@ LEAST = {
         "--policies", "frontier", "--worlds", "fig5", "--robots", "1", "--oracles", "none", "--duration", "2",
         "--particles", "5", "--seeds", "1", *SEED,
     ),
+    "bench scale": (
+        "--extents", "20", "--robots", "1", "--duration", "2", "--particles", "5", "--seeds", "1", *SEED,
+    ),
     "bench start": ("--parts", "count", "--repeats", "1"),
     "bench train": ("--world", "fig5", "--robots", "1", "--envs", "1", "--workers", "0", "--steps", "2"),
     "bench alignment": ("--methods", "gnc", "--seeds", "1", "--hard", "0", *SEED),

@@ -29,6 +29,7 @@ CASES: dict[type[ExperimentConfig], dict[str, Any]] = {
     bench.EnvBenchConfig: {"worlds": ("fig5",)},
     bench.ExplorationBenchConfig: {"policies": ("frontier@discrete",), "worlds": ("maze",)},
     bench.FilterBenchConfig: {"proposals": ("fastslam1",), "large": True},
+    bench.ScaleBenchConfig: {"extents": (40.0, 75.5), "family": "campus"},
     bench.StartBenchConfig: {"parts": ("import",), "repeats": 1}, bench.StereoBenchConfig: {"descriptors": ("orb",)},
     bench.TrainBenchConfig: {"workers": (0, 2)},
     bench.MrclamPairsConfig: {"path": "log", "durations": (50.0,)},
@@ -72,6 +73,10 @@ BAD: dict[type[ExperimentConfig], dict[str, dict[Any, str]]] = {
         "steps": {0: AT_LEAST_1}, "proposals": {("ekf",): "one of 'fastslam2', 'fastslam1'"},
         "particles": {(5, 5): "at least one value, each once"}, "lookalikes": {0: AT_LEAST_1},
         "landmarks": {(9,): "an int >= 10"},
+    },
+    bench.ScaleBenchConfig: {
+        "extents": {(0.0,): ABOVE_0, (): "at least one value, each once"}, "robots": {(9,): ROBOTS},
+        "family": {"maze": "one of 'rooms', 'office', 'campus'"}, "duration": {0.0: "a finite number >= 1"},
     },
     bench.StartBenchConfig: {"repeats": {0: AT_LEAST_1}, "parts": {("none",): "one of"}},
     bench.StereoBenchConfig: {

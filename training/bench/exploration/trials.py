@@ -56,8 +56,8 @@ def play(config: ExplorationBenchConfig, trial: ExplorationTrial) -> dict[str, A
     taken = 1e3 * np.array(team.seconds)
     scores = score_episode(record)
     seconds = np.arange(np.floor(record.times[-1]) + 1.0)
-    covered = _at(record.times, record.coverage, seconds)
-    errors = _pose_errors(record)
+    covered = values_at(record.times, record.coverage, seconds)
+    errors = pose_errors(record)
     reached = np.flatnonzero(covered >= NEARLY_ALL)
     points = np.linspace(0.0, record.times[-1], CURVE_POINTS)
     lines = (record.coverage, record.map_errors.mean(axis=0), errors)
@@ -70,7 +70,9 @@ def play(config: ExplorationBenchConfig, trial: ExplorationTrial) -> dict[str, A
         "attempts": record.attempts, "collisions": sum(int(info["collisions"]) for info in record.infos),
         "invalid_actions": invalid,
         "decision_ms": float(np.median(taken)), "decision_p99_ms": float(np.quantile(taken, 0.99)),
-        "curves": {"time_s": points} | {n: _at(record.times, v, points) for n, v in zip(CURVES, lines, strict=True)},
+        "curves": {"time_s": points} | {
+            name: values_at(record.times, line, points) for name, line in zip(CURVES, lines, strict=True)
+        },
     }  # fmt: skip
 
 
@@ -89,12 +91,12 @@ def count_merges(merges: Sequence[MergeRecord]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _at(times: FloatArray, values: FloatArray, when: FloatArray) -> FloatArray:
+def values_at(times: FloatArray, values: FloatArray, when: FloatArray) -> FloatArray:
     """Return the last of the values (T,) at or before each time (n,)."""
     return values[np.searchsorted(times, when + 1e-6, side="right") - 1]
 
 
-def _pose_errors(record: EpisodeRecord) -> FloatArray:
+def pose_errors(record: EpisodeRecord) -> FloatArray:
     """Return the mean over robots (T + 1,) [m] of the position error, with start frames at the true start poses."""
     believed = np.stack([
         compose(truth[0], path) for truth, path in zip(record.true_poses, record.estimated, strict=True)
