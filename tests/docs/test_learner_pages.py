@@ -32,8 +32,8 @@ def test_each_learner_has_what_its_target_needs() -> None:
 
 @pytest.mark.slow
 def test_the_program_of_stable_baselines3_runs(capsys: pytest.CaptureFixture[str]) -> None:
-    """The program on the page on training runs as written."""
+    """The programs on the page on training run as written."""
     pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed: pip install .[train]")
-    (program,) = _programs(ROOT / "docs" / "how-to" / "training.md")
-    exec(compile(program, "training.md", "exec"), {"__name__": "__page__"})
+    for program in _programs(ROOT / "docs" / "how-to" / "training.md"):
+        exec(compile(program, "training.md", "exec"), {"__name__": "__page__"})
     assert capsys.readouterr().out == "4 slots, 80 decisions\n"
