@@ -314,7 +314,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
             "cycle": 0 if episode is None else self._cycle,
             "episode": None if episode is None else episode.get_state(),
             "drivers": [] if episode is None else self._drivers.get_state(),
-            "standing": None if episode is None else self._team_metrics,
+            "team_metrics": None if episode is None else self._team_metrics,
         }
 
     def set_state(self, state: Mapping[str, Any]) -> None:
@@ -329,7 +329,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         """
         with refuse_malformed("state"):
             state = check_state(state, self.config, self._objects)
-            root, scenario = check_parts(state, self.config, self._episode)
+            root, scenario = check_parts(state, self.config, self._episode, self._reads_beliefs)
         self._root, self.agents = root, []
         if scenario is None:
             self._episode = None
@@ -339,7 +339,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         self._episode.set_state(state["episode"], scenario)
         self._drivers = ActionExecutor(self.config)
         self._drivers.set_state(state["drivers"])
-        self._team_metrics, self._cycle, self.agents = state["standing"], state["cycle"], list(state["agents"])
+        self._team_metrics, self._cycle, self.agents = state["team_metrics"], state["cycle"], list(state["agents"])
 
     def clone(self) -> "ExplorationEnv":
         """Return an independent environment in the same state, without window and recorder."""

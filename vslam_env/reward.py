@@ -53,7 +53,7 @@ class _NamedTerm:
 
     @property
     def reads_beliefs(self) -> bool:
-        return self.name == INFORMATION
+        return self.name in READS_BELIEFS
 
     def __call__(self, before: TeamMetrics, after: TeamMetrics) -> list[float]:
         return TERMS[self.name](before, after)
@@ -104,6 +104,7 @@ def _shared_by_all(reward: float, after: TeamMetrics) -> list[float]:
 # Potentials telescope: their sum over an episode is the final value minus the initial one, so that oscillation gains
 # nothing. Costs are never positive.
 OWN_RECALL, INFORMATION = "own_recall", "information"
+READS_BELIEFS = frozenset({INFORMATION})  # built-in terms whose metrics contain beliefs, which takes time
 POTENTIALS: dict[str, RewardFunction] = {
     "map_error": _fall_of("map_errors"),
     "map_error_squared": _map_error_squared,

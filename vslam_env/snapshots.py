@@ -16,7 +16,7 @@ from slam_backend.core.files import os_errors_as_argument_errors, write_file
 from slam_backend.core.state_codec import ForeignObjectError, decode, encode, read_file, sequence_of
 from slam_backend.core.validation import argument_error
 from vslam_env.config import EnvConfig
-from vslam_env.reward import INFORMATION, RewardTerm, is_named
+from vslam_env.reward import RewardTerm, is_named
 from vslam_env.simulation.episode import Episode
 from vslam_env.simulation.scenario import Scenario
 from vslam_env.state_checks import EpisodeCheck, check_drivers, check_team_metrics
@@ -25,7 +25,7 @@ from vslam_env.world import WorldSource
 
 STATE_FORMAT = 34  # raised when the content of states changes; exact continuation needs the same version
 MAGIC = b"vslam_env state "
-KEYS = ("version", "config", "objects", "root", "agents", "cycle", "episode", "drivers", "standing")
+KEYS = ("version", "config", "objects", "root", "agents", "cycle", "episode", "drivers", "team_metrics")
 
 EnvState = dict[str, Any]
 
@@ -75,7 +75,7 @@ def check_state(state: Any, config: EnvConfig, objects: Mapping[str, str]) -> Ma
 
 
 def check_parts(
-    state: Mapping[str, Any], config: EnvConfig, own: Episode | None
+    state: Mapping[str, Any], config: EnvConfig, own: Episode | None, reads_beliefs: bool
 ) -> tuple[np.random.SeedSequence | None, Scenario | None]:
     """Validate all parts of a state that passed `check_state`; return its seed sequence and its scenario.
 
@@ -83,6 +83,7 @@ def check_parts(
         state: State of an environment.
         config: Configuration of the environment.
         own: Running episode of the environment, if any.
+        reads_beliefs: Whether a reward term reads beliefs, which the metrics then hold.
 
     Raises:
         ValueError: If a part is malformed; the message names it.
@@ -101,7 +102,7 @@ def check_parts(
         return root, None
     episode = EpisodeCheck(config, own)
     episode.check("state['episode']", state["episode"])
-    check_team_metrics("state['standing']", state["standing"], config.num_robots, INFORMATION in config.reward)
+    check_team_metrics("state['team_metrics']", state["team_metrics"], config.num_robots, reads_beliefs)
     check_drivers("state['drivers']", state["drivers"], config.num_robots)
     return root, episode.scenario
 

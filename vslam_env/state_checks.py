@@ -67,11 +67,11 @@ class EpisodeCheck:
         if own is not None and scenario is own.given_scenario:
             scenario = own.scenario
         elif own is None or scenario is not own.scenario:
-            self._check_scenario(f"{name}['setting']", scenario)
+            self._check_scenario(f"{name}['scenario']", scenario)
             try:
                 self.scenario = scenario = Scenario.from_parts(*scenario.to_parts())
             except Exception as error:  # any error of a constructor
-                check.refuse(f"{name}['setting']", "parts that fit together", f"'{error}'")
+                check.refuse(f"{name}['scenario']", "parts that fit together", f"'{error}'")
         check.integer(f"{name}['tick']", state["tick"])
         self._tick = tick = state["tick"]
         check.keys(f"{name}['simulator']", state["simulator"], ("poses", "bumped"))

@@ -38,11 +38,11 @@ class FilterOptions:
         proposal: "fastslam2": the measurements shape the sampled pose. "fastslam1": poses are sampled from the motion
             model alone and association follows Algorithm 1 to the letter (as corrected).
         resampling: Scheme, a key of `slam_backend.resampling.RESAMPLING`.
-        resample_threshold: ESS / M below which particles are resampled; 1 = at every step with a measurement.
+        resample_threshold: ESS / M at or below which particles are resampled; 1 = at every step with a measurement.
         position_gate: D0, largest squared Mahalanobis distance of a match [-] (11.34: 99 % at 3 degrees of freedom).
         descriptor_gate: Square root of E0, largest L2 distance between matched descriptors [-].
-        new_landmark_gate: Upper end of the dead zone: measurements whose nearest candidate lies between `position_gate`
-            and this are neither matched nor new (`fastslam2`) [-].
+        new_landmark_gate: Upper end of the dead zone: a measurement without a match is not new if any candidate, even
+            one that is taken, has a squared Mahalanobis distance up to this (`fastslam2`) [-].
         new_landmark_radius: Distance from a similar landmark within which no measurement is new (`fastslam2`) [m].
         recovery_position: Position sigma of the prior for recovery (`fastslam2`) [m]. If a pose with this prior
             explains at least three measurements and most of those it can explain, but the particle's own pose does not,

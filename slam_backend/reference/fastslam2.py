@@ -15,7 +15,7 @@ from slam_backend.reference.pose_gaussian import GaussianPose, WhitenedPose
 
 WIDE_HEADING = 0.03  # [rad]; a larger sigma of the predicted heading needs more iterations
 MORE_ITERATIONS = 3
-RELINEARISE_BELOW = 4  # largest count of a landmark updated by the iterated EKF, as its depth is still uncertain
+RELINEARISE_UP_TO = 4  # largest count of a landmark updated by the iterated EKF, as its depth is still uncertain
 
 Gates = dict[tuple[int, int], Innovation]  # by measurement and landmark, for visible candidates
 
@@ -62,7 +62,7 @@ def update_fastslam2(
     for b, name in enumerate(chosen):
         if name >= 0:
             frame.update(
-                pose, landmarks[name], b, walk, iterations=2 if landmarks[name].count <= RELINEARISE_BELOW else 1
+                pose, landmarks[name], b, walk, iterations=2 if landmarks[name].count <= RELINEARISE_UP_TO else 1
             )
         elif name != REJECTED:
             landmarks[name] = frame.new_landmark(pose, b, walk)

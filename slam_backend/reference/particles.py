@@ -77,7 +77,7 @@ def report_of(records: Sequence[RobotStep], best: int, weights: FloatArray, resa
         records: Results of all robots.
         best: Index of the most probable particle.
         weights: (M,) float64, summing to 1, after the step.
-        resample_threshold: Share of M below which the effective sample size triggers resampling.
+        resample_threshold: Share of M at or below which the effective sample size triggers resampling.
     """
     associations = tuple(record.associations[:, best] for record in records)
     created = tuple(record.created for record in records)

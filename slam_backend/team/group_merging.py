@@ -1,4 +1,4 @@
-"""Merging of two groups, detection of inconsistent merges, and restoration of the groups before a merge."""
+"""Merging of two groups, detection of inconsistent merges, and separation of the groups before a merge."""
 
 import math
 from typing import NamedTuple, Self

@@ -1,7 +1,7 @@
 """Rollback of a false merge over several steps, which bounds the replayed input per step.
 
-The groups before the merge are restored and catch up, a few steps of input at a time, while their robots still use the
-joint filter. When they have caught up they replace it, as if the merge had never happened.
+The groups from before the merge are rebuilt from snapshots and catch up, a few steps of input at a time, while their
+robots still use the joint filter. When they have caught up they replace it, as if the merge had never happened.
 """
 
 from collections.abc import Iterator, Mapping

@@ -275,10 +275,10 @@ class TeamSlam:
             return
         self._epoch += 1
         self._replace([group], separate_groups(group, undoing, self._records, self._epoch))
-        for monitor in merges:
-            pair = (monitor.sides[0].robots, monitor.sides[1].robots)
+        pairs = [(monitor.sides[0].robots, monitor.sides[1].robots) for monitor in merges]
+        for monitor, pair in zip(merges, pairs, strict=True):
             self._events.append(MergeEvent(self._step, "undo", *pair, monitor.alignment))
-        self._schedule.block(pair, self._step + self._merging.blocked_steps)
+        self._schedule.block(pairs[-1], self._step + self._merging.blocked_steps)
 
     def _attempt(self, networks: IntArray) -> tuple[LandmarkIdMap, ...]:
         """Run an attempt, and merge the groups if it succeeds."""

@@ -68,7 +68,7 @@ def scored(
     true_starts: FloatArray,
     true_poses: FloatArray,
 ) -> TeamMetrics:
-    """Return how a team stands of which nothing else is known."""
+    """Return the scores of a team; all other metrics are NaN or 0."""
     robots = len(true_poses)
     figures, nothing = np.full((len(RobotMetrics._fields), robots), np.nan), (0,) * robots
     ground_truth.score(outlines, points, true_starts, true_poses, figures)

@@ -225,7 +225,7 @@ def test_bad_states_are_refused(act: Callable[[], Any], says: str) -> None:
         act()
 
 
-PARTS = ["episode", "drivers", "root", "agents", "standing", "cycle", "objects"]
+PARTS = ["episode", "drivers", "root", "agents", "team_metrics", "cycle", "objects"]
 PARTS += [f"episode.{part}" for part in ("tick", "streams", "simulator", "belief", "ground_truth", "coverage", "paths")]
 
 

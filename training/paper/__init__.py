@@ -1,1 +1,1 @@
-"""RobotMetrics of the paper, reproduced in simulation."""
+"""Figures of the paper, reproduced in simulation."""

@@ -11,7 +11,7 @@ Row = TypeVar("Row", covariant=True)  # sequence of one number per robot
 
 
 class RobotMetrics(NamedTuple, Generic[Row]):
-    """Metrics of all robots, one row per metric, in the order of `score_team`; see `TeamMetrics`."""
+    """Metrics of all robots, one row per metric; `score_team` writes the first eight, `Episode` the others."""
 
     map_errors: Row
     map_rmses: Row

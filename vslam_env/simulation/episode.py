@@ -122,7 +122,7 @@ class Episode:
         self._collisions: tuple[int, ...] = (0,) * config.num_robots
         self._figures = np.zeros((len(RobotMetrics._fields), config.num_robots))  # distances accumulate
         rows: RobotMetrics[FloatArray] = RobotMetrics(*self._figures)
-        self._map_errors, self._found, self._distances = rows.map_errors, rows.discovered, rows.distances
+        self._map_errors, self._discovered, self._distances = rows.map_errors, rows.discovered, rows.distances
         self._error_integrals, self._own_recalls = rows.error_integrals, rows.own_recalls
         self._integrates = RUNNING_COST in config.reward  # scoring every tick is slow
         self._gives_credit = OWN_RECALL in config.reward
@@ -192,7 +192,7 @@ class Episode:
         return compose(self.true_starts, self.estimated_path[-1])
 
     def team_metrics(self, with_beliefs: bool = False) -> TeamMetrics:
-        """Return the current metrics of the team.
+        """Score the team now, update coverage and credits, and return the metrics.
 
         Args:
             with_beliefs: Whether they include the beliefs, which takes longer.
@@ -202,7 +202,7 @@ class Episode:
         if self._gives_credit:
             self._credits.update(self.ground_truth.accurate)
             self._own_recalls[:] = self._credits.shares
-        coverage = self._coverage.update(belief.grids, poses, self._found)
+        coverage = self._coverage.update(belief.grids, poses, self._discovered)
         counts, figures = (
             RobotCounts(self._collisions, tuple(belief.exchange.sent)),
             RobotMetrics(*self._figures.tolist()),

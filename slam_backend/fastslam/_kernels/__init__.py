@@ -22,7 +22,7 @@ special case. With A = (dr/dx) C and S = Sigma + R, a match adds A^T S^-1 A to t
 """
 
 from slam_backend.fastslam._kernels.inputs import extent, read_team, to_robot_axes
-from slam_backend.fastslam._kernels.landmark_ekf import RELINEARISE_BELOW
+from slam_backend.fastslam._kernels.landmark_ekf import RELINEARISE_UP_TO
 from slam_backend.fastslam._kernels.layout import (
     EXACT_POSE,
     FAR,
@@ -50,7 +50,7 @@ __all__ = [
     "NUM_MEASURED",
     "NUM_NOTED",
     "REJECTED",
-    "RELINEARISE_BELOW",
+    "RELINEARISE_UP_TO",
     "STATIONARY",
     "MapArrays",
     "add_gauge_covariance",

@@ -206,8 +206,9 @@ def consider(
 ) -> None:  # fmt: skip
     """Let candidate q compete for the measurement, unless row TAKEN says that its landmark is taken.
 
-    Its cost is D + log |S| + descriptor cost, -2 times the log-likelihood of image coordinates and descriptor up to a
-    constant. Of two that cost the same the first, whose descriptor is nearer, wins.
+    Its cost is D + log |S + A P A^T| + descriptor cost, with the uncertainty P of the pose as in D: -2 times the
+    log-likelihood of image coordinates and descriptor up to a constant. Of two that cost the same the first, whose
+    descriptor is nearer, wins.
 
     Args:
         work, record: Rows of the block and of the candidate.

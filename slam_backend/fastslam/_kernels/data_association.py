@@ -14,6 +14,7 @@ from slam_backend.core.jit import device, simd
 from slam_backend.core.validation import FloatArray, Int32Array
 from slam_backend.fastslam._kernels.candidates import begin_choice, consider, mark_assigned, mask_of
 from slam_backend.fastslam._kernels.layout import (
+    ANY_HELD,
     BEST_COST,
     C00,
     C01,
@@ -27,6 +28,7 @@ from slam_backend.fastslam._kernels.layout import (
     CONTRADICT,
     COS,
     DEAD_ZONE,
+    IS_WIDE,
     KEPT00,
     KEPT01,
     KEPT10,
@@ -54,7 +56,6 @@ from slam_backend.fastslam._kernels.layout import (
     SIN,
     SURE,
     TAKEN,
-    WIDE,
 )
 from slam_backend.fastslam._kernels.map_storage import tile_of
 from slam_backend.fastslam._kernels.measurement_model import (
@@ -85,7 +86,7 @@ def _judge_nearest(work: FloatArray, record: FloatArray, begin: bool) -> None:
         now, before = record[Q_D + i] if held else np.inf, record[Q_FIRST_D + i] if held else np.inf
         work[LEAST_D + i] = now if begin or now < work[LEAST_D + i] else work[LEAST_D + i]
         work[LEAST_FIRST_D + i] = before if begin or before < work[LEAST_FIRST_D + i] else work[LEAST_FIRST_D + i]
-        work[CHOSEN + i] = 1.0 if held else (0.0 if begin else work[CHOSEN + i])
+        work[ANY_HELD + i] = 1.0 if held else (0.0 if begin else work[ANY_HELD + i])
 
 
 @device
@@ -95,9 +96,9 @@ def associate_unambiguous(
 ) -> int:
     """Match unambiguous measurements of one block at the predicted pose, and sum their information (first pass).
 
-    A measurement is matched to its candidate of least cost (see `consider`) within the gate if the second best costs
-    at least `Rules.ambiguity` more and no earlier measurement of the frame has taken the landmark. A match has Cauchy's
-    weight 1 / (1 + D / gate). Where the caller identifies the landmarks, any D may match. A measurement that has
+    A measurement is matched to its candidate of least cost (`candidates.consider`) within the gate if the second best
+    costs at least `Rules.ambiguity` more and no earlier measurement of the frame has taken the landmark. A match has
+    Cauchy's weight 1 / (1 + D / gate). Where the caller identifies landmarks, any D may match. A measurement that has
     candidates, none of which explains it at the predicted pose, contradicts the pose.
 
     Returns:
@@ -141,7 +142,7 @@ def associate_unambiguous(
             _judge_nearest(work, records[q], q == low)
         if low < high:
             for i in range(LANES):
-                work[CONTRADICT + i] += 1.0 if work[CHOSEN + i] > 0.0 and not work[LEAST_D + i] <= gate else 0.0
+                work[CONTRADICT + i] += 1.0 if work[ANY_HELD + i] > 0.0 and not work[LEAST_D + i] <= gate else 0.0
     suspects = 0
     for i in range(LANES):
         suspects += 1 if work[CONTRADICT + i] >= MIN_CONTRADICTIONS else 0
@@ -171,7 +172,7 @@ def _match_alone(
 
 @device
 @simd
-def try_inflated_prior(
+def try_wide_prior(
     space: Space, block: int, maps: MapArrays, frame: Frame, candidates: Candidates, rules: Rules
 ) -> None:
     """Give suspects of one block a wide prior, and keep it where it explains what the stated uncertainty does not."""
@@ -182,11 +183,11 @@ def try_inflated_prior(
         work[KEPT00 + i], work[KEPT01 + i] = work[C00 + i], work[C01 + i]
         work[KEPT10 + i], work[KEPT11 + i] = work[C10 + i], work[C11 + i]
         work[KEPT20 + i], work[KEPT21 + i], work[KEPT22 + i] = work[C20 + i], work[C21 + i], work[C22 + i]
-        work[KEPT_WIDE + i] = work[WIDE + i]
+        work[KEPT_WIDE + i] = work[IS_WIDE + i]
         suspect = work[CONTRADICT + i] >= MIN_CONTRADICTIONS
         c, s = work[COS + i], work[SIN + i]
         work[LOST + i] = 1.0 if suspect else 0.0
-        work[WIDE + i] = 1.0 if suspect else work[WIDE + i]
+        work[IS_WIDE + i] = 1.0 if suspect else work[IS_WIDE + i]
         work[C00 + i] = c * recovery[0] if suspect else work[C00 + i]
         work[C01 + i] = -s * recovery[1] if suspect else work[C01 + i]
         work[C10 + i] = s * recovery[0] if suspect else work[C10 + i]
@@ -221,19 +222,17 @@ def try_inflated_prior(
         work[C20 + i] = work[KEPT20 + i] if back else work[C20 + i]
         work[C21 + i] = work[KEPT21 + i] if back else work[C21 + i]
         work[C22 + i] = work[KEPT22 + i] if back else work[C22 + i]
-        work[WIDE + i] = work[KEPT_WIDE + i] if back else work[WIDE + i]
+        work[IS_WIDE + i] = work[KEPT_WIDE + i] if back else work[IS_WIDE + i]
 
 
 @device
 @simd
-def iterate_inflated(
-    space: Space, block: int, maps: MapArrays, frame: Frame, candidates: Candidates, gate: float
-) -> None:
+def iterate_wide(space: Space, block: int, maps: MapArrays, frame: Frame, candidates: Candidates, gate: float) -> None:
     """Take more steps of Gauss-Newton in the lanes of one block whose prior is wide, with the matches as they are."""
     work, match, row_of = space.work, space.match, maps.table[ROW_OF]
     padded, first, num_wide = maps.counts.shape[1], block * LANES, 0
     for i in range(LANES):
-        num_wide += 1 if work[WIDE + i] > 0.0 else 0
+        num_wide += 1 if work[IS_WIDE + i] > 0.0 else 0
     for _ in range(MORE_STEPS if num_wide > 0 else 0):
         set_linearisation_point(work)
         for b in range(len(match)):
@@ -255,21 +254,22 @@ def associate_all(
     """Match, reject or start a landmark for each measurement of one block at the refined pose (second pass).
 
     Measurements are decided in their order; a landmark that an earlier one of the frame has taken cannot be matched
-    again (`Rules.one_to_one`). The free landmark of least cost (see `consider`) with D <= `position_gate` is matched,
-    unless the second best costs less than `ambiguity` more: then the measurement is rejected. Without a match it is
-    rejected as well if a candidate, taken or not, lies in the dead zone: D <= `new_landmark_gate`, or closer than
+    again (`Rules.one_to_one`). The free landmark of least cost (`candidates.consider`) with D <= `position_gate` is
+    matched, unless the second best costs less than `ambiguity` more: then the measurement is rejected. Without a match
+    it is rejected as well if a candidate, taken or not, lies in the dead zone: D <= `new_landmark_gate`, or closer than
     `new_landmark_radius`. Otherwise it starts a landmark. Sums the information on the pose and its likelihood. The same
     in plain Python: `slam_backend.reference.fastslam2.decide`.
     """
     work, records, match = space.work, space.records, space.match
     starts, slots, row_of = candidates.starts, candidates.slots, maps.table[ROW_OF]
     padded, first, gate = maps.counts.shape[1], block * LANES, rules.position_gate
+    # Of an identified landmark any D matches: an only candidate has no limit, among several D is capped at the gate.
     reach, cap = (MAX_DISTANCE, gate) if frame.identified else (gate, MAX_DISTANCE)
     new_landmark_gate = MAX_DISTANCE if frame.identified else rules.new_landmark_gate
     clear_likelihood(work)
     for b in range(len(starts) - 1):
         low, high, chosen = starts[b], starts[b + 1], match[b]
-        # A density [1/m^3] becomes one of image coordinates by the factor Z^4, see the package docstring.
+        # A density [1/m^3] becomes one of image coordinates by the factor depth^4, see `_kernels/__init__.py`.
         log_clutter = rules.log_p0 + (0.0 if frame.given else 4.0 * math.log(frame.points[b, 0]))
         if high - low == 1:
             row = row_of[slots[low]]

@@ -8,8 +8,8 @@ from slam_backend.fastslam._kernels.candidates import create_once, find_candidat
 from slam_backend.fastslam._kernels.data_association import (
     associate_all,
     associate_unambiguous,
-    iterate_inflated,
-    try_inflated_prior,
+    iterate_wide,
+    try_wide_prior,
 )
 from slam_backend.fastslam._kernels.landmark_ekf import new_landmark, update_matched
 from slam_backend.fastslam._kernels.layout import (
@@ -72,11 +72,11 @@ def update_fastslam2(
         # First pass: refine the pose with unambiguous matches.
         suspects = associate_unambiguous(space, block, maps, frame, candidates, rules)
         if suspects > 0 and rules.recovery[0] > 0.0:
-            try_inflated_prior(space, block, maps, frame, candidates, rules)
+            try_wide_prior(space, block, maps, frame, candidates, rules)
             set_linearisation_point(work)
             associate_unambiguous(space, block, maps, frame, candidates, rules)
         gauss_newton_step(work, False)
-        iterate_inflated(space, block, maps, frame, candidates, rules.position_gate)
+        iterate_wide(space, block, maps, frame, candidates, rules.position_gate)
         set_linearisation_point(work)
 
         # Second pass: decide at the refined pose.

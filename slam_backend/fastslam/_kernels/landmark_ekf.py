@@ -40,7 +40,7 @@ from slam_backend.fastslam._kernels.measurement_model import accumulate_likeliho
 from slam_backend.fastslam._kernels.records import Candidates, Frame, MapArrays, Space
 
 FLAT = 1e-12  # where cofactors keep less, S has eigenvalues in a ratio of a million, and K R loses its digits
-RELINEARISE_BELOW = 4  # a landmark seen up to so many times is updated by the iterated EKF: its depth is still vague
+RELINEARISE_UP_TO = 4  # a landmark seen up to so many times is updated by the iterated EKF: its depth is still vague
 
 Matrix = tuple[float, float, float, float, float, float, float, float, float]  # by rows
 
@@ -225,7 +225,7 @@ def update_matched(
             num_young = 0
             for i in range(len(seen)):
                 on = mask[i] > 0.0
-                is_young = on and seen[i] <= RELINEARISE_BELOW
+                is_young = on and seen[i] <= RELINEARISE_UP_TO
                 young[i] = 1.0 if is_young else 0.0
                 num_young += 1 if is_young else 0
                 seen[i] += np.int32(1) if on else np.int32(0)

@@ -33,8 +33,8 @@ CLUTTER = LANES * 48  # log-likelihood of the measurements that are not matched
 # one, and log-likelihood of the best candidate. Once the choice is made, the first two rows hold the least D of any
 # candidate now and in the evaluation before.
 BEST_COST, SECOND_COST, CHOSEN, DEAD_ZONE, LOG_BEST = (LANES * k for k in range(49, 54))
-LEAST_D, LEAST_FIRST_D = BEST_COST, SECOND_COST
-LOST, SURE, CONTRADICT, WIDE = (LANES * k for k in range(54, 58))
+LEAST_D, LEAST_FIRST_D, ANY_HELD = BEST_COST, SECOND_COST, CHOSEN  # names of the same rows once the choice is made
+LOST, SURE, CONTRADICT, IS_WIDE = (LANES * k for k in range(54, 58))
 TAKEN, C01 = LANES * 58, LANES * 59
 KEPT00, KEPT10, KEPT11, KEPT20, KEPT21, KEPT22, KEPT01, KEPT_WIDE = (LANES * k for k in range(60, 68))  # of C
 DRAW0, DRAW1, DRAW2 = (LANES * k for k in range(68, 71))  # standard normal

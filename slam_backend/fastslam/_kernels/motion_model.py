@@ -20,6 +20,7 @@ from slam_backend.fastslam._kernels.layout import (
     DRAW0,
     DRAW1,
     DRAW2,
+    IS_WIDE,
     LANES,
     N00,
     N01,
@@ -29,7 +30,6 @@ from slam_backend.fastslam._kernels.layout import (
     N22,
     SIN,
     T0,
-    WIDE,
     X0,
     XI0,
     XI1,
@@ -133,7 +133,7 @@ def predict(work: FloatArray, robot: Poses, motion: Motion, propagated_only: boo
         for i in range(LANES):
             advance(work, i, dx, dy, turn, v0, v1, v2)
     for i in range(LANES):
-        work[WIDE + i] = 1.0 if work[N22 + i] > WIDE_HEADING**2 else 0.0
+        work[IS_WIDE + i] = 1.0 if work[N22 + i] > WIDE_HEADING**2 else 0.0
     for i in range(LANES):
         q00, q11, q22 = work[N00 + i], work[N11 + i], work[N22 + i]
         c, s = work[COS + i], work[SIN + i]

@@ -32,6 +32,7 @@ from slam_backend.fastslam._kernels.layout import (
     INFO11,
     INFO12,
     INFO22,
+    IS_WIDE,
     LANES,
     Q_D,
     Q_GRAD0,
@@ -45,7 +46,6 @@ from slam_backend.fastslam._kernels.layout import (
     Q_INFO22,
     SIN,
     T0,
-    WIDE,
     X0,
     XI0,
     XI1,
@@ -123,7 +123,7 @@ def sum_matches(work: FloatArray, record: FloatArray, chosen: FloatArray, q: flo
 def gauss_newton_step(work: FloatArray, only_wide: bool) -> None:
     """Take one step of Gauss-Newton from the sums: xi <- xi - J^-1 G, with covariance J^-1."""
     for i in range(LANES):
-        go = work[WIDE + i] > 0.0 or not only_wide
+        go = work[IS_WIDE + i] > 0.0 or not only_wide
         inverse, _ = inverted(
             (work[INFO00 + i], work[INFO01 + i], work[INFO02 + i], work[INFO11 + i], work[INFO12 + i], work[INFO22 + i])
         )

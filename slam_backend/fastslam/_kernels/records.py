@@ -147,7 +147,7 @@ class Frame(NamedTuple):
         given: Whether the covariances come with the measurements.
         camera: (7,) focal length, baseline, sigma of image coordinates, sigma of the disparity [px], mount (3) [m].
         descriptors: (B, d).
-        identities: (B,) the caller's identities of the landmarks measured, if `identified`; gates then play no part.
+        identities: (B,) the caller's identities of landmarks, if `identified`; gates then rule out no match.
         identified: Whether identities decide instead of descriptors.
     """
 
@@ -171,7 +171,7 @@ class Rules(NamedTuple):
         new_landmark_radius: Distance [m] from a landmark of similar descriptor up to which a measurement is not new.
         ambiguity: Cost within which a runner-up makes a measurement ambiguous: it is rejected.
         recovery: (3,) prior sigmas [m, m, rad] of the pose of a lost particle, see `FilterOptions`; zeros: no recovery.
-        log_p0: Log-density of a measurement that starts a new landmark.
+        log_p0: Log-density of a measurement that matches nothing: it starts a landmark, or lies in the dead zone.
         walk: Variance [m^2] along each axis by which a landmark may have moved between two measurements.
         one_to_one: Whether a landmark is matched at most once in a frame.
     """
@@ -194,7 +194,7 @@ class Candidates(NamedTuple):
     Attributes:
         starts: (B + 1,) where the candidates of each measurement begin among all C.
         slots: (C,) slots of the landmarks.
-        descriptor_costs: (C,) squared distances E of descriptors [-], which `fastslam2` divides by their variance.
+        descriptor_costs: (C,) squared distances e of descriptors [-], which `fastslam2` divides by their variance.
         owners: (C,) measurements.
         same: (C,) previous candidate of the same slot, -1 if there is none.
     """

@@ -8,7 +8,7 @@ from builders.linear_world import CAMERA, turn
 from builders.worlds import StereoWorld
 
 from slam_backend.core.validation import FloatArray
-from slam_backend.fastslam._kernels import RELINEARISE_BELOW
+from slam_backend.fastslam._kernels import RELINEARISE_UP_TO
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.options import CALIBRATED_NOISE
 from slam_backend.geometry import compose
@@ -19,7 +19,7 @@ PROPOSALS = pytest.mark.parametrize("proposal", ["fastslam2", "fastslam1"])
 
 
 class StereoEkf:
-    """An EKF of one landmark in (u, v, disparity), as textbooks have it: f, b, noise, and nothing shared with ours."""
+    """An EKF of one landmark in (u, v, disparity), as textbooks have it; shares the camera's mount with ours."""
 
     def __init__(self, world: StereoWorld, pose: FloatArray, point: FloatArray) -> None:
         self.world = world
@@ -68,7 +68,7 @@ def test_stereo_on_a_known_path_makes_it_independent_ekfs(proposal: Any) -> None
         for pose, some, frame in zip(poses, names, frames, strict=True):
             for name, point in zip(some.tolist(), frame.points, strict=True):
                 if name in filters:
-                    young = proposal == "fastslam2" and filters[name].sightings <= RELINEARISE_BELOW
+                    young = proposal == "fastslam2" and filters[name].sightings <= RELINEARISE_UP_TO
                     filters[name].update(pose, point, young)
                 else:
                     filters[name] = StereoEkf(world, pose, point)

@@ -44,7 +44,7 @@ def _map(means: np.ndarray, ids: IntArray) -> LandmarkMap:
 
 
 def _ground_truth() -> GroundTruthAssociation:
-    """Return books of two robots: the first holds 0, 1 and a false point, the second 1, 3 and what does not count."""
+    """Return claims of two robots: the first holds 0, 1 and a false point, the second 1, 3 and what does not count."""
     ground_truth = GroundTruthAssociation(2, TRUTHS, COUNTABLE, 1.0)
     ground_truth.record(_report((_ids(0, 1, -1, 2), _ids(0, 1, 2))), [_ids(0, 1, 3, -1), _ids(1, 3, 2)])
     return ground_truth
