@@ -9,10 +9,9 @@ the path to that of now. Robots leave frontiers to which a teammate is nearer.
 
 import numpy as np
 
-from agents.goal_choice import SWITCH_RATIO, own_share
+from agents.goal_choice import SWITCH_RATIO, nearest_own_frontiers
 from agents.predicted_pose import d_optimality, predict_covariances
 from vslam_env.belief.team_belief import Belief
-from vslam_env.navigation import CandidateKind
 
 LEAST = 1e-3  # D-optimality below which the pose counts as known: .02 m and .001 rad or so
 REACH = 3.0  # [m] added to the length of a path
@@ -32,8 +31,7 @@ class DOptimality:
     def choose(self, belief: Belief, rng: np.random.Generator) -> int | None:
         """Return the slot to go to; the path to the previous one counts half."""
         candidates = belief.candidates
-        slots = own_share(belief, candidates.of_kind(CandidateKind.FRONTIER))
-        slots = slots[np.argsort(candidates.lengths[slots], kind="stable")][:MOST_PREDICTED]
+        slots = nearest_own_frontiers(belief, MOST_PREDICTED)
         if not len(slots):
             self._held = None
             return None

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from slam_backend.core.validation import FloatArray, IntArray
 from vslam_env.belief.team_belief import Belief, Candidates
-from vslam_env.navigation import distance_map, follow_path, plan_path
+from vslam_env.navigation import CandidateKind, distance_map, follow_path, plan_path
 
 SWITCH_RATIO = 0.5  # switch goals if the path is shorter than this share of the remaining path
 REPLAN_TICKS = 10
@@ -115,6 +115,13 @@ def own_share(belief: Belief, slots: IntArray) -> IntArray:
     gaps = np.linalg.norm(candidates.goals[slots, None] - mates[None], axis=-1)
     own = slots[(gaps >= candidates.lengths[slots, None]).all(axis=1)]
     return own if len(own) else slots
+
+
+def nearest_own_frontiers(belief: Belief, most: int) -> IntArray:
+    """Return the slots of the nearest frontiers, at most `most`, of those to which no teammate is nearer."""
+    candidates = belief.candidates
+    slots = own_share(belief, candidates.of_kind(CandidateKind.FRONTIER))
+    return slots[np.argsort(candidates.lengths[slots], kind="stable")][:most]
 
 
 def nearest_slot(candidates: Candidates, slots: IntArray, held: int | None) -> int | None:

@@ -11,10 +11,10 @@ import math
 
 import numpy as np
 
-from agents.goal_choice import SWITCH_RATIO, own_share
+from agents.goal_choice import SWITCH_RATIO, nearest_own_frontiers
 from agents.predicted_pose import predict_covariances
 from vslam_env.belief.team_belief import Belief
-from vslam_env.navigation import CELL, CandidateKind
+from vslam_env.navigation import CELL
 
 AREA_NATS = math.log(2.0) / CELL**2  # [1/m^2] entropy of the unknown cells of a square metre
 MAP_WEIGHT = 0.02  # cells of a grid are not independent: weight of their entropy beside that of the pose
@@ -35,8 +35,7 @@ class RbpfGain:
     def choose(self, belief: Belief, rng: np.random.Generator) -> int | None:
         """Return the slot to go to; the path to the previous one counts half."""
         candidates = belief.candidates
-        slots = own_share(belief, candidates.of_kind(CandidateKind.FRONTIER))
-        slots = slots[np.argsort(candidates.lengths[slots], kind="stable")][:MOST_PREDICTED]
+        slots = nearest_own_frontiers(belief, MOST_PREDICTED)
         if not len(slots):
             self._held = None
             return None

@@ -101,8 +101,8 @@ def _shared_by_all(reward: float, after: TeamMetrics) -> list[float]:
     return [reward] * len(after.per_robot.map_errors)
 
 
-# Potentials telescope: their sum over an episode is the final value minus the initial one, so that oscillation gains
-# nothing. Costs are never positive.
+# Potentials telescope: their sum over an episode is what the value has improved between its first and last step, so
+# that oscillation gains nothing. Costs are never positive.
 OWN_RECALL, INFORMATION = "own_recall", "information"
 READS_BELIEFS = frozenset({INFORMATION})  # built-in terms whose metrics contain beliefs, which takes time
 POTENTIALS: dict[str, RewardFunction] = {

@@ -66,6 +66,21 @@ def summarise_means(
     return lines
 
 
+def mean_curves(rows: Iterable[Mapping[str, Any]], by: Sequence[str], names: Sequence[str]) -> list[dict[str, Any]]:
+    """Return one line for each group and time of its `curves`: `by`, `time_s`, and curves by `mean_ci`.
+
+    Groups may have other times.
+    """
+    found = []
+    for key, own in grouped(rows, by).items():
+        for point, when in enumerate(own[0]["curves"]["time_s"]):
+            line: dict[str, Any] = dict(zip(by, key, strict=True)) | {"time_s": when}
+            for name in names:
+                line |= mean_ci(name, [row["curves"][name][point] for row in own])
+            found.append(line)
+    return found
+
+
 def paired_difference(own: Mapping[int, float], other: Mapping[int, float]) -> FloatArray:
     """Return the differences (k,) between two sets of values on their common seeds, in the order of the seeds.
 

@@ -45,6 +45,22 @@ def _inverse(a: FloatArray, out: FloatArray) -> float:
     return det
 
 
+@inline
+def invert(matrix: FloatArray, inverse: FloatArray) -> None:
+    """Write the inverse (3, 3) of a symmetric matrix (3, 3)."""
+    upper, result, at = stack_array(6), stack_array(6), 0
+    for r in range(3):
+        for c in range(r, 3):
+            upper[at] = matrix[r, c]
+            at += 1
+    _inverse(upper, result)
+    at = 0
+    for r in range(3):
+        for c in range(r, 3):
+            inverse[r, c] = inverse[c, r] = result[at]
+            at += 1
+
+
 @jit
 def sum_pose_information(previous: IntArray, noises: FloatArray) -> tuple[IntArray, FloatArray, int, bool]:
     """Number the poses that are sought, and invert the covariances of the odometry that leads to them.

@@ -6,7 +6,7 @@ import numpy as np
 
 from slam_backend.core.jit import inline, jit, stack_array
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
-from slam_backend.smoother._kernels.factors import _inverse, _rotate_in_plane
+from slam_backend.smoother._kernels.factors import _rotate_in_plane, invert
 from slam_backend.smoother._kernels.records import LEVER, NONE, Condensed, Keys, LandmarkFactors
 
 
@@ -76,22 +76,6 @@ def chain_biased(
     first[0], first[1], first[2] = o0, o1, o2
     for i in range(3):
         motion[i] += jacobian[i, 0] * bias[0] + jacobian[i, 1] * bias[1] + jacobian[i, 2] * bias[2]
-
-
-@inline
-def invert(matrix: FloatArray, inverse: FloatArray) -> None:
-    """Write the inverse (3, 3) of a symmetric matrix (3, 3)."""
-    upper, result, at = stack_array(6), stack_array(6), 0
-    for r in range(3):
-        for c in range(r, 3):
-            upper[at] = matrix[r, c]
-            at += 1
-    _inverse(upper, result)
-    at = 0
-    for r in range(3):
-        for c in range(r, 3):
-            inverse[r, c] = inverse[c, r] = result[at]
-            at += 1
 
 
 @jit

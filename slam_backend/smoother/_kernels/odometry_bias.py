@@ -4,9 +4,9 @@ import math
 
 import numpy as np
 
-from slam_backend.core.jit import jit_fma, stack_array
+from slam_backend.core.jit import jit_fma
 from slam_backend.core.validation import FloatArray, IntArray
-from slam_backend.smoother._kernels.factors import _inverse
+from slam_backend.smoother._kernels.factors import invert
 from slam_backend.smoother._kernels.records import Keys
 
 
@@ -55,17 +55,8 @@ def condition_bias(
             r2 += j[2, 1] * mean[1, i] + j[2, 2] * mean[2, i]
             for axis in range(3):
                 slopes[axis, i] += product[axis, 0] * r0 + product[axis, 1] * r1 + product[axis, 2] * r2
-    upper, inverse, covariance, at = stack_array(6), stack_array(6), np.empty((3, 3)), 0
-    for r in range(3):
-        for c in range(r, 3):
-            upper[at] = information[r, c]
-            at += 1
-    _inverse(upper, inverse)
-    at = 0
-    for r in range(3):
-        for c in range(r, 3):
-            covariance[r, c] = covariance[c, r] = inverse[at]
-            at += 1
+    covariance = np.empty((3, 3))
+    invert(information, covariance)
     for axis in range(3):
         for i in range(m):
             mean[axis, i] -= (

@@ -14,7 +14,7 @@ from agents.trained import MODEL_FILE
 from training.bench.config import NO_ORACLE
 from training.bench.exploration.trials import CURVES, TEAM
 from training.experiments.plotting import save_png
-from training.experiments.statistics import format_ci, grouped, mean_ci, paired_difference, summarise_means
+from training.experiments.statistics import format_ci, grouped, mean_ci, mean_curves, paired_difference, summarise_means
 from training.experiments.tables import console_table, csv_text, markdown_table
 
 Rows = Sequence[Mapping[str, Any]]
@@ -122,14 +122,7 @@ def curves(rows: Rows) -> list[dict[str, Any]]:
 
     Policies with other decision intervals may have other times.
     """
-    found = []
-    for key, own in grouped(rows, CONDITION).items():
-        for point, when in enumerate(own[0]["curves"]["time_s"]):
-            line: dict[str, Any] = dict(zip(CONDITION, key, strict=True)) | {"time_s": when}
-            for name in CURVES:
-                line |= mean_ci(name, [row["curves"][name][point] for row in own])
-            found.append(line)
-    return found
+    return mean_curves(rows, CONDITION, CURVES)
 
 
 def _differences(line: Mapping[str, Any], own: Rows, other: Rows) -> list[dict[str, Any]]:

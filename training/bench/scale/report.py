@@ -13,7 +13,7 @@ from training.bench.exploration.report import COLOURS, STYLES, Column
 from training.bench.exploration.trials import TEAM
 from training.bench.scale.trials import CURVES
 from training.experiments.plotting import save_png
-from training.experiments.statistics import grouped, mean_ci, summarise_means
+from training.experiments.statistics import grouped, mean_curves, summarise_means
 from training.experiments.tables import console_table, markdown_table
 
 Rows = Sequence[Mapping[str, Any]]
@@ -53,14 +53,7 @@ def summarise(rows: Rows) -> list[dict[str, Any]]:
 
 def curves(rows: Rows) -> list[dict[str, Any]]:
     """Return a row for each of `CONDITION` and time: means of `CURVES` over seeds, with intervals."""
-    found = []
-    for key, own in grouped(rows, CONDITION).items():
-        for point, when in enumerate(own[0]["curves"]["time_s"]):
-            line: dict[str, Any] = dict(zip(CONDITION, key, strict=True)) | {"time_s": when}
-            for name in CURVES:
-                line |= mean_ci(name, [row["curves"][name][point] for row in own])
-            found.append(line)
-    return found
+    return mean_curves(rows, CONDITION, CURVES)
 
 
 def _label(line: Mapping[str, Any]) -> str:
