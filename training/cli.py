@@ -21,6 +21,7 @@ from training.commands.train import train
 from training.commands.warm_up import warm_up
 from training.commands.worlds import worlds
 from training.experiments.interrupt import signals_answered
+from training.experiments.logs import LogLevel, begin_logging
 
 BAD_INPUT = 2
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -35,7 +36,7 @@ def _print_version(is_wanted: bool) -> None:
 
 app = typer.Typer(
     name="vslam", help="Robots that do not know where they start explore, map and merge: runs, replays and figures.",
-    no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
+    no_args_is_help=True, pretty_exceptions_enable=False,
 )  # fmt: skip
 
 
@@ -44,8 +45,12 @@ def options(
     version: Annotated[
         bool, typer.Option("--version", help="Print the version and exit.", callback=_print_version, is_eager=True)
     ] = False,
+    log_level: Annotated[
+        LogLevel, typer.Option(help="Messages on stderr from this level on: debug, info, warning or error.")
+    ] = "warning",
 ) -> None:
     """Take the options that come before a command."""
+    begin_logging(log_level)
 
 
 app.command("run")(run)

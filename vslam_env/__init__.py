@@ -4,6 +4,8 @@ Importing the package registers `vslam_env/Exploration-v0` with PettingZoo and `
 Gymnasium.
 """
 
+from importlib.metadata import PackageNotFoundError, version
+
 import gymnasium
 import pettingzoo
 
@@ -16,6 +18,11 @@ from vslam_env.snapshots import load_state, save_state
 from vslam_env.warm_up import warm_up
 from vslam_env.world import World
 
+try:
+    __version__ = version("vslam-env")
+except PackageNotFoundError:  # source files that are not installed
+    __version__ = "unknown"
+
 __all__ = [
     "CANDIDATE_FEATURES",
     "NUM_CANDIDATES",
@@ -24,6 +31,7 @@ __all__ = [
     "EnvConfig",
     "ExplorationEnv",
     "World",
+    "__version__",
     "load_state",
     "preset_config",
     "save_state",

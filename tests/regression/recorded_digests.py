@@ -169,7 +169,7 @@ def pair_of_maps(rng: np.random.Generator, count: int) -> tuple[LandmarkMap, Lan
 def commands() -> dict[str, list[str]]:
     """Return the commands whose metrics are hashed."""
     found = {
-        "bench accuracy": ["bench", "accuracy", "--seeds", "1", "--length", "20", "--particles", "30"],
+        "bench accuracy": ["bench", "accuracy", "--seeds", "1", "--lengths", "20", "--particles", "30"],
         "bench alignment": ["bench", "alignment", "--seeds", "2", "--hard", "9"],
         "run": ["run", "--world", "maze", "--robots", "2", "--max-cycles", "120", "--no-video"],
         "replay mrclam": ["replay", "mrclam", "--path", str(DATA / "mrclam/MRCLAM_Dataset7"), "--duration", "150"],

@@ -23,6 +23,7 @@ from training.experiments.config import (
     option_arguments,
     setting,
 )
+from training.experiments.labels import check_labels, parted_label
 from training.replay.config import MRCLAM, log_path
 
 if TYPE_CHECKING:  # numerical modules are imported when a command runs, so that --help is fast
@@ -77,40 +78,43 @@ class AccuracyConfig(ExperimentConfig):
     seeds: int = option(16, "Number of seeds.", ge=1, hint="Use at least one seed.")
     seed: int = first_seed()
     worlds: tuple[str, ...] | None = option(
-        None, "World families or paths to explore; without it, stereo runs through a simulated office.", name="world"
+        None, "World families or paths to explore; without it, stereo runs through a simulated office."
     )
     presets: tuple[str, ...] | None = option(
-        None, "Noise presets: good, coarse, paper; with --world easy, standard, hard.", name="preset",
-        shown="good; standard with --world",
+        None, "Noise presets: good, coarse, paper; with --worlds easy, standard, hard.",
+        shown="good; standard with --worlds",
     )  # fmt: skip
     robots: tuple[Positive, ...] = option((1,), "Numbers of robots; of stereo runs, they share a map.")
     particles: tuple[Positive, ...] | None = option(
-        None, "Numbers of particles per filter.", hint=ONE_PARTICLE, shown="10,30,100,300,1000; 100 with --world"
+        None, "Numbers of particles per filter.", hint=ONE_PARTICLE, shown="10,30,100,300,1000; 100 with --worlds"
     )
     split: Literal["train", "validation", "test", "any"] = option(
-        "validation", "Split of the worlds in --world: train, validation, test, or any."
+        "validation", "Split of the worlds in --worlds: train, validation, test, or any.", name="world_split"
     )
     policies: tuple[str, ...] = option(
-        ("frontier",), "Policies of the robots in --world: name, path of a model, or MODULE:NAME; @discrete selects "
-        "the action type.", name="policy",
+        ("frontier",), "Policies of the robots in --worlds: name, path of a model, MODULE:NAME, or LABEL= and one of "
+        "these; @discrete selects the action type.",
     )  # fmt: skip
-    duration: float = option(120.0, "Duration of an episode in --world [s].", ge=1.0, hint="Give seconds.")
+    duration: float = option(
+        120.0, "Simulated time of an episode in --worlds [s].", name="max_seconds", also="--duration", ge=1.0,
+        hint="Give seconds.",
+    )  # fmt: skip
     rejuvenate_every: int | None = option(
-        None, "Ticks between rejuvenations of the particles in --world; 0: never.", shown="100", ge=0
+        None, "Ticks between rejuvenations of the particles in --worlds; 0: never.", shown="100", ge=0
     )
     max_ranges: tuple[Annotated[float, Field(gt=0.0)], ...] | None = option(
-        None, "Ranges of the camera in --world [m].", name="max_range", shown="8", hint="Give metres."
+        None, "Ranges of the camera in --worlds [m].", shown="8", hint="Give metres."
     )
     baselines: tuple[Annotated[float, Field(gt=0.0)], ...] | None = option(
-        None, "Baselines of the camera in --world [m].", name="baseline", shown="0.12", hint="Give metres."
+        None, "Baselines of the camera in --worlds [m].", shown="0.12", hint="Give metres."
     )
     measurements: tuple[Positive, ...] | None = option(
-        None, "Largest numbers of measurements of a frame in --world.", shown="5"
+        None, "Largest numbers of measurements of a frame in --worlds.", shown="5"
     )
     associations: tuple[Literal["known", "unknown"], ...] = option(
-        ("known",), "Data association of stereo runs: known or unknown.", name="association"
+        ("known",), "Data association of stereo runs: known or unknown."
     )
-    lengths: tuple[float, ...] = option((100.0,), "Lengths of each robot's path in stereo runs [m].", name="length")
+    lengths: tuple[float, ...] = option((100.0,), "Lengths of each robot's path in stereo runs [m].")
     methods: tuple[Method, ...] = option(
         ("dead_reckoning", "batch_ml", "ideal_online", "fastslam1", "fastslam2"),
         "Methods on stereo runs: dead_reckoning, batch_ml, ideal_online, fastslam1, fastslam2, fastslam2+existence, "
@@ -131,22 +135,22 @@ class AccuracyConfig(ExperimentConfig):
         from slam_backend.core.validation import argument_error
 
         idle: tuple[str, ...] = EPISODES_ONLY
-        hint = "Give --world, too."
+        hint = "Give --worlds, too."
         if self.worlds is not None:
-            idle, hint = STEREO_RUNS_ONLY, "Omit --world."
+            idle, hint = STEREO_RUNS_ONLY, "Omit --worlds."
         for name in idle:
             field = type(self).model_fields[name]
             if getattr(self, name) != field.default:
                 about = option_arguments(field) or {}
                 raise argument_error(
-                    str(about["option"] or name), f"no value {'without' if self.worlds is None else 'with'} --world",
+                    str(about["option"] or name), f"no value {'without' if self.worlds is None else 'with'} --worlds",
                     getattr(self, name), hint,
                 )  # fmt: skip
         known = STEREO_PRESETS if self.worlds is None else ENV_PRESETS
         for preset in self.presets or ():
             if preset not in known:
                 raise argument_error(
-                    "preset", f"one of {', '.join(map(repr, known))}", preset, "Choose one of these names."
+                    "presets", f"one of {', '.join(map(repr, known))}", preset, "Choose one of these names."
                 )  # fmt: skip
         if self.worlds is None:
             self.trials()
@@ -154,6 +158,7 @@ class AccuracyConfig(ExperimentConfig):
         from training.bench.exploration.players import BOUND, parted
         from vslam_env.world.registry import check_source
 
+        check_labels(self.policies)
         for policy in self.policies:
             if parted(policy).role == BOUND:
                 hint = "Bounds know the truth, which readings alone do not tell."
@@ -235,15 +240,22 @@ def world_split(split: str, world: str) -> str | None:
 
 def with_absolute_paths(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return plain values of a configuration with absolute paths of worlds and of models."""
-    from agents.registry import is_model
     from vslam_env.world import portable_source
 
     found = dict(values)
     if isinstance(found.get("worlds"), list | tuple):
         found["worlds"] = [portable_source(str(world)) for world in found["worlds"]]
     if isinstance(found.get("policies"), list | tuple):
-        found["policies"] = [str(Path(p).resolve()) if is_model(p) else p for p in found["policies"]]
+        found["policies"] = [_portable_policy(policy) for policy in found["policies"]]
     return found
+
+
+def _portable_policy(text: Any) -> Any:
+    """Return a policy on the command line with an absolute path of its model, if it is one."""
+    from agents.registry import is_model
+
+    label, policy = parted_label(text) if isinstance(text, str) else ("", text)
+    return text if not is_model(policy) else f"{label}{'=' if label else ''}{Path(policy).resolve()}"
 
 
 class AlignmentBenchConfig(ExperimentConfig):
@@ -332,18 +344,21 @@ class ExplorationBenchConfig(ExperimentConfig):
 
     policies: tuple[str, ...] = option(
         ("frontier", "random_goals", "random_walk"),
-        "Policies by name, path of a model, or MODULE:NAME; NAME@discrete selects the action type, NAME@team the "
-        "central team policy, oracles@bound and rollout@bound are bounds. The others are compared with the first.",
+        "Policies by name, path of a model, MODULE:NAME, or LABEL= and one of these; NAME@discrete selects the action "
+        "type, NAME@team the central team policy, oracles@bound and rollout@bound are bounds. The others are compared "
+        "with the first.",
     )
     worlds: tuple[str, ...] = option(("office", "maze", "loops", "hall"), "World families or paths.")
     split: Literal["train", "validation", "test", "any"] = option(
-        "validation", "Split of the worlds: train, validation, test, or any."
+        "validation", "Split of the worlds: train, validation, test, or any.", name="world_split"
     )
     robots: tuple[RobotCount, ...] = option((3,), "Numbers of robots in a team.", hint="Use 1 to 8 robots.")
     oracles: tuple[Literal["none", "pose", "association", "merge", "all"], ...] = option(
         (NO_ORACLE, ALL_ORACLES), "Ground truth given to robots: none, pose, association, merge, all."
     )
-    duration: float = option(120.0, "Duration of an episode [s].", ge=1.0, hint="Give seconds.")
+    duration: float = option(
+        120.0, "Simulated time of an episode [s].", name="max_seconds", also="--duration", ge=1.0, hint="Give seconds."
+    )
     particles: int = option(100, "Number of particles per filter.", ge=1, hint=ONE_PARTICLE)
     rejuvenate_every: int | None = option(
         None, "Ticks between rejuvenations of the particles; 0: never.", shown="100", ge=0
@@ -363,6 +378,7 @@ class ExplorationBenchConfig(ExperimentConfig):
         """Refuse policies and worlds that do not exist."""
         from training.bench.exploration.players import parted
 
+        check_labels(self.policies)
         for policy in self.policies:
             parted(policy)
         for robots, world in product(self.robots, self.worlds):
@@ -411,8 +427,9 @@ class FilterBenchConfig(ExperimentConfig):
     robots: tuple[Positive, ...] = option((1, 2, 3), "Numbers of robots K.", hint="Use 1 to 8 robots.")
     proposals: tuple[Proposal, ...] = ("fastslam1", "fastslam2")
     lookalikes: int = option(
-        1, "Number of landmarks that share one descriptor.", ge=1, hint="Use 1 for distinct descriptors."
-    )
+        1, "Number of landmarks that share one descriptor.", name="look_alikes", ge=1,
+        hint="Use 1 for distinct descriptors.",
+    )  # fmt: skip
     steps: int = option(300, "Number of timed steps per row.", ge=1, hint="Use at least one step.")
     large: bool = option(False, "Include 10,000 particles with 300 and 1,000 landmarks.")
     compile: bool = option(False, "Include the compilation time of all kernels with an empty cache.")
@@ -490,10 +507,12 @@ class ScaleBenchConfig(ExperimentConfig):
     )
     robots: tuple[RobotCount, ...] = option((1, 3, 8), "Numbers of robots in a team.", hint="Use 1 to 8 robots.")
     policy: str = option("frontier", "Policy by name, path of a model, or MODULE:NAME; @team selects the central one.")
-    duration: float = option(600.0, "Duration of an episode [s].", ge=1.0, hint="Give seconds.")
+    duration: float = option(
+        600.0, "Simulated time of an episode [s].", name="max_seconds", also="--duration", ge=1.0, hint="Give seconds."
+    )
     particles: int = option(100, "Number of particles per filter.", ge=1, hint=ONE_PARTICLE)
     split: Literal["train", "validation", "test", "any"] = option(
-        "validation", "Split of the worlds: train, validation, test, or any."
+        "validation", "Split of the worlds: train, validation, test, or any.", name="world_split"
     )
     preset: NoisePreset = option("standard", "Noise preset: easy, standard or hard.")
     seeds: int = option(2, "Number of episodes of each combination.", ge=1, hint="Use at least one episode.")

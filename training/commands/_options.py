@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import wraps
 from inspect import Parameter, signature
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal, get_args, get_origin
 
 import typer
 from pydantic.fields import FieldInfo
@@ -32,15 +32,17 @@ Config = Annotated[
 OUT = {False: "New run folder.", True: "Run folder: a new one, or the one of a stopped run to resume."}
 
 
-def _check_processes(number: int) -> int:
+def _check_workers(number: int) -> int:
     if number < 1:
         from slam_backend.core.validation import argument_error
 
-        raise argument_error("processes", "an int >= 1", number, "Use at least one process.")
+        raise argument_error("workers", "an int >= 1", number, "Use at least one process.")
     return number
 
 
-Processes = Annotated[int, typer.Option(help="Number of trials that run in parallel.", callback=_check_processes)]
+Workers = Annotated[
+    int, typer.Option(help="Number of processes; each runs a trial at a time.", callback=_check_workers)
+]
 
 
 def options(
@@ -139,7 +141,23 @@ def _parameter(option: str, name: str, field: FieldInfo) -> Parameter:
     if about["is_argument"]:
         return _keyword(option, Annotated[kind | None, typer.Argument(help=text, show_default=False)])
     flags = [about["option"]] if about["option"].startswith("--") else []
-    return _keyword(option, Annotated[kind | None, typer.Option(*flags, help=text, show_default=shown)])
+    if about["also"]:
+        flags = [f"--{option.replace('_', '-')}", about["also"]]
+    found = typer.Option(*flags, help=text, show_default=shown, autocompletion=_completion(field))
+    return _keyword(option, Annotated[kind | None, found])
+
+
+def _completion(field: FieldInfo) -> Callable[[str], list[str]] | None:
+    """Return the function with which a shell completes an option that has names to choose from."""
+    leaf, _ = value_type(field.annotation)
+    if get_origin(leaf) is not Literal:
+        return None
+
+    def complete(incomplete: str) -> list[str]:
+        before, comma, last = incomplete.rpartition(",") if _is_list(field) else ("", "", incomplete)
+        return [f"{before}{comma}{name}" for name in get_args(leaf) if name.startswith(last)]
+
+    return complete
 
 
 def _shown(option: str, default: Any) -> str | bool:

@@ -10,6 +10,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from training.experiments.logs import LOGGER
+
 if TYPE_CHECKING:  # numerical modules are imported when a command runs, so that --help is fast
     from training.experiments.run_folder import RunFolder
 
@@ -67,7 +69,7 @@ class TrialSet:
     trials: Sequence[Any]  # All trials, in order
     tell: Callable[[dict[str, Any]], str]  # Short description of a row
     cost: Callable[[Any], int] = lambda trial: 1  # Approximate cost of a trial, in an arbitrary unit
-    processes: int = 1  # Number of parallel processes; 1: this process
+    workers: int = 1  # Number of parallel processes; 1: this process
     failures: list[str] = field(default_factory=list)  # Errors of failed trials, appended as they end
 
 
@@ -84,6 +86,10 @@ def run_trial_sets(
     kept = [finished_trials(folder, part.file, part.kind) for part in parts]
     total = sum(part.cost(trial) for part in parts for trial in part.trials)
     done = sum(part.cost(t) for part, found in zip(parts, kept, strict=True) for t in part.trials if t in found)
+    stored, wanted = sum(map(len, kept)), sum(len(part.trials) for part in parts)
+    if stored:
+        text = f"Resuming {folder.path}: {stored} of {wanted} trials are finished, {wanted - stored} are left."
+        console.print(text, soft_wrap=True)
     with trial_progress(console, total, done, timed) as (advance, interrupted):
         for part, found in zip(parts, kept, strict=True):
 
@@ -96,12 +102,13 @@ def run_trial_sets(
                     advance("failed", part.cost(trial))
                     return
                 found[trial] = row
+                LOGGER.debug("Finished %s", part.tell(row))
                 advance(part.tell(row), part.cost(trial))
 
             left = [trial for trial in part.trials if trial not in found]
-            run_trials(folder, part.file, part.play, left, part.processes, interrupted, on_trial)
+            run_trials(folder, part.file, part.play, left, part.workers, interrupted, on_trial)
     rows = [[found[t] for t in part.trials if t in found] for part, found in zip(parts, kept, strict=True)]
-    finished, wanted = sum(map(len, rows)), sum(len(part.trials) for part in parts)
+    finished = sum(map(len, rows))
     failed = sum(len(part.failures) for part in parts)
     if failed:
         text = f"{failed} of {wanted} trials failed; the same command with --out {folder.path} repeats them."

@@ -15,6 +15,7 @@ from rich.console import Console
 
 from training.experiments.compilation import prepare
 from training.experiments.config import ExperimentConfig
+from training.experiments.logs import LOGGER
 from training.replay.config import find_log
 
 if TYPE_CHECKING:  # numerical modules are imported when a command runs, so that --help is fast
@@ -91,6 +92,7 @@ class Call(Generic[ConfigT]):
         folders: list[RunFolder] = []
         prepare(*first_steps, lambda: folders.append(make(out, self.command, chosen.to_mapping(), chosen.seed)))
         self.folder = folders[0]
+        LOGGER.info("Seed %d, configuration in %s", self.folder.seed, self.folder.path / CONFIG_FILE)
         return self.console, self.folder
 
     def write(self, metrics: Mapping[str, Any]) -> None:

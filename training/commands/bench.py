@@ -24,7 +24,7 @@ from training.bench.config import (
     StereoBenchConfig,
     TrainBenchConfig,
 )
-from training.commands._options import Processes, options
+from training.commands._options import Workers, options
 from training.commands._progress import TrialSet, run_trial_sets, share_progress, trial_progress
 from training.commands._run_folder import Call
 from training.commands.replay import MRCLAM_LOG
@@ -43,7 +43,7 @@ bench = typer.Typer(help="Measure accuracy and speed of filters, environments an
     AccuracyConfig, "bench accuracy", continues=True, quick={"seeds": 2, "particles": (30,)},
     quick_help="2 seeds, 30 particles.",
 )  # fmt: skip
-def bench_accuracy(call: Call[AccuracyConfig], processes: Processes = 1) -> None:
+def bench_accuracy(call: Call[AccuracyConfig], workers: Workers = 1) -> None:
     """Measure filter accuracy against lower bounds of the error, and name the losses in between.
 
     Without --world: filters on simulated stereo runs, against dead reckoning, batch maximum likelihood and the ideal
@@ -53,12 +53,12 @@ def bench_accuracy(call: Call[AccuracyConfig], processes: Processes = 1) -> None
     current trial and summarises the finished ones; the same command with --out FOLDER resumes the run.
     """
     if call.config.worlds is None:
-        _accuracy_of_stereo_runs(call, processes)
+        _accuracy_of_stereo_runs(call, workers)
     else:
-        _losses_in_worlds(call, processes)
+        _losses_in_worlds(call, workers)
 
 
-def _accuracy_of_stereo_runs(call: Call[AccuracyConfig], processes: int) -> None:
+def _accuracy_of_stereo_runs(call: Call[AccuracyConfig], workers: int) -> None:
     """Run filters on simulated stereo runs."""
     from training.bench.accuracy.report import draw_accuracy, markdown, print_tables, summarise
     from training.bench.accuracy.trials import TRIALS_FILE, Trial, play
@@ -70,7 +70,7 @@ def _accuracy_of_stereo_runs(call: Call[AccuracyConfig], processes: int) -> None
         return f"seed {row['seed']}, {row['method']}" + (f" {row['particles']}" if row["particles"] else "")
 
     trials = call.config.trials()
-    part = TrialSet(file=TRIALS_FILE, kind=Trial, play=play, trials=trials, tell=tell, processes=processes)
+    part = TrialSet(file=TRIALS_FILE, kind=Trial, play=play, trials=trials, tell=tell, workers=workers)
     (rows,) = run_trial_sets(console, folder, part)
     lines = plain(summarise(rows))
     print_tables(console, lines)
@@ -81,7 +81,7 @@ def _accuracy_of_stereo_runs(call: Call[AccuracyConfig], processes: int) -> None
     call.finish()
 
 
-def _losses_in_worlds(call: Call[AccuracyConfig], processes: int) -> None:
+def _losses_in_worlds(call: Call[AccuracyConfig], workers: int) -> None:
     """Run episodes and split the errors of their filters into losses."""
     from training.bench.accuracy.losses import EPISODES_FILE, LONGEST_DECISION, play
     from training.bench.accuracy.losses_report import draw_losses, markdown, print_tables, summarise
@@ -94,7 +94,7 @@ def _losses_in_worlds(call: Call[AccuracyConfig], processes: int) -> None:
     checks = (partial(_first_steps, config.environment(t), parted(t.policy), t.seed, LONGEST_DECISION) for t in firsts)
     console, folder = call.begin(*checks)
     part = TrialSet(
-        file=EPISODES_FILE, kind=EpisodeTrial, play=partial(play, config), trials=trials, processes=processes,
+        file=EPISODES_FILE, kind=EpisodeTrial, play=partial(play, config), trials=trials, workers=workers,
         tell=lambda row: f"{row['world']}, seed {row['seed']}: {row['position_rms_m']['filter']:.3f} m",
     )  # fmt: skip
     (rows,) = run_trial_sets(console, folder, part)
@@ -212,7 +212,7 @@ def bench_env(call: Call[EnvBenchConfig]) -> None:
     ExplorationBenchConfig, "bench exploration", continues=True,
     quick={"worlds": ("office",), "duration": 60.0, "seeds": 3}, quick_help="Office worlds only, 60 s, 3 seeds.",
 )  # fmt: skip
-def bench_exploration(call: Call[ExplorationBenchConfig], processes: Processes = 1) -> None:
+def bench_exploration(call: Call[ExplorationBenchConfig], workers: Workers = 1) -> None:
     """Compare policies over worlds: coverage, map errors, pose errors and merges, with confidence intervals.
 
     All policies of a seed have the same worlds, starts and noise. Options in the plural take comma-separated values;
@@ -233,7 +233,7 @@ def bench_exploration(call: Call[ExplorationBenchConfig], processes: Processes =
     )  # fmt: skip
     console, folder = call.begin(*checks)
     part = TrialSet(
-        file=TRIALS_FILE, kind=ExplorationTrial, play=partial(play, call.config), trials=trials, processes=processes,
+        file=TRIALS_FILE, kind=ExplorationTrial, play=partial(play, call.config), trials=trials, workers=workers,
         tell=lambda row: f"{row['world']}, {row['policy']}, seed {row['seed']}: {row['coverage']:.0%} seen",
     )  # fmt: skip
     (rows,) = run_trial_sets(console, folder, part)
@@ -258,7 +258,7 @@ def bench_exploration(call: Call[ExplorationBenchConfig], processes: Processes =
     quick={"extents": (30.0, 60.0), "robots": (3,), "duration": 60.0, "seeds": 1},
     quick_help="Worlds of 30 and 60 m, 3 robots, 60 s, 1 seed.",
 )  # fmt: skip
-def bench_scale(call: Call[ScaleBenchConfig], processes: Processes = 1) -> None:
+def bench_scale(call: Call[ScaleBenchConfig], workers: Workers = 1) -> None:
     """Measure cost and results over the size of the world and the number of robots.
 
     Times of steps and snapshots, memory, coverage over time, errors of maps and poses, merges. Options in the plural
@@ -280,7 +280,7 @@ def bench_scale(call: Call[ScaleBenchConfig], processes: Processes = 1) -> None:
     )
     console, folder = call.begin(*checks)
     part = TrialSet(
-        file=TRIALS_FILE, kind=ScaleTrial, play=partial(play, config), trials=trials, processes=processes,
+        file=TRIALS_FILE, kind=ScaleTrial, play=partial(play, config), trials=trials, workers=workers,
         tell=lambda row: f"{row['extent']:g} m, K={row['robots']}: {row['coverage']:.0%}, {row['median_ms']:.1f} ms",
     )  # fmt: skip
     (rows,) = run_trial_sets(console, folder, part)

@@ -13,6 +13,9 @@ EPISODE_S = 600.0  # [s]
 
 def drive_by_hand(
     world: Annotated[str, typer.Option(help="World family or path; see vslam worlds list.")] = "office",
+    world_split: Annotated[
+        str | None, typer.Option(help="Split of the worlds: train, validation or test.", show_default="any")
+    ] = None,
     robots: Annotated[int, typer.Option(help="Number of robots, 1 to 8.")] = 3,
     policy: Annotated[str, typer.Option(help="Policy of the other robots, or none.")] = "frontier",
     seed: Annotated[int, typer.Option(help="Seed of the episode.")] = 0,
@@ -33,13 +36,19 @@ def drive_by_hand(
     from training.episodes.teleoperation import KEYS, drive
     from training.episodes.video import VideoWriter
     from training.experiments.interrupt import interrupt_flag
+    from training.experiments.tables import E_SCALE
     from vslam_env import vslam_v0
     from vslam_env.rendering.window import Window, display_unavailable_reason
 
     if max_cycles is None and max_seconds is None:
         max_seconds = EPISODE_S
     env = vslam_v0.parallel_env(
-        world=world, num_robots=robots, preset=preset, max_cycles=max_cycles, max_seconds=max_seconds
+        world=world,
+        world_split=world_split,
+        num_robots=robots,
+        preset=preset,
+        max_cycles=max_cycles,
+        max_seconds=max_seconds,
     )
     policies = {} if policy == "none" else {a: make_policy(policy, "continuous") for a in env.possible_agents}
     env.reset(seed=seed)  # detects a world that cannot be built first
@@ -55,9 +64,10 @@ def drive_by_hand(
         film = None if record is None else stack.enter_context(VideoWriter(record, (960, 720), 10))
         infos = drive(env, window, policies, seed, film.add if film is not None else lambda frame: None, interrupted)
     window.close()
+    console.print(E_SCALE)
     for agent, info in infos.items():
         console.print(
-            f"{agent}: map error {info['map_error']:.3f} m, recall {info['map_recall']:.0%}, "
+            f"{agent}: E {info['map_error']:.3f} m, recall {info['map_recall']:.0%}, "
             f"pose error {info['pose_error']:.2f} m, group {info['group']}"
         )
     if record is not None:

@@ -3,7 +3,7 @@
 from functools import partial
 from typing import Any
 
-from training.commands._options import Processes, options
+from training.commands._options import Workers, options
 from training.commands._progress import TrialSet, run_trial_sets
 from training.commands._run_folder import Call
 from training.rl.config import EvaluateConfig, EvaluateTrial
@@ -12,7 +12,7 @@ TRIALS_FILE = "trials.jsonl"
 
 
 @options(EvaluateConfig, "evaluate", continues=True)
-def evaluate(call: Call[EvaluateConfig], processes: Processes = 1) -> None:
+def evaluate(call: Call[EvaluateConfig], workers: Workers = 1) -> None:
     """Compare a model with baseline policies on the same unseen worlds, with confidence intervals.
 
     All policies have the same worlds, starts and noise, and the same decision interval.
@@ -27,11 +27,11 @@ def evaluate(call: Call[EvaluateConfig], processes: Processes = 1) -> None:
     chosen = call.config
     env = vslam_v0.parallel_env(config=chosen.environment())  # detects bad input before the folder is created
     if "split" in call.given and env.config.world_split is None:
-        hint = "Omit --split: starts and noise differ from the training anyway."
-        raise argument_error("split", "a world family or folder", env.config.world, hint)
+        hint = "Omit --world-split: starts and noise differ from the training anyway."
+        raise argument_error("world_split", "a world family or folder", env.config.world, hint)
     console, folder = call.begin(lambda: _one_step(env, chosen))
     part = TrialSet(
-        file=TRIALS_FILE, kind=EvaluateTrial, play=partial(play, chosen), trials=chosen.trials(), processes=processes,
+        file=TRIALS_FILE, kind=EvaluateTrial, play=partial(play, chosen), trials=chosen.trials(), workers=workers,
         tell=lambda row: f"{row['policy']}, seed {row['seed']}: return {row['return']:.3f}",
     )  # fmt: skip
     (rows,) = run_trial_sets(console, folder, part)

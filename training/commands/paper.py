@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from training.commands._options import Check, Processes, options
+from training.commands._options import Check, Workers, options
 from training.commands._progress import TrialSet, run_trial_sets
 from training.commands._run_folder import Call
 from training.paper.config import Fig1Config, Fig2Config, Fig5Config, Fig6Config, PairConfig
@@ -13,46 +13,6 @@ if TYPE_CHECKING:  # numerical modules are imported when the command runs, so th
     from training.paper.fig3 import AlignedPair
 
 paper = typer.Typer(help="Reproduce figures of the paper.", no_args_is_help=True)
-
-
-@paper.command("fig6")
-@options(
-    Fig6Config, "paper fig6", continues=True, quick={"particles": (1, 10, 100), "seeds": 3, "length": 25.0},
-    quick_help="3 seeds, M = 1, 10, 100, and 25 m.",
-)  # fmt: skip
-def fig6(call: Call[Fig6Config], processes: Processes = 1, check: Check = False) -> None:
-    """Reproduce Fig. 6: step time and map error of one to three robots that share B measurements.
-
-    The filter is the paper's (`fastslam1`, unknown association, random resampling at every step), with large noise
-    relative to the odometry. Further regimes: similar landmarks with false points, and good stereo with both proposals
-    and with rejuvenation, for M = 10, 100, 1000. Map errors run in --processes at a time, times in one process. The
-    paper's claims are checked. Ctrl-C finishes the current trial and summarises the finished ones; the same command
-    with --out FOLDER resumes the run.
-    """
-    from training.experiments.run_folder import plain
-    from training.paper.fig6.claims import check_claims, robots_ratios, summarise, to_csv
-    from training.paper.fig6.report import draw_fig6, print_result
-    from training.paper.fig6.trials import ERRORS_FILE, TIMES_FILE, ErrorTrial, TimeTrial, cost, play_error, play_time
-
-    console, folder = call.begin()
-    parts = (
-        TrialSet(
-            file=ERRORS_FILE, kind=ErrorTrial, play=play_error, trials=call.config.error_trials(), processes=processes,
-            tell=lambda row: f"map errors: seed {row['seed']}, M={row['particles']}", cost=cost,
-        ),
-        TrialSet(
-            file=TIMES_FILE, kind=TimeTrial, play=play_time, trials=call.config.time_trials(),
-            tell=lambda row: f"times: seed {row['seed']}, M={row['particles']}", cost=cost,
-        ),
-    )  # fmt: skip
-    errors, times = run_trial_sets(console, folder, *parts, timed=True)
-    lines, ratios, claims = plain(summarise(errors, times)), plain(robots_ratios(errors)), check_claims(errors, times)
-    print_result(console, lines, ratios, claims)
-    call.write({"summary": lines, "robots_ratios": ratios, "claims": [claim.to_mapping() for claim in claims]})
-    folder.write_text("fig6.csv", to_csv(lines))
-    if lines:
-        draw_fig6(folder.path / "fig6.png", lines)
-    call.finish(check, [claim.holds for claim in claims])
 
 
 @paper.command("fig1")
@@ -175,3 +135,43 @@ def fig5(call: Call[Fig5Config]) -> None:
     console.print(f"Walls and robots hide {hidden} of {in_view} landmarks in view.")
     call.write({"robots": rows, "landmarks": len(found.landmarks)})
     call.finish()
+
+
+@paper.command("fig6")
+@options(
+    Fig6Config, "paper fig6", continues=True, quick={"particles": (1, 10, 100), "seeds": 3, "length": 25.0},
+    quick_help="3 seeds, M = 1, 10, 100, and 25 m.",
+)  # fmt: skip
+def fig6(call: Call[Fig6Config], workers: Workers = 1, check: Check = False) -> None:
+    """Reproduce Fig. 6: step time and map error of one to three robots that share B measurements.
+
+    The filter is the paper's (`fastslam1`, unknown association, random resampling at every step), with large noise
+    relative to the odometry. Further regimes: similar landmarks with false points, and good stereo with both proposals
+    and with rejuvenation, for M = 10, 100, 1000. Map errors run in --workers at a time, times in one process. The
+    paper's claims are checked. Ctrl-C finishes the current trial and summarises the finished ones; the same command
+    with --out FOLDER resumes the run.
+    """
+    from training.experiments.run_folder import plain
+    from training.paper.fig6.claims import check_claims, robots_ratios, summarise, to_csv
+    from training.paper.fig6.report import draw_fig6, print_result
+    from training.paper.fig6.trials import ERRORS_FILE, TIMES_FILE, ErrorTrial, TimeTrial, cost, play_error, play_time
+
+    console, folder = call.begin()
+    parts = (
+        TrialSet(
+            file=ERRORS_FILE, kind=ErrorTrial, play=play_error, trials=call.config.error_trials(), workers=workers,
+            tell=lambda row: f"map errors: seed {row['seed']}, M={row['particles']}", cost=cost,
+        ),
+        TrialSet(
+            file=TIMES_FILE, kind=TimeTrial, play=play_time, trials=call.config.time_trials(),
+            tell=lambda row: f"times: seed {row['seed']}, M={row['particles']}", cost=cost,
+        ),
+    )  # fmt: skip
+    errors, times = run_trial_sets(console, folder, *parts, timed=True)
+    lines, ratios, claims = plain(summarise(errors, times)), plain(robots_ratios(errors)), check_claims(errors, times)
+    print_result(console, lines, ratios, claims)
+    call.write({"summary": lines, "robots_ratios": ratios, "claims": [claim.to_mapping() for claim in claims]})
+    folder.write_text("fig6.csv", to_csv(lines))
+    if lines:
+        draw_fig6(folder.path / "fig6.png", lines)
+    call.finish(check, [claim.holds for claim in claims])

@@ -11,7 +11,7 @@ from training.commands._options import options
 from training.commands._progress import share_progress
 from training.commands._run_folder import Call
 from training.episodes.tables import print_consistency, print_refusals, write_maps
-from training.experiments.tables import console_table, number
+from training.experiments.tables import E_SCALE, console_table, number
 from training.replay.config import (
     KITTI,
     MRCLAM,
@@ -119,7 +119,7 @@ def _print_tables(console: Console, metrics: dict[str, Any], with_poses: set[int
     }  # fmt: skip
     maps = {
         f"RMSE (m),\n{aligned}": "map_rmse_m", "recall": "map_recall", "precision": "map_precision",
-        f"map error E (m),\nerrors cut at 1 m,\n{start}": "map_error",
+        f"E (m),\n{start}": "map_error",
     }  # fmt: skip
     for title, columns in (("Paths", paths), ("Maps", maps)):
         rows = [row for row in metrics["robots"] if any(row[key] is not None for key in columns.values())]
@@ -127,6 +127,8 @@ def _print_tables(console: Console, metrics: dict[str, Any], with_poses: set[int
         if rows:
             cells = [[str(row["robot"]), *(number(row[key]) for key in shown.values())] for row in rows]
             console.print(console_table(title, ("robot", *shown), cells))
+            if "map_error" in shown.values():
+                console.print(E_SCALE)
         unknown = [row["robot"] for row in metrics["robots"] if row not in rows]
         missed = [robot for robot in unknown if title == "Paths" and robot in with_poses]
         for robots, why in (

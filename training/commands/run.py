@@ -98,7 +98,7 @@ def live_progress(console: Console, num_steps: int, agents: Sequence[str]) -> It
     """Show a bar with the metrics of a running episode, and a line for each merge; yield the callback for a step."""
     columns = (
         TextColumn("{task.fields[time]:6.1f} s"), BarColumn(20), TextColumn("E {task.fields[errors]} m"),
-        TextColumn("{task.fields[coverage]:2.0f} % seen"), TextColumn("{task.fields[groups]} maps"),
+        TextColumn("coverage {task.fields[coverage]:2.0f} %"), TextColumn("{task.fields[groups]} maps"),
         TimeRemainingColumn(),
     )  # fmt: skip
     with Bar(*columns, console=console) as bar:
@@ -111,11 +111,22 @@ def live_progress(console: Console, num_steps: int, agents: Sequence[str]) -> It
                 infos = [progress.infos[agent] for agent in agents]
                 bar.update(
                     task, completed=progress.step, time=progress.time,
-                    errors=" ".join(f"{info['map_error']:.2f}" for info in infos),
+                    errors=errors_in_short([info["map_error"] for info in infos]),
                     coverage=100.0 * infos[0]["coverage"], groups=len({info["group"] for info in infos}),
                 )  # fmt: skip
 
         yield show
+
+
+def errors_in_short(errors: Sequence[float]) -> str:
+    """Return the map errors [m] of up to three robots, or mean and range of more.
+
+    >>> errors_in_short([0.5, 0.25]), errors_in_short([0.5, 0.25, 0.25, 0.0])
+    ('0.50 0.25', '0.25 (0.00 to 0.50)')
+    """
+    if len(errors) <= 3:
+        return " ".join(f"{error:.2f}" for error in errors)
+    return f"{sum(errors) / len(errors):.2f} ({min(errors):.2f} to {max(errors):.2f})"
 
 
 def describe(merge: "MergeRecord") -> str:

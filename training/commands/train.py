@@ -110,6 +110,9 @@ def _run_live(console: Console, training: "Training") -> tuple[bool, float]:
     if done >= total:
         console.print("This training is complete already.")
         return True, 0.0
+    if done:
+        rollouts = f"{len(training.rows)} of {config.updates} rollouts are finished"
+        console.print(f"Resuming: {rollouts}, {config.updates - len(training.rows)} are left.")
     with ExitStack() as stack:
         bar = stack.enter_context(Progress(*columns, console=console, expand=True, speed_estimate_period=300.0))
         status = _rollout_text(training.rows[-1]) if done else "first rollout"
@@ -135,6 +138,7 @@ def _rollout_text(row: "Row") -> str:
 
 def _finish(call: Call[TrainConfig], training: "Training", complete: bool, seconds: float) -> None:
     """Write and print the results of the training."""
+    from training.experiments.tables import E_SCALE
     from training.rl.curves import draw_learning, first_and_last_tenth, to_csv
 
     rows, console, folder = training.rows, call.console, call.folder
@@ -144,8 +148,9 @@ def _finish(call: Call[TrainConfig], training: "Training", complete: bool, secon
     first, last = ends["first"], ends["last"]
     console.print(
         f"Return in the first tenth {first['return']:.3f}, in the last {last['return']:.3f}; "
-        f"map error {first['map_error']:.3f} m, {last['map_error']:.3f} m."
+        f"E {first['map_error']:.3f} m, {last['map_error']:.3f} m."
     )
+    console.print(E_SCALE)
     call.write({"complete": complete, "decisions": int(rows[-1]["steps"]), "seconds_this_time": seconds, **ends})
     call.finish()
     if complete:

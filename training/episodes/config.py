@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from training.experiments.config import ONE_PARTICLE, ActionType, ExperimentConfig, NoisePreset, Sensor, option
 
@@ -18,6 +18,9 @@ class RunConfig(ExperimentConfig):
     """Configuration of a run; all robots have the same policy."""
 
     world: str = option("office", "World family or path; see vslam worlds list.")
+    world_split: Literal["train", "validation", "test"] | None = option(
+        None, "Split of the worlds: train, validation or test.", shown="any", hint="Choose one of these names."
+    )
     robots: int = option(3, "Number of robots, 1 to 8.", ge=1, le=8, hint="Use 1 to 8 robots.")
     policy: str = option(
         "frontier", "Policy by name (docs/how-to/exploration.md lists them), path of a trained model, or MODULE:NAME."
@@ -106,8 +109,8 @@ class RunConfig(ExperimentConfig):
         if self.rejuvenate_every is not None:
             assumed["rejuvenate_every"] = self.rejuvenate_every or None
         return preset_config(self.preset, self.sensor).replace(
-            belief={"filter": assumed}, world=self.world, num_robots=self.robots, action_type=self.action_type,
-            decision_ticks=self.decision_ticks, **self._limit,
+            belief={"filter": assumed}, world=self.world, world_split=self.world_split, num_robots=self.robots,
+            action_type=self.action_type, decision_ticks=self.decision_ticks, **self._limit,
         )  # fmt: skip
 
     def make_env(self) -> "ExplorationEnv":

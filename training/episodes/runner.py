@@ -1,6 +1,6 @@
 """Runner for one episode of an environment with given policies, and its record for tables and figures."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -15,6 +15,7 @@ from slam_backend.maps.alignment_types import PairAttempts, count_attempts
 from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.trajectory import dead_reckoning
 from training.episodes.guard import GuardedTeam
+from training.experiments.logs import LOGGER
 from vslam_env.belief.readings import Readings
 from vslam_env.config import TICK
 from vslam_env.environment import ExplorationEnv
@@ -132,6 +133,25 @@ def run_episode(
     return log.finish(np.array(odometry))
 
 
+def describe_event(event: MergeEvent, names: Sequence[int] | None = None) -> str:
+    """Describe an event of the team in one line.
+
+    Args:
+        names: Numbers of the robots; None: their indices.
+    """
+    sides = [", ".join(str(robot if names is None else names[robot]) for robot in side)
+             for side in (event.robots_a, event.robots_b)]  # fmt: skip
+    both = f"{sides[0]} and {sides[1]}"
+    shared = len(event.alignment.inliers)
+    if event.kind == "merge":
+        return f"maps of {both} merged on {shared} landmarks"
+    if event.kind == "undo":
+        return f"merge of {both} undone"
+    if event.alignment.success:
+        return f"maps of {both} aligned on {shared} landmarks"
+    return f"maps of {both} not aligned: {event.alignment.reason}"
+
+
 class _Log:
     """Collector of the record, step by step."""
 
@@ -167,6 +187,7 @@ class _Log:
                 self._alone_until.setdefault(robot, merge.time)
         self._merges.extend(merges)
         for event in events:
+            LOGGER.debug("%.1f s: %s", event.step * TICK, describe_event(event))
             if event.kind == "undo":
                 self._record_undo(event)
         return Progress(len(self._ticks) - 1, tick * TICK, infos, merges)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.table import Table
 
-from training.experiments.tables import console_table, number
+from training.experiments.tables import E_SCALE, console_table, number
 
 if TYPE_CHECKING:  # numerical modules are imported when the command runs, so that --help is fast
     from slam_backend.fastslam.consistency import Consistency
@@ -14,13 +14,15 @@ if TYPE_CHECKING:  # numerical modules are imported when the command runs, so th
     from slam_backend.maps.landmark_map import LandmarkMap
     from training.experiments.run_folder import RunFolder
 
-ROWS = (
-    ("map error E [m], errors cut at 1 m", "map_error", 3, 1.0),
-    ("map RMSE of matched landmarks [m]", "map_rmse_m", 3, 1.0), ("recall [%]", "map_recall", 1, 100.0),
-    ("precision [%]", "map_precision", 1, 100.0), ("ATE, aligned [m]", "ate_aligned_m", 3, 1.0),
-    ("   odometry's [m]", "dead_reckoning_ate_aligned_m", 3, 1.0), ("ATE, start frame [m]", "ate_start_m", 3, 1.0),
-    ("   odometry's [m]", "dead_reckoning_ate_start_m", 3, 1.0), ("path [m]", "path_m", 1, 1.0),
-    ("odometry's final error [% of path]", "dead_reckoning_end_percent", 1, 1.0),
+# Columns of the tables: heading, metric, digits, factor
+MAPS = (
+    ("E [m]", "map_error", 3, 1.0), ("RMSE [m]", "map_rmse_m", 3, 1.0), ("recall [%]", "map_recall", 1, 100.0),
+    ("precision [%]", "map_precision", 1, 100.0),
+)  # fmt: skip
+PATHS = (
+    ("ATE [m],\naligned", "ate_aligned_m", 3, 1.0), ("odometry's", "dead_reckoning_ate_aligned_m", 3, 1.0),
+    ("ATE [m],\nstart frame", "ate_start_m", 3, 1.0), ("odometry's", "dead_reckoning_ate_start_m", 3, 1.0),
+    ("path [m]", "path_m", 1, 1.0), ("odometry's\nend error [%]", "dead_reckoning_end_percent", 1, 1.0),
 )  # fmt: skip
 
 MISSED = {
@@ -37,12 +39,16 @@ MAP_COLUMNS = ("id", "count", "x_m", "y_m", "z_m", *(f"cov_{pair}_m2" for pair i
 
 
 def print_tables(console: Console, metrics: Mapping[str, Any]) -> None:
-    """Print the metrics of robots and team, then the merges."""
-    columns = {f"robot {robot}": row for robot, row in enumerate(metrics["robots"])} | {"team": metrics["team"]}
-    rows = [
-        [label, *(number(row[key], digits, factor) for row in columns.values())] for label, key, digits, factor in ROWS
-    ]
-    console.print(console_table("Maps and paths, each robot in its own start frame", ("", *columns), rows))
+    """Print the metrics of robots and team, a row for each, then the merges."""
+    lines = {str(robot): row for robot, row in enumerate(metrics["robots"])} | {"team": metrics["team"]}
+    for title, columns in (("Maps, each in its robot's start frame", MAPS), ("Paths", PATHS)):
+        rows = [
+            [name, *(number(row[key], digits, factor) for _, key, digits, factor in columns)]
+            for name, row in lines.items()
+        ]
+        console.print(console_table(title, ("robot", *(heading for heading, *_ in columns)), rows))
+        if columns is MAPS:
+            console.print(E_SCALE)
     if metrics["merges"]:
         console.print(_merges(metrics["merges"]))
     else:

@@ -34,20 +34,22 @@ HINTS = {int: "Choose a number in this range.", bool: "Say true or false.", str:
 
 
 def option(
-    default: Any, help: str, *, name: str | None = None, shown: str | None = None, hint: str = "",
+    default: Any, help: str, *, name: str | None = None, also: str = "", shown: str | None = None, hint: str = "",
     is_path: bool = False, is_argument: bool = False, **constraints: Any,
 ) -> Any:  # fmt: skip
     """Return a field that is also an option on the command line.
 
     Args:
         name: Name of the option, or two names with a slash for a flag; None: the name of the field.
+        also: Second spelling of the option, with its dashes.
         shown: Default as `--help` shows it; None: the value.
         hint: Advice in the error for a bad value; a full sentence.
         is_path: Whether the value is a path, which is made absolute.
         constraints: Bounds, as for `pydantic.Field`.
     """
     about: JsonDict = {
-        "option": name or "", "shown": shown, "hint": hint, "is_path": is_path, "is_argument": is_argument,
+        "option": name or "", "also": also, "shown": shown, "hint": hint, "is_path": is_path,
+        "is_argument": is_argument,
     }  # fmt: skip
     return Field(default, description=help, json_schema_extra=about, **constraints)
 

@@ -2,6 +2,7 @@
 
 import csv
 import io
+import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -10,6 +11,9 @@ from rich.markup import escape
 from rich.table import Table
 
 LARGE = 1e5  # numbers from here on have an exponent
+CUTOFF_M = 1.0  # errors of landmarks are cut here in the map error E [m]
+E_NOTHING = CUTOFF_M / math.sqrt(2.0)  # E of an empty map [m]
+E_SCALE = f"E: map error; 0 m = perfect map, {E_NOTHING:.2f} m = nothing found; errors are cut at {CUTOFF_M:g} m."
 
 
 def number(value: float | None, digits: int = 2, factor: float = 1.0) -> str:

@@ -76,7 +76,7 @@ def trial_of(row: Mapping[str, Any], kind: type[TrialT]) -> TrialT:
 
 
 def run_trials(
-    folder: RunFolder, name: str, play: Callable[[TrialT], dict[str, Any]], trials: Iterable[TrialT], processes: int,
+    folder: RunFolder, name: str, play: Callable[[TrialT], dict[str, Any]], trials: Iterable[TrialT], workers: int,
     interrupted: Callable[[], bool], on_trial: Callable[[dict[str, Any]], None],
 ) -> None:  # fmt: skip
     """Run trials and append each to the folder as it ends; after an interrupt, running trials are finished.
@@ -85,13 +85,13 @@ def run_trials(
 
     Args:
         play: Function that runs a trial and returns its row; importable by other processes.
-        processes: Number of parallel processes; 1: this process.
+        workers: Number of parallel processes; 1: this process.
 
     Raises:
         ValueError: If a row cannot be written; earlier rows are kept.
     """
     going = _until(interrupted, trials)
-    with closing(_in_turn(play, going) if processes == 1 else _spread(play, going, processes)) as rows:
+    with closing(_in_turn(play, going) if workers == 1 else _spread(play, going, workers)) as rows:
         for row in rows:
             kept = plain(row)
             if FAILED not in kept:
@@ -116,7 +116,7 @@ def _in_turn(
 
 
 def _spread(
-    play: Callable[[TrialT], dict[str, Any]], trials: Iterable[TrialT], processes: int
+    play: Callable[[TrialT], dict[str, Any]], trials: Iterable[TrialT], workers: int
 ) -> Generator[dict[str, Any], None, None]:
     """Run trials in several processes with one thread each, and yield their rows as they end.
 
@@ -124,13 +124,13 @@ def _spread(
     """
     context = get_context("spawn")
     others = set(active_children())
-    with one_thread_each(), ProcessPoolExecutor(processes, mp_context=context, initializer=begin_worker) as pool:
+    with one_thread_each(), ProcessPoolExecutor(workers, mp_context=context, initializer=begin_worker) as pool:
         try:
             running: set[Future[dict[str, Any]]] = set()
             for trial in trials:
                 with signals_held():
                     running.add(pool.submit(play, trial))  # starts a process if there are fewer than the maximum
-                while len(running) >= processes:
+                while len(running) >= workers:
                     done, running = wait(running, return_when=FIRST_COMPLETED)
                     yield from (future.result() for future in done)
             for future in running:

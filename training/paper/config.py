@@ -73,8 +73,9 @@ class Fig5Config(ExperimentConfig):
 
     robots: int = option(3, "Number of robots.", ge=1, le=8, hint="Use 1 to 8 robots.")
     decisions: int = option(
-        30, "Duration of the exploration before the figure [s].", ge=1, hint="Give at least one second."
-    )
+        30, "Simulated time of the exploration before the figure [s].", name="max_seconds", ge=1,
+        hint="Give at least one second.",
+    )  # fmt: skip
     measurements: int = option(
         5, "Maximum number of measurements B per robot and tick.", ge=1,
         hint="Use at least one measurement.",

@@ -57,7 +57,7 @@ class ReplayConfig(ExperimentConfig):
     duration: float | None = option(
         None, "Duration to replay [s].", shown="all", gt=0.0, hint="Give seconds, or omit it."
     )
-    estimator: Proposal = option("fastslam2", "Proposal: fastslam2 or fastslam1.")
+    estimator: Proposal = option("fastslam2", "Proposal: fastslam2 or fastslam1.", name="proposal")
     rejuvenate_every: int = option(
         REJUVENATE_EVERY, "Steps between rejuvenations of the particles from smoothed paths; 0: never.", ge=0,
         hint="Give a number of steps, or 0 for never.",

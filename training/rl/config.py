@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import Field
 
 from training.experiments.config import ExperimentConfig, NoisePreset, Positive, first_seed, option, setting
+from training.experiments.labels import check_labels, parted_label
 
 if TYPE_CHECKING:  # numerical modules are imported when a command runs, so that --help is fast
     from vslam_env.config import EnvConfig
@@ -114,8 +115,12 @@ class EvaluateConfig(ExperimentConfig):
     """Evaluation of a trained model and baseline policies; all decide at the interval of the training."""
 
     model: str = option(..., "Model of vslam train, or its run folder.", is_path=True, is_argument=True)
-    policies: tuple[str, ...] = option(("random_goals", "frontier"), "Baseline policies, comma-separated.")
-    split: Literal["validation", "test"] = option("validation", "Split of the worlds: validation or test.")
+    policies: tuple[str, ...] = option(
+        ("random_goals", "frontier"), "Baseline policies, comma-separated; LABEL= may come before each."
+    )
+    split: Literal["validation", "test"] = option(
+        "validation", "Split of the worlds: validation or test.", name="world_split"
+    )
     world: str | None = option(None, "World family or path.", shown="as in the training")
     robots: int | None = option(None, "Number of robots, 1 to 8.", shown="as in the training")
     max_cycles: int | None = option(None, "Number of decisions per episode.", shown="as in the training")
@@ -132,8 +137,9 @@ class EvaluateConfig(ExperimentConfig):
         from vslam_env.config import check_one_limit
 
         check_one_limit(self.max_cycles, self.max_seconds)
+        check_labels(self.policies)
         for name in self.policies:
-            make_policy(name, "goal")
+            make_policy(parted_label(name)[1], "goal")
 
     @classmethod
     def completed(cls, values: Mapping[str, Any]) -> Mapping[str, Any]:

@@ -12,8 +12,9 @@ from agents.policy import Policy
 from agents.registry import make_policy
 from agents.trained import TrainedGoalPolicy, load_model
 from training.episodes.runner import run_episode
+from training.experiments.labels import parted_label
 from training.experiments.statistics import format_ci, mean_ci, paired_difference, summarise_means
-from training.experiments.tables import console_table
+from training.experiments.tables import E_SCALE, console_table
 from training.rl.config import MODEL, EvaluateConfig, EvaluateTrial
 from vslam_env import vslam_v0
 from vslam_env.environment import ExplorationEnv
@@ -23,7 +24,7 @@ FIGURES = ("return", *LAST)
 
 Rows = Sequence[Mapping[str, Any]]
 SHOWN = {
-    "return": "return [m]", "map_error": "map error [m]", "map_recall": "recall", "coverage": "floor",
+    "return": "return [m]", "map_error": "E [m]", "map_recall": "recall", "coverage": "cover-\nage",
     "merges": "merges", "distance": "path [m]",
 }  # fmt: skip
 WITH_INTERVAL = ("return", "map_error")  # metrics.json has the intervals of all metrics
@@ -45,7 +46,9 @@ def _environment(config: EvaluateConfig) -> ExplorationEnv:
 
 
 def _policy(config: EvaluateConfig, name: str) -> Policy:
-    return TrainedGoalPolicy(load_model(config.model)[0], config.greedy) if name == MODEL else make_policy(name, "goal")
+    if name == MODEL:
+        return TrainedGoalPolicy(load_model(config.model)[0], config.greedy)
+    return make_policy(parted_label(name)[1], "goal")
 
 
 def summarise(rows: Rows) -> list[dict[str, Any]]:
@@ -72,6 +75,11 @@ def leads(rows: Rows) -> list[dict[str, Any]]:
     return found
 
 
+def _shown(policy: str) -> str:
+    """Return the label of a policy, or else the policy."""
+    return parted_label(policy)[0] or policy
+
+
 def print_evaluation(console: Console, lines: Rows, ahead: Rows, split: str | None) -> None:
     """Print a table that fits into 80 columns, and one line for each lead.
 
@@ -82,7 +90,7 @@ def print_evaluation(console: Console, lines: Rows, ahead: Rows, split: str | No
     episodes = "-".join(str(n) for n in (played if len(played) < 2 else (played[0], played[-1])))
     rows = [
         [
-            line["policy"],
+            _shown(line["policy"]),
             *(format_ci(line, name, stacked=True) if name in WITH_INTERVAL else f"{line[name]:.2f}" for name in SHOWN),
         ]
         for line in lines
@@ -94,9 +102,10 @@ def print_evaluation(console: Console, lines: Rows, ahead: Rows, split: str | No
     for column in table.columns[1:]:
         column.no_wrap = True
     console.print(table)
+    console.print(E_SCALE)
     for lead in ahead:
         console.print(
-            f"model - {lead['over']}: {format_ci(lead, 'lead')} m of return, ahead in {100.0 * lead['won']:.0f} % "
-            f"of {lead['seeds']} seeds",
+            f"model, paired difference to {_shown(lead['over'])}: {format_ci(lead, 'lead')} m of return, ahead in "
+            f"{100.0 * lead['won']:.0f} % of {lead['seeds']} seeds",
             soft_wrap=True,
         )

@@ -294,8 +294,8 @@ def test_failures_of_policies_are_reported(vslam: Any, tmp_path: Path, monkeypat
         "    def act(self, observation, belief, rng):\n        raise KeyError('way')\n"
     )  # fmt: skip
     monkeypatch.chdir(tmp_path)
-    arguments = ["bench", "accuracy", "--world", "fig5", "--duration", "2", "--particles", "5", "--seeds", "1"]
-    said = vslam(*arguments, "--policy", "lost:Lost,frontier", "--out", "run")
+    arguments = ["bench", "accuracy", "--worlds", "fig5", "--max-seconds", "2", "--particles", "5", "--seeds", "1"]
+    said = vslam(*arguments, "--policies", "lost:Lost,frontier", "--out", "run")
     assert said.status == 2
     assert "1 of 2 trials failed" in said.out
     (line,) = json.loads((tmp_path / "run" / "metrics.json").read_text())["summary"]
@@ -343,14 +343,14 @@ def test_cameras_change_in_the_world_and_in_the_filter() -> None:
 def test_options_without_effect_are_refused() -> None:
     """Options of one kind of trial are refused with the other, as are presets and policies that do not exist."""
     for values, match in (
-        ({"split": "any"}, "split: expected no value without --world, got 'any'"),
-        ({"duration": 9.0}, "duration: expected no value without --world, got 9"),
-        ({"baselines": (0.2,)}, "baseline: expected no value without --world"),
-        ({"presets": ("easy",)}, "preset: expected one of 'good', 'coarse', 'paper', got 'easy'"),
-        ({"worlds": ("office",), "lengths": (9.0,)}, "length: expected no value with --world"),
+        ({"split": "any"}, "world_split: expected no value without --worlds, got 'any'"),
+        ({"duration": 9.0}, "max_seconds: expected no value without --worlds, got 9"),
+        ({"baselines": (0.2,)}, "baselines: expected no value without --worlds"),
+        ({"presets": ("easy",)}, "presets: expected one of 'good', 'coarse', 'paper', got 'easy'"),
+        ({"worlds": ("office",), "lengths": (9.0,)}, "lengths: expected no value with --worlds"),
         (
             {"worlds": ("office",), "presets": ("good",)},
-            "preset: expected one of 'easy', 'standard', 'hard', got 'good'",
+            "presets: expected one of 'easy', 'standard', 'hard', got 'good'",
         ),
         ({"worlds": ("nowhere",)}, "world: expected one of 'office'"),
         ({"worlds": ("office",), "policies": ("magic",)}, "policy"),
@@ -364,7 +364,7 @@ def test_options_without_effect_are_refused() -> None:
 def test_the_command_resumes_and_writes_tables(vslam: Any, tmp_path: Path) -> None:
     """The command writes rows, metrics, tables and a figure; a stopped run continues; its config repeats it."""
     out, again = tmp_path / "first", tmp_path / "again"
-    arguments = ["bench", "accuracy", "--world", "fig5", "--duration", "2", "--particles", "5", "--seeds", "2"]
+    arguments = ["bench", "accuracy", "--worlds", "fig5", "--max-seconds", "2", "--particles", "5", "--seeds", "2"]
     arguments += ["--first-seed", "71"]
     said = vslam(*arguments, "--out", str(out), "--json", str(out / "copy.json"))
     assert said.status == 0, said.err

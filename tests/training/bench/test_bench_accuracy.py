@@ -245,7 +245,7 @@ def test_tables_and_figure(tmp_path: Path, rows: list[dict[str, Any]]) -> None:
 def test_the_command_from_end_to_end(vslam: Any, tmp_path: Path) -> None:
     """The command prints its tables, writes JSON, Markdown and figure, and resumes when called again."""
     out = tmp_path / "bench"
-    arguments = ["bench", "accuracy", "--seeds", "1", "--first-seed", "40", "--length", "3,5", "--methods"]
+    arguments = ["bench", "accuracy", "--seeds", "1", "--first-seed", "40", "--lengths", "3,5", "--methods"]
     arguments += ["dead_reckoning,fastslam2", "--particles", "7", "--out", str(out), "--json", str(out / "copy.json")]
     for _ in range(2):
         said = vslam(*arguments)

@@ -14,12 +14,14 @@ from rich.console import Console
 
 from training.bench.config import ExplorationBenchConfig, ExplorationTrial
 from training.bench.exploration import trials as exploration_trials
+from training.bench.exploration.players import parted
 from training.bench.exploration.report import (
     FIGURES,
     compare_oracles,
     compare_policies,
     curves,
     draw_exploration,
+    label,
     markdown,
     print_tables,
     summarise,
@@ -161,7 +163,7 @@ def test_policies_that_fail_do_not_stop_the_others(vslam: Any, own_policy: str, 
     names = ["frontier", *(f"{module}:{name}" for name in ("Failing", "Nonsense", "Slow"))]
     done = vslam(
         "bench", "exploration", "--policies", ",".join(names), "--worlds", "fig5", "--robots", "2", "--oracles", "none",
-        "--duration", "6", "--particles", "10", "--seeds", "2", "--decision-limit", "0.5", "--out", str(out),
+        "--max-seconds", "6", "--particles", "10", "--seeds", "2", "--decision-limit", "0.5", "--out", str(out),
     )  # fmt: skip
     assert done.status == 2
     lines = [line for line in done.out.splitlines() if line.startswith("error")]
@@ -254,7 +256,7 @@ def test_stored_trials_are_not_run_again(
     out = tmp_path / "run"
     command = (
         "bench", "exploration", "--policies", f"frontier,{own_policy}", "--worlds", "fig5", "--robots", "2",
-        "--oracles", "none", "--duration", "3", "--particles", "10", "--seeds", "2", "--first-seed", "200",
+        "--oracles", "none", "--max-seconds", "3", "--particles", "10", "--seeds", "2", "--first-seed", "200",
         "--out", str(out),
     )  # fmt: skip
     assert vslam(*command).status == 0
@@ -292,3 +294,17 @@ def test_paths_are_stored_absolute(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert config.environment(config.trials()[-1]).world_split is None  # a single layout has no splits
     assert config.environment(config.trials()[0]).world_split == "validation"
     assert ExplorationBenchConfig.from_mapping(config.to_mapping() | {"seed": 0}) == config
+
+
+def test_labels_name_policies_in_tables() -> None:
+    """`LABEL=POLICY` plays the policy and is shown by its label; one label for two policies is refused."""
+    player = parted("mine=frontier@discrete")
+    assert (player.name, player.action_type, player.role) == ("frontier", "discrete", "robot")
+    assert label("mine=frontier@discrete") == "mine@discrete"
+    assert label("best=oracles@bound") == "best@bound"  # bounds stay marked
+    config = ExplorationBenchConfig(policies=("a=frontier", "b=frontier"), seeds=1)
+    assert [trial.policy for trial in config.trials()[:2]] == ["a=frontier", "b=frontier"]
+    with pytest.raises(ValueError, match="policies: expected a different label for each policy, got 'a'"):
+        ExplorationBenchConfig(policies=("a=frontier", "a=random_goals"))
+    with pytest.raises(ValueError, match="policy: expected one of 'frontier'"):
+        ExplorationBenchConfig(policies=("a=unknown",))

@@ -16,7 +16,7 @@ from training.bench.scale.trials import CURVES, TRIALS_FILE, play, sharing_pairs
 from training.cli import app
 
 FEW = (
-    "bench", "scale", "--extents", "20,30", "--robots", "2", "--duration", "4", "--particles", "5", "--seeds", "1",
+    "bench", "scale", "--extents", "20,30", "--robots", "2", "--max-seconds", "4", "--particles", "5", "--seeds", "1",
     "--first-seed", "100",
 )  # fmt: skip
 

@@ -3,9 +3,12 @@ import subprocess
 import sys
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import pytest
+from typer.main import get_command
 
+import vslam_env
 from training import cli
 
 
@@ -20,9 +23,9 @@ def test_a_fault_of_the_program_keeps_its_traceback(monkeypatch: pytest.MonkeyPa
         cli.main()
 
 
-@pytest.mark.parametrize("module", ["training", "training.cli"])
+@pytest.mark.parametrize("module", ["training", "training.cli", "vslam_env"])
 def test_modules_run_the_command(module: str) -> None:
-    """`python -m training` and `python -m training.cli` have the output and exit status of `vslam`."""
+    """`python -m` of the packages and of the command line has the output and exit status of `vslam`."""
     for arguments, status, says in (
         (["--help"], 0, "Usage: vslam"),
         (["--version"], 0, f"vslam-env {version('vslam-env')}"),
@@ -54,3 +57,63 @@ def test_a_deleted_folder_gives_a_one_line_error(arguments: tuple[str, ...], tmp
     assert done.stderr.splitlines() == [expected]
     gone.mkdir()
     assert subprocess.run([*shell, "--help"], cwd=gone, env=environment, capture_output=True).returncode == 0
+
+
+def test_the_version_is_that_of_the_distribution() -> None:
+    """`vslam_env.__version__` is what `vslam --version` prints."""
+    assert vslam_env.__version__ == version("vslam-env")
+
+
+def test_figures_of_the_paper_are_listed_in_order() -> None:
+    """`vslam paper --help` lists fig1 to fig6."""
+    assert list(get_command(cli.app).commands["paper"].commands) == [f"fig{n}" for n in range(1, 7)]  # type: ignore[attr-defined]
+
+
+def test_words_mean_the_same_in_all_commands() -> None:
+    """No command has a second word for what others call --workers, --world-split, --proposal or --max-seconds."""
+    former = {"--processes", "--jobs", "--split", "--estimator", "--decisions", "--lookalikes"}
+    assert not former & {option for params in _options().values() for option in params}
+    lists = {"--world": "--worlds", "--policy": "--policies", "--preset": "--presets", "--length": "--lengths"}
+    for command, params in _options().items():
+        for one, many in lists.items():
+            assert not {one, many} <= params, f"{command} has {one} and {many}"
+
+
+def _options() -> dict[str, set[str]]:
+    """Return the options of all commands."""
+    found: dict[str, set[str]] = {}
+
+    def walk(command: Any, name: str) -> None:
+        for word, below in getattr(command, "commands", {}).items():
+            walk(below, f"{name} {word}")
+        found[name] = {option for param in command.params for option in param.opts}
+
+    walk(get_command(cli.app), "vslam")
+    return found
+
+
+def test_shells_complete_commands_options_and_names() -> None:
+    """Completion offers commands, options, and the names that an option takes, also after a comma."""
+    for words, wanted in (
+        ("vslam be", {"bench"}),
+        ("vslam run --max-s", {"--max-seconds"}),
+        ("vslam run --preset s", {"standard"}),
+        ("vslam bench exploration --oracles none,a", {"none,association", "none,all"}),
+    ):
+        environment = os.environ | {
+            "_VSLAM_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(len(words.split()) - 1),
+        }  # fmt: skip
+        done = subprocess.run(
+            [sys.executable, "-m", "training"], env=environment, capture_output=True, text=True, check=False
+        )
+        assert wanted <= set(done.stdout.split()), (words, done.stdout, done.stderr)
+
+
+def test_the_log_level_shows_what_a_run_does(vslam: Any, tmp_path: Path) -> None:
+    """With `--log-level debug` a run reports its folder on stderr; by default it does not."""
+    few = ("run", "--world", "fig5", "--robots", "1", "--max-cycles", "3", "--particles", "5", "--no-video")
+    for level, name in (("info", "loud"), ("warning", "calm")):
+        said = vslam("--log-level", level, *few, "--out", str(tmp_path / name))
+        assert said.status == 0
+        assert ("configuration in" in said.err) is (level == "info")
+    assert "log-level" in vslam("--log-level", "loud", *few).err

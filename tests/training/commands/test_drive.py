@@ -121,4 +121,4 @@ def test_the_command_records_a_video(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     result = runner.invoke(app, arguments)
     assert result.exit_code == 0, result.output
     assert film.stat().st_size > 1000
-    assert "robot_1: map error" in result.output
+    assert "robot_1: E " in result.output

@@ -24,7 +24,7 @@ LEAST = {
     "replay victoria": ("--path", "park", "--duration", "6", "--particles", "3"),
     "replay kitti": ("--path", "drive", "--duration", "6", "--particles", "3"),
     "replay stereo": (),
-    "bench accuracy": ("--seeds", "1", *SEED, "--length", "2", "--methods", "fastslam2", "--particles", "5"),
+    "bench accuracy": ("--seeds", "1", *SEED, "--lengths", "2", "--methods", "fastslam2", "--particles", "5"),
     "bench filter": (
         "--particles", "5", "--landmarks", "40", "--measurements", "3", "--robots", "1", "--steps", "2",
     ),
@@ -33,11 +33,11 @@ LEAST = {
         "--robots", "1", "--particles", "5", "--worlds", "fig5", "--modes", "flat", "--steps", "2", "--no-peer",
     ),
     "bench exploration": (
-        "--policies", "frontier", "--worlds", "fig5", "--robots", "1", "--oracles", "none", "--duration", "2",
+        "--policies", "frontier", "--worlds", "fig5", "--robots", "1", "--oracles", "none", "--max-seconds", "2",
         "--particles", "5", "--seeds", "1", *SEED,
     ),
     "bench scale": (
-        "--extents", "20", "--robots", "1", "--duration", "2", "--particles", "5", "--seeds", "1", *SEED,
+        "--extents", "20", "--robots", "1", "--max-seconds", "2", "--particles", "5", "--seeds", "1", *SEED,
     ),
     "bench start": ("--parts", "count", "--repeats", "1"),
     "bench train": ("--world", "fig5", "--robots", "1", "--envs", "1", "--workers", "0", "--steps", "2"),
@@ -47,7 +47,7 @@ LEAST = {
     "paper fig2": ("--seeds", "1", "--length", "5", "--every", "5", "--particles", "5", *SEED),
     "paper fig3": ("--seed", "100", "--length", "20", "--particles", "20"),
     "paper fig4": ("--seed", "100", "--length", "20", "--particles", "20"),
-    "paper fig5": ("--robots", "1", "--decisions", "1"),
+    "paper fig5": ("--robots", "1", "--max-seconds", "1"),
     "paper fig6": ("--seeds", "1", "--robots", "1", "--particles", "3", "--length", "2", "--regimes", "good", *SEED),
 }  # fmt: skip
 LEARNING = ("train", "evaluate", "bench train")
@@ -126,9 +126,10 @@ class Loud:
 def test_output_of_workers_goes_to_stderr(closed: bool, tmp_path: Path) -> None:
     """Output of a policy in a worker process, by print or to the descriptor of stdout, goes to stderr."""
     (tmp_path / "loud.py").write_text(LOUD)
-    arguments = ["--policies", "frontier,loud:Loud", "--processes", "2", "--json", "-", "--out", str(tmp_path / "run")]
+    arguments = ["--policies", "frontier,loud:Loud", "--workers", "2", "--json", "-", "--out", str(tmp_path / "run")]
     few = [
-        "--worlds", "fig5", "--robots", "1", "--oracles", "none", "--duration", "2", "--particles", "5", "--seeds", "1",
+        "--worlds", "fig5", "--robots", "1", "--oracles", "none", "--max-seconds", "2", "--particles", "5",
+        "--seeds", "1",
     ]  # fmt: skip
     command = [sys.executable, "-m", "training", "bench", "exploration", *arguments, *few]
     shell = ["sh", "-c", 'exec "$@" 2>&-', "sh", *command] if closed else command

@@ -183,6 +183,7 @@ def test_a_stopped_command_can_be_resumed(tmp_path: Path) -> None:
     assert [[row["seed"] for row in own] for own in rows] == [[0, 1], []]
     assert f"Stopped after 2 of 5 trials; resume with --out {folder.path}." in shown.export_text()
     rows = run_trial_sets(shown, folder, *parts)
+    assert f"Resuming {folder.path}: 2 of 5 trials are finished, 3 are left." in shown.export_text(clear=False)
     assert played == [0, 1, 2]
     assert [[row["square"] for row in own] for own in rows] == [[0, 1, 4], [25, 36]]
     assert "Stopped" not in shown.export_text()

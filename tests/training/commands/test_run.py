@@ -14,7 +14,7 @@ from rich.console import Console
 from slam_backend.geometry import between, compose
 from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.trajectory import Trajectory
-from training.commands.run import describe, live_progress
+from training.commands.run import describe, errors_in_short, live_progress
 from training.episodes.config import EPISODE_S, RunConfig
 from training.episodes.figures import draw_errors, draw_maps
 from training.episodes.metrics import score_episode
@@ -177,7 +177,7 @@ def test_tables_show_unknown_values_as_a_dash(record: EpisodeRecord) -> None:
     print_tables(console, metrics)
     console.file.close()
     text = console.export_text()
-    for word in ("map error E [m], errors cut at 1 m", "error [deg]", "false", " - ", "robot 1", "team"):
+    for word in ("E [m]", "0.71 m = nothing found", "error [deg]", "false", " - ", "robot", "team"):
         assert word in text
 
 
@@ -189,6 +189,35 @@ def test_merges_are_printed_live(record: EpisodeRecord) -> None:
         with live_progress(console, STEPS, list(infos)) as show:
             show(Progress(5, 0.5, infos, record.merges))
     assert "maps of 0 and 1 merged" in console.export_text()
+
+
+def test_tables_of_eight_robots_fit_into_80_columns(record: EpisodeRecord) -> None:
+    """Each robot has a row with all metrics, also at 80 columns and with large numbers."""
+    metrics = score_episode(record)
+    row = metrics["robots"][0] | {"path_m": 1234.5, "ate_start_m": 12.345}
+    with open("/dev/null", "w") as nowhere:
+        console = Console(width=80, record=True, file=nowhere)
+        print_tables(console, metrics | {"robots": [row] * 8, "merges": []})
+    lines = console.export_text().splitlines()
+    assert max(map(len, lines)) <= 80
+    rows = [line.split() for line in lines if line.split()[:1] in ([str(robot)] for robot in range(8))]
+    assert [len(cells) for cells in rows] == [5] * 8 + [7] * 8
+    assert rows[8][3] == "12.345"
+
+
+def test_the_bar_of_eight_robots_has_mean_and_range() -> None:
+    """Map errors of many robots are shown in short; those of three are listed."""
+    assert errors_in_short([0.1, 0.2, 0.3]) == "0.10 0.20 0.30"
+    assert errors_in_short([0.7] * 7 + [0.3]) == "0.65 (0.30 to 0.70)"
+
+
+def test_a_run_takes_worlds_of_a_split() -> None:
+    """`world_split` reaches the environment and the run folder; other names are refused."""
+    config = RunConfig(world="maze", world_split="test", robots=1)
+    assert config.environment().world_split == "test"
+    assert config.to_mapping()["world_split"] == "test"
+    with pytest.raises(ValueError, match="world_split: expected one of 'train', 'validation', 'test', got 'any'"):
+        RunConfig(world_split="any")
 
 
 SHORT = ("--robots", "2", "--particles", "11", "--max-cycles", "23", "--world", "fig5")

@@ -119,7 +119,10 @@ BAD: dict[type[ExperimentConfig], dict[str, dict[Any, str]]] = {
     },
 }  # fmt: skip
 # Fields whose options have other names, which errors use.
-OPTIONS = {"seed": "first_seed", "presets": "preset", "associations": "association", "lengths": "length"}
+OPTIONS = {
+    "seed": "first_seed", "lengths": "length", "split": "world_split", "estimator": "proposal",
+    "lookalikes": "look_alikes", "duration": "max_seconds", "decisions": "max_seconds",
+}  # fmt: skip
 BAD_VALUES = [
     pytest.param(kind, name, value, expected, id=f"{kind.__name__}-{name}-{value}")
     for kind, names in BAD.items()

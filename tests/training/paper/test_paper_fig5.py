@@ -73,7 +73,7 @@ def test_the_table_matches_the_figure(found: Fig5) -> None:
 def test_the_command_writes_picture_and_table(tmp_path: Path) -> None:
     """The run folder has a PNG with the robots' colours, the CSV, and numbers per robot."""
     out = tmp_path / "run"
-    arguments = ["--robots", "2", "--decisions", "2", "--seed", "3", "--out", str(out)]
+    arguments = ["--robots", "2", "--max-seconds", "2", "--seed", "3", "--out", str(out)]
     result = runner.invoke(app, ["paper", "fig5", *arguments])
     assert result.exit_code == 0, result.output
     picture = cv2.imread(str(out / "fig5.png"))

@@ -332,7 +332,7 @@ def test_commands_train_resume_evaluate_and_run(tmp_path: Path, monkeypatch: pyt
 
     plan = tmp_path / "plan.png"
     cv2.imwrite(str(plan), np.pad(np.full((200, 300), 255, np.uint8), 5))
-    result = runner.invoke(app, ["evaluate", str(out), "--world", str(plan), "--split", "test"])
+    result = runner.invoke(app, ["evaluate", str(out), "--world", str(plan), "--world-split", "test"])
     assert "split: expected a world family or folder" in str(result.exception)
 
     played = tmp_path / "played"

@@ -117,7 +117,7 @@ def tables(lines: Sequence[Line]) -> list[Table]:
         ),
         (
             "Associations, map, worst seed",
-            ["world", "wrong [%]", "unused [%]", "copies", "map RMS [m]", "worst [m]", "its seed", "way [m]"], matches,
+            ["world", "wrong [%]", "unused [%]", "copies", "map RMS [m]", "worst [m]", "its seed", "path [m]"], matches,
         ),
     ]  # fmt: skip
 

@@ -6,6 +6,7 @@ from agents.bounds import BOUNDS, make_bound
 from agents.registry import action_types, make_policy, make_team_policy
 from slam_backend.core.validation import check_choice
 from training.episodes.guard import GuardedTeam
+from training.experiments.labels import parted_label
 from vslam_env.environment import ExplorationEnv
 
 ROBOT, TEAM, BOUND = "robot", "team", "bound"
@@ -55,7 +56,7 @@ class Player(NamedTuple):
 def parted(label: str) -> Player:
     """Return the policy of a label: `goal` if the policy supports it, unless `@` selects another action type.
 
-    `NAME@team` is the central team policy, `NAME@bound` a bound.
+    `NAME@team` is the central team policy, `NAME@bound` a bound; `LABEL=` may come first.
 
     Raises:
         ValueError: If there is no such policy, or it does not support the action type.
@@ -63,7 +64,8 @@ def parted(label: str) -> Player:
     >>> parted("mtsp@team").role, parted("frontier@discrete").action_type, parted("random_walk").action_type
     ('team', 'discrete', 'continuous')
     """
-    name, at, wanted = label.rpartition("@") if "@" in label else (label, "", "")
+    _, policy = parted_label(label)
+    name, at, wanted = policy.rpartition("@") if "@" in policy else (policy, "", "")
     if wanted == BOUND:
         hint = "Choose one of these; policies have no @bound."
         return Player(label, check_choice("bound", name, BOUNDS, hint), "goal", BOUND)

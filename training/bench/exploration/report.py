@@ -13,9 +13,10 @@ from agents.plugins import is_plugin
 from agents.trained import MODEL_FILE
 from training.bench.config import NO_ORACLE
 from training.bench.exploration.trials import CURVES, TEAM
+from training.experiments.labels import parted_label
 from training.experiments.plotting import save_png
 from training.experiments.statistics import format_ci, grouped, mean_ci, mean_curves, paired_difference, summarise_means
-from training.experiments.tables import console_table, csv_text, markdown_table
+from training.experiments.tables import E_SCALE, console_table, csv_text, markdown_table
 
 Rows = Sequence[Mapping[str, Any]]
 PLACE = ("world", "robots", "oracle")
@@ -34,7 +35,7 @@ COMPARED = {
 PRINTED = ("mean_coverage", "below_90_s", "map_error", "map_recall", "pose_error")  # fit into 80 columns
 BELOW = "\n  "  # separator that puts the oracle on its own line
 CURVE_PANELS = {
-    "coverage": ("floor seen [%]", 100.0), "map_error": ("map error E [m]", 1.0), "pose_error": ("pose error [m]", 1.0),
+    "coverage": ("coverage [%]", 100.0), "map_error": ("map error E [m]", 1.0), "pose_error": ("pose error [m]", 1.0),
 }  # fmt: skip
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7f7f7f")  # safe for colour-blind readers
 STYLES = ("-", "--", ":", "-.")
@@ -64,8 +65,8 @@ IN_SHORT = (
 )  # fmt: skip
 PARTS: dict[str, tuple[Column, ...]] = {
     "coverage": (
-        Column("floor seen [%]", "coverage", 1, 100.0, True), OVER_TIME, BELOW_90,
-        Column("90 % reached [%]", "reached_90", 0, 100.0), Column("distance [m]", "way_m", 0),
+        Column("coverage [%]", "coverage", 1, 100.0, True), OVER_TIME, BELOW_90,
+        Column("90 % reached [%]", "reached_90", 0, 100.0), Column("path [m]", "way_m", 0),
     ),
     "maps and poses": (
         Column("E [m]", "map_error", 3, 1.0, True), Column("RMSE [m]", "map_rmse_m", 3, 1.0, True),
@@ -140,9 +141,13 @@ def _differences(line: Mapping[str, Any], own: Rows, other: Rows) -> list[dict[s
 def label(name: str) -> str:
     """Return the label of a policy or a world for tables and figures: a path is given without its folders.
 
-    >>> label("runs/train-0-1"), label("runs/train-0-1/model.npz"), label("random_goals")
-    ('train-0-1', 'train-0-1/model.npz', 'random_goals')
+    >>> label("runs/train-0-1"), label("runs/train-0-1/model.npz"), label("mine=look_again:LookAgain@discrete")
+    ('train-0-1', 'train-0-1/model.npz', 'mine@discrete')
     """
+    given, policy = parted_label(name)
+    if given:
+        _, at, suffix = policy.rpartition("@")
+        return f"{given}{at}{suffix}" if at else given
     path = Path(name)
     if is_plugin(name):
         return name
@@ -154,6 +159,7 @@ def print_tables(console: Console, lines: Rows, policies: Rows, oracles: Rows) -
     for title, own, comparisons in _places(lines, policies, oracles):
         rows = [[who, *(column.cell(line, True) for column in IN_SHORT)] for who, line in _named(own, BELOW)]
         console.print(console_table(title, _stacked(column.heading for column in IN_SHORT), rows))
+        console.print(E_SCALE)
         for heading, differences in comparisons:
             cells = _difference_rows(differences, PRINTED, True)
             headings = _stacked(COMPARED[name][1] for name in PRINTED)
@@ -164,7 +170,7 @@ def markdown(lines: Rows, policies: Rows, oracles: Rows) -> str:
     """Return all metrics and differences as Markdown."""
     parts = []
     for place, own, comparisons in _places(lines, policies, oracles):
-        parts.append(f"### {place}\n")
+        parts.append(f"### {place}\n\n{E_SCALE}\n")
         for title, columns in PARTS.items():
             rows = [[who, *(column.cell(line) for column in columns)] for who, line in _named(own)]
             parts.append(markdown_table([title, *(column.heading for column in columns)], rows))
@@ -206,9 +212,9 @@ def _places(lines: Rows, policies: Rows, oracles: Rows) -> Iterator[tuple[str, R
         count = f"{seeds[0]}-{seeds[-1]} seeds" if len(seeds) > 1 else f"{seeds[0]} seed{'s' if seeds[0] > 1 else ''}"
         comparisons: list[tuple[str, Rows]] = []
         if by_policy := grouped(policies, place).get((world, robots)):
-            comparisons.append((f"minus {label(by_policy[0]['than'])}, paired", by_policy))
+            comparisons.append((f"paired difference to {label(by_policy[0]['than'])}", by_policy))
         if by_oracle := grouped(oracles, place).get((world, robots)):
-            comparisons.append(("with minus without oracle, paired", by_oracle))
+            comparisons.append(("paired difference to no oracle", by_oracle))
         yield f"{label(world)}, K={robots}, {count}", own, comparisons
 
 

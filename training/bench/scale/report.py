@@ -32,14 +32,14 @@ SPEED = (
     Column("memory [MB]", "memory_mb", 0), Column("reset [s]", "reset_s", 1),
 )  # fmt: skip
 RESULTS = (
-    Column("floor seen [%]", "coverage", 1, 100.0, True), Column("landmarks", "landmarks", 0),
+    Column("coverage [%]", "coverage", 1, 100.0, True), Column("landmarks", "landmarks", 0),
     Column("pose [m]", "pose_error", 2, 1.0, True), Column("E [m]", "map_error", 2, 1.0, True),
     Column("RMSE [m]", "map_rmse_m", 2), Column("recall [%]", "map_recall", 1, 100.0),
     Column("right", "right_merges", 1), Column("false", "false_merges", 1), Column("undone", "undone_merges", 1),
     Column("pairs to merge", "sharing_pairs", 1), Column("merged", "merged_pairs", 1),
 )  # fmt: skip
 IN_SHORT = (SPEED[1], SPEED[4], SPEED[5], SPEED[8], Column("seen [%]", "coverage", 1, 100.0), RESULTS[2], RESULTS[6])
-OVER_TIME = {"coverage": ("floor seen [%]", 100.0), "step_ms": ("median step [ms]", 1.0)}
+OVER_TIME = {"coverage": ("coverage [%]", 100.0), "step_ms": ("median step [ms]", 1.0)}
 OVER_EXTENT = {
     "longest_ms": ("longest step [ms]", 1.0), "get_state_ms": ("get_state [ms]", 1.0),
     "snapshot_mb": ("snapshot [MB]", 1.0), "pose_error": ("pose error [m]", 1.0),
