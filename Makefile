@@ -4,18 +4,21 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: demo test test-all lint metrics kernels-wheel clients compat clean
+.PHONY: demo test test-all checks lint kernels metrics kernels-wheel clients compat clean
 
 demo: $(VENV)/.core  ## run three robots that explore an office, build maps and merge them; writes a folder under runs/
 	$(BIN)/vslam run --world office --robots 3 --policy frontier --seed 0
 
 PYTEST := -m pytest --numprocesses auto --maxprocesses 4 --dist worksteal
 
-test: lint  ## linters, and all tests that are not marked slow
+test: checks  ## linters, and all tests that are not marked slow
 	$(BIN)/python $(PYTEST) -m "not slow"
 
-test-all: lint  ## linters and all tests
+test-all: checks  ## linters and all tests
 	$(BIN)/python $(PYTEST)
+
+checks: $(VENV)/.dev  # linters, and meanwhile the compilation of the kernels
+	@$(MAKE) --no-print-directory --jobs 2 kernels lint
 
 lint: $(VENV)/.dev  ## style, types, the direction of imports, and prose
 	$(BIN)/ruff check .
@@ -23,6 +26,9 @@ lint: $(VENV)/.dev  ## style, types, the direction of imports, and prose
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python benchmarks/prose.py
+
+kernels: $(VENV)/.dev  ## compile all kernels
+	$(BIN)/vslam warm-up --all
 
 metrics: $(VENV)/.core  ## metrics of the code: sizes, folders, path of a measurement, private accesses, import cycles
 	$(BIN)/python benchmarks/code_metrics.py

@@ -23,6 +23,11 @@ def pytest_sessionstart(session: pytest.Session) -> None:
             reporter.write_line(done.stdout.strip() or done.stderr)
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the slow tests, so that no worker is left alone with one at the end."""
+    items.sort(key=lambda item: item.get_closest_marker("slow") is None)
+
+
 def pytest_collection_finish() -> None:
     """Spare the garbage collector the million objects of imported packages: tests that time or trace collect often."""
     gc.collect()

@@ -1,6 +1,7 @@
 """Learning signal of rewards: advantages by hand, relative choices, discounted returns, tables."""
 
 import importlib.util
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -107,8 +108,9 @@ def test_the_table_compares_with_the_frontier() -> None:
 
 
 @pytest.mark.slow
-def test_returns_are_printed(capsys: pytest.CaptureFixture[str]) -> None:
-    """In two episodes each the frontier has the largest default reward in each line."""
+def test_returns_are_printed(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """In two short episodes each the frontier has the largest default reward in each line."""
+    monkeypatch.setattr(learning_signal.vslam_v0, "parallel_env", partial(vslam_v0.parallel_env, max_cycles=400))
     learning_signal.returns(seeds=2)
     lines = [line.split(" | ") for line in capsys.readouterr().out.splitlines() if line.startswith("| default")]
     assert len(lines) == len(learning_signal.PLAYERS)

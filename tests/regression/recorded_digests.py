@@ -34,6 +34,7 @@ DATA = Path(os.environ.get("VSLAM_DATA", ROOT.parent / "shared" / "data"))
 LIBRARIES = ("numpy", "scipy", "numba", "llvmlite", "opencv-python-headless", "pymunk")
 NOT_RESULTS = {"config", "versions", "seed"}  # tables of metrics.json
 STEPS, STEREO_STEPS = 300, 40
+ALIGNMENT = "align and fuse"
 FALSE_MERGE, FALSE_MERGE_STEP = "fig5, undone merge", 60
 
 SHORT_RANGE = {"comm_range": 6.0, "comm_line_of_sight": True}
@@ -76,13 +77,21 @@ def environment() -> dict[str, str]:
     } | {name: version(name) for name in LIBRARIES}
 
 
+def names() -> list[str]:
+    """Return the names of all that is computed; replays are left out where the data are not there."""
+    return [*EPISODES, ALIGNMENT, *commands()]
+
+
+def digests_of(name: str) -> dict[str, str]:
+    """Compute an episode, the alignment or a command; return its digests by name."""
+    if name in EPISODES:
+        return {f"{name}: {part}": digest for part, digest in play(name).items()}
+    return {name: align_and_fuse() if name == ALIGNMENT else run_command(commands()[name])}
+
+
 def all_digests() -> dict[str, str]:
-    """Compute all digests; those of replays are left out where the data are not there."""
-    found = {f"{name}: {part}": digest for name in EPISODES for part, digest in play(name).items()}
-    found["align and fuse"] = align_and_fuse()
-    for name, arguments in commands().items():
-        found[name] = run_command(arguments)
-    return found
+    """Compute all digests."""
+    return {part: digest for name in names() for part, digest in digests_of(name).items()}
 
 
 def play(name: str) -> dict[str, str]:

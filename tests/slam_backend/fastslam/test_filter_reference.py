@@ -243,16 +243,16 @@ def test_compiled_filter_equals_the_plain_one(happened: Counter[str]) -> None:
 
 @pytest.mark.slow
 def test_compiled_filter_equals_the_plain_one_in_many_worlds(happened: Counter[str]) -> None:
-    """The same over some thousand steps, with all combinations of options and of arguments."""
-    happened.update(run_worlds(range(2000, 2120), (1, 2, 3, 5, 7), 7, 14))
-    assert min(happened[kind] for kind in KINDS) > 50, happened
-    assert happened["steps"] == 120 * 14
+    """The same over hundreds of steps, with all combinations of options and of arguments."""
+    happened.update(run_worlds(range(2000, 2060), (1, 2, 3, 5, 7), 7, 14))
+    assert min(happened[kind] for kind in KINDS) > 15, happened
+    assert happened["steps"] == 60 * 14
 
 
 @pytest.mark.slow
 def test_compiled_filter_equals_the_plain_one_in_a_crowd(happened: Counter[str]) -> None:
     """The same with up to a hundred particles and twenty measurements in a frame."""
-    happened.update(run_worlds(range(3000, 3006), (33, 100), 20, 3))
+    happened.update(run_worlds(range(3000, 3004), (33, 100), 20, 3))
     assert min(happened[kind] for kind in ("matched", "new", "resampled", "frames of fifteen and more")) > 5, happened
 
 
