@@ -100,7 +100,7 @@ class AccuracyConfig(ExperimentConfig):
         hint="Give seconds.",
     )  # fmt: skip
     rejuvenate_every: int | None = option(
-        None, "Ticks between rejuvenations of the particles in --worlds; 0: never.", shown="100", ge=0
+        None, "Ticks between rejuvenations of the particles in --worlds; 0: never.", shown="50", ge=0
     )
     max_ranges: tuple[Annotated[float, Field(gt=0.0)], ...] | None = option(
         None, "Ranges of the camera in --worlds [m].", shown="8", hint="Give metres."
@@ -361,7 +361,7 @@ class ExplorationBenchConfig(ExperimentConfig):
     )
     particles: int = option(100, "Number of particles per filter.", ge=1, hint=ONE_PARTICLE)
     rejuvenate_every: int | None = option(
-        None, "Ticks between rejuvenations of the particles; 0: never.", shown="100", ge=0
+        None, "Ticks between rejuvenations of the particles; 0: never.", shown="50", ge=0
     )
     preset: NoisePreset = option("standard", "Noise preset: easy, standard or hard.")
     sensor: Sensor = option("landmark", "Sensor: landmark, or stereo (rendered images).")

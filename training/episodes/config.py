@@ -36,7 +36,7 @@ class RunConfig(ExperimentConfig):
     )
     particles: int = option(100, "Number of particles per filter.", ge=1, hint=ONE_PARTICLE)
     rejuvenate_every: int | None = option(
-        None, "Ticks between rejuvenations of the particles; 0: never.", shown="100", ge=0,
+        None, "Ticks between rejuvenations of the particles; 0: never.", shown="50", ge=0,
         hint="Give a number of ticks, or 0 for never.",
     )  # fmt: skip
     preset: NoisePreset = option("standard", "Noise preset: easy, standard or hard.")

@@ -21,6 +21,7 @@ from training.bench.accuracy.losses import (
     LOSSES,
     Associations,
     build_problem,
+    count_revisits,
     estimates,
     fusions_of_merges,
     play,
@@ -280,10 +281,27 @@ def test_trials_report_errors_and_associations(rows: list[dict[str, Any]]) -> No
         assert 0.0 <= row["wrong_match_share"] <= 1.0
         assert 0.0 <= row["unused_share"] <= 1.0
         assert row["copies_per_landmark"] >= 1.0
+        assert 0 <= row["missed_revisits"] <= row["revisits"]
         assert row["duration_s"] == pytest.approx(4.0)
         assert json.loads(json.dumps(row)) == row
     again = play(SMALL, SMALL.episodes()[0])
     assert {**again, "seconds": 0.0} == {**rows[0], "seconds": 0.0}
+
+
+def test_revisits_are_missed_where_no_measurement_has_an_earlier_label() -> None:
+    """A visit ends after 100 ticks without a measurement; a match may follow a rejection in the same visit."""
+    seen = {  # tick: (true landmark, label) of the measurements of robot 0; robot 1 sees landmark 7 once
+        0: [(7, 0), (8, 1), (-1, 2)], 90: [(7, 0)], 195: [(7, -1)], 196: [(7, 0)], 200: [(8, 5), (9, 6)],
+        301: [(8, 1)], 320: [(9, -1)],
+    }  # fmt: skip
+    truths, labels = (
+        [[np.array([pair[k] for pair in seen.get(tick, [])], dtype=np.int64), np.array([7 - 7 * k] * (tick == 250))]
+         for tick in range(330)]
+        for k in (0, 1)
+    )  # fmt: skip
+    # 7 again at 195: found in the next tick. 8 at 200: a new landmark; at 301: found. 9 at 320: rejected.
+    assert count_revisits(truths, labels) == {"revisits": 4, "missed_revisits": 2}
+    assert count_revisits([], []) == {"revisits": 0, "missed_revisits": 0}
 
 
 def test_failures_of_policies_are_reported(vslam: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

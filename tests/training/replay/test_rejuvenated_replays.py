@@ -13,7 +13,7 @@ from slam_backend.fastslam import rejuvenation as _rejuvenation_step
 from slam_backend.fastslam.reports import RejuvenationReport
 from training.commands.replay import _rejuvenations
 from training.episodes.config import RunConfig
-from training.replay.config import ImagesConfig, KittiConfig, MrclamConfig, VictoriaConfig
+from training.replay.config import REJUVENATE_EVERY, ImagesConfig, KittiConfig, MrclamConfig, VictoriaConfig
 from training.replay.single_robot import RejuvenationCount
 from vslam_env.config import EnvConfig
 from vslam_env.presets import preset_config
@@ -79,11 +79,10 @@ def test_a_replay_is_rejuvenated_and_repeats_itself(
     assert first == second
 
 
-def test_replays_and_environments_have_the_same_default_interval() -> None:
-    """The default is the interval of the environments' filters."""
-    usual = preset_config("standard").belief.filter.rejuvenate_every
+def test_replays_have_one_default_interval() -> None:
+    """Replays of all kinds of logs are rejuvenated after the same number of steps."""
     for config in (MrclamConfig, VictoriaConfig, KittiConfig, ImagesConfig):
-        assert config(path="log").rejuvenate_every == usual
+        assert config(path="log").rejuvenate_every == REJUVENATE_EVERY > 0
 
 
 @pytest.mark.parametrize("command", WRITERS)

@@ -28,6 +28,7 @@ from vslam_env import vslam_v0
 from vslam_env.world import OdometryNoise
 
 EPISODES_FILE = "episodes.jsonl"
+LONG_UNSEEN = 100  # ticks without a measurement after which a landmark is seen again
 LONGEST_DECISION = 600.0  # [s]
 LEAST_SIGMA = 1e-4  # [m, rad]; lower limit of claimed standard deviations: robots at their start know their pose
 TRUE_FLOOR = 2e-5  # [m, rad] of true odometry noise in a tick, which is 0 for robots at rest
@@ -65,6 +66,8 @@ def play(config: AccuracyConfig, trial: EpisodeTrial) -> dict[str, Any]:
     - `wrong_match_share`: of the filter's matches, those with another true landmark than the landmark's first
       measurement; `unused_share`: of the measurements of true landmarks, those without a landmark;
       `copies_per_landmark`: landmarks of the filter for each true one.
+    - `revisits`: number of times that a robot sees a landmark again which it did not see for `LONG_UNSEEN` ticks, and
+      `missed_revisits`: those in which none of its measurements is associated with what it was before.
     - `merges`: merges that were not undone; `groups`: groups at the end; `way_m`, `duration_s`, `landmarks`,
       `num_measurements`, `seconds`.
 
@@ -86,7 +89,7 @@ def play(config: AccuracyConfig, trial: EpisodeTrial) -> dict[str, Any]:
     return {
         **asdict(trial), **score_paths(episode, found),
         **_consistency(episode, {"ideal_online": found["ideal_covariances"], "filter": track.covariances}, found),
-        **_maps(episode, found), **_matches(episode, track),
+        **_maps(episode, found), **_matches(episode, track), **count_revisits(episode.true_ids, track.labels),
         "merges": len(track.merges), "groups": len(record.groups),
         "way_m": float(np.mean([float(info["distance"]) for info in record.infos])),
         "duration_s": float(record.times[-1]),
@@ -309,3 +312,32 @@ def _matches(episode: RecordedEpisode, track: FilterTrack) -> dict[str, float]:
         "unused_share": float((real & ~used).sum() / max(real.sum(), 1)),
         "copies_per_landmark": len(true_claims) / max(len(np.unique(true_claims)), 1),
     }  # fmt: skip
+
+
+def count_revisits(
+    true_ids: Sequence[Sequence[IntArray]], labels: Sequence[Sequence[IntArray]]
+) -> dict[str, int]:  # fmt: skip
+    """Return the number of revisits of landmarks, and of those that the filter missed; see `play`.
+
+    Args:
+        true_ids: True landmarks (n,) of the measurements, by tick and robot; `NONE`: of no landmark.
+        labels: Labels (n,) of the filter's landmarks; `NONE`: rejected.
+    """
+    visits: dict[tuple[int, int], list[tuple[int, set[int]]]] = {}  # last tick and labels of each visit
+    for tick, (named, labelled) in enumerate(zip(true_ids, labels, strict=True)):
+        for robot, (truths, own) in enumerate(zip(named, labelled, strict=True)):
+            for truth, label in zip(truths.tolist(), own.tolist(), strict=True):
+                if truth == NONE:
+                    continue
+                of_landmark = visits.setdefault((robot, truth), [])
+                if not of_landmark or tick - of_landmark[-1][0] > LONG_UNSEEN:
+                    of_landmark.append((tick, set()))
+                of_landmark[-1] = (tick, of_landmark[-1][1] | ({label} - {NONE}))
+    count = missed = 0
+    for of_landmark in visits.values():
+        known: set[int] = set()
+        for _, seen in of_landmark:
+            count += bool(known)
+            missed += bool(known) and not known & seen
+            known |= seen
+    return {"revisits": count, "missed_revisits": missed}

@@ -23,7 +23,7 @@ NAMES = {
 }  # fmt: skip
 OF_TRIALS = (
     "map_rms_m", "batch_map_rms_m", "map_recall", "map_precision", "wrong_match_share", "unused_share",
-    "copies_per_landmark", "way_m", "merges", "groups",
+    "copies_per_landmark", "way_m", "merges", "groups", "revisits", "missed_revisits",
 )  # fmt: skip
 COLOURS = ("#7f7f7f", "#E69F00", "#D55E00", "#56B4E9", "#009E73", "#0072B2")  # safe for colour-blind readers
 Line = dict[str, Any]
@@ -103,7 +103,8 @@ def tables(lines: Sequence[Line]) -> list[Table]:
         ])  # fmt: skip
         matches.append([
             title, number(line["wrong_match_share"], 2, 100.0), number(line["unused_share"], 1, 100.0),
-            number(line["copies_per_landmark"], 2), number(line["map_rms_m"], 3), number(found["filter"]["worst"], 3),
+            number(line["copies_per_landmark"], 2), number(line["revisits"], 1), number(line["missed_revisits"], 2),
+            number(line["map_rms_m"], 3), number(found["filter"]["worst"], 3),
             str(line["worst_seed"]), number(line["way_m"], 0),
         ])  # fmt: skip
     return [
@@ -117,7 +118,8 @@ def tables(lines: Sequence[Line]) -> list[Table]:
         ),
         (
             "Associations, map, worst seed",
-            ["world", "wrong [%]", "unused [%]", "copies", "map RMS [m]", "worst [m]", "its seed", "path [m]"], matches,
+            ["world", "wrong [%]", "unused [%]", "copies", "revisits", "missed", "map RMS [m]", "worst [m]", "its seed",
+             "path [m]"], matches,
         ),
     ]  # fmt: skip
 
