@@ -16,6 +16,7 @@ from training.commands.drive import drive_by_hand
 from training.commands.evaluate import evaluate
 from training.commands.paper import paper
 from training.commands.replay import replay
+from training.commands.report import compare, report
 from training.commands.run import run
 from training.commands.train import train
 from training.commands.warm_up import warm_up
@@ -57,6 +58,8 @@ app.command("run")(run)
 app.command("drive")(drive_by_hand)
 app.command("train")(train)
 app.command("evaluate")(evaluate)
+app.command("report")(report)
+app.command("compare")(compare)
 app.command("warm-up")(warm_up)
 app.add_typer(replay, name="replay")
 app.add_typer(bench, name="bench")

@@ -106,9 +106,12 @@ class Call(Generic[ConfigT]):
             typer.Exit: With status 1, if `check` is set and a claim does not hold or none was checked.
         """
         from training.experiments.run_folder import to_json
+        from training.report.page import write_report
 
         if self.json is not None:
             write_json(self.json, to_json(self.metrics))
+        report = write_report(self.folder.path)
+        self.console.print(f"Report: {report}", soft_wrap=True)
         self.console.print(f"Run folder: {self.folder.path}", soft_wrap=True)
         verdicts = list(held)
         if check and not (verdicts and all(verdicts)):

@@ -60,6 +60,7 @@ def replay_mrclam(call: Call[MrclamConfig]) -> None:
     from training.experiments.run_folder import plain, to_json
     from training.replay.figures import draw_joint_map, draw_replay
     from training.replay.metrics import score_path, summarise
+    from training.replay.recordings import record_team
 
     chosen = call.config
     log = load_mrclam(chosen.path, chosen.robots, chosen.duration, chosen.truth)
@@ -88,6 +89,7 @@ def replay_mrclam(call: Call[MrclamConfig]) -> None:
     for group in result.groups:
         if len(group) > 1:
             draw_joint_map(folder.path / f"joint_map_{names[group]}.png", log, result, paths, group)
+    record_team(log, result, paths).save(folder.path)
     call.write(scores)
     call.finish()
 
@@ -333,6 +335,7 @@ def _finish_one(
     from slam_backend.trajectory import Trajectory
     from training.experiments.run_folder import plain, to_json
     from training.replay.figures import draw_one
+    from training.replay.recordings import record_one
 
     console, folder = call.console, call.folder
     shown = plain(metrics)
@@ -346,6 +349,8 @@ def _finish_one(
         folder.path / "replay.png", title, result, (estimate[:, :2], reckoned[:, :2]),
         scored.scores if scored else None, None if known is None else known[:, :2], known_as,
     )  # fmt: skip
+    true_poses = getattr(scored, "truth", None)  # fixes of a GPS are no poses
+    record_one(result, (estimate, reckoned), scored.scores if scored else None, true_poses).save(folder.path)
     folder.write_trajectory("estimate", Trajectory(result.times, result.path))
     folder.write_trajectory("dead_reckoning", Trajectory(result.times, result.reckoned))
     if truth is not None:

@@ -16,6 +16,7 @@ from training.episodes.config import RunConfig
 
 if TYPE_CHECKING:  # numerical modules are imported when the command runs, so that --help is fast
     from training.episodes.runner import EpisodeRecord, MergeRecord, Progress
+    from training.report.recording import EpisodeRecorder
 
 VIDEO_SIZE = (960, 720)
 REFRESH_STEPS = 5
@@ -31,6 +32,7 @@ def run(call: Call[RunConfig], video: Annotated[bool, typer.Option(help="Whether
     from training.episodes.metrics import score_episode
     from training.episodes.tables import print_consistency, print_tables, write_maps
     from training.experiments.run_folder import plain
+    from training.report.recording import EpisodeRecorder
 
     policy = call.given.get("policy")
     if "action_type" not in call.given and policy is not None and "continuous" not in (known := action_types(policy)):
@@ -41,7 +43,8 @@ def run(call: Call[RunConfig], video: Annotated[bool, typer.Option(help="Whether
     # Detect a world that cannot be built before the folder is created.
     console, folder = call.begin(lambda: _first_steps(env, policies, chosen.seed))
     folder.write_text("environment.toml", env.config.replace(world=folder.config["world"]).to_toml())
-    record = _run_live(console, env, policies, chosen, folder.path / "video.mp4" if video else None)
+    recorder = EpisodeRecorder(env, chosen.num_steps)
+    record = _run_live(console, env, policies, chosen, folder.path / "video.mp4" if video else None, recorder)
     scores = plain(score_episode(record))
     print_tables(console, scores)
     print_consistency(console, scores["consistency"])
@@ -55,6 +58,7 @@ def run(call: Call[RunConfig], video: Annotated[bool, typer.Option(help="Whether
     console.print(write_maps(folder, maps), soft_wrap=True)
     draw_maps(record, folder.path / "map.png")
     draw_errors(record, folder.path / "error.png")
+    recorder.finish(record).save(folder.path)
     call.finish()
 
 
@@ -66,8 +70,10 @@ def _first_steps(env: Any, policies: Any, seed: int) -> None:
     run_episode(env, policies, seed, should_stop=lambda: next(steps, None) is None)
 
 
-def _run_live(console: Console, env: Any, policies: Any, config: RunConfig, video: Path | None) -> "EpisodeRecord":
-    """Run the episode with live metrics, recording it if there is a path for the video; Ctrl-C stops it."""
+def _run_live(
+    console: Console, env: Any, policies: Any, config: RunConfig, video: Path | None, recorder: "EpisodeRecorder"
+) -> "EpisodeRecord":
+    """Run and record the episode with live metrics, with a video if there is a path for it; Ctrl-C stops it."""
     from training.episodes.runner import run_episode
     from training.episodes.video import VideoWriter, choose_pace, with_camera_images, with_video_time_merges
     from training.experiments.interrupt import interrupt_flag
@@ -83,6 +89,7 @@ def _run_live(console: Console, env: Any, policies: Any, config: RunConfig, vide
 
         def on_step(progress: "Progress") -> None:
             show(progress)
+            recorder.on_step(progress)
             if writer is not None and progress.step % pace.stride == 0:
                 picture = draw_frame(with_video_time_merges(env.scene(), env.events, pace.speedup), VIDEO_SIZE)
                 writer.add(with_camera_images(picture, env.episode.frames[0], IMAGE_WIDTH) if eyes else picture)

@@ -67,7 +67,7 @@ def _draw_robot(ax: Axes, log: MrclamLog, replay: Replay, path: PathScore | None
     colour = COLOURS[robot % len(COLOURS)]
     title = f"robot {log.robots[robot].robot}"
     fitted = align_to_truth(replay.maps[robot], replay.claims[robot], log)
-    own = _own_frame(fitted, path)
+    own = own_frame(fitted, path)
     frames, labels = (own, own), ("odometry", "estimate")
     if path is not None:
         ax.plot(*path.truth[:, :2].T, color=TRUTH, alpha=0.7, lw=2.2, label="true path")
@@ -91,7 +91,7 @@ def _draw_group(
     names = ", ".join(str(log.robots[robot].robot) for robot in group)
     first = group[0]
     fitted = align_to_truth(replay.maps[first], replay.claims[first], log)
-    own = _own_frame(fitted, paths[first])
+    own = own_frame(fitted, paths[first])
     in_world = fitted is not None or paths[first] is not None
     for robot in group:
         # The map is in the first robot's start frame; the group relates it to the other start frames.
@@ -107,7 +107,7 @@ def _draw_group(
     _finish(ax, log, f"joint map of {names}, " + ("one fit for all" if in_world else "start frame of the first"))
 
 
-def _own_frame(fitted: AlignedMap | None, path: PathScore | None) -> FloatArray:
+def own_frame(fitted: AlignedMap | None, path: PathScore | None) -> FloatArray:
     """Return the start frame (3,) of a robot in the plot: aligned by its map, else by its path, else the identity."""
     if fitted is not None:
         return fitted.world_from_map

@@ -232,6 +232,7 @@ def test_a_run_folder_repeats_itself(vslam: Any, tmp_path: Path) -> None:
     names = {file.name for file in one.iterdir()}
     paths = {f"robot{k}_{kind}.tum" for k in range(2) for kind in ("estimate", "dead_reckoning", "truth")}
     usual = {"config.toml", "environment.toml", "metrics.json", "map.png", "error.png", "video.mp4"}
+    usual |= {"recording.npz", "report.html"}
     groups = json.loads((one / "metrics.json").read_text())["groups"]
     stems = {f"map_{'-'.join(map(str, group))}" for group in groups}
     assert names == paths | usual | {f"{stem}.{kind}" for stem in stems for kind in ("npz", "csv")}

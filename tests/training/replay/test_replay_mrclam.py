@@ -76,6 +76,7 @@ def test_a_run_is_written_and_repeats_itself(tmp_path: Path, monkeypatch: pytest
     names = {f"robot{n}_{kind}.tum" for n in (2, 5) for kind in ("estimate", "dead_reckoning", "truth")}
     assert {file.name for file in first.iterdir()} == {
         "config.toml", "metrics.json", "replay.png", "joint_map_2-5.png", "timing.json", "map_2-5.npz", "map_2-5.csv",
+        "recording.npz", "report.html",
         *names,
     }  # fmt: skip
     assert "Maps as data: map_2-5" in said.out
@@ -143,7 +144,7 @@ def test_the_map_error_states_its_cutoff(tmp_path: Path, monkeypatch: pytest.Mon
     said = vslam("replay", "mrclam", "--path", ".", "--duration", "5", "--particles", "2", "--out", "run")
     assert "E (m)," in said.out
     assert "0.71 m = nothing found" in said.out
-    assert "errors cut at 1 m," in said.out
+    assert "errors are cut at 1 m." in said.out
 
 
 def test_a_log_without_truth_has_no_path_scores(tmp_path: Path) -> None:

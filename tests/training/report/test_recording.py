@@ -1,0 +1,111 @@
+"""Recordings of episodes: what they hold, and that they change nothing."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from slam_backend.geometry import compose
+from tests.training.report.conftest import STEPS, play
+from training.report import recording as recording_module
+from training.report.content import parts_of_error
+from training.report.recording import RECORDING_FILE, SCORES, Recording, ellipses, run_lengths
+from vslam_env.navigation import CELL
+
+
+def test_a_recording_holds_the_record(episode: Any) -> None:
+    """Poses, errors and coverage are those of the record, in the world frame; the last step is a keyframe."""
+    _, record, recording = episode
+    np.testing.assert_array_equal(recording.times, record.times)
+    np.testing.assert_array_equal(recording.truth, np.swapaxes(record.true_poses, 0, 1))
+    starts = record.true_poses[:, 0]
+    for name, paths in (("estimate", record.estimated), ("reckoned", record.reckoned)):
+        for robot in range(2):
+            np.testing.assert_allclose(getattr(recording, name)[:, robot], compose(starts[robot], paths[robot]))
+    np.testing.assert_array_equal(recording.scores[..., SCORES.index("map_error")], record.map_errors.T)
+    np.testing.assert_array_equal(recording.coverage, record.coverage)
+    assert recording.keyframes[-1] == STEPS
+    (merge,) = [event for event in recording.about["events"] if event["kind"] == "merge"]
+    assert (merge["a"], merge["b"], merge["time"]) == ([0], [1], record.merges[0].time)
+    assert merge["error_m"] < 1e-9
+    assert merge["text"].startswith("maps of 0 and 1 merged on ")
+
+
+def test_the_last_map_and_grid_are_those_of_the_belief(episode: Any) -> None:
+    """A map that two robots share is stored once, with the first; its grid comes back cell by cell."""
+    env, record, recording = episode
+    first, last = recording.map_ends[-2, -1], recording.map_ends[-1]
+    assert last[0] == last[1]  # robot 1 has the map of robot 0
+    whole = ellipses(record.maps[0].moved(record.true_poses[0, 0]))
+    np.testing.assert_allclose(recording.map_points[first : last[0]], whole)
+    grid = env.belief("robot_0").grid
+    row, column, last_row, last_column = grid.bounds
+    begin, end = recording.grid_ends[-2, -1], recording.grid_ends[-1, 0]
+    x, y, rows, columns = recording.grid_boxes[-1, 0]
+    cells = np.repeat(recording.grid_values[begin:end], recording.grid_runs[begin:end]).reshape(int(rows), int(columns))
+    np.testing.assert_array_equal(cells, grid.cells[row:last_row, column:last_column])
+    # The start pose, at the origin, is in a free cell of the box.
+    at = cells[int(-y / CELL), int(-x / CELL)]
+    assert at == env.belief("robot_0").grid.cells[len(grid.cells) // 2, len(grid.cells) // 2]
+
+
+def test_recording_changes_nothing() -> None:
+    """An episode with a recorder has the same record, bit by bit, as one without."""
+    (_, with_one, _), (_, without, _) = play(), play(recorded=False)
+    for name in ("true_poses", "estimated", "reckoned", "map_errors", "coverage"):
+        np.testing.assert_array_equal(getattr(with_one, name), getattr(without, name))
+    np.testing.assert_array_equal(with_one.maps[0].means, without.maps[0].means)
+
+
+def test_long_episodes_are_thinned(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At most so many steps and keyframes are recorded, evenly, and the last step always."""
+    monkeypatch.setattr(recording_module, "MOST_FRAMES", 15)
+    monkeypatch.setattr(recording_module, "MOST_KEYFRAMES", 4)
+    _, record, recording = play()
+    assert recording is not None
+    np.testing.assert_allclose(recording.times, record.times[[*range(0, STEPS, 3), STEPS]])
+    assert recording.keyframes.tolist() == [0, 4, 8, 12, 14]
+    assert recording.scores.shape == (15, 2, 4)
+    assert recording.sight_ends.shape == (15, 2)
+    assert recording.sight_ends[-1, -1] == len(recording.sights)
+
+
+def test_files_restore_a_recording(episode: Any, tmp_path: Path) -> None:
+    """A saved recording is read again with single precision; a damaged one or another format is refused."""
+    _, _, recording = episode
+    recording.save(tmp_path)
+    again = Recording.load(tmp_path)
+    assert dict(again.about) == dict(recording.about) | {"format": 1}
+    for name in ("truth", "map_points", "sights", "grid_boxes", "candidates", "scores"):
+        np.testing.assert_allclose(getattr(again, name), getattr(recording, name), rtol=1e-6)
+    np.testing.assert_array_equal(again.grid_runs, recording.grid_runs)
+    file = tmp_path / RECORDING_FILE
+    file.write_bytes(file.read_bytes()[:-40])
+    with pytest.raises(ValueError, match="folder: expected a recording of an episode, got a broken file"):
+        Recording.load(tmp_path)
+    Recording(about={}, times=np.zeros(1), estimate=np.zeros((1, 1, 3)), truth=np.zeros((1, 1, 3))).save(tmp_path)
+    with np.load(file) as stored:
+        other = dict(stored) | {"about": np.frombuffer(b'{"format": 9}', np.uint8)}
+    np.savez(file, **other)
+    with pytest.raises(ValueError, match="folder: expected a recording of format 1, got a recording of format 9"):
+        Recording.load(tmp_path)
+
+
+def test_the_parts_of_the_error_add_up(episode: Any) -> None:
+    """Missed, false and wrongly placed landmarks give the mean of E^2; without a map only missed ones count."""
+    _, _, recording = episode
+    parts = parts_of_error(recording)
+    errors = recording.scores[..., SCORES.index("map_error")]
+    np.testing.assert_allclose(sum(parts.values()), (errors**2).mean(axis=1))
+    assert all((part >= -1e-12).all() for part in parts.values())
+    assert parts["missed landmarks"][0] == pytest.approx(0.5 * (1.0 - recording.scores[0, :, 1].mean()))
+
+
+def test_runs_of_cells_are_exact() -> None:
+    """Any cells come back from their runs."""
+    rng = np.random.default_rng(5)
+    for shape in ((7, 11), (1, 1), (0, 0), (3, 300)):
+        cells = rng.integers(0, 3, shape, dtype=np.uint8)
+        values, lengths = run_lengths(cells)
+        np.testing.assert_array_equal(np.repeat(values, lengths).reshape(shape), cells)

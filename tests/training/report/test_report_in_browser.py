@@ -1,0 +1,61 @@
+"""Reports in a headless browser: no error, playback moves, tables and charts appear."""
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from tests.training.report.test_comparison_page import bench
+from training.report.page import write_report
+
+BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(BROWSER is None, reason="no chromium is installed (Debian: apt-get install chromium)"),
+]
+
+
+def shown(page: Path, fragment: str, folder: Path, *, seconds: float = 3.0) -> str:
+    """Return the document after some seconds of the browser's time; any message on the console is an error."""
+    assert BROWSER is not None
+    command = [
+        BROWSER, "--headless=new", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr",
+        f"--user-data-dir={folder / 'profile'}", f"--virtual-time-budget={round(1e3 * seconds)}",
+        "--run-all-compositor-stages-before-draw", "--window-size=1280,1600", "--dump-dom",
+        f"{page.resolve().as_uri()}{fragment}",
+    ]  # fmt: skip
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    messages = [line for line in done.stderr.splitlines() if ":CONSOLE" in line]
+    assert messages == []
+    assert 'data-ready="yes"' in done.stdout
+    return done.stdout
+
+
+def clock(document: str) -> float:
+    """Return the time that the playback shows."""
+    found = re.search(r'<output id="time">([\d.]+) of ', document)
+    assert found is not None
+    return float(found[1])
+
+
+def test_playback_moves(run: Path, tmp_path: Path) -> None:
+    """A page opens at a given time; when it plays, the time advances, and the robots' errors change with it."""
+    page = write_report(run)
+    still = shown(page, "#t=0.5&show=grids,candidates,reckoned&hide=truth", tmp_path)
+    assert clock(still) == 0.5
+    assert still.count("<svg") == 4
+    assert "maps of 0 and 1 merged" in still
+    moved = shown(page, "#t=0.5&play", tmp_path)
+    assert clock(moved) > 1.0
+    rows = [re.findall(r"<td>(?:<span[^>]*></span>)?([^<]*)</td>", text) for text in (still, moved)]
+    assert rows[0] != rows[1]
+
+
+def test_benches_have_tables_and_curves(tmp_path: Path) -> None:
+    """The page of a bench has a chart and a table, and no player."""
+    document = shown(write_report(bench(tmp_path / "bench", "frontier", {1: 0.5, 2: 0.25})), "", tmp_path)
+    assert '<section id="player" hidden' in document
+    assert document.count("<svg") == 1
+    assert "0.25" in document
