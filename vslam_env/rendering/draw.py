@@ -27,7 +27,7 @@ EMPTY_EXTENT_M = 2.0  # [m] margin around the robots if there are no walls
 
 
 def draw_frame(scene: Scene, size: tuple[int, int] = (960, 720)) -> Image:
-    """Draw a scene.
+    """Draw a scene, with a scale bar in the header.
 
     The truth is grey or faint: walls, landmarks, paths and filled bodies. Estimates have the robot's colour: dots with
     95 % ellipses are its map, the outlined disc and the particle cloud its pose. Members of a group have a halo of the
@@ -58,7 +58,7 @@ def draw_frame(scene: Scene, size: tuple[int, int] = (960, 720)) -> Image:
     draw_flashes(plot, view, scene, unit)
     _draw_bodies(plot, view, scene, unit)
     draw_captions(plot, scene, unit)
-    draw_header(image[:top], scene)
+    draw_header(image[:top], scene, view.scale)
     draw_footer(image[bottom:], scene)
     return image
 
@@ -88,7 +88,7 @@ def _draw_truth(plot: Image, view: Viewport, scene: Scene, unit: float) -> None:
         path(plot, view.pixels(robot.true_path), faint, max(1, round(4 * unit)))
     wall_width = max(2, round(WALL_WIDTH_M * view.scale))
     lines(plot, view.pixels(scene.walls.reshape(-1, 2, 2)), palette.WALL, wall_width, False)
-    dots(plot, view.pixels(scene.landmarks), max(1.3, 2.0 * unit), palette.TRUE_LANDMARK)
+    dots(plot, view.pixels(scene.landmarks), max(1.2, 1.5 * unit), palette.TRUE_LANDMARK)
 
 
 def _draw_map(plot: Image, view: Viewport, robot: RobotView, colour: palette.Colour, unit: float) -> None:

@@ -8,30 +8,53 @@ from vslam_env.rendering.palette import mix, robot_colour
 from vslam_env.rendering.scene import Scene
 
 
-def draw_header(strip: Image, scene: Scene) -> None:
-    """Draw the simulated time, the number of maps and a bar of the coverage.
+def draw_header(strip: Image, scene: Scene, scale: float) -> None:
+    """Draw the simulated time, a scale bar, the number of maps and a bar of the coverage.
 
     Args:
         strip: (H, W, 3) uint8. Top of the picture, whose height sets all sizes; changed in place.
         scene: Content of the picture.
+        scale: Scale of the top view below [px/m].
     """
     height, width = strip.shape[:2]
     fill(strip, palette.STRIP)
     strip[-1] = palette.RULE
     size, middle, edge = 0.26 * height, 0.47 * height, 0.4 * height
     write(strip, f"{scene.time:.1f} s", edge, middle, size, palette.INK)
+    _scale_bar(strip, 2.0 * edge + text_width("9999.9 s", size), middle, size, scale)
     maps = len({robot.group for robot in scene.robots})
     words = f"{maps} map{'s' * (maps != 1)} of {len(scene.robots)} robot{'s' * (len(scene.robots) != 1)}"
     write(strip, words, 0.5 * (width - text_width(words, size)), middle, size, palette.INK)
-    percent = f"seen {100.0 * scene.coverage:.0f} %"
+    percent = f"coverage {100.0 * scene.coverage:.0f} %"
     bar = 0.12 * width
     left = width - edge - bar
-    write(strip, percent, left - text_width("seen 100 %", size) - size, middle, size, palette.INK)
+    write(strip, percent, left - text_width("coverage 100 %", size) - size, middle, size, palette.INK)
     half = 0.13 * height
     _bar(strip, left, left + bar, middle, half, palette.RULE)
     filled = float(np.clip(scene.coverage, 0.0, 1.0)) * bar
     if filled > 0.0:
         _bar(strip, left, left + filled, middle, half, palette.FAINT_INK)
+
+
+def scale_length(longest: float) -> float:
+    """Return the longest length of 1, 2 or 5 times a power of ten [m] up to a given one, > 0.
+
+    >>> scale_length(9.0), scale_length(0.25)
+    (5.0, 0.2)
+    """
+    power = 10.0 ** np.floor(np.log10(longest))
+    return float(power * max(factor for factor in (1.0, 2.0, 5.0) if factor * power <= longest * (1.0 + 1e-9)))
+
+
+def _scale_bar(strip: Image, left: float, middle: float, size: float, scale: float) -> None:
+    """Draw a bar of a round length, at most a twelfth of the picture wide, with its length [m]."""
+    length = scale_length(strip.shape[1] / 12.0 / scale)
+    right = left + length * scale
+    half = max(1.0, 0.1 * size)
+    _bar(strip, left, right, middle, half, palette.INK)
+    for end in (left, right):
+        _bar(strip, end - half, end + half, middle, 4.0 * half, palette.INK)
+    write(strip, f"{length:g} m", right + 0.7 * size, middle, size, palette.INK)
 
 
 def _bar(strip: Image, left: float, right: float, middle: float, half: float, colour: palette.Colour) -> None:

@@ -9,8 +9,8 @@ STRIP: Colour = (240, 239, 235)
 RULE: Colour = (216, 214, 208)
 INK: Colour = (52, 54, 60)
 FAINT_INK: Colour = (122, 124, 130)
-WALL: Colour = (176, 178, 184)
-TRUE_LANDMARK: Colour = (160, 160, 158)
+WALL: Colour = (190, 192, 198)
+TRUE_LANDMARK: Colour = (84, 86, 92)
 FLASH: Colour = (240, 196, 25)
 
 # Palette of Okabe and Ito, with brown instead of yellow, which is too light on this background.

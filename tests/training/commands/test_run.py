@@ -1,3 +1,4 @@
+import itertools
 import json
 import signal
 import sys
@@ -16,7 +17,7 @@ from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.trajectory import Trajectory
 from training.commands.run import describe, errors_in_short, live_progress
 from training.episodes.config import EPISODE_S, RunConfig
-from training.episodes.figures import draw_errors, draw_maps
+from training.episodes.figures import LETTER, draw_errors, draw_maps, place_labels, turns
 from training.episodes.metrics import score_episode
 from training.episodes.runner import EpisodeRecord, MergeRecord, Progress, run_episode
 from training.episodes.tables import print_tables
@@ -166,6 +167,34 @@ def test_figures_are_drawn_for_any_team(record: EpisodeRecord, tmp_path: Path) -
             file = tmp_path / f"{draw.__name__}-{robots}-{rows}.png"
             draw(cut(robots, rows), file)
             assert file.read_bytes().startswith(b"\x89PNG")
+
+
+def test_robots_that_share_a_map_draw_their_curves_in_turn(record: EpisodeRecord) -> None:
+    """Before a merge each robot draws its curve all the time, afterwards exactly one of the group at a time."""
+    (merge,) = record.merges
+    before, drawn = record.times < merge.time, turns(record)
+    assert drawn[:, before].all()
+    assert (drawn[:, ~before].sum(axis=0) == 1).all()
+    assert drawn[:, ~before].any(axis=1).all()
+    undone = turns(replace(record, merges=(replace(merge, undone=merge.time + 1.0),)))
+    assert undone[:, record.times >= merge.time + 1.0].all()
+
+
+def test_labels_of_merges_neither_overlap_nor_leave_the_plot() -> None:
+    """Labels of any times and lengths lie within the plot, and those of one row apart from each other."""
+    rng, width, end = np.random.default_rng(4), 8.0, 180.0
+    for _ in range(50):
+        times = np.sort(rng.uniform(0.0, end, 7)).tolist()
+        labels = ["0, 1 + 2 merged" + "x" * int(rng.integers(0, 30)) for _ in times]
+        spans: dict[int, list[tuple[float, float]]] = {}
+        for (row, is_left), time, label in zip(place_labels(times, labels, end, width), times, labels, strict=True):
+            at, length = width * time / end, LETTER * len(label)
+            spans.setdefault(row, []).append((at - length, at) if is_left else (at, at + length))
+        for own in spans.values():
+            own.sort()
+            assert own[0][0] >= 0.0
+            assert own[-1][1] <= width
+            assert all(first[1] < second[0] for first, second in itertools.pairwise(own))
 
 
 def test_tables_show_unknown_values_as_a_dash(record: EpisodeRecord) -> None:
