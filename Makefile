@@ -1,4 +1,4 @@
-# Two commands for a bare machine with Python >= 3.11, pip and gcc:  make demo   and   make test
+# Two commands for a bare machine with Python >= 3.11 and pip:  make demo   and   make test
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
