@@ -6,6 +6,7 @@ from typing import Literal
 import numpy as np
 
 from slam_backend.core import state_checks
+from slam_backend.core.compilation import ahead
 from slam_backend.core.compilation.compiler import Progress, Signatures, compile_kernels, recorded_signatures
 from slam_backend.core.compilation.messages import watch_compilation
 from slam_backend.fastslam.existence import ExistenceModel
@@ -64,8 +65,9 @@ def warm_up(
         Seconds spent compiling; 0 if all kernels came from the cache.
     """
     extras = EXTRAS if everything else extras_of(FilterOptions() if options is None else options)
-    seconds = compile_kernels(needed(recorded_signatures("slam_backend"), extras), workers, progress)
-    return seconds + run_all_paths(extras)
+    with ahead.set_aside():
+        seconds = compile_kernels(needed(recorded_signatures("slam_backend"), extras), workers, progress)
+        return seconds + run_all_paths(extras)
 
 
 def extras_of(options: FilterOptions) -> set[str]:

@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -10,6 +11,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
+from slam_backend.core.compilation import ahead
 from slam_backend.core.state_checks import refuse_malformed
 from slam_backend.core.validation import FloatArray, argument_error, check_choice, check_int
 from slam_backend.fastslam.reports import MergeEvent
@@ -126,6 +128,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         world_seed = options.get("world_seed")
         if world_seed is not None:
             check_int("options['world_seed']", world_seed, 0, "Give an int >= 0.")
+        ahead.expect(partial(_signatures_of, self.config))
         scenario = sample_scenario(self.config, self._source, root.spawn(1)[0], world_seed, options.get("start_poses"))
         episode = Episode(self.config, scenario, self._tap)
         episode.begin()
@@ -462,3 +465,10 @@ def build_observations(
         agent: {"observation": flatten(each), "action_mask": each["action_mask"]} if goal else flatten(each)
         for agent, each in zip(agents, named, strict=True)
     }
+
+
+def _signatures_of(config: EnvConfig) -> dict[str, list[str]]:
+    """Return the signatures of the kernels that an environment needs."""
+    from vslam_env.warm_up import signatures_of  # which imports this module
+
+    return signatures_of(config)

@@ -1,7 +1,10 @@
 """Compilation of the kernels of an environment before its first episode."""
 
+from collections.abc import Collection
+
 import numpy as np
 
+from slam_backend.core.compilation import ahead
 from slam_backend.core.compilation.compiler import Progress, compile_kernels, recorded_signatures
 from slam_backend.core.compilation.messages import watch_compilation
 from slam_backend.warm_up import EXTRAS, extras_of, needed, run_all_paths
@@ -36,26 +39,39 @@ def warm_up(
         Time spent compiling [s]; 0 if all kernels came from the cache.
     """
     chosen = EnvConfig() if config is None else config
-    extras = set(EXTRAS) if everything else extras_of(chosen.belief.filter)
-    if chosen.sensor == "stereo":
-        extras.add("images")
-    signatures = needed(recorded_signatures("slam_backend", "vslam_env"), extras)
-    seconds = compile_kernels(signatures, workers, progress)
-    with watch_compilation(lambda name: None) as watch:
-        run_all_paths(extras)
-        sensor = LandmarkSensorConfig(false_points=2.0)
-        config = EnvConfig(num_robots=2, action_type="goal", oracle_merge=True, landmark_sensor=sensor)
-        env = ExplorationEnv(config, World("room", WALLS))
-        env.reset(seed=0)  # drawn starts; given ones in the next line
-        env.reset(seed=0, options={"start_poses": STARTS})
-        for _ in range(STEPS):
-            valid = {agent: env.belief(agent).candidates.valid for agent in env.agents}
-            env.step({agent: 1 + int(slots.argmax()) if slots.any() else 0 for agent, slots in valid.items()})
-        if "planners" in extras:
-            belief = env.belief("robot_0")
-            ways, places = distance_map(belief.grid.cells, belief.pose[:2]), np.zeros((2, 2))
-            between = lengths_between(ways, places, places)
-            tour_length(open_tour(between[0], between), between[0], between)
-            share_places(between, between)
-            sees(ways, places, cells_of(ways, places), 1.0)
+    extras = set(EXTRAS) if everything else _extras_of(chosen)
+    with ahead.set_aside():
+        seconds = compile_kernels(needed(recorded_signatures("slam_backend", "vslam_env"), extras), workers, progress)
+        with watch_compilation(lambda name: None) as watch:
+            _run_all_paths(extras)
     return seconds + watch.seconds
+
+
+def signatures_of(config: EnvConfig) -> dict[str, list[str]]:
+    """Return the signatures of the kernels that an environment needs, by dotted name."""
+    return needed(recorded_signatures("slam_backend", "vslam_env"), _extras_of(config))
+
+
+def _extras_of(config: EnvConfig) -> set[str]:
+    """Return the keys of `EXTRAS` that an environment needs."""
+    return extras_of(config.belief.filter) | ({"images"} if config.sensor == "stereo" else set())
+
+
+def _run_all_paths(extras: Collection[str]) -> None:
+    """Run a tiny environment along all paths that end in a kernel."""
+    run_all_paths(extras)
+    sensor = LandmarkSensorConfig(false_points=2.0)
+    config = EnvConfig(num_robots=2, action_type="goal", oracle_merge=True, landmark_sensor=sensor)
+    env = ExplorationEnv(config, World("room", WALLS))
+    env.reset(seed=0)  # drawn starts; given ones in the next line
+    env.reset(seed=0, options={"start_poses": STARTS})
+    for _ in range(STEPS):
+        valid = {agent: env.belief(agent).candidates.valid for agent in env.agents}
+        env.step({agent: 1 + int(slots.argmax()) if slots.any() else 0 for agent, slots in valid.items()})
+    if "planners" in extras:
+        belief = env.belief("robot_0")
+        ways, places = distance_map(belief.grid.cells, belief.pose[:2]), np.zeros((2, 2))
+        between = lengths_between(ways, places, places)
+        tour_length(open_tour(between[0], between), between[0], between)
+        share_places(between, between)
+        sees(ways, places, cells_of(ways, places), 1.0)

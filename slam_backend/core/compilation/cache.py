@@ -71,8 +71,17 @@ class KernelCache(NullCache):
         return any(_read(file) is not None for file in self._files(signature, codegen))
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Return the kernel of a signature; None: no usable one."""
+        """Return the kernel of a signature; None: no usable one, even after waiting for a worker that compiles it."""
+        from slam_backend.core.compilation import ahead  # which builds on this module
+
         target_context.refresh()
+        found = self._load(sig, target_context)
+        if found is None and ahead.await_kernel(self._kernel, sigutils.normalize_signature(sig)[0]):  # type: ignore[no-untyped-call]
+            found = self._load(sig, target_context)
+        return found
+
+    def _load(self, sig: Any, target_context: Any) -> Any:
+        """Return the kernel of a signature; None: no usable one."""
         for file in self._files(sig, target_context.codegen()):
             content = _read(file)
             if content is not None:

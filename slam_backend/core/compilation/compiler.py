@@ -26,7 +26,8 @@ from numba import from_dtype, types
 from numba.core.registry import CPUDispatcher
 from numpy import dtype
 
-from slam_backend.core.compilation.cache import KernelCache
+from slam_backend.core.compilation.cache import KernelCache, cache_folder
+from slam_backend.core.compilation.shipped import CONFIG
 from slam_backend.core.jit import DeviceKernel
 from slam_backend.core.validation import check_int
 
@@ -131,13 +132,11 @@ class Task:
         name: Dotted name.
         signature: Argument types, see `encode_signature`.
         parts: Code size of the kernel and of each kernel that it calls, by dotted name.
-        folder: Folder of the cache's files.
     """
 
     name: str
     signature: str
     parts: Mapping[str, int]
-    folder: str
 
 
 def missing_tasks(signatures: Signatures) -> list[Task]:
@@ -151,7 +150,7 @@ def missing_tasks(signatures: Signatures) -> list[Task]:
         for signature in words:
             context: Any = kernel.targetctx
             if not cache.holds(decode_signature(signature), context.codegen()):
-                tasks.append(Task(name, signature, _code_sizes(kernel), cache.cache_path))
+                tasks.append(Task(name, signature, _code_sizes(kernel)))
     return tasks
 
 
@@ -199,7 +198,7 @@ def compile_kernels(signatures: Signatures, workers: int | None = None, progress
     if workers < 2 or not (tasks := missing_tasks(signatures)):
         return 0.0
     begun = time.perf_counter()
-    lock = FileLock(Path(tasks[0].folder) / LOCK)
+    lock = cache_lock()
     try:
         try:
             lock.acquire(blocking=False)
@@ -217,6 +216,18 @@ def compile_kernels(signatures: Signatures, workers: int | None = None, progress
     return time.perf_counter() - begun
 
 
+def cache_lock() -> FileLock:
+    """Return the lock of the process that fills the cache; any thread may release it.
+
+    Raises:
+        OSError: If there is no cache.
+    """
+    folder = cache_folder(Path(__file__).parent, CONFIG.CACHE_DIR)
+    if folder is None:
+        raise OSError("no folder of the cache can be written")
+    return FileLock(folder / LOCK, thread_local=False)
+
+
 def available_cores() -> int:
     """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -230,17 +241,10 @@ def _compiled(shares: Sequence[Sequence[Task]], begun: float) -> Iterator[tuple[
     if not shares:
         return
     yield 0, math.nan
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     lines: Queue[str | None] = Queue()
     sizes = {f"{task.name} {task.signature}": sum(task.parts.values()) for share in shares for task in share}
     whole, done, size = sum(sizes.values()), 0, 0
-    processes = [
-        subprocess.Popen(
-            [sys.executable, "-m", WORKER],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env=environment,
-        )
-        for _ in shares
-    ]  # fmt: skip
+    processes = [start_worker() for _ in shares]
     try:
         for process, share in zip(processes, shares, strict=True):
             assert process.stdin is not None
@@ -259,6 +263,15 @@ def _compiled(shares: Sequence[Sequence[Task]], begun: float) -> Iterator[tuple[
         for process in processes:
             process.terminate()
             process.wait()
+
+
+def start_worker() -> "subprocess.Popen[str]":
+    """Start a process that compiles the kernels named on its input; it ends with this one."""
+    return subprocess.Popen(
+        [sys.executable, "-m", WORKER, str(os.getpid())],
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
+    )  # fmt: skip
 
 
 def _forward_lines(process: subprocess.Popen[str], lines: "Queue[str | None]") -> None:

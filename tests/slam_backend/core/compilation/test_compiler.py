@@ -90,7 +90,7 @@ def test_recorded_kernels_exist(package: str) -> None:
 @pytest.mark.parametrize("workers", [1, 2, 3, 8])
 def test_each_kernel_is_given_to_one_worker(workers: int) -> None:
     """All tasks are shared out once, and the workers' loads differ by no more than one task."""
-    tasks = [Task(f"k{i}", "int64", {f"k{i}": 10 + i, "common": 5}, "") for i in range(20)]
+    tasks = [Task(f"k{i}", "int64", {f"k{i}": 10 + i, "common": 5}) for i in range(20)]
     shares = divide_tasks(tasks, workers)
     assert sorted(task.name for share in shares for task in share) == sorted(task.name for task in tasks)
     loads = [5 + sum(10 + int(task.name[1:]) for task in share) for share in shares]

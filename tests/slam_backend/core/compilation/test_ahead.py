@@ -1,0 +1,99 @@
+"""Kernels are compiled by other processes while a program compiles and runs what it calls first."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from filelock import FileLock
+
+from slam_backend.core.compilation import ahead, compiler
+from slam_backend.core.compilation.cache import cache_folder
+
+ROOT = Path(__file__).parents[4]
+# Expects two kernels, does something when the first is compiled, and calls the second; prints what it has compiled.
+PROGRAM = """
+import os, signal, sys, time
+from slam_backend.core.compilation import ahead
+from slam_backend.core.compilation.compiler import decode_signature, find_kernel, missing_tasks, recorded_signatures
+from slam_backend.core.compilation.messages import watch_compilation
+ahead.available_cores = lambda: int(sys.argv[1])
+names = ["slam_backend.smoother.reassociation.find_only", "slam_backend.geometry._invert_rows"]
+needed = {name: recorded_signatures("slam_backend")[name] for name in names}
+ahead.expect(lambda: needed)
+with watch_compilation(lambda name: None) as watch:
+    for name in names:
+        find_kernel(name).compile(decode_signature(needed[name][0]))
+        if name == names[0]:
+            exec(sys.argv[2])
+print([name.rpartition(".")[2] for name in watch.names], len(missing_tasks(needed)))
+"""
+BOTH, FIRST, NONE = "['find_only', '_invert_rows'] 0", "['find_only'] 0", "[] 0"
+
+
+def start(folder: Path, act: str = "pass", cores: int = 2) -> "subprocess.Popen[str]":
+    """Start the program with a cache of its own."""
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(folder), "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-c", PROGRAM, str(cores), act]
+    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
+
+
+def printed(folder: Path, act: str = "pass", cores: int = 2) -> str:
+    """Return what the program prints."""
+    process = start(folder, act, cores)
+    output, _ = process.communicate(timeout=300)
+    assert process.returncode == 0
+    return output.strip()
+
+
+def test_a_kernel_that_a_worker_has_begun_is_waited_for(tmp_path: Path) -> None:
+    """The program compiles one kernel, and finds the other in the cache; later none does anything."""
+    assert printed(tmp_path) == FIRST
+    assert printed(tmp_path, "assert ahead._helpers is None") == NONE
+
+
+def test_a_killed_worker_is_not_waited_for(tmp_path: Path) -> None:
+    """The program compiles what the worker has not finished."""
+    assert printed(tmp_path, "[worker.kill() for worker in ahead._helpers._workers]") in (BOTH, FIRST)
+
+
+def test_on_one_core_no_worker_is_started(tmp_path: Path) -> None:
+    """The program compiles both kernels itself."""
+    assert printed(tmp_path, cores=1) == BOTH
+
+
+def test_while_another_process_fills_the_cache_no_worker_is_started(tmp_path: Path) -> None:
+    """The program compiles both kernels itself, and does not wait for the other process."""
+    folder = cache_folder(Path(compiler.__file__).parent, str(tmp_path))
+    assert folder is not None
+    with FileLock(folder / compiler.LOCK):
+        assert printed(tmp_path) == BOTH
+
+
+def test_a_warm_up_waits_for_no_worker() -> None:
+    """It compiles with processes of its own; what is expected within it starts none."""
+    ahead.expect(dict)
+    with ahead.set_aside():
+        assert ahead._needed is None
+        ahead.expect(dict)
+        assert ahead._needed is None
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs signals")
+def test_workers_end_with_a_killed_program(tmp_path: Path) -> None:
+    """No process goes on compiling."""
+    act = "print(*(worker.pid for worker in ahead._helpers._workers), flush=True); time.sleep(600)"
+    program = start(tmp_path, act)
+    assert program.stdout is not None
+    worker = int(program.stdout.readline())
+    os.kill(program.pid, signal.SIGKILL)
+    program.wait()
+    program.stdout.close()
+    end = time.monotonic() + 60.0
+    while time.monotonic() < end and Path(f"/proc/{worker}").exists():
+        time.sleep(0.1)
+    with pytest.raises(ProcessLookupError):
+        os.kill(worker, 0)
