@@ -172,7 +172,7 @@ def run_trial(seed: int, **changes: Any) -> Trial:
     bias = draw_bias(noise, 1, rng)
     slam = FastSlam.from_options(1, replace(default_filter_options(), **changes), seed)
     claims: dict[int, int] = {}
-    seen: dict[int, int] = {}  # last tick of each true landmark
+    matched_at: dict[int, int] = {}  # last tick at which each true landmark was created or rightly matched
     wrong_at: list[int] = []  # wrong matches by tick
     matched, known_again, sigma, error = 0, 0, 0.0, 0.0
     for tick, pose in enumerate(built.path):
@@ -189,8 +189,9 @@ def run_trial(seed: int, **changes: Any) -> Trial:
         matched += len(pairs)
         wrong_at.append(sum(claim != truth for claim, truth in pairs))
         if tick >= built.back:
-            known_again += sum(claim == t and tick - seen.get(t, tick) > LONG_UNSEEN for claim, t in pairs)
-        seen |= {truth: tick for truth in truths if truth >= 0}
+            known_again += sum(claim == t and tick - matched_at[t] > LONG_UNSEEN for claim, t in pairs)
+        matched_at |= {t: tick for claim, t in pairs if claim == t}
+        matched_at |= {truth: tick for new, truth in zip(made, truths, strict=True) if new >= 0}
         if tick == built.in_b:
             belief = slam.pose()
             sigma = float(np.sqrt(belief.covariance[1, 1]))

@@ -110,6 +110,8 @@ def _descend(
                 damping = 0.0
             else:
                 return at, system, iteration + 1
+        elif damping <= FIRST_DAMPING and changed.cost - system.cost <= LEAST_DECREASE * (1.0 + system.cost):
+            return at, system, iteration + 1  # at the minimum: the cost rises by rounding alone
         else:
             damping = max(10.0 * damping, 1e-9)
             if damping > MAX_DAMPING:
