@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: demo test test-all checks lint kernels metrics kernels-wheel clients compat clean
+.PHONY: demo test test-all checks lint kernels metrics wheel kernels-wheel clients compat clean
 
 demo: $(VENV)/.core  ## run three robots that explore an office, build maps and merge them; writes a folder under runs/
 	$(BIN)/vslam run --world office --robots 3 --policy frontier --seed 0
@@ -32,6 +32,10 @@ kernels: $(VENV)/.dev  ## compile all kernels
 
 metrics: $(VENV)/.core  ## metrics of the code: sizes, folders, path of a measurement, private accesses, import cycles
 	$(BIN)/python benchmarks/code_metrics.py
+
+wheel: $(VENV)/.core  ## build the package as a wheel in dist/
+	rm -rf build
+	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir dist .
 
 kernels-wheel: $(VENV)/.core  ## build a wheel of kernels compiled for x86-64-v3 and v4 in dist/; takes minutes
 	$(BIN)/python -m slam_backend.core.compilation.wheel dist slam_backend vslam_env
