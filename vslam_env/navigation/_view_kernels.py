@@ -29,13 +29,15 @@ from vslam_env.navigation._planning_kernels.dijkstra import (
 )
 
 MOST_LOOKS = 255
-LOOKED = 10  # looks at a border cell and its eight neighbours from which a wall counts as seen twice
+LOOKED = 45  # looks at a border cell and its eight neighbours after which hardly a landmark there is missed
 WEAK = 3  # landmarks with fewer measurements are to be seen again
 FACING = 0.5  # cosine of the largest incidence at which landmarks are measured
+NEAREST = 1.4  # [m] from which landmarks 0.5 m above or below the camera are in its view
 BEFORE = 0.2  # [m] from a hit to the cell that counts the look
 JUMP = 0.5  # [m] neighbouring hits farther apart lie on different surfaces
 MARCH = 0.75 * CELL  # [m] step along a line of sight
 RAY_ANGLE = 0.05  # [rad] between rays of a view
+WALL_CELLS = 3  # [cells] from a wall within which a point may be a landmark
 AT_WALL = 0.3  # [m] a line of sight to a landmark ends so far before it
 
 UNKNOWN_AREA, UNSEEN_WALL, WEAK_LANDMARKS, UNCERTAIN_LENGTH, NUM_GAINS = 0, 1, 2, 3, 4
@@ -97,6 +99,12 @@ def mark_borders(cells: Any, row: int, first: int, last: int, flags: Any) -> Non
         flags[i] = (here[i] == FREE) & beside
 
 
+@inline
+def nearest_look(reach: float) -> float:
+    """Return the range [m] from which a wall is seen at all heights of landmarks, for cameras with a range [m]."""
+    return min(NEAREST, 0.5 * reach)
+
+
 @device
 @in_place
 def wall_length(cells: Any, row: int, col: int, along_x: float, along_y: float) -> float:
@@ -125,9 +133,9 @@ def looks_of(scan: Any, directions: Any, reach: float, points: Any) -> int:
     Returns:
         Number of points.
     """
-    count, num = len(scan), 0
+    count, num, nearest = len(scan), 0, nearest_look(reach)
     for k in range(count):
-        if not 0.0 < scan[k] < reach:
+        if not nearest < scan[k] < reach:
             continue
         first = k - 1 if k > 0 and abs(scan[k - 1] - scan[k]) < JUMP else k
         last = k + 1 if k + 1 < count and abs(scan[k + 1] - scan[k]) < JUMP else k
@@ -203,9 +211,9 @@ def is_clear(cells: Any, x: float, y: float, to_x: float, to_y: float, slack: fl
 
 @device
 @in_place
-def is_unseen(cells: Any, looks: Any, row: int, col: int) -> bool:
-    """Return whether a cell, not at the edge of the grid, is a border cell whose wall was looked at too little."""
-    return is_border(cells, row, col) and count_looks(looks, row, col) < LOOKED
+def lack_of_looks(looks: Any, row: int, col: int) -> float:
+    """Return the share, 0 to 1, of the looks that the wall beside a cell, not at the edge of the grid, still lacks."""
+    return max(1.0 - count_looks(looks, row, col) / LOOKED, 0.0)
 
 
 @device
@@ -220,7 +228,7 @@ def view_gains(cells: Any, looks: Any, weak: Any, view: Any, camera: Any, gains:
         view: (3 or more,) [m, m, rad]. Pose of the camera.
         camera: (3,). Half the field of view [rad], range [m], radius of the robot [m].
         gains: (3 or more,). Output: unknown area [m^2] in view, through what is unknown; length [m] of walls in view
-            that were looked at too little; number of weak landmarks in view.
+            that were looked at too little, by the share of looks that they lack; number of weak landmarks in view.
     """
     size, half_fov, reach = len(cells), camera[0], camera[1]
     x, y = view[0], view[1]
@@ -229,7 +237,7 @@ def view_gains(cells: Any, looks: Any, weak: Any, view: Any, camera: Any, gains:
     width = 2.0 * half_fov / rays
     inset = (LARGEST_SIZE - size) // 2  # in the largest grid coordinates are positive, so that `int` rounds them down
     start_col, start_row = (x + LARGEST_HALF_WIDTH) / CELL, (y + LARGEST_HALF_WIDTH) / CELL
-    area, wall = 0.0, 0.0
+    area, wall, nearest = 0.0, 0.0, nearest_look(reach)
     for k in range(rays):
         angle = view[2] - half_fov + (k + 0.5) * width
         c, s = math.cos(angle), math.sin(angle)
@@ -239,8 +247,10 @@ def view_gains(cells: Any, looks: Any, weak: Any, view: Any, camera: Any, gains:
             inside = 1 <= row < size - 1 and 1 <= col < size - 1
             state = cells[row, col] if inside else UNKNOWN
             if state == OCCUPIED:
-                if last_row >= 0 and is_unseen(cells, looks, last_row, last_col):
-                    wall += wall_length(cells, last_row, last_col, c, s) * i
+                if i * CELL >= nearest and is_border(cells, last_row, last_col):
+                    lack = lack_of_looks(looks, last_row, last_col)
+                    if lack > 0.0:
+                        wall += wall_length(cells, last_row, last_col, c, s) * i * lack
                 break
             area += i if state == UNKNOWN else 0
             last_row, last_col = row, col
@@ -257,10 +267,10 @@ def view_gains(cells: Any, looks: Any, weak: Any, view: Any, camera: Any, gains:
 BLOCK = 5  # [cells] side of the blocks into which unseen walls are cut
 SPACING = 6  # [cells] between the places that are tried
 BINS = 24  # headings that are tried; a view holds targets of three neighbouring ones
-NEAREST, FARTHEST = 0.8, 4.5  # [m] from which targets are looked at
+FARTHEST = 4.5  # [m] from which targets are looked at
 LEAST_BLOCK = 2  # border cells of a block that is a target
 LANDMARK_VALUE = 0.6  # [m] of unseen wall that a weak landmark is worth
-MOST_TARGETS = 96
+MOST_TARGETS = 192
 LEAST_GAIN, LEAST_KEPT = 1.0, 0.6  # [m] of a new candidate and of one that is kept
 APART = 1.0  # [m] between new candidates
 AT_GOAL, LOOKING, PATIENCE = 0.5, 0.4, 4  # [m], [rad], and updates after which what is still unseen is given up
@@ -289,15 +299,16 @@ def collect_targets(cells: Any, bounds: Any, looks: Any, weak: Any) -> Any:
         mark_borders(cells, row, first, last, flags)
         for i in range(len(flags)):
             col = first + i
-            if not flags[i] or count_looks(looks, row, col) >= LOOKED:
+            lack = lack_of_looks(looks, row, col) if flags[i] else 0.0
+            if lack == 0.0:
                 continue
             block = blocks[row // BLOCK - top, col // BLOCK - left]
-            block[0] += to_coordinate(col, size)
-            block[1] += to_coordinate(row, size)
+            block[0] += lack * to_coordinate(col, size)
+            block[1] += lack * to_coordinate(row, size)
             for v, u in ((0, 1), (1, 0), (0, -1), (-1, 0)):
                 if cells[row + v, col + u] == OCCUPIED:
-                    block[2], block[3] = block[2] - u, block[3] - v
-            block[4] += 1.0
+                    block[2], block[3] = block[2] - lack * u, block[3] - lack * v
+            block[4] += lack
     targets = np.empty((MOST_TARGETS, 6))
     num = 0
     for r in range(blocks.shape[0]):
@@ -325,8 +336,8 @@ def collect_targets(cells: Any, bounds: Any, looks: Any, weak: Any) -> Any:
 def is_measurable(cells: Any, target: Any, x: float, y: float, reach: float) -> bool:
     """Return whether a target can be measured from a place [m] by a camera that looks at it."""
     u, v = target[0] - x, target[1] - y
-    square, most = u * u + v * v, min(FARTHEST, reach)
-    if not NEAREST * NEAREST <= square <= most * most:
+    square, nearest, most = u * u + v * v, nearest_look(reach), min(FARTHEST, reach)
+    if not nearest * nearest <= square <= most * most:
         return False
     if target[2] != 0.0 or target[3] != 0.0:
         before = -(u * target[2] + v * target[3])
@@ -408,8 +419,20 @@ def give_up(looks: Any, target: Any) -> None:
 
 
 @device
+@in_place
+def is_at_unseen_wall(cells: Any, looks: Any, row: int, col: int) -> bool:
+    """Return whether a border cell whose wall lacks looks lies within `WALL_CELLS` of a cell."""
+    last = len(cells) - 1
+    for r in range(max(row - WALL_CELLS, 1), min(row + WALL_CELLS + 1, last)):
+        for c in range(max(col - WALL_CELLS, 1), min(col + WALL_CELLS + 1, last)):
+            if is_border(cells, r, c) and lack_of_looks(looks, r, c) > 0.0:
+                return True
+    return False
+
+
+@device
 @jit
-def worth_seeing(looks: Any, bounds: Any, places: Any, counts: Any, start: Any) -> tuple[Any, Any]:
+def worth_seeing(cells: Any, looks: Any, bounds: Any, places: Any, counts: Any, start: Any) -> tuple[Any, Any]:
     """Return the places (n, 2) of landmarks measured too rarely, and the blocks (m, m) bool near the other ones.
 
     Landmarks that stay rare however often the robot looks at them are taken for false points. The landmarks (n, 2 or
@@ -427,7 +450,7 @@ def worth_seeing(looks: Any, bounds: Any, places: Any, counts: Any, start: Any) 
         if not (bounds[0] <= row < bounds[2] and bounds[1] <= col < bounds[3]):
             continue
         if counts[k, 0] < WEAK:
-            if looks[row, col] < MOST_LOOKS:
+            if looks[row, col] < MOST_LOOKS and is_at_unseen_wall(cells, looks, row, col):
                 weak[num, 0], weak[num, 1] = x, y
                 num += 1
         else:
@@ -634,7 +657,7 @@ def renew_candidates(
     first_revisit, first_rendezvous = len(rows) - num_places - len(visits), len(rows) - num_places
     box, weights, cost, parents, first_row, first_col = ways
     corner = (first_row, first_col)
-    weak, sure = worth_seeing(looks, bounds, *landmarks)
+    weak, sure = worth_seeing(cells, looks, bounds, *landmarks)
 
     revisits = rows[first_revisit:first_rendezvous]
     targets = collect_targets(cells, bounds, looks, weak)

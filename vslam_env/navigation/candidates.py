@@ -65,8 +65,8 @@ class CandidateGains(NamedTuple):
 
     Attributes:
         unknown_area: Unknown area in view from the goal [m^2], looking through what is unknown up to the next wall.
-        unseen_wall: Length of walls in view that were looked at too little [m].
-        weak_landmarks: Number of landmarks in view with fewer than three measurements.
+        unseen_wall: Length of walls in view that were looked at too little, by the share of looks that they lack [m].
+        weak_landmarks: Number of landmarks in view with fewer than three measurements, at walls that lack looks.
         uncertain_length: Length of the path over floor without well-known landmarks nearby [m].
     """
 

@@ -21,7 +21,8 @@ SLACK = 1e-6  # [rad] so that the outermost rays of a scan over the field of vie
 class TeamLooks:
     """Looks of each robot at walls, in the frame and with the cells of its occupancy grid.
 
-    Each ray of a scan that meets a wall within the range of the camera, at an incidence below 60 degrees, is a look. It
+    Each ray of a scan that meets a wall within the range of the camera, not nearer than 1.4 m or half that range, where
+    high and low landmarks are out of view, at an incidence below 60 degrees, is a look. It
     is counted on the free cell just before the wall, so that the two sides of a wall differ, once a tick and cell.
     Looks follow the grids when these grow and when robots merge, part and meet again.
 
