@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from importlib import import_module
 from inspect import signature
 from pathlib import Path
+from traceback import extract_tb
 from typing import Any
 
 from agents.policy import Policy
@@ -44,9 +45,11 @@ def load_plugin(name: str) -> Policy:
         name: Module and name, e.g. `"my_module:Careful"`.
 
     Raises:
-        ValueError: If the module or the name does not exist, or the result is not a policy.
+        ValueError: If the module or the name does not exist, the call raises, or the result is not a policy.
     """
-    policy = _find(name)()
+    maker = _find(name)
+    with _one_line(name):
+        policy = maker()
     missing = [method for method in METHODS if not callable(getattr(policy, method, None))]
     if missing:
         got = f"a {type(policy).__name__} without {missing[0]}"
@@ -59,11 +62,9 @@ def _find(name: str) -> Any:
     """Return the class or function that makes the policy."""
     module, _, factory = name.partition(":")
     try:
-        with _current_folder_first():
+        with _current_folder_first(), _one_line(module):
             found = import_module(module)
     except ModuleNotFoundError as error:
-        if error.name is None or not f"{module}.".startswith(f"{error.name}."):
-            raise  # the module exists; one of its own imports is missing
         hint = "Name an installed module, or change into the folder that contains it."
         raise argument_error("policy", EXPECTED, f"no module {module!r}", hint) from error
     made = getattr(found, factory, None)
@@ -83,6 +84,29 @@ def _may_make_policies(maker: Any) -> bool:
     except (TypeError, ValueError):  # ValueError: no signature is available
         return False
     return True
+
+
+@contextmanager
+def _one_line(name: str) -> Iterator[None]:
+    """Turn what a custom module raises within the block into an error of one line, unless the module is missing."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if error.name is not None and f"{name}.".startswith(f"{error.name}."):
+            raise
+        raise _raised(name, error) from error  # one of its own imports is missing
+    except Exception as error:
+        raise _raised(name, error) from error
+
+
+def _raised(name: str, error: Exception) -> ValueError:
+    """Return an error of one line that says what a custom module raised, and where."""
+    last = extract_tb(error.__traceback__)[-1]
+    what = " ".join(f"{type(error).__name__}: {error}".split())
+    return ValueError(
+        f"policy {name!r}: expected it to be imported and made, got {what} ({Path(last.filename).name}, line "
+        f"{last.lineno}). Correct the policy."
+    )
 
 
 @contextmanager

@@ -174,6 +174,11 @@ class Mute:
         pass
 
 
+class Broken(Still):
+    def __init__(self):
+        raise RuntimeError("no weights")
+
+
 class Odd(Still):
     action_type = "flight"
 
@@ -241,10 +246,20 @@ def test_invalid_policies_have_specific_errors(module: str, name: str, action_ty
         make_policy(name.format(module), action_type)
 
 
-def test_a_failing_module_keeps_its_own_error(module: str) -> None:
-    """A module with a failing import of its own keeps its own error."""
-    with pytest.raises(ModuleNotFoundError, match="a_missing_module"):
-        make_policy("asks_for_more:Still", "goal")
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("asks_for_more:Still", "ModuleNotFoundError: No module named 'a_missing_module' (asks_for_more.py, line 1)"),
+        ("{}:Broken", "RuntimeError: no weights (policies_of_a_user.py, line "),
+    ],
+)
+def test_modules_and_classes_that_raise_have_errors_of_one_line(module: str, name: str, says: str) -> None:
+    """What a module of a user raises while it is imported, or a class while it is made, is told in one line."""
+    with pytest.raises(ValueError, match="expected it to be imported and made, got ") as raised:
+        make_policy(name.format(module), "continuous")
+    assert says in str(raised.value)
+    assert "\n" not in str(raised.value)
+    assert raised.value.__cause__ is not None
 
 
 def test_paths_are_not_taken_for_modules() -> None:
