@@ -254,7 +254,7 @@ def test_invalid_policies_have_specific_errors(module: str, name: str, action_ty
     ],
 )
 def test_modules_and_classes_that_raise_have_errors_of_one_line(module: str, name: str, says: str) -> None:
-    """What a module of a user raises while it is imported, or a class while it is made, is told in one line."""
+    """What a module of a user raises while it is imported, or a class while it is made, becomes one line."""
     with pytest.raises(ValueError, match="expected it to be imported and made, got ") as raised:
         make_policy(name.format(module), "continuous")
     assert says in str(raised.value)
