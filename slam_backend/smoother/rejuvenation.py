@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.geometry import wrap_angle
 from slam_backend.models.odometry import OdometryModel
-from slam_backend.resampling import systematic
 from slam_backend.smoother import _kernels
 from slam_backend.smoother._kernels import Keys
 from slam_backend.smoother.duplicates import find_duplicates, without_duplicates
@@ -27,7 +26,7 @@ from slam_backend.smoother.graph_reduction import reduce_keyframes, relinearise,
 from slam_backend.smoother.log_arrays import EXACT, REJECTED, LogArrays
 from slam_backend.smoother.optimizer import NO_POSE, MapEstimate, optimize
 from slam_backend.smoother.options import SmoothingOptions
-from slam_backend.smoother.sampling import PathSamples, sample_paths, sample_transition_variances
+from slam_backend.smoother.sampling import PathSamples, sample_more_paths, sample_paths, sample_transition_variances
 
 DRAFT_TOLERANCE = 10.0  # factor on the tolerance of descents without draws
 
@@ -203,9 +202,8 @@ def sample_particles(
     chosen, ess = draws, draws.sample_size
     needed = options.least_ess * num_particles
     if needed > ess >= needed / options.more_draws:
-        many = sample_paths(grown, mode, options.more_draws * num_particles, rng)
-        chosen = many.taken(systematic(many.weights, rng, num_particles))
-        ess = min(many.sample_size, float(num_particles))
+        chosen, size = sample_more_paths(grown, mode, options.more_draws * num_particles, num_particles, rng)
+        ess = min(size, float(num_particles))
     graph = reduce_keyframes(relinearise(grown, mode, draws.transition_variances), camera, options, mode.sightings)
     if not ess >= needed:
         return Rejuvenation(graph, f"an effective sample size of {ess:.1f}", ess, mode.iterations, None)

@@ -6,12 +6,14 @@ sampled about the mode and then retracted motion by motion.
 """
 
 import math
-from typing import NamedTuple, Self
+from collections.abc import Callable
+from typing import NamedTuple, Self, TypeVar
 
 import numpy as np
 
 from slam_backend.core.jit import jit
 from slam_backend.core.validation import FloatArray, IntArray
+from slam_backend.resampling import systematic
 from slam_backend.smoother import _kernels
 from slam_backend.smoother._kernels import LANES, POSE_ROWS, Keys
 from slam_backend.smoother.graph import SlamGraph
@@ -103,15 +105,15 @@ class PathSamples(NamedTuple):
         rows = self.tiles.transpose(0, 2, 1, 3).reshape(count, 9, blocks * LANES)
         return np.ascontiguousarray(rows[:, :, : self.poses.shape[2]])
 
-    def taken(self, ancestors: IntArray) -> "PathSamples":
-        """Return copies of the paths with indices `ancestors` (M',), with equal weights."""
-        m = len(ancestors)
-        padded = np.concatenate([ancestors, np.repeat(ancestors[:1], -m % LANES)])  # surplus lanes are copies
-        blocks = len(padded) // LANES
-        tiles = self.landmarks[:, :, padded].reshape(len(self.tiles), 9, blocks, LANES).transpose(0, 2, 1, 3)
-        return PathSamples.weighed(
-            self.poses[:, :, ancestors], np.ascontiguousarray(tiles), np.zeros(m), self.transition_variances
-        )
+
+class PathWeights(NamedTuple):
+    """M paths without landmarks: the attributes of `PathSamples` that weighing them yields."""
+
+    poses: FloatArray
+    log_weights: FloatArray
+    weights: FloatArray
+    sample_size: float
+    transition_variances: FloatArray
 
 
 def sample_paths(graph: SlamGraph, mode: MapEstimate, num_particles: int, rng: np.random.Generator) -> PathSamples:
@@ -127,11 +129,42 @@ def sample_paths(graph: SlamGraph, mode: MapEstimate, num_particles: int, rng: n
         num_particles: M >= 1.
         rng: Source of the draws.
     """
-    poses, log_proposals = mode.paths(num_particles, rng)
-    gaussian = _importance_weights(graph, mode, poses, log_proposals)
-    if gaussian.sample_size >= MIN_GAUSSIAN_SAMPLE_SIZE * num_particles:
+    return _best_of_two_charts(graph, mode, num_particles, rng, _importance_weights)
+
+
+def sample_more_paths(
+    graph: SlamGraph, mode: MapEstimate, num_drawn: int, num_particles: int, rng: np.random.Generator
+) -> tuple[PathSamples, float]:
+    """Draw and weigh paths as `sample_paths` does, and resample fewer of them: only these get landmarks.
+
+    Args:
+        graph, mode, rng: Same arguments as `sample_paths`.
+        num_drawn: Number of weighed paths.
+        num_particles: M, number of resampled paths.
+
+    Returns:
+        M paths with equal weights, and the effective sample size of the weighed ones.
+    """
+    drawn = _best_of_two_charts(graph, mode, num_drawn, rng, _weights_alone)
+    poses = drawn.poses[:, :, systematic(drawn.weights, rng, num_particles)]
+    tiles = replay(mode, lane_rows(poses), num_particles)[0]
+    chosen = PathSamples.weighed(poses, tiles, np.zeros(num_particles), drawn.transition_variances)
+    return chosen, drawn.sample_size
+
+
+Draws = TypeVar("Draws", PathSamples, PathWeights)
+
+
+def _best_of_two_charts(
+    graph: SlamGraph, mode: MapEstimate, num_paths: int, rng: np.random.Generator,
+    weigh: Callable[[SlamGraph, MapEstimate, FloatArray, FloatArray], Draws],
+) -> Draws:  # fmt: skip
+    """Draw paths and weigh them, see `sample_paths`."""
+    poses, log_proposals = mode.paths(num_paths, rng)
+    gaussian = weigh(graph, mode, poses, log_proposals)
+    if gaussian.sample_size >= MIN_GAUSSIAN_SAMPLE_SIZE * num_paths:
         return gaussian
-    retracted = _importance_weights(
+    retracted = weigh(
         graph, mode, retract_on_se2(mode.poses, graph.parents, poses - mode.poses[:, :, None]), log_proposals
     )
     return max(gaussian, retracted, key=lambda draws: np.nan_to_num(draws.sample_size))
@@ -158,6 +191,21 @@ def _importance_weights(
     tiles, log_likelihood = replay(mode, rows, num_paths)
     log_odometry, transition_variances = odometry_log_density(graph, mode, rows, num_paths)
     return PathSamples.weighed(poses, tiles, log_likelihood + log_odometry - log_proposals, transition_variances)  # (2)
+
+
+def _weights_alone(graph: SlamGraph, mode: MapEstimate, poses: FloatArray, log_proposals: FloatArray) -> PathWeights:
+    """Return the importance weights of paths (k, 3, M) as `_importance_weights` does; landmarks are not kept."""
+    num_paths = poses.shape[2]
+    rows = lane_rows(poses)
+    tiles = np.empty(len(mode.landmarks) * 9 * LANES)  # of one block after the other: of all they exceed a cache
+    log_likelihood = np.empty((len(rows), LANES))
+    for block, out in zip(rows, log_likelihood, strict=True):
+        _kernels.replay(block.reshape(-1), len(poses), 1, mode.landmarks, mode.sightings, tiles, out)
+    log_odometry, transition_variances = odometry_log_density(graph, mode, rows, num_paths)
+    log_weights = log_likelihood.reshape(-1)[:num_paths] + log_odometry - log_proposals
+    weights = np.empty(num_paths)
+    sample_size = _kernels.normalise(log_weights, weights)
+    return PathWeights(poses, log_weights, weights, sample_size, transition_variances)
 
 
 def lane_rows(poses: FloatArray) -> FloatArray:

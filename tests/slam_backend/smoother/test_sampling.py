@@ -11,17 +11,18 @@ from slam_backend.fastslam._kernels import LANES as FILTER_LANES
 from slam_backend.fastslam.run_log import RobotLog
 from slam_backend.geometry import between, compose
 from slam_backend.models.odometry import OdometryModel
+from slam_backend.resampling import systematic
 from slam_backend.smoother._kernels import LANES, normalise, weigh_deviations
 from slam_backend.smoother.graph import SlamGraph
 from slam_backend.smoother.graph_building import extend_graph
 from slam_backend.smoother.optimizer import MapEstimate, optimize
 from slam_backend.smoother.sampling import (
-    PathSamples,
     _importance_weights,
     lane_rows,
     odometry_log_density,
     replay,
     retract_on_se2,
+    sample_more_paths,
     sample_paths,
     sample_transition_variances,
 )
@@ -60,14 +61,20 @@ def linear_toy(steps: int = 6) -> tuple[SlamGraph, MapEstimate]:
     return graph, optimize(graph, CAMERA, TIGHT)
 
 
-def test_paths_of_a_run_without_landmarks_can_be_sampled():
-    """Draws without a landmark are taken as any others; they have none then, either."""
-    tiles = np.empty((0, 1, 9, LANES))
-    draws = PathSamples.weighed(np.zeros((2, 3, 40)), tiles, np.zeros(40), np.zeros(2))
-    taken = draws.taken(np.arange(60) % 40)
-    assert draws.landmarks.shape == (0, 9, 40)
-    assert taken.tiles.shape == (0, 2, 9, LANES)
-    assert taken.poses.shape == (2, 3, 60)
+@pytest.mark.parametrize("turn", [0.0, 0.1])  # with uncertain headings the paths are retracted
+def test_resampled_paths_are_those_of_all_draws(turn):
+    """Paths resampled of more draws equal those of all draws with their landmarks, to the bit."""
+    graph, mode = linear_toy() if turn == 0.0 else wandering(turn)
+    rng, other = np.random.default_rng(4), np.random.default_rng(4)
+    every = sample_paths(graph, mode, 8 * 70, rng)
+    ancestors = systematic(every.weights, rng, 70)
+    chosen, size = sample_more_paths(graph, mode, 8 * 70, 70, other)
+    assert size == every.sample_size
+    np.testing.assert_array_equal(chosen.poses, every.poses[:, :, ancestors])
+    np.testing.assert_array_equal(chosen.landmarks, every.landmarks[:, :, ancestors])
+    np.testing.assert_array_equal(chosen.weights, np.full(70, chosen.weights[0]))
+    np.testing.assert_array_equal(chosen.transition_variances, every.transition_variances)
+    assert rng.bit_generator.state == other.bit_generator.state
 
 
 def test_where_all_is_linear_the_weights_are_constant():
