@@ -103,7 +103,15 @@ def align_maps(
     options, rng = _checked(map_a, map_b, method, rng, options)
     if too_many(map_a, map_b, options):
         return Alignment.refused("too many candidates")
-    matches, distinctive = candidates(map_a, map_b, options)
+    return align_candidates(map_a, map_b, candidates(map_a, map_b, options), method, rng, options)
+
+
+def align_candidates(
+    map_a: LandmarkMap, map_b: LandmarkMap, found: tuple[IntArray, BoolArray], method: str, rng: np.random.Generator,
+    options: AlignmentOptions,
+) -> Alignment:  # fmt: skip
+    """Return the result of `align_maps`, which takes the other arguments, with the result of `candidates`."""
+    matches, distinctive = found
     if len(matches) < options.min_inliers:
         return Alignment.refused("too few candidates")
     table = match_table(map_a, map_b, matches)

@@ -7,9 +7,11 @@ from numpy.typing import NDArray
 
 from slam_backend.core.validation import BoolArray, Float32Array, FloatArray, IntArray, argument_error
 from slam_backend.maps import _kernels as kernels
+from slam_backend.maps import near_pairs
 from slam_backend.maps._kernels import descriptor_matching
 from slam_backend.maps.alignment_types import AlignmentOptions
 from slam_backend.maps.landmark_map import LandmarkMap
+from slam_backend.maps.near_pairs import NearPairs
 
 MAX_PAIRS = 10_000  # candidates without appearance
 ALL = 2**62  # as good as no limit to a number of pairs
@@ -20,8 +22,13 @@ def too_many(map_a: LandmarkMap, map_b: LandmarkMap, options: AlignmentOptions) 
     return not options.appearance and len(map_a) * len(map_b) > MAX_PAIRS
 
 
-def candidates(map_a: LandmarkMap, map_b: LandmarkMap, options: AlignmentOptions) -> tuple[IntArray, BoolArray]:
-    """Return the candidates (k, 2), and the mask (k,) of distinctive ones, which are one-to-one."""
+def candidates(
+    map_a: LandmarkMap, map_b: LandmarkMap, options: AlignmentOptions, near: NearPairs | None = None
+) -> tuple[IntArray, BoolArray]:
+    """Return the candidates (k, 2), and the mask (k,) of distinctive ones, which are one-to-one.
+
+    With the near pairs of the two maps, descriptors are not compared again; the result is the same.
+    """
     if map_a.descriptors.shape[1] != map_b.descriptors.shape[1]:
         raise argument_error(
             "map_b",
@@ -34,7 +41,12 @@ def candidates(map_a: LandmarkMap, map_b: LandmarkMap, options: AlignmentOptions
             "map_b", f"at most {MAX_PAIRS} pairs of landmarks without appearance", len(map_a) * len(map_b),
             "Give smaller maps, or use appearance.",
         )  # fmt: skip
-    if options.appearance:
+    if near is not None:
+        clear = near_pairs.mutual_pairs(near, options)
+        for side, other in ((1, map_b), (0, map_a)):
+            clear = clear[near_pairs.passes_ratio_test(near, clear, side, other.means, options)]
+        alike = near_pairs.similar_pairs(near, options) if options.max_similar else clear[:0]
+    elif options.appearance:
         clear = mutual_nearest(map_a.descriptors, map_b.descriptors, options.descriptor_gate)
         for one, other, here, there in ((map_a, map_b, 0, 1), (map_b, map_a, 1, 0)):
             descriptors, partners = one.descriptors[clear[:, here]], clear[:, there]
@@ -56,11 +68,17 @@ def candidates(map_a: LandmarkMap, map_b: LandmarkMap, options: AlignmentOptions
     return matches[level], distinctive[level]
 
 
-def has_enough_candidates(descriptors_a: Float32Array, descriptors_b: Float32Array, options: AlignmentOptions) -> bool:
+def has_enough_candidates(
+    descriptors_a: Float32Array, descriptors_b: Float32Array, options: AlignmentOptions, near: NearPairs | None = None
+) -> bool:
     """Return whether two maps with descriptors (n, d), (m, d) may have enough candidates for an alignment.
 
-    With appearance every candidate is a pair within the gate; with too few of them no maps need to be built.
+    With appearance every candidate is a pair within the gate; with too few of them no maps need to be built. With the
+    near pairs of the two maps, descriptors are not compared again.
     """
+    if near is not None:
+        gate = options.descriptor_gate * options.descriptor_gate
+        return int(np.count_nonzero(near.squares.astype(np.float64) <= gate)) >= options.min_inliers
     if not options.appearance or descriptors_a.shape[1] != descriptors_b.shape[1]:
         return True
     least = options.min_inliers

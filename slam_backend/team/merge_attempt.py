@@ -11,10 +11,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from slam_backend.core.validation import IntArray
+from slam_backend.fastslam.particle_maps import present_slots
 from slam_backend.fastslam.reports import MergeEvent
-from slam_backend.maps.alignment import Alignment, AlignmentOptions, align_maps
+from slam_backend.maps.alignment import Alignment, AlignmentOptions, align_candidates
 from slam_backend.maps.correspondences import has_enough_candidates
 from slam_backend.maps.landmark_map import LandmarkMap
+from slam_backend.maps.near_pairs import Appearance
 from slam_backend.team.group_merging import MergePlan, smoothed_maps, transform_uncertainty
 from slam_backend.team.groups import Group
 from slam_backend.team.merge_scheduler import MergeScheduler, PairKey, PendingAttempt
@@ -70,7 +72,7 @@ def run_attempt(
         return None
     schedule.pending_attempt = None
     maps = _mixtures(pair)
-    outcome = _realign(pair, pending.alignment, maps, alignment, records, rng)
+    outcome = _realign(pair, pending.alignment, maps, schedule, alignment, records, rng)
     return _finish(MergePlan(pair, maps, outcome), step, pending.alignment, schedule, alignment, merging, rng)
 
 
@@ -83,19 +85,19 @@ def _start(
         return None
     connected = (pair for pair in _pairs(groups) if _are_connected(pair, networks))
     pairs = {_key(pair): pair for pair in connected if schedule.may_try(_key(pair), step)}
-    found = {group.robots: group.trunk.filter.descriptors() for group in _unique(pairs)}
-    pairs = {key: pair for key, pair in pairs.items() if has_enough_candidates(found[key[0]], found[key[1]], options)}
+    found = {group.robots: _appearance(group) for group in _unique(pairs)}
+    pairs = {key: pair for key, pair in pairs.items() if _may_align(key, found, schedule, options)}
     maps = {group.robots: group.trunk.filter.map("mixture") for group in _unique(pairs)}
     chosen = schedule.choose({key: (maps[key[0]], maps[key[1]]) for key in pairs}, step)
     if chosen is None:
         return None
     pair, (map_a, map_b) = pairs[chosen], (maps[chosen[0]], maps[chosen[1]])
-    unsmoothed = align_maps(map_a, map_b, rng=rng, options=options)
+    unsmoothed = _align(pair, (map_a, map_b), schedule, options, rng)
     records.exchange.record_maps(*representatives(pair), map_a, map_b)
     plan = MergePlan(pair, (map_a, map_b), unsmoothed)
     if not unsmoothed.success or not merging.smooth_first:
         return _finish(plan, step, None, schedule, options, merging, rng)
-    if all(group.trunk.filter.smooths_incrementally for group in pair):
+    if _smooth_in_slices(pair):
         for group in pair:
             group.trunk.filter.request_rejuvenation()
         schedule.pending_attempt = PendingAttempt(chosen, _numbers(pair), unsmoothed, step)
@@ -104,20 +106,41 @@ def _start(
     smoothed = smoothed_maps(*pair)
     if smoothed is None:
         return _finish(plan, step, None, schedule, options, merging, rng)
-    outcome = _realign(pair, unsmoothed, smoothed, options, records, rng, before)
+    outcome = _realign(pair, unsmoothed, smoothed, schedule, options, records, rng, before)
     return _finish(MergePlan(pair, smoothed, outcome), step, unsmoothed, schedule, options, merging, rng)
 
 
+def _appearance(group: Group) -> Appearance:
+    """Return the landmarks of a group's `map`."""
+    state = group.trunk.filter.state
+    slots = present_slots(state.maps, state.best, 1)
+    return Appearance(state.maps.ids[slots], state.maps.descriptors[slots])
+
+
+def _may_align(
+    key: PairKey, found: Mapping[tuple[int, ...], Appearance], schedule: MergeScheduler, options: AlignmentOptions
+) -> bool:
+    """Return whether the maps of two groups may have enough candidates; with too few no maps need to be built."""
+    a, b = (found[robots] for robots in key)
+    return has_enough_candidates(a.descriptors, b.descriptors, options, schedule.near_pairs(key, a, b))
+
+
+def _align(
+    pair: Pair, maps: Maps, schedule: MergeScheduler, options: AlignmentOptions, rng: np.random.Generator
+) -> Alignment:
+    """Return the result of `align_maps`; descriptors compared in earlier attempts are not compared again."""
+    return align_candidates(*maps, schedule.candidates(_key(pair), *maps), "ransac", rng, options)
+
+
 def _realign(
-    pair: Pair, unsmoothed: Alignment, maps: Maps, options: AlignmentOptions, records: SharedRecords,
-    rng: np.random.Generator,
-    before: Sequence[Mapping[str, Any]] = (),
+    pair: Pair, unsmoothed: Alignment, maps: Maps, schedule: MergeScheduler, options: AlignmentOptions,
+    records: SharedRecords, rng: np.random.Generator, before: Sequence[Mapping[str, Any]] = (),
 ) -> Alignment:  # fmt: skip
     """Align smoothed maps, which must keep most inliers of the unsmoothed ones.
 
     Otherwise filters that were smoothed for the attempt are restored to their states `before` it.
     """
-    alignment = align_maps(*maps, rng=rng, options=options)
+    alignment = _align(pair, maps, schedule, options, rng)
     records.exchange.record_smoothed(*representatives(pair), *maps)
     fewer = alignment.success and len(alignment.inliers) < LEAST_KEPT * len(unsmoothed.inliers)
     if fewer or alignment.reason == "too few inliers":
@@ -144,7 +167,7 @@ def _finish(
         if not found.success:  # the draws for the merge are dropped
             rng.bit_generator.state = before
             plan = plan._replace(pairing=None, joint=None)
-    schedule.record(_key(pair), step, found.success, smoothed=unsmoothed is not None)
+    schedule.record(_key(pair), step, found.success, unsmoothed is not None, _smooth_in_slices(pair))
     event = MergeEvent(step, "attempt", pair[0].robots, pair[1].robots, found, unsmoothed, uncertainty)
     return AttemptResult(event, plan if found.success else None)
 
@@ -183,6 +206,11 @@ def _are_connected(pair: Pair, networks: IntArray) -> bool:
     """Return whether two groups are in contact."""
     one, other = representatives(pair)
     return bool(networks[one] == networks[other])
+
+
+def _smooth_in_slices(pair: Pair) -> bool:
+    """Return whether the smoothers of both joint filters work in slices."""
+    return all(group.trunk.filter.smooths_incrementally for group in pair)
 
 
 def _unique(pairs: Mapping[PairKey, Pair]) -> list[Group]:

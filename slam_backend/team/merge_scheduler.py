@@ -7,17 +7,17 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from slam_backend.core.read_only import as_constant, with_constants
-from slam_backend.core.validation import MOST, FloatArray, argument_error, check_int, known_names
+from slam_backend.core.validation import MOST, BoolArray, FloatArray, IntArray, argument_error, check_int, known_names
 from slam_backend.geometry import wrap_angle
 from slam_backend.maps.alignment import (
     DISTINCT_ROTATION,
     DISTINCT_TRANSLATION,
     Alignment,
     AlignmentOptions,
-    candidate_matches,
 )
-from slam_backend.maps.correspondences import too_many
+from slam_backend.maps.correspondences import candidates, too_many
 from slam_backend.maps.landmark_map import LandmarkMap
+from slam_backend.maps.near_pairs import Appearance, NearPairs, near_pairs
 
 PairKey = tuple[tuple[int, ...], tuple[int, ...]]  # two groups, as tuples of robots
 MIN_LOG_GROWTH = 0.125  # least share of new entries in the logs before they are smoothed again for the same pair
@@ -96,6 +96,7 @@ class MergeScheduler:
         self._alignment = alignment
         self._records: dict[PairKey, AttemptRecord] = {}
         self._proposed: dict[PairKey, set[tuple[int, int]]] = {}
+        self._near: dict[PairKey, NearPairs] = {}  # results of `near_pairs`; not part of the state
         self._blocks: list[tuple[PairKey, int]] = []  # blocked pairs, and the step when the block ends
         self._uncertainties: dict[tuple[int, int], float] = {}  # least uncertainty by robots of both sides
         self._trials: dict[tuple[int, int], FloatArray] = {}  # last motion by the robots that define the frames
@@ -112,6 +113,21 @@ class MergeScheduler:
             return False
         return pair not in self._records or step >= self._records[pair].next_step
 
+    def near_pairs(self, pair: PairKey, a: Appearance, b: Appearance) -> NearPairs | None:
+        """Return the near pairs of two groups' landmarks; those of the last call for these groups are not sought again.
+
+        None: there are too many, or matching is not by appearance.
+        """
+        found = near_pairs(a, b, self._alignment, self._near.pop(pair, None))
+        if found is not None:
+            self._near[pair] = found
+        return found
+
+    def candidates(self, pair: PairKey, map_a: LandmarkMap, map_b: LandmarkMap) -> tuple[IntArray, BoolArray]:
+        """Return the result of `correspondences.candidates` for two groups' maps."""
+        a, b = (Appearance(landmarks.ids, landmarks.descriptors) for landmarks in (map_a, map_b))
+        return candidates(map_a, map_b, self._alignment, self.near_pairs(pair, a, b))
+
     def choose(self, maps: Mapping[PairKey, tuple[LandmarkMap, LandmarkMap]], step: int) -> PairKey | None:
         """Return the pair with the most new candidate matches, if it has enough for an attempt; the first of equals."""
         best: PairKey | None = None
@@ -122,7 +138,7 @@ class MergeScheduler:
                 continue  # an empty map has no descriptor length yet
             if too_many(map_a, map_b, self._alignment):
                 continue
-            rows = candidate_matches(map_a, map_b, self._alignment)
+            rows = self.candidates(pair, map_a, map_b)[0]
             if len(rows) < self._alignment.min_inliers:
                 continue
             found = set(zip(map_a.ids[rows[:, 0]].tolist(), map_b.ids[rows[:, 1]].tolist(), strict=True))
@@ -172,7 +188,7 @@ class MergeScheduler:
             math.hypot(x, y) / (0.5 * DISTINCT_TRANSLATION), abs(float(wrap_angle(turn))) / (0.5 * DISTINCT_ROTATION)
         )
 
-    def record(self, pair: PairKey, step: int, success: bool, smoothed: bool = False) -> None:
+    def record(self, pair: PairKey, step: int, success: bool, smoothed: bool = False, in_slices: bool = False) -> None:
         """Record an attempt of the pair that `choose` returned: its candidate matches, and its next wait.
 
         Args:
@@ -182,15 +198,18 @@ class MergeScheduler:
             smoothed: Whether the logs were smoothed for the attempt, as the candidates fitted; the next attempt then
                 needs no new ones. The cost of smoothing may grow with the logs, so that a refused pair waits until an
                 eighth of them is new: the total cost is then at most a multiple of the last one.
+            in_slices: Whether the smoothers work in slices, so that the cost is bounded; the wait then is, too.
         """
         if success:
             gone = set(pair[0]) | set(pair[1])
             self._records = {key: value for key, value in self._records.items() if not gone & set(key[0] + key[1])}
+            self._near = {key: value for key, value in self._near.items() if not gone & set(key[0] + key[1])}
             return
         record = self._records.setdefault(pair, AttemptRecord(self._options.every))
         record.tried = set() if smoothed else self._proposed.get(pair, set())
         record.last_step = step
-        record.next_step = step + max(record.wait, math.ceil(MIN_LOG_GROWTH * step) if smoothed else 0)
+        growth = math.ceil(MIN_LOG_GROWTH * step) if smoothed else 0
+        record.next_step = step + max(record.wait, min(growth, self._options.longest_wait) if in_slices else growth)
         record.wait = min(2 * record.wait, self._options.longest_wait)
 
     def block(self, pair: PairKey, until: int) -> None:
@@ -206,7 +225,7 @@ class MergeScheduler:
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Restore options and memory from `get_state`."""
-        self._options, self._alignment = state["options"], state["alignment"]
+        self._options, self._alignment, self._near = state["options"], state["alignment"], {}
         self.pending_attempt = state["pending_attempt"]
         self._records = copy.deepcopy(state["records"])
         self._blocks = list(state["blocks"])

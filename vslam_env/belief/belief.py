@@ -56,7 +56,7 @@ class BeliefConfig:
     filter: FilterOptions = field(default_factory=default_filter_options)
     alignment: AlignmentOptions = field(default_factory=AlignmentOptions)
     attempts: AttemptOptions = field(default_factory=AttemptOptions)
-    merging: MergeOptions = field(default_factory=lambda: MergeOptions(min_sigmas_on_trial=5.0))
+    merging: MergeOptions = field(default_factory=lambda: MergeOptions(min_sigmas_on_trial=3.0))
     confirm_after: int = 2
 
     def __post_init__(self) -> None:

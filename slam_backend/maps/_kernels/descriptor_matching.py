@@ -210,3 +210,37 @@ def alike(a: Float32Array, b_columns: Float32Array, limit: float, most: int, eno
                     pairs[k, 0], pairs[k, 1] = i, j
                     k += 1
     return pairs[:k], total
+
+
+@jit
+def near(a: Float32Array, b_columns: Float32Array, limit: float, most: int) -> tuple[IntArray, Float32Array]:
+    """Return all pairs (k, 2) of descriptors within a squared distance `limit`, and their squared distances (k,).
+
+    Pairs are not ordered. With more than `most` pairs the search ends early.
+    """
+    n, m, size = len(a), b_columns.shape[1], a.shape[1]
+    head = min(HEAD, size)
+    lengths_b, tails_b = _squared_lengths(b_columns), np.sqrt(_squared_lengths(b_columns[head:]))
+    products, bound, count = np.empty(BLOCK, np.float32), np.float32(limit), 0
+    pairs, squares = np.empty((n + m, 2), np.int64), np.empty(n + m, np.float32)
+    for start in range(0, m, BLOCK):
+        stop = min(start + BLOCK, m)
+        lengths, tails = lengths_b[start:stop], tails_b[start:stop]
+        for i in range(n):
+            if count > most:
+                break
+            length = _products_if_near(a[i], head, b_columns, lengths, tails, start, stop, bound, products)
+            if length < 0.0:
+                continue
+            if count + stop - start > len(squares):
+                more_pairs = np.empty((2 * len(pairs) + BLOCK, 2), np.int64)
+                more_pairs[:count] = pairs[:count]
+                more = np.empty(len(more_pairs), np.float32)
+                more[:count] = squares[:count]
+                pairs, squares = more_pairs, more
+            for j in range(stop - start):
+                square = length + lengths[j] - np.float32(2.0) * products[j]
+                if square <= bound:
+                    pairs[count, 0], pairs[count, 1], squares[count] = i, start + j, square
+                    count += 1
+    return pairs[:count], squares[:count]
