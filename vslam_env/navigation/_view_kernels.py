@@ -23,6 +23,7 @@ from vslam_env.navigation._grid_kernels import (
 )
 from vslam_env.navigation._planning_kernels.dijkstra import (
     ESCAPE_CELLS,
+    ISLAND,
     UNREACHED,
     nearest_open,
     wavefront,
@@ -610,7 +611,7 @@ def measure_teammates(
                         weight, old = here[2 * i + j], there[i]
                         there[i] = weight if weight > 0 and (old == 0 or weight < old) else old
         row, col = to_index(poses[k, 1], size) - corner[0], to_index(poses[k, 0], size) - corner[1]
-        start_row, start_col = nearest_open(box, weights, row, col, ESCAPE_CELLS)
+        start_row, start_col = nearest_open(box, weights, row, col, ESCAPE_CELLS, ISLAND)
         if start_row < 0:
             continue
         cost, parents = wavefront(wide, start_row // 2, start_col // 2, -1)
@@ -772,6 +773,39 @@ COARSE = 48  # cells along a side of the global grid, as of the local one, so th
 NUM_COARSE = 3  # channels: free, occupied, walls looked at
 
 
+@device
+@in_place
+def add_row(cells: Any, flags: Any, looks: Any, row: int, first: int, columns: Any, counts: Any) -> None:
+    """Add a part of a row to the numbers of free, occupied and border cells and of those looked at, (4, n) uint16.
+
+    Without branches and with small numbers, loops become vector code.
+
+    Args:
+        cells: (n,) uint8. Cells of the part.
+        flags: (n,) uint8. Result of `mark_borders` for the part.
+        looks: (S, S) uint8. Looks of the grid.
+        row: Row of the part.
+        first: First column of the part, >= 1; its end is at most S - 1.
+        columns: (n + 2,) uint16. Workspace.
+        counts: (4, n) uint16. Changed.
+    """
+    last = first + len(cells)
+    above, here, below = (
+        looks[row - 1, first - 1 : last + 1],
+        looks[row, first - 1 : last + 1],
+        looks[row + 1, first - 1 : last + 1],
+    )
+    for i in range(len(columns)):
+        columns[i] = np.uint16(above[i] + here[i] + below[i])
+    free, occupied, borders, looked = counts[0], counts[1], counts[2], counts[3]
+    for i in range(len(cells)):
+        around = np.uint16(columns[i] + columns[i + 1] + columns[i + 2])
+        free[i] += cells[i] == FREE
+        occupied[i] += cells[i] == OCCUPIED
+        borders[i] += flags[i]
+        looked[i] += flags[i] & (around >= LOOKED)
+
+
 @jit
 def write_global_grid(cells: Any, looks: Any, bounds: Any, picture: Any, frame: Any) -> None:
     """Write the known part of a grid at the finest resolution at which it fits, by whole multiples of a cell.
@@ -789,12 +823,14 @@ def write_global_grid(cells: Any, looks: Any, bounds: Any, picture: Any, frame: 
     scale = max((max(height, width) + COARSE - 1) // COARSE, 1)
     top, left = bounds[0] - (COARSE * scale - height) // 2, bounds[1] - (COARSE * scale - width) // 2
     first, last = max(bounds[1], 1), min(bounds[3], size - 1)
-    flags, places = np.empty(max(last - first, 0), np.uint8), np.empty(max(last - first, 0), np.int32)
-    for i in range(len(places)):
+    width = max(last - first, 0)
+    flags, places = np.empty(width, np.uint8), np.empty(width, np.int32)
+    for i in range(width):
         places[i] = (first + i - left) // scale
     shades = np.empty(scale * scale + 1, np.uint8)  # instead of a division per cell
     for k in range(len(shades)):
         shades[k] = k * 255 // (scale * scale)
+    counts, columns = np.empty((4, width), np.uint16), np.empty(width + 2, np.uint16)
     sums = np.empty((4, COARSE), np.int32)
     picture[:] = 0
     first_row, last_row = max(bounds[0], 1), min(bounds[2], size - 1)
@@ -802,17 +838,14 @@ def write_global_grid(cells: Any, looks: Any, bounds: Any, picture: Any, frame: 
         begin, end = max(top + r * scale, first_row), min(top + (r + 1) * scale, last_row)
         if begin >= end:
             continue
-        sums[:] = 0
+        counts[:] = 0
         for row in range(begin, end):
             mark_borders(cells, row, first, last, flags)
-            here = cells[row, first:last]
-            for i in range(len(flags)):
-                c = places[i]
-                sums[0, c] += here[i] == FREE
-                sums[1, c] += here[i] == OCCUPIED
-                if flags[i]:
-                    sums[2, c] += 1
-                    sums[3, c] += count_looks(looks, row, first + i) >= LOOKED
+            add_row(cells[row, first:last], flags, looks, row, first, columns, counts)
+        sums[:] = 0
+        for k in range(4):
+            for i in range(width):
+                sums[k, places[i]] += counts[k, i]
         for c in range(COARSE):
             picture[0, r, c], picture[1, r, c] = shades[sums[0, c]], shades[sums[1, c]]
             if sums[2, c] > 0:

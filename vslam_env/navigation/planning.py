@@ -145,7 +145,7 @@ class DistanceMap:
         """
         goal = point_floats(goal_xy, "goal_xy")
         goal_cell = self.cell_of(goal)
-        end_cell = nearest_open(self.box, self.weights, *goal_cell, GOAL_CELLS)
+        end_cell = nearest_open(self.box, self.weights, *goal_cell, GOAL_CELLS, 1)
         if end_cell[0] < 0 or self.cost[end_cell] == UNREACHED:
             return None
         corners = shorten_path(self.weights, self.cost, self.parent, *end_cell)

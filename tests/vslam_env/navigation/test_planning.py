@@ -150,6 +150,20 @@ def test_a_robot_among_walls_that_drift_drew_finds_open_floor() -> None:
     assert 2.0 < np.hypot(*path[1]) < 2.6
 
 
+@pytest.mark.parametrize("width", [0.3, 0.7, 1.1, 2.6])
+def test_a_robot_on_an_island_of_floor_starts_beyond_it(width: float) -> None:
+    """Where what is unknown leaves less than 25 open cells around a robot, its ways begin at the floor beyond."""
+    cells = floor((-6.0, -5.0), (7.0, 8.1), [])
+    centres = centre_of(np.argwhere(cells == FREE))
+    for (row, col), (x, y) in zip(np.argwhere(cells == FREE), centres, strict=True):
+        if max(abs(x), abs(y)) < 0.5 * width + 0.8 and max(abs(x), abs(y)) > 0.5 * width:
+            cells[row, col] = UNKNOWN
+    path = plan_path(cells, (0.0, 0.0), (5.0, 5.0))
+    assert (path is None) == (width > 1.0)
+    if path is not None:
+        assert np.hypot(*path[1]) > 0.5 * width
+
+
 def test_a_path_in_an_open_room_is_one_straight_line() -> None:
     """Without walls near, start and goal are joined directly."""
     cells = floor((-6.0, -5.0), (7.0, 8.1), [])

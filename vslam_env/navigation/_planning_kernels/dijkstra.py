@@ -71,20 +71,44 @@ STRAIGHT, DIAGONAL = 5, 7  # length of a step in fifths of a cell; 7/5 is 1 % sh
 NUM_STRAIGHT = 4  # of the eight directions, the first ones
 ESCAPE_CELLS = 25  # a robot that a bump put into a wall's margin, or drift among walls, looks this far for open floor
 GOAL_CELLS = 2  # search radius for an open cell if the goal lies in an inflated wall
+ISLAND = 25  # fewer open cells that lead nowhere else (1 m^2) are no floor to begin at
 NUM_BUCKETS = 64  # a power of two above the dearest step, DIAGONAL * (CLOSE + CLOSE)
 UNREACHED = np.iinfo(np.int32).max
 
 
+@device
 @jit
-def nearest_open(box: Any, weights: Any, row: int, col: int, reach: int) -> tuple[int, int]:
+def is_island(weights: Any, row: int, col: int, least: int) -> bool:
+    """Return whether fewer than `least` > 1 open cells (at most 256) can be reached from an open cell (row, col)."""
+    queue, num = np.empty((least, 2), np.int64), 1
+    queue[0, 0], queue[0, 1] = row, col
+    head = 0
+    while head < num < least:
+        r, c = queue[head]
+        head += 1
+        for i in range(r - 1, r + 2):
+            for j in range(c - 1, c + 2):
+                is_new = weights[i, j] > 0 and num < least  # the outermost cells are closed
+                for k in range(num):
+                    is_new &= queue[k, 0] != i or queue[k, 1] != j
+                if is_new:
+                    queue[num, 0], queue[num, 1] = i, j
+                    num += 1
+    return num < least
+
+
+@jit
+def nearest_open(box: Any, weights: Any, row: int, col: int, reach: int, least: int) -> tuple[int, int]:
     """Find the open cell that is the fewest steps away, without stepping through a wall.
 
     Args:
         box: (h, w) uint8. Cells.
-        weights: (h, w) uint8. 0 where a robot may not be.
+        weights: (h, w) uint8. 0 where a robot may not be. The outermost cells must be closed.
         row: Row of the first cell, which may be a wall.
         col: Column of the first cell.
         reach: Search radius in cells.
+        least: Number of open cells that must be reachable from it, if another one is within reach: walls drawn twice
+            leave islands, from which a robot would see no way out.
 
     Returns:
         Row and column of the cell, or (-1, -1).
@@ -97,12 +121,15 @@ def nearest_open(box: Any, weights: Any, row: int, col: int, reach: int) -> tupl
     queue = np.empty((side * side, 2), np.int64)
     queue[0, 0], queue[0, 1] = row, col
     visited[reach, reach] = True
-    head, tail = 0, 1
+    head, tail, first_row, first_col = 0, 1, -1, -1
     while head < tail:
         r, c = queue[head]
         head += 1
         if weights[r, c] > 0:
-            return r, c
+            if least <= 1 or not is_island(weights, r, c, least):
+                return r, c
+            if first_row < 0:
+                first_row, first_col = r, c
         for i, j in ((0, 1), (1, 0), (0, -1), (-1, 0)):
             nr, nc = r + i, c + j
             if not (0 <= nr < height and 0 <= nc < width) or abs(nr - row) > reach or abs(nc - col) > reach:
@@ -112,7 +139,7 @@ def nearest_open(box: Any, weights: Any, row: int, col: int, reach: int) -> tupl
             visited[nr - row + reach, nc - col + reach] = True
             queue[tail, 0], queue[tail, 1] = nr, nc
             tail += 1
-    return -1, -1
+    return first_row, first_col
 
 
 @device
@@ -240,12 +267,12 @@ def dijkstra(
     far = 2.0 * LARGEST_HALF_WIDTH  # as good as anywhere outside
     row = cell_index(min(max(y, -far), far), margin_of(size)) - first_row
     col = cell_index(min(max(x, -far), far), margin_of(size)) - first_col
-    start_row, start_col = nearest_open(box, weights, row, col, ESCAPE_CELLS)
+    start_row, start_col = nearest_open(box, weights, row, col, ESCAPE_CELLS, ISLAND)
     goal = -1
     if not np.isnan(goal_x):
         row = cell_index(min(max(goal_y, -far), far), margin_of(size)) - first_row
         col = cell_index(min(max(goal_x, -far), far), margin_of(size)) - first_col
-        goal_row, goal_col = nearest_open(box, weights, row, col, GOAL_CELLS)
+        goal_row, goal_col = nearest_open(box, weights, row, col, GOAL_CELLS, 1)
         goal = goal_row * box.shape[1] + goal_col if goal_row >= 0 else -1
         start_row = start_row if goal >= 0 else -1  # nowhere to go
     cost, parents = wavefront(weights, start_row, start_col, goal)
