@@ -41,6 +41,9 @@ class RunConfig(ExperimentConfig):
     )  # fmt: skip
     preset: NoisePreset = option("standard", "Noise preset: easy, standard or hard.")
     sensor: Sensor = option("landmark", "Sensor: landmark, or stereo (rendered images).")
+    decision_limit: float = option(
+        30.0, "Longest time of a decision [s]; a slower policy ends the run.", gt=0.0, hint="Give seconds."
+    )
 
     def check(self) -> None:
         """Refuse two limits of the episode."""
@@ -125,4 +128,4 @@ class RunConfig(ExperimentConfig):
         from training.episodes.guard import GuardedTeam
 
         policies = {agent: make_policy(self.policy, self.action_type) for agent in env.possible_agents}
-        return GuardedTeam(policies, self.policy, self.action_type)
+        return GuardedTeam(policies, self.policy, self.action_type, self.decision_limit)

@@ -293,6 +293,23 @@ def test_policies_determine_the_default_action_type(
     assert (metrics["robots"][0]["path_m"] == 0.0) is (action_type == "discrete")
 
 
+def test_a_policy_that_never_returns_ends_the_run_with_one_line(
+    vslam: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Past the decision limit the run ends; the first three decisions have a minute, for they may compile kernels."""
+    lines = (
+        "class Spins:", "    def reset(self): self.left = 5", "    def act(self, *_):", "        self.left -= 1",
+        "        while self.left < 0: pass", "        return 0",
+    )  # fmt: skip
+    (tmp_path / "a_policy_of_mine.py").write_text("\n".join(lines))
+    monkeypatch.chdir(tmp_path)
+    few = ("--world", "fig5", "--robots", "1", "--max-cycles", "9", "--particles", "5", "--no-video", "--out", "run")
+    said = vslam("run", "--policy", "a_policy_of_mine:Spins", *few, "--decision-limit", "0.4")
+    assert said.status == 2
+    assert said.err.count("expected decisions within 0.4 s, got one of at least 0.4 s") == 1
+    assert "Traceback" not in said.err
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_run_writes_partial_results(
