@@ -1,0 +1,43 @@
+"""Hooks of the site: pages of the repository's root, and links to files that are not pages."""
+
+import posixpath
+import re
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[2]
+ROOT_PAGES = ("CONTRIBUTING.md", "CHANGELOG.md", "CODE_OF_CONDUCT.md")
+LINK = re.compile(r"\[([^\]]*)\]\(([^)\s:]+)\)")
+
+
+def on_files(files: Any, config: Any) -> Any:
+    """Add the pages of the root to the site."""
+    from mkdocs.structure.files import File
+
+    for name in ROOT_PAGES:
+        files.append(File.generated(config, name, abs_src_path=str(ROOT / name)))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
+    """Let links to files outside of `docs` lead to the pages of the root, or show the file's name."""
+    source = page.file.src_uri
+    folder = "" if source in ROOT_PAGES else posixpath.dirname(f"docs/{source}")
+
+    def site_link(link: re.Match[str]) -> str:
+        text, target = link.groups()
+        path, mark, anchor = target.partition("#")
+        if not path:
+            return link[0]
+        place = posixpath.normpath(posixpath.join(folder, path))
+        if place in ROOT_PAGES:
+            inside = place
+        elif place.startswith("docs/"):
+            inside = place.removeprefix("docs/")
+        else:
+            return f"{text} (`{place}`)" if text.strip("`") != place else text
+        if files.get_file_from_path(inside) is None:  # a folder or a file that is no page
+            return f"{text} (`{place}`)"
+        return f"[{text}]({posixpath.relpath(inside, posixpath.dirname(source) or '.')}{mark}{anchor})"
+
+    return LINK.sub(site_link, markdown)

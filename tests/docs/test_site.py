@@ -1,0 +1,70 @@
+"""The site: all pages are in its navigation, and links out of `docs` are resolved."""
+
+import importlib.util
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).parents[2]
+CONFIG = yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))
+
+
+def pages(nav: Any) -> list[str]:
+    """Return the pages of a part of the navigation."""
+    if isinstance(nav, str):
+        return [nav]
+    parts = nav.values() if isinstance(nav, dict) else nav
+    return [page for part in parts for page in pages(part)]
+
+
+@pytest.fixture(scope="module")
+def hooks() -> Any:
+    """Return the hooks of the site, which need no mkdocs to be imported."""
+    spec = importlib.util.spec_from_file_location("site_hooks", ROOT / CONFIG["hooks"][0])
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_all_pages_are_in_the_navigation(hooks: Any) -> None:
+    """Each page of `docs` is listed once, with the pages of the root; none is missing or gone."""
+    found = sorted(page.relative_to(ROOT / "docs").as_posix() for page in (ROOT / "docs").rglob("*.md"))
+    assert sorted(pages(CONFIG["nav"])) == sorted([*found, *hooks.ROOT_PAGES])
+    assert all((ROOT / page).is_file() for page in hooks.ROOT_PAGES)
+
+
+@pytest.mark.parametrize(("source", "before", "after"), [
+    ("how-to/own_world.md", "[add](../../CONTRIBUTING.md#a-world-family)", "[add](../CONTRIBUTING.md#a-world-family)"),
+    ("how-to/own_log.md", "[example](../../examples/own_log.py)", "example (`examples/own_log.py`)"),
+    ("how-to/own_log.md", "[`examples/own_log.py`](../../examples/own_log.py)", "`examples/own_log.py`"),
+    ("README.md", "[lab](lab/README.md)", "[lab](lab/README.md)"),
+    ("CONTRIBUTING.md", "[site](docs/architecture.md#x)", "[site](architecture.md#x)"),
+    ("reference/results.md", "[here](#there) [web](https://example.org/a)", "[here](#there) [web](https://example.org/a)"),
+    ("how-to/exploration.md", "![picture](../figures/exploration.png)", "![picture](../figures/exploration.png)"),
+])  # fmt: skip
+def test_links_lead_to_pages_of_the_site(source: str, before: str, after: str, hooks: Any) -> None:
+    """Links to pages are relative to the page; other files of the repository are named."""
+    known = {*hooks.ROOT_PAGES, "architecture.md", "lab/README.md", "figures/exploration.png"}
+    files = SimpleNamespace(get_file_from_path=lambda path: path if path in known else None)
+    page = SimpleNamespace(file=SimpleNamespace(src_uri=source))
+    assert hooks.on_page_markdown(before, page, None, files) == after
+
+
+@pytest.mark.slow
+def test_the_site_builds_strictly(tmp_path: Path) -> None:
+    """The site builds without a warning; its search finds classes, and the interface shows their docstrings."""
+    pytest.importorskip("mkdocstrings", reason="the extra docs is not installed: make docs")
+    command = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--strict", "--site-dir", str(tmp_path / "site")]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    interface = (tmp_path / "site" / "reference" / "api.html").read_text(encoding="utf-8")
+    for name in ("vslam_env.vslam_v0.parallel_env", "slam_backend.FastSlam.step", "agents.make_policy"):
+        assert f'id="{name}"' in interface
+    assert "FastSlam" in (tmp_path / "site" / "search" / "search_index.json").read_text(encoding="utf-8")
