@@ -108,6 +108,28 @@ def nearest_look(reach: float) -> float:
 
 @device
 @in_place
+def mark_unseen(flags: Any, looks: Any, row: int, first: int, columns: Any, unseen: Any) -> None:
+    """Write 1 for the border cells of a part of a row that were looked at too little, else 0; this becomes vector code.
+
+    Args:
+        flags: (n,) uint8. Result of `mark_borders` for the part.
+        looks: (S, S) uint8. Looks of the grid.
+        row: Row of the part, not at the edge of the grid.
+        first: First column of the part; neither it nor its last one is at the edge.
+        columns: (n + 2,) uint16. Workspace.
+        unseen: (n,) uint8. Output.
+    """
+    end = first + len(flags) + 1
+    above, here, below = looks[row - 1, first - 1 : end], looks[row, first - 1 : end], looks[row + 1, first - 1 : end]
+    for i in range(len(columns)):
+        columns[i] = above[i] + here[i] + below[i]
+    for i in range(len(flags)):
+        around = np.uint16(columns[i] + columns[i + 1] + columns[i + 2])
+        unseen[i] = flags[i] & (around < LOOKED)
+
+
+@device
+@in_place
 def wall_length(cells: Any, row: int, col: int, along_x: float, along_y: float) -> float:
     """Return the length of wall beside a border cell that a ray of unit width covers; 0 if the ray grazes it."""
     normal_x, normal_y = 0, 0
@@ -773,39 +795,6 @@ COARSE = 48  # cells along a side of the global grid, as of the local one, so th
 NUM_COARSE = 3  # channels: free, occupied, walls looked at
 
 
-@device
-@in_place
-def add_row(cells: Any, flags: Any, looks: Any, row: int, first: int, columns: Any, counts: Any) -> None:
-    """Add a part of a row to the numbers of free, occupied and border cells and of those looked at, (4, n) uint16.
-
-    Without branches and with small numbers, loops become vector code.
-
-    Args:
-        cells: (n,) uint8. Cells of the part.
-        flags: (n,) uint8. Result of `mark_borders` for the part.
-        looks: (S, S) uint8. Looks of the grid.
-        row: Row of the part.
-        first: First column of the part, >= 1; its end is at most S - 1.
-        columns: (n + 2,) uint16. Workspace.
-        counts: (4, n) uint16. Changed.
-    """
-    last = first + len(cells)
-    above, here, below = (
-        looks[row - 1, first - 1 : last + 1],
-        looks[row, first - 1 : last + 1],
-        looks[row + 1, first - 1 : last + 1],
-    )
-    for i in range(len(columns)):
-        columns[i] = np.uint16(above[i] + here[i] + below[i])
-    free, occupied, borders, looked = counts[0], counts[1], counts[2], counts[3]
-    for i in range(len(cells)):
-        around = np.uint16(columns[i] + columns[i + 1] + columns[i + 2])
-        free[i] += cells[i] == FREE
-        occupied[i] += cells[i] == OCCUPIED
-        borders[i] += flags[i]
-        looked[i] += flags[i] & (around >= LOOKED)
-
-
 @jit
 def write_global_grid(cells: Any, looks: Any, bounds: Any, picture: Any, frame: Any) -> None:
     """Write the known part of a grid at the finest resolution at which it fits, by whole multiples of a cell.
@@ -824,7 +813,7 @@ def write_global_grid(cells: Any, looks: Any, bounds: Any, picture: Any, frame: 
     top, left = bounds[0] - (COARSE * scale - height) // 2, bounds[1] - (COARSE * scale - width) // 2
     first, last = max(bounds[1], 1), min(bounds[3], size - 1)
     width = max(last - first, 0)
-    flags, places = np.empty(width, np.uint8), np.empty(width, np.int32)
+    flags, unseen, places = np.empty(width, np.uint8), np.empty(width, np.uint8), np.empty(width, np.int32)
     for i in range(width):
         places[i] = (first + i - left) // scale
     shades = np.empty(scale * scale + 1, np.uint8)  # instead of a division per cell
@@ -839,9 +828,16 @@ def write_global_grid(cells: Any, looks: Any, bounds: Any, picture: Any, frame: 
         if begin >= end:
             continue
         counts[:] = 0
+        free, occupied, borders, looked = counts[0], counts[1], counts[2], counts[3]
         for row in range(begin, end):
             mark_borders(cells, row, first, last, flags)
-            add_row(cells[row, first:last], flags, looks, row, first, columns, counts)
+            mark_unseen(flags, looks, row, first, columns, unseen)
+            here = cells[row, first:last]
+            for i in range(width):  # without branches: this becomes vector code
+                free[i] += here[i] == FREE
+                occupied[i] += here[i] == OCCUPIED
+                borders[i] += flags[i]
+                looked[i] += flags[i] - unseen[i]
         sums[:] = 0
         for k in range(4):
             for i in range(width):
