@@ -13,6 +13,7 @@ from vslam_env.evaluation.map_scores import GroundTruthAssociation
 from vslam_env.sensors import LandmarkSensor, RangeFinder, ScanConfig, StereoSensor, StereoSensorConfig
 from vslam_env.sensors.stereo.ground_truth import TextureCorners
 from vslam_env.sensors.stereo.textures import check_textures
+from vslam_env.simulation.memory import available_memory, check_memory
 from vslam_env.world import FreeSpace, World, WorldSource, draw_bias, draw_world_seed, make_world, place_landmarks
 
 
@@ -115,7 +116,8 @@ def sample_scenario(
         start_poses: (K, 3) [m, m, rad], world frame; None: start poses of the world, or drawn ones.
 
     Raises:
-        ValueError: If the world does not exist, robots cannot start there, or no landmark is observable.
+        ValueError: If the world does not exist, robots cannot start there, no landmark is observable, or the landmarks
+            of all particles would exceed the memory.
     """
     layout, textures, starts, odometry, detections, scan, belief_seed, radio = seed.spawn(8)
     if world_seed is None and config.world_split is not None:
@@ -137,6 +139,7 @@ def sample_scenario(
     if not observable.any():
         got, hint = f"no such landmark among {len(landmarks)} in {bare.name!r}", "Put some on walls that robots pass."
         raise argument_error("world", "landmarks that robots can see", got, hint)
+    check_memory(int(np.count_nonzero(observable)), config.belief.filter.num_particles, available_memory())
     world = World(bare.name, bare.walls, landmarks, bare.start_poses)
     true_starts = _starts(config, world, free_space, start_poses, np.random.default_rng(starts))
     streams = {
