@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import math
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -305,6 +304,8 @@ class EnvConfig:
         Omitted fields, also in nested tables, have the value of the `standard` preset; a missing `format` means the
         current one.
         """
+        import tomllib  # a slow import
+
         try:
             values = tomllib.loads(Path(path).read_text(encoding="utf-8"))
         except (OSError, TypeError, ValueError) as error:  # path, encoding or syntax
@@ -316,6 +317,8 @@ class EnvConfig:
         """Build a configuration from a text of `to_toml`."""
         if not isinstance(text, str):
             raise argument_error("config", "TOML as text", text, "Pass what to_toml returned, or use from_toml.")
+        import tomllib
+
         try:
             values = tomllib.loads(text)
         except tomllib.TOMLDecodeError as error:

@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Callable
+from inspect import signature
 from typing import Any, ParamSpec, TypeVar, cast
 
 import numba
@@ -11,7 +12,6 @@ from numba.core import cgutils, types
 from numba.core.cpu import CPUTargetOptions
 from numba.core.registry import CPUDispatcher
 from numba.extending import intrinsic
-from numba.np import arrayobj
 from numpy.typing import NDArray
 
 from slam_backend.core.compilation.cache import KernelCache
@@ -107,6 +107,8 @@ def _compiled(function: Callable[P, T], counted: bool, **options: Any) -> Callab
     if HAS_NRT_OPTION:
         options["_nrt"] = counted
     options |= {"nogil": True, "no_cfunc_wrapper": True}  # no C code calls a kernel
+    python: Any = function
+    python.__signature__ = signature(function)  # numba asks for it twice, which takes a tenth of this package's import
     kernel: Any = numba.njit(**options)(function)
     if not IS_PLAIN:
         kernel._cache = KernelCache(kernel)
@@ -131,9 +133,8 @@ def _bits_float(typing_context: Any, x: Any) -> Any:
     return types.float64(types.int64), code
 
 
-# numba declares no types for these.
+# numba declares no types for this.
 alloca_once: Callable[..., Any] = cgutils.alloca_once
-populate_array: Callable[..., Any] = arrayobj.populate_array
 
 
 def _unset(number: Any, size: Any, *others: Any) -> Any:
@@ -143,10 +144,13 @@ def _unset(number: Any, size: Any, *others: Any) -> Any:
     row = types.Array(number, 1, "C")
 
     def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        from numba.np import arrayobj  # a slow import
+
         data = alloca_once(builder, context.get_data_type(number), size=size.literal_value)
         data.align = LINE
         array = context.make_array(row)(context, builder)
         item, length = (context.get_constant(types.intp, n) for n in (number.bitwidth // 8, size.literal_value))
+        populate_array: Any = arrayobj.populate_array
         populate_array(array, data=data, shape=[length], strides=[item], itemsize=item, meminfo=None)
         return array._getvalue()
 

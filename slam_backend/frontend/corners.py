@@ -5,14 +5,19 @@ OpenCV; its peaks are found here, because their sub-pixel positions need the res
 """
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-import cv2
 import numpy as np
 
 from slam_backend.core.jit import jit
+from slam_backend.core.lazy_import import LazyModule
 from slam_backend.core.validation import MOST, Float32Array, FloatArray, IntArray, check_float, check_int, known_names
 from slam_backend.frontend.images import Image, check_image
+
+if TYPE_CHECKING:
+    import cv2
+else:
+    cv2 = LazyModule("cv2")  # takes as long to import as numpy
 
 LARGEST_WINDOW = 1000  # [px]
 SENSITIVITY = 0.04  # k of det - k trace^2

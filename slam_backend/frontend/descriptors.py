@@ -1,13 +1,18 @@
 """Upright image descriptors of unit length: u-SURF, SIFT and ORB."""
 
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-import cv2
 import numpy as np
 
+from slam_backend.core.lazy_import import LazyModule
 from slam_backend.core.validation import Float32Array, FloatArray, IntArray
 from slam_backend.frontend.images import Image
 from slam_backend.frontend.usurf import SIZE, describe, integral_of
+
+if TYPE_CHECKING:
+    import cv2
+else:
+    cv2 = LazyModule("cv2")  # takes as long to import as numpy
 
 DESCRIPTORS = ("usurf", "sift", "orb")
 SIFT_DIAMETER = 5.0  # of a SIFT keypoint per scale [px]; its 16 cells cover about the window of u-SURF, 21 s

@@ -11,15 +11,20 @@ Sec. 4.2, without the rotation of Sec. 4.1. Box edges are not rounded to pixels.
 All box edges lie on one lattice of 22 x 22 points, so that 484 reads of the integral image suffice for 400 samples.
 """
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.core.jit import jit_fma
+from slam_backend.core.lazy_import import LazyModule
 from slam_backend.core.validation import Float32Array, FloatArray, argument_error, check_array
 from slam_backend.frontend.images import Image, check_image
+
+if TYPE_CHECKING:
+    import cv2
+else:
+    cv2 = LazyModule("cv2")  # takes as long to import as numpy
 
 SIZE = 64
 SAMPLES = 20  # along a side of the window

@@ -2,14 +2,19 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from slam_backend.core.lazy_import import LazyModule
 from slam_backend.core.validation import FloatArray
 from vslam_env.rendering.palette import Colour
+
+if TYPE_CHECKING:
+    import cv2
+else:
+    cv2 = LazyModule("cv2")  # takes as long to import as numpy
 
 Image = NDArray[np.uint8]
 
@@ -18,7 +23,7 @@ FARTHEST = 20_000.0  # [px] limit against overflow of OpenCV's fixed-point coord
 MARGIN_M = 0.4  # [m] margin around the world
 UNSEEN_PX = 0.3  # tolerance of simplified paths
 CHI_SQUARE_95 = 5.991  # 95 % of a planar Gaussian lie inside this squared Mahalanobis distance
-FONT = cv2.FONT_HERSHEY_SIMPLEX
+FONT = 0  # cv2.FONT_HERSHEY_SIMPLEX
 _TURN = 2.0 * np.pi * np.arange(16) / 16
 _CIRCLE = np.stack([np.cos(_TURN), np.sin(_TURN)], axis=-1)
 

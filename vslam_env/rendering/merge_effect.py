@@ -1,13 +1,20 @@
 """Visual effect of a merge: fading lines between the groups, expanding rings and a caption."""
 
-import cv2
+from typing import TYPE_CHECKING
+
 import numpy as np
 
+from slam_backend.core.lazy_import import LazyModule
 from slam_backend.core.validation import FloatArray
 from vslam_env.rendering import palette
 from vslam_env.rendering.canvas import Image, Viewport, disc, lines, text_width, write
 from vslam_env.rendering.palette import mix
 from vslam_env.rendering.scene import MergeFlash, Scene
+
+if TYPE_CHECKING:
+    import cv2
+else:
+    cv2 = LazyModule("cv2")  # takes as long to import as numpy
 
 FLASH_TICKS = 20
 RING_M = 2.2  # [m] final radius of the rings

@@ -12,9 +12,7 @@ import subprocess
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from typing import Any
-
-from filelock import FileLock, Timeout
+from typing import TYPE_CHECKING, Any
 
 from slam_backend.core.compilation.compiler import (
     Signatures,
@@ -26,6 +24,9 @@ from slam_backend.core.compilation.compiler import (
     missing_tasks,
     start_worker,
 )
+
+if TYPE_CHECKING:
+    from filelock import FileLock
 
 LOGGER = logging.getLogger("slam_backend")
 MOST = 3  # processes beside the program: the longest kernel takes a third of all that an environment needs at first
@@ -41,7 +42,7 @@ class Helpers:
         lock: Lock on the cache, released when they have ended.
     """
 
-    def __init__(self, tasks: Sequence[Task], number: int, lock: FileLock) -> None:
+    def __init__(self, tasks: Sequence[Task], number: int, lock: "FileLock") -> None:
         longest_first = sorted(tasks, key=lambda task: -sum(task.parts.values()))
         self.process = os.getpid()
         self._lines = [f"{task.name} {task.signature}" for task in longest_first]
@@ -171,7 +172,7 @@ def _start(needed: Needed, own: str) -> None:
             lock = cache_lock()
             lock.acquire(blocking=False)
             _helpers = Helpers(tasks, number, lock)
-    except (OSError, Timeout) as error:
+    except OSError as error:
         LOGGER.debug("Not compiled ahead: %s", error)
 
 

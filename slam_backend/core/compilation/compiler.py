@@ -19,9 +19,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from queue import Queue
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from filelock import FileLock, Timeout
 from numba import from_dtype, types
 from numba.core.registry import CPUDispatcher
 from numpy import dtype
@@ -30,6 +29,9 @@ from slam_backend.core.compilation.cache import KernelCache, cache_folder
 from slam_backend.core.compilation.shipped import CONFIG
 from slam_backend.core.jit import DeviceKernel
 from slam_backend.core.validation import check_int
+
+if TYPE_CHECKING:
+    from filelock import FileLock
 
 LOGGER = logging.getLogger("slam_backend")
 SIGNATURES = "kernel_signatures.json"  # file in the folder of each package
@@ -202,7 +204,7 @@ def compile_kernels(signatures: Signatures, workers: int | None = None, progress
     try:
         try:
             lock.acquire(blocking=False)
-        except Timeout:
+        except TimeoutError:
             LOGGER.info("Waiting for another process that compiles the kernels ...")
             lock.acquire()
         tasks = missing_tasks(signatures)  # another process may have compiled them meanwhile
@@ -216,12 +218,14 @@ def compile_kernels(signatures: Signatures, workers: int | None = None, progress
     return time.perf_counter() - begun
 
 
-def cache_lock() -> FileLock:
+def cache_lock() -> "FileLock":
     """Return the lock of the process that fills the cache; any thread may release it.
 
     Raises:
         OSError: If there is no cache.
     """
+    from filelock import FileLock  # a slow import
+
     folder = cache_folder(Path(__file__).parent, CONFIG.CACHE_DIR)
     if folder is None:
         raise OSError("no folder of the cache can be written")

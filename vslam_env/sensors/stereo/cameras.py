@@ -1,11 +1,11 @@
 """Renderer of stereo images of a textured world."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-import cv2
 import numpy as np
 
+from slam_backend.core.lazy_import import LazyModule
 from slam_backend.core.read_only import as_read_only
 from slam_backend.core.validation import Float32Array, FloatArray, IntArray, check_float, check_int
 from slam_backend.frontend.images import Image
@@ -14,6 +14,11 @@ from vslam_env.sensors.stereo._render_kernels import Faces, expose, render, trac
 from vslam_env.sensors.stereo.textures import WallTextures
 from vslam_env.world._kernels import walls_in_wedge
 from vslam_env.world.visibility import as_coordinate_rows
+
+if TYPE_CHECKING:
+    import cv2
+else:
+    cv2 = LazyModule("cv2")  # takes as long to import as numpy
 
 VIEW = 60.0  # [m] farther walls are not drawn
 

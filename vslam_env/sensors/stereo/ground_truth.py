@@ -3,9 +3,11 @@
 They serve the evaluation of maps only and are unknown to the filters.
 """
 
-import cv2
+from typing import TYPE_CHECKING
+
 import numpy as np
 
+from slam_backend.core.lazy_import import LazyModule
 from slam_backend.core.read_only import as_constant, as_read_only
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.frontend import CornerOptions, harris_corners, usurf_descriptors
@@ -14,6 +16,11 @@ from vslam_env.sensors.stereo.cameras import Traced
 from vslam_env.sensors.stereo.textures import WallTextures
 from vslam_env.world.freespace import FreeSpace
 from vslam_env.world.spec import Landmarks, World
+
+if TYPE_CHECKING:
+    import cv2
+else:
+    cv2 = LazyModule("cv2")  # takes as long to import as numpy
 
 LOOK = 0.12  # [m] a face is visible if the point this far in front of it lies in the free space
 ALL = 1 << 20

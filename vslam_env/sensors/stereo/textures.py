@@ -2,15 +2,20 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from slam_backend.core.lazy_import import LazyModule
 from slam_backend.core.read_only import as_constant, as_read_only
 from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_array, check_choice, check_float
 from slam_backend.frontend.images import Image
+
+if TYPE_CHECKING:
+    import cv2
+else:
+    cv2 = LazyModule("cv2")  # takes as long to import as numpy
 
 STYLES = ("distinct", "bricks", "posters_alike", "bricks_alike")
 LEVELS = (20.0, 235.0)  # darkest and brightest grey level

@@ -3,14 +3,19 @@
 import json
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import cv2
 import numpy as np
 
 from slam_backend.core.files import write_file
+from slam_backend.core.lazy_import import LazyModule
 from slam_backend.core.validation import FloatArray, argument_error, check_float
 from vslam_env.world.spec import LARGEST_EXTENT, World
+
+if TYPE_CHECKING:
+    import cv2
+else:
+    cv2 = LazyModule("cv2")  # takes as long to import as numpy
 
 BRIGHT_SHARE = 0.85  # separates grey 195 from 128, white from black, and 254 from "unknown" 205 in ROS maps
 COLOURED = 60  # least range of the channels of a coloured marker such as a yellow start cell

@@ -1,16 +1,21 @@
 """Loader of ROS maps: a YAML file and an image."""
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import cv2
 import numpy as np
 import yaml
 
+from slam_backend.core.lazy_import import LazyModule
 from slam_backend.core.validation import argument_error, check_array, check_choice, check_float
 from slam_backend.geometry import transform_points
 from vslam_env.world.loaders.floorplan import existing, largest_part, read_image, trace
 from vslam_env.world.spec import World
+
+if TYPE_CHECKING:
+    import cv2
+else:
+    cv2 = LazyModule("cv2")  # takes as long to import as numpy
 
 MODES = ("trinary", "scale", "raw")
 HINT = "Write image, resolution, origin, negate, occupied_thresh and free_thresh, like map_saver."
