@@ -43,7 +43,7 @@ def run(call: Call[RunConfig], video: Annotated[bool, typer.Option(help="Whether
     # Detect a world that cannot be built before the folder is created.
     console, folder = call.begin(lambda: _first_steps(env, policies, chosen.seed))
     folder.write_text("environment.toml", env.config.replace(world=folder.config["world"]).to_toml())
-    recorder = EpisodeRecorder(env, chosen.num_steps)
+    recorder = EpisodeRecorder(env, chosen.num_steps, chosen.step_s)
     record = _run_live(console, env, policies, chosen, folder.path / "video.mp4" if video else None, recorder)
     scores = plain(score_episode(record))
     print_tables(console, scores)

@@ -14,11 +14,10 @@ import numpy as np
 
 from slam_backend.core.validation import FloatArray, argument_error
 from training.experiments.labels import parted_label
-from training.experiments.plotting import CHI_SQUARE_95
 from training.experiments.run_folder import CONFIG_FILE, METRICS_FILE
 from training.experiments.tables import E_SCALE
 from training.report.packing import Packer
-from training.report.recording import RECORDING_FILE, Recording
+from training.report.recording import RECORDING_FILE, Recording, axes_95
 from vslam_env.navigation import CELL, FREE, OCCUPIED, CandidateKind
 from vslam_env.rendering.palette import robot_colour
 
@@ -138,7 +137,7 @@ def _episode(recording: Recording, packer: Packer) -> dict[str, Any]:
         "scored": list(recording.scores.shape) if recording.scores.size else [],
         "arrays": {
             "times": add(recording.times), "estimate": add(recording.estimate), "truth": add(recording.truth),
-            "reckoned": add(recording.reckoned), "ellipses": add(_position_ellipses(recording.covariances)),
+            "reckoned": add(recording.reckoned), "ellipses": add(axes_95(recording.covariances)),
             "frames": exact(recording.frames), "errors": add(recording.scores[..., 0]),
             "coverage": add(recording.coverage), "sights": add(recording.sights),
             "sightEnds": exact(recording.sight_ends),
@@ -163,17 +162,6 @@ def _thinned_grids(recording: Recording) -> tuple[tuple[FloatArray, Any], Any]:
     is_kept[::-1][::stride] = True  # with the last
     runs = np.repeat(is_kept.ravel(), lengths.ravel())
     return (boxes, np.cumsum(np.where(is_kept, lengths, 0).ravel())), runs
-
-
-def _position_ellipses(covariances: FloatArray) -> FloatArray:
-    """Return semi-axes [m] and angle [rad] of the 95 % ellipses (..., 3) of covariances xx, xy, yy."""
-    if not covariances.size:
-        return covariances
-    whole = covariances[..., [0, 1, 1, 2]].reshape(*covariances.shape[:-1], 2, 2)
-    values, vectors = np.linalg.eigh(whole)
-    axes = np.sqrt(CHI_SQUARE_95 * np.maximum(values, 0.0))
-    angles = np.arctan2(vectors[..., 1, 1], vectors[..., 0, 1])
-    return np.concatenate([axes[..., ::-1], angles[..., None]], axis=-1)
 
 
 def parts_of_error(recording: Recording) -> dict[str, FloatArray]:
@@ -226,16 +214,10 @@ def _episode_charts(recording: Recording, packer: Packer) -> list[dict[str, Any]
         charts.append({"title": "coverage", "unit": "%", "lines": [whole], "note": ""})
     errors = np.hypot(*np.moveaxis((recording.estimate - recording.truth)[..., :2], -1, 0))
     if np.isfinite(errors).any():
-        bands = np.sqrt(CHI_SQUARE_95 * _largest(recording.covariances)) if recording.covariances.size else None
+        bands = axes_95(recording.covariances)[..., 0] if recording.covariances.size else None
         note = "Bands: radius that holds the position with 95 %, as the filter claims." if bands is not None else ""
         charts.append({"title": "position error", "unit": "m", "lines": lines(errors, bands), "note": note})
     return charts
-
-
-def _largest(covariances: FloatArray) -> FloatArray:
-    """Return the larger eigenvalue of covariances xx, xy, yy (..., 3)."""
-    xx, xy, yy = np.moveaxis(covariances.astype(np.float64), -1, 0)
-    return np.asarray(0.5 * (xx + yy) + np.hypot(0.5 * (xx - yy), xy))
 
 
 # ---------------------------------------------------------------- curves, tables, pictures

@@ -29,6 +29,7 @@ RECORDING_FILE = "recording.npz"
 FORMAT = 1
 MOST_FRAMES = 600  # recorded steps of an episode
 MOST_KEYFRAMES = 75  # those of them with maps, grids and candidates
+FRAME_S, KEYFRAME_S = 0.2, 1.0  # shortest times between them [s]
 Array = NDArray[Any]
 SCORES = ("map_error", "map_recall", "map_precision", "map_rmse")  # columns of `Recording.scores`
 
@@ -121,10 +122,19 @@ def _end_of(arrays: Sequence[NDArray[Any]], shape: tuple[int, int]) -> IntArray:
 
 def ellipses(landmarks: LandmarkMap) -> FloatArray:
     """Return x, y [m], and semi-axes [m] and angle [rad] of the 95 % ellipse of each landmark, (n, 5)."""
-    values, vectors = np.linalg.eigh(landmarks.covariances[:, :2, :2])
-    axes = np.sqrt(CHI_SQUARE_95 * np.maximum(values, 0.0))
-    angles = np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])
-    return np.column_stack([landmarks.means[:, :2], axes[:, ::-1], angles])
+    return np.column_stack([landmarks.means[:, :2], axes_95(landmarks.covariances[:, [0, 0, 1], [0, 1, 1]])])
+
+
+def axes_95(covariances: FloatArray) -> FloatArray:
+    """Return semi-axes, the larger first [m], and angle [rad] of the 95 % ellipses of covariances xx, xy, yy (..., 3).
+
+    >>> axes_95(np.array([1.0, 0.0, 4.0]) / CHI_SQUARE_95).round(3).tolist()
+    [2.0, 1.0, 1.571]
+    """
+    xx, xy, yy = np.moveaxis(np.asarray(covariances, np.float64), -1, 0)
+    middle, spread = 0.5 * (xx + yy), np.hypot(0.5 * (xx - yy), xy)
+    ends = np.sqrt(CHI_SQUARE_95 * np.maximum(np.stack([middle + spread, middle - spread]), 0.0))
+    return np.stack([*ends, 0.5 * np.arctan2(2.0 * xy, xx - yy)], axis=-1)
 
 
 def run_lengths(cells: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], IntArray]:
@@ -146,12 +156,14 @@ class EpisodeRecorder:
     Args:
         env: Environment of the episode.
         num_steps: Number of steps of the episode.
+        step_s: Duration of a step [s].
     """
 
-    def __init__(self, env: ExplorationEnv, num_steps: int) -> None:
+    def __init__(self, env: ExplorationEnv, num_steps: int, step_s: float) -> None:
         self._env, self._agents = env, list(env.possible_agents)
-        self._stride = math.ceil((num_steps + 1) / MOST_FRAMES)
-        self._key_stride = math.ceil((num_steps + 1) / self._stride / MOST_KEYFRAMES)
+        self._stride = max(math.ceil((num_steps + 1) / MOST_FRAMES), round(FRAME_S / step_s))
+        most = math.ceil((num_steps + 1) / self._stride / MOST_KEYFRAMES)
+        self._key_stride = max(most, round(KEYFRAME_S / (self._stride * step_s)))
         self._steps: list[int] = []
         self._rows: dict[str, list[Any]] = {}
         self._last = Progress(0, 0.0, {}, ())
@@ -236,9 +248,10 @@ class EpisodeRecorder:
         values, lengths = run_lengths(cells)
         corner = centre_of([row, column], len(belief.grid.cells)) - 0.5 * CELL
         shown = belief.candidates
+        frame = compose(start, belief.start_from_group)
         goals = compose(start, np.column_stack([shown.goals, np.zeros(len(shown.goals))]))[shown.valid]
         self._enter(
-            maps=ellipses(belief.map.moved(start)) if is_owner else np.zeros((0, 5)),
+            maps=ellipses(belief.group_map.moved(frame)) if is_owner else np.zeros((0, 5)),
             grid_values=values, grid_runs=lengths.astype(np.int32), grid_boxes=[*corner.tolist(), *cells.shape],
             candidates=np.column_stack([goals[:, :2], shown.kinds[shown.valid], shown.own_goal[shown.valid]]),
         )  # fmt: skip

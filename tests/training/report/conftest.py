@@ -27,7 +27,7 @@ def play(recorded: bool = True) -> tuple[ExplorationEnv, EpisodeRecord, Recordin
     """Run two random walkers whose maps the oracle merges, with or without a recorder."""
     config = RunConfig(robots=2, policy="random_walk", seed=3)
     env = vslam_v0.parallel_env(world=ROOM, num_robots=2, max_cycles=STEPS, num_particles=13, oracle_merge=True)
-    recorder = EpisodeRecorder(env, STEPS)
+    recorder = EpisodeRecorder(env, STEPS, 0.1)
     record = run_episode(env, config.make_policies(env), config.seed, *([recorder.on_step] if recorded else []))
     return env, record, recorder.finish(record) if recorded else None
 

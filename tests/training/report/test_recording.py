@@ -8,24 +8,26 @@ import pytest
 
 from slam_backend.geometry import compose
 from tests.training.report.conftest import STEPS, play
+from training.experiments.plotting import CHI_SQUARE_95
 from training.report import recording as recording_module
 from training.report.content import parts_of_error
-from training.report.recording import RECORDING_FILE, SCORES, Recording, ellipses, run_lengths
+from training.report.recording import RECORDING_FILE, SCORES, Recording, run_lengths
 from vslam_env.navigation import CELL
 
 
 def test_a_recording_holds_the_record(episode: Any) -> None:
     """Poses, errors and coverage are those of the record, in the world frame; the last step is a keyframe."""
     _, record, recording = episode
-    np.testing.assert_array_equal(recording.times, record.times)
-    np.testing.assert_array_equal(recording.truth, np.swapaxes(record.true_poses, 0, 1))
+    steps = [*range(0, STEPS, 2), STEPS]  # every 0.2 s, and the last
+    np.testing.assert_array_equal(recording.times, record.times[steps])
+    np.testing.assert_array_equal(recording.truth, np.swapaxes(record.true_poses[:, steps], 0, 1))
     starts = record.true_poses[:, 0]
     for name, paths in (("estimate", record.estimated), ("reckoned", record.reckoned)):
         for robot in range(2):
-            np.testing.assert_allclose(getattr(recording, name)[:, robot], compose(starts[robot], paths[robot]))
-    np.testing.assert_array_equal(recording.scores[..., SCORES.index("map_error")], record.map_errors.T)
-    np.testing.assert_array_equal(recording.coverage, record.coverage)
-    assert recording.keyframes[-1] == STEPS
+            np.testing.assert_allclose(getattr(recording, name)[:, robot], compose(starts[robot], paths[robot, steps]))
+    np.testing.assert_array_equal(recording.scores[..., SCORES.index("map_error")], record.map_errors.T[steps])
+    np.testing.assert_array_equal(recording.coverage, record.coverage[steps])
+    assert recording.keyframes.tolist() == [0, 5, 10, 15, 20, 21]  # every second, and the last
     (merge,) = [event for event in recording.about["events"] if event["kind"] == "merge"]
     assert (merge["a"], merge["b"], merge["time"]) == ([0], [1], record.merges[0].time)
     assert merge["error_m"] < 1e-9
@@ -37,8 +39,13 @@ def test_the_last_map_and_grid_are_those_of_the_belief(episode: Any) -> None:
     env, record, recording = episode
     first, last = recording.map_ends[-2, -1], recording.map_ends[-1]
     assert last[0] == last[1]  # robot 1 has the map of robot 0
-    whole = ellipses(record.maps[0].moved(record.true_poses[0, 0]))
-    np.testing.assert_allclose(recording.map_points[first : last[0]], whole)
+    held = record.maps[0].moved(record.true_poses[0, 0])
+    points = recording.map_points[first : last[0]]
+    np.testing.assert_allclose(points[:, :2], held.means[:, :2])
+    for (*_, large, small, angle), covariance in zip(points, held.covariances[:, :2, :2], strict=True):
+        turned = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        again = turned @ np.diag([large, small]) ** 2 @ turned.T / CHI_SQUARE_95
+        np.testing.assert_allclose(again, covariance, atol=1e-9)
     grid = env.belief("robot_0").grid
     row, column, last_row, last_column = grid.bounds
     begin, end = recording.grid_ends[-2, -1], recording.grid_ends[-1, 0]
@@ -65,7 +72,7 @@ def test_long_episodes_are_thinned(monkeypatch: pytest.MonkeyPatch) -> None:
     _, record, recording = play()
     assert recording is not None
     np.testing.assert_allclose(recording.times, record.times[[*range(0, STEPS, 3), STEPS]])
-    assert recording.keyframes.tolist() == [0, 4, 8, 12, 14]
+    assert recording.keyframes.tolist() == [0, 4, 8, 12, 14]  # every 1.2 s
     assert recording.scores.shape == (15, 2, 4)
     assert recording.sight_ends.shape == (15, 2)
     assert recording.sight_ends[-1, -1] == len(recording.sights)
