@@ -99,6 +99,8 @@ BAD: dict[str, dict[str, str]] = {
     "paper fig4": {"--landmarks 0": "landmarks: expected an int >= 1, got 0."},
     "paper fig5": {"--max-seconds 0": "max_seconds: expected an int >= 1, got 0."},
     "paper fig6": {"--robots 16": "measurements: expected an int >= 16, got 15.", "--robots a": f"robots: {LIST} 'a'."},
+    "report": {"nowhere": "folder: expected the folder of a run, with config.toml, got no such folder."},
+    "compare": {"nowhere elsewhere": "folder: expected the folder of a run, with config.toml, got no such folder."},
     "worlds validate": {
         "castle": "world: expected one of 'office'",
         "fig5 --first-seed -1": "first_seed: expected an int >= 0",
