@@ -51,8 +51,8 @@ def near_pairs(
     if not options.appearance or a.descriptors.shape[1] != b.descriptors.shape[1]:
         return None
     limit = 1.001 * (options.descriptor_gate / min(options.descriptor_ratio, 1.0)) ** 2  # rivals in the ratio test
-    if known is not None and known.limit != limit:
-        known = None
+    if known is not None and (known.limit != limit or _widths(known.a, known.b) != _widths(a, b)):
+        known = None  # other options, or a map that was empty: its descriptors had no width
     new_a, new_b = np.arange(len(a.ids)), np.arange(len(b.ids))
     parts: list[tuple[IntArray, Float32Array]] = []
     if known is not None:
@@ -75,6 +75,10 @@ def near_pairs(
     squares = np.concatenate([part[1] for part in parts]) if parts else np.empty(0, np.float32)
     order = np.lexsort((rows[:, 1], rows[:, 0]))
     return NearPairs(a, b, rows[order], squares[order], limit)
+
+
+def _widths(a: Appearance, b: Appearance) -> tuple[int, int]:
+    return a.descriptors.shape[1], b.descriptors.shape[1]
 
 
 def _rows_now(before: Appearance, now: Appearance) -> IntArray:

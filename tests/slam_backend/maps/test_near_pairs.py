@@ -96,3 +96,16 @@ def test_maps_of_look_alikes_have_no_near_pairs() -> None:
     few = appearance(a.subset(np.arange(200) < 5)), appearance(b)
     assert near_pairs(*few, AlignmentOptions()) is not None
     assert near_pairs(*few, AlignmentOptions(appearance=False)) is None
+
+
+def test_pairs_with_a_map_that_was_empty_are_found_anew() -> None:
+    """An empty map has descriptors of width 0; what was known of two of them is dropped once they have landmarks."""
+    options, rng = AlignmentOptions(), np.random.default_rng(0)
+    empty = Appearance(np.empty(0, np.int64), np.empty((0, 0), np.float32))
+    look = rng.normal(size=(3, 64)).astype(np.float32)
+    full = Appearance(np.arange(3), look / np.linalg.norm(look, axis=1, keepdims=True))
+    known = near_pairs(empty, empty, options)
+    assert known is not None
+    found = near_pairs(full, full, options, known)
+    assert found is not None
+    assert {(0, 0), (1, 1), (2, 2)} <= set(map(tuple, found.rows.tolist()))

@@ -301,10 +301,10 @@ def test_a_policy_that_never_returns_ends_the_run_with_one_line(
         "class Spins:", "    def reset(self): self.left = 5", "    def act(self, *_):", "        self.left -= 1",
         "        while self.left < 0: pass", "        return 0",
     )  # fmt: skip
-    (tmp_path / "a_policy_of_mine.py").write_text("\n".join(lines))
+    (tmp_path / "a_policy_that_spins.py").write_text("\n".join(lines))
     monkeypatch.chdir(tmp_path)
     few = ("--world", "fig5", "--robots", "1", "--max-cycles", "9", "--particles", "5", "--no-video", "--out", "run")
-    said = vslam("run", "--policy", "a_policy_of_mine:Spins", *few, "--decision-limit", "0.4")
+    said = vslam("run", "--policy", "a_policy_that_spins:Spins", *few, "--decision-limit", "0.4")
     assert said.status == 2
     assert said.err.count("expected decisions within 0.4 s, got one of at least 0.4 s") == 1
     assert "Traceback" not in said.err
