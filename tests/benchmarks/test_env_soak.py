@@ -1,4 +1,3 @@
-import importlib.util
 import signal
 import subprocess
 import sys
@@ -7,14 +6,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from builders.scripts import load_script
 
 PATH = Path(__file__).parents[2] / "benchmarks" / "env_soak.py"
-SPEC = importlib.util.spec_from_file_location("env_soak", PATH)
-assert SPEC is not None
-assert SPEC.loader is not None
-env_soak = importlib.util.module_from_spec(SPEC)
-sys.modules["env_soak"] = env_soak  # dataclasses look up their module
-SPEC.loader.exec_module(env_soak)
+env_soak = load_script(PATH)
 
 
 @pytest.fixture

@@ -1,12 +1,11 @@
 """Look-alike corridors close no loop falsely, and the script would count it if they did."""
 
-import importlib.util
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from builders.scripts import load_script
 
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "false_closures.py"
 
@@ -14,13 +13,7 @@ SCRIPT = Path(__file__).parents[2] / "benchmarks" / "false_closures.py"
 @pytest.fixture(scope="module")
 def closures() -> Any:
     """Script as a module."""
-    spec = importlib.util.spec_from_file_location("false_closures", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["false_closures"] = module
-    spec.loader.exec_module(module)
-    return module
+    return load_script(SCRIPT)
 
 
 @pytest.mark.parametrize("kind", ["seen", "blind", "turned"])

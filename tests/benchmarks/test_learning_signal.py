@@ -1,22 +1,18 @@
 """Learning signal of rewards: advantages by hand, relative choices, discounted returns, tables."""
 
-import importlib.util
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from builders.scripts import load_script
 
 from vslam_env import CANDIDATE_FEATURES, NUM_CANDIDATES, vslam_v0
 from vslam_env.config import TICK
 
 PATH = Path(__file__).parents[2] / "benchmarks" / "learning_signal.py"
-SPEC = importlib.util.spec_from_file_location("learning_signal", PATH)
-assert SPEC is not None
-assert SPEC.loader is not None
-learning_signal = importlib.util.module_from_spec(SPEC)
-SPEC.loader.exec_module(learning_signal)
+learning_signal = load_script(PATH)
 
 
 def _seen(candidates: list[list[float]]) -> dict[str, Any]:

@@ -1,12 +1,12 @@
 """The soak test of merges runs, and reports the outcome of each merge."""
 
-import importlib.util
 import math
 import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
+from builders.scripts import load_script
 
 FOLDER = Path(__file__).parents[2] / "benchmarks"
 
@@ -15,13 +15,7 @@ FOLDER = Path(__file__).parents[2] / "benchmarks"
 def soak() -> Any:
     """Script as a module."""
     sys.path.insert(0, str(FOLDER))  # it imports a script in its folder
-    spec = importlib.util.spec_from_file_location("merge_soak", FOLDER / "merge_soak.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["merge_soak"] = module
-    spec.loader.exec_module(module)
-    yield module
+    yield load_script(FOLDER / "merge_soak.py")
     sys.path.remove(str(FOLDER))
 
 

@@ -1,12 +1,11 @@
 """Tables of merges from the results of soak tests."""
 
-import importlib.util
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
+from builders.scripts import load_script
 
 PATH = Path(__file__).parents[2] / "benchmarks" / "merge_tables.py"
 KEPT = sorted((PATH.parent / "merge_soak").glob("*.json"))
@@ -15,13 +14,7 @@ KEPT = sorted((PATH.parent / "merge_soak").glob("*.json"))
 @pytest.fixture(scope="module")
 def tables() -> Any:
     """Script as a module."""
-    spec = importlib.util.spec_from_file_location("merge_tables", PATH)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["merge_tables"] = module
-    spec.loader.exec_module(module)
-    return module
+    return load_script(PATH)
 
 
 def merge(seed: int, metres: float, bent: float | None) -> dict[str, Any]:

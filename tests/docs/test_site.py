@@ -1,6 +1,5 @@
 """The site: all pages are in its navigation, and links out of `docs` are resolved."""
 
-import importlib.util
 import subprocess
 import sys
 from pathlib import Path
@@ -9,6 +8,7 @@ from typing import Any
 
 import pytest
 import yaml
+from builders.scripts import load_script
 
 ROOT = Path(__file__).parents[2]
 CONFIG = yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))
@@ -25,12 +25,7 @@ def pages(nav: Any) -> list[str]:
 @pytest.fixture(scope="module")
 def hooks() -> Any:
     """Return the hooks of the site, which need no mkdocs to be imported."""
-    spec = importlib.util.spec_from_file_location("site_hooks", ROOT / CONFIG["hooks"][0])
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return load_script(ROOT / CONFIG["hooks"][0])
 
 
 def test_all_pages_are_in_the_navigation(hooks: Any) -> None:

@@ -1,15 +1,11 @@
-import importlib.util
 from pathlib import Path
 
 import cv2
 import pytest
+from builders.scripts import load_script
 
 PATH = Path(__file__).parents[2] / "examples" / "own_log.py"
-SPEC = importlib.util.spec_from_file_location("own_log", PATH)
-assert SPEC is not None
-assert SPEC.loader is not None
-example = importlib.util.module_from_spec(SPEC)
-SPEC.loader.exec_module(example)
+example = load_script(PATH)
 
 
 @pytest.fixture(scope="module")

@@ -1,15 +1,11 @@
-import importlib.util
 from pathlib import Path
 
 import numpy as np
 import pytest
+from builders.scripts import load_script
 
 PATH = Path(__file__).parents[2] / "examples" / "plan_with_snapshots.py"
-SPEC = importlib.util.spec_from_file_location("plan_with_snapshots", PATH)
-assert SPEC is not None
-assert SPEC.loader is not None
-example = importlib.util.module_from_spec(SPEC)
-SPEC.loader.exec_module(example)
+example = load_script(PATH)
 
 
 @pytest.mark.slow
