@@ -98,7 +98,7 @@ def test_maps_of_look_alikes_have_no_near_pairs() -> None:
     assert near_pairs(*few, AlignmentOptions(appearance=False)) is None
 
 
-def test_pairs_with_a_map_that_was_empty_are_found_anew() -> None:
+def test_pairs_with_a_map_that_was_empty_are_found_again() -> None:
     """An empty map has descriptors of width 0; what was known of two of them is dropped once they have landmarks."""
     options, rng = AlignmentOptions(), np.random.default_rng(0)
     empty = Appearance(np.empty(0, np.int64), np.empty((0, 0), np.float32))
