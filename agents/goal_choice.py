@@ -74,6 +74,11 @@ class DrivingPolicy:
         self._heading: float | None = None
         self._age = REPLAN_TICKS
 
+    @property
+    def goal(self) -> FloatArray | None:
+        """(2,) float64 [m]. Place to which the robot drives, start frame; None: there is none."""
+        return None if self._path is None else self._path[-1]
+
     def act(self, observation: Any, belief: Belief, rng: np.random.Generator) -> int | NDArray[np.float32]:
         """Return the action that drives towards the goal."""
         self._age += 1

@@ -16,7 +16,6 @@ from training.episodes.config import RunConfig
 
 if TYPE_CHECKING:  # numerical modules are imported when the command runs, so that --help is fast
     from training.episodes.runner import EpisodeRecord, MergeRecord, Progress
-    from training.report.recording import EpisodeRecorder
 
 VIDEO_SIZE = (960, 720)
 REFRESH_STEPS = 5
@@ -24,16 +23,42 @@ IMAGE_WIDTH = 480  # width of a robot's camera images, beside the map [px]
 
 
 @options(RunConfig, "run")
-def run(call: Call[RunConfig], video: Annotated[bool, typer.Option(help="Whether to record a video.")] = True) -> None:
+def run(
+    call: Call[RunConfig],
+    video: Annotated[bool, typer.Option(help="Whether to record a video.")] = True,
+    live: Annotated[
+        bool, typer.Option("--live", help="Show the episode in a browser on this machine while it runs.")
+    ] = False,
+    speed: Annotated[
+        float, typer.Option(help="Simulated seconds per second with --live; 0: as fast as it runs.", min=0.0)
+    ] = 10.0,
+    port: Annotated[int, typer.Option(help="Port of 127.0.0.1 for --live; 0: any free one.", min=0, max=65535)] = 8765,
+    rerun: Annotated[
+        Path | None,
+        typer.Option(help="Also write the episode to this .rrd file for rerun (extra rerun).", show_default=False),
+    ] = None,
+    show: Annotated[
+        bool, typer.Option("--open", help="Open the browser: with --live at once, else at the end.")
+    ] = False,
+) -> None:
     """Let robots with unknown starts explore a building, map it, and merge their maps."""
+    import webbrowser
+
     from agents.registry import action_types
     from slam_backend.trajectory import Trajectory
     from training.episodes.figures import draw_errors, draw_maps
     from training.episodes.metrics import score_episode
     from training.episodes.tables import print_consistency, print_tables, write_maps
+    from training.experiments.interrupt import interrupt_flag
     from training.experiments.run_folder import plain
+    from training.report.content import live_content
+    from training.report.live import LiveView
+    from training.report.page import REPORT_FILE
     from training.report.recording import EpisodeRecorder
+    from training.report.rerun_file import check_rerun, write_rerun
 
+    if rerun is not None:
+        check_rerun(rerun)
     policy = call.given.get("policy")
     if "action_type" not in call.given and policy is not None and "continuous" not in (known := action_types(policy)):
         call.given["action_type"] = known[0]
@@ -41,10 +66,25 @@ def run(call: Call[RunConfig], video: Annotated[bool, typer.Option(help="Whether
     env = chosen.make_env()
     policies = chosen.make_policies(env)
     # Detect a world that cannot be built before the folder is created.
-    console, folder = call.begin(lambda: _first_steps(env, policies, chosen.seed))
-    folder.write_text("environment.toml", env.config.replace(world=folder.config["world"]).to_toml())
-    recorder = EpisodeRecorder(env, chosen.num_steps, chosen.step_s)
-    record = _run_live(console, env, policies, chosen, folder.path / "video.mp4" if video else None, recorder)
+    with ExitStack() as stack:
+        view = stack.enter_context(LiveView(port, speed)) if live else None
+        console, folder = call.begin(lambda: _first_steps(env, policies, chosen.seed))
+        folder.write_text("environment.toml", env.config.replace(world=folder.config["world"]).to_toml())
+        recorder = EpisodeRecorder(env, chosen.num_steps, chosen.step_s, policies.goals)
+        interrupted = stack.enter_context(interrupt_flag())
+        on_steps = [recorder.on_step]
+        if view is not None:
+            view.shows(lambda: live_content(folder.path, "run", recorder.so_far()), interrupted)
+            console.print(f"Live: {view.address}, where the episode begins once the page is open.", soft_wrap=True)
+            on_steps.append(view.on_step)
+            if show:
+                webbrowser.open(view.address)
+        record = _run_with_progress(
+            console, env, policies, chosen, folder.path / "video.mp4" if video else None, on_steps, interrupted
+        )
+        recording = recorder.finish(record)
+        if view is not None:
+            view.finish()
     scores = plain(score_episode(record))
     print_tables(console, scores)
     print_consistency(console, scores["consistency"])
@@ -58,8 +98,12 @@ def run(call: Call[RunConfig], video: Annotated[bool, typer.Option(help="Whether
     console.print(write_maps(folder, maps), soft_wrap=True)
     draw_maps(record, folder.path / "map.png")
     draw_errors(record, folder.path / "error.png")
-    recorder.finish(record).save(folder.path)
+    recording.save(folder.path)
+    if rerun is not None:
+        console.print(f"For rerun: {write_rerun(recording, rerun)}", soft_wrap=True)
     call.finish()
+    if show and not live:
+        webbrowser.open((folder.path / REPORT_FILE).resolve().as_uri())
 
 
 def _first_steps(env: Any, policies: Any, seed: int) -> None:
@@ -70,26 +114,26 @@ def _first_steps(env: Any, policies: Any, seed: int) -> None:
     run_episode(env, policies, seed, should_stop=lambda: next(steps, None) is None)
 
 
-def _run_live(
-    console: Console, env: Any, policies: Any, config: RunConfig, video: Path | None, recorder: "EpisodeRecorder"
-) -> "EpisodeRecord":
-    """Run and record the episode with live metrics, with a video if there is a path for it; Ctrl-C stops it."""
+def _run_with_progress(
+    console: Console, env: Any, policies: Any, config: RunConfig, video: Path | None,
+    on_steps: "Sequence[Callable[[Progress], None]]", interrupted: Callable[[], bool],
+) -> "EpisodeRecord":  # fmt: skip
+    """Run the episode with live metrics, with a video if there is a path for it, until it ends or is interrupted."""
     from training.episodes.runner import run_episode
     from training.episodes.video import VideoWriter, choose_pace, with_camera_images, with_video_time_merges
-    from training.experiments.interrupt import interrupt_flag
     from vslam_env.rendering import draw_frame
 
     pace = choose_pace(config.num_steps, config.step_s)
     eyes = config.sensor == "stereo"
     size = (VIDEO_SIZE[0] + (IMAGE_WIDTH if eyes else 0), VIDEO_SIZE[1])
     with ExitStack() as stack:
-        interrupted = stack.enter_context(interrupt_flag())
         show = stack.enter_context(live_progress(console, config.num_steps, env.possible_agents))
         writer = None if video is None else stack.enter_context(VideoWriter(video, size, pace.fps))
 
         def on_step(progress: "Progress") -> None:
             show(progress)
-            recorder.on_step(progress)
+            for each in on_steps:
+                each(progress)
             if writer is not None and progress.step % pace.stride == 0:
                 picture = draw_frame(with_video_time_merges(env.scene(), env.events, pace.speedup), VIDEO_SIZE)
                 writer.add(with_camera_images(picture, env.episode.frames[0], IMAGE_WIDTH) if eyes else picture)

@@ -12,8 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from agents.goal_choice import DrivingPolicy
 from agents.policy import Policy
 from agents.team import TeamPolicy
+from slam_backend.core.validation import FloatArray
 from vslam_env.actions import checked_actions
 from vslam_env.belief.team_belief import Belief
 
@@ -82,6 +84,11 @@ class GuardedTeam:
         except ValueError as error:
             raise PolicyError(f"policy {self._name!r}: {error}") from error
         return actions
+
+    def goals(self) -> dict[str, FloatArray | None]:
+        """Return the place (2,) [m] to which each robot drives, start frame, of policies that plan paths themselves."""
+        policies = self._team if isinstance(self._team, Mapping) else {}
+        return {agent: policy.goal for agent, policy in policies.items() if isinstance(policy, DrivingPolicy)}
 
     @contextmanager
     def _guarded(self, method: str, limit: float | None) -> Iterator[None]:

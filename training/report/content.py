@@ -83,11 +83,7 @@ def folder_content(folder: Path) -> Content:
     """
     config, metrics = read_folder(folder)
     command = str(config.get("command", ""))
-    content = Content(
-        title=f"vslam {command}: {folder.resolve().name}",
-        command=f"vslam {command} --config {folder / CONFIG_FILE}",
-        config=(folder / CONFIG_FILE).read_text(encoding="utf-8"),
-    )
+    content = _begin(folder, command)
     versions = config.get("versions", {})
     content.about = [("command", command), ("seed", str(config.get("seed", "")))]
     content.about += [(name, str(versions[name])) for name in ("vslam-env", "python", "numpy") if name in versions]
@@ -96,14 +92,32 @@ def folder_content(folder: Path) -> Content:
         if isinstance(value, int | float | str | bool) and name != "seed"
     ]  # fmt: skip
     if (folder / RECORDING_FILE).is_file():
-        recording = Recording.load(folder)
-        content.episode = _episode(recording, content.packer)
-        content.charts += _episode_charts(recording, content.packer)
+        _add_recording(content, Recording.load(folder))
     content.charts += _curve_charts(folder / CURVES_FILE, content.packer)
     content.tables = list(_tables(metrics))
     if content.episode is None or not len(content.episode["scored"]):
         content.pictures = list(_pictures(folder))
     return content
+
+
+def live_content(folder: Path, command: str, recording: Recording) -> Content:
+    """Return playback and charts of an episode that still runs, for the run folder of a command."""
+    content = _begin(folder, command)
+    _add_recording(content, recording)
+    return content
+
+
+def _begin(folder: Path, command: str) -> Content:
+    return Content(
+        title=f"vslam {command}: {folder.resolve().name}",
+        command=f"vslam {command} --config {folder / CONFIG_FILE}",
+        config=(folder / CONFIG_FILE).read_text(encoding="utf-8"),
+    )
+
+
+def _add_recording(content: Content, recording: Recording) -> None:
+    content.episode = _episode(recording, content.packer)
+    content.charts += _episode_charts(recording, content.packer)
 
 
 def _text(value: Any) -> str:

@@ -14,9 +14,16 @@ REPORT_FILE = "report.html"
 SLOT = re.compile(r"\{\{(\w+)\}\}")
 
 
-def render(content: Content) -> str:
-    """Return the page; all texts of the run are data, which the page shows as text and never as HTML."""
+def render(content: Content, live: bool = False) -> str:
+    """Return the page; all texts of the run are data, which the page shows as text and never as HTML.
+
+    Args:
+        content: Content of the page.
+        live: Whether the page asks its server for newer content; otherwise it may not use the network.
+    """
     parts = {
+        "connect": "; connect-src 'self'" if live else "",
+        "live": f"<script>\n{_asset('live.js')}</script>" if live else "",
         "title": escape(content.title), "style": _asset("report.css"), "program": _asset("report.js"),
         "data": _as_script(content.to_mapping()), "arrays": content.packer.text(),
     }  # fmt: skip

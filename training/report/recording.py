@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from io import BytesIO
 from pathlib import Path
@@ -17,18 +17,20 @@ from slam_backend.core.validation import FloatArray, IntArray, argument_error
 from slam_backend.fastslam.reports import MergeEvent
 from slam_backend.geometry import compose, rotate_covariances
 from slam_backend.maps.landmark_map import LandmarkMap
-from training.episodes.runner import EpisodeRecord, Progress, describe_event
+from training.episodes.runner import EpisodeRecord, MergeRecord, Progress, describe_event
 from training.experiments.plotting import CHI_SQUARE_95
 from training.experiments.run_folder import plain
 from vslam_env.belief.team_belief import Belief
 from vslam_env.config import TICK
 from vslam_env.environment import ExplorationEnv
+from vslam_env.navigation import CandidateKind
 from vslam_env.navigation.occupancy_grid import CELL, centre_of
 
 RECORDING_FILE = "recording.npz"
 FORMAT = 1
 MOST_FRAMES = 600  # recorded steps of an episode
 MOST_KEYFRAMES = 75  # those of them with maps, grids and candidates
+SAME_PLACE = 0.2  # a goal nearer to a candidate than this is that candidate [m]
 FRAME_S, KEYFRAME_S = 0.2, 1.0  # shortest times between them [s]
 Array = NDArray[Any]
 SCORES = ("map_error", "map_recall", "map_precision", "map_rmse")  # columns of `Recording.scores`
@@ -80,7 +82,7 @@ class Recording:
     )  # (K, 3) float64 [m, m, rad]. Start frames, in which the grids lie.
     candidates: Array = field(
         default_factory=_empty(0, 4)
-    )  # (n, 4) x, y [m], `CandidateKind`, whether it is the robot's goal
+    )  # (n, 4) x, y [m], `CandidateKind` (NONE: a goal that is no candidate), whether it is the robot's goal
     candidate_ends: Array = field(default_factory=_empty(0, 0))  # (J, K)
 
     def save(self, folder: Path) -> Path:
@@ -157,20 +159,27 @@ class EpisodeRecorder:
         env: Environment of the episode.
         num_steps: Number of steps of the episode.
         step_s: Duration of a step [s].
+        goals: Function that returns the place (2,) [m] to which each robot drives, start frame, or None, where these
+            are not the candidates that the environment drives to.
     """
 
-    def __init__(self, env: ExplorationEnv, num_steps: int, step_s: float) -> None:
-        self._env, self._agents = env, list(env.possible_agents)
+    def __init__(
+        self, env: ExplorationEnv, num_steps: int, step_s: float,
+        goals: Callable[[], Mapping[str, FloatArray | None]] = dict,
+    ) -> None:  # fmt: skip
+        self._env, self._agents, self._goals = env, list(env.possible_agents), goals
         self._stride = max(math.ceil((num_steps + 1) / MOST_FRAMES), round(FRAME_S / step_s))
         most = math.ceil((num_steps + 1) / self._stride / MOST_KEYFRAMES)
         self._key_stride = max(most, round(KEYFRAME_S / (self._stride * step_s)))
         self._steps: list[int] = []
         self._rows: dict[str, list[Any]] = {}
         self._last = Progress(0, 0.0, {}, ())
+        self._merges: list[MergeRecord] = []
 
     def on_step(self, progress: Progress) -> None:
         """Record a step, if it is one of those to record."""
         self._last = progress
+        self._merges.extend(progress.new_merges)
         if progress.step % self._stride == 0:
             self._record(progress, len(self._steps) % self._key_stride == 0)
 
@@ -180,11 +189,16 @@ class EpisodeRecorder:
             if self._steps[-1] == self._last.step:
                 self._forget_last()
             self._record(self._last, True)
+        starts = self._env.true_start_poses
+        reckoned = [compose(start, path[self._steps]) for start, path in zip(starts, record.reckoned, strict=True)]
+        return replace(self.so_far(), reckoned=np.stack(reckoned, axis=1))
+
+    def so_far(self) -> Recording:
+        """Return the recording up to the last recorded step, without dead reckoning."""
         rows, starts = self._rows, self._env.true_start_poses
-        steps, robots = np.array(self._steps), len(self._agents)
-        frames, keys = (len(steps), robots), (len(rows["keyframes"]), robots)
-        reckoned = [compose(start, path[steps]) for start, path in zip(starts, record.reckoned, strict=True)]
-        merges = {(merge.tick, merge.robots_a, merge.robots_b): merge for merge in record.merges}
+        robots = len(self._agents)
+        frames, keys = (len(self._steps), robots), (len(rows["keyframes"]), robots)
+        merges = {(merge.tick, merge.robots_a, merge.robots_b): merge for merge in self._merges}
         events = []
         for event in self._env.events:
             entry = event_entry(event, event.step * TICK)
@@ -197,8 +211,8 @@ class EpisodeRecorder:
                 "names": [f"robot {robot}" for robot in range(robots)], "events": events,
                 "cutoff": self._env.config.map_error_cutoff, "placed": "by the true start poses, without a fit",
             },
-            times=record.times[steps], estimate=np.array(rows["estimate"]), truth=np.array(rows["truth"]),
-            reckoned=np.stack(reckoned, axis=1), covariances=np.array(rows["covariances"]),
+            times=np.array(rows["times"]), estimate=np.array(rows["estimate"]), truth=np.array(rows["truth"]),
+            covariances=np.array(rows["covariances"]),
             frames=np.array(rows["frames"]), scores=np.array(rows["scores"]), coverage=np.array(rows["coverage"]),
             sights=np.concatenate(rows["sights"]), sight_ends=_end_of(rows["sights"], frames),
             walls=self._env.world.walls, landmarks=self._env.true_landmarks[:, :2],
@@ -216,7 +230,7 @@ class EpisodeRecorder:
     def _forget_last(self) -> None:
         """Remove the last step, which has no map and is recorded again."""
         self._steps.pop()
-        for name in ("estimate", "truth", "covariances", "frames", "scores", "coverage"):
+        for name in ("times", "estimate", "truth", "covariances", "frames", "scores", "coverage"):
             self._rows[name].pop()
         del self._rows["sights"][-len(self._agents) :]
 
@@ -229,7 +243,8 @@ class EpisodeRecorder:
         covariances = np.stack([rotate_covariances(s[2], b.covariance) for s, b in zip(starts, beliefs, strict=True)])
         self._steps.append(progress.step)
         self._enter(
-            estimate=compose(starts, np.stack([belief.pose for belief in beliefs])), truth=env.true_poses,
+            times=progress.time, estimate=compose(starts, np.stack([belief.pose for belief in beliefs])),
+            truth=env.true_poses,
             covariances=covariances[:, [0, 0, 1], [0, 1, 1]], frames=[belief.frame for belief in beliefs],
             scores=[[float(info[name]) for name in SCORES] for info in infos], coverage=float(infos[0]["coverage"]),
         )  # fmt: skip
@@ -237,23 +252,30 @@ class EpisodeRecorder:
             self._enter(sights=positions.positions[frame.true_ids[frame.true_ids >= 0], :2])
         if with_maps:
             self._enter(keyframes=len(self._steps) - 1)
+            goals = self._goals()
             owners = {belief.frame: robot for robot, belief in reversed(list(enumerate(beliefs)))}
             for robot, (start, belief) in enumerate(zip(starts, beliefs, strict=True)):
-                self._record_map(start, belief, owners[belief.frame] == robot)
+                self._record_map(start, belief, owners[belief.frame] == robot, goals.get(self._agents[robot]))
 
-    def _record_map(self, start: FloatArray, belief: Belief, is_owner: bool) -> None:
-        """Record the map and grid of a robot, unless another robot has them, and its candidates."""
+    def _record_map(self, start: FloatArray, belief: Belief, is_owner: bool, goal: FloatArray | None) -> None:
+        """Record the map and grid of a robot, unless another robot has them, its candidates and its goal."""
         row, column, last_row, last_column = belief.grid.bounds.tolist() if is_owner else (0, 0, 0, 0)
         cells = belief.grid.cells[row:last_row, column:last_column]
         values, lengths = run_lengths(cells)
         corner = centre_of([row, column], len(belief.grid.cells)) - 0.5 * CELL
         shown = belief.candidates
         frame = compose(start, belief.start_from_group)
-        goals = compose(start, np.column_stack([shown.goals, np.zeros(len(shown.goals))]))[shown.valid]
+        places, kinds, is_goal = shown.goals[shown.valid], shown.kinds[shown.valid], shown.own_goal[shown.valid]
+        if goal is not None:
+            is_goal = np.linalg.norm(places - goal, axis=1) < SAME_PLACE
+            if not is_goal.any():  # no candidate
+                places, kinds = np.vstack([places, goal]), np.append(kinds, CandidateKind.NONE)
+                is_goal = np.append(is_goal, True)
+        goals = compose(start, np.column_stack([places, np.zeros(len(places))]))
         self._enter(
             maps=ellipses(belief.group_map.moved(frame)) if is_owner else np.zeros((0, 5)),
             grid_values=values, grid_runs=lengths.astype(np.int32), grid_boxes=[*corner.tolist(), *cells.shape],
-            candidates=np.column_stack([goals[:, :2], shown.kinds[shown.valid], shown.own_goal[shown.valid]]),
+            candidates=np.column_stack([goals[:, :2], kinds, is_goal]),
         )  # fmt: skip
 
 

@@ -7,11 +7,14 @@ import numpy as np
 import pytest
 
 from slam_backend.geometry import compose
-from tests.training.report.conftest import STEPS, play
+from tests.training.report.conftest import ROOM, STEPS, play
+from training.episodes.config import RunConfig
+from training.episodes.runner import run_episode
 from training.experiments.plotting import CHI_SQUARE_95
 from training.report import recording as recording_module
 from training.report.content import parts_of_error
-from training.report.recording import RECORDING_FILE, SCORES, Recording, run_lengths
+from training.report.recording import RECORDING_FILE, SCORES, EpisodeRecorder, Recording, run_lengths
+from vslam_env import vslam_v0
 from vslam_env.navigation import CELL
 
 
@@ -116,3 +119,18 @@ def test_runs_of_cells_are_exact() -> None:
         cells = rng.integers(0, 3, shape, dtype=np.uint8)
         values, lengths = run_lengths(cells)
         np.testing.assert_array_equal(np.repeat(values, lengths).reshape(shape), cells)
+
+
+def test_goals_of_policies_that_drive_are_recorded() -> None:
+    """The goal of a robot is one of its candidates, or a place of its own; it lies where its path ends."""
+    config = RunConfig(robots=1, policy="frontier", seed=3)
+    env = vslam_v0.parallel_env(world=ROOM, num_robots=1, max_cycles=30, num_particles=5)
+    policies = config.make_policies(env)
+    recorder = EpisodeRecorder(env, 30, 0.1, policies.goals)
+    recording = recorder.finish(run_episode(env, policies, 3, recorder.on_step))
+    goal = policies.goals()["robot_0"]
+    assert goal is not None
+    last = recording.candidates[int(recording.candidate_ends[-2, 0]) :]
+    (place,) = last[last[:, 3] > 0, :2]
+    where = compose(env.true_start_poses[0], [*goal, 0.0])[:2]
+    assert np.linalg.norm(place - where) < 0.2

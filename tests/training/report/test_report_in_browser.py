@@ -11,20 +11,23 @@ from tests.training.report.test_comparison_page import bench
 from training.report.page import write_report
 
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(BROWSER is None, reason="no chromium is installed (Debian: apt-get install chromium)"),
-]
+needs_browser = pytest.mark.skipif(
+    BROWSER is None, reason="no chromium is installed (Debian: apt-get install chromium)"
+)
+pytestmark = [pytest.mark.slow, needs_browser]
 
 
-def shown(page: Path, fragment: str, folder: Path, *, seconds: float = 3.0) -> str:
-    """Return the document after some seconds of the browser's time; any message on the console is an error."""
+def shown(page: Path | str, fragment: str, folder: Path, *, seconds: float = 3.0) -> str:
+    """Return the document of a file or address after some seconds of the browser's time.
+
+    Any message on the console is an error.
+    """
     assert BROWSER is not None
     command = [
         BROWSER, "--headless=new", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr",
         f"--user-data-dir={folder / 'profile'}", f"--virtual-time-budget={round(1e3 * seconds)}",
         "--run-all-compositor-stages-before-draw", "--window-size=1280,1600", "--dump-dom",
-        f"{page.resolve().as_uri()}{fragment}",
+        f"{page if isinstance(page, str) else page.resolve().as_uri()}{fragment}",
     ]  # fmt: skip
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
     messages = [line for line in done.stderr.splitlines() if ":CONSOLE" in line]

@@ -2,8 +2,11 @@
 
 // Shows the content of a run: playback on a canvas, charts as SVG, tables. All texts are inserted as text.
 (async () => {
-  const page = JSON.parse(document.getElementById("data").textContent);
-  const bytes = await inflated(document.getElementById("arrays").textContent);
+  const early = []; // content of a running episode that comes before the page is built
+  let take = (content) => early.push(content);
+  document.addEventListener("content", (event) => take(event.detail));
+  let page = JSON.parse(document.getElementById("data").textContent);
+  let bytes = await inflated(document.getElementById("arrays").textContent);
 
   // ------------------------------------------------------------ helpers
 
@@ -46,7 +49,7 @@
     return Math.max(low - 1, 0);
   }
 
-  const seekers = []; // called with the time of the playback
+  let seekers = []; // called with the time of the playback
 
   // ------------------------------------------------------------ head and foot
 
@@ -66,8 +69,19 @@
   let seek = null;
 
   function playback(episode) {
-    const data = Object.fromEntries(Object.entries(episode.arrays).map(([name, packed]) => [name, unpacked(packed)]));
-    const names = episode.names, count = names.length, times = data.times, end = times[times.length - 1];
+    let data, times, end, needs;
+    function read() {
+      data = Object.fromEntries(Object.entries(episode.arrays).map(([name, packed]) => [name, unpacked(packed)]));
+      times = data.times;
+      end = times[times.length - 1];
+      needs = {
+        truth: data.walls.length || data.landmarks.length || data.truth.some((value) => !isNaN(value)), maps: data.mapXY.length,
+        ellipses: data.mapXY.length, paths: true, reckoned: data.reckoned.length, sights: data.sights.length,
+        grids: data.gridRuns.length, candidates: data.candidateXY.length,
+      };
+    }
+    read();
+    const names = episode.names, count = names.length;
     const canvas = document.querySelector("canvas"), pen = canvas.getContext("2d");
     const slider = document.getElementById("slider"), play = document.getElementById("play");
     const caption = document.getElementById("caption"), clock = document.getElementById("time");
@@ -77,17 +91,11 @@
       ["sights", "lines of sight", true], ["grids", "occupancy grids", false],
       ["candidates", "candidates", false],
     ];
-    const needs = {
-      truth: data.walls.length || data.landmarks.length || data.truth.some((value) => !isNaN(value)), maps: data.mapXY.length,
-      ellipses: data.mapXY.length, paths: true, reckoned: data.reckoned.length, sights: data.sights.length,
-      grids: data.gridRuns.length, candidates: data.candidateXY.length,
-    };
-    const shown = {};
+    const shown = {}, labels = {};
     const panel = document.getElementById("layers");
     const kindColours = ["#b8860b", "#8e44ad", "#16a085"];
     for (const [name, text, isOn] of layers) {
-      shown[name] = isOn && Boolean(needs[name]);
-      if (!needs[name]) continue;
+      shown[name] = isOn;
       const box = make("input", { type: "checkbox", id: `layer-${name}` });
       box.checked = shown[name];
       box.addEventListener("change", () => { shown[name] = box.checked; draw(); });
@@ -99,11 +107,15 @@
           return [dot, `${kind.replace("_", " ")} `];
         }), "; ring: goal");
       }
-      panel.append(make("label", {}, box, " ", ...words));
+      panel.append(labels[name] = make("label", {}, box, " ", ...words));
     }
+    function offerLayers() {
+      for (const [name, label] of Object.entries(labels)) label.hidden = !needs[name];
+    }
+    offerLayers();
     panel.append(make("p", { class: "note" }, `Estimates are placed ${episode.placed}.`));
 
-    const state = { time: 0, playing: false, speed: 10, zoom: 1, x: 0, y: 0, stamp: 0 };
+    const state = { time: 0, playing: false, following: false, speed: 10, zoom: 1, x: 0, y: 0, stamp: 0 };
     slider.max = end;
 
     // extent of the world
@@ -314,7 +326,7 @@
       const first = key ? data.candidateEnds[key * count - 1] : 0, last = data.candidateEnds[key * count + count - 1];
       for (let n = first; n < last; n++) {
         const x = px(data.candidateXY[2 * n], s), y = py(data.candidateXY[2 * n + 1], s);
-        pen.fillStyle = pen.strokeStyle = kindColours[data.candidateKinds[2 * n] % 3];
+        pen.fillStyle = pen.strokeStyle = kindColours[data.candidateKinds[2 * n]] || "#34363c"; // goals that are no candidates
         pen.beginPath();
         pen.arc(x, y, 3 * ratio, 0, 2 * Math.PI);
         pen.fill();
@@ -348,18 +360,23 @@
     document.getElementById("robots").append(
       make("tr", {}, ...["", data.errors.length ? "E [m]" : "", hasTruth ? "pose error [m]" : "", data.frames.length ? "map of" : ""].map((text) => make("th", {}, text))), ...rows,
     );
-    const events = episode.events, list = document.getElementById("events"), refusals = document.getElementById("refusals");
-    const items = events.map((event) => {
+    let events = [], items = [];
+    const list = document.getElementById("events"), refusals = document.getElementById("refusals");
+    function readEvents() {
+      events = episode.events;
+      items = events.map((event) => {
       const kind = event.success ? event.kind : "refused";
       const text = `${event.time.toFixed(1)} s  ${event.text}${event.error_m === undefined || event.error_m === null ? "" : `, error ${event.error_m.toFixed(2)} m, ${event.error_deg.toFixed(1)}°`}${event.false ? ": a false merge" : ""}`;
-      return make("li", { class: kind }, make("button", { type: "button", onclick: () => moveTo(event.time) }, text));
-    });
+      return make("li", { class: kind }, make("button", { type: "button", onclick: () => jump(event.time) }, text));
+      });
+      listEvents();
+    }
     function listEvents() {
       const wanted = items.filter((_, n) => refusals.checked || events[n].kind !== "attempt");
       list.replaceChildren(...(wanted.length ? wanted : [make("li", { class: "note" }, "None.")]));
     }
     refusals.addEventListener("change", listEvents);
-    listEvents();
+    readEvents();
 
     function showTexts(i) {
       clock.textContent = `${state.time.toFixed(1)} of ${end.toFixed(1)} s`;
@@ -392,22 +409,52 @@
       if (state.time >= end) setPlaying(false);
       else requestAnimationFrame(step);
     }
+    /** Move there; who jumps back no longer follows a running episode, who jumps to its end does. */
+    function jump(time) {
+      state.following = time >= end;
+      moveTo(time);
+    }
+    let isMoving = false; // whether a step towards the end of a running episode is due
+    function follow(stamp) {
+      isMoving = state.following && !state.playing && state.time < end;
+      if (!isMoving) return;
+      const gap = state.stamp ? Math.min(stamp - state.stamp, 100) / 1000 : 0;
+      state.stamp = stamp;
+      moveTo(end - state.time < 0.02 ? end : end - (end - state.time) * Math.exp(-3 * gap));
+      requestAnimationFrame(follow);
+    }
+    /** Take newer content of a running episode. */
+    function renew(newer) {
+      const wasAtEnd = state.time >= end;
+      episode = newer;
+      read();
+      offerLayers();
+      readEvents();
+      grids.clear();
+      slider.max = end;
+      state.following = state.following || (wasAtEnd && !state.playing);
+      draw();
+      if (isMoving || state.playing) return;
+      state.stamp = 0;
+      requestAnimationFrame(follow);
+    }
     function setPlaying(isPlaying) {
       if (isPlaying && state.time >= end) moveTo(0);
+      state.following = !isPlaying && state.time >= end;
       state.playing = isPlaying;
       state.stamp = 0;
       play.textContent = isPlaying ? "Pause" : "Play";
       if (isPlaying) requestAnimationFrame(step);
     }
     play.addEventListener("click", () => setPlaying(!state.playing));
-    slider.addEventListener("input", () => { setPlaying(false); moveTo(Number(slider.value)); });
+    slider.addEventListener("input", () => { setPlaying(false); jump(Number(slider.value)); });
     document.getElementById("speed").addEventListener("change", (event) => { state.speed = Number(event.target.value); });
     document.getElementById("whole").addEventListener("click", () => { fit(); draw(); });
     document.addEventListener("keydown", (event) => {
       if (/^(INPUT|SELECT|BUTTON|SUMMARY)$/.test(event.target.tagName)) return;
       const acts = {
-        " ": () => setPlaying(!state.playing), ArrowRight: () => moveTo(state.time + 1), ArrowLeft: () => moveTo(state.time - 1),
-        Home: () => moveTo(0), End: () => moveTo(end), 0: () => { fit(); draw(); },
+        " ": () => setPlaying(!state.playing), ArrowRight: () => jump(state.time + 1), ArrowLeft: () => jump(state.time - 1),
+        Home: () => jump(0), End: () => jump(end), 0: () => { fit(); draw(); },
       };
       if (acts[event.key]) { event.preventDefault(); acts[event.key](); }
     });
@@ -435,14 +482,14 @@
 
     document.getElementById("player").hidden = false;
     fit();
-    seek = moveTo;
+    seek = jump;
     function setLayer(name, isOn) {
       const switched = document.getElementById(`layer-${name}`);
-      if (!switched) return;
+      if (!switched || labels[name].hidden) return;
       switched.checked = isOn;
       switched.dispatchEvent(new Event("change"));
     }
-    return { moveTo, setPlaying, setLayer };
+    return { moveTo, setPlaying, setLayer, renew };
   }
 
   // ------------------------------------------------------------ charts
@@ -574,7 +621,11 @@
   // ------------------------------------------------------------ whole page
 
   const player = page.episode ? playback(page.episode) : null;
-  document.getElementById("charts").append(...page.charts.map(chart));
+  function showCharts() {
+    seekers = [];
+    document.getElementById("charts").replaceChildren(...page.charts.map(chart));
+  }
+  showCharts();
   document.getElementById("tables").append(...page.tables.map(table));
   for (const { title, source } of page.pictures) {
     document.getElementById("pictures").append(make("h2", {}, title), make("img", { src: source, alt: title, loading: "lazy" }));
@@ -587,6 +638,16 @@
     player.moveTo(Number(wanted.get("t")) || 0);
     if (wanted.has("play")) player.setPlaying(true);
   }
+  let renewed = Promise.resolve();
+  take = (content) => {
+    renewed = renewed.then(async () => {
+      page = content.page;
+      bytes = await inflated(content.arrays);
+      showCharts();
+      player.renew(page.episode);
+    });
+  };
+  early.forEach(take);
   document.body.dataset.ready = "yes";
 })().catch((error) => {
   console.error(error);
