@@ -19,6 +19,8 @@ ARRIVED = 0.5  # [m]
 MAX_SPEED, MAX_TURN = 1.0, 1.5  # [m/s], [rad/s]: speeds of a continuous action of 1
 UNREACHABLE = np.iinfo(np.int32).max  # unreachable, in `DistanceMap.cost`
 STAY, AHEAD, LEFT, RIGHT = 0, 1, 2, 3  # discrete actions
+SWEEP = 0.6  # [rad] to each side: walls of a corridor are seen within 60 degrees of incidence only if the camera turns
+SWEEP_TICKS = 8  # on each side: the time to turn there at full rate
 TURN_FIRST = 0.5  # [rad/s] desired turn rate from which a discrete action turns
 
 
@@ -60,10 +62,12 @@ class DrivingPolicy:
     Args:
         planner: Planner of this robot.
         discrete: Whether actions are `discrete`; otherwise they are `continuous`.
+        sweeps: Whether the robot sweeps its camera from side to side on the way, with `continuous` actions: the walls
+            beside a path are too oblique to be measured by a camera that looks along it.
     """
 
-    def __init__(self, planner: Planner, discrete: bool = False) -> None:
-        self._planner, self._discrete = planner, discrete
+    def __init__(self, planner: Planner, discrete: bool = False, sweeps: bool = False) -> None:
+        self._planner, self._discrete, self._sweeps = planner, discrete, sweeps and not discrete
         self.reset()
 
     def reset(self) -> None:
@@ -87,7 +91,10 @@ class DrivingPolicy:
         if self._path is None:
             speed, turn = 0.0, MAX_TURN  # turn on the spot until free floor is seen
         else:
-            speed, turn = follow_path(belief.pose, self._path, MAX_SPEED, MAX_TURN, self._heading)
+            aside = 0.0
+            if self._sweeps:
+                aside = SWEEP if belief.tick % (2 * SWEEP_TICKS) < SWEEP_TICKS else -SWEEP
+            speed, turn = follow_path(belief.pose, self._path, MAX_SPEED, MAX_TURN, self._heading, aside)
         if self._discrete:
             if abs(turn) >= TURN_FIRST or (speed == 0.0 and turn != 0.0):
                 return LEFT if turn > 0.0 else RIGHT

@@ -5,14 +5,17 @@ indoor environments", IJRR 2002, and to the active revisits of Stachniss, Haehne
 loop-closing for FastSLAM", IROS 2004. The map error counts landmarks measured too rarely as missing, so that looking
 again pays; but maps must meet first, since each robot is scored by the map that it shares. So the time is divided:
 
-1. While frontiers are left, distance advantage chooses among them (`agents.distance_advantage`): of the planners here
-   its robots share their maps earliest. Views on the way are not taken: each costs a stop, and merges come later.
-2. Then views are worth what they show, walls [m] looked at too little and weak landmarks, for the path to them.
+1. A robot explores while there are frontiers to which no teammate has a shorter path, chosen by distance advantage
+   (`agents.distance_advantage`): of the planners here its robots share their maps earliest. Views on the way are not
+   taken: each costs a stop, and exploring takes longer by more than they show.
+2. Otherwise it goes to views, worth what they show, walls [m] looked at too little and weak landmarks, for the path to
+   them. Frontiers that are left to teammates come after that.
 3. If nothing is left to see and robots are missing in the group, or a loop can be closed, the robot goes to the nearest
    rendezvous.
 
 Places that cannot be reached in the time that is left are passed over, and those to which a teammate is nearer or
-drives already are left to it.
+drives already are left to it. With continuous actions robots sweep their cameras on the way (`DrivingPolicy`), so that
+walls beside the path have their looks without a stop.
 """
 
 import numpy as np
@@ -43,28 +46,43 @@ class NextBestView:
         """Return the slot to go to, or None if there is nothing left to see."""
         candidates = belief.candidates
         can_reach = candidates.valid & (candidates.lengths < belief.seconds_left)
+        frontier, is_own = None, False
         if (can_reach & (candidates.kinds == CandidateKind.FRONTIER)).any():
             targets = own_targets(belief, self._held)
             assert targets is not None  # there is a frontier
-            self._held = int(targets.slots[0, distance_advantage(targets, rng)[0]])
-            return self._held
-        rates = view_rates(belief)
-        mates = candidates.teammate_lengths.min(axis=1, initial=np.inf)
-        is_own = can_reach & (candidates.lengths <= mates) & ~candidates.teammate_goal
-        self._held = _best(rates, is_own)
-        if self._held is None:
-            self._held = _best(rates, can_reach)
+            frontier = int(targets.slots[0, distance_advantage(targets, rng)[0]])
+            is_own = bool((targets.lengths.argmin(axis=0) == 0).any())
+        if not is_own:
+            self._held = self._view(belief, can_reach)
+        if is_own or self._held is None:
+            self._held = frontier
         if self._held is None:
             is_meeting = can_reach & (candidates.kinds == CandidateKind.RENDEZVOUS)
             self._held = _best(1.0 / (1.0 + candidates.lengths), is_meeting)
         return self._held
 
+    def _view(self, belief: Belief, can_reach: BoolArray) -> int | None:
+        """Return the slot of the best view: of those left to this robot, of those no teammate goes to, or of all."""
+        candidates, rates = belief.candidates, view_rates(belief, self._held)
+        is_nearest = candidates.lengths <= candidates.teammate_lengths.min(axis=1, initial=np.inf)
+        for allowed in (is_nearest & ~candidates.teammate_goal, ~candidates.teammate_goal, can_reach):
+            best = _best(rates, can_reach & allowed)
+            if best is not None:
+                return best
+        return None
 
-def view_rates(belief: Belief) -> FloatArray:
-    """Return what each revisit candidate shows for the path to it, (C,) float64; 0 for other kinds and empty slots."""
+
+def view_rates(belief: Belief, held: int | None = None) -> FloatArray:
+    """Return what each revisit candidate shows for the path to it, (C,) float64; 0 for other kinds and empty slots.
+
+    Args:
+        belief: Belief of the robot.
+        held: Slot of its previous goal.
+    """
     candidates = belief.candidates
     values = candidates.gains.unseen_wall + LANDMARK_VALUE * candidates.gains.weak_landmarks
-    values = np.where(candidates.own_goal, HOLD * values, values)
+    if held is not None:
+        values[held] *= HOLD
     is_view = candidates.kinds == CandidateKind.REVISIT
     lengths = np.where(is_view, candidates.lengths, 0.0)
     return np.asarray(np.where(is_view, values / (STOP + lengths) ** PATH_POWER, 0.0))

@@ -43,15 +43,16 @@ def predict_covariances(belief: Belief, slots: IntArray) -> list[FloatArray]:
     starts = np.cumsum([0, *map(len, poses)])
     for k, own in enumerate(poses):
         gained[k, : len(own)] = information[starts[k] : starts[k + 1]]
+    before = np.concatenate([np.repeat(belief.pose[None, None], len(poses), axis=0), all_poses[:, :-1]], axis=1)
+    jacobians, noise = _motions(before, all_poses)
+    transposed = np.ascontiguousarray(jacobians.swapaxes(-1, -2))
     covariance = np.repeat(belief.covariance[None] + LEAST_COVARIANCE, len(poses), axis=0)
-    before, found = np.repeat(belief.pose[None], len(poses), axis=0), []
+    together = np.empty((len(poses), longest, 3, 3))
     for step in range(longest):
-        covariance = _moved(covariance, before, all_poses[:, step])
+        covariance = jacobians[:, step] @ covariance @ transposed[:, step] + noise[:, step]
         covariance = np.asarray(np.linalg.inv(np.linalg.inv(covariance) + gained[:, step]), dtype=np.float64)
         covariance = np.asarray(0.5 * (covariance + covariance.transpose(0, 2, 1)), dtype=np.float64)
-        found.append(covariance)
-        before = all_poses[:, step]
-    together = np.stack(found, axis=1)
+        together[:, step] = covariance
     return [together[k, : len(own)] for k, own in enumerate(poses)]
 
 
@@ -60,6 +61,9 @@ def _information(poses: FloatArray, ways: DistanceMap, landmarks: FloatArray, co
 
     The jacobian is that of the offset from the robot to the landmark, rotated to the world's axes.
     """
+    low, high = poses[:, :2].min(axis=0) - SIGHT, poses[:, :2].max(axis=0) + SIGHT
+    near = ((low <= landmarks) & (landmarks <= high)).all(axis=1)
+    landmarks, covariances = landmarks[near], covariances[near]
     gaps = landmarks[None] - poses[:, None, :2]
     bearings = np.arctan2(gaps[..., 1], gaps[..., 0]) - poses[:, None, 2]
     in_view = np.abs((bearings + math.pi) % (2.0 * math.pi) - math.pi) < HALF_VIEW
@@ -96,15 +100,15 @@ def _poses_along(path: FloatArray, final_heading: float) -> FloatArray:
     return np.column_stack([np.vstack([points, points[-1:]]), [*headings, final_heading]])
 
 
-def _moved(covariances: FloatArray, before: FloatArray, after: FloatArray) -> FloatArray:
-    """Return covariances (k, 3, 3) after motions between poses (k, 3)."""
-    moves = after[:, :2] - before[:, :2]
-    distances = np.hypot(moves[:, 0], moves[:, 1])
-    jacobians = np.tile(np.eye(3), (len(moves), 1, 1))
-    jacobians[:, 0, 2], jacobians[:, 1, 2] = -moves[:, 1], moves[:, 0]
-    outer = moves[:, :, None] * moves[:, None, :]  # squared distance along the motion
-    across = distances[:, None, None] ** 2 * np.eye(2) - outer
-    noise = np.tile(LEAST_COVARIANCE, (len(moves), 1, 1))
-    noise[:, :2, :2] += ALONG**2 * outer + ACROSS**2 * across
-    noise[:, 2, 2] += (TURN * distances) ** 2
-    return np.asarray(jacobians @ covariances @ jacobians.transpose(0, 2, 1) + noise)
+def _motions(before: FloatArray, after: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the jacobians (k, n, 3, 3) and the noise (k, n, 3, 3) of motions between poses (k, n, 3)."""
+    moves = after[..., :2] - before[..., :2]
+    distances = np.hypot(moves[..., 0], moves[..., 1])
+    jacobians = np.broadcast_to(np.eye(3), (*distances.shape, 3, 3)).copy()
+    jacobians[..., 0, 2], jacobians[..., 1, 2] = -moves[..., 1], moves[..., 0]
+    outer = moves[..., :, None] * moves[..., None, :]  # squared distance along the motion
+    across = distances[..., None, None] ** 2 * np.eye(2) - outer
+    noise = np.broadcast_to(LEAST_COVARIANCE, (*distances.shape, 3, 3)).copy()
+    noise[..., :2, :2] += ALONG**2 * outer + ACROSS**2 * across
+    noise[..., 2, 2] += (TURN * distances) ** 2
+    return jacobians, noise

@@ -41,6 +41,7 @@ PLANNERS: dict[str, Callable[[], Planner]] = {
     "d_optimality": DOptimality,
     **{name: partial(Assigned, assign) for name, assign in ASSIGNMENTS.items()},
 }
+SWEEPING = ("next_best_view",)  # planners whose robots sweep their cameras on the way, with continuous actions
 POLICIES: dict[str, tuple[str, ...]] = {  # with supported action types; comparisons of policies use the first one
     "frontier": ("goal", "continuous", "discrete"),
     "random_goals": ("goal",),
@@ -86,7 +87,9 @@ def make_policy(name: str, action_type: str) -> Policy:
         return load_plugin(name)
     if name in PLANNERS:
         planner = PLANNERS[name]()
-        return GoalPolicy(planner) if action_type == "goal" else DrivingPolicy(planner, action_type == "discrete")
+        if action_type == "goal":
+            return GoalPolicy(planner)
+        return DrivingPolicy(planner, action_type == "discrete", name in SWEEPING)
     return RandomGoals() if name == "random_goals" else RandomWalk(action_type == "discrete")
 
 

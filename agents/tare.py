@@ -26,9 +26,11 @@ def tare(targets: Targets, rng: np.random.Generator) -> IntArray:
         own = targets.share(robot)
         if not len(own):
             continue
+        own_covers = covers[own]
+        own_covers = own_covers[:, own_covers.any(axis=0)]  # few of all cells, which shortens the draws
         shortest = np.inf
         for _ in range(DRAWS if len(own) > 1 else 1):
-            drawn = own[draw_cover(covers[own], rng)]
+            drawn = own[draw_cover(own_covers, rng)]
             pairs = targets.between[np.ix_(drawn, drawn)]
             tour = open_tour(ways[drawn], pairs)
             length = tour_length(tour, ways[drawn], pairs)
@@ -48,11 +50,13 @@ def draw_cover(covers: BoolArray, rng: np.random.Generator) -> IntArray:
         (k,) int64, k >= 1. Viewpoints in the order of the draws; each adds at least `LEFT_OVER` cells, but the first.
     """
     drawn: list[int] = []
-    left = covers.any(axis=0)
+    weights = covers.astype(np.float64)
+    left = np.asarray(covers.any(axis=0), dtype=np.float64)
     while True:
-        gains = (covers & left).sum(axis=1).astype(np.float64)
+        gains = weights @ left
+        total = gains.sum()
         if drawn and gains.max() < LEFT_OVER:
             return np.array(drawn)
-        chances = gains / gains.sum() if gains.sum() > 0.0 else np.full(len(gains), 1.0 / len(gains))
-        drawn.append(int(rng.choice(len(gains), p=chances)))
-        left &= ~covers[drawn[-1]]
+        limits = np.cumsum(gains / total if total > 0.0 else np.full(len(gains), 1.0 / len(gains)))
+        drawn.append(int(np.searchsorted(limits / limits[-1], rng.random(), side="right")))
+        left[covers[drawn[-1]]] = 0.0

@@ -110,31 +110,32 @@ def team_targets(beliefs: Sequence[Belief], held: Mapping[int, int | None]) -> T
         held: Slot of the previous goal of each robot, by its index.
     """
     first = beliefs[0]
-    places: list[FloatArray] = []
+    places = np.empty((0, 2))
     entries: list[tuple[int, int, int, float]] = []  # robot, target, slot, length
     positions = []
     for row, belief in enumerate(beliefs):
         first_from_own = compose(first.start_from_group, inverse(belief.start_from_group))
         positions.append(transform_points(first_from_own, belief.pose[None, :2])[0])
         slots = _nearest(belief)
-        for slot, place in zip(slots, transform_points(first_from_own, belief.candidates.goals[slots]), strict=True):
-            gaps = np.linalg.norm(np.array(places).reshape(-1, 2) - place, axis=1)
-            taken = {target for robot, target, _, _ in entries if robot == row}
-            gaps[list(taken)] = np.inf
-            target = int(gaps.argmin()) if len(gaps) and gaps.min() < SAME_TARGET else len(places)
+        found = transform_points(first_from_own, belief.candidates.goals[slots])
+        gaps = np.linalg.norm(places - found[:, None], axis=-1)  # to the frontiers of the robots before
+        for i, slot in enumerate(slots):
+            target = int(gaps[i].argmin()) if gaps.shape[1] and gaps[i].min() < SAME_TARGET else len(places)
             if target == len(places):
-                places.append(place)
+                places = np.vstack([places, found[i]])
+            else:
+                gaps[:, target] = np.inf  # a robot has at most one frontier for each target
             length = float(belief.candidates.lengths[slot])
             length *= SWITCH_RATIO if held.get(belief.robot) == slot else 1.0
             entries.append((row, target, int(slot), length))
-    if not places:
+    if not len(places):
         return None
     lengths = np.full((len(beliefs), len(places)), NO_PATH)
     own = np.full(lengths.shape, -1)
     for row, target, slot, length in entries:
         lengths[row, target], own[row, target] = length, slot
     ways = distance_map(first.grid, first.pose[:2])
-    return Targets(ways, np.array(positions), np.array(places), lengths, own, len(beliefs))
+    return Targets(ways, np.array(positions), places, lengths, own, len(beliefs))
 
 
 def _nearest(belief: Belief) -> IntArray:

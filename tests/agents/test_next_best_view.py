@@ -61,6 +61,15 @@ def test_frontiers_come_before_views_and_views_before_meetings() -> None:
         slots.pop(expected or -1, None)
 
 
+def test_robots_look_again_while_teammates_explore_what_is_left() -> None:
+    """A frontier to which a teammate, 4 m away, is nearer comes after views; one that is near comes before them."""
+    far, near = (FRONTIER, 9.0, 0.0), (FRONTIER, 1.0, 0.0)
+    view = {20: (REVISIT, 1.0, 3.0)}
+    assert NextBestView().choose(_belief({3: far, **view}, {}), RNG) == 20
+    assert NextBestView().choose(_belief({3: near, **view}, {}), RNG) == 3
+    assert NextBestView().choose(_belief({3: far}, {}), RNG) == 3
+
+
 def test_views_are_worth_what_they_show_for_the_path() -> None:
     """The rate grows with the wall and falls with the path; the current goal counts more; other kinds have none."""
     slots = {16: (REVISIT, 2.0, 1.0), 17: (REVISIT, 2.0, 2.0), 18: (REVISIT, 9.0, 2.0), 0: (FRONTIER, 1.0, 5.0)}
@@ -68,8 +77,7 @@ def test_views_are_worth_what_they_show_for_the_path() -> None:
     assert rates[17] > rates[18] > 0.0
     assert rates[17] == pytest.approx(2.0 * rates[16])
     assert rates[0] == 0.0
-    held = np.arange(len(rates)) == 16
-    assert view_rates(_belief(slots, own_goal=held))[16] == pytest.approx(1.5 * rates[16])
+    assert view_rates(_belief(slots), 16)[16] == pytest.approx(1.5 * rates[16])
 
 
 def test_views_are_left_to_teammates_and_to_time() -> None:

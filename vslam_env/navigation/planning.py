@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slam_backend.core.jit import in_place
-from slam_backend.core.validation import FloatArray, argument_error, check_float
+from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_float
 from vslam_env.navigation._grid_kernels import LARGEST_HALF_WIDTH
 from vslam_env.navigation._planning_kernels import (
     GOAL_CELLS,
@@ -100,6 +100,7 @@ TURN_ONLY = 0.7  # [rad] heading error above which the robot turns in place
 ARRIVED = 0.1  # [m]
 SLOW_DOWN = 1.5  # [1/s] speed limit per metre of remaining path
 FACED = 0.05  # [rad]
+SWEPT_FROM, SWEPT_WITHIN = 0.6, 1.0  # [m] before the end, and [rad] of heading error, in which robots look aside
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -132,6 +133,12 @@ class DistanceMap:
         point = [min(max(coordinate, -limit), limit) for coordinate in point_floats(xy, "xy")]
         row, col = (cell_of(point, self.size) - self.corner).tolist()
         return row, col
+
+    def cells_of(self, places: ArrayLike) -> IntArray:
+        """Return the cells (n, 2) int64, rows (row, column), of points (n, 2) [m] in the arrays, as `cell_of`."""
+        limit = 2.0 * LARGEST_HALF_WIDTH
+        points = np.clip(positions_array(places, "places"), -limit, limit)
+        return np.asarray(cell_of(points, self.size) - np.array(self.corner), dtype=np.int64)
 
     def centre_of(self, cells: ArrayLike) -> FloatArray:
         """Return the centres (..., 2) [m], start frame, of cells (..., 2) of the arrays, rows (row, column)."""
@@ -249,6 +256,7 @@ def follow_path(
     max_speed: float = 1.0,
     max_turn: float = 1.5,
     final_heading: float | None = None,
+    aside: float = 0.0,
 ) -> tuple[float, float]:
     """Return a velocity command that follows a path by pure pursuit, slower for larger heading errors.
 
@@ -258,6 +266,9 @@ def follow_path(
         max_speed: Largest speed [m/s].
         max_turn: Largest turn rate [rad/s].
         final_heading: Heading to turn to at the end of the path [rad], start frame; None: any.
+        aside: Angle [rad] between the wanted heading and the path, left of it if positive, at least 0.6 m before its
+            end. If its sign alternates every second or so, the robot sweeps its camera over the walls on both sides and
+            stays near the path.
 
     Returns:
         (v, omega) with 0 <= v <= max_speed [m/s] and |omega| <= max_turn [rad/s]; (0, 0) at the end.
@@ -279,5 +290,8 @@ def follow_path(
         error = math.remainder(final_heading - theta, 2.0 * math.pi)
         return 0.0, 0.0 if abs(error) < FACED else min(max(TURN_GAIN * error, -max_turn), max_turn)
     error = math.remainder(math.atan2(target_y - y, target_x - x) - theta, 2.0 * math.pi)
+    if aside != 0.0 and left > SWEPT_FROM and abs(error) < SWEPT_WITHIN:
+        omega = min(max(TURN_GAIN * (error + aside), -max_turn), max_turn)
+        return min(max_speed * math.cos(error), SLOW_DOWN * left), omega
     omega = min(max(TURN_GAIN * error, -max_turn), max_turn)
     return min(max_speed * max(0.0, 1.0 - abs(error) / TURN_ONLY), SLOW_DOWN * left), omega

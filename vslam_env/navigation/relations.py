@@ -10,7 +10,6 @@ from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from vslam_env.navigation._grid_kernels import CELL, FREE, OCCUPIED, UNKNOWN
 from vslam_env.navigation._planning_kernels import lines_of_sight, nearest_open, path_lengths
 from vslam_env.navigation.planning import DistanceMap
-from vslam_env.navigation.validation import positions_array
 
 OPEN_CELLS = 5  # [cells] an open cell is looked for this far from a place in an inflated wall
 ROOM_CORE = 0.75  # [m] distance from walls of the cells at the core of a room; doors are narrower than twice this
@@ -53,8 +52,7 @@ def sees(ways: DistanceMap, viewpoints: ArrayLike, targets: IntArray, reach: flo
 
 def cells_of(ways: DistanceMap, places: ArrayLike) -> IntArray:
     """Return the cells (n, 2) int64 rows (row, column) of places (n, 2) [m]; those outside are moved to the edge."""
-    cells = np.array([ways.cell_of(place) for place in positions_array(places, "places")], np.int64).reshape(-1, 2)
-    return np.clip(cells, 0, np.array(ways.box.shape) - 1)
+    return np.clip(ways.cells_of(places), 0, np.array(ways.box.shape) - 1)
 
 
 def frontier_cells(ways: DistanceMap) -> IntArray:
@@ -92,8 +90,7 @@ def rooms_of(ways: DistanceMap, places: ArrayLike, core: float = ROOM_CORE) -> I
 
 def _open_cells(ways: DistanceMap, places: ArrayLike) -> NDArray[np.int64]:
     """Return the open cells (n, 2) nearest to places (n, 2) [m]; -1 where there is none nearby."""
-    cells = [
-        nearest_open(ways.box, ways.weights, *ways.cell_of(place), OPEN_CELLS, 1)
-        for place in positions_array(places, "places")
+    found = [
+        nearest_open(ways.box, ways.weights, row, col, OPEN_CELLS, 1) for row, col in ways.cells_of(places).tolist()
     ]
-    return np.array(cells, np.int64).reshape(-1, 2)
+    return np.array(found, np.int64).reshape(-1, 2)

@@ -260,14 +260,33 @@ def test_following_a_planned_path_arrives_without_touching_walls() -> None:
     st.lists(st.tuples(st.floats(-9, 9), st.floats(-9, 9)), min_size=1, max_size=6),
     st.floats(0.1, 1.0),
     st.floats(0.2, 1.5),
+    st.floats(-1.0, 1.0),
 )
 def test_commands_stay_within_their_limits(
-    pose: tuple[float, float, float], path: list[tuple[float, float]], max_speed: float, max_turn: float
+    pose: tuple[float, float, float], path: list[tuple[float, float]], max_speed: float, max_turn: float, aside: float
 ) -> None:
     """0 <= v <= max_speed and |omega| <= max_turn for all poses and paths, degenerate ones included."""
-    v, omega = follow_path(pose, path, max_speed, max_turn)
+    v, omega = follow_path(pose, path, max_speed, max_turn, aside=aside)
     assert 0.0 <= v <= max_speed
     assert abs(omega) <= max_turn
+
+
+def test_a_robot_that_looks_aside_stays_near_its_path() -> None:
+    """With alternating sides its heading swings by more than half of the angle; it keeps to the path and arrives."""
+    pose, track = np.zeros(3), []
+    path = [[0.0, 0.0], [6.0, 0.0], [6.0, 6.0]]
+    for tick in range(200):
+        v, omega = follow_path(pose, path, final_heading=0.0, aside=0.6 if tick % 16 < 8 else -0.6)
+        pose = compose(pose, [v * 0.1, 0.0, omega * 0.1])
+        track.append(pose)
+    gaps = np.minimum(np.abs(np.array(track)[:, 1]), np.abs(np.array(track)[:, 0] - 6.0))
+    assert gaps.max() < 0.3
+    straight = np.array([pose[2] for pose in track if 1.0 < pose[0] < 5.0])
+    assert straight.max() > 0.3
+    assert straight.min() < -0.3
+    assert np.hypot(*(pose[:2] - path[-1])) < 0.1
+    assert abs(pose[2]) < 0.06
+    assert np.hypot(*np.diff(np.array(track)[:, :2], axis=0).T).sum() < 1.1 * 12.0
 
 
 def test_a_robot_turns_in_place_towards_a_path_behind_it() -> None:
