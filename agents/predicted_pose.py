@@ -68,7 +68,7 @@ def _information(poses: FloatArray, ways: DistanceMap, landmarks: FloatArray, co
     bearings = np.arctan2(gaps[..., 1], gaps[..., 0]) - poses[:, None, 2]
     in_view = np.abs((bearings + math.pi) % (2.0 * math.pi) - math.pi) < HALF_VIEW
     in_view &= (gaps**2).sum(axis=-1) < SIGHT**2
-    in_view &= sees(ways, poses[:, :2], cells_of(ways, landmarks), SIGHT)
+    in_view = sees(ways, poses[:, :2], cells_of(ways, landmarks), SIGHT, among=in_view)
     pose, landmark = np.nonzero(in_view)
     offsets = gaps[pose, landmark]
     ranges = np.maximum(np.hypot(offsets[:, 0], offsets[:, 1]), 0.5)
@@ -91,13 +91,18 @@ def d_optimality(covariances: FloatArray | Sequence[FloatArray]) -> FloatArray:
 
 def _poses_along(path: FloatArray, final_heading: float) -> FloatArray:
     """Return poses (n, 3) about every `STEP` of a path (m, 2) [m], heading along it; the last one at the goal."""
-    lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+    moves = np.diff(path, axis=0)
+    lengths = np.zeros(len(path))
+    np.sqrt((moves * moves).sum(axis=1)).cumsum(out=lengths[1:])
     count = max(1, math.ceil(lengths[-1] / STEP))
-    at = np.linspace(0.0, lengths[-1], count + 1)[1:]
-    points = np.column_stack([np.interp(at, lengths, path[:, axis]) for axis in (0, 1)])
-    moves = np.diff(np.vstack([path[:1], points]), axis=0)
-    headings = np.arctan2(moves[:, 1], moves[:, 0])
-    return np.column_stack([np.vstack([points, points[-1:]]), [*headings, final_heading]])
+    at = np.linspace(0.0, lengths[-1], count + 1)
+    points = np.empty((count + 1, 2))
+    points[:, 0], points[:, 1] = np.interp(at, lengths, path[:, 0]), np.interp(at, lengths, path[:, 1])
+    moves = np.diff(points, axis=0)
+    poses = np.empty((count + 1, 3))
+    poses[:-1, :2], poses[-1, :2] = points[1:], points[-1]
+    poses[:-1, 2], poses[-1, 2] = np.arctan2(moves[:, 1], moves[:, 0]), final_heading
+    return poses
 
 
 def _motions(before: FloatArray, after: FloatArray) -> tuple[FloatArray, FloatArray]:

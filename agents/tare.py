@@ -57,6 +57,6 @@ def draw_cover(covers: BoolArray, rng: np.random.Generator) -> IntArray:
         total = gains.sum()
         if drawn and gains.max() < LEFT_OVER:
             return np.array(drawn)
-        limits = np.cumsum(gains / total if total > 0.0 else np.full(len(gains), 1.0 / len(gains)))
-        drawn.append(int(np.searchsorted(limits / limits[-1], rng.random(), side="right")))
+        limits = (gains / total if total > 0.0 else np.full(len(gains), 1.0 / len(gains))).cumsum()
+        drawn.append(int((limits / limits[-1]).searchsorted(rng.random(), side="right")))
         left[covers[drawn[-1]]] = 0.0

@@ -32,7 +32,9 @@ def lengths_between(ways: DistanceMap, starts: ArrayLike, goals: ArrayLike) -> F
     return np.asarray(path_lengths(ways.weights, _open_cells(ways, starts), _open_cells(ways, goals)))
 
 
-def sees(ways: DistanceMap, viewpoints: ArrayLike, targets: IntArray, reach: float) -> BoolArray:
+def sees(
+    ways: DistanceMap, viewpoints: ArrayLike, targets: IntArray, reach: float, among: BoolArray | None = None
+) -> BoolArray:
     """Return which cells are visible from which places: no occupied cell lies between them.
 
     Args:
@@ -40,12 +42,13 @@ def sees(ways: DistanceMap, viewpoints: ArrayLike, targets: IntArray, reach: flo
         viewpoints: (n, 2) float64 [m], start frame. Places to look from; any heading.
         targets: (m, 2) int64 rows (row, column) in the arrays of `ways`, as from `frontier_cells` or `cells_of`.
         reach: Range of view [m].
+        among: (n, m) bool. Pairs of a place and a cell that are tried; the result is False for others. None: all.
 
     Returns:
         (n, m) bool.
     """
     places = cells_of(ways, viewpoints)
-    visible = np.empty((len(places), len(targets)), np.bool_)
+    visible = np.ones((len(places), len(targets)), np.bool_) if among is None else among.copy()
     lines_of_sight(ways.box, places, np.ascontiguousarray(targets), reach / CELL, visible)
     return visible
 

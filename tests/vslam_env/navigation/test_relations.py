@@ -75,6 +75,9 @@ def test_walls_block_the_view(ways: DistanceMap) -> None:
     assert visible[2, 3]
     assert np.array_equal(visible, visible.T)
     assert not sees(ways, places, cells_of(ways, places), 1.0)[2, 3]
+    pairs = np.eye(4, dtype=np.bool_)
+    pairs[0] = True
+    assert np.array_equal(sees(ways, places, cells_of(ways, places), 8.0, among=pairs), visible & pairs)
 
 
 def test_frontier_cells_border_on_free_ones(grid: OccupancyGrid, ways: DistanceMap) -> None:

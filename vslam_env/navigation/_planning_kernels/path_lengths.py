@@ -48,11 +48,13 @@ def lines_of_sight(box: Any, viewpoints: Any, targets: Any, reach: float, visibl
         viewpoints: (n, 2) int64. Rows and columns of cells in the box.
         targets: (m, 2) int64. Rows and columns of cells in the box, which do not hide themselves.
         reach: Range of view [cells].
-        visible: (n, m) bool. Result.
+        visible: (n, m) bool. Pairs that are tried; those not visible become False.
     """
     for i in range(len(viewpoints)):
         row, col = viewpoints[i]
         for j in range(len(targets)):
+            if not visible[i, j]:
+                continue
             rows, cols = targets[j, 0] - row, targets[j, 1] - col
             distance = math.hypot(rows, cols)
             is_seen = distance <= reach
