@@ -1,4 +1,4 @@
-"""Presets of easy, standard and hard environments, for the landmark sensor and for rendered stereo cameras."""
+"""Presets of easy, standard, hard and large environments, for the landmark sensor and for rendered stereo cameras."""
 
 import dataclasses
 from typing import Any
@@ -10,7 +10,9 @@ from vslam_env.belief.belief import BeliefConfig
 from vslam_env.config import SENSORS, EnvConfig
 from vslam_env.sensors import StereoSensorConfig
 
-PRESETS = ("easy", "standard", "hard")
+NOISE_PRESETS = ("easy", "standard", "hard")
+PRESETS = (*NOISE_PRESETS, "large")
+LARGE = {"world": "rooms:extent=120", "action_type": "goal", "max_seconds": 1800.0}
 
 
 def preset_config(name: str, sensor: str = "landmark") -> EnvConfig:
@@ -23,6 +25,7 @@ def preset_config(name: str, sensor: str = "landmark") -> EnvConfig:
     points, descriptor noise 0.1.
     `hard`: odometry noise and bias doubled, 3 landmarks a tick within 5 m, detected with probability 0.8, 0.1 false
     points, descriptor noise 0.25, every fifth landmark copies the descriptor of another one, half of the contacts lost.
+    `large`: that of `standard`, for half an hour with `goal` actions in a world of 120 x 120 m, `rooms:extent=120`.
     The filters assume the range and the odometry noise of their preset.
     With `sensor="stereo"` presets differ in odometry and communication only, and the filters use `stereo_belief`.
 
@@ -36,6 +39,8 @@ def preset_config(name: str, sensor: str = "landmark") -> EnvConfig:
         return dataclasses.replace(config, belief=stereo_belief(config.stereo, config.belief))
     if name == "standard":
         return EnvConfig()
+    if name == "large":
+        return EnvConfig().replace(**LARGE)
     scale, max_range = (0.5, 12.0) if name == "easy" else (2.0, 5.0)
     standard = EnvConfig()
     motion = standard.belief.filter.motion

@@ -56,7 +56,7 @@ def parallel_env(
         num_particles: Number of particles of each filter; default 100.
         max_cycles: Number of steps after which the episode is truncated; default: as many as `max_seconds` takes.
         max_seconds: Simulated time after which the episode is truncated [s]; default 100. Give one of the two.
-        preset: `"easy"`, `"standard"` (default) or `"hard"`; see `preset_config`.
+        preset: `"easy"`, `"standard"` (default), `"hard"` or `"large"`; see `preset_config`.
         reward: Weights of terms by name (default `{"map_error": 1.0}`), or a list of custom terms. Learners should use
             a discount of at least 0.999 per tick: `gamma ** decision_ticks` per step.
         observation_type: `"dict"` (default) or `"flat"`.

@@ -224,6 +224,11 @@ class FastSlam:
         """Whether the filter has a smoother that works in slices."""
         return self.state.rejuvenation is not None and self.options.smoothing.slice_steps is not None
 
+    @property
+    def smooths_large_graph(self) -> bool:
+        """Whether the smoother's graph has so many landmarks that each slice of its work is costly."""
+        return self.state.rejuvenation is not None and self.state.rejuvenation.has_large_graph
+
     def request_rejuvenation(self) -> None:
         """Request a rejuvenation as soon as possible, in slices if the smoother works incrementally."""
         if self.state.rejuvenation is not None:

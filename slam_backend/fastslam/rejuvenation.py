@@ -156,6 +156,7 @@ def _thinned(graph: SlamGraph, robots: int, camera: FloatArray, options: Smoothi
 MIN_CLOSURE_MATCHES = 3  # matches with landmarks not seen for long that count as a loop closure in one step
 MIN_INTERVAL_FRACTION = 5  # a loop closure shortens the interval to a fifth at most
 MIN_ROWS = 8  # least steps of each log in a slice, so that the work keeps up with the input
+LARGE_GRAPH = 2000  # landmarks; those of worlds of 30 m are some 500
 MAX_FAILURES = 2  # failed optimisations in a row, without slices, before measurements are dropped
 SCHEDULE = ("_asked", "_waited", "_read", "_closed", "_failures", "_exact", "_last_closing", "steps")
 
@@ -247,6 +248,11 @@ class RejuvenationScheduler:
         smoothing = self._options.smoothing
         sightings = 0 if self._graph is None else self._graph.num_sightings - smoothing.free_sightings
         return haste * smoothing.effort * self._read >= sightings
+
+    @property
+    def has_large_graph(self) -> bool:
+        """Whether the graph has so many landmarks that each slice of work is costly."""
+        return self._graph is not None and len(self._graph.landmark_ids) > LARGE_GRAPH
 
     def is_waiting(self, step: int) -> bool:
         """Return whether nothing is due after a step for any content of the logs; a fast check before `is_idle`."""

@@ -19,7 +19,9 @@ from slam_backend.fastslam.step_input import InputBuffer, RobotRows, StepInput, 
 from slam_backend.team.merge_monitor import MergeMonitor
 
 MAX_REPLAYED = 20  # buffered steps that a filter replays per tick
-TURNS = 4  # each robot's filter may smooth in one of this many steps
+TURNS = (
+    4  # each robot's filter may smooth in one of this many steps, robots of a joint filter in turn; large graphs once
+)
 
 
 @dataclass(slots=True, eq=False)
@@ -172,7 +174,7 @@ def process_step(
         branch.report = report = _silent_report(branch, rows, associations)
         return report
     slam = branch.filter
-    slam.may_smooth = step % TURNS in batches
+    slam.may_smooth = step % TURNS in batches and (not slam.smooths_large_graph or step % TURNS == min(batches))
     branch.report = report = slam.step_checked(inputs, rows, associations, buffer, step)
     if report.num_created:
         for monitor in branch.monitors:

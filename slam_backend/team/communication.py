@@ -1,6 +1,5 @@
 """Communication within a team: connected components and a traffic count."""
 
-import copy
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -129,9 +128,14 @@ class TrafficCounter:
 
     def get_state(self) -> dict[str, Any]:
         """Return a copy of the counts."""
-        return {"bytes_sent": tuple(self.sent), "known": copy.deepcopy(self._known)}
+        return {"bytes_sent": tuple(self.sent), "known": _copied(self._known)}
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Restore the counts from `get_state`."""
         self.sent = list(state["bytes_sent"])
-        self._known = copy.deepcopy(state["known"])
+        self._known = _copied(state["known"])
+
+
+def _copied(known: Mapping[tuple[int, int], Mapping[int, int]]) -> dict[tuple[int, int], dict[int, int]]:
+    """Return a copy of the counts of all pairs of robots."""
+    return {pair: dict(counts) for pair, counts in known.items()}

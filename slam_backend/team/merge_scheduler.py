@@ -1,9 +1,8 @@
 """Scheduler of merge attempts: alignment is expensive, and a retry on the same evidence fails again."""
 
-import copy
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from slam_backend.core.read_only import as_constant, with_constants
@@ -59,6 +58,10 @@ class AttemptRecord:
     last_step: int = 0
     next_step: int = 0
     tried: set[tuple[int, int]] = field(default_factory=set)  # candidate matches of the last attempt, by landmark ids
+
+    def copy(self) -> "AttemptRecord":
+        """Return an independent copy."""
+        return replace(self, tried=set(self.tried))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -218,7 +221,8 @@ class MergeScheduler:
 
     def get_state(self) -> dict[str, Any]:
         """Return the options and a copy of the memory; arrays are read-only."""
-        memory: dict[str, Any] = {"records": copy.deepcopy(self._records), "blocks": tuple(self._blocks)}
+        records = {pair: record.copy() for pair, record in self._records.items()}
+        memory: dict[str, Any] = {"records": records, "blocks": tuple(self._blocks)}
         memory |= {"uncertainties": dict(self._uncertainties), "trials": dict(self._trials)}
         fixed = {"options": self._options, "alignment": self._alignment, "pending_attempt": self.pending_attempt}
         return fixed | memory
@@ -227,7 +231,7 @@ class MergeScheduler:
         """Restore options and memory from `get_state`."""
         self._options, self._alignment, self._near = state["options"], state["alignment"], {}
         self.pending_attempt = state["pending_attempt"]
-        self._records = copy.deepcopy(state["records"])
+        self._records = {pair: record.copy() for pair, record in state["records"].items()}
         self._blocks = list(state["blocks"])
         self._uncertainties, self._trials = dict(state["uncertainties"]), dict(with_constants(state["trials"]))
 

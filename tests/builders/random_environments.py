@@ -17,7 +17,7 @@ from builders.environments import room, wander
 
 from vslam_env import EnvConfig, ExplorationEnv, World, preset_config
 from vslam_env.config import ACTION_TYPES
-from vslam_env.presets import PRESETS
+from vslam_env.presets import NOISE_PRESETS
 from vslam_env.world import load_floorplan
 
 REFUSAL = r"[\w.\[\]'{}, ]+: expected .*, got .*\. .*\."
@@ -53,7 +53,7 @@ def drawn(seed: int) -> Case:
     """Draw a case: a preset, what kind of environment, and some numbers that are moved, a few of them to extremes."""
     rng = np.random.default_rng(seed)
     sensor = "stereo" if rng.random() < 0.12 else "landmark"
-    preset = str(rng.choice(PRESETS))
+    preset = str(rng.choice(NOISE_PRESETS))
     world: Any = str(rng.choice(WORLDS)) if rng.random() < 0.5 else tuple(rng.uniform(2.0, 60.0, 2).tolist())
     if rng.random() < 0.1:
         world = tuple((10.0 ** rng.uniform(-0.5, 2.3, 2)).tolist())

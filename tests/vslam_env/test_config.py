@@ -33,6 +33,18 @@ def test_presets_are_ordered() -> None:
         assert less.comm_loss <= more.comm_loss
 
 
+def test_the_large_preset_has_a_large_world_and_standard_noise() -> None:
+    """It differs from the standard preset in world, actions and time alone, and arguments replace its values."""
+    large = vslam_v0.parallel_env(preset="large").config
+    assert large.world == "rooms:extent=120"
+    assert large.action_type == "goal"
+    assert large.max_seconds == 1800.0
+    common = {"world": "office", "action_type": "continuous", "max_seconds": 60.0}
+    assert large.replace(**common) == preset_config("standard").replace(**common)
+    own = vslam_v0.parallel_env(preset="large", world="campus", max_seconds=300.0).config
+    assert (own.world, own.action_type, own.max_seconds) == ("campus", "goal", 300.0)
+
+
 def test_true_and_assumed_noise_are_apart() -> None:
     """Changing what the filters assume leaves the simulator's noise, and the other way round."""
     config = EnvConfig()

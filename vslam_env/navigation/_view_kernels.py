@@ -21,6 +21,8 @@ from vslam_env.navigation._grid_kernels import (
     cell_index,
     margin_of,
 )
+from vslam_env.navigation._planning_kernels.candidates import is_settled
+from vslam_env.navigation._planning_kernels.costmap import PAD
 from vslam_env.navigation._planning_kernels.dijkstra import (
     ESCAPE_CELLS,
     ISLAND,
@@ -487,14 +489,14 @@ def worth_seeing(cells: Any, looks: Any, bounds: Any, places: Any, counts: Any, 
 @device
 @jit
 def keep_revisits(
-    cells: Any, looks: Any, pose: Any, camera: Any, targets: Any, values: Any, rows: Any, visits: Any
+    cells: Any, looks: Any, pose: Any, camera: Any, targets: Any, values: Any, rows: Any, visits: Any, distant: Any
 ) -> None:
     """Keep the revisit candidates (m, 5) with something left to gain, and empty the other slots.
 
-    Values (n,) of targets (n, 6) that they cover become 0.
+    Values (n,) of targets (n, 6) that they cover become 0. Distant candidates, a mask (m,), stay as they are.
     """
     for i in range(len(rows)):
-        if np.isnan(rows[i, X]):
+        if np.isnan(rows[i, X]) or distant[i]:
             continue
         at_goal = math.hypot(rows[i, X] - pose[0], rows[i, Y] - pose[1]) <= AT_GOAL
         if at_goal and math.cos(rows[i, HEADING] - pose[2]) > math.cos(LOOKING):
@@ -586,13 +588,16 @@ def add_revisits(cells: Any, cost: Any, corner: Any, camera: Any, targets: Any, 
 
 @device
 @in_place
-def set_rendezvous(cost: Any, corner: Any, size: int, pose: Any, places: Any, rows: Any) -> None:
+def set_rendezvous(cost: Any, corner: Any, size: int, pose: Any, places: Any, rows: Any, distant: Any) -> None:
     """Move places (m, 3), NaN: none, to the nearest reachable cells and write them as candidates (m, 5).
 
-    Places that the robot has reached, or that no reachable cell is near, leave their slots empty.
+    Places that the robot has reached, or that no reachable cell is near, leave their slots empty. Distant candidates, a
+    mask (m,), stay while their places do.
     """
     height, width = cost.shape
     for i in range(len(rows)):
+        if distant[i] and math.hypot(rows[i, X] - places[i, 0], rows[i, Y] - places[i, 1]) <= NEAR_PLACE * CELL:
+            continue
         rows[i] = np.nan
         if np.isnan(places[i, 0]):
             continue
@@ -632,9 +637,10 @@ def measure_teammates(
                     for j in range(2):
                         weight, old = here[2 * i + j], there[i]
                         there[i] = weight if weight > 0 and (old == 0 or weight < old) else old
+            wide[0], wide[height - 1], wide[:, 0], wide[:, width - 1] = 0, 0, 0, 0  # open where the floor was cut off
         row, col = to_index(poses[k, 1], size) - corner[0], to_index(poses[k, 0], size) - corner[1]
         start_row, start_col = nearest_open(box, weights, row, col, ESCAPE_CELLS, ISLAND)
-        if start_row < 0:
+        if not (0 < start_row // 2 < height - 1 and 0 < start_col // 2 < width - 1):
             continue
         cost, parents = wavefront(wide, start_row // 2, start_col // 2, -1)
         flat = parents.ravel()
@@ -642,7 +648,8 @@ def measure_teammates(
             if np.isnan(rows[i, X]):
                 continue
             row, col = to_index(rows[i, Y], size) - corner[0], to_index(rows[i, X], size) - corner[1]
-            if cost[row // 2, col // 2] == UNREACHED:
+            inside = 0 <= row < box.shape[0] and 0 <= col < box.shape[1]
+            if not inside or cost[row // 2, col // 2] == UNREACHED:
                 continue
             cell, length = row // 2 * width + col // 2, 0.0
             while flat[cell] >= 0:
@@ -663,7 +670,8 @@ def renew_candidates(
         cells: (S, S) uint8. Cells of the robot's grid.
         bounds: (4,) int32. Bounds of its known part.
         looks: (S, S) uint8. Looks of the grid; those at walls that cannot be seen are set to the largest number.
-        ways: Paths from the robot, of `dijkstra`.
+        ways: Paths from the robot, of `dijkstra`. Where they cover a part of the known floor, candidates of which they
+            tell nothing (`is_settled`) stay as they are.
         landmarks: All landmarks of the robot's map (n, 4), their counts (n, 2), and the motion (3,) from the map frame
             to the start frame; see `MapSummaryRows`.
         poses: (K, 3) [m, m, rad]. Poses of all robots in the robot's frame; NaN: unknown.
@@ -680,25 +688,40 @@ def renew_candidates(
     first_revisit, first_rendezvous = len(rows) - num_places - len(visits), len(rows) - num_places
     box, weights, cost, parents, first_row, first_col = ways
     corner = (first_row, first_col)
-    weak, sure = worth_seeing(cells, looks, bounds, *landmarks)
+    part = np.empty(4, np.int32)  # the part of the known floor that was searched
+    part[0], part[1] = first_row + PAD, first_col + PAD
+    part[2], part[3] = first_row + box.shape[0] - PAD, first_col + box.shape[1] - PAD
+    is_part = False
+    for i in range(4):
+        is_part |= part[i] != bounds[i]
+    distant = np.zeros(len(rows), np.bool_)
+    if is_part:
+        for i in range(len(rows)):
+            if not np.isnan(rows[i, X]):
+                row, col = to_index(rows[i, Y], size), to_index(rows[i, X], size)
+                distant[i] = not is_settled(weights, cost, corner, bounds, row, col)
+    weak, sure = worth_seeing(cells, looks, part, *landmarks)
 
     revisits = rows[first_revisit:first_rendezvous]
-    targets = collect_targets(cells, bounds, looks, weak)
+    targets = collect_targets(cells, part, looks, weak)
     values = targets[:, 4].copy()
     for i in range(len(revisits)):
-        if not np.isnan(revisits[i, X]):
+        if not np.isnan(revisits[i, X]) and not distant[first_revisit + i]:
             row, col = to_index(revisits[i, Y], size) - first_row, to_index(revisits[i, X], size) - first_col
             inside = 0 <= row < cost.shape[0] and 0 <= col < cost.shape[1]
             if not inside or cost[row, col] == UNREACHED:
                 revisits[i], visits[i] = np.nan, 0
-    keep_revisits(cells, looks, poses[robot], camera, targets, values, revisits, visits)
+    kept = distant[first_revisit:first_rendezvous]
+    keep_revisits(cells, looks, poses[robot], camera, targets, values, revisits, visits, kept)
     if update % 2 == 0:
         add_revisits(cells, cost, corner, camera, targets, values, revisits)
-    set_rendezvous(cost, corner, size, poses[robot], places, rows[first_rendezvous:])
+    set_rendezvous(cost, corner, size, poses[robot], places, rows[first_rendezvous:], distant[first_rendezvous:])
 
-    lengths[:] = np.inf
     for i in range(len(rows)):
-        if not np.isnan(rows[i, X]):
+        off = math.hypot(rows[i, X] - views[i, X], rows[i, Y] - views[i, Y])  # NaN: another candidate, or none
+        if not (is_part and off < APART):
+            lengths[i] = np.inf
+        if not np.isnan(rows[i, X]) and not distant[i]:
             row, col = to_index(rows[i, Y], size) - first_row, to_index(rows[i, X], size) - first_col
             if cost[row, col] != UNREACHED:
                 lengths[i, robot], gains[i, UNCERTAIN_LENGTH] = path_lengths_to(parents, row, col, corner, sure)
@@ -710,7 +733,7 @@ def renew_candidates(
             continue
         moved = math.hypot(rows[i, X] - views[i, X], rows[i, Y] - views[i, Y])  # NaN: not looked at yet
         is_near = moved < MOVED and math.cos(rows[i, HEADING] - views[i, HEADING]) > math.cos(TURNED)
-        if not is_near or i % RECHECKED == update % RECHECKED:
+        if not is_near or (i % RECHECKED == update % RECHECKED and not distant[i]):
             view_gains(cells, looks, weak, rows[i], camera, gains[i])
             views[i] = rows[i, :3]
 

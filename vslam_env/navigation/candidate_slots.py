@@ -102,7 +102,14 @@ class CandidateSlots:
         poses = _together(pose, teammates)
         self.renew(*known_part(cells), poses, 0)
 
-    def renew(self, cells: NDArray[np.uint8], bounds: NDArray[np.int32], poses: FloatArray, robot: int) -> Ways:
+    def renew(
+        self,
+        cells: NDArray[np.uint8],
+        bounds: NDArray[np.int32],
+        poses: FloatArray,
+        robot: int,
+        reach: float = math.inf,
+    ) -> Ways:
         """Update the candidates of a robot without checks; return the paths from it, of `dijkstra`.
 
         Args:
@@ -110,10 +117,11 @@ class CandidateSlots:
             bounds: (4,) int32. Bounds of the known part of the grid, see `GridStorage`.
             poses: (n, 3) float64 [m, m, rad], start frame. Poses of the robot and its teammates; NaN: unknown.
             robot: Row of the robot in `poses`.
+            reach: Distance [m] from the robot along x and y beyond which candidates stay as they are.
         """
         slots = self._rows, self._visits
         found, costs, is_clear, self._given_up, ways = update_slots(
-            cells, bounds, ROBOT_RADIUS, poses, robot, *slots, self._given_up
+            cells, bounds, ROBOT_RADIUS, poses, robot, *slots, self._given_up, float(reach)
         )
         if not is_clear:
             fill_slots(_assign(costs), found, *slots)

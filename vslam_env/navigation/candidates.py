@@ -1,5 +1,6 @@
 """Candidates of three kinds, in slots with stable numbers: frontiers, places to look from again, and rendezvous."""
 
+import math
 from collections.abc import Mapping, Sequence
 from enum import IntEnum
 from typing import Any, NamedTuple
@@ -43,6 +44,9 @@ CANDIDATE_FEATURES = (
 """Names of the columns of the candidates in observations."""
 
 FIRST_KIND = NUM_DESCRIBED  # column of the first kind
+WHOLE_CELLS = 100_000  # cells of a known part, 63 x 63 m, that is searched wholly at every update
+SHARE_CELLS = 40_000  # cells of a larger one that an update searches beyond what is near, in the mean
+NEAR = 18.0  # [m] from the robot along x and y that are searched at every update of a larger one
 
 
 class CandidateKind(IntEnum):
@@ -85,6 +89,10 @@ class TeamCandidates:
     Slots 0 to 15 hold frontiers (`CandidateSlots`), 16 to 27 places to look from again, 28 to 31 rendezvous. A
     candidate keeps its slot while it lives: a place to look from again, while something is left to gain there.
 
+    An update costs what is near: where more than 63 x 63 m are known most updates search only within 18 m of the robot,
+    and candidates farther away, with their lengths and gains, stay as they were. All known floor is searched at every
+    n-th update, robots in turn, n the known area over 40 x 40 m; and as soon as no frontier is left.
+
     Args:
         num_robots: Number of robots K.
         camera: Half the field of view [rad], range [m], and radius of the robots [m].
@@ -119,11 +127,22 @@ class TeamCandidates:
             places: (4, 3) float64 [m, m, rad], start frame. Places for rendezvous; NaN: none.
         """
         cells, bounds = grids.grids[robot].cells, grids.bounds[robot]
-        ways = self.frontiers[robot].renew(cells, bounds, poses[robot], robot)
+        frontiers = self.frontiers[robot]
         self._updates[robot] += 1
+        reach, any_before = self._reach(robot, bounds), frontiers.valid.any()
+        ways = frontiers.renew(cells, bounds, poses[robot], robot, reach)
+        if reach < math.inf and any_before and not frontiers.valid.any():
+            ways = frontiers.renew(cells, bounds, poses[robot], robot)
         gains = self._gains[robot], self._views[robot]
         slots = self._rows[robot], self._visits[robot], *gains, self._lengths[robot], robot, self._updates[robot]
         renew_candidates(cells, bounds, looks, ways, landmarks, poses[robot], self._camera, places, slots)
+
+    def _reach(self, robot: int, bounds: NDArray[np.int32]) -> float:
+        """Return the distance [m] from a robot along x and y that the present update searches; inf: everywhere."""
+        top, left, bottom, right = bounds.tolist()
+        known = (bottom - top) * (right - left)
+        period = 1 if known <= WHOLE_CELLS else -(-known // SHARE_CELLS)
+        return math.inf if self._updates[robot] % period == robot % period else NEAR
 
     def rows(self, robot: int) -> FloatArray:
         """Return the candidates (32, 5) of a robot, columns as in `FrontierColumns`; NaN in empty slots. A view."""

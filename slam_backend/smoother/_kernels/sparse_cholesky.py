@@ -50,17 +50,19 @@ def minimum_degree(near: Bits, order: IntArray) -> int:
             degree += _num_bits(near[v, w])
         degrees[v] = degree
         times[degree] += 1
-    left = np.arange(num)
-    filled, least = 0, 0
+    left, places = np.arange(num), np.arange(num)
+    filled, least, sought, begin = 0, 0, -1, 0  # before `begin` no node that is left has the degree sought last
     for turn in range(num):
         least = max(least - 1, 0)  # no degree falls by more than one when a node goes
         while times[least] == 0:
             least += 1
-        at = turn
+        at = max(begin, turn) if least == sought else turn
         while degrees[left[at]] != least:
             at += 1
+        sought, begin = least, at + 1
         v = left[at]
         left[at] = left[turn]
+        places[left[at]] = at
         left[turn] = v
         order[turn] = v
         times[least] -= 1
@@ -72,16 +74,21 @@ def minimum_degree(near: Bits, order: IntArray) -> int:
                 low = rest & (~rest + ONE)
                 rest ^= low
                 u = w * WORD + _num_bits(low - ONE)
-                degree = 0
-                for i in range(words):
-                    near[u, i] |= near[v, i]
-                near[u, u >> 6] &= ~(ONE << np.uint64(u & 63))
                 near[u, mine] &= own
-                for i in range(words):
-                    degree += _num_bits(near[u, i])
+                degree = degrees[u] - 1
+                if least > 1:  # a single neighbour gets no new ones
+                    for i in range(words):
+                        near[u, i] |= near[v, i]
+                    near[u, u >> 6] &= ~(ONE << np.uint64(u & 63))
+                    near[u, mine] &= own
+                    degree = 0
+                    for i in range(words):
+                        degree += _num_bits(near[u, i])
                 times[degrees[u]] -= 1
                 times[degree] += 1
                 degrees[u] = degree
+                if degree == sought:
+                    begin = min(begin, places[u])
     return filled
 
 

@@ -10,7 +10,9 @@ from builders.comparison import assert_same
 from builders.filters import contents
 from builders.teams import NEVER, SimulatedTeam, check_snapshot, driven, false_alignment, links
 
+from slam_backend.fastslam import rejuvenation
 from slam_backend.fastslam.filter import FastSlam
+from slam_backend.fastslam.rejuvenation import RejuvenationScheduler
 from slam_backend.geometry import between, compose
 from slam_backend.maps.alignment import DISTINCT_ROTATION, DISTINCT_TRANSLATION, AlignmentOptions, align_maps
 from slam_backend.maps.landmark_map import LandmarkMap
@@ -288,6 +290,27 @@ def test_only_a_smoother_that_works_in_slices_can_be_waited_for(every: int | Non
     assert not team._find(0)[0].filter.smooths_incrementally
     simulation.run(team, STEPS)
     assert [event.step for event in team.events] == [STEPS - 1] * 2
+
+
+@pytest.mark.parametrize(("most", "turns"), [(10**6, {0, 1}), (0, {0})])
+def test_large_joint_graphs_are_smoothed_in_one_of_four_steps(
+    most: int, turns: set[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A joint filter smooths in the turns of all its robots; with a large graph in that of the first alone."""
+    monkeypatch.setattr(rejuvenation, "LARGE_GRAPH", most)
+    smoothing = SmoothingOptions(slice_steps=20)
+    simulation, team = driven(2, 112, STEPS, attempts=NEVER, num_particles=8, rejuvenate_every=20, smoothing=smoothing)
+    team.merge(0, 1, align_maps(team.map(0, "mixture"), team.map(1, "mixture")))
+    smoothed, run = [], RejuvenationScheduler.run
+
+    def noted(self: RejuvenationScheduler, *args: Any) -> Any:
+        smoothed.append(team._step % 4)
+        return run(self, *args)
+
+    monkeypatch.setattr(RejuvenationScheduler, "run", noted)
+    simulation.run(team, SOON)
+    assert len(smoothed) > 4
+    assert set(smoothed) == turns
 
 
 FEW_STEPS = 60

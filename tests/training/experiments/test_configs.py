@@ -20,7 +20,7 @@ from training.paper.fig6.trials import REGIMES
 from training.replay import config as replay
 from training.rl.config import TRAIN_PRESETS, EvaluateConfig, TrainConfig
 from vslam_env.config import ACTION_TYPES, MAX_ROBOTS, SENSORS
-from vslam_env.presets import PRESETS
+from vslam_env.presets import NOISE_PRESETS
 from vslam_env.world import SPLITS
 
 # Required values of each class, and a value that differs from its default.
@@ -186,7 +186,7 @@ def test_choices_match_the_packages() -> None:
     assert get_args(experiments.Proposal) == PROPOSALS
     assert get_args(experiments.Descriptor) == DESCRIPTORS
     assert get_args(experiments.ActionType) == ACTION_TYPES
-    assert get_args(experiments.NoisePreset) == PRESETS
+    assert get_args(experiments.NoisePreset) == NOISE_PRESETS
     assert get_args(experiments.Sensor) == SENSORS
     assert get_args(bench.AlignmentMethod) == METHODS
     assert get_args(bench.Method) == trials.METHODS

@@ -5,8 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.core.jit import device, in_place, jit
-from vslam_env.navigation._planning_kernels.dijkstra import dijkstra
+from slam_backend.core.jit import device, in_place, inline, jit
+from vslam_env.navigation._grid_kernels import cell_index, margin_of
+from vslam_env.navigation._planning_kernels.costmap import PAD
+from vslam_env.navigation._planning_kernels.dijkstra import UNREACHED, dijkstra
 from vslam_env.navigation._planning_kernels.frontiers import HEADING, NUM_COLUMNS, frontiers_reached
 
 SAME_GOAL = 1.0  # [m] between updates the goal of a living candidate moves less than this
@@ -14,6 +16,65 @@ AT_GOAL = 0.5  # [m]
 LOOKING = 0.6  # [rad] a robot whose heading is this near to a candidate's looks at the unknown
 LOOK_COUNTS = 4  # times as much as a visit without a look, for a teammate's direction is not told
 PATIENCE = 16  # visits, after which what is still unseen there never will be seen
+CUT_MARGIN = 25  # [cells] from where a search was cut off: what is to be seen from there may lie beyond
+
+
+@inline
+def is_settled(weights: Any, cost: Any, corner: Any, bounds: Any, row: int, col: int) -> bool:
+    """Return whether a search over all known floor, or over a part, tells what there is at a cell of the grid.
+
+    It does unless the cell is open and not reached, or within `CUT_MARGIN` of an edge where the search was cut off.
+
+    Args:
+        weights: (h, w) uint8. Weights of a box, 0 = closed.
+        cost: (h, w) int32. Costs of `wavefront` over it.
+        corner: Row and column of the box in the grid.
+        bounds: (4,) int32. Bounds of the known part of the grid.
+        row: Row of the cell in the grid.
+        col: Column of the cell in the grid.
+    """
+    height, width = cost.shape
+    r, c = row - corner[0], col - corner[1]
+    if not (0 <= r < height and 0 <= c < width) or (weights[r, c] > 0 and cost[r, c] == UNREACHED):
+        return False
+    top, left, bottom, right = corner[0] + PAD, corner[1] + PAD, corner[0] + height - PAD, corner[1] + width - PAD
+    inside_rows = (top <= bounds[0] or row >= top + CUT_MARGIN) and (bottom >= bounds[2] or row < bottom - CUT_MARGIN)
+    inside_cols = (left <= bounds[1] or col >= left + CUT_MARGIN) and (right >= bounds[3] or col < right - CUT_MARGIN)
+    return bool(inside_rows and inside_cols)
+
+
+@device
+@jit
+def with_distant(found: Any, rows: Any, ways: tuple[Any, Any, Any, Any, int, int], bounds: Any, size: int) -> Any:
+    """Return the frontiers (n, 5) that a search over a part found, and the candidates of which it tells nothing.
+
+    Args:
+        found: (m, 5). Frontiers; those of which the search does not tell all are left out.
+        rows: (k, 5). Candidates; NaN: none.
+        ways: Paths of the search, of `dijkstra`.
+        bounds: (4,) int32. Bounds of the known part of the grid.
+        size: Number of cells along a side of the grid.
+    """
+    _, weights, cost, _, row, col = ways
+    corner = row, col
+    both, num, margin = np.empty((len(found) + len(rows), NUM_COLUMNS)), 0, margin_of(size)
+    for i in range(len(found)):
+        if is_settled(weights, cost, corner, bounds, cell_index(found[i, 1], margin), cell_index(found[i, 0], margin)):
+            both[num] = found[i]
+            num += 1
+    num_found = num
+    for i in range(len(rows)):
+        if np.isnan(rows[i, 0]):
+            continue
+        if is_settled(weights, cost, corner, bounds, cell_index(rows[i, 1], margin), cell_index(rows[i, 0], margin)):
+            continue
+        is_new = True
+        for j in range(num_found):
+            is_new &= np.hypot(both[j, 0] - rows[i, 0], both[j, 1] - rows[i, 1]) >= SAME_GOAL
+        if is_new:
+            both[num] = rows[i]
+            num += 1
+    return both[:num]
 
 
 @device
@@ -70,7 +131,7 @@ def fill_slots(costs: Any, found: Any, rows: Any, visits: Any) -> None:
 
 @jit
 def update_slots(
-    cells: Any, bounds: Any, radius: float, poses: Any, robot: int, rows: Any, visits: Any, given_up: Any
+    cells: Any, bounds: Any, radius: float, poses: Any, robot: int, rows: Any, visits: Any, given_up: Any, reach: float
 ) -> tuple[Any, Any, bool, Any, tuple[Any, Any, Any, Any, int, int]]:
     """Bring a robot's candidates up to date, if it is clear which of them are found again.
 
@@ -85,11 +146,13 @@ def update_slots(
         rows: (m, 5). Slots, see `FrontierColumns`; NaN in empty ones. Changed.
         visits: (m,) int64. Visits of each candidate so far; changed.
         given_up: (g, 2) [m]. Goals that no longer count.
+        reach: Distance [m] from the robot along x and y beyond which candidates stay as they are; infinity: all known
+            floor is searched.
 
     Returns:
-        The frontiers (n, 5); the distances (m, n), of `pair_distances`; whether the slots are filled: if not, the pairs
-        are to be chosen, and `fill_slots` called; the goals that no longer count now; and the paths from the robot, of
-        `dijkstra`.
+        The frontiers (n, 5), candidates that stay included; the distances (m, n), of `pair_distances`; whether the
+        slots are filled: if not, the pairs are to be chosen, and `fill_slots` called; the goals that no longer count
+        now; and the paths from the robot, of `dijkstra`.
     """
     x, y, theta = poses[robot]
     for i in range(len(rows)):
@@ -105,8 +168,10 @@ def update_slots(
             given_up[: len(before)] = before
             given_up[-1, 0], given_up[-1, 1] = goal_x, goal_y
 
-    ways = dijkstra(cells, bounds, x, y, radius, np.nan, np.nan, np.inf)
+    ways = dijkstra(cells, bounds, x, y, radius, np.nan, np.nan, reach)
     found = frontiers_reached(ways, len(cells), given_up)
+    if reach < np.inf:
+        found = with_distant(found, rows, ways, bounds, len(cells))
     costs = np.empty((len(rows), len(found)))
     is_clear = pair_distances(rows, found, costs)
     if is_clear:
