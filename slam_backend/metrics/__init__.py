@@ -1,12 +1,22 @@
 """Metrics of the accuracy of maps and paths, and of the consistency of their covariances."""
 
 from slam_backend.metrics.consistency import anees, nees, nis
-from slam_backend.metrics.maps import GospaResult, MapScore, gospa, map_error, map_rmse, ospa
+from slam_backend.metrics.maps import (
+    GospaResult,
+    MapErrorParts,
+    MapScore,
+    gospa,
+    map_error,
+    map_error_parts,
+    map_rmse,
+    ospa,
+)
 from slam_backend.metrics.paths import AteResult, RpeResult, align_se2, ate, rpe
 
 __all__ = [
     "AteResult",
     "GospaResult",
+    "MapErrorParts",
     "MapScore",
     "RpeResult",
     "align_se2",
@@ -14,6 +24,7 @@ __all__ = [
     "ate",
     "gospa",
     "map_error",
+    "map_error_parts",
     "map_rmse",
     "nees",
     "nis",

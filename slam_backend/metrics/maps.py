@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -46,6 +47,22 @@ class MapScore:
     recall: float
     precision: float
     matched: IntArray
+
+
+class MapErrorParts(NamedTuple):
+    """Parts of E^2 [m^2], which add up to it, see `map_error`.
+
+    Attributes:
+        misplaced: Part from the distances of matched landmarks.
+        missed: Part from true landmarks without an estimate.
+        duplicate: Part from further estimates of the same true landmark.
+        false: Part from estimates of no true landmark.
+    """
+
+    misplaced: float
+    missed: float
+    duplicate: float
+    false: float
 
 
 @jit
@@ -103,14 +120,40 @@ def map_error(means: FloatArray, claims: IntArray, true_positions: FloatArray, c
     >>> map_error(np.array([[0.0, 0.6, 0.0]]), np.array([0]), np.array([[0.0, 0.0, 0.0]]))
     0.6
     """
-    holder, total = _claimed(means, claims, true_positions, float(cutoff))
+    holder, total = _scored(means, claims, true_positions, cutoff)
+    return math.sqrt(total / len(holder))
+
+
+def map_error_parts(
+    means: FloatArray, claims: IntArray, true_positions: FloatArray, cutoff: float = 1.0
+) -> MapErrorParts:
+    """Return what the square of the map error E consists of; arguments and errors as in `map_error`.
+
+    >>> map_error_parts(np.array([[0.0, 0.6, 0.0], [9.0, 0.0, 0.0]]), np.array([0, -1]), np.zeros((1, 3)))
+    MapErrorParts(misplaced=0.36, missed=0.0, duplicate=0.0, false=0.5)
+    """
+    holder, _ = _scored(means, claims, true_positions, cutoff)
+    held = np.flatnonzero(holder >= 0)
+    squares = ((np.asarray(means)[holder[held]] - np.asarray(true_positions)[held]) ** 2).sum(axis=1)
+    count, half = len(holder), 0.5 * cutoff**2
+    return MapErrorParts(
+        misplaced=float(np.minimum(squares, cutoff**2).sum() / count),
+        missed=half * (count - len(held)) / count,
+        duplicate=half * (int(np.count_nonzero(np.asarray(claims) >= 0)) - len(held)) / count,
+        false=half * int(np.count_nonzero(np.asarray(claims) == FALSE)) / count,
+    )
+
+
+def _scored(means: FloatArray, claims: IntArray, truths: FloatArray, cutoff: float) -> tuple[IntArray, float]:
+    """Check all arguments of `map_error` and return the nearest claimants and the sum from `_nearest_claimants`."""
+    holder, total = _claimed(means, claims, truths, float(cutoff))
     if not cutoff > 0.0:
         raise argument_error("cutoff", "a number > 0", cutoff, "Give the cutoff distance in metres.")
     if not len(holder):
         raise argument_error(
             "true_positions", "at least one landmark", "an array of none", "Use a world with landmarks."
         )
-    return math.sqrt(total / len(holder))
+    return holder, total
 
 
 def _claimed(means: FloatArray, claims: IntArray, truths: FloatArray, cutoff: float) -> tuple[IntArray, float]:

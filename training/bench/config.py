@@ -418,6 +418,32 @@ class ExplorationBenchConfig(ExperimentConfig):
         return self.run(trial).environment().replace(world_split=split, **oracles)
 
 
+class PlanBenchConfig(ExperimentConfig):
+    """Run of a benchmark plan, which fixes all but the policies."""
+
+    plan: str = setting("vslam-bench-v0", "Name or TOML file of the plan.")
+    plan_hash: str = setting("", "Hash of the plan's content.")
+    policies: tuple[str, ...] | None = setting(None, "Labels of the policies; None: those of the plan.")
+    quick: bool = setting(False, "Whether only the first seeds of the base part are played.")
+    decision_limit: float = setting(2.0, "Longest time of a decision [s].", gt=0.0)
+
+    def check(self) -> None:
+        """Refuse policies that do not exist."""
+        from training.bench.exploration.players import parted
+
+        check_labels(self.policies or ())
+        for policy in self.policies or ():
+            parted(policy)
+
+    @classmethod
+    def completed(cls, values: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Make paths of models and of the plan absolute, so that a run can be resumed from any folder."""
+        found = with_absolute_paths(values)
+        if "plan" in found and Path(found["plan"]).is_file():
+            found["plan"] = str(Path(found["plan"]).resolve())
+        return found
+
+
 class FilterBenchConfig(ExperimentConfig):
     """Filter benchmark; rows are all combinations of the given numbers."""
 

@@ -70,6 +70,7 @@ class TrialSet:
     tell: Callable[[dict[str, Any]], str]  # Short description of a row
     cost: Callable[[Any], int] = lambda trial: 1  # Approximate cost of a trial, in an arbitrary unit
     workers: int = 1  # Number of parallel processes; 1: this process
+    cluster: str | None = None  # Address of a Ray cluster that runs the trials instead; None: this machine
     failures: list[str] = field(default_factory=list)  # Errors of failed trials, appended as they end
 
 
@@ -106,7 +107,7 @@ def run_trial_sets(
                 advance(part.tell(row), part.cost(trial))
 
             left = [trial for trial in part.trials if trial not in found]
-            run_trials(folder, part.file, part.play, left, part.workers, interrupted, on_trial)
+            run_trials(folder, part.file, part.play, left, part.workers, interrupted, on_trial, part.cluster)
     rows = [[found[t] for t in part.trials if t in found] for part, found in zip(parts, kept, strict=True)]
     finished = sum(map(len, rows))
     failed = sum(len(part.failures) for part in parts)

@@ -25,15 +25,24 @@ from training.bench.config import (
     TrainBenchConfig,
 )
 from training.commands._options import Workers, options
+from training.commands._plan import (
+    Cluster,
+    PlanName,
+    Verified,
+    VerifiedRows,
+    first_steps,
+    is_plan_run,
+    run_plan,
+    verify_rows,
+    write_leaderboard,
+)
 from training.commands._progress import TrialSet, run_trial_sets, share_progress, trial_progress
 from training.commands._run_folder import Call
 from training.commands.replay import MRCLAM_LOG
 from training.rl.config import require_extra
 
 if TYPE_CHECKING:  # numerical modules are imported when the command runs, so that --help is fast
-    from training.bench.exploration.players import Player
     from training.bench.stereo.real_images import RealPart
-    from vslam_env.config import EnvConfig
 
 bench = typer.Typer(help="Measure accuracy and speed of filters, environments and training.", no_args_is_help=True)
 
@@ -91,7 +100,7 @@ def _losses_in_worlds(call: Call[AccuracyConfig], workers: int) -> None:
     config = call.config
     trials = config.episodes()
     firsts = {(t.policy, t.world, t.robots): t for t in reversed(trials)}.values()
-    checks = (partial(_first_steps, config.environment(t), parted(t.policy), t.seed, LONGEST_DECISION) for t in firsts)
+    checks = (partial(first_steps, config.environment(t), parted(t.policy), t.seed, LONGEST_DECISION) for t in firsts)
     console, folder = call.begin(*checks)
     part = TrialSet(
         file=EPISODES_FILE, kind=EpisodeTrial, play=partial(play, config), trials=trials, workers=workers,
@@ -212,14 +221,26 @@ def bench_env(call: Call[EnvBenchConfig]) -> None:
     ExplorationBenchConfig, "bench exploration", continues=True,
     quick={"worlds": ("office",), "duration": 60.0, "seeds": 3}, quick_help="Office worlds only, 60 s, 3 seeds.",
 )  # fmt: skip
-def bench_exploration(call: Call[ExplorationBenchConfig], workers: Workers = 1) -> None:
+def bench_exploration(
+    call: Call[ExplorationBenchConfig], plan: PlanName = None, workers: Workers = 1, ray: Cluster = None,
+    verify: Verified = None, verified_rows: VerifiedRows = 5,
+) -> None:  # fmt: skip
     """Compare policies over worlds: coverage, map errors, pose errors and merges, with confidence intervals.
+
+    With --plan, the plan of a benchmark fixes all but the policies; --quick then plays two worlds of four families.
+    With --verify, episodes of a finished run are played again and compared bit for bit.
 
     All policies of a seed have the same worlds, starts and noise. Options in the plural take comma-separated values;
     all combinations are run. Robots with known poses, landmark names and merges show the cost of estimation.
     Episodes of a policy that raises, returns no valid action or takes too long are left out, with status 2 at the end.
     Ctrl-C finishes the current episode; the same command with --out FOLDER resumes the run.
     """
+    if verify is not None:
+        verify_rows(call, verify, verified_rows)
+        return
+    if plan is not None or is_plan_run(call):
+        run_plan(call, plan, workers, ray)
+        return
     from training.bench.exploration import report
     from training.bench.exploration.players import parted
     from training.bench.exploration.trials import TRIALS_FILE, play
@@ -229,11 +250,12 @@ def bench_exploration(call: Call[ExplorationBenchConfig], workers: Workers = 1) 
     firsts = {(t.policy, t.world, t.robots): t for t in reversed(trials)}.values()
     config = call.config
     checks = (
-        partial(_first_steps, config.environment(t), parted(t.policy), t.seed, config.decision_limit) for t in firsts
+        partial(first_steps, config.environment(t), parted(t.policy), t.seed, config.decision_limit) for t in firsts
     )  # fmt: skip
     console, folder = call.begin(*checks)
     part = TrialSet(
         file=TRIALS_FILE, kind=ExplorationTrial, play=partial(play, call.config), trials=trials, workers=workers,
+        cluster=ray,
         tell=lambda row: f"{row['world']}, {row['policy']}, seed {row['seed']}: {row['coverage']:.0%} seen",
     )  # fmt: skip
     (rows,) = run_trial_sets(console, folder, part)
@@ -276,7 +298,7 @@ def bench_scale(call: Call[ScaleBenchConfig], workers: Workers = 1) -> None:
     trials = config.trials()
     firsts = {t.extent: t for t in trials}.values()  # with the most robots
     checks = (
-        partial(_first_steps, config.environment(t), parted(config.policy), t.seed, DECISION_LIMIT) for t in firsts
+        partial(first_steps, config.environment(t), parted(config.policy), t.seed, DECISION_LIMIT) for t in firsts
     )
     console, folder = call.begin(*checks)
     part = TrialSet(
@@ -297,26 +319,13 @@ def bench_scale(call: Call[ScaleBenchConfig], workers: Workers = 1) -> None:
         raise typer.Exit(2)
 
 
-def _first_steps(environment: "EnvConfig", player: "Player", seed: int, decision_limit: float) -> None:
-    """Run the first two steps of an episode, to detect worlds that cannot be built, and compile what its policy needs.
-
-    The trial itself reports a policy that fails.
-    """
-    from contextlib import suppress
-
-    from training.bench.exploration.players import BOUND
-    from training.episodes.guard import PolicyError
-    from training.episodes.runner import run_episode
-    from vslam_env import vslam_v0
-
-    steps = iter(range(2))
-    if player.role == BOUND:
-        return
-    env = vslam_v0.parallel_env(config=environment)
-    with suppress(PolicyError):
-        team = player.make(env, decision_limit)
-        run_episode(env, team, seed, should_stop=lambda: next(steps, None) is None)
-    env.close()
+@bench.command("leaderboard")
+def bench_leaderboard(
+    folders: Annotated[list[Path], typer.Argument(help="Run folders of one plan, each with the rows of its policies.")],
+    out: Annotated[Path, typer.Option(help="Markdown file to write.")] = Path("leaderboard.md"),
+) -> None:
+    """Write the leaderboard of a benchmark plan from the results in run folders."""
+    write_leaderboard(folders, out)
 
 
 @bench.command("start")

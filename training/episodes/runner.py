@@ -10,9 +10,10 @@ from agents.policy import Policy
 from slam_backend.core.validation import FloatArray, IntArray, argument_error
 from slam_backend.fastslam.consistency import Consistency
 from slam_backend.fastslam.reports import MergeEvent
-from slam_backend.geometry import between
+from slam_backend.geometry import between, wrap_angle
 from slam_backend.maps.alignment_types import PairAttempts, count_attempts
 from slam_backend.maps.landmark_map import LandmarkMap
+from slam_backend.metrics import nees
 from slam_backend.trajectory import dead_reckoning
 from training.episodes.guard import GuardedTeam
 from training.experiments.logs import LOGGER
@@ -22,6 +23,7 @@ from vslam_env.environment import ExplorationEnv
 from vslam_env.rendering import Scene
 
 FALSE_MERGE_M, FALSE_MERGE_DEG = 0.5, 5.0
+KNOWN = 1e-6  # a pose with a smaller standard deviation in any direction is known exactly [m, rad]
 
 
 def is_false_merge(error_m: float, error_deg: float) -> bool:
@@ -57,7 +59,9 @@ class EpisodeRecord:
     estimated: FloatArray  # (K, T + 1, 3) float64 [m, m, rad]. Pose estimates at the time, start frames.
     reckoned: FloatArray  # (K, T + 1, 3) float64 [m, m, rad]. Dead reckoning, start frames.
     map_errors: FloatArray  # (K, T + 1) float64 [m]
+    nees: FloatArray  # (K, T + 1) float64 [-]. NEES of the poses, ideally 3; NaN where a pose is known exactly
     coverage: FloatArray  # (T + 1,) float64 [-]
+    overlap: float  # Share of the seen floor that at least two robots have seen
     merges: tuple[MergeRecord, ...]  # Merges in order
     attempts: int  # Number of alignment attempts
     pairs: tuple[PairAttempts, ...]  # Outcomes of these attempts, by pairs of groups
@@ -162,6 +166,7 @@ class _Log:
         self._true: list[FloatArray] = []
         self._estimated: list[FloatArray] = []
         self._errors: list[list[float]] = []
+        self._covariances: list[FloatArray] = []
         self._coverage: list[float] = []
         self._merges: list[MergeRecord] = []
         self._events = 0
@@ -205,7 +210,8 @@ class _Log:
         maps = {**self._maps, **{r: belief.map for r, belief in last.items() if r not in self._alone_until}}
         return EpisodeRecord(
             times=ticks * TICK, true_poses=np.stack(self._true, axis=1), estimated=np.stack(self._estimated, axis=1),
-            reckoned=np.stack(reckoned), map_errors=np.array(self._errors).T, coverage=np.array(self._coverage),
+            reckoned=np.stack(reckoned), map_errors=np.array(self._errors).T, nees=self._nees(),
+            coverage=np.array(self._coverage), overlap=self._env.episode.overlap,
             merges=tuple(self._merges), attempts=sum(event.kind == "attempt" for event in self._env.events),
             pairs=count_attempts(self._env.events), groups=tuple(sorted({belief.group for belief in last.values()})),
             infos=tuple(dict(self._infos[agent]) for agent in self._agents),
@@ -217,11 +223,23 @@ class _Log:
             complete=not self._env.agents,
         )  # fmt: skip
 
+    def _nees(self) -> FloatArray:
+        """Return the NEES (K, T + 1) of the poses, NaN where a pose is known exactly, as at the start."""
+        errors = np.stack(self._estimated, axis=1) - between(self._starts[:, None], np.stack(self._true, axis=1))
+        errors[..., 2] = wrap_angle(errors[..., 2])
+        covariances = np.stack(self._covariances, axis=1)
+        found = np.full(errors.shape[:-1], np.nan)
+        uncertain = np.linalg.eigvalsh(covariances)[..., 0] > KNOWN**2
+        found[uncertain] = nees(errors[uncertain], covariances[uncertain])
+        return found
+
     def _enter(self, infos: Mapping[str, Mapping[str, Any]], tick: int) -> None:
         self._infos = infos
         self._ticks.append(tick)
+        beliefs = [self._env.belief(agent) for agent in self._agents]
         self._true.append(self._env.true_poses)
-        self._estimated.append(np.stack([self._env.belief(agent).pose for agent in self._agents]))
+        self._estimated.append(np.stack([belief.pose for belief in beliefs]))
+        self._covariances.append(np.stack([belief.covariance for belief in beliefs]))
         self._errors.append([float(infos[agent]["map_error"]) for agent in self._agents])
         self._coverage.append(float(infos[self._agents[0]]["coverage"]))
 

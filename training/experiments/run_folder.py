@@ -96,6 +96,12 @@ def read_config(path: Path, command: str, option: str = "config") -> tuple[dict[
     return config, seed
 
 
+def read_versions(path: Path) -> dict[str, str]:
+    """Read the versions of Python and packages of an earlier run, whose configuration `read_config` accepts."""
+    file = path / CONFIG_FILE if path.is_dir() else path
+    return dict(tomllib.loads(file.read_text(encoding="utf-8")).get("versions", {}))
+
+
 def plain(value: Any) -> Any:
     """Convert numpy values, tuples and paths for JSON and TOML; numbers that are not finite become None.
 

@@ -1,7 +1,9 @@
 """Storage of finished trials, so that a stopped run can be resumed."""
 
 import json
+import logging
 import os
+import socket
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from contextlib import closing, contextmanager
@@ -15,6 +17,7 @@ from training.experiments.interrupt import begin_worker, signals_held
 from training.experiments.run_folder import CONFIG_FILE, RunFolder, installed_versions, plain, read_config
 
 FAILED = "failed"  # field of the row of a trial without a result: the error, in one line
+CONNECT_S = 10.0  # limit for reaching a cluster
 SINGLE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 TrialT = TypeVar("TrialT")
@@ -77,7 +80,7 @@ def trial_of(row: Mapping[str, Any], kind: type[TrialT]) -> TrialT:
 
 def run_trials(
     folder: RunFolder, name: str, play: Callable[[TrialT], dict[str, Any]], trials: Iterable[TrialT], workers: int,
-    interrupted: Callable[[], bool], on_trial: Callable[[dict[str, Any]], None],
+    interrupted: Callable[[], bool], on_trial: Callable[[dict[str, Any]], None], cluster: str | None = None,
 ) -> None:  # fmt: skip
     """Run trials and append each to the folder as it ends; after an interrupt, running trials are finished.
 
@@ -86,12 +89,17 @@ def run_trials(
     Args:
         play: Function that runs a trial and returns its row; importable by other processes.
         workers: Number of parallel processes; 1: this process.
+        cluster: Address of a Ray cluster that runs the trials instead, see `ray.init`; None: this machine.
 
     Raises:
-        ValueError: If a row cannot be written; earlier rows are kept.
+        ValueError: If a row cannot be written, or the cluster cannot be reached; earlier rows are kept.
     """
     going = _until(interrupted, trials)
-    with closing(_in_turn(play, going) if workers == 1 else _spread(play, going, workers)) as rows:
+    if cluster is not None:
+        played = _over_cluster(play, going, cluster)
+    else:
+        played = _in_turn(play, going) if workers == 1 else _spread(play, going, workers)
+    with closing(played) as rows:
         for row in rows:
             kept = plain(row)
             if FAILED not in kept:
@@ -139,6 +147,56 @@ def _spread(
             for process in set(active_children()) - others:
                 process.kill()
             raise
+
+
+def _over_cluster(
+    play: Callable[[TrialT], dict[str, Any]], trials: Iterable[TrialT], address: str
+) -> Generator[dict[str, Any], None, None]:
+    """Run trials on a Ray cluster, one per core, and yield their rows as they end.
+
+    A trial whose process or node is lost is run again elsewhere.
+    """
+    try:
+        import ray
+    except ImportError as error:
+        hint = 'Install it: pip install "vslam-env[distributed]".'
+        raise argument_error("ray", "an installation of Ray", "none", hint) from error
+    variables = dict.fromkeys(SINGLE_THREAD, "1")
+    try:
+        _check_reachable(address)  # Ray itself tries for minutes
+        ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, runtime_env={"env_vars": variables})
+    except (OSError, ValueError, RuntimeError) as error:
+        hint = f"Start one with `ray start --head`. Ray says: {str(error).splitlines()[0]}"
+        raise argument_error("ray", "the address of a Ray cluster that runs", address, hint) from error
+    try:
+        task: Any = ray.remote(num_cpus=1, max_retries=-1)(_play_one)
+        shared: Any = ray.put(play)
+        running: list[Any] = []
+        cores: Any = ray.cluster_resources
+        for trial in trials:
+            running.append(task.remote(shared, trial))
+            while len(running) >= 2 * max(1, int(cores().get("CPU", 1))):  # nodes may come and go
+                done, running = ray.wait(running)
+                yield from ray.get(done)
+        while running:
+            done, running = ray.wait(running)
+            yield from ray.get(done)
+    except ray.exceptions.RayTaskError as error:
+        raise error.cause from error
+    finally:
+        ray.shutdown()
+
+
+def _check_reachable(address: str) -> None:
+    """Raise an OSError unless something listens at HOST:PORT; other addresses, such as `auto`, are left to Ray."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if host and port.isdecimal():
+        socket.create_connection((host, int(port)), CONNECT_S).close()
+
+
+def _play_one(play: Callable[[TrialT], dict[str, Any]], trial: TrialT) -> dict[str, Any]:
+    """Run a trial in a process of a cluster."""
+    return play(trial)
 
 
 @contextmanager

@@ -178,6 +178,11 @@ class CoverageTracker:
         )
         return self._covered / max(len(area.cells), 1)
 
+    @property
+    def overlap(self) -> float:
+        """Share of the floor seen by any robot that at least two robots see in their own grids; 0 if none is seen."""
+        return int(np.count_nonzero(self._tally.seers > 1)) / max(self._covered, 1)
+
     def get_state(self) -> dict[str, Any]:
         """Return a copy of the state that cannot be recomputed from the grids."""
         return {"ever": self._tally.ever > 0, "found": self._tally.found.copy()}

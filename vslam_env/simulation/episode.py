@@ -187,6 +187,11 @@ class Episode:
             self._score(simulator.poses)
             self._error_integrals += self._map_errors * TICK
 
+    @property
+    def overlap(self) -> float:
+        """Share of the floor seen by the team that at least two robots have seen, as of the last `team_metrics`."""
+        return self._coverage.overlap
+
     def estimated_poses(self) -> FloatArray:
         """Return the estimated poses (K, 3) [m, m, rad], moved by the true start poses to the world frame."""
         return compose(self.true_starts, self.estimated_path[-1])

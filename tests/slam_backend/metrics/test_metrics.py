@@ -24,6 +24,9 @@ def test_map_error_counts_each_kind_of_mistake() -> None:
     c = 0.8
     expected = (0.3**2 + c**2 + 0.0 + c**2 / 2 * (2 + 1 + 1)) / 5  # two missed, one false, one duplicate
     assert metrics.map_error(means, claims, truths, cutoff=c) == pytest.approx(np.sqrt(expected))
+    half = c**2 / 2 / 5
+    parts = metrics.map_error_parts(means, claims, truths, cutoff=c)
+    assert parts == pytest.approx(((0.3**2 + c**2) / 5, 2 * half, half, half))
     assert metrics.map_error(np.empty((0, 3)), np.empty(0, np.int64), truths) == pytest.approx(np.sqrt(0.5))
     assert metrics.map_error(truths, np.arange(5), truths) == 0.0
 
@@ -35,6 +38,7 @@ def test_the_nearest_claimant_holds_a_landmark_in_any_order() -> None:
     means = GRID[claims] + rng.normal(0.0, 0.4, (40, 3))
     order = rng.permutation(40)
     expected = metrics.map_error(means, claims, GRID)
+    assert sum(metrics.map_error_parts(means, claims, GRID)) == pytest.approx(expected**2)
     assert metrics.map_error(means[order], claims[order], GRID) == pytest.approx(expected, rel=1e-12)
 
 

@@ -1,41 +1,61 @@
 """Trial of `vslam bench exploration`: an episode, and its metrics for the comparison of policies."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
-from slam_backend.core.validation import FloatArray
+from slam_backend.core.validation import BoolArray, FloatArray
 from slam_backend.geometry import compose
-from training.bench.config import ExplorationBenchConfig, ExplorationTrial
+from slam_backend.metrics import MapErrorParts, map_error_parts
+from training.bench.exploration.machine import machine
 from training.bench.exploration.players import parted
+from training.episodes.digest import episode_digest
 from training.episodes.guard import PolicyError
 from training.episodes.metrics import score_episode
 from training.episodes.runner import EpisodeRecord, MergeRecord, run_episode
 from training.experiments.trial_store import FAILED
 from vslam_env import vslam_v0
+from vslam_env.config import EnvConfig
 
 TRIALS_FILE = "trials.jsonl"
-NEARLY_ALL = 0.9  # share of the floor
+HALF, NEARLY_ALL = 0.5, 0.9  # shares of the floor
 WATCHED_S = 20.0  # a wrong merge that persists for this long, or to the end, is false
 CURVE_POINTS = 25
 TEAM = ("map_error", "map_rmse_m", "map_recall", "map_precision", "ate_start_m", "ate_aligned_m")
 CURVES = ("coverage", "map_error", "pose_error")
 
 
-def play(config: ExplorationBenchConfig, trial: ExplorationTrial) -> dict[str, Any]:
+class Bench(Protocol):
+    """Configuration of trials."""
+
+    @property
+    def decision_limit(self) -> float:
+        """Longest time of a decision [s]."""
+
+    def environment(self, trial: Any) -> EnvConfig:
+        """Return the environment of a trial."""
+
+
+def play(config: Bench, trial: Any) -> dict[str, Any]:
     """Run an episode and return the trial with its metrics, means over the robots unless noted otherwise.
 
     - `coverage`: share of the reachable floor seen at the end; `mean_coverage`: its mean over time;
-      `reached_90`: whether 90 % are reached; `below_90_s`: whole seconds until then, or of the whole episode.
-    - At the end, in start frames: `TEAM`, as in `score_episode`, `pose_error`, and `way_m`, the distance driven.
+      `reached_90`: whether 90 % are reached; `below_50_s`, `below_90_s`: whole seconds until half and 90 % are reached,
+      or of the whole episode; `overlap`: share of the seen floor that at least two robots have seen.
+    - At the end, in start frames: `TEAM`, as in `score_episode`, `pose_error`, and `way_m`, the distance driven;
+      `squared_misplaced`, ...: what E^2 consists of, see `map_error_parts`.
+    - `nees`: median of the NEES of the poses over robots and time, None if all poses are known.
+    - `balance`: shortest over longest path of the robots.
     - For the team: `right_merges`, `false_merges`, `undone_merges`, `first_merge_s`, `last_merge_s`, see
-      `count_merges`; `one_group`: whether all share a map at the end; `attempts`, `collisions` (ticks),
-      `invalid_actions`.
+      `count_merges`; `one_group`: whether all share a map at the end; `attempts`, `refusals` (by reason), `collisions`
+      (ticks), `invalid_actions`, `bytes_sent`.
     - `decision_ms`, `decision_p99_ms`: median and 99th percentile of the processor time of a decision of the policy, of
       a team policy for all robots.
     - `curves`: `time_s` and the values of `CURVES` at these times.
+    - `digest`: see `episode_digest`; `machine`: what its last bits depend on.
 
     If the policy fails, the trial is returned with the error as `failed`, and no metrics.
     """
@@ -58,22 +78,44 @@ def play(config: ExplorationBenchConfig, trial: ExplorationTrial) -> dict[str, A
     seconds = np.arange(np.floor(record.times[-1]) + 1.0)
     covered = values_at(record.times, record.coverage, seconds)
     errors = pose_errors(record)
-    reached = np.flatnonzero(covered >= NEARLY_ALL)
+    below = {share: np.append(seconds, record.times[-1])[_first(covered >= share)] for share in (HALF, NEARLY_ALL)}
+    paths = np.array([info["distance"] for info in record.infos])
+    refusals = sum((Counter(pair.refusals) for pair in record.pairs), Counter[str]())
     points = np.linspace(0.0, record.times[-1], CURVE_POINTS)
     lines = (record.coverage, record.map_errors.mean(axis=0), errors)
     return {
         **asdict(trial), "coverage": float(record.coverage[-1]), "mean_coverage": float(covered.mean()),
-        "reached_90": bool(len(reached)),
-        "below_90_s": float(seconds[reached[0]] if len(reached) else record.times[-1]),
-        **{name: scores["team"][name] for name in TEAM}, "pose_error": float(errors[-1]),
-        "way_m": scores["team"]["path_m"], **count_merges(record.merges), "one_group": len(record.groups) == 1,
-        "attempts": record.attempts, "collisions": sum(int(info["collisions"]) for info in record.infos),
-        "invalid_actions": invalid,
+        "reached_90": bool((covered >= NEARLY_ALL).any()), "below_50_s": float(below[HALF]),
+        "below_90_s": float(below[NEARLY_ALL]), "overlap": record.overlap,
+        **{name: scores["team"][name] for name in TEAM}, **_error_parts(record, env.config.map_error_cutoff),
+        "pose_error": float(errors[-1]),
+        "nees": float(np.nanmedian(record.nees)) if np.isfinite(record.nees).any() else None,
+        "way_m": scores["team"]["path_m"], "balance": float(paths.min() / paths.max()) if paths.max() > 0.0 else 1.0,
+        **count_merges(record.merges), "one_group": len(record.groups) == 1, "attempts": record.attempts,
+        "refusals": dict(refusals), "bytes_sent": sum(int(info["bytes_sent"]) for info in record.infos),
+        "collisions": sum(int(info["collisions"]) for info in record.infos), "invalid_actions": invalid,
         "decision_ms": float(np.median(taken)), "decision_p99_ms": float(np.quantile(taken, 0.99)),
         "curves": {"time_s": points} | {
             name: values_at(record.times, line, points) for name, line in zip(CURVES, lines, strict=True)
         },
+        "digest": episode_digest(record), "machine": machine(),
     }  # fmt: skip
+
+
+def _first(reached: BoolArray) -> int:
+    """Return the index of the first true entry, or the length if there is none."""
+    return int(reached.argmax()) if reached.any() else len(reached)
+
+
+def _error_parts(record: EpisodeRecord, cutoff: float) -> dict[str, float]:
+    """Return the means over robots of the parts of E^2 at the end [m^2]."""
+    parts = [
+        map_error_parts(own.moved(start).means, claims, record.true_landmarks, cutoff)
+        for own, start, claims in zip(record.maps, record.true_poses[:, 0], record.map_claims, strict=True)
+    ]
+    return {
+        f"squared_{name}": float(mean) for name, mean in zip(MapErrorParts._fields, np.mean(parts, axis=0), strict=True)
+    }
 
 
 def count_merges(merges: Sequence[MergeRecord]) -> dict[str, Any]:

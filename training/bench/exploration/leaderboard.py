@@ -1,0 +1,69 @@
+"""Leaderboard of a benchmark plan, generated from kept results."""
+
+import gzip
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from slam_backend.core.validation import argument_error
+from training.bench.exploration.plan import BASE_PART, Plan
+from training.bench.exploration.plan_report import markdown, read_episodes
+from training.bench.exploration.report import label
+from training.bench.exploration.verification import equal_rows
+from training.experiments.run_folder import read_config
+from training.experiments.statistics import grouped
+from training.experiments.tables import markdown_table
+
+EPISODES = ("episodes.csv", "episodes.csv.gz")
+
+
+@dataclass(frozen=True, slots=True)
+class Results:
+    """Results of some policies on a plan."""
+
+    plan: Plan
+    rows: Sequence[Mapping[str, Any]]  # A row per episode
+    verified: Mapping[str, tuple[int, int]]  # Numbers of equal and different episodes by policy, see `equal_rows`
+
+    @property
+    def policies(self) -> list[str]:
+        """Labels of the policies with rows in the base part."""
+        return list(dict.fromkeys(row["policy"] for row in self.rows if row["part"] == BASE_PART))
+
+
+def read_results(folder: Path) -> Results:
+    """Read the results in a run folder of a plan; `episodes.csv` may be compressed.
+
+    Raises:
+        ValueError: If there are none, or the installed plan of that name has another hash.
+    """
+    values, _ = read_config(folder, "bench exploration", "folders")
+    file = next((folder / name for name in EPISODES if (folder / name).is_file()), None)
+    if file is None or "plan" not in values:
+        hint = "Run vslam bench exploration --plan."
+        raise argument_error("folders", "results of a plan", f"none in {str(folder)!r}", hint)
+    plan = Plan.load(values["plan"])
+    if plan.digest != values["plan_hash"]:
+        hint = "Use the release that wrote it."
+        raise argument_error("folders", f"results of plan {plan.digest}", values["plan_hash"], hint)
+    content = file.read_bytes()
+    text = (gzip.decompress(content) if file.suffix == ".gz" else content).decode()
+    return Results(plan, read_episodes(text), equal_rows(folder))
+
+
+def leaderboard(results: Sequence[Results]) -> str:
+    """Return the page: all tables, and which episodes were played again."""
+    plan, rows = results[0].plan, [row for each in results for row in each.rows]
+    verified = {policy: counts for each in results for policy, counts in each.verified.items()}
+    episodes = {policy: len(own) for (policy,), own in grouped(rows, ("policy",)).items()}
+    shown = [
+        [label(policy), str(count), *map(str, verified.get(policy, ("-", "-")))] for policy, count in episodes.items()
+    ]
+    headings = ("policy", "episodes", "played again: equal", "different")
+    machines = sorted({str(row["machine"]) for row in rows})
+    return "\n".join([
+        "# Leaderboard\n", markdown(plan, rows), "### Verification\n",
+        "Episodes of each policy that were played again at the last verification, and whether all bits were equal.\n",
+        markdown_table(headings, shown), f"Played on: {'; '.join(machines)}.\n",
+    ])  # fmt: skip

@@ -1,0 +1,190 @@
+"""Plans of the exploration benchmark: which episodes every policy plays. A plan is a TOML file, frozen by its hash."""
+
+import hashlib
+import os
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import product
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, Self
+
+from slam_backend.core.validation import argument_error
+from training.bench.config import ALL_ORACLES, ORACLES, world_split
+from training.bench.exploration.players import parted
+from training.experiments.config import Checked, NoisePreset, Positive, RobotCount
+
+if TYPE_CHECKING:
+    from vslam_env.config import EnvConfig
+
+PLANS = Path(__file__).parent / "plans"
+BASE_PART, FLOOR_PLANS = "base", "floor plans"
+QUICK_SEEDS = 2
+Oracle = Literal["none", "pose", "association", "merge", "all"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlanTrial:
+    """One episode of one policy."""
+
+    part: str  # Part of the plan
+    policy: str  # Label, see `parted`
+    family: str  # World as the part names it
+    world: str  # Family, or file name of a floor plan
+    robots: int  # K
+    particles: int  # M
+    oracle: str  # Ground truth given to the robots
+    preset: str  # Noise preset
+    comm_loss: float | None  # Probability that a contact fails; None: that of the preset
+    seed: int  # Seed of the episode
+
+
+class PlanPart(Checked):
+    """Part of a plan: all combinations of its lists, with every policy."""
+
+    title: str
+    worlds: tuple[str, ...] = ("office", "maze", "loops", "hall")
+    seeds: Positive
+    robots: tuple[RobotCount, ...] = (3,)
+    particles: tuple[Positive, ...] = (100,)
+    oracles: tuple[Oracle, ...] = ("none",)
+    preset: NoisePreset = "standard"
+    comm_loss: float | None = None
+    policies: tuple[str, ...] | None = None  # None: those of the run
+
+
+class Plan(Checked):
+    """Plan of a benchmark."""
+
+    name: str
+    split: Literal["train", "validation", "test"]
+    duration: float  # Simulated time of an episode [s]
+    policies: tuple[str, ...]  # Policies of a run that names none; the others are compared with the first
+    parts: Mapping[str, Any]
+    floor_plans: Mapping[str, str] = {}  # SHA-256 of each floor plan, by file name
+
+    def check(self) -> None:
+        """Refuse parts that are incomplete or name unknown worlds."""
+        from vslam_env.world.registry import check_source
+
+        for part in self.all_parts().values():
+            for world in part.worlds:
+                if world != FLOOR_PLANS:
+                    check_source(world)
+                elif part.seeds > len(self.floor_plans):
+                    hint = "Name as many floor plans as the part has seeds."
+                    raise argument_error("floor_plans", f"at least {part.seeds}", len(self.floor_plans), hint)
+
+    @classmethod
+    def load(cls, source: str) -> Self:
+        """Read a plan by its name, or from a TOML file.
+
+        Raises:
+            ValueError: If there is no such plan, or a field is missing, unknown or out of range.
+        """
+        file = PLANS / f"{source}.toml"
+        if not file.is_file():
+            file = Path(source)
+        if not file.is_file():
+            known = ", ".join(repr(path.stem) for path in sorted(PLANS.glob("*.toml")))
+            raise argument_error("plan", f"one of {known}, or the path of a TOML file", source, "Check the spelling.")
+        try:
+            return cls(**tomllib.loads(file.read_text(encoding="utf-8")))
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise argument_error("plan", "a TOML file", str(file), f"The reader says: {error}.") from error
+        except ValueError as error:
+            raise ValueError(f"plan {str(file)!r}: {error}") from error
+
+    def all_parts(self) -> dict[str, PlanPart]:
+        """Return the parts by name."""
+        return {name: PlanPart(**values) for name, values in self.parts.items()}
+
+    @property
+    def digest(self) -> str:
+        """First 16 hexadecimal digits of SHA-256 over the plan's content; comments and order of names do not count."""
+        return hashlib.sha256(repr(_sorted(self.model_dump())).encode()).hexdigest()[:16]
+
+    def trials(self, policies: tuple[str, ...] | None = None, quick: bool = False) -> list[PlanTrial]:
+        """Return all episodes, part by part, ordered by seed; those on floor plans that are missing are left out.
+
+        Args:
+            policies: Labels of the policies; None: those of the plan. Parts with policies of their own are played by
+                those of these that are chosen.
+            quick: Whether only the first seeds of the base part are played, without floor plans and large worlds.
+        """
+        parts = self.all_parts()
+        if quick:
+            base, worlds = parts[BASE_PART], PlanPart.model_fields["worlds"].default
+            parts = {BASE_PART: base.replace(seeds=min(QUICK_SEEDS, base.seeds), worlds=worlds)}
+        return [
+            PlanTrial(
+                part=name, policy=policy, family=family, robots=robots, particles=particles, oracle=oracle, seed=seed,
+                world=list(self.floor_plans)[seed] if family == FLOOR_PLANS else family, preset=part.preset,
+                comm_loss=part.comm_loss,
+            )
+            for name, part in parts.items()
+            for seed, family, robots, particles, oracle, policy in product(
+                range(part.seeds), part.worlds, part.robots, part.particles, part.oracles, self._players(part, policies)
+            )
+            if family != FLOOR_PLANS or not self.missing_floor_plans()
+        ]  # fmt: skip
+
+    def _players(self, part: PlanPart, chosen: tuple[str, ...] | None) -> tuple[str, ...]:
+        """Return the policies that play a part."""
+        if part.policies is None or chosen is None:
+            return part.policies or chosen or self.policies
+        return tuple(policy for policy in chosen if policy in part.policies)
+
+    def missing_floor_plans(self) -> list[str]:
+        """Return the names of floor plans that `VSLAM_DATA` does not contain."""
+        return [name for name, digest in self.floor_plans.items() if _find_floor_plan(name, digest, _data()) is None]
+
+    def environment(self, trial: PlanTrial) -> "EnvConfig":
+        """Return the environment of an episode; all policies of a seed have the same world."""
+        from training.episodes.config import RunConfig
+
+        player, world = parted(trial.policy), trial.world
+        if trial.family == FLOOR_PLANS:
+            found = _find_floor_plan(world, self.floor_plans[world], _data())
+            if found is None:
+                raise argument_error("VSLAM_DATA", f"a folder with {world!r}", _data(), "Set it to the data folder.")
+            world = str(found)
+        config = RunConfig(
+            world=world, robots=trial.robots, policy=player.policy, particles=trial.particles, seed=trial.seed,
+            action_type=player.action_type, preset=trial.preset, max_seconds=self.duration,  # type: ignore[arg-type]
+        ).environment()  # fmt: skip
+        has_all = trial.oracle == ALL_ORACLES or player.needs_oracles
+        changes: dict[str, Any] = {f"oracle_{name}": has_all or trial.oracle == name for name in ORACLES}
+        if trial.comm_loss is not None:
+            changes["comm_loss"] = trial.comm_loss
+        return config.replace(world_split=world_split(self.split, world), **changes)
+
+
+@dataclass(frozen=True, slots=True)
+class PlanBench:
+    """What an episode of a plan needs, see `trials.Bench`."""
+
+    plan: Plan
+    decision_limit: float
+
+    def environment(self, trial: PlanTrial) -> "EnvConfig":
+        """Return the environment of an episode."""
+        return self.plan.environment(trial)
+
+
+def _sorted(value: Any) -> Any:
+    """Return nested mappings as sorted pairs."""
+    return sorted((name, _sorted(each)) for name, each in value.items()) if isinstance(value, Mapping) else value
+
+
+def _data() -> str:
+    """Return the folder of data sets, empty if it is not set."""
+    return os.environ.get("VSLAM_DATA", "")
+
+
+@lru_cache(maxsize=1024)
+def _find_floor_plan(name: str, digest: str, data: str) -> Path | None:
+    """Return the file of this name and SHA-256 below a folder, None if there is none."""
+    found = sorted(Path(data).rglob(name)) if data and Path(data).is_dir() else []
+    return next((file for file in found if hashlib.sha256(file.read_bytes()).hexdigest() == digest), None)

@@ -1,0 +1,241 @@
+"""Runs of benchmark plans, repetition of their episodes, and the leaderboard."""
+
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+
+from training.bench.config import ExplorationBenchConfig, ExplorationTrial, PlanBenchConfig
+from training.commands._progress import TrialSet, run_trial_sets, trial_progress
+from training.commands._run_folder import Call
+
+if TYPE_CHECKING:  # numerical modules are imported when the command runs, so that --help is fast
+    from training.bench.exploration.plan import Plan
+    from training.bench.exploration.players import Player
+    from vslam_env.config import EnvConfig
+
+COMMAND = "bench exploration"
+EPISODES_CSV, EPISODES_PARQUET = "episodes.csv", "episodes.parquet"
+OPEN = ("policies", "decision_limit")  # options that a plan leaves open
+
+PlanName = Annotated[
+    str | None, typer.Option(help="Plan of a benchmark: vslam-bench-v0, or a TOML file.", show_default="none")
+]
+Cluster = Annotated[
+    str | None,
+    typer.Option(
+        help="Address of a Ray cluster that plays the episodes, or auto; see ray start.", show_default="this machine"
+    ),
+]
+Verified = Annotated[
+    Path | None, typer.Option(help="Run folder whose episodes are played again and compared.", show_default=False)
+]
+VerifiedRows = Annotated[
+    int, typer.Option("--rows", help="Number of episodes of each policy that --verify plays.", min=1)
+]
+
+
+def is_plan_run(call: Call[ExplorationBenchConfig]) -> bool:
+    """Return whether the configuration in --config is that of a plan."""
+    from training.experiments.run_folder import read_config
+
+    return call.file is not None and "plan" in read_config(call.file, COMMAND)[0]
+
+
+def run_plan(call: Call[ExplorationBenchConfig], name: str | None, workers: int, cluster: str | None) -> None:
+    """Play the episodes of a plan that the run folder does not contain yet, and write its tables."""
+    from training.bench.exploration.plan import PlanBench, PlanTrial
+    from training.bench.exploration.plan_report import aggregate, draw_plan, episodes_csv, markdown, write_parquet
+    from training.bench.exploration.players import parted
+    from training.bench.exploration.trials import TRIALS_FILE, play
+    from training.experiments.run_folder import plain
+
+    config, plan = _configured(call, name)
+    _check_same_plan(call.out, plan)
+    trials = plan.trials(config.policies, config.quick)
+    bench = PlanBench(plan, config.decision_limit)
+    firsts = {(t.policy, t.family, t.robots): t for t in reversed(trials) if t.part == trials[0].part}.values()
+    console, folder = call.begin(
+        *(partial(first_steps, bench.environment(t), parted(t.policy), t.seed, bench.decision_limit) for t in firsts),
+        config=config,
+    )
+    part = TrialSet(
+        file=TRIALS_FILE, kind=PlanTrial, play=partial(play, bench), trials=trials, workers=workers, cluster=cluster,
+        tell=lambda row: f"{row['part']}, {row['family']}, {row['policy']}, seed {row['seed']}",
+    )  # fmt: skip
+    (rows,) = run_trial_sets(console, folder, part)
+    _print_sections(console, plan, rows)
+    call.write({"plan": plan.name, "plan_hash": plan.digest, "summary": plain(aggregate(plan, rows))})
+    folder.write_text(EPISODES_CSV, episodes_csv(rows))
+    if rows and not write_parquet(folder.path / EPISODES_PARQUET, rows):
+        console.print(f"{EPISODES_PARQUET} is not written: it needs pip install 'vslam-env[parquet]'.", soft_wrap=True)
+    folder.write_text("tables.md", markdown(plan, rows))
+    if rows:
+        draw_plan(folder.path / "plan.png", rows)
+    call.finish()
+    if part.failures:
+        raise typer.Exit(2)
+
+
+def _print_sections(console: Console, plan: "Plan", rows: list[dict[str, Any]]) -> None:
+    """Print the main table, as far as it fits into 80 columns, and where the others are."""
+    from training.bench.exploration.plan_report import sections
+    from training.experiments.tables import E_SCALE, console_table
+
+    for section in sections(plan, rows)[:1]:
+        few = range(min(4, len(section.headings)))
+        console.print(
+            console_table(
+                section.title, [section.headings[i] for i in few], [[r[i] for i in few] for r in section.rows]
+            )
+        )
+        console.print(section.note, soft_wrap=False)
+    console.print(E_SCALE)
+
+
+def _configured(call: Call[ExplorationBenchConfig], name: str | None) -> "tuple[PlanBenchConfig, Plan]":
+    """Return the configuration of a run of a plan, and the plan.
+
+    Raises:
+        ValueError: If an option is given that the plan fixes, or the plan has changed since the run in --config.
+    """
+    from slam_backend.core.validation import argument_error
+    from training.bench.exploration.plan import Plan
+    from training.experiments.run_folder import read_config
+
+    for option in call.given:
+        if option not in OPEN:
+            hint = "Omit it, or write a plan of your own."
+            raise argument_error(option, "no value with --plan, which fixes it", call.given[option], hint)
+    earlier = read_config(call.file, COMMAND)[0] if call.file is not None else {}
+    values = earlier | {key: call.given[key] for key in OPEN if key in call.given}
+    values |= {"plan": name} if name is not None else {}
+    values |= {"quick": True} if call.quick else {}
+    plan = Plan.load(values["plan"])
+    config = PlanBenchConfig.from_mapping(values | {"plan_hash": plan.digest})
+    if earlier.get("plan") == config.plan and earlier["plan_hash"] != plan.digest:
+        hint = "Use the release that wrote it."
+        raise argument_error("config", f"a run of plan {plan.digest}", earlier["plan_hash"], hint)
+    return config, plan
+
+
+def _check_same_plan(out: Path | None, plan: "Plan") -> None:
+    """Refuse to resume results of another plan or of another version of the package."""
+    from slam_backend.core.validation import argument_error
+    from training.experiments.run_folder import CONFIG_FILE, installed_versions, read_config, read_versions
+
+    if out is None or not (out / CONFIG_FILE).is_file():
+        return
+    kept = read_config(out, COMMAND, "out")[0]
+    hint = "Choose another folder, or the release that wrote it."
+    if kept.get("plan_hash") != plan.digest:
+        got = f"one of {kept.get('plan', 'no plan')!r}, hash {kept.get('plan_hash', 'none')}"
+        raise argument_error("out", f"a folder of plan {plan.name!r}, hash {plan.digest}", got, hint)
+    before, now = read_versions(out).get("vslam-env"), installed_versions().get("vslam-env")
+    if before != now:
+        raise argument_error("out", f"results of vslam-env {now}", f"results of {before}", hint)
+
+
+def verify_rows(call: Call[ExplorationBenchConfig], folder: Path, count: int) -> None:
+    """Play some episodes of each policy of a run again, and compare them with what the run stored.
+
+    Raises:
+        typer.Exit: With status 1 if an episode differs from one of the same processor and versions.
+    """
+    import numpy as np
+
+    from slam_backend.core.validation import argument_error
+    from training.bench.exploration.machine import machine
+    from training.bench.exploration.plan import Plan, PlanBench, PlanTrial
+    from training.bench.exploration.trials import TRIALS_FILE, Bench, play
+    from training.bench.exploration.verification import HEADINGS, choose, compare, keep, table_rows
+    from training.experiments.run_folder import CONFIG_FILE, RunFolder, installed_versions, read_config
+    from training.experiments.tables import console_table
+    from training.experiments.trial_store import FAILED, finished_trials, trial_of
+
+    values, seed = read_config(folder, COMMAND, "verify")
+    bench: Bench
+    kind: type[Any] = ExplorationTrial
+    if "plan" in values:
+        plan = Plan.load(values["plan"])
+        if plan.digest != values["plan_hash"]:
+            hint = "Use the release that wrote it."
+            raise argument_error("verify", f"a run of plan {plan.digest}", values["plan_hash"], hint)
+        bench, kind = PlanBench(plan, float(values["decision_limit"])), PlanTrial
+    else:
+        bench = ExplorationBenchConfig.from_mapping(values | {"seed": seed})
+    stored = finished_trials(RunFolder(folder, COMMAND, values, seed, installed_versions()), TRIALS_FILE, kind)
+    chosen = choose(list(stored.values()), count, np.random.default_rng())
+    if not chosen or any("digest" not in row for row in chosen):
+        hint = f"Check {str(folder / CONFIG_FILE)!r}, or play its episodes again with this release."
+        raise argument_error("verify", "a run folder whose episodes have digests", "none", hint)
+    found = []
+    with trial_progress(call.console, len(chosen), timed=False) as (advance, interrupted):
+        for row in chosen:
+            if interrupted():
+                break
+            trial = trial_of(row, kind)
+            again = play(bench, trial)
+            if FAILED in again:
+                call.console.print(f"[red]error[/] {again[FAILED]}", soft_wrap=True)
+                raise typer.Exit(2)
+            found.append(compare(row, again))
+            keep(folder, found[-1], asdict(trial))
+            advance(f"{trial.policy}, seed {trial.seed}")
+    call.console.print(console_table("Episodes played again", HEADINGS, table_rows(found)))
+    others = sorted({row["stored_on"] for row in found if row["is_equal"] is None})
+    if others:
+        text = f"Other processor or versions, so that only means compare: {'; '.join(others)}. Here: {machine()}."
+        call.console.print(text, soft_wrap=True)
+    if any(row["is_equal"] is False for row in found):
+        raise typer.Exit(1)
+
+
+def write_leaderboard(folders: list[Path], out: Path) -> None:
+    """Write the tables of all results in some run folders of one plan.
+
+    Raises:
+        ValueError: If a folder has no results of a plan, plans differ, or two folders have the same policy.
+    """
+    from slam_backend.core.files import write_file
+    from slam_backend.core.validation import argument_error
+    from training.bench.exploration.leaderboard import leaderboard, read_results
+
+    results = [read_results(folder) for folder in folders]
+    for each in results[1:]:
+        if each.plan.digest != results[0].plan.digest:
+            hint = "Give results of the same plan."
+            raise argument_error("folders", f"results of plan {results[0].plan.digest}", each.plan.digest, hint)
+    names: set[str] = set()
+    for each in results:
+        for policy in each.policies:
+            if policy in names:
+                raise argument_error("folders", "each policy once", policy, "Omit one of the folders.")
+            names.add(policy)
+    write_file(out, leaderboard(results), "out")
+    typer.echo(f"Leaderboard: {out}")
+
+
+def first_steps(environment: "EnvConfig", player: "Player", seed: int, decision_limit: float) -> None:
+    """Run the first two steps of an episode, to detect worlds that cannot be built, and compile what its policy needs.
+
+    The trial itself reports a policy that fails.
+    """
+    from contextlib import suppress
+
+    from training.bench.exploration.players import BOUND
+    from training.episodes.guard import PolicyError
+    from training.episodes.runner import run_episode
+    from vslam_env import vslam_v0
+
+    steps = iter(range(2))
+    if player.role == BOUND:
+        return
+    env = vslam_v0.parallel_env(config=environment)
+    with suppress(PolicyError):
+        team = player.make(env, decision_limit)
+        run_episode(env, team, seed, should_stop=lambda: next(steps, None) is None)
+    env.close()
