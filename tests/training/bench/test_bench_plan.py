@@ -32,7 +32,7 @@ from training.bench.exploration.plan_report import (
 )
 from training.bench.exploration.trials import TRIALS_FILE
 
-FROZEN = {"vslam-bench-v0": "84aa00a30eb6138a"}  # by name; a plan that changes gets a new name once it is frozen
+FROZEN = {"vslam-bench-v0": "bdfcfe73b00377aa"}  # by name; a plan that changes gets a new name once it is frozen
 TINY = """
 name = "tiny"
 split = "validation"
@@ -109,10 +109,11 @@ def test_shipped_plans_do_not_change(name: str, monkeypatch: pytest.MonkeyPatch)
 
 
 def test_the_hash_follows_the_content_alone() -> None:
-    """Comments and the order of names do not change it, each value does."""
+    """Comments, the order of names and the default policies do not change it, each other value does."""
     plan = Plan.load("vslam-bench-v0")
     values = plan.model_dump()
     assert Plan(**dict(reversed(values.items()))).digest == plan.digest
+    assert Plan(**{**values, "policies": ("random_walk",)}).digest == plan.digest
     parts = {**values["parts"], "hard": {**values["parts"]["hard"], "seeds": 6}}
     assert Plan(**{**values, "parts": parts}).digest != plan.digest
     assert Plan(**{**values, "duration": 121.0}).digest != plan.digest

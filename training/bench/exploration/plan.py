@@ -102,8 +102,11 @@ class Plan(Checked):
 
     @property
     def digest(self) -> str:
-        """First 16 hexadecimal digits of SHA-256 over the plan's content; comments and order of names do not count."""
-        return hashlib.sha256(repr(_sorted(self.model_dump())).encode()).hexdigest()[:16]
+        """First 16 hexadecimal digits of SHA-256 over what is played.
+
+        Comments, the order of names, and the policies of a run that names none do not count.
+        """
+        return hashlib.sha256(repr(_sorted(self.model_dump(exclude={"policies"}))).encode()).hexdigest()[:16]
 
     def trials(self, policies: tuple[str, ...] | None = None, quick: bool = False) -> list[PlanTrial]:
         """Return all episodes, part by part, ordered by seed; those on floor plans that are missing are left out.
