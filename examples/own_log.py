@@ -5,7 +5,7 @@
 The folder contains `odometry.csv` (time, v, omega), `sightings.csv` (time, landmark, range, bearing) and, if the truth
 is known, `truth.csv` (time, x, y, theta) and `landmarks.csv` (landmark, x, y): seconds, metres, radians, bearings
 positive to the left. The robot moves in the plane. Without a folder the example simulates a log.
-The page docs/how-to/own_log.md explains the changes for another robot.
+The page docs/tutorials/own_log.md explains the changes for another robot.
 """
 
 import sys

@@ -1,4 +1,4 @@
-"""Hooks of the site: pages of the repository's root, and links to files that are not pages."""
+"""Hooks of the site: pages of the repository's root, pages of notebooks, and links to files that are not pages."""
 
 import posixpath
 import re
@@ -7,16 +7,39 @@ from typing import Any
 
 ROOT = Path(__file__).parents[2]
 ROOT_PAGES = ("CONTRIBUTING.md", "CHANGELOG.md", "CODE_OF_CONDUCT.md")
+NOTEBOOKS = ROOT / "docs" / "notebooks"
+CELL = re.compile(r"^# %%(?P<kind>[^\n]*)\n", re.MULTILINE)
 LINK = re.compile(r"\[([^\]]*)\]\(([^)\s:]+)\)")
 
 
 def on_files(files: Any, config: Any) -> Any:
-    """Add the pages of the root to the site."""
+    """Add the pages of the root and of the notebooks to the site."""
     from mkdocs.structure.files import File
 
     for name in ROOT_PAGES:
         files.append(File.generated(config, name, abs_src_path=str(ROOT / name)))
+    for notebook in notebooks():
+        content = notebook_page(notebook.read_text(encoding="utf-8"), notebook.name)
+        files.append(File.generated(config, f"notebooks/{notebook.stem}.md", content=content))
     return files
+
+
+def notebooks() -> list[Path]:
+    """Return the notebooks: Python files with cells, as jupytext writes and reads them."""
+    return sorted(NOTEBOOKS.glob("*.py"))
+
+
+def notebook_page(text: str, name: str) -> str:
+    """Return the page of a notebook: its texts, and its programs as code blocks."""
+    parts = CELL.split(text)[1:]
+    cells = []
+    for kind, cell in zip(parts[::2], parts[1::2], strict=True):
+        if "markdown" in kind:
+            cells.append(re.sub(r"^# ?", "", cell.strip(), flags=re.MULTILINE))
+        else:
+            cells.append(f"```python\n{cell.strip()}\n```")
+    how = f"*`docs/notebooks/{name}`: open it in Jupyter with jupytext, or `jupytext --to ipynb {name}`.*"
+    return "\n\n".join([cells[0], how, *cells[1:]]) + "\n"
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:

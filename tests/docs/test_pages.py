@@ -1,49 +1,90 @@
-"""Programs on the pages run as written."""
+"""Code blocks on pages run as written, and give the output that the page shows."""
 
 import re
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from agents import make_policy
+from tests.docs.blocks import PAGES, ROOT, alike, blocks, call, commands
 from vslam_env import vslam_v0
 
-DOCS = Path(__file__).parents[2] / "docs"
-BLOCK = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
-EXPECTED = {
-    "how-to/environment.md": r"^$",
-    "how-to/own_world.md": r"rooms 7 walls, \d+ observable landmarks",
-    "how-to/own_reward.md": r"\S+ 0\.0\n$",
-    "how-to/own_policy.md": r"\d+% of the floor seen, map error 0\.\d\d m",
-    "how-to/own_log.md": r"^door at 2\.9, 0\.9 m\ndesk at -0\.\d, 1\.8 m\nlamp at 0\.3, -4\.0 m\n$",
-    "tutorials/first_episode.md": r"landmarks, pose(.|\n)*'merge', \(0,\), \(1,\)",
-    "tutorials/first_filter.md": r"\(\)\ngroups \(\(0, 1\),\) .*: \[-1\.0, -?0\.0, -?0\.0\]\n$",
+# Pages that take more than a few seconds
+SLOW = (
+    "docs/how-to/training.md",
+    *(f"docs/tutorials/{stem}.md" for stem in ("reinforcement_learning", "own_planner", "train_a_policy")),
+)
+NEEDS = {
+    "docs/tutorials/train_a_policy.md": "stable_baselines3",
+    "docs/how-to/training.md": "stable_baselines3",
 }
+KINDS = {"python", "console", "text", "sh", "toml"}
 
 
-def _programs(page: str) -> list[str]:
-    return BLOCK.findall((DOCS / page).read_text(encoding="utf-8"))
+def name(page: Path) -> str:
+    """Return the path of a page in the repository."""
+    return page.relative_to(ROOT).as_posix()
 
 
-@pytest.mark.parametrize("page", EXPECTED)
-def test_programs_run_as_written(
-    page: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_every_block_runs_or_says_why_not(page: Path) -> None:
+    """A block is a program, commands with their output, a text, or has a comment `not run: REASON` above it."""
+    for block in blocks(page):
+        assert block.kind in KINDS, f"a block without a kind: {block.text[:60]!r}"
+        if block.kind != "text":
+            assert block.runs or block.why, f"a block that is not run, without a reason: {block.text[:60]!r}"
+        if block.runs and block.kind == "console":
+            assert block.text.startswith("$ ")
+
+
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, id=name(page), marks=[pytest.mark.slow] if name(page) in SLOW else [])
+        for page in PAGES
+        if any(block.runs for block in blocks(page))
+    ],
+)
+def test_blocks_run_as_written(
+    page: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each program of a page runs by itself; the last one prints the topic of the page; none is long."""
-    monkeypatch.chdir(tmp_path)  # output of a program is removed
-    programs = _programs(page)
-    assert programs
-    for program in programs:
-        lines = [line for line in program.splitlines() if line.strip() and not line.startswith(("import", "from"))]
-        assert len(lines) <= 26
-        exec(compile(program, page, "exec"), {"__name__": "__main__"})
-    assert re.search(EXPECTED[page], capsys.readouterr().out)
+    """The blocks of a page run in their order in one empty folder; no program is long."""
+    if name(page) in NEEDS:
+        pytest.importorskip(NEEDS[name(page)], reason="stable-baselines3 is not installed: pip install .[train]")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("COLUMNS", "80")
+    before = set(sys.modules)
+    for block in blocks(page):
+        if not block.runs:
+            continue
+        if block.kind == "python":
+            lines = filter(str.strip, block.text.splitlines())
+            assert sum(not line.startswith(("import", "from", "#")) for line in lines) <= 26
+            if file := re.match(r"# (\w+\.py)\n", block.text):
+                Path(file[1]).write_text(block.text, encoding="utf-8")
+            exec(compile(block.text, str(page), "exec"), {"__name__": "__main__"})
+            given = [(block.text[:60], block.output or "...", capsys.readouterr().out)]
+        else:
+            given = []
+            for command, expected in commands(block.text):
+                call(command, monkeypatch)
+                said = capsys.readouterr()
+                given.append((command, expected or "...", said.out + said.err))
+        for what, expected, got in given:
+            assert alike(expected, got), f"{what}\nexpected:\n{expected}\ngot:\n{got}"
+    for module in set(sys.modules) - before:  # modules of the folder
+        if str(tmp_path) in str(getattr(sys.modules[module], "__file__", "")):
+            del sys.modules[module]
 
 
 def test_the_planner_of_a_page_is_found_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The planner of the page, saved under the name that the page gives, is a policy of the command line."""
-    (tmp_path / "look_again.py").write_text(_programs("how-to/own_policy.md")[0], encoding="utf-8")
+    program = blocks(ROOT / "docs" / "tutorials" / "own_planner.md")[0]
+    assert program.text.startswith("# look_again.py\n")
+    (tmp_path / "look_again.py").write_text(program.text, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     policy = make_policy("look_again:LookAgain", "goal")
     env = vslam_v0.parallel_env(world="office", num_robots=1, action_type="goal", max_cycles=3)

@@ -30,15 +30,16 @@ def hooks() -> Any:
 
 def test_all_pages_are_in_the_navigation(hooks: Any) -> None:
     """Each page of `docs` is listed once, with the pages of the root; none is missing or gone."""
-    found = sorted(page.relative_to(ROOT / "docs").as_posix() for page in (ROOT / "docs").rglob("*.md"))
+    found = [page.relative_to(ROOT / "docs").as_posix() for page in (ROOT / "docs").rglob("*.md")]
+    found += [f"notebooks/{notebook.stem}.md" for notebook in hooks.notebooks()]
     assert sorted(pages(CONFIG["nav"])) == sorted([*found, *hooks.ROOT_PAGES])
     assert all((ROOT / page).is_file() for page in hooks.ROOT_PAGES)
 
 
 @pytest.mark.parametrize(("source", "before", "after"), [
     ("how-to/own_world.md", "[add](../../CONTRIBUTING.md#a-world-family)", "[add](../CONTRIBUTING.md#a-world-family)"),
-    ("how-to/own_log.md", "[example](../../examples/own_log.py)", "example (`examples/own_log.py`)"),
-    ("how-to/own_log.md", "[`examples/own_log.py`](../../examples/own_log.py)", "`examples/own_log.py`"),
+    ("tutorials/own_log.md", "[example](../../examples/own_log.py)", "example (`examples/own_log.py`)"),
+    ("tutorials/own_log.md", "[`examples/own_log.py`](../../examples/own_log.py)", "`examples/own_log.py`"),
     ("README.md", "[lab](lab/README.md)", "[lab](lab/README.md)"),
     ("CONTRIBUTING.md", "[site](docs/architecture.md#x)", "[site](architecture.md#x)"),
     ("reference/results.md", "[here](#there) [web](https://example.org/a)", "[here](#there) [web](https://example.org/a)"),
@@ -50,6 +51,32 @@ def test_links_lead_to_pages_of_the_site(source: str, before: str, after: str, h
     files = SimpleNamespace(get_file_from_path=lambda path: path if path in known else None)
     page = SimpleNamespace(file=SimpleNamespace(src_uri=source))
     assert hooks.on_page_markdown(before, page, None, files) == after
+
+
+def test_notebooks_are_pages(hooks: Any) -> None:
+    """Texts lose their comment signs, programs become code blocks, the header of jupytext is left out."""
+    text = "# ---\n# jupyter: x\n# ---\n\n# %% [markdown]\n# # Title\n#\n# A text.\n\n# %%\nprint(1)  # %% no cell\n"
+    page = hooks.notebook_page(text, "some.py")
+    assert page.startswith("# Title\n\nA text.\n\n*`docs/notebooks/some.py`")
+    assert page.endswith("\n\n```python\nprint(1)  # %% no cell\n```\n")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["first_episode", "slam_on_a_log", "compare_planners"])
+def test_notebooks_run(name: str, hooks: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The cells run in their order, and draw pictures."""
+    matplotlib = pytest.importorskip("matplotlib")
+    matplotlib.use("agg")
+    from matplotlib import pyplot
+
+    shown: list[Any] = []
+    monkeypatch.setattr(pyplot, "show", lambda: shown.append(pyplot.gcf()))
+    monkeypatch.chdir(tmp_path)
+    notebook = next(each for each in hooks.notebooks() if each.stem == name)
+    exec(compile(notebook.read_text(encoding="utf-8"), str(notebook), "exec"), {"__name__": "__main__"})
+    assert shown
+    assert all(axes.has_data() for figure in shown for axes in figure.axes)
+    pyplot.close("all")
 
 
 @pytest.mark.slow
