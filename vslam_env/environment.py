@@ -150,6 +150,9 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
     ]:
         """Execute the actions of all robots for `decision_ticks` ticks.
 
+        In the last step of an episode filters with a smoother are rejuvenated before the maps are scored;
+        `running_cost` charges the maps before that.
+
         Args:
             actions: One action per agent.
 
@@ -170,10 +173,13 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         self._team_metrics = episode.team_metrics(self._reads_beliefs)
         self._cycle += 1
 
-        terms = evaluate(self._terms, before, self._team_metrics, self.config.shared_reward)
         recall = self.config.stop_at_recall
         terminated = recall is not None and bool(self._team_metrics.map_recalls.min() >= recall)
         truncated = not terminated and self._cycle >= self._max_cycles
+        if terminated or truncated:  # the maps that are handed in are smoothed up to the last tick
+            episode.belief.rejuvenate()
+            self._team_metrics = episode.team_metrics(self._reads_beliefs)
+        terms = evaluate(self._terms, before, self._team_metrics, self.config.shared_reward)
         observations, infos = self._observe(episode, terms, invalid)
         results = (
             observations,

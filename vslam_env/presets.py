@@ -6,7 +6,7 @@ from typing import Any
 from slam_backend.core.validation import check_choice
 from slam_backend.fastslam.existence import ExistenceModel
 from slam_backend.frontend import DESCRIPTOR_TYPES
-from vslam_env.belief.belief import BeliefConfig
+from vslam_env.belief.belief import BeliefConfig, motion_without_smoother
 from vslam_env.config import SENSORS, EnvConfig
 from vslam_env.sensors import StereoSensorConfig
 
@@ -63,12 +63,12 @@ def preset_config(name: str, sensor: str = "landmark") -> EnvConfig:
 def stereo_belief(eyes: StereoSensorConfig, belief: BeliefConfig) -> BeliefConfig:
     """Return a belief configuration for rendered stereo cameras.
 
-    It takes their optics, keeps the assumed noise of `belief`, and adds the existence model. The front end measures
-    disparities to 0.05 px and corners to 0.1 to 0.2 px, but corners shift with the viewpoint and some points slide
-    along edges: the existence model removes such landmarks. Recovery is off: with twenty measurements a frame among
-    many similar landmarks it sometimes triggers falsely. In offices 100 and 101 (three robots, 60 s) the errors of the
-    six paths were 1 to 9 cm with recovery and 1 to 2 cm without. Rejuvenation is off: it has not been evaluated with
-    rendered cameras.
+    It takes their optics, keeps the assumed camera noise of `belief`, and adds the existence model. The front end
+    measures disparities to 0.05 px and corners to 0.1 to 0.2 px, but corners shift with the viewpoint and some points
+    slide along edges: the existence model removes such landmarks. Recovery is off: with twenty measurements a frame
+    among many similar landmarks it sometimes triggers falsely. In offices 100 and 101 (three robots, 60 s) the errors
+    of the six paths were 1 to 9 cm with recovery and 1 to 2 cm without. Rejuvenation is off: it has not been evaluated
+    with rendered cameras, so that more odometry noise is assumed (`motion_without_smoother`).
 
     Args:
         eyes: Configuration of the stereo sensor.
@@ -79,6 +79,6 @@ def stereo_belief(eyes: StereoSensorConfig, belief: BeliefConfig) -> BeliefConfi
     existence = ExistenceModel(detection=0.7, frame_limit=eyes.front_end.max_measurements)
     gate = DESCRIPTOR_TYPES[eyes.front_end.descriptor].gate
     changes: dict[str, Any] = {"existence": existence, "descriptor_gate": gate, "recovery_position": 0.0}
-    changes["rejuvenate_every"] = None
+    changes |= {"rejuvenate_every": None, "motion": motion_without_smoother(belief.filter.motion)}
     assumed = dataclasses.replace(belief.filter, camera=camera, **changes)
     return dataclasses.replace(belief, filter=assumed)

@@ -46,7 +46,8 @@ class FilterOptions:
         new_landmark_radius: Distance from a similar landmark within which no measurement is new (`fastslam2`) [m].
         recovery_position: Position sigma of the prior for recovery (`fastslam2`) [m]. If a pose with this prior
             explains at least three measurements and most of those it can explain, but the particle's own pose does not,
-            the particle is lost and re-localised from this prior. 0: no recovery.
+            the particle is lost and re-localised from this prior, if three matches hold at the pose found. 0: no
+            recovery.
         recovery_heading: Heading sigma of the prior for recovery [rad].
         descriptor_sigma: L2 distance between descriptors that costs a match as much as one sigma of position
             (`fastslam2`) [-].

@@ -46,14 +46,17 @@ def update_fastslam2(
     predicted = WhitenedPose.of(prior)
     iterations = 1 + MORE_ITERATIONS * bool(prior.covariance[2, 2] > WIDE_HEADING**2)
     gates = gates_at(predicted, landmarks, frame, candidates)  # first pass
+    tentative = unambiguous_matches(gates, frame, candidates, options)
+    refined = refine(predicted, landmarks, frame, tentative, iterations, options.position_gate)
     if options.recovery_position > 0.0 and not is_exact:
         wide = np.diag([options.recovery_position, options.recovery_position, options.recovery_heading]) ** 2
         inflated = WhitenedPose.of(GaussianPose(prior.mean, wide))
         wide_gates = gates_at(inflated, landmarks, frame, candidates)
         if is_lost(gates, wide_gates, candidates, options):
-            predicted, gates, iterations = inflated, wide_gates, 1 + MORE_ITERATIONS
-    tentative = unambiguous_matches(gates, frame, candidates, options)
-    refined = refine(predicted, landmarks, frame, tentative, iterations, options.position_gate)
+            tentative = unambiguous_matches(wide_gates, frame, candidates, options)
+            found = refine(inflated, landmarks, frame, tentative, 1 + MORE_ITERATIONS, options.position_gate)
+            if is_confirmed(found, landmarks, frame, tentative, options):
+                refined, gates = found, wide_gates
     chosen, log_unmatched = decide(refined, landmarks, frame, candidates, options)  # second pass
     matches = {b: name for b, name in enumerate(chosen) if name >= 0}
     posterior, log_evidence = pose_given(refined, landmarks, frame, matches)
@@ -111,6 +114,25 @@ def is_lost(gates: Gates, wide_gates: Gates, candidates: Candidates, options: Fi
         if wide <= options.position_gate:
             verdicts.append(narrow > options.position_gate)
     return sum(verdicts) >= 3 and 2 * sum(verdicts) > len(verdicts)
+
+
+def is_confirmed(
+    found: WhitenedPose, landmarks: Landmarks, frame: Frame, matches: dict[int, int], options: FilterOptions
+) -> bool:
+    """Return whether at least three matches hold together at the pose found with a wide prior.
+
+    The wide prior explains each measurement by itself, at poses that need not agree.
+
+    Args:
+        found: Pose refined with the wide prior.
+        landmarks: Map of the particle.
+        frame: Measurements of the robot.
+        matches: Landmark by measurement, as matched with the wide prior.
+        options: Options of the filter; within `position_gate` a match holds.
+    """
+    terms = [frame.compare(found.pose, landmarks[name], b) for b, name in matches.items()]
+    holding = [term for term in terms if term and term.widened(found.covariance).distance <= options.position_gate]
+    return len(holding) >= 3
 
 
 def unambiguous_matches(gates: Gates, frame: Frame, candidates: Candidates, options: FilterOptions) -> dict[int, int]:

@@ -197,6 +197,19 @@ class TeamSlam:
                 rejuvenations += ((routing.robots, report.rejuvenation),)
         return associations, rejuvenations
 
+    def rejuvenate(self) -> tuple[Rejuvenation, ...]:
+        """Sample the particles of all filters with `rejuvenate_every` from the posterior of whole paths now.
+
+        Maps are then those of paths smoothed up to the last step, not up to the last scheduled rejuvenation.
+
+        Returns:
+            The robots and outcome of each filter; if an outcome has a reason, the particles are unchanged.
+        """
+        if self.filter_options.rejuvenate_every is None:
+            return ()
+        branches = [branch for group in self._groups for branch in group.branches]
+        return tuple((branch.active_robots, branch.filter.rejuvenate()) for branch in branches)
+
     def merge(self, robot_a: int, robot_b: int, alignment: Alignment, known: bool = False) -> LandmarkIdMap:
         """Merge the joint filters of two robots' groups with a given alignment, without verification.
 

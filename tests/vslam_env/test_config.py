@@ -3,6 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from slam_backend.models.odometry import OdometryModel
 from vslam_env import EnvConfig, preset_config, vslam_v0
 from vslam_env.presets import PRESETS
 
@@ -43,6 +44,19 @@ def test_the_large_preset_has_a_large_world_and_standard_noise() -> None:
     assert large.replace(**common) == preset_config("standard").replace(**common)
     own = vslam_v0.parallel_env(preset="large", world="campus", max_seconds=300.0).config
     assert (own.world, own.action_type, own.max_seconds) == ("campus", "goal", 300.0)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_filters_without_a_smoother_assume_more_odometry_noise(name: str) -> None:
+    """Rendered cameras, whose filters are not rejuvenated, have the plain model's noise in proportion to its scale."""
+    rejuvenated, not_rejuvenated = (preset_config(name, sensor).belief.filter for sensor in ("landmark", "stereo"))
+    assert rejuvenated.rejuvenate_every is not None
+    assert not_rejuvenated.rejuvenate_every is None
+    plain, motion, less = OdometryModel(), not_rejuvenated.motion, rejuvenated.motion
+    assert motion.sigma_across / motion.sigma_along == pytest.approx(plain.sigma_across / plain.sigma_along)
+    assert (motion.sigma_turn, motion.floor_heading) == (plain.sigma_turn, plain.floor_heading)
+    assert less.sigma_across < motion.sigma_across
+    assert (less.sigma_along, less.bias_scale) == (motion.sigma_along, motion.bias_scale)
 
 
 def test_true_and_assumed_noise_are_apart() -> None:

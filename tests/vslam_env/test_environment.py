@@ -27,6 +27,37 @@ def test_all_agents_are_truncated_together() -> None:
     assert env.agents == []
 
 
+@pytest.mark.parametrize("ending", [{"max_cycles": 30}, {"stop_at_recall": 0.05}])
+def test_maps_are_smoothed_when_an_episode_ends(ending: dict[str, Any]) -> None:
+    """After the last step, maps and their scores are those that a rejuvenation gives, and no earlier ones are."""
+    env, twin = small_env(**ending), small_env()
+    for each in (env, twin):
+        each.reset(seed=1, options={"start_poses": MEETING})
+    while env.agents:
+        actions = turning(env.agents)
+        *_, infos = env.step(actions)
+        twin.step(actions)
+        own, other = (each.episode.belief.group_map(0).means for each in (env, twin))
+        assert np.array_equal(own, other) == bool(env.agents)
+    twin.episode.belief.rejuvenate()
+    for robot, agent in enumerate(env.possible_agents):
+        assert np.array_equal(env.episode.belief.group_map(robot).means, twin.episode.belief.group_map(robot).means)
+        assert infos[agent]["map_error"] == twin.episode.team_metrics().map_errors[robot]
+
+
+def test_filters_without_a_smoother_end_as_they_are() -> None:
+    """Without rejuvenation the last step changes the beliefs as any other step does."""
+    config = small_env().config.replace(belief={"filter": {"rejuvenate_every": None}})
+    env, twin = (small_env(config=config, max_cycles=cycles) for cycles in (12, 40))
+    for each in (env, twin):
+        each.reset(seed=1)
+        for _ in range(12):
+            each.step(turning(each.agents))
+    assert not env.agents
+    assert twin.agents
+    assert np.array_equal(env.episode.belief.group_map(0).means, twin.episode.belief.group_map(0).means)
+
+
 def test_stop_at_recall_terminates_all_agents() -> None:
     """With `stop_at_recall` all agents terminate in the step in which the poorest map holds that share."""
     env = small_env(stop_at_recall=0.03, max_cycles=300)

@@ -318,7 +318,7 @@ def _standing_still(env: ExplorationEnv) -> dict[str, Any]:
 def test_the_running_cost_charges_every_tick() -> None:
     """A step of several ticks costs what its ticks cost one by one: the map error after each, times its 0.1 s."""
     weights = {"map_error": 1.0, RUNNING_COST: 0.5}
-    each, many = (small_env(reward=weights, decision_ticks=ticks, max_cycles=120) for ticks in (1, 6))
+    each, many = (small_env(reward=weights, decision_ticks=ticks, max_cycles=130) for ticks in (1, 6))
     for env in (each, many):
         env.reset(seed=5, options={"start_poses": MEETING})
     for _ in range(20):

@@ -89,17 +89,18 @@ class TrainConfig(ExperimentConfig):
 
     def make_env_config(self, split: str | None) -> "EnvConfig":
         """Return the environment for worlds of a split; a world with a single layout has no splits."""
+        from vslam_env.belief.belief import motion_without_smoother
         from vslam_env.presets import preset_config
         from vslam_env.world import is_single_layout
 
-        return preset_config(self.noise).replace(
+        config = preset_config(self.noise)
+        assumed: dict[str, Any] = {"num_particles": self.particles}
+        if not self.straighten:
+            assumed |= {"rejuvenate_every": None, "motion": motion_without_smoother(config.belief.filter.motion)}
+        return config.replace(
             world=self.world, world_split=None if is_single_layout(self.world) else split, num_robots=self.robots,
             action_type="goal", decision_ticks=self.decision_ticks, max_cycles=self.max_cycles,
-            reward=dict(self.reward),
-            belief={
-                "filter": {"num_particles": self.particles} | ({} if self.straighten else {"rejuvenate_every": None}),
-                "merging": {"smooth_first": self.straighten},
-            },
+            reward=dict(self.reward), belief={"filter": assumed, "merging": {"smooth_first": self.straighten}},
         )  # fmt: skip
 
 

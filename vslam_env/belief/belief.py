@@ -1,7 +1,7 @@
 """Belief of one robot after a tick, and the configuration of beliefs."""
 
 import math
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -23,20 +23,39 @@ from vslam_env.navigation import CandidateGains, CandidateKind, OccupancyGrid
 
 
 def default_filter_options() -> FilterOptions:
-    """Return the default filter options: 1.5 times the noise of the default camera, the true prior of odometry biases.
+    """Return the default filter options: assumptions for the default camera and odometry, with some reserve.
 
-    Particle filters are over-confident. On eight episodes each of four world families (docs/lab/accuracy.md) 1.5 times
-    the true noise gives the smallest pose errors in the mean; the median NEES of poses is 1.6 to 3.3 (ideal 3), 2.5 to
-    4.3 with the true noise, and 1.5 to 2.7 with twice. Rejuvenation every 50 ticks gives 0.94 times the pose errors of
-    every 100; for its effect and cost see docs/explanation/smoothing.md.
+    Particle filters are over-confident: 1.5 times the camera noise gives the smallest pose errors in the mean
+    (docs/lab/accuracy.md). The odometry is that of wheels: it hardly slips sideways, and its error of the turn grows
+    with the distance, not with the turn; the prior of its biases is the true one. Position errors and maps are better
+    with these values than with the defaults of `OdometryModel`, and the median NEES of poses is nearer to the ideal
+    (docs/explanation/accuracy_limits.md). Rejuvenation every 50 ticks gives 0.94 times the pose errors of every 100;
+    for its effect and cost see docs/explanation/smoothing.md.
     """
     true = StereoCamera()
     return FilterOptions(
-        motion=OdometryModel(bias_scale=0.02, bias_heading=math.radians(0.5)),
+        motion=OdometryModel(
+            sigma_across=0.005, sigma_turn=0.005, floor_position=1e-4, floor_heading=1e-4,
+            bias_scale=0.02, bias_heading=math.radians(0.5),
+        ),
         camera=StereoCamera(sigma_px=1.5 * true.sigma_px, sigma_disparity_px=1.5 * true.sigma_disparity_px),
         rejuvenate_every=50,
         smoothing=SmoothingOptions(max_keys=180, further_keys=0, slice_steps=90, rigid_within=0.007),
-    )
+    )  # fmt: skip
+
+
+def motion_without_smoother(motion: OdometryModel) -> OdometryModel:
+    """Return the odometry noise to assume in filters that are not rejuvenated, given that of those that are.
+
+    They keep as much slip and noise of turns and at rest as `OdometryModel()` has in proportion to `sigma_along`: less
+    gains nothing without a smoother (docs/lab/accuracy.md), and has not been tried with rendered cameras.
+    """
+    plain = OdometryModel()
+    scale = motion.sigma_along / plain.sigma_along
+    return replace(
+        motion, sigma_across=scale * plain.sigma_across, sigma_turn=plain.sigma_turn,
+        floor_position=plain.floor_position, floor_heading=plain.floor_heading,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

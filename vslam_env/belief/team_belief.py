@@ -160,6 +160,11 @@ class TeamBelief:
         self._grids.share_on_contact(self._tick + 1, self._topology.same_filter, self.points.starts)
         return id_map
 
+    def rejuvenate(self) -> None:
+        """Smooth paths and maps of all filters that have a smoother now; see `TeamSlam.rejuvenate`."""
+        self._team.rejuvenate()
+        self._refresh_poses()
+
     def representative(self, group: tuple[int, ...]) -> int:
         """Return the first robot of a group that uses the joint filter, which merges need."""
         return self._team.trunk_robots(group[0])[0]

@@ -2,7 +2,8 @@
 
 The first pass, `associate_unambiguous`, matches at the predicted pose what is unambiguous, which refines the pose. The
 second, `associate_all`, matches, rejects or starts a landmark at the refined pose. In between, particles whose
-measurements contradict their pose are re-localised with a wide prior. The same in plain Python, which is the oracle of
+measurements contradict their pose are re-localised with a wide prior, and get their own prior back where the pose
+found with it is not confirmed (`undo_unconfirmed`). The same in plain Python, which is the oracle of
 `tests/slam_backend/fastslam/test_filter_reference.py`: `slam_backend.reference.fastslam2`.
 """
 
@@ -10,7 +11,7 @@ import math
 
 import numpy as np
 
-from slam_backend.core.jit import device, simd
+from slam_backend.core.jit import device, simd, simd_inline
 from slam_backend.core.validation import FloatArray, Int32Array
 from slam_backend.fastslam._kernels.candidates import begin_choice, consider, mark_assigned, mask_of
 from slam_backend.fastslam._kernels.layout import (
@@ -56,6 +57,9 @@ from slam_backend.fastslam._kernels.layout import (
     SIN,
     SURE,
     TAKEN,
+    XI0,
+    XI1,
+    XI2,
 )
 from slam_backend.fastslam._kernels.map_storage import tile_of
 from slam_backend.fastslam._kernels.measurement_model import (
@@ -214,15 +218,57 @@ def try_wide_prior(
                 work[CONTRADICT + i] += 1.0 if sure and not work[LEAST_FIRST_D + i] <= gate else 0.0
     for i in range(LANES):  # suspects that are not lost after all get back what they had
         lost = work[CONTRADICT + i] >= MIN_CONTRADICTIONS and 2.0 * work[CONTRADICT + i] > work[SURE + i]
-        back = work[LOST + i] > 0.0 and not lost
-        work[C00 + i] = work[KEPT00 + i] if back else work[C00 + i]
-        work[C01 + i] = work[KEPT01 + i] if back else work[C01 + i]
-        work[C10 + i] = work[KEPT10 + i] if back else work[C10 + i]
-        work[C11 + i] = work[KEPT11 + i] if back else work[C11 + i]
-        work[C20 + i] = work[KEPT20 + i] if back else work[C20 + i]
-        work[C21 + i] = work[KEPT21 + i] if back else work[C21 + i]
-        work[C22 + i] = work[KEPT22 + i] if back else work[C22 + i]
-        work[IS_WIDE + i] = work[KEPT_WIDE + i] if back else work[IS_WIDE + i]
+        _give_back(work, i, work[LOST + i] > 0.0 and not lost)
+
+
+@simd_inline
+def _give_back(work: FloatArray, i: int, back: bool) -> None:
+    """Where `back`, give a suspect the prior back that it had; it is not lost."""
+    work[C00 + i] = work[KEPT00 + i] if back else work[C00 + i]
+    work[C01 + i] = work[KEPT01 + i] if back else work[C01 + i]
+    work[C10 + i] = work[KEPT10 + i] if back else work[C10 + i]
+    work[C11 + i] = work[KEPT11 + i] if back else work[C11 + i]
+    work[C20 + i] = work[KEPT20 + i] if back else work[C20 + i]
+    work[C21 + i] = work[KEPT21 + i] if back else work[C21 + i]
+    work[C22 + i] = work[KEPT22 + i] if back else work[C22 + i]
+    work[IS_WIDE + i] = work[KEPT_WIDE + i] if back else work[IS_WIDE + i]
+    work[LOST + i] = 0.0 if back else work[LOST + i]
+
+
+@device
+@simd
+def undo_unconfirmed(
+    space: Space, block: int, maps: MapArrays, frame: Frame, candidates: Candidates, gate: float
+) -> int:
+    """Give lost lanes of one block their own prior back if too few matches hold at the pose found with the wide one.
+
+    The wide prior explains each measurement by itself, at poses that need not agree. A pose at which fewer than three
+    of the unambiguous matches lie within the gate is not confirmed.
+
+    Returns:
+        The number of lanes that were given their prior back. Their pose has to be refined again; xi is then 0.
+    """
+    work, match, row_of = space.work, space.match, maps.table[ROW_OF]
+    padded, first, num_lost, num_back = maps.counts.shape[1], block * LANES, 0, 0
+    for i in range(LANES):
+        work[SURE + i] = 0.0
+        num_lost += 1 if work[LOST + i] > 0.0 else 0
+    for b in range(len(match) if num_lost > 0 else 0):
+        for q in range(candidates.starts[b], candidates.starts[b + 1]):
+            if mask_of(match[b], float(q), space.mask) > 0:
+                row, record, chosen = row_of[candidates.slots[q]], space.records[q], match[b]
+                tile, seen = maps.values[tile_of(padded, row, block)], maps.counts[row, first : first + LANES]
+                innovate(work, tile, frame, b)
+                evaluate(work, tile, record, seen, True)
+                for i in range(LANES):
+                    work[SURE + i] += 1.0 if chosen[i] == float(q) and record[Q_D + i] <= gate else 0.0
+    for i in range(LANES):
+        back = work[LOST + i] > 0.0 and work[SURE + i] < MIN_CONTRADICTIONS
+        _give_back(work, i, back)
+        num_back += 1 if back else 0
+    for i in range(LANES if num_back > 0 else 0):
+        work[XI0 + i] = work[XI1 + i] = work[XI2 + i] = 0.0
+    return num_back
 
 
 @device

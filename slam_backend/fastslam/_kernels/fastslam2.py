@@ -10,6 +10,7 @@ from slam_backend.fastslam._kernels.data_association import (
     associate_unambiguous,
     iterate_wide,
     try_wide_prior,
+    undo_unconfirmed,
 )
 from slam_backend.fastslam._kernels.landmark_ekf import new_landmark, update_matched
 from slam_backend.fastslam._kernels.layout import (
@@ -41,7 +42,8 @@ def update_fastslam2(
     Data association takes two passes: unambiguous matches first refine the pose robustly, then all measurements are
     decided on at the refined pose. If a wide prior explains at least three measurements that the particle's own
     covariance does not, and these are most of those it explains, the particle is lost and the wide prior replaces its
-    covariance. `slam_backend.reference.fastslam2` is the same in plain Python, step by step.
+    covariance, unless fewer than three matches hold at the pose found with it. `slam_backend.reference.fastslam2` is
+    the same in plain Python, step by step.
 
     Args:
         robot: Poses before the motion, written: the new samples, and N(x^, P^) of each particle before sampling.
@@ -71,13 +73,20 @@ def update_fastslam2(
 
         # First pass: refine the pose with unambiguous matches.
         suspects = associate_unambiguous(space, block, maps, frame, candidates, rules)
-        if suspects > 0 and rules.recovery[0] > 0.0:
+        recovers = suspects > 0 and rules.recovery[0] > 0.0
+        if recovers:
             try_wide_prior(space, block, maps, frame, candidates, rules)
             set_linearisation_point(work)
             associate_unambiguous(space, block, maps, frame, candidates, rules)
         gauss_newton_step(work, False)
         iterate_wide(space, block, maps, frame, candidates, rules.position_gate)
         set_linearisation_point(work)
+        if recovers and undo_unconfirmed(space, block, maps, frame, candidates, rules.position_gate) > 0:
+            set_linearisation_point(work)
+            associate_unambiguous(space, block, maps, frame, candidates, rules)
+            gauss_newton_step(work, False)
+            iterate_wide(space, block, maps, frame, candidates, rules.position_gate)
+            set_linearisation_point(work)
 
         # Second pass: decide at the refined pose.
         associate_all(space, block, maps, frame, candidates, rules)

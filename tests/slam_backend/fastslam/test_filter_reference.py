@@ -139,10 +139,16 @@ def happened(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
     """Count events inside the plain filter that its reports do not show."""
     counts: Counter[str] = Counter()
     is_lost, refine, update_existence = fastslam2.is_lost, fastslam2.refine, plain_filter.update_existence
+    is_confirmed = fastslam2.is_confirmed
 
     def counted_is_lost(*args: Any) -> bool:
         answer = is_lost(*args)
         counts["lost"] += answer
+        return answer
+
+    def counted_is_confirmed(*args: Any) -> bool:
+        answer = is_confirmed(*args)
+        counts["confirmed" if answer else "unconfirmed"] += 1
         return answer
 
     def counted_refine(*args: Any) -> Any:
@@ -156,6 +162,7 @@ def happened(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
 
     monkeypatch.setattr(plain_filter, "update_existence", counted_weigh_existence)
     monkeypatch.setattr(fastslam2, "is_lost", counted_is_lost)
+    monkeypatch.setattr(fastslam2, "is_confirmed", counted_is_confirmed)
     monkeypatch.setattr(fastslam2, "refine", counted_refine)
     return counts
 
@@ -313,4 +320,17 @@ def test_half_of_the_measurements_do_not_make_a_robot_lost(
     step_both(slam, plain, [None], [Measurements(points, np.eye(6))])
     points[:num_displaced, 2] += 0.15
     step_both(slam, plain, [None], [Measurements(points, np.eye(6))])
-    assert happened["lost"] == (2 if is_lost else 0)
+    assert happened["lost"] == happened["confirmed"] == (2 if is_lost else 0)
+
+
+def test_a_pose_that_explains_each_measurement_by_itself_is_not_taken(happened: Counter[str]) -> None:
+    """Six landmarks lie elsewhere, each by another motion: no pose explains three, and the robot keeps its own."""
+    slam, plain = both(1, 3, num_particles=2)
+    points = np.array([[x, 0.1 * x, 2.0] for x in (-0.9, -0.5, -0.2, 0.2, 0.5, 0.9)])
+    step_both(slam, plain, [None], [Measurements(points, np.eye(6))])
+    points[:, 0] += 0.3 * np.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
+    points[:, 2] += 0.3 * np.array([1.0, 1.0, -1.0, -1.0, 1.0, 1.0])
+    report = step_both(slam, plain, [None], [Measurements(points, np.eye(6))])
+    assert happened["lost"] == happened["unconfirmed"] == 2
+    assert report.num_matched == 0
+    assert np.linalg.norm(slam.pose().mean) < 0.01
