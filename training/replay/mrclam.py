@@ -4,7 +4,7 @@ The default odometry noise was calibrated on data sets 7 and 4: their results ar
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,7 +22,7 @@ from slam_backend.readers.mrclam import MrclamLog, to_filter_steps
 from slam_backend.team.merge_scheduler import AttemptOptions
 from slam_backend.team.team import TeamSlam
 from training.replay.config import MRCLAM_MOTION, MrclamConfig
-from training.replay.single_robot import PLANAR_GATE, RejuvenationCount
+from training.replay.single_robot import PLANAR_GATE, RejuvenationCount, is_stage
 from vslam_env.evaluation.map_scores import GroundTruthAssociation
 
 # The weights of a joint filter's particles combine the measurements of all its robots, so that depletion is faster:
@@ -69,6 +69,8 @@ class Replay:
     paths: FloatArray
     reckoned: FloatArray  # (K, T, 3) float64 [m, m, rad]. Dead reckoning of the commands, start frames.
     maps: tuple[LandmarkMap, ...]  # Final map of each robot's group, in the robot's start frame
+    # Steps, and the maps after them by the first robot of each group, in its start frame; the last step included
+    stages: tuple[tuple[int, Mapping[int, LandmarkMap]], ...]
     # Row in `MrclamLog.positions` of the measurement that created each landmark of each robot's map, (N,) int64;
     # recorded outside the filters, which do not use it.
     claims: tuple[IntArray, ...]
@@ -102,6 +104,7 @@ def replay_team(
     ground_truth = GroundTruthAssociation(len(robots), flat, np.ones(len(flat), dtype=np.bool_), cutoff=1.0)
     paths = np.zeros((len(robots), num_steps, 3))
     merges: list[Merge] = []
+    stages: list[tuple[int, Mapping[int, LandmarkMap]]] = []
     attempts, seconds, rejuvenations = 0, 0.0, RejuvenationCount()
     for step in range(num_steps):
         seen = [own.measurements[step] for own in readings.robots]
@@ -131,12 +134,16 @@ def replay_team(
         ground_truth.record(report, rows)
         for robot in robots:
             paths[robot, step] = team.pose_from_start(robot).mean
+        if is_stage(step, num_steps):
+            firsts = [group[0] for group in team.groups]
+            stages.append((step, {first: team.map(first).moved(team.start_from_group(first)) for first in firsts}))
         on_step((step + 1) / num_steps, report)
     frames = np.array([team.start_from_group(robot) for robot in robots])
     maps_of = [team.map(robot) for robot in robots]
     return Replay(
         times=readings.times, paths=paths, reckoned=np.array([own.reckoned for own in readings.robots]),
         maps=tuple(own.moved(frame) for own, frame in zip(maps_of, frames, strict=True)),
+        stages=tuple(stages),
         claims=tuple(ground_truth.true_ids(robot, maps_of[robot].ids) for robot in robots), start_from_group=frames,
         groups=team.groups, merges=tuple(merges), attempts=attempts, pairs=None if config.alone else team.pair_attempts,
         rejuvenations=rejuvenations.to_mapping(), consistency=tuple(map(team.consistency, robots)), seconds=seconds,

@@ -1,11 +1,11 @@
-"""Recordings of replays for the playback in reports: paths over time, final maps, and merges."""
+"""Recordings of replays for the playback in reports: paths and maps over time, and merges."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from slam_backend.core.validation import FloatArray
+from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.geometry import compose, inverse
 from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.readers.mrclam import MrclamLog
@@ -22,11 +22,23 @@ def _steps(count: int) -> slice:
     return slice(0, None, math.ceil(count / MOST_FRAMES))
 
 
-def _maps(maps: Sequence[LandmarkMap | None]) -> dict[str, FloatArray]:
-    """Return the fields of final maps, one for each robot or None, which are shown from the first step on."""
-    points = [np.zeros((0, 5)) if each is None else ellipses(each) for each in maps]
-    ends = np.cumsum([len(each) for each in points])[None]
-    return {"keyframes": np.zeros(1, np.int64), "map_points": np.concatenate(points), "map_ends": ends}
+def _maps(
+    stages: Sequence[tuple[int, Mapping[int, LandmarkMap]]], steps: slice, count: int
+) -> dict[str, IntArray | FloatArray]:
+    """Return the fields of maps over time.
+
+    Args:
+        stages: Steps, ascending, and the maps after them by robot, in the world frame.
+        steps: Recorded ones of the steps.
+        count: Number of robots.
+    """
+    last = (stages[-1][0]) // steps.step  # index of the last recorded step
+    keys = {min(-(-step // steps.step), last): maps for step, maps in stages}  # shown when the step is over
+    points = [
+        ellipses(maps[robot]) if robot in maps else np.zeros((0, 5)) for maps in keys.values() for robot in range(count)
+    ]
+    ends = np.cumsum([len(each) for each in points]).reshape(len(keys), count)
+    return {"keyframes": np.array(list(keys)), "map_points": np.concatenate(points), "map_ends": ends}
 
 
 def record_team(log: MrclamLog, replay: Replay, paths: Sequence[PathScore | None]) -> Recording:
@@ -38,14 +50,13 @@ def record_team(log: MrclamLog, replay: Replay, paths: Sequence[PathScore | None
     steps = _steps(len(replay.times))
     times, count = replay.times[steps], len(log.robots)
     estimate, reckoned, truth = (np.full((len(times), count, 3), np.nan) for _ in range(3))
-    maps: list[LandmarkMap | None] = [None] * count
+    starts: list[FloatArray] = [np.zeros(3)] * count
     for group in replay.groups:
         first = group[0]
         own = own_frame(align_to_truth(replay.maps[first], replay.claims[first], log), paths[first])
-        maps[first] = replay.maps[first].moved(own)
         for robot in group:
             first_from_own = compose(replay.start_from_group[first], inverse(replay.start_from_group[robot]))
-            start = compose(own, first_from_own)
+            start = starts[robot] = compose(own, first_from_own)
             estimate[:, robot] = compose(start, replay.paths[robot][steps])
             reckoned[:, robot] = compose(start, replay.reckoned[robot][steps])
     for robot, each in enumerate(log.robots):
@@ -56,14 +67,16 @@ def record_team(log: MrclamLog, replay: Replay, paths: Sequence[PathScore | None
         events.append(event_entry(merge.event, merge.time, numbers))
         if merge.undone is not None:
             events.append(events[-1] | {"kind": "undo", "time": merge.undone, "text": f"undone: {events[-1]['text']}"})
+    placed = [(step, {r: own.moved(starts[r]) for r, own in maps.items()}) for step, maps in replay.stages]
     return Recording(
         about={
             "names": [f"robot {number}" for number in numbers], "cutoff": 1.0,
             "events": sorted(events, key=lambda event: float(event["time"])),
-            "placed": "by one rigid fit of each final map, which is shown from the start",
+            "placed": "by one rigid fit of each final map",
         },
         times=times - times[0], estimate=estimate, truth=truth, reckoned=reckoned,
-        landmarks=np.zeros((0, 2)) if log.positions is None else log.positions[:, :2], **_maps(maps),
+        landmarks=np.zeros((0, 2)) if log.positions is None else log.positions[:, :2],
+        **_maps(placed, steps, count),
     )  # fmt: skip
 
 
@@ -91,10 +104,10 @@ def record_one(
     return Recording(
         about={
             "names": ["robot"], "events": [], "cutoff": 1.0,
-            "placed": "in the start frame" if scores is None else "by a rigid fit; the final map is shown throughout",
+            "placed": "in the start frame" if scores is None else "by a rigid fit of the path",
         },
         times=(result.times - result.times[0])[steps], estimate=placed[0], reckoned=placed[1], truth=known[steps],
-        **_maps([result.landmarks.moved(fits[0])]),
+        **_maps([(step, {0: found.moved(fits[0])}) for step, found in result.stages], steps, 1),
     )  # fmt: skip
 
 

@@ -1,5 +1,6 @@
 """Replay of the log of one robot with one filter, and scores of its path at known positions."""
 
+import math
 import re
 import time
 from collections import Counter
@@ -24,6 +25,8 @@ if TYPE_CHECKING:  # numerical modules are imported when the command runs, so th
     from slam_backend.fastslam.reports import RejuvenationReport
 
 NUMBER = re.compile(r"\d+(\.\d+)?")
+
+MOST_STAGES = 75  # maps of a replay over time, for its playback
 
 # A planar measurement has two degrees of freedom: 99.9 % of correct matches have a smaller squared Mahalanobis
 # distance.
@@ -55,6 +58,7 @@ class OneReplay:
     path: FloatArray  # (T, 3) float64 [m, m, rad]. Pose estimates at the time of each step, start frame.
     reckoned: FloatArray  # (T, 3) float64 [m, m, rad]. Dead reckoning, start frame.
     landmarks: LandmarkMap  # Final map, start frame
+    stages: tuple[tuple[int, LandmarkMap], ...]  # Steps, and the maps after them, start frame; the last step included
     matched: int  # Number of measurements matched by the most probable particle
     created: int  # Number of landmarks created by it
     rejected: int  # Number of measurements rejected by it
@@ -96,6 +100,7 @@ def replay_one(
     path, odometry = np.zeros((len(times), 3)), np.zeros((len(times), 3))
     matched, created, rejected, seconds = 0, 0, 0, 0.0
     rejuvenations = RejuvenationCount()
+    stages: list[tuple[int, LandmarkMap]] = []
     for step, (move, frame) in enumerate(steps):
         odometry[step] = move if step else 0.0
         started = time.perf_counter()
@@ -107,13 +112,21 @@ def replay_one(
         created += report.num_new
         rejected += report.num_rejected
         rejuvenations.add(report.rejuvenation)
+        if is_stage(step, len(times)):
+            stages.append((step, slam.map()))
         on_report(report)
         on_step((step + 1) / len(times))
     return OneReplay(
         times=times, path=path, reckoned=dead_reckoning(np.zeros(3), odometry[1:]), landmarks=slam.map(),
-        matched=matched, created=created, rejected=rejected, rejuvenations=rejuvenations.to_mapping(),
+        stages=tuple(stages), matched=matched, created=created, rejected=rejected,
+        rejuvenations=rejuvenations.to_mapping(),
         consistency=slam.consistency, seconds=seconds,
     )  # fmt: skip
+
+
+def is_stage(step: int, num_steps: int) -> bool:
+    """Return whether the map after a step is one of the at most `MOST_STAGES` + 1 maps for the playback."""
+    return step == num_steps - 1 or step % math.ceil(num_steps / MOST_STAGES) == 0
 
 
 def score_positions(points: FloatArray, truth: FloatArray, world_from_start: FloatArray) -> PositionScore:
