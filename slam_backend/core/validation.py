@@ -241,7 +241,8 @@ def check_array(
 def _read(name: str, value: Any, shape: tuple[int | None, ...], hint: str) -> NDArray[Any]:
     """Return any other value as an array of real numbers, perhaps the caller's own array, or raise."""
     expected = f"an array of shape {_shape_text(shape)}"
-    if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value):  # numpy would read the masked entries
+    is_subclass = type(value) is not np.ndarray and isinstance(value, np.ndarray)
+    if is_subclass and np.ma.is_masked(value):  # numpy would read the masked entries; its `ma` is imported at first use
         raise argument_error(name, expected, "a masked array with hidden entries", hint)
     try:
         given = np.asarray(value)

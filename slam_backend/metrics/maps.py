@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from slam_backend.core.jit import jit
+from slam_backend.core.read_only import as_read_only
 from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_array, check_float
 
 FALSE, UNCOUNTED = -1, -2
@@ -164,7 +165,7 @@ def _claimed(means: FloatArray, claims: IntArray, truths: FloatArray, cutoff: fl
         raise argument_error("means", f"an array of shape ({len(claims)}, 3)", f"shape {means.shape}", "One per claim.")
     if truths.ndim != 2 or truths.shape[1] != 3:
         raise argument_error("true_positions", "an array of shape (N, 3)", f"shape {truths.shape}", "One row each.")
-    holder, total, bad = _nearest_claimants(means, claims, truths, cutoff)
+    holder, total, bad = _nearest_claimants(as_read_only(means), as_read_only(claims), as_read_only(truths), cutoff)
     if bad >= 0:
         if not np.isfinite(means[bad]).all():
             hint = "Drop landmarks that are not finite."

@@ -123,9 +123,10 @@ def dots(image: Image, centres: FloatArray, radius: float, colour: Colour) -> No
         radius: Radius [px].
         colour: Colour (RGB).
     """
+    draw, smooth = cv2.fillConvexPoly, cv2.LINE_AA
     # Anti-aliasing adds half a pixel all around.
     for outline in fixed(centres[:, None] + (radius - 0.5) * _CIRCLE[::2]):
-        cv2.fillConvexPoly(image, outline, colour, cv2.LINE_AA, SHIFT)
+        draw(image, outline, colour, smooth, SHIFT)
 
 
 def translucent_fill(image: Image, centres: FloatArray, radius: float, colour: Colour, opacity: float) -> None:
@@ -156,7 +157,8 @@ def translucent_fill(image: Image, centres: FloatArray, radius: float, colour: C
     at = (rows * width + columns)[seen]
     through = np.ones(height * width, np.float32)
     np.multiply.at(through, at, (1.0 - cover[seen]).astype(np.float32))
-    share, pixels = through[at, None], np.divmod(at, width)
+    covered = np.flatnonzero(through != 1.0)
+    share, pixels = through[covered, None], np.divmod(covered, width)
     part[pixels] = np.rint(part[pixels] * share + np.array(colour, np.float32) * (1.0 - share)).astype(np.uint8)
 
 

@@ -21,10 +21,15 @@ def build_scene(episode: Episode, metrics: TeamMetrics) -> Scene:
     """
     landmarks = episode.world.landmarks
     assert landmarks is not None
+    paths = (episode.true_path, episode.estimated_path)
+    truth, estimates = (np.concatenate(path).reshape(len(path), -1, 3) for path in paths)
     return Scene(
         walls=episode.world.walls,
         landmarks=landmarks.positions,
-        robots=tuple(_view(episode, robot, landmarks.positions) for robot in range(len(episode.true_starts))),
+        robots=tuple(
+            _view(episode, robot, truth[:, robot], estimates[:, robot], landmarks.positions)
+            for robot in range(len(episode.true_starts))
+        ),
         tick=episode.tick,
         time=episode.tick * TICK,
         robot_radius=episode.body.radius,
@@ -38,15 +43,15 @@ def build_scene(episode: Episode, metrics: TeamMetrics) -> Scene:
     )
 
 
-def _view(episode: Episode, robot: int, positions: FloatArray) -> RobotView:
+def _view(episode: Episode, robot: int, truth: FloatArray, estimates: FloatArray, positions: FloatArray) -> RobotView:
     start = episode.true_starts[robot]
     belief = episode.belief.belief(robot)
     world_map = belief.map.moved(start)
     seen = episode.frames[robot].true_ids
-    estimated = compose(start, np.array([poses[robot] for poses in episode.estimated_path]))
+    estimated = compose(start, estimates)
     return RobotView(
-        true_pose=episode.true_path[-1][robot],
-        true_path=np.array([poses[robot, :2] for poses in episode.true_path]),
+        true_pose=truth[-1],
+        true_path=truth[:, :2],
         estimated_pose=estimated[-1],
         estimated_path=estimated[:, :2],
         particles=compose(start, belief.particles),
