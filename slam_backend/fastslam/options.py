@@ -23,7 +23,7 @@ from slam_backend.smoother.options import SmoothingOptions
 
 PROPOSALS = ("fastslam2", "fastslam1")
 MAX_ROBOTS, MAX_PARTICLES = 1_000, 1_000_000  # beyond any memory
-CALIBRATED_NOISE = 0.005  # [m]; chosen on simulated stereo runs, see docs/explanation/smoothing.md
+CALIBRATED_NOISE = 0.005  # [m]; chosen on simulated stereo runs, see docs/reference/smoother.md
 
 
 @known_names

@@ -113,7 +113,7 @@ def write_tiles(tiles: FloatArray, rows: IntArray, walk: float, blocks: FloatArr
             for row in range(9):
                 added = walk if row in (XX, YY, ZZ) else 0.0
                 for lane in range(tiles.shape[3]):
-                    block[row, lane] = tile[row, lane] + added  # (7) of docs/explanation/smoothing.md
+                    block[row, lane] = tile[row, lane] + added  # (7) of docs/reference/smoother.md
 
 
 def joint_graph(

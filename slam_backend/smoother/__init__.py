@@ -1,1 +1,1 @@
-"""Rejuvenation of particles from the posterior of whole paths; equations (n) in `docs/explanation/smoothing.md`."""
+"""Rejuvenation of particles from the posterior of whole paths; equations (n) in `docs/reference/smoother.md`."""
