@@ -439,7 +439,7 @@ class PlanBenchConfig(ExperimentConfig):
     def completed(cls, values: Mapping[str, Any]) -> Mapping[str, Any]:
         """Make paths of models and of the plan absolute, so that a run can be resumed from any folder."""
         found = with_absolute_paths(values)
-        if "plan" in found and Path(found["plan"]).is_file():
+        if isinstance(found.get("plan"), str) and Path(found["plan"]).is_file():
             found["plan"] = str(Path(found["plan"]).resolve())
         return found
 

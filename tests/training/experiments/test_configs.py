@@ -29,6 +29,7 @@ CASES: dict[type[ExperimentConfig], dict[str, Any]] = {
     bench.EnvBenchConfig: {"worlds": ("fig5",)},
     bench.ExplorationBenchConfig: {"policies": ("frontier@discrete",), "worlds": ("maze",)},
     bench.FilterBenchConfig: {"proposals": ("fastslam1",), "large": True},
+    bench.PlanBenchConfig: {"plan": "vslam-bench-v0", "policies": ("frontier",), "quick": True},
     bench.ScaleBenchConfig: {"extents": (40.0, 75.5), "family": "campus"},
     bench.StartBenchConfig: {"parts": ("import",), "repeats": 1}, bench.StereoBenchConfig: {"descriptors": ("orb",)},
     bench.TrainBenchConfig: {"workers": (0, 2)},
@@ -73,6 +74,10 @@ BAD: dict[type[ExperimentConfig], dict[str, dict[Any, str]]] = {
         "steps": {0: AT_LEAST_1}, "proposals": {("ekf",): "one of 'fastslam2', 'fastslam1'"},
         "particles": {(5, 5): "at least one value, each once"}, "lookalikes": {0: AT_LEAST_1},
         "landmarks": {(9,): "an int >= 10"},
+    },
+    bench.PlanBenchConfig: {
+        "decision_limit": {0.0: ABOVE_0}, "quick": {1: "a bool"}, "plan": {3: "a text"},
+        "policies": {("frontier", "frontier"): "at least one value, each once"},
     },
     bench.ScaleBenchConfig: {
         "extents": {(0.0,): ABOVE_0, (): "at least one value, each once"}, "robots": {(9,): ROBOTS},
