@@ -58,6 +58,19 @@ def load_plugin(name: str) -> Policy:
     return made
 
 
+def plugin_file(name: str) -> Path:
+    """Return the file of a policy's module, `"my_module:Careful"`.
+
+    Raises:
+        ValueError: If there is no such policy, or its module has no file.
+    """
+    _find(name)
+    file = sys.modules[name.partition(":")[0]].__file__
+    if file is None:
+        raise argument_error("policy", EXPECTED, f"a module without a file: {name}", "Write it into a file.")
+    return Path(file)
+
+
 def _find(name: str) -> Any:
     """Return the class or function that makes the policy."""
     module, _, factory = name.partition(":")

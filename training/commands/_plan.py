@@ -50,11 +50,12 @@ def run_plan(call: Call[ExplorationBenchConfig], name: str | None, workers: int,
     from training.bench.exploration.plan import PlanBench, PlanTrial
     from training.bench.exploration.plan_report import aggregate, draw_plan, episodes_csv, markdown, write_parquet
     from training.bench.exploration.players import parted
-    from training.bench.exploration.trials import TRIALS_FILE, play
+    from training.bench.exploration.trials import TRIALS_FILE, check_same_policies, play
     from training.experiments.run_folder import plain
 
     config, plan = _configured(call, name)
     _check_same_plan(call.out, plan)
+    check_same_policies(call.out)
     trials = plan.trials(config.policies, config.quick)
     bench = PlanBench(plan, config.decision_limit)
     firsts = {(t.policy, t.family, t.robots): t for t in reversed(trials) if t.part == trials[0].part}.values()
@@ -71,7 +72,8 @@ def run_plan(call: Call[ExplorationBenchConfig], name: str | None, workers: int,
     call.write({"plan": plan.name, "plan_hash": plan.digest, "summary": plain(aggregate(plan, rows))})
     folder.write_text(EPISODES_CSV, episodes_csv(rows))
     if rows and not write_parquet(folder.path / EPISODES_PARQUET, rows):
-        console.print(f"{EPISODES_PARQUET} is not written: it needs pip install 'vslam-env[parquet]'.", soft_wrap=True)
+        text = f"{EPISODES_PARQUET} is not written: it needs pip install 'vslam-env[parquet]'."
+        console.print(text, soft_wrap=True, markup=False)
     folder.write_text("tables.md", markdown(plan, rows))
     if rows:
         draw_plan(folder.path / "plan.png", rows)
@@ -198,7 +200,8 @@ def write_leaderboard(folders: list[Path], out: Path) -> None:
     """Write the tables of all results in some run folders of one plan.
 
     Raises:
-        ValueError: If a folder has no results of a plan, plans differ, or two folders have the same policy.
+        ValueError: If a folder has no results of a plan, they are incomplete, plans differ, or two folders have
+            different policies of the same label.
     """
     from slam_backend.core.files import write_file
     from slam_backend.core.validation import argument_error
@@ -209,12 +212,6 @@ def write_leaderboard(folders: list[Path], out: Path) -> None:
         if each.plan.digest != results[0].plan.digest:
             hint = "Give results of the same plan."
             raise argument_error("folders", f"results of plan {results[0].plan.digest}", each.plan.digest, hint)
-    names: set[str] = set()
-    for each in results:
-        for policy in each.policies:
-            if policy in names:
-                raise argument_error("folders", "each policy once", policy, "Omit one of the folders.")
-            names.add(policy)
     write_file(out, leaderboard(results), "out")
     typer.echo(f"Leaderboard: {out}")
 

@@ -219,7 +219,8 @@ def bench_env(call: Call[EnvBenchConfig]) -> None:
 @bench.command("exploration")
 @options(
     ExplorationBenchConfig, "bench exploration", continues=True,
-    quick={"worlds": ("office",), "duration": 60.0, "seeds": 3}, quick_help="Office worlds only, 60 s, 3 seeds.",
+    quick={"worlds": ("office",), "duration": 60.0, "seeds": 3},
+    quick_help="Office worlds only, 60 s, 3 seeds; with --plan 2 worlds of four families.",
 )  # fmt: skip
 def bench_exploration(
     call: Call[ExplorationBenchConfig], plan: PlanName = None, workers: Workers = 1, ray: Cluster = None,
@@ -243,9 +244,10 @@ def bench_exploration(
         return
     from training.bench.exploration import report
     from training.bench.exploration.players import parted
-    from training.bench.exploration.trials import TRIALS_FILE, play
+    from training.bench.exploration.trials import TRIALS_FILE, check_same_policies, play
     from training.experiments.run_folder import plain
 
+    check_same_policies(call.out)
     trials = call.config.trials()
     firsts = {(t.policy, t.world, t.robots): t for t in reversed(trials)}.values()
     config = call.config

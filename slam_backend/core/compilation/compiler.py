@@ -281,8 +281,9 @@ def start_worker() -> "subprocess.Popen[str]":
 def _forward_lines(process: subprocess.Popen[str], lines: "Queue[str | None]") -> None:
     """Put what a process prints into a queue, and None when it ends."""
     assert process.stdout is not None
-    for line in process.stdout:
-        lines.put(line.strip())
+    with process.stdout:
+        for line in process.stdout:
+            lines.put(line.strip())
     lines.put(None)
 
 

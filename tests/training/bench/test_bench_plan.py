@@ -6,6 +6,7 @@ import hashlib
 import io
 import json
 import shutil
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -214,8 +215,13 @@ def test_the_leaderboard_is_made_from_kept_results(vslam: Any, run: Path, tmp_pa
     assert text.startswith("# Leaderboard\n")
     for section in (run / "tables.md").read_text().split("### ")[1:]:
         assert section.rstrip("\n") in text
+    assert vslam("bench", "leaderboard", str(kept), str(run), "--out", str(page)).status == 0
+    assert page.read_text() == text  # a policy in both, such as the baseline, counts once
+    other = (run / "episodes.csv").read_text().replace(",random_walk,", ",frontier,")
+    (run / "episodes.csv").write_text("\n".join(other.splitlines()[:4]) + "\n")
     done = vslam("bench", "leaderboard", str(kept), str(run), "--out", str(page))
-    assert "folders: expected each policy once, got 'frontier'" in done.err
+    assert "folders: expected complete results, got" in done.err
+    assert "of 4 episodes of the base part" in done.err
     done = vslam("bench", "leaderboard", str(tmp_path), "--out", str(page))
     assert "folders: expected the config.toml of an earlier run" in done.err
 
@@ -236,6 +242,36 @@ def test_results_of_other_plans_are_not_mixed(vslam: Any, run: Path, tiny: Path,
     assert "out: expected results of vslam-env" in done.err
 
 
+def test_a_changed_policy_does_not_continue_old_results(
+    vslam: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The rows name the policy's file by its digest; a folder of another version of it is refused."""
+    file = tmp_path / "plan_policies.py"
+    source = """
+class Staying:
+    def reset(self):
+        pass
+
+    def act(self, observation, belief, rng):
+        return 0
+"""
+    file.write_text(source)
+    monkeypatch.chdir(tmp_path)
+    command = (
+        "bench", "exploration", "--policies", "plan_policies:Staying", "--worlds", "fig5", "--robots", "1",
+        "--oracles", "none", "--max-seconds", "2", "--particles", "5", "--seeds", "1", "--out", "run",
+    )  # fmt: skip
+    assert vslam(*command).status == 0
+    (row,) = _rows(tmp_path / "run")
+    assert row["policy_digest"] == hashlib.sha256(source.encode()).hexdigest()[:16]
+    file.write_text(source + "# changed\n")
+    done = vslam(*command)
+    assert "out: expected episodes of 'plan_policies:Staying' as it is now, got" in done.err
+    file.write_text(source)
+    assert vslam(*command).status == 0
+    sys.modules.pop("plan_policies", None)
+
+
 # ------------------------------------------------------------------ tables and statistics
 
 
@@ -251,7 +287,7 @@ def _row(policy: str, family: str, seed: int, **values: Any) -> dict[str, Any]:
     about = {
         "part": "base", "policy": policy, "family": family, "world": family, "robots": 3, "particles": 100,
         "oracle": "none", "preset": "standard", "comm_loss": None, "seed": seed, "digest": f"{seed:032x}",
-        "machine": machine_module.machine(), "refusals": {},
+        "policy_digest": None, "machine": machine_module.machine(), "refusals": {},
     }  # fmt: skip
     return about | dict.fromkeys(names, 0.5) | values
 
@@ -287,6 +323,8 @@ def test_policies_are_ordered_and_compared_with_the_first() -> None:
     assert main.rows[1][-1].startswith("0.38 (")  # 3 + 2 + 1 of 16 pairs are better, none is equal
     assert families.rows[1][1] == "25.0, 6.2 (6.2 .. 6.2)"
     assert "The rows of floor plans are left out" in markdown(plan, rows)
+    assert "`frontier` has 8 of 180 episodes" not in markdown(plan, rows)
+    assert "`frontier` has 8 of 150 episodes of the base part" in markdown(plan, rows)
     assert "The rows of floor plans" not in markdown(plan, [*rows, _row("frontier", FLOOR_PLANS, 0)])
 
 

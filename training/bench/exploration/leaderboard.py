@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from slam_backend.core.validation import argument_error
-from training.bench.exploration.plan import BASE_PART, Plan
-from training.bench.exploration.plan_report import markdown, read_episodes
+from training.bench.exploration.plan import Plan
+from training.bench.exploration.plan_report import incomplete, markdown, read_episodes
 from training.bench.exploration.report import label
 from training.bench.exploration.verification import equal_rows
 from training.experiments.run_folder import read_config
@@ -26,17 +26,12 @@ class Results:
     rows: Sequence[Mapping[str, Any]]  # A row per episode
     verified: Mapping[str, tuple[int, int]]  # Numbers of equal and different episodes by policy, see `equal_rows`
 
-    @property
-    def policies(self) -> list[str]:
-        """Labels of the policies with rows in the base part."""
-        return list(dict.fromkeys(row["policy"] for row in self.rows if row["part"] == BASE_PART))
-
 
 def read_results(folder: Path) -> Results:
     """Read the results in a run folder of a plan; `episodes.csv` may be compressed.
 
     Raises:
-        ValueError: If there are none, or the installed plan of that name has another hash.
+        ValueError: If there are none, they are incomplete, or the installed plan of that name has another hash.
     """
     values, _ = read_config(folder, "bench exploration", "folders")
     file = next((folder / name for name in EPISODES if (folder / name).is_file()), None)
@@ -49,12 +44,30 @@ def read_results(folder: Path) -> Results:
         raise argument_error("folders", f"results of plan {plan.digest}", values["plan_hash"], hint)
     content = file.read_bytes()
     text = (gzip.decompress(content) if file.suffix == ".gz" else content).decode()
-    return Results(plan, read_episodes(text), equal_rows(folder))
+    rows = read_episodes(text)
+    if values.get("quick") or (lacking := incomplete(plan, rows)):
+        got = "those of --quick" if values.get("quick") else f"a folder in which {lacking[0]}"
+        raise argument_error("folders", "complete results", got, f"Resume the run in {str(folder)!r}, without --quick.")
+    return Results(plan, rows, equal_rows(folder))
 
 
 def leaderboard(results: Sequence[Results]) -> str:
-    """Return the page: all tables, and which episodes were played again."""
-    plan, rows = results[0].plan, [row for each in results for row in each.rows]
+    """Return the page: all tables, and which episodes were played again.
+
+    A policy in several folders, such as the baseline, counts once, as in the first of them.
+
+    Raises:
+        ValueError: If two folders have different custom policies or models of the same label.
+    """
+    plan = results[0].plan
+    kept: dict[str, list[Mapping[str, Any]]] = {}
+    for each in results:
+        for (policy,), own in grouped(each.rows, ("policy",)).items():
+            sources = {row["policy_digest"] for row in (*kept.get(policy, []), *own)}
+            if len(sources) > 1:
+                raise argument_error("folders", "one policy for each label", policy, "Give one of them a LABEL=.")
+            kept.setdefault(policy, own)
+    rows = [row for own in kept.values() for row in own]
     verified = {policy: counts for each in results for policy, counts in each.verified.items()}
     episodes = {policy: len(own) for (policy,), own in grouped(rows, ("policy",)).items()}
     shown = [

@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from slam_backend.core.validation import FloatArray, argument_error
+from slam_backend.maps.alignment import REASONS
 from training.bench.exploration.aggregate import (
     by_family,
     iqm,
@@ -33,7 +34,17 @@ PROFILE_CM = (10.0, 20.0, 30.0, 40.0)
 THRESHOLDS = np.linspace(0.0, 0.75, 151)  # of E [m]
 CM = 100.0
 REFUSED = "refused: "  # columns of the number of refused merges by reason
-TEXTS = ("part", "policy", "family", "world", "oracle", "preset", "digest", "machine")  # columns of texts
+TEXTS = (
+    "part",
+    "policy",
+    "family",
+    "world",
+    "oracle",
+    "preset",
+    "digest",
+    "policy_digest",
+    "machine",
+)  # columns of texts
 
 
 class Section(NamedTuple):
@@ -64,9 +75,24 @@ def markdown(plan: Plan, rows: Rows) -> str:
     parts = [f"Plan {plan.name}, hash {plan.digest}. {E_SCALE}\n"]
     if plan.floor_plans and not any(row["family"] == FLOOR_PLANS for row in rows):
         parts.append("The rows of floor plans are left out: `VSLAM_DATA` does not contain them.\n")
+    parts += [f"Not a complete result: {text}.\n" for text in incomplete(plan, rows)]
     for section in sections(plan, rows):
         parts.append(f"### {section.title}\n\n{section.note}\n\n{markdown_table(section.headings, section.rows)}")
     return "\n".join(parts)
+
+
+def incomplete(plan: Plan, rows: Rows) -> list[str]:
+    """Return a text for each policy that lacks episodes of the base part; floor plans may be missing altogether."""
+    found = []
+    base = plan.all_parts()[BASE_PART]
+    own = [row for row in rows if row["part"] == BASE_PART]
+    has_plans = any(row["family"] == FLOOR_PLANS for row in own)
+    conditions = len(base.robots) * len(base.particles) * len(base.oracles) * base.seeds
+    wanted = conditions * sum(world != FLOOR_PLANS or has_plans for world in base.worlds)
+    for (policy,), played in grouped(own, ("policy",)).items():
+        if len(played) < wanted:
+            found.append(f"`{label(policy)}` has {len(played)} of {wanted} episodes of the base part")
+    return found
 
 
 def aggregate(plan: Plan, rows: Rows) -> list[dict[str, Any]]:
@@ -83,10 +109,9 @@ def aggregate(plan: Plan, rows: Rows) -> list[dict[str, Any]]:
 
 def tidy_rows(rows: Rows) -> list[dict[str, Any]]:
     """Return rows with a column for each reason of a refusal, and without curves."""
-    reasons = sorted({reason for row in rows for reason in row["refusals"]})
     return [
         {name: value for name, value in row.items() if name not in ("curves", "refusals")}
-        | {f"{REFUSED}{reason}": row["refusals"].get(reason, 0) for reason in reasons}
+        | {f"{REFUSED}{reason}": row["refusals"].get(reason, 0) for reason in REASONS}
         for row in rows
     ]
 

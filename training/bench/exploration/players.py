@@ -1,9 +1,13 @@
 """Policies of the exploration benchmark: of each robot, of the team, and bounds, by their names on the command line."""
 
+import hashlib
+from pathlib import Path
 from typing import NamedTuple
 
 from agents.bounds import BOUNDS, make_bound
-from agents.registry import action_types, make_policy, make_team_policy
+from agents.plugins import is_plugin, plugin_file
+from agents.registry import action_types, is_model, make_policy, make_team_policy
+from agents.trained import MODEL_FILE
 from slam_backend.core.validation import check_choice
 from training.episodes.guard import GuardedTeam
 from training.experiments.labels import parted_label
@@ -32,6 +36,16 @@ class Player(NamedTuple):
     def policy(self) -> str:
         """Name of a policy: that of the base policy for a bound."""
         return BASE if self.role == BOUND else self.name
+
+    def source_digest(self) -> str:
+        """Return 16 hexadecimal digits of SHA-256 over a custom policy's file or a model; empty for built-in ones."""
+        if is_model(self.policy):
+            file = Path(self.policy) / MODEL_FILE if Path(self.policy).is_dir() else Path(self.policy)
+        elif is_plugin(self.policy):
+            file = plugin_file(self.policy)
+        else:
+            return ""
+        return hashlib.sha256(file.read_bytes()).hexdigest()[:16]
 
     @property
     def needs_oracles(self) -> bool:

@@ -1,13 +1,16 @@
 """Trial of `vslam bench exploration`: an episode, and its metrics for the comparison of policies."""
 
+import json
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
-from slam_backend.core.validation import BoolArray, FloatArray
+from slam_backend.core.validation import BoolArray, FloatArray, argument_error
 from slam_backend.geometry import compose
 from slam_backend.metrics import MapErrorParts, map_error_parts
 from training.bench.exploration.machine import machine
@@ -55,7 +58,8 @@ def play(config: Bench, trial: Any) -> dict[str, Any]:
     - `decision_ms`, `decision_p99_ms`: median and 99th percentile of the processor time of a decision of the policy, of
       a team policy for all robots.
     - `curves`: `time_s` and the values of `CURVES` at these times.
-    - `digest`: see `episode_digest`; `machine`: what its last bits depend on.
+    - `digest`: see `episode_digest`; `policy_digest`: that of a custom policy's file or a model; `machine`: what last
+      bits depend on.
 
     If the policy fails, the trial is returned with the error as `failed`, and no metrics.
     """
@@ -98,8 +102,27 @@ def play(config: Bench, trial: Any) -> dict[str, Any]:
         "curves": {"time_s": points} | {
             name: values_at(record.times, line, points) for name, line in zip(CURVES, lines, strict=True)
         },
-        "digest": episode_digest(record), "machine": machine(),
+        "digest": episode_digest(record), "policy_digest": parted(trial.policy).source_digest(), "machine": machine(),
     }  # fmt: skip
+
+
+def check_same_policies(out: Path | None) -> None:
+    """Refuse to resume a folder whose episodes were played with another version of a custom policy or model.
+
+    Raises:
+        ValueError: If the file of a policy has changed since.
+    """
+    file = None if out is None else out / TRIALS_FILE
+    if file is None or not file.is_file():
+        return
+    now: dict[str, str] = {}
+    for line in file.read_text(encoding="utf-8").splitlines():
+        with suppress(json.JSONDecodeError, TypeError, KeyError):  # `finished_trials` reports damage
+            row = json.loads(line)
+            policy, before = row["policy"], row["policy_digest"]
+            if now.setdefault(policy, parted(policy).source_digest()) != before:
+                hint = "Choose another folder, or restore the file."
+                raise argument_error("out", f"episodes of {policy!r} as it is now", "episodes of another version", hint)
 
 
 def _first(reached: BoolArray) -> int:
