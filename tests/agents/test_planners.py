@@ -121,7 +121,7 @@ def _explored(num_robots: int, cycles: int, seed: int = 3) -> ExplorationEnv:
 
 def test_targets_of_a_team_are_the_robots_own() -> None:
     """Each target of a group is a candidate of some robot, moved exactly; a robot's lengths are its own."""
-    env = _explored(3, 6)
+    env = _explored(3, 4)
     beliefs = [env.belief(agent) for agent in env.agents]
     group = [belief for belief in beliefs if belief.group == beliefs[0].group]
     targets = team_targets(group, {})

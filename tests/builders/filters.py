@@ -106,7 +106,7 @@ def filter_after_some_steps(num_particles: int, seed: int) -> tuple[FastSlam, np
     looks = np.linalg.qr(rng.standard_normal((14, 14)))[0].astype(np.float32)
     for step in range(12):
         seen = rng.choice(14 if step > 4 else 8, 5, replace=False)
-        noisy = points[seen] + rng.normal(0.0, 0.02, (5, 3))
+        noisy = points[seen] + rng.normal(0.0, 0.004, (5, 3))
         slam.step([np.array([0.0, 0.0, 0.001])], [Measurements(noisy, looks[seen])])
     return slam, points, looks
 

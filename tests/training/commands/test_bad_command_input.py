@@ -32,6 +32,10 @@ BAD: dict[str, dict[str, str]] = {
         "none.npz --policies random_walk": "action_type: expected 'continuous' or 'discrete' for policy",
         "none.npz --workers 0": "workers: expected an int >= 1, got 0.",
     },
+    "bench leaderboard": {
+        "none": "folders: expected the config.toml of an earlier run, got no such file. Check 'none'.",
+        "full": "folders: expected the config.toml of an earlier run, got no such file. Check 'full",
+    },
     "warm-up": {"--workers 0": "workers: expected an int >= 1, got 0."},
     "replay mrclam": {
         "--path /nowhere": MRCLAM + ", got no such path. Check '/nowhere'; without --path it is ",

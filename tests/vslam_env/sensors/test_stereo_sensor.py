@@ -15,6 +15,7 @@ from slam_backend.frontend import FrontEndOptions, StereoFrontEnd
 from slam_backend.geometry import transform_points
 from slam_backend.models.camera import StereoCamera
 from vslam_env import ExplorationEnv
+from vslam_env.belief.belief import motion_without_smoother
 from vslam_env.presets import preset_config, stereo_belief
 from vslam_env.sensors.stereo.cameras import ImagingConfig, StereoRenderer
 from vslam_env.sensors.stereo.sensor import RenderedFrame, StereoSensor, StereoSensorConfig
@@ -170,7 +171,10 @@ def test_the_filter_assumes_the_camera_that_the_robot_has() -> None:
         assert getattr(assumed.camera, name) == getattr(eyes.camera, name)
     assert assumed.existence is not None
     assert assumed.existence.frame_limit == eyes.front_end.max_measurements
-    assert preset_config("hard", "stereo").belief.filter.motion == preset_config("hard").belief.filter.motion
+    odometry = preset_config("hard").belief.filter.motion
+    assert preset_config("hard", "stereo").belief.filter.motion == motion_without_smoother(odometry)
+    assert motion_without_smoother(odometry).sigma_along == odometry.sigma_along
+    assert motion_without_smoother(odometry).sigma_across > odometry.sigma_across  # there is no smoother
     assert preset_config("standard").belief.filter.existence is None
 
 

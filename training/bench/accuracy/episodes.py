@@ -108,6 +108,8 @@ def replay(episode: RecordedEpisode, options: FilterOptions) -> FilterTrack:
         contacts = None if tick[0].contacts is None else np.stack([own.contacts for own in tick])  # type: ignore[misc]
         report = team.step([own.odometry for own in tick], [own.measurements for own in tick], contacts)
         labels.record(report)
+        if tick is episode.readings[-1]:
+            team.rejuvenate()  # as environments do in the last step
         team.team_poses(points)
         paths.append(points.own.copy())
         covariances.append(points.covariances.copy())

@@ -92,7 +92,8 @@ class Plan(Checked):
         try:
             return cls(**tomllib.loads(file.read_text(encoding="utf-8")))
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise argument_error("plan", "a TOML file", str(file), f"The reader says: {error}.") from error
+            hint = f"Correct {str(file)!r}. The reader says: {error}."
+            raise argument_error("plan", "a TOML file", "a file with other content", hint) from error
         except ValueError as error:
             raise ValueError(f"plan {str(file)!r}: {error}") from error
 
