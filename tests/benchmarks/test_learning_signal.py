@@ -80,7 +80,7 @@ def test_spinning_and_idle_policies() -> None:
 
 
 def test_episode_records_have_rewards_and_errors() -> None:
-    """The record has the environment's rewards, and the errors between them; the last map is smoothed after its cost."""
+    """The record has the environment's rewards and the errors between them; the last map is smoothed after its cost."""
     weights = {"map_error": 1.0, "running_cost": 1.0}
     env = vslam_v0.parallel_env(world="fig5", num_robots=2, num_particles=5, max_cycles=12, reward=weights)
     paid, errors = learning_signal.play_ticks(env, learning_signal.PLAYERS["spin"], 0)
