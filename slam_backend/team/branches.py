@@ -19,9 +19,9 @@ from slam_backend.fastslam.step_input import InputBuffer, RobotRows, StepInput, 
 from slam_backend.team.merge_monitor import MergeMonitor
 
 MAX_REPLAYED = 20  # buffered steps that a filter replays per tick
-TURNS = (
-    4  # each robot's filter may smooth in one of this many steps, robots of a joint filter in turn; large graphs once
-)
+# Each robot's filter may smooth in one of this many steps; a joint filter in the turns of all its robots, unless its
+# graph is large.
+TURNS = 4
 
 
 @dataclass(slots=True, eq=False)

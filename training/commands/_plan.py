@@ -75,8 +75,7 @@ def run_plan(call: Call[ExplorationBenchConfig], name: str | None, workers: int,
         text = f"{EPISODES_PARQUET} is not written: it needs pip install 'vslam-env[parquet]'."
         console.print(text, soft_wrap=True, markup=False)
     folder.write_text("tables.md", markdown(plan, rows))
-    if rows:
-        draw_plan(folder.path / "plan.png", rows)
+    draw_plan(folder.path / "plan.png", rows)
     call.finish()
     if part.failures:
         raise typer.Exit(2)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from slam_backend.core.validation import FloatArray, argument_error
@@ -165,31 +166,40 @@ def write_parquet(file: Path, rows: Rows) -> bool:
 
 
 def draw_plan(file: Path, rows: Rows) -> None:
-    """Draw profiles of E in the base part, and E over team sizes and particles, into a PNG file."""
-    base, sizes = ([row for row in rows if row["part"] == part] for part in (BASE_PART, TEAM_SIZE))
-    figure = Figure(figsize=(11.0, 4.0), layout="constrained")
-    left, right = figure.subplots(1, 2)
+    """Draw profiles of E in the base part, and E over team sizes and particles, as far as played, into a PNG file."""
+    parts = {BASE_PART: _draw_profiles, TEAM_SIZE: _draw_team_sizes}
+    played = [(draw, own) for part, draw in parts.items() if (own := [row for row in rows if row["part"] == part])]
+    if not played:
+        return
+    figure = Figure(figsize=(5.5 * len(played), 4.0), layout="constrained")
+    for panel, (draw, own) in zip(figure.subplots(1, len(played), squeeze=False)[0], played, strict=True):
+        draw(panel, own)
+        panel.legend(fontsize=7, frameon=False)
+        panel.grid(alpha=0.2)
+        panel.spines[["top", "right"]].set_visible(False)
+    save_png(figure, file, 110)
+
+
+def _draw_profiles(panel: Axes, base: Rows) -> None:
+    """Draw the share of worlds below each map error, a line per policy."""
     for i, policy in enumerate(dict.fromkeys(row["policy"] for row in base)):
         worlds = [-own for own in by_family(_values(base, policy, "map_error"))]
         style = STYLES[i // len(COLOURS) % len(STYLES)]
         share = performance_profile(worlds, -THRESHOLDS)
-        left.plot(THRESHOLDS, share, style, color=COLOURS[i % len(COLOURS)], label=label(policy), linewidth=1.3)
-    left.set(xlabel="map error E [m]", ylabel="share of worlds with a smaller error", title="base part")
-    if base:
-        left.legend(fontsize=7, frameon=False)
+        panel.plot(THRESHOLDS, share, style, color=COLOURS[i % len(COLOURS)], label=label(policy), linewidth=1.3)
+    panel.set(xlabel="map error E [m]", ylabel="share of worlds with a smaller error", title="base part")
+
+
+def _draw_team_sizes(panel: Axes, sizes: Rows) -> None:
+    """Draw E over the number of robots, a line per number of particles."""
     for i, ((particles,), own) in enumerate(sorted(grouped(sizes, ("particles",)).items())):
         teams = sorted(grouped(own, ("robots",)).items())
         middle, low, high = np.array([_ci(each, "map_error") for _, each in teams]).T
-        robots = [count for (count,), _ in teams]
-        right.plot(robots, middle, "o-", color=COLOURS[i % len(COLOURS)], label=f"{particles} particles", markersize=3)
-        right.fill_between(robots, low, high, color=COLOURS[i % len(COLOURS)], alpha=0.12, linewidth=0)
-    right.set(xlabel="robots", ylabel="map error E [m]", title="team size and particles")
-    if sizes:
-        right.legend(fontsize=8, frameon=False)
-    for panel in (left, right):
-        panel.grid(alpha=0.2)
-        panel.spines[["top", "right"]].set_visible(False)
-    save_png(figure, file, 110)
+        robots, colour = [count for (count,), _ in teams], COLOURS[i % len(COLOURS)]
+        panel.plot(robots, middle, "o-", color=colour, label=f"{particles} particles", markersize=3)
+        panel.fill_between(robots, low, high, color=colour, alpha=0.12, linewidth=0)
+    panel.set(xlabel="robots", ylabel="map error E [m]", title="team size and particles")
+    panel.set_xticks(sorted({row["robots"] for row in sizes}))
 
 
 # ------------------------------------------------------------------ tables
