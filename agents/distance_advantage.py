@@ -8,18 +8,23 @@ the other frontiers with the weight `REMOTENESS`.
 import numpy as np
 
 from agents.targets import Targets
-from slam_backend.core.validation import IntArray
+from slam_backend.core.validation import FloatArray, IntArray
 
 REMOTENESS = 0.5  # weight of the mean path length to the other frontiers
 
 
 def distance_advantage(targets: Targets, rng: np.random.Generator) -> IntArray:
     """Return the target (K,) of each robot."""
-    n = len(targets.places)
-    remoteness = targets.between.sum(axis=1) / max(1, n - 1)
     assigned = np.zeros(len(targets.lengths), np.int64)
-    for robot, ways in enumerate(targets.lengths[: targets.num_deciding]):
-        own = targets.share(robot)
+    for robot in range(targets.num_deciding):
+        own, costs = advantage_costs(targets, robot)
         if len(own):
-            assigned[robot] = own[np.argmin(ways[own] - REMOTENESS * remoteness[own])]
+            assigned[robot] = own[np.argmin(costs)]
     return assigned
+
+
+def advantage_costs(targets: Targets, robot: int) -> tuple[IntArray, FloatArray]:
+    """Return the targets (m,) int64 left to a robot, and the cost of each (m,) float64 [m]."""
+    own = targets.share(robot)
+    remoteness = targets.between.sum(axis=1) / max(1, len(targets.places) - 1)
+    return own, targets.lengths[robot, own] - REMOTENESS * remoteness[own]

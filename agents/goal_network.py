@@ -1,4 +1,10 @@
-"""Network of trained policies in numpy: its inputs, their scales and the action logits."""
+"""Network of trained policies in numpy: its inputs, their scales and the action logits.
+
+A robot, its candidates and its teammates are tokens. Layers of attention (Vaswani et al., "Attention is all you need",
+NeurIPS 2017, with normalisation before each part) relate them; a pointer (Vinyals, Fortunato and Jaitly, "Pointer
+networks", NeurIPS 2015) from the robot's token to the candidates gives the logits. Empty slots and absent teammates are
+left out, so that the time depends on what there is.
+"""
 
 from collections.abc import Mapping
 from typing import Any
@@ -6,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.core.validation import Float32Array
+from slam_backend.core.validation import BoolArray, Float32Array, IntArray
 from vslam_env.navigation import CANDIDATE_FEATURES, NUM_CANDIDATES
 
 Weights = Mapping[str, Float32Array]
@@ -29,8 +35,6 @@ VECTORS: dict[str, tuple[float, ...]] = {
     "pose_std": (2.0, 2.0, 10.0),
     "map_stats": (0.01, 5.0, 5.0, 0.1, 1.0, 0.25),
     "scan": (0.125,),
-    "teammates": (0.1, 0.1, 1.0, 1.0, 2.0),
-    "teammates_mask": (1.0,),
     "landmark_counts": (0.02,),
     "time_left": (0.01,),
 }
@@ -47,43 +51,91 @@ FEATURE_SCALES: dict[str, float] = {
     "nearest_candidate": 0.1,
 }  # 1 for the others
 CANDIDATE_SCALE = tuple(FEATURE_SCALES.get(name, 1.0) for name in CANDIDATE_FEATURES)
+TEAMMATE_SCALE = (0.1, 0.1, 1.0, 1.0, 2.0)
 GRID_SCALE = 1.0 / 255.0
 PATCHES = (4, 3)  # sides of the non-overlapping patches of each convolution
 CHANNELS = (16, 32)
-CONTEXT = 64  # width of all other layers
+WIDTH = 64  # of a token
+NUM_HEADS = 4
+NUM_LAYERS = 2
+FEED_WIDTH = 128  # of the hidden layer behind each attention
+EPSILON = 1e-5  # added to variances by the normalisation
+INVALID = -1e8  # logit of an invalid action
 VECTOR_SIZE = sum(int(np.prod(SHAPES[name])) for name in VECTORS)
 PICTURE_SIZE = CHANNELS[1] * (48 // (PATCHES[0] * PATCHES[1])) ** 2
 
 
 def logits(weights: Weights, observations: Mapping[str, NDArray[Any]]) -> Float32Array:
-    """Return the logit of each action, (n, 1 + C) float32, for valid and invalid actions.
+    """Return the logit of each action, (n, 1 + C) float32; `INVALID` for invalid ones.
 
-    A convolution of the local grid and the vectors give a context. One small network with shared weights scores each
-    candidate from this context and the candidate's features, so that the result does not depend on the slot.
+    The result does not depend on the slots of the candidates, nor on the order of the teammates.
 
     Args:
         weights: Weights by the layer names of the learner.
         observations: (n, ...) arrays by name, as the environment returns them.
     """
     picture = observations["local_grid"] * np.float32(GRID_SCALE)
+    n = len(picture)
     for layer, patch in enumerate(PATCHES):
         picture = np.maximum(_convolve(picture, weights, f"picture.{2 * layer}", patch), 0.0)
-    seen = np.maximum(_linear(weights, "picture_out", picture.reshape(len(picture), -1)), 0.0)
-    vectors = [
-        (observations[name] * np.array(scale, np.float32)).reshape(len(picture), -1) for name, scale in VECTORS.items()
-    ]
-    context = np.tanh(_linear(weights, "context", np.concatenate([seen, *vectors], axis=1)))
-    candidates = observations["candidates"] * np.array(CANDIDATE_SCALE, np.float32)
-    beside = _linear(weights, "slot", candidates) + _linear(weights, "slot_context", context)[:, None]
-    hidden = np.tanh(_linear(weights, "slot_hidden", np.tanh(beside)))
-    scores = _linear(weights, "slot_score", hidden)[..., 0]
-    stay = _linear(weights, "stay_score", context)
-    return np.concatenate([stay, scores], axis=1).astype(np.float32)
+    vectors = [(observations[name] * np.array(scale, np.float32)).reshape(n, -1) for name, scale in VECTORS.items()]
+    robot = _linear(weights, "robot", np.concatenate([picture.reshape(n, -1), *vectors], axis=1))
+    is_valid, is_mate = observations["action_mask"][:, 1:] != 0, observations["teammates_mask"] != 0
+    present = np.concatenate([np.ones((n, 1), np.bool_), is_valid, is_mate], axis=1)
+    slots = _linear(weights, "candidate", observations["candidates"] * np.array(CANDIDATE_SCALE, np.float32))
+    mates = _linear(weights, "teammate", observations["teammates"] * np.array(TEAMMATE_SCALE, np.float32))
+    tokens = np.concatenate([robot[:, None], slots, mates], axis=1)[present]
+    row, place = np.nonzero(present)[0], (present.cumsum(axis=1) - 1)[present]
+    size = int(present.sum(axis=1).max())
+    absent = np.arange(size) >= present.sum(axis=1, keepdims=True)
+    for layer in range(NUM_LAYERS):
+        tokens = tokens + _attention(weights, f"layers.{layer}", tokens, row, place, absent)
+        hidden = _linear(weights, f"layers.{layer}.feed_in", _normalised(weights, f"layers.{layer}.feed_norm", tokens))
+        tokens = tokens + _linear(weights, f"layers.{layer}.feed_out", np.maximum(hidden, 0.0))
+    final = np.zeros((n, present.shape[1], WIDTH), np.float32)
+    final[present] = _normalised(weights, "last_norm", tokens)
+    queries, keys = _linear(weights, "query", final[:, 0]), _linear(weights, "key", final[:, 1 : 1 + NUM_CANDIDATES])
+    scores = (keys @ queries[:, :, None])[..., 0] / np.float32(np.sqrt(WIDTH))
+    stay = _linear(weights, "stay", final[:, 0])
+    return np.concatenate([stay, np.where(is_valid, scores, np.float32(INVALID))], axis=1).astype(np.float32)
+
+
+def _attention(
+    weights: Weights, name: str, tokens: NDArray[Any], row: IntArray, place: IntArray, absent: BoolArray
+) -> NDArray[Any]:
+    """Attend within each observation.
+
+    Args:
+        weights: Weights by layer name.
+        name: Name of the layer.
+        tokens: (p, WIDTH) float32. Tokens of all observations.
+        row: (p,) int64. Observation of each token.
+        place: (p,) int64. Number of each token within its observation.
+        absent: (n, m) bool. Places without a token.
+    """
+    n, size = absent.shape
+    parts = np.zeros((n, size, 3, NUM_HEADS, WIDTH // NUM_HEADS), np.float32)
+    mixed = _linear(weights, f"{name}.query_key_value", _normalised(weights, f"{name}.norm", tokens))
+    parts[row, place] = mixed.reshape(-1, *parts.shape[2:])
+    query, key, value = parts.transpose(2, 0, 3, 1, 4)
+    scores = query @ key.swapaxes(-1, -2) / np.float32(np.sqrt(WIDTH // NUM_HEADS))
+    scores = np.where(absent[:, None, None], np.float32(INVALID), scores)
+    shares = np.exp(scores - scores.max(axis=-1, keepdims=True))
+    seen = (shares / shares.sum(axis=-1, keepdims=True)) @ value
+    return _linear(weights, f"{name}.out", seen.swapaxes(1, 2).reshape(n, size, WIDTH)[row, place])
+
+
+def _normalised(weights: Weights, name: str, tokens: NDArray[Any]) -> NDArray[Any]:
+    """Scale tokens to mean 0 and variance 1, and then by the weights."""
+    centred = tokens - tokens.mean(axis=-1, keepdims=True)
+    scaled = centred / np.sqrt((centred**2).mean(axis=-1, keepdims=True) + np.float32(EPSILON))
+    normalised: NDArray[Any] = scaled * weights[f"{name}.weight"] + weights[f"{name}.bias"]
+    return normalised
 
 
 def _linear(weights: Weights, name: str, rows: NDArray[Any]) -> NDArray[Any]:
     product: NDArray[Any] = rows @ weights[f"{name}.weight"].T
-    return product + weights[f"{name}.bias"] if f"{name}.bias" in weights else product
+    return product + weights[f"{name}.bias"]
 
 
 def _convolve(picture: NDArray[Any], weights: Weights, name: str, patch: int) -> NDArray[Any]:

@@ -20,7 +20,7 @@ walls beside the path have their looks without a stop.
 
 import numpy as np
 
-from agents.distance_advantage import distance_advantage
+from agents.distance_advantage import advantage_costs
 from agents.targets import own_targets
 from slam_backend.core.validation import BoolArray, FloatArray
 from vslam_env.belief.team_belief import Belief
@@ -30,6 +30,8 @@ LANDMARK_VALUE = 0.6  # [m] of unseen wall that a weak landmark is worth
 STOP = 3.0  # [m] path that takes as long as the turn to a view and the look
 PATH_POWER = 0.8  # exponent of the path's length: below 1, far views of much come before near views of little
 HOLD = 1.5  # factor for the value of the current goal
+PATH_SPREAD = 2.0  # [m] by which one frontier must cost more than another to be e times less preferred
+VIEW_SHARPNESS = 4.0  # power of the rates of views that gives preferences
 
 
 class NextBestView:
@@ -44,32 +46,61 @@ class NextBestView:
 
     def choose(self, belief: Belief, rng: np.random.Generator) -> int | None:
         """Return the slot to go to, or None if there is nothing left to see."""
-        candidates = belief.candidates
-        can_reach = candidates.valid & (candidates.lengths < belief.seconds_left)
-        frontier, is_own = None, False
-        if (can_reach & (candidates.kinds == CandidateKind.FRONTIER)).any():
-            targets = own_targets(belief, self._held)
-            assert targets is not None  # there is a frontier
-            frontier = int(targets.slots[0, distance_advantage(targets, rng)[0]])
-            is_own = bool((targets.lengths.argmin(axis=0) == 0).any())
-        if not is_own:
-            self._held = self._view(belief, can_reach)
-        if is_own or self._held is None:
-            self._held = frontier
-        if self._held is None:
-            is_meeting = can_reach & (candidates.kinds == CandidateKind.RENDEZVOUS)
-            self._held = _best(1.0 / (1.0 + candidates.lengths), is_meeting)
+        self._held, _ = decide(belief, self._held)
         return self._held
 
-    def _view(self, belief: Belief, can_reach: BoolArray) -> int | None:
-        """Return the slot of the best view: of those left to this robot, of those no teammate goes to, or of all."""
-        candidates, rates = belief.candidates, view_rates(belief, self._held)
-        is_nearest = candidates.lengths <= candidates.teammate_lengths.min(axis=1, initial=np.inf)
-        for allowed in (is_nearest & ~candidates.teammate_goal, ~candidates.teammate_goal, can_reach):
-            best = _best(rates, can_reach & allowed)
-            if best is not None:
-                return best
-        return None
+
+def decide(belief: Belief, held: int | None) -> tuple[int | None, FloatArray]:
+    """Return the slot to go to, and how much each action is preferred.
+
+    Args:
+        belief: Belief of the robot.
+        held: Slot of its previous goal.
+
+    Returns:
+        The slot, or None to stay; and (1 + C,) float64 logarithms of preferences, for staying and for the slots, up to
+        a constant: -inf for actions that are not considered. The slot has the highest one.
+    """
+    candidates = belief.candidates
+    can_reach = candidates.valid & (candidates.lengths < belief.seconds_left)
+    preferences = np.full(1 + len(can_reach), -np.inf)
+    frontiers, costs, is_own = np.empty(0, np.int64), np.empty(0), False
+    if (can_reach & (candidates.kinds == CandidateKind.FRONTIER)).any():
+        targets = own_targets(belief, held)
+        assert targets is not None  # there is a frontier
+        own, costs = advantage_costs(targets, 0)
+        frontiers = targets.slots[0, own]
+        is_own = bool((targets.lengths.argmin(axis=0) == 0).any())
+    if not is_own:
+        rates, allowed = view_rates(belief, held), _left_views(belief, can_reach)
+        values = np.where(allowed, rates, 0.0)
+        if (slot := _best(values)) is not None:
+            preferences[1:] = VIEW_SHARPNESS * np.log(values, out=np.full(len(values), -np.inf), where=values > 0.0)
+            return slot, preferences
+    if len(frontiers):
+        preferences[1 + frontiers] = -costs / PATH_SPREAD
+        return int(frontiers[np.argmin(costs)]), preferences
+    meetings = np.where(
+        can_reach & (candidates.kinds == CandidateKind.RENDEZVOUS), 1.0 / (1.0 + candidates.lengths), 0.0
+    )
+    slot = _best(meetings)
+    if slot is None:
+        preferences[0] = 0.0
+    else:
+        is_meeting = meetings > 0.0
+        preferences[1:][is_meeting] = -candidates.lengths[is_meeting] / PATH_SPREAD
+    return slot, preferences
+
+
+def _left_views(belief: Belief, can_reach: BoolArray) -> BoolArray:
+    """Return the views (C,) left to this robot; if there are none, those no teammate goes to, or else all."""
+    candidates = belief.candidates
+    is_view = can_reach & (view_rates(belief) > 0.0)
+    is_nearest = candidates.lengths <= candidates.teammate_lengths.min(axis=1, initial=np.inf)
+    for allowed in (is_nearest & ~candidates.teammate_goal, ~candidates.teammate_goal):
+        if (is_view & allowed).any():
+            return is_view & allowed
+    return is_view
 
 
 def view_rates(belief: Belief, held: int | None = None) -> FloatArray:
@@ -88,7 +119,6 @@ def view_rates(belief: Belief, held: int | None = None) -> FloatArray:
     return np.asarray(np.where(is_view, values / (STOP + lengths) ** PATH_POWER, 0.0))
 
 
-def _best(values: FloatArray, allowed: BoolArray) -> int | None:
-    """Return the index of the largest value > 0 among the allowed ones, or None."""
-    masked = np.where(allowed, values, 0.0)
-    return int(masked.argmax()) if masked.max(initial=0.0) > 0.0 else None
+def _best(values: FloatArray) -> int | None:
+    """Return the index of the largest value > 0, or None."""
+    return int(values.argmax()) if values.max(initial=0.0) > 0.0 else None

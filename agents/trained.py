@@ -16,7 +16,7 @@ from slam_backend.core.files import write_file
 from slam_backend.core.validation import argument_error
 from vslam_env.belief.team_belief import Belief
 
-FORMAT = 2  # incremented when the network or the meaning of observations changes
+FORMAT = 3  # incremented when the network or the meaning of observations changes
 SUFFIX = ".npz"
 MODEL_FILE = "model" + SUFFIX
 ABOUT = "about"

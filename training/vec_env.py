@@ -18,16 +18,17 @@ from vslam_env.reward import RewardSpec
 
 
 def make_vec_env(
-    config: EnvConfig,
+    config: EnvConfig | Sequence[EnvConfig],
     num_envs: int,
     workers: int = 0,
     seed: int | None = None,
     render_mode: str | None = None,
     reward: RewardSpec | None = None,
 ) -> "ExplorationVecEnv":
-    """Make environments of one configuration.
+    """Make environments of one configuration, or of several.
 
     Args:
+        config: Configuration, or several that alternate, e.g. with worlds of different families.
         num_envs: Number of environments E; there are E x K slots.
         workers: Number of worker processes; 0: this process. Results do not depend on it. A script that uses workers
             needs the guard `if __name__ == "__main__":`, because each worker imports it.
@@ -39,11 +40,15 @@ def make_vec_env(
         ValueError: If a number is out of range.
     """
     check_int("num_envs", num_envs, 1, "Use at least one environment.")
-    make = partial(vslam_v0.parallel_env, config=config, render_mode=render_mode, reward=reward)
-    load = partial(load_kernels, config)
+    configs = [config] if isinstance(config, EnvConfig) else list(config)
+    if not configs:
+        raise argument_error("config", "at least one configuration", configs, "Give an EnvConfig.")
+    make = partial(vslam_v0.parallel_env, render_mode=render_mode, reward=reward)
+    makers = [partial(make, config=configs[i % len(configs)]) for i in range(num_envs)]
+    load = partial(load_kernels, configs[0])
     if workers > 0:
         prepare(load)  # compiles once, with a message; workers then load from the cache
-    env = ExplorationVecEnv([make] * num_envs, workers, load)
+    env = ExplorationVecEnv(makers, workers, load)
     if seed is not None:
         env.seed(seed)
     return env

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from agents.goal_choice import Planner
-from agents.next_best_view import NextBestView, view_rates
+from agents.next_best_view import PATH_SPREAD, NextBestView, decide, view_rates
 from agents.rendezvous import INTERVAL, Rendezvous
 from tests.agents.test_policies import ROOM
 from vslam_env import vslam_v0
@@ -78,6 +78,23 @@ def test_views_are_worth_what_they_show_for_the_path() -> None:
     assert rates[17] == pytest.approx(2.0 * rates[16])
     assert rates[0] == 0.0
     assert view_rates(_belief(slots), 16)[16] == pytest.approx(1.5 * rates[16])
+
+
+def test_preferences_follow_the_choice() -> None:
+    """Only candidates of the kind that is due are preferred, by their costs; the choice has the highest preference."""
+    frontiers = {3: (FRONTIER, 4.0, 0.0), 5: (FRONTIER, 7.0, 0.0), 20: (REVISIT, 1.0, 3.0), 29: (MEETING, 0.5, 0.0)}
+    slot, preferences = decide(_belief(frontiers), None)
+    assert (slot, np.flatnonzero(np.isfinite(preferences)).tolist()) == (3, [4, 6])
+    assert preferences[4] - preferences[6] == pytest.approx(3.0 / PATH_SPREAD)
+    assert decide(_belief(frontiers), 5)[0] == 5  # kept, since its path counts half
+    views = {20: (REVISIT, 2.0, 3.0), 21: (REVISIT, 2.0, 1.0), 29: (MEETING, 0.5, 0.0)}
+    slot, preferences = decide(_belief(views), None)
+    assert (slot, np.flatnonzero(np.isfinite(preferences)).tolist()) == (20, [21, 22])
+    assert preferences[21] > preferences[22]
+    slot, preferences = decide(_belief({29: (MEETING, 0.5, 0.0)}), None)
+    assert (slot, np.flatnonzero(np.isfinite(preferences)).tolist()) == (29, [30])
+    slot, preferences = decide(_belief({}), None)
+    assert (slot, np.flatnonzero(np.isfinite(preferences)).tolist()) == (None, [0])
 
 
 def test_views_are_left_to_teammates_and_to_time() -> None:

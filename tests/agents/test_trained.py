@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,19 @@ import numpy as np
 import pytest
 
 from agents import make_policy
-from agents.goal_network import CHANNELS, CONTEXT, PATCHES, PICTURE_SIZE, SHAPES, VECTOR_SIZE, logits
+from agents.goal_network import (
+    CHANNELS,
+    FEED_WIDTH,
+    INVALID,
+    NUM_LAYERS,
+    PATCHES,
+    PICTURE_SIZE,
+    SHAPES,
+    TEAMMATE_SCALE,
+    VECTOR_SIZE,
+    WIDTH,
+    logits,
+)
 from agents.trained import FORMAT, TrainedGoalPolicy, check_observation, load_model, save_model
 from vslam_env import CANDIDATE_FEATURES, NUM_CANDIDATES, vslam_v0
 from vslam_env.belief.observation import observation_space
@@ -24,18 +37,26 @@ def _weights(seed: int = 0) -> dict[str, Any]:
     shapes = {
         "picture.0": (CHANNELS[0], 3, PATCHES[0], PATCHES[0]),
         "picture.2": (CHANNELS[1], CHANNELS[0], PATCHES[1], PATCHES[1]),
-        "picture_out": (CONTEXT, PICTURE_SIZE),
-        "context": (CONTEXT, CONTEXT + VECTOR_SIZE),
-        "slot": (CONTEXT, len(CANDIDATE_FEATURES)),
-        "slot_hidden": (CONTEXT, CONTEXT),
-        "slot_score": (1, CONTEXT),
-        "stay_score": (1, CONTEXT),
+        "robot": (WIDTH, PICTURE_SIZE + VECTOR_SIZE),
+        "candidate": (WIDTH, len(CANDIDATE_FEATURES)),
+        "teammate": (WIDTH, len(TEAMMATE_SCALE)),
+        "query": (WIDTH, WIDTH),
+        "key": (WIDTH, WIDTH),
+        "stay": (1, WIDTH),
     }
+    norms = ["last_norm"]
+    for layer in range(NUM_LAYERS):
+        name = f"layers.{layer}"
+        shapes |= {f"{name}.query_key_value": (3 * WIDTH, WIDTH), f"{name}.out": (WIDTH, WIDTH)}
+        shapes |= {f"{name}.feed_in": (FEED_WIDTH, WIDTH), f"{name}.feed_out": (WIDTH, FEED_WIDTH)}
+        norms += [f"{name}.norm", f"{name}.feed_norm"]
     weights = {}
     for name, shape in shapes.items():
         weights[f"{name}.weight"] = (rng.standard_normal(shape) / np.sqrt(np.prod(shape[1:]))).astype(np.float32)
-        weights[f"{name}.bias"] = rng.standard_normal(shape[0]).astype(np.float32)
-    weights["slot_context.weight"] = (0.1 * rng.standard_normal((CONTEXT, CONTEXT))).astype(np.float32)
+        weights[f"{name}.bias"] = (0.1 * rng.standard_normal(shape[0])).astype(np.float32)
+    for name in norms:
+        weights[f"{name}.weight"] = rng.uniform(0.5, 1.5, WIDTH).astype(np.float32)
+        weights[f"{name}.bias"] = (0.1 * rng.standard_normal(WIDTH)).astype(np.float32)
     return weights
 
 
@@ -43,6 +64,8 @@ def _observation(seed: int = 0) -> dict[str, Any]:
     SPACE.seed(seed)
     observation = SPACE.sample()
     observation["candidates"] = np.random.default_rng(seed).uniform(-5.0, 5.0, SHAPES["candidates"]).astype(np.float32)
+    observation["teammates"] = np.random.default_rng(seed).uniform(-3.0, 3.0, SHAPES["teammates"]).astype(np.float32)
+    observation["teammates_mask"][:] = [1, 0, 1, 0, 0, 1, 0]
     observation["landmark_counts"], observation["time_left"] = np.arange(5.0, dtype=np.float32), np.float32([30.0])
     observation["map_stats"] = np.array([40.0, 0.1, 0.3, 8.0, 0.5, 2.0], np.float32)
     observation["action_mask"][:] = [1, *([1, 0, 1, 1] * (NUM_CANDIDATES // 4))]
@@ -50,13 +73,47 @@ def _observation(seed: int = 0) -> dict[str, Any]:
 
 
 def test_logits_do_not_depend_on_slots() -> None:
-    """Permuting candidates permutes their logits, and keeps the logit of staying."""
-    observation, order = _observation(), np.random.default_rng(5).permutation(NUM_CANDIDATES)
-    moved = observation | {"candidates": observation["candidates"][order]}
+    """Permuting candidates permutes their logits, and keeps the logit of staying; teammates may stand in any row."""
+    observation, rng = _observation(), np.random.default_rng(5)
+    order, mates = rng.permutation(NUM_CANDIDATES), rng.permutation(7)
+    moved = observation | {
+        "candidates": observation["candidates"][order],
+        "action_mask": observation["action_mask"][np.concatenate([[0], 1 + order])],
+        "teammates": observation["teammates"][mates], "teammates_mask": observation["teammates_mask"][mates],
+    }  # fmt: skip
     before, after = (logits(_weights(), {k: v[None] for k, v in o.items()})[0] for o in (observation, moved))
     np.testing.assert_allclose(after[1:], before[1:][order], atol=1e-5)
     assert after[0] == pytest.approx(before[0], abs=1e-5)
-    assert np.ptp(before) > 0.1
+    assert np.ptp(before[observation["action_mask"] != 0]) > 0.1
+
+
+def test_candidates_and_teammates_are_seen_together() -> None:
+    """The logit of a candidate depends on the others and on teammates; empty rows have no effect."""
+    observation, weights = _observation(), _weights()
+    kept = observation["action_mask"][1:] != 0
+    before = logits(weights, {k: v[None] for k, v in observation.items()})[0]
+    assert (before[1:][~kept] == np.float32(INVALID)).all()
+    for name, row, is_seen in (
+        ("candidates", 0, True), ("candidates", 1, False), ("teammates", 0, True), ("teammates", 1, False),
+    ):  # fmt: skip
+        other = observation[name].copy()
+        other[row] += 1.0
+        after = logits(weights, {k: v[None] for k, v in (observation | {name: other}).items()})[0]
+        assert (abs(after[3] - before[3]) > 1e-4) == is_seen
+
+
+def test_decisions_are_fast_and_models_small(tmp_path: Path) -> None:
+    """A decision takes less than 5 ms, the best of several, with all slots full; a model has less than 1 MB."""
+    weights, observation = _weights(), _observation()
+    observation["action_mask"][:], observation["teammates_mask"][:] = 1, 1
+    policy, rng, times = TrainedGoalPolicy(weights), np.random.default_rng(0), []
+    belief: Any = None  # only the observation matters
+    for _ in range(20):
+        begin = time.process_time()
+        policy.act(observation, belief, rng)
+        times.append(time.process_time() - begin)
+    assert min(times) < 5e-3
+    assert _saved(tmp_path / "model.npz").stat().st_size < 1_000_000
 
 
 def test_batched_observations_are_independent() -> None:
@@ -147,12 +204,12 @@ def test_damaged_models_are_refused(tmp_path: Path) -> None:
         load_model(file)
     with np.load(_saved(tmp_path / "b.npz"), allow_pickle=False) as content:
         arrays = {name: content[name] for name in content.files}
-    np.savez(file, **arrays | {"slot.bias": arrays["slot.bias"] + 1.0})
+    np.savez(file, **arrays | {"stay.bias": arrays["stay.bias"] + 1.0})
     with pytest.raises(ValueError, match=r"model: .* got a broken file. .* was changed"):
         load_model(file)
     about = json.loads(str(arrays["about"])) | {"format": FORMAT + 1, "version": "9.9"}
     np.savez(file, **arrays | {"about": np.array(json.dumps(about))})
-    with pytest.raises(ValueError, match=r"expected one of format 2, got a model of format 3. .* wrote it, 9.9"):
+    with pytest.raises(ValueError, match=r"expected one of format 3, got a model of format 4. .* wrote it, 9.9"):
         load_model(file)
 
 

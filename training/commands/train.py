@@ -1,6 +1,7 @@
-"""Command `vslam train`: training of one goal-selection network for all robots; curves, checkpoints, model."""
+"""Command `vslam train`: training of one goal-selection network by PPO or imitation; curves, checkpoints, model."""
 
 import os
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -15,6 +16,7 @@ from training.rl.config import SPLIT_TRAIN, TrainConfig, require_extra
 
 if TYPE_CHECKING:  # numerical modules are imported when the command runs, so that --help is fast
     from training.rl.callbacks import Row
+    from training.rl.imitation.imitation import Imitation
     from training.rl.trainer import Training
 
 
@@ -35,10 +37,13 @@ def train(
 ) -> None:
     """Train one network for all robots by PPO with masked goal actions; use it with vslam run --policy FOLDER.
 
+    --preset imitate clones a planner instead: it labels decisions, in later
+    rounds those of the pupil. --steps counts decisions; every second is a label.
+
     A config.toml sets all other values. Its gamma is the discount per decision:
     the discount per tick, at least 0.999, to the power of decision_ticks.
 
-    Ctrl-C stops after the current rollout and saves; a second Ctrl-C stops at
+    Ctrl-C stops after the current rollout, file of labels or epoch, and saves; a second Ctrl-C stops at
     once. --resume FOLDER continues from the last checkpoint and gives the same
     weights as an uninterrupted training, even if the process was killed.
     """
@@ -69,12 +74,21 @@ def train(
     else:
         prepare()
         call.folder = RunFolder(resume, call.command, chosen.to_mapping(), chosen.seed, installed_versions())
-    training = Training(chosen, call.folder.path, crew, device)
+    kind: Any = Training
+    if chosen.teacher is not None:
+        from training.rl.imitation.imitation import Imitation
+
+        kind = Imitation
+    training = kind(chosen, call.folder.path, crew, device)
     try:
         if resume is not None:
             training.restore(kept)
-        complete, seconds = _run_live(call.console, training)
-        _finish(call, training, complete, seconds)
+        if chosen.teacher is None:
+            complete, seconds = _run_live(call.console, training)
+            _finish(call, training, complete, seconds)
+        else:
+            complete, seconds = _imitate_live(call.console, training)
+            _finish_imitation(call, training, complete, seconds)
     except KeyboardInterrupt:
         _print_resume_command(call.console, call.folder.path)
         raise
@@ -129,6 +143,76 @@ def _run_live(console: Console, training: "Training") -> tuple[bool, float]:
     if not complete:
         console.print("Stopped; the checkpoint contains all finished rollouts.")
     return complete, time.perf_counter() - begin
+
+
+def _imitate_live(console: Console, imitation: "Imitation") -> tuple[bool, float]:
+    """Imitate under a bar with the time left; Ctrl-C stops after the current file of labels or epoch.
+
+    Returns:
+        Whether the training is complete, and its duration [s].
+    """
+    import time
+
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    from training.experiments.interrupt import interrupt_flag
+
+    columns = (
+        TextColumn("{task.description}"), BarColumn(None), TextColumn("{task.fields[status]}"), TimeElapsedColumn(),
+        TextColumn("left"), TimeRemainingColumn(),
+    )  # fmt: skip
+    begin = time.perf_counter()
+    epochs, config = imitation.config.epochs * (imitation.config.rounds or 0), imitation.config
+    if len(imitation.rows) >= epochs:
+        console.print("This training is complete already.")
+        return True, 0.0
+    if imitation.rows:
+        console.print(f"Resuming: {len(imitation.rows)} of {epochs} epochs are finished.")
+    bar = Progress(*columns, console=console, expand=True, speed_estimate_period=300.0)
+    with bar, interrupt_flag() as interrupted:
+        task = None
+
+        def on_progress(stage: str, done: float, total: float) -> None:
+            nonlocal task
+            status = "stopping after this part" if interrupted() else _epoch_text(imitation.rows)
+            if task is None:  # the time left counts from here, also in a run that was resumed
+                task = bar.add_task(stage, total=total, completed=int(done), status=status)
+            bar.update(task, description=stage, completed=done, status=status)
+
+        complete = imitation.run(on_progress, interrupted)
+    if not complete:
+        console.print("Stopped; the checkpoint contains all finished epochs, the folder all files of labels.")
+    console.print(f"Teacher: {config.teacher}; labels take {imitation.label_bytes / 1e6:.1f} MB.")
+    return complete, time.perf_counter() - begin
+
+
+def _epoch_text(rows: "Sequence[Row]") -> str:
+    """Return the text of the bar about the last epoch."""
+    return f"agreement {rows[-1]['agreement']:.2f}" if rows else "first epoch"
+
+
+def _finish_imitation(call: Call[TrainConfig], imitation: "Imitation", complete: bool, seconds: float) -> None:
+    """Write and print the results of the imitation."""
+    from training.rl.curves import draw_imitation, to_csv
+
+    rows, console, folder = imitation.rows, call.console, call.folder
+    best: dict[str, Any] = {}
+    if rows:
+        best = dict(imitation.best_row)
+        folder.write_text("curves.csv", to_csv(rows))
+        draw_imitation(folder.path / "learning.png", rows)
+        console.print(
+            f"On validation worlds the pupil agrees with the teacher in {100.0 * best['agreement']:.1f} % of the "
+            f"decisions where the teacher drives, in {100.0 * best['driven_agreement']:.1f} % where the pupil drives.",
+            soft_wrap=True,
+        )
+    sums = {"label_bytes": imitation.label_bytes, "seconds_this_time": seconds}
+    call.write({"complete": complete, "labels": int(best.get("labels", 0)), **sums, "best": best})
+    call.finish()
+    if complete:
+        console.print(f"Next: vslam evaluate {folder.path} --policies frontier,next_best_view", soft_wrap=True)
+    else:
+        _print_resume_command(console, folder.path)
 
 
 def _rollout_text(row: "Row") -> str:

@@ -21,6 +21,10 @@ ONE = "Give a number >= 1."
 Share = Annotated[float, Field(gt=0.0, le=1.0)]
 TRAIN_PRESETS: dict[str, dict[str, Any]] = {
     "quick": {},
+    "imitate": {
+        "teacher": "next_best_view", "rounds": 3, "world": "office,maze,loops,hall", "max_cycles": 60, "steps": 103_680,
+        "learning_rate": 1e-3, "epochs": 8,
+    },
     # Takes seconds; checks that everything works.
     "smoke": {"world": "fig5", "robots": 2, "particles": 5, "max_cycles": 4, "envs": 2, "steps": 48, "batch": 16,
               "epochs": 2, "checkpoint_updates": 1},
@@ -28,13 +32,21 @@ TRAIN_PRESETS: dict[str, dict[str, Any]] = {
 
 
 class TrainConfig(ExperimentConfig):
-    """MaskablePPO with one network for all robots and `goal` actions.
+    """Training of one network for all robots and `goal` actions: MaskablePPO, or imitation of a planner.
 
     A rollout is one episode of every robot. Omitted values come from the preset `quick`.
     """
 
-    preset: Literal["quick", "smoke"] = option("quick", "Preset: quick or smoke.")
-    world: str = option("office", "World family or path; see vslam worlds list.")
+    preset: Literal["quick", "imitate", "smoke"] = option(
+        "quick", "Preset: quick or smoke (PPO), or imitate (a planner)."
+    )
+    teacher: Literal["next_best_view"] | None = setting(None, "Planner to imitate; None: PPO.")
+    rounds: Positive | None = option(
+        None, "Rounds of an imitation; the pupil drives in all but the first.", shown="3 with imitate", hint=ONE
+    )
+    temperature: float = setting(0.25, "Divisor of the teacher's log preferences in its soft choices.", gt=0.0)
+    thin: Positive = setting(2, "Number of decisions of an imitation for each that is kept as a label.")
+    world: str = option("office", "World family or path, or several, comma-separated; see vslam worlds list.")
     robots: int = option(3, "Number of robots, 1 to 8.", ge=1, le=8, hint="Use 1 to 8 robots.")
     noise: NoisePreset = setting("standard", "Noise preset of the environment.")
     particles: Positive = setting(30, "Number of particles of each filter.")
@@ -48,8 +60,8 @@ class TrainConfig(ExperimentConfig):
     reward: Mapping[str, float] = setting({"map_error": 3.0, "own_coverage": 10.0}, "Weights of the reward terms.")
     envs: int = option(16, "Number of parallel environments.", ge=1, hint=ONE)
     steps: int = option(64_800, "Decisions of all robots in total, rounded up to whole rollouts.", ge=1, hint=ONE)
-    batch: int = setting(360, "Minibatch size of the optimiser; advantages are normalised per minibatch.", ge=2)
-    epochs: Positive = setting(10, "Number of passes over each rollout.")
+    batch: int = setting(360, "Minibatch size of the optimiser; PPO normalises advantages per minibatch.", ge=2)
+    epochs: Positive = setting(4, "Number of passes over each rollout, or in each round of an imitation.")
     learning_rate: float = setting(1.5e-3, "Initial learning rate; it decays linearly to zero.", gt=0.0)
     gamma: Share = setting(
         0.95, "Discount per decision, the discount per tick to the power of `decision_ticks`: 0.999 per tick is 0.98."
@@ -57,14 +69,28 @@ class TrainConfig(ExperimentConfig):
     gae_lambda: Share = setting(0.5, "Lambda of the generalised advantage estimate.")
     clip: float = setting(0.2, "Clip range of PPO's probability ratio.", gt=0.0)
     entropy: float = setting(0.002, "Weight of the entropy bonus.", ge=0.0)
-    checkpoint_updates: Positive = setting(5, "Number of rollouts between checkpoints.")
+    checkpoint_updates: Positive = setting(5, "Number of rollouts between PPO's checkpoints.")
 
     def check(self) -> None:
         """Refuse values that the environment refuses."""
+        from slam_backend.core.validation import argument_error
         from vslam_env.world import check_source
 
-        check_source(self.world)
-        self.make_env_config(SPLIT_TRAIN)
+        for world in self.worlds:
+            check_source(world)
+        self.make_env_configs(SPLIT_TRAIN)
+        if self.envs % len(self.worlds):
+            expected = f"a multiple of the {len(self.worlds)} worlds"
+            raise argument_error("envs", expected, self.envs, "Each world has as many environments.")
+        if self.thin > self.max_cycles:
+            hint = "Keep a label of each episode."
+            raise argument_error("thin", f"at most max_cycles, {self.max_cycles}", self.thin, hint)
+        if (self.teacher is None) != (self.rounds is None):
+            expected = "no number, without a teacher" if self.teacher is None else "a number of rounds for the teacher"
+            raise argument_error("rounds", expected, self.rounds, "Use --preset imitate.")
+        if self.rounds is not None and self.rounds > self.updates:
+            hint = "Use fewer rounds or more --steps."
+            raise argument_error("rounds", f"at most one per rollout, {self.updates}", self.rounds, hint)
 
     @classmethod
     def completed(cls, values: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -75,7 +101,12 @@ class TrainConfig(ExperimentConfig):
         """Return plain values that repeat this training from any folder, except the seed."""
         from vslam_env.world import portable_source
 
-        return super().to_mapping() | {"world": portable_source(self.world)}
+        return super().to_mapping() | {"world": ",".join(str(portable_source(world)) for world in self.worlds)}
+
+    @property
+    def worlds(self) -> tuple[str, ...]:
+        """World families and paths."""
+        return tuple(self.world.split(","))
 
     @property
     def rollout(self) -> int:
@@ -87,8 +118,17 @@ class TrainConfig(ExperimentConfig):
         """Number of rollouts, each followed by an update of the network."""
         return -(-self.steps // self.rollout)
 
-    def make_env_config(self, split: str | None) -> "EnvConfig":
-        """Return the environment for worlds of a split; a world with a single layout has no splits."""
+    def make_env_configs(self, split: str | None) -> "tuple[EnvConfig, ...]":
+        """Return an environment for each of the worlds; see `make_env_config`."""
+        return tuple(self.make_env_config(split, world) for world in self.worlds)
+
+    def make_env_config(self, split: str | None, world: str | None = None) -> "EnvConfig":
+        """Return the environment for worlds of a split; a world with a single layout has no splits.
+
+        Args:
+            split: Split of the worlds.
+            world: World; None: the first.
+        """
         from vslam_env.belief.belief import motion_without_smoother
         from vslam_env.presets import preset_config
         from vslam_env.world import is_single_layout
@@ -97,8 +137,9 @@ class TrainConfig(ExperimentConfig):
         assumed: dict[str, Any] = {"num_particles": self.particles}
         if not self.straighten:
             assumed |= {"rejuvenate_every": None, "motion": motion_without_smoother(config.belief.filter.motion)}
+        world = self.worlds[0] if world is None else world
         return config.replace(
-            world=self.world, world_split=None if is_single_layout(self.world) else split, num_robots=self.robots,
+            world=world, world_split=None if is_single_layout(world) else split, num_robots=self.robots,
             action_type="goal", decision_ticks=self.decision_ticks, max_cycles=self.max_cycles,
             reward=dict(self.reward), belief={"filter": assumed, "merging": {"smooth_first": self.straighten}},
         )  # fmt: skip

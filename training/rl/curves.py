@@ -18,6 +18,10 @@ PANELS = (
     ("return", "return of an episode"), ("map_error", "map error at its end [m]"), ("map_recall", "recall at its end"),
     ("merges", "merges"),
 )  # fmt: skip
+EPOCH_PANELS = (
+    ("loss", "cross entropy, training worlds"), ("cross_entropy", "cross entropy, validation worlds"),
+    ("agreement", "agreement with the teacher"), ("return", "return of the driver"),
+)  # fmt: skip
 COLOUR = "#0072B2"
 
 
@@ -52,6 +56,23 @@ def draw_learning(file: Path, rows: Sequence[Mapping[str, float]]) -> None:
             if axes.get_subplotspec().is_last_row():
                 axes.set_xlabel("decisions of all robots")
         figure.axes[0].legend(loc="lower right")
+        save_png(figure, file, 120)
+
+
+def draw_imitation(file: Path, rows: Sequence[Mapping[str, float]]) -> None:
+    """Plot each metric of an imitation by epoch, with a line where a round begins, into a PNG file."""
+    epochs = np.arange(1, len(rows) + 1)
+    begins = [n for n in range(1, len(rows)) if rows[n]["round"] != rows[n - 1]["round"]]
+    with mpl.rc_context({"font.size": 9}):
+        figure = Figure(figsize=(10.0, 5.6), layout="constrained")
+        for axes, (name, label) in zip(figure.subplots(2, 2, sharex=True).flat, EPOCH_PANELS, strict=True):
+            axes.plot(epochs, [row[name] for row in rows], ".-", color=COLOUR)
+            for begin in begins:
+                axes.axvline(begin + 0.5, color="0.6", linewidth=0.8)
+            axes.set_ylabel(label)
+            axes.grid(alpha=0.3)
+            if axes.get_subplotspec().is_last_row():
+                axes.set_xlabel("epochs of all rounds")
         save_png(figure, file, 120)
 
 

@@ -1,5 +1,6 @@
-"""`GoalPolicy`: torch version of `agents.goal_network` with a value head, for MaskablePPO."""
+"""`GoalPolicy`: torch version of `agents.goal_network` with a value head, for MaskablePPO and for imitation."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -9,75 +10,122 @@ from sb3_contrib.common.maskable.policies import MaskableMultiInputActorCriticPo
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
-from agents.goal_network import CANDIDATE_SCALE, CHANNELS, CONTEXT, PATCHES, PICTURE_SIZE, SHAPES, VECTOR_SIZE, VECTORS
+from agents.goal_network import (
+    CANDIDATE_SCALE,
+    CHANNELS,
+    FEED_WIDTH,
+    INVALID,
+    NUM_HEADS,
+    NUM_LAYERS,
+    PATCHES,
+    PICTURE_SIZE,
+    SHAPES,
+    TEAMMATE_SCALE,
+    VECTOR_SIZE,
+    VECTORS,
+    WIDTH,
+)
 
 NUM_SLOTS, NUM_FEATURES = SHAPES["candidates"]
 
 
-class GoalFeatures(BaseFeaturesExtractor):  # type: ignore[misc]   # its types are not checked
-    """Context of the robot, scaled candidates, and the mask of valid candidates."""
+class AttentionLayer(nn.Module):  # type: ignore[misc]   # its types are not checked
+    """Attention within each observation and a hidden layer, each with normalisation before and a shortcut."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.norm = nn.LayerNorm(WIDTH)
+        self.query_key_value = nn.Linear(WIDTH, 3 * WIDTH)
+        self.out = nn.Linear(WIDTH, WIDTH)
+        self.feed_norm = nn.LayerNorm(WIDTH)
+        self.feed_in = nn.Linear(WIDTH, FEED_WIDTH)
+        self.feed_out = nn.Linear(FEED_WIDTH, WIDTH)
+
+    def forward(self, tokens: Any, row: Any, place: Any, absent: Any) -> Any:
+        """Return new tokens (p, WIDTH), from those of all observations; see `agents.goal_network`."""
+        n, size = absent.shape
+        parts = tokens.new_zeros(n, size, 3 * WIDTH)
+        parts[row, place] = self.query_key_value(self.norm(tokens))
+        query, key, value = parts.unflatten(2, (3, NUM_HEADS, WIDTH // NUM_HEADS)).permute(2, 0, 3, 1, 4)
+        scores = query @ key.transpose(-1, -2) / (WIDTH // NUM_HEADS) ** 0.5
+        shares = scores.masked_fill(absent[:, None, None], INVALID).softmax(dim=-1)
+        seen = (shares @ value).transpose(1, 2).flatten(2)[row, place]
+        tokens = tokens + self.out(seen)
+        return tokens + self.feed_out(torch.relu(self.feed_in(self.feed_norm(tokens))))
+
+
+class GoalFeatures(BaseFeaturesExtractor):  # type: ignore[misc]
+    """Tokens of the robot and of its candidates after attention, and the mask of valid candidates."""
 
     def __init__(self, observation_space: Any) -> None:
-        super().__init__(observation_space, CONTEXT + (NUM_FEATURES + 1) * NUM_SLOTS)
+        super().__init__(observation_space, (1 + NUM_SLOTS) * WIDTH + NUM_SLOTS)
         first, second = PATCHES
         self.picture = nn.Sequential(
             nn.Conv2d(3, CHANNELS[0], first, first), nn.ReLU(), nn.Conv2d(CHANNELS[0], CHANNELS[1], second, second),
             nn.ReLU(),
         )  # fmt: skip
-        self.picture_out = nn.Linear(PICTURE_SIZE, CONTEXT)
-        self.context = nn.Linear(CONTEXT + VECTOR_SIZE, CONTEXT)
-        for name, scale in {**VECTORS, "candidates": CANDIDATE_SCALE}.items():
+        self.robot = nn.Linear(PICTURE_SIZE + VECTOR_SIZE, WIDTH)
+        self.candidate = nn.Linear(NUM_FEATURES, WIDTH)
+        self.teammate = nn.Linear(len(TEAMMATE_SCALE), WIDTH)
+        self.layers = nn.ModuleList(AttentionLayer() for _ in range(NUM_LAYERS))
+        self.last_norm = nn.LayerNorm(WIDTH)
+        scales = {**VECTORS, "candidates": CANDIDATE_SCALE, "teammates": TEAMMATE_SCALE}
+        for name, scale in scales.items():
             self.register_buffer(f"{name}_scale", torch.tensor(scale), persistent=False)
 
     def forward(self, observations: dict[str, Any]) -> Any:
-        """Return (n, 64 + C x F + C): context, candidates row by row, mask of valid candidates."""
-        seen = torch.relu(self.picture_out(self.picture(observations["local_grid"]).flatten(1)))
+        """Return (n, (1 + C) x WIDTH + C): token of the robot, tokens of the candidates (0 if invalid), mask."""
+        picture = self.picture(observations["local_grid"]).flatten(1)
         vectors = [(observations[name] * getattr(self, f"{name}_scale")).flatten(1) for name in VECTORS]
-        context = torch.tanh(self.context(torch.cat([seen, *vectors], dim=1)))
-        candidates = observations["candidates"] * self.candidates_scale
-        return torch.cat([context, candidates.flatten(1), observations["action_mask"][:, 1:]], dim=1)
+        robot = self.robot(torch.cat([picture, *vectors], dim=1)).unsqueeze(1)
+        slots = self.candidate(observations["candidates"] * self.candidates_scale)
+        mates = self.teammate(observations["teammates"] * self.teammates_scale)
+        valid = observations["action_mask"][:, 1:]
+        present = torch.cat([torch.ones_like(valid[:, :1]), valid, observations["teammates_mask"]], dim=1) != 0
+        row, place = present.nonzero(as_tuple=True)[0], (present.cumsum(1) - 1)[present]
+        counts = present.sum(1, keepdim=True)
+        absent = torch.arange(int(counts.max()), device=counts.device) >= counts
+        tokens = torch.cat([robot, slots, mates], dim=1)[present]
+        for layer in self.layers:
+            tokens = layer(tokens, row, place, absent)
+        final = tokens.new_zeros(*present.shape, WIDTH)
+        final[present] = self.last_norm(tokens)
+        return torch.cat([final[:, : 1 + NUM_SLOTS].flatten(1), valid], dim=1)
 
 
-class SlotScorer(nn.Module):  # type: ignore[misc]
-    """Scores of the candidates by one shared network; the value uses its mean features over valid candidates."""
+class SlotPointer(nn.Module):  # type: ignore[misc]
+    """Logits of the candidates by a pointer from the robot; the value uses the mean of the valid candidates."""
 
     latent_dim_pi = 1 + NUM_SLOTS
-    latent_dim_vf = CONTEXT
+    latent_dim_vf = WIDTH
 
     def __init__(self) -> None:
         super().__init__()
-        self.slot = nn.Linear(len(CANDIDATE_SCALE), CONTEXT)
-        self.slot_context = nn.Linear(CONTEXT, CONTEXT, bias=False)
-        self.slot_hidden = nn.Linear(CONTEXT, CONTEXT)
-        self.slot_score = nn.Linear(CONTEXT, 1)
-        self.stay_score = nn.Linear(CONTEXT, 1)
-        self.value_hidden = nn.Linear(2 * CONTEXT, CONTEXT)
+        self.query = nn.Linear(WIDTH, WIDTH)
+        self.key = nn.Linear(WIDTH, WIDTH)
+        self.stay = nn.Linear(WIDTH, 1)
+        self.value_hidden = nn.Linear(2 * WIDTH, WIDTH)
 
     def forward(self, features: Any) -> tuple[Any, Any]:
-        """Return logits (n, 1 + C) and features of the value head (n, 64)."""
-        context, hidden, valid = self._look(features)
-        return self._logits(context, hidden), self._value(context, hidden, valid)
+        """Return logits (n, 1 + C) and features of the value head (n, WIDTH)."""
+        return self.forward_actor(features), self.forward_critic(features)
 
     def forward_actor(self, features: Any) -> Any:
         """Return the logits only."""
-        context, hidden, _ = self._look(features)
-        return self._logits(context, hidden)
+        robot, slots, valid = _split(features)
+        scores = (self.key(slots) @ self.query(robot).unsqueeze(2)).squeeze(2) / WIDTH**0.5
+        return torch.cat([self.stay(robot), scores.masked_fill(valid == 0, INVALID)], dim=1)
 
     def forward_critic(self, features: Any) -> Any:
         """Return the features of the value head only."""
-        return self._value(*self._look(features))
+        robot, slots, valid = _split(features)
+        mean = slots.sum(1) / valid.sum(1, keepdim=True).clamp(min=1.0)  # invalid slots are 0
+        return torch.tanh(self.value_hidden(torch.cat([robot, mean], dim=1)))
 
-    def _look(self, features: Any) -> tuple[Any, Any, Any]:
-        context, candidates, valid = features.split([CONTEXT, NUM_FEATURES * NUM_SLOTS, NUM_SLOTS], dim=1)
-        beside = self.slot(candidates.unflatten(1, (NUM_SLOTS, NUM_FEATURES))) + self.slot_context(context).unsqueeze(1)
-        return context, torch.tanh(self.slot_hidden(torch.tanh(beside))), valid
 
-    def _logits(self, context: Any, hidden: Any) -> Any:
-        return torch.cat([self.stay_score(context), self.slot_score(hidden).squeeze(-1)], dim=1)
-
-    def _value(self, context: Any, hidden: Any, valid: Any) -> Any:
-        mean = (hidden * valid.unsqueeze(-1)).sum(1) / valid.sum(1, keepdim=True).clamp(min=1.0)
-        return torch.tanh(self.value_hidden(torch.cat([context, mean], dim=1)))
+def _split(features: Any) -> tuple[Any, Any, Any]:
+    robot, slots, valid = features.split([WIDTH, NUM_SLOTS * WIDTH, NUM_SLOTS], dim=1)
+    return robot, slots.unflatten(1, (NUM_SLOTS, WIDTH)), valid
 
 
 class GoalPolicy(MaskableMultiInputActorCriticPolicy):  # type: ignore[misc]
@@ -87,22 +135,31 @@ class GoalPolicy(MaskableMultiInputActorCriticPolicy):  # type: ignore[misc]
         super().__init__(*args, **kwargs | {"features_extractor_class": GoalFeatures})
 
     def _build(self, lr_schedule: Any) -> None:
-        """Make the layers and the optimiser; the scorer's outputs already are the logits."""
-        self.mlp_extractor = SlotScorer()
+        """Make the layers and the optimiser; the pointer's outputs already are the logits."""
+        self.mlp_extractor = SlotPointer()
         self.action_net = nn.Identity()
-        self.value_net = nn.Linear(CONTEXT, 1)
+        self.value_net = nn.Linear(WIDTH, 1)
         for module in (self.features_extractor, self.mlp_extractor):
-            module.apply(lambda layer: self.init_weights(layer, gain=np.sqrt(2.0)))
-        for layer in (self.mlp_extractor.slot_score, self.mlp_extractor.stay_score):
-            self.init_weights(layer, gain=0.01)
+            module.apply(lambda layer: self.init_weights(layer, gain=1.0))
+        for layer in (self.mlp_extractor.query, self.mlp_extractor.stay):
+            self.init_weights(layer, gain=0.01)  # all actions are about equally probable at first
         self.init_weights(self.value_net, gain=1.0)
         self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)
 
+    def logits(self, observations: dict[str, Any]) -> Any:
+        """Return the logits (n, 1 + C) of observations as float tensors; grids from 0 to 1."""
+        return self.mlp_extractor.forward_actor(self.features_extractor(observations))
+
     def actor_weights(self) -> dict[str, NDArray[np.float32]]:
         """Return copies of the weights that `agents.goal_network` needs, by layer name."""
-        layers = {**self.features_extractor.state_dict(), **self.mlp_extractor.state_dict()}
-        return {
-            name: tensor.detach().cpu().numpy().copy()
-            for name, tensor in layers.items()
-            if not name.startswith("value_hidden")
-        }
+        return actor_part({name: tensor.detach().cpu().numpy() for name, tensor in self.state_dict().items()})
+
+
+def actor_part(state: Mapping[str, Any]) -> dict[str, NDArray[np.float32]]:
+    """Return copies of the weights that `agents.goal_network` needs, by layer name, of a policy's state dict."""
+    found: dict[str, NDArray[np.float32]] = {}
+    for name, values in state.items():
+        part, _, layer = name.partition(".")
+        if part in ("features_extractor", "mlp_extractor") and not layer.startswith("value_hidden"):
+            found[layer] = np.array(values, np.float32)
+    return found

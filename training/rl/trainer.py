@@ -46,7 +46,7 @@ class Training:
         check_device(device)
         torch.set_num_threads(1)
         self.config, self._folder = config, folder
-        self.env = make_vec_env(config.make_env_config(SPLIT_TRAIN), config.envs, workers)
+        self.env = make_vec_env(config.make_env_configs(SPLIT_TRAIN), config.envs, workers)
         self.model = MaskablePPO(
             GoalPolicy, self.env, learning_rate=lambda left: left * config.learning_rate, n_steps=config.max_cycles,
             batch_size=config.batch, n_epochs=config.epochs, gamma=config.gamma, gae_lambda=config.gae_lambda,

@@ -317,6 +317,8 @@ def test_bad_numbers_are_refused() -> None:
         make_vec_env(GOALS, 1, workers=-1)
     with pytest.raises(ValueError, match="workers: expected at most one per environment, 1, got 2"):
         make_vec_env(GOALS, 1, workers=2)
+    with pytest.raises(ValueError, match="config: expected at least one configuration, got \\[\\]"):
+        make_vec_env([], 1)
     env = make_vec_env(GOALS, 1)
     with pytest.raises(ValueError, match="seed: expected an int >= 0, got -3"):
         env.seed(-3)
