@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.core.blas import single_threaded_blas
-from slam_backend.core.jit import in_place
 from slam_backend.core.read_only import with_constants, with_read_only
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.fastslam import _kernels
@@ -65,9 +64,6 @@ def max_pending_steps(logs: Sequence[RobotLog], graph: SlamGraph) -> int:
     return max(log.num_since(step + 1) for log, step in zip(logs, graph.latest.tolist(), strict=True))
 
 
-XX, YY, ZZ = 3, 6, 8  # the diagonal of a landmark's covariance, in the rows of a tile
-
-
 def write_maps(maps: ParticleMaps, best: int, particles: Particles, walk: float) -> None:
     """Write to all particles the landmarks of their paths: those of the most probable one that a sighting supports.
 
@@ -94,26 +90,7 @@ def write_maps(maps: ParticleMaps, best: int, particles: Particles, walk: float)
         particles.counts[rows, None], maps.descriptors[slots], maps.ids[slots], maps.identities[slots], maps.next_id,
         odds, maps.last_seen[slots],
     )  # fmt: skip
-    write_tiles(particles.tiles, rows, walk, maps.blocks)
-
-
-@in_place
-def write_tiles(tiles: FloatArray, rows: IntArray, walk: float, blocks: FloatArray) -> None:
-    """Write landmarks of new particles, with a variance [m^2] along each axis added.
-
-    Args:
-        tiles: (l, P / lanes, 9, lanes) means and covariances.
-        rows: (n,) rows of the landmarks there.
-        walk: Variance.
-        blocks: (>= n, P / lanes, 9, lanes) values, of which the first are written.
-    """
-    for n in range(len(rows)):
-        for b in range(tiles.shape[1]):
-            tile, block = tiles[rows[n], b], blocks[n, b]
-            for row in range(9):
-                added = walk if row in (XX, YY, ZZ) else 0.0
-                for lane in range(tiles.shape[3]):
-                    block[row, lane] = tile[row, lane] + added  # (7) of docs/reference/smoother.md
+    particles.landmarks.write(rows, walk, maps.blocks)  # the walk: (7) of docs/reference/smoother.md
 
 
 def joint_graph(

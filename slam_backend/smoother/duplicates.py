@@ -9,7 +9,7 @@ from slam_backend.core.packed_symmetric import UNPACK_INDEX
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.smoother.graph import SlamGraph
 from slam_backend.smoother.optimizer import MapEstimate
-from slam_backend.smoother.sampling import PathSamples
+from slam_backend.smoother.sampling import PathSamples, lane_rows, replay
 
 REACH = 0.5  # [m]; largest distance of duplicates
 GATE = 7.81  # squared Mahalanobis distance, 95 % of 3 degrees of freedom
@@ -26,7 +26,7 @@ def find_duplicates(
     Args:
         graph: Pose-landmark graph.
         mode: MAP estimate of the graph.
-        draws: Paths with their landmarks.
+        draws: Paths drawn about it.
         descriptors: (l, d) by row of `graph.landmark_ids`; NaN for a landmark that must stay as it is.
         descriptor_gate: Largest L2 distance of similar descriptors.
     """
@@ -36,7 +36,7 @@ def find_duplicates(
         return pairs
     taken: set[int] = set()
     rows = []
-    for _, a, b in sorted(_together(draws, pairs)):
+    for _, a, b in sorted(_together(mode, draws, pairs)):
         if a not in taken and b not in taken:
             taken |= {a, b}
             rows.append(sorted((int(graph.landmark_ids[a]), int(graph.landmark_ids[b])), reverse=True))
@@ -91,19 +91,17 @@ def similar_pairs(
 
 
 @single_threaded_blas
-def _together(draws: PathSamples, pairs: IntArray) -> list[tuple[float, int, int]]:
+def _together(mode: MapEstimate, draws: PathSamples, pairs: IntArray) -> list[tuple[float, int, int]]:
     """Return (squared Mahalanobis distance, a, b) of the pairs (n, 2) within the gate."""
+    rows, num_paths = np.unique(pairs), draws.poses.shape[2]
+    tiles, _ = replay(mode, lane_rows(draws.poses), num_paths, rows)
+    values = tiles.transpose(0, 2, 1, 3).reshape(len(rows), 9, -1)[:, :, :num_paths]
     found = []
     for a, b in pairs.tolist():
-        distance = _distance(_values(draws, a), _values(draws, b))
+        distance = _distance(*values[np.searchsorted(rows, (a, b))])
         if distance <= GATE:
             found.append((distance, a, b))
     return found
-
-
-def _values(draws: PathSamples, row: int) -> FloatArray:
-    """Return the means and covariances (9, M) of one landmark."""
-    return np.asarray(draws.tiles[row].transpose(1, 0, 2).reshape(9, -1)[:, : draws.poses.shape[2]])
 
 
 def _distance(a: FloatArray, b: FloatArray) -> float:

@@ -13,10 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from slam_backend.core.jit import device, in_place, jit, simd, stack_array
+from slam_backend.core.jit import device, in_place, jit
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.geometry import between, wrap_angle
-from slam_backend.smoother._kernels import LANES
 from slam_backend.smoother.graph import LEVER
 
 XX, YY = 3, 6  # rows of a tile: variances of a landmark in the plane
@@ -176,42 +175,3 @@ def move(poses: FloatArray, motions: FloatArray, moved: FloatArray) -> None:
             moved[robot, 0, i] = motions[i, 0] + c * x - s * y
             moved[robot, 1, i] = motions[i, 1] + s * x + c * y
             moved[robot, 2, i] = (motions[i, 2] + heading + math.pi) % (2.0 * math.pi) - math.pi
-
-
-def transform_tiles(tiles: FloatArray, motions: FloatArray) -> None:
-    """Move landmarks (l, P / LANES, 9, LANES) of each particle, in place, by its motion (M, 3); surplus lanes stay."""
-    transformed_tiles(tiles.reshape(-1), len(tiles), tiles.shape[1], motions)
-
-
-@simd
-def transformed_tiles(tiles: FloatArray, num_landmarks: int, num_blocks: int, motions: FloatArray) -> None:
-    """Move means and covariances of landmarks, in place.
-
-    Args:
-        tiles: (num_landmarks * num_blocks * 9 * LANES,) x, y, z, xx, xy, xz, yy, yz, zz of each, by lanes.
-        num_landmarks, num_blocks: Numbers of landmarks and of blocks.
-        motions: (M, 3) [m, m, rad] of the particles.
-    """
-    cosine, sine, ahead, left = stack_array(LANES), stack_array(LANES), stack_array(LANES), stack_array(LANES)
-    for block in range(num_blocks):
-        first = block * LANES
-        for i in range(LANES):
-            cosine[i], sine[i], ahead[i], left[i] = 1.0, 0.0, 0.0, 0.0
-        for i in range(min(LANES, len(motions) - first)):
-            motion = motions[first + i]
-            cosine[i], sine[i], ahead[i], left[i] = math.cos(motion[2]), math.sin(motion[2]), motion[0], motion[1]
-        for landmark in range(num_landmarks):
-            base = (landmark * num_blocks + block) * 9 * LANES
-            tile = tiles[base : base + 9 * LANES]
-            for i in range(LANES):
-                c, s = cosine[i], sine[i]
-                x, y = tile[i], tile[LANES + i]
-                tile[i] = c * x - s * y + ahead[i]
-                tile[LANES + i] = s * x + c * y + left[i]
-                xx, xy, yy = tile[3 * LANES + i], tile[4 * LANES + i], tile[6 * LANES + i]
-                xz, yz = tile[5 * LANES + i], tile[7 * LANES + i]
-                tile[3 * LANES + i] = c * c * xx - 2.0 * c * s * xy + s * s * yy
-                tile[4 * LANES + i] = c * s * (xx - yy) + (c * c - s * s) * xy
-                tile[6 * LANES + i] = s * s * xx + 2.0 * c * s * xy + c * c * yy
-                tile[5 * LANES + i] = c * xz - s * yz
-                tile[7 * LANES + i] = s * xz + c * yz

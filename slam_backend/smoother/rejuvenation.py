@@ -19,14 +19,22 @@ from slam_backend.models.odometry import OdometryModel
 from slam_backend.smoother import _kernels
 from slam_backend.smoother._kernels import Keys
 from slam_backend.smoother.duplicates import find_duplicates, without_duplicates
-from slam_backend.smoother.gauge import fix_gauge, fix_start, move, transform_tiles
+from slam_backend.smoother.gauge import fix_gauge, fix_start, move
 from slam_backend.smoother.graph import SlamGraph
 from slam_backend.smoother.graph_building import InitialPoses, LandmarkPositions, extend_graph, log_head
 from slam_backend.smoother.graph_reduction import reduce_keyframes, relinearise, without_unused_frames
 from slam_backend.smoother.log_arrays import EXACT, REJECTED, LogArrays
 from slam_backend.smoother.optimizer import NO_POSE, MapEstimate, optimize
 from slam_backend.smoother.options import SmoothingOptions
-from slam_backend.smoother.sampling import PathSamples, sample_more_paths, sample_paths, sample_transition_variances
+from slam_backend.smoother.sampling import (
+    PathLandmarks,
+    PathSamples,
+    lane_rows,
+    replay,
+    sample_more_paths,
+    sample_paths,
+    sample_transition_variances,
+)
 
 DRAFT_TOLERANCE = 10.0  # factor on the tolerance of descents without draws
 
@@ -55,8 +63,7 @@ class Particles(NamedTuple):
         log_densities: (M,) float64. Log densities of the newest poses under the Gaussian about the mode, up to a
             constant: 0 for the first particle, whose path is the mode, unless more than M were drawn.
         ids: (l,) int64. Landmarks with at least one sighting.
-        tiles: (l, P / LANES, 9, LANES) float64. Means (3) and covariances (6) of landmarks, map frame, in blocks of
-            lanes.
+        landmarks: Landmarks of these particles, in the order of `ids`.
         counts: (l,) int64. Number of measurements of each landmark.
         means, covariances: (K, 3), (K, 3, 3) float64. Newest poses under the Gaussian about the mode.
         biases: (K, 3, M) float64 [m/m, rad/m, rad/rad]. Mean of each robot's odometry bias, given the path.
@@ -70,7 +77,7 @@ class Particles(NamedTuple):
     log_weights: FloatArray
     log_densities: FloatArray
     ids: IntArray
-    tiles: FloatArray
+    landmarks: PathLandmarks
     counts: IntArray
     means: FloatArray
     covariances: FloatArray
@@ -202,7 +209,7 @@ def sample_particles(
     chosen, ess = draws, draws.sample_size
     needed = options.least_ess * num_particles
     if needed > ess >= needed / options.more_draws:
-        chosen, size = sample_more_paths(grown, mode, options.more_draws * num_particles, num_particles, rng)
+        chosen, size = sample_more_paths(grown, mode, options.more_draws * num_particles, draws, rng)
         ess = min(size, float(num_particles))
     graph = reduce_keyframes(relinearise(grown, mode, draws.transition_variances), camera, options, mode.sightings)
     if not ess >= needed:
@@ -224,13 +231,12 @@ def _descriptors(graph: SlamGraph, appearance: LandmarkDescriptors) -> NDArray[n
 
 def _particles(graph: SlamGraph, mode: MapEstimate, draws: PathSamples) -> Particles:
     """Return the particles of draws, in a fixed gauge."""
-    weights, tiles, ids, landmarks = draws.weights, draws.tiles, graph.landmark_ids, mode.landmarks
-    counts, in_view = np.zeros(len(ids), dtype=np.int64), np.zeros(len(ids), dtype=np.bool_)
+    weights, counts = draws.weights, np.zeros(len(graph.landmark_ids), dtype=np.int64)
     np.add.at(counts, mode.sightings.landmarks, mode.sightings.counts)
+    in_view = np.zeros(len(counts), dtype=np.bool_)
     in_view[graph.point_landmarks] = True
-    if not counts.all():
-        seen = counts > 0
-        tiles, ids, landmarks, in_view, counts = tiles[seen], ids[seen], landmarks[seen], in_view[seen], counts[seen]
+    rows, in_sight = np.flatnonzero(counts), np.flatnonzero(in_view & (counts > 0))
+    paths = lane_rows(draws.poses)
     poses, starts = draws.poses[graph.last_keys], draws.poses[graph.first_keys]
     means = mode.poses[graph.last_keys]
     covariances = np.zeros((len(means), 3, 3))
@@ -248,11 +254,12 @@ def _particles(graph: SlamGraph, mode: MapEstimate, draws: PathSamples) -> Parti
                 draws.poses, graph.part(Keys), graph.biases_of_odometry(), mode.odometry_infos, key
             )
     frame, start_scatters = np.zeros((3, 3)), np.zeros((len(means), 3, 3))
-    (in_sight,) = in_view.nonzero()
-    held = fix_gauge(tiles, in_sight, landmarks, poses, means, weights)
+    tiles, _ = replay(mode, paths, len(weights), in_sight)
+    held = fix_gauge(tiles, np.arange(len(in_sight)), mode.landmarks[in_sight], poses, means, weights)
     if held is not None:
-        transform_tiles(tiles, held.motions)
-        poses, frame = held.poses, held.scatter
+        moved = np.empty_like(draws.poses)
+        move(draws.poses, held.motions, moved)
+        paths, poses, frame = lane_rows(moved), held.poses, held.scatter
     for index in (mode.columns[graph.first_keys] >= 0).nonzero()[0].tolist():
         start = starts[index : index + 1]
         if held is not None:
@@ -262,8 +269,9 @@ def _particles(graph: SlamGraph, mode: MapEstimate, draws: PathSamples) -> Parti
     for array in (poses, starts, means):
         array[:, 2] = wrap_angle(array[:, 2])
     return Particles(
-        poses, starts, np.log(np.maximum(weights, 1e-300)), densities, ids, tiles, counts, means, covariances, biases,
-        bias_covariances, frame, start_scatters,
+        poses, starts, np.log(np.maximum(weights, 1e-300)), densities, graph.landmark_ids[rows],
+        PathLandmarks(paths, mode, rows), counts[rows], means, covariances, biases, bias_covariances, frame,
+        start_scatters,
     )  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""Importance sampling of whole paths and their landmarks from the posterior of a smoother.
+"""Importance sampling of whole paths from the posterior of a smoother, and the landmarks given these paths.
 
 Under heading uncertainty the poses of a path have a banana-shaped distribution, which is not Gaussian in coordinates.
 The motions between poses are nearly Gaussian (Long et al., The Banana Distribution Is Gaussian, RSS 2012): paths are
@@ -6,16 +6,15 @@ sampled about the mode and then retracted motion by motion.
 """
 
 import math
-from collections.abc import Callable
-from typing import NamedTuple, Self, TypeVar
+from typing import NamedTuple, Self
 
 import numpy as np
 
 from slam_backend.core.jit import jit
-from slam_backend.core.validation import FloatArray, IntArray
+from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.resampling import systematic
 from slam_backend.smoother import _kernels
-from slam_backend.smoother._kernels import LANES, POSE_ROWS, Keys
+from slam_backend.smoother._kernels import LANES, POSE_ROWS, Keys, LandmarkFactors
 from slam_backend.smoother.graph import SlamGraph
 from slam_backend.smoother.optimizer import MapEstimate
 
@@ -71,53 +70,77 @@ MIN_GAUSSIAN_SAMPLE_SIZE = 0.5  # share of M: below this sample size of the Gaus
 
 
 class PathSamples(NamedTuple):
-    """M paths, each with its conditional landmarks.
+    """M weighed paths.
 
     Attributes:
         poses: (k, 3, M) float64 [m, m, rad], map frame.
-        tiles: (l, P / LANES, 9, LANES) float64. Means (3) and covariances (6) of the landmarks, map frame, by lanes.
         log_weights: (M,) float64. Importance weights, not normalised.
         weights: (M,) float64. Normalised importance weights; NaN if one is not finite.
         sample_size: Effective sample size of the weights; NaN if one is not finite.
         transition_variances: (k,) float64 [m^2]. Variances of the motions from the previous keys, headings at `LEVER`.
+        is_retracted: Whether the paths were retracted on SE(2).
     """
 
     poses: FloatArray
-    tiles: FloatArray
     log_weights: FloatArray
     weights: FloatArray
     sample_size: float
     transition_variances: FloatArray
+    is_retracted: bool = False
 
     @classmethod
-    def weighed(
-        cls, poses: FloatArray, tiles: FloatArray, log_weights: FloatArray, transition_variances: FloatArray
-    ) -> Self:
+    def weighed(cls, poses: FloatArray, log_weights: FloatArray, transition_variances: FloatArray) -> Self:
         """Return paths with normalised weights; arguments as the attributes."""
         weights = np.empty(len(log_weights))
         sample_size = _kernels.normalise(log_weights, weights)
-        return cls(poses, tiles, log_weights, weights, sample_size, transition_variances)
-
-    @property
-    def landmarks(self) -> FloatArray:
-        """Means and covariances (l, 9, M) float64 of the landmarks, a copy."""
-        count, blocks = self.tiles.shape[:2]
-        rows = self.tiles.transpose(0, 2, 1, 3).reshape(count, 9, blocks * LANES)
-        return np.ascontiguousarray(rows[:, :, : self.poses.shape[2]])
+        return cls(poses, log_weights, weights, sample_size, transition_variances)
 
 
-class PathWeights(NamedTuple):
-    """M paths without landmarks: the attributes of `PathSamples` that weighing them yields."""
+class PathLandmarks(NamedTuple):
+    """Landmarks given M paths, computed where they are written.
 
-    poses: FloatArray
-    log_weights: FloatArray
-    weights: FloatArray
-    sample_size: float
-    transition_variances: FloatArray
+    Attributes:
+        paths: (P / LANES, k, 5, LANES) float64. Paths as `lane_rows` returns them.
+        mode: Sightings, linearised there.
+        rows: (l,) int64. Rows of the landmarks in the graph.
+    """
+
+    paths: FloatArray
+    mode: MapEstimate
+    rows: IntArray
+
+    def write(self, chosen: IntArray, walk: float, tiles: FloatArray) -> None:
+        """Write means and covariances, map frame.
+
+        Args:
+            chosen: (n,) int64. Indices of the landmarks to write.
+            walk: Variance [m^2] of a random walk along each axis, which is added.
+            tiles: (>= n, P / LANES, 9, LANES) float64. The first n are written, in blocks of lanes.
+        """
+        seen, rows = self.mode.sightings, self.rows[chosen]
+        blocks, k = self.paths.shape[:2]
+        out, paths = tiles[: len(rows)].reshape(-1), self.paths.reshape(-1)
+        is_rigid = has_single_sighting(seen)[rows]
+        others, log_likelihood = np.where(is_rigid, -1, rows), np.empty(blocks * LANES)
+        _kernels.replay(paths, k, blocks, self.mode.landmarks, seen, others, out, log_likelihood)
+        _kernels.place_landmarks(paths, k, blocks, seen, rows, is_rigid, walk, out)
+
+
+WELL_DETERMINED = 1.0  # [1/m^6] least determinant of the information of a single sighting that determines its landmark
+
+
+def has_single_sighting(seen: LandmarkFactors) -> BoolArray:
+    """Return which landmarks (l,) have a single sighting that determines their place from its key."""
+    first = np.minimum(seen.starts[:-1], max(len(seen.keys) - 1, 0))
+    if not len(seen.keys):
+        return np.zeros(len(first), dtype=np.bool_)
+    a, b, c, d, e, f = seen.information[first].T
+    determinant = a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)
+    return np.asarray((np.diff(seen.starts) == 1) & (determinant > WELL_DETERMINED))
 
 
 def sample_paths(graph: SlamGraph, mode: MapEstimate, num_particles: int, rng: np.random.Generator) -> PathSamples:
-    """Draw x^(i) from the Gaussian about the mode, and replay each path.
+    """Draw x^(i) from the Gaussian about the mode, and weigh each path.
 
     log w = log p(path given odometry) + log p(measurements given path) - log q(path). The first path is the mode. If
     their effective sample size is low, the same paths are also retracted on SE(2) (`retract_on_se2`), and the set with
@@ -129,45 +152,39 @@ def sample_paths(graph: SlamGraph, mode: MapEstimate, num_particles: int, rng: n
         num_particles: M >= 1.
         rng: Source of the draws.
     """
-    return _best_of_two_charts(graph, mode, num_particles, rng, _importance_weights)
+    poses, log_proposals = mode.paths(num_particles, rng)
+    gaussian = importance_weights(graph, mode, poses, log_proposals)
+    if gaussian.sample_size >= MIN_GAUSSIAN_SAMPLE_SIZE * num_particles:
+        return gaussian
+    retracted = importance_weights(graph, mode, _retracted(graph, mode, poses), log_proposals)
+    retracted = retracted._replace(is_retracted=True)
+    return max(gaussian, retracted, key=lambda draws: np.nan_to_num(draws.sample_size))
+
+
+def _retracted(graph: SlamGraph, mode: MapEstimate, poses: FloatArray) -> FloatArray:
+    """Return paths (k, 3, M) drawn from the Gaussian about the mode, retracted on SE(2)."""
+    return retract_on_se2(mode.poses, graph.parents, poses - mode.poses[:, :, None])
 
 
 def sample_more_paths(
-    graph: SlamGraph, mode: MapEstimate, num_drawn: int, num_particles: int, rng: np.random.Generator
+    graph: SlamGraph, mode: MapEstimate, num_drawn: int, first: PathSamples, rng: np.random.Generator
 ) -> tuple[PathSamples, float]:
-    """Draw and weigh paths as `sample_paths` does, and resample fewer of them: only these get landmarks.
+    """Draw and weigh more paths as those of `sample_paths` were drawn, and resample fewer of them.
 
     Args:
         graph, mode, rng: Same arguments as `sample_paths`.
         num_drawn: Number of weighed paths.
-        num_particles: M, number of resampled paths.
+        first: Result of `sample_paths`. It says whether these paths are retracted, and how many are resampled.
 
     Returns:
-        M paths with equal weights, and the effective sample size of the weighed ones.
+        Paths with equal weights, and the effective sample size of the weighed ones.
     """
-    drawn = _best_of_two_charts(graph, mode, num_drawn, rng, _weights_alone)
-    poses = drawn.poses[:, :, systematic(drawn.weights, rng, num_particles)]
-    tiles = replay(mode, lane_rows(poses), num_particles)[0]
-    chosen = PathSamples.weighed(poses, tiles, np.zeros(num_particles), drawn.transition_variances)
-    return chosen, drawn.sample_size
-
-
-Draws = TypeVar("Draws", PathSamples, PathWeights)
-
-
-def _best_of_two_charts(
-    graph: SlamGraph, mode: MapEstimate, num_paths: int, rng: np.random.Generator,
-    weigh: Callable[[SlamGraph, MapEstimate, FloatArray, FloatArray], Draws],
-) -> Draws:  # fmt: skip
-    """Draw paths and weigh them, see `sample_paths`."""
-    poses, log_proposals = mode.paths(num_paths, rng)
-    gaussian = weigh(graph, mode, poses, log_proposals)
-    if gaussian.sample_size >= MIN_GAUSSIAN_SAMPLE_SIZE * num_paths:
-        return gaussian
-    retracted = weigh(
-        graph, mode, retract_on_se2(mode.poses, graph.parents, poses - mode.poses[:, :, None]), log_proposals
-    )
-    return max(gaussian, retracted, key=lambda draws: np.nan_to_num(draws.sample_size))
+    num_particles = len(first.weights)
+    poses, log_proposals = mode.paths(num_drawn, rng)
+    poses = _retracted(graph, mode, poses) if first.is_retracted else poses
+    drawn = importance_weights(graph, mode, poses, log_proposals)
+    poses = np.take(poses, systematic(drawn.weights, rng, num_particles), axis=2)
+    return PathSamples.weighed(poses, np.zeros(num_particles), drawn.transition_variances), drawn.sample_size
 
 
 def sample_transition_variances(graph: SlamGraph, mode: MapEstimate, rng: np.random.Generator) -> FloatArray:
@@ -182,30 +199,29 @@ def sample_transition_variances(graph: SlamGraph, mode: MapEstimate, rng: np.ran
     return odometry_log_density(graph, mode, lane_rows(paths), LANES)[1]
 
 
-def _importance_weights(
+def importance_weights(
     graph: SlamGraph, mode: MapEstimate, poses: FloatArray, log_proposals: FloatArray
 ) -> PathSamples:
-    """Replay paths (k, 3, M) and compute their importance weights."""
-    num_paths = poses.shape[2]
-    rows = lane_rows(poses)
-    tiles, log_likelihood = replay(mode, rows, num_paths)
-    log_odometry, transition_variances = odometry_log_density(graph, mode, rows, num_paths)
-    return PathSamples.weighed(poses, tiles, log_likelihood + log_odometry - log_proposals, transition_variances)  # (2)
+    """Return paths (k, 3, M) with their importance weights, up to a common factor.
 
+    Landmarks seen from one key alone do not take part: their likelihood is the same given any path.
 
-def _weights_alone(graph: SlamGraph, mode: MapEstimate, poses: FloatArray, log_proposals: FloatArray) -> PathWeights:
-    """Return the importance weights of paths (k, 3, M) as `_importance_weights` does; landmarks are not kept."""
-    num_paths = poses.shape[2]
+    Args:
+        graph: Odometry and measurements.
+        mode: Sightings, linearised there.
+        poses: (k, 3, M) float64 [m, m, rad], map frame.
+        log_proposals: (M,) float64. Log densities of the draws.
+    """
+    num_paths, seen = poses.shape[2], mode.sightings
     rows = lane_rows(poses)
-    tiles = np.empty(len(mode.landmarks) * 9 * LANES)  # of one block after the other: of all they exceed a cache
-    log_likelihood = np.empty((len(rows), LANES))
-    for block, out in zip(rows, log_likelihood, strict=True):
-        _kernels.replay(block.reshape(-1), len(poses), 1, mode.landmarks, mode.sightings, tiles, out)
+    blocks, log_likelihood = len(rows), np.empty(len(rows) * LANES)
+    chosen = np.flatnonzero(np.diff(seen.starts) > 0)
+    chosen = chosen[seen.keys[seen.starts[chosen]] != seen.keys[seen.starts[chosen + 1] - 1]]
+    one_tile = np.empty(9 * LANES)
+    _kernels.replay(rows.reshape(-1), len(poses), blocks, mode.landmarks, seen, chosen, one_tile, log_likelihood)
     log_odometry, transition_variances = odometry_log_density(graph, mode, rows, num_paths)
-    log_weights = log_likelihood.reshape(-1)[:num_paths] + log_odometry - log_proposals
-    weights = np.empty(num_paths)
-    sample_size = _kernels.normalise(log_weights, weights)
-    return PathWeights(poses, log_weights, weights, sample_size, transition_variances)
+    log_weights = log_likelihood[:num_paths] + log_odometry - log_proposals  # (2)
+    return PathSamples.weighed(poses, log_weights, transition_variances)
 
 
 def lane_rows(poses: FloatArray) -> FloatArray:
@@ -223,21 +239,27 @@ def lane_rows(poses: FloatArray) -> FloatArray:
     return rows
 
 
-def replay(mode: MapEstimate, rows: FloatArray, num_particles: int) -> tuple[FloatArray, FloatArray]:
-    """Return the landmarks of M paths, and log p(measurements given path) up to a constant.
+def replay(
+    mode: MapEstimate, rows: FloatArray, num_particles: int, chosen: IntArray | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """Return the landmarks of M paths, and log p(their measurements given path) up to a constant.
 
     Args:
         mode: Sightings, linearised there.
         rows: Paths as `lane_rows` returns them.
         num_particles: M.
+        chosen: (n,) int64. Rows of some landmarks. None: all.
 
     Returns:
-        (l, P / LANES, 9, LANES) means and covariances in blocks of lanes, zeros where a landmark has no sighting; (M,).
+        (n, P / LANES, 9, LANES) means and covariances in blocks of lanes, zeros where a landmark has no sighting; (M,).
     """
     blocks, k = rows.shape[:2]
-    tiles = np.empty((len(mode.landmarks), blocks, 9, LANES))
+    chosen = np.arange(len(mode.landmarks)) if chosen is None else chosen
+    tiles = np.empty((len(chosen), blocks, 9, LANES))
     log_likelihood = np.empty(blocks * LANES)
-    _kernels.replay(rows.reshape(-1), k, blocks, mode.landmarks, mode.sightings, tiles.reshape(-1), log_likelihood)
+    _kernels.replay(
+        rows.reshape(-1), k, blocks, mode.landmarks, mode.sightings, chosen, tiles.reshape(-1), log_likelihood
+    )
     return tiles, log_likelihood[:num_particles]
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from slam_backend.core.jit import in_place, jit_fma, simd, stack_array
 from slam_backend.core.simd_math import log_of, sine_cosine
-from slam_backend.core.validation import FloatArray, IntArray
+from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.smoother._kernels.factors import _inverse
 from slam_backend.smoother._kernels.normal_equations import WEAK
 from slam_backend.smoother._kernels.records import (
@@ -197,8 +197,8 @@ def to_lanes(poses: FloatArray, rows: FloatArray) -> None:
 
 @simd
 def replay(
-    poses: FloatArray, num_keys: int, num_blocks: int, landmarks: FloatArray, seen: LandmarkFactors, tiles: FloatArray,
-    log_likelihood: FloatArray,
+    poses: FloatArray, num_keys: int, num_blocks: int, landmarks: FloatArray, seen: LandmarkFactors, chosen: IntArray,
+    tiles: FloatArray, log_likelihood: FloatArray,
 ) -> None:  # fmt: skip
     """Give each path the landmarks that its sightings ask for, and the log-likelihood of these, up to a constant.
 
@@ -207,8 +207,9 @@ def replay(
         num_keys, num_blocks: k, and the number of blocks of lanes.
         landmarks: (l, 3) about which forms are evaluated, map frame.
         seen: Sightings, linearised there.
-        tiles: (l * num_blocks * 9 * LANES,), result: mean (3) and covariance (6) per lane; zeros for a landmark without
-            sightings.
+        chosen: (n,) rows of the landmarks that take part; negative: left out.
+        tiles: (n * num_blocks * 9 * LANES,), result: mean (3) and covariance (6) per lane; zeros for a landmark without
+            sightings. (9 * LANES,): each landmark overwrites the one before, where likelihoods alone are wanted.
         log_likelihood: (num_blocks * LANES,), result.
     """
     keys, starts, centres, infos, slopes = (
@@ -222,10 +223,13 @@ def replay(
     work = stack_array(WORK_SIZE)
     for block in range(num_blocks):  # one after the other, for the poses of one are as many as a cache holds
         out = log_likelihood[block * LANES : (block + 1) * LANES]
-        for landmark in range(len(landmarks)):
+        for n in range(len(chosen)):
+            landmark = chosen[n]
+            if landmark < 0:
+                continue
             first, last = starts[landmark], starts[landmark + 1]
             x, y, z = landmarks[landmark, 0], landmarks[landmark, 1], landmarks[landmark, 2]
-            base = (landmark * num_blocks + block) * 9 * LANES
+            base = (n * num_blocks + block) * 9 * LANES if len(tiles) > 9 * LANES else 0
             tile = tiles[base : base + 9 * LANES]
             if first == last:
                 tile[:] = 0.0
@@ -282,6 +286,65 @@ def replay(
                 det = work[A00 + i]
                 log_det = log_of(det) if det > 0.0 else math.nan
                 out[i] += work[ENERGY + i] - 0.5 * log_det  # (6)
+
+
+@simd
+def place_landmarks(
+    poses: FloatArray, num_keys: int, num_blocks: int, seen: LandmarkFactors, chosen: IntArray, is_rigid: BoolArray,
+    walk: float, tiles: FloatArray,
+) -> None:  # fmt: skip
+    """Write landmarks with a single sighting, which stand rigidly to its key, and add a random walk to all.
+
+    Args:
+        poses, num_keys, num_blocks: Paths, as `replay` takes them.
+        seen: Sightings.
+        chosen: (n,) rows of landmarks.
+        is_rigid: (n,) bool. True for those with a single sighting, which are written.
+        walk: Variance [m^2] that is added along each axis.
+        tiles: (n * num_blocks * 9 * LANES,), landmarks of the chosen rows as `replay` writes them; changed.
+    """
+    keys, starts, centres, infos, slopes = (
+        seen.keys,
+        seen.starts,
+        seen.linearisation_points,
+        seen.information,
+        seen.gradients,
+    )
+    p = stack_array(6)
+    for n in range(len(chosen)):
+        row = starts[chosen[n]]
+        if is_rigid[n]:
+            _inverse(infos[row], p)
+            g0, g1, g2 = slopes[row, 0], slopes[row, 1], slopes[row, 2]
+            ahead = centres[row, 0] + p[0] * g0 + p[1] * g1 + p[2] * g2
+            left = centres[row, 1] + p[1] * g0 + p[3] * g1 + p[4] * g2
+            up = centres[row, 2] + p[2] * g0 + p[4] * g1 + p[5] * g2
+            p0, p1, p2, p3, p4, p5 = p[0], p[1], p[2], p[3], p[4], p[5]
+        else:
+            ahead, left, up = 0.0, 0.0, 0.0
+            p0, p1, p2, p3, p4, p5 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for block in range(num_blocks):
+            base = (n * num_blocks + block) * 9 * LANES
+            tile = tiles[base : base + 9 * LANES]
+            if not is_rigid[n]:
+                for i in range(LANES):
+                    tile[3 * LANES + i] += walk
+                    tile[6 * LANES + i] += walk
+                    tile[8 * LANES + i] += walk
+                continue
+            base = (block * num_keys + keys[row]) * POSE_ROWS * LANES
+            pose = poses[base : base + POSE_ROWS * LANES]
+            for i in range(LANES):
+                c, s = pose[COS + i], pose[SIN + i]
+                tile[i] = pose[PX + i] + c * ahead - s * left
+                tile[LANES + i] = pose[PY + i] + s * ahead + c * left
+                tile[2 * LANES + i] = up
+                tile[3 * LANES + i] = c * c * p0 - 2.0 * c * s * p1 + s * s * p3 + walk
+                tile[4 * LANES + i] = c * s * (p0 - p3) + (c * c - s * s) * p1
+                tile[5 * LANES + i] = c * p2 - s * p4
+                tile[6 * LANES + i] = s * s * p0 + 2.0 * c * s * p1 + c * c * p3 + walk
+                tile[7 * LANES + i] = s * p2 + c * p4
+                tile[8 * LANES + i] = p5 + walk
 
 
 @simd

@@ -16,7 +16,7 @@ from slam_backend.fastslam.rejuvenation import RejuvenationScheduler
 from slam_backend.geometry import between, compose, inverse, rotation, transform_points, wrap_angle
 from slam_backend.smoother import rejuvenation
 from slam_backend.smoother._kernels import LANES
-from slam_backend.smoother.gauge import compute_gauge_fix, fix_gauge, fix_start, move, transform_tiles
+from slam_backend.smoother.gauge import compute_gauge_fix, fix_gauge, fix_start, move
 from slam_backend.smoother.graph import RIGID, SlamGraph
 from training.bench.accuracy.runs import RunSpec, simulate_run
 
@@ -71,17 +71,6 @@ def open_run(seed: int = 103) -> tuple[FastSlam, list[FloatArray], list[int]]:
             drawn.append(step)
         poses.append(slam.pose().mean)
     return slam, poses, drawn
-
-
-def test_landmarks_are_moved_as_one_by_one():
-    """The compiled kernel moves means and covariances of each particle by its own motion; surplus lanes stay."""
-    rng = np.random.default_rng(1)
-    values, motions = random_maps(5, 70, rng), rng.normal(size=(70, 3))
-    tiles = laned(values)
-    before = tiles.copy()
-    transform_tiles(tiles, motions)
-    np.testing.assert_allclose(unlaned(tiles, 70), moved_plainly(values, motions), atol=1e-12)
-    np.testing.assert_array_equal(tiles[:, 1, :, 70 - LANES :], before[:, 1, :, 70 - LANES :])
 
 
 def off_by(poses: FloatArray, means: FloatArray) -> FloatArray:

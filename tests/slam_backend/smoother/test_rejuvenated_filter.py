@@ -121,7 +121,8 @@ def test_landmarks_without_sightings_are_deleted(left, monkeypatch):
 
     def renew(new):
         kept.append(new.ids[:left])
-        renew_all(new._replace(ids=new.ids[:left], tiles=new.tiles[:left], counts=new.counts[:left]))
+        landmarks = new.landmarks._replace(rows=new.landmarks.rows[:left])
+        renew_all(new._replace(ids=new.ids[:left], landmarks=landmarks, counts=new.counts[:left]))
 
     renew_all = slam.state._replace_particles
     monkeypatch.setattr(slam.state, "_replace_particles", renew)
