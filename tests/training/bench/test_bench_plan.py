@@ -33,7 +33,7 @@ from training.bench.exploration.plan_report import (
 )
 from training.bench.exploration.trials import TRIALS_FILE
 
-FROZEN = {"vslam-bench-v0": "bdfcfe73b00377aa"}  # by name; a plan that changes gets a new name once it is frozen
+FROZEN = {"vslam-bench-v0": "c93f9cc37b4e9f61"}  # by name; a plan that changes gets a new name once it is frozen
 TINY = """
 name = "tiny"
 split = "validation"
@@ -102,10 +102,13 @@ def test_shipped_plans_do_not_change(name: str, monkeypatch: pytest.MonkeyPatch)
     plan = Plan.load(name)
     assert (plan.name, plan.digest) == (name, FROZEN[name])
     per_policy = [t for t in plan.trials(("frontier@continuous",)) if t.part == "base"]
-    assert len(per_policy) == len({(t.world, t.seed) for t in per_policy}) == 5 * 30  # floor plans are left out
+    assert len(per_policy) == len({(t.world, t.seed) for t in per_policy}) == 4 * 30  # floor plans are left out
     assert plan.missing_floor_plans() == list(plan.floor_plans)
     quick = plan.trials(quick=True)
     assert {t.part for t in quick} == {"base"}
+    assert {t.duration for t in plan.trials() if t.part != "large_world"} == {plan.duration}
+    (trial, *_) = (t for t in plan.trials() if t.part == "large_world")
+    assert plan.environment(trial).max_seconds == trial.duration == 600.0
     assert len(quick) == 4 * 2 * len(plan.policies)
 
 
@@ -286,8 +289,8 @@ def _row(policy: str, family: str, seed: int, **values: Any) -> dict[str, Any]:
     )  # fmt: skip
     about = {
         "part": "base", "policy": policy, "family": family, "world": family, "robots": 3, "particles": 100,
-        "oracle": "none", "preset": "standard", "comm_loss": None, "seed": seed, "digest": f"{seed:032x}",
-        "policy_digest": None, "machine": machine_module.machine(), "refusals": {},
+        "oracle": "none", "preset": "standard", "comm_loss": None, "duration": 120.0, "seed": seed,
+        "digest": f"{seed:032x}", "policy_digest": None, "machine": machine_module.machine(), "refusals": {},
     }  # fmt: skip
     return about | dict.fromkeys(names, 0.5) | values
 
@@ -323,8 +326,8 @@ def test_policies_are_ordered_and_compared_with_the_first() -> None:
     assert main.rows[1][-1].startswith("0.38 (")  # 3 + 2 + 1 of 16 pairs are better, none is equal
     assert families.rows[1][1] == "25.0, 6.2 (6.2 .. 6.2)"
     assert "The rows of floor plans are left out" in markdown(plan, rows)
-    assert "`frontier` has 8 of 180 episodes" not in markdown(plan, rows)
-    assert "`frontier` has 8 of 150 episodes of the base part" in markdown(plan, rows)
+    assert "`frontier` has 8 of 150 episodes of the base part" not in markdown(plan, rows)
+    assert "`frontier` has 8 of 120 episodes of the base part" in markdown(plan, rows)
     assert "The rows of floor plans" not in markdown(plan, [*rows, _row("frontier", FLOOR_PLANS, 0)])
 
 

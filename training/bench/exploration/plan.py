@@ -37,6 +37,7 @@ class PlanTrial:
     oracle: str  # Ground truth given to the robots
     preset: str  # Noise preset
     comm_loss: float | None  # Probability that a contact fails; None: that of the preset
+    duration: float  # Simulated time [s]
     seed: int  # Seed of the episode
 
 
@@ -51,6 +52,7 @@ class PlanPart(Checked):
     oracles: tuple[Oracle, ...] = ("none",)
     preset: NoisePreset = "standard"
     comm_loss: float | None = None
+    duration: float | None = None  # Simulated time of an episode [s]; None: that of the plan
     policies: tuple[str, ...] | None = None  # None: those of the run
 
 
@@ -115,7 +117,7 @@ class Plan(Checked):
         Args:
             policies: Labels of the policies; None: those of the plan. Parts with policies of their own are played by
                 those of these that are chosen.
-            quick: Whether only the first seeds of the base part are played, without floor plans and large worlds.
+            quick: Whether only the first seeds of the base part are played, without floor plans.
         """
         parts = self.all_parts()
         if quick:
@@ -125,7 +127,7 @@ class Plan(Checked):
             PlanTrial(
                 part=name, policy=policy, family=family, robots=robots, particles=particles, oracle=oracle, seed=seed,
                 world=list(self.floor_plans)[seed] if family == FLOOR_PLANS else family, preset=part.preset,
-                comm_loss=part.comm_loss,
+                comm_loss=part.comm_loss, duration=part.duration or self.duration,
             )
             for name, part in parts.items()
             for seed, family, robots, particles, oracle, policy in product(
@@ -156,7 +158,7 @@ class Plan(Checked):
             world = str(found)
         config = RunConfig(
             world=world, robots=trial.robots, policy=player.policy, particles=trial.particles, seed=trial.seed,
-            action_type=player.action_type, preset=trial.preset, max_seconds=self.duration,  # type: ignore[arg-type]
+            action_type=player.action_type, preset=trial.preset, max_seconds=trial.duration,  # type: ignore[arg-type]
         ).environment()  # fmt: skip
         has_all = trial.oracle == ALL_ORACLES or player.needs_oracles
         changes: dict[str, Any] = {f"oracle_{name}": has_all or trial.oracle == name for name in ORACLES}

@@ -28,7 +28,7 @@ from training.experiments.tables import E_SCALE, csv_text, markdown_table, numbe
 
 Rows = Sequence[Mapping[str, Any]]
 Values = dict[tuple[str, int], float]  # of worlds, by family and seed
-FACTORS = ("one_robot", "five_robots", "hard", "lossy_radio")
+FACTORS = ("large_world", "one_robot", "five_robots", "hard", "lossy_radio")
 ORACLES, TEAM_SIZE = "oracles", "team_size"
 PARTS_OF_E = ("missed", "misplaced", "duplicate", "false")
 PROFILE_CM = (10.0, 20.0, 30.0, 40.0)
