@@ -215,7 +215,7 @@ def test_the_leaderboard_is_made_from_kept_results(vslam: Any, run: Path, tmp_pa
     page = tmp_path / "leaderboard.md"
     assert vslam("bench", "leaderboard", str(kept), "--out", str(page)).status == 0
     text = page.read_text()
-    assert text.startswith("# Leaderboard\n")
+    assert text.startswith("# Leaderboard of exploration policies\n")
     for section in (run / "tables.md").read_text().split("### ")[1:]:
         assert section.rstrip("\n") in text
     assert vslam("bench", "leaderboard", str(kept), str(run), "--out", str(page)).status == 0

@@ -16,6 +16,10 @@ from training.experiments.statistics import grouped
 from training.experiments.tables import markdown_table
 
 EPISODES = ("episodes.csv", "episodes.csv.gz")
+ABOUT = (
+    "Made by `vslam bench leaderboard` from kept results (`benchmarks/vslam-bench-v0/*`). `docs/how-to/exploration.md` "
+    "describes the policies, `docs/reference/metrics.md` the columns, `docs/how-to/benchmark.md` how to add a row.\n"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +80,7 @@ def leaderboard(results: Sequence[Results]) -> str:
     headings = ("policy", "episodes", "played again: equal", "different")
     machines = sorted({str(row["machine"]) for row in rows})
     return "\n".join([
-        "# Leaderboard\n", markdown(plan, rows), "### Verification\n",
+        "# Leaderboard of exploration policies\n", ABOUT, markdown(plan, rows), "### Verification\n",
         "Episodes of each policy that were played again at the last verification, and whether all bits were equal.\n",
         markdown_table(headings, shown), f"Played on: {'; '.join(machines)}.\n",
     ])  # fmt: skip
