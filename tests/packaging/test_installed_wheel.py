@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 import slam_backend
+from slam_backend.core.compilation.cache import cache_folder
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("slam_backend", "vslam_env", "agents", "training")
@@ -68,12 +69,15 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         wheel,
         cwd=place,
     )
-    checkout = Path(slam_backend.__file__).parents[1]
+    checkout, chosen = Path(slam_backend.__file__).parents[1], os.environ.get("NUMBA_CACHE_DIR", "")
     for name in PACKAGES:
-        for file in (checkout / name).rglob("__pycache__/*.nbc"):
-            target = site / file.relative_to(checkout)
-            target.parent.mkdir(mode=0o700, exist_ok=True)
-            shutil.copy(file, target)
+        for sources in {file.parent for file in (checkout / name).rglob("*.py")}:
+            kept = cache_folder(sources, chosen)
+            here = cache_folder(site / sources.relative_to(checkout), chosen)
+            assert kept is not None
+            assert here is not None
+            for file in kept.glob("*.nbc"):
+                shutil.copy(file, here)
     return place
 
 
