@@ -1,12 +1,13 @@
 """Registry of policies: built-in ones by name, trained ones by file, custom ones by module."""
 
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 from agents.d_optimality import DOptimality
 from agents.distance_advantage import distance_advantage
 from agents.goal_choice import DrivingPolicy, GoalPolicy, Planner
+from agents.goal_network import Weights
 from agents.hungarian import hungarian
 from agents.independent_frontier import IndependentFrontier
 from agents.mtsp import mtsp
@@ -41,11 +42,13 @@ PLANNERS: dict[str, Callable[[], Planner]] = {
     "d_optimality": DOptimality,
     **{name: partial(Assigned, assign) for name, assign in ASSIGNMENTS.items()},
 }
+LEARNED = Path(__file__).parent / "pretrained" / f"goal{SUFFIX}"
 SWEEPING = ("next_best_view",)  # planners whose robots sweep their cameras on the way, with continuous actions
 POLICIES: dict[str, tuple[str, ...]] = {  # with supported action types; comparisons of policies use the first one
     "frontier": ("goal", "continuous", "discrete"),
     "random_goals": ("goal",),
     "random_walk": ("continuous", "discrete"),
+    "learned": ("goal",),
     **dict.fromkeys(PLANNERS, ("goal", "continuous", "discrete")),
 }
 
@@ -72,15 +75,18 @@ def make_policy(name: str, action_type: str) -> Policy:
 
     Args:
         name: Name of the policy: one of `POLICIES`, with the action types given there; the planners among them are
-            described in docs/how-to/exploration.md. Path of a model of `vslam train`, or of its run folder: trained
-            policy, for `goal` actions and dict observations. `"module:Name"`: custom policy, made by calling `Name`
-            without arguments, for its attribute `action_type`, or else for `goal`.
+            described in docs/how-to/exploration.md, and `learned` in agents/pretrained/goal.md. Path of a model of
+            `vslam train`, or of its run folder: trained policy, for `goal` actions and dict observations.
+            `"module:Name"`: custom policy, made by calling `Name` without arguments, for its attribute `action_type`,
+            or else for `goal`.
         action_type: Action type of the environment.
 
     Raises:
         ValueError: If there is no such policy, it does not support the action type, or a model cannot be read.
     """
     _check_action_type(name, action_type)
+    if name == "learned":
+        return TrainedGoalPolicy(_shipped_weights(), greedy=True)
     if is_model(name):
         return TrainedGoalPolicy(load_model(name)[0])
     if is_plugin(name):
@@ -91,6 +97,11 @@ def make_policy(name: str, action_type: str) -> Policy:
             return GoalPolicy(planner)
         return DrivingPolicy(planner, action_type == "discrete", name in SWEEPING)
     return RandomGoals() if name == "random_goals" else RandomWalk(action_type == "discrete")
+
+
+@cache
+def _shipped_weights() -> Weights:
+    return load_model(LEARNED)[0]
 
 
 def make_team_policy(name: str, action_type: str) -> TeamPolicy:

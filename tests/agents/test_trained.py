@@ -24,6 +24,7 @@ from agents.goal_network import (
     WIDTH,
     logits,
 )
+from agents.registry import LEARNED
 from agents.trained import FORMAT, TrainedGoalPolicy, check_observation, load_model, save_model
 from vslam_env import CANDIDATE_FEATURES, NUM_CANDIDATES, vslam_v0
 from vslam_env.belief.observation import observation_space
@@ -227,3 +228,18 @@ def test_other_spaces_are_refused() -> None:
 def _saved(file: Path) -> Path:
     save_model(file, _weights(), ABOUT)
     return file
+
+
+def test_the_shipped_model_is_small_and_has_a_card() -> None:
+    """`learned` plays the model in `agents/pretrained/`, of less than 1 MB, greedily; its card names these weights."""
+    assert LEARNED.stat().st_size < 1_000_000
+    weights, about = load_model(LEARNED)
+    assert about["weights"] in LEARNED.with_suffix(".md").read_text(encoding="utf-8")
+    env = vslam_v0.parallel_env(world="fig5", num_robots=2, num_particles=5, action_type="goal", max_seconds=5.0)
+    seen, _ = env.reset(seed=2)
+    for agent in env.agents:
+        inputs = {name: np.asarray(seen[agent][name])[None] for name in SHAPES}
+        actions = {make_policy("learned", "goal").act(seen[agent], None, np.random.default_rng(k)) for k in range(5)}
+        assert actions == {int(logits(weights, inputs)[0].argmax())}
+    with pytest.raises(ValueError, match="action_type: expected 'goal' for policy 'learned', got 'discrete'"):
+        make_policy("learned", "discrete")

@@ -22,8 +22,8 @@ Share = Annotated[float, Field(gt=0.0, le=1.0)]
 TRAIN_PRESETS: dict[str, dict[str, Any]] = {
     "quick": {},
     "imitate": {
-        "teacher": "next_best_view", "rounds": 3, "world": "office,maze,loops,hall", "max_cycles": 60, "steps": 103_680,
-        "learning_rate": 1e-3, "epochs": 8,
+        "teacher": "next_best_view", "rounds": 2, "world": "office,maze,loops,hall", "max_cycles": 60, "steps": 69_120,
+        "learning_rate": 1e-3, "epochs": 6,
     },
     # Takes seconds; checks that everything works.
     "smoke": {"world": "fig5", "robots": 2, "particles": 5, "max_cycles": 4, "envs": 2, "steps": 48, "batch": 16,
@@ -41,8 +41,11 @@ class TrainConfig(ExperimentConfig):
         "quick", "Preset: quick or smoke (PPO), or imitate (a planner)."
     )
     teacher: Literal["next_best_view"] | None = setting(None, "Planner to imitate; None: PPO.")
+    start: str | None = option(
+        None, "Model of vslam train to begin with, or its run folder.", shown="random weights", is_path=True
+    )
     rounds: Positive | None = option(
-        None, "Rounds of an imitation; the pupil drives in all but the first.", shown="3 with imitate", hint=ONE
+        None, "Rounds of an imitation; the pupil drives in all but the first.", shown="2 with imitate", hint=ONE
     )
     temperature: float = setting(0.25, "Divisor of the teacher's log preferences in its soft choices.", gt=0.0)
     thin: Positive = setting(2, "Number of decisions of an imitation for each that is kept as a label.")
@@ -76,6 +79,10 @@ class TrainConfig(ExperimentConfig):
         from slam_backend.core.validation import argument_error
         from vslam_env.world import check_source
 
+        if self.start is not None:
+            from agents.trained import load_model
+
+            load_model(self.start)
         for world in self.worlds:
             check_source(world)
         self.make_env_configs(SPLIT_TRAIN)
@@ -101,7 +108,8 @@ class TrainConfig(ExperimentConfig):
         """Return plain values that repeat this training from any folder, except the seed."""
         from vslam_env.world import portable_source
 
-        return super().to_mapping() | {"world": ",".join(str(portable_source(world)) for world in self.worlds)}
+        values = super().to_mapping() | {"world": ",".join(str(portable_source(world)) for world in self.worlds)}
+        return values if self.start is None else values | {"start": str(Path(self.start).resolve())}
 
     @property
     def worlds(self) -> tuple[str, ...]:

@@ -24,6 +24,7 @@ from agents.goal_network import (
     VECTOR_SIZE,
     VECTORS,
     WIDTH,
+    Weights,
 )
 
 NUM_SLOTS, NUM_FEATURES = SHAPES["candidates"]
@@ -149,6 +150,13 @@ class GoalPolicy(MaskableMultiInputActorCriticPolicy):  # type: ignore[misc]
     def logits(self, observations: dict[str, Any]) -> Any:
         """Return the logits (n, 1 + C) of observations as float tensors; grids from 0 to 1."""
         return self.mlp_extractor.forward_actor(self.features_extractor(observations))
+
+    def load_actor(self, weights: Weights) -> None:
+        """Take the weights of `agents.goal_network`; those of the value head stay as they are."""
+        own = {**self.features_extractor.state_dict(), **self.mlp_extractor.state_dict()}
+        with torch.no_grad():
+            for name, values in weights.items():
+                own[name].copy_(torch.from_numpy(np.array(values)))
 
     def actor_weights(self) -> dict[str, NDArray[np.float32]]:
         """Return copies of the weights that `agents.goal_network` needs, by layer name."""

@@ -10,7 +10,7 @@ import torch
 from sb3_contrib import MaskablePPO
 from stable_baselines3.common.logger import configure
 
-from agents.trained import MODEL_FILE, save_model
+from agents.trained import MODEL_FILE, load_model, save_model
 from slam_backend.core.state_checks import generator as check_generator
 from slam_backend.core.validation import argument_error
 from training.experiments.run_folder import installed_versions
@@ -52,6 +52,8 @@ class Training:
             batch_size=config.batch, n_epochs=config.epochs, gamma=config.gamma, gae_lambda=config.gae_lambda,
             clip_range=config.clip, ent_coef=config.entropy, seed=config.seed, device=device,
         )  # fmt: skip
+        if config.start is not None:
+            self.model.policy.load_actor(load_model(config.start)[0])
         self.watch = TrainingCallback(self.env, self.save, config.checkpoint_updates)
 
     @property

@@ -24,7 +24,7 @@ from training.rl.config import SPLIT_TRAIN, TrainConfig
 from training.rl.imitation.collection import collect, draw, make_taught_envs
 from training.rl.imitation.imitation import LABELS, Imitation
 from training.rl.imitation.labels import FORMAT, Labels, joined, pack, read_labels, write_labels
-from training.rl.trainer import stored_checkpoint
+from training.rl.trainer import Training, stored_checkpoint
 from vslam_env import vslam_v0
 from vslam_env.belief.observation import observation_space
 
@@ -296,6 +296,23 @@ def test_environments_play_the_worlds_in_turn() -> None:
         TrainConfig.from_mapping(SMALL | {"world": "fig5,mase"})
     with pytest.raises(ValueError, match="thin: expected at most max_cycles, 4, got 5"):
         TrainConfig.from_mapping(SMALL | {"thin": 5})
+
+
+def test_trainings_begin_with_a_model(whole: tuple[Path, Imitation], tmp_path: Path) -> None:
+    """Imitation and PPO begin with the weights of `start`, which must be a model."""
+    weights = whole[1].policy.actor_weights()
+    values = SMALL | {"start": str(whole[0]), "seed": 6}
+    ppo = {name: value for name, value in values.items() if name not in ("rounds", "thin")} | {"preset": "smoke"}
+    trainings = (
+        Imitation(TrainConfig.from_mapping(values), tmp_path), Training(TrainConfig.from_mapping(ppo), tmp_path)
+    )  # fmt: skip
+    for policy in (trainings[0].policy, trainings[1].model.policy):
+        for name, expected in weights.items():
+            np.testing.assert_array_equal(policy.actor_weights()[name], expected)
+    for training in trainings:
+        training.close()
+    with pytest.raises(ValueError, match="model: expected a model that vslam train wrote, got no such file"):
+        TrainConfig.from_mapping(SMALL | {"start": str(tmp_path / "none.npz")})
 
 
 def test_rounds_need_a_teacher() -> None:

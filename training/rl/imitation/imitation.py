@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.logger import configure
 
 from agents.goal_network import GRID_SCALE, NAMES, SHAPES
-from agents.trained import MODEL_FILE, save_model
+from agents.trained import MODEL_FILE, load_model, save_model
 from slam_backend.core.validation import argument_error
 from training.experiments.run_folder import installed_versions
 from training.rl.checkpoint import CHECKPOINT_FILE, write_checkpoint
@@ -66,6 +66,8 @@ class Imitation:
         torch.manual_seed(config.seed)
         space, actions = observation_space(32, 8.0, True, False), spaces.Discrete(SHAPES["action_mask"][0])
         self.policy = GoalPolicy(space, actions, lambda left: config.learning_rate).to(device)
+        if config.start is not None:
+            self.policy.load_actor(load_model(config.start)[0])
         self.rows: list[Row] = []
         self._best = np.inf
         self._best_weights: dict[str, Any] = {}

@@ -1,0 +1,1 @@
+"""Shipped model of the policy `learned`; `goal.md` is its card."""
