@@ -220,6 +220,11 @@ def test_the_leaderboard_is_made_from_kept_results(vslam: Any, run: Path, tmp_pa
         assert section.rstrip("\n") in text
     assert vslam("bench", "leaderboard", str(kept), str(run), "--out", str(page)).status == 0
     assert page.read_text() == text  # a policy in both, such as the baseline, counts once
+    played = (run / "episodes.csv").read_text().splitlines()
+    assert "\nteam_size,frontier," in "\n".join(played)
+    (kept / "episodes.csv.gz").write_bytes(gzip.compress("\n".join(played[:-1]).encode()))
+    assert vslam("bench", "leaderboard", str(kept), "--out", str(page)).status == 0
+    assert page.read_text().count("### ") == text.count("### ") - 1  # the last part is not finished
     other = (run / "episodes.csv").read_text().replace(",random_walk,", ",frontier,")
     (run / "episodes.csv").write_text("\n".join(other.splitlines()[:4]) + "\n")
     done = vslam("bench", "leaderboard", str(kept), str(run), "--out", str(page))

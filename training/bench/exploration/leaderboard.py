@@ -1,13 +1,14 @@
 """Leaderboard of a benchmark plan, generated from kept results."""
 
 import gzip
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from slam_backend.core.validation import argument_error
-from training.bench.exploration.plan import Plan
+from training.bench.exploration.plan import BASE_PART, Plan
 from training.bench.exploration.plan_report import incomplete, markdown, read_episodes
 from training.bench.exploration.report import label
 from training.bench.exploration.verification import equal_rows
@@ -17,7 +18,7 @@ from training.experiments.tables import markdown_table
 
 EPISODES = ("episodes.csv", "episodes.csv.gz")
 ABOUT = (
-    "Made by `vslam bench leaderboard` from kept results (`benchmarks/vslam-bench-v0/*`). `docs/how-to/exploration.md` "
+    "Made by `vslam bench leaderboard` from kept results (`benchmarks/vslam-bench-v0`). `docs/how-to/exploration.md` "
     "describes the policies, `docs/reference/metrics.md` the columns, `docs/how-to/benchmark.md` how to add a row.\n"
 )
 
@@ -58,19 +59,20 @@ def read_results(folder: Path) -> Results:
 def leaderboard(results: Sequence[Results]) -> str:
     """Return the page: all tables, and which episodes were played again.
 
-    A policy in several folders, such as the baseline, counts once, as in the first of them.
+    A policy in several folders, such as the baseline, counts once, as in the first of them. Parts of the plan that it
+    has not played to the end are left out.
 
     Raises:
         ValueError: If two folders have different custom policies or models of the same label.
     """
     plan = results[0].plan
-    kept: dict[str, list[Mapping[str, Any]]] = {}
+    kept: dict[str, Sequence[Mapping[str, Any]]] = {}
     for each in results:
         for (policy,), own in grouped(each.rows, ("policy",)).items():
             sources = {row["policy_digest"] for row in (*kept.get(policy, []), *own)}
             if len(sources) > 1:
                 raise argument_error("folders", "one policy for each label", policy, "Give one of them a LABEL=.")
-            kept.setdefault(policy, own)
+            kept.setdefault(policy, _finished(plan, policy, own))
     rows = [row for own in kept.values() for row in own]
     verified = {policy: counts for each in results for policy, counts in each.verified.items()}
     episodes = {policy: len(own) for (policy,), own in grouped(rows, ("policy",)).items()}
@@ -84,3 +86,10 @@ def leaderboard(results: Sequence[Results]) -> str:
         "Episodes of each policy that were played again at the last verification, and whether all bits were equal.\n",
         markdown_table(headings, shown), f"Played on: {'; '.join(machines)}.\n",
     ])  # fmt: skip
+
+
+def _finished(plan: Plan, policy: str, rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """Return the rows of parts of which none is missing; `read_results` checks the base part."""
+    wanted = Counter(trial.part for trial in plan.trials((policy,)))
+    parts = grouped(rows, ("part",)).items()
+    return [row for (part,), own in parts if part == BASE_PART or len(own) >= wanted[part] for row in own]
