@@ -9,6 +9,7 @@ particle are at its own place. Thus no two particles share values that one of th
 """
 
 import math
+import weakref
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from slam_backend.core.jit import LINE
 from slam_backend.core.packed_symmetric import UNPACK_INDEX
+from slam_backend.core.read_only import as_read_only, is_read_only
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.fastslam import _kernels
 from slam_backend.fastslam._kernels import LANES
@@ -80,10 +82,11 @@ class MapStore:
         self.odds: FloatArray = empty_aligned((0, self.padded), np.float64)
         self.maps: NDArray[np.int32] = np.zeros((1, self.padded), dtype=np.int32)
         self.users: IntArray = np.zeros(1, dtype=np.int64)
-        self.table: IntArray = np.zeros((6, 0), dtype=np.int64)
+        self.table: IntArray = np.zeros((7, 0), dtype=np.int64)
         self.descriptors: NDArray[np.float32] = np.zeros((0, 0), dtype=np.float32)
         self.heads: NDArray[np.float32] = np.zeros((0, 0), dtype=np.float32)
         self._free_maps = 0
+        self._copied: dict[int, tuple[IntArray, weakref.ref[FloatArray]]] = {}  # of the last state; not part of it
         self.free_rows: IntArray = np.zeros(0, dtype=np.int64)
         self.tops: IntArray = np.zeros(3, dtype=np.int64)
 
@@ -178,6 +181,7 @@ class MapStore:
             if new or descriptor_size:
                 self._grow_slots(max(64, new), descriptor_size)
                 self._grow_rows(max(64, new + new // 2 + 1))
+        self._copied = {}
         slots, rows = len(self.ids), len(self.counts)
         self.row_of[:new], self.map_of[:new] = np.arange(new), 0
         self.ids[new:] = self.identities[new:] = -1
@@ -233,6 +237,9 @@ class MapStore:
             self.heads[:, :n] = self.descriptors[:n, :: self.descriptors.shape[1] // len(self.heads)].T
             self.heads[:, n:] = _kernels.FAR
 
+
+WHOLE = 1024  # landmarks up to which the values of a snapshot are one array
+CHUNK = 128  # landmarks of an array in larger snapshots
 
 MAX_MAPS = 512  # limit of ancestor maps; beyond it the slots of the least used maps are refreshed
 MAPS_KEPT = (  # parts of a state
@@ -353,8 +360,16 @@ class ParticleMaps(MapStore):
 
     # ------------------------------------------------------------------ snapshots
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the attributes for copies and pickles, which share no arrays with states."""
+        return vars(self) | {"_copied": {}}
+
     def get_state(self) -> dict[str, Any]:
-        """Return the complete state of the maps, compact; nothing is shared."""
+        """Return the complete state of the maps, compact; `values` may be shared with other states and are read-only.
+
+        They are a tuple of arrays (n, 9 P): one with all landmarks, or of more than `WHOLE` landmarks one for each
+        `CHUNK`, so that those of landmarks that were not written since the last state need not be copied.
+        """
         used = self.used_slots()
         of, rows = self.map_of[used], self.row_of[used]
         live, first = np.unique(of[of > 0], return_index=True)
@@ -363,7 +378,7 @@ class ParticleMaps(MapStore):
         number[live] = np.arange(1, len(live) + 1)
         return {
             "num_particles": self.num_particles,
-            "values": np.take(self.values.reshape(-1, 9 * self.padded), rows, axis=0),
+            "values": self._copied_values(used),
             "counts": np.take(self.counts, rows, axis=0),
             "odds": None if self.log_odds_prior is None else np.take(self.odds, used, axis=0),
             "maps": np.take(self.maps, live, axis=0),
@@ -375,13 +390,35 @@ class ParticleMaps(MapStore):
             "next_id": self.next_id,
         }
 
+    def _copied_values(self, used: IntArray) -> tuple[FloatArray, ...]:
+        """Return the values of used slots, read-only; arrays of the last state that still hold are taken over."""
+        values, changed, parts = self.values.reshape(-1, 9 * self.padded), self.table[SLOT.changed], []
+        for slots in _chunks(used):
+            known = self._copied.get(int(slots[0]) if len(slots) else -1)
+            part = None if known is None or not np.array_equal(known[0], slots) else known[1]()
+            if part is None or changed[slots].any():
+                part = as_read_only(np.take(values, self.row_of[slots], axis=0))
+            parts.append((slots, part))
+        changed[:] = 0
+        self._remember(parts)
+        return tuple(part for _, part in parts)
+
+    def _remember(self, parts: list[tuple[IntArray, FloatArray]]) -> None:
+        """Keep which slots (n,) and arrays (n, 9 P) the last state has, as long as anyone else keeps the arrays."""
+        self._copied = {int(slots[0]): (slots, weakref.ref(part)) for slots, part in parts if len(slots)}
+
     def set_state(self, state: dict[str, Any]) -> None:
         """Restore the maps from `get_state`; allocated rows are reused."""
         n, m, maps = len(state["ids"]), int(state["num_particles"]), state["maps"]
         if m != self.num_particles:
             self._clear(m)
         self._begin(n, state["descriptors"].shape[1])
-        self.values.reshape(-1, 9 * self.padded)[:n] = state["values"]
+        values, parts = self.values.reshape(-1, 9 * self.padded), state["values"]
+        for slots, part in zip(_chunks(np.arange(n)), parts, strict=True):
+            values[slots] = part
+        self.table[SLOT.changed] = 0
+        if all(map(is_read_only, parts)):
+            self._remember(list(zip(_chunks(np.arange(n)), parts, strict=True)))
         self.counts[:n] = state["counts"]
         if self.log_odds_prior is not None:
             self.odds[:n] = state["odds"]
@@ -392,6 +429,20 @@ class ParticleMaps(MapStore):
         self.users = np.bincount(state["map_of"], minlength=len(maps) + 1).astype(np.int64)
         self.users[0], self._free_maps = 0, 0
         self.tops[2] = state["next_id"]
+
+
+def chunk_sizes(n: int) -> list[int]:
+    """Return how many landmarks each array of values in a state of n landmarks has.
+
+    >>> chunk_sizes(0), chunk_sizes(1024), chunk_sizes(1030)
+    ([0], [1024], [128, 128, 128, 128, 128, 128, 128, 128, 6])
+    """
+    return [n] if n <= WHOLE else [min(CHUNK, n - first) for first in range(0, n, CHUNK)]
+
+
+def _chunks(slots: IntArray) -> list[IntArray]:
+    """Divide slots (n,) as `chunk_sizes` says."""
+    return np.split(slots, np.cumsum(chunk_sizes(len(slots)))[:-1])
 
 
 def write_summary(maps: ParticleMaps, m: int, min_count: int, rows: MapSummaryRows, first: int) -> int:

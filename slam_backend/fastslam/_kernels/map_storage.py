@@ -9,6 +9,7 @@ from slam_backend.core.jit import device, in_place, inline, simd, simd_inline
 from slam_backend.core.validation import FloatArray, Int32Array, IntArray
 from slam_backend.fastslam._kernels.layout import (
     BLOCK,
+    CHANGED,
     FAR,
     FREE_SLOTS,
     IDENTITIES,
@@ -98,13 +99,15 @@ def _copy_row(
 def apply_resampling(slots: IntArray, maps: MapArrays) -> None:
     """Bring landmarks up to date: copy each particle's values from where its ancestor left them to its own place.
 
-    One free row is needed: the row that a landmark leaves is taken by the next, while it is still in the cache.
+    One free row is needed: the row that a landmark leaves is taken by the next, while it is still in the cache. The
+    landmarks are marked as changed, for only those that were brought up to date are written.
     """
     row_of, map_of, tops = maps.table[ROW_OF], maps.table[MAP_OF], maps.tops
     padded = maps.counts.shape[1]
     size = 9 * padded
     for k in range(len(slots)):
         slot = slots[k]
+        maps.table[CHANGED, slot] = 1
         e = map_of[slot]
         if e == 0:
             continue
@@ -144,6 +147,7 @@ def register_new(new_slots: IntArray, frame: Frame, maps: MapArrays) -> None:
         if slot < 0:
             continue
         ids[slot] = maps.tops[2]
+        maps.table[CHANGED, slot] = 1
         maps.tops[2] += 1
         identities[slot] = frame.identities[b] if frame.identified else -1
         size = frame.descriptors.shape[1]

@@ -18,7 +18,7 @@ class MapArrays(NamedTuple):
         values: (rows * 9 * P,) [m, m^2], map frame, each row [block][x, y, z, Sxx, Sxy, Sxz, Syy, Syz, Szz][lane].
         counts: (rows, P). Number of matches of the landmark in the particle, its start included; 0: it lacks it.
         odds: (slots, P) log-odds of existence; (0, P) where existence is not kept.
-        table: (6, slots), see `SlotRows`.
+        table: (7, slots), see `SlotRows`.
         maps: (maps, P). Ancestor maps; map 0 stands for the identity.
         users: (maps,). Number of slots read by each map.
         free_rows: (rows,). Stack of free rows.
@@ -40,7 +40,7 @@ class MapArrays(NamedTuple):
 
 
 class SlotRows(NamedTuple):
-    """Rows of the table (6, slots) of a map's slots.
+    """Rows of the table (7, slots) of a map's slots.
 
     Attributes:
         row_of: Row of each slot in the storage.
@@ -49,6 +49,7 @@ class SlotRows(NamedTuple):
         identities: The caller's identity of the landmark, -1 = none.
         last_seen: Step of the smoother in which the most probable particle last matched the landmark, 0 = never.
         free_slots: Stack of free slots.
+        changed: 1 where the values of the slot may have been written since the last snapshot.
     """
 
     row_of: int = 0
@@ -57,6 +58,7 @@ class SlotRows(NamedTuple):
     identities: int = 3
     last_seen: int = 4
     free_slots: int = 5
+    changed: int = 6
 
 
 class WeightRows(NamedTuple):

@@ -154,7 +154,7 @@ def summarise(
             measurement, -1 = rejected; and id of the landmark that it created in any particle, -1 = none. The latter
             row holds the slots of these landmarks before.
         best: The most probable particle.
-        table: (6, slots), see `layout`; `LAST_SEEN` is written.
+        table: (7, slots), see `layout`; `LAST_SEEN` is written.
         now: Number of the step.
         long: Number of steps after which a landmark was not seen for long.
 
