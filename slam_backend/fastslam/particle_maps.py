@@ -238,7 +238,7 @@ class MapStore:
             self.heads[:, n:] = _kernels.FAR
 
 
-WHOLE = 1024  # landmarks up to which the values of a snapshot are one array
+WHOLE = 2048  # landmarks up to which the values of a snapshot are one array
 CHUNK = 128  # landmarks of an array in larger snapshots
 
 MAX_MAPS = 512  # limit of ancestor maps; beyond it the slots of the least used maps are refreshed
@@ -434,8 +434,8 @@ class ParticleMaps(MapStore):
 def chunk_sizes(n: int) -> list[int]:
     """Return how many landmarks each array of values in a state of n landmarks has.
 
-    >>> chunk_sizes(0), chunk_sizes(1024), chunk_sizes(1030)
-    ([0], [1024], [128, 128, 128, 128, 128, 128, 128, 128, 6])
+    >>> chunk_sizes(0), chunk_sizes(2048), chunk_sizes(2100)[-2:]
+    ([0], [2048], [128, 52])
     """
     return [n] if n <= WHOLE else [min(CHUNK, n - first) for first in range(0, n, CHUNK)]
 

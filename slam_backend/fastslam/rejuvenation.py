@@ -147,11 +147,13 @@ class RejuvenationScheduler:
 
     Attributes:
         steps: Number of steps recorded.
+        starts_at_mode: See `Particles`, of the last rejuvenation; None before one. Not part of the state.
     """
 
     def __init__(self, options: FilterOptions, num_robots: int) -> None:
         assert options.rejuvenate_every is not None
         self.steps = 0
+        self.starts_at_mode: FloatArray | None = None
         self._options = options
         self._every = options.rejuvenate_every
         self._share = max(MIN_ROWS, (options.smoothing.slice_steps or 0) // num_robots)  # steps of a robot in a slice
@@ -295,6 +297,7 @@ class RejuvenationScheduler:
         if isinstance(drawn, Rejuvenation):
             self._restart_interval()
             self._accept(drawn.graph)
+            self._note_starts(drawn)
             return drawn
         return self._finish_slice(graph, drawn, lambda: last, smoother)
 
@@ -348,6 +351,7 @@ class RejuvenationScheduler:
             self._guesses, landmark_descriptors(maps, self._options.descriptor_gate), landmark_positions(maps, best),
         )  # fmt: skip
         self._restart_interval()
+        self._note_starts(result)
         if np.isfinite(result.ess) or result.reason == NO_POSE:
             self._accept(result.graph)
         else:
@@ -380,6 +384,10 @@ class RejuvenationScheduler:
             return _failed(tried, f"{reason}; measurements since the last rejuvenation are dropped")
         self._graph = None
         return _failed(tried, f"{reason}; the smoother restarts from the logs")
+
+    def _note_starts(self, result: Rejuvenation) -> None:
+        """Keep how certain the starts are at the mode."""
+        self.starts_at_mode = None if result.particles is None else result.particles.starts_at_mode
 
     def _set_graph(self, graph: SlamGraph) -> None:
         """Set the graph and its oldest step."""

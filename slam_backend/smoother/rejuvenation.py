@@ -36,6 +36,8 @@ from slam_backend.smoother.sampling import (
     sample_transition_variances,
 )
 
+LARGE_MAP = 1000  # landmarks; teams in worlds of 30 m know some 500
+LONG_RUN = 2000  # steps; 200 s in environments
 DRAFT_TOLERANCE = 10.0  # factor on the tolerance of descents without draws
 
 
@@ -70,6 +72,8 @@ class Particles(NamedTuple):
         bias_covariances: (K, 3, 3) float64. Covariance of each bias given the path; zeros where there is none.
         frame: (3, 3) float64 [m, m, rad]. Covariance of the gauge, a motion of the whole map; not in the particles.
         start_scatters: (K, 3, 3) float64 [m, m, rad], start frames. Covariance of each start; not in the particles.
+        starts_at_mode: (K, 3, 3) float64 [m, m, rad], map frame. Covariance of each start under the Gaussian about the
+            mode, zeros for known starts; None if the graph has at most `LARGE_MAP` landmarks or `LONG_RUN` steps.
     """
 
     poses: FloatArray
@@ -85,6 +89,7 @@ class Particles(NamedTuple):
     bias_covariances: FloatArray
     frame: FloatArray
     start_scatters: FloatArray
+    starts_at_mode: FloatArray | None
 
 
 class Rejuvenation(NamedTuple):
@@ -260,7 +265,12 @@ def _particles(graph: SlamGraph, mode: MapEstimate, draws: PathSamples) -> Parti
         moved = np.empty_like(draws.poses)
         move(draws.poses, held.motions, moved)
         paths, poses, frame = lane_rows(moved), held.poses, held.scatter
-    for index in (mode.columns[graph.first_keys] >= 0).nonzero()[0].tolist():
+    unknown = (mode.columns[graph.first_keys] >= 0).nonzero()[0].tolist()
+    is_large = len(graph.landmark_ids) > LARGE_MAP and graph.latest.max() > LONG_RUN
+    at_mode = np.zeros((len(means), 3, 3)) if is_large else None
+    for index in unknown:
+        if at_mode is not None:
+            at_mode[index] = mode.covariance(graph.first_keys[index : index + 1])
         start = starts[index : index + 1]
         if held is not None:
             move(start, held.motions, start)
@@ -271,7 +281,7 @@ def _particles(graph: SlamGraph, mode: MapEstimate, draws: PathSamples) -> Parti
     return Particles(
         poses, starts, np.log(np.maximum(weights, 1e-300)), densities, graph.landmark_ids[rows],
         PathLandmarks(paths, mode, rows), counts[rows], means, covariances, biases, bias_covariances, frame,
-        start_scatters,
+        start_scatters, at_mode,
     )  # fmt: skip
 
 

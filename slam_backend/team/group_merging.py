@@ -110,12 +110,30 @@ class MergePlan(NamedTuple):
         start = rotate_covariances(float(motion[2]), joint.state.start_covariances[a.num_robots])
         covariance = scattered(starts) + start
         _kernels.add_gauge_covariance(joint.state.gauge_covariance, motion[None], covariance[None])
+        covariance = _cautious(covariance, joint, a.num_robots)
         x, y, theta = motion.tolist()
         alignment = Alignment(True, "", x, y, theta, covariance, self.alignment.inliers, self.alignment.ratio)
         before, after = (self.maps[0], renamed_map(self.maps[1], dict(renamed.tolist()))), joint.map("mixture")
         deformed = any(deformed_fraction(old, after, options) > merging.max_deformed for old in before)
         plan = self._replace(alignment=alignment, joint=(joint, renamed))
         return plan, math.inf if deformed else _relative_uncertainty(covariance)
+
+
+# Factor by which the standard deviations of a start in a large map are too small, as keyframes have been joined: with
+# 2,000 instead of 180 per robot they are 1.3 times as large after eight minutes (docs/lab/scale.md).
+JOINED_KEYFRAMES = 1.3
+
+
+def _cautious(covariance: FloatArray, joint: FastSlam, robot: int) -> FloatArray:
+    """Return the covariance of a robot's start, or in large maps that of the Gaussian at the mode, if that is larger.
+
+    Along long paths few samples carry weight, and the scatter of these few understates the uncertainty.
+    """
+    at_mode = None if joint.state.rejuvenation is None else joint.state.rejuvenation.starts_at_mode
+    if at_mode is None:
+        return covariance
+    larger: FloatArray = max(covariance, at_mode[robot], key=_relative_uncertainty)
+    return JOINED_KEYFRAMES**2 * larger
 
 
 def transform_uncertainty(plan: MergePlan) -> float:

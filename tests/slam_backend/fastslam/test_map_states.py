@@ -69,7 +69,7 @@ def test_a_filter_that_was_set_to_a_state_shares_it_and_continues_alike() -> Non
 
 @pytest.mark.usefixtures("small_chunks")
 def test_arrays_live_as_long_as_a_state_that_has_them() -> None:
-    """A filter does not keep the arrays of states that nobody else keeps."""
+    """A filter does not keep the arrays of states that were dropped."""
     slam, _ = large_filter()
     state = slam.get_state()
     references = [reference for _, reference in slam.state.maps._copied.values()]

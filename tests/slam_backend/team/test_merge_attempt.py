@@ -2,6 +2,7 @@
 
 import copy
 import math
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from slam_backend.fastslam.rejuvenation import RejuvenationScheduler
 from slam_backend.geometry import between, compose
 from slam_backend.maps.alignment import DISTINCT_ROTATION, DISTINCT_TRANSLATION, AlignmentOptions, align_maps
 from slam_backend.maps.landmark_map import LandmarkMap
+from slam_backend.smoother import rejuvenation as smoothing_of_paths
 from slam_backend.smoother.graph import mean_pose
 from slam_backend.smoother.options import SmoothingOptions
 from slam_backend.team import group_merging, merge_attempt
@@ -339,6 +341,41 @@ def test_a_trial_leaves_both_filters_as_they_are() -> None:
     np.testing.assert_allclose(tried.alignment.transform, mean_pose(joint.state.starts[1, :, : joint.num_particles]))
     assert_same(tried.alignment.inliers, plan.alignment.inliers)
     assert 0.0 < doubt < 1.0
+
+
+@pytest.mark.parametrize("slice_steps", [None, 90])
+def test_trials_of_large_maps_claim_no_more_than_the_gaussian_at_the_mode(
+    slice_steps: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Their covariance is the larger one, for joined keyframes times 1.3 squared; the motion is that of small maps."""
+    monkeypatch.setattr(smoothing_of_paths, "LONG_RUN", 0)
+    smoothing = SmoothingOptions(slice_steps=slice_steps)
+    options: Any = {"attempts": NEVER, "rejuvenate_every": 1000, "smoothing": smoothing}
+    trials = []
+    for particles in (2, 400):
+        plan = planned(driven(2, 112, FEW_STEPS, num_particles=particles, **options)[1])
+        for most in (10**6, 0):
+            monkeypatch.setattr(smoothing_of_paths, "LARGE_MAP", most)
+            trial = plan.on_trial(MergeOptions(), AlignmentOptions(), np.random.default_rng(2))
+            assert trial is not None
+            trials.append(trial)
+    for (small, _), (large, _) in (trials[:2], trials[2:]):
+        assert small.joint is not None
+        assert large.joint is not None
+        of_small, of_large = (plan.joint[0].state.rejuvenation for plan in (small, large))
+        assert of_small.starts_at_mode is None  # as in a short run
+        np.testing.assert_array_equal(of_large.starts_at_mode[0], 0.0)  # the first robot defines the frame
+        np.testing.assert_array_equal(large.alignment.transform, small.alignment.transform)
+    scatter = trials[2][0].alignment.covariance
+    at_mode = trials[3][0].joint[0].state.rejuvenation.starts_at_mode[1]  # type: ignore[index,union-attr]
+    np.testing.assert_allclose(np.diag(scatter), np.diag(at_mode), rtol=0.3)  # nearly all 400 samples carry weight
+    for small, large in zip(trials[::2], trials[1::2], strict=True):
+        assert large[1] >= 1.3 * small[1]
+    for factor in (0.5, 2.0):
+        smoother = SimpleNamespace(starts_at_mode=np.stack([np.zeros((3, 3)), factor * scatter]))
+        joint: Any = SimpleNamespace(state=SimpleNamespace(rejuvenation=smoother))
+        expected = 1.3**2 * max(factor, 1.0) * scatter
+        np.testing.assert_allclose(group_merging._cautious(scatter, joint, 1), expected)
 
 
 def test_a_trial_whose_merge_would_be_undone_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
