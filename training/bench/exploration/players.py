@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from agents.bounds import BOUNDS, make_bound
 from agents.plugins import is_plugin, plugin_file
-from agents.registry import action_types, is_model, make_policy, make_team_policy
+from agents.registry import LEARNED, action_types, is_model, make_policy, make_team_policy
 from agents.trained import MODEL_FILE
 from slam_backend.core.validation import check_choice
 from training.episodes.guard import GuardedTeam
@@ -38,11 +38,13 @@ class Player(NamedTuple):
         return BASE if self.role == BOUND else self.name
 
     def source_digest(self) -> str:
-        """Return 16 hexadecimal digits of SHA-256 over a custom policy's file or a model; empty for built-in ones."""
+        """Return 16 hexadecimal digits of SHA-256 over a custom policy's file or a model; empty for planners."""
         if is_model(self.policy):
             file = Path(self.policy) / MODEL_FILE if Path(self.policy).is_dir() else Path(self.policy)
         elif is_plugin(self.policy):
             file = plugin_file(self.policy)
+        elif self.policy == "learned":
+            file = LEARNED
         else:
             return ""
         return hashlib.sha256(file.read_bytes()).hexdigest()[:16]
