@@ -93,6 +93,7 @@ def test_a_wheel_holds_the_packages_and_their_data(wheel: Path) -> None:
     }  # fmt: skip
     assert sources <= names
     assert {name for name in sources if not name.endswith((".py", "py.typed"))} >= {
+        "agents/pretrained/goal.npz",
         "training/report/assets/report.html", "training/report/assets/report.css", "training/report/assets/report.js",
         "vslam_env/kernel_signatures.json",
     }  # fmt: skip
@@ -113,6 +114,8 @@ def test_the_demo_runs_outside_of_the_checkout(installed: Path, tmp_path: Path) 
     names = {file.name for file in (tmp_path / "demo").iterdir()}
     assert names >= {"report.html", "metrics.json", "map.png", "error.png", "video.mp4", "recording.npz", "config.toml"}
     run(vslam, "report", "demo", cwd=tmp_path)
+    few = ("--world", "hall", "--robots", "1", "--policy", "learned", "--max-seconds", "4", "--particles", "10")
+    run(vslam, "run", *few, "--no-video", "--out", "learned", cwd=tmp_path)
 
 
 def test_the_program_of_the_readme_runs_outside_of_the_checkout(installed: Path, tmp_path: Path) -> None:
