@@ -1,6 +1,7 @@
 """Policies that choose among candidates: for `goal` actions, or driving to the chosen one themselves.
 
-A planner decides by its `choose` only; `GoalPolicy` and `DrivingPolicy` turn its choice into actions.
+A planner decides by its `choose` only; `GoalPolicy` turns its choice into an action, and `DrivingPolicy` drives to what
+any policy for `goal` actions chooses.
 """
 
 from typing import Any, Protocol
@@ -8,6 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from agents.policy import Policy
 from slam_backend.core.validation import FloatArray, IntArray
 from vslam_env.belief.team_belief import Belief, Candidates
 from vslam_env.navigation import CandidateKind, distance_map, follow_path, plan_path
@@ -57,22 +59,22 @@ class GoalPolicy:
 class DrivingPolicy:
     """Policy for `continuous` and `discrete` actions that plans on the robot's grid and follows the path to its goal.
 
-    If the planner chooses nothing, the robot patrols to far places, so that groups whose maps are not aligned yet meet.
+    If nothing is chosen, the robot patrols to far places, so that groups whose maps are not aligned yet meet.
 
     Args:
-        planner: Planner of this robot.
+        chooser: Policy of this robot for `goal` actions, asked once a second.
         discrete: Whether actions are `discrete`; otherwise they are `continuous`.
         sweeps: Whether the robot sweeps its camera from side to side on the way, with `continuous` actions: the walls
             beside a path are too oblique to be measured by a camera that looks along it.
     """
 
-    def __init__(self, planner: Planner, discrete: bool = False, sweeps: bool = False) -> None:
-        self._planner, self._discrete, self._sweeps = planner, discrete, sweeps and not discrete
+    def __init__(self, chooser: Policy, discrete: bool = False, sweeps: bool = False) -> None:
+        self._chooser, self._discrete, self._sweeps = chooser, discrete, sweeps and not discrete
         self.reset()
 
     def reset(self) -> None:
         """Clear the state of the last episode."""
-        self._planner.reset()
+        self._chooser.reset()
         self._patrol: FloatArray | None = None
         self._path: FloatArray | None = None
         self._heading: float | None = None
@@ -87,7 +89,7 @@ class DrivingPolicy:
         """Return the action that drives towards the goal."""
         self._age += 1
         if self._path is None or self._age >= REPLAN_TICKS:
-            self._plan(belief, rng)
+            self._plan(observation, belief, rng)
         if self._path is None:
             speed, turn = 0.0, MAX_TURN  # turn on the spot until free floor is seen
         else:
@@ -101,12 +103,13 @@ class DrivingPolicy:
             return AHEAD if speed > 0.0 else STAY
         return np.array([speed / MAX_SPEED, turn / MAX_TURN], dtype=np.float32)
 
-    def _plan(self, belief: Belief, rng: np.random.Generator) -> None:
+    def _plan(self, observation: Any, belief: Belief, rng: np.random.Generator) -> None:
         """Choose a goal and a path to it."""
         self._age = 0
-        slot = self._planner.choose(belief, rng)
+        action = self._chooser.act(observation, belief, rng)
+        slot = action - 1
         goal: FloatArray | None
-        if slot is not None:
+        if action > 0:
             goal, self._heading = belief.candidates.goals[slot], float(belief.candidates.headings[slot])
         else:
             here = belief.pose[:2]
@@ -116,7 +119,7 @@ class DrivingPolicy:
         self._path = None if goal is None else plan_path(belief.grid, belief.pose[:2], goal)
         if self._path is None:
             self._patrol = None
-        elif slot is None:
+        elif action == 0:
             self._patrol = self._path[-1]  # the nearest reachable point, if a wall was discovered at the goal
 
 

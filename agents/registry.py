@@ -43,13 +43,14 @@ PLANNERS: dict[str, Callable[[], Planner]] = {
     **{name: partial(Assigned, assign) for name, assign in ASSIGNMENTS.items()},
 }
 LEARNED = Path(__file__).parent / "pretrained" / f"goal{SUFFIX}"
-SWEEPING = ("next_best_view",)  # planners whose robots sweep their cameras on the way, with continuous actions
+ANY = ("goal", "continuous", "discrete")
+SWEEPING = ("next_best_view",)  # planners whose robots sweep their cameras on the way, as those of models do
 POLICIES: dict[str, tuple[str, ...]] = {  # with supported action types; comparisons of policies use the first one
-    "frontier": ("goal", "continuous", "discrete"),
+    "frontier": ANY,
     "random_goals": ("goal",),
     "random_walk": ("continuous", "discrete"),
-    "learned": ("goal",),
-    **dict.fromkeys(PLANNERS, ("goal", "continuous", "discrete")),
+    "learned": ANY,
+    **dict.fromkeys(PLANNERS, ANY),
 }
 
 
@@ -63,7 +64,7 @@ def action_types(name: str) -> tuple[str, ...]:
         ValueError: If there is no such policy.
     """
     if is_model(name):
-        return ("goal",)
+        return ANY
     if is_plugin(name):
         return (plugin_action_type(name),)
     hint = "Choose one of these names, the path of a trained model, or MODULE:NAME of a custom policy."
@@ -76,7 +77,8 @@ def make_policy(name: str, action_type: str) -> Policy:
     Args:
         name: Name of the policy: one of `POLICIES`, with the action types given there; the planners among them are
             described in docs/how-to/exploration.md, and `learned` in agents/pretrained/goal.md. Path of a model of
-            `vslam train`, or of its run folder: trained policy, for `goal` actions and dict observations.
+            `vslam train`, or of its run folder: trained policy, for dict observations; it chooses goals, to which the
+            robot drives itself with other than `goal` actions.
             `"module:Name"`: custom policy, made by calling `Name` without arguments, for its attribute `action_type`,
             or else for `goal`.
         action_type: Action type of the environment.
@@ -85,18 +87,21 @@ def make_policy(name: str, action_type: str) -> Policy:
         ValueError: If there is no such policy, it does not support the action type, or a model cannot be read.
     """
     _check_action_type(name, action_type)
-    if name == "learned":
-        return TrainedGoalPolicy(_shipped_weights(), greedy=True)
-    if is_model(name):
-        return TrainedGoalPolicy(load_model(name)[0])
     if is_plugin(name):
         return load_plugin(name)
+    if name == "random_goals":
+        return RandomGoals()
+    if name == "random_walk":
+        return RandomWalk(action_type == "discrete")
     if name in PLANNERS:
-        planner = PLANNERS[name]()
-        if action_type == "goal":
-            return GoalPolicy(planner)
-        return DrivingPolicy(planner, action_type == "discrete", name in SWEEPING)
-    return RandomGoals() if name == "random_goals" else RandomWalk(action_type == "discrete")
+        chooser: Policy = GoalPolicy(PLANNERS[name]())
+    elif name == "learned":
+        chooser = TrainedGoalPolicy(_shipped_weights(), greedy=True)
+    else:
+        chooser = TrainedGoalPolicy(load_model(name)[0])
+    if action_type == "goal":
+        return chooser
+    return DrivingPolicy(chooser, action_type == "discrete", name not in PLANNERS or name in SWEEPING)
 
 
 @cache

@@ -14,16 +14,20 @@ from agents.goal_network import NAMES, SHAPES, Weights, logits
 from slam_backend.core.array_files import read_arrays
 from slam_backend.core.files import write_file
 from slam_backend.core.validation import argument_error
+from vslam_env.belief.observation import action_mask
 from vslam_env.belief.team_belief import Belief
+from vslam_env.navigation import CANDIDATE_FEATURES
 
 FORMAT = 3  # incremented when the network or the meaning of observations changes
 SUFFIX = ".npz"
 MODEL_FILE = "model" + SUFFIX
 ABOUT = "about"
+MASK = "action_mask"
+OWN_GOAL = CANDIDATE_FEATURES.index("own_goal")
 
 
 class TrainedGoalPolicy:
-    """A trained policy for `goal` actions and dict observations.
+    """A trained policy for `goal` actions and dict observations; also the choice of goals for a `DrivingPolicy`.
 
     Args:
         weights: Weights of the network, as `load_model` returns them.
@@ -33,9 +37,11 @@ class TrainedGoalPolicy:
     def __init__(self, weights: Weights, greedy: bool = False) -> None:
         self._weights = weights
         self._greedy = greedy
+        self.reset()
 
     def reset(self) -> None:
-        """Do nothing; the policy has no state."""
+        """Forget the last choice."""
+        self._last = 0
 
     def act(self, observation: Any, belief: Belief, rng: np.random.Generator) -> int:
         """Return 0 to stay, or 1 + the slot of a valid candidate.
@@ -43,13 +49,22 @@ class TrainedGoalPolicy:
         Raises:
             ValueError: If the observation lacks an input of the network.
         """
-        check_observation({name: np.shape(observation[name]) for name in observation})
-        scores = logits(self._weights, {name: np.asarray(observation[name])[None] for name in NAMES})[0]
-        scores = np.where(observation["action_mask"] != 0, scores, -np.inf)
+        named = observation if isinstance(observation, Mapping) else {}
+        if MASK not in named and "candidates" in named:  # the robot drives itself; only it knows its goal
+            candidates = np.array(named["candidates"])
+            mask = action_mask(candidates)
+            if self._last > 0:
+                candidates[self._last - 1, OWN_GOAL] = mask[self._last]
+            named = {**named, "candidates": candidates, MASK: mask}
+        check_observation({name: np.shape(named[name]) for name in named})
+        scores = logits(self._weights, {name: np.asarray(named[name])[None] for name in NAMES})[0]
+        scores = np.where(named[MASK] != 0, scores, -np.inf)
         if self._greedy:
-            return int(scores.argmax())
-        chances = np.exp(scores - scores.max())
-        return int(rng.choice(len(scores), p=chances / chances.sum()))
+            self._last = int(scores.argmax())
+        else:
+            chances = np.exp(scores - scores.max())
+            self._last = int(rng.choice(len(scores), p=chances / chances.sum()))
+        return self._last
 
 
 def check_observation(shapes: Mapping[str, tuple[int, ...]]) -> None:
@@ -63,7 +78,7 @@ def check_observation(shapes: Mapping[str, tuple[int, ...]]) -> None:
     """
     for name, shape in SHAPES.items():
         if shapes.get(name) != shape:
-            hint = "Use goal actions, dict observations and the standard scan."
+            hint = "Use dict observations and the standard scan."
             got = f"no {name!r}" if name not in shapes else f"shape {shapes[name]}"
             raise argument_error("observation", f"{name!r} of shape {shape}, as the model was trained on", got, hint)
 

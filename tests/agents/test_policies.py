@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from agents import POLICIES, make_policy
-from agents.goal_choice import DrivingPolicy, patrol_goal
+from agents.goal_choice import DrivingPolicy, GoalPolicy, patrol_goal
 from agents.nearest_frontier import NearestFrontier, choose_slot
 from agents.plugins import is_plugin
 from agents.registry import action_types
@@ -67,7 +67,7 @@ def test_a_swept_camera_maps_the_walls_of_a_corridor() -> None:
     recall, coverage = {}, {}
     for sweeps in (False, True):
         env = _env("continuous", world=corridor, num_robots=1, max_cycles=230)
-        policy, rng = DrivingPolicy(NearestFrontier(), sweeps=sweeps), np.random.default_rng(0)
+        policy, rng = DrivingPolicy(GoalPolicy(NearestFrontier()), sweeps=sweeps), np.random.default_rng(0)
         observations, infos = env.reset(seed=0, options={"start_poses": [[1.0, 1.2, 0.0]]})
         while env.agents:
             action = policy.act(observations["robot_0"], env.belief("robot_0"), rng)

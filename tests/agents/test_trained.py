@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from agents import make_policy
+from agents.goal_choice import DrivingPolicy
 from agents.goal_network import (
     CHANNELS,
     FEED_WIDTH,
@@ -25,9 +26,9 @@ from agents.goal_network import (
     logits,
 )
 from agents.registry import LEARNED
-from agents.trained import FORMAT, TrainedGoalPolicy, check_observation, load_model, save_model
+from agents.trained import FORMAT, OWN_GOAL, TrainedGoalPolicy, check_observation, load_model, save_model
 from vslam_env import CANDIDATE_FEATURES, NUM_CANDIDATES, vslam_v0
-from vslam_env.belief.observation import observation_space
+from vslam_env.belief.observation import action_mask, observation_space
 
 SPACE = observation_space(32, 8.0, True, False)
 ABOUT = {"version": "0", "environment": ""}
@@ -154,8 +155,45 @@ def test_models_work_like_other_policies(tmp_path: Path) -> None:
             actions = {agent: policy.act(observations[agent], env.belief(agent), rng) for agent in env.agents}
             observations, _, _, _, infos = env.step(actions)
             assert not any(info["invalid_action"] for info in infos.values())
-    with pytest.raises(ValueError, match=r"action_type: expected 'goal' for policy '.*', got 'discrete'"):
-        make_policy(str(tmp_path), "discrete")
+
+
+@pytest.mark.parametrize("action_type", ["continuous", "discrete"])
+def test_the_robots_of_a_model_drive_to_its_goals(action_type: str) -> None:
+    """Without the environment's driving, robots of `learned` drive to what the network chooses, once a second."""
+    env = vslam_v0.parallel_env(world="fig5", num_robots=2, num_particles=5, action_type=action_type, max_seconds=3.0)
+    seen, _ = env.reset(seed=2)
+    policies = {agent: make_policy("learned", action_type) for agent in env.agents}
+    rng, chosen = np.random.default_rng(0), 0
+    while env.agents:
+        actions = {}
+        for agent in env.agents:
+            driving, belief = policies[agent], env.belief(agent)
+            assert isinstance(driving, DrivingPolicy)
+            actions[agent] = driving.act(seen[agent], belief, rng)
+            chooser: Any = driving._chooser
+            if belief.tick % 10 == 0 and chooser._last > 0 and driving.goal is not None:
+                chosen += 1
+                assert np.linalg.norm(driving.goal - belief.candidates.goals[chooser._last - 1]) < 0.5
+        seen, _, _, _, _ = env.step(actions)
+    assert chosen >= 3
+
+
+def test_without_a_mask_the_last_choice_is_marked_as_the_goal() -> None:
+    """Where the environment does not drive, the policy tells the network which candidates exist and which it chose."""
+    weights, observation = _weights(), _observation(seed=3)
+    observation["candidates"][5:] = 0.0
+    observation["action_mask"] = action_mask(observation["candidates"])
+    observation["candidates"][:, OWN_GOAL] = 0.0
+    bare = {name: value for name, value in observation.items() if name != "action_mask"}
+    policy, rng, belief = TrainedGoalPolicy(weights, greedy=True), np.random.default_rng(0), None
+    first = policy.act(bare, belief, rng)  # type: ignore[arg-type]
+    assert first == TrainedGoalPolicy(weights, greedy=True).act(observation, belief, rng)  # type: ignore[arg-type]
+    assert 0 < first <= 5
+    marked = {**observation, "candidates": observation["candidates"].copy()}
+    marked["candidates"][first - 1, OWN_GOAL] = 1.0
+    expected = logits(weights, {name: marked[name][None] for name in SHAPES})[0].argmax()
+    assert policy.act(bare, belief, rng) == expected  # type: ignore[arg-type]
+    assert not bare["candidates"][:, OWN_GOAL].any()  # the caller's arrays stay as they were
 
 
 @pytest.mark.slow
@@ -220,8 +258,10 @@ def test_other_spaces_are_refused() -> None:
     short = observation | {"scan": observation["scan"][:16]}
     with pytest.raises(ValueError, match=r"observation: expected 'scan' of shape \(32,\), .* got shape \(16,\)"):
         TrainedGoalPolicy(_weights()).act(short, None, np.random.default_rng(0))  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"observation: expected 'local_grid' .* got no 'local_grid'. Use dict"):
+        TrainedGoalPolicy(_weights()).act(np.zeros(9), None, np.random.default_rng(0))  # type: ignore[arg-type]
     shapes = {name: np.shape(value) for name, value in observation.items() if name != "action_mask"}
-    with pytest.raises(ValueError, match=r"observation: expected 'action_mask' .* got no 'action_mask'. Use goal"):
+    with pytest.raises(ValueError, match=r"observation: expected 'action_mask' .* got no 'action_mask'. Use dict"):
         check_observation(shapes)
 
 
@@ -241,5 +281,3 @@ def test_the_shipped_model_is_small_and_has_a_card() -> None:
         inputs = {name: np.asarray(seen[agent][name])[None] for name in SHAPES}
         actions = {make_policy("learned", "goal").act(seen[agent], None, np.random.default_rng(k)) for k in range(5)}
         assert actions == {int(logits(weights, inputs)[0].argmax())}
-    with pytest.raises(ValueError, match="action_type: expected 'goal' for policy 'learned', got 'discrete'"):
-        make_policy("learned", "discrete")
