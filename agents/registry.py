@@ -133,6 +133,11 @@ def is_model(name: str) -> bool:
     return isinstance(name, str) and name not in POLICIES and (name.endswith(SUFFIX) or Path(name).is_dir())
 
 
+def is_trained(name: str) -> bool:
+    """Return whether a policy is a model, which has learned from `goal` actions."""
+    return name == "learned" or is_model(name)
+
+
 def _check_action_type(name: str, action_type: str) -> None:
     known = action_types(name)
     if check_choice("action_type", action_type, ACTION_TYPES) not in known:

@@ -44,7 +44,7 @@ def run(
     """Let robots with unknown starts explore a building, map it, and merge their maps."""
     import webbrowser
 
-    from agents.registry import action_types
+    from agents.registry import action_types, is_trained
     from slam_backend.trajectory import Trajectory
     from training.episodes.figures import draw_errors, draw_maps
     from training.episodes.metrics import score_episode
@@ -60,8 +60,10 @@ def run(
     if rerun is not None:
         check_rerun(rerun)
     policy = call.given.get("policy")
-    if "action_type" not in call.given and policy is not None and "continuous" not in (known := action_types(policy)):
-        call.given["action_type"] = known[0]
+    if "action_type" not in call.given and policy is not None:
+        known = action_types(policy)
+        if is_trained(policy) or "continuous" not in known:
+            call.given["action_type"] = known[0]
     chosen = call.config
     env = chosen.make_env()
     policies = chosen.make_policies(env)

@@ -26,7 +26,7 @@ class RunConfig(ExperimentConfig):
         "frontier", "Policy by name (docs/how-to/exploration.md lists them), path of a trained model, or MODULE:NAME."
     )
     action_type: ActionType = option(
-        "continuous", "Action type: continuous, discrete or goal.", shown="continuous, if the policy supports it"
+        "continuous", "Action type: continuous, discrete or goal.", shown="continuous if supported, goal for models"
     )
     max_cycles: int | None = option(
         None, "Number of steps of the episode.", shown="180 s", ge=1, hint="Give a number of steps."
