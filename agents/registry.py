@@ -21,7 +21,7 @@ from agents.rbpf_gain import RbpfGain
 from agents.rendezvous import Rendezvous
 from agents.tare import tare
 from agents.team import Assign, Assigned, CentralPolicy, SeparatePolicies, TeamPolicy
-from agents.trained import SUFFIX, TrainedGoalPolicy, load_model
+from agents.trained import MODEL_FILE, SUFFIX, TrainedGoalPolicy, load_model
 from agents.utility_cost import utility_cost
 from slam_backend.core.validation import argument_error, check_choice
 
@@ -133,9 +133,13 @@ def is_model(name: str) -> bool:
     return isinstance(name, str) and name not in POLICIES and (name.endswith(SUFFIX) or Path(name).is_dir())
 
 
-def is_trained(name: str) -> bool:
-    """Return whether a policy is a model, which has learned from `goal` actions."""
-    return name == "learned" or is_model(name)
+def model_file(name: str) -> Path | None:
+    """Return the file of a trained policy's model; None for other policies."""
+    if name == "learned":
+        return LEARNED
+    if is_model(name):
+        return Path(name) / MODEL_FILE if Path(name).is_dir() else Path(name)
+    return None
 
 
 def _check_action_type(name: str, action_type: str) -> None:

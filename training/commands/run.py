@@ -44,7 +44,7 @@ def run(
     """Let robots with unknown starts explore a building, map it, and merge their maps."""
     import webbrowser
 
-    from agents.registry import action_types, is_trained
+    from agents.registry import action_types, model_file
     from slam_backend.trajectory import Trajectory
     from training.episodes.figures import draw_errors, draw_maps
     from training.episodes.metrics import score_episode
@@ -62,7 +62,7 @@ def run(
     policy = call.given.get("policy")
     if "action_type" not in call.given and policy is not None:
         known = action_types(policy)
-        if is_trained(policy) or "continuous" not in known:
+        if model_file(policy) is not None or "continuous" not in known:  # models have learned from goal actions
             call.given["action_type"] = known[0]
     chosen = call.config
     env = chosen.make_env()

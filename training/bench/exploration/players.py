@@ -1,13 +1,11 @@
 """Policies of the exploration benchmark: of each robot, of the team, and bounds, by their names on the command line."""
 
 import hashlib
-from pathlib import Path
 from typing import NamedTuple
 
 from agents.bounds import BOUNDS, make_bound
 from agents.plugins import is_plugin, plugin_file
-from agents.registry import LEARNED, action_types, is_model, make_policy, make_team_policy
-from agents.trained import MODEL_FILE
+from agents.registry import action_types, make_policy, make_team_policy, model_file
 from slam_backend.core.validation import check_choice
 from training.episodes.guard import GuardedTeam
 from training.experiments.labels import parted_label
@@ -39,13 +37,8 @@ class Player(NamedTuple):
 
     def source_digest(self) -> str:
         """Return 16 hexadecimal digits of SHA-256 over a custom policy's file or a model; empty for planners."""
-        if is_model(self.policy):
-            file = Path(self.policy) / MODEL_FILE if Path(self.policy).is_dir() else Path(self.policy)
-        elif is_plugin(self.policy):
-            file = plugin_file(self.policy)
-        elif self.policy == "learned":
-            file = LEARNED
-        else:
+        file = plugin_file(self.policy) if is_plugin(self.policy) else model_file(self.policy)
+        if file is None:
             return ""
         return hashlib.sha256(file.read_bytes()).hexdigest()[:16]
 
