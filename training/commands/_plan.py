@@ -149,6 +149,7 @@ def verify_rows(call: Call[ExplorationBenchConfig], folder: Path, count: int) ->
     import numpy as np
 
     from slam_backend.core.validation import argument_error
+    from training.bench.exploration.leaderboard import kept_episodes
     from training.bench.exploration.machine import machine
     from training.bench.exploration.plan import Plan, PlanBench, PlanTrial
     from training.bench.exploration.trials import TRIALS_FILE, Bench, play
@@ -169,7 +170,7 @@ def verify_rows(call: Call[ExplorationBenchConfig], folder: Path, count: int) ->
     else:
         bench = ExplorationBenchConfig.from_mapping(values | {"seed": seed})
     stored = finished_trials(RunFolder(folder, COMMAND, values, seed, installed_versions()), TRIALS_FILE, kind)
-    chosen = choose(list(stored.values()), count, np.random.default_rng())
+    chosen = choose(list(stored.values()) or kept_episodes(folder) or [], count, np.random.default_rng())
     if not chosen or any("digest" not in row for row in chosen):
         hint = f"Check {str(folder / CONFIG_FILE)!r}, or play its episodes again with this release."
         raise argument_error("verify", "a run folder whose episodes have digests", "none", hint)
@@ -189,7 +190,7 @@ def verify_rows(call: Call[ExplorationBenchConfig], folder: Path, count: int) ->
     call.console.print(console_table("Episodes played again", HEADINGS, table_rows(found)))
     others = sorted({row["stored_on"] for row in found if row["is_equal"] is None})
     if others:
-        text = f"Other processor or versions, so that only means compare: {'; '.join(others)}. Here: {machine()}."
+        text = f"Other processor or versions, so that last bits may differ: {'; '.join(others)}. Here: {machine()}."
         call.console.print(text, soft_wrap=True)
     if any(row["is_equal"] is False for row in found):
         raise typer.Exit(1)

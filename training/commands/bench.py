@@ -229,7 +229,8 @@ def bench_exploration(
     """Compare policies over worlds: coverage, map errors, pose errors and merges, with confidence intervals.
 
     With --plan, the plan of a benchmark fixes all but the policies; --quick then plays two worlds of four families.
-    With --verify, episodes of a finished run are played again and compared bit for bit.
+    With --verify, episodes of a finished run are played again: all bits are compared on the same machine, all numbers
+    elsewhere.
 
     All policies of a seed have the same worlds, starts and noise. Options in the plural take comma-separated values;
     all combinations are run. Robots with known poses, landmark names and merges show the cost of estimation.

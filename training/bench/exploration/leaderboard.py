@@ -11,7 +11,7 @@ from slam_backend.core.validation import argument_error
 from training.bench.exploration.plan import BASE_PART, Plan
 from training.bench.exploration.plan_report import incomplete, markdown, read_episodes
 from training.bench.exploration.report import label
-from training.bench.exploration.verification import equal_rows
+from training.bench.exploration.verification import OUTCOMES, last_outcomes
 from training.experiments.run_folder import read_config
 from training.experiments.statistics import grouped
 from training.experiments.tables import markdown_table
@@ -29,7 +29,7 @@ class Results:
 
     plan: Plan
     rows: Sequence[Mapping[str, Any]]  # A row per episode
-    verified: Mapping[str, tuple[int, int]]  # Numbers of equal and different episodes by policy, see `equal_rows`
+    verified: Mapping[str, Sequence[int]]  # Numbers of `OUTCOMES` by policy, see `last_outcomes`
 
 
 def read_results(folder: Path) -> Results:
@@ -39,21 +39,27 @@ def read_results(folder: Path) -> Results:
         ValueError: If there are none, they are incomplete, or the installed plan of that name has another hash.
     """
     values, _ = read_config(folder, "bench exploration", "folders")
-    file = next((folder / name for name in EPISODES if (folder / name).is_file()), None)
-    if file is None or "plan" not in values:
+    rows = kept_episodes(folder)
+    if rows is None or "plan" not in values:
         hint = "Run vslam bench exploration --plan."
         raise argument_error("folders", "results of a plan", f"none in {str(folder)!r}", hint)
     plan = Plan.load(values["plan"])
     if plan.digest != values["plan_hash"]:
         hint = "Use the release that wrote it."
         raise argument_error("folders", f"results of plan {plan.digest}", values["plan_hash"], hint)
-    content = file.read_bytes()
-    text = (gzip.decompress(content) if file.suffix == ".gz" else content).decode()
-    rows = read_episodes(text)
     if values.get("quick") or (lacking := incomplete(plan, rows)):
         got = "those of --quick" if values.get("quick") else f"a folder in which {lacking[0]}"
         raise argument_error("folders", "complete results", got, f"Resume the run in {str(folder)!r}, without --quick.")
-    return Results(plan, rows, equal_rows(folder))
+    return Results(plan, rows, last_outcomes(folder))
+
+
+def kept_episodes(folder: Path) -> list[dict[str, Any]] | None:
+    """Return the rows of `episodes.csv` or its compressed form in a folder, or None if there is neither."""
+    file = next((folder / name for name in EPISODES if (folder / name).is_file()), None)
+    if file is None:
+        return None
+    content = file.read_bytes()
+    return read_episodes((gzip.decompress(content) if file.suffix == ".gz" else content).decode())
 
 
 def leaderboard(results: Sequence[Results]) -> str:
@@ -77,13 +83,15 @@ def leaderboard(results: Sequence[Results]) -> str:
     verified = {policy: counts for each in results for policy, counts in each.verified.items()}
     episodes = {policy: len(own) for (policy,), own in grouped(rows, ("policy",)).items()}
     shown = [
-        [label(policy), str(count), *map(str, verified.get(policy, ("-", "-")))] for policy, count in episodes.items()
+        [label(policy), str(count), *map(str, verified.get(policy, "-" * len(OUTCOMES)))]
+        for policy, count in episodes.items()
     ]
-    headings = ("policy", "episodes", "played again: equal", "different")
+    headings = ("policy", "episodes", f"again: {OUTCOMES[0]}", *OUTCOMES[1:])
     machines = sorted({str(row["machine"]) for row in rows})
     return "\n".join([
         "# Leaderboard of exploration policies\n", ABOUT, markdown(plan, rows), "### Verification\n",
-        "Episodes of each policy that were played again at the last verification, and whether all bits were equal.\n",
+        "Episodes of each policy that were played again at the last verification: all bits are compared on the same "
+        "processor and versions, all results up to a ten-thousandth elsewhere.\n",
         markdown_table(headings, shown), f"Played on: {'; '.join(machines)}.\n",
     ])  # fmt: skip
 

@@ -1,7 +1,8 @@
-"""Repetition of finished episodes: the same bits on the same machine, the same means elsewhere."""
+"""Repetition of finished episodes: the same bits on the same machine, the same numbers up to rounding elsewhere."""
 
 import datetime
 import json
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,11 @@ from training.experiments.statistics import format_ci, grouped, mean_ci
 
 VERIFIED_FILE = "verified.jsonl"
 Rows = Sequence[Mapping[str, Any]]
-HEADINGS = ("policy", "played again", "equal", "different", "other machine", "E [cm], again minus stored")
+OUTCOMES = ("all bits equal", "all numbers equal", "different")
+HEADINGS = ("policy", "played again", *OUTCOMES, "E [cm], again minus stored")
+CLOSE = 1e-4  # relative difference up to which numbers count as equal on another machine
+CLOSE_TO_ZERO = 1e-7  # absolute one
+NOT_COMPARED = ("digest", "policy_digest", "machine", "decision_ms", "decision_p99_ms", "curves")
 
 
 def choose(rows: Rows, count: int, rng: np.random.Generator) -> list[Mapping[str, Any]]:
@@ -29,11 +34,13 @@ def choose(rows: Rows, count: int, rng: np.random.Generator) -> list[Mapping[str
 def compare(stored: Mapping[str, Any], again: Mapping[str, Any]) -> dict[str, Any]:
     """Return a stored row's comparison with its repetition.
 
-    `is_equal` is None where processor or versions differ, so that last bits may, too.
+    `is_equal` is None where processor or versions differ, so that last bits may, too; `is_close` tells whether all
+    results are the same there, numbers up to `CLOSE`.
     """
     comparable = stored["machine"] == machine()
     return {
         "policy": stored["policy"], "is_equal": stored["digest"] == again["digest"] if comparable else None,
+        "is_close": all(_close(value, again[name]) for name, value in stored.items() if name not in NOT_COMPARED),
         "digest": stored["digest"], "again": again["digest"], "machine": machine(), "stored_on": stored["machine"],
         "map_error": stored["map_error"], "map_error_again": again["map_error"],
     }  # fmt: skip
@@ -45,22 +52,41 @@ def keep(folder: Path, comparison: Mapping[str, Any], trial: Mapping[str, Any]) 
     append_text(folder / VERIFIED_FILE, json.dumps(line) + "\n", "verify")
 
 
+def outcome_counts(comparisons: Rows) -> list[int]:
+    """Return the numbers of comparisons with each of `OUTCOMES`: the second is found on other machines only."""
+    found = [OUTCOMES[_outcome(row)] for row in comparisons]
+    return [found.count(outcome) for outcome in OUTCOMES]
+
+
 def table_rows(comparisons: Rows) -> list[list[str]]:
     """Return the cells of a table of `HEADINGS`, a row per policy."""
     found = []
     for (policy,), own in grouped(comparisons, ("policy",)).items():
-        counts = [sum(row["is_equal"] is value for row in own) for value in (True, False, None)]
+        counts = outcome_counts(own)
         more = [row["map_error_again"] - row["map_error"] for row in own]
         found.append([label(policy), str(len(own)), *map(str, counts), format_ci(mean_ci("E", more), "E", 2, 100.0)])
     return found
 
 
-def equal_rows(folder: Path) -> dict[str, tuple[int, int]]:
-    """Return the numbers of equal and different rows of each policy's last verification date in a run folder."""
+def last_outcomes(folder: Path) -> dict[str, list[int]]:
+    """Return the `outcome_counts` of each policy's last verification date in a run folder."""
     file = folder / VERIFIED_FILE
     lines = [json.loads(text) for text in file.read_text(encoding="utf-8").splitlines()] if file.is_file() else []
-    found: dict[str, tuple[int, int]] = {}
+    found: dict[str, list[int]] = {}
     for (policy,), own in grouped(lines, ("policy",)).items():
-        last = [row for row in own if row["date"] == max(line["date"] for line in own)]
-        found[policy] = sum(row["is_equal"] is True for row in last), sum(row["is_equal"] is False for row in last)
+        last = max(line["date"] for line in own)
+        found[policy] = outcome_counts([row for row in own if row["date"] == last])
     return found
+
+
+def _outcome(comparison: Mapping[str, Any]) -> int:
+    if comparison["is_equal"] is None:
+        return 1 if comparison["is_close"] else 2
+    return 0 if comparison["is_equal"] else 2
+
+
+def _close(stored: Any, again: Any) -> bool:
+    """Return whether two results are the same, numbers up to rounding."""
+    if isinstance(stored, (int, float)) and isinstance(again, (int, float)):
+        return math.isclose(stored, again, rel_tol=CLOSE, abs_tol=CLOSE_TO_ZERO)
+    return bool(stored == again)
