@@ -4,25 +4,25 @@ from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
 
-from agents.d_optimality import DOptimality
-from agents.distance_advantage import distance_advantage
 from agents.goal_choice import DrivingPolicy, GoalPolicy, Planner
 from agents.goal_network import Weights
-from agents.hungarian import hungarian
-from agents.independent_frontier import IndependentFrontier
-from agents.mtsp import mtsp
-from agents.nearest_frontier import NearestFrontier
-from agents.next_best_view import NextBestView
+from agents.planners.d_optimality import DOptimality
+from agents.planners.distance_advantage import distance_advantage
+from agents.planners.hungarian import hungarian
+from agents.planners.independent_frontier import IndependentFrontier
+from agents.planners.mtsp import mtsp
+from agents.planners.nearest_frontier import NearestFrontier
+from agents.planners.next_best_view import NextBestView
+from agents.planners.random_goals import RandomGoals
+from agents.planners.random_walk import RandomWalk
+from agents.planners.rbpf_gain import RbpfGain
+from agents.planners.rendezvous import Rendezvous
+from agents.planners.tare import tare
+from agents.planners.utility_cost import utility_cost
 from agents.plugins import ACTION_TYPES, is_plugin, load_plugin, plugin_action_type
 from agents.policy import Policy
-from agents.random_goals import RandomGoals
-from agents.random_walk import RandomWalk
-from agents.rbpf_gain import RbpfGain
-from agents.rendezvous import Rendezvous
-from agents.tare import tare
 from agents.team import Assign, Assigned, CentralPolicy, SeparatePolicies, TeamPolicy
 from agents.trained import MODEL_FILE, SUFFIX, TrainedGoalPolicy, load_model
-from agents.utility_cost import utility_cost
 from slam_backend.core.validation import argument_error, check_choice
 
 # Planners that divide the frontiers of a group among its robots, and planners of a single robot

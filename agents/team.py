@@ -5,8 +5,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from agents.planners.targets import Targets, own_targets, team_targets
 from agents.policy import Policy
-from agents.targets import Targets, own_targets, team_targets
 from slam_backend.core.validation import IntArray
 from vslam_env.belief.team_belief import Belief
 

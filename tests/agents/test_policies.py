@@ -11,7 +11,7 @@ import pytest
 
 from agents import POLICIES, make_policy
 from agents.goal_choice import DrivingPolicy, GoalPolicy, patrol_goal
-from agents.nearest_frontier import NearestFrontier, choose_slot
+from agents.planners.nearest_frontier import NearestFrontier, choose_slot
 from agents.plugins import is_plugin
 from agents.registry import action_types
 from slam_backend.geometry import compose

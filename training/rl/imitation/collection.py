@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.goal_network import Weights, logits
-from agents.next_best_view import decide
+from agents.planners.next_best_view import decide
 from slam_backend.core.validation import BoolArray, Float32Array
 from training.rl.imitation.labels import Labels, joined, pack
 from training.vec_env import ExplorationVecEnv, load_kernels

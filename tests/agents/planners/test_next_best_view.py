@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from agents.goal_choice import Planner
-from agents.next_best_view import PATH_SPREAD, NextBestView, decide, view_rates
-from agents.rendezvous import INTERVAL, Rendezvous
+from agents.planners.next_best_view import PATH_SPREAD, NextBestView, decide, view_rates
+from agents.planners.rendezvous import INTERVAL, Rendezvous
 from tests.agents.test_policies import ROOM
 from vslam_env import vslam_v0
 from vslam_env.belief.team_belief import Belief, Teammate

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from agents import make_policy, make_team_policy
-from agents.hungarian import assign_all, hungarian
+from agents.planners.hungarian import assign_all, hungarian
+from agents.planners.tare import LEFT_OVER, draw_cover
+from agents.planners.targets import NO_PATH, Targets, own_targets, team_targets
+from agents.planners.utility_cost import COST, utility_cost
 from agents.registry import ASSIGNMENTS, PLANNERS
-from agents.tare import LEFT_OVER, draw_cover
-from agents.targets import NO_PATH, Targets, own_targets, team_targets
-from agents.utility_cost import COST, utility_cost
 from slam_backend.geometry import compose, inverse
 from tests.agents.test_policies import ROOM
 from vslam_env import CandidateKind, ExplorationEnv, vslam_v0

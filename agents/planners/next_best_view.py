@@ -6,8 +6,8 @@ loop-closing for FastSLAM", IROS 2004. The map error counts landmarks measured t
 again pays; but maps must meet first, since each robot is scored by the map that it shares. So the time is divided:
 
 1. A robot explores while there are frontiers to which no teammate has a shorter path, chosen by distance advantage
-   (`agents.distance_advantage`): of the planners here its robots share their maps earliest. Views on the way are not
-   taken: each costs a stop, and exploring takes longer by more than they show.
+   (`agents.planners.distance_advantage`): of the planners here its robots share their maps earliest. Views on the way
+   are not taken: each costs a stop, and exploring takes longer by more than they show.
 2. Otherwise it goes to views, worth what they show, walls [m] looked at too little and weak landmarks, for the path to
    them. Frontiers that are left to teammates come after that.
 3. If nothing is left to see and robots are missing in the group, or a loop can be closed, the robot goes to the nearest
@@ -20,8 +20,8 @@ walls beside the path have their looks without a stop.
 
 import numpy as np
 
-from agents.distance_advantage import advantage_costs
-from agents.targets import own_targets
+from agents.planners.distance_advantage import advantage_costs
+from agents.planners.targets import own_targets
 from slam_backend.core.validation import BoolArray, FloatArray
 from vslam_env.belief.team_belief import Belief
 from vslam_env.navigation import CandidateKind
