@@ -44,9 +44,9 @@ def parallel_env(
     """Make the parallel environment. Arguments that are None keep the value of the configuration or preset.
 
     Args:
-        world: `"office"` (default), `"maze"`, `"loops"`, `"hall"`, `"fig5"`; the path of a floor plan (.png, .jpg,
-            .pgm), of a ROS map (.yaml), of a .json file of walls or of a folder of these; a `World`; or a function
-            that takes a random generator and returns a `World`.
+        world: `"office"` (default), `"maze"`, `"loops"`, `"hall"`, `"rooms"`, `"campus"`, `"fig5"`; the path of a floor
+            plan (.png, .jpg, .pgm), of a ROS map (.yaml), of a .json file of walls or of a folder of these; a `World`;
+            or a function that takes a random generator and returns a `World`.
         num_robots: Number of robots, 1 to 8; default 3.
         sensor: `"landmark"` (default): simulated measurements. `"stereo"`: rendered images of textured walls, measured
             by the stereo front end.

@@ -1,4 +1,4 @@
-"""Hooks of the site: pages of the repository's root, pages of notebooks, and links to files that are not pages."""
+"""Hooks of the site: pages of the repository's root, of notebooks and of the commands, and links to other files."""
 
 import posixpath
 import re
@@ -13,7 +13,7 @@ LINK = re.compile(r"\[([^\]]*)\]\(([^)\s:]+)\)")
 
 
 def on_files(files: Any, config: Any) -> Any:
-    """Add the pages of the root and of the notebooks to the site."""
+    """Add the pages of the root, of the notebooks and of the commands to the site."""
     from mkdocs.structure.files import File
 
     for name in ROOT_PAGES:
@@ -21,7 +21,19 @@ def on_files(files: Any, config: Any) -> Any:
     for notebook in notebooks():
         content = notebook_page(notebook.read_text(encoding="utf-8"), notebook.name)
         files.append(File.generated(config, f"notebooks/{notebook.stem}.md", content=content))
+    files.append(File.generated(config, "reference/commands.md", content=commands_page()))
     return files
+
+
+def commands_page() -> str:
+    """Return the page of all commands with their options and defaults."""
+    import typer
+    from typer.cli import get_docs_for_click
+
+    from training.cli import app
+
+    command = typer.main.get_command(app)
+    return get_docs_for_click(obj=command, ctx=typer.Context(command, info_name="vslam"), name="vslam")
 
 
 def notebooks() -> list[Path]:

@@ -32,8 +32,16 @@ def test_all_pages_are_in_the_navigation(hooks: Any) -> None:
     """Each page of `docs` is listed once, with the pages of the root; none is missing or gone."""
     found = [page.relative_to(ROOT / "docs").as_posix() for page in (ROOT / "docs").rglob("*.md")]
     found += [f"notebooks/{notebook.stem}.md" for notebook in hooks.notebooks()]
-    assert sorted(pages(CONFIG["nav"])) == sorted([*found, *hooks.ROOT_PAGES])
+    assert sorted(pages(CONFIG["nav"])) == sorted([*found, *hooks.ROOT_PAGES, "reference/commands.md"])
     assert all((ROOT / page).is_file() for page in hooks.ROOT_PAGES)
+
+
+def test_the_page_of_commands_has_all_options(hooks: Any) -> None:
+    """Each command is a section; options have their defaults."""
+    text = hooks.commands_page()
+    assert {"## `vslam run`", "### `vslam bench exploration`", "## `vslam evaluate`"} <= set(text.splitlines())
+    own = text.split("## `vslam evaluate`")[1].split("\n## ")[0]
+    assert "* `--world-split <str>`: Split of the worlds: validation or test.  [default: (validation)]" in own
 
 
 @pytest.mark.parametrize(("source", "before", "after"), [
