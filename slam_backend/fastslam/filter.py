@@ -41,14 +41,12 @@ NO_WEIGHTS = np.empty(0)  # unused where all particles start at the same pose
 class FastSlam:
     """Visual FastSLAM for one robot, or jointly for several that share a map frame.
 
+    All arguments but these three are fields of `FilterOptions`, which describes them.
+
     Args:
         num_robots: K. Each particle holds K poses and one map (Eq. 19).
         seed: Seed of the filter's own random stream: an int, a `numpy.random.SeedSequence` or a Generator.
         initial_poses: (K, 3) [m, m, rad], map frame. None: all at the origin.
-        num_particles, camera, motion, proposal, resampling, resample_threshold, position_gate, descriptor_gate,
-        new_landmark_gate, new_landmark_radius, recovery_position, recovery_heading, descriptor_sigma, ambiguity_margin,
-        new_landmark_density, one_to_one, landmark_noise, existence, rejuvenate_every, smoothing: See
-        `FilterOptions`.
 
     Raises:
         ValueError: If an argument is out of its range; the text names it.
@@ -152,11 +150,12 @@ class FastSlam:
         """Move the robots, match their measurements, weigh, update, and resample if needed.
 
         Args:
-            odometry: One (3,) [m, m, rad] per robot, motion since its last step in its previous frame; None: it stood
-                still.
+            odometry: One (3,) [m, m, rad] per robot, motion (dx, dy, dtheta) since its last step in its previous frame,
+                x ahead, y and dtheta to the left; None: it stood still.
             measurements: One frame per robot, or None.
             identities: One (n_i,) int per robot, the caller's own names of the measured landmarks, -1 for a measurement
-                to be rejected; data association follows these names. None: association by gates and descriptors.
+                to be rejected; data association follows these names alone. None: association by gates and
+                descriptors; without appearance all descriptors are equal, such as `np.ones((n, 1))`.
             poses: One (3,) [m, m, rad] per robot, its exact pose in its own start frame; odometry is ignored.
 
         Returns:

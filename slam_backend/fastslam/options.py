@@ -36,7 +36,7 @@ class FilterOptions:
         camera: Assumed camera and its noise.
         motion: Assumed noise of the odometry.
         proposal: "fastslam2": the measurements shape the sampled pose. "fastslam1": poses are sampled from the motion
-            model alone and association follows Algorithm 1 to the letter (as corrected).
+            model alone and association follows Algorithm 1, with the corrections in `docs/reference/errata.md`.
         resampling: Scheme, a key of `slam_backend.resampling.RESAMPLING`.
         resample_threshold: ESS / M at or below which particles are resampled; 1 = at every step with a measurement.
         position_gate: D0, largest squared Mahalanobis distance of a match [-] (11.34: 99 % at 3 degrees of freedom).
@@ -62,7 +62,8 @@ class FilterOptions:
         existence: Detection model that updates the probability of existence of landmarks; particles delete improbable
             ones. None: landmarks are never deleted.
         rejuvenate_every: Steps after which particles are sampled from the smoother's posterior of whole paths; also at
-            the first step after a merge, and sooner after a loop closure. None: never.
+            the first step after a merge, and sooner after a loop closure. None: never, except that a `TeamSlam`
+            smooths both sides before a merge (`MergeOptions.smooth_first`).
         smoothing: Options of the smoother.
     """
 
