@@ -20,9 +20,6 @@ ROBOT_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0
 class StereoCamera:
     """A rectified stereo pair with its assumed noise.
 
-    By default 320 x 240 px, focal length 320 px, baseline 0.12 m, range 8 m, standard deviations of 0.2 px, and of
-    0.1 px in disparity.
-
     Attributes:
         focal_px: Focal length [px].
         baseline: Distance between the two cameras [m].

@@ -17,8 +17,7 @@ class OdometryModel:
     """Gaussian noise of an odometry reading u = (dx, dy, dtheta) in the robot's previous frame.
 
     The three components are independent; the variance of each is the sum of a floor and a part that grows with the
-    motion: by default 5 % of the distance along, 2 % across, 2 degrees per metre and 2 % of the turn, with floors of
-    0.3 mm and 0.3 mrad.
+    motion.
 
     A *bias* b = (scale of the translation, turn per metre travelled, turn per radian turned) is constant in a run and
     differs between robots, such as that of wheels of unequal size. It has a zero-mean Gaussian prior of the given
