@@ -27,6 +27,7 @@ from vslam_env.rendering.window import Window
 from vslam_env.reward import RewardSpec, evaluate, make_terms, reads_beliefs, totals
 from vslam_env.simulation.controllers import ActionExecutor
 from vslam_env.simulation.episode import Episode, ReadingsHook, Recorder
+from vslam_env.simulation.memory import memory_errors_as_argument_errors
 from vslam_env.simulation.scenario import sample_scenario
 from vslam_env.snapshots import EnvState, check_parts, check_state, sequence_state, snapshot_objects, state_version
 from vslam_env.world import World, WorldSource, check_source, is_single_layout
@@ -129,7 +130,10 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         if world_seed is not None:
             check_int("options['world_seed']", world_seed, 0, "Give an int >= 0.")
         ahead.expect(partial(_signatures_of, self.config))
-        scenario = sample_scenario(self.config, self._source, root.spawn(1)[0], world_seed, options.get("start_poses"))
+        with memory_errors_as_argument_errors():
+            scenario = sample_scenario(
+                self.config, self._source, root.spawn(1)[0], world_seed, options.get("start_poses")
+            )
         episode = Episode(self.config, scenario, self._tap)
         episode.begin()
         self._team_metrics = episode.team_metrics(self._reads_beliefs)

@@ -383,7 +383,7 @@ class FilterState:
     @classmethod
     def joined(
         cls, a: "FilterState", from_a: IntArray, b: "FilterState", from_b: IntArray, motion: FloatArray,
-        evidence: FloatArray, rng: np.random.Generator,
+        evidence: FloatArray, rng: np.random.Generator, unused: ParticleMaps | None = None,
     ) -> "FilterState":  # fmt: skip
         """Return the state of both groups' robots, a's first, in a's map frame, without landmarks yet.
 
@@ -393,11 +393,14 @@ class FilterState:
             motion: (M, 3) [m, m, rad], frame a from frame b, of each joint particle.
             evidence: (M,) log-weight of each pair.
             rng: Generator that seeds the joint filter's own stream.
+            unused: Maps no longer in use, whose memory the joint filter takes if they fit.
         """
         count, k = len(motion), a.num_robots
         same = a.options.num_particles == count
         options = a.options if same else replace(a.options, num_particles=count)
         joint = cls(k + b.num_robots, options, np.random.default_rng(rng.integers(2**63, size=4)))
+        if unused is not None and unused.num_particles == count and unused.log_odds_prior == joint.maps.log_odds_prior:
+            joint.maps = unused
         for target, of_a, of_b in zip(joint.pose_arrays[:3], a.pose_arrays, b.pose_arrays, strict=False):
             target[:k, :, :count] = of_a[:, :, from_a]
             target[k:, :, :count] = compose(motion, of_b[:, :, from_b].transpose(0, 2, 1)).transpose(0, 2, 1)

@@ -8,6 +8,7 @@ import numpy as np
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.fastslam import _kernels
 from slam_backend.fastslam.filter import FastSlam
+from slam_backend.fastslam.particle_maps import SpareMaps
 from slam_backend.fastslam.reports import LandmarkIdMap, MergeUndone
 from slam_backend.geometry import rotate_covariances
 from slam_backend.maps.alignment import DISTINCT_ROTATION, DISTINCT_TRANSLATION, Alignment, AlignmentOptions
@@ -88,22 +89,31 @@ class MergePlan(NamedTuple):
         return self._replace(pairing=pairing)
 
     def on_trial(
-        self, merging: MergeOptions, options: AlignmentOptions, rng: np.random.Generator
-    ) -> tuple[Self, float] | None:
+        self, merging: MergeOptions, options: AlignmentOptions, rng: np.random.Generator,
+        spare: SpareMaps | None = None,
+    ) -> tuple[Self, float] | None:  # fmt: skip
         """Merge both filters into one and rejuvenate it from its smoothed paths; the filters do not change.
 
         Each map constrains the other robots' paths between their starts and the common landmarks. The joint filter may
         therefore know the relative start of the groups well where neither map does.
+
+        Args:
+            merging, options: Options of merges and alignments.
+            rng: Generator for the draws.
+            spare: Maps for the joint filter's memory; if the smoother fails, those of the joint filter.
 
         Returns:
             The plan with the motion estimated by the joint filter, and its uncertainty, see `transform_uncertainty`;
             infinite if the shape of the joint map is inconsistent. None if the smoother fails.
         """
         a, b = self.filters
+        spare = SpareMaps() if spare is None else spare
         joint, renamed = merge_filters(
-            a, b, self.alignment, self.pairs, rng, merging.merged_particles, pairing=self.pairing
+            a, b, self.alignment, self.pairs, rng, merging.merged_particles, pairing=self.pairing, on_trial=True,
+            unused=spare.take(),
         )  # fmt: skip
         if joint.rejuvenate().reason:
+            spare.maps = joint.state.maps
             return None
         starts = joint.state.starts[a.num_robots, :, : joint.num_particles]
         motion = mean_pose(starts)

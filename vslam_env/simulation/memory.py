@@ -1,5 +1,9 @@
 """Memory for the landmarks of an episode, compared with what is available before its first step."""
 
+import importlib
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from slam_backend.core.validation import argument_error
@@ -8,6 +12,7 @@ PER_PARTICLE = 9 * 8 + 4  # bytes of a landmark in a particle: mean, covariance 
 COPIES = 2  # a map that grows is copied, and a joint map exists beside those from which it is merged
 GROUP = Path("/sys/fs/cgroup")  # limits of containers
 SYSTEM = Path("/proc/meminfo")
+OWN = Path("/proc/self/statm")
 
 
 def required_memory(num_landmarks: int, num_particles: int) -> int:
@@ -15,12 +20,13 @@ def required_memory(num_landmarks: int, num_particles: int) -> int:
     return COPIES * PER_PARTICLE * num_landmarks * num_particles
 
 
-def available_memory(system: Path = SYSTEM, group: Path = GROUP) -> int | None:
+def available_memory(system: Path = SYSTEM, group: Path = GROUP, own: Path = OWN) -> int | None:
     """Return the memory [bytes] that this process can still use; None where the system does not say.
 
     Args:
         system: File in which Linux tells it.
         group: Folder with the limit of the process's control group, if there is one.
+        own: File with the size of this process, for which `ulimit -v` sets a limit.
     """
     try:
         fields = dict(line.split(":", 1) for line in system.read_text(encoding="ascii").splitlines())
@@ -29,9 +35,22 @@ def available_memory(system: Path = SYSTEM, group: Path = GROUP) -> int | None:
         return None
     try:
         limit, used = (int((group / name).read_text(encoding="ascii")) for name in ("memory.max", "memory.current"))
+        found = min(found, max(limit - used, 0))
     except (OSError, ValueError):  # no group, or "max": no limit
-        return found
-    return min(found, max(limit - used, 0))
+        pass
+    free = _free_addresses(own)
+    return found if free is None else min(found, free)
+
+
+def _free_addresses(own: Path) -> int | None:
+    """Return the address space [bytes] that this process may still take; None: there is no limit."""
+    try:
+        resource = importlib.import_module("resource")  # missing on Windows
+        limit = int(resource.getrlimit(resource.RLIMIT_AS)[0])
+        size = int(own.read_text(encoding="ascii").split()[0]) * os.sysconf("SC_PAGE_SIZE")
+    except (ImportError, OSError, ValueError, IndexError):
+        return None
+    return None if limit == resource.RLIM_INFINITY else max(limit - size, 0)
 
 
 def check_memory(num_landmarks: int, num_particles: int, available: int | None) -> None:
@@ -52,3 +71,12 @@ def check_memory(num_landmarks: int, num_particles: int, available: int | None) 
         f"at most {most} for the {num_landmarks} landmarks of this world in {available / 1e9:.1f} GB of free memory"
     )
     raise argument_error("num_particles", expected, num_particles, "Use fewer, or a smaller world, or free memory.")
+
+
+@contextmanager
+def memory_errors_as_argument_errors() -> Iterator[None]:
+    """Turn a lack of memory in a block that builds an episode into a `ValueError`."""
+    try:
+        yield
+    except MemoryError as error:
+        raise argument_error("world", "one that fits into the free memory", str(error), "Use a smaller one.") from error

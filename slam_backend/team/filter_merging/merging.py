@@ -23,7 +23,9 @@ import math
 import numpy as np
 
 from slam_backend.core.validation import FloatArray, IntArray
+from slam_backend.fastslam._kernels import LANES
 from slam_backend.fastslam.filter import FastSlam
+from slam_backend.fastslam.particle_maps import ParticleMaps
 from slam_backend.fastslam.state import FilterState
 from slam_backend.geometry import inverse, wrap_angle
 from slam_backend.maps.alignment import Alignment
@@ -39,6 +41,8 @@ from slam_backend.team.filter_merging.landmarks import (
     write_joint,
 )
 from slam_backend.team.filter_merging.pairing import Pairing, pair_particles
+
+PART = 512  # landmarks of one particle that are written at once
 
 
 def inverse_alignment(alignment: Alignment) -> Alignment:
@@ -61,6 +65,8 @@ def merge_filters(
     num_particles: int | None = None,
     known: bool = False,
     pairing: Pairing | None = None,
+    on_trial: bool = False,
+    unused: ParticleMaps | None = None,
 ) -> tuple[FastSlam, IntArray]:
     """Merge two filters into a joint one in a's map frame (Secs. 3.2 and 4).
 
@@ -76,6 +82,9 @@ def merge_filters(
         num_particles: Number of particles of the joint filter; None: the larger of the two.
         known: Whether the motion is drawn from the alignment alone, ignoring the common landmarks.
         pairing: Result of `pair_filters` for these arguments; None: a new draw.
+        on_trial: Whether the joint filter is to be rejuvenated at once, or dropped: then only the most probable
+            particle gets landmarks, which the smoother starts from.
+        unused: Maps no longer in use, for the joint filter's memory.
 
     Returns:
         The joint filter, a's robots first; and (n, 2) int64 rows (id in b, id in the joint map) of all of b's
@@ -86,7 +95,7 @@ def merge_filters(
     from_a, from_b, motion, evidence, extra, scale = pairing
     fitting, named = merge_by_identity(a.state.maps, b.state.maps, pairs)
     pairs = np.concatenate([fitting, named])
-    joint = FilterState.joined(a.state, from_a, b.state, from_b, motion, evidence, rng)
+    joint = FilterState.joined(a.state, from_a, b.state, from_b, motion, evidence, rng, unused)
 
     of_a, of_b = Landmarks.of(a.state.maps, from_a), Landmarks.of(b.state.maps, from_b)
     ids_a, ids_b = of_a.ids, of_b.ids
@@ -125,7 +134,16 @@ def merge_filters(
     if len(named):
         sides = Landmarks.of(a.state.maps, from_a, named[:, 0]), Landmarks.of(b.state.maps, from_b, named[:, 1])
         scales[np.searchsorted(ids_a, named[:, 0])] = np.maximum(scale, birge_ratios(*sides, motion, 0.5 * extra))
-    write_joint(of_a, of_b, rows_a[held], rows_b[held], motion, 0.5 * extra, scales[held], joint.maps.blocks)
+    if on_trial:
+        best = int(joint.path_log_weights.argmax())
+        of_a, of_b = Landmarks.of(a.state.maps, from_a[[best]]), Landmarks.of(b.state.maps, from_b[[best]])
+        tiles, lane = np.empty((PART, 1, 9, LANES)), joint.maps.blocks[:, best // LANES, :, best % LANES]
+        for first in range(0, len(held), PART):
+            part = held[first : first + PART]
+            write_joint(of_a, of_b, rows_a[part], rows_b[part], motion[[best]], 0.5 * extra, scales[part], tiles)
+            lane[first : first + len(part)] = tiles[: len(part), 0, :, 0]
+    else:
+        write_joint(of_a, of_b, rows_a[held], rows_b[held], motion, 0.5 * extra, scales[held], joint.maps.blocks)
     renamed = np.concatenate([pairs[:, ::-1], np.column_stack([ids_b[exclusive], new_ids])]).astype(np.int64)
     joint.finish_join(a.state, b.state, renamed)
     return FastSlam.from_filter_state(joint), renamed

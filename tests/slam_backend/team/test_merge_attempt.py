@@ -13,6 +13,7 @@ from builders.teams import NEVER, SimulatedTeam, check_snapshot, driven, false_a
 
 from slam_backend.fastslam import rejuvenation
 from slam_backend.fastslam.filter import FastSlam
+from slam_backend.fastslam.particle_maps import SpareMaps
 from slam_backend.fastslam.rejuvenation import RejuvenationScheduler
 from slam_backend.geometry import between, compose
 from slam_backend.maps.alignment import DISTINCT_ROTATION, DISTINCT_TRANSLATION, AlignmentOptions, align_maps
@@ -341,6 +342,26 @@ def test_a_trial_leaves_both_filters_as_they_are() -> None:
     np.testing.assert_allclose(tried.alignment.transform, mean_pose(joint.state.starts[1, :, : joint.num_particles]))
     assert_same(tried.alignment.inliers, plan.alignment.inliers)
     assert 0.0 < doubt < 1.0
+
+
+def test_a_trial_is_a_merge_that_is_smoothed_whatever_maps_it_takes_over() -> None:
+    """Landmarks of the most probable particle suffice, and what the spare maps held does not matter: all is equal."""
+    _, team = driven(2, 112, FEW_STEPS, num_particles=8)
+    plan = planned(team)
+    spare = SpareMaps()
+    joints = []
+    for _ in range(2):
+        trial = plan.on_trial(MergeOptions(), AlignmentOptions(), np.random.default_rng(2), spare)
+        assert trial is not None
+        assert trial[0].joint is not None
+        joints.append(contents(trial[0].joint[0]))
+        spare.maps = trial[0].joint[0].state.maps
+    whole, _ = merge_filters(
+        *plan.filters, plan.alignment, plan.pairs, np.random.default_rng(2), None, pairing=plan.pairing
+    )
+    assert not whole.rejuvenate().reason
+    for joint in joints:
+        assert_same(joint, contents(whole))
 
 
 @pytest.mark.parametrize("slice_steps", [None, 90])

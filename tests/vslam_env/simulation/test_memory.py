@@ -1,6 +1,9 @@
 """Episodes that cannot fit into memory are refused before their first step."""
 
+import importlib
+import os
 import re
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +38,32 @@ def test_the_least_of_all_limits_counts(tmp_path: Path) -> None:
         assert memory.available_memory(system, group) == expected
     system.write_text("MemTotal:  9000 kB\n")
     assert memory.available_memory(system, group) is None
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the size of a process is read from /proc")
+def test_a_limit_of_the_address_space_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What `ulimit -v` leaves to this process counts if it is less than the free memory."""
+    resource = importlib.import_module("resource")
+    system, own, page = tmp_path / "meminfo", tmp_path / "statm", os.sysconf("SC_PAGE_SIZE")
+    system.write_text("MemAvailable:   5000 kB\n")
+    own.write_text("100 50 3\n")
+    for limit, expected in ((101 * page, page), (99 * page, 0), (10**12, 5_120_000), (-1, 5_120_000)):
+        monkeypatch.setattr(resource, "getrlimit", lambda _, limit=limit: (limit, limit))
+        assert memory.available_memory(system, tmp_path, own) == expected
+
+
+def test_a_lack_of_memory_at_a_reset_is_one_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It names the world; the running episode goes on."""
+    env = vslam_v0.parallel_env(world="hall", num_robots=2, num_particles=4)
+    env.reset(seed=3)
+
+    def fail(*_: object) -> None:
+        raise MemoryError("Unable to allocate 9 GiB")
+
+    monkeypatch.setattr("vslam_env.environment.sample_scenario", fail)
+    with pytest.raises(ValueError, match=r"world: expected one that fits into the free memory, got .*9 GiB"):
+        env.reset(seed=4)
+    assert env.agents
 
 
 def test_what_fits_passes_and_the_error_names_what_would() -> None:
