@@ -60,7 +60,7 @@ def play(config: AccuracyConfig, trial: EpisodeTrial) -> dict[str, Any]:
 
     - `position_rms_m`: for each of `ESTIMATES` the RMS position error [m] over robots and ticks, in start frames and
       without a fit; `heading_rms_deg` and `end_error_m` (mean over robots) in the same way.
-    - `nees_median`, `nees_mean`: of the poses (3-D, ideal 3) by `ideal_online` and by `filter`.
+    - `nees_median` (ideal 2.4), `nees_mean` (ideal 3): of the poses (3-D) by `ideal_online` and by `filter`.
     - `map_rms_m`: RMS error of the filter's landmarks at the end, `batch_map_rms_m`: of the same landmarks in the batch
       estimate, both in start frames, means over robots; `map_recall`, `map_precision`.
     - `wrong_match_share`: of the filter's matches, those with another true landmark than the landmark's first

@@ -113,7 +113,7 @@ def tables(lines: Sequence[Line]) -> list[Table]:
             ["world", "estimate", "position RMS [m]", "loss", "factor"], errors,
         ),
         (
-            "Filter over ideal online estimate; map over batch ML; median NEES (ideal 3)",
+            "Filter over ideal online estimate; map over batch ML; median NEES (ideal 2.4)",
             ["world", "seeds", "filter over ideal", "worst", "map over batch", "NEES", "of ideal"], others,
         ),
         (
