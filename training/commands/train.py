@@ -37,7 +37,7 @@ def train(
 ) -> None:
     """Train one network for all robots by PPO with masked goal actions; use it with vslam run --policy FOLDER.
 
-    --preset imitate clones a planner instead: it labels decisions, in later
+    Worlds are those of the training split. --preset imitate clones a planner instead: it labels decisions, in later
     rounds those of the pupil. --steps counts decisions; every second is a label.
 
     A config.toml sets all other values. Its gamma is the discount per decision:
