@@ -31,7 +31,7 @@ from slam_backend.team.team import TeamSlam
 # Features that default options do not use, and the prefixes of the kernels that only these call, signature included.
 EXTRAS = {
     "fastslam1": (),
-    "existence": ("slam_backend.fastslam._kernels.existence.",),
+    "existence": ("slam_backend.fastslam._kernels.update.existence.",),
     "clique": ("slam_backend.maps._kernels.max_clique.",),
     "images": ("slam_backend.frontend.",),
     "planners": ("vslam_env.navigation.tours.", "vslam_env.navigation._planning_kernels.path_lengths."),

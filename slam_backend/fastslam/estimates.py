@@ -6,7 +6,7 @@ import numpy as np
 
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.fastslam import _kernels
-from slam_backend.fastslam._kernels.map_mixture import mix
+from slam_backend.fastslam._kernels.particles.map_mixture import mix
 from slam_backend.fastslam.particle_maps import ParticleMaps, present_slots
 from slam_backend.fastslam.reports import PoseEstimates
 

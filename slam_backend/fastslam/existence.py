@@ -9,7 +9,7 @@ it does not exist) = f,
     detection: + log(d / f)         miss: + log((1 - d) / (1 - f)).
 
 The log-odds are capped, so that a landmark with a thousand detections can still be deleted. The filter's loops over
-landmarks and particles are in `fastslam/_kernels/existence.py`.
+landmarks and particles are in `fastslam/_kernels/update/existence.py`.
 """
 
 from dataclasses import dataclass
@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.core.validation import MOST, FloatArray, IntArray, argument_error, check_float, check_int, known_names
-from slam_backend.fastslam._kernels import existence as kernels
 from slam_backend.fastslam._kernels.records import ViewBounds, Viewpoint
+from slam_backend.fastslam._kernels.update import existence as kernels
 from slam_backend.fastslam.particle_maps import ParticleMaps
 from slam_backend.models.camera import StereoCamera
 

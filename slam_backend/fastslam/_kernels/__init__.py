@@ -1,5 +1,9 @@
 """The compiled inner loops of the filter: one robot's frame, for all particles.
 
+`step` takes the robots in turn; `fastslam1` or `fastslam2` processes one robot's frame. Their parts are in folders:
+`motion`, `measurement`, `association`, `update` (landmark EKF, existence) and `particles` (weights, resampling, storage
+of landmarks, estimates).
+
 Particles are taken in blocks of `LANES`, and every loop over the lanes of a block is plain arithmetic on rows of one
 flat workspace, which the compiler turns into vector instructions; decisions become masks. A row is addressed as
 `work[ROW + i]`, lane i, with ROW a multiple of LANES known at compile time.
@@ -22,7 +26,6 @@ special case. With A = (dr/dx) C and S = Sigma + R, a match adds A^T S^-1 A to t
 """
 
 from slam_backend.fastslam._kernels.inputs import extent, read_team, to_robot_axes
-from slam_backend.fastslam._kernels.landmark_ekf import RELINEARISE_UP_TO
 from slam_backend.fastslam._kernels.layout import (
     EXACT_POSE,
     FAR,
@@ -35,10 +38,12 @@ from slam_backend.fastslam._kernels.layout import (
     REJECTED,
     STATIONARY,
 )
-from slam_backend.fastslam._kernels.map_storage import apply_resampling, map_summary, release, resample
+from slam_backend.fastslam._kernels.particles.map_storage import map_summary, release
+from slam_backend.fastslam._kernels.particles.pose_estimates import add_gauge_covariance, mixture, write_team_poses
+from slam_backend.fastslam._kernels.particles.resampling import apply_resampling, resample
 from slam_backend.fastslam._kernels.records import MapArrays
 from slam_backend.fastslam._kernels.step import step_robots, write_sigmas
-from slam_backend.fastslam._kernels.weights import add_gauge_covariance, mixture, write_team_poses
+from slam_backend.fastslam._kernels.update.landmark_ekf import RELINEARISE_UP_TO
 
 __all__ = [
     "EXACT_POSE",

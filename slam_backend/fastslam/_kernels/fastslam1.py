@@ -7,14 +7,13 @@ import numpy as np
 from slam_backend.core.jit import device, jit_fma, stack_array
 from slam_backend.core.simd_math import sine_cosine
 from slam_backend.core.validation import FloatArray
-from slam_backend.fastslam._kernels.candidates import (
+from slam_backend.fastslam._kernels.association.candidates import (
     create_once,
     find_candidates,
     mark_assigned,
     mask_of,
     write_associations,
 )
-from slam_backend.fastslam._kernels.landmark_ekf import gate_and_update, new_landmark
 from slam_backend.fastslam._kernels.layout import (
     CANDIDATE_ROWS,
     CLUTTER,
@@ -29,11 +28,17 @@ from slam_backend.fastslam._kernels.layout import (
     T,
     X,
 )
-from slam_backend.fastslam._kernels.map_storage import apply_resampling, tile_of
-from slam_backend.fastslam._kernels.measurement_model import clear_likelihood, innovate, total_log_likelihood
-from slam_backend.fastslam._kernels.motion_model import load_rows, sample_motion, set_exact
-from slam_backend.fastslam._kernels.odometry_bias import correct_bias_by_draws
+from slam_backend.fastslam._kernels.measurement.measurement_model import (
+    clear_likelihood,
+    innovate,
+    total_log_likelihood,
+)
+from slam_backend.fastslam._kernels.motion.motion_model import load_rows, sample_motion, set_exact
+from slam_backend.fastslam._kernels.motion.odometry_bias import correct_bias_by_draws
+from slam_backend.fastslam._kernels.particles.map_storage import tile_of
+from slam_backend.fastslam._kernels.particles.resampling import apply_resampling
 from slam_backend.fastslam._kernels.records import Frame, MapArrays, Motion, Outcome, Poses, Rules, Space
+from slam_backend.fastslam._kernels.update.landmark_ekf import gate_and_update, new_landmark
 
 
 @device

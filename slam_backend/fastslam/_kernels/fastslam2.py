@@ -4,15 +4,19 @@ import numpy as np
 
 from slam_backend.core.jit import device, jit_fma, stack_array
 from slam_backend.core.validation import FloatArray
-from slam_backend.fastslam._kernels.candidates import create_once, find_candidates, mask_of, write_associations
-from slam_backend.fastslam._kernels.data_association import (
+from slam_backend.fastslam._kernels.association.candidates import (
+    create_once,
+    find_candidates,
+    mask_of,
+    write_associations,
+)
+from slam_backend.fastslam._kernels.association.data_association import (
     associate_all,
     associate_unambiguous,
     iterate_wide,
     try_wide_prior,
     undo_unconfirmed,
 )
-from slam_backend.fastslam._kernels.landmark_ekf import new_landmark, update_matched
 from slam_backend.fastslam._kernels.layout import (
     CANDIDATE_ROWS,
     COV_XI00,
@@ -24,11 +28,16 @@ from slam_backend.fastslam._kernels.layout import (
     X0,
     X,
 )
-from slam_backend.fastslam._kernels.map_storage import apply_resampling
-from slam_backend.fastslam._kernels.motion_model import predict, store_rows, take_draws
-from slam_backend.fastslam._kernels.odometry_bias import correct_bias, set_bias_gain
-from slam_backend.fastslam._kernels.pose_posterior import gauss_newton_step, posterior, set_linearisation_point
+from slam_backend.fastslam._kernels.measurement.pose_posterior import (
+    gauss_newton_step,
+    posterior,
+    set_linearisation_point,
+)
+from slam_backend.fastslam._kernels.motion.motion_model import predict, store_rows, take_draws
+from slam_backend.fastslam._kernels.motion.odometry_bias import correct_bias, set_bias_gain
+from slam_backend.fastslam._kernels.particles.resampling import apply_resampling
 from slam_backend.fastslam._kernels.records import Frame, MapArrays, Motion, Outcome, Poses, Rules, Space
+from slam_backend.fastslam._kernels.update.landmark_ekf import new_landmark, update_matched
 
 
 @device

@@ -1,6 +1,8 @@
-"""One step of the filter: robot by robot motion, data association and update, and an entry of the run log."""
+"""One step of the filter: robot by robot motion, data association and update; then a summary and a log entry."""
 
 import math
+
+import numpy as np
 
 from slam_backend.core.jit import device, in_place, stack_array
 from slam_backend.core.validation import Float32Array, FloatArray, Int32Array, IntArray
@@ -24,7 +26,9 @@ from slam_backend.fastslam._kernels.layout import (
     EXACT_POSE,
     HAS_COVARIANCES,
     HAS_IDS,
+    IDS,
     IS_ONE_TO_ONE,
+    LAST_SEEN,
     LOG_LIKELIHOOD,
     LOG_P0,
     LOGGED,
@@ -43,17 +47,19 @@ from slam_backend.fastslam._kernels.layout import (
     POSES,
     POSITION_GATE,
     RECOVERY,
+    REJECTED,
     RESAMPLE_THRESHOLD,
     USED,
     WALK,
     WEIGHTS,
     WORK_SIZE,
 )
-from slam_backend.fastslam._kernels.map_storage import register_new
-from slam_backend.fastslam._kernels.motion_model import propagate, set_exact
-from slam_backend.fastslam._kernels.odometry_bias import prepare_bias, set_draw_gain
+from slam_backend.fastslam._kernels.motion.motion_model import propagate, set_exact
+from slam_backend.fastslam._kernels.motion.odometry_bias import prepare_bias, set_draw_gain
+from slam_backend.fastslam._kernels.particles.map_storage import register_new
+from slam_backend.fastslam._kernels.particles.pose_estimates import add_gauge_covariance, mixture
+from slam_backend.fastslam._kernels.particles.weights import weigh
 from slam_backend.fastslam._kernels.records import Frame, MapArrays, Motion, Outcome, Poses, Rules
-from slam_backend.fastslam._kernels.weights import add_gauge_covariance, mixture, summarise, weigh
 
 
 @device
@@ -98,6 +104,60 @@ def write_sigmas(noise: FloatArray, move: FloatArray, sigmas: FloatArray) -> Non
     sigmas[0] = math.hypot(noise[0] * distance, noise[4])
     sigmas[1] = math.hypot(noise[1] * distance, noise[4])
     sigmas[2] = math.hypot(math.hypot(noise[2] * distance, noise[3] * move[2]), noise[5])
+
+
+@device
+@in_place
+def summarise(
+    rows: IntArray, inputs_table: IntArray, found: Int32Array, distances: FloatArray, associations: IntArray, best: int,
+    table: IntArray, now: int, long: float,
+) -> tuple[int, int, int, int, int, float]:  # fmt: skip
+    """Count what became of the robots' measurements.
+
+    Args:
+        rows, inputs_table: Robots and their inputs, see `step_robots`; measurements of other robots are passed over.
+        found: (n, P) slots to which the particles gave the measurements, -1 = rejected.
+        distances: (n, P) squared distances of matches.
+        associations: (2, n), written: id of the landmark with which the most probable particle associated each
+            measurement, -1 = rejected; and id of the landmark that it created in any particle, -1 = none. The latter
+            row holds the slots of these landmarks before.
+        best: The most probable particle.
+        table: (7, slots), see `layout`; `LAST_SEEN` is written.
+        now: Number of the step.
+        long: Number of steps after which a landmark was not seen for long.
+
+    Returns:
+        The number of landmarks not seen for long that the most probable particle matched; the number of measurements
+        that started a landmark in any particle; the numbers of those that the most probable particle started, matched,
+        and rejected, unused ones included; and the mean of its squared distances, without what it predicted
+        behind the camera, NaN if there is none.
+    """
+    associated, created, ids, last_seen = associations[ASSOCIATED], associations[CREATED], table[IDS], table[LAST_SEEN]
+    num_measurements, num_created, num_new, num_matched, num_long_unseen, squares, judged = 0, 0, 0, 0, 0, 0.0, 0
+    for row in rows:
+        if row < 0:
+            continue
+        num_measurements += max(inputs_table[row, COUNT], 0)
+        for b in range(inputs_table[row, BEGIN], inputs_table[row, END]):
+            slot, new = found[b, best], created[b]
+            associated[b] = ids[slot] if slot >= 0 else REJECTED
+            created[b] = ids[new] if new >= 0 else REJECTED
+            if new >= 0:
+                num_created += 1
+                last_seen[new] = 0
+            if slot < 0:
+                continue
+            num_long_unseen += 0 < last_seen[slot] < now - long
+            last_seen[slot] = now
+            if slot == new:
+                num_new += 1
+            else:
+                num_matched += 1
+                if distances[b, best] < np.inf:
+                    squares += distances[b, best]
+                    judged += 1
+    num_rejected = num_measurements - num_new - num_matched
+    return num_long_unseen, num_created, num_new, num_matched, num_rejected, squares / judged if judged > 0 else np.nan
 
 
 @in_place

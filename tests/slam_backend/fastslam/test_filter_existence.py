@@ -16,8 +16,8 @@ from scipy import stats
 
 from slam_backend.core.validation import FloatArray
 from slam_backend.fastslam._kernels import LANES
-from slam_backend.fastslam._kernels.existence import in_view, landmarks_in_view, updated_log_odds
 from slam_backend.fastslam._kernels.records import Viewpoint
+from slam_backend.fastslam._kernels.update.existence import in_view, landmarks_in_view, updated_log_odds
 from slam_backend.fastslam.existence import ExistenceModel, FieldOfView
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.particle_maps import ParticleMaps

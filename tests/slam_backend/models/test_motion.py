@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from slam_backend.fastslam import _kernels
-from slam_backend.fastslam._kernels import odometry_bias
+from slam_backend.fastslam._kernels.motion import odometry_bias
 from slam_backend.geometry import compose, wrap_angle
 from slam_backend.models.odometry import OdometryModel
 

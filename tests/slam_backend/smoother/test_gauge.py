@@ -9,7 +9,7 @@ from builders.runs import small_run
 
 from slam_backend.core.validation import FloatArray
 from slam_backend.fastslam._kernels import add_gauge_covariance
-from slam_backend.fastslam._kernels.map_mixture import add_gauge_to_landmarks
+from slam_backend.fastslam._kernels.particles.map_mixture import add_gauge_to_landmarks
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.options import FilterOptions
 from slam_backend.fastslam.rejuvenation import RejuvenationScheduler

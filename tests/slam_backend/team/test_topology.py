@@ -11,7 +11,7 @@ from builders.teams import NEVER, SimulatedTeam, false_alignment, links, true_al
 
 from slam_backend.core.packed_symmetric import UNPACK_INDEX
 from slam_backend.fastslam._kernels import LANES, add_gauge_covariance
-from slam_backend.fastslam._kernels.weights import (
+from slam_backend.fastslam._kernels.particles.pose_estimates import (
     AT_ORIGIN,
     KNOWN,
     SPREAD,

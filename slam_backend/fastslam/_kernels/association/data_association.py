@@ -13,7 +13,7 @@ import numpy as np
 
 from slam_backend.core.jit import device, simd, simd_inline
 from slam_backend.core.validation import FloatArray, Int32Array
-from slam_backend.fastslam._kernels.candidates import begin_choice, consider, mark_assigned, mask_of
+from slam_backend.fastslam._kernels.association.candidates import begin_choice, consider, mark_assigned, mask_of
 from slam_backend.fastslam._kernels.layout import (
     ANY_HELD,
     BEST_COST,
@@ -61,20 +61,20 @@ from slam_backend.fastslam._kernels.layout import (
     XI1,
     XI2,
 )
-from slam_backend.fastslam._kernels.map_storage import tile_of
-from slam_backend.fastslam._kernels.measurement_model import (
+from slam_backend.fastslam._kernels.measurement.measurement_model import (
     accumulate_likelihood,
     clear_likelihood,
     evaluate,
     innovate,
     match_terms,
 )
-from slam_backend.fastslam._kernels.pose_posterior import (
+from slam_backend.fastslam._kernels.measurement.pose_posterior import (
     add_terms,
     gauss_newton_step,
     set_linearisation_point,
     sum_matches,
 )
+from slam_backend.fastslam._kernels.particles.map_storage import tile_of
 from slam_backend.fastslam._kernels.records import Candidates, Frame, MapArrays, Rules, Space
 
 MORE_STEPS = 3  # further Gauss-Newton iterations where the prior is wide

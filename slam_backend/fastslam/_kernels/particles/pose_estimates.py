@@ -1,4 +1,4 @@
-"""Weights of particles, estimates over all of them, and poses relative to where robots started."""
+"""Pose estimates over all particles, and relative to where robots started."""
 
 import math
 
@@ -6,58 +6,15 @@ import numpy as np
 
 from slam_backend.core.jit import device, in_place, inline, jit, simd, simd_inline, stack_array
 from slam_backend.core.simd_math import sine_cosine, wrapped
-from slam_backend.core.validation import FloatArray, Int32Array, IntArray
+from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.fastslam._kernels.layout import (
-    ASSOCIATED,
-    BEGIN,
-    COUNT,
     COV_XI_SIZE,
     COVARIANCES,
-    CREATED,
-    END,
-    IDS,
     LANES,
-    LAST_SEEN,
-    LOG_LIKELIHOOD,
-    LOG_WEIGHTS,
     MEANS,
-    PATH_LOG_WEIGHTS,
-    REJECTED,
     STARTS,
-    WEIGHTS,
 )
 from slam_backend.fastslam.relative_poses import COVARIANCE, OWN, SIGMAS, START
-
-
-@device
-@in_place
-def weigh(weights: FloatArray, count: int) -> float:
-    """Add a step's log-likelihood to the log-weights and normalise (Eqs. 3, 11, 12; Algorithm 1, l. 9).
-
-    Args:
-        weights: (4, P), see `layout`; all rows but the likelihood are written up to `count`.
-        count: M.
-
-    Returns:
-        The effective sample size.
-    """
-    log_weights, path_log_weights, own = weights[LOG_WEIGHTS], weights[PATH_LOG_WEIGHTS], weights[WEIGHTS]
-    log_likelihood, largest = weights[LOG_LIKELIHOOD], -np.inf
-    for i in range(count):
-        path_log_weights[i] += log_likelihood[i]  # Eq. 12
-        log_weights[i] += log_likelihood[i]  # Eqs. 3, 11
-        largest = max(largest, log_weights[i])
-    total = 0.0
-    for i in range(count):
-        own[i] = math.exp(log_weights[i] - largest)
-        total += own[i]
-    log_total = math.log(total)
-    squares = 0.0
-    for i in range(count):
-        log_weights[i] = log_weights[i] - largest - log_total  # one after the other: the largest may be huge
-        own[i] /= total
-        squares += own[i] * own[i]
-    return 1.0 / squares
 
 
 @simd_inline
@@ -136,60 +93,6 @@ def add_gauge_covariance(scatter: FloatArray, poses: FloatArray, covariances: Fl
         c[1, 2] += along
         c[2, 1] += along
         c[2, 2] += scatter[2, 2]
-
-
-@device
-@in_place
-def summarise(
-    rows: IntArray, inputs_table: IntArray, found: Int32Array, distances: FloatArray, associations: IntArray, best: int,
-    table: IntArray, now: int, long: float,
-) -> tuple[int, int, int, int, int, float]:  # fmt: skip
-    """Count what became of the robots' measurements.
-
-    Args:
-        rows, inputs_table: Robots and their inputs, see `step_robots`; measurements of other robots are passed over.
-        found: (n, P) slots to which the particles gave the measurements, -1 = rejected.
-        distances: (n, P) squared distances of matches.
-        associations: (2, n), written: id of the landmark with which the most probable particle associated each
-            measurement, -1 = rejected; and id of the landmark that it created in any particle, -1 = none. The latter
-            row holds the slots of these landmarks before.
-        best: The most probable particle.
-        table: (7, slots), see `layout`; `LAST_SEEN` is written.
-        now: Number of the step.
-        long: Number of steps after which a landmark was not seen for long.
-
-    Returns:
-        The number of landmarks not seen for long that the most probable particle matched; the number of measurements
-        that started a landmark in any particle; the numbers of those that the most probable particle started, matched,
-        and rejected, unused ones included; and the mean of its squared distances, without what it predicted
-        behind the camera, NaN if there is none.
-    """
-    associated, created, ids, last_seen = associations[ASSOCIATED], associations[CREATED], table[IDS], table[LAST_SEEN]
-    num_measurements, num_created, num_new, num_matched, num_long_unseen, squares, judged = 0, 0, 0, 0, 0, 0.0, 0
-    for row in rows:
-        if row < 0:
-            continue
-        num_measurements += max(inputs_table[row, COUNT], 0)
-        for b in range(inputs_table[row, BEGIN], inputs_table[row, END]):
-            slot, new = found[b, best], created[b]
-            associated[b] = ids[slot] if slot >= 0 else REJECTED
-            created[b] = ids[new] if new >= 0 else REJECTED
-            if new >= 0:
-                num_created += 1
-                last_seen[new] = 0
-            if slot < 0:
-                continue
-            num_long_unseen += 0 < last_seen[slot] < now - long
-            last_seen[slot] = now
-            if slot == new:
-                num_new += 1
-            else:
-                num_matched += 1
-                if distances[b, best] < np.inf:
-                    squares += distances[b, best]
-                    judged += 1
-    num_rejected = num_measurements - num_new - num_matched
-    return num_long_unseen, num_created, num_new, num_matched, num_rejected, squares / judged if judged > 0 else np.nan
 
 
 AT_ORIGIN, KNOWN, SPREAD = 0, 1, 2  # what starts of particles can be

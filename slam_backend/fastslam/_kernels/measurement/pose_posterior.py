@@ -55,7 +55,7 @@ from slam_backend.fastslam._kernels.layout import (
     X,
     Y,
 )
-from slam_backend.fastslam._kernels.measurement_model import Terms, total_log_likelihood
+from slam_backend.fastslam._kernels.measurement.measurement_model import Terms, total_log_likelihood
 
 
 @device

@@ -39,7 +39,7 @@ from slam_backend.fastslam._kernels.layout import (
     X,
     Y,
 )
-from slam_backend.fastslam._kernels.odometry_bias import add_bias_spread
+from slam_backend.fastslam._kernels.motion.odometry_bias import add_bias_spread
 from slam_backend.fastslam._kernels.records import Motion, Poses
 
 WIDE_HEADING = 0.03  # [rad]; where the heading is less sure, one step of Gauss-Newton is not enough

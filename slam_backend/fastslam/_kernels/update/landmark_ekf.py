@@ -8,7 +8,7 @@ import numpy as np
 from slam_backend.core.jit import device, simd, simd_inline, stack_array
 from slam_backend.core.simd_math import Symmetric, inverted, inverted_by_parts, quadratic_form
 from slam_backend.core.validation import FloatArray, Int32Array, IntArray
-from slam_backend.fastslam._kernels.candidates import mask_of
+from slam_backend.fastslam._kernels.association.candidates import mask_of
 from slam_backend.fastslam._kernels.layout import (
     COS,
     DEPTH,
@@ -35,8 +35,8 @@ from slam_backend.fastslam._kernels.layout import (
     X,
     Y,
 )
-from slam_backend.fastslam._kernels.map_storage import tile_of
-from slam_backend.fastslam._kernels.measurement_model import accumulate_likelihood, innovate
+from slam_backend.fastslam._kernels.measurement.measurement_model import accumulate_likelihood, innovate
+from slam_backend.fastslam._kernels.particles.map_storage import tile_of
 from slam_backend.fastslam._kernels.records import Candidates, Frame, MapArrays, Space
 
 FLAT = 1e-12  # where cofactors keep less, S has eigenvalues in a ratio of a million, and K R loses its digits

@@ -1,0 +1,1 @@
+"""Data association: candidate landmarks, and the choice among them."""

@@ -1,0 +1,1 @@
+"""Measurement model, and the pose given measurements and their landmarks."""

@@ -1,0 +1,1 @@
+"""Motion model: predicted, sampled, and with the odometry bias."""

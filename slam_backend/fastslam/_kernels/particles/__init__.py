@@ -1,0 +1,1 @@
+"""All particles together: weights, resampling, storage of their landmarks, estimates over them."""

@@ -1,0 +1,1 @@
+"""Updates of landmarks by a frame: EKF, and log-odds of existence."""
