@@ -45,7 +45,7 @@ def _near_heads(
         stride: Step between the components compared.
         limit: Largest squared distance.
         partial: (n,), written: the squared distances of the first n slots.
-        hits: (n,), written: the slots up to the limit, ascending. Runs without one are skipped.
+        hits: (n + 1,), written: the slots up to the limit, ascending. Runs without one are skipped.
     """
     n = len(partial)
     for slot in range(n):
@@ -64,17 +64,16 @@ def _near_heads(
         for slot in range(n):
             difference = value - row[slot]
             partial[slot] += difference * difference
-    count = 0
+    count, most = 0, np.float32(limit)
     for first in range(0, n, RUN):
         run = partial[first : min(first + RUN, n)]
         inside = 0
         for i in range(len(run)):
-            inside += 1 if run[i] <= limit else 0
-        if inside > 0:
+            inside += 1 if run[i] <= most else 0
+        if inside > 0:  # without branches, for none could be foreseen
             for i in range(len(run)):
-                if run[i] <= limit:
-                    hits[count] = first + i
-                    count += 1
+                hits[count] = first + i
+                count += 1 if run[i] <= most else 0
     return count
 
 
@@ -125,7 +124,7 @@ def find_candidates(frame: Frame, maps: MapArrays, gate: float) -> tuple[Candida
     starts = np.zeros(num + 1, dtype=np.int64)
     listed, squares = np.empty((4, num * n), dtype=np.int64), np.empty(num * n)  # as far as they are written to
     slots, owners, same, unique = listed[0], listed[1], listed[2], listed[3]
-    partial, of_slots = np.empty(n, dtype=np.float32), np.empty((2, n), dtype=np.int64)
+    partial, of_slots = np.empty(n, dtype=np.float32), np.empty((2, n + 1), dtype=np.int64)
     hits, last = of_slots[0], of_slots[1]
     stride = measured.shape[1] // max(maps.heads.shape[0], 1)
     limit = 1.0001 * gate + 1e-4  # rounding of single precision decides nothing
