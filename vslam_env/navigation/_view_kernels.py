@@ -539,16 +539,23 @@ def add_revisits(cells: Any, cost: Any, corner: Any, camera: Any, targets: Any, 
     num_places = 0
     places = np.empty(((height // SPACING + 1) * (width // SPACING + 1), 2), np.int64)
     bins, best = np.empty((len(places), left), np.int8), np.zeros((len(places), 2))
-    gains = np.empty(BINS)
+    gains, beside = np.empty(BINS), np.empty(left, np.int64)
+    most = min(FARTHEST, camera[1]) + CELL  # rounding must not decide
     margin = margin_of(size)  # the lattice is that of a new grid
     for row in range((margin - corner[0]) % SPACING, height, SPACING):
+        y, num_beside = to_coordinate(row + corner[0], size), 0
+        for t in range(left):
+            if abs(targets[t, 1] - y) <= most:
+                beside[num_beside] = t
+                num_beside += 1
+        if num_beside == 0:
+            continue
         for col in range((margin - corner[1]) % SPACING, width, SPACING):
             if cost[row, col] == UNREACHED:
                 continue
-            x, y = to_coordinate(col + corner[1], size), to_coordinate(row + corner[0], size)
-            total = 0.0
-            for t in range(left):
-                bins[num_places, t] = -1
+            x, total = to_coordinate(col + corner[1], size), 0.0
+            bins[num_places] = -1
+            for t in beside[:num_beside]:
                 if is_measurable(cells, targets[t], x, y, camera[1]):
                     bins[num_places, t] = bin_of(math.atan2(targets[t, 1] - y, targets[t, 0] - x))
                     total += values[t]

@@ -29,17 +29,21 @@ from vslam_env.navigation import (
     ray_directions,
 )
 from vslam_env.navigation._view_kernels import (
+    BINS,
     COARSE,
+    FARTHEST,
     LOOKED,
     MOST_LOOKS,
     NEAREST,
     PATIENCE,
+    SPACING,
+    add_revisits,
     view_gains,
     write_global_grid,
 )
 from vslam_env.navigation.grid_storage import GRID_SIZES, LARGEST_SIZE, known_bounds, margin
 
-gains_of = python_entry(view_gains)
+gains_of, places_of = python_entry(view_gains), python_entry(add_revisits)
 HALF_FOV, REACH = 0.46, 8.0
 CAMERA = np.array([HALF_FOV, REACH, 0.2])
 ANGLES = np.linspace(-HALF_FOV, HALF_FOV, 33)
@@ -280,6 +284,29 @@ def test_places_to_look_from_cover_the_unseen_walls() -> None:
         assert length >= np.hypot(x, y) - 0.3
     robot.looks[:] = LOOKED
     assert np.isnan(robot.update()).all()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_first_place_sees_most_of_all_targets(seed: int) -> None:
+    """Among all places of the lattice, and all targets, near and far, it is the one with the best heading."""
+    rng, corner, side = np.random.default_rng(seed), np.array([60, 66]), 180
+    low, high = centre_of(corner, GRID_SIZE), centre_of(corner + side, GRID_SIZE)
+    places, values = rng.uniform(low, high, (80, 2)), rng.uniform(0.5, 1.0, 80)
+    targets = np.hstack([places, np.zeros((80, 2)), values[:, None], np.zeros((80, 1))])
+    lattice = np.stack(np.meshgrid(*[np.arange(0, side, SPACING)] * 2, indexing="ij"), axis=-1).reshape(-1, 2) + corner
+    spots = centre_of(lattice, GRID_SIZE)
+    away = places[None] - spots[:, None]
+    near = (np.hypot(*away.T).T >= NEAREST) & (np.hypot(*away.T).T <= FARTHEST)
+    bins = np.floor(np.arctan2(away[..., 1], away[..., 0]) / (2 * np.pi) * BINS + 0.5).astype(int) % BINS
+    totals = [
+        [(values * seen * ((own - b + 1) % BINS <= 2)).sum() for b in range(BINS)]
+        for own, seen in zip(bins, near, strict=True)
+    ]
+    rows, cells = np.full((12, 5), np.nan), np.full((GRID_SIZE, GRID_SIZE), FREE, np.uint8)
+    places_of(cells, np.zeros((side, side), np.int32), tuple(corner.tolist()), CAMERA, targets, values.copy(), rows)
+    assert rows[0, 3] == pytest.approx(np.max(totals))
+    at = np.hypot(*(spots - rows[0, :2]).T).argmin()
+    assert rows[0, 3] == pytest.approx(np.max(totals[at]))
 
 
 def test_places_keep_their_slots_while_something_is_left_to_see() -> None:
