@@ -1,12 +1,10 @@
 """Landmark sensor: noisy measurements of the landmarks in view of each camera."""
 
 from dataclasses import dataclass, field
-from functools import cached_property
 from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam_backend.core.read_only import as_read_only
 from slam_backend.core.validation import (
@@ -21,7 +19,7 @@ from slam_backend.core.validation import (
 from slam_backend.models.camera import StereoCamera
 from slam_backend.models.measurements import Measurements, TeamMeasurements
 from vslam_env.sensors._landmark_kernels import BEYOND, FARTHEST, measure, sample_clutter
-from vslam_env.world._kernels import NO_STREAM, detect, jump_table, stream_state
+from vslam_env.world._kernels import detect
 from vslam_env.world.spec import Landmarks
 from vslam_env.world.visibility import (
     as_coordinate_rows,
@@ -32,7 +30,6 @@ from vslam_env.world.visibility import (
 )
 
 MAX_POINTS = 10_000  # limit per frame
-MANY_KEYS = 8192  # draws that take longer than looking up where the few that are needed stand in the stream
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -144,16 +141,11 @@ class LandmarkSensor:
             self._view,
         )
         self._frame_shape = config.max_measurements, self._points.shape[1]
-        self._no_false_points, self._no_keys = np.empty((0, self._points.shape[1])), np.empty((0, len(landmarks)))
+        self._no_false_points = np.empty((0, self._points.shape[1]))
         # Descriptors of false points resemble those of landmarks: a common part and an individual part.
         common = descriptors.mean(axis=0) if len(landmarks) else np.zeros(descriptors.shape[1])
         self._common = as_read_only(common)
         self._own_share = np.sqrt(max(0.0, 1.0 - float(self._common @ self._common)))
-
-    @cached_property
-    def _jumps(self) -> NDArray[np.uint64]:
-        """`jump_table` of the landmarks, made where keys are first looked up."""
-        return jump_table(len(self._points))
 
     def visible(self, poses: FloatArray) -> BoolArray:
         """Return which landmarks are visible (K, N) from poses (K, 3) [m, m, rad], world frame."""
@@ -174,15 +166,10 @@ class LandmarkSensor:
         """
         config, robots, (most, size) = self.config, len(poses), self._frame_shape
         num_false = rng.poisson(config.false_points, robots)
-        generator, num_keys = rng.bit_generator, robots * len(self._points)
-        if num_keys < MANY_KEYS or not isinstance(generator, np.random.PCG64):
-            keys, stream = rng.random((robots, len(self._points))), NO_STREAM
-        else:  # most landmarks are out of sight
-            keys, stream = self._no_keys, (stream_state(generator), self._jumps)
-            generator.advance(num_keys)
+        keys = rng.random((robots, len(self._points)))
         ids, ends = np.empty((robots, most), np.int64), np.empty(robots, np.int64)
         ids.fill(-1)
-        total, extra = detect(poses, self._sight, keys, stream, config.detection_probability, num_false, ids, ends)
+        total, extra = detect(poses, self._sight, keys, config.detection_probability, num_false, ids, ends)
         false_points = self._no_false_points
         if extra:
             total += extra

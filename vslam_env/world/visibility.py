@@ -7,7 +7,7 @@ import numpy as np
 from slam_backend.core.read_only import as_read_only
 from slam_backend.core.validation import BoolArray, FloatArray
 from slam_backend.models.camera import StereoCamera
-from vslam_env.world._kernels import EPSILON, GROUP, NO_STREAM, detect
+from vslam_env.world._kernels import EPSILON, GROUP, detect
 from vslam_env.world.spec import Landmarks
 
 
@@ -70,7 +70,7 @@ def visible_landmarks(
     marks, bounds = landmark_geometry(landmarks), group_bounds(landmarks)
     sight = marks, bounds, landmarks.walls, as_coordinate_rows(walls), robot_radius, view
     chosen, counts, seen = np.empty(shape, np.int64), np.empty(len(poses), np.int64), np.zeros(shape, np.bool_)
-    detect(poses, sight, np.zeros(shape), NO_STREAM, 1.0, np.zeros(len(poses), np.int64), chosen, counts)
+    detect(poses, sight, np.zeros(shape), 1.0, np.zeros(len(poses), np.int64), chosen, counts)
     for row, names, count in zip(seen, chosen, counts, strict=True):
         row[names[:count]] = True
     return seen

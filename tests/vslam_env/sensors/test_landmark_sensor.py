@@ -13,9 +13,9 @@ from slam_backend.geometry import compose
 from slam_backend.models.camera import StereoCamera
 from vslam_env.sensors import LandmarkSensor, LandmarkSensorConfig
 from vslam_env.sensors._landmark_kernels import NEAREST, measure, sample_clutter
-from vslam_env.sensors.landmark_sensor import MANY_KEYS, shuffle_clutter
+from vslam_env.sensors.landmark_sensor import shuffle_clutter
 from vslam_env.world import FreeSpace, Landmarks, World, make_world, place_landmarks
-from vslam_env.world._kernels import NO_STREAM, detect, jump_table, stream_state
+from vslam_env.world._kernels import detect
 from vslam_env.world.visibility import group_bounds, landmark_geometry, view_limits, visible_landmarks
 
 SHARP = StereoCamera(sigma_px=1e-9, sigma_disparity_px=1e-9)
@@ -188,54 +188,13 @@ def test_each_robot_detects_what_it_sees_as_false_points_leave_places(size: int)
     for _ in range(5):
         keys, num_false = rng.random((4, len(marks))), np.array([0, 2, size, 9])
         chosen, counts = np.empty((4, size), np.int64), np.empty(4, np.int64)
-        total, extra = detect(poses, sight, keys, NO_STREAM, 0.8, num_false, chosen, counts)
+        total, extra = detect(poses, sight, keys, 0.8, num_false, chosen, counts)
         assert num_false.tolist() == [0, 2, size, min(9, size)]
         assert (total, extra) == (counts.sum(), num_false.sum())
         for seen, own, left, names, count in zip(visible, keys, size - num_false, chosen, counts, strict=True):
             detected = np.flatnonzero(seen & (own < 0.8))
             expected = detected[np.argsort(own[detected])][:left]
             assert names[:count].tolist() == expected.tolist()
-
-
-def test_keys_that_are_looked_up_are_those_of_the_stream() -> None:
-    """Of many landmarks only the keys of those in the image are drawn: frames and later draws are as with all keys."""
-    world, free, marks = office(2)
-    sensor = LandmarkSensor(LandmarkSensorConfig(false_points=0.2), world.walls, marks)
-    poses, rng = free.draw_starts(8, np.random.default_rng(0), 1.0), np.random.default_rng(13)
-    poses = np.tile(poses, (MANY_KEYS // (8 * len(marks)) + 1, 1))
-    for _ in range(20):
-        plain = np.random.default_rng()
-        plain.bit_generator.state = rng.bit_generator.state
-        assert len(poses) * len(marks) >= MANY_KEYS
-        frames = sensor.measure(poses, rng)
-        num_false, keys = plain.poisson(0.2, len(poses)), plain.random((len(poses), len(marks)))
-        ids, counts = np.full((len(poses), 5), -1), np.empty(len(poses), np.int64)
-        total, extra = detect(poses, sensor._sight, keys, NO_STREAM, 0.9, num_false, ids, counts)
-        if extra:
-            total += extra
-            plain.random((3, extra)), plain.standard_normal((extra, 64))
-            shuffle_clutter(num_false, plain.random(total), ids, counts)
-        plain.standard_normal((total, 67))
-        assert plain.bit_generator.state == rng.bit_generator.state
-        got = [own.tolist() for own in frames.true_ids]
-        assert got == [np.maximum(row[:count], -1).tolist() for row, count in zip(ids, counts, strict=True)]
-
-
-def test_a_stream_can_be_read_at_any_place() -> None:
-    """Numbers looked up are those of `Generator.random`, from any state on, also those of the next row."""
-    marks, view = on_wall([[0.002 * i - 2.8, 0.0] for i in range(2800)], 2800), view_limits(StereoCamera(), 1.5)
-    sight = landmark_geometry(marks), group_bounds(marks), marks.walls, WALL.T.copy(), 0.2, view
-    poses, table = np.array([[0.0, 0.0, 0.0], [-1.0, 0.0, 0.1]]), jump_table(len(marks))
-    for seed in range(20):
-        rng, found = np.random.default_rng(seed), []
-        state = stream_state(rng.bit_generator)
-        for keys, stream in ((rng.random((2, len(marks))), NO_STREAM), (np.empty((0, len(marks))), (state, table))):
-            chosen, counts = np.full((2, 3000), -1), np.empty(2, np.int64)
-            detect(poses, sight, keys, stream, 1.0, np.zeros(2, np.int64), chosen, counts)
-            found.append(chosen.tolist())  # in the order of their keys
-        assert min(counts) > 500
-        assert found[0] == found[1]
-        assert stream_state(rng.bit_generator).tolist() == state.tolist()
 
 
 def test_descriptor_noise_has_the_stated_length() -> None:

@@ -8,7 +8,6 @@ import numpy as np
 from slam_backend.core.jit import device, in_place, jit
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from vslam_env.world._kernels.ray_casting import EPSILON, ray_to_disc, ray_to_wall, walls_in_wedge
-from vslam_env.world._kernels.uniform_stream import UInt64Array, jump, uniform_at
 
 GROUP = 64  # successive landmarks, which lie on few walls, whose bounds are compared with the range at once
 TOUCH = 1e-6  # [m] what a ray meets this close to its target does not hide the target
@@ -32,7 +31,6 @@ def detect(
     poses: FloatArray,
     sight: tuple[FloatArray, FloatArray, IntArray, FloatArray, float, FloatArray],
     keys: FloatArray,
-    stream: tuple[UInt64Array, UInt64Array],
     detection_probability: float,
     num_false: IntArray,
     chosen: IntArray,
@@ -55,9 +53,7 @@ def detect(
             (4, S) float64 [m], world frame. Walls, by rows as well.
             Radius of the robots [m]; they are as tall as their cameras.
             (7,) float64. See `view_limits`.
-        keys: (K, N) float64, uniform. Key of each landmark for each robot; without rows, they are the next K N draws of
-            a stream, of which only those of landmarks in the image are made.
-        stream: State of the stream (4,) and `jump_table` of N draws, see `uniform_stream`; the state is changed.
+        keys: (K, N) float64, uniform. Key of each landmark for each robot.
         detection_probability: Probability that a visible landmark is detected.
         num_false: (K,) int64. Places that false points take in the frame of each robot; changed to B where larger.
         chosen: (K, B) int64. Written to: the chosen landmarks of each robot.
@@ -69,9 +65,7 @@ def detect(
     marks, bounds, own_walls, walls, robot_radius, limits = sight
     forward, aside, height, max_range, tan_half, tan_vertical, cos_incidence = limits
     near, near_rows = np.empty((walls.shape[1], 4)), np.empty(walls.shape[1], np.int64)
-    rows, own_keys = np.empty(marks.shape[1], np.int64), np.empty(marks.shape[1])
-    kept_keys = np.empty(chosen.shape[1])
-    state, jumps = stream
+    rows = np.empty(marks.shape[1], np.int64)
     total = extra = 0
     for k in range(len(poses)):
         c, s = np.cos(poses[k, 2]), np.sin(poses[k, 2])
@@ -92,19 +86,12 @@ def detect(
                 flag = rows[n]
                 rows[num_rows] = n
                 num_rows += flag
-        if len(keys) > 0:
-            for i in range(num_rows):
-                own_keys[i] = keys[k, rows[i]]
-        elif len(jumps) > 0:
-            uniform_at(state, jumps, rows[:num_rows], own_keys)
-            jump(state, jumps[len(jumps) - 1])
 
         num_false[k] = min(num_false[k], chosen.shape[1])
-        places, count, own = chosen.shape[1] - num_false[k], 0, chosen[k]
-        for i in range(num_rows):
-            n, key = rows[i], own_keys[i]
-            is_worse = count == places and (count == 0 or key >= kept_keys[count - 1])
-            if key >= detection_probability or is_worse:
+        places, count, own_keys, own = chosen.shape[1] - num_false[k], 0, keys[k], chosen[k]
+        for n in rows[:num_rows]:
+            is_worse = count == places and (count == 0 or own_keys[n] >= own_keys[own[count - 1]])
+            if own_keys[n] >= detection_probability or is_worse:
                 continue
             dx, dy, dz = marks[0, n] - eye_x, marks[1, n] - eye_y, marks[2, n] - height
             ahead, left = c * dx + s * dy, c * dy - s * dx
@@ -122,10 +109,10 @@ def detect(
             if free:
                 count = min(count + 1, places)
                 at = count - 1
-                while at > 0 and kept_keys[at - 1] > key:
-                    own[at], kept_keys[at] = own[at - 1], kept_keys[at - 1]
+                while at > 0 and own_keys[own[at - 1]] > own_keys[n]:
+                    own[at] = own[at - 1]
                     at -= 1
-                own[at], kept_keys[at] = n, key
+                own[at] = n
         counts[k] = count
         total, extra = total + count, extra + num_false[k]
     return total, extra
