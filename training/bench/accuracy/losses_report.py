@@ -169,6 +169,7 @@ def draw_losses(file: Path, lines: Sequence[Line]) -> None:
         ax.set_yticks(range(len(lines)), [condition_name(line) for line in lines])
         ax.invert_yaxis()
         ax.set_xscale("log")
+        ax.set_xlim(left=0.5 * min(line["position_rms_m"]["batch"]["mean"] for line in lines))  # shows all bars
         ax.set_xlabel("position RMS [m], geometric mean over seeds")
         ax.grid(alpha=0.25, axis="x", which="both")
         figure.legend(loc="outside lower center", ncols=5, frameon=False)
