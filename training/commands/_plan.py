@@ -197,7 +197,7 @@ def verify_rows(call: Call[ExplorationBenchConfig], folder: Path, count: int) ->
 
 
 def write_leaderboard(folders: list[Path], out: Path) -> None:
-    """Write the tables of all results in some run folders of one plan.
+    """Write the tables of all results in some run folders of one plan, and their figure beside the page.
 
     Raises:
         ValueError: If a folder has no results of a plan, they are incomplete, plans differ, or two folders have
@@ -205,14 +205,17 @@ def write_leaderboard(folders: list[Path], out: Path) -> None:
     """
     from slam_backend.core.files import write_file
     from slam_backend.core.validation import argument_error
-    from training.bench.exploration.leaderboard import leaderboard, read_results
+    from training.bench.exploration.leaderboard import leaderboard, played_rows, read_results
+    from training.bench.exploration.plan_report import draw_plan
 
     results = [read_results(folder) for folder in folders]
     for each in results[1:]:
         if each.plan.digest != results[0].plan.digest:
             hint = "Give results of the same plan."
             raise argument_error("folders", f"results of plan {results[0].plan.digest}", each.plan.digest, hint)
-    write_file(out, leaderboard(results), "out")
+    figure = out.with_suffix(".png")
+    write_file(out, leaderboard(results, figure.name), "out")
+    draw_plan(figure, played_rows(results))
     typer.echo(f"Leaderboard: {out}")
 
 

@@ -325,7 +325,7 @@ def bench_scale(call: Call[ScaleBenchConfig], workers: Workers = 1) -> None:
 @bench.command("leaderboard")
 def bench_leaderboard(
     folders: Annotated[list[Path], typer.Argument(help="Run folders of one plan, each with the rows of its policies.")],
-    out: Annotated[Path, typer.Option(help="Markdown file to write.")] = Path("leaderboard.md"),
+    out: Annotated[Path, typer.Option(help="Markdown file; its figure goes beside it.")] = Path("leaderboard.md"),
 ) -> None:
     """Write the leaderboard of a benchmark plan from the results in run folders."""
     write_leaderboard(folders, out)

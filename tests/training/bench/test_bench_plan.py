@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from training.bench.exploration import machine as machine_module
 from training.bench.exploration import verification
@@ -233,6 +234,9 @@ def test_the_leaderboard_is_made_from_kept_results(vslam: Any, run: Path, tmp_pa
     assert vslam("bench", "leaderboard", str(kept), "--out", str(page)).status == 0
     text = page.read_text()
     assert text.startswith("# Leaderboard of exploration policies\n")
+    assert "](leaderboard.png)" in text
+    with Image.open(tmp_path / "leaderboard.png") as figure:
+        assert min(figure.size) > 400
     for section in (run / "tables.md").read_text().split("### ")[1:]:
         assert section.rstrip("\n") in text
     assert vslam("bench", "leaderboard", str(kept), str(run), "--out", str(page)).status == 0

@@ -21,6 +21,7 @@ ABOUT = (
     "Made by `vslam bench leaderboard` from kept results (`benchmarks/vslam-bench-v0`). `docs/how-to/exploration.md` "
     "describes the policies, `docs/reference/metrics.md` the columns, `docs/how-to/benchmark.md` how to add a row.\n"
 )
+PICTURE = "Share of worlds below each map error, and map error over the number of robots and particles"
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,34 +63,45 @@ def kept_episodes(folder: Path) -> list[dict[str, Any]] | None:
     return read_episodes((gzip.decompress(content) if file.suffix == ".gz" else content).decode())
 
 
-def leaderboard(results: Sequence[Results]) -> str:
-    """Return the page: all tables, and which episodes were played again.
+def played_rows(results: Sequence[Results]) -> list[Mapping[str, Any]]:
+    """Return the rows of the finished parts of all policies.
 
-    A policy in several folders, such as the baseline, counts once, as in the first of them. Parts of the plan that it
-    has not played to the end are left out.
+    A policy in several folders, such as the baseline, counts once, as in the first of them.
 
     Raises:
         ValueError: If two folders have different custom policies or models of the same label.
     """
-    plan = results[0].plan
     kept: dict[str, Sequence[Mapping[str, Any]]] = {}
     for each in results:
         for (policy,), own in grouped(each.rows, ("policy",)).items():
             sources = {row["policy_digest"] for row in (*kept.get(policy, []), *own)}
             if len(sources) > 1:
                 raise argument_error("folders", "one policy for each label", policy, "Give one of them a LABEL=.")
-            kept.setdefault(policy, _finished(plan, policy, own))
-    rows = [row for own in kept.values() for row in own]
+            kept.setdefault(policy, _finished(each.plan, policy, own))
+    return [row for own in kept.values() for row in own]
+
+
+def leaderboard(results: Sequence[Results], figure: str) -> str:
+    """Return the page: figure, all tables, and which episodes were played again.
+
+    Args:
+        results: Results of one plan.
+        figure: Path from the page to the picture that `draw_plan` makes of `played_rows`.
+
+    Raises:
+        ValueError: As in `played_rows`.
+    """
+    rows = played_rows(results)
     verified = {policy: counts for each in results for policy, counts in each.verified.items()}
-    episodes = {policy: len(own) for (policy,), own in grouped(rows, ("policy",)).items()}
     shown = [
-        [label(policy), str(count), *map(str, verified.get(policy, "-" * len(OUTCOMES)))]
-        for policy, count in episodes.items()
+        [label(policy), str(len(own)), *map(str, verified.get(policy, "-" * len(OUTCOMES)))]
+        for (policy,), own in grouped(rows, ("policy",)).items()
     ]
     headings = ("policy", "episodes", f"again: {OUTCOMES[0]}", *OUTCOMES[1:])
     machines = sorted({str(row["machine"]) for row in rows})
     return "\n".join([
-        "# Leaderboard of exploration policies\n", ABOUT, markdown(plan, rows), "### Verification\n",
+        "# Leaderboard of exploration policies\n", ABOUT, f"![{PICTURE}]({figure})\n", markdown(results[0].plan, rows),
+        "### Verification\n",
         "Episodes of each policy that were played again at the last verification: all bits are compared on the same "
         "processor and versions, all results up to a ten-thousandth elsewhere.\n",
         markdown_table(headings, shown), f"Played on: {'; '.join(machines)}.\n",

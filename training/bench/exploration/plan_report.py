@@ -171,10 +171,10 @@ def draw_plan(file: Path, rows: Rows) -> None:
     played = [(draw, own) for part, draw in parts.items() if (own := [row for row in rows if row["part"] == part])]
     if not played:
         return
-    figure = Figure(figsize=(5.5 * len(played), 4.0), layout="constrained")
+    figure = Figure(figsize=(6.8 * len(played), 4.4), layout="constrained")
     for panel, (draw, own) in zip(figure.subplots(1, len(played), squeeze=False)[0], played, strict=True):
         draw(panel, own)
-        panel.legend(fontsize=7, frameon=False)
+        panel.legend(fontsize=7, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
         panel.grid(alpha=0.2)
         panel.spines[["top", "right"]].set_visible(False)
     save_png(figure, file, 110)
@@ -182,7 +182,8 @@ def draw_plan(file: Path, rows: Rows) -> None:
 
 def _draw_profiles(panel: Axes, base: Rows) -> None:
     """Draw the share of worlds below each map error, a line per policy."""
-    for i, policy in enumerate(dict.fromkeys(row["policy"] for row in base)):
+    names = sorted({row["policy"] for row in base}, key=lambda name: float(_iqm(base, name, "map_error")))
+    for i, policy in enumerate(names):
         worlds = [-own for own in by_family(_values(base, policy, "map_error"))]
         style = STYLES[i // len(COLOURS) % len(STYLES)]
         share = performance_profile(worlds, -THRESHOLDS)
