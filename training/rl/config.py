@@ -17,6 +17,7 @@ if TYPE_CHECKING:  # numerical modules are imported when a command runs, so that
 SPLIT_TRAIN, SPLIT_TRY = "train", "validation"
 NEEDED = ("torch", "stable_baselines3", "sb3_contrib", "tensorboard")
 MODEL = "model"
+LEARNED = "learned"  # the shipped model
 ONE = "Give a number >= 1."
 Share = Annotated[float, Field(gt=0.0, le=1.0)]
 TRAIN_PRESETS: dict[str, dict[str, Any]] = {
@@ -24,6 +25,12 @@ TRAIN_PRESETS: dict[str, dict[str, Any]] = {
     "imitate": {
         "teacher": "next_best_view", "rounds": 2, "world": "office,maze,loops,hall", "max_cycles": 60, "steps": 69_120,
         "learning_rate": 1e-3, "epochs": 6,
+    },
+    # A policy that is good already is refined by small steps near it, and its critic learns first.
+    "ppo": {
+        "start": "learned", "anchor": 0.1, "value_rollouts": 2, "world": "office,maze,loops,hall", "max_cycles": 60,
+        "reward": {"map_error": 3.0, "own_recall": 10.0, "own_coverage": 2.0}, "envs": 32, "steps": 115_200,
+        "batch": 720, "epochs": 3, "learning_rate": 3e-4, "gamma": 0.98, "clip": 0.15,
     },
     # Takes seconds; checks that everything works.
     "smoke": {"world": "fig5", "robots": 2, "particles": 5, "max_cycles": 4, "envs": 2, "steps": 48, "batch": 16,
@@ -37,13 +44,21 @@ class TrainConfig(ExperimentConfig):
     A rollout is one episode of every robot. Omitted values come from the preset `quick`.
     """
 
-    preset: Literal["quick", "imitate", "smoke"] = option(
-        "quick", "Preset: quick or smoke (PPO), or imitate (a planner)."
+    preset: Literal["quick", "imitate", "ppo", "smoke"] = option(
+        "quick", "Preset: quick or smoke (PPO), imitate (a planner), or ppo (from the policy learned)."
     )
     teacher: Literal["next_best_view"] | None = setting(None, "Planner to imitate; None: PPO.")
     start: str | None = option(
-        None, "Model of vslam train to begin with, or its run folder.", shown="random weights", is_path=True
+        None, "Model of vslam train to begin with, its run folder, or learned.", shown="learned with ppo"
     )
+    anchor: float = option(
+        0.0,
+        "Weight of PPO's KL divergence from the policy of the start model [1/nat].",
+        shown="0.1 with ppo",
+        ge=0.0,
+        hint="Use 0 for no anchor.",
+    )
+    value_rollouts: int = setting(0, "Number of PPO's first rollouts that train the value head alone.", ge=0)
     rounds: Positive | None = option(
         None, "Rounds of an imitation; the pupil drives in all but the first.", shown="2 with imitate", hint=ONE
     )
@@ -79,10 +94,16 @@ class TrainConfig(ExperimentConfig):
         from slam_backend.core.validation import argument_error
         from vslam_env.world import check_source
 
-        if self.start is not None:
+        if self.start_file is not None:
             from agents.trained import load_model
 
-            load_model(self.start)
+            load_model(self.start_file)
+        if self.anchor and (self.start is None or self.teacher is not None):
+            got = "no start" if self.start is None else "a planner to imitate"
+            raise argument_error("anchor", "PPO that begins with a model", got, "Give --start, or no --anchor.")
+        if self.value_rollouts and self.teacher is not None:
+            hint = "Leave it out."
+            raise argument_error("value_rollouts", "0 in an imitation", self.value_rollouts, hint)
         for world in self.worlds:
             check_source(world)
         self.make_env_configs(SPLIT_TRAIN)
@@ -95,6 +116,9 @@ class TrainConfig(ExperimentConfig):
         if (self.teacher is None) != (self.rounds is None):
             expected = "no number, without a teacher" if self.teacher is None else "a number of rounds for the teacher"
             raise argument_error("rounds", expected, self.rounds, "Use --preset imitate.")
+        if self.value_rollouts >= self.updates:
+            expected = f"fewer than the rollouts, {self.updates}"
+            raise argument_error("value_rollouts", expected, self.value_rollouts, "Use fewer, or more --steps.")
         if self.rounds is not None and self.rounds > self.updates:
             hint = "Use fewer rounds or more --steps."
             raise argument_error("rounds", f"at most one per rollout, {self.updates}", self.rounds, hint)
@@ -109,7 +133,16 @@ class TrainConfig(ExperimentConfig):
         from vslam_env.world import portable_source
 
         values = super().to_mapping() | {"world": ",".join(str(portable_source(world)) for world in self.worlds)}
-        return values if self.start is None else values | {"start": str(Path(self.start).resolve())}
+        return values if self.start in (None, LEARNED) else values | {"start": str(Path(self.start).resolve())}
+
+    @property
+    def start_file(self) -> Path | None:
+        """File or run folder of the model to begin with; None: random weights."""
+        if self.start == LEARNED:
+            from agents.registry import model_file
+
+            return model_file(LEARNED)
+        return None if self.start is None else Path(self.start)
 
     @property
     def worlds(self) -> tuple[str, ...]:

@@ -1,7 +1,7 @@
 """`GoalPolicy`: torch version of `agents.goal_network` with a value head, for MaskablePPO and for imitation."""
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -27,7 +27,24 @@ from agents.goal_network import (
     Weights,
 )
 
+GROUP = 60  # observations that attention pads to the same number of tokens
 NUM_SLOTS, NUM_FEATURES = SHAPES["candidates"]
+
+
+class Group(NamedTuple):
+    """Observations with about as many tokens, which attention pads to the same number."""
+
+    place: Any  # (q,) int64. Places of their tokens among n x m
+    absent: Any  # (n, m) bool. Places without a token
+
+
+def _groups(counts: Any) -> list[Group]:
+    """Return groups of observations with numbers of tokens (n,) in ascending order."""
+    found = []
+    for part in counts.split(GROUP):
+        is_token = torch.arange(int(part[-1]), device=part.device) < part.unsqueeze(1)
+        found.append(Group(is_token.flatten().nonzero().squeeze(1), ~is_token))
+    return found
 
 
 class AttentionLayer(nn.Module):  # type: ignore[misc]   # its types are not checked
@@ -42,17 +59,22 @@ class AttentionLayer(nn.Module):  # type: ignore[misc]   # its types are not che
         self.feed_in = nn.Linear(WIDTH, FEED_WIDTH)
         self.feed_out = nn.Linear(FEED_WIDTH, WIDTH)
 
-    def forward(self, tokens: Any, row: Any, place: Any, absent: Any) -> Any:
+    def forward(self, tokens: Any, groups: Sequence[Group]) -> Any:
         """Return new tokens (p, WIDTH), from those of all observations; see `agents.goal_network`."""
-        n, size = absent.shape
-        parts = tokens.new_zeros(n, size, 3 * WIDTH)
-        parts[row, place] = self.query_key_value(self.norm(tokens))
-        query, key, value = parts.unflatten(2, (3, NUM_HEADS, WIDTH // NUM_HEADS)).permute(2, 0, 3, 1, 4)
-        scores = query @ key.transpose(-1, -2) / (WIDTH // NUM_HEADS) ** 0.5
-        shares = scores.masked_fill(absent[:, None, None], INVALID).softmax(dim=-1)
-        seen = (shares @ value).transpose(1, 2).flatten(2)[row, place]
+        mixed = self.query_key_value(self.norm(tokens)).split([len(group.place) for group in groups])
+        seen = torch.cat([_attend(part, group) for part, group in zip(mixed, groups, strict=True)])
         tokens = tokens + self.out(seen)
         return tokens + self.feed_out(torch.relu(self.feed_in(self.feed_norm(tokens))))
+
+
+def _attend(mixed: Any, group: Group) -> Any:
+    """Return what the tokens of a group (q, WIDTH) see, from their queries, keys and values (q, 3 x WIDTH)."""
+    n, size = group.absent.shape
+    parts = mixed.new_zeros(n * size, 3 * WIDTH).index_copy(0, group.place, mixed)
+    query, key, value = parts.view(n, size, 3, NUM_HEADS, WIDTH // NUM_HEADS).permute(2, 0, 3, 1, 4)
+    scores = query @ key.transpose(-1, -2) / (WIDTH // NUM_HEADS) ** 0.5
+    shares = scores.masked_fill(group.absent[:, None, None], INVALID).softmax(dim=-1)
+    return (shares @ value).transpose(1, 2).reshape(n * size, WIDTH).index_select(0, group.place)
 
 
 class GoalFeatures(BaseFeaturesExtractor):  # type: ignore[misc]
@@ -83,14 +105,15 @@ class GoalFeatures(BaseFeaturesExtractor):  # type: ignore[misc]
         mates = self.teammate(observations["teammates"] * self.teammates_scale)
         valid = observations["action_mask"][:, 1:]
         present = torch.cat([torch.ones_like(valid[:, :1]), valid, observations["teammates_mask"]], dim=1) != 0
-        row, place = present.nonzero(as_tuple=True)[0], (present.cumsum(1) - 1)[present]
-        counts = present.sum(1, keepdim=True)
-        absent = torch.arange(int(counts.max()), device=counts.device) >= counts
-        tokens = torch.cat([robot, slots, mates], dim=1)[present]
+        counts, order = present.sum(1).sort(stable=True)
+        row, column = present[order].nonzero(as_tuple=True)
+        places = order[row] * present.shape[1] + column  # of tokens, by the number of tokens of their observation
+        tokens = torch.cat([robot, slots, mates], dim=1).flatten(0, 1).index_select(0, places)
+        groups = _groups(counts)
         for layer in self.layers:
-            tokens = layer(tokens, row, place, absent)
-        final = tokens.new_zeros(*present.shape, WIDTH)
-        final[present] = self.last_norm(tokens)
+            tokens = layer(tokens, groups)
+        final = tokens.new_zeros(present.numel(), WIDTH).index_copy(0, places, self.last_norm(tokens))
+        final = final.view(*present.shape, WIDTH)
         return torch.cat([final[:, : 1 + NUM_SLOTS].flatten(1), valid], dim=1)
 
 
@@ -150,6 +173,20 @@ class GoalPolicy(MaskableMultiInputActorCriticPolicy):  # type: ignore[misc]
     def logits(self, observations: dict[str, Any]) -> Any:
         """Return the logits (n, 1 + C) of observations as float tensors; grids from 0 to 1."""
         return self.mlp_extractor.forward_actor(self.features_extractor(observations))
+
+    def evaluate(self, observations: Mapping[str, Any], trains_actor: bool = True) -> tuple[Any, Any]:
+        """Return values (n,) and log probabilities of all actions (n, 1 + C), about -1e8 for invalid ones.
+
+        Args:
+            observations: Tensors (n, ...) by name, as the environment returns them; other names are ignored.
+            trains_actor: Whether gradients reach the layers that the actor uses; otherwise the value head's alone.
+        """
+        inputs = {name: observations[name] for name in SHAPES} | {"local_grid": observations["local_grid"] / 255.0}
+        with torch.set_grad_enabled(trains_actor and torch.is_grad_enabled()):
+            features = self.features_extractor(inputs)
+            scores = self.mlp_extractor.forward_actor(features)
+        values = self.value_net(self.mlp_extractor.forward_critic(features))
+        return values.squeeze(1), scores.log_softmax(1)
 
     def load_actor(self, weights: Weights) -> None:
         """Take the weights of `agents.goal_network`; those of the value head stay as they are."""

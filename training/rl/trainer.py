@@ -1,4 +1,4 @@
-"""`Training`: MaskablePPO built from a configuration; runs, saves checkpoints and resumes exactly."""
+"""`Training`: PPO built from a configuration; runs, saves checkpoints and resumes exactly."""
 
 import random
 from collections.abc import Mapping
@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from sb3_contrib import MaskablePPO
 from stable_baselines3.common.logger import configure
 
 from agents.trained import MODEL_FILE, load_model, save_model
@@ -17,7 +16,7 @@ from training.experiments.run_folder import installed_versions
 from training.rl.callbacks import Row, TrainingCallback
 from training.rl.checkpoint import CHECKPOINT_FILE, read_checkpoint, write_checkpoint
 from training.rl.config import SPLIT_TRAIN, SPLIT_TRY, TrainConfig
-from training.rl.network import GoalPolicy
+from training.rl.learner import GoalPPO
 from training.vec_env import make_vec_env
 
 BOARD = "tensorboard"
@@ -47,13 +46,14 @@ class Training:
         torch.set_num_threads(1)
         self.config, self._folder = config, folder
         self.env = make_vec_env(config.make_env_configs(SPLIT_TRAIN), config.envs, workers)
-        self.model = MaskablePPO(
-            GoalPolicy, self.env, learning_rate=lambda left: left * config.learning_rate, n_steps=config.max_cycles,
+        self.model = GoalPPO(
+            env=self.env, learning_rate=lambda left: left * config.learning_rate, n_steps=config.max_cycles,
             batch_size=config.batch, n_epochs=config.epochs, gamma=config.gamma, gae_lambda=config.gae_lambda,
-            clip_range=config.clip, ent_coef=config.entropy, seed=config.seed, device=device,
+            clip_range=config.clip, ent_coef=config.entropy, seed=config.seed, device=device, anchor=config.anchor,
+            value_rollouts=config.value_rollouts,
         )  # fmt: skip
-        if config.start is not None:
-            self.model.policy.load_actor(load_model(config.start)[0])
+        if config.start_file is not None:
+            self.model.start_from(load_model(config.start_file)[0])
         self.watch = TrainingCallback(self.env, self.save, config.checkpoint_updates)
 
     @property
@@ -84,6 +84,7 @@ class Training:
             "seed": self.config.seed,
             "policy": as_arrays(model.policy.state_dict()),
             "optimizer": as_arrays(model.policy.optimizer.state_dict()),
+            "start": as_arrays(model.start_state()),
             "counts": (model.num_timesteps, model._n_updates, model._current_progress_remaining),
             "last": (model._last_obs, model._last_episode_starts),
             "environments": self.env.get_state(),
@@ -124,6 +125,7 @@ class Training:
         model, draws = self.model, kept["draws"]
         model.policy.load_state_dict(as_tensors(kept["policy"]))
         model.policy.optimizer.load_state_dict(as_tensors(kept["optimizer"]))
+        model.set_start_state(as_tensors(kept["start"]))
         model.num_timesteps, model._n_updates, model._current_progress_remaining = kept["counts"]
         model._last_obs, model._last_episode_starts = kept["last"]
         self.env.set_state(kept["environments"])

@@ -215,7 +215,7 @@ def test_pickles_are_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr("training.rl.checkpoint._versions", dict)
     file, proof = tmp_path / CHECKPOINT_FILE, tmp_path / "proof"
     body = pickle.dumps({"config": Trap(proof)})
-    for number, says in ((FORMAT, "got a broken file"), (1, "expected one of format 2, got a checkpoint of format 1")):
+    for number, says in ((FORMAT, "got a broken file"), (1, "expected one of format 3, got a checkpoint of format 1")):
         file.write_bytes(_marked(body, number))
         with pytest.raises(ValueError, match=f"resume: .*{says}"):
             stored_checkpoint(tmp_path, SMOKE)

@@ -10,13 +10,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
-from sb3_contrib import MaskablePPO
 
 from slam_backend.core.validation import BoolArray, FloatArray
 from training.experiments.statistics import interval
 from training.experiments.timing import clock, no_garbage_collection
 from training.rl.config import TrainConfig
-from training.rl.network import GoalPolicy
+from training.rl.learner import GoalPPO
 from training.vec_env import ExplorationVecEnv, make_vec_env
 from vslam_env import vslam_v0
 from vslam_env.config import EnvConfig
@@ -126,10 +125,9 @@ def time_learner(recording: Recording, config: TrainConfig) -> list[Part]:
     """Return the time per decision of sampling actions from the network and of updating it, on one thread."""
     torch.set_num_threads(1)
     env = ExplorationVecEnv([lambda: Replay(recording)] * config.envs)
-    model = MaskablePPO(
-        GoalPolicy, env, n_steps=config.max_cycles, batch_size=config.batch, n_epochs=config.epochs, seed=0,
-        device="cpu",
-    )  # fmt: skip
+    model = GoalPPO(
+        env=env, n_steps=config.max_cycles, batch_size=config.batch, n_epochs=config.epochs, seed=0, device="cpu"
+    )
     seen: Mapping[str, NDArray[Any]] = env.reset()
     masks: NDArray[Any] = np.stack(env.env_method("action_masks"))
 

@@ -66,8 +66,8 @@ class Imitation:
         torch.manual_seed(config.seed)
         space, actions = observation_space(32, 8.0, True, False), spaces.Discrete(SHAPES["action_mask"][0])
         self.policy = GoalPolicy(space, actions, lambda left: config.learning_rate).to(device)
-        if config.start is not None:
-            self.policy.load_actor(load_model(config.start)[0])
+        if config.start_file is not None:
+            self.policy.load_actor(load_model(config.start_file)[0])
         self.rows: list[Row] = []
         self._best = np.inf
         self._best_weights: dict[str, Any] = {}
