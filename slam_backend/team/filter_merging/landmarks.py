@@ -6,12 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.core.packed_symmetric import UNPACK_INDEX
-from slam_backend.core.validation import FloatArray, IntArray, argument_error
+from slam_backend.core.validation import BoolArray, FloatArray, IntArray, argument_error
 from slam_backend.fastslam._kernels import LANES
 from slam_backend.fastslam.existence import ExistenceModel
 from slam_backend.fastslam.particle_maps import ParticleMaps
 from slam_backend.geometry import rotation
-from slam_backend.team.filter_merging._kernels.joint_map import Side, join
+from slam_backend.team.filter_merging._kernels.joint_map import Side, by_particle, join
 
 
 class Landmarks(NamedTuple):
@@ -48,6 +48,16 @@ class Landmarks(NamedTuple):
     def values(self) -> FloatArray:
         """(n, 9, M) float64 [m, m^2]: means and upper triangles of covariances. A copy."""
         return np.asarray(self.maps.values[self.where[:, None] + LANES * np.arange(9)[:, None]])
+
+    @property
+    def values_by_particle(self) -> FloatArray:
+        """(M, n, 9) float64, as `values`. A copy."""
+        return by_particle(self.maps.values, self.where, LANES)
+
+    @property
+    def held_by_particle(self) -> BoolArray:
+        """(M, n) whether each particle holds each landmark. A copy."""
+        return np.ascontiguousarray((self.counts > 0).T)
 
     @property
     def ids(self) -> IntArray:

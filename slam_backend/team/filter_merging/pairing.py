@@ -53,7 +53,9 @@ def pair_particles(
     """
     from_a = systematic(weights_a, rng, CANDIDATES * count)
     from_b = rng.permutation(systematic(weights_b, rng, CANDIDATES * count))
-    common = common_a.values, common_a.counts > 0, common_b.values, common_b.counts > 0
+    common = (
+        common_a.values_by_particle, common_a.held_by_particle, common_b.values_by_particle, common_b.held_by_particle
+    )  # fmt: skip
     some_a, some_b = from_a[::CANDIDATES].copy(), from_b[::CANDIDATES].copy()
     extra = _between_map_variance(*reduced_chi2(*common, some_a, some_b, alignment.transform, ROUNDS))
     motions, informations, chi2, log_dets, shared = fit(

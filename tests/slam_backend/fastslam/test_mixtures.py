@@ -204,6 +204,8 @@ def test_landmarks_are_read_wherever_they_lie() -> None:
     for m in range(33):
         values, counts = maps.of_particle(m, some.slots)
         np.testing.assert_array_equal(some.values[:, :, m], values)
+        np.testing.assert_array_equal(some.values_by_particle[m], values)
+        np.testing.assert_array_equal(some.held_by_particle[m], counts > 0)
         np.testing.assert_array_equal(some.counts[:, m], counts)
 
 
@@ -236,7 +238,8 @@ def common_landmarks(seed: int, count: int, pairs: int) -> Common:
         values = np.empty((count, 9, particles))
         values[:, :3] = points[:, :, None] + rng.normal(0.0, 0.04, (count, 3, particles))
         values[:, 3:] = spread[..., *UPPER].transpose(0, 2, 1)
-        sides += [values, rng.random((count, particles)) < 0.8]
+        held = rng.random((count, particles)) < 0.8
+        sides += [np.ascontiguousarray(values.transpose(2, 0, 1)), np.ascontiguousarray(held.T)]
     return sides[0], sides[1], sides[2], sides[3], rng.integers(0, 11, pairs), rng.integers(0, 7, pairs)
 
 
@@ -246,8 +249,8 @@ def plain_fit(
     """Return what `fit` says of one pair of particles, and how fast chi^2 falls with tau^2, by matrices."""
     a, held_a, b, held_b, from_a, from_b = common
     m, n = from_a[pair], from_b[pair]
-    both = held_a[:, m] & held_b[:, n]
-    ours, theirs = a[both, :, m], b[both, :, n]
+    both = held_a[m] & held_b[n]
+    ours, theirs = a[m, both], b[n, both]
     motion = motion.copy()
     for iteration in range(iterations + 1):
         c, s = math.cos(motion[2]), math.sin(motion[2])
@@ -302,8 +305,8 @@ def test_unexplained_variance_agrees_with_newtons_method() -> None:
 
 def test_landmarks_at_one_place_do_not_change_the_rotation() -> None:
     """Where all that is shared lies at one place the rotation stays as it began, and nothing is infinite."""
-    values, held = np.zeros((5, 9, 1)), np.ones((5, 1), np.bool_)
-    values[:, [3, 6, 8]] = 0.01
+    values, held = np.zeros((1, 5, 9)), np.ones((1, 5), np.bool_)
+    values[:, :, [3, 6, 8]] = 0.01
     none = np.zeros(2, np.int64)
     motions = fit(values, held, values, held, none, none, np.array([0.3, 0.2, 0.1]), 0.0, 3)[0]
     np.testing.assert_allclose(motions, [[0.0, 0.0, 0.1]] * 2, atol=1e-12)

@@ -28,6 +28,17 @@ class Side(NamedTuple):
     rows: IntArray
 
 
+@jit
+def by_particle(values: FloatArray, where: IntArray, lanes: int) -> FloatArray:
+    """Return the landmarks (M, n, 9) of each particle, whose first numbers are at `where` (n, M)."""
+    landmarks = np.empty((where.shape[1], len(where), 9))
+    for k in range(len(where)):
+        for m in range(where.shape[1]):
+            for c in range(9):
+                landmarks[m, k, c] = values[where[k, m] + c * lanes]
+    return landmarks
+
+
 @inline
 def _widened(values: Any, at: int, lanes: int, extra: float, scale: float, landmark: Any) -> None:
     """Write a landmark to `landmark` (9,) with `extra` [m^2] added to its variances, all then times `scale`."""

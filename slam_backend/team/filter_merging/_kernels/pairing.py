@@ -26,24 +26,27 @@ LOG_2PI = math.log(2.0 * math.pi)
 
 @device
 @simd
-def _add(records: FloatArray, at: int, state: FloatArray) -> None:
-    """Add a landmark, whose record begins at `at`, to the sums of all pairs of a block."""
+def _add(record: FloatArray, state: FloatArray) -> None:
+    """Add a landmark to the sums of all pairs of a block.
+
+    Indices that begin with the first lane are known not to be negative, so that the loop becomes vector instructions.
+    """
     for i in range(WIDTH):
         c, s = state[COS + i], state[SIN + i]
-        bx, by = records[at + 9 * WIDTH + i], records[at + 10 * WIDTH + i]
-        bxx, bxy, bxz = records[at + 12 * WIDTH + i], records[at + 13 * WIDTH + i], records[at + 14 * WIDTH + i]
-        byy, byz, bzz = records[at + 15 * WIDTH + i], records[at + 16 * WIDTH + i], records[at + 17 * WIDTH + i]
-        held, extra = records[at + HELD + i], state[EXTRA + i]
+        bx, by = record[9 * WIDTH + i], record[10 * WIDTH + i]
+        bxx, bxy, bxz = record[12 * WIDTH + i], record[13 * WIDTH + i], record[14 * WIDTH + i]
+        byy, byz, bzz = record[15 * WIDTH + i], record[16 * WIDTH + i], record[17 * WIDTH + i]
+        held, extra = record[HELD + i], state[EXTRA + i]
         ux, uy = c * bx - s * by, s * bx + c * by
-        rx = records[at + i] - ux - state[X + i]
-        ry = records[at + WIDTH + i] - uy - state[Y + i]
-        rz = records[at + 2 * WIDTH + i] - records[at + 11 * WIDTH + i]
-        sxx = records[at + 3 * WIDTH + i] + c * c * bxx - 2.0 * c * s * bxy + s * s * byy + extra  # Eq. 16 *
-        sxy = records[at + 4 * WIDTH + i] + c * s * (bxx - byy) + (c * c - s * s) * bxy
-        sxz = records[at + 5 * WIDTH + i] + c * bxz - s * byz
-        syy = records[at + 6 * WIDTH + i] + s * s * bxx + 2.0 * c * s * bxy + c * c * byy + extra
-        syz = records[at + 7 * WIDTH + i] + s * bxz + c * byz
-        szz = records[at + 8 * WIDTH + i] + bzz + extra
+        rx = record[i] - ux - state[X + i]
+        ry = record[WIDTH + i] - uy - state[Y + i]
+        rz = record[2 * WIDTH + i] - record[11 * WIDTH + i]
+        sxx = record[3 * WIDTH + i] + c * c * bxx - 2.0 * c * s * bxy + s * s * byy + extra  # Eq. 16 *
+        sxy = record[4 * WIDTH + i] + c * s * (bxx - byy) + (c * c - s * s) * bxy
+        sxz = record[5 * WIDTH + i] + c * bxz - s * byz
+        syy = record[6 * WIDTH + i] + s * s * bxx + 2.0 * c * s * bxy + c * c * byy + extra
+        syz = record[7 * WIDTH + i] + s * bxz + c * byz
+        szz = record[8 * WIDTH + i] + bzz + extra
         wxx, wxy, wxz = syy * szz - syz * syz, sxz * syz - sxy * szz, sxy * syz - sxz * syy
         det = sxx * wxx + sxy * wxy + sxz * wxz
         scale = held / det
@@ -76,18 +79,20 @@ def _gather(
 
     A block that lacks pairs is filled up with the last one.
     """
-    for p in range(WIDTH):
-        pair = min(first + p, len(from_a) - 1)
-        m, n, count = from_a[pair], from_b[pair], 0
-        for k in range(len(landmarks_a)):
-            at = k * RECORD * WIDTH + p
-            both = held_a[k, m] and held_b[k, n]
-            count += both
-            records[at + HELD] = 1.0 if both else 0.0
+    last = len(from_a) - 1
+    shared[first : first + WIDTH] = 0
+    for k in range(landmarks_a.shape[1]):
+        record = records[k * RECORD * WIDTH : (k + 1) * RECORD * WIDTH]
+        for p in range(WIDTH):
+            pair = min(first + p, last)
+            m, n = from_a[pair], from_b[pair]
+            one, two, both = landmarks_a[m, k], landmarks_b[n, k], held_a[m, k] and held_b[n, k]
+            if first + p <= last:
+                shared[pair] += both
+            record[HELD + p] = 1.0 if both else 0.0
             for c in range(9):
-                records[at + c * WIDTH] = landmarks_a[k, c, m] if both else (1.0 if c == 3 or c == 6 or c == 8 else 0.0)
-                records[at + (9 + c) * WIDTH] = landmarks_b[k, c, n] if both else 0.0
-        shared[pair] = count
+                record[c * WIDTH + p] = one[c] if both else (1.0 if c == 3 or c == 6 or c == 8 else 0.0)
+                record[(9 + c) * WIDTH + p] = two[c] if both else 0.0
 
 
 @device
@@ -100,7 +105,7 @@ def _sum(records: FloatArray, motions: FloatArray, first: int, state: FloatArray
         state[COS + p], state[SIN + p] = math.cos(motion[2]), math.sin(motion[2])
     state[N00:] = 0.0
     for at in range(0, len(records), RECORD * WIDTH):
-        _add(records, at, state)
+        _add(records[at : at + RECORD * WIDTH], state)
         if len(log_dets):
             for p in range(WIDTH):
                 if records[at + HELD + p] > 0.0 and first + p < len(log_dets):
@@ -131,8 +136,8 @@ def fit(
     """Fit the motions of pairs of particles to the landmarks that both of each hold.
 
     Args:
-        landmarks_a, landmarks_b: (k, 9, M_a), (k, 9, M_b) shared landmarks of both filters, in the same order.
-        held_a, held_b: (k, M_a), (k, M_b) whether each particle has them.
+        landmarks_a, landmarks_b: (M_a, k, 9), (M_b, k, 9) shared landmarks of both filters, in the same order.
+        held_a, held_b: (M_a, k), (M_b, k) whether each particle has them.
         from_a, from_b: (c,) particles of each pair.
         start: (3,) motion from which all begin.
         extra: tau^2, added to the variances of all differences [m^2].
@@ -145,7 +150,7 @@ def fit(
     count = len(from_a)
     motions, information = np.empty((count, 3)), np.empty((count, 3, 3))
     chi2, log_dets, shared = np.empty(count), np.zeros(count), np.empty(count, np.int64)
-    records, state = np.empty(len(landmarks_a) * RECORD * WIDTH), np.empty(STATE * WIDTH)
+    records, state = np.empty(landmarks_a.shape[1] * RECORD * WIDTH), np.empty(STATE * WIDTH)
     motions[:] = start
     state[EXTRA : EXTRA + WIDTH] = extra
     for first in range(0, count, WIDTH):
@@ -179,7 +184,7 @@ def reduced_chi2(
     """
     count = len(from_a)
     extra, shared, motions = np.zeros(count), np.empty(count, np.int64), np.empty((count, 3))
-    records, state = np.empty(len(landmarks_a) * RECORD * WIDTH), np.empty(STATE * WIDTH)
+    records, state = np.empty(landmarks_a.shape[1] * RECORD * WIDTH), np.empty(STATE * WIDTH)
     motions[:] = start
     for first in range(0, count, WIDTH):
         _gather(landmarks_a, held_a, landmarks_b, held_b, from_a, from_b, first, records, shared)
