@@ -372,11 +372,12 @@ class FastSlam:
             ValueError: If `estimate` is neither.
         """
         check_choice("estimate", estimate, ("best", "mixture"))
-        maps, best = self.state.maps, self.state.best
+        state = self.state
         if estimate == "best":
-            return unchecked_map(*best_map(maps, best, min_count))
-        mixture = map_mixture(maps, best, self.state.log_weights, self.state.gauge_covariance, min_count)
-        return unchecked_map(*mixture)
+            return unchecked_map(*best_map(state.maps, state.best, min_count))
+        every = [state.maps] if state.unwritten is None else state.unwritten.in_parts(state.num_particles)
+        parts = [map_mixture(maps, state.best, state.log_weights, state.gauge_covariance, min_count) for maps in every]
+        return unchecked_map(*(parts[0] if len(parts) == 1 else map(np.concatenate, zip(*parts, strict=True))))
 
     def descriptors(self) -> NDArray[np.float32]:
         """Return the descriptors (n, d) of the landmarks of `map()`. A copy."""

@@ -489,22 +489,6 @@ class ParticleMaps(MapStore):
         self.tops[2] = state["next_id"]
 
 
-class SpareMaps:
-    """Maps no longer in use, if there are any: the next joint filter takes their memory.
-
-    Attributes:
-        maps: The maps, or None.
-    """
-
-    def __init__(self) -> None:
-        self.maps: ParticleMaps | None = None
-
-    def take(self) -> ParticleMaps | None:
-        """Return the maps, and keep them no longer."""
-        maps, self.maps = self.maps, None
-        return maps
-
-
 def chunk_sizes(n: int) -> list[int]:
     """Return how many landmarks each array of values in a state of n landmarks has.
 

@@ -1,8 +1,8 @@
 """Rejuvenation of a filter: schedule and inputs of the smoother, and replacement of the particles by its samples."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,9 @@ from slam_backend.smoother.optimizer import NO_POSE
 from slam_backend.smoother.options import SmoothingOptions
 from slam_backend.smoother.reassociation import LandmarkTable, RejectedMeasurements, reassociate
 from slam_backend.smoother.rejuvenation import Draft, LandmarkDescriptors, Particles, Rejuvenation, Smoother, rejuvenate
+from slam_backend.smoother.sampling import PathLandmarks
+
+PART = 512  # landmarks of all particles that are written at once where they are read only once
 
 
 def landmark_positions(maps: ParticleMaps, best: int) -> LandmarkPositions:
@@ -64,33 +67,79 @@ def max_pending_steps(logs: Sequence[RobotLog], graph: SlamGraph) -> int:
     return max(log.num_since(step + 1) for log, step in zip(logs, graph.latest.tolist(), strict=True))
 
 
-def write_maps(maps: ParticleMaps, best: int, particles: Particles, walk: float) -> None:
-    """Write to all particles the landmarks of their paths: those of the most probable one that a sighting supports.
+class NewLandmarks(NamedTuple):
+    """Landmarks of new particles: those of the most probable one so far that a sighting supports.
 
     Landmarks of other particles only are dropped: the log holds the data association of the most probable one. Names,
     descriptors and odds stay; where a landmark's odds differ between particles, all get the mean of those that hold it.
-    The smoother assumes static landmarks; their random walk until the next sighting is added here.
+    The smoother assumes static landmarks; their random walk until the next sighting is added here. Positions are
+    computed where they are written.
 
-    Args:
-        maps: Maps of the filter, changed.
-        best: Index of its most probable particle.
-        particles: The new particles.
+    Attributes:
+        counts: (n, 1) int64. Number of measurements of each landmark, the same in all particles.
+        descriptors: (n, d) float32.
+        ids, identities, last_seen: (n,) int64, see `MapStore`; by ascending id.
+        next_id: Name of the next landmark.
+        odds: (n, 1) float64, or None if existence is not estimated.
+        landmarks: Positions, and covariances given the paths.
+        rows: (n,) rows of the landmarks in `landmarks`.
         walk: Variance [m^2] along each axis, see `FilterOptions.landmark_walk`.
     """
-    slots = present_slots(maps, best, 1)
-    order, names = particles.ids.argsort(), maps.ids[slots]
-    _, of_slots, at = np.intersect1d(names, particles.ids[order], assume_unique=True, return_indices=True)
-    slots, rows = slots[of_slots], order[at]
-    odds = maps.dense_odds(slots)
-    if odds is not None:
-        held = maps.dense(slots)[1] > 0
-        mean = (odds * held).sum(axis=1) / np.maximum(held.sum(axis=1), 1)
-        odds = mean[:, None]
-    maps.load_metadata(
-        particles.counts[rows, None], maps.descriptors[slots], maps.ids[slots], maps.identities[slots], maps.next_id,
-        odds, maps.last_seen[slots],
-    )  # fmt: skip
-    particles.landmarks.write(rows, walk, maps.blocks)  # the walk: (7) of docs/reference/smoother.md
+
+    counts: IntArray
+    descriptors: NDArray[np.float32]
+    ids: IntArray
+    identities: IntArray
+    last_seen: IntArray
+    next_id: int
+    odds: FloatArray | None
+    landmarks: PathLandmarks
+    rows: IntArray
+    walk: float
+
+    @classmethod
+    def of(cls, maps: ParticleMaps, best: int, particles: Particles, walk: float) -> Self:
+        """Return the landmarks of new particles; arrays are copies.
+
+        Args:
+            maps: Maps of the filter so far.
+            best: Index of its most probable particle.
+            particles: The new particles.
+            walk: See the class.
+        """
+        slots = present_slots(maps, best, 1)
+        order, names = particles.ids.argsort(), maps.ids[slots]
+        _, of_slots, at = np.intersect1d(names, particles.ids[order], assume_unique=True, return_indices=True)
+        slots, rows = slots[of_slots], order[at]
+        odds = maps.dense_odds(slots)
+        if odds is not None:
+            odds = mean_odds(odds, maps.dense(slots)[1])
+        return cls(
+            particles.counts[rows, None], maps.descriptors[slots], maps.ids[slots], maps.identities[slots],
+            maps.last_seen[slots], maps.next_id, odds, particles.landmarks, rows, walk,
+        )  # fmt: skip
+
+    def write(self, maps: ParticleMaps, part: slice = slice(None)) -> None:
+        """Replace all landmarks of all particles by these, or by a part of them."""
+        odds = None if self.odds is None else self.odds[part]
+        maps.load_metadata(
+            self.counts[part], self.descriptors[part], self.ids[part], self.identities[part], self.next_id, odds,
+            self.last_seen[part],
+        )  # fmt: skip
+        self.landmarks.write(self.rows[part], self.walk, maps.blocks)  # the walk: (7) of docs/reference/smoother.md
+
+    def in_parts(self, num_particles: int) -> Iterator[ParticleMaps]:
+        """Yield maps of M particles with `PART` landmarks at a time; each takes the memory of the last."""
+        maps = ParticleMaps(num_particles)
+        for first in range(0, max(len(self.ids), 1), PART):
+            self._replace(odds=None).write(maps, slice(first, first + PART))
+            yield maps
+
+
+def mean_odds(odds: FloatArray, counts: NDArray[np.integer[Any]]) -> FloatArray:
+    """Return the means (n, 1) of log-odds (n, M) over the particles whose counts (n, M) are above 0, 0 if none are."""
+    held = counts > 0
+    return np.asarray((odds * held).sum(axis=1) / np.maximum(held.sum(axis=1), 1))[:, None]
 
 
 def joint_graph(
@@ -264,8 +313,8 @@ class RejuvenationScheduler:
             logs: Log of each robot.
             starts: (K, 3, M) start poses, map frame.
             held: (K,) whether each start pose has a covariance in `FilterState.start_covariances`.
-            maps: Maps of the present particles; not changed.
-            best: Index of the most probable particle.
+            maps: Maps of the present particles, or of the most probable one alone; not changed.
+            best: Index of the most probable particle in `maps`.
             camera: (7,) as kernels take it.
             rng: Source of the draws.
         """
@@ -278,7 +327,8 @@ class RejuvenationScheduler:
             return _failed(graph, reason)
         smoother = Smoother(options.motion, camera, options.smoothing, rng)
         if options.smoothing.slice_steps is None:
-            return self._run_at_once(graph, self._new_log_rows(logs, graph, maps, best), smoother, maps, best)
+            new = self._new_log_rows(logs, graph, maps, best)
+            return self._run_at_once(graph, new, smoother, starts.shape[2], maps, best)
         self._set_graph(graph)
         if (draft := self._draft) is not None:
             outcome = smoother.optimise_slice(draft)
@@ -293,7 +343,7 @@ class RejuvenationScheduler:
         last = self._new_log_rows(logs, graph, maps, best)
         positions = landmark_positions(maps, best)
         descriptors = landmark_descriptors(maps, self._options.descriptor_gate)
-        drawn = smoother.draw(graph, last, self._guesses, positions, maps.num_particles, descriptors)
+        drawn = smoother.draw(graph, last, self._guesses, positions, starts.shape[2], descriptors)
         if isinstance(drawn, Rejuvenation):
             self._restart_interval()
             self._accept(drawn.graph)
@@ -343,11 +393,12 @@ class RejuvenationScheduler:
     # ------------------------------------------------------------------ results
 
     def _run_at_once(
-        self, graph: SlamGraph, logs: Sequence[LogArrays], smoother: Smoother, maps: ParticleMaps, best: int
-    ) -> Rejuvenation:
+        self, graph: SlamGraph, logs: Sequence[LogArrays], smoother: Smoother, num_particles: int, maps: ParticleMaps,
+        best: int,
+    ) -> Rejuvenation:  # fmt: skip
         """Smooth all logs at once."""
         result = rejuvenate(
-            graph, logs, smoother.motion, smoother.camera, maps.num_particles, smoother.rng, smoother.options,
+            graph, logs, smoother.motion, smoother.camera, num_particles, smoother.rng, smoother.options,
             self._guesses, landmark_descriptors(maps, self._options.descriptor_gate), landmark_positions(maps, best),
         )  # fmt: skip
         self._restart_interval()

@@ -19,7 +19,7 @@ from slam_backend.fastslam.estimates import pose_mixtures
 from slam_backend.fastslam.existence import ExistenceUpdate
 from slam_backend.fastslam.options import MAX_ROBOTS, FilterOptions, pack_options, packed_camera, robot_batches
 from slam_backend.fastslam.particle_maps import ParticleMaps, zeros_aligned
-from slam_backend.fastslam.rejuvenation import RejuvenationScheduler, write_maps
+from slam_backend.fastslam.rejuvenation import NewLandmarks, RejuvenationScheduler
 from slam_backend.fastslam.reports import PoseEstimates, RejuvenationReport
 from slam_backend.fastslam.run_log import RobotLog
 from slam_backend.fastslam.state_checks import KEPT
@@ -134,7 +134,8 @@ class FilterState:
             represent, as their frame was fixed when they were sampled from smoothed paths; estimates include it.
         start_covariances: (K, 3, 3) float64 [m, m, rad], start frames. Covariance of each robot's start pose that the
             particles do not represent; poses in the start frame include it.
-        maps: Landmarks of all particles.
+        maps: Landmarks of all particles; in a trial merge those of the most probable one, as the only particle.
+        unwritten: Landmarks of all particles after a trial merge, until they are written into `maps`; None otherwise.
         estimates: Poses of all robots over all particles; updated in each step.
         best: Index of the most probable particle, by accumulated log-weight (Eq. 12).
         starts_at_origin: Whether all robots started at the origin, as in a filter without merges.
@@ -160,6 +161,7 @@ class FilterState:
         self.existence = None if existence is None else ExistenceUpdate(existence, options.camera)
         self.rejuvenation = None if options.rejuvenate_every is None else RejuvenationScheduler(options, k)
         self.maps = ParticleMaps(m, None if existence is None else existence.log_odds_prior)
+        self.unwritten: NewLandmarks | None = None
         padded = self.maps.padded
         self.pose_arrays: FloatArray = zeros_aligned((6, k, 3, padded), np.float64)
         self.weight_arrays: FloatArray = zeros_aligned((4, padded), np.float64)
@@ -329,7 +331,7 @@ class FilterState:
             return None
         starts = self.starts[:, :, : self.num_particles]
         result = smoother.run(
-            self.logs, starts, self._held_starts, self.maps, self.best, self.packed_camera, self.rng
+            self.logs, starts, self._held_starts, self.maps, self._best_in_maps, self.packed_camera, self.rng
         )  # fmt: skip
         if result is None:
             return None
@@ -340,7 +342,11 @@ class FilterState:
     def _replace_particles(self, new: Particles) -> None:
         """Replace the M particles by samples of smoothed paths, with landmarks of the most probable particle so far."""
         m = self.num_particles
-        write_maps(self.maps, self.best, new, self.options.landmark_walk)
+        landmarks = NewLandmarks.of(self.maps, self._best_in_maps, new, self.options.landmark_walk)
+        if self.maps.num_particles == m:
+            landmarks.write(self.maps)
+        else:
+            self.unwritten = landmarks
         self.poses[:, :, :m], self.starts[:, :, :m], self.biases[:, :, :m] = new.poses, new.starts, new.biases
         self.bias_covariances[0], self.bias_covariances[1] = new.bias_covariances, 0.0
         self._refresh_starts()
@@ -352,6 +358,23 @@ class FilterState:
         self._refresh_best_particle()
         self.weights[:] = np.exp(new.log_weights)
         self.estimates.means[:], self.estimates.covariances[:] = new.means, new.covariances
+
+    @property
+    def _best_in_maps(self) -> int:
+        """Index of the most probable particle in `maps`, where it may be alone."""
+        return self.best if self.maps.num_particles == self.num_particles else 0
+
+    def write_landmarks(self, unused: ParticleMaps) -> None:
+        """Write the landmarks of all particles that were left unwritten, if they were.
+
+        Args:
+            unused: Maps no longer in use, whose memory is taken if they fit.
+        """
+        if self.unwritten is not None:
+            fits = (unused.num_particles, unused.log_odds_prior) == (self.num_particles, self.maps.log_odds_prior)
+            self.maps = unused if fits else ParticleMaps(self.num_particles, self.maps.log_odds_prior)
+            self.unwritten.write(self.maps)
+            self.unwritten = None
 
     @property
     def logs(self) -> list[RobotLog]:
@@ -383,7 +406,7 @@ class FilterState:
     @classmethod
     def joined(
         cls, a: "FilterState", from_a: IntArray, b: "FilterState", from_b: IntArray, motion: FloatArray,
-        evidence: FloatArray, rng: np.random.Generator, unused: ParticleMaps | None = None,
+        evidence: FloatArray, rng: np.random.Generator,
     ) -> "FilterState":  # fmt: skip
         """Return the state of both groups' robots, a's first, in a's map frame, without landmarks yet.
 
@@ -393,14 +416,11 @@ class FilterState:
             motion: (M, 3) [m, m, rad], frame a from frame b, of each joint particle.
             evidence: (M,) log-weight of each pair.
             rng: Generator that seeds the joint filter's own stream.
-            unused: Maps no longer in use, whose memory the joint filter takes if they fit.
         """
         count, k = len(motion), a.num_robots
         same = a.options.num_particles == count
         options = a.options if same else replace(a.options, num_particles=count)
         joint = cls(k + b.num_robots, options, np.random.default_rng(rng.integers(2**63, size=4)))
-        if unused is not None and unused.num_particles == count and unused.log_odds_prior == joint.maps.log_odds_prior:
-            joint.maps = unused
         for target, of_a, of_b in zip(joint.pose_arrays[:3], a.pose_arrays, b.pose_arrays, strict=False):
             target[:k, :, :count] = of_a[:, :, from_a]
             target[k:, :, :count] = compose(motion, of_b[:, :, from_b].transpose(0, 2, 1)).transpose(0, 2, 1)

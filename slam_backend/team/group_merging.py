@@ -8,7 +8,6 @@ import numpy as np
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.fastslam import _kernels
 from slam_backend.fastslam.filter import FastSlam
-from slam_backend.fastslam.particle_maps import SpareMaps
 from slam_backend.fastslam.reports import LandmarkIdMap, MergeUndone
 from slam_backend.geometry import rotate_covariances
 from slam_backend.maps.alignment import DISTINCT_ROTATION, DISTINCT_TRANSLATION, Alignment, AlignmentOptions
@@ -89,9 +88,8 @@ class MergePlan(NamedTuple):
         return self._replace(pairing=pairing)
 
     def on_trial(
-        self, merging: MergeOptions, options: AlignmentOptions, rng: np.random.Generator,
-        spare: SpareMaps | None = None,
-    ) -> tuple[Self, float] | None:  # fmt: skip
+        self, merging: MergeOptions, options: AlignmentOptions, rng: np.random.Generator
+    ) -> tuple[Self, float] | None:
         """Merge both filters into one and rejuvenate it from its smoothed paths; the filters do not change.
 
         Each map constrains the other robots' paths between their starts and the common landmarks. The joint filter may
@@ -100,20 +98,16 @@ class MergePlan(NamedTuple):
         Args:
             merging, options: Options of merges and alignments.
             rng: Generator for the draws.
-            spare: Maps for the joint filter's memory; if the smoother fails, those of the joint filter.
 
         Returns:
             The plan with the motion estimated by the joint filter, and its uncertainty, see `transform_uncertainty`;
             infinite if the shape of the joint map is inconsistent. None if the smoother fails.
         """
         a, b = self.filters
-        spare = SpareMaps() if spare is None else spare
         joint, renamed = merge_filters(
-            a, b, self.alignment, self.pairs, rng, merging.merged_particles, pairing=self.pairing, on_trial=True,
-            unused=spare.take(),
-        )  # fmt: skip
+            a, b, self.alignment, self.pairs, rng, merging.merged_particles, pairing=self.pairing, on_trial=True
+        )
         if joint.rejuvenate().reason:
-            spare.maps = joint.state.maps
             return None
         starts = joint.state.starts[a.num_robots, :, : joint.num_particles]
         motion = mean_pose(starts)
@@ -203,6 +197,7 @@ def merge_groups(
         common = renamed[np.isin(renamed[:, 1], a.filter.state.maps.ids), ::-1]
         fresh = begin_monitoring(number, alignment, sides, plan.maps, renamed, common)
         trunk.monitors = [*sorted(older, key=lambda monitor: monitor.number), fresh]
+    joint.state.write_landmarks(a.filter.state.maps)
     id_map = LandmarkIdMap(a.robots, b.robots, renamed, (a.number, b.number, number))
     records.entries.append(id_map)
     return Group(trunk, [*group_a.branches[1:], *group_b.branches[1:]]), id_map

@@ -166,8 +166,6 @@ def _finish(
             found = Alignment.refused("too uncertain", found.ratio, "repeat", change)
         if not found.success:  # the draws for the merge are dropped
             rng.bit_generator.state = before
-            if plan.joint is not None:
-                schedule.spare.maps = plan.joint[0].state.maps
             plan = plan._replace(pairing=None, joint=None)
     schedule.record(_key(pair), step, found.success, unsmoothed is not None, _smooth_in_slices(pair))
     event = MergeEvent(step, "attempt", pair[0].robots, pair[1].robots, found, unsmoothed, uncertainty)
@@ -187,7 +185,7 @@ def _on_trial(
     uncertainty = merging.min_sigmas * transform_uncertainty(plan)
     if uncertainty <= 1.0 or not (merging.min_sigmas_on_trial and merging.smooth_first):
         return plan, uncertainty, 0.0
-    trial = plan.on_trial(merging, alignment, rng, schedule.spare)
+    trial = plan.on_trial(merging, alignment, rng)
     if trial is None:
         return plan, uncertainty, 0.0
     return trial[0], merging.min_sigmas * trial[1], schedule.change(_key(plan.groups), trial[0].alignment.transform)

@@ -7,7 +7,6 @@ from typing import Any
 
 from slam_backend.core.read_only import as_constant, with_constants
 from slam_backend.core.validation import MOST, BoolArray, FloatArray, IntArray, argument_error, check_int, known_names
-from slam_backend.fastslam.particle_maps import SpareMaps
 from slam_backend.geometry import wrap_angle
 from slam_backend.maps.alignment import (
     DISTINCT_ROTATION,
@@ -93,8 +92,6 @@ class MergeScheduler:
 
     Attributes:
         pending_attempt: Attempt that waits for smoothed maps, or None.
-        spare: Maps of the last trial that was refused, or of a group that has merged, for the next trial; not part of
-            the state.
     """
 
     def __init__(self, options: AttemptOptions, alignment: AlignmentOptions) -> None:
@@ -107,7 +104,6 @@ class MergeScheduler:
         self._uncertainties: dict[tuple[int, int], float] = {}  # least uncertainty by robots of both sides
         self._trials: dict[tuple[int, int], FloatArray] = {}  # last motion by the robots that define the frames
         self.pending_attempt: PendingAttempt | None = None
-        self.spare = SpareMaps()
 
     def is_due(self, step: int) -> bool:
         """Return whether a pair may try at this step, or an attempt is pending."""

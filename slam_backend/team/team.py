@@ -254,8 +254,6 @@ class TeamSlam:
         self._epoch = epoch
         self._events.append(MergeEvent(self._step, "merge", id_map.robots_a, id_map.robots_b, plan.alignment))
         self._replace(plan.groups, [joint])
-        if len(self._groups) > 1:
-            self._schedule.spare.maps = plan.groups[0].trunk.filter.state.maps
         return id_map
 
     def _replace(self, old: Sequence[Group], new: Sequence[Group]) -> None:

@@ -21,14 +21,14 @@ class Landmarks(NamedTuple):
         maps: Maps of the filter.
         slots: (n,) slots of the landmarks.
         chosen: (M,) particles.
-        where: (n, M) index of the first value of each landmark and particle in `maps.values`.
+        places: (n, M) places of the particles in the rows of the landmarks.
         counts: (n, M), 0 where the particle lacks the landmark.
     """
 
     maps: ParticleMaps
     slots: IntArray
     chosen: IntArray
-    where: IntArray
+    places: IntArray
     counts: IntArray
 
     @classmethod
@@ -39,10 +39,14 @@ class Landmarks(NamedTuple):
             slots = slots[np.searchsorted(maps.ids[slots], ids)]
         chosen = np.arange(maps.num_particles) if chosen is None else chosen
         rows, ancestors = maps.row_of[slots][:, None], maps.map_of[slots][:, None]
-        particles = np.where(ancestors > 0, maps.maps[ancestors, chosen], chosen)
-        blocks, lanes = np.divmod(particles, LANES)
-        where = 9 * (rows * maps.counts.shape[1] + blocks * LANES) + lanes
-        return cls(maps, slots, chosen, where, maps.counts[rows, particles].astype(np.int64))
+        places = np.where(ancestors > 0, maps.maps[ancestors, chosen], chosen)
+        return cls(maps, slots, chosen, places, maps.counts[rows, places].astype(np.int64))
+
+    @property
+    def where(self) -> IntArray:
+        """(n, M) index of the first value of each landmark and particle in `maps.values`."""
+        rows, (blocks, lanes) = self.maps.row_of[self.slots][:, None], np.divmod(self.places, LANES)
+        return np.asarray(9 * (rows * self.maps.padded + blocks * LANES) + lanes)
 
     @property
     def values(self) -> FloatArray:
@@ -78,9 +82,7 @@ class Landmarks(NamedTuple):
         """Return the log-odds of existence (n, M): the prior, if the filter does not estimate them."""
         if self.maps.log_odds_prior is None:
             return np.full(self.counts.shape, 0.0 if model is None else model.log_odds_prior)
-        ancestors = self.maps.map_of[self.slots][:, None]
-        particles = np.where(ancestors > 0, self.maps.maps[ancestors, self.chosen], self.chosen)
-        return np.asarray(self.maps.odds[self.slots[:, None], particles])
+        return np.asarray(self.maps.odds[self.slots[:, None], self.places])
 
 
 def merge_by_identity(a: ParticleMaps, b: ParticleMaps, pairs: IntArray) -> tuple[IntArray, IntArray]:

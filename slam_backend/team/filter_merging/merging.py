@@ -23,9 +23,9 @@ import math
 import numpy as np
 
 from slam_backend.core.validation import FloatArray, IntArray
-from slam_backend.fastslam._kernels import LANES
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.particle_maps import ParticleMaps
+from slam_backend.fastslam.rejuvenation import mean_odds
 from slam_backend.fastslam.state import FilterState
 from slam_backend.geometry import inverse, wrap_angle
 from slam_backend.maps.alignment import Alignment
@@ -41,8 +41,6 @@ from slam_backend.team.filter_merging.landmarks import (
     write_joint,
 )
 from slam_backend.team.filter_merging.pairing import Pairing, pair_particles
-
-PART = 512  # landmarks of one particle that are written at once
 
 
 def inverse_alignment(alignment: Alignment) -> Alignment:
@@ -66,7 +64,6 @@ def merge_filters(
     known: bool = False,
     pairing: Pairing | None = None,
     on_trial: bool = False,
-    unused: ParticleMaps | None = None,
 ) -> tuple[FastSlam, IntArray]:
     """Merge two filters into a joint one in a's map frame (Secs. 3.2 and 4).
 
@@ -82,9 +79,8 @@ def merge_filters(
         num_particles: Number of particles of the joint filter; None: the larger of the two.
         known: Whether the motion is drawn from the alignment alone, ignoring the common landmarks.
         pairing: Result of `pair_filters` for these arguments; None: a new draw.
-        on_trial: Whether the joint filter is to be rejuvenated at once, or dropped: then only the most probable
-            particle gets landmarks, which the smoother starts from.
-        unused: Maps no longer in use, for the joint filter's memory.
+        on_trial: Whether the joint filter is to be rejuvenated at once, or dropped: then it has only the landmarks of
+            the most probable particle, which the smoother starts from; see `FilterState.write_landmarks`.
 
     Returns:
         The joint filter, a's robots first; and (n, 2) int64 rows (id in b, id in the joint map) of all of b's
@@ -95,7 +91,7 @@ def merge_filters(
     from_a, from_b, motion, evidence, extra, scale = pairing
     fitting, named = merge_by_identity(a.state.maps, b.state.maps, pairs)
     pairs = np.concatenate([fitting, named])
-    joint = FilterState.joined(a.state, from_a, b.state, from_b, motion, evidence, rng, unused)
+    joint = FilterState.joined(a.state, from_a, b.state, from_b, motion, evidence, rng)
 
     of_a, of_b = Landmarks.of(a.state.maps, from_a), Landmarks.of(b.state.maps, from_b)
     ids_a, ids_b = of_a.ids, of_b.ids
@@ -121,13 +117,19 @@ def merge_filters(
     next_id = a.state.maps.next_id
     new_ids = next_id + np.arange(len(exclusive))
     held = np.flatnonzero((counts > 0).any(axis=1))
+    kept, odds = counts[held], np.concatenate([odds_a, odds_b[exclusive]])[held]
+    best = int(joint.path_log_weights.argmax())
+    if on_trial:
+        joint.maps = ParticleMaps(1, joint.maps.log_odds_prior)
+        odds = odds if joint.maps.log_odds_prior is None else mean_odds(odds, kept)
+        kept = kept[:, [best]]
     joint.maps.load_metadata(
-        counts[held],
+        kept,
         stack_descriptors(descriptors, descriptors_b[exclusive])[held],
         np.concatenate([ids_a, new_ids])[held],
         names[held],
         next_id + len(exclusive),
-        np.concatenate([odds_a, odds_b[exclusive]])[held],
+        odds,
     )
     # Each map takes half of the extra variance.
     scales = np.full(len(counts), scale)
@@ -135,15 +137,9 @@ def merge_filters(
         sides = Landmarks.of(a.state.maps, from_a, named[:, 0]), Landmarks.of(b.state.maps, from_b, named[:, 1])
         scales[np.searchsorted(ids_a, named[:, 0])] = np.maximum(scale, birge_ratios(*sides, motion, 0.5 * extra))
     if on_trial:
-        best = int(joint.path_log_weights.argmax())
         of_a, of_b = Landmarks.of(a.state.maps, from_a[[best]]), Landmarks.of(b.state.maps, from_b[[best]])
-        tiles, lane = np.empty((PART, 1, 9, LANES)), joint.maps.blocks[:, best // LANES, :, best % LANES]
-        for first in range(0, len(held), PART):
-            part = held[first : first + PART]
-            write_joint(of_a, of_b, rows_a[part], rows_b[part], motion[[best]], 0.5 * extra, scales[part], tiles)
-            lane[first : first + len(part)] = tiles[: len(part), 0, :, 0]
-    else:
-        write_joint(of_a, of_b, rows_a[held], rows_b[held], motion, 0.5 * extra, scales[held], joint.maps.blocks)
+        motion = motion[[best]]
+    write_joint(of_a, of_b, rows_a[held], rows_b[held], motion, 0.5 * extra, scales[held], joint.maps.blocks)
     renamed = np.concatenate([pairs[:, ::-1], np.column_stack([ids_b[exclusive], new_ids])]).astype(np.int64)
     joint.finish_join(a.state, b.state, renamed)
     return FastSlam.from_filter_state(joint), renamed

@@ -1,4 +1,4 @@
-"""Memory of large maps grows where it is, and is used again."""
+"""Memory of large maps grows where it is."""
 
 import sys
 from copy import deepcopy
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from slam_backend.fastslam import particle_maps
-from slam_backend.fastslam.particle_maps import GrowingMemory, ParticleMaps, SpareMaps
+from slam_backend.fastslam.particle_maps import GrowingMemory, ParticleMaps
 
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="memory moves on Linux alone")
 
@@ -46,12 +46,3 @@ def test_large_maps_grow_as_small_ones_do(is_held: bool, monkeypatch: pytest.Mon
         states.append((maps.values.copy(), maps.counts.copy(), maps.free_rows.copy()))
     for small, large in zip(*states, strict=True):
         np.testing.assert_array_equal(small, large)
-
-
-def test_spare_maps_are_taken_once() -> None:
-    """There are none before, and none after they were taken."""
-    spare, maps = SpareMaps(), ParticleMaps(3)
-    assert spare.take() is None
-    spare.maps = maps
-    assert spare.take() is maps
-    assert spare.take() is None

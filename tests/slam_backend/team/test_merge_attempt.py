@@ -12,8 +12,9 @@ from builders.filters import contents
 from builders.teams import NEVER, SimulatedTeam, check_snapshot, driven, false_alignment, links
 
 from slam_backend.fastslam import rejuvenation
+from slam_backend.fastslam.existence import ExistenceModel
 from slam_backend.fastslam.filter import FastSlam
-from slam_backend.fastslam.particle_maps import SpareMaps
+from slam_backend.fastslam.particle_maps import ParticleMaps
 from slam_backend.fastslam.rejuvenation import RejuvenationScheduler
 from slam_backend.geometry import between, compose
 from slam_backend.maps.alignment import DISTINCT_ROTATION, DISTINCT_TRANSLATION, AlignmentOptions, align_maps
@@ -344,18 +345,28 @@ def test_a_trial_leaves_both_filters_as_they_are() -> None:
     assert 0.0 < doubt < 1.0
 
 
-def test_a_trial_is_a_merge_that_is_smoothed_whatever_maps_it_takes_over() -> None:
-    """Landmarks of the most probable particle suffice, and what the spare maps held does not matter: all is equal."""
-    _, team = driven(2, 112, FEW_STEPS, num_particles=8)
+@pytest.mark.parametrize("existence", [None, ExistenceModel()])
+def test_a_trial_is_a_merge_that_is_smoothed(existence: ExistenceModel | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Landmarks of the most probable particle suffice, and the memory that those of all take does not matter."""
+    _, team = driven(2, 112, FEW_STEPS, num_particles=8, existence=existence)
     plan = planned(team)
-    spare = SpareMaps()
-    joints = []
-    for _ in range(2):
-        trial = plan.on_trial(MergeOptions(), AlignmentOptions(), np.random.default_rng(2), spare)
+    joints, mixtures = [], []
+    for part, unused in ((10**6, ParticleMaps(8)), (7, copy.deepcopy(plan.filters[0].state.maps))):
+        monkeypatch.setattr(rejuvenation, "PART", part)
+        trial = plan.on_trial(MergeOptions(), AlignmentOptions(), np.random.default_rng(2))
         assert trial is not None
         assert trial[0].joint is not None
-        joints.append(contents(trial[0].joint[0]))
-        spare.maps = trial[0].joint[0].state.maps
+        joint = trial[0].joint[0]
+        assert joint.state.maps.num_particles == 1
+        mixtures.append(joint.map("mixture"))
+        joint.state.write_landmarks(unused)
+        joint.state.write_landmarks(ParticleMaps(8))  # nothing is left to be written
+        mixtures.append(joint.map("mixture"))
+        joints.append(contents(joint))
+    assert len(mixtures[0]) > 14
+    for mixture in mixtures[1:]:
+        for name in ("means", "covariances", "descriptors", "counts", "ids"):
+            assert_same(getattr(mixture, name), getattr(mixtures[0], name))
     whole, _ = merge_filters(
         *plan.filters, plan.alignment, plan.pairs, np.random.default_rng(2), None, pairing=plan.pairing
     )
