@@ -296,7 +296,7 @@ class MapStore:
             self.heads[:, n:] = _kernels.FAR
 
 
-WHOLE = 2048  # landmarks up to which the values of a snapshot are one array
+WHOLE = 512  # landmarks up to which the values of a snapshot are one array
 CHUNK = 128  # landmarks of an array in larger snapshots
 
 MAX_MAPS = 512  # limit of ancestor maps; beyond it the slots of the least used maps are refreshed
