@@ -2,10 +2,12 @@
 
     python tests/regression/recorded_digests.py            # compare with the recorded ones, say which differ
     python tests/regression/recorded_digests.py --record   # record them, after a change that is meant to change numbers
+    python tests/regression/recorded_digests.py --add      # record the same numbers for this processor, too
 
 Digests hold no names and no texts: observations are hashed in the order of their sorted keys, states and results as
 unordered collections of their arrays and numbers. Last bits depend on the processor and on the versions of the
-libraries, so the file says for which of these it was recorded.
+libraries, so the file has a record for each of them; `--record` removes those of others. Where only the content of
+states changed, the digests of snapshots are removed from the records that cannot be renewed.
 """
 
 import hashlib
@@ -75,6 +77,12 @@ def environment() -> dict[str, str]:
         "processor": llvmlite.binding.get_host_cpu_name(),
         "features": hashlib.sha256(features.encode()).hexdigest()[:16],
     } | {name: version(name) for name in LIBRARIES}
+
+
+def recorded() -> Mapping[str, str] | None:
+    """Return the digests recorded for this processor and these versions, or None."""
+    here = environment()
+    return next((record["digests"] for record in json.loads(FILE.read_text()) if record["environment"] == here), None)
 
 
 def names() -> list[str]:
@@ -254,16 +262,19 @@ def bytes_of(value: Any) -> bytes:
 
 def main() -> int:
     """Compare with the recorded digests, or record them."""
-    found = {"environment": environment(), "digests": all_digests()}
-    if "--record" in sys.argv[1:]:
-        FILE.write_text(json.dumps(found, indent=1) + "\n")
+    before, found = recorded(), all_digests()
+    if arguments := sys.argv[1:]:
+        others = json.loads(FILE.read_text()) if arguments == ["--add"] else []
+        kept = [record for record in others if record["environment"] != environment()]
+        FILE.write_text(json.dumps([*kept, {"environment": environment(), "digests": found}], indent=1) + "\n")
         return 0
-    recorded = json.loads(FILE.read_text())
-    if recorded["environment"] != found["environment"]:
-        print(f"Recorded for {recorded['environment']}, computed for {found['environment']}: last bits may differ.")
-    differing = {name for name, digest in found["digests"].items() if recorded["digests"].get(name) != digest}
+    if before is None:
+        print(f"Nothing is recorded for {environment()}.")
+        return 1
+    differing = {name for name, digest in found.items() if before.get(name, digest) != digest}
     print(*(f"differs: {name}" for name in sorted(differing)), sep="\n")
-    print(f"{len(found['digests']) - len(differing)} of {len(found['digests'])} digests are equal.")
+    print(*(f"not recorded: {name}" for name in sorted(found.keys() - before.keys())), sep="\n")
+    print(f"{len(found.keys() & before.keys()) - len(differing)} of {len(found)} digests are equal.")
     return 1 if differing else 0
 
 
