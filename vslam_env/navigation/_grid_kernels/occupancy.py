@@ -148,6 +148,12 @@ def reach_of_merge(known: Any, size: int, x: float, y: float, theta: float) -> i
     return cells_to_middle(max(max(-low_x, high_x), max(-low_y, high_y)))
 
 
+@inline
+def evidence_at(evidence: Any, row: int, col: int) -> int:
+    """Return the evidence of a cell, 0 outside the grid."""
+    return evidence[row, col] if 0 <= row < len(evidence) and 0 <= col < len(evidence) else 0
+
+
 @in_place
 def merge_grid(grid: Grid, other: Any, known: Any, x: float, y: float, theta: float) -> None:
     """Add another grid's evidence, seen from pose (x, y, theta) of its frame in this one.
@@ -175,15 +181,14 @@ def merge_grid(grid: Grid, other: Any, known: Any, x: float, y: float, theta: fl
             u = (col - margin + 0.5) * CELL - HALF_WIDTH - x
             v = (row - margin + 0.5) * CELL - HALF_WIDTH - y
             other_x, other_y = (c * u + s * v + HALF_WIDTH) / CELL, (-s * u + c * v + HALF_WIDTH) / CELL
-            found = 0
-            for point in range(5):
-                shift = 0.0 if point == 0 else 0.25
-                px = other_x + (shift if point % 2 else -shift)
-                py = other_y + (shift if point > 2 else -shift)
-                if -others <= px < GRID_SIZE + others and -others <= py < GRID_SIZE + others:
-                    value = other[math.floor(py) + others, math.floor(px) + others]
-                    if point == 0 or value > max(found, 0):
-                        found = value
+            top, bottom = math.floor(other_y - 0.25) + others, math.floor(other_y + 0.25) + others
+            left, right = math.floor(other_x - 0.25) + others, math.floor(other_x + 0.25) + others
+            found = evidence_at(other, math.floor(other_y) + others, math.floor(other_x) + others)
+            wall = max(
+                max(evidence_at(other, top, left), evidence_at(other, top, right)),
+                max(evidence_at(other, bottom, left), evidence_at(other, bottom, right)),
+            )
+            found = wall if wall > max(found, 0) else found
             if found != 0:
                 grid.evidence[row, col] = clamp_evidence(grid.evidence[row, col] + found)
                 set_state(grid, row, col, OCCUPIED if grid.evidence[row, col] > 0 else FREE)
