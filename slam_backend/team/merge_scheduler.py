@@ -117,11 +117,15 @@ class MergeScheduler:
         return pair not in self._records or step >= self._records[pair].next_step
 
     def near_pairs(self, pair: PairKey, a: Appearance, b: Appearance) -> NearPairs | None:
-        """Return the near pairs of two groups' landmarks; those of the last call for these groups are not sought again.
+        """Return the near pairs of two groups' landmarks; None: too many, or matching is not by appearance.
 
-        None: there are too many, or matching is not by appearance.
+        Those of the last call for these groups, or for groups that have merged into them, are not sought again.
         """
-        found = near_pairs(a, b, self._alignment, self._near.pop(pair, None))
+        one, other = map(set, pair)
+        earlier = [key for key in self._near if one | other >= {*key[0], *key[1]}]
+        known = {key: self._near.pop(key) for key in earlier}
+        fitting = [near for key, near in known.items() if one.issuperset(key[0]) and other.issuperset(key[1])]
+        found = near_pairs(a, b, self._alignment, max(fitting, key=lambda near: len(near.rows), default=None))
         if found is not None:
             self._near[pair] = found
         return found
@@ -206,7 +210,7 @@ class MergeScheduler:
         if success:
             gone = set(pair[0]) | set(pair[1])
             self._records = {key: value for key, value in self._records.items() if not gone & set(key[0] + key[1])}
-            self._near = {key: value for key, value in self._near.items() if not gone & set(key[0] + key[1])}
+            self._near = {key: value for key, value in self._near.items() if not gone >= set(key[0] + key[1])}
             return
         record = self._records.setdefault(pair, AttemptRecord(self._options.every))
         record.tried = set() if smoothed else self._proposed.get(pair, set())
