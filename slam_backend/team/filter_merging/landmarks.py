@@ -78,10 +78,10 @@ class Landmarks(NamedTuple):
         """(n, d) descriptors."""
         return np.asarray(self.maps.descriptors[self.slots])
 
-    def odds(self, model: ExistenceModel | None) -> FloatArray:
+    def odds(self, model: ExistenceModel) -> FloatArray:
         """Return the log-odds of existence (n, M): the prior, if the filter does not estimate them."""
         if self.maps.log_odds_prior is None:
-            return np.full(self.counts.shape, 0.0 if model is None else model.log_odds_prior)
+            return np.full(self.counts.shape, model.log_odds_prior)
         return np.asarray(self.maps.odds[self.slots[:, None], self.places])
 
 

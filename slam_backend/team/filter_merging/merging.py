@@ -96,8 +96,6 @@ def merge_filters(
     of_a, of_b = Landmarks.of(a.state.maps, from_a), Landmarks.of(b.state.maps, from_b)
     ids_a, ids_b = of_a.ids, of_b.ids
     shared_a, shared_b = np.searchsorted(ids_a, pairs[:, 0]), np.searchsorted(ids_b, pairs[:, 1])
-    model = a.options.existence
-    odds_a, odds_b = of_a.odds(model), of_b.odds(model)
     descriptors, identities, descriptors_b = of_a.descriptors, of_a.identities, of_b.descriptors
     if len(shared_a):
         seen_a, seen_b = of_a.counts[shared_a].max(axis=1), of_b.counts[shared_b].max(axis=1)
@@ -106,8 +104,6 @@ def merge_filters(
         )
         names = identities[shared_a]
         identities[shared_a] = np.where(names < 0, of_b.identities[shared_b], names)
-        if model is not None:
-            fuse_odds(model, odds_a, of_a.counts, shared_a, odds_b, of_b.counts, shared_b)
     exclusive = np.setdiff1d(np.arange(len(ids_b)), shared_b)  # b's landmarks that a lacks
     n_a, n = len(ids_a), len(ids_a) + len(exclusive)
     rows_a, rows_b = np.arange(n), np.full(n, -1)
@@ -117,15 +113,21 @@ def merge_filters(
     next_id = a.state.maps.next_id
     new_ids = next_id + np.arange(len(exclusive))
     held = np.flatnonzero((counts > 0).any(axis=1))
-    kept, odds = counts[held], np.concatenate([odds_a, odds_b[exclusive]])[held]
+    kept, odds, model = counts[held], None, a.options.existence
+    if model is not None:
+        odds_a, odds_b = of_a.odds(model), of_b.odds(model)
+        fuse_odds(model, odds_a, of_a.counts, shared_a, odds_b, of_b.counts, shared_b)
+        odds = np.concatenate([odds_a, odds_b[exclusive]])[held]
+    descriptors = stack_descriptors(descriptors, descriptors_b[exclusive])[held]
     best = int(joint.path_log_weights.argmax())
     if on_trial:
         joint.maps = ParticleMaps(1, joint.maps.log_odds_prior)
-        odds = odds if joint.maps.log_odds_prior is None else mean_odds(odds, kept)
+        odds = None if odds is None else mean_odds(odds, kept)
         kept = kept[:, [best]]
+        joint.maps.reserve(len(held), descriptors.shape[1])  # a trial gets no new landmarks
     joint.maps.load_metadata(
         kept,
-        stack_descriptors(descriptors, descriptors_b[exclusive])[held],
+        descriptors,
         np.concatenate([ids_a, new_ids])[held],
         names[held],
         next_id + len(exclusive),
