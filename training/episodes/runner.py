@@ -125,16 +125,19 @@ def run_episode(
             other(readings)
 
     env.recorder = record
-    observations, infos = env.reset(seed=seed)
-    team.reset()
-    log = _Log(env, infos)
-    on_step(Progress(0, 0.0, infos, ()))
-    while env.agents and not should_stop():
-        actions = team.act_all(observations, {agent: env.belief(agent) for agent in env.agents}, rngs, team_rng)
-        log.before_step()
-        observations, rewards, _, _, infos = env.step(actions)
-        on_step(replace(log.after_step(infos, len(odometry) - 1), rewards=rewards))
-    return log.finish(np.array(odometry))
+    try:
+        observations, infos = env.reset(seed=seed)
+        team.reset()
+        log = _Log(env, infos)
+        on_step(Progress(0, 0.0, infos, ()))
+        while env.agents and not should_stop():
+            actions = team.act_all(observations, {agent: env.belief(agent) for agent in env.agents}, rngs, team_rng)
+            log.before_step()
+            observations, rewards, _, _, infos = env.step(actions)
+            on_step(replace(log.after_step(infos, len(odometry) - 1), rewards=rewards))
+        return log.finish(np.array(odometry))
+    finally:
+        env.recorder = other
 
 
 def describe_event(event: MergeEvent, names: Sequence[int] | None = None) -> str:

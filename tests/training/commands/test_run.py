@@ -99,6 +99,21 @@ def test_an_episode_can_be_stopped() -> None:
     assert len(stopped.times) == 6
 
 
+def test_an_episode_leaves_the_recorder_as_it_was() -> None:
+    """Episodes in one environment do not keep each other's readings; a recorder that was there gets those of both."""
+    config = RunConfig(robots=2, policy="random_walk", seed=3)
+    env = vslam_v0.parallel_env(world=ROOM, num_robots=2, max_cycles=4, num_particles=13)
+    run_episode(env, config.make_policies(env), 3)
+    assert env.recorder is None
+    seen: list[Any] = []
+    env.recorder = seen.append
+    kept = env.recorder
+    for _ in range(2):
+        run_episode(env, config.make_policies(env), 3)
+        assert env.recorder is kept
+    assert len(seen) == 10
+
+
 def test_every_agent_needs_a_policy() -> None:
     """A missing policy is reported before anything runs."""
     env = vslam_v0.parallel_env(world=ROOM, num_robots=2)
