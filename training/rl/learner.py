@@ -1,7 +1,7 @@
 """`GoalPPO`: MaskablePPO for `GoalPolicy`, whose loss may keep the policy near that of the model it began with.
 
 The penalty is the Kullback-Leibler divergence from the start policy to the current one, as in Baker et al., "Video
-PreTraining (VPT): learning to act by watching unlabeled online videos", NeurIPS 2022, section 4.4.
+PreTraining (VPT): learning to act by watching unlabeled online videos", NeurIPS 2022.
 """
 
 from collections.abc import Mapping
@@ -109,7 +109,8 @@ class GoalPPO(MaskablePPO):  # type: ignore[misc]   # its types are not checked
         if not trains_actor:
             return {"loss": self.vf_coef * value_loss, "value_loss": value_loss}
         advantages = batch["advantages"]
-        advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+        if len(advantages) > 1:  # a single decision has no standard deviation
+            advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
         log_ratio = log_probs.gather(1, batch["actions"]).squeeze(1) - batch["old_log_probs"]
         ratio = log_ratio.exp()
         gain = torch.min(advantages * ratio, advantages * ratio.clamp(1.0 - clip, 1.0 + clip)).mean()
