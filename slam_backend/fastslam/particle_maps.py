@@ -9,7 +9,10 @@ particle are at its own place. Thus no two particles share values that one of th
 """
 
 import math
+import mmap
+import sys
 import weakref
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -39,6 +42,45 @@ def zeros_aligned(shape: tuple[int, ...], dtype: Any) -> Any:
     array = empty_aligned(shape, dtype)
     array.fill(0)
     return array
+
+
+LARGE = 1 << 24  # bytes of values from which memory grows where it is, on Linux
+
+
+class GrowingMemory:
+    """Memory of float64 numbers that the system moves instead of copying it, as the pages of a process can be.
+
+    New pages are costly: the system clears each when it is first written.
+
+    Args:
+        size: Number of float64 numbers.
+    """
+
+    def __init__(self, size: int) -> None:
+        self._pages = mmap.mmap(-1, 8 * size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+        self._prefer_huge_pages()
+
+    def array(self, size: int) -> FloatArray:
+        """Return the first `size` numbers, aligned to a cache line. A view."""
+        return np.frombuffer(self._pages, np.float64, size)
+
+    def reserve(self, size: int) -> bool:
+        """Provide `size` numbers, the first of them as before; return whether that is possible.
+
+        No array of the memory may be in use.
+        """
+        if 8 * size > len(self._pages):
+            try:
+                self._pages.resize(8 * size)
+            except (BufferError, OSError):
+                return False
+            self._prefer_huge_pages()
+        return True
+
+    def _prefer_huge_pages(self) -> None:
+        """Ask for pages of 2 MB, as numpy does for large arrays."""
+        with suppress(OSError):  # a system without them
+            self._pages.madvise(mmap.MADV_HUGEPAGE)
 
 
 def _num_heads(descriptor_size: int) -> int:
@@ -78,6 +120,7 @@ class MapStore:
         self.num_particles = num_particles
         self.padded = -(-num_particles // LANES) * LANES
         self.values: FloatArray = empty_aligned((0,), np.float64)
+        self._memory: GrowingMemory | None = None  # of large `values`
         self.counts: NDArray[np.int32] = empty_aligned((0, self.padded), np.int32)
         self.odds: FloatArray = empty_aligned((0, self.padded), np.float64)
         self.maps: NDArray[np.int32] = np.zeros((1, self.padded), dtype=np.int32)
@@ -177,7 +220,9 @@ class MapStore:
             descriptor_size: Length d of the descriptors.
         """
         if min(len(self.ids), len(self.counts)) < new or self.descriptors.shape[1] != descriptor_size:
+            memory = self._memory
             self._clear(self.num_particles)
+            self._memory = memory
             if new or descriptor_size:
                 self._grow_slots(max(64, new), descriptor_size)
                 self._grow_rows(max(64, new + new // 2 + 1))
@@ -219,9 +264,7 @@ class MapStore:
     def _grow_rows(self, extra: int) -> None:
         """Add `extra` rows, uninitialised."""
         old, padded = len(self.counts), self.padded
-        values = empty_aligned(((old + extra) * 9 * padded,), np.float64)
-        values[: len(self.values)] = self.values
-        self.values = values
+        self._grow_values((old + extra) * 9 * padded)
         counts = empty_aligned((old + extra, padded), np.int32)
         counts[:old] = self.counts
         self.counts = counts
@@ -231,6 +274,20 @@ class MapStore:
         free[extra : extra + top] = self.free_rows[:top]
         self.free_rows = free
         self.tops[0] = extra + top
+
+    def _grow_values(self, size: int) -> None:
+        """Provide `size` values, the first of them as before, the others uninitialised."""
+        old = len(self.values)
+        if self._memory is not None:
+            self.values = empty_aligned((0,), np.float64)
+            is_grown = self._memory.reserve(size)
+            self.values = self._memory.array(size if is_grown else old)
+            if is_grown:
+                return
+        self._memory = GrowingMemory(size) if 8 * size >= LARGE and sys.platform == "linux" else None
+        values = empty_aligned((size,), np.float64) if self._memory is None else self._memory.array(size)
+        values[:old] = self.values
+        self.values = values
 
     def _set_descriptor_prefixes(self, n: int) -> None:
         """Write the heads of the first n slots and mark the others free."""
@@ -363,7 +420,7 @@ class ParticleMaps(MapStore):
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the attributes for copies and pickles, which share no arrays with states."""
-        return vars(self) | {"_copied": {}}
+        return vars(self) | {"_copied": {}, "_memory": None}
 
     def get_state(self) -> dict[str, Any]:
         """Return the complete state of the maps, compact; `values` may be shared with other states and are read-only.
