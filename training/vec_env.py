@@ -6,12 +6,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
 from slam_backend.core.validation import BoolArray, FloatArray, argument_error, check_int
 from training.experiments.compilation import prepare
+from training.rl.cluster import ClusterEnvs
 from training.rl.slots import MASK, WHOLE, MakeEnv, StepResult, SyncEnvs
-from training.rl.workers import ProcessEnvs
+from training.rl.workers import ProcessEnvs, WorkerEnvs
 from vslam_env import vslam_v0, warm_up
 from vslam_env.config import EnvConfig
 from vslam_env.reward import RewardSpec
@@ -24,7 +25,9 @@ def make_vec_env(
     seed: int | None = None,
     render_mode: str | None = None,
     reward: RewardSpec | None = None,
-) -> "ExplorationVecEnv":
+    cluster: str | None = None,
+    monitor: bool = True,
+) -> "ExplorationVecEnv | VecMonitor":
     """Make environments of one configuration, or of several.
 
     Args:
@@ -35,9 +38,13 @@ def make_vec_env(
         seed: Seed of all environments; None: the learner's own `seed` decides.
         reward: Reward in place of that of `config`, such as a list with custom terms, see `vslam_v0.parallel_env`. The
             environments of a process share these terms, which must keep no state.
+        cluster: Address of a Ray cluster that runs the workers, see `ray.init`; 0 workers are then one per core, at
+            most one per environment. None: this machine.
+        monitor: Whether a `VecMonitor`, which has the attributes of the environments, too, records return and length of
+            episodes for the logs of learners.
 
     Raises:
-        ValueError: If a number is out of range.
+        ValueError: If a number is out of range, or the cluster cannot be used.
     """
     check_int("num_envs", num_envs, 1, "Use at least one environment.")
     configs = [config] if isinstance(config, EnvConfig) else list(config)
@@ -46,12 +53,12 @@ def make_vec_env(
     make = partial(vslam_v0.parallel_env, render_mode=render_mode, reward=reward)
     makers = [partial(make, config=configs[i % len(configs)]) for i in range(num_envs)]
     load = partial(load_kernels, configs[0])
-    if workers > 0:
+    if workers > 0 and cluster is None:
         prepare(load)  # compiles once, with a message; workers then load from the cache
-    env = ExplorationVecEnv(makers, workers, load)
+    env = ExplorationVecEnv(makers, workers, load, cluster)
     if seed is not None:
         env.seed(seed)
-    return env
+    return VecMonitor(env) if monitor else env
 
 
 def load_kernels(config: EnvConfig) -> None:
@@ -85,6 +92,7 @@ class ExplorationVecEnv(VecEnv):  # type: ignore[misc]   # its types are not che
         makers: Functions that each make a parallel environment; picklable if there are workers.
         workers: Number of worker processes; 0: this process.
         prepare: Function called once in each worker before its environments are made, e.g. to load kernels.
+        cluster: Address of a Ray cluster that runs the workers; 0 of them are then one per core. None: this machine.
 
     Attributes:
         first_slots: First slot of each environment.
@@ -92,18 +100,28 @@ class ExplorationVecEnv(VecEnv):  # type: ignore[misc]   # its types are not che
             in the last step; zeros before the first step.
 
     Raises:
-        ValueError: If there is no environment, spaces differ, or there are more workers than environments.
+        ValueError: If there is no environment, spaces differ, there are more workers than environments, or the cluster
+            cannot be used.
     """
 
     def __init__(
-        self, makers: Sequence[MakeEnv], workers: int = 0, prepare: Callable[[], object] = lambda: None
+        self,
+        makers: Sequence[MakeEnv],
+        workers: int = 0,
+        prepare: Callable[[], object] = lambda: None,
+        cluster: str | None = None,
     ) -> None:
         check_int("workers", workers, 0, "Use 0 for this process, or a number of processes.")
-        self._slots: SyncEnvs | ProcessEnvs = ProcessEnvs(makers, workers, prepare) if workers else SyncEnvs(makers)
+        self._slots: SyncEnvs | WorkerEnvs
+        if cluster is not None:
+            self._slots = ClusterEnvs(makers, cluster, workers, prepare)
+        else:
+            self._slots = ProcessEnvs(makers, workers, prepare) if workers else SyncEnvs(makers)
         self._masks: BoolArray | None = None
         ends = np.cumsum(self._slots.counts)
         self.first_slots: list[int] = [0, *ends[:-1].tolist()]
-        self.spent: FloatArray = np.zeros((max(workers, 1), 2))
+        processes = self._slots.num_workers if isinstance(self._slots, WorkerEnvs) else 1
+        self.spent: FloatArray = np.zeros((processes, 2))
         super().__init__(int(ends[-1]), self._slots.observation_space, self._slots.action_space)
 
     def seed(self, seed: int | None = None) -> list[int | None]:

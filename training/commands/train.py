@@ -26,10 +26,18 @@ def train(
     workers: Annotated[
         int | None,
         typer.Option(
-            help="Number of environment processes; 0: this one. Weights do not depend on it.", show_default="cores"
+            help="Number of environment processes; 0: this one. Weights do not depend on it.",
+            show_default="cores, with --ray those of the cluster",
         ),
     ] = None,
     device: Annotated[str, typer.Option(help="Device of the network updates: cpu or cuda.")] = "cpu",
+    ray: Annotated[
+        str | None,
+        typer.Option(
+            help="Address of a Ray cluster that steps the environments, or auto; see ray start.",
+            show_default="this machine",
+        ),
+    ] = None,
     resume: Annotated[
         Path | None,
         typer.Option(help="Run folder of a stopped training to resume.", show_default=False),
@@ -48,6 +56,7 @@ def train(
     weights as an uninterrupted training, even if the process was killed.
     """
     from slam_backend.core.validation import argument_error, check_int
+    from training.experiments.cluster import LostWorkerError, connected
     from training.experiments.run_folder import RunFolder, installed_versions, read_config
 
     require_extra()
@@ -56,18 +65,23 @@ def train(
 
     if workers is not None:
         check_int("workers", workers, 0, "Use 0 for this process, or a number of processes.")
+        if workers == 0 and ray is not None:
+            raise argument_error("workers", "an int >= 1 with --ray", 0, "Omit it to use all cores of the cluster.")
     check_device(device)
     if resume is None:
         chosen = call.config
     else:
         others = [*call.given, *(name for name, value in (("out", call.out), ("config", call.file)) if value)]
         if others:
-            hint = "A resumed training keeps its configuration; only --workers, --device and --json may be given."
+            hint = "A resumed training keeps its configuration; omit all but --workers, --ray, --device and --json."
             raise argument_error("resume", "no options that change the training", others, hint)
         values, seed = read_config(resume, call.command, "resume")
         chosen = TrainConfig.from_mapping(values | {"seed": seed})
         kept = stored_checkpoint(resume, chosen)  # detects a bad checkpoint before kernels are compiled
-    crew = default_workers(chosen) if workers is None else workers
+    if ray is not None:
+        with connected(ray):  # detects a bad address before the folder is created
+            pass
+    crew = (default_workers(chosen) if ray is None else 0) if workers is None else workers
     if resume is None:
         # Detect a world that cannot be built before the folder is created.
         call.begin(lambda: load_kernels(chosen.make_env_config(SPLIT_TRAIN)))
@@ -79,7 +93,7 @@ def train(
         from training.rl.imitation.imitation import Imitation
 
         kind = Imitation
-    training = kind(chosen, call.folder.path, crew, device)
+    training = kind(chosen, call.folder.path, crew, device, ray)
     try:
         if resume is not None:
             training.restore(kept)
@@ -89,7 +103,7 @@ def train(
         else:
             complete, seconds = _imitate_live(call.console, training)
             _finish_imitation(call, training, complete, seconds)
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, LostWorkerError):
         _print_resume_command(call.console, call.folder.path)
         raise
     finally:

@@ -1,9 +1,7 @@
 """Storage of finished trials, so that a stopped run can be resumed."""
 
 import json
-import logging
 import os
-import socket
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from contextlib import closing, contextmanager
@@ -13,12 +11,11 @@ from typing import Any, TypeVar
 
 from slam_backend.core.files import append_text
 from slam_backend.core.validation import argument_error
+from training.experiments.cluster import SINGLE_THREAD, connected
 from training.experiments.interrupt import begin_worker, signals_held
 from training.experiments.run_folder import CONFIG_FILE, RunFolder, installed_versions, plain, read_config
 
 FAILED = "failed"  # field of the row of a trial without a result: the error, in one line
-CONNECT_S = 10.0  # limit for reaching a cluster
-SINGLE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 TrialT = TypeVar("TrialT")
 
@@ -156,42 +153,22 @@ def _over_cluster(
 
     A trial whose process or node is lost is run again elsewhere.
     """
-    try:
-        import ray
-    except ImportError as error:
-        hint = 'Install it: pip install "vslam-env[distributed]".'
-        raise argument_error("ray", "an installation of Ray", "none", hint) from error
-    variables = dict.fromkeys(SINGLE_THREAD, "1")
-    try:
-        _check_reachable(address)  # Ray itself tries for minutes
-        ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, runtime_env={"env_vars": variables})
-    except (OSError, ValueError, RuntimeError) as error:
-        hint = f"Start one with `ray start --head`. Ray says: {str(error).splitlines()[0]}"
-        raise argument_error("ray", "the address of a Ray cluster that runs", address, hint) from error
-    try:
+    with connected(address) as ray:
         task: Any = ray.remote(num_cpus=1, max_retries=-1)(_play_one)
         shared: Any = ray.put(play)
         running: list[Any] = []
         cores: Any = ray.cluster_resources
-        for trial in trials:
-            running.append(task.remote(shared, trial))
-            while len(running) >= 2 * max(1, int(cores().get("CPU", 1))):  # nodes may come and go
+        try:
+            for trial in trials:
+                running.append(task.remote(shared, trial))
+                while len(running) >= 2 * max(1, int(cores().get("CPU", 1))):  # nodes may come and go
+                    done, running = ray.wait(running)
+                    yield from ray.get(done)
+            while running:
                 done, running = ray.wait(running)
                 yield from ray.get(done)
-        while running:
-            done, running = ray.wait(running)
-            yield from ray.get(done)
-    except ray.exceptions.RayTaskError as error:
-        raise error.cause from error
-    finally:
-        ray.shutdown()
-
-
-def _check_reachable(address: str) -> None:
-    """Raise an OSError unless something listens at HOST:PORT; other addresses, such as `auto`, are left to Ray."""
-    host, _, port = address.removeprefix("ray://").rpartition(":")
-    if host and port.isdecimal():
-        socket.create_connection((host, int(port)), CONNECT_S).close()
+        except ray.exceptions.RayTaskError as error:
+            raise error.cause from error
 
 
 def _play_one(play: Callable[[TrialT], dict[str, Any]], trial: TrialT) -> dict[str, Any]:

@@ -32,20 +32,25 @@ class Training:
         folder: Folder of checkpoint, model and TensorBoard curves.
         workers: Number of processes that step the environments; 0: this process.
         device: Torch device: `"cpu"`, `"cuda"` or one of several GPUs.
+        cluster: Address of a Ray cluster that steps the environments; 0 workers are then one per core.
 
     Attributes:
         model: The learner.
         watch: Callback that reports progress and stops the training.
 
     Raises:
-        ValueError: If the device does not exist, or the environment cannot be built.
+        ValueError: If the device does not exist, the environment cannot be built, or the cluster cannot be used.
     """
 
-    def __init__(self, config: TrainConfig, folder: Path, workers: int = 0, device: str = "cpu") -> None:
+    def __init__(
+        self, config: TrainConfig, folder: Path, workers: int = 0, device: str = "cpu", cluster: str | None = None
+    ) -> None:
         check_device(device)
         torch.set_num_threads(1)
         self.config, self._folder = config, folder
-        self.env = make_vec_env(config.make_env_configs(SPLIT_TRAIN), config.envs, workers)
+        self.env = make_vec_env(
+            config.make_env_configs(SPLIT_TRAIN), config.envs, workers, cluster=cluster, monitor=False
+        )
         self.model = GoalPPO(
             env=self.env, learning_rate=lambda left: left * config.learning_rate, n_steps=config.max_cycles,
             batch_size=config.batch, n_epochs=config.epochs, gamma=config.gamma, gae_lambda=config.gae_lambda,

@@ -1,10 +1,12 @@
-"""`ProcessEnvs`: environments of `SyncEnvs` in worker processes; observations use shared memory."""
+"""`WorkerEnvs`: environments of `SyncEnvs` divided among workers; `ProcessEnvs`: workers are processes."""
 
 import atexit
 import time
 import traceback
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
@@ -23,20 +25,14 @@ from training.rl.slots import NOTHING_SENT, Infos, Layout, MakeEnv, StepResult, 
 CLOSE_S = 5.0  # time after which running workers are killed
 
 
-class ProcessEnvs:
-    """Environments in worker processes, with the methods and the results of `SyncEnvs`.
+class WorkerEnvs(ABC):
+    """Environments divided among workers, with the methods and the results of `SyncEnvs`.
 
-    Each worker runs consecutive environments, as equal in number as possible. It writes observations into shared
-    memory, which this process copies before the next step; everything else goes through a pipe. Workers use one thread
-    each, leave SIGINT and SIGTERM to this process, and end when it ends. An error in a worker is raised here and ends
-    all workers.
+    Each worker runs consecutive environments, as equal in number as possible.
 
     Args:
         makers: Functions that each make an environment; cloudpickle must support them. This process calls each once, to
             read its spaces.
-        workers: Number of processes, at least 1.
-        prepare: Function called once in each process, in all at the same time, before environments are made, e.g. to
-            load kernels. Picklable by cloudpickle.
 
     Attributes:
         observation_space: Observation space of a slot.
@@ -45,66 +41,46 @@ class ProcessEnvs:
         counts: Number of slots of each environment.
 
     Raises:
-        ValueError: If there are more workers than environments, or their spaces differ.
+        ValueError: If the spaces of environments differ.
     """
 
-    def __init__(self, makers: Sequence[MakeEnv], workers: int, prepare: Callable[[], object] = lambda: None) -> None:
+    def __init__(self, makers: Sequence[MakeEnv]) -> None:
         sample = SyncEnvs(makers)
-        if workers > len(makers):
-            hint = "Use fewer workers, or more environments."
-            raise argument_error("workers", f"at most one per environment, {len(makers)}", workers, hint)
         self.observation_space: spaces.Space[Any] = sample.observation_space
         self.action_space: spaces.Space[Any] = sample.action_space
         self.render_mode, self.counts = sample.render_mode, sample.counts
+        self._layout = sample.layout
         sample.close()
-        context = get_context("spawn")
-        memory = {
-            name: context.RawArray("b", max(1, array.nbytes))
-            for name, array in buffers(sample.layout, sample.num_slots).items()
-        }
-        self._seen = _views(memory, sample.layout, sample.num_slots)
         self._envs: list[slice] = []
         self._slots: list[slice] = []
-        self._pipes: list[Connection] = []
-        self._processes: list[Any] = []
+        self._is_open = True
         self._sent = False
-        ends = [0, *np.cumsum(self.counts).tolist()]
-        self._kill = partial(_kill, self._processes)
-        atexit.register(self._kill)  # runs before multiprocessing's handler, which sends SIGTERM and waits
-        with one_thread_each(), signals_held():
-            for share in np.array_split(np.arange(len(makers)), workers):
-                envs = slice(int(share[0]), int(share[-1]) + 1)
-                slots = slice(ends[envs.start], ends[envs.stop])
-                ours, theirs = context.Pipe()
-                packed = cloudpickle.dumps((prepare, list(makers[envs])))
-                process = context.Process(
-                    target=_worker_loop, args=(theirs, packed, memory, slots, ends[-1]), daemon=True
-                )
-                process.start()
-                theirs.close()
-                self._envs.append(envs)
-                self._slots.append(slots)
-                self._pipes.append(ours)
-                self._processes.append(process)
 
     @property
     def num_slots(self) -> int:
         """S."""
         return sum(self.counts)
 
+    @property
+    def num_workers(self) -> int:
+        """P."""
+        return len(self._envs)
+
     def reset(
         self, seeds: Sequence[int | None], options: Sequence[Mapping[str, Any]]
     ) -> tuple[dict[str, NDArray[Any]], Infos]:
         """Reset all environments; see `SyncEnvs.reset`."""
         self._discard_pending()
-        answers = self._ask_all([("reset", list(seeds[envs]), list(options[envs])) for envs in self._envs])
-        return self._copy_observations(), [info for infos in answers for info in infos]
+        for worker, envs in enumerate(self._envs):
+            self._send(worker, "reset", list(seeds[envs]), list(options[envs]))
+        answers = self._answers()
+        return self._observations([seen for seen, _ in answers]), [info for _, infos in answers for info in infos]
 
     def step_async(self, actions: NDArray[Any]) -> None:
         """Start a step of all environments with actions (S, ...)."""
         self._discard_pending()
-        for pipe, slots in zip(self._pipes, self._slots, strict=True):
-            self._send(pipe, ("step", actions[slots]))
+        for worker, slots in enumerate(self._slots):
+            self._send(worker, "step", actions[slots])
         self._sent = True
 
     def step_wait(self) -> StepResult:
@@ -116,10 +92,13 @@ class ProcessEnvs:
         if not self._sent:
             raise RuntimeError(NOTHING_SENT)
         self._sent = False
-        answers = self._answers()
-        rewards, dones, spent = (np.concatenate([each[part] for each in answers]) for part in (0, 1, 2))
+        answers: list[StepResult] = self._answers()
         return StepResult(
-            self._copy_observations(), rewards, dones, [info for each in answers for info in each[3]], spent
+            self._observations([each.observations for each in answers]),
+            np.concatenate([each.rewards for each in answers]),
+            np.concatenate([each.dones for each in answers]),
+            [info for each in answers for info in each.infos],
+            np.concatenate([each.spent for each in answers]),
         )
 
     def ask(self, command: str, slots: Sequence[int], name: str, *rest: Any) -> list[Any]:
@@ -131,14 +110,100 @@ class ProcessEnvs:
             asked.setdefault(worker, []).append(slot)
         for worker, theirs in asked.items():
             local = [slot - self._slots[worker].start for slot in theirs]
-            self._send(self._pipes[worker], ("ask", command, local, name, *rest))
+            self._send(worker, "ask", command, local, name, *rest)
         found: dict[int, Any] = {}
         for worker, theirs in asked.items():
             found |= dict(zip(theirs, self._answer(worker), strict=True))
         return [found[slot] for slot in slots]
 
+    @abstractmethod
+    def close(self) -> None:
+        """End all workers."""
+
+    # ------------------------------------------------------------------ within
+
+    def _divide(self, workers: int) -> None:
+        """Divide environments and slots among workers.
+
+        Raises:
+            ValueError: If there are more workers than environments.
+        """
+        if workers > len(self.counts):
+            hint = "Use fewer workers, or more environments."
+            raise argument_error("workers", f"at most one per environment, {len(self.counts)}", workers, hint)
+        ends = [0, *np.cumsum(self.counts).tolist()]
+        for share in np.array_split(np.arange(len(self.counts)), workers):
+            self._envs.append(slice(int(share[0]), int(share[-1]) + 1))
+            self._slots.append(slice(ends[self._envs[-1].start], ends[self._envs[-1].stop]))
+
+    @abstractmethod
+    def _send(self, worker: int, command: str, *rest: Any) -> None:
+        """Let a worker call a method of its `SyncEnvs`."""
+
+    @abstractmethod
+    def _answer(self, worker: int) -> Any:
+        """Return the result of the last call; an error or the loss of a worker ends all workers."""
+
+    def _answers(self) -> list[Any]:
+        return [self._answer(worker) for worker in range(self.num_workers)]
+
+    @abstractmethod
+    def _observations(self, parts: Sequence[dict[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
+        """Return new arrays (S, ...) by name, from those in the answers of all workers."""
+
+    def _discard_pending(self) -> None:
+        """Discard the result of a pending step, and refuse closed environments."""
+        if not self._is_open:
+            raise RuntimeError("environments: expected running workers, got closed ones. Make new ones.")
+        if self._sent:
+            self.step_wait()
+
+
+class ProcessEnvs(WorkerEnvs):
+    """Environments in worker processes.
+
+    A worker writes observations into shared memory, which this process copies before the next step; everything else
+    goes through a pipe. Workers use one thread each, leave SIGINT and SIGTERM to this process, and end when it ends. An
+    error in a worker is raised here and ends all workers.
+
+    Args:
+        makers: Functions that each make an environment, see `WorkerEnvs`.
+        workers: Number of processes, at least 1.
+        prepare: Function called once in each process, in all at the same time, before environments are made, e.g. to
+            load kernels. Picklable by cloudpickle.
+
+    Raises:
+        ValueError: If there are more workers than environments, or their spaces differ.
+    """
+
+    def __init__(self, makers: Sequence[MakeEnv], workers: int, prepare: Callable[[], object] = lambda: None) -> None:
+        super().__init__(makers)
+        self._divide(workers)
+        context = get_context("spawn")
+        memory = {
+            name: context.RawArray("b", max(1, array.nbytes))
+            for name, array in buffers(self._layout, self.num_slots).items()
+        }
+        self._seen = _views(memory, self._layout, self.num_slots)
+        self._pipes: list[Connection] = []
+        self._processes: list[Any] = []
+        self._kill = partial(_kill, self._processes)
+        atexit.register(self._kill)  # runs before multiprocessing's handler, which sends SIGTERM and waits
+        with one_thread_each(), signals_held():
+            for envs, slots in zip(self._envs, self._slots, strict=True):
+                ours, theirs = context.Pipe()
+                packed = cloudpickle.dumps((prepare, list(makers[envs])))
+                process = context.Process(
+                    target=_worker_loop, args=(theirs, packed, memory, slots, self.num_slots), daemon=True
+                )
+                process.start()
+                theirs.close()
+                self._pipes.append(ours)
+                self._processes.append(process)
+
     def close(self) -> None:
         """End all processes."""
+        self._is_open = False
         atexit.unregister(self._kill)
         for pipe in self._pipes:
             with suppress(OSError):
@@ -155,27 +220,11 @@ class ProcessEnvs:
 
     # ------------------------------------------------------------------ within
 
-    def _discard_pending(self) -> None:
-        """Discard the result of a pending step, and refuse closed environments."""
-        if not self._pipes:
-            raise RuntimeError("environments: expected running workers, got closed ones. Make new ones.")
-        if self._sent:
-            self.step_wait()
-
-    def _ask_all(self, messages: Sequence[tuple[Any, ...]]) -> list[Any]:
-        for pipe, message in zip(self._pipes, messages, strict=True):
-            self._send(pipe, message)
-        return self._answers()
-
-    def _send(self, pipe: Connection, message: tuple[Any, ...]) -> None:
+    def _send(self, worker: int, command: str, *rest: Any) -> None:
         with suppress(BrokenPipeError):  # a dead worker is detected when its answer is missing
-            pipe.send(message)
-
-    def _answers(self) -> list[Any]:
-        return [self._answer(worker) for worker in range(len(self._pipes))]
+            self._pipes[worker].send((command, *rest))
 
     def _answer(self, worker: int) -> Any:
-        """Return the answer of a worker; an error or the death of a worker ends all workers."""
         try:
             failed, answer = self._pipes[worker].recv()
         except (EOFError, ConnectionResetError):
@@ -190,7 +239,7 @@ class ProcessEnvs:
             raise answer
         return answer
 
-    def _copy_observations(self) -> dict[str, NDArray[Any]]:
+    def _observations(self, parts: Sequence[dict[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
         return {name: view.copy() for name, view in self._seen.items()}
 
 
@@ -219,7 +268,7 @@ def _worker_loop(pipe: Connection, packed: bytes, memory: Mapping[str, Any], par
         batch = SyncEnvs(makers)
         rows = {name: view[part] for name, view in _views(memory, batch.layout, slots).items()}
     except Exception as error:  # reported in the answer to the next command
-        failure = _with_traceback(error)
+        failure = with_traceback(error)
     while True:
         try:
             command, *rest = pipe.recv()
@@ -232,7 +281,7 @@ def _worker_loop(pipe: Connection, packed: bytes, memory: Mapping[str, Any], par
         try:
             answer = (True, failure) if batch is None or failure else (False, _execute(batch, rows, command, rest))
         except Exception as error:
-            answer = (True, _with_traceback(error))
+            answer = (True, with_traceback(error))
         if not _send_answer(pipe, answer):
             return
 
@@ -244,11 +293,11 @@ def _send_answer(pipe: Connection, answer: tuple[bool, Any]) -> bool:
     except OSError:
         return False
     except Exception as error:
-        return _send_answer(pipe, (True, _with_traceback(error)))
+        return _send_answer(pipe, (True, with_traceback(error)))
     return True
 
 
-def _with_traceback(error: Exception) -> Exception:
+def with_traceback(error: Exception) -> Exception:
     """Return the current error with its traceback as a note, which survives pickling."""
     error.add_note(f"In a worker:\n{traceback.format_exc()}")
     return error
@@ -256,15 +305,14 @@ def _with_traceback(error: Exception) -> Exception:
 
 def _execute(batch: SyncEnvs, rows: Mapping[str, NDArray[Any]], command: str, rest: Sequence[Any]) -> Any:
     """Execute a command; observations go to the shared rows, all other results into the answer."""
+    answer = getattr(batch, command)(*rest)
     if command == "step":
-        stepped = batch.step(rest[0])
-        _write_rows(rows, stepped.observations)
-        return stepped.rewards, stepped.dones, stepped.spent, stepped.infos
+        _write_rows(rows, answer.observations)
+        return replace(answer, observations={})
     if command == "reset":
-        observations, infos = batch.reset(*rest)
-        _write_rows(rows, observations)
-        return infos
-    return getattr(batch, command)(*rest)
+        _write_rows(rows, answer[0])
+        return {}, answer[1]
+    return answer
 
 
 def _write_rows(rows: Mapping[str, NDArray[Any]], observations: Mapping[str, NDArray[Any]]) -> None:

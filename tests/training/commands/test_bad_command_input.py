@@ -24,7 +24,12 @@ BAD: dict[str, dict[str, str]] = {
         "--world fig5 --out full": "out: expected a new or empty folder",
         "--world fig5 --out /proc/version/run": "out: expected a folder that can be written",
     },
-    "train": {"--robots 9": f"{ROBOTS} 9.", "--world castle": "world: expected one of 'office'"},
+    "train": {
+        "--robots 9": f"{ROBOTS} 9.",
+        "--world castle": "world: expected one of 'office'",
+        "--ray auto --workers 0": "workers: expected an int >= 1 with --ray, got 0.",
+        "--ray 127.0.0.1:1": "ray: expected the address of a Ray cluster that runs, got '127.0.0.1:1'.",
+    },
     "evaluate": {
         "": "model: expected a model that vslam train wrote, got no model",
         "none.npz": "model: expected a model that vslam train wrote, got no such file",

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from builders.ray_cluster import two_nodes
 
 from training.experiments.run_folder import RunFolder
 from training.experiments.trial_store import finished_trials, run_trials
@@ -34,14 +35,8 @@ def wait_and_square(trial: Waiting) -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Any]:
     """Cluster of two nodes with one core each, on this machine."""
-    from ray.cluster_utils import Cluster
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", str(Path(__file__).parent))  # where its processes find this module
-        started = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
-        started.add_node(num_cpus=1)
-    yield started
-    started.shutdown()
+    with two_nodes(Path(__file__).parent) as started:  # where its processes find this module
+        yield started
 
 
 @pytest.mark.slow

@@ -15,9 +15,12 @@ from pettingzoo import ParallelEnv
 
 pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed: pip install .[train]")
 
+from sb3_contrib import MaskablePPO
 from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecMonitor
 
-from training.vec_env import ExplorationVecEnv, env_seeds, make_vec_env
+from training.vec_env import ExplorationVecEnv, env_seeds
+from training.vec_env import make_vec_env as make_monitored
 from vslam_env import vslam_v0
 from vslam_env.config import EnvConfig
 from vslam_env.reward import TeamMetrics, make_terms
@@ -25,6 +28,8 @@ from vslam_env.reward import TeamMetrics, make_terms
 GOALS = EnvConfig().replace(
     world="fig5", num_robots=2, action_type="goal", max_cycles=4, belief={"filter": {"num_particles": 10}}
 )
+
+make_vec_env = partial(make_monitored, monitor=False)
 
 
 def _goals(masks: Any, rng: np.random.Generator) -> NDArray[np.int64]:
@@ -134,6 +139,31 @@ def test_rollouts_equal_a_loop() -> None:
                 assert kept.rewards[step, slot] == pytest.approx(reward, rel=1e-6, abs=1e-9)
             if not env.agents:
                 observations, _ = env.reset()
+
+
+def test_episodes_are_monitored() -> None:
+    """By default learners log return and length of episodes and find the masks; nothing else differs."""
+    env, bare = make_monitored(GOALS, 2, seed=1), make_vec_env(GOALS, 2, seed=1)
+    assert isinstance(env, VecMonitor)
+    assert env.first_slots == bare.first_slots
+    _assert_equal(env.reset(), bare.reset())
+    rng, returns = np.random.default_rng(0), np.zeros(4)
+    for step in range(GOALS.max_cycles):
+        masks = bare.env_method("action_masks")
+        np.testing.assert_array_equal(env.env_method("action_masks"), masks)
+        actions = _goals(masks, rng)
+        ours, theirs = env.step(actions), bare.step(actions)
+        _assert_equal(ours[0], theirs[0])
+        np.testing.assert_array_equal(ours[1], theirs[1])
+        returns += theirs[1]
+        for one, two in zip(ours[3], theirs[3], strict=True):
+            assert set(one) - set(two) == ({"episode"} if step == GOALS.max_cycles - 1 else set())
+    assert [info["episode"]["l"] for info in ours[3]] == [GOALS.max_cycles] * 4
+    np.testing.assert_allclose([info["episode"]["r"] for info in ours[3]], returns, atol=1e-6)
+    flat = make_monitored(GOALS.replace(observation_type="flat"), 1)
+    model = MaskablePPO("MultiInputPolicy", flat, n_steps=4, batch_size=8, n_epochs=1, seed=3, device="cpu")
+    model.learn(16)
+    assert len(model.ep_info_buffer) == 4
 
 
 def test_termination_is_not_truncation() -> None:

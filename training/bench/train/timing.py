@@ -183,7 +183,7 @@ def time_workers(
     with ExitStack() as open_now:
         envs = []
         for count in workers:
-            env = make_vec_env(config, num_envs, count, seed)
+            env = make_vec_env(config, num_envs, count, seed, monitor=False)
             open_now.callback(env.close)
             env.reset()
             envs.append(env)

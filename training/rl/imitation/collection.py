@@ -43,10 +43,12 @@ class TaughtEnv:
         return found
 
 
-def make_taught_envs(configs: Sequence[EnvConfig], num_envs: int, workers: int) -> ExplorationVecEnv:
+def make_taught_envs(
+    configs: Sequence[EnvConfig], num_envs: int, workers: int, cluster: str | None = None
+) -> ExplorationVecEnv:
     """Make environments that can be asked for the teacher's labels; their configurations alternate."""
     makers = [partial(TaughtEnv, configs[i % len(configs)]) for i in range(num_envs)]
-    return ExplorationVecEnv(makers, workers, partial(load_kernels, configs[0]))
+    return ExplorationVecEnv(makers, workers, partial(load_kernels, configs[0]), cluster)
 
 
 def collect(

@@ -46,6 +46,7 @@ class Imitation:
         folder: Folder of labels, checkpoint, model and TensorBoard curves.
         workers: Number of processes that step the environments of the training; 0: this process.
         device: Torch device: `"cpu"`, `"cuda"` or one of several GPUs.
+        cluster: Address of a Ray cluster that steps the environments; 0 workers are then one per core.
 
     Attributes:
         rows: One row per epoch: `round`, `epoch`, `labels`, `loss`; on validation worlds in which the teacher drives
@@ -57,11 +58,14 @@ class Imitation:
         ValueError: If the device does not exist.
     """
 
-    def __init__(self, config: TrainConfig, folder: Path, workers: int = 0, device: str = "cpu") -> None:
+    def __init__(
+        self, config: TrainConfig, folder: Path, workers: int = 0, device: str = "cpu", cluster: str | None = None
+    ) -> None:
         check_device(device)
         torch.set_num_threads(1)
         assert config.rounds is not None  # the configuration checks it
-        self.config, self._folder, self._device, self._workers = config, folder, device, workers
+        self.config, self._folder, self._device = config, folder, device
+        self._workers, self._cluster = workers, cluster
         self._rounds = config.rounds
         torch.manual_seed(config.seed)
         space, actions = observation_space(32, 8.0, True, False), spaces.Discrete(SHAPES["action_mask"][0])
@@ -72,7 +76,7 @@ class Imitation:
         self._best = np.inf
         self._best_weights: dict[str, Any] = {}
         self._returns: dict[str, float] = {}
-        self._envs: dict[str, ExplorationVecEnv] = {}
+        self._envs: dict[str, ExplorationVecEnv] = {}  # those of one split, whose workers keep cores of a cluster
 
     @property
     def parts(self) -> int:
@@ -195,7 +199,8 @@ class Imitation:
         if name not in self._returns:
             file.parent.mkdir(exist_ok=True)
             if split not in self._envs:
-                self._envs[split] = make_taught_envs(env_configs, config.envs, self._workers)
+                self.close()
+                self._envs[split] = make_taught_envs(env_configs, config.envs, self._workers, self._cluster)
             stage, begun = f"round {number + 1} of {self._rounds}, labels {name}", self._work
             kept = (np.arange(config.max_cycles) + part) % (config.thin if split == SPLIT_TRAIN else 1) == 0
             found, gained = collect(
