@@ -12,6 +12,7 @@ from vslam_env.belief.observation import NUM_ACTIONS
 MAX_SPEED, MAX_REVERSE, MAX_TURN = 1.0, 0.3, 1.5  # [m/s], [m/s], [rad/s]
 DISCRETE_COMMANDS = ((0.0, 0.0), (MAX_SPEED, 0.0), (0.0, MAX_TURN), (0.0, -MAX_TURN))  # stay ahead left right
 PAIR_HINT = "Give (speed, turn) in [-1, 1]."
+CLIP_HINT = f"{PAIR_HINT} Clip what a learner draws: gymnasium.wrappers.ClipAction, or clip_actions_v0 of SuperSuit."
 
 
 def action_space(action_type: str) -> spaces.Space[Any]:
@@ -66,7 +67,7 @@ def _continuous_commands(actions: Mapping[str, Any], agents: Sequence[str]) -> F
         if type(speed) is not float or type(turn) is not float:
             speed, turn = _pair(agent, action)
         if not (-1.0 <= speed <= 1.0 and -1.0 <= turn <= 1.0):  # false for NaN
-            raise argument_error(f"actions[{agent!r}]", "two numbers in [-1, 1]", [speed, turn], PAIR_HINT)
+            raise argument_error(f"actions[{agent!r}]", "two numbers in [-1, 1]", [speed, turn], CLIP_HINT)
         commands[robot, 0] = speed * (MAX_SPEED if speed > 0.0 else MAX_REVERSE)
         commands[robot, 1] = turn * MAX_TURN
     return commands

@@ -1,0 +1,98 @@
+"""Masks in the forms of learning libraries."""
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from builders.environments import room
+
+from vslam_env import vslam_v0
+from vslam_env.wrappers import MasksBesideVectors, MasksInInfos
+
+# pettingzoo.test imports connect_four in a way that pettingzoo itself deprecates
+pytestmark = pytest.mark.filterwarnings("ignore:The old environment creation API:DeprecationWarning")
+
+
+def _env(observation_type: str = "dict", **changed: Any) -> Any:
+    given = {"world": room(), "num_robots": 2, "num_particles": 10, "action_type": "goal", "max_cycles": 4} | changed
+    return vslam_v0.parallel_env(observation_type=observation_type, **given)
+
+
+def _episode(env: Any) -> tuple[list[Any], list[Any]]:
+    """Play valid actions; return observations and infos of each time."""
+    bare = _env()
+    seen, infos = env.reset(seed=3)
+    masks = bare.reset(seed=3)[0]
+    kept = [seen], [infos]
+    rng = np.random.default_rng(0)
+    while env.agents:
+        actions = {agent: int(rng.choice(np.flatnonzero(masks[agent]["action_mask"]))) for agent in env.agents}
+        seen, _, _, _, infos = env.step(actions)
+        masks = bare.step(actions)[0]
+        kept[0].append(seen)
+        kept[1].append(infos)
+    return kept
+
+
+@pytest.mark.parametrize("observation_type", ["dict", "flat"])
+def test_wrapped_environments_pass_the_suite(observation_type: str) -> None:
+    """PettingZoo's suite passes without masks in observations: it samples with masks of int8 only."""
+    from pettingzoo.test import parallel_api_test
+
+    env = MasksInInfos(_env(observation_type))
+    parallel_api_test(env, num_cycles=6)
+    env.reset(seed=0)
+    np.testing.assert_array_equal(env.state(), env.unwrapped.state())
+    assert env.observation_space("robot_0") is env.observation_space("robot_0")
+
+
+def test_vectors_do_not_depend_on_the_observation_type() -> None:
+    """Vectors of dict observations equal those of flat ones; both lie in their space beside the mask as float32."""
+    env = MasksBesideVectors(_env("dict"))
+    ours, theirs, plain = (_episode(each)[0] for each in (env, MasksBesideVectors(_env("flat")), _env("flat")))
+    for one, two, three in zip(ours, theirs, plain, strict=True):
+        for agent, seen in one.items():
+            assert env.observation_space(agent).contains(seen)
+            np.testing.assert_array_equal(seen["observations"], two[agent]["observations"])
+            np.testing.assert_array_equal(seen["observations"], three[agent]["observation"])
+            np.testing.assert_array_equal(seen["action_mask"], three[agent]["action_mask"])
+            assert seen["action_mask"].dtype == np.float32
+
+
+@pytest.mark.parametrize("observation_type", ["dict", "flat"])
+def test_masks_move_to_the_infos(observation_type: str) -> None:
+    """Infos have the masks at each time, observations everything else."""
+    env = MasksInInfos(_env(observation_type))
+    (ours, infos), plain = _episode(env), _episode(_env(observation_type))[0]
+    for seen, info, whole in zip(ours, infos, plain, strict=True):
+        for agent in whole:
+            assert env.observation_space(agent).contains(seen[agent])
+            np.testing.assert_array_equal(info[agent]["action_mask"], whole[agent]["action_mask"])
+            if observation_type == "flat":
+                np.testing.assert_array_equal(seen[agent], whole[agent]["observation"])
+            else:
+                assert set(seen[agent]) == set(whole[agent]) - {"action_mask"}
+
+
+def test_environments_without_masks_are_refused() -> None:
+    """Other actions have no masks, and images fit into no vector."""
+    with pytest.raises(ValueError, match="action_type: expected 'goal', whose actions have masks, got 'discrete'"):
+        MasksInInfos(_env(action_type="discrete"))
+    with pytest.raises(ValueError, match="observe_images: expected False: images are no part of a vector"):
+        MasksBesideVectors(_env(sensor="stereo", observe_images=True))
+
+
+def test_actions_out_of_bounds_name_the_cure() -> None:
+    """The error names both wrappers that clip actions, and the one of Gymnasium mends it."""
+    env = gymnasium.make(
+        "vslam_env/SoloExploration-v0", world=room(), num_particles=10, max_cycles=3, disable_env_checker=True
+    )
+    env.reset(seed=0)
+    with pytest.raises(
+        ValueError, match=r"two numbers in \[-1, 1\], got .*ClipAction, or clip_actions_v0 of SuperSuit"
+    ):
+        env.step(np.array([1.5, 0.0], np.float32))
+    clipped = gymnasium.wrappers.ClipAction(env)
+    clipped.reset(seed=0)
+    clipped.step(np.array([1.5, 0.0], np.float32))
