@@ -492,8 +492,8 @@ class ParticleMaps(MapStore):
 def chunk_sizes(n: int) -> list[int]:
     """Return how many landmarks each array of values in a state of n landmarks has.
 
-    >>> chunk_sizes(0), chunk_sizes(2048), chunk_sizes(2100)[-2:]
-    ([0], [2048], [128, 52])
+    >>> chunk_sizes(0), chunk_sizes(512), chunk_sizes(2100)[-2:]
+    ([0], [512], [128, 52])
     """
     return [n] if n <= WHOLE else [min(CHUNK, n - first) for first in range(0, n, CHUNK)]
 
