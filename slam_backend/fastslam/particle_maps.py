@@ -44,7 +44,7 @@ def zeros_aligned(shape: tuple[int, ...], dtype: Any) -> Any:
     return array
 
 
-LARGE = 1 << 24  # bytes of values from which memory grows where it is, on Linux
+LARGE = 1 << 25  # bytes of values from which memory grows where it is, on Linux; the allocator uses smaller ones again
 
 
 class GrowingMemory:
