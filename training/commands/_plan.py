@@ -47,7 +47,7 @@ def is_plan_run(call: Call[ExplorationBenchConfig]) -> bool:
 
 def run_plan(call: Call[ExplorationBenchConfig], name: str | None, workers: int, cluster: str | None) -> None:
     """Play the episodes of a plan that the run folder does not contain yet, and write its tables."""
-    from training.bench.exploration.plan import PlanBench, PlanTrial
+    from training.bench.exploration.plan import PLAN_COPY, PlanBench, PlanTrial
     from training.bench.exploration.plan_report import aggregate, draw_plan, episodes_csv, markdown, write_parquet
     from training.bench.exploration.players import parted
     from training.bench.exploration.trials import TRIALS_FILE, check_same_policies, play
@@ -63,6 +63,11 @@ def run_plan(call: Call[ExplorationBenchConfig], name: str | None, workers: int,
         *(partial(first_steps, bench.environment(t), parted(t.policy), t.seed, bench.decision_limit) for t in firsts),
         config=config,
     )
+    if (file := Path(config.plan)).is_file():
+        folder.write_text(PLAN_COPY, file.read_text(encoding="utf-8"))
+    if missing := plan.missing_floor_plans():
+        text = f"Floor plans are left out: VSLAM_DATA does not contain {len(missing)} of {len(plan.floor_plans)}."
+        console.print(text, soft_wrap=True)
     part = TrialSet(
         file=TRIALS_FILE, kind=PlanTrial, play=partial(play, bench), trials=trials, workers=workers, cluster=cluster,
         tell=lambda row: f"{row['part']}, {row['family']}, {row['policy']}, seed {row['seed']}",
@@ -74,7 +79,7 @@ def run_plan(call: Call[ExplorationBenchConfig], name: str | None, workers: int,
     if rows and not write_parquet(folder.path / EPISODES_PARQUET, rows):
         text = f"{EPISODES_PARQUET} is not written: it needs pip install 'vslam-env[parquet]'."
         console.print(text, soft_wrap=True, markup=False)
-    folder.write_text("tables.md", markdown(plan, rows))
+    folder.write_text("tables.md", markdown(plan, rows, config.policies or plan.policies))
     draw_plan(folder.path / "plan.png", rows)
     call.finish()
     if part.failures:
@@ -162,10 +167,7 @@ def verify_rows(call: Call[ExplorationBenchConfig], folder: Path, count: int) ->
     bench: Bench
     kind: type[Any] = ExplorationTrial
     if "plan" in values:
-        plan = Plan.load(values["plan"])
-        if plan.digest != values["plan_hash"]:
-            hint = "Use the release that wrote it."
-            raise argument_error("verify", f"a run of plan {plan.digest}", values["plan_hash"], hint)
+        plan = Plan.of_run(folder, values, "verify")
         bench, kind = PlanBench(plan, float(values["decision_limit"])), PlanTrial
     else:
         bench = ExplorationBenchConfig.from_mapping(values | {"seed": seed})
@@ -192,6 +194,10 @@ def verify_rows(call: Call[ExplorationBenchConfig], folder: Path, count: int) ->
     if others:
         text = f"Other processor or versions, so that last bits may differ: {'; '.join(others)}. Here: {machine()}."
         call.console.print(text, soft_wrap=True)
+    changed = sorted({row["policy"] for row in found if row["is_other_policy"]})
+    if changed:
+        text = f"The file of {', '.join(changed)} is another one than when the episodes were played."
+        call.console.print(text, soft_wrap=True, markup=False)
     if any(row["is_equal"] is False for row in found):
         raise typer.Exit(1)
 

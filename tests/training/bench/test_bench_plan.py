@@ -23,6 +23,7 @@ from training.bench.exploration.aggregate import (
     probability_of_improvement,
     stratified_ci,
 )
+from training.bench.exploration.leaderboard import Results, played_rows
 from training.bench.exploration.plan import FLOOR_PLANS, Plan
 from training.bench.exploration.plan_report import (
     episodes_csv,
@@ -197,6 +198,9 @@ def test_episodes_are_played_again(vslam: Any, run: Path, monkeypatch: pytest.Mo
     kept = [json.loads(line) for line in (run / verification.VERIFIED_FILE).read_text().splitlines()]
     assert [row["is_equal"] for row in kept] == [True, True]
     assert verification.last_outcomes(run) == {"frontier": [1, 0, 0], "random_walk": [1, 0, 0]}
+    changed = [json.dumps({**row, "policy_digest": "0" * 16}) for row in _rows(run)]
+    (run / TRIALS_FILE).write_text("\n".join(changed) + "\n")
+    assert "The file of frontier" in vslam("bench", "exploration", "--verify", str(run), "--rows", "1").out
     forged = [json.dumps({**row, "digest": "0" * 32}) for row in _rows(run)]
     (run / TRIALS_FILE).write_text("\n".join(forged) + "\n")
     assert vslam("bench", "exploration", "--verify", str(run), "--rows", "1").status == 1
@@ -224,7 +228,7 @@ def test_episodes_are_played_again(vslam: Any, run: Path, monkeypatch: pytest.Mo
 
 
 @pytest.mark.slow
-def test_the_leaderboard_is_made_from_kept_results(vslam: Any, run: Path, tmp_path: Path) -> None:
+def test_the_leaderboard_is_made_from_kept_results(vslam: Any, run: Path, tiny: Path, tmp_path: Path) -> None:
     """Compressed results suffice; results of another plan and repeated policies are refused."""
     kept = tmp_path / "kept"
     kept.mkdir()
@@ -246,6 +250,7 @@ def test_the_leaderboard_is_made_from_kept_results(vslam: Any, run: Path, tmp_pa
     (kept / "episodes.csv.gz").write_bytes(gzip.compress("\n".join(played[:-1]).encode()))
     assert vslam("bench", "leaderboard", str(kept), "--out", str(page)).status == 0
     assert page.read_text().count("### ") == text.count("### ") - 1  # the last part is not finished
+    assert (run / "plan.toml").read_text() == tiny.read_text()  # results are read where the plan's file is not
     other = (run / "episodes.csv").read_text().replace(",random_walk,", ",frontier,")
     (run / "episodes.csv").write_text("\n".join(other.splitlines()[:4]) + "\n")
     done = vslam("bench", "leaderboard", str(kept), str(run), "--out", str(page))
@@ -351,10 +356,24 @@ def test_policies_are_ordered_and_compared_with_the_first() -> None:
     assert main.rows[0][-1] == "-"
     assert main.rows[1][-1].startswith("0.38 (")  # 3 + 2 + 1 of 16 pairs are better, none is equal
     assert families.rows[1][1] == "25.0, 6.2 (6.2 .. 6.2)"
-    assert "The rows of floor plans are left out" in markdown(plan, rows)
-    assert "`frontier` has 8 of 150 episodes of the base part" not in markdown(plan, rows)
-    assert "`frontier` has 8 of 120 episodes of the base part" in markdown(plan, rows)
-    assert "The rows of floor plans" not in markdown(plan, [*rows, _row("frontier", FLOOR_PLANS, 0)])
+    text = markdown(plan, rows, ("frontier", "tare"))
+    assert "There are no rows of floor plans" in text
+    assert "`frontier` has 8 of 150 episodes of the base part" not in text
+    assert "`frontier` has 8 of 120 episodes of the base part" in text
+    assert "`tare` has 0 of 120 episodes of the base part" in text  # all have failed
+    assert "There are no rows" not in markdown(plan, [*rows, _row("frontier", FLOOR_PLANS, 0)], ())
+
+
+def test_policies_of_a_leaderboard_have_played_in_the_same_families() -> None:
+    """Rows without floor plans are not put beside rows with them, which are harder."""
+    plan = Plan.load("vslam-bench-v0")
+    whole, other = (
+        Results(plan, [_row(policy, family, 0) for family in families], {})
+        for policy, families in (("frontier", ("office", FLOOR_PLANS)), ("tare", ("office",)))
+    )
+    assert len(played_rows([whole])) == 2
+    with pytest.raises(ValueError, match="none of 'tare' in floor plans"):
+        played_rows([whole, other])
 
 
 def test_interquartile_means_ignore_outliers() -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from slam_backend.core.validation import argument_error
-from training.bench.exploration.plan import BASE_PART, Plan
+from training.bench.exploration.plan import BASE_PART, FLOOR_PLANS, Plan
 from training.bench.exploration.plan_report import incomplete, markdown, read_episodes
 from training.bench.exploration.report import label
 from training.bench.exploration.verification import OUTCOMES, last_outcomes
@@ -44,13 +44,13 @@ def read_results(folder: Path) -> Results:
     if rows is None or "plan" not in values:
         hint = "Run vslam bench exploration --plan."
         raise argument_error("folders", "results of a plan", f"none in {str(folder)!r}", hint)
-    plan = Plan.load(values["plan"])
-    if plan.digest != values["plan_hash"]:
-        hint = "Use the release that wrote it."
-        raise argument_error("folders", f"results of plan {plan.digest}", values["plan_hash"], hint)
-    if values.get("quick") or (lacking := incomplete(plan, rows)):
-        got = "those of --quick" if values.get("quick") else f"a folder in which {lacking[0]}"
-        raise argument_error("folders", "complete results", got, f"Resume the run in {str(folder)!r}, without --quick.")
+    plan = Plan.of_run(folder, values, "folders")
+    if values.get("quick"):
+        hint = "Play without --quick, in a new folder."
+        raise argument_error("folders", "complete results", f"those of --quick in {str(folder)!r}", hint)
+    if lacking := incomplete(plan, rows, values.get("policies") or plan.policies):
+        hint = f"Resume the run in {str(folder)!r}."
+        raise argument_error("folders", "complete results", f"a folder in which {lacking[0]}", hint)
     return Results(plan, rows, last_outcomes(folder))
 
 
@@ -69,7 +69,8 @@ def played_rows(results: Sequence[Results]) -> list[Mapping[str, Any]]:
     A policy in several folders, such as the baseline, counts once, as in the first of them.
 
     Raises:
-        ValueError: If two folders have different custom policies or models of the same label.
+        ValueError: If two folders have different custom policies or models of the same label, or a policy has not
+            played in a family in which another one has.
     """
     kept: dict[str, Sequence[Mapping[str, Any]]] = {}
     for each in results:
@@ -78,6 +79,13 @@ def played_rows(results: Sequence[Results]) -> list[Mapping[str, Any]]:
             if len(sources) > 1:
                 raise argument_error("folders", "one policy for each label", policy, "Give one of them a LABEL=.")
             kept.setdefault(policy, _finished(each.plan, policy, own))
+    families = {policy: {row["family"] for row in own if row["part"] == BASE_PART} for policy, own in kept.items()}
+    all_families = set().union(*families.values())
+    for policy, own_families in families.items():
+        if missing := all_families - own_families:
+            hint = "Set VSLAM_DATA, and resume the run." if FLOOR_PLANS in missing else "Resume the run."
+            got = f"none of {policy!r} in {', '.join(sorted(missing))}"
+            raise argument_error("folders", "episodes of all policies in the same families", got, hint)
     return [row for own in kept.values() for row in own]
 
 
@@ -100,8 +108,8 @@ def leaderboard(results: Sequence[Results], figure: str) -> str:
     headings = ("policy", "episodes", f"again: {OUTCOMES[0]}", *OUTCOMES[1:])
     machines = sorted({str(row["machine"]) for row in rows})
     return "\n".join([
-        "# Leaderboard of exploration policies\n", ABOUT, f"![{PICTURE}]({figure})\n", markdown(results[0].plan, rows),
-        "### Verification\n",
+        "# Leaderboard of exploration policies\n", ABOUT, f"![{PICTURE}]({figure})\n",
+        markdown(results[0].plan, rows, ()), "### Verification\n",
         "Episodes of each policy that were played again at the last verification: all bits are compared on the same "
         "processor and versions, all results up to a ten-thousandth elsewhere.\n",
         markdown_table(headings, shown), f"Played on: {'; '.join(machines)}.\n",

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from vslam_env.config import EnvConfig
 
 PLANS = Path(__file__).parent / "plans"
+PLAN_COPY = "plan.toml"  # in run folders of plans that are not shipped
 BASE_PART, FLOOR_PLANS = "base", "floor plans"
 QUICK_SEEDS = 2
 Oracle = Literal["none", "pose", "association", "merge", "all"]
@@ -98,6 +99,20 @@ class Plan(Checked):
             raise argument_error("plan", "a TOML file", "a file with other content", hint) from error
         except ValueError as error:
             raise ValueError(f"plan {str(file)!r}: {error}") from error
+
+    @classmethod
+    def of_run(cls, folder: Path, values: Mapping[str, Any], argument: str) -> Self:
+        """Read the plan of a run folder: the copy in it, or else the plan of the name in its configuration `values`.
+
+        Raises:
+            ValueError: As in `load`; also if the plan has another hash than in the run. The message names `argument`.
+        """
+        copy = folder / PLAN_COPY
+        plan = cls.load(str(copy) if copy.is_file() else values["plan"])
+        if plan.digest != values["plan_hash"]:
+            hint = "Use the release that wrote it."
+            raise argument_error(argument, f"results of plan {plan.digest}", values["plan_hash"], hint)
+        return plan
 
     def all_parts(self) -> dict[str, PlanPart]:
         """Return the parts by name."""

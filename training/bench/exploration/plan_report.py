@@ -71,28 +71,36 @@ def sections(plan: Plan, rows: Rows) -> list[Section]:
     return [section for section in found if section.rows]
 
 
-def markdown(plan: Plan, rows: Rows) -> str:
-    """Return all tables as Markdown, with what is left out."""
+def markdown(plan: Plan, rows: Rows, policies: Sequence[str]) -> str:
+    """Return all tables as Markdown, with what is left out.
+
+    Args:
+        policies: Labels of the policies that should have rows.
+    """
     parts = [f"Plan {plan.name}, hash {plan.digest}. {E_SCALE}\n"]
     if plan.floor_plans and not any(row["family"] == FLOOR_PLANS for row in rows):
-        parts.append("The rows of floor plans are left out: `VSLAM_DATA` does not contain them.\n")
-    parts += [f"Not a complete result: {text}.\n" for text in incomplete(plan, rows)]
+        parts.append("There are no rows of floor plans: they need `VSLAM_DATA`, and `--quick` leaves them out.\n")
+    parts += [f"Not a complete result: {text}.\n" for text in incomplete(plan, rows, policies)]
     for section in sections(plan, rows):
         parts.append(f"### {section.title}\n\n{section.note}\n\n{markdown_table(section.headings, section.rows)}")
     return "\n".join(parts)
 
 
-def incomplete(plan: Plan, rows: Rows) -> list[str]:
-    """Return a text for each policy that lacks episodes of the base part; floor plans may be missing altogether."""
+def incomplete(plan: Plan, rows: Rows, policies: Sequence[str]) -> list[str]:
+    """Return a text for each of some policies that lacks episodes of the base part.
+
+    Floor plans may be missing altogether.
+    """
     found = []
     base = plan.all_parts()[BASE_PART]
     own = [row for row in rows if row["part"] == BASE_PART]
     has_plans = any(row["family"] == FLOOR_PLANS for row in own)
     conditions = len(base.robots) * len(base.particles) * len(base.oracles) * base.seeds
     wanted = conditions * sum(world != FLOOR_PLANS or has_plans for world in base.worlds)
-    for (policy,), played in grouped(own, ("policy",)).items():
-        if len(played) < wanted:
-            found.append(f"`{label(policy)}` has {len(played)} of {wanted} episodes of the base part")
+    for policy in dict.fromkeys([*policies, *(row["policy"] for row in own)]):
+        played = sum(row["policy"] == policy for row in own)
+        if played < wanted:
+            found.append(f"`{label(policy)}` has {played} of {wanted} episodes of the base part")
     return found
 
 

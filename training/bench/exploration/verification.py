@@ -41,6 +41,7 @@ def compare(stored: Mapping[str, Any], again: Mapping[str, Any]) -> dict[str, An
     return {
         "policy": stored["policy"], "is_equal": stored["digest"] == again["digest"] if comparable else None,
         "is_close": all(_close(value, again[name]) for name, value in stored.items() if name not in NOT_COMPARED),
+        "is_other_policy": (stored["policy_digest"] or "") != again["policy_digest"],
         "digest": stored["digest"], "again": again["digest"], "machine": machine(), "stored_on": stored["machine"],
         "map_error": stored["map_error"], "map_error_again": again["map_error"],
     }  # fmt: skip
@@ -69,13 +70,14 @@ def table_rows(comparisons: Rows) -> list[list[str]]:
 
 
 def last_outcomes(folder: Path) -> dict[str, list[int]]:
-    """Return the `outcome_counts` of each policy's last verification date in a run folder."""
+    """Return the `outcome_counts` of each policy's last verification date in a run folder, an episode once."""
     file = folder / VERIFIED_FILE
     lines = [json.loads(text) for text in file.read_text(encoding="utf-8").splitlines()] if file.is_file() else []
     found: dict[str, list[int]] = {}
     for (policy,), own in grouped(lines, ("policy",)).items():
         last = max(line["date"] for line in own)
-        found[policy] = outcome_counts([row for row in own if row["date"] == last])
+        of_last = {row["digest"]: row for row in own if row["date"] == last}
+        found[policy] = outcome_counts(list(of_last.values()))
     return found
 
 
