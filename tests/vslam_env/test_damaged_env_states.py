@@ -191,6 +191,7 @@ def played(seeds: Iterable[int]) -> float:
     return sum(checked) / len(checked)
 
 
+@pytest.mark.slow
 def test_random_environments_run() -> None:
     """Nothing is raised in a step, nothing is NaN or outside its space, and all bytes repeat; most cases are played."""
     assert played(range(40)) > 0.5

@@ -69,6 +69,7 @@ def test_arrays_shared_by_a_state_are_read_only(name: str, tmp_path: Path) -> No
         assert not shared_and_writable(other, env)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ENVS)
 def test_writing_into_a_state_changes_no_environment(name: str) -> None:
     """An environment continues unchanged when all writable arrays of a state are overwritten."""

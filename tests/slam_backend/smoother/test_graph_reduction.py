@@ -287,6 +287,7 @@ def plainly_walked(kinds, motions, variances, counts, guesses, start, rigid_with
     )  # fmt: skip
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=60)
 @given(st.integers(1, 30), st.sampled_from([0.0, 0.02, 0.2]), st.integers(0, 2**32 - 1))
 def test_the_compiled_walk_is_the_plain_one(steps, rigid_within, seed):
@@ -351,6 +352,7 @@ def settled(known, names, aliases=NO_ALIASES, old=(), frozen=((), ()), held=NO_L
     return raw.point_landmarks, landmarks, np.array(expected).reshape(-1, 3)
 
 
+@pytest.mark.slow
 @given(st.lists(st.integers(0, 9), unique=True, max_size=8), st.lists(st.integers(0, 12), max_size=20))
 def test_landmarks_are_numbered_in_order_of_appearance(known, names):
     """A known landmark keeps row and place, a new one gets the next row and the place of its first measurement.

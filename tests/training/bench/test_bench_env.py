@@ -147,6 +147,7 @@ def test_stopping_early_keeps_finished_results() -> None:
     assert not result["snapshots"]
 
 
+@pytest.mark.slow
 def test_the_command_writes_its_results(tmp_path: Path) -> None:
     """The run folder and the JSON have rows, budget, snapshots and resets; the config repeats the run."""
     out, file = tmp_path / "run", tmp_path / "figures.json"

@@ -34,6 +34,7 @@ def _result(milliseconds: Any, loads: list[FilterLoad]) -> dict[str, Any]:
     return {"machine": machine, "rows": rows, "state": state, "compilation": None, "complete": False}
 
 
+@pytest.mark.slow
 def test_a_run_folder_repeats_the_benchmark(vslam: Any, tmp_path: Path) -> None:
     """There is one row per combination, in table, metrics.json and its copy; the config repeats them."""
     first, second, copy = tmp_path / "first", tmp_path / "second", tmp_path / "copy.json"

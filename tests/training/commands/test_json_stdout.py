@@ -142,6 +142,7 @@ def test_output_of_workers_goes_to_stderr(closed: bool, tmp_path: Path) -> None:
         assert "written" in done.stderr
 
 
+@pytest.mark.slow
 def test_a_closed_stdout_gives_a_one_line_error(tmp_path: Path) -> None:
     """If stdout is closed, the command has a one-line error, and its folder is complete."""
     few = "--world fig5 --robots 1 --max-cycles 3 --particles 5 --no-video --out run --json -"

@@ -93,7 +93,7 @@ BAD: dict[type[ExperimentConfig], dict[str, dict[Any, str]]] = {
     bench.MrclamPairsConfig: {"durations": {(-1.0,): "a finite number >= 0"}, "particles": {0: AT_LEAST_1}},
     EvaluateConfig: {"seeds": {1: "an int >= 2"}, "split": {"train": "one of 'validation', 'test'"}},
     TrainConfig: {
-        "preset": {"slow": "one of 'quick', 'imitate', 'smoke'"}, "rounds": {0: AT_LEAST_1},
+        "preset": {"slow": "one of 'quick', 'imitate', 'ppo', 'smoke'"}, "rounds": {0: AT_LEAST_1},
         "noise": {"calm": "one of 'easy'"}, "robots": {9: ROBOTS},
         "batch": {1: "an int >= 2"}, "gamma": {1.5: "a finite number > 0 and <= 1"}, "clip": {0.0: ABOVE_0},
         "entropy": {-1.0: "a finite number >= 0"}, "envs": {0: AT_LEAST_1}, "straighten": {1: "a bool"},
@@ -197,7 +197,7 @@ def test_choices_match_the_packages() -> None:
     assert get_args(bench.AlignmentMethod) == METHODS
     assert get_args(bench.Method) == trials.METHODS
     assert paper.STEP == runs.STEP
-    assert tuple(TRAIN_PRESETS) == ("quick", "imitate", "smoke")
+    assert tuple(TRAIN_PRESETS) == ("quick", "imitate", "ppo", "smoke")
     assert paper.Fig6Config().regimes == tuple(REGIMES)
     assert bench.EnvBenchConfig().robots[-1] == MAX_ROBOTS
     assert set(SPLITS) < {"train", "validation", "test", "any"}

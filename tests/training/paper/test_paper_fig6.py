@@ -352,6 +352,7 @@ def test_a_stopped_run_is_resumed(finished: Path, tmp_path: Path) -> None:
     assert _call([*ARGUMENTS, "--length", "5", "--out", str(out)]) == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("factor", "status"), [(0.5, 0), (1.5, 1)])
 def test_check_sets_the_exit_status(tmp_path: Path, factor: float, status: int) -> None:
     """The status is 0 if all claims hold, 1 otherwise: errors of three robots are 0.5 or 1.5 times those of one."""

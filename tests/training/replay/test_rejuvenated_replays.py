@@ -48,6 +48,7 @@ def reasons(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", WRITERS)
 def test_a_replay_is_rejuvenated_and_repeats_itself(
     command: str, vslam: Any, tmp_path: Path, reasons: list[str]

@@ -286,6 +286,7 @@ def test_places_to_look_from_cover_the_unseen_walls() -> None:
     assert np.isnan(robot.update()).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_the_first_place_sees_most_of_all_targets(seed: int) -> None:
     """Among all places of the lattice, and all targets, near and far, it is the one with the best heading."""

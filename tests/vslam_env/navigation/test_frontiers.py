@@ -94,6 +94,7 @@ def test_a_gap_too_narrow_for_the_robot_is_no_frontier() -> None:
     assert len(find_frontiers(room((1.0,), width=0.4), (0.0, 0.0)).goals) == 0
 
 
+@pytest.mark.slow
 def test_a_candidate_keeps_its_slot_while_it_lives() -> None:
     """When one of three candidates dies, the others stay in their slots, and the next new one takes the free one."""
     slots = CandidateSlots()

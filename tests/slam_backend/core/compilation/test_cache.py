@@ -200,6 +200,7 @@ def test_who_may_write_to_a_folder(user: int, mode: int, is_own: bool, expected:
     assert is_private(status, lambda group, owner: is_own and (group, owner) == (7, os.geteuid())) is expected
 
 
+@pytest.mark.slow
 def test_files_of_older_sources_are_removed(tmp_path: Path) -> None:
     """An edited kernel leaves one file, as do other signatures."""
     for number in (1, 1, 2):
@@ -267,6 +268,7 @@ def _run_edited(folder: Path, number: float, first: str = "", body: str = "throu
     return float(subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("first", "body"),
     [

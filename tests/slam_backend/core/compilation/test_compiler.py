@@ -104,6 +104,7 @@ def test_a_process_compiles_what_the_cache_lacks(tmp_path: Path) -> None:
     assert program(tmp_path) == "0 0 []"
 
 
+@pytest.mark.slow
 def test_damaged_files_are_missing(tmp_path: Path) -> None:
     """A file that is truncated counts as not kept."""
     program(tmp_path)
