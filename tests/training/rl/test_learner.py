@@ -11,8 +11,8 @@ pytest.importorskip("torch", reason="torch is not installed: pip install .[train
 pytest.importorskip("sb3_contrib", reason="sb3-contrib is not installed: pip install .[train]")
 
 import torch
-from gymnasium import spaces
-from pettingzoo import ParallelEnv
+from builders.goal_choices import GoalChoices
+from numpy.typing import NDArray
 from sb3_contrib import MaskablePPO
 
 from agents.registry import LEARNED
@@ -23,9 +23,7 @@ from training.rl.network import GoalPolicy
 from training.rl.trainer import Training, stored_checkpoint
 from training.vec_env import ExplorationVecEnv
 from vslam_env import NUM_CANDIDATES
-from vslam_env.belief.observation import observation_space
 
-SPACE = observation_space(32, 8.0, True, False)
 SETTINGS: dict[str, Any] = {
     "n_steps": 20, "batch_size": 50, "n_epochs": 2, "ent_coef": 0.01, "vf_coef": 0.5, "gamma": 0.9, "seed": 3,
     "device": "cpu",
@@ -33,34 +31,17 @@ SETTINGS: dict[str, Any] = {
 ANCHORED = {"preset": "smoke", "start": "learned", "anchor": 0.5, "value_rollouts": 1, "seed": 5}
 
 
-class _RandomViews(ParallelEnv):  # type: ignore[misc]
-    """Environment of one robot with random observations and rewards for the first candidates."""
+class _RandomViews(GoalChoices):
+    """Environment with random observations and rewards for the first candidates."""
 
-    possible_agents = ("robot_0",)
-    render_mode = None
-
-    def observation_space(self, agent: str) -> Any:
-        return SPACE
-
-    def action_space(self, agent: str) -> Any:
-        return spaces.Discrete(1 + NUM_CANDIDATES)
-
-    def reset(self, seed: int | None = None, options: Any = None) -> tuple[Any, Any]:
-        self.rng = np.random.default_rng(seed)
-        self.agents = ["robot_0"]
-        return self._seen(), {"robot_0": {}}
-
-    def step(self, actions: Any) -> tuple[Any, ...]:
-        gained = 1.0 / (1.0 + int(actions["robot_0"]))
-        return self._seen(), {"robot_0": gained}, {"robot_0": False}, {"robot_0": False}, {"robot_0": {}}
-
-    def _seen(self) -> Any:
-        seen = {name: np.zeros(box.shape, box.dtype) for name, box in SPACE.spaces.items()}
+    def draw(self, seen: Any) -> NDArray[np.int64]:
         slots = self.rng.permutation(NUM_CANDIDATES)[: self.rng.integers(3, 12)]
         seen["candidates"][slots] = self.rng.uniform(0.0, 3.0, (len(slots), seen["candidates"].shape[1]))
-        seen["action_mask"][[0, *(1 + slots)]] = 1
         seen["local_grid"][:] = self.rng.integers(0, 255, seen["local_grid"].shape)
-        return {"robot_0": seen}
+        return slots
+
+    def reward(self, action: int) -> float:
+        return 1.0 / (1.0 + action)
 
 
 def _learner(**settings: Any) -> GoalPPO:

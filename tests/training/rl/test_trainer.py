@@ -12,8 +12,9 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from builders.goal_choices import SPACE, GoalChoices
 from gymnasium import spaces
-from pettingzoo import ParallelEnv
+from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 pytest.importorskip("torch", reason="torch is not installed: pip install .[train]")
@@ -34,43 +35,23 @@ from training.rl.network import GoalPolicy
 from training.rl.trainer import Training, as_arrays, as_tensors, check_device, stored_checkpoint
 from training.vec_env import ExplorationVecEnv
 from vslam_env import NUM_CANDIDATES
-from vslam_env.belief.observation import observation_space
 from vslam_env.state_kinds import ENV_KINDS
 
 SMOKE = TrainConfig.from_mapping({"preset": "smoke", "seed": 5})
-SPACE = observation_space(32, 8.0, True, False)
 runner = CliRunner()
 
 
-class _NearIsGood(ParallelEnv):  # type: ignore[misc]
-    """Environment of one robot with new candidates at each step; the reward is larger for shorter paths."""
+class _NearIsGood(GoalChoices):
+    """Environment whose reward is larger for shorter paths."""
 
-    possible_agents = ("robot_0",)
-    render_mode = None
-
-    def observation_space(self, agent: str) -> Any:
-        return SPACE
-
-    def action_space(self, agent: str) -> Any:
-        return spaces.Discrete(1 + NUM_CANDIDATES)
-
-    def reset(self, seed: int | None = None, options: Any = None) -> tuple[Any, Any]:
-        self.rng = np.random.default_rng(seed)
-        self.agents = ["robot_0"]
-        return self._seen(), {"robot_0": {}}
-
-    def step(self, actions: Any) -> tuple[Any, ...]:
-        action = int(actions["robot_0"])
-        gained = 0.0 if action == 0 else 1.0 / (1.0 + self.lengths[action - 1])
-        return self._seen(), {"robot_0": gained}, {"robot_0": False}, {"robot_0": False}, {"robot_0": {}}
-
-    def _seen(self) -> Any:
-        seen = {name: np.zeros(box.shape, box.dtype) for name, box in SPACE.spaces.items()}
+    def draw(self, seen: Any) -> NDArray[np.int64]:
         slots = self.rng.permutation(16)[: self.rng.integers(2, 7)]
         seen["candidates"][slots, 2] = self.rng.uniform(0.5, 15.0, len(slots))
-        seen["action_mask"][[0, *(1 + slots)]] = 1
         self.lengths = seen["candidates"][:, 2].copy()
-        return {"robot_0": seen}
+        return slots
+
+    def reward(self, action: int) -> float:
+        return 0.0 if action == 0 else 1.0 / (1.0 + float(self.lengths[action - 1]))
 
 
 @pytest.fixture(scope="module")

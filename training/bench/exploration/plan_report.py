@@ -230,10 +230,9 @@ def _overall(base: Rows, order: Sequence[str], first: str | None) -> Section:
         lines.append(
             [label(policy), *cells, number(_mean(own, "decision_p99_ms"), 1), _improvement(base, policy, first)]
         )
-    note = (
-        f"Interquartile means over {_worlds(base)} worlds, with 95 % intervals. P: probability that the map of a "
-        f"random world is better than one of `{first}`."
-    )
+    note = f"Interquartile means over {_worlds(base)} worlds, with 95 % intervals."
+    if first is not None:
+        note += f" P: probability that the map of a random world is better than one of `{first}`."
     headings = ["all worlds", *(heading for heading, *_ in columns), "decision, p99 [ms]", "P"]
     return Section("All worlds", note, headings, lines)
 

@@ -1,6 +1,5 @@
 """Trial of `vslam bench scale`: a timed episode."""
 
-import gc
 import os
 import tempfile
 import time
@@ -148,10 +147,5 @@ def memory_mb() -> Any:
 
 @cache
 def _warm_up() -> None:
-    """Load all kernels into this process, once.
-
-    Kernels are many objects. Python searches them for garbage no more, which takes 100 ms in one step of hundreds.
-    """
+    """Load all kernels into this process, once."""
     warm_up(workers=1)
-    gc.collect()
-    gc.freeze()
