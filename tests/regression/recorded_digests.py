@@ -2,12 +2,11 @@
 
     python tests/regression/recorded_digests.py            # compare with the recorded ones, say which differ
     python tests/regression/recorded_digests.py --record   # record them, after a change that is meant to change numbers
-    python tests/regression/recorded_digests.py --add      # record the same numbers for this processor, too
 
 Digests hold no names and no texts: observations are hashed in the order of their sorted keys, states and results as
-unordered collections of their arrays and numbers. Last bits depend on the processor and on the versions of the
-libraries, so the file has a record for each of them; `--record` removes those of others. Where only the content of
-states changed, the digests of snapshots are removed from the records that cannot be renewed.
+unordered collections of their arrays and numbers. Last bits depend on the versions of the libraries, and on the
+processor through NumPy and OpenBLAS: they are computed as on a processor with AVX2 and no more, so that they are the
+same on all newer ones.
 """
 
 import hashlib
@@ -23,11 +22,11 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import llvmlite.binding
 import numpy as np
 
 from slam_backend import Alignment, LandmarkMap, align_maps, fuse_maps
 from slam_backend.geometry import between
+from training.experiments.numerics import PORTABLE, numerics, variables_for
 from vslam_env import vslam_v0
 
 FILE = Path(__file__).with_name("digests.json")
@@ -36,10 +35,11 @@ DATA = Path(os.environ.get("VSLAM_DATA", ROOT.parent / "shared" / "data"))
 LIBRARIES = ("numpy", "scipy", "numba", "llvmlite", "opencv-python-headless", "pymunk")
 NOT_RESULTS = {"config", "versions", "seed"}  # tables of metrics.json
 STEPS, STEREO_STEPS = 300, 40
+NOT_COMPARABLE = 5  # status
+IS_PORTABLE = "RECORDED_DIGESTS"  # variable of the processes that compute
 ALIGNMENT = "align and fuse"
 FALSE_MERGE, FALSE_MERGE_STEP = "fig5, undone merge", 60
 
-SHORT_RANGE = {"comm_range": 6.0, "comm_line_of_sight": True}
 NO_ATTEMPTS = {"belief": {"attempts": {"enabled": False}}}
 NEAR = {"min_start_distance": 1.0, "shared_start_view": True}
 SHORT_RANGE = {"comm_range": 6.0, "comm_line_of_sight": True}
@@ -71,18 +71,14 @@ EPISODES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {  # arguments of p
 
 def environment() -> dict[str, str]:
     """Return what last bits depend on."""
-    features = llvmlite.binding.get_host_cpu_features().flatten()
-    return {
-        "python": ".".join(platform.python_version_tuple()[:2]),
-        "processor": llvmlite.binding.get_host_cpu_name(),
-        "features": hashlib.sha256(features.encode()).hexdigest()[:16],
-    } | {name: version(name) for name in LIBRARIES}
+    python = ".".join(platform.python_version_tuple()[:2])
+    return {"python": python, "numerics": numerics()} | {name: version(name) for name in LIBRARIES}
 
 
 def recorded() -> Mapping[str, str] | None:
-    """Return the digests recorded for this processor and these versions, or None."""
-    here = environment()
-    return next((record["digests"] for record in json.loads(FILE.read_text()) if record["environment"] == here), None)
+    """Return the recorded digests, or None if they are of other numerics or versions."""
+    record: dict[str, Any] = json.loads(FILE.read_text())
+    return record["digests"] if record["environment"] == environment() else None
 
 
 def names() -> list[str]:
@@ -260,23 +256,36 @@ def bytes_of(value: Any) -> bytes:
     return f"{array.dtype.str}{array.shape}".encode() + array.tobytes()
 
 
-def main() -> int:
-    """Compare with the recorded digests, or record them."""
-    before, found = recorded(), all_digests()
-    if arguments := sys.argv[1:]:
-        others = json.loads(FILE.read_text()) if arguments == ["--add"] else []
-        kept = [record for record in others if record["environment"] != environment()]
-        FILE.write_text(json.dumps([*kept, {"environment": environment(), "digests": found}], indent=1) + "\n")
+def main(arguments: list[str]) -> int:
+    """Compare with the recorded digests those of some names, or of all; or record them.
+
+    Returns:
+        0 if they are equal, 1 if some differ, `NOT_COMPARABLE` if none are recorded for this environment.
+    """
+    before = recorded()
+    if arguments == ["--record"]:
+        FILE.write_text(json.dumps({"environment": environment(), "digests": all_digests()}, indent=1) + "\n")
         return 0
     if before is None:
         print(f"Nothing is recorded for {environment()}.")
-        return 1
-    differing = {name for name, digest in found.items() if before.get(name, digest) != digest}
+        return NOT_COMPARABLE
+    found = {part: digest for name in arguments or names() for part, digest in digests_of(name).items()}
+    differing = {name for name, digest in found.items() if before.get(name) != digest}
     print(*(f"differs: {name}" for name in sorted(differing)), sep="\n")
-    print(*(f"not recorded: {name}" for name in sorted(found.keys() - before.keys())), sep="\n")
-    print(f"{len(found.keys() & before.keys()) - len(differing)} of {len(found)} digests are equal.")
+    print(f"{len(found) - len(differing)} of {len(found)} digests are equal.")
     return 1 if differing else 0
 
 
+def run(arguments: list[str]) -> "subprocess.CompletedProcess[str]":
+    """Run this file in a process with the numerics of the records."""
+    command = [sys.executable, __file__, *arguments]
+    environ = os.environ | variables_for(PORTABLE) | {IS_PORTABLE: "1"}
+    return subprocess.run(command, env=environ, cwd=ROOT, capture_output=True, text=True, check=False)
+
+
 if __name__ == "__main__":
-    sys.exit(main())
+    if IS_PORTABLE in os.environ:
+        sys.exit(main(sys.argv[1:]))
+    done = run(sys.argv[1:])
+    print(done.stdout + done.stderr, end="")
+    sys.exit(done.returncode)

@@ -1,7 +1,9 @@
 """Runs of benchmark plans, repetition of their episodes, and the leaderboard."""
 
+from contextlib import closing
 from dataclasses import asdict
 from functools import partial
+from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -51,6 +53,7 @@ def run_plan(call: Call[ExplorationBenchConfig], name: str | None, workers: int,
     from training.bench.exploration.plan_report import aggregate, draw_plan, episodes_csv, markdown, write_parquet
     from training.bench.exploration.players import parted
     from training.bench.exploration.trials import TRIALS_FILE, check_same_policies, play
+    from training.experiments.numerics import PORTABLE, variables_for
     from training.experiments.run_folder import plain
 
     config, plan = _configured(call, name)
@@ -70,6 +73,7 @@ def run_plan(call: Call[ExplorationBenchConfig], name: str | None, workers: int,
         console.print(text, soft_wrap=True)
     part = TrialSet(
         file=TRIALS_FILE, kind=PlanTrial, play=partial(play, bench), trials=trials, workers=workers, cluster=cluster,
+        variables=variables_for(PORTABLE),
         tell=lambda row: f"{row['part']}, {row['family']}, {row['policy']}, seed {row['seed']}",
     )  # fmt: skip
     (rows,) = run_trial_sets(console, folder, part)
@@ -145,23 +149,26 @@ def _check_same_plan(out: Path | None, plan: "Plan") -> None:
         raise argument_error("out", f"results of vslam-env {now}", f"results of {before}", hint)
 
 
-def verify_rows(call: Call[ExplorationBenchConfig], folder: Path, count: int) -> None:
+def verify_rows(call: Call[ExplorationBenchConfig], folder: Path, count: int, workers: int) -> None:
     """Play some episodes of each policy of a run again, and compare them with what the run stored.
 
+    Processes that play them have the numerics of the stored ones, where this processor can do these.
+
     Raises:
-        typer.Exit: With status 1 if an episode differs from one of the same processor and versions.
+        typer.Exit: With status 1 if an episode differs from one of the same numerics and versions.
     """
     import numpy as np
 
     from slam_backend.core.validation import argument_error
     from training.bench.exploration.leaderboard import kept_episodes
-    from training.bench.exploration.machine import machine
     from training.bench.exploration.plan import Plan, PlanBench, PlanTrial
     from training.bench.exploration.trials import TRIALS_FILE, Bench, play
     from training.bench.exploration.verification import HEADINGS, choose, compare, keep, table_rows
+    from training.experiments.numerics import variables_for
     from training.experiments.run_folder import CONFIG_FILE, RunFolder, installed_versions, read_config
+    from training.experiments.statistics import grouped
     from training.experiments.tables import console_table
-    from training.experiments.trial_store import FAILED, finished_trials, trial_of
+    from training.experiments.trial_store import FAILED, finished_trials, run_in_processes, trial_of
 
     values, seed = read_config(folder, COMMAND, "verify")
     bench: Bench
@@ -178,21 +185,23 @@ def verify_rows(call: Call[ExplorationBenchConfig], folder: Path, count: int) ->
         raise argument_error("verify", "a run folder whose episodes have digests", "none", hint)
     found = []
     with trial_progress(call.console, len(chosen), timed=False) as (advance, interrupted):
-        for row in chosen:
-            if interrupted():
-                break
-            trial = trial_of(row, kind)
-            again = play(bench, trial)
-            if FAILED in again:
-                call.console.print(f"[red]error[/] {again[FAILED]}", soft_wrap=True)
-                raise typer.Exit(2)
-            found.append(compare(row, again))
-            keep(folder, found[-1], asdict(trial))
-            advance(f"{trial.policy}, seed {trial.seed}")
+        for (where,), own in grouped(chosen, ("machine",)).items():
+            rows = {trial_of(row, kind): row for row in own}
+            going = takewhile(lambda _: not interrupted(), rows)
+            played = run_in_processes(partial(play, bench), going, workers, variables_for(where))
+            with closing(played) as repeated:
+                for again in repeated:
+                    if FAILED in again:
+                        call.console.print(f"[red]error[/] {again[FAILED]}", soft_wrap=True)
+                        raise typer.Exit(2)
+                    trial = trial_of(again, kind)
+                    found.append(compare(rows[trial], again))
+                    keep(folder, found[-1], asdict(trial))
+                    advance(f"{trial.policy}, seed {trial.seed}")
     call.console.print(console_table("Episodes played again", HEADINGS, table_rows(found)))
-    others = sorted({row["stored_on"] for row in found if row["is_equal"] is None})
-    if others:
-        text = f"Other processor or versions, so that last bits may differ: {'; '.join(others)}. Here: {machine()}."
+    others = sorted({(row["stored_on"], row["machine"]) for row in found if row["is_equal"] is None})
+    for stored_on, here in others:
+        text = f"Other numerics or versions, so that last bits may differ: {stored_on}. Here: {here}."
         call.console.print(text, soft_wrap=True)
     changed = sorted({row["policy"] for row in found if row["is_other_policy"]})
     if changed:

@@ -1,7 +1,7 @@
 """Progress displays of commands: a bar over trials or over a fraction of the work; Ctrl-C stops after the trial."""
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -69,8 +69,9 @@ class TrialSet:
     trials: Sequence[Any]  # All trials, in order
     tell: Callable[[dict[str, Any]], str]  # Short description of a row
     cost: Callable[[Any], int] = lambda trial: 1  # Approximate cost of a trial, in an arbitrary unit
-    workers: int = 1  # Number of parallel processes; 1: this process
+    workers: int = 1  # Number of parallel processes; 1: this process, unless there are variables
     cluster: str | None = None  # Address of a Ray cluster that runs the trials instead; None: this machine
+    variables: Mapping[str, str] | None = None  # Variables of the environment of the processes that run the trials
     failures: list[str] = field(default_factory=list)  # Errors of failed trials, appended as they end
 
 
@@ -107,7 +108,9 @@ def run_trial_sets(
                 advance(part.tell(row), part.cost(trial))
 
             left = [trial for trial in part.trials if trial not in found]
-            run_trials(folder, part.file, part.play, left, part.workers, interrupted, on_trial, part.cluster)
+            run_trials(
+                folder, part.file, part.play, left, part.workers, interrupted, on_trial, part.cluster, part.variables
+            )
     rows = [[found[t] for t in part.trials if t in found] for part, found in zip(parts, kept, strict=True)]
     finished = sum(map(len, rows))
     failed = sum(len(part.failures) for part in parts)

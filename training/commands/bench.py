@@ -229,8 +229,8 @@ def bench_exploration(
     """Compare policies over worlds: coverage, map errors, pose errors and merges, with confidence intervals.
 
     With --plan, the plan of a benchmark fixes all but the policies; --quick then plays two worlds of four families.
-    With --verify, episodes of a finished run are played again: all bits are compared on the same machine, all numbers
-    elsewhere.
+    With --verify, episodes of a finished run are played again: all bits are compared where versions
+    are the same and this processor can do the same, all numbers elsewhere.
 
     All policies of a seed have the same worlds, starts and noise. Options in the plural take comma-separated values;
     all combinations are run. Robots with known poses, landmark names and merges show the cost of estimation.
@@ -238,7 +238,7 @@ def bench_exploration(
     Ctrl-C finishes the current episode; the same command with --out FOLDER resumes the run.
     """
     if verify is not None:
-        verify_rows(call, verify, verified_rows)
+        verify_rows(call, verify, verified_rows, workers)
         return
     if plan is not None or is_plan_run(call):
         run_plan(call, plan, workers, ray)

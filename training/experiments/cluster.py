@@ -4,7 +4,7 @@ import logging
 import signal
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
@@ -19,11 +19,12 @@ class LostWorkerError(ValueError):
 
 
 @contextmanager
-def connected(address: str) -> Iterator[Any]:
+def connected(address: str, variables: Mapping[str, str] | None = None) -> Iterator[Any]:
     """Connect this process to a Ray cluster, whose processes then use one thread each.
 
     Args:
         address: Address of the cluster, see `ray.init`.
+        variables: More variables of the environment of its processes.
 
     Yields:
         The module `ray`.
@@ -36,13 +37,11 @@ def connected(address: str) -> Iterator[Any]:
     except ImportError as error:
         hint = 'Install it: pip install "vslam-env[distributed]".'
         raise argument_error("ray", "an installation of Ray", "none", hint) from error
-    variables = dict.fromkeys(SINGLE_THREAD, "1")
+    settings = {"env_vars": dict.fromkeys(SINGLE_THREAD, "1") | dict(variables or {})}
     try:
         _check_reachable(address)  # Ray itself tries for minutes
         with _sigterm_kept():
-            ray.init(
-                address=address, log_to_driver=False, logging_level=logging.ERROR, runtime_env={"env_vars": variables}
-            )
+            ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, runtime_env=settings)
     except (OSError, ValueError, RuntimeError) as error:
         hint = f"Start one with `ray start --head`. Ray says: {str(error).splitlines()[0]}"
         raise argument_error("ray", "the address of a Ray cluster that runs", address, hint) from error

@@ -78,6 +78,7 @@ def trial_of(row: Mapping[str, Any], kind: type[TrialT]) -> TrialT:
 def run_trials(
     folder: RunFolder, name: str, play: Callable[[TrialT], dict[str, Any]], trials: Iterable[TrialT], workers: int,
     interrupted: Callable[[], bool], on_trial: Callable[[dict[str, Any]], None], cluster: str | None = None,
+    variables: Mapping[str, str] | None = None,
 ) -> None:  # fmt: skip
     """Run trials and append each to the folder as it ends; after an interrupt, running trials are finished.
 
@@ -85,17 +86,20 @@ def run_trials(
 
     Args:
         play: Function that runs a trial and returns its row; importable by other processes.
-        workers: Number of parallel processes; 1: this process.
+        workers: Number of parallel processes; 1: this process, unless there are variables.
         cluster: Address of a Ray cluster that runs the trials instead, see `ray.init`; None: this machine.
+        variables: Variables of the environment of the processes that run the trials.
 
     Raises:
         ValueError: If a row cannot be written, or the cluster cannot be reached; earlier rows are kept.
     """
     going = _until(interrupted, trials)
     if cluster is not None:
-        played = _over_cluster(play, going, cluster)
+        played = _over_cluster(play, going, cluster, variables)
+    elif workers == 1 and not variables:
+        played = _in_turn(play, going)
     else:
-        played = _in_turn(play, going) if workers == 1 else _spread(play, going, workers)
+        played = run_in_processes(play, going, workers, variables)
     with closing(played) as rows:
         for row in rows:
             kept = plain(row)
@@ -120,16 +124,20 @@ def _in_turn(
         yield play(trial)
 
 
-def _spread(
-    play: Callable[[TrialT], dict[str, Any]], trials: Iterable[TrialT], workers: int
-) -> Generator[dict[str, Any], None, None]:
+def run_in_processes(
+    play: Callable[[TrialT], dict[str, Any]], trials: Iterable[TrialT], workers: int,
+    variables: Mapping[str, str] | None = None,
+) -> Generator[dict[str, Any], None, None]:  # fmt: skip
     """Run trials in several processes with one thread each, and yield their rows as they end.
 
     If the consumer stops early, the processes are killed.
+
+    Args:
+        variables: More variables of their environment.
     """
     context = get_context("spawn")
     others = set(active_children())
-    with one_thread_each(), ProcessPoolExecutor(workers, mp_context=context, initializer=begin_worker) as pool:
+    with one_thread_each(variables), ProcessPoolExecutor(workers, mp_context=context, initializer=begin_worker) as pool:
         try:
             running: set[Future[dict[str, Any]]] = set()
             for trial in trials:
@@ -147,13 +155,14 @@ def _spread(
 
 
 def _over_cluster(
-    play: Callable[[TrialT], dict[str, Any]], trials: Iterable[TrialT], address: str
-) -> Generator[dict[str, Any], None, None]:
+    play: Callable[[TrialT], dict[str, Any]], trials: Iterable[TrialT], address: str,
+    variables: Mapping[str, str] | None,
+) -> Generator[dict[str, Any], None, None]:  # fmt: skip
     """Run trials on a Ray cluster, one per core, and yield their rows as they end.
 
     A trial whose process or node is lost is run again elsewhere.
     """
-    with connected(address) as ray:
+    with connected(address, variables) as ray:
         task: Any = ray.remote(num_cpus=1, max_retries=-1)(_play_one)
         shared: Any = ray.put(play)
         running: list[Any] = []
@@ -177,10 +186,15 @@ def _play_one(play: Callable[[TrialT], dict[str, Any]], trial: TrialT) -> dict[s
 
 
 @contextmanager
-def one_thread_each() -> Iterator[None]:
-    """Limit the libraries of started processes to one thread each, because processes already use all cores."""
-    before = {name: os.environ.get(name) for name in SINGLE_THREAD}
-    os.environ |= dict.fromkeys(SINGLE_THREAD, "1")
+def one_thread_each(variables: Mapping[str, str] | None = None) -> Iterator[None]:
+    """Limit the libraries of started processes to one thread each, because processes already use all cores.
+
+    Args:
+        variables: More variables of their environment.
+    """
+    changed = dict.fromkeys(SINGLE_THREAD, "1") | dict(variables or {})
+    before = {name: os.environ.get(name) for name in changed}
+    os.environ |= changed
     try:
         yield
     finally:

@@ -110,8 +110,8 @@ def leaderboard(results: Sequence[Results], figure: str) -> str:
     return "\n".join([
         "# Leaderboard of exploration policies\n", ABOUT, f"![{PICTURE}]({figure})\n",
         markdown(results[0].plan, rows, ()), "### Verification\n",
-        "Episodes of each policy that were played again at the last verification: all bits are compared on the same "
-        "processor and versions, all results up to a ten-thousandth elsewhere.\n",
+        "Episodes of each policy that were played again at the last verification: all bits are compared where "
+        "versions are the same and the processor can do the same, all results up to a ten-thousandth elsewhere.\n",
         markdown_table(headings, shown), f"Played on: {'; '.join(machines)}.\n",
     ])  # fmt: skip
 

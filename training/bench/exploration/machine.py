@@ -1,19 +1,16 @@
-"""What the last bits of results depend on: processor, Python and packages."""
+"""What the last bits of results depend on: numerical libraries, Python and packages."""
 
-import hashlib
 import platform
 from functools import cache
 from importlib.metadata import version
+
+from training.experiments.numerics import numerics
 
 PACKAGES = ("vslam-env", "numpy", "scipy", "numba", "llvmlite", "opencv-python-headless", "pymunk")
 
 
 @cache
 def machine() -> str:
-    """Return processor, Python and package versions as one text; where it is the same, episodes repeat bit for bit."""
-    import llvmlite.binding
-
-    features = hashlib.sha256(llvmlite.binding.get_host_cpu_features().flatten().encode()).hexdigest()[:8]
-    processor = f"{llvmlite.binding.get_host_cpu_name()}/{features}"
+    """Return numerics, Python and package versions as one text; where it is the same, episodes repeat bit for bit."""
     packages = (f"{name} {version(name)}" for name in PACKAGES)
-    return ", ".join([processor, f"python {platform.python_version()}", *packages])
+    return ", ".join([numerics(), f"python {platform.python_version()}", *packages])

@@ -1,4 +1,4 @@
-"""Repetition of finished episodes: the same bits on the same machine, the same numbers up to rounding elsewhere."""
+"""Repetition of finished episodes: the same bits with the same numerics, the same numbers up to rounding elsewhere."""
 
 import datetime
 import json
@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from slam_backend.core.files import append_text
-from training.bench.exploration.machine import machine
 from training.bench.exploration.report import label
 from training.experiments.statistics import format_ci, grouped, mean_ci
 
@@ -18,7 +17,7 @@ VERIFIED_FILE = "verified.jsonl"
 Rows = Sequence[Mapping[str, Any]]
 OUTCOMES = ("all bits equal", "all numbers equal", "different")
 HEADINGS = ("policy", "played again", *OUTCOMES, "E [cm], again minus stored")
-CLOSE = 1e-4  # relative difference up to which numbers count as equal on another machine
+CLOSE = 1e-4  # relative difference up to which numbers count as equal where last bits may differ
 CLOSE_TO_ZERO = 1e-7  # absolute one
 NOT_COMPARED = ("digest", "policy_digest", "machine", "decision_ms", "decision_p99_ms", "curves")
 
@@ -34,16 +33,16 @@ def choose(rows: Rows, count: int, rng: np.random.Generator) -> list[Mapping[str
 def compare(stored: Mapping[str, Any], again: Mapping[str, Any]) -> dict[str, Any]:
     """Return a stored row's comparison with its repetition.
 
-    `is_equal` is None where processor or versions differ, so that last bits may, too; `is_close` tells whether all
+    `is_equal` is None where numerics or versions differ, so that last bits may, too; `is_close` tells whether all
     results are the same there, numbers up to `CLOSE`.
     """
-    comparable = stored["machine"] == machine()
+    comparable = stored["machine"] == again["machine"]
     return {
         "policy": stored["policy"], "is_equal": stored["digest"] == again["digest"] if comparable else None,
         "is_close": all(_close(value, again[name]) for name, value in stored.items() if name not in NOT_COMPARED),
         "is_other_policy": (stored["policy_digest"] or "") != again["policy_digest"],
-        "digest": stored["digest"], "again": again["digest"], "machine": machine(), "stored_on": stored["machine"],
-        "map_error": stored["map_error"], "map_error_again": again["map_error"],
+        "digest": stored["digest"], "again": again["digest"], "machine": again["machine"],
+        "stored_on": stored["machine"], "map_error": stored["map_error"], "map_error_again": again["map_error"],
     }  # fmt: skip
 
 
@@ -54,7 +53,7 @@ def keep(folder: Path, comparison: Mapping[str, Any], trial: Mapping[str, Any]) 
 
 
 def outcome_counts(comparisons: Rows) -> list[int]:
-    """Return the numbers of comparisons with each of `OUTCOMES`: the second is found on other machines only."""
+    """Return the numbers of comparisons with each of `OUTCOMES`: the second is found where last bits may differ."""
     found = [OUTCOMES[_outcome(row)] for row in comparisons]
     return [found.count(outcome) for outcome in OUTCOMES]
 
