@@ -2,6 +2,7 @@
 
 python benchmarks/moving_picture.py                  # docs/figures/episode.webp, about a minute
 python benchmarks/moving_picture.py --seed 1 --out other.webp
+python benchmarks/moving_picture.py --policy learned --beside next_best_view --out both.webp   # the same world twice
 """
 
 import argparse
@@ -36,9 +37,20 @@ def film(config: RunConfig) -> list[Image.Image]:
     return frames
 
 
+def side_by_side(left: list[Image.Image], right: list[Image.Image]) -> list[Image.Image]:
+    """Return the frames of two episodes beside each other; the last frame of the shorter one stays."""
+    both = []
+    for k in range(max(len(left), len(right))):
+        pair = [frames[min(k, len(frames) - 1)] for frames in (left, right)]
+        both.append(Image.new("RGB", (sum(frame.width for frame in pair), pair[0].height)))
+        both[-1].paste(pair[0], (0, 0))
+        both[-1].paste(pair[1], (pair[0].width, 0))
+    return both
+
+
 def with_few_colours(frames: list[Image.Image]) -> list[Image.Image]:
     """Return frames in the colours that suit all of them best."""
-    width, height = SIZE
+    width, height = frames[0].size
     some = frames[:: max(1, len(frames) // 10)]
     sheet = Image.new("RGB", (width, height * len(some)))
     for row, frame in enumerate(some):
@@ -52,12 +64,23 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=ROOT / "docs" / "figures" / "episode.webp")
     parser.add_argument("--world", default="office")
+    parser.add_argument("--world-split", choices=("train", "validation", "test"))
     parser.add_argument("--policy", default="frontier")
+    parser.add_argument("--beside", metavar="POLICY", help="second policy, in the same world")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--max-seconds", type=float, default=120.0)
     options = parser.parse_args()
-    config = RunConfig(world=options.world, policy=options.policy, seed=options.seed, max_seconds=options.max_seconds)
-    frames = with_few_colours(film(config))
+    episodes = [
+        film(
+            RunConfig(
+                world=options.world, world_split=options.world_split, policy=policy, seed=options.seed,
+                max_seconds=options.max_seconds,
+            )
+        )
+        for policy in (options.policy, options.beside)
+        if policy is not None
+    ]  # fmt: skip
+    frames = with_few_colours(episodes[0] if len(episodes) == 1 else side_by_side(*episodes))
     durations = [round(1e3 / FPS)] * (len(frames) - 1) + [round(1e3 * LINGER)]
     frames[0].save(
         options.out, save_all=True, append_images=frames[1:], duration=durations, loop=0, lossless=True, quality=80,

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from benchmarks.moving_picture import COLOURS, ROOT, SIZE, film, with_few_colours
+from benchmarks.moving_picture import COLOURS, ROOT, SIZE, film, side_by_side, with_few_colours
 from training.episodes.config import RunConfig
 
 
@@ -16,6 +16,16 @@ def test_an_episode_is_filmed_in_few_colours() -> None:
     assert {frame.size for frame in frames} == {SIZE}
     colours = {colour for frame in frames for _, colour in frame.getcolors(COLOURS)}
     assert 8 < len(colours) <= COLOURS
+
+
+def test_two_episodes_are_shown_side_by_side() -> None:
+    """The last frame of the shorter episode stays until the other one ends."""
+    left = [Image.new("RGB", (3, 2), (k, 0, 0)) for k in range(2)]
+    right = [Image.new("RGB", (3, 2), (0, k, 0)) for k in range(4)]
+    both = side_by_side(left, right)
+    assert [frame.size for frame in both] == [(6, 2)] * 4
+    assert [frame.getpixel((0, 0)) for frame in both] == [(min(k, 1), 0, 0) for k in range(4)]
+    assert [frame.getpixel((5, 1)) for frame in both] == [(0, k, 0) for k in range(4)]
 
 
 def test_the_picture_of_the_readme_moves_and_is_small() -> None:
