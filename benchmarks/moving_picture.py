@@ -67,6 +67,7 @@ def main() -> None:
     parser.add_argument("--world-split", choices=("train", "validation", "test"))
     parser.add_argument("--policy", default="frontier")
     parser.add_argument("--beside", metavar="POLICY", help="second policy, in the same world")
+    parser.add_argument("--action-type", choices=("continuous", "discrete", "goal"), default="continuous")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--max-seconds", type=float, default=120.0)
     options = parser.parse_args()
@@ -74,7 +75,7 @@ def main() -> None:
         film(
             RunConfig(
                 world=options.world, world_split=options.world_split, policy=policy, seed=options.seed,
-                max_seconds=options.max_seconds,
+                max_seconds=options.max_seconds, action_type=options.action_type,
             )
         )
         for policy in (options.policy, options.beside)
