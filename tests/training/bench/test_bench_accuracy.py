@@ -212,11 +212,11 @@ def test_a_folder_accepts_one_configuration(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_results_do_not_depend_on_processes(tmp_path: Path, rows: list[dict[str, Any]]) -> None:
-    """Two processes give the results of one: exactly for the filter, to 1e-9 for batch maximum likelihood.
+    """Two processes give the results of one: exactly for the filter, to 1e-7 for batch maximum likelihood.
 
-    The linear algebra of the latter uses a BLAS, whose sums depend on its number of threads, and the processes of a
-    benchmark have one thread each. The only matrix product in a run of the filter is with the camera's axes, a signed
-    permutation, which is exact in any order.
+    The linear algebra of the latter uses a BLAS, whose sums depend on its number of threads and on the processor, and
+    the processes of a benchmark have one thread each; the descent ends within its tolerance. The only matrix product in
+    a run of the filter is with the camera's axes, a signed permutation, which is exact in any order.
     """
     few = [trial for trial in SMALL.trials() if trial.method in ("batch_ml", "fastslam2")]
     done: list[dict[str, Any]] = []
@@ -225,7 +225,7 @@ def test_results_do_not_depend_on_processes(tmp_path: Path, rows: list[dict[str,
     assert len(done) == len(few)
     for row in done:
         alone = expected[row["seed"], row["method"], row["particles"]]
-        assert row["pose_rms_m"] == (pytest.approx(alone, rel=1e-9) if row["method"] == "batch_ml" else alone)
+        assert row["pose_rms_m"] == (pytest.approx(alone, rel=1e-7) if row["method"] == "batch_ml" else alone)
 
 
 def test_tables_and_figure(tmp_path: Path, rows: list[dict[str, Any]]) -> None:
