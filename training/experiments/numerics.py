@@ -1,8 +1,8 @@
 """What the last bits of results depend on beside versions: vector instructions of NumPy, kernels of OpenBLAS, libm.
 
-All three choose code by the processor. Compiled kernels do not matter: numba neither reorders nor contracts sums. The
-first two choices can be made otherwise by variables of the environment, so that a process on a newer processor gives
-the bits of an older one.
+All three choose code by the processor. Compiled kernels were not seen to matter: no sum is reordered, and lane kernels
+fuse the same products and sums on all processors that can. The first two choices can be made otherwise by variables of
+the environment, so that a process on a newer processor gives the bits of an older one.
 """
 
 import platform
