@@ -27,6 +27,7 @@ def make_vec_env(
     reward: RewardSpec | None = None,
     cluster: str | None = None,
     monitor: bool = True,
+    wrap: Callable[[Any], Any] | None = None,
 ) -> "ExplorationVecEnv | VecMonitor":
     """Make environments of one configuration, or of several.
 
@@ -42,6 +43,7 @@ def make_vec_env(
             most one per environment. None: this machine.
         monitor: Whether a `VecMonitor`, which has the attributes of the environments, too, records return and length of
             episodes for the logs of learners.
+        wrap: Function that wraps each parallel environment; cloudpickle must support it. None: they stay as they are.
 
     Raises:
         ValueError: If a number is out of range, or the cluster cannot be used.
@@ -51,7 +53,9 @@ def make_vec_env(
     if not configs:
         raise argument_error("config", "at least one configuration", configs, "Give an EnvConfig.")
     make = partial(vslam_v0.parallel_env, render_mode=render_mode, reward=reward)
-    makers = [partial(make, config=configs[i % len(configs)]) for i in range(num_envs)]
+    makers: list[MakeEnv] = [partial(make, config=configs[i % len(configs)]) for i in range(num_envs)]
+    if wrap is not None:
+        makers = [partial(_wrapped, maker, wrap) for maker in makers]
     load = partial(load_kernels, configs[0])
     if workers > 0 and cluster is None:
         prepare(load)  # compiles once, with a message; workers then load from the cache
@@ -59,6 +63,10 @@ def make_vec_env(
     if seed is not None:
         env.seed(seed)
     return VecMonitor(env) if monitor else env
+
+
+def _wrapped(make: MakeEnv, wrap: Callable[[Any], Any]) -> Any:
+    return wrap(make())
 
 
 def load_kernels(config: EnvConfig) -> None:

@@ -4,8 +4,11 @@ The penalty is the Kullback-Leibler divergence from the start policy to the curr
 PreTraining (VPT): learning to act by watching unlabeled online videos", NeurIPS 2022.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from copy import deepcopy
+from functools import partial
+from threading import Event
 from typing import Any
 
 import numpy as np
@@ -14,20 +17,51 @@ from sb3_contrib import MaskablePPO
 from stable_baselines3.common.utils import explained_variance
 from torch.nn.functional import mse_loss
 
-from agents.goal_network import Weights
+from agents.goal_network import SHAPES, Weights
+from slam_backend.core.validation import IntArray
 from training.rl.network import GoalPolicy
+from training.rl.true_state import STATE
+
+USED = (*SHAPES, STATE)  # observations of actor and critic
+
+
+class Update:
+    """Call of a function in a thread of its own, with as many threads of torch as the caller has.
+
+    Args:
+        function: Function that ends early when its argument, an event, is set.
+    """
+
+    def __init__(self, function: Callable[[Event], dict[str, float]]) -> None:
+        self._stops = Event()
+        pool = ThreadPoolExecutor(1, "update", torch.set_num_threads, (torch.get_num_threads(),))
+        self._future = pool.submit(function, self._stops)
+        pool.shutdown(wait=False)
+
+    def result(self) -> dict[str, float]:
+        """Wait for the end, and return the result or raise the error."""
+        return self._future.result()
+
+    def cancel(self) -> None:
+        """Let the function end early, and wait for it."""
+        self._stops.set()
+        self._future.exception()
 
 
 class GoalPPO(MaskablePPO):  # type: ignore[misc]   # its types are not checked
     """PPO with masks for a `GoalPolicy`, with an optional anchor to the policy of the start model.
 
-    Without a start model the updates are those of MaskablePPO. Clipping of values and a target of the KL divergence are
-    not supported.
+    Without a start model an update is that of MaskablePPO. It runs while the next rollout is played, which is played by
+    the policy before it; the probability ratios of PPO take this into account. Clipping of values and a target of the
+    KL divergence are not supported.
 
     Args:
         anchor: Weight of the penalty KL(start || policy) [1/nat], a mean over the decisions of a minibatch.
         value_rollouts: Number of first rollouts that train the value head alone; its weights are random at first.
         arguments: Arguments of MaskablePPO.
+
+    Attributes:
+        trained: Policy with the weights of all finished updates; `policy` plays.
     """
 
     policy: GoalPolicy
@@ -35,41 +69,96 @@ class GoalPPO(MaskablePPO):  # type: ignore[misc]   # its types are not checked
     def __init__(self, *, anchor: float = 0.0, value_rollouts: int = 0, **arguments: Any) -> None:
         super().__init__(GoalPolicy, **arguments)
         self._anchor, self._value_rollouts = anchor, value_rollouts
+        self.trained = deepcopy(self.policy)
         self._start: GoalPolicy | None = None
+        self._update: Update | None = None
 
     def start_from(self, weights: Weights) -> None:
         """Begin with the actor of a model, and keep its policy for the penalty."""
         self.policy.load_actor(weights)
+        self.trained.load_actor(weights)
         if self._anchor:
             self._start = deepcopy(self.policy).requires_grad_(False)
 
-    def start_state(self) -> dict[str, Any] | None:
-        """Return the state dict of the start policy; None without an anchor."""
-        return None if self._start is None else dict(self._start.state_dict())
+    def get_state(self) -> dict[str, Any]:
+        """Return weights and optimiser, once the update that is running has ended."""
+        self.finish_update()
+        return {
+            "playing": self.policy.state_dict(), "trained": self.trained.state_dict(),
+            "optimizer": self.trained.optimizer.state_dict(),
+            "start": None if self._start is None else self._start.state_dict(),
+        }  # fmt: skip
 
-    def set_start_state(self, state: Mapping[str, Any] | None) -> None:
-        """Restore the start policy of `start_state`.
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Restore a state of `get_state`.
 
         Raises:
-            RuntimeError: If there is a start policy in one of the two only, or it has other layers.
+            RuntimeError: If it has other layers, or there is a start policy in one of the two only.
         """
-        if (self._start is None) != (state is None):
+        if (self._start is None) != (state["start"] is None):
             raise RuntimeError("the start policy is missing, or not expected")
+        self.policy.load_state_dict(state["playing"])
+        self.trained.load_state_dict(state["trained"])
+        self.trained.optimizer.load_state_dict(state["optimizer"])
         if self._start is not None:
-            self._start.load_state_dict(state)
+            self._start.load_state_dict(state["start"])
+
+    def learn(self, *arguments: Any, **named: Any) -> "GoalPPO":
+        """Learn as MaskablePPO does; at the end the policy has all updates."""
+        super().learn(*arguments, **named)
+        self.finish_update()
+        self._take_over()
+        return self
 
     def train(self) -> None:
-        """Update actor and critic with the decisions of the last rollout."""
-        policy, optimizer = self.policy, self.policy.optimizer
-        policy.set_training_mode(True)
-        self._update_learning_rate(optimizer)
+        """Start the update of actor and critic with the decisions of the last rollout.
+
+        The next rollout is played meanwhile, by the policy before this update. The update draws from numpy's
+        generator and the rollout from torch's, so that neither depends on which is faster.
+        """
+        self.finish_update()
+        self._take_over()
+        self._update_learning_rate(self.trained.optimizer)
+        rounds = [np.random.permutation(self.n_steps * self.n_envs) for _ in range(self.n_epochs)]  # noqa: NPY002
         clip = self.clip_range(self._current_progress_remaining)
         trains_actor = self.num_timesteps > self._value_rollouts * self.n_steps * self.n_envs
-        data = self._decisions()
+        self._update = Update(partial(self._train, self._decisions(), rounds, clip, trains_actor))
+        values, returns = self.rollout_buffer.values.flatten(), self.rollout_buffer.returns.flatten()
+        self.logger.record("train/explained_variance", explained_variance(values, returns))
+        self._n_updates += self.n_epochs
+
+    def finish_update(self) -> None:
+        """Wait for the update that is running, and record its figures."""
+        if self._update is not None:
+            figures, self._update = self._update.result(), None
+            for name, value in figures.items():
+                self.logger.record(f"train/{name}", value)
+
+    def close(self) -> None:
+        """End the update that is running, after its current minibatch, and discard it."""
+        if self._update is not None:
+            self._update.cancel()
+            self._update = None
+
+    # ------------------------------------------------------------------ within
+
+    def _take_over(self) -> None:
+        """Let the policy that plays have the trained weights."""
+        self.policy.load_state_dict(self.trained.state_dict())
+
+    def _train(
+        self, data: dict[str, Any], rounds: Sequence[IntArray], clip: float, trains_actor: bool, stops: Event
+    ) -> dict[str, float]:
+        """Update the trained policy with decisions (n, ...), in the order (n,) of each round; return mean figures."""
+        policy, optimizer = self.trained, self.trained.optimizer
+        policy.set_training_mode(True)
+        if self._start is not None:
+            data["start_log_probs"] = self._start_log_probs(data)
         figures: dict[str, list[Any]] = {}
-        for _ in range(self.n_epochs):
-            order = np.random.permutation(len(data["actions"]))  # noqa: NPY002   # the learner uses the global generator
+        for order in rounds:
             for rows in torch.from_numpy(order).to(self.device).split(self.batch_size):
+                if stops.is_set():
+                    return {}
                 batch = {name: values[rows] for name, values in data.items()}
                 terms = self._losses(batch, clip, trains_actor)
                 optimizer.zero_grad()
@@ -78,33 +167,34 @@ class GoalPPO(MaskablePPO):  # type: ignore[misc]   # its types are not checked
                 optimizer.step()
                 for name, value in terms.items():
                     figures.setdefault(name, []).append(value.detach())
-            self._n_updates += 1
-        for name, values in figures.items():
-            self.logger.record(f"train/{name}", float(torch.stack(values).mean()))
-        values, returns = self.rollout_buffer.values.flatten(), self.rollout_buffer.returns.flatten()
-        self.logger.record("train/explained_variance", explained_variance(values, returns))
+        return {name: float(torch.stack(values).mean()) for name, values in figures.items()}
 
     def _decisions(self) -> dict[str, Any]:
         """Return the rollout as tensors with a row for each decision (n, ...); observations by their names."""
         buffer = self.rollout_buffer
         named = {"old_log_probs": buffer.log_probs, "advantages": buffer.advantages, "returns": buffer.returns}
+        observed = {name: array for name, array in buffer.observations.items() if name in USED}
         found = {
             name: torch.as_tensor(buffer.swap_and_flatten(array), device=self.device)
-            for name, array in (buffer.observations | named | {"actions": buffer.actions}).items()
+            for name, array in (observed | named | {"actions": buffer.actions}).items()
         }
         found |= {name: found[name].flatten() for name in named}
         found["actions"] = found["actions"].long()
-        if self._start is not None:
-            parts = []
-            with torch.no_grad():
-                for rows in torch.arange(len(found["actions"]), device=self.device).split(self.batch_size):
-                    parts.append(self._start.evaluate({name: found[name][rows] for name in buffer.observations})[1])
-            found["start_log_probs"] = torch.cat(parts)
         return found
+
+    def _start_log_probs(self, data: Mapping[str, Any]) -> Any:
+        """Return the log probabilities (n, 1 + C) of the start policy."""
+        assert self._start is not None
+        observed = {name: values for name, values in data.items() if name in USED}
+        parts = []
+        with torch.no_grad():
+            for rows in torch.arange(len(data["actions"]), device=self.device).split(self.batch_size):
+                parts.append(self._start.evaluate({name: values[rows] for name, values in observed.items()})[1])
+        return torch.cat(parts)
 
     def _losses(self, batch: Mapping[str, Any], clip: float, trains_actor: bool) -> dict[str, Any]:
         """Return `loss`, its terms and what describes the update, each a mean over a minibatch."""
-        values, log_probs = self.policy.evaluate(batch, trains_actor)
+        values, log_probs = self.trained.evaluate(batch, trains_actor)
         value_loss = mse_loss(batch["returns"], values)
         if not trains_actor:
             return {"loss": self.vf_coef * value_loss, "value_loss": value_loss}

@@ -1,4 +1,8 @@
-"""`GoalPolicy`: torch version of `agents.goal_network` with a value head, for MaskablePPO and for imitation."""
+"""`GoalPolicy`: torch version of `agents.goal_network` with a value head, for MaskablePPO and for imitation.
+
+The actor uses what a robot observes. Where observations have the true state (`training.rl.true_state`), the value head
+uses it as well (Pinto et al., "Asymmetric actor critic for image-based robot learning", RSS 2018).
+"""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -26,9 +30,11 @@ from agents.goal_network import (
     WIDTH,
     Weights,
 )
+from training.rl.true_state import STATE
 
 GROUP = 60  # observations that attention pads to the same number of tokens
 NUM_SLOTS, NUM_FEATURES = SHAPES["candidates"]
+KEPT = (1 + NUM_SLOTS) * WIDTH + NUM_SLOTS  # features without the true state
 
 
 class Group(NamedTuple):
@@ -78,10 +84,10 @@ def _attend(mixed: Any, group: Group) -> Any:
 
 
 class GoalFeatures(BaseFeaturesExtractor):  # type: ignore[misc]
-    """Tokens of the robot and of its candidates after attention, and the mask of valid candidates."""
+    """Tokens of the robot and of its candidates after attention, the mask of valid candidates, and the true state."""
 
     def __init__(self, observation_space: Any) -> None:
-        super().__init__(observation_space, (1 + NUM_SLOTS) * WIDTH + NUM_SLOTS)
+        super().__init__(observation_space, KEPT + _state_size(observation_space))
         first, second = PATCHES
         self.picture = nn.Sequential(
             nn.Conv2d(3, CHANNELS[0], first, first), nn.ReLU(), nn.Conv2d(CHANNELS[0], CHANNELS[1], second, second),
@@ -97,7 +103,7 @@ class GoalFeatures(BaseFeaturesExtractor):  # type: ignore[misc]
             self.register_buffer(f"{name}_scale", torch.tensor(scale), persistent=False)
 
     def forward(self, observations: dict[str, Any]) -> Any:
-        """Return (n, (1 + C) x WIDTH + C): token of the robot, tokens of the candidates (0 if invalid), mask."""
+        """Return (n, (1 + C) x WIDTH + C + S): tokens of robot and candidates (0 if invalid), mask, true state."""
         picture = self.picture(observations["local_grid"]).flatten(1)
         vectors = [(observations[name] * getattr(self, f"{name}_scale")).flatten(1) for name in VECTORS]
         robot = self.robot(torch.cat([picture, *vectors], dim=1)).unsqueeze(1)
@@ -114,21 +120,32 @@ class GoalFeatures(BaseFeaturesExtractor):  # type: ignore[misc]
             tokens = layer(tokens, groups)
         final = tokens.new_zeros(present.numel(), WIDTH).index_copy(0, places, self.last_norm(tokens))
         final = final.view(*present.shape, WIDTH)
-        return torch.cat([final[:, : 1 + NUM_SLOTS].flatten(1), valid], dim=1)
+        truth = [observations[STATE]] if STATE in observations else []
+        return torch.cat([final[:, : 1 + NUM_SLOTS].flatten(1), valid, *truth], dim=1)
+
+
+def _state_size(space: Any) -> int:
+    """Return S, the length of the true state in the observations; 0 if they have none."""
+    return int(space[STATE].shape[0]) if STATE in space.spaces else 0
 
 
 class SlotPointer(nn.Module):  # type: ignore[misc]
-    """Logits of the candidates by a pointer from the robot; the value uses the mean of the valid candidates."""
+    """Logits of the candidates by a pointer from the robot; the value uses the mean of the valid candidates.
+
+    Args:
+        state_size: S, the length of the true state, which the value uses as well; 0: there is none.
+    """
 
     latent_dim_pi = 1 + NUM_SLOTS
     latent_dim_vf = WIDTH
 
-    def __init__(self) -> None:
+    def __init__(self, state_size: int) -> None:
         super().__init__()
+        self.value_state = nn.Linear(state_size, WIDTH) if state_size else None
         self.query = nn.Linear(WIDTH, WIDTH)
         self.key = nn.Linear(WIDTH, WIDTH)
         self.stay = nn.Linear(WIDTH, 1)
-        self.value_hidden = nn.Linear(2 * WIDTH, WIDTH)
+        self.value_hidden = nn.Linear((2 + (state_size > 0)) * WIDTH, WIDTH)
 
     def forward(self, features: Any) -> tuple[Any, Any]:
         """Return logits (n, 1 + C) and features of the value head (n, WIDTH)."""
@@ -136,20 +153,22 @@ class SlotPointer(nn.Module):  # type: ignore[misc]
 
     def forward_actor(self, features: Any) -> Any:
         """Return the logits only."""
-        robot, slots, valid = _split(features)
+        robot, slots, valid, _ = _split(features)
         scores = (self.key(slots) @ self.query(robot).unsqueeze(2)).squeeze(2) / WIDTH**0.5
         return torch.cat([self.stay(robot), scores.masked_fill(valid == 0, INVALID)], dim=1)
 
     def forward_critic(self, features: Any) -> Any:
         """Return the features of the value head only."""
-        robot, slots, valid = _split(features)
+        robot, slots, valid, state = _split(features)
         mean = slots.sum(1) / valid.sum(1, keepdim=True).clamp(min=1.0)  # invalid slots are 0
-        return torch.tanh(self.value_hidden(torch.cat([robot, mean], dim=1)))
+        truth = [] if self.value_state is None else [torch.relu(self.value_state(state))]
+        return torch.tanh(self.value_hidden(torch.cat([robot, mean, *truth], dim=1)))
 
 
-def _split(features: Any) -> tuple[Any, Any, Any]:
-    robot, slots, valid = features.split([WIDTH, NUM_SLOTS * WIDTH, NUM_SLOTS], dim=1)
-    return robot, slots.unflatten(1, (NUM_SLOTS, WIDTH)), valid
+def _split(features: Any) -> tuple[Any, Any, Any, Any]:
+    sizes = [WIDTH, NUM_SLOTS * WIDTH, NUM_SLOTS, features.shape[1] - KEPT]
+    robot, slots, valid, state = features.split(sizes, dim=1)
+    return robot, slots.unflatten(1, (NUM_SLOTS, WIDTH)), valid, state
 
 
 class GoalPolicy(MaskableMultiInputActorCriticPolicy):  # type: ignore[misc]
@@ -160,7 +179,7 @@ class GoalPolicy(MaskableMultiInputActorCriticPolicy):  # type: ignore[misc]
 
     def _build(self, lr_schedule: Any) -> None:
         """Make the layers and the optimiser; the pointer's outputs already are the logits."""
-        self.mlp_extractor = SlotPointer()
+        self.mlp_extractor = SlotPointer(_state_size(self.observation_space))
         self.action_net = nn.Identity()
         self.value_net = nn.Linear(WIDTH, 1)
         for module in (self.features_extractor, self.mlp_extractor):
@@ -181,7 +200,8 @@ class GoalPolicy(MaskableMultiInputActorCriticPolicy):  # type: ignore[misc]
             observations: Tensors (n, ...) by name, as the environment returns them; other names are ignored.
             trains_actor: Whether gradients reach the layers that the actor uses; otherwise the value head's alone.
         """
-        inputs = {name: observations[name] for name in SHAPES} | {"local_grid": observations["local_grid"] / 255.0}
+        inputs = {name: observations[name] for name in (*SHAPES, STATE) if name in observations}
+        inputs["local_grid"] = observations["local_grid"] / 255.0
         with torch.set_grad_enabled(trains_actor and torch.is_grad_enabled()):
             features = self.features_extractor(inputs)
             scores = self.mlp_extractor.forward_actor(features)
@@ -205,6 +225,6 @@ def actor_part(state: Mapping[str, Any]) -> dict[str, NDArray[np.float32]]:
     found: dict[str, NDArray[np.float32]] = {}
     for name, values in state.items():
         part, _, layer = name.partition(".")
-        if part in ("features_extractor", "mlp_extractor") and not layer.startswith("value_hidden"):
+        if part in ("features_extractor", "mlp_extractor") and not layer.startswith("value_"):
             found[layer] = np.array(values, np.float32)
     return found

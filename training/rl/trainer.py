@@ -17,6 +17,7 @@ from training.rl.callbacks import Row, TrainingCallback
 from training.rl.checkpoint import CHECKPOINT_FILE, read_checkpoint, write_checkpoint
 from training.rl.config import SPLIT_TRAIN, SPLIT_TRY, TrainConfig
 from training.rl.learner import GoalPPO
+from training.rl.true_state import WithTrueState
 from training.vec_env import make_vec_env
 
 BOARD = "tensorboard"
@@ -49,8 +50,9 @@ class Training:
         torch.set_num_threads(1)
         self.config, self._folder = config, folder
         self.env = make_vec_env(
-            config.make_env_configs(SPLIT_TRAIN), config.envs, workers, cluster=cluster, monitor=False
-        )
+            config.make_env_configs(SPLIT_TRAIN), config.envs, workers, cluster=cluster, monitor=False,
+            wrap=WithTrueState,
+        )  # fmt: skip
         self.model = GoalPPO(
             env=self.env, learning_rate=lambda left: left * config.learning_rate, n_steps=config.max_cycles,
             batch_size=config.batch, n_epochs=config.epochs, gamma=config.gamma, gae_lambda=config.gae_lambda,
@@ -87,9 +89,7 @@ class Training:
         content = {
             "config": self.config.to_mapping(),
             "seed": self.config.seed,
-            "policy": as_arrays(model.policy.state_dict()),
-            "optimizer": as_arrays(model.policy.optimizer.state_dict()),
-            "start": as_arrays(model.start_state()),
+            "learner": as_arrays(model.get_state()),
             "counts": (model.num_timesteps, model._n_updates, model._current_progress_remaining),
             "last": (model._last_obs, model._last_episode_starts),
             "environments": self.env.get_state(),
@@ -111,7 +111,7 @@ class Training:
             "environment": self.config.make_env_config(SPLIT_TRY).to_toml(), "steps": int(self.model.num_timesteps),
             "seed": self.config.seed, "config": self.config.to_mapping(),
         }  # fmt: skip
-        save_model(file, self.model.policy.actor_weights(), about)
+        save_model(file, self.model.trained.actor_weights(), about)
 
     def restore(self, kept: Mapping[str, Any]) -> None:
         """Resume from a checkpoint of `stored_checkpoint`.
@@ -128,9 +128,7 @@ class Training:
     def _go_on_from(self, kept: Mapping[str, Any]) -> None:
         """Load the parts of a checkpoint."""
         model, draws = self.model, kept["draws"]
-        model.policy.load_state_dict(as_tensors(kept["policy"]))
-        model.policy.optimizer.load_state_dict(as_tensors(kept["optimizer"]))
-        model.set_start_state(as_tensors(kept["start"]))
+        model.set_state(as_tensors(kept["learner"]))
         model.num_timesteps, model._n_updates, model._current_progress_remaining = kept["counts"]
         model._last_obs, model._last_episode_starts = kept["last"]
         self.env.set_state(kept["environments"])
@@ -143,7 +141,8 @@ class Training:
             torch.cuda.set_rng_state_all(as_tensors(draws["cuda"]))
 
     def close(self) -> None:
-        """Close the environments and their processes."""
+        """Close the environments and their processes, and end an update that is running."""
+        self.model.close()
         self.env.close()
 
 

@@ -57,12 +57,29 @@ def _largest_difference(ours: dict[str, Any], theirs: dict[str, Any]) -> float:
     return max(float(np.abs(ours[name] - theirs[name]).max()) for name in ours)
 
 
-def test_without_anchor_updates_are_those_of_maskable_ppo() -> None:
-    """Weights after several updates equal those of sb3-contrib, but for rounding."""
+class _DelayedPPO(MaskablePPO):
+    """MaskablePPO that plays each rollout with the policy before the last update, all in one thread."""
+
+    latest: Any = None
+
+    def train(self) -> None:
+        if self.latest is not None:
+            self.policy.load_state_dict(self.latest)
+        before = deepcopy(self.policy.state_dict())
+        super().train()
+        self.latest = deepcopy(self.policy.state_dict())
+        self.policy.load_state_dict(before)
+
+
+@pytest.mark.parametrize(("plain", "decisions"), [(MaskablePPO, 100), (_DelayedPPO, 400)])
+def test_without_anchor_updates_are_those_of_maskable_ppo(plain: type[MaskablePPO], decisions: int) -> None:
+    """The first update equals that of sb3-contrib, but for rounding; later ones, if it plays with the policy before."""
     ours = _learner()
     begin = _weights(ours.policy)
-    ours.learn(300)
-    theirs = MaskablePPO(GoalPolicy, ExplorationVecEnv([_RandomViews] * 5), **SETTINGS).learn(300)
+    ours.learn(decisions)
+    theirs = plain(GoalPolicy, ExplorationVecEnv([_RandomViews] * 5), **SETTINGS).learn(decisions)
+    if plain is _DelayedPPO:
+        theirs.policy.load_state_dict(theirs.latest)
     moved = _largest_difference(_weights(ours.policy), begin)
     assert _largest_difference(_weights(ours.policy), _weights(theirs.policy)) < 0.02 * moved
 
@@ -73,10 +90,11 @@ def test_the_penalty_is_the_kl_divergence_from_the_start() -> None:
     learner.start_from(load_model(LEARNED)[0])
     learner.learn(100)  # fills the buffer, and moves the policy away from the start
     data = learner._decisions()
+    data["start_log_probs"] = learner._start_log_probs(data)
     batch = {name: values[:30] for name, values in data.items()} | {"advantages": torch.tensor([1.0, -1.0] * 15)}
     batch["old_log_probs"] = torch.zeros(30)
     caught: list[Any] = []
-    kept = learner.policy.mlp_extractor.forward_actor
+    kept = learner.trained.mlp_extractor.forward_actor
 
     def catch(features: Any) -> Any:
         scores = kept(features)
@@ -84,7 +102,7 @@ def test_the_penalty_is_the_kl_divergence_from_the_start() -> None:
         caught.append(scores)
         return scores
 
-    learner.policy.mlp_extractor.forward_actor = catch
+    learner.trained.mlp_extractor.forward_actor = catch
     terms = learner._losses(batch, 0.2, True)
     (0.7 * terms["anchor_kl"]).backward()
     terms = {name: value.detach() for name, value in terms.items()}
@@ -114,7 +132,7 @@ def test_a_large_weight_keeps_the_policy(anchor: float, low: float, high: float)
     data = learner._decisions()
     with torch.no_grad():
         now = learner.policy.evaluate(data)[1]
-    start = data["start_log_probs"]
+    start = learner._start_log_probs(data)
     divergence = float((start.exp() * (start - now)).sum(1).mean())
     assert low <= divergence <= high
 
@@ -140,10 +158,12 @@ def test_a_resumed_training_keeps_its_anchor(tmp_path: Path) -> None:
     assert weights[0] == weights[2] != weights[1]
     assert (whole / "model.npz").read_bytes() == (stopped / "model.npz").read_bytes()
     kept = stored_checkpoint(whole, config)
-    np.testing.assert_array_equal(kept["start"]["mlp_extractor.query.weight"], load_model(LEARNED)[0]["query.weight"])
+    np.testing.assert_array_equal(
+        kept["learner"]["start"]["mlp_extractor.query.weight"], load_model(LEARNED)[0]["query.weight"]
+    )
     training = Training(config, whole)
     with pytest.raises(ValueError, match="resume: expected a checkpoint of this model, got a different one"):
-        training.restore(kept | {"start": None})
+        training.restore(kept | {"learner": kept["learner"] | {"start": None}})
     training.close()
 
 

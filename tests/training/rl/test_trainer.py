@@ -196,7 +196,10 @@ def test_pickles_are_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr("training.rl.checkpoint._versions", dict)
     file, proof = tmp_path / CHECKPOINT_FILE, tmp_path / "proof"
     body = pickle.dumps({"config": Trap(proof)})
-    for number, says in ((FORMAT, "got a broken file"), (1, "expected one of format 3, got a checkpoint of format 1")):
+    for number, says in (
+        (FORMAT, "got a broken file"),
+        (1, f"expected one of format {FORMAT}, got a checkpoint of format 1"),
+    ):
         file.write_bytes(_marked(body, number))
         with pytest.raises(ValueError, match=f"resume: .*{says}"):
             stored_checkpoint(tmp_path, SMOKE)
@@ -227,8 +230,8 @@ def test_a_checkpoint_with_other_parts_is_refused(whole: tuple[Path, dict[str, A
     streams = kept["draws"]["numpy"]
     beyond = streams | {"state": streams["state"] | {"pos": 10**9}}
     for part in (
-        {"policy": {}},
-        {"optimizer": None},
+        {"learner": kept["learner"] | {"trained": {}}},
+        {"learner": kept["learner"] | {"optimizer": None}},
         {"environments": {"environments": [], "masks": None}},
         {"draws": kept["draws"] | {"numpy": beyond}},
         {"draws": kept["draws"] | {"torch": np.zeros(3, np.uint8)}},

@@ -141,6 +141,7 @@ def time_learner(recording: Recording, config: TrainConfig) -> list[Part]:
     for _ in range(3):
         begin = time.perf_counter()
         model.train()
+        model.finish_update()
         updates.append(time.perf_counter() - begin)
     return [
         Part.of("network, sampling", drawn, env.num_envs),
