@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from slam_backend.core.blas import single_threaded_blas
 from slam_backend.core.validation import MOST, BoolArray, FloatArray, IntArray
 from slam_backend.fastslam.options import FilterOptions
 from slam_backend.geometry import inverse, transform_points, wrap_angle
@@ -55,6 +56,7 @@ class Associations:
     merges: Sequence[tuple[int, Sequence[int], Sequence[int]]]  # Tick and groups of merges
 
 
+@single_threaded_blas
 def play(config: AccuracyConfig, trial: EpisodeTrial) -> dict[str, Any]:
     """Run an episode and return the trial with the errors of all estimates from its readings.
 

@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from slam_backend.core.blas import single_threaded_blas
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.fastslam.existence import ExistenceModel
 from slam_backend.fastslam.filter import FastSlam
@@ -62,6 +63,7 @@ class Answer:
     extra: dict[str, float] | None = None  # Additional metrics of a filter
 
 
+@single_threaded_blas
 def play(trial: Trial) -> dict[str, Any]:
     """Run a trial.
 
