@@ -35,6 +35,8 @@ from vslam_env.world import World, WorldSource, check_source, is_single_layout
 AgentID = str
 STATE_PER_ROBOT = 12
 RENDER_MODES = ("human", "rgb_array")
+# Kernels of rejuvenations and merges, which the first steps do not call
+LATER = ("slam_backend.smoother.", "slam_backend.maps.", "slam_backend.team.")
 
 
 class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # PettingZoo has no type information
@@ -129,7 +131,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         world_seed = options.get("world_seed")
         if world_seed is not None:
             check_int("options['world_seed']", world_seed, 0, "Give an int >= 0.")
-        ahead.expect(partial(_signatures_of, self.config))
+        ahead.expect(partial(_signatures_of, self.config), LATER)
         with memory_errors_as_argument_errors():
             scenario = sample_scenario(
                 self.config, self._source, root.spawn(1)[0], world_seed, options.get("start_poses")

@@ -22,6 +22,7 @@ from slam_backend.core.validation import IntArray
 from training.rl.network import GoalPolicy
 from training.rl.true_state import STATE
 
+VALUE_RATE = 6.0  # learning rate of a value head with layers of its own, over that of the actor
 USED = (*SHAPES, STATE)  # observations of actor and critic
 
 
@@ -70,13 +71,20 @@ class GoalPPO(MaskablePPO):  # type: ignore[misc]   # its types are not checked
         super().__init__(GoalPolicy, **arguments)
         self._anchor, self._value_rollouts = anchor, value_rollouts
         self.trained = deepcopy(self.policy)
+        self._shares_layers = True
         self._start: GoalPolicy | None = None
         self._update: Update | None = None
 
     def start_from(self, weights: Weights) -> None:
-        """Begin with the actor of a model, and keep its policy for the penalty."""
+        """Begin with the actor of a model, and keep its policy for the penalty.
+
+        The value head then uses the layers of the actor as they are: its gradients, at first several times those of the
+        actor, would change what the actor can do already.
+        """
         self.policy.load_actor(weights)
         self.trained.load_actor(weights)
+        self.trained.separate(VALUE_RATE)
+        self._shares_layers = False
         if self._anchor:
             self._start = deepcopy(self.policy).requires_grad_(False)
 
@@ -118,7 +126,10 @@ class GoalPPO(MaskablePPO):  # type: ignore[misc]   # its types are not checked
         """
         self.finish_update()
         self._take_over()
-        self._update_learning_rate(self.trained.optimizer)
+        rate = self.lr_schedule(self._current_progress_remaining)
+        for group in self.trained.optimizer.param_groups:
+            group["lr"] = rate * group.get("rate", 1.0)
+        self.logger.record("train/learning_rate", rate)
         rounds = [np.random.permutation(self.n_steps * self.n_envs) for _ in range(self.n_epochs)]  # noqa: NPY002
         clip = self.clip_range(self._current_progress_remaining)
         trains_actor = self.num_timesteps > self._value_rollouts * self.n_steps * self.n_envs
@@ -163,7 +174,8 @@ class GoalPPO(MaskablePPO):  # type: ignore[misc]   # its types are not checked
                 terms = self._losses(batch, clip, trains_actor)
                 optimizer.zero_grad()
                 terms["loss"].backward()
-                torch.nn.utils.clip_grad_norm_(policy.parameters(), self.max_grad_norm)
+                for group in optimizer.param_groups:
+                    torch.nn.utils.clip_grad_norm_(group["params"], self.max_grad_norm)
                 optimizer.step()
                 for name, value in terms.items():
                     figures.setdefault(name, []).append(value.detach())
@@ -194,7 +206,7 @@ class GoalPPO(MaskablePPO):  # type: ignore[misc]   # its types are not checked
 
     def _losses(self, batch: Mapping[str, Any], clip: float, trains_actor: bool) -> dict[str, Any]:
         """Return `loss`, its terms and what describes the update, each a mean over a minibatch."""
-        values, log_probs = self.trained.evaluate(batch, trains_actor)
+        values, log_probs = self.trained.evaluate(batch, trains_actor, self._shares_layers)
         value_loss = mse_loss(batch["returns"], values)
         if not trains_actor:
             return {"loss": self.vf_coef * value_loss, "value_loss": value_loss}

@@ -34,6 +34,7 @@ from training.rl.true_state import STATE
 
 GROUP = 60  # observations that attention pads to the same number of tokens
 NUM_SLOTS, NUM_FEATURES = SHAPES["candidates"]
+VALUE_WIDTH = 128  # of the hidden layers of the value head
 KEPT = (1 + NUM_SLOTS) * WIDTH + NUM_SLOTS  # features without the true state
 
 
@@ -137,7 +138,7 @@ class SlotPointer(nn.Module):  # type: ignore[misc]
     """
 
     latent_dim_pi = 1 + NUM_SLOTS
-    latent_dim_vf = WIDTH
+    latent_dim_vf = VALUE_WIDTH
 
     def __init__(self, state_size: int) -> None:
         super().__init__()
@@ -145,10 +146,13 @@ class SlotPointer(nn.Module):  # type: ignore[misc]
         self.query = nn.Linear(WIDTH, WIDTH)
         self.key = nn.Linear(WIDTH, WIDTH)
         self.stay = nn.Linear(WIDTH, 1)
-        self.value_hidden = nn.Linear((2 + (state_size > 0)) * WIDTH, WIDTH)
+        size = (2 + (state_size > 0)) * WIDTH
+        self.value_hidden = nn.Sequential(
+            nn.Linear(size, VALUE_WIDTH), nn.ReLU(), nn.Linear(VALUE_WIDTH, VALUE_WIDTH), nn.Tanh()
+        )
 
     def forward(self, features: Any) -> tuple[Any, Any]:
-        """Return logits (n, 1 + C) and features of the value head (n, WIDTH)."""
+        """Return logits (n, 1 + C) and features of the value head (n, VALUE_WIDTH)."""
         return self.forward_actor(features), self.forward_critic(features)
 
     def forward_actor(self, features: Any) -> Any:
@@ -158,11 +162,11 @@ class SlotPointer(nn.Module):  # type: ignore[misc]
         return torch.cat([self.stay(robot), scores.masked_fill(valid == 0, INVALID)], dim=1)
 
     def forward_critic(self, features: Any) -> Any:
-        """Return the features of the value head only."""
+        """Return the features of the value head (n, VALUE_WIDTH) only."""
         robot, slots, valid, state = _split(features)
         mean = slots.sum(1) / valid.sum(1, keepdim=True).clamp(min=1.0)  # invalid slots are 0
         truth = [] if self.value_state is None else [torch.relu(self.value_state(state))]
-        return torch.tanh(self.value_hidden(torch.cat([robot, mean, *truth], dim=1)))
+        return self.value_hidden(torch.cat([robot, mean, *truth], dim=1))
 
 
 def _split(features: Any) -> tuple[Any, Any, Any, Any]:
@@ -181,7 +185,7 @@ class GoalPolicy(MaskableMultiInputActorCriticPolicy):  # type: ignore[misc]
         """Make the layers and the optimiser; the pointer's outputs already are the logits."""
         self.mlp_extractor = SlotPointer(_state_size(self.observation_space))
         self.action_net = nn.Identity()
-        self.value_net = nn.Linear(WIDTH, 1)
+        self.value_net = nn.Linear(VALUE_WIDTH, 1)
         for module in (self.features_extractor, self.mlp_extractor):
             module.apply(lambda layer: self.init_weights(layer, gain=1.0))
         for layer in (self.mlp_extractor.query, self.mlp_extractor.stay):
@@ -193,20 +197,38 @@ class GoalPolicy(MaskableMultiInputActorCriticPolicy):  # type: ignore[misc]
         """Return the logits (n, 1 + C) of observations as float tensors; grids from 0 to 1."""
         return self.mlp_extractor.forward_actor(self.features_extractor(observations))
 
-    def evaluate(self, observations: Mapping[str, Any], trains_actor: bool = True) -> tuple[Any, Any]:
+    def evaluate(
+        self, observations: Mapping[str, Any], trains_actor: bool = True, shares_layers: bool = True
+    ) -> tuple[Any, Any]:
         """Return values (n,) and log probabilities of all actions (n, 1 + C), about -1e8 for invalid ones.
 
         Args:
             observations: Tensors (n, ...) by name, as the environment returns them; other names are ignored.
-            trains_actor: Whether gradients reach the layers that the actor uses; otherwise the value head's alone.
+            trains_actor: Whether gradients reach the layers that the actor uses.
+            shares_layers: Whether those of the values reach them, too; otherwise the value head's alone.
         """
         inputs = {name: observations[name] for name in (*SHAPES, STATE) if name in observations}
         inputs["local_grid"] = observations["local_grid"] / 255.0
         with torch.set_grad_enabled(trains_actor and torch.is_grad_enabled()):
             features = self.features_extractor(inputs)
             scores = self.mlp_extractor.forward_actor(features)
-        values = self.value_net(self.mlp_extractor.forward_critic(features))
+        seen = features if shares_layers else features.detach()
+        values = self.value_net(self.mlp_extractor.forward_critic(seen))
         return values.squeeze(1), scores.log_softmax(1)
+
+    def separate(self, value_rate: float) -> None:
+        """Give actor and value head an optimiser group each.
+
+        Args:
+            value_rate: Learning rate of the value head over that of the actor.
+        """
+        named = dict(self.named_parameters())
+        values = [tensor for name, tensor in named.items() if ".value_" in f".{name}"]
+        others = [tensor for name, tensor in named.items() if ".value_" not in f".{name}"]
+        self.optimizer = self.optimizer_class(
+            [{"params": others, "rate": 1.0}, {"params": values, "rate": value_rate}],
+            lr=self.optimizer.param_groups[0]["lr"], **self.optimizer_kwargs,
+        )  # fmt: skip
 
     def load_actor(self, weights: Weights) -> None:
         """Take the weights of `agents.goal_network`; those of the value head stay as they are."""

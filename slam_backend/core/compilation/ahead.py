@@ -1,7 +1,8 @@
 """Compilation, by other processes, of the kernels that a program will soon call.
 
 A kernel that the disk cache lacks is compiled when it is called, by the calling process, on one core. A program that
-has said what it will need (`expect`) lets the other cores compile the rest of that meanwhile, what takes longest first.
+has said what it will need (`expect`) lets the other cores compile the rest of that meanwhile: first what it will call
+soon, and of that what takes longest.
 A kernel that one of them compiles is waited for when it is called; one that none has begun is compiled by the caller.
 """
 
@@ -38,12 +39,13 @@ class Helpers:
 
     Args:
         tasks: Kernels to compile.
+        later: Prefixes of the names of kernels that come last.
         number: Number of processes.
         lock: Lock on the cache, released when they have ended.
     """
 
-    def __init__(self, tasks: Sequence[Task], number: int, lock: "FileLock") -> None:
-        longest_first = sorted(tasks, key=lambda task: -sum(task.parts.values()))
+    def __init__(self, tasks: Sequence[Task], later: tuple[str, ...], number: int, lock: "FileLock") -> None:
+        longest_first = sorted(tasks, key=lambda task: (task.name.startswith(later), -sum(task.parts.values())))
         self.process = os.getpid()
         self._lines = [f"{task.name} {task.signature}" for task in longest_first]
         self._begun: set[str] = set()
@@ -115,20 +117,22 @@ class Helpers:
             return line
 
 
-_needed: Needed | None = None  # what the program said it will need; None: nothing, or it was asked for already
+# What the program said it will need, and prefixes of what it calls last; None: nothing, or it was asked for already.
+_needed: tuple[Needed, tuple[str, ...]] | None = None
 _helpers: Helpers | None = None
 _is_set_aside = False
 
 
-def expect(needed: Needed) -> None:
+def expect(needed: Needed, later: tuple[str, ...] = ()) -> None:
     """Say what this program will call. Nothing happens unless it calls a kernel that the cache lacks.
 
     Args:
         needed: Function that returns signatures by dotted name of a kernel.
+        later: Prefixes of the names of kernels that it calls later than others.
     """
     global _needed
     if not _is_set_aside:
-        _needed = needed
+        _needed = needed, later
 
 
 def await_kernel(kernel: Any, signature: Sequence[Any]) -> bool:
@@ -137,7 +141,7 @@ def await_kernel(kernel: Any, signature: Sequence[Any]) -> bool:
         return False
     line = f"{kernel_name(kernel)} {encode_signature(signature)}"
     if _needed is not None:
-        _start(_needed, line)
+        _start(*_needed, line)
     return _helpers is not None and _helpers.wait_for(line)
 
 
@@ -153,11 +157,12 @@ def set_aside() -> Iterator[None]:
         _is_set_aside = before
 
 
-def _start(needed: Needed, own: str) -> None:
+def _start(needed: Needed, later: tuple[str, ...], own: str) -> None:
     """Start workers on the other cores, unless another process compiles for the same cache.
 
     Args:
         needed: Function that returns the signatures of the kernels to compile.
+        later: Prefixes of the names of those that come last.
         own: Name and signature of the kernel that the caller compiles.
     """
     global _needed, _helpers
@@ -171,7 +176,7 @@ def _start(needed: Needed, own: str) -> None:
         if tasks:
             lock = cache_lock()
             lock.acquire(blocking=False)
-            _helpers = Helpers(tasks, number, lock)
+            _helpers = Helpers(tasks, later, number, lock)
     except OSError as error:
         LOGGER.debug("Not compiled ahead: %s", error)
 

@@ -73,6 +73,34 @@ def test_while_another_process_fills_the_cache_no_worker_is_started(tmp_path: Pa
         assert printed(tmp_path) == BOTH
 
 
+def test_workers_compile_what_is_called_soon_first(tmp_path: Path) -> None:
+    """Kernels that are called later come last, within both parts the longest first."""
+    sizes = {"now.short": 1, "later.long": 9, "now.long": 5, "later.short": 2}
+    tasks = [compiler.Task(name, "float64", {name: size}) for name, size in sizes.items()]
+    helpers = ahead.Helpers(tasks, ("later.",), 0, FileLock(tmp_path / "lock"))
+    assert [helpers._next_line().split()[0] for _ in tasks] == ["now.long", "now.short", "later.long", "later.short"]
+    assert helpers._next_line() == ""
+
+
+def test_first_steps_call_no_kernel_that_comes_last() -> None:
+    """What environments expect to call later is not called in the first ten steps, and there is such a kernel."""
+    code = """
+from slam_backend.core.compilation.compiler import compiled_signatures, recorded_signatures
+from vslam_env import vslam_v0
+from vslam_env.environment import LATER
+env = vslam_v0.parallel_env()
+env.reset(seed=0)
+for _ in range(10):
+    env.step({agent: env.action_space(agent).sample() for agent in env.agents})
+called = [name for package in ("slam_backend", "vslam_env") for name in compiled_signatures(package)]
+recorded = recorded_signatures("slam_backend", "vslam_env")
+print(len(called) > 20, [name for name in called if name.startswith(LATER)])
+print([start for start in LATER if not any(name.startswith(start) for name in recorded)])
+"""
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.stdout.splitlines() == ["True []", "[]"], done.stderr
+
+
 def test_a_warm_up_waits_for_no_worker() -> None:
     """It compiles with processes of its own; what is expected within it starts none."""
     ahead.expect(dict)
