@@ -189,7 +189,7 @@ def parts_of_error(recording: Recording) -> dict[str, FloatArray]:
     missed = half * (1.0 - recalls)
     known = precisions > 0.0
     surplus = half * recalls * (1.0 / np.where(known, precisions, 1.0) - 1.0)
-    surplus = np.where(known, surplus, errors**2 - missed)  # without a match all of the rest is false
+    surplus = np.where(known, surplus, np.maximum(errors**2 - missed, 0.0))  # without a match all of the rest is false
     off = np.maximum(errors**2 - missed - surplus, 0.0)
     parts = {"missed landmarks": missed, "false and duplicate ones": surplus, "position errors": off}
     return {name: part.mean(axis=1) for name, part in parts.items()}

@@ -197,38 +197,26 @@ class GoalPolicy(MaskableMultiInputActorCriticPolicy):  # type: ignore[misc]
         """Return the logits (n, 1 + C) of observations as float tensors; grids from 0 to 1."""
         return self.mlp_extractor.forward_actor(self.features_extractor(observations))
 
-    def evaluate(
-        self, observations: Mapping[str, Any], trains_actor: bool = True, shares_layers: bool = True
-    ) -> tuple[Any, Any]:
-        """Return values (n,) and log probabilities of all actions (n, 1 + C), about -1e8 for invalid ones.
-
-        Args:
-            observations: Tensors (n, ...) by name, as the environment returns them; other names are ignored.
-            trains_actor: Whether gradients reach the layers that the actor uses.
-            shares_layers: Whether those of the values reach them, too; otherwise the value head's alone.
-        """
+    def encode(self, observations: Mapping[str, Any]) -> Any:
+        """Return features (n, f) of observations: tensors (n, ...) by name, as the environment returns them."""
         inputs = {name: observations[name] for name in (*SHAPES, STATE) if name in observations}
         inputs["local_grid"] = observations["local_grid"] / 255.0
-        with torch.set_grad_enabled(trains_actor and torch.is_grad_enabled()):
-            features = self.features_extractor(inputs)
-            scores = self.mlp_extractor.forward_actor(features)
-        seen = features if shares_layers else features.detach()
-        values = self.value_net(self.mlp_extractor.forward_critic(seen))
-        return values.squeeze(1), scores.log_softmax(1)
+        return self.features_extractor(inputs)
 
-    def separate(self, value_rate: float) -> None:
-        """Give actor and value head an optimiser group each.
+    def log_probs(self, features: Any) -> Any:
+        """Return log probabilities of all actions (n, 1 + C), about -1e8 for invalid ones."""
+        return self.mlp_extractor.forward_actor(features).log_softmax(1)
 
-        Args:
-            value_rate: Learning rate of the value head over that of the actor.
-        """
-        named = dict(self.named_parameters())
-        values = [tensor for name, tensor in named.items() if ".value_" in f".{name}"]
-        others = [tensor for name, tensor in named.items() if ".value_" not in f".{name}"]
-        self.optimizer = self.optimizer_class(
-            [{"params": others, "rate": 1.0}, {"params": values, "rate": value_rate}],
-            lr=self.optimizer.param_groups[0]["lr"], **self.optimizer_kwargs,
-        )  # fmt: skip
+    def values(self, features: Any) -> Any:
+        """Return values (n,)."""
+        return self.value_net(self.mlp_extractor.forward_critic(features)).squeeze(1)
+
+    def parts(self) -> tuple[list[Any], list[Any]]:
+        """Return the parameters of the actor with the shared layers, and those of the value head alone."""
+        parts: tuple[list[Any], list[Any]] = ([], [])
+        for name, tensor in self.named_parameters():
+            parts[".value_" in f".{name}"].append(tensor)
+        return parts
 
     def load_actor(self, weights: Weights) -> None:
         """Take the weights of `agents.goal_network`; those of the value head stay as they are."""

@@ -90,7 +90,7 @@ def test_the_penalty_is_the_kl_divergence_from_the_start() -> None:
     learner.start_from(load_model(LEARNED)[0])
     learner.learn(100)  # fills the buffer, and moves the policy away from the start
     data = learner._decisions()
-    data["start_log_probs"] = learner._start_log_probs(data)
+    data["start_log_probs"] = learner._by_chunks(data, learner._start_log_probs)
     batch = {name: values[:30] for name, values in data.items()} | {"advantages": torch.tensor([1.0, -1.0] * 15)}
     batch["old_log_probs"] = torch.zeros(30)
     caught: list[Any] = []
@@ -103,7 +103,7 @@ def test_the_penalty_is_the_kl_divergence_from_the_start() -> None:
         return scores
 
     learner.trained.mlp_extractor.forward_actor = catch
-    terms = learner._losses(batch, 0.2, True)
+    terms = learner._losses(batch, 0.2)
     (0.7 * terms["anchor_kl"]).backward()
     terms = {name: value.detach() for name, value in terms.items()}
     scores = caught[0].detach().numpy().astype(np.float64)
@@ -131,8 +131,8 @@ def test_a_large_weight_keeps_the_policy(anchor: float, low: float, high: float)
     learner.learn(1000)
     data = learner._decisions()
     with torch.no_grad():
-        now = learner.policy.evaluate(data)[1]
-    start = learner._start_log_probs(data)
+        now = learner.policy.log_probs(learner.policy.encode(data))
+    start = learner._by_chunks(data, learner._start_log_probs)
     divergence = float((start.exp() * (start - now)).sum(1).mean())
     assert low <= divergence <= high
 
@@ -188,8 +188,10 @@ def test_an_anchor_needs_a_start() -> None:
         TrainConfig.from_mapping({"preset": "imitate", "value_rollouts": 1})
     with pytest.raises(ValueError, match=r"anchor: expected .*>= 0.*, got -0\.1"):
         TrainConfig.from_mapping({"preset": "ppo", "anchor": -0.1})
+    with pytest.raises(ValueError, match="value_rollouts: expected 0 without a model to begin with, got 1"):
+        TrainConfig.from_mapping({"preset": "smoke", "value_rollouts": 1})
     with pytest.raises(ValueError, match=r"value_rollouts: expected fewer than the rollouts, 3, got 3"):
-        TrainConfig.from_mapping({"preset": "smoke", "value_rollouts": 3})
+        TrainConfig.from_mapping({"preset": "smoke", "start": "learned", "value_rollouts": 3})
 
 
 def test_learned_is_a_start() -> None:

@@ -89,7 +89,8 @@ def test_the_true_state_moves_values_and_no_action() -> None:
     seen = _some(WITH_STATE, 5)
     batch = {name: torch.as_tensor(values) for name, values in seen.items()}
     batch[STATE].requires_grad_(True)
-    values, log_probs = policy.evaluate(batch)
+    features = policy.encode(batch)
+    values, log_probs = policy.values(features), policy.log_probs(features)
     by_state = torch.autograd.grad(values.sum(), batch[STATE], retain_graph=True)[0]
     assert (by_state.abs().sum(0) > 0).all()
     assert not torch.autograd.grad(log_probs.sum(), batch[STATE])[0].any()
