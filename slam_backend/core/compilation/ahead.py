@@ -3,7 +3,8 @@
 A kernel that the disk cache lacks is compiled when it is called, by the calling process, on one core. A program that
 has said what it will need (`expect`) lets the other cores compile the rest of that meanwhile: first what it will call
 soon, and of that what takes longest.
-A kernel that one of them compiles is waited for when it is called; one that none has begun is compiled by the caller.
+A kernel that one of them has begun is waited for when it is called, and the caller compiles others meanwhile; one that
+none has begun is compiled by the caller.
 """
 
 import atexit
@@ -15,11 +16,14 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
+from numba.core.targetconfig import ConfigStack
+
 from slam_backend.core.compilation.compiler import (
     Signatures,
     Task,
     available_cores,
     cache_lock,
+    compile_lines,
     encode_signature,
     kernel_name,
     missing_tasks,
@@ -48,6 +52,7 @@ class Helpers:
         longest_first = sorted(tasks, key=lambda task: (task.name.startswith(later), -sum(task.parts.values())))
         self.process = os.getpid()
         self._lines = [f"{task.name} {task.signature}" for task in longest_first]
+        self._later = later
         self._begun: set[str] = set()
         self._changed = threading.Condition()
         self._lock = lock
@@ -57,11 +62,12 @@ class Helpers:
         for thread in self._threads:
             thread.start()
 
-    def wait_for(self, line: str) -> bool:
+    def wait_for(self, line: str, helps: bool = False) -> bool:
         """Wait until a kernel is compiled if a worker has begun with it; else leave it to the caller.
 
         Args:
             line: Name and signature.
+            helps: Whether to compile meanwhile, in this process, what the program will call soon.
 
         Returns:
             Whether a worker had begun with it; it is in the cache then, unless the worker failed.
@@ -71,8 +77,20 @@ class Helpers:
                 self._lines.remove(line)
             if line not in self._begun:
                 return False
+        while helps and (other := self._take_soon(line)):
+            compile_lines(iter([other]), lambda done: None)
+        with self._changed:
             self._changed.wait_for(lambda: line not in self._begun)
-            return True
+        return True
+
+    def _take_soon(self, line: str) -> str:
+        """Return a kernel for this process to compile; empty: none will be called soon, or the awaited one is done."""
+        with self._changed:
+            soon = [other for other in self._lines if not other.startswith(self._later)]
+            if line not in self._begun or not soon:
+                return ""
+            self._lines.remove(soon[0])
+            return soon[0]
 
     def end(self) -> None:
         """End the workers and release the lock."""
@@ -142,7 +160,8 @@ def await_kernel(kernel: Any, signature: Sequence[Any]) -> bool:
     line = f"{kernel_name(kernel)} {encode_signature(signature)}"
     if _needed is not None:
         _start(*_needed, line)
-    return _helpers is not None and _helpers.wait_for(line)
+    # A compilation within another one may inherit its options.
+    return _helpers is not None and _helpers.wait_for(line, helps=not ConfigStack())  # type: ignore[no-untyped-call]
 
 
 @contextmanager

@@ -270,10 +270,13 @@ def _compiled(shares: Sequence[Sequence[Task]], begun: float) -> Iterator[tuple[
 
 
 def start_worker() -> "subprocess.Popen[str]":
-    """Start a process that compiles the kernels named on its input; it ends with this one."""
+    """Start a process that compiles the kernels named on its input; it ends with this one.
+
+    It imports what this process imports: `-P` keeps it from looking into the current folder first.
+    """
     return subprocess.Popen(
-        [sys.executable, "-m", WORKER, str(os.getpid())],
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        [sys.executable, "-P", "-m", WORKER, str(os.getpid())],
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path)},
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
     )  # fmt: skip
 

@@ -5,7 +5,9 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from filelock import FileLock
@@ -34,11 +36,15 @@ print([name.rpartition(".")[2] for name in watch.names], len(missing_tasks(neede
 BOTH, FIRST, NONE = "['find_only', '_invert_rows'] 0", "['find_only'] 0", "[] 0"
 
 
-def start(folder: Path, act: str = "pass", cores: int = 2) -> "subprocess.Popen[str]":
-    """Start the program with a cache of its own."""
+def start(folder: Path, act: str = "pass", cores: int = 2, place: Path | None = None) -> "subprocess.Popen[str]":
+    """Start the program with a cache of its own, from a file in a folder `place`, or as a command."""
     environment = os.environ | {"NUMBA_CACHE_DIR": str(folder), "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-c", PROGRAM, str(cores), act]
-    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
+    if place is not None:
+        (place / "program.py").write_text(PROGRAM, encoding="utf-8")
+        command[1:3] = [str(place / "program.py")]
+    elsewhere = None if place is None else place / "elsewhere"
+    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True, cwd=elsewhere)
 
 
 def printed(folder: Path, act: str = "pass", cores: int = 2) -> str:
@@ -53,6 +59,15 @@ def test_a_kernel_that_a_worker_has_begun_is_waited_for(tmp_path: Path) -> None:
     """The program compiles one kernel, and finds the other in the cache; later none does anything."""
     assert printed(tmp_path) == FIRST
     assert printed(tmp_path, "assert ahead._helpers is None") == NONE
+
+
+def test_workers_import_what_the_program_imports(tmp_path: Path) -> None:
+    """Another `slam_backend` in the current folder, which the program does not import, is not imported by workers."""
+    other = tmp_path / "elsewhere" / "slam_backend"
+    other.mkdir(parents=True)
+    (other / "__init__.py").write_text("raise ImportError\n", encoding="utf-8")
+    program = start(tmp_path / "cache", place=tmp_path)
+    assert program.communicate(timeout=300)[0].strip() == FIRST
 
 
 def test_a_killed_worker_is_not_waited_for(tmp_path: Path) -> None:
@@ -80,6 +95,25 @@ def test_workers_compile_what_is_called_soon_first(tmp_path: Path) -> None:
     helpers = ahead.Helpers(tasks, ("later.",), 0, FileLock(tmp_path / "lock"))
     assert [helpers._next_line().split()[0] for _ in tasks] == ["now.long", "now.short", "later.long", "later.short"]
     assert helpers._next_line() == ""
+
+
+def test_a_waiting_program_compiles_what_it_will_call_soon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Until the awaited kernel is done, the longest first; kernels that are called later are left to workers."""
+    names = ["now.awaited", "now.long", "now.short", "now.left", "later.long"]
+    tasks = [compiler.Task(name, "float64", {name: 9 - place}) for place, name in enumerate(names)]
+    helpers = ahead.Helpers(tasks, ("later.",), 0, FileLock(tmp_path / "lock"))
+    awaited, compiled = helpers._next_line(), []
+
+    def compile_lines(lines: Iterator[str], report: Any) -> None:
+        compiled.append(next(lines).split()[0])
+        if len(compiled) == 2:
+            helpers._begun.discard(awaited)
+
+    monkeypatch.setattr(ahead, "compile_lines", compile_lines)
+    assert helpers.wait_for(awaited, helps=True)
+    assert compiled == ["now.long", "now.short"]
+    assert [helpers._next_line().split()[0] for _ in range(2)] == ["now.left", "later.long"]
+    assert not helpers.wait_for("unknown float64", helps=True)
 
 
 def test_first_steps_call_no_kernel_that_comes_last() -> None:
