@@ -55,9 +55,9 @@ class Update:
 class GoalPPO(MaskablePPO):  # type: ignore[misc]   # its types are not checked
     """PPO with masks for a `GoalPolicy`, with an optional anchor to the policy of the start model.
 
-    Without a start model an update is that of MaskablePPO. It runs while the next rollout is played, which is played by
-    the policy before it; the probability ratios of PPO take this into account. Clipping of values and a target of the
-    KL divergence are not supported.
+    Without a start model updates are those of MaskablePPO. After one, an update runs while the next rollout is played
+    by the policy before it, which the probability ratios of PPO take into account. Clipping of values and a target of
+    the KL divergence are not supported.
 
     Args:
         anchor: Weight of the penalty KL(start || policy) [1/nat], a mean over the decisions of a minibatch.
@@ -127,10 +127,11 @@ class GoalPPO(MaskablePPO):  # type: ignore[misc]   # its types are not checked
         return self
 
     def train(self) -> None:
-        """Start the update of actor and critic with the decisions of the last rollout.
+        """Update actor and critic with the decisions of the last rollout.
 
-        The next rollout is played meanwhile, by the policy before this update. The update draws from numpy's
-        generator and the rollout from torch's, so that neither depends on which is faster.
+        After a start model the update is only begun here, and runs while the next rollout is played by the policy
+        before it: steps are small. It uses numpy's random numbers and the rollout torch's, so that neither depends on
+        which of them is faster.
         """
         self.finish_update()
         self._take_over()
@@ -149,6 +150,9 @@ class GoalPPO(MaskablePPO):  # type: ignore[misc]   # its types are not checked
         values, returns = self.rollout_buffer.values.flatten(), self.rollout_buffer.returns.flatten()
         self.logger.record("train/explained_variance", explained_variance(values, returns))
         self._n_updates += self.n_epochs
+        if self._value_optimizer is None:
+            self.finish_update()
+            self._take_over()
 
     def finish_update(self) -> None:
         """Wait for the update that is running, and record its figures."""

@@ -15,11 +15,10 @@ ROBOT_SCALE = np.array([0.05, 0.05, 1.0, 1.0, 0.05, 0.05, 1.0, 1.0, 1.0, 1.0, 1.
 
 
 class WithTrueState(BaseParallelWrapper):  # type: ignore[misc]   # its types are not checked
-    """Environment whose observations also have `state`, and whose time limit ends the task.
+    """Environment whose observations also have `state`.
 
     `state` has the values of `ExplorationEnv.state`, scaled, with those of the observing robot first. It is the truth:
-    a critic may use it in training, a policy may not. The time limit is reported as a termination, since `time_left` is
-    observed: what could be mapped after it is worth nothing, and learners must not bootstrap.
+    a critic may use it in training, a policy may not.
 
     Args:
         env: `ExplorationEnv` with dict observations.
@@ -44,9 +43,8 @@ class WithTrueState(BaseParallelWrapper):  # type: ignore[misc]   # its types ar
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, Any]:
         """Step; see `ExplorationEnv.step`."""
-        observations, rewards, terminations, truncations, infos = self.env.step(actions)
-        over = {agent: ended or truncations[agent] for agent, ended in terminations.items()}
-        return self._with_state(observations), rewards, over, dict.fromkeys(over, False), infos
+        observations, *others = self.env.step(actions)
+        return self._with_state(observations), *others
 
     def _with_state(self, observations: dict[str, Any]) -> dict[str, Any]:
         state: NDArray[np.float32] = self.env.state()

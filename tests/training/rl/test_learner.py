@@ -57,31 +57,43 @@ def _largest_difference(ours: dict[str, Any], theirs: dict[str, Any]) -> float:
     return max(float(np.abs(ours[name] - theirs[name]).max()) for name in ours)
 
 
-class _DelayedPPO(MaskablePPO):
-    """MaskablePPO that plays each rollout with the policy before the last update, all in one thread."""
-
-    latest: Any = None
-
-    def train(self) -> None:
-        if self.latest is not None:
-            self.policy.load_state_dict(self.latest)
-        before = deepcopy(self.policy.state_dict())
-        super().train()
-        self.latest = deepcopy(self.policy.state_dict())
-        self.policy.load_state_dict(before)
-
-
-@pytest.mark.parametrize(("plain", "decisions"), [(MaskablePPO, 100), (_DelayedPPO, 400)])
-def test_without_anchor_updates_are_those_of_maskable_ppo(plain: type[MaskablePPO], decisions: int) -> None:
-    """The first update equals that of sb3-contrib, but for rounding; later ones, if it plays with the policy before."""
+def test_without_anchor_updates_are_those_of_maskable_ppo() -> None:
+    """Weights after several updates equal those of sb3-contrib, but for rounding."""
     ours = _learner()
     begin = _weights(ours.policy)
-    ours.learn(decisions)
-    theirs = plain(GoalPolicy, ExplorationVecEnv([_RandomViews] * 5), **SETTINGS).learn(decisions)
-    if plain is _DelayedPPO:
-        theirs.policy.load_state_dict(theirs.latest)
+    ours.learn(300)
+    theirs = MaskablePPO(GoalPolicy, ExplorationVecEnv([_RandomViews] * 5), **SETTINGS).learn(300)
     moved = _largest_difference(_weights(ours.policy), begin)
     assert _largest_difference(_weights(ours.policy), _weights(theirs.policy)) < 0.02 * moved
+
+
+class _WaitingPPO(GoalPPO):
+    """Learner that waits for each update before it plays the next rollout, still by the policy before."""
+
+    def train(self) -> None:
+        super().train()
+        self.finish_update()
+
+
+def test_after_a_start_model_updates_run_beside_rollouts() -> None:
+    """Each rollout is played by the policy before the last update; weights are those of one after the other."""
+    learners = []
+    for kind in (GoalPPO, _WaitingPPO):
+        learner = kind(env=ExplorationVecEnv([_RandomViews] * 5), **SETTINGS)  # seeds the global generators
+        learners.append(learner)
+        learner.start_from(load_model(LEARNED)[0])
+        begin = _weights(learner.policy)
+        learner.learn(100)
+        assert _largest_difference(_weights(learner.policy), begin) > 0.0  # at the end the policy has all updates
+        learner.learn(300, reset_num_timesteps=False)
+    ours, theirs = (_weights(learner.policy) for learner in learners)
+    assert _largest_difference(ours, theirs) == 0.0
+    played, trained = _weights(learners[0].policy), _weights(learners[0].trained)
+    assert _largest_difference(played, trained) == 0.0
+    learners[0].train()
+    learners[0].finish_update()
+    assert _largest_difference(_weights(learners[0].policy), played) == 0.0
+    assert _largest_difference(_weights(learners[0].trained), played) > 0.0
 
 
 def test_the_penalty_is_the_kl_divergence_from_the_start() -> None:
