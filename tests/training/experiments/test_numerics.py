@@ -4,17 +4,16 @@ import sys
 
 import pytest
 
-from training.experiments.numerics import CORE, DISABLED, PORTABLE, numerics, variables_for
+from training.experiments.numerics import CORE, PORTABLE, numerics, variables_for
 
 HERE = numerics()
 
 
 def of_a_process(variables: dict[str, str]) -> str:
-    """Return the numerics of a new process."""
+    """Return the numerics of a new process, which has the environment of this one, too."""
     code = "from training.experiments.numerics import numerics; print(numerics())"
-    environ = {name: value for name, value in os.environ.items() if name not in (CORE, DISABLED)}
     done = subprocess.run(
-        [sys.executable, "-c", code], env=environ | variables, capture_output=True, text=True, check=True
+        [sys.executable, "-c", code], env=os.environ | variables, capture_output=True, text=True, check=True
     )
     return done.stdout.strip()
 
