@@ -1,4 +1,4 @@
-"""`WithTrueState`: environment as the learner sees it, with the true state for the critic."""
+"""`WithTrueState`: environment with the true state in its observations, for the critic of a learner."""
 
 from typing import Any
 

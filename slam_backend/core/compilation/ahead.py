@@ -2,9 +2,8 @@
 
 A kernel that the disk cache lacks is compiled when it is called, by the calling process, on one core. A program that
 has said what it will need (`expect`) lets the other cores compile the rest of that meanwhile: first what it will call
-soon, and of that what takes longest.
-A kernel that one of them has begun is waited for when it is called, and the caller compiles others meanwhile; one that
-none has begun is compiled by the caller.
+soon, and of that what takes longest. A kernel that one of them has begun is waited for when it is called, and the
+caller compiles others meanwhile; one that none has begun is compiled by the caller.
 """
 
 import atexit
