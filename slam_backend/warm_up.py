@@ -9,6 +9,7 @@ from slam_backend.core import state_checks
 from slam_backend.core.compilation import ahead
 from slam_backend.core.compilation.compiler import Progress, Signatures, compile_kernels, recorded_signatures
 from slam_backend.core.compilation.messages import watch_compilation
+from slam_backend.core.jit import IS_PLAIN
 from slam_backend.fastslam.existence import ExistenceModel
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.options import FilterOptions
@@ -62,8 +63,10 @@ def warm_up(
         progress: Callback with the number of compiled kernels, the total number, and the estimated seconds left [s].
 
     Returns:
-        Seconds spent compiling; 0 if all kernels came from the cache.
+        Seconds spent compiling; 0 if all kernels came from the cache, or numba's compiler is switched off.
     """
+    if IS_PLAIN:
+        return 0.0
     extras = EXTRAS if everything else extras_of(FilterOptions() if options is None else options)
     with ahead.set_aside():
         seconds = compile_kernels(needed(recorded_signatures("slam_backend"), extras), workers, progress)

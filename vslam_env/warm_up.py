@@ -7,6 +7,7 @@ import numpy as np
 from slam_backend.core.compilation import ahead
 from slam_backend.core.compilation.compiler import Progress, compile_kernels, recorded_signatures
 from slam_backend.core.compilation.messages import watch_compilation
+from slam_backend.core.jit import IS_PLAIN
 from slam_backend.warm_up import EXTRAS, extras_of, needed, run_all_paths
 from vslam_env.config import EnvConfig
 from vslam_env.environment import ExplorationEnv
@@ -36,8 +37,10 @@ def warm_up(
         progress: Callback that receives the number of compiled kernels, their total and the estimated time left [s].
 
     Returns:
-        Time spent compiling [s]; 0 if all kernels came from the cache.
+        Time spent compiling [s]; 0 if all kernels came from the cache, or numba's compiler is switched off.
     """
+    if IS_PLAIN:
+        return 0.0
     chosen = EnvConfig() if config is None else config
     extras = set(EXTRAS) if everything else _extras_of(chosen)
     with ahead.set_aside():

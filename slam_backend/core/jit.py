@@ -104,14 +104,15 @@ def device(kernel: Callable[P, T]) -> Callable[P, T]:
 
 def _compiled(function: Callable[P, T], counted: bool, **options: Any) -> Callable[P, T]:
     """Compile without the interpreter lock and with the cache on disk."""
+    if IS_PLAIN:  # compiled arithmetic overflows and divides by zero without a warning
+        return np.errstate(all="ignore")(function)
     if HAS_NRT_OPTION:
         options["_nrt"] = counted
     options |= {"nogil": True, "no_cfunc_wrapper": True}  # no C code calls a kernel
     python: Any = function
     python.__signature__ = signature(function)  # numba asks for it twice, which takes a tenth of this package's import
     kernel: Any = numba.njit(**options)(function)
-    if not IS_PLAIN:
-        kernel._cache = KernelCache(kernel)
+    kernel._cache = KernelCache(kernel)
     return cast(Callable[P, T], kernel)
 
 

@@ -14,9 +14,10 @@ def warm_up(
 ) -> None:
     """Compile the kernels into the disk cache; takes seconds if they are cached already."""
     import vslam_env
+    from slam_backend.core.jit import IS_PLAIN
     from training.experiments.compilation import compilation_progress
 
     with compilation_progress(Console(stderr=True)) as progress:
         seconds = vslam_env.warm_up(everything=everything, workers=workers, progress=progress)
     if not seconds:
-        Console().print("All kernels are in the cache.")
+        Console().print("There is nothing to compile." if IS_PLAIN else "All kernels are in the cache.")

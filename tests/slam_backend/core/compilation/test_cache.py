@@ -356,9 +356,17 @@ def test_without_a_compiler_kernels_run_as_plain_python() -> None:
     code += "[f.step([(0.0, 0.0, 0.1)], [m]) for _ in range(3)]; print(*f.map().means.ravel())"
     outputs = []
     for variables in ({}, {"NUMBA_DISABLE_JIT": "1"}):
-        command = [sys.executable, "-c", code]
+        command = [sys.executable, "-W", "error", "-c", code]
         done = subprocess.run(command, env=environment | variables, capture_output=True, text=True, check=True)
         outputs.append(np.array(done.stdout.split(), dtype=float))
     assert done.stderr == "NUMBA_DISABLE_JIT is set: kernels run as plain Python, some hundred times as slow.\n"
     assert len(outputs[0]) == 9
     np.testing.assert_allclose(*outputs, rtol=1e-9)
+
+
+def test_without_a_compiler_nothing_is_warmed_up_and_all_paths_run_without_warnings() -> None:
+    """Numbers of numpy warn of overflow and of division by zero, which compiled kernels allow."""
+    code = "import vslam_env; assert vslam_env.warm_up(everything=True) == 0.0; "
+    code += "from vslam_env.warm_up import _run_all_paths; _run_all_paths({'existence', 'clique', 'planners'})"
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "NUMBA_DISABLE_JIT": "1"}
+    subprocess.run([sys.executable, "-W", "error", "-c", code], env=environment, check=True)
