@@ -43,7 +43,7 @@ def compilation_progress(console: Console) -> Iterator[Callable[[int, int, float
         yield progress
         seconds = time.perf_counter() - begun[0] if begun else 0.0
     if begun:
-        console.print(f"Compiled in {seconds:.0f} s; later runs take them from a cache.", highlight=False)
+        console.print(f"Compiled in {seconds:.0f} s.", highlight=False)
 
 
 def prepare(*first_steps: Callable[[], object]) -> None:
@@ -52,11 +52,11 @@ def prepare(*first_steps: Callable[[], object]) -> None:
     Args:
         first_steps: Functions called in order before all kernels are compiled, so that bad input is reported early.
     """
-    from slam_backend.core.compilation.messages import log_compilation
+    from slam_backend.core.compilation.messages import MESSAGE, log_compilation
     from vslam_env.warm_up import warm_up
 
     with compilation_progress(Console(stderr=True)) as progress:
         for step in first_steps:
             step()
         warm_up(progress=progress)
-    log_compilation(lambda text: Console(stderr=True).print(text, highlight=False))  # kernels that only some runs need
+    log_compilation(lambda: Console(stderr=True).print(MESSAGE, highlight=False))  # kernels that only some runs need

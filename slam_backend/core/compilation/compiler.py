@@ -26,6 +26,7 @@ from numba.core.registry import CPUDispatcher
 from numpy import dtype
 
 from slam_backend.core.compilation.cache import KernelCache, cache_folder
+from slam_backend.core.compilation.messages import announce
 from slam_backend.core.compilation.shipped import CONFIG
 from slam_backend.core.jit import DeviceKernel
 from slam_backend.core.validation import check_int
@@ -191,7 +192,7 @@ def compile_kernels(signatures: Signatures, workers: int | None = None, progress
     Args:
         signatures: Signatures by dotted name of a kernel, see `encode_signature`.
         workers: Number of processes; None: one for each core. With one, kernels are compiled when they are called.
-        progress: Called after each kernel.
+        progress: Called after each kernel; None: one line says that the compiler runs.
 
     Returns:
         Seconds that this took; 0 if no kernel was missing.
@@ -205,9 +206,11 @@ def compile_kernels(signatures: Signatures, workers: int | None = None, progress
         try:
             lock.acquire(blocking=False)
         except TimeoutError:
-            LOGGER.info("Waiting for another process that compiles the kernels ...")
+            LOGGER.warning("Waiting for another process that compiles the kernels ...")
             lock.acquire()
         tasks = missing_tasks(signatures)  # another process may have compiled them meanwhile
+        if tasks and progress is None:
+            announce()
         for done, left in _compiled(divide_tasks(tasks, workers), begun):
             if progress is not None:
                 progress(done, len(tasks), left)

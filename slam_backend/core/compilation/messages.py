@@ -4,6 +4,7 @@ import logging
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
 from typing import Any
 
 from numba.core import event as numba_event
@@ -60,17 +61,23 @@ def watch_compilation(tell: Callable[[str], None]) -> Iterator[CompilationListen
         yield watch
 
 
-def log_compilation(tell_first: Callable[[str], object] = LOGGER.info) -> None:
+@cache
+def announce() -> None:
+    """Say once why the program waits: log it with level INFO, or print it on stderr if no logging is configured."""
+    LOGGER.log(logging.INFO if LOGGER.hasHandlers() else logging.WARNING, MESSAGE)
+
+
+def log_compilation(announce: Callable[[], object] = announce) -> None:
     """Announce the next compilation, and log the name of each kernel with level DEBUG.
 
     Args:
-        tell_first: Called with the announcement; logs with level INFO by default.
+        announce: Called when the compilation begins.
     """
     first = iter([True])
 
     def tell(name: str) -> None:
         if next(first, False):
-            tell_first(MESSAGE)
+            announce()
         LOGGER.debug("Compiling %s", name)
 
     numba_event.register("numba:compile", CompilationListener(tell))  # type: ignore[no-untyped-call]

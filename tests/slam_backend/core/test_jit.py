@@ -269,20 +269,35 @@ def test_compilation_progress_reports_only_kernels_of_this_project() -> None:
     assert once == watch.seconds > 0.0
 
 
-def test_compilations_are_logged() -> None:
-    """The first compilation of a process is logged with level INFO, each one with DEBUG; nothing is printed."""
-    code = """
-import logging, numba, slam_backend
-logging.basicConfig(format="%(levelname)s %(name)s %(message)s")
-logging.getLogger("slam_backend").setLevel(logging.DEBUG)
+COMPILING = """
+import numba, slam_backend
 for module in ("slam_backend.a", "slam_backend.b", "somebody.else"):
     def kernel(x): return x
     kernel.__module__ = module
     numba.njit(kernel)(1.0)
 """
+
+
+def test_compilations_are_logged() -> None:
+    """The first compilation of a process is logged with level INFO, each one with DEBUG; nothing is printed."""
+    code = (
+        """
+import logging
+logging.basicConfig(format="%(levelname)s %(name)s %(message)s")
+logging.getLogger("slam_backend").setLevel(logging.DEBUG)
+"""
+        + COMPILING
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     each = [f"DEBUG slam_backend Compiling slam_backend.{name}.kernel" for name in "ab"]
     assert (done.stdout, done.stderr.splitlines()) == ("", [f"INFO slam_backend {MESSAGE}", *each])
+
+
+def test_a_program_that_configured_no_logging_is_told_why_it_waits() -> None:
+    """One line on stderr says so; where the first compilation is ahead of time, too."""
+    for code in (COMPILING, "from slam_backend.core.compilation.messages import announce; announce()\n" + COMPILING):
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+        assert (done.stdout, done.stderr.splitlines()) == ("", [MESSAGE])
 
 
 def classes_of(hint: Any) -> set[type]:
