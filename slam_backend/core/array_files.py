@@ -14,6 +14,7 @@ from slam_backend.core.state_codec import MAX_BYTES, read_file
 
 HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 KINDS = "biufUS"  # dtype kinds of numbers and texts; objects would be pickles
+COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # zipfile unpacks a part of these, but all of other members
 
 
 class UnreadableArchiveError(ValueError):
@@ -29,7 +30,7 @@ def read_arrays(path: Path, names: Iterable[str] | None = None) -> dict[str, NDA
 
     Raises:
         UnreadableArchiveError: If the file is no such archive, is damaged, holds other data than numbers and texts, or
-            unpacks to more than `MAX_BYTES`.
+            unpacks to more than `MAX_BYTES`, or is compressed as numpy does not.
     """
     try:
         with zipfile.ZipFile(io.BytesIO(read_file(path))) as archive:
@@ -45,7 +46,9 @@ def read_arrays(path: Path, names: Iterable[str] | None = None) -> dict[str, NDA
 
 
 def _array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[np.generic]:
-    """Return an array, after checking its size against its header."""
+    """Return an array, after checking its compression, and its size against its header."""
+    if member.compress_type not in COMPRESSIONS:
+        raise UnreadableArchiveError(f"{member.filename} is compressed by another method than numpy's")
     with archive.open(member) as stream:
         shape, by_columns, dtype = HEADERS[npy.read_magic(stream)](stream)
         if dtype.kind not in KINDS or dtype.hasobject:

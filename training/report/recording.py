@@ -12,6 +12,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from slam_backend.core.array_files import read_arrays
 from slam_backend.core.files import write_file
 from slam_backend.core.validation import FloatArray, IntArray, argument_error
 from slam_backend.fastslam.reports import MergeEvent
@@ -106,8 +107,7 @@ class Recording:
         file = folder / RECORDING_FILE
         hint = f"Remove {str(file)!r}, or repeat the run."
         try:
-            with np.load(BytesIO(file.read_bytes()), allow_pickle=False) as stored:
-                arrays: dict[str, NDArray[Any]] = {name: stored[name] for name in stored.files}
+            arrays: dict[str, NDArray[Any]] = dict(read_arrays(file))
             about = json.loads(arrays.pop("about").tobytes().decode())
             if about["format"] == FORMAT:
                 return cls(about=about, **arrays)

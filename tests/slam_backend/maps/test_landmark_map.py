@@ -286,3 +286,12 @@ def test_archives_that_unpack_to_too_much_are_refused(tmp_path: Path) -> None:
     assert file.stat().st_size < 10_000_000
     with pytest.raises(UnreadableArchiveError, match="unpacks to more than 1024 MiB"):
         read_arrays(file)
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_archives_that_are_compressed_otherwise_are_refused(method: int, tmp_path: Path) -> None:
+    """Of such a member all would be unpacked, whatever size it claims: 2 kB can become gigabytes."""
+    with zipfile.ZipFile(tmp_path / "x.npz", "w", method) as out:
+        out.writestr("a.npy", header("(3,)") + bytes(24))
+    with pytest.raises(UnreadableArchiveError, match=r"a\.npy is compressed by another method than numpy's"):
+        read_arrays(tmp_path / "x.npz")

@@ -127,7 +127,7 @@ def test_foreign_and_damaged_labels_are_refused(tmp_path: Path) -> None:
         read_labels(file, ABOUT)
     for changed in (
         {"scan": arrays["scan"][:, :16]}, {"scan": arrays["scan"][0]}, {"preferences": arrays["preferences"][:, :17]},
-        {"local_grid": arrays["local_grid"][:, :5]}, {"chosen": arrays["chosen"] + 33},
+        {"local_grid": arrays["local_grid"][:, :, :5]}, {"chosen": arrays["chosen"] + 33},
     ):  # fmt: skip
         np.savez(file, **arrays | changed)
         with pytest.raises(ValueError, match=r"labels: .* got .another file.\. .* has other arrays"):

@@ -15,7 +15,7 @@ from slam_backend.core.array_files import read_arrays
 from slam_backend.core.files import write_file
 from slam_backend.core.validation import Float32Array, IntArray, argument_error
 
-FORMAT = 2  # incremented when the content of files or the meaning of observations changes
+FORMAT = 3  # incremented when the content of files or the meaning of observations changes
 GRID, MASKS = "local_grid", ("action_mask", "teammates_mask")
 ABOUT = "about"
 MOST = 6e4  # largest number in a file
@@ -27,8 +27,9 @@ class Labels:
     """n decisions, with the inputs of the network only, in 2 kB each.
 
     Attributes:
-        packed: Arrays by the names of `agents.goal_network.SHAPES`: grids and masks as bits (n, bytes) uint8, other
-            numbers as (n, ...) float16 with 6 bits of mantissa, exact to 0.8 %.
+        packed: Arrays by the names of `agents.goal_network.SHAPES`: grids as bits, eight rows of an image in a row of
+            bytes (n, 3, 6, 48) uint8, which are compressed best; masks as bits (n, bytes) uint8; other numbers as
+            (n, ...) float16 with 6 bits of mantissa, exact to 0.8 %.
         chosen: (n,) int64. Action of the teacher.
         preferences: (n, 1 + C) float32. Logarithms of the teacher's preferences, 0 for the best, -inf for actions that
             it did not consider.
@@ -51,9 +52,10 @@ class Labels:
         found: dict[str, NDArray[Any]] = {}
         for name, shape in SHAPES.items():
             values = self.packed[name][rows]
-            if name == GRID or name in MASKS:
-                bits = np.unpackbits(values, axis=1, count=int(np.prod(shape))).reshape(-1, *shape)
-                found[name] = bits * np.uint8(255) if name == GRID else bits.view(np.int8)
+            if name == GRID:
+                found[name] = np.unpackbits(values, axis=2) * np.uint8(255)
+            elif name in MASKS:
+                found[name] = np.unpackbits(values, axis=1, count=shape[0]).view(np.int8)
             else:
                 found[name] = values.astype(np.float32)
         return found
@@ -65,7 +67,7 @@ def pack(seen: Mapping[str, NDArray[Any]], chosen: IntArray, preferences: Float3
     for name in SHAPES:
         values = np.asarray(seen[name])
         if name == GRID or name in MASKS:
-            packed[name] = np.packbits(values.reshape(len(values), -1) != 0, axis=1)
+            packed[name] = np.packbits(values != 0, axis=2 if name == GRID else 1)
         else:
             packed[name] = _rounded(values)
     return Labels(packed, chosen, preferences)
@@ -142,7 +144,8 @@ def _unpacked(arrays: Mapping[str, NDArray[Any]]) -> Labels:
     for name, shape in SHAPES.items():
         is_bits = name == GRID or name in MASKS
         packed[name] = arrays[name] if is_bits else _from_planes(arrays[name])
-        expected = (n, -(-int(np.prod(shape)) // 8)) if is_bits else (n, *shape)
+        expected = (n, shape[0], shape[1] // 8, shape[2]) if name == GRID else (n, *shape)
+        expected = (n, -(-shape[0] // 8)) if name in MASKS else expected
         if packed[name].dtype != (np.uint8 if is_bits else np.float16) or packed[name].shape != expected:
             raise ValueError(f"{name} of another shape")
     return Labels(packed, chosen, preferences)
