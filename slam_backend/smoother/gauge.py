@@ -168,10 +168,13 @@ def fit_rigid_2d(points: FloatArray, targets: FloatArray, shares: FloatArray, mo
 @in_place
 def move(poses: FloatArray, motions: FloatArray, moved: FloatArray) -> None:
     """Write poses (K, 3, M) moved by each particle's motion (M, 3); `moved` may be `poses`."""
-    for robot in range(len(poses)):
-        for i in range(len(motions)):
+    for i in range(len(motions)):
+        c, s = math.cos(motions[i, 2]), math.sin(motions[i, 2])
+        for robot in range(len(poses)):
             x, y, heading = poses[robot, 0, i], poses[robot, 1, i], poses[robot, 2, i]
-            c, s = math.cos(motions[i, 2]), math.sin(motions[i, 2])
             moved[robot, 0, i] = motions[i, 0] + c * x - s * y
             moved[robot, 1, i] = motions[i, 1] + s * x + c * y
-            moved[robot, 2, i] = (motions[i, 2] + heading + math.pi) % (2.0 * math.pi) - math.pi
+            turned = motions[i, 2] + heading + math.pi
+            if not 0.0 <= turned < 2.0 * math.pi:  # where it lies there, `%` would not change it
+                turned %= 2.0 * math.pi
+            moved[robot, 2, i] = turned - math.pi
