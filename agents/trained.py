@@ -101,11 +101,12 @@ def save_model(file: Path, weights: Weights, about: Mapping[str, Any]) -> None:
     write_file(file, packed.getvalue(), "file")
 
 
-def load_model(path: str | Path) -> tuple[Weights, dict[str, Any]]:
+def load_model(path: str | Path, argument: str = "model") -> tuple[Weights, dict[str, Any]]:
     """Read a model that `save_model` wrote; no code from the file is run.
 
     Args:
         path: Path of the model, or of the run folder that contains it.
+        argument: Name of the path in errors.
 
     Returns:
         The weights and the metadata.
@@ -116,20 +117,20 @@ def load_model(path: str | Path) -> tuple[Weights, dict[str, Any]]:
     file = Path(path) / MODEL_FILE if Path(path).is_dir() else Path(path)
     expected = "a model that vslam train wrote"
     if not file.is_file():
-        raise argument_error("model", expected, "no such file", f"Check {str(file)!r}.")
+        raise argument_error(argument, expected, "no such file", f"Check {str(file)!r}.")
     try:
         arrays: dict[str, NDArray[Any]] = dict(read_arrays(file))
         about = json.loads(str(arrays.pop(ABOUT)))
         version, digest = about["format"], about["weights"]
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         hint = f"{str(file)!r} cannot be read. Copy it again, or train again."
-        raise argument_error("model", expected, "a broken file", hint) from error
+        raise argument_error(argument, expected, "a broken file", hint) from error
     if version != FORMAT:
         hint = f"Train again, or use the release that wrote it, {about.get('version', 'unknown')}."
-        raise argument_error("model", f"one of format {FORMAT}", f"a model of format {version}", hint)
+        raise argument_error(argument, f"one of format {FORMAT}", f"a model of format {version}", hint)
     if _digest(arrays) != digest:
         raise argument_error(
-            "model", expected, "a broken file", f"{str(file)!r} was changed. Copy it again, or train again."
+            argument, expected, "a broken file", f"{str(file)!r} was changed. Copy it again, or train again."
         )
     return arrays, about
 

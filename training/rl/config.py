@@ -99,7 +99,7 @@ class TrainConfig(ExperimentConfig):
         if self.start_file is not None:
             from agents.trained import load_model
 
-            load_model(self.start_file)
+            load_model(self.start_file, "start")
         if self.anchor and (self.start is None or self.teacher is not None):
             got = "no start" if self.start is None else "a planner to imitate"
             raise argument_error("anchor", "PPO that begins with a model", got, "Give --start, or no --anchor.")

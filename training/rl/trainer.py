@@ -122,7 +122,7 @@ class Training:
         try:
             self._go_on_from(kept)
         except Exception as error:  # torch raises various errors for parts of another model
-            hint = f"Copy the checkpoint again, or train again. Error: {error}."
+            hint = "Another version or another run wrote it: copy the checkpoint again, or train again."
             raise argument_error("resume", "a checkpoint of this model", "a different one", hint) from error
 
     def _go_on_from(self, kept: Mapping[str, Any]) -> None:

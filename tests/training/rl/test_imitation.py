@@ -311,7 +311,7 @@ def test_trainings_begin_with_a_model(whole: tuple[Path, Imitation], tmp_path: P
             np.testing.assert_array_equal(policy.actor_weights()[name], expected)
     for training in trainings:
         training.close()
-    with pytest.raises(ValueError, match="model: expected a model that vslam train wrote, got no such file"):
+    with pytest.raises(ValueError, match="start: expected a model that vslam train wrote, got no such file"):
         TrainConfig.from_mapping(SMALL | {"start": str(tmp_path / "none.npz")})
 
 

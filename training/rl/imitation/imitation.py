@@ -127,7 +127,7 @@ class Imitation:
             self._best, self._best_weights = kept["best"]
             self._returns = dict(kept["returns"])
         except Exception as error:  # torch raises various errors for parts of another model
-            hint = f"Copy the checkpoint again, or train again. Error: {error}."
+            hint = "Another version or another run wrote it: copy the checkpoint again, or train again."
             raise argument_error("resume", "a checkpoint of this model", "a different one", hint) from error
 
     def close(self) -> None:
