@@ -18,8 +18,9 @@ from training.experiments.tables import markdown_table
 
 EPISODES = ("episodes.csv", "episodes.csv.gz")
 ABOUT = (
-    "Made by `vslam bench leaderboard` from kept results (`benchmarks/vslam-bench-v0`). `docs/how-to/exploration.md` "
-    "describes the policies, `docs/reference/metrics.md` the columns, `docs/how-to/benchmark.md` how to add a row.\n"
+    "Made by `vslam bench leaderboard` from folders of results; this project keeps its own in "
+    "`benchmarks/vslam-bench-v0`. `docs/how-to/exploration.md` describes the policies, `docs/reference/metrics.md` the "
+    "columns, `docs/how-to/benchmark.md` how to add a row.\n"
 )
 PICTURE = "Share of worlds below each map error, and map error over the number of robots and particles"
 
