@@ -1,18 +1,16 @@
 """Memory for the landmarks of an episode, compared with what is available before its first step."""
 
-import importlib
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from slam_backend.core.address_space import OWN, free_addresses
 from slam_backend.core.validation import argument_error
 
 PER_PARTICLE = 9 * 8 + 4  # bytes of a landmark in a particle: mean, covariance and count
 COPIES = 2  # a map that grows is copied, and a joint map exists beside those from which it is merged
 GROUP = Path("/sys/fs/cgroup")  # limits of containers
 SYSTEM = Path("/proc/meminfo")
-OWN = Path("/proc/self/statm")
 
 
 def required_memory(num_landmarks: int, num_particles: int) -> int:
@@ -38,19 +36,8 @@ def available_memory(system: Path = SYSTEM, group: Path = GROUP, own: Path = OWN
         found = min(found, max(limit - used, 0))
     except (OSError, ValueError):  # no group, or "max": no limit
         pass
-    free = _free_addresses(own)
+    free = free_addresses(own)
     return found if free is None else min(found, free)
-
-
-def _free_addresses(own: Path) -> int | None:
-    """Return the address space [bytes] that this process may still take; None: there is no limit."""
-    try:
-        resource = importlib.import_module("resource")  # missing on Windows
-        limit = int(resource.getrlimit(resource.RLIMIT_AS)[0])
-        size = int(own.read_text(encoding="ascii").split()[0]) * os.sysconf("SC_PAGE_SIZE")
-    except (ImportError, OSError, ValueError, IndexError):
-        return None
-    return None if limit == resource.RLIM_INFINITY else max(limit - size, 0)
 
 
 def check_memory(num_landmarks: int, num_particles: int, available: int | None) -> None:

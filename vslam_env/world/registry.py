@@ -181,10 +181,9 @@ def _files(world: str) -> list[Path]:
         return files
     if path.suffix.lower() not in FILE_SUFFIXES:
         names = ", ".join(repr(name) for name in WORLD_FAMILIES)
-        raise argument_error(
-            "world",
-            f"one of {names}, or a path of an image, a .yaml or .json file or a folder",
-            str(world),
-            "Check the spelling, or that the file ends in .png, .jpg, .pgm, .yaml or .json.",
-        )
+        hint = "Check the spelling, or that the file ends in .png, .jpg, .pgm, .yaml or .json."
+        if world.split(":")[0] in WORLD_FAMILIES:
+            hint = "Write options as in rooms:extent=60:room=10."
+        expected = f"one of {names}, or a path of an image, a .yaml or .json file or a folder"
+        raise argument_error("world", expected, world, hint)
     return [existing(path)]

@@ -23,6 +23,7 @@ from numba.core.registry import CPUDispatcher
 from numba.core.serialize import dumps
 from numba.misc.appdirs import AppDirs
 
+from slam_backend.core.address_space import check_address_space
 from slam_backend.core.compilation.shipped import CONFIG, shipped_kernels, warn_once
 from slam_backend.core.compilation.stamp import stamp_of, types_text
 
@@ -74,6 +75,7 @@ class KernelCache(NullCache):
         """Return the kernel of a signature; None: no usable one, even after waiting for a worker that compiles it."""
         from slam_backend.core.compilation import ahead  # which builds on this module
 
+        check_address_space()
         target_context.refresh()
         found = self._load(sig, target_context)
         if found is None and ahead.await_kernel(self._kernel, sigutils.normalize_signature(sig)[0]):  # type: ignore[no-untyped-call]

@@ -238,6 +238,7 @@ def test_options_of_a_plan_set_its_scale(tmp_path: Path) -> None:
     [
         ("rooms:extent=201", r"^extent: expected a finite number > 0 and <= 200, got 201"),
         ("rooms:extent=15:room=10", r"^extent: expected at least 20 m for rooms of 10 m, got 15"),
+        ("rooms:extent=30,room=5", r"^world: expected one of .* Write options as in rooms:extent=60:room=10\.$"),
         ("rooms:room=1000", r"^room: expected a finite number"),
         ("office:extent=20", r"^extent: expected a finite number >= 30 and <= 200, got 20.*leave it out"),
         ("campus:extent=nan", r"^extent: expected a finite number"),
