@@ -293,7 +293,7 @@ logging.getLogger("slam_backend").setLevel(logging.DEBUG)
     assert (done.stdout, done.stderr.splitlines()) == ("", [f"INFO slam_backend {MESSAGE}", *each])
 
 
-def test_a_program_that_configured_no_logging_is_told_why_it_waits() -> None:
+def test_a_program_that_configured_no_logging_prints_why_it_waits() -> None:
     """One line on stderr says so; where the first compilation is ahead of time, too."""
     for code in (COMPILING, "from slam_backend.core.compilation.messages import announce; announce()\n" + COMPILING):
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
