@@ -599,13 +599,13 @@ def set_rendezvous(cost: Any, corner: Any, size: int, pose: Any, places: Any, ro
     """Move places (m, 3), NaN: none, to the nearest reachable cells and write them as candidates (m, 5).
 
     Places that the robot has reached, or that no reachable cell is near, leave their slots empty. Distant candidates, a
-    mask (m,), stay while their places do.
+    mask (m,), stay while their places do; those that do not are no longer marked.
     """
     height, width = cost.shape
     for i in range(len(rows)):
         if distant[i] and math.hypot(rows[i, X] - places[i, 0], rows[i, Y] - places[i, 1]) <= NEAR_PLACE * CELL:
             continue
-        rows[i] = np.nan
+        rows[i], distant[i] = np.nan, False
         if np.isnan(places[i, 0]):
             continue
         row, col = to_index(places[i, 1], size) - corner[0], to_index(places[i, 0], size) - corner[1]

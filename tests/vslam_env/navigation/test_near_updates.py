@@ -145,6 +145,19 @@ def test_rendezvous_far_away_stay_while_their_places_do() -> None:
     assert np.hypot(*(robot.candidates.rows(0)[28, :2] - [-4.0, 1.0])) < CELL
 
 
+def test_a_rendezvous_that_moves_near_in_one_update_has_its_path() -> None:
+    """A slot whose place was out of reach and now is near has a new candidate, with a length as any other."""
+    robot, places = Robot(crossing()), NO_PLACES.copy()
+    places[0] = 20.0, 1.0, 0.0
+    for _ in range(PERIOD + 1):
+        robot.update(-9.0, places=places)
+    places[0] = -4.0, 1.0, 0.0
+    robot.update(-9.0, places=places)
+    row = robot.candidates.rows(0)[28]
+    assert np.hypot(*(row[:2] - [-4.0, 1.0])) < CELL
+    assert row[4] == robot.candidates.lengths(0)[28, 0] == pytest.approx(5.2, abs=0.5)
+
+
 @pytest.mark.parametrize("mate", [-21.0, -20.8, -20.6, 2.6, 2.8, 3.0, 3.2, 100.0, np.nan])
 def test_teammates_at_the_edge_of_a_near_update_do_no_harm(mate: float) -> None:
     """A teammate at or beyond the edge of what is searched leaves all candidates finite."""
