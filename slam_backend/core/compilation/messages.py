@@ -67,17 +67,17 @@ def announce() -> None:
     LOGGER.log(logging.INFO if LOGGER.hasHandlers() else logging.WARNING, MESSAGE)
 
 
-def log_compilation(announce: Callable[[], object] = announce) -> None:
+def log_compilation(begin: Callable[[], object] = announce) -> None:
     """Announce the next compilation, and log the name of each kernel with level DEBUG.
 
     Args:
-        announce: Called when the compilation begins.
+        begin: Called when the first kernel is compiled.
     """
     first = iter([True])
 
     def tell(name: str) -> None:
         if next(first, False):
-            announce()
+            begin()
         LOGGER.debug("Compiling %s", name)
 
     numba_event.register("numba:compile", CompilationListener(tell))  # type: ignore[no-untyped-call]

@@ -16,7 +16,8 @@ from slam_backend.core.files import write_file
 from slam_backend.core.validation import Float32Array, IntArray, argument_error
 
 FORMAT = 3  # incremented when the content of files or the meaning of observations changes
-GRID, MASKS = "local_grid", ("action_mask", "teammates_mask")
+GRID = "local_grid"
+BIT_AXES = {GRID: 2, "action_mask": 1, "teammates_mask": 1}  # axes along which arrays of bits are packed
 ABOUT = "about"
 MOST = 6e4  # largest number in a file
 HINT = "Delete it, or use another folder."
@@ -51,13 +52,12 @@ class Labels:
         """Return the inputs (m, ...) of the network for m labels, with the types that the environment returns."""
         found: dict[str, NDArray[Any]] = {}
         for name, shape in SHAPES.items():
-            values = self.packed[name][rows]
-            if name == GRID:
-                found[name] = np.unpackbits(values, axis=2) * np.uint8(255)
-            elif name in MASKS:
-                found[name] = np.unpackbits(values, axis=1, count=shape[0]).view(np.int8)
-            else:
+            values, axis = self.packed[name][rows], BIT_AXES.get(name)
+            if axis is None:
                 found[name] = values.astype(np.float32)
+            else:
+                bits = np.unpackbits(values, axis=axis, count=shape[axis - 1])
+                found[name] = bits * np.uint8(255) if name == GRID else bits.view(np.int8)
         return found
 
 
@@ -65,11 +65,8 @@ def pack(seen: Mapping[str, NDArray[Any]], chosen: IntArray, preferences: Float3
     """Return labels for observations (n, ...) as the environment returned them."""
     packed: dict[str, NDArray[Any]] = {}
     for name in SHAPES:
-        values = np.asarray(seen[name])
-        if name == GRID or name in MASKS:
-            packed[name] = np.packbits(values != 0, axis=2 if name == GRID else 1)
-        else:
-            packed[name] = _rounded(values)
+        values, axis = np.asarray(seen[name]), BIT_AXES.get(name)
+        packed[name] = _rounded(values) if axis is None else np.packbits(values != 0, axis=axis)
     return Labels(packed, chosen, preferences)
 
 
@@ -142,11 +139,12 @@ def _unpacked(arrays: Mapping[str, NDArray[Any]]) -> Labels:
         raise ValueError("labels of other actions")
     packed: dict[str, NDArray[Any]] = {}
     for name, shape in SHAPES.items():
-        is_bits = name == GRID or name in MASKS
-        packed[name] = arrays[name] if is_bits else _from_planes(arrays[name])
-        expected = (n, shape[0], shape[1] // 8, shape[2]) if name == GRID else (n, *shape)
-        expected = (n, -(-shape[0] // 8)) if name in MASKS else expected
-        if packed[name].dtype != (np.uint8 if is_bits else np.float16) or packed[name].shape != expected:
+        axis, expected = BIT_AXES.get(name), [n, *shape]
+        packed[name] = arrays[name] if axis is not None else _from_planes(arrays[name])
+        if axis is not None:
+            expected[axis] = -(-expected[axis] // 8)
+        dtype = np.float16 if axis is None else np.uint8
+        if packed[name].dtype != dtype or packed[name].shape != tuple(expected):
             raise ValueError(f"{name} of another shape")
     return Labels(packed, chosen, preferences)
 
