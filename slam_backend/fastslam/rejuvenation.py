@@ -158,9 +158,11 @@ def joint_graph(
         options: Options of the smoother. With slices and too many keyframes, each graph is first reduced to its share.
     """
     robots = len(starts[2])
-    most_keys = options.most_keys(robots) + graph_a.num_biases + graph_b.num_biases
-    if options.slice_steps is not None and graph_a.num_keys + graph_b.num_keys > most_keys:
-        graph_a, graph_b = (_thinned(graph, robots, camera, options) for graph in (graph_a, graph_b))
+    common = np.union1d(graph_a.landmark_ids, renamed[np.isin(renamed[:, 0], graph_b.landmark_ids), 1])
+    most_keys = options.most_keys(len(common), np.concatenate([graph_a.latest, graph_b.latest]))
+    num_keys = sum(graph.num_keys - graph.num_biases for graph in (graph_a, graph_b))
+    if options.slice_steps is not None and num_keys > most_keys:
+        graph_a, graph_b = (_thinned(graph, most_keys, robots, camera, options) for graph in (graph_a, graph_b))
     robot = int(np.flatnonzero(graph_b.parents[graph_b.first_keys] < 0)[0])  # one that defines b's frame
     start = starts[2][len(starts[0]) + robot]
     began = graph_b.poses[graph_b.first_keys[robot]].copy()  # writable, as `add_gauge_covariance` is compiled for
@@ -172,11 +174,11 @@ def joint_graph(
     return merge_graphs(graph_a, graph_b, motion, renamed, spread), motion
 
 
-def _thinned(graph: SlamGraph, robots: int, camera: FloatArray, options: SmoothingOptions) -> SlamGraph:
+def _thinned(graph: SlamGraph, most_keys: int, robots: int, camera: FloatArray, options: SmoothingOptions) -> SlamGraph:
     """Return a graph reduced to its share of the keyframes of all robots."""
     share = len(graph.last_keys) / robots
-    keys, fresh = max(2, int(share * options.most_keys(robots))), max(1, int(share * options.recent_keys))
-    return reduce_keyframes(graph, camera, replace(options, max_keys=keys, further_keys=0, recent_keys=fresh))
+    keys, fresh = max(2, int(share * most_keys)), max(1, int(share * options.recent_keys))
+    return reduce_keyframes(graph, camera, replace(options, recent_keys=fresh), most_keys=keys)
 
 
 MIN_CLOSURE_MATCHES = 3  # matches with landmarks not seen for long that count as a loop closure in one step

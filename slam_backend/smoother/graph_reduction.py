@@ -20,8 +20,9 @@ CONTRADICTION = 2.0  # factor on the kernel's squared distance: measurements bey
 
 
 def reduce_keyframes(
-    graph: SlamGraph, camera: FloatArray, options: SmoothingOptions, sightings: LandmarkFactors | None = None
-) -> SlamGraph:
+    graph: SlamGraph, camera: FloatArray, options: SmoothingOptions, sightings: LandmarkFactors | None = None,
+    most_keys: int | None = None,
+) -> SlamGraph:  # fmt: skip
     """Return the graph with old keys condensed and at most `most_keys` keys, if the recent ones allow.
 
     The measurements of a recent key stay raw unless it has more than `MAX_FRAMES` frames. Old keys without measurements
@@ -33,6 +34,7 @@ def reduce_keyframes(
         camera: (7,) focal length, baseline, sigma_px, sigma_disparity, mount.
         options: Limits on all keys and on recent keys of all robots together.
         sightings: Sightings of the graph, which are linearised again; None: gathered here.
+        most_keys: Limit on all keys; None: that of the options.
     """
     seen = gathered(graph) if sightings is None else sightings
     share = max(1, options.recent_keys // len(graph.last_keys))
@@ -44,8 +46,11 @@ def reduce_keyframes(
     rows, sighted = np.flatnonzero(seen.condensed | ~raw[seen.keys]), np.zeros(graph.num_keys, dtype=np.bool_)
     sighted[seen.keys[rows]] = True
     keys = mapped(graph.part(Keys), np.copy)
-    most_keys = options.most_keys(len(graph.last_keys)) + graph.num_biases
-    left, roots, numbers, offsets = _kernels.merge_keys(fresh, sighted, most_keys, keys, graph.biases_of_odometry())
+    if most_keys is None:
+        most_keys = options.most_keys(len(graph.landmark_ids), graph.latest)
+    left, roots, numbers, offsets = _kernels.merge_keys(
+        fresh, sighted, most_keys + graph.num_biases, keys, graph.biases_of_odometry()
+    )
     frozen = _kernels.add_sightings(rows, seen, roots, numbers, offsets)
     fewer = graph.with_columns(
         **{name: column[:left] for name, column in keys._asdict().items()},

@@ -2,7 +2,12 @@
 
 from dataclasses import dataclass
 
-from slam_backend.core.validation import MOST, check_float, check_int, known_names
+import numpy as np
+
+from slam_backend.core.validation import MOST, IntArray, check_float, check_int, known_names
+
+MANY_LANDMARKS, LANDMARKS_PER_KEY = 2700, 15  # beyond so many landmarks one more keyframe for every 15,
+MANY_STEPS, STEPS_PER_KEY = 6000, 50  # and beyond so many steps of a robot for every 50
 
 
 @known_names
@@ -11,8 +16,9 @@ class SmoothingOptions:
     """Options of a rejuvenation.
 
     Attributes:
-        max_keys: Maximum number of keyframes of one robot; beyond it the most rigid neighbours are joined. Memory grows
-            with the product of keyframes and landmarks in view, effort hardly faster than the keyframes.
+        max_keys: Maximum number of keyframes of one robot; beyond it the most rigid neighbours are joined. Large maps
+            and long runs may have more, see `most_keys`. Memory grows with the product of keyframes and landmarks in
+            view, effort hardly faster than the keyframes.
         further_keys: Additional keyframes for each further robot of the filter.
         recent_keys: Newest keyframes, of all robots together, that keep their raw measurements, relinearised at each
             rejuvenation.
@@ -71,6 +77,16 @@ class SmoothingOptions:
         check_float("tolerance", self.tolerance, "Use 0.1.", above=0.0)
         check_float("least_ess", self.least_ess, "Give a share of M.", at_least=0.0, at_most=1.0)
 
-    def most_keys(self, num_robots: int) -> int:
-        """Return the maximum number of keyframes of K robots together."""
-        return self.max_keys + (num_robots - 1) * self.further_keys
+    def most_keys(self, num_landmarks: int, latest: IntArray) -> int:
+        """Return the maximum number of keyframes of K robots together.
+
+        It grows with large maps and long runs. Few keyframes for a long way are joined over long distances, and their
+        relative poses, linearised once, then claim a certainty that they do not have (docs/lab/scale.md).
+
+        Args:
+            num_landmarks: Number of landmarks of the graph.
+            latest: (K,) int64. Last step of each robot.
+        """
+        more = max(num_landmarks - MANY_LANDMARKS, 0) // LANDMARKS_PER_KEY
+        later = int(np.maximum(latest - MANY_STEPS, 0).sum()) // STEPS_PER_KEY
+        return self.max_keys + (len(latest) - 1) * self.further_keys + more + later

@@ -144,7 +144,7 @@ def rejuvenate(
     """
     if any((log.kinds == EXACT).any() for log in logs):
         return Rejuvenation(graph, "poses that were given as exact", float("nan"), 0, None)
-    share = max(1, 2 * options.most_keys(len(logs)) // len(logs))
+    share = max(1, 2 * options.most_keys(len(graph.landmark_ids), graph.latest) // len(logs))
     rest = list(logs)
     while True:
         last = all(len(log) <= share for log in rest)
@@ -186,7 +186,7 @@ def relinearised_and_reduced(
         camera, options: Same arguments as `rejuvenate`.
         rng: Source of draws, where sampling the variances is cheaper than computing them.
     """
-    if graph.num_keys <= options.most_keys(len(graph.last_keys)) + graph.num_biases:
+    if graph.num_keys <= options.most_keys(len(graph.landmark_ids), graph.latest) + graph.num_biases:
         return relinearise(graph, mode)
     transition_variances = (
         sample_transition_variances(graph, mode, rng) if mode.crowded else mode.transition_variances()

@@ -33,7 +33,7 @@ def plain_reduced(graph: SlamGraph, camera: FloatArray, options: SmoothingOption
         fresh[np.flatnonzero(graph.robots == robot)[-share:]] = True
     condensed = _without_blind(_condensed(graph, fresh, camera, options), fresh)
     representatives, slack = _representatives(
-        condensed, graph.transition_variances, fresh, options.most_keys(len(graph.last_keys))
+        condensed, graph.transition_variances, fresh, options.most_keys(len(graph.landmark_ids), graph.latest)
     )
     return plain_compacted(_joined(replace(condensed, rigid_variances=slack), representatives))
 

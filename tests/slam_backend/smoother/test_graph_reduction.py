@@ -152,13 +152,21 @@ def test_the_keyframe_limit_grows_with_the_number_of_robots():
     run = small_run(robots=2, length=10.0)
     for further, most in ((0, 20), (6, 26)):
         options = SmoothingOptions(max_keys=20, further_keys=further, recent_keys=8)
-        assert options.most_keys(1) == 20
-        assert options.most_keys(2) == most
+        assert options.most_keys(0, np.zeros(1, dtype=np.int64)) == 20
+        assert options.most_keys(0, np.zeros(2, dtype=np.int64)) == most
         result = rejuvenate(
             SlamGraph.at_starts(run.true_paths[:, 0]), [log.arrays() for log in logs_of(run)], run.spec.noise.motion,
             camera_of(run), 20, np.random.default_rng(3), options,
         )  # fmt: skip
         assert result.graph.num_keys == most
+
+
+def test_the_keyframe_limit_grows_with_large_maps_and_long_runs():
+    """Up to 2,700 landmarks and 6,000 steps of each robot it is that of the options; beyond, more is in proportion."""
+    options = SmoothingOptions(max_keys=20, further_keys=5)
+    assert options.most_keys(2700, np.array([6000, 6000])) == 25
+    assert options.most_keys(2700 + 150, np.array([6000, 6000])) == 25 + 10
+    assert options.most_keys(2700 + 150, np.array([6000 + 500, 6000 + 250])) == 25 + 10 + 15
 
 
 def test_using_a_graph_does_not_change_it():
@@ -194,7 +202,7 @@ def test_keys_are_joined_as_by_the_plain_program(max_keys, kernel):
         mode = optimize(graph, camera_of(run), TIGHT)
         graph = relinearise(graph, mode, mode.transition_variances())
         found, expected = (how(graph, camera_of(run), options) for how in (reduce_keyframes, plain_reduced))
-        assert found.num_keys <= max(options.most_keys(2), 8)
+        assert found.num_keys <= max(options.most_keys(len(graph.landmark_ids), graph.latest), 8)
         for name in graph.__dataclass_fields__:
             one, other = getattr(found, name), getattr(expected, name)
             assert one.dtype == other.dtype
