@@ -7,7 +7,8 @@ import numpy as np
 from slam_backend.core.validation import MOST, IntArray, check_float, check_int, known_names
 
 MANY_LANDMARKS, LANDMARKS_PER_KEY = 2700, 15  # beyond so many landmarks one more keyframe for every 15,
-MANY_STEPS, STEPS_PER_KEY = 6000, 50  # and beyond so many steps of a robot for every 50
+MANY_STEPS, MANY_ROBOTS, STEPS_PER_KEY = 6000, 3, 50  # beyond so many steps of a robot, or of 3, for every 50,
+LEAST_LANDMARKS_PER_KEY = 5  # but at most one for every 5 landmarks: a run in the same place needs no more
 
 
 @known_names
@@ -34,7 +35,8 @@ class SmoothingOptions:
         free_sightings: Number of sightings that `effort` does not count.
         least_ess: Share of M that the effective sample size of the importance weights must reach.
         more_draws: Factor on M for a second draw where the first one misses `least_ess` by less than this factor; M of
-            these paths are then resampled. 1: no second draw.
+            these paths are then resampled. 1: no second draw. Beyond `max_keys` keyframes no second draw is made: the
+            weights are tempered until they reach `least_ess`.
         slice_steps: New steps, of all robots together but at least eight of each, that one slice adds to the graph; no
             step of the filter then does more than one slice of the work. None: all work in the step in which it is due.
         rigid_within: Limit [m] of the odometry's scatter since the last keyframe (root mean square of position and of
@@ -80,13 +82,22 @@ class SmoothingOptions:
     def most_keys(self, num_landmarks: int, latest: IntArray) -> int:
         """Return the maximum number of keyframes of K robots together.
 
-        It grows with large maps and long runs. Few keyframes for a long way are joined over long distances, and their
-        relative poses, linearised once, then claim a certainty that they do not have (docs/lab/scale.md).
-
         Args:
             num_landmarks: Number of landmarks of the graph.
             latest: (K,) int64. Last step of each robot.
         """
-        more = max(num_landmarks - MANY_LANDMARKS, 0) // LANDMARKS_PER_KEY
-        later = int(np.maximum(latest - MANY_STEPS, 0).sum()) // STEPS_PER_KEY
-        return self.max_keys + (len(latest) - 1) * self.further_keys + more + later
+        return self.max_keys + (len(latest) - 1) * self.further_keys + extra_keys(num_landmarks, latest)
+
+
+def extra_keys(num_landmarks: int, latest: IntArray) -> int:
+    """Return by how much the limit of keyframes grows in large maps and long runs; bounded where the map is.
+
+    Few keyframes for a long way are joined over long distances, and their relative poses, linearised once, claim a
+    certainty that they do not have (docs/lab/scale.md).
+
+    Args:
+        num_landmarks, latest: See `SmoothingOptions.most_keys`.
+    """
+    large = max(num_landmarks - MANY_LANDMARKS, 0) // LANDMARKS_PER_KEY
+    steps = max(int(np.maximum(latest - MANY_STEPS, 0).sum()), int(latest.sum()) - MANY_ROBOTS * MANY_STEPS)
+    return min(large + steps // STEPS_PER_KEY, num_landmarks // LEAST_LANDMARKS_PER_KEY)

@@ -25,7 +25,7 @@ from slam_backend.smoother.graph_building import InitialPoses, LandmarkPositions
 from slam_backend.smoother.graph_reduction import reduce_keyframes, relinearise, without_unused_frames
 from slam_backend.smoother.log_arrays import EXACT, REJECTED, LogArrays
 from slam_backend.smoother.optimizer import NO_POSE, MapEstimate, optimize
-from slam_backend.smoother.options import SmoothingOptions
+from slam_backend.smoother.options import SmoothingOptions, extra_keys
 from slam_backend.smoother.sampling import (
     PathLandmarks,
     PathSamples,
@@ -34,6 +34,7 @@ from slam_backend.smoother.sampling import (
     sample_more_paths,
     sample_paths,
     sample_transition_variances,
+    tempered,
 )
 
 LARGE_MAP = 1000  # landmarks; teams in worlds of 30 m know some 500
@@ -213,7 +214,9 @@ def sample_particles(
     draws = sample_paths(grown, mode, num_particles, rng)
     chosen, ess = draws, draws.sample_size
     needed = options.least_ess * num_particles
-    if needed > ess >= needed / options.more_draws:
+    if ess < needed and extra_keys(len(grown.landmark_ids), grown.latest):
+        chosen, ess = tempered(draws, needed), needed
+    elif needed > ess >= needed / options.more_draws:
         chosen, size = sample_more_paths(grown, mode, options.more_draws * num_particles, draws, rng)
         ess = min(size, float(num_particles))
     graph = reduce_keyframes(relinearise(grown, mode, draws.transition_variances), camera, options, mode.sightings)

@@ -187,6 +187,27 @@ def sample_more_paths(
     return PathSamples.weighed(poses, np.zeros(num_particles), drawn.transition_variances), drawn.sample_size
 
 
+HALVINGS = 30  # of the interval of powers
+
+
+def tempered(draws: PathSamples, sample_size: float) -> PathSamples:
+    """Return paths whose weights are raised to the largest power that lets their effective sample size reach a value.
+
+    They lie between the Gaussian about the mode (power 0) and the posterior (power 1).
+
+    Args:
+        draws: Paths with finite weights.
+        sample_size: Effective sample size to reach, at most M.
+    """
+    low, high = 0.0, 1.0
+    logs, weights = draws.log_weights - draws.log_weights.max(), np.empty(len(draws.weights))
+    for _ in range(HALVINGS):
+        power = 0.5 * (low + high)
+        low, high = (power, high) if _kernels.normalise(power * logs, weights) >= sample_size else (low, power)
+    size = _kernels.normalise(low * logs, weights)
+    return draws._replace(log_weights=low * logs, weights=weights, sample_size=size)
+
+
 def sample_transition_variances(graph: SlamGraph, mode: MapEstimate, rng: np.random.Generator) -> FloatArray:
     """Return the variances (k,) [m^2] of motions from the previous keys over `LANES` paths, each to about 14 %.
 

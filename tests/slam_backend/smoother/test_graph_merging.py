@@ -9,7 +9,7 @@ from builders.teams import NEVER, SimulatedTeam, check_snapshot, false_alignment
 
 from slam_backend.geometry import between, compose
 from slam_backend.maps.alignment import AlignmentOptions
-from slam_backend.smoother import rejuvenation
+from slam_backend.smoother import options, rejuvenation
 from slam_backend.smoother.graph import NONE, SlamGraph, scattered
 from slam_backend.smoother.graph_building import extend_graph, merge_graphs
 from slam_backend.smoother.optimizer import optimize
@@ -242,6 +242,26 @@ def test_no_two_filters_work_on_their_smoothers_in_one_step(monkeypatch):
     simulation.run(team, 60)
     assert len(worked) > 10
     assert len(set(worked)) == len(worked)
+
+
+def test_joint_filters_of_long_runs_keep_more_keyframes(monkeypatch):
+    """Two groups with many keyframes are reduced to their shares of the limit, which grows with the run."""
+    smoothing = SmoothingOptions(slice_steps=16, max_keys=20, further_keys=0, recent_keys=4)
+
+    def joint_keys():
+        simulation = SimulatedTeam(num_robots=2, seed=101)
+        team = simulation.build(attempts=NEVER, rejuvenate_every=20, smoothing=smoothing)
+        simulation.run(team, 80)
+        alone = [len(smoother_of(group)["poses"]) for group in team._groups]
+        team.merge(0, 1, false_alignment(simulation, team, np.zeros(3)))
+        return sum(alone), len(smoother_of(team._groups[0])["poses"])
+
+    alone, joint = joint_keys()
+    assert joint <= 20 + 1 < alone  # each share of the limit may be exceeded by the newest keyframes
+    monkeypatch.setattr(options, "MANY_STEPS", 40)
+    monkeypatch.setattr(options, "STEPS_PER_KEY", 16)
+    alone, joint = joint_keys()
+    assert 20 + 1 < joint <= 20 + (80 - 40) * 2 // 16 + 1 < alone
 
 
 def test_after_an_undo_smoothers_are_as_if_they_had_never_been_joined():

@@ -162,11 +162,12 @@ def test_the_keyframe_limit_grows_with_the_number_of_robots():
 
 
 def test_the_keyframe_limit_grows_with_large_maps_and_long_runs():
-    """Up to 2,700 landmarks and 6,000 steps of each robot it is that of the options; beyond, more is in proportion."""
+    """Up to 2,700 landmarks and 6,000 steps it is that of the options; beyond, it grows as far as the map is large."""
     options = SmoothingOptions(max_keys=20, further_keys=5)
     assert options.most_keys(2700, np.array([6000, 6000])) == 25
     assert options.most_keys(2700 + 150, np.array([6000, 6000])) == 25 + 10
     assert options.most_keys(2700 + 150, np.array([6000 + 500, 6000 + 250])) == 25 + 10 + 15
+    assert options.most_keys(100, np.array([10**9, 10**9])) == 25 + 20
 
 
 def test_using_a_graph_does_not_change_it():

@@ -239,6 +239,24 @@ def test_more_paths_are_sampled_if_the_sample_size_is_too_small():
             assert np.unique(many.particles(0)[0], axis=0).shape[0] > 20
 
 
+def test_in_large_maps_weights_are_tempered_where_the_sample_size_is_too_small(monkeypatch):
+    """Beyond the ordinary limit of keyframes no draw is refused; the particles still scatter about the same mean."""
+    run = small_run()
+    monkeypatch.setattr(rejuvenation, "extra_keys", lambda *_: 1)
+    slam = rejuvenated(run, every=20, smoothing=SmoothingOptions(least_ess=1.0, more_draws=1))
+    plain = rejuvenated(run, every=20)
+    reached = []
+    for reading in run.readings():
+        reports = slam.step(**reading).rejuvenation, plain.step(**reading).rejuvenation
+        if reports[0] is not None:
+            assert reports[0].reason == ""
+            reached.append(reports[0].ess)
+            covariance = plain.pose(0).covariance
+            off = slam.particles(0)[0].mean(axis=0) - plain.pose(0).mean
+            assert 30.0 * off @ np.linalg.solve(covariance, off) < 16.3  # 99.9 % of 3 degrees of freedom
+    assert set(reached) == {30.0}
+
+
 @pytest.mark.slow
 def test_a_rejuvenated_filter_has_smaller_map_errors_and_nees():
     """After 80 m with 30 particles, map errors are below two thirds of the plain filter's, and NEES below a fifth."""

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 from builders.linear_world import LANDMARKS
 from builders.runs import TIGHT, camera_of, graph_of, small_run, upper
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.stats import chi2
 
 from slam_backend.core.validation import FloatArray, IntArray
@@ -20,6 +22,7 @@ from slam_backend.smoother.optimizer import MapEstimate, optimize
 from slam_backend.smoother.options import SmoothingOptions
 from slam_backend.smoother.sampling import (
     PathLandmarks,
+    PathSamples,
     has_single_sighting,
     importance_weights,
     lane_rows,
@@ -29,6 +32,7 @@ from slam_backend.smoother.sampling import (
     sample_more_paths,
     sample_paths,
     sample_transition_variances,
+    tempered,
 )
 
 MOUNT = np.array([0.1, -0.05, 0.2])
@@ -388,3 +392,24 @@ def test_landmarks_of_one_key_do_not_change_the_weights():
     apart = found.log_weights - whole
     assert len(single) > 0
     assert np.ptp(apart) < 1e-4
+
+
+@given(
+    logs=st.lists(st.floats(-1e6, 1e6), min_size=2, max_size=40),
+    share=st.floats(0.0, 1.0),
+)
+def test_tempered_weights_are_a_power_with_the_given_sample_size(logs: list[float], share: float) -> None:
+    """It is the largest power of the weights that reaches the sample size; paths and order stay."""
+    paths = np.zeros((1, 3, len(logs)))
+    draws = PathSamples.weighed(paths, np.array(logs), np.zeros(1))
+    least = 1.0 + share * (len(logs) - 1.0) * 0.999
+    found = tempered(draws, least)
+    assert found.poses is paths
+    assert found.sample_size >= least * (1.0 - 1e-9)
+    if draws.sample_size < least:
+        spread = np.ptp(logs)
+        power = np.ptp(found.log_weights) / spread
+        more = PathSamples.weighed(paths, (power + 1e-8 + 1e-6 * power) * np.array(logs), np.zeros(1))
+        assert more.sample_size <= least * (1.0 + 1e-6) or power > 1.0 - 1e-6
+    else:
+        np.testing.assert_allclose(found.weights, draws.weights, rtol=1e-5, atol=1e-12)
