@@ -193,7 +193,8 @@ HALVINGS = 30  # of the interval of powers
 def tempered(draws: PathSamples, sample_size: float) -> PathSamples:
     """Return paths whose weights are raised to the largest power that lets their effective sample size reach a value.
 
-    They lie between the Gaussian about the mode (power 0) and the posterior (power 1).
+    The power is found as in adaptive tempering (Jasra et al., Scandinavian Journal of Statistics 38, 2011). The paths
+    then lie between the Gaussian about the mode (power 0) and the posterior (power 1).
 
     Args:
         draws: Paths with finite weights.
