@@ -158,8 +158,8 @@ def joint_graph(
         options: Options of the smoother. With slices and too many keyframes, each graph is first reduced to its share.
     """
     robots = len(starts[2])
-    common = np.union1d(graph_a.landmark_ids, renamed[np.isin(renamed[:, 0], graph_b.landmark_ids), 1])
-    most_keys = options.most_keys(len(common), np.concatenate([graph_a.latest, graph_b.latest]))
+    landmarks = np.union1d(graph_a.landmark_ids, renamed[np.isin(renamed[:, 0], graph_b.landmark_ids), 1])
+    most_keys = options.most_keys(len(landmarks), np.concatenate([graph_a.latest, graph_b.latest]))
     num_keys = sum(graph.num_keys - graph.num_biases for graph in (graph_a, graph_b))
     if options.slice_steps is not None and num_keys > most_keys:
         graph_a, graph_b = (_thinned(graph, most_keys, robots, camera, options) for graph in (graph_a, graph_b))
