@@ -21,7 +21,7 @@ from slam_backend.smoother.graph_building import InitialPoses, LandmarkPositions
 from slam_backend.smoother.graph_reduction import reduce_keyframes
 from slam_backend.smoother.log_arrays import LogArrays
 from slam_backend.smoother.optimizer import NO_POSE
-from slam_backend.smoother.options import SmoothingOptions
+from slam_backend.smoother.options import SmoothingOptions, keyframe_limit
 from slam_backend.smoother.reassociation import LandmarkTable, RejectedMeasurements, reassociate
 from slam_backend.smoother.rejuvenation import Draft, LandmarkDescriptors, Particles, Rejuvenation, Smoother, rejuvenate
 from slam_backend.smoother.sampling import PathLandmarks
@@ -159,7 +159,7 @@ def joint_graph(
     """
     robots = len(starts[2])
     landmarks = np.union1d(graph_a.landmark_ids, renamed[np.isin(renamed[:, 0], graph_b.landmark_ids), 1])
-    most_keys = options.most_keys(len(landmarks), np.concatenate([graph_a.latest, graph_b.latest]))
+    most_keys = keyframe_limit(options, len(landmarks), np.concatenate([graph_a.latest, graph_b.latest]))
     num_keys = sum(graph.num_keys - graph.num_biases for graph in (graph_a, graph_b))
     if options.slice_steps is not None and num_keys > most_keys:
         graph_a, graph_b = (_thinned(graph, most_keys, robots, camera, options) for graph in (graph_a, graph_b))

@@ -13,7 +13,7 @@ from slam_backend.smoother import _kernels
 from slam_backend.smoother._kernels import NONE, Keys, LandmarkFactors, Points
 from slam_backend.smoother.graph import SlamGraph, mapped
 from slam_backend.smoother.optimizer import MapEstimate, gathered, linearise
-from slam_backend.smoother.options import SmoothingOptions
+from slam_backend.smoother.options import SmoothingOptions, keyframe_limit
 
 MAX_FRAMES = 100  # frames of a recent key with raw measurements: a robot that waits adds frames to the same key
 CONTRADICTION = 2.0  # factor on the kernel's squared distance: measurements beyond it are dropped
@@ -47,7 +47,7 @@ def reduce_keyframes(
     sighted[seen.keys[rows]] = True
     keys = mapped(graph.part(Keys), np.copy)
     if most_keys is None:
-        most_keys = options.most_keys(len(graph.landmark_ids), graph.latest)
+        most_keys = keyframe_limit(options, len(graph.landmark_ids), graph.latest)
     left, roots, numbers, offsets = _kernels.merge_keys(
         fresh, sighted, most_keys + graph.num_biases, keys, graph.biases_of_odometry()
     )

@@ -18,7 +18,7 @@ class SmoothingOptions:
 
     Attributes:
         max_keys: Maximum number of keyframes of one robot; beyond it the most rigid neighbours are joined. Large maps
-            and long runs may have more, see `most_keys`. Memory grows with the product of keyframes and landmarks in
+            and long runs may have more, see `extra_keys`. Memory grows with the product of keyframes and landmarks in
             view, effort hardly faster than the keyframes.
         further_keys: Additional keyframes for each further robot of the filter.
         recent_keys: Newest keyframes, of all robots together, that keep their raw measurements, relinearised at each
@@ -79,14 +79,20 @@ class SmoothingOptions:
         check_float("tolerance", self.tolerance, "Use 0.1.", above=0.0)
         check_float("least_ess", self.least_ess, "Give a share of M.", at_least=0.0, at_most=1.0)
 
-    def most_keys(self, num_landmarks: int, latest: IntArray) -> int:
-        """Return the maximum number of keyframes of K robots together.
+    def most_keys(self, num_robots: int) -> int:
+        """Return the maximum number of keyframes of K robots together, without those of `extra_keys`."""
+        return self.max_keys + (num_robots - 1) * self.further_keys
 
-        Args:
-            num_landmarks: Number of landmarks of the graph.
-            latest: (K,) int64. Last step of each robot.
-        """
-        return self.max_keys + (len(latest) - 1) * self.further_keys + extra_keys(num_landmarks, latest)
+
+def keyframe_limit(options: SmoothingOptions, num_landmarks: int, latest: IntArray) -> int:
+    """Return the maximum number of keyframes of K robots together.
+
+    Args:
+        options: Options of the smoother.
+        num_landmarks: Number of landmarks of the graph.
+        latest: (K,) int64. Last step of each robot.
+    """
+    return options.most_keys(len(latest)) + extra_keys(num_landmarks, latest)
 
 
 def extra_keys(num_landmarks: int, latest: IntArray) -> int:
@@ -96,7 +102,7 @@ def extra_keys(num_landmarks: int, latest: IntArray) -> int:
     certainty that they do not have (docs/lab/scale.md).
 
     Args:
-        num_landmarks, latest: See `SmoothingOptions.most_keys`.
+        num_landmarks, latest: See `keyframe_limit`.
     """
     large = max(num_landmarks - MANY_LANDMARKS, 0) // LANDMARKS_PER_KEY
     steps = max(int(np.maximum(latest - MANY_STEPS, 0).sum()), int(latest.sum()) - MANY_ROBOTS * MANY_STEPS)

@@ -25,7 +25,7 @@ from slam_backend.smoother.graph_building import InitialPoses, LandmarkPositions
 from slam_backend.smoother.graph_reduction import reduce_keyframes, relinearise, without_unused_frames
 from slam_backend.smoother.log_arrays import EXACT, REJECTED, LogArrays
 from slam_backend.smoother.optimizer import NO_POSE, MapEstimate, optimize
-from slam_backend.smoother.options import SmoothingOptions, extra_keys
+from slam_backend.smoother.options import SmoothingOptions, extra_keys, keyframe_limit
 from slam_backend.smoother.sampling import (
     PathLandmarks,
     PathSamples,
@@ -145,7 +145,7 @@ def rejuvenate(
     """
     if any((log.kinds == EXACT).any() for log in logs):
         return Rejuvenation(graph, "poses that were given as exact", float("nan"), 0, None)
-    share = max(1, 2 * options.most_keys(len(graph.landmark_ids), graph.latest) // len(logs))
+    share = max(1, 2 * keyframe_limit(options, len(graph.landmark_ids), graph.latest) // len(logs))
     rest = list(logs)
     while True:
         last = all(len(log) <= share for log in rest)
@@ -187,7 +187,7 @@ def relinearised_and_reduced(
         camera, options: Same arguments as `rejuvenate`.
         rng: Source of draws, where sampling the variances is cheaper than computing them.
     """
-    if graph.num_keys <= options.most_keys(len(graph.landmark_ids), graph.latest) + graph.num_biases:
+    if graph.num_keys <= keyframe_limit(options, len(graph.landmark_ids), graph.latest) + graph.num_biases:
         return relinearise(graph, mode)
     transition_variances = (
         sample_transition_variances(graph, mode, rng) if mode.crowded else mode.transition_variances()

@@ -12,7 +12,7 @@ from slam_backend.smoother._kernels import LandmarkFactors, Points
 from slam_backend.smoother.graph import NONE, SlamGraph
 from slam_backend.smoother.graph_reduction import CONTRADICTION
 from slam_backend.smoother.optimizer import gathered, linearise
-from slam_backend.smoother.options import SmoothingOptions
+from slam_backend.smoother.options import SmoothingOptions, keyframe_limit
 
 
 def chained(
@@ -33,7 +33,7 @@ def plain_reduced(graph: SlamGraph, camera: FloatArray, options: SmoothingOption
         fresh[np.flatnonzero(graph.robots == robot)[-share:]] = True
     condensed = _without_blind(_condensed(graph, fresh, camera, options), fresh)
     representatives, slack = _representatives(
-        condensed, graph.transition_variances, fresh, options.most_keys(len(graph.landmark_ids), graph.latest)
+        condensed, graph.transition_variances, fresh, keyframe_limit(options, len(graph.landmark_ids), graph.latest)
     )
     return plain_compacted(_joined(replace(condensed, rigid_variances=slack), representatives))
 

@@ -27,7 +27,7 @@ from slam_backend.smoother.graph_building import NO_LANDMARK_POSITIONS, InitialP
 from slam_backend.smoother.graph_reduction import reduce_keyframes, relinearise
 from slam_backend.smoother.log_arrays import ODOMETRY, REJECTED, STATIONARY
 from slam_backend.smoother.optimizer import optimize
-from slam_backend.smoother.options import SmoothingOptions
+from slam_backend.smoother.options import SmoothingOptions, keyframe_limit
 from slam_backend.smoother.rejuvenation import rejuvenate
 from slam_backend.smoother.sampling import lane_rows, replay, sample_paths
 from training.bench.accuracy.runs import RunSpec, simulate_run
@@ -152,8 +152,8 @@ def test_the_keyframe_limit_grows_with_the_number_of_robots():
     run = small_run(robots=2, length=10.0)
     for further, most in ((0, 20), (6, 26)):
         options = SmoothingOptions(max_keys=20, further_keys=further, recent_keys=8)
-        assert options.most_keys(0, np.zeros(1, dtype=np.int64)) == 20
-        assert options.most_keys(0, np.zeros(2, dtype=np.int64)) == most
+        assert options.most_keys(1) == 20
+        assert options.most_keys(2) == most
         result = rejuvenate(
             SlamGraph.at_starts(run.true_paths[:, 0]), [log.arrays() for log in logs_of(run)], run.spec.noise.motion,
             camera_of(run), 20, np.random.default_rng(3), options,
@@ -164,10 +164,10 @@ def test_the_keyframe_limit_grows_with_the_number_of_robots():
 def test_the_keyframe_limit_grows_with_large_maps_and_long_runs():
     """Up to 2,700 landmarks and 6,000 steps it is that of the options; beyond, it grows as far as the map is large."""
     options = SmoothingOptions(max_keys=20, further_keys=5)
-    assert options.most_keys(2700, np.array([6000, 6000])) == 25
-    assert options.most_keys(2700 + 150, np.array([6000, 6000])) == 25 + 10
-    assert options.most_keys(2700 + 150, np.array([6000 + 500, 6000 + 250])) == 25 + 10 + 15
-    assert options.most_keys(100, np.array([10**9, 10**9])) == 25 + 20
+    assert keyframe_limit(options, 2700, np.array([6000, 6000])) == 25
+    assert keyframe_limit(options, 2700 + 150, np.array([6000, 6000])) == 25 + 10
+    assert keyframe_limit(options, 2700 + 150, np.array([6000 + 500, 6000 + 250])) == 25 + 10 + 15
+    assert keyframe_limit(options, 100, np.array([10**9, 10**9])) == 25 + 20
 
 
 def test_using_a_graph_does_not_change_it():
@@ -203,7 +203,7 @@ def test_keys_are_joined_as_by_the_plain_program(max_keys, kernel):
         mode = optimize(graph, camera_of(run), TIGHT)
         graph = relinearise(graph, mode, mode.transition_variances())
         found, expected = (how(graph, camera_of(run), options) for how in (reduce_keyframes, plain_reduced))
-        assert found.num_keys <= max(options.most_keys(len(graph.landmark_ids), graph.latest), 8)
+        assert found.num_keys <= max(keyframe_limit(options, len(graph.landmark_ids), graph.latest), 8)
         for name in graph.__dataclass_fields__:
             one, other = getattr(found, name), getattr(expected, name)
             assert one.dtype == other.dtype
