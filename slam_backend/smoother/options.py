@@ -35,8 +35,8 @@ class SmoothingOptions:
         free_sightings: Number of sightings that `effort` does not count.
         least_ess: Share of M that the effective sample size of the importance weights must reach.
         more_draws: Factor on M for a second draw where the first one misses `least_ess` by less than this factor; M of
-            these paths are then resampled. 1: no second draw. Beyond `max_keys` keyframes no second draw is made: the
-            weights are tempered until they reach `least_ess`.
+            these paths are then resampled. 1: no second draw. Where `extra_keys` raises the limit of
+            keyframes, weights are tempered until they reach `least_ess` instead.
         slice_steps: New steps, of all robots together but at least eight of each, that one slice adds to the graph; no
             step of the filter then does more than one slice of the work. None: all work in the step in which it is due.
         rigid_within: Limit [m] of the odometry's scatter since the last keyframe (root mean square of position and of
