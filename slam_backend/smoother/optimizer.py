@@ -16,7 +16,7 @@ from slam_backend.smoother._kernels import (
     Points,
 )
 from slam_backend.smoother.graph import SlamGraph
-from slam_backend.smoother.options import SmoothingOptions
+from slam_backend.smoother.options import MANY_LANDMARKS, SmoothingOptions
 
 
 def gathered(graph: SlamGraph) -> LandmarkFactors:
@@ -47,6 +47,7 @@ def linearise(
 FIRST_DAMPING, MAX_DAMPING = 1e-4, 1e8
 LARGEST_STEP = 1e3  # [m, rad]; larger steps count as divergence
 LONG_COLUMNS = 16  # mean blocks per column, weighted by length, above which draws are cheaper than the inverse
+FEW_POSES = 10  # landmarks of a large map that are seen from at most so many poses are eliminated first
 NO_POSE = "no pose to seek"  # reason if all poses are fixed
 SLOW_PROGRESS = 10.0  # factor on the tolerance in the last iteration of the options
 
@@ -192,7 +193,8 @@ class NormalEquations:
         num, k = size + len(graph.landmark_ids), graph.num_keys
         self.num_poses = size
         self.biases = graph.biases_of_odometry()
-        self.pattern = _kernels.lay_out(columns, graph.parents, self.biases, sightings, num)
+        few = FEW_POSES if len(graph.landmark_ids) > MANY_LANDMARKS else 0
+        self.pattern = _kernels.lay_out(columns, graph.parents, self.biases, sightings, num, few)
         cross = np.empty((len(sightings.keys), 3, 3))
         self.equations = EquationBlocks(
             np.empty((k, 2)), np.empty((num, 6)), np.empty((k, 3, 3)), cross, np.empty((len(self.biases), 3, 3)),

@@ -60,7 +60,9 @@ class TeamLooks:
         if size > self.counts.shape[1]:
             before, shift = self.counts, (size - self.counts.shape[1]) // 2
             self.counts = np.zeros((len(before), size, size), np.uint8)
-            self.counts[:, shift:-shift, shift:-shift] = before
+            for looks, old in zip(self.counts, before, strict=True):  # memory that nothing is written to costs nothing
+                top, left, bottom, right = known_bounds(old).tolist()
+                looks[top + shift : bottom + shift, left + shift : right + shift] = old[top:bottom, left:right]
 
     def get_state(self, robot: int) -> dict[str, Any]:
         """Return the looks of a robot: the part that is not zero, and its first row and column in a new grid."""

@@ -107,21 +107,49 @@ def _place(tops: IntArray, rows: IntArray, a: int, b: int) -> int:
     return first + 1 if a > b else -first - 1
 
 
+@inline
+def _sees_again(columns: IntArray, keys: IntArray, first: int, q: int) -> bool:
+    """Return whether a sighting is of a given pose, or of the same one as that before it; `first` is the landmark's."""
+    return columns[keys[q]] < 0 or (q > first and keys[q] == keys[q - 1])
+
+
 @jit
 def lay_out(
-    columns: IntArray, previous: IntArray, biases: IntArray, seen: LandmarkFactors, num: int
+    columns: IntArray, previous: IntArray, biases: IntArray, seen: LandmarkFactors, num: int, few: int = 0
 ) -> SymbolicFactor:  # fmt: skip
     """Choose the order in which `num` poses and landmarks are eliminated, and lay out the blocks of the factor.
+
+    Landmarks of few poses may go first, in any order, since none shares a block with another; where there are many, the
+    order of all others is then found much faster. The blocks are a few per cent more or fewer.
 
     Args:
         columns, previous: (k,) first column of each pose, and its previous key.
         biases: (k,) key of the bias of the odometry from the previous key, `NONE` if it has none; (0,) without biases.
         seen: Sightings.
         num: Poses that are sought, and landmarks.
+        few: Landmarks seen from at most so many poses go first; 0: all in the order of `minimum_degree`.
     """
     keys, starts = seen.keys, seen.starts
-    words, first_landmark = -(-num // WORD), num - (len(starts) - 1)
-    near = np.zeros((num, words), np.uint64)  # bits of the nodes that share a block
+    first_landmark = num - (len(starts) - 1)
+    order, ranks = np.empty(num, np.int64), np.empty(num, np.int64)
+    places = np.arange(num)  # of the poses, and of the landmarks that do not go first, among these
+    early, first_filled, later = 0, 0, first_landmark
+    for landmark in range(len(starts) - 1):
+        count, node = 0, first_landmark + landmark
+        for q in range(starts[landmark], starts[landmark + 1]):
+            count += not _sees_again(columns, keys, starts[landmark], q)
+        if count <= few and few > 0:
+            order[early], ranks[node], places[node] = node, early, -1
+            early, first_filled = early + 1, first_filled + count
+        else:
+            places[node] = later
+            later += 1
+    nodes = np.empty(later, np.int64)
+    for node in range(num):
+        if places[node] >= 0:
+            nodes[places[node]] = node
+    words = -(-later // WORD)
+    near = np.zeros((later, words), np.uint64)  # bits of the nodes that share a block
     for b in range(len(columns)):
         a = previous[b]
         if a >= 0 and columns[a] >= 0 and columns[b] >= 0:
@@ -137,28 +165,45 @@ def lay_out(
                     near[one, two >> 6] |= ONE << np.uint64(two & 63)
                     near[two, one >> 6] |= ONE << np.uint64(one & 63)
     for landmark in range(len(starts) - 1):
+        two = places[first_landmark + landmark]
         for q in range(starts[landmark], starts[landmark + 1]):
-            if columns[keys[q]] >= 0:
-                one, two = columns[keys[q]] // 3, first_landmark + landmark
+            if columns[keys[q]] < 0:
+                continue
+            one = columns[keys[q]] // 3
+            if two >= 0:
                 near[one, two >> 6] |= ONE << np.uint64(two & 63)
                 near[two, one >> 6] |= ONE << np.uint64(one & 63)
-    order = np.empty(num, np.int64)
-    filled = minimum_degree(near, order)
-    ranks, tops, row_tops = np.empty(num, np.int64), np.empty(num + 1, np.int64), np.zeros(num + 1, np.int64)
+                continue
+            for r in range(starts[landmark], q):  # gone: its poses share blocks
+                if columns[keys[r]] >= 0 and keys[r] != keys[q]:
+                    other = columns[keys[r]] // 3
+                    near[one, other >> 6] |= ONE << np.uint64(other & 63)
+                    near[other, one >> 6] |= ONE << np.uint64(one & 63)
+    filled = first_filled + minimum_degree(near, order[early:])
+    tops, row_tops = np.empty(num + 1, np.int64), np.zeros(num + 1, np.int64)
     rows, row_columns, row_places = np.empty(filled, np.int64), np.empty(filled, np.int64), np.empty(filled, np.int64)
     link_places, cross_places = np.zeros(len(columns), np.int64), np.zeros(len(keys), np.int64)
-    for j in range(num):
+    for j in range(early, num):
+        order[j] = nodes[order[j]]
         ranks[order[j]] = j
     top = 0
-    for j in range(num):
+    for j in range(num):  # rows are not yet ascending
         tops[j] = top
-        v = order[j]
+        place = places[order[j]]
+        if place < 0:
+            landmark = order[j] - first_landmark
+            for q in range(starts[landmark], starts[landmark + 1]):
+                if not _sees_again(columns, keys, starts[landmark], q):
+                    rows[top] = ranks[columns[keys[q]] // 3]
+                    row_tops[rows[top] + 1] += 1
+                    top += 1
+            continue
         for w in range(words):
-            rest = near[v, w]
+            rest = near[place, w]
             while rest != np.uint64(0):
                 low = rest & (~rest + ONE)
                 rest ^= low
-                rows[top] = ranks[w * WORD + _num_bits(low - ONE)]  # not yet ascending
+                rows[top] = ranks[nodes[w * WORD + _num_bits(low - ONE)]]
                 row_tops[rows[top] + 1] += 1
                 top += 1
     tops[num] = top

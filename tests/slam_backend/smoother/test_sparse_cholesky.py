@@ -10,7 +10,7 @@ from slam_backend.core.validation import FloatArray
 from slam_backend.fastslam.run_log import RobotLog
 from slam_backend.geometry import between
 from slam_backend.models.odometry import OdometryModel
-from slam_backend.smoother import _kernels
+from slam_backend.smoother import _kernels, optimizer
 from slam_backend.smoother.graph import LEVER, NONE, SlamGraph
 from slam_backend.smoother.graph_building import extend_graph
 from slam_backend.smoother.graph_reduction import reduce_keyframes, relinearise
@@ -19,15 +19,26 @@ from slam_backend.smoother.options import SmoothingOptions
 
 
 class Problem(NamedTuple):
-    """A graph, its mode, and the dense information of its poses and landmarks, (N, 3, N, 3)."""
+    """A graph, its mode, and the dense information of its poses and landmarks, (N, 3, N, 3).
+
+    Landmarks of at most `few` poses are eliminated first, as in large maps.
+    """
 
     graph: SlamGraph
     mode: MapEstimate
     dense: FloatArray
+    few: int
 
 
-def problem(robots: int, max_keys: int, motion: OdometryModel | None = None) -> Problem:
+def problem(robots: int, max_keys: int, motion: OdometryModel | None = None, few: int = 0) -> Problem:
     """Return one of each kind: raw and frozen sightings, poses that are given, landmarks that poses share."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(optimizer, "MANY_LANDMARKS", 0 if few else 10**6)
+        patch.setattr(optimizer, "FEW_POSES", few)
+        return _problem(robots, max_keys, motion, few)
+
+
+def _problem(robots: int, max_keys: int, motion: OdometryModel | None, few: int) -> Problem:
     run = small_run(robots)
     camera = camera_of(run)
     options = SmoothingOptions(max_keys=max_keys, further_keys=0, recent_keys=6, kernel=0.0)
@@ -57,7 +68,7 @@ def problem(robots: int, max_keys: int, motion: OdometryModel | None = None) -> 
             i, j = mode.columns[key] // 3, n + landmark
             dense[i, :, j] += system.equations.cross[q]
             dense[j, :, i] += system.equations.cross[q].T
-    return Problem(graph, mode, dense)
+    return Problem(graph, mode, dense, few)
 
 
 PROBLEMS = {
@@ -65,6 +76,8 @@ PROBLEMS = {
     "two robots": problem(2, 1000),
     "one biased robot": problem(1, 12, BIASED),
     "two biased robots": problem(2, 1000, BIASED),
+    "few poses first": problem(1, 12, few=3),
+    "few of two biased robots first": problem(2, 1000, BIASED, few=4),
 }
 
 
@@ -83,7 +96,10 @@ def information(posed: Problem) -> FloatArray:
 
 
 def test_a_node_with_the_fewest_neighbours_goes_first(posed):
-    """The order is that of the textbook with sets for neighbours, and so is what it fills in."""
+    """The order is that of the textbook with sets for neighbours, and so is what it fills in.
+
+    In large maps that is so after the landmarks of few poses.
+    """
     size = len(posed.dense)
     near = [set(np.flatnonzero(row)) - {i} for i, row in enumerate(np.abs(posed.dense).sum(axis=(1, 3)) > 0)]
     assert posed.mode.system is not None
@@ -91,8 +107,12 @@ def test_a_node_with_the_fewest_neighbours_goes_first(posed):
     order = pattern.order
     assert sorted(order.tolist()) == list(range(size))
     left, count = set(range(size)), 0
-    for node in order.tolist():
-        assert len(near[node]) == min(len(near[other]) for other in left)
+    landmarks = range(posed.mode.system.num_poses, size)
+    first = {node for node in landmarks if len(near[node]) <= posed.few} if posed.few else set()
+    assert bool(first) == bool(posed.few)
+    assert set(order[: len(first)].tolist()) == first
+    for turn, node in enumerate(order.tolist()):
+        assert turn < len(first) or len(near[node]) == min(len(near[other]) for other in left)
         left.remove(node)
         count += len(near[node])
         for other in near[node]:
