@@ -7,7 +7,13 @@ import numpy as np
 
 from slam_backend.core import state_checks
 from slam_backend.core.compilation import ahead
-from slam_backend.core.compilation.compiler import Progress, Signatures, compile_kernels, recorded_signatures
+from slam_backend.core.compilation.compiler import (
+    Progress,
+    Signatures,
+    compile_kernels,
+    exempt_from_collection,
+    recorded_signatures,
+)
 from slam_backend.core.compilation.messages import watch_compilation
 from slam_backend.core.jit import IS_PLAIN
 from slam_backend.fastslam.existence import ExistenceModel
@@ -54,7 +60,8 @@ def warm_up(
 
     Kernels are stored beside the package if its folder is writable, else in the user's cache folder, or in the folder
     NUMBA_CACHE_DIR. Missing kernels come from the package `vslam-env-kernels` if a matching version is installed, else
-    they are compiled. While one process fills the cache, others wait.
+    they are compiled. While one process fills the cache, others wait. Afterwards the objects of this process are left
+    out of Python's searches for garbage (`gc.freeze`), which would interrupt a step for 0.1 s now and then.
 
     Args:
         options: Options of the filters; None: the defaults.
@@ -70,7 +77,9 @@ def warm_up(
     extras = EXTRAS if everything else extras_of(FilterOptions() if options is None else options)
     with ahead.set_aside():
         seconds = compile_kernels(needed(recorded_signatures("slam_backend"), extras), workers, progress)
-        return seconds + run_all_paths(extras)
+        seconds += run_all_paths(extras)
+    exempt_from_collection()
+    return seconds
 
 
 def extras_of(options: FilterOptions) -> set[str]:

@@ -5,7 +5,12 @@ from collections.abc import Collection
 import numpy as np
 
 from slam_backend.core.compilation import ahead
-from slam_backend.core.compilation.compiler import Progress, compile_kernels, recorded_signatures
+from slam_backend.core.compilation.compiler import (
+    Progress,
+    compile_kernels,
+    exempt_from_collection,
+    recorded_signatures,
+)
 from slam_backend.core.compilation.messages import watch_compilation
 from slam_backend.core.jit import IS_PLAIN
 from slam_backend.warm_up import EXTRAS, extras_of, needed, run_all_paths
@@ -47,6 +52,7 @@ def warm_up(
         seconds = compile_kernels(needed(recorded_signatures("slam_backend", "vslam_env"), extras), workers, progress)
         with watch_compilation(lambda name: None) as watch:
             _run_all_paths(extras)
+    exempt_from_collection()
     return seconds + watch.seconds
 
 

@@ -1,7 +1,6 @@
 """Rejuvenation of a filter: schedule and inputs of the smoother, and replacement of the particles by its samples."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -17,11 +16,11 @@ from slam_backend.fastslam.run_log import RobotLog
 from slam_backend.geometry import compose, inverse, rotate_covariances
 from slam_backend.maps.landmark_map import MapSummaryRows
 from slam_backend.smoother.graph import SlamGraph, mean_pose, scattered
-from slam_backend.smoother.graph_building import InitialPoses, LandmarkPositions, log_head, merge_graphs
-from slam_backend.smoother.graph_reduction import reduce_keyframes
+from slam_backend.smoother.graph_building import InitialPoses, LandmarkPositions, log_head
+from slam_backend.smoother.joint_graphs import merge_thinned
 from slam_backend.smoother.log_arrays import LogArrays
 from slam_backend.smoother.optimizer import NO_POSE
-from slam_backend.smoother.options import SmoothingOptions, keyframe_limit
+from slam_backend.smoother.options import SmoothingOptions
 from slam_backend.smoother.reassociation import LandmarkTable, RejectedMeasurements, reassociate
 from slam_backend.smoother.rejuvenation import Draft, LandmarkDescriptors, Particles, Rejuvenation, Smoother, rejuvenate
 from slam_backend.smoother.sampling import PathLandmarks
@@ -154,15 +153,8 @@ def joint_graph(
             in a's.
         frames: Gauge covariances (3, 3) of a's and b's maps, not represented by the particles.
         renamed: (n, 2) rows (name in b, name in the joint map).
-        camera: (7,) as kernels take it.
-        options: Options of the smoother. With slices and too many keyframes, each graph is first reduced to its share.
+        camera, options: See `merge_thinned`.
     """
-    robots = len(starts[2])
-    landmarks = np.union1d(graph_a.landmark_ids, renamed[np.isin(renamed[:, 0], graph_b.landmark_ids), 1])
-    most_keys = keyframe_limit(options, len(landmarks), np.concatenate([graph_a.latest, graph_b.latest]))
-    num_keys = sum(graph.num_keys - graph.num_biases for graph in (graph_a, graph_b))
-    if options.slice_steps is not None and num_keys > most_keys:
-        graph_a, graph_b = (_thinned(graph, most_keys, robots, camera, options) for graph in (graph_a, graph_b))
     robot = int(np.flatnonzero(graph_b.parents[graph_b.first_keys] < 0)[0])  # one that defines b's frame
     start = starts[2][len(starts[0]) + robot]
     began = graph_b.poses[graph_b.first_keys[robot]].copy()  # writable, as `add_gauge_covariance` is compiled for
@@ -171,14 +163,7 @@ def joint_graph(
     for frame, pose, spread in zip(frames, (mean_pose(start), began), spreads, strict=True):
         _kernels.add_gauge_covariance(frame, pose[None], spread)
     spread = spreads[0][0] + rotate_covariances(float(motion[2]), spreads[1][0])
-    return merge_graphs(graph_a, graph_b, motion, renamed, spread), motion
-
-
-def _thinned(graph: SlamGraph, most_keys: int, robots: int, camera: FloatArray, options: SmoothingOptions) -> SlamGraph:
-    """Return a graph reduced to its share of the keyframes of all robots."""
-    share = len(graph.last_keys) / robots
-    keys, fresh = max(2, int(share * most_keys)), max(1, int(share * options.recent_keys))
-    return reduce_keyframes(graph, camera, replace(options, recent_keys=fresh), most_keys=keys)
+    return merge_thinned(graph_a, graph_b, motion, renamed, spread, camera, options), motion
 
 
 MIN_CLOSURE_MATCHES = 3  # matches with landmarks not seen for long that count as a loop closure in one step
@@ -254,6 +239,11 @@ class RejuvenationScheduler:
     def request(self) -> None:
         """Make a rejuvenation due now, as before a merge."""
         self._asked = True
+
+    @property
+    def graph(self) -> SlamGraph | None:
+        """Graph at its mode, up to the last slice of work; None before the first one."""
+        return self._graph
 
     @property
     def requested(self) -> bool:

@@ -237,6 +237,11 @@ def _descriptors(graph: SlamGraph, appearance: LandmarkDescriptors) -> NDArray[n
     return result
 
 
+def is_large(num_landmarks: int, latest: IntArray) -> bool:
+    """Return whether a map is so large, and the latest of its paths (K,) so long, that few drawn paths carry weight."""
+    return bool(num_landmarks > LARGE_MAP and latest.max() > LONG_RUN)
+
+
 def _particles(graph: SlamGraph, mode: MapEstimate, draws: PathSamples) -> Particles:
     """Return the particles of draws, in a fixed gauge."""
     weights, counts = draws.weights, np.zeros(len(graph.landmark_ids), dtype=np.int64)
@@ -269,8 +274,7 @@ def _particles(graph: SlamGraph, mode: MapEstimate, draws: PathSamples) -> Parti
         move(draws.poses, held.motions, moved)
         paths, poses, frame = lane_rows(moved), held.poses, held.scatter
     unknown = (mode.columns[graph.first_keys] >= 0).nonzero()[0].tolist()
-    is_large = len(graph.landmark_ids) > LARGE_MAP and graph.latest.max() > LONG_RUN
-    at_mode = np.zeros((len(means), 3, 3)) if is_large else None
+    at_mode = np.zeros((len(means), 3, 3)) if is_large(len(graph.landmark_ids), graph.latest) else None
     for index in unknown:
         if at_mode is not None:
             at_mode[index] = mode.covariance(graph.first_keys[index : index + 1])

@@ -13,8 +13,10 @@ from slam_backend.geometry import rotate_covariances
 from slam_backend.maps.alignment import DISTINCT_ROTATION, DISTINCT_TRANSLATION, Alignment, AlignmentOptions
 from slam_backend.maps.fusion import check_inliers
 from slam_backend.maps.landmark_map import LandmarkMap
-from slam_backend.smoother.graph import mean_pose, scattered
+from slam_backend.smoother.graph import SlamGraph, mean_pose, scattered
+from slam_backend.smoother.joint_graphs import relative_start
 from slam_backend.team.branches import Branch, fork
+from slam_backend.team.filter_merging.landmarks import merge_by_identity
 from slam_backend.team.filter_merging.merging import merge_filters, pair_filters, transform_covariance
 from slam_backend.team.filter_merging.pairing import Pairing
 from slam_backend.team.groups import Group
@@ -41,6 +43,12 @@ def smoothed_maps(group_a: Group, group_b: Group) -> tuple[LandmarkMap, Landmark
     filters = group_a.trunk.filter, group_b.trunk.filter
     reports = [slam.rejuvenate() for slam in filters]
     return None if all(report.reason for report in reports) else (filters[0].map("mixture"), filters[1].map("mixture"))
+
+
+def smoothed_graphs(a: FastSlam, b: FastSlam) -> tuple[SlamGraph, SlamGraph] | None:
+    """Return the graphs of the smoothers of two filters; None if one has not smoothed yet."""
+    of_a, of_b = (None if slam.state.rejuvenation is None else slam.state.rejuvenation.graph for slam in (a, b))
+    return None if of_a is None or of_b is None else (of_a, of_b)
 
 
 class MergePlan(NamedTuple):
@@ -81,6 +89,29 @@ class MergePlan(NamedTuple):
         """(k, 2) int64 rows (landmark id in a, landmark id in b) of the common landmarks."""
         rows = self.alignment.inliers
         return np.column_stack([self.maps[0].ids[rows[:, 0]], self.maps[1].ids[rows[:, 1]]])
+
+    def by_graphs(self) -> tuple[Self, float] | None:
+        """Estimate the motion by the joint graph of both groups alone, as a trial does before it draws particles.
+
+        Returns:
+            The plan with the motion at the mode, and its uncertainty, see `transform_uncertainty`; that of a trial
+            hardly falls below it. None where `relative_start` is.
+        """
+        graphs = smoothed_graphs(*self.filters)
+        if graphs is None:
+            return None
+        of_a, of_b = (slam.state.maps for slam in self.filters)
+        common = np.concatenate(merge_by_identity(of_a, of_b, self.pairs))
+        others = np.setdiff1d(of_b.ids[of_b.used_slots()], common[:, 1])
+        renamed = np.concatenate([common[:, ::-1], np.column_stack([others, of_a.next_id + np.arange(len(others))])])
+        state, found = self.filters[0].state, self.alignment
+        start = relative_start(*graphs, found.transform, renamed, state.packed_camera, state.options.smoothing)
+        if start is None:
+            return None
+        covariance = JOINED_KEYFRAMES**2 * start.covariance
+        x, y, theta = start.motion.tolist()
+        alignment = Alignment(True, "", x, y, theta, covariance, found.inliers, found.ratio)
+        return self._replace(alignment=alignment), _relative_uncertainty(covariance)
 
     def with_pairing(self, merging: MergeOptions, rng: np.random.Generator) -> Self:
         """Return the plan with the particles paired by draws from `rng`, as in a merge."""

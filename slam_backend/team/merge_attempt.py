@@ -17,7 +17,8 @@ from slam_backend.maps.alignment import Alignment, AlignmentOptions, align_candi
 from slam_backend.maps.correspondences import has_enough_candidates
 from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.maps.near_pairs import Appearance
-from slam_backend.team.group_merging import MergePlan, smoothed_maps, transform_uncertainty
+from slam_backend.smoother.options import extra_keys
+from slam_backend.team.group_merging import MergePlan, smoothed_graphs, smoothed_maps, transform_uncertainty
 from slam_backend.team.groups import Group
 from slam_backend.team.merge_scheduler import MergeScheduler, PairKey, PendingAttempt
 from slam_backend.team.options import MergeOptions
@@ -25,6 +26,7 @@ from slam_backend.team.shared_records import SharedRecords
 
 LEAST_KEPT = 0.8  # least share of the inliers before smoothing that must remain after it
 MOST_STEPS = 40  # longest wait of an attempt for smoothed maps and contact; then it takes the maps as they are
+LEAST_STEPS = 10  # shortest wait of a costly one, so that its work does not all fall into one decision of a robot
 
 Pair = tuple[Group, Group]
 Maps = tuple[LandmarkMap, LandmarkMap]
@@ -64,7 +66,8 @@ def run_attempt(
     if pair is None or (late and not _are_connected(pair, networks)):
         schedule.pending_attempt = None
         return None
-    if not pending.ready or not _are_connected(pair, networks):
+    soon = step - pending.since < LEAST_STEPS and _is_costly(pair)
+    if not pending.ready or soon or not _are_connected(pair, networks):
         ready = pending.ready or late or not any(group.trunk.filter.rejuvenation_requested for group in pair)
         schedule.pending_attempt = replace(
             pending, ready=ready
@@ -158,7 +161,7 @@ def _finish(
     pair, found, uncertainty = plan.groups, plan.alignment, float("nan")
     if found.success and merging.min_sigmas:
         before = rng.bit_generator.state
-        plan, uncertainty, change = _on_trial(plan.with_pairing(merging, rng), schedule, alignment, merging, rng)
+        plan, uncertainty, change = _on_trial(plan, schedule, alignment, merging, rng)
         found = plan.alignment
         if schedule.should_defer(_key(pair), uncertainty, merging.max_uncertainty):
             found = Alignment.refused("too uncertain", found.ratio, "paths", uncertainty)
@@ -178,17 +181,29 @@ def _on_trial(
 ) -> tuple[MergePlan, float, float]:  # fmt: skip
     """Merge on trial if the two maps alone leave the motion too uncertain.
 
+    Where the joint graph of large maps does so, too, no trial is made: most attempts of large maps end there.
+
     Returns:
         The plan with the last estimate of the motion; its relative uncertainty, at most 1 for a merge; and its change
         since the last trial of this pair, at most 1 for a merge, 0 without a trial.
     """
+    may_try, change = merging.min_sigmas_on_trial > 0.0 and merging.smooth_first, 0.0
+    claimed = plan.by_graphs() if may_try else None
+    if claimed is not None:
+        uncertainty = merging.min_sigmas * claimed[1]
+        change = schedule.change(_key(plan.groups), claimed[0].alignment.transform)
+        if uncertainty > merging.max_uncertainty or change > 1.0:
+            return claimed[0], uncertainty, change
+    plan = plan.with_pairing(merging, rng)
     uncertainty = merging.min_sigmas * transform_uncertainty(plan)
-    if uncertainty <= 1.0 or not (merging.min_sigmas_on_trial and merging.smooth_first):
+    if not may_try or (claimed is None and uncertainty <= 1.0):
         return plan, uncertainty, 0.0
     trial = plan.on_trial(merging, alignment, rng)
     if trial is None:
-        return plan, uncertainty, 0.0
-    return trial[0], merging.min_sigmas * trial[1], schedule.change(_key(plan.groups), trial[0].alignment.transform)
+        return plan, uncertainty, change
+    if claimed is None:
+        change = schedule.change(_key(plan.groups), trial[0].alignment.transform)
+    return trial[0], merging.min_sigmas * trial[1], change
 
 
 def representatives(pair: Pair) -> tuple[int, int]:
@@ -211,6 +226,15 @@ def _are_connected(pair: Pair, networks: IntArray) -> bool:
 def _smooth_in_slices(pair: Pair) -> bool:
     """Return whether the smoothers of both joint filters work in slices."""
     return all(group.trunk.filter.smooths_incrementally for group in pair)
+
+
+def _is_costly(pair: Pair) -> bool:
+    """Return whether the run of two groups is so long, or one of their maps so large, that an attempt is costly."""
+    graphs = smoothed_graphs(*(group.trunk.filter for group in pair))
+    if graphs is None:
+        return False
+    latest = np.concatenate([graph.latest for graph in graphs])
+    return extra_keys(max(len(graph.landmark_ids) for graph in graphs), latest) > 0
 
 
 def _unique(pairs: Mapping[PairKey, Pair]) -> list[Group]:

@@ -1,5 +1,6 @@
 """How kernels are compiled, kept, found again and warmed up; public names."""
 
+import gc
 import os
 import subprocess
 import sys
@@ -252,6 +253,19 @@ def test_a_second_warm_up_finds_everything_compiled() -> None:
     with watch_compilation(lambda name: None) as watch:
         seconds = warm_up(everything=True)
     assert (watch.names, seconds) == ([], 0.0)
+
+
+def test_collections_after_a_warm_up_search_only_what_is_new() -> None:
+    """The objects of the kernels are left out; cycles made later are found."""
+    warm_up()
+    assert gc.get_freeze_count() > 10_000
+    assert len(gc.get_objects()) < 1000
+    cycle: list[Any] = []
+    cycle.append(cycle)
+    name = id(cycle)
+    del cycle
+    assert gc.collect() > 0
+    assert all(id(found) != name for found in gc.get_objects())
 
 
 def test_compilation_progress_reports_only_kernels_of_this_project() -> None:

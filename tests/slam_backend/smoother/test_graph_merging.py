@@ -12,6 +12,7 @@ from slam_backend.maps.alignment import AlignmentOptions
 from slam_backend.smoother import options, rejuvenation
 from slam_backend.smoother.graph import NONE, SlamGraph, scattered
 from slam_backend.smoother.graph_building import extend_graph, merge_graphs
+from slam_backend.smoother.joint_graphs import relative_start
 from slam_backend.smoother.optimizer import optimize
 from slam_backend.smoother.options import SmoothingOptions
 from slam_backend.team.merge_scheduler import AttemptOptions
@@ -97,6 +98,40 @@ def test_a_third_robot_joins_later():
     pair = merge_graphs(graphs[1][0], graphs[2][0], motion(1, 2), names)
     names = np.column_stack([pair.landmark_ids, pair.landmark_ids - OFFSET])
     assert_same_posterior(merge_graphs(graphs[0][0], pair, motion(0, 1), names), whole, run)
+
+
+def test_the_relative_start_is_that_of_the_joint_mode(monkeypatch):
+    """Motion and covariance are those of the dense inverse; small maps and short runs get none."""
+    run = small_run(2, seed=104, length=8.0)
+    (a, _), (b, renamed) = group_graph(run, [0]), group_graph(run, [1], OFFSET)
+    motion = compose(np.array([0.15, -0.1, 0.04]), between(run.true_paths[0, 0], run.true_paths[1, 0]))
+    known = a, b, motion, renamed, camera_of(run), SmoothingOptions(kernel=0.0)
+    assert relative_start(*known) is None
+    monkeypatch.setattr(options, "MANY_LANDMARKS", 1)
+    monkeypatch.setattr(options, "LANDMARKS_PER_KEY", 1)
+    assert relative_start(*known) is None
+    monkeypatch.setattr(rejuvenation, "LARGE_MAP", 1)
+    monkeypatch.setattr(rejuvenation, "LONG_RUN", 1)
+    found = relative_start(*known)
+    both = merge_graphs(a, b, motion, renamed)
+    mode = optimize(both, camera_of(run), TIGHT)
+    key = both.first_keys[1]
+    np.testing.assert_allclose(found.motion, mode.poses[key], atol=1e-4)
+    half = np.linalg.inv(upper(mode))
+    rows = mode.columns[key] + np.arange(3)
+    np.testing.assert_allclose(found.covariance, (half @ half.T)[np.ix_(rows, rows)], rtol=1e-2, atol=1e-9)
+    assert np.hypot(*(found.motion - motion)[:2]) > 0.05  # it began elsewhere
+
+
+def test_a_joint_graph_without_a_mode_tells_no_start(monkeypatch):
+    """Where the descent fails, no motion is claimed."""
+    run = small_run(2, seed=104)
+    (a, _), (b, renamed) = group_graph(run, [0]), group_graph(run, [1], OFFSET)
+    for module, name in ((options, "MANY_LANDMARKS"), (rejuvenation, "LARGE_MAP"), (rejuvenation, "LONG_RUN")):
+        monkeypatch.setattr(module, name, 1)
+    monkeypatch.setattr(options, "LANDMARKS_PER_KEY", 1)
+    known = renamed, camera_of(run), SmoothingOptions(max_iterations=1)
+    assert relative_start(a, b, np.array([3.0, -2.0, 2.0]), *known) is None
 
 
 def test_landmarks_without_a_new_name_are_left_out():

@@ -19,6 +19,7 @@ from slam_backend.fastslam.rejuvenation import RejuvenationScheduler
 from slam_backend.geometry import between, compose
 from slam_backend.maps.alignment import DISTINCT_ROTATION, DISTINCT_TRANSLATION, AlignmentOptions, align_maps
 from slam_backend.maps.landmark_map import LandmarkMap
+from slam_backend.smoother import options as smoothing_options
 from slam_backend.smoother import rejuvenation as smoothing_of_paths
 from slam_backend.smoother.graph import mean_pose
 from slam_backend.smoother.options import SmoothingOptions
@@ -28,7 +29,7 @@ from slam_backend.team.communication import LANDMARK_BYTES
 from slam_backend.team.filter_merging.merging import merge_filters, pair_filters, transform_covariance
 from slam_backend.team.group_merging import MergePlan, transform_uncertainty
 from slam_backend.team.groups import Group
-from slam_backend.team.merge_attempt import MOST_STEPS
+from slam_backend.team.merge_attempt import LEAST_STEPS, MOST_STEPS
 from slam_backend.team.merge_scheduler import AttemptOptions
 from slam_backend.team.options import MergeOptions
 from slam_backend.team.team import TeamSlam
@@ -408,6 +409,86 @@ def test_trials_of_large_maps_claim_no_more_than_the_gaussian_at_the_mode(
         joint: Any = SimpleNamespace(state=SimpleNamespace(rejuvenation=smoother))
         expected = 1.3**2 * max(factor, 1.0) * scatter
         np.testing.assert_allclose(group_merging._cautious(scatter, joint, 1), expected)
+
+
+def large_maps(patch: pytest.MonkeyPatch) -> None:
+    """Let all maps and runs count as large."""
+    for module, name in (
+        (smoothing_options, "MANY_LANDMARKS"), (smoothing_of_paths, "LARGE_MAP"), (smoothing_of_paths, "LONG_RUN"),
+    ):  # fmt: skip
+        patch.setattr(module, name, 0)
+    patch.setattr(smoothing_options, "LANDMARKS_PER_KEY", 1)
+
+
+IN_SLICES: Any = {"num_particles": 8, "rejuvenate_every": 1000, "smoothing": SmoothingOptions(slice_steps=20)}
+
+
+def test_the_joint_graph_claims_hardly_more_than_a_trial(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In large maps it finds the motion and its covariance at the mode, to which a trial adds the last few steps."""
+    _, team = driven(2, 112, FEW_STEPS, **IN_SLICES)
+    plan = planned(team)
+    assert plan.by_graphs() is None
+    large_maps(monkeypatch)
+    for slam in plan.filters:
+        slam.rejuvenate()  # as an attempt does
+    before = [contents(slam) for slam in plan.filters]
+    claimed = plan.by_graphs()
+    assert claimed is not None
+    for slam, kept in zip(plan.filters, before, strict=True):
+        assert_same(contents(slam), kept)
+    trial = plan.on_trial(MergeOptions(), AlignmentOptions(), np.random.default_rng(2))
+    assert trial is not None
+    sigmas = np.sqrt(np.diag(trial[0].alignment.covariance))
+    assert (np.abs(claimed[0].alignment.transform - trial[0].alignment.transform) < 2.0 * sigmas).all()
+    assert 0.5 * trial[1] < claimed[1] < 1.1 * trial[1]
+    assert_same(claimed[0].alignment.inliers, plan.alignment.inliers)
+    _, alone = driven(2, 112, FEW_STEPS, num_particles=8)
+    assert planned(alone).by_graphs() is None  # without smoothers there are no graphs
+
+
+@pytest.mark.parametrize("is_large", [False, True])
+def test_attempts_of_large_maps_end_without_a_trial_if_their_graph_is_uncertain(
+    is_large: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They are refused as by a trial, no earlier than ten steps after they began; groups stay as they were."""
+    tried = []
+    on_trial = MergePlan.on_trial
+
+    def noted(self: MergePlan, *args: Any) -> Any:
+        tried.append(self)
+        return on_trial(self, *args)
+
+    monkeypatch.setattr(MergePlan, "on_trial", noted)
+    if is_large:
+        large_maps(monkeypatch)
+    merging = MergeOptions(min_sigmas=NEVER_SURE, min_sigmas_on_trial=NEVER_SURE)
+    simulation, team = driven(2, 112, STEPS, attempts=AT_LAST, merging=merging, **IN_SLICES)
+    begun = team._step - 1
+    while not team.events:
+        simulation.run(team, 1)
+    (attempt,) = team.events
+    assert (attempt.alignment.reason, attempt.alignment.missed) == ("too uncertain", "paths")
+    assert np.isfinite(attempt.uncertainty)
+    assert attempt.uncertainty > 1.0
+    assert bool(tried) != is_large
+    if is_large:
+        assert attempt.step - begun >= LEAST_STEPS
+
+
+def test_groups_with_large_maps_merge_by_a_trial_once_their_graph_agrees_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first estimate of the joint graph waits for a second one; then the groups merge as after any trial."""
+    large_maps(monkeypatch)
+    simulation = SimulatedTeam(num_robots=2, seed=112)
+    merging = MergeOptions(min_sigmas=NEVER_SURE, min_sigmas_on_trial=1.0)
+    team = simulation.build(attempts=AttemptOptions(every=20), merging=merging, **IN_SLICES)
+    while len(team.groups) > 1 and team._step < 400:
+        simulation.run(team, 1)
+    *refused, last, merge = team.events
+    assert [event.kind for event in (last, merge)] == ["attempt", "merge"]
+    assert {event.alignment.missed for event in refused} <= {"paths", "repeat", ""}
+    assert merge.alignment is last.alignment
+    starts = team._groups[0].trunk.filter.state.starts[1, :, :8]
+    np.testing.assert_allclose(merge.alignment.transform, mean_pose(starts), atol=1e-12)
 
 
 def test_a_trial_whose_merge_would_be_undone_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
