@@ -108,7 +108,7 @@ class MergePlan(NamedTuple):
         start = relative_start(*graphs, found.transform, renamed, state.packed_camera, state.options.smoothing)
         if start is None:
             return None
-        covariance = JOINED_KEYFRAMES**2 * start.covariance
+        covariance = WIDENED_KEYFRAMES**2 * start.covariance
         x, y, theta = start.motion.tolist()
         alignment = Alignment(True, "", x, y, theta, covariance, found.inliers, found.ratio)
         return self._replace(alignment=alignment), _relative_uncertainty(covariance)
@@ -157,6 +157,9 @@ class MergePlan(NamedTuple):
 # Factor by which the standard deviations of a start in a large map are too small, as keyframes have been joined: with
 # 2,000 instead of 180 per robot they are 1.3 times as large after eight minutes (docs/lab/scale.md).
 JOINED_KEYFRAMES = 1.3
+# The same where the smoother widens what it joins (`graph_reduction.WIDENED`): claims agree with errors, and merges at
+# 2.4 standard deviations instead of 3 come in time.
+WIDENED_KEYFRAMES = 0.8
 
 
 def _cautious(covariance: FloatArray, joint: FastSlam, robot: int) -> FloatArray:
@@ -164,11 +167,11 @@ def _cautious(covariance: FloatArray, joint: FastSlam, robot: int) -> FloatArray
 
     Along long paths few samples carry weight, and the scatter of these few understates the uncertainty.
     """
-    at_mode = None if joint.state.rejuvenation is None else joint.state.rejuvenation.starts_at_mode
-    if at_mode is None:
+    smoother = joint.state.rejuvenation
+    if smoother is None or smoother.starts_at_mode is None:
         return covariance
-    larger: FloatArray = max(covariance, at_mode[robot], key=_relative_uncertainty)
-    return JOINED_KEYFRAMES**2 * larger
+    larger: FloatArray = max(covariance, smoother.starts_at_mode[robot], key=_relative_uncertainty)
+    return (WIDENED_KEYFRAMES if smoother.widens else JOINED_KEYFRAMES) ** 2 * larger
 
 
 def transform_uncertainty(plan: MergePlan) -> float:

@@ -1,9 +1,11 @@
 """Graph reduction: joining and dropping keyframes, and condensing their measurements."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
+from builders import plain_graph_reduction
 from builders.plain_graph_reduction import chained, plain_reduced
 from builders.runs import TIGHT, camera_of, graph_of, logs_of, small_run, upper
 from hypothesis import given, settings
@@ -12,6 +14,7 @@ from hypothesis import strategies as st
 from slam_backend.fastslam.run_log import RobotLog
 from slam_backend.geometry import between, compose, transform_points, wrap_angle
 from slam_backend.models.odometry import OdometryModel
+from slam_backend.smoother import graph_reduction
 from slam_backend.smoother._kernels import (
     Condensed,
     Frames,
@@ -190,9 +193,15 @@ def test_using_a_graph_does_not_change_it():
 
 
 @pytest.mark.parametrize("max_keys", [3, 14, 30, 1000])
-@pytest.mark.parametrize("kernel", [0.0, 0.2])
-def test_keys_are_joined_as_by_the_plain_program(max_keys, kernel):
-    """Kernels leave the same keys as numpy: blind ones, measurements that contradict, and joining twice included."""
+@pytest.mark.parametrize(("kernel", "widened"), [(0.0, False), (0.2, False), (0.2, True)])
+def test_keys_are_joined_as_by_the_plain_program(max_keys, kernel, widened, monkeypatch):
+    """Kernels leave the same keys as numpy: blind ones, measurements that contradict, and joining twice included.
+
+    In large maps they widen what they join.
+    """
+    for module in (graph_reduction, plain_graph_reduction) if widened else ():
+        monkeypatch.setattr(module, "extra_keys", lambda *_: 1)
+        monkeypatch.setattr(module, "WIDENED", 5.0)
     run = small_run(2, length=8.0)
     options = SmoothingOptions(max_keys=max_keys, further_keys=0, recent_keys=6, kernel=kernel)
     graph = graph_of(run, skip=(3, 4, 7))
@@ -210,6 +219,26 @@ def test_keys_are_joined_as_by_the_plain_program(max_keys, kernel):
             np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-7, err_msg=name)
         options = replace(options, max_keys=max(2, max_keys - 2))
         graph = found
+
+
+def test_widened_keyframes_claim_no_more_than_before(monkeypatch):
+    """Each share leaves the mode where it was, and claims less; the newest poses are then known less than all say."""
+    run = small_run()
+    graph = graph_of(run)
+    mode = optimize(graph, camera_of(run), TIGHT)
+    graph = relinearise(graph, mode, mode.transition_variances())
+    monkeypatch.setattr(graph_reduction, "extra_keys", lambda *_: 1)
+    claims = []
+    for share in (0.0, 0.2, 1.0):
+        monkeypatch.setattr(graph_reduction, "WIDENED", share)
+        fewer = reduce_keyframes(graph, camera_of(run), limits(9, 3))
+        again = optimize(fewer, camera_of(run), TIGHT)
+        assert again.reason == ""
+        np.testing.assert_allclose(again.poses[fewer.last_keys][:, :2], mode.poses[graph.last_keys][:, :2], atol=0.02)
+        claims.append(again.covariance(fewer.last_keys))
+    for certain, other in pairwise(claims):
+        assert np.linalg.eigvalsh(other - certain)[0] > 0.0
+    assert np.linalg.eigvalsh(claims[-1] - mode.covariance(graph.last_keys))[0] > 0.0
 
 
 OLD = 4  # keys and frames of others before

@@ -380,7 +380,10 @@ def test_a_trial_is_a_merge_that_is_smoothed(existence: ExistenceModel | None, m
 def test_trials_of_large_maps_claim_no_more_than_the_gaussian_at_the_mode(
     slice_steps: int | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Their covariance is the larger one, for joined keyframes times 1.3 squared; the motion is that of small maps."""
+    """Their covariance is the larger one, for joined keyframes times 1.3 squared; the motion is that of small maps.
+
+    Where joined keyframes are widened it is times 0.8 squared.
+    """
     monkeypatch.setattr(smoothing_of_paths, "LONG_RUN", 0)
     smoothing = SmoothingOptions(slice_steps=slice_steps)
     options: Any = {"attempts": NEVER, "rejuvenate_every": 1000, "smoothing": smoothing}
@@ -404,10 +407,10 @@ def test_trials_of_large_maps_claim_no_more_than_the_gaussian_at_the_mode(
     np.testing.assert_allclose(np.diag(scatter), np.diag(at_mode), rtol=0.3)  # nearly all 400 samples carry weight
     for small, large in zip(trials[::2], trials[1::2], strict=True):
         assert large[1] >= 1.3 * small[1]
-    for factor in (0.5, 2.0):
-        smoother = SimpleNamespace(starts_at_mode=np.stack([np.zeros((3, 3)), factor * scatter]))
+    for factor, widens in ((0.5, False), (2.0, False), (0.5, True), (2.0, True)):
+        smoother = SimpleNamespace(starts_at_mode=np.stack([np.zeros((3, 3)), factor * scatter]), widens=widens)
         joint: Any = SimpleNamespace(state=SimpleNamespace(rejuvenation=smoother))
-        expected = 1.3**2 * max(factor, 1.0) * scatter
+        expected = (0.8 if widens else 1.3) ** 2 * max(factor, 1.0) * scatter
         np.testing.assert_allclose(group_merging._cautious(scatter, joint, 1), expected)
 
 
