@@ -19,7 +19,7 @@ MAX_FRAMES = 100  # frames of a recent key with raw measurements: a robot that w
 # Share of the variance of a rigid motion that is added, in large maps (`extra_keys`), to the odometry after it, and,
 # times the number n of the sightings that move, to each of them. 1 would be cautious: all n together then tell no more
 # about the motion than was known. With this share claims agree with errors (docs/lab/scale.md).
-WIDENED = 0.2
+WIDENED = 0.5
 CONTRADICTION = 2.0  # factor on the kernel's squared distance: measurements beyond it are dropped
 
 
