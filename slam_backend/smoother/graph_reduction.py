@@ -52,11 +52,11 @@ def reduce_keyframes(
     keys = mapped(graph.part(Keys), np.copy)
     if most_keys is None:
         most_keys = keyframe_limit(options, len(graph.landmark_ids), graph.latest)
-    share = WIDENED if extra_keys(len(graph.landmark_ids), graph.latest) else 0.0
+    widened = WIDENED if extra_keys(len(graph.landmark_ids), graph.latest) else 0.0
     left, roots, numbers, offsets, spreads = _kernels.merge_keys(
-        fresh, sighted, most_keys + graph.num_biases, keys, graph.biases_of_odometry(), share
+        fresh, sighted, most_keys + graph.num_biases, keys, graph.biases_of_odometry(), widened
     )
-    widths = share * spreads * np.bincount(seen.keys[rows], minlength=graph.num_keys)
+    widths = widened * spreads * np.bincount(seen.keys[rows], minlength=graph.num_keys)
     frozen = _kernels.add_sightings(rows, seen, roots, numbers, offsets, widths)
     fewer = graph.with_columns(
         **{name: column[:left] for name, column in keys._asdict().items()},

@@ -19,8 +19,8 @@ class RelativeStart(NamedTuple):
     """Where a group starts in the map frame of another, by their joint graph.
 
     Attributes:
-        motion: (3,) float64 [m, m, rad]. Motion from b's frame to a's.
-        covariance: (3, 3) float64 [m, m, rad]. Its covariance under the Gaussian about the mode.
+        motion: (3,) float64 [m, m, rad]. Motion from the frame of b to that of a.
+        covariance: (3, 3) float64 [m, m, rad]. Covariance of the motion under the Gaussian about the mode.
     """
 
     motion: FloatArray
