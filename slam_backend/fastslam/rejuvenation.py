@@ -20,7 +20,7 @@ from slam_backend.smoother.graph_building import InitialPoses, LandmarkPositions
 from slam_backend.smoother.joint_graphs import merge_thinned
 from slam_backend.smoother.log_arrays import LogArrays
 from slam_backend.smoother.optimizer import NO_POSE
-from slam_backend.smoother.options import SmoothingOptions, extra_keys
+from slam_backend.smoother.options import SmoothingOptions
 from slam_backend.smoother.reassociation import LandmarkTable, RejectedMeasurements, reassociate
 from slam_backend.smoother.rejuvenation import Draft, LandmarkDescriptors, Particles, Rejuvenation, Smoother, rejuvenate
 from slam_backend.smoother.sampling import PathLandmarks
@@ -244,11 +244,6 @@ class RejuvenationScheduler:
     def graph(self) -> SlamGraph | None:
         """Graph at its mode, up to the last slice of work; None before the first one."""
         return self._graph
-
-    @property
-    def widens(self) -> bool:
-        """Whether the limit of keyframes has grown, so that what is joined is widened (`reduce_keyframes`)."""
-        return self._graph is not None and extra_keys(len(self._graph.landmark_ids), self._graph.latest) > 0
 
     @property
     def requested(self) -> bool:

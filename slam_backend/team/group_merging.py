@@ -15,6 +15,7 @@ from slam_backend.maps.fusion import check_inliers
 from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.smoother.graph import SlamGraph, mean_pose, scattered
 from slam_backend.smoother.joint_graphs import relative_start
+from slam_backend.smoother.options import MANY_ROBOTS, MANY_STEPS
 from slam_backend.team.branches import Branch, fork
 from slam_backend.team.filter_merging.landmarks import merge_by_identity
 from slam_backend.team.filter_merging.merging import merge_filters, pair_filters, transform_covariance
@@ -108,7 +109,7 @@ class MergePlan(NamedTuple):
         start = relative_start(*graphs, found.transform, renamed, state.packed_camera, state.options.smoothing)
         if start is None:
             return None
-        covariance = WIDENED_KEYFRAMES**2 * start.covariance
+        covariance = _variance_factor(np.concatenate([graph.latest for graph in graphs])) * start.covariance
         x, y, theta = start.motion.tolist()
         alignment = Alignment(True, "", x, y, theta, covariance, found.inliers, found.ratio)
         return self._replace(alignment=alignment), _relative_uncertainty(covariance)
@@ -157,8 +158,8 @@ class MergePlan(NamedTuple):
 # Factor by which the standard deviations of a start in a large map are too small, as keyframes have been joined: with
 # 2,000 instead of 180 per robot they are 1.3 times as large after eight minutes (docs/lab/scale.md).
 JOINED_KEYFRAMES = 1.3
-# The same where the smoother widens what it joins (`graph_reduction.WIDENED`): claims agree with errors, and merges at
-# 2.4 standard deviations instead of 3 come in time.
+# The same for what has been joined since the smoother widens it (`graph_reduction.WIDENED`): claims agree with errors,
+# and merges at 2.4 standard deviations instead of 3 come in time.
 WIDENED_KEYFRAMES = 0.8
 
 
@@ -168,10 +169,20 @@ def _cautious(covariance: FloatArray, joint: FastSlam, robot: int) -> FloatArray
     Along long paths few samples carry weight, and the scatter of these few understates the uncertainty.
     """
     smoother = joint.state.rejuvenation
-    if smoother is None or smoother.starts_at_mode is None:
+    if smoother is None or smoother.starts_at_mode is None or smoother.graph is None:
         return covariance
     larger: FloatArray = max(covariance, smoother.starts_at_mode[robot], key=_relative_uncertainty)
-    return (WIDENED_KEYFRAMES if smoother.widens else JOINED_KEYFRAMES) ** 2 * larger
+    return _variance_factor(smoother.graph.latest) * larger
+
+
+def _variance_factor(latest: IntArray) -> float:
+    """Return the factor on covariances of starts in a large map, by the share of steps before keyframes are widened.
+
+    Args:
+        latest: (K,) int64. Last step of each robot.
+    """
+    before = min(MANY_STEPS * min(len(latest), MANY_ROBOTS) / max(int(latest.sum()), 1), 1.0)
+    return before * JOINED_KEYFRAMES**2 + (1.0 - before) * WIDENED_KEYFRAMES**2
 
 
 def transform_uncertainty(plan: MergePlan) -> float:

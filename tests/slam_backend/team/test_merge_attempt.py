@@ -382,7 +382,7 @@ def test_trials_of_large_maps_claim_no_more_than_the_gaussian_at_the_mode(
 ) -> None:
     """Their covariance is the larger one, for joined keyframes times 1.3 squared; the motion is that of small maps.
 
-    Where joined keyframes are widened it is times 0.8 squared.
+    For what is joined after 6,000 steps of up to three robots, which is widened, it is times 0.8 squared.
     """
     monkeypatch.setattr(smoothing_of_paths, "LONG_RUN", 0)
     smoothing = SmoothingOptions(slice_steps=slice_steps)
@@ -407,11 +407,16 @@ def test_trials_of_large_maps_claim_no_more_than_the_gaussian_at_the_mode(
     np.testing.assert_allclose(np.diag(scatter), np.diag(at_mode), rtol=0.3)  # nearly all 400 samples carry weight
     for small, large in zip(trials[::2], trials[1::2], strict=True):
         assert large[1] >= 1.3 * small[1]
-    for factor, widens in ((0.5, False), (2.0, False), (0.5, True), (2.0, True)):
-        smoother = SimpleNamespace(starts_at_mode=np.stack([np.zeros((3, 3)), factor * scatter]), widens=widens)
+    for factor, steps, expected in (
+        (0.5, 6000, 1.3**2),
+        (2.0, 6000, 2.0 * 1.3**2),
+        (0.5, 12_000, (1.3**2 + 0.8**2) / 2),
+    ):
+        at_mode = np.stack([np.zeros((3, 3)), factor * scatter])
+        smoother = SimpleNamespace(starts_at_mode=at_mode, graph=SimpleNamespace(latest=np.array([steps, steps])))
         joint: Any = SimpleNamespace(state=SimpleNamespace(rejuvenation=smoother))
-        expected = (0.8 if widens else 1.3) ** 2 * max(factor, 1.0) * scatter
-        np.testing.assert_allclose(group_merging._cautious(scatter, joint, 1), expected)
+        np.testing.assert_allclose(group_merging._cautious(scatter, joint, 1), expected * scatter)
+    assert group_merging._variance_factor(np.full(8, 9000)) == pytest.approx(0.25 * 1.3**2 + 0.75 * 0.8**2)
 
 
 def large_maps(patch: pytest.MonkeyPatch) -> None:
