@@ -15,7 +15,7 @@ from slam_backend.maps.fusion import check_inliers
 from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.smoother.graph import SlamGraph, mean_pose, scattered
 from slam_backend.smoother.joint_graphs import relative_start
-from slam_backend.smoother.options import MANY_ROBOTS, MANY_STEPS
+from slam_backend.smoother.options import MANY_STEPS
 from slam_backend.team.branches import Branch, fork
 from slam_backend.team.filter_merging.landmarks import merge_by_identity
 from slam_backend.team.filter_merging.merging import merge_filters, pair_filters, transform_covariance
@@ -176,12 +176,14 @@ def _cautious(covariance: FloatArray, joint: FastSlam, robot: int) -> FloatArray
 
 
 def _variance_factor(latest: IntArray) -> float:
-    """Return the factor on covariances of starts in a large map, by the share of steps before keyframes are widened.
+    """Return the factor on covariances of starts in a large map, by the share of steps before `MANY_STEPS`.
+
+    Not before these are all keyframes widened that are joined.
 
     Args:
         latest: (K,) int64. Last step of each robot.
     """
-    before = min(MANY_STEPS * min(len(latest), MANY_ROBOTS) / max(int(latest.sum()), 1), 1.0)
+    before = min(MANY_STEPS * len(latest) / max(int(latest.sum()), 1), 1.0)
     return before * JOINED_KEYFRAMES**2 + (1.0 - before) * WIDENED_KEYFRAMES**2
 
 

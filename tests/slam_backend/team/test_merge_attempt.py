@@ -382,7 +382,7 @@ def test_trials_of_large_maps_claim_no_more_than_the_gaussian_at_the_mode(
 ) -> None:
     """Their covariance is the larger one, for joined keyframes times 1.3 squared; the motion is that of small maps.
 
-    For what is joined after 6,000 steps of up to three robots, which is widened, it is times 0.8 squared.
+    For what is joined after 6,000 steps, which is widened, it is times 0.8 squared.
     """
     monkeypatch.setattr(smoothing_of_paths, "LONG_RUN", 0)
     smoothing = SmoothingOptions(slice_steps=slice_steps)
@@ -416,7 +416,7 @@ def test_trials_of_large_maps_claim_no_more_than_the_gaussian_at_the_mode(
         smoother = SimpleNamespace(starts_at_mode=at_mode, graph=SimpleNamespace(latest=np.array([steps, steps])))
         joint: Any = SimpleNamespace(state=SimpleNamespace(rejuvenation=smoother))
         np.testing.assert_allclose(group_merging._cautious(scatter, joint, 1), expected * scatter)
-    assert group_merging._variance_factor(np.full(8, 9000)) == pytest.approx(0.25 * 1.3**2 + 0.75 * 0.8**2)
+    assert group_merging._variance_factor(np.full(8, 24_000)) == pytest.approx(0.25 * 1.3**2 + 0.75 * 0.8**2)
 
 
 def large_maps(patch: pytest.MonkeyPatch) -> None:
