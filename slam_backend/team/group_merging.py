@@ -176,9 +176,9 @@ def _cautious(covariance: FloatArray, joint: FastSlam, robot: int) -> FloatArray
 
 
 def _variance_factor(latest: IntArray) -> float:
-    """Return the factor on covariances of starts in a large map, by the share of steps before `MANY_STEPS`.
+    """Return the factor on covariances of starts in a large map, the mean of two by their shares of a run.
 
-    Not before these are all keyframes widened that are joined.
+    Keyframes joined in the first `MANY_STEPS` steps may not be widened, later ones are.
 
     Args:
         latest: (K,) int64. Last step of each robot.
