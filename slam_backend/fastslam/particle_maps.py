@@ -92,6 +92,10 @@ def _num_heads(descriptor_size: int) -> int:
     return descriptor_size // 2 if descriptor_size >= 32 and descriptor_size % 2 == 0 else descriptor_size
 
 
+Copied = tuple[IntArray, list["weakref.ref[FloatArray]"]]
+_NOTHING_COPIED: Copied = np.zeros(0, np.int64), []
+
+
 class MapStore:
     """Storage of the landmark Gaussians, counts, descriptors and names of all particles; see the module.
 
@@ -129,7 +133,7 @@ class MapStore:
         self.descriptors: NDArray[np.float32] = np.zeros((0, 0), dtype=np.float32)
         self.heads: NDArray[np.float32] = np.zeros((0, 0), dtype=np.float32)
         self._free_maps = 0
-        self._copied: dict[int, tuple[IntArray, weakref.ref[FloatArray]]] = {}  # of the last state; not part of it
+        self._copied = _NOTHING_COPIED  # slots of the last state, and its arrays while others keep them; not part of it
         self.free_rows: IntArray = np.zeros(0, dtype=np.int64)
         self.tops: IntArray = np.zeros(3, dtype=np.int64)
 
@@ -226,7 +230,7 @@ class MapStore:
             if new or descriptor_size:
                 self._grow_slots(max(64, new), descriptor_size)
                 self._grow_rows(max(64, new + new // 2 + 1))
-        self._copied = {}
+        self._copied = _NOTHING_COPIED
         slots, rows = len(self.ids), len(self.counts)
         self.row_of[:new], self.map_of[:new] = np.arange(new), 0
         self.ids[new:] = self.identities[new:] = -1
@@ -420,7 +424,7 @@ class ParticleMaps(MapStore):
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the attributes for copies and pickles, which share no arrays with states."""
-        return vars(self) | {"_copied": {}, "_memory": None}
+        return vars(self) | {"_copied": _NOTHING_COPIED, "_memory": None}
 
     def get_state(self) -> dict[str, Any]:
         """Return the complete state of the maps, compact; `values` may be shared with other states and are read-only.
@@ -450,20 +454,24 @@ class ParticleMaps(MapStore):
 
     def _copied_values(self, used: IntArray) -> tuple[FloatArray, ...]:
         """Return the values of used slots, read-only; arrays of the last state that still hold are taken over."""
-        values, changed, parts = self.values.reshape(-1, 9 * self.padded), self.table[SLOT.changed], []
-        for slots in _chunks(used):
-            known = self._copied.get(int(slots[0]) if len(slots) else -1)
-            part = None if known is None or not np.array_equal(known[0], slots) else known[1]()
-            if part is None or changed[slots].any():
-                part = as_read_only(np.take(values, self.row_of[slots], axis=0))
-            parts.append((slots, part))
+        values, changed = self.values.reshape(-1, 9 * self.padded), self.table[SLOT.changed]
+        before, copied = self._copied
+        both = min(len(before), len(used))
+        stale = changed[used] > 0
+        stale[:both] |= used[:both] != before[:both]
+        stale[both:] = True
+        sizes = chunk_sizes(len(used))
+        firsts: IntArray = np.cumsum(sizes, dtype=np.int64) - np.array(sizes)
+        written = np.logical_or.reduceat(stale, firsts).tolist() if len(used) else [True]
+        parts = []
+        for chunk, (first, size) in enumerate(zip(firsts.tolist(), sizes, strict=True)):
+            part = copied[chunk]() if chunk < len(copied) and not written[chunk] else None
+            if part is None or len(part) != size:
+                part = as_read_only(np.take(values, self.row_of[used[first : first + size]], axis=0))
+            parts.append(part)
         changed[:] = 0
-        self._remember(parts)
-        return tuple(part for _, part in parts)
-
-    def _remember(self, parts: list[tuple[IntArray, FloatArray]]) -> None:
-        """Keep which slots (n,) and arrays (n, 9 P) the last state has, as long as anyone else keeps the arrays."""
-        self._copied = {int(slots[0]): (slots, weakref.ref(part)) for slots, part in parts if len(slots)}
+        self._copied = used, list(map(weakref.ref, parts))
+        return tuple(parts)
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Restore the maps from `get_state`; allocated rows are reused."""
@@ -472,11 +480,13 @@ class ParticleMaps(MapStore):
             self._clear(m)
         self._begin(n, state["descriptors"].shape[1])
         values, parts = self.values.reshape(-1, 9 * self.padded), state["values"]
-        for slots, part in zip(_chunks(np.arange(n)), parts, strict=True):
-            values[slots] = part
+        first = 0
+        for part in parts:
+            values[first : first + len(part)] = part
+            first += len(part)
         self.table[SLOT.changed] = 0
         if all(map(is_read_only, parts)):
-            self._remember(list(zip(_chunks(np.arange(n)), parts, strict=True)))
+            self._copied = np.arange(n), list(map(weakref.ref, parts))
         self.counts[:n] = state["counts"]
         if self.log_odds_prior is not None:
             self.odds[:n] = state["odds"]
@@ -496,11 +506,6 @@ def chunk_sizes(n: int) -> list[int]:
     ([0], [512], [128, 52])
     """
     return [n] if n <= WHOLE else [min(CHUNK, n - first) for first in range(0, n, CHUNK)]
-
-
-def _chunks(slots: IntArray) -> list[IntArray]:
-    """Divide slots (n,) as `chunk_sizes` says."""
-    return np.split(slots, np.cumsum(chunk_sizes(len(slots)))[:-1])
 
 
 def write_summary(maps: ParticleMaps, m: int, min_count: int, rows: MapSummaryRows, first: int) -> int:
