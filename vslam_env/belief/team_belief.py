@@ -148,8 +148,7 @@ class TeamBelief:
             landmarks = rows.positions[first:last], rows.counts_and_ids[first:last], points.starts[robot]
             known, shared = self._topology.known_robots[robot], self._grids.shared[robot]
             places = self._rendezvous.update(robot, points, known, shared, landmarks)
-            looks = self._grids.looks.counts[robot]
-            self._candidates.update(robot, self.grids, looks, points.poses, landmarks, places)
+            self._candidates.update(robot, self.grids, self._grids.looks, points.poses, landmarks, places)
         return report
 
     def merge(self, robot_a: int, robot_b: int, alignment: Alignment, known: bool = False) -> LandmarkIdMap:

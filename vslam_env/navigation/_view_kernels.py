@@ -174,12 +174,26 @@ def looks_of(scan: Any, directions: Any, reach: float, points: Any) -> int:
     return num
 
 
+@device
 @in_place
-def paint_looks(looks: Any, shared: Any, poses: Any, scans: Any, directions: Any, reach: float, points: Any) -> None:
+def count_looks_at(looks: Any, bounds: Any, row: int, col: int, more: int) -> None:
+    """Add to the looks at a cell, and widen the bounds (4,) of the cells with looks."""
+    looks[row, col] = min(looks[row, col] + more, MOST_LOOKS)
+    if bounds[2] == 0:
+        bounds[0], bounds[1] = row, col
+    bounds[0], bounds[1] = min(bounds[0], row), min(bounds[1], col)
+    bounds[2], bounds[3] = max(bounds[2], row + 1), max(bounds[3], col + 1)
+
+
+@in_place
+def paint_looks(
+    looks: Any, bounds: Any, shared: Any, poses: Any, scans: Any, directions: Any, reach: float, points: Any
+) -> None:
     """Count the looks of a tick, once a scan and cell.
 
     Args:
         looks: (K, S, S) uint8. Looks of the grids of K robots; changed.
+        bounds: (K, 4) int32. Bounds of those that are not zero, as in `GridStorage`; changed.
         shared: (K, K) int64. See `TeamGrids.update`.
         poses: (K, K, 3) [m, m, rad]. See there.
         scans: (K, R) [m]. See there.
@@ -200,25 +214,25 @@ def paint_looks(looks: Any, shared: Any, poses: Any, scans: Any, directions: Any
                 row = to_index(y + s * points[k, 0] + c * points[k, 1], size)
                 col = to_index(x + c * points[k, 0] - s * points[k, 1], size)
                 if 0 <= row < size and 0 <= col < size and (row != last_row or col != last_col):
-                    looks[owner, row, col] = min(looks[owner, row, col] + 1, MOST_LOOKS)
+                    count_looks_at(looks[owner], bounds[owner], row, col, 1)
                     last_row, last_col = row, col
 
 
 @in_place
-def merge_looks(looks: Any, other: Any, bounds: Any, x: float, y: float, theta: float) -> None:
+def merge_looks(looks: Any, bounds: Any, other: Any, others_bounds: Any, x: float, y: float, theta: float) -> None:
     """Add the looks (S', S') uint8 of another grid, whose start pose in this one is (x, y, theta), to looks (S, S).
 
-    Bounds (4,) int32 of the part of the other looks that is not zero are given, as in `GridStorage`.
+    Bounds (4,) int32 of the part of either that is not zero are given, as in `GridStorage`; those of looks change.
     """
     c, s = math.cos(theta), math.sin(theta)
     size, others = len(looks), len(other)
-    for other_row in range(bounds[0], bounds[2]):
-        for other_col in range(bounds[1], bounds[3]):
+    for other_row in range(others_bounds[0], others_bounds[2]):
+        for other_col in range(others_bounds[1], others_bounds[3]):
             if other[other_row, other_col] > 0:
                 u, v = to_coordinate(other_col, others), to_coordinate(other_row, others)
                 row, col = to_index(y + s * u + c * v, size), to_index(x + c * u - s * v, size)
                 if 0 <= row < size and 0 <= col < size:
-                    looks[row, col] = min(looks[row, col] + other[other_row, other_col], MOST_LOOKS)
+                    count_looks_at(looks, bounds, row, col, other[other_row, other_col])
 
 
 @device
@@ -434,13 +448,13 @@ def path_lengths_to(parents: Any, row: int, col: int, corner: Any, sure: Any) ->
 
 @device
 @in_place
-def give_up(looks: Any, target: Any) -> None:
+def give_up(looks: Any, bounds: Any, target: Any) -> None:
     """Count the cells around a target that cannot be seen as looked at as often as possible."""
     size = len(looks)
     row, col = to_index(target[1], size), to_index(target[0], size)
     for r in range(max(row - GIVEN_UP, 0), min(row + GIVEN_UP + 1, size)):
         for c in range(max(col - GIVEN_UP, 0), min(col + GIVEN_UP + 1, size)):
-            looks[r, c] = MOST_LOOKS
+            count_looks_at(looks, bounds, r, c, MOST_LOOKS)
 
 
 @device
@@ -489,12 +503,15 @@ def worth_seeing(cells: Any, looks: Any, bounds: Any, places: Any, counts: Any, 
 @device
 @jit
 def keep_revisits(
-    cells: Any, looks: Any, pose: Any, camera: Any, targets: Any, values: Any, rows: Any, visits: Any, distant: Any
-) -> None:
+    cells: Any, seen: tuple[Any, Any], pose: Any, camera: Any, targets: Any, values: Any, rows: Any, visits: Any,
+    distant: Any,
+) -> None:  # fmt: skip
     """Keep the revisit candidates (m, 5) with something left to gain, and empty the other slots.
 
-    Values (n,) of targets (n, 6) that they cover become 0. Distant candidates, a mask (m,), stay as they are.
+    Looks (S, S) and their bounds (4,) are given together. Values (n,) of targets (n, 6) that candidates cover become
+    0. Distant candidates, a mask (m,), stay as they are.
     """
+    looks, looks_bounds = seen
     for i in range(len(rows)):
         if np.isnan(rows[i, X]) or distant[i]:
             continue
@@ -507,7 +524,7 @@ def keep_revisits(
                 continue
             if is_in_view(bin_of(math.atan2(targets[t, 1] - rows[i, Y], targets[t, 0] - rows[i, X])), heading):
                 if visits[i] >= PATIENCE:
-                    give_up(looks, targets[t])
+                    give_up(looks, looks_bounds, targets[t])
                 else:
                     gain += values[t]
                 values[t] = 0.0
@@ -668,15 +685,17 @@ def measure_teammates(
 
 @jit
 def renew_candidates(
-    cells: Any, bounds: Any, looks: Any, ways: tuple[Any, Any, Any, Any, int, int], landmarks: tuple[Any, Any, Any],
-    poses: Any, camera: Any, places: Any, slots: tuple[Any, Any, Any, Any, Any, int, int],
+    cells: Any, bounds: Any, seen: tuple[Any, Any], ways: tuple[Any, Any, Any, Any, int, int],
+    landmarks: tuple[Any, Any, Any], poses: Any, camera: Any, places: Any,
+    slots: tuple[Any, Any, Any, Any, Any, int, int],
 ) -> None:  # fmt: skip
     """Bring a robot's candidates up to date, given its frontiers.
 
     Args:
         cells: (S, S) uint8. Cells of the robot's grid.
         bounds: (4,) int32. Bounds of its known part.
-        looks: (S, S) uint8. Looks of the grid; those at walls that cannot be seen are set to the largest number.
+        seen: Looks of the grid (S, S) uint8, of which those at walls that cannot be seen are set to the largest number;
+            and their bounds (4,) int32.
         ways: Paths from the robot, of `dijkstra`. Where they cover a part of the known floor, candidates of which they
             tell nothing (`is_settled`) stay as they are.
         landmarks: All landmarks of the robot's map (n, 4), their counts (n, 2), and the motion (3,) from the map frame
@@ -690,6 +709,7 @@ def renew_candidates(
             unreachable; all changed; the row of the robot in `poses`; the number of the update: the gains of a
             candidate that stays are computed in every fourth one, new places to look from are sought in every second.
     """
+    looks, _ = seen
     rows, visits, gains, views, lengths, robot, update = slots
     size, num_places = len(cells), len(places)
     first_revisit, first_rendezvous = len(rows) - num_places - len(visits), len(rows) - num_places
@@ -719,7 +739,7 @@ def renew_candidates(
             if not inside or cost[row, col] == UNREACHED:
                 revisits[i], visits[i] = np.nan, 0
     kept = distant[first_revisit:first_rendezvous]
-    keep_revisits(cells, looks, poses[robot], camera, targets, values, revisits, visits, kept)
+    keep_revisits(cells, seen, poses[robot], camera, targets, values, revisits, visits, kept)
     if update % 2 == 0:
         add_revisits(cells, cost, corner, camera, targets, values, revisits)
     set_rendezvous(cost, corner, size, poses[robot], places, rows[first_rendezvous:], distant[first_rendezvous:])

@@ -16,6 +16,7 @@ from vslam_env.navigation._view_kernels import (
     renew_candidates,
 )
 from vslam_env.navigation.candidate_slots import NUM_COLUMNS, NUM_SLOTS, CandidateSlots
+from vslam_env.navigation.looks import TeamLooks
 from vslam_env.navigation.team_grids import TeamGrids
 
 __all__ = ["CANDIDATE_FEATURES", "NUM_CANDIDATES", "CandidateGains", "CandidateKind", "TeamCandidates"]
@@ -112,7 +113,7 @@ class TeamCandidates:
         self.frontiers = [CandidateSlots.over(rows[:NUM_SLOTS]) for rows in self._rows]
 
     def update(
-        self, robot: int, grids: TeamGrids, looks: NDArray[np.uint8], poses: FloatArray, landmarks: LandmarkRows,
+        self, robot: int, grids: TeamGrids, looks: TeamLooks, poses: FloatArray, landmarks: LandmarkRows,
         places: FloatArray,
     ) -> None:  # fmt: skip
         """Update a robot's candidates without checks.
@@ -120,7 +121,7 @@ class TeamCandidates:
         Args:
             robot: Index of the robot.
             grids: Occupancy grids of the robots.
-            looks: (S, S) uint8. Looks of the robot; those at walls that cannot be seen are changed.
+            looks: Looks of the robots; those of this one at walls that cannot be seen are changed.
             poses: (K, K, 3) float64 [m, m, rad]. Pose of robot j in the start frame of robot i; NaN: unknown.
             landmarks: All landmarks of the robot's map (n, 4), their counts (n, 2), see `MapSummaryRows`, and the
                 motion (3,) from the map frame to the start frame.
@@ -135,7 +136,8 @@ class TeamCandidates:
             ways = frontiers.renew(cells, bounds, poses[robot], robot)
         gains = self._gains[robot], self._views[robot]
         slots = self._rows[robot], self._visits[robot], *gains, self._lengths[robot], robot, self._updates[robot]
-        renew_candidates(cells, bounds, looks, ways, landmarks, poses[robot], self._camera, places, slots)
+        seen = looks.counts[robot], looks.bounds[robot]
+        renew_candidates(cells, bounds, seen, ways, landmarks, poses[robot], self._camera, places, slots)
 
     def _reach(self, robot: int, bounds: NDArray[np.int32]) -> float:
         """Return the distance [m] from a robot along x and y that the present update searches; inf: everywhere."""

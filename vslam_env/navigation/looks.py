@@ -34,6 +34,7 @@ class TeamLooks:
 
     Attributes:
         counts: (K, S, S) uint8. Looks at each cell; a new array when the looks grow.
+        bounds: (K, 4) int32. Bounds of the cells with looks, as in `GridStorage`.
     """
 
     def __init__(self, num_robots: int, angles: FloatArray, half_fov: float, reach: float) -> None:
@@ -41,6 +42,7 @@ class TeamLooks:
         self._points = np.empty((len(angles), 2))
         self._directions[:, np.abs(angles) > half_fov + SLACK] = 0.0
         self.counts: NDArray[np.uint8] = np.zeros((num_robots, GRID_SIZE, GRID_SIZE), np.uint8)
+        self.bounds: NDArray[np.int32] = np.zeros((num_robots, 4), np.int32)
 
     def update(self, shared: IntArray, poses: FloatArray, scans: FloatArray, size: int) -> None:
         """Count the looks of a tick; see `TeamGrids.update` for the arguments.
@@ -49,25 +51,30 @@ class TeamLooks:
             size: Number of cells S along a side of the grids, to which the looks grow.
         """
         self.reserve(size)
-        paint_looks(self.counts, shared, poses, scans, self._directions, self._reach, self._points)
+        paint_looks(self.counts, self.bounds, shared, poses, scans, self._directions, self._reach, self._points)
 
     def merge(self, robot: int, other: NDArray[np.uint8], self_from_other: ArrayLike) -> None:
         """Add another robot's looks (S', S') uint8; its start pose in this robot's frame is (3,) [m, m, rad]."""
-        merge_looks(self.counts[robot], other, known_bounds(other), *pose_floats(self_from_other, "self_from_other"))
+        motion = pose_floats(self_from_other, "self_from_other")
+        merge_looks(self.counts[robot], self.bounds[robot], other, known_bounds(other), *motion)
 
     def reserve(self, size: int) -> None:
         """Grow to the size S of the grids, unless the looks have it; views taken before are no longer updated."""
         if size > self.counts.shape[1]:
             before, shift = self.counts, (size - self.counts.shape[1]) // 2
             self.counts = np.zeros((len(before), size, size), np.uint8)
-            for looks, old in zip(self.counts, before, strict=True):  # memory that nothing is written to costs nothing
-                top, left, bottom, right = known_bounds(old).tolist()
-                looks[top + shift : bottom + shift, left + shift : right + shift] = old[top:bottom, left:right]
+            for k, (top, left, bottom, right) in enumerate(self.bounds.tolist()):
+                there = (k, slice(top + shift, bottom + shift), slice(left + shift, right + shift))
+                self.counts[there] = before[
+                    k, top:bottom, left:right
+                ]  # memory that nothing is written to costs nothing
+                if bottom:
+                    self.bounds[k] += shift
 
     def get_state(self, robot: int) -> dict[str, Any]:
         """Return the looks of a robot: the part that is not zero, and its first row and column in a new grid."""
         looks = self.counts[robot]
-        top, left, bottom, right = known_bounds(looks).tolist()
+        top, left, bottom, right = self.bounds[robot].tolist()
         shift = margin(len(looks)) if bottom else 0
         return {"counts": looks[top:bottom, left:right].copy(), "corner": (top - shift, left - shift)}
 
@@ -76,7 +83,11 @@ class TeamLooks:
         shift, (row, col) = margin(self.counts.shape[1]), state["corner"]
         height, width = state["counts"].shape
         self.counts[robot] = 0
-        self.counts[robot, row + shift : row + shift + height, col + shift : col + shift + width] = state["counts"]
+        looks = self.counts[robot, row + shift : row + shift + height, col + shift : col + shift + width]
+        looks[:] = state["counts"]
+        self.bounds[robot] = known_bounds(state["counts"])
+        if self.bounds[robot, 2]:
+            self.bounds[robot] += row + shift, col + shift, row + shift, col + shift
 
 
 def looks_reach(state: Mapping[str, Any]) -> int:

@@ -115,6 +115,7 @@ def test_looks_of_other_frames_are_moved_into_the_own_one() -> None:
     looks, own = TeamLooks(1, ANGLES, HALF_FOV, REACH), TeamLooks(1, ANGLES, HALF_FOV, REACH)
     theirs = looks_after(pose, facing_wall(4.0), ticks=3)
     looks.merge(0, theirs, other_start)
+    assert (looks.bounds[0] == known_bounds(looks.counts[0])).all()
     own.update(ALONE, compose(other_start, pose)[None, None], facing_wall(4.0)[None], GRID_SIZE)
     expected, found = np.argwhere(own.counts[0]), np.argwhere(looks.counts[0])
     gaps = np.abs(found[:, None] - expected[None]).max(axis=2).min(axis=1)
@@ -139,9 +140,11 @@ def test_looks_grow_with_the_grid() -> None:
     assert again["corner"] == state["corner"]
     assert (again["counts"] == state["counts"]).all()
     assert state["counts"].size < 60
+    assert (looks.bounds[0] == known_bounds(looks.counts[0])).all()
     empty = TeamLooks(1, ANGLES, HALF_FOV, REACH)
     looks.set_state(0, empty.get_state(0))
     assert not looks.counts.any()
+    assert not looks.bounds.any()
 
 
 def test_candidates_do_not_depend_on_the_size_of_the_grid() -> None:
@@ -159,10 +162,11 @@ def test_candidates_do_not_depend_on_the_size_of_the_grid() -> None:
                 grids.update(ALONE, pose, scan, np.zeros(1, bool), ray_directions(ANGLES), REACH, 0.2)
                 looks.update(ALONE, pose, scan, grids.size)
             marks = rng.uniform([-3.0, -3.0, 0.0, 0.1], [x + 3.0, x, 0.0, 0.1], (20, 4)), rng.integers(1, 9, (20, 2))
-            candidates.update(0, grids, looks.counts[0], pose[0][None], (*marks, np.zeros(3)), NO_PLACES)
+            candidates.update(0, grids, looks, pose[0][None], (*marks, np.zeros(3)), NO_PLACES)
             picture, frame = np.empty((3, COARSE, COARSE), np.uint8), np.empty(3, np.float32)
             write_global_grid(grids.cells[0], looks.counts[0], grids.bounds[0], picture, frame)
             gains = np.array(candidates.gains(0))
+            np.testing.assert_array_equal(looks.bounds[0], known_bounds(looks.counts[0]))
             seen.append((candidates.rows(0).copy(), candidates.lengths(0).copy(), gains, picture, frame))
             sizes.add(grids.size)
         found.append((seen, sizes))
@@ -249,13 +253,14 @@ class Robot:
         self.grids, self.candidates = TeamGrids(1), TeamCandidates(1, (HALF_FOV, REACH, 0.2))
         evidence = np.where(cells == FREE, -5, np.where(cells == OCCUPIED, 5, 0)).astype(np.int8)
         self.grids.grids[0].set_state({"evidence": evidence, "corner": (0, 0)})
-        self.looks = np.zeros(cells.shape, np.uint8)
+        self.team_looks = TeamLooks(1, ANGLES, HALF_FOV, REACH)
+        self.looks = self.team_looks.counts[0]
 
     def update(self, pose: Any = (0.0, 0.0, 0.0), landmarks: Any = NO_LANDMARKS, places: Any = NO_PLACES) -> FloatArray:
         """Update twice, since new places are sought in every other update; return the rows of places to look from."""
         poses = np.array([[pose]], float)
         for _ in range(2):
-            self.candidates.update(0, self.grids, self.looks, poses, landmarks, places)
+            self.candidates.update(0, self.grids, self.team_looks, poses, landmarks, places)
         return self.candidates.rows(0)[16:28]
 
 
@@ -344,6 +349,7 @@ def test_what_stays_unseen_is_given_up() -> None:
         rows = robot.update(goal[:3])
     assert not (np.isclose(rows[:, :3], goal[:3]).all(axis=1)).any()
     assert (robot.looks == MOST_LOOKS).any()
+    np.testing.assert_array_equal(robot.team_looks.bounds[0], known_bounds(robot.looks))
 
 
 def test_weak_landmarks_make_places_to_look_from() -> None:
@@ -380,7 +386,7 @@ def test_teammates_paths_are_those_of_a_search_from_them() -> None:
     poses = np.full((3, 3, 3), np.nan)
     poses[1, 1], poses[1, 0] = [0.0, 0.0, 0.0], [5.0, -2.0, 1.0]
     for _ in range(2):
-        candidates.update(1, grids, np.zeros((GRID_SIZE, GRID_SIZE), np.uint8), poses, NO_LANDMARKS, NO_PLACES)
+        candidates.update(1, grids, TeamLooks(2, ANGLES, HALF_FOV, REACH), poses, NO_LANDMARKS, NO_PLACES)
     rows = candidates.rows(1)
     valid = ~np.isnan(rows[:, 0])
     ways = distance_map(grids.grids[1].cells, (0.0, 0.0))

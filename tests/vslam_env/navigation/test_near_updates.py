@@ -11,6 +11,7 @@ from vslam_env.navigation import (
     UNKNOWN,
     TeamCandidates,
     TeamGrids,
+    TeamLooks,
     candidates,
     cell_of,
 )
@@ -52,7 +53,8 @@ class Robot:
 
     def __init__(self, cells: np.ndarray, num_robots: int = 1) -> None:
         self.grids, self.candidates = TeamGrids(num_robots), TeamCandidates(num_robots, CAMERA)
-        self.looks = np.full(cells.shape, 255, np.uint8)
+        self.looks = TeamLooks(num_robots, np.zeros(1), 0.46, 8.0)
+        self.looks.counts[:] = 255
         self.know(cells)
 
     def know(self, cells: np.ndarray) -> None:
