@@ -53,17 +53,18 @@ def near_pairs(
     limit = 1.001 * (options.descriptor_gate / min(options.descriptor_ratio, 1.0)) ** 2  # rivals in the ratio test
     if known is not None and (known.limit != limit or _widths(known.a, known.b) != _widths(a, b)):
         known = None  # other options, or a map that was empty: its descriptors had no width
-    new_a, new_b = np.arange(len(a.ids)), np.arange(len(b.ids))
+    is_new_a, is_new_b = np.ones(len(a.ids), np.bool_), np.ones(len(b.ids), np.bool_)
     parts: list[tuple[IntArray, Float32Array]] = []
     if known is not None:
         now_a, now_b = _rows_now(known.a, a), _rows_now(known.b, b)
         rows = np.column_stack([now_a[known.rows[:, 0]], now_b[known.rows[:, 1]]])
         held = (rows >= 0).all(axis=1)
         parts.append((rows[held], known.squares[held]))
-        new_a, new_b = np.setdiff1d(new_a, now_a), np.setdiff1d(new_b, now_b)
-    old_a = np.setdiff1d(np.arange(len(a.ids)), new_a)
+        is_new_a[now_a[now_a >= 0]] = is_new_b[now_b[now_b >= 0]] = False
     most = MOST_PER_LANDMARK * (len(a.ids) + len(b.ids))
-    for rows_a, rows_b in ((new_a, np.arange(len(b.ids))), (old_a, new_b)):
+    for rows_a, rows_b in (
+        (np.flatnonzero(is_new_a), np.arange(len(b.ids))), (np.flatnonzero(~is_new_a), np.flatnonzero(is_new_b)),
+    ):  # fmt: skip
         if not len(rows_a) or not len(rows_b):
             continue
         columns = np.ascontiguousarray(b.descriptors[rows_b].T)
