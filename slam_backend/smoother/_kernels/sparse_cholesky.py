@@ -115,7 +115,7 @@ def _sees_again(columns: IntArray, keys: IntArray, first: int, q: int) -> bool:
 
 @jit
 def lay_out(
-    columns: IntArray, previous: IntArray, biases: IntArray, seen: LandmarkFactors, num: int, few: int = 0
+    columns: IntArray, previous: IntArray, biases: IntArray, seen: LandmarkFactors, num: int, few: int
 ) -> SymbolicFactor:  # fmt: skip
     """Choose the order in which `num` poses and landmarks are eliminated, and lay out the blocks of the factor.
 
