@@ -26,6 +26,7 @@ from slam_backend.smoother.rejuvenation import Draft, LandmarkDescriptors, Parti
 from slam_backend.smoother.sampling import PathLandmarks
 
 PART = 512  # landmarks of all particles that are written at once where they are read only once
+PIECE = 1024  # landmarks of all particles that are written in one step where they are written over several
 
 
 def landmark_positions(maps: ParticleMaps, best: int) -> LandmarkPositions:
@@ -120,12 +121,24 @@ class NewLandmarks(NamedTuple):
 
     def write(self, maps: ParticleMaps, part: slice = slice(None)) -> None:
         """Replace all landmarks of all particles by these, or by a part of them."""
+        self._begin(maps, part)
+        self.landmarks.write(self.rows[part], self.walk, maps.blocks)  # the walk: (7) of docs/reference/smoother.md
+
+    def write_in_parts(self, maps: ParticleMaps) -> Iterator[None]:
+        """Replace all landmarks of all particles by these, `PIECE` of them before each of the yields."""
+        self._begin(maps, slice(None))
+        for first in range(0, len(self.ids), PIECE):
+            part = slice(first, first + PIECE)
+            self.landmarks.write(self.rows[part], self.walk, maps.blocks[part])
+            yield
+
+    def _begin(self, maps: ParticleMaps, part: slice) -> None:
+        """Replace all landmarks but for positions and covariances."""
         odds = None if self.odds is None else self.odds[part]
         maps.load_metadata(
             self.counts[part], self.descriptors[part], self.ids[part], self.identities[part], self.next_id, odds,
             self.last_seen[part],
         )  # fmt: skip
-        self.landmarks.write(self.rows[part], self.walk, maps.blocks)  # the walk: (7) of docs/reference/smoother.md
 
     def in_parts(self, num_particles: int) -> Iterator[ParticleMaps]:
         """Yield maps of M particles with `PART` landmarks at a time; each takes the memory of the last."""

@@ -234,9 +234,11 @@ class LandmarkIdMap:
     """Renaming of the landmark ids of two groups to ids of their joint map.
 
     Attributes:
-        robots_a: Group a before the merge; its landmark ids stay.
+        robots_a: Group a before the merge; its landmark ids stay. Landmarks that it found while a merge of large maps
+            was prepared are found again, under new ids, in `TeamReport.map_changes`.
         robots_b: Group b before the merge.
         ids_b: (k, 2) int64, read-only. Rows (id in b's map, id in the joint map); fused landmarks get the id of a.
+            Without landmarks that b found during such a preparation.
         maps: Numbers of a's map, of b's and of the joint one. The first two are kept until their `MapReleased`: an undo
             restores them.
     """

@@ -1,7 +1,7 @@
 """State of a filter, and the operations that change it: step, resampling, rejuvenation and merge."""
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -375,6 +375,13 @@ class FilterState:
             self.maps = unused if fits else ParticleMaps(self.num_particles, self.maps.log_odds_prior)
             self.unwritten.write(self.maps)
             self.unwritten = None
+
+    def landmarks_in_parts(self) -> Iterator[None]:
+        """Write the landmarks that were left unwritten, if they were, a part before each of the yields."""
+        if self.unwritten is not None:
+            maps = ParticleMaps(self.num_particles, self.maps.log_odds_prior)
+            yield from self.unwritten.write_in_parts(maps)
+            self.maps, self.unwritten = maps, None
 
     @property
     def logs(self) -> list[RobotLog]:

@@ -1,6 +1,7 @@
 """Merging of two groups, detection of inconsistent merges, and separation of the groups before a merge."""
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -16,8 +17,8 @@ from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.smoother.graph import SlamGraph, mean_pose, scattered
 from slam_backend.smoother.joint_graphs import relative_start
 from slam_backend.smoother.options import MANY_STEPS
-from slam_backend.team.branches import Branch, fork
-from slam_backend.team.filter_merging.landmarks import merge_by_identity
+from slam_backend.team.branches import Branch, ReplayedStep, fork
+from slam_backend.team.filter_merging.landmarks import merge_by_identity, renaming
 from slam_backend.team.filter_merging.merging import merge_filters, pair_filters, transform_covariance
 from slam_backend.team.filter_merging.pairing import Pairing
 from slam_backend.team.groups import Group
@@ -52,6 +53,20 @@ def smoothed_graphs(a: FastSlam, b: FastSlam) -> tuple[SlamGraph, SlamGraph] | N
     return None if of_a is None or of_b is None else (of_a, of_b)
 
 
+class PreparedTrunk(NamedTuple):
+    """Branch of a joint filter, made some steps before the merge.
+
+    Attributes:
+        branch: The branch.
+        renamed: (n, 2) int64 rows (id in b, id in the joint map) of the landmarks that b had then.
+        replayed: Steps replayed since.
+    """
+
+    branch: Branch
+    renamed: IntArray
+    replayed: Sequence[ReplayedStep] = ()
+
+
 class MergePlan(NamedTuple):
     """Two groups with an alignment of their maps, ready to merge.
 
@@ -61,6 +76,7 @@ class MergePlan(NamedTuple):
         alignment: Motion from b's map frame to a's; `inliers` are rows of the maps.
         pairing: Pairing of the joint filters' particles, if drawn already.
         joint: Result of `merge_filters`, if merged already.
+        prepared: Branch of the joint filter that has caught up with both groups, if it was prepared.
     """
 
     groups: tuple[Group, Group]
@@ -68,6 +84,7 @@ class MergePlan(NamedTuple):
     alignment: Alignment
     pairing: Pairing | None = None
     joint: tuple[FastSlam, IntArray] | None = None
+    prepared: PreparedTrunk | None = None
 
     @classmethod
     def of(cls, group_a: Group, group_b: Group, alignment: Alignment) -> Self:
@@ -102,9 +119,7 @@ class MergePlan(NamedTuple):
         if graphs is None:
             return None
         of_a, of_b = (slam.state.maps for slam in self.filters)
-        common = np.concatenate(merge_by_identity(of_a, of_b, self.pairs))
-        others = np.setdiff1d(of_b.ids[of_b.used_slots()], common[:, 1])
-        renamed = np.concatenate([common[:, ::-1], np.column_stack([others, of_a.next_id + np.arange(len(others))])])
+        renamed = renaming(of_a, of_b, np.concatenate(merge_by_identity(of_a, of_b, self.pairs)))
         state, found = self.filters[0].state, self.alignment
         start = relative_start(*graphs, found.transform, renamed, state.packed_camera, state.options.smoothing)
         if start is None:
@@ -132,8 +147,7 @@ class MergePlan(NamedTuple):
             rng: Generator for the draws.
 
         Returns:
-            The plan with the motion estimated by the joint filter, and its uncertainty, see `transform_uncertainty`;
-            infinite if the shape of the joint map is inconsistent. None if the smoother fails.
+            The plan with the result of `judge_trial`. None if the smoother fails.
         """
         a, b = self.filters
         joint, renamed = merge_filters(
@@ -141,18 +155,39 @@ class MergePlan(NamedTuple):
         )
         if joint.rejuvenate().reason:
             return None
-        starts = joint.state.starts[a.num_robots, :, : joint.num_particles]
-        motion = mean_pose(starts)
-        start = rotate_covariances(float(motion[2]), joint.state.start_covariances[a.num_robots])
-        covariance = scattered(starts) + start
-        _kernels.add_gauge_covariance(joint.state.gauge_covariance, motion[None], covariance[None])
-        covariance = _cautious(covariance, joint, a.num_robots)
-        x, y, theta = motion.tolist()
-        alignment = Alignment(True, "", x, y, theta, covariance, self.alignment.inliers, self.alignment.ratio)
-        before, after = (self.maps[0], renamed_map(self.maps[1], dict(renamed.tolist()))), joint.map("mixture")
-        deformed = any(deformed_fraction(old, after, options) > merging.max_deformed for old in before)
-        plan = self._replace(alignment=alignment, joint=(joint, renamed))
-        return plan, math.inf if deformed else _relative_uncertainty(covariance)
+        found, uncertainty = judge_trial(joint, a.num_robots, self.maps, renamed, self.alignment, merging, options)
+        return self._replace(alignment=found, joint=(joint, renamed)), uncertainty
+
+
+def judge_trial(
+    joint: FastSlam, robot: int, maps: tuple[LandmarkMap, LandmarkMap], renamed: IntArray, alignment: Alignment,
+    merging: MergeOptions, options: AlignmentOptions,
+) -> tuple[Alignment, float]:  # fmt: skip
+    """Return the motion between two maps by a joint filter that was rejuvenated on trial, and how uncertain it is.
+
+    Args:
+        joint: The joint filter, a's robots first.
+        robot: Index of b's first robot, whose start defines b's frame.
+        maps: Maps of a and b before, with mixture covariances.
+        renamed: (n, 2) int64 rows (id in b, id in the joint map).
+        alignment: Alignment by which they were merged.
+        merging, options: Options of merges and alignments.
+
+    Returns:
+        The alignment with this motion, and its uncertainty, see `transform_uncertainty`; infinite if the shape of the
+        joint map is inconsistent.
+    """
+    starts = joint.state.starts[robot, :, : joint.num_particles]
+    motion = mean_pose(starts)
+    start = rotate_covariances(float(motion[2]), joint.state.start_covariances[robot])
+    covariance = scattered(starts) + start
+    _kernels.add_gauge_covariance(joint.state.gauge_covariance, motion[None], covariance[None])
+    covariance = _cautious(covariance, joint, robot)
+    x, y, theta = motion.tolist()
+    found = Alignment(True, "", x, y, theta, covariance, alignment.inliers, alignment.ratio)
+    before, after = (maps[0], renamed_map(maps[1], dict(renamed.tolist()))), joint.map("mixture")
+    deformed = any(deformed_fraction(old, after, options) > merging.max_deformed for old in before)
+    return found, math.inf if deformed else _relative_uncertainty(covariance)
 
 
 # Factor by which the standard deviations of a start in a large map are too small, as keyframes have been joined: with
@@ -228,26 +263,46 @@ def merge_groups(
         epoch: Epoch of the joint filter.
         known: Whether the motion is known from the alignment, see `merge_filters`.
     """
-    (group_a, group_b), alignment, pairs = plan.groups, plan.alignment, plan.pairs
+    group_a, group_b = plan.groups
     a, b = group_a.trunk, group_b.trunk
-    joint, renamed = plan.joint or merge_filters(
-        a.filter, b.filter, alignment, pairs, rng, merging.merged_particles, known, plan.pairing
-    )
-    robots, active = a.robots + b.robots, a.active_robots + b.active_robots
-    joint.reorder(np.argsort(robots))
-    number = records.new_number()
-    trunk = Branch(tuple(sorted(robots)), tuple(sorted(active)), joint, a.last_steps | b.last_steps, number, epoch)
+    prepared = plan.prepared
+    if prepared is None:
+        joint, renamed = plan.joint or merge_filters(
+            a.filter, b.filter, plan.alignment, plan.pairs, rng, merging.merged_particles, known, plan.pairing
+        )
+        joint.reorder(np.argsort(a.robots + b.robots))
+        prepared = PreparedTrunk(joint_trunk(plan.groups, joint, renamed, records.new_number()), renamed)
+    trunk, renamed, replayed = prepared
+    trunk.active_robots, trunk.epoch = tuple(sorted(a.active_robots + b.active_robots)), epoch
     if merging.watch_steps:
-        new_ids = dict(renamed.tolist())
-        older = [*(monitor.copy() for monitor in a.monitors), *(monitor.copy(new_ids) for monitor in b.monitors)]
         sides = PreMergeSnapshot.of(a.get_state()), PreMergeSnapshot.of(b.get_state())
         common = renamed[np.isin(renamed[:, 1], a.filter.state.maps.ids), ::-1]
-        fresh = begin_monitoring(number, alignment, sides, plan.maps, renamed, common)
-        trunk.monitors = [*sorted(older, key=lambda monitor: monitor.number), fresh]
-    joint.state.write_landmarks(a.filter.state.maps)
-    id_map = LandmarkIdMap(a.robots, b.robots, renamed, (a.number, b.number, number))
+        fresh = begin_monitoring(trunk.number, plan.alignment, sides, plan.maps, renamed, common)
+        for done in replayed:
+            fresh.update(trunk.robots, done.report)
+        trunk.monitors.append(fresh)
+    trunk.filter.state.write_landmarks(a.filter.state.maps)
+    id_map = LandmarkIdMap(a.robots, b.robots, renamed, (a.number, b.number, trunk.number))
     records.entries.append(id_map)
+    records.note_replay(trunk.number, replayed)
     return Group(trunk, [*group_a.branches[1:], *group_b.branches[1:]]), id_map
+
+
+def joint_trunk(groups: tuple[Group, Group], joint: FastSlam, renamed: IntArray, number: int) -> Branch:
+    """Return the branch of the joint filter of two groups, which still uses none of its robots' inputs.
+
+    Args:
+        groups: Groups a and b.
+        joint: Joint filter of their robots, in any order.
+        renamed: (n, 2) int64 rows (id in b, id in the joint map).
+        number: Number of the joint map.
+    """
+    a, b = (group.trunk for group in groups)
+    new_ids = dict(renamed.tolist())
+    older = [*(monitor.copy() for monitor in a.monitors), *(monitor.copy(new_ids) for monitor in b.monitors)]
+    trunk = Branch(tuple(sorted(a.robots + b.robots)), (), joint, a.last_steps | b.last_steps, number)
+    trunk.monitors = sorted(older, key=lambda monitor: monitor.number)
+    return trunk
 
 
 def find_inconsistent_merge(trunk: Branch, merging: MergeOptions, options: AlignmentOptions) -> MergeMonitor | None:

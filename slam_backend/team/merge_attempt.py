@@ -1,9 +1,12 @@
 """Attempt of two groups to align their maps: choice of the pair, smoothing of both maps, and a second alignment.
 
 Filters whose smoother works in slices smooth over several steps, one slice in each, as for a rejuvenation that is due.
-The attempt continues when both have finished and are in contact. Other filters smooth their whole logs in one step.
+The attempt continues when both have finished and are in contact; of large maps ten steps later at the earliest, so that
+its work does not all fall into one decision of a robot, and their merge is prepared (`merge_preparation`). Other
+filters smooth their whole logs in one step.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -20,6 +23,7 @@ from slam_backend.maps.near_pairs import Appearance
 from slam_backend.smoother.options import extra_keys
 from slam_backend.team.group_merging import MergePlan, smoothed_graphs, smoothed_maps, transform_uncertainty
 from slam_backend.team.groups import Group
+from slam_backend.team.merge_preparation import MergePreparation
 from slam_backend.team.merge_scheduler import MergeScheduler, PairKey, PendingAttempt
 from slam_backend.team.options import MergeOptions
 from slam_backend.team.shared_records import SharedRecords
@@ -33,17 +37,25 @@ Maps = tuple[LandmarkMap, LandmarkMap]
 
 
 class AttemptResult(NamedTuple):
-    """Completed attempt, and the plan of the merge if it succeeded."""
+    """Outcome of a step for the attempts of a team.
 
-    event: MergeEvent
-    plan: MergePlan | None
+    Attributes:
+        event: The attempt that ends in this step, or None.
+        plan: Plan of the merge, if it succeeded.
+        preparation: Preparation of a merge of large maps that goes on in the next step, or None.
+    """
+
+    event: MergeEvent | None = None
+    plan: MergePlan | None = None
+    preparation: MergePreparation | None = None
 
 
 def run_attempt(
     groups: Sequence[Group], networks: IntArray, step: int, schedule: MergeScheduler, alignment: AlignmentOptions,
     merging: MergeOptions, records: SharedRecords, rng: np.random.Generator,
-) -> AttemptResult | None:  # fmt: skip
-    """Start an attempt of the most promising pair of groups, or continue a pending one.
+    preparation: MergePreparation | None = None,
+) -> AttemptResult:  # fmt: skip
+    """Start an attempt of the most promising pair of groups, or continue a pending one, or the preparation of a merge.
 
     Args:
         groups: Groups of the team, by their robots. The filters of the pair may be smoothed.
@@ -54,10 +66,10 @@ def run_attempt(
         merging: Options of merges.
         records: Records of the team, which count the traffic.
         rng: Generator for the search and for the draws of the merge that follows.
-
-    Returns:
-        The attempt that ends in this step, or None; its groups are to be merged if its alignment succeeded.
+        preparation: Preparation that goes on since the last step, or None; its attributes change.
     """
+    if preparation is not None:
+        return _prepare(preparation, groups, networks, step, schedule, alignment, merging, records, rng)
     pending = schedule.pending_attempt
     if pending is None:
         return _start(groups, networks, step, schedule, alignment, merging, records, rng)
@@ -65,27 +77,46 @@ def run_attempt(
     late = step - pending.since >= MOST_STEPS
     if pair is None or (late and not _are_connected(pair, networks)):
         schedule.pending_attempt = None
-        return None
+        return AttemptResult()
     soon = step - pending.since < LEAST_STEPS and _is_costly(pair)
     if not pending.ready or soon or not _are_connected(pair, networks):
         ready = pending.ready or late or not any(group.trunk.filter.rejuvenation_requested for group in pair)
         schedule.pending_attempt = replace(
             pending, ready=ready
         )  # continued in the next step to limit the work per step
-        return None
+        return AttemptResult()
     schedule.pending_attempt = None
     maps = _mixtures(pair)
     outcome = _realign(pair, pending.alignment, maps, schedule, alignment, records, rng)
     return _finish(MergePlan(pair, maps, outcome), step, pending.alignment, schedule, alignment, merging, rng)
 
 
+def _prepare(
+    preparation: MergePreparation, groups: Sequence[Group], networks: IntArray, step: int, schedule: MergeScheduler,
+    alignment: AlignmentOptions, merging: MergeOptions, records: SharedRecords, rng: np.random.Generator,
+) -> AttemptResult:  # fmt: skip
+    """Continue the preparation of a merge; it ends, too, if a group has changed or is out of contact for long."""
+    pair = next((pair for pair in _pairs(groups) if preparation.is_of(pair)), None)
+    if pair is None:
+        return AttemptResult()
+    if not preparation.advance(pair, _are_connected(pair, networks), merging, alignment, records, rng):
+        return AttemptResult(preparation=preparation)
+    uncertainty = merging.min_sigmas * preparation.uncertainty
+    if math.isnan(uncertainty):
+        return AttemptResult()  # given up
+    plan = None if preparation.joint is None else preparation.plan(pair)
+    found = preparation.alignment if plan is None else plan.alignment
+    found = _refused_if_uncertain(found, pair, uncertainty, 0.0, schedule, merging)
+    return _end(pair, found, plan, step, preparation.unsmoothed, uncertainty, schedule)
+
+
 def _start(
     groups: Sequence[Group], networks: IntArray, step: int, schedule: MergeScheduler, options: AlignmentOptions,
     merging: MergeOptions, records: SharedRecords, rng: np.random.Generator,
-) -> AttemptResult | None:  # fmt: skip
+) -> AttemptResult:  # fmt: skip
     """Choose a pair and align its maps before smoothing."""
     if len(groups) < 2:
-        return None
+        return AttemptResult()
     connected = (pair for pair in _pairs(groups) if _are_connected(pair, networks))
     pairs = {_key(pair): pair for pair in connected if schedule.may_try(_key(pair), step)}
     found = {group.robots: _appearance(group) for group in _unique(pairs)}
@@ -93,7 +124,7 @@ def _start(
     maps = {group.robots: group.trunk.filter.map("mixture") for group in _unique(pairs)}
     chosen = schedule.choose({key: (maps[key[0]], maps[key[1]]) for key in pairs}, step)
     if chosen is None:
-        return None
+        return AttemptResult()
     pair, (map_a, map_b) = pairs[chosen], (maps[chosen[0]], maps[chosen[1]])
     unsmoothed = _align(pair, (map_a, map_b), schedule, options, rng)
     records.exchange.record_maps(*representatives(pair), map_a, map_b)
@@ -104,7 +135,7 @@ def _start(
         for group in pair:
             group.trunk.filter.request_rejuvenation()
         schedule.pending_attempt = PendingAttempt(chosen, _numbers(pair), unsmoothed, step)
-        return None
+        return AttemptResult()
     before = [group.trunk.filter.get_state() for group in pair]
     smoothed = smoothed_maps(*pair)
     if smoothed is None:
@@ -157,53 +188,65 @@ def _finish(
     plan: MergePlan, step: int, unsmoothed: Alignment | None, schedule: MergeScheduler, alignment: AlignmentOptions,
     merging: MergeOptions, rng: np.random.Generator,
 ) -> AttemptResult:  # fmt: skip
-    """Check the uncertainty of the merge, and record the outcome of the attempt."""
+    """Check the uncertainty of the merge, and record the outcome of the attempt.
+
+    Where the joint graph of large maps tells, most attempts end there, and the merges of others are prepared.
+    """
     pair, found, uncertainty = plan.groups, plan.alignment, float("nan")
     if found.success and merging.min_sigmas:
-        before = rng.bit_generator.state
-        plan, uncertainty, change = _on_trial(plan, schedule, alignment, merging, rng)
-        found = plan.alignment
-        if schedule.should_defer(_key(pair), uncertainty, merging.max_uncertainty):
-            found = Alignment.refused("too uncertain", found.ratio, "paths", uncertainty)
-        elif change > 1.0:
-            found = Alignment.refused("too uncertain", found.ratio, "repeat", change)
+        may_try, before = merging.min_sigmas_on_trial > 0.0 and merging.smooth_first, rng.bit_generator.state
+        claimed = plan.by_graphs() if may_try else None
+        if claimed is None:
+            plan, uncertainty, change = _on_trial(plan, may_try, schedule, alignment, merging, rng)
+        else:
+            plan, uncertainty = claimed[0], merging.min_sigmas * claimed[1]
+            change = schedule.change(_key(pair), plan.alignment.transform)
+            if uncertainty <= merging.max_uncertainty and change <= 1.0:
+                return AttemptResult(preparation=MergePreparation.of(plan, unsmoothed))
+        found = _refused_if_uncertain(plan.alignment, pair, uncertainty, change, schedule, merging)
         if not found.success:  # the draws for the merge are dropped
             rng.bit_generator.state = before
-            plan = plan._replace(pairing=None, joint=None)
-    schedule.record(_key(pair), step, found.success, unsmoothed is not None, _smooth_in_slices(pair))
-    event = MergeEvent(step, "attempt", pair[0].robots, pair[1].robots, found, unsmoothed, uncertainty)
-    return AttemptResult(event, plan if found.success else None)
+    return _end(pair, found, plan, step, unsmoothed, uncertainty, schedule)
 
 
 def _on_trial(
-    plan: MergePlan, schedule: MergeScheduler, alignment: AlignmentOptions, merging: MergeOptions,
+    plan: MergePlan, may_try: bool, schedule: MergeScheduler, alignment: AlignmentOptions, merging: MergeOptions,
     rng: np.random.Generator,
 ) -> tuple[MergePlan, float, float]:  # fmt: skip
-    """Merge on trial if the two maps alone leave the motion too uncertain.
-
-    Where the joint graph of large maps does so, too, no trial is made: most attempts of large maps end there.
+    """Merge on trial, if allowed and if the two maps alone leave the motion too uncertain.
 
     Returns:
         The plan with the last estimate of the motion; its relative uncertainty, at most 1 for a merge; and its change
         since the last trial of this pair, at most 1 for a merge, 0 without a trial.
     """
-    may_try, change = merging.min_sigmas_on_trial > 0.0 and merging.smooth_first, 0.0
-    claimed = plan.by_graphs() if may_try else None
-    if claimed is not None:
-        uncertainty = merging.min_sigmas * claimed[1]
-        change = schedule.change(_key(plan.groups), claimed[0].alignment.transform)
-        if uncertainty > merging.max_uncertainty or change > 1.0:
-            return claimed[0], uncertainty, change
     plan = plan.with_pairing(merging, rng)
     uncertainty = merging.min_sigmas * transform_uncertainty(plan)
-    if not may_try or (claimed is None and uncertainty <= 1.0):
-        return plan, uncertainty, 0.0
-    trial = plan.on_trial(merging, alignment, rng)
+    trial = plan.on_trial(merging, alignment, rng) if may_try and uncertainty > 1.0 else None
     if trial is None:
-        return plan, uncertainty, change
-    if claimed is None:
-        change = schedule.change(_key(plan.groups), trial[0].alignment.transform)
+        return plan, uncertainty, 0.0
+    change = schedule.change(_key(plan.groups), trial[0].alignment.transform)
     return trial[0], merging.min_sigmas * trial[1], change
+
+
+def _refused_if_uncertain(
+    found: Alignment, pair: Pair, uncertainty: float, change: float, schedule: MergeScheduler, merging: MergeOptions
+) -> Alignment:
+    """Return an alignment, or its refusal if its uncertainty, or its change since the last one, exceeds the limits."""
+    if schedule.should_defer(_key(pair), uncertainty, merging.max_uncertainty):
+        return Alignment.refused("too uncertain", found.ratio, "paths", uncertainty)
+    if change > 1.0:
+        return Alignment.refused("too uncertain", found.ratio, "repeat", change)
+    return found
+
+
+def _end(
+    pair: Pair, found: Alignment, plan: MergePlan | None, step: int, unsmoothed: Alignment | None, uncertainty: float,
+    schedule: MergeScheduler,
+) -> AttemptResult:  # fmt: skip
+    """Record the outcome of an attempt."""
+    schedule.record(_key(pair), step, found.success, unsmoothed is not None, _smooth_in_slices(pair))
+    event = MergeEvent(step, "attempt", pair[0].robots, pair[1].robots, found, unsmoothed, uncertainty)
+    return AttemptResult(event, plan if found.success else None)
 
 
 def representatives(pair: Pair) -> tuple[int, int]:

@@ -13,6 +13,7 @@ from slam_backend.fastslam.options import FilterOptions
 from slam_backend.fastslam.state_checks import check_descriptors, check_filter, check_landmarks, last_step
 from slam_backend.fastslam.step_input import StepInput
 from slam_backend.maps.alignment_types import Alignment, AlignmentOptions
+from slam_backend.maps.fusion import check_inliers
 from slam_backend.smoother.log_arrays import REJECTED
 from slam_backend.team.branches import ReplayedStep
 from slam_backend.team.merge_monitor import MergeMonitor, PreMergeSnapshot
@@ -33,6 +34,10 @@ BRANCH = (
     "split_from",
     "split_counts",
 )
+PREPARATION = (
+    "pair", "numbers", "maps", "alignment", "unsmoothed", "counts", "oldest", "joint", "renamed", "uncertainty",
+    "replayed",
+)  # fmt: skip
 KINDS = ("attempt", "merge", "undo")
 
 
@@ -85,6 +90,8 @@ class TeamCheck:
         self._check_schedule(f"{name}['schedule']", state["schedule"])
         for where, group in check.named_items(f"{name}['groups']", state["groups"]):
             self._check_group(where, group)
+        if "preparation" in state:
+            self._check_preparation(f"{name}['preparation']", state["preparation"])
         trunks = [group["branches"][0]["robots"] for group in state["groups"]]
         if sorted(sum(trunks, ())) != list(range(self._count)) or trunks != sorted(trunks):
             check.refuse(f"{name}['groups']", "groups of all robots, ordered by their first robots", trunks)
@@ -127,6 +134,42 @@ class TeamCheck:
                 self._need_from(where, last + 1)
                 if last > trunk["last_steps"].get(robot, -1):
                     check.refuse(where, "sides that know no more steps than the joint filter", last)
+
+    def _check_preparation(self, name: str, state: Any) -> None:
+        """Refuse a value that is not the preparation of a merge."""
+        check.keys(name, state, PREPARATION)
+        self._check_pair(f"{name}['pair']", state["pair"])
+        check.integers(f"{name}['numbers']", state["numbers"])
+        check.sequence(f"{name}['numbers']", state["numbers"], 2)
+        for where, landmarks in check.named_items(f"{name}['maps']", state["maps"], 2):
+            check_landmarks(where, landmarks)
+        check.instance(f"{name}['alignment']", state["alignment"], Alignment)
+        check_inliers(state["alignment"].inliers, *map(len, state["maps"]))
+        check.instance(f"{name}['unsmoothed']", state["unsmoothed"], Alignment, type(None))
+        check.integers(f"{name}['counts']", state["counts"], 0, check.MAX_INT)
+        check.sequence(f"{name}['counts']", state["counts"], 4)
+        if state["renamed"] is not None:
+            check.indices(f"{name}['renamed']", state["renamed"], (None, 2), *check.LANDMARK)
+        if not isinstance(state["uncertainty"], float) or state["uncertainty"] < 0.0:
+            check.refuse(f"{name}['uncertainty']", "a float at least 0, or NaN", state["uncertainty"])
+        for where, done in check.named_items(f"{name}['replayed']", state["replayed"]):
+            self._check_replayed(where, done)
+        if state["oldest"] is not None:
+            check.integer(f"{name}['oldest']", state["oldest"], 0, self._step)
+            self._need_from(f"{name}['oldest']", state["oldest"])
+        if state["joint"] is None:
+            return
+        self._check_branch(f"{name}['joint']", state["joint"])
+        if (
+            sorted(sum(state["pair"], ())) != list(state["joint"]["robots"])
+            or state["renamed"] is None
+            or state["oldest"] is None
+        ):
+            check.refuse(f"{name}['joint']", f"the joint filter of {state['pair']}", state["joint"]["robots"])
+        if min(state["joint"]["last_steps"].values()) + 1 < state["oldest"]:
+            check.refuse(
+                f"{name}['joint']", f"no step before {state['oldest']} to replay", state["joint"]["last_steps"]
+            )
 
     def _check_branch(self, name: str, branch: Any) -> None:
         """Refuse a value that is not a branch with a valid filter and monitors."""

@@ -11,9 +11,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from builders.comparison import digest
+from builders.comparison import assert_same, digest
 from builders.damage import Trap
 from builders.environments import MEETING, small_env, wander
+from builders.teams import large_maps
 
 from slam_backend.core.state_codec import encode
 from vslam_env import ExplorationEnv, load_state, save_state, vslam_v0
@@ -111,6 +112,29 @@ def test_before_and_after_a_merge() -> None:
         assert _go_on(env, 150) == first
         env.set_state(joined)
         assert _go_on(env, 50) == second
+
+
+def test_during_the_preparation_of_a_merge(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """States taken while a merge of large maps is prepared continue bit for bit, and taking them changes nothing."""
+    large_maps(monkeypatch)
+    quiet, env = _begun(), _begun()
+    team, rng = env.episode.belief._team, np.random.default_rng(3)
+    snapshots: list[tuple[int, ExplorationEnv]] = []
+    taken: list[dict[str, Any]] = []
+    while not any(event.kind == "merge" for event in env.events):
+        actions = wander(env, rng)
+        quiet.step(actions)
+        env.step(actions)
+        taken.append(actions)
+        if team._preparation is not None and len(taken) % 5 == 0:
+            snapshots.append((len(taken), _through_disk(env, tmp_path)))
+    assert len(snapshots) > 6
+    for begun, other in [(len(taken), quiet), *snapshots]:
+        for actions in taken[begun:]:
+            other.step(actions)
+        assert_same(other.state(), env.state())
+        assert_same(other.events, env.events)
+        assert _go_on(other, 3) == _go_on(env.clone(), 3)
 
 
 def test_taking_a_state_changes_nothing() -> None:

@@ -37,6 +37,7 @@ from slam_backend.team.filter_merging.landmarks import (
     fuse_odds,
     joint_counts,
     merge_by_identity,
+    renaming,
     stack_descriptors,
     write_joint,
 )
@@ -64,6 +65,7 @@ def merge_filters(
     known: bool = False,
     pairing: Pairing | None = None,
     on_trial: bool = False,
+    spared: int = 0,
 ) -> tuple[FastSlam, IntArray]:
     """Merge two filters into a joint one in a's map frame (Secs. 3.2 and 4).
 
@@ -81,6 +83,7 @@ def merge_filters(
         pairing: Result of `pair_filters` for these arguments; None: a new draw.
         on_trial: Whether the joint filter is to be rejuvenated at once, or dropped: then it has only the landmarks of
             the most probable particle, which the smoother starts from; see `FilterState.write_landmarks`.
+        spared: See `renaming`.
 
     Returns:
         The joint filter, a's robots first; and (n, 2) int64 rows (id in b, id in the joint map) of all of b's
@@ -110,8 +113,8 @@ def merge_filters(
     rows_a[n_a:], rows_b[n_a:], rows_b[shared_a] = -1, exclusive, shared_b
     counts, names = joint_counts(of_a, of_b, rows_a, rows_b), np.concatenate([identities, of_b.identities[exclusive]])
     drop_repeated_identities(counts, names)
-    next_id = a.state.maps.next_id
-    new_ids = next_id + np.arange(len(exclusive))
+    renamed = renaming(a.state.maps, b.state.maps, pairs, spared)
+    new_ids = renamed[len(pairs) :, 1]
     held = np.flatnonzero((counts > 0).any(axis=1))
     kept, odds, model = counts[held], None, a.options.existence
     if model is not None:
@@ -130,7 +133,7 @@ def merge_filters(
         descriptors,
         np.concatenate([ids_a, new_ids])[held],
         names[held],
-        next_id + len(exclusive),
+        a.state.maps.next_id + spared + len(exclusive),
         odds,
     )
     # Each map takes half of the extra variance.
@@ -142,7 +145,6 @@ def merge_filters(
         of_a, of_b = Landmarks.of(a.state.maps, from_a[[best]]), Landmarks.of(b.state.maps, from_b[[best]])
         motion = motion[[best]]
     write_joint(of_a, of_b, rows_a[held], rows_b[held], motion, 0.5 * extra, scales[held], joint.maps.blocks)
-    renamed = np.concatenate([pairs[:, ::-1], np.column_stack([ids_b[exclusive], new_ids])]).astype(np.int64)
     joint.finish_join(a.state, b.state, renamed)
     return FastSlam.from_filter_state(joint), renamed
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from builders.comparison import assert_same
 from builders.filters import contents
-from builders.teams import NEVER, SimulatedTeam, check_snapshot, driven, false_alignment, links
+from builders.teams import IN_SLICES, NEVER, SimulatedTeam, check_snapshot, driven, false_alignment, large_maps, links
 
 from slam_backend.fastslam import rejuvenation
 from slam_backend.fastslam.existence import ExistenceModel
@@ -19,7 +19,6 @@ from slam_backend.fastslam.rejuvenation import RejuvenationScheduler
 from slam_backend.geometry import between, compose
 from slam_backend.maps.alignment import DISTINCT_ROTATION, DISTINCT_TRANSLATION, AlignmentOptions, align_maps
 from slam_backend.maps.landmark_map import LandmarkMap
-from slam_backend.smoother import options as smoothing_options
 from slam_backend.smoother import rejuvenation as smoothing_of_paths
 from slam_backend.smoother.graph import mean_pose
 from slam_backend.smoother.options import SmoothingOptions
@@ -419,18 +418,6 @@ def test_trials_of_large_maps_claim_no_more_than_the_gaussian_at_the_mode(
     assert group_merging._variance_factor(np.full(8, 24_000)) == pytest.approx(0.25 * 1.3**2 + 0.75 * 0.8**2)
 
 
-def large_maps(patch: pytest.MonkeyPatch) -> None:
-    """Let all maps and runs count as large."""
-    for module, name in (
-        (smoothing_options, "MANY_LANDMARKS"), (smoothing_of_paths, "LARGE_MAP"), (smoothing_of_paths, "LONG_RUN"),
-    ):  # fmt: skip
-        patch.setattr(module, name, 0)
-    patch.setattr(smoothing_options, "LANDMARKS_PER_KEY", 1)
-
-
-IN_SLICES: Any = {"num_particles": 8, "rejuvenate_every": 1000, "smoothing": SmoothingOptions(slice_steps=20)}
-
-
 def test_the_joint_graph_claims_hardly_more_than_a_trial(monkeypatch: pytest.MonkeyPatch) -> None:
     """In large maps it finds the motion and its covariance at the mode, to which a trial adds the last few steps."""
     _, team = driven(2, 112, FEW_STEPS, **IN_SLICES)
@@ -484,7 +471,7 @@ def test_attempts_of_large_maps_end_without_a_trial_if_their_graph_is_uncertain(
 
 
 def test_groups_with_large_maps_merge_by_a_trial_once_their_graph_agrees_twice(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The first estimate of the joint graph waits for a second one; then the groups merge as after any trial."""
+    """The first estimate of the joint graph waits for a second one; then a merge is prepared, which a trial decides."""
     large_maps(monkeypatch)
     simulation = SimulatedTeam(num_robots=2, seed=112)
     merging = MergeOptions(min_sigmas=NEVER_SURE, min_sigmas_on_trial=1.0)
@@ -495,8 +482,7 @@ def test_groups_with_large_maps_merge_by_a_trial_once_their_graph_agrees_twice(m
     assert [event.kind for event in (last, merge)] == ["attempt", "merge"]
     assert {event.alignment.missed for event in refused} <= {"paths", "repeat", ""}
     assert merge.alignment is last.alignment
-    starts = team._groups[0].trunk.filter.state.starts[1, :, :8]
-    np.testing.assert_allclose(merge.alignment.transform, mean_pose(starts), atol=1e-12)
+    assert last.uncertainty <= 1e4
 
 
 def test_a_trial_whose_merge_would_be_undone_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
