@@ -274,6 +274,8 @@ def merge_groups(
         prepared = PreparedTrunk(joint_trunk(plan.groups, joint, renamed, records.new_number()), renamed)
     trunk, renamed, replayed = prepared
     trunk.active_robots, trunk.epoch = tuple(sorted(a.active_robots + b.active_robots)), epoch
+    watched = {monitor.number for monitor in (*a.monitors, *b.monitors)}
+    trunk.monitors = [monitor for monitor in trunk.monitors if monitor.number in watched]  # some ended meanwhile
     if merging.watch_steps:
         sides = PreMergeSnapshot.of(a.get_state()), PreMergeSnapshot.of(b.get_state())
         common = renamed[np.isin(renamed[:, 1], a.filter.state.maps.ids), ::-1]

@@ -17,7 +17,10 @@ from builders.environments import MEETING, small_env, wander
 from builders.teams import large_maps
 
 from slam_backend.core.state_codec import encode
-from vslam_env import ExplorationEnv, load_state, save_state, vslam_v0
+from slam_backend.team import team
+from slam_backend.team.branches import Branch
+from slam_backend.team.merge_monitor import MergeMonitor
+from vslam_env import EnvConfig, ExplorationEnv, load_state, save_state, vslam_v0
 from vslam_env.reward import RUNNING_COST
 from vslam_env.snapshots import STATE_FORMAT, check_state, state_version
 from vslam_env.state_kinds import ENV_KINDS
@@ -118,7 +121,7 @@ def test_during_the_preparation_of_a_merge(monkeypatch: pytest.MonkeyPatch, tmp_
     """States taken while a merge of large maps is prepared continue bit for bit, and taking them changes nothing."""
     large_maps(monkeypatch)
     quiet, env = _begun(), _begun()
-    team, rng = env.episode.belief._team, np.random.default_rng(3)
+    slam, rng = env.episode.belief._team, np.random.default_rng(3)
     snapshots: list[tuple[int, ExplorationEnv]] = []
     taken: list[dict[str, Any]] = []
     while not any(event.kind == "merge" for event in env.events):
@@ -126,7 +129,7 @@ def test_during_the_preparation_of_a_merge(monkeypatch: pytest.MonkeyPatch, tmp_
         quiet.step(actions)
         env.step(actions)
         taken.append(actions)
-        if team._preparation is not None and len(taken) % 5 == 0:
+        if slam._preparation is not None and len(taken) % 5 == 0:
             snapshots.append((len(taken), _through_disk(env, tmp_path)))
     assert len(snapshots) > 6
     for begun, other in [(len(taken), quiet), *snapshots]:
@@ -135,6 +138,47 @@ def test_during_the_preparation_of_a_merge(monkeypatch: pytest.MonkeyPatch, tmp_
         assert_same(other.state(), env.state())
         assert_same(other.events, env.events)
         assert _go_on(other, 3) == _go_on(env.clone(), 3)
+
+
+def _sometimes_inconsistent(trunk: Branch, *_: Any) -> MergeMonitor | None:
+    """Return a merge that can be undone now, in some steps."""
+    connected = [monitor.both_sides_connected(trunk.active_robots) for monitor in trunk.monitors]
+    for i, monitor in enumerate(trunk.monitors):
+        if all(connected[i:]) and (13 * monitor.number + monitor.steps) % 97 < 5:
+            return monitor
+    return None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("world", "robots", "seed"), [("loops", 3, 0), ("hall", 3, 2), ("office", 4, 3)])
+def test_prepared_merges_that_are_undone_in_a_lossy_network(
+    world: str, robots: int, seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Copies taken at any time continue bit for bit, and the records of maps, grids and inputs stay complete."""
+    large_maps(monkeypatch)
+    monkeypatch.setattr(team, "find_inconsistent_merge", _sometimes_inconsistent)
+    rng = np.random.default_rng(seed)
+    config = EnvConfig().replace(
+        world=world, num_robots=robots, action_type="goal", decision_ticks=3, comm_range=12.0, comm_loss=0.1,
+        max_cycles=1000,
+        belief={"filter": {"num_particles": 13}, "merging": {"watch_every": 5, "blocked_steps": 5}},
+    )  # fmt: skip
+    env = vslam_v0.parallel_env(config=config)
+    env.reset(seed=seed)
+    copies: list[tuple[ExplorationEnv, int]] = []
+    for step in range(400):
+        actions = wander(env, rng)
+        returned = env.step(actions)
+        for copied, since in list(copies):
+            assert_same(copied.step(actions), returned)
+            assert_same(copied.state(), env.state())
+            if step - since > 60:
+                copies.remove((copied, since))
+        if step % 9 == 0 and len(copies) < 3:
+            copies.append((pickle.loads(pickle.dumps(env)), step))
+    kinds = [event.kind for event in env.events]
+    assert kinds.count("merge") > 1
+    assert kinds.count("undo") > 0
 
 
 def test_taking_a_state_changes_nothing() -> None:

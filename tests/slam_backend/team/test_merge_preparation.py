@@ -221,6 +221,26 @@ def test_a_preparation_ends_if_a_group_has_changed() -> None:
     assert len(team.groups) == 2
 
 
+@pytest.mark.parametrize("left", [3, 60, 190])
+def test_earlier_merges_that_are_final_meanwhile_stay_final(left: int) -> None:
+    """The joint filter goes on to watch those that its groups still watch; no map is released twice."""
+    simulation = SimulatedTeam(3, 113)
+    team = simulation.build(attempts=AttemptOptions(every=20), merging=MERGING, **IN_SLICES)
+    simulation.run(team, 19)
+    team.merge(0, 1, true_alignment(simulation, team, 0, 1))
+    while team._preparation is None:
+        assert team._step < MOST
+        simulation.run(team, 1)
+    (earlier,) = team._groups[0].trunk.monitors
+    earlier.steps = MERGING.watch_steps - left
+    reports = run_until_over(simulation, team)
+    assert kinds(reports) == ["attempt", "merge"]
+    assert len(team._groups[0].trunk.monitors) == (2 if left == 190 else 1)
+    reports += simulation.run(team, 250)
+    released = [change.number for report in reports for change in report.map_changes if isinstance(change, MapReleased)]
+    assert sorted(released) == [0, 1, 2, 3]
+
+
 @pytest.mark.parametrize("why", ["uncertain", "smoother"])
 def test_a_prepared_merge_is_refused_by_its_trial(why: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """If the joint filter knows the motion badly, or cannot be smoothed, the attempt ends like any uncertain one."""
