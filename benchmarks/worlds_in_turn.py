@@ -16,12 +16,12 @@ import typer
 
 from slam_backend.core.validation import argument_error, check_int
 from training.bench.exploration.players import parted
+from training.bench.scale.trials import DECISION_LIMIT
 from training.episodes.config import RunConfig
 from vslam_env import warm_up
 from vslam_env.environment import ExplorationEnv
 
 BURST, EVERY = 10, 5  # steps in a burst, and from one snapshot to the next
-DECISION_LIMIT = 10.0  # [s] longest time of a decision
 
 
 @dataclass
@@ -85,13 +85,13 @@ def main(
     worlds: Annotated[list[str], typer.Argument(help="WORLD@SECONDS, the last one is the reference.")],
     seed: Annotated[int, typer.Option(help="Seed of all episodes.")] = 10002,
     robots: Annotated[int, typer.Option(help="Robots of each world.")] = 3,
-    steps: Annotated[int, typer.Option(help="Timed steps of each world.")] = 120,
+    steps: Annotated[int, typer.Option(help="Timed steps of each world, in whole bursts.")] = 120,
 ) -> None:
     """Print quantiles of the times of steps and snapshots, and ratios of medians to those of the last world."""
-    check_int("steps", steps, BURST, f"Use a multiple of {BURST}.")
+    bursts = -(-check_int("steps", steps, 1, "Use at least one step.") // BURST)
     warm_up(workers=1)
-    all_played = [played(named, seed, robots, steps) for named in worlds]
-    for _ in range(steps // BURST):
+    all_played = [played(named, seed, robots, BURST * bursts) for named in worlds]
+    for _ in range(bursts):
         for one in all_played:
             one.burst()
     reference = all_played[-1]

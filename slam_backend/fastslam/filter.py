@@ -5,7 +5,7 @@ one moves, matches its measurements to the map as updated by the robots before i
 landmarks. Then the joint particles are resampled.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -213,20 +213,10 @@ class FastSlam:
         smoother = self.state.rejuvenation
         if smoother is None:
             smoother = RejuvenationScheduler(replace(self.options, rejuvenate_every=1), self.num_robots)
-        return next(report for report in self._rejuvenation(smoother) if report is not None)
-
-    def rejuvenate_in_slices(self) -> Iterator[RejuvenationReport | None]:
-        """Do the same as `rejuvenate` slice by slice, if the smoother works in slices; yield the outcome at the end."""
-        assert self.state.rejuvenation is not None
-        return self._rejuvenation(self.state.rejuvenation)
-
-    def _rejuvenation(self, smoother: RejuvenationScheduler) -> Iterator[RejuvenationReport | None]:
-        """Rejuvenate now, and yield None after each slice of the work and the outcome after the last."""
         smoother.request()
-        report = None
-        while report is None:
-            report = self.state.rejuvenate(smoother)
-            yield report
+        while (report := self.state.rejuvenate(smoother)) is None:
+            pass
+        return report
 
     @property
     def smooths_incrementally(self) -> bool:

@@ -264,6 +264,11 @@ class RejuvenationScheduler:
         return self._asked
 
     @property
+    def is_disabled(self) -> bool:
+        """Whether rejuvenation is impossible for good."""
+        return bool(self._why_disabled)
+
+    @property
     def _why_disabled(self) -> str:
         """Reason why rejuvenation is impossible; "" if it is possible."""
         if self._exact:

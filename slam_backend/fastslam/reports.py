@@ -309,7 +309,8 @@ class TeamReport(NamedTuple):
         all_associations: Data association of all measurements; `associations` and `created` are parts of it.
         groups: The groups after this step.
         events: This step's attempts, merges and undos, in order.
-        id_maps: Landmark renaming of each merge of this step, in order; apply them after `created`.
+        id_maps: Landmark renaming of each merge of this step, in order; apply them after `created`. Landmarks found
+            while a merge was prepared are in `map_changes` alone.
         maps: Number of each robot's map after this step. Before the first step they are 0, 1, ...
         map_changes: All changes of maps in this step, in order, replays and `created` included: the complete record for
             keeping track of landmarks.

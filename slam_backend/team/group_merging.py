@@ -48,9 +48,10 @@ def smoothed_maps(group_a: Group, group_b: Group) -> tuple[LandmarkMap, Landmark
 
 
 def smoothed_graphs(a: FastSlam, b: FastSlam) -> tuple[SlamGraph, SlamGraph] | None:
-    """Return the graphs of the smoothers of two filters; None if one has not smoothed yet."""
-    of_a, of_b = (None if slam.state.rejuvenation is None else slam.state.rejuvenation.graph for slam in (a, b))
-    return None if of_a is None or of_b is None else (of_a, of_b)
+    """Return the graphs of the smoothers of two filters; None if one has not smoothed yet, or cannot any more."""
+    smoothers = (slam.state.rejuvenation for slam in (a, b))
+    graphs = [None if smoother is None or smoother.is_disabled else smoother.graph for smoother in smoothers]
+    return None if graphs[0] is None or graphs[1] is None else (graphs[0], graphs[1])
 
 
 class PreparedTrunk(NamedTuple):
@@ -59,11 +60,13 @@ class PreparedTrunk(NamedTuple):
     Attributes:
         branch: The branch.
         renamed: (n, 2) int64 rows (id in b, id in the joint map) of the landmarks that b had then.
+        end_of_common: Ids in the joint map below this one are those of landmarks that a had then.
         replayed: Steps replayed since.
     """
 
     branch: Branch
     renamed: IntArray
+    end_of_common: int
     replayed: Sequence[ReplayedStep] = ()
 
 
@@ -271,14 +274,15 @@ def merge_groups(
             a.filter, b.filter, plan.alignment, plan.pairs, rng, merging.merged_particles, known, plan.pairing
         )
         joint.reorder(np.argsort(a.robots + b.robots))
-        prepared = PreparedTrunk(joint_trunk(plan.groups, joint, renamed, records.new_number()), renamed)
-    trunk, renamed, replayed = prepared
+        branch = joint_trunk(plan.groups, joint, renamed, records.new_number())
+        prepared = PreparedTrunk(branch, renamed, a.filter.state.maps.next_id)
+    trunk, renamed, end_of_common, replayed = prepared
     trunk.active_robots, trunk.epoch = tuple(sorted(a.active_robots + b.active_robots)), epoch
     watched = {monitor.number for monitor in (*a.monitors, *b.monitors)}
     trunk.monitors = [monitor for monitor in trunk.monitors if monitor.number in watched]  # some ended meanwhile
     if merging.watch_steps:
         sides = PreMergeSnapshot.of(a.get_state()), PreMergeSnapshot.of(b.get_state())
-        common = renamed[np.isin(renamed[:, 1], a.filter.state.maps.ids), ::-1]
+        common = renamed[renamed[:, 1] < end_of_common, ::-1]
         fresh = begin_monitoring(trunk.number, plan.alignment, sides, plan.maps, renamed, common)
         for done in replayed:
             fresh.update(trunk.robots, done.report)

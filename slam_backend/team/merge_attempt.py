@@ -73,7 +73,7 @@ def run_attempt(
     pending = schedule.pending_attempt
     if pending is None:
         return _start(groups, networks, step, schedule, alignment, merging, records, rng)
-    pair = next((pair for pair in _pairs(groups) if _is_pending(pending, pair)), None)
+    pair = next((pair for pair in _pairs(groups) if _is_same(pending, pair)), None)
     late = step - pending.since >= MOST_STEPS
     if pair is None or (late and not _are_connected(pair, networks)):
         schedule.pending_attempt = None
@@ -96,8 +96,9 @@ def _prepare(
     alignment: AlignmentOptions, merging: MergeOptions, records: SharedRecords, rng: np.random.Generator,
 ) -> AttemptResult:  # fmt: skip
     """Continue the preparation of a merge; it ends, too, if a group has changed or is out of contact for long."""
-    pair = next((pair for pair in _pairs(groups) if preparation.is_of(pair)), None)
+    pair = next((pair for pair in _pairs(groups) if _is_same(preparation, pair)), None)
     if pair is None:
+        preparation.give_up()
         return AttemptResult()
     if not preparation.advance(pair, _are_connected(pair, networks), merging, alignment, records, rng):
         return AttemptResult(preparation=preparation)
@@ -201,7 +202,7 @@ def _finish(
         else:
             plan, uncertainty = claimed[0], merging.min_sigmas * claimed[1]
             change = schedule.change(_key(pair), plan.alignment.transform)
-            if uncertainty <= merging.max_uncertainty and change <= 1.0:
+            if uncertainty <= merging.prepared_uncertainty and change <= 1.0:
                 return AttemptResult(preparation=MergePreparation.of(plan, unsmoothed))
         found = _refused_if_uncertain(plan.alignment, pair, uncertainty, change, schedule, merging)
         if not found.success:  # the draws for the merge are dropped
@@ -293,9 +294,9 @@ def _numbers(pair: Pair) -> tuple[int, int]:
     return pair[0].trunk.number, pair[1].trunk.number
 
 
-def _is_pending(pending: PendingAttempt, pair: Pair) -> bool:
-    """Return whether a pair is that of the pending attempt, with the same filters."""
-    return (pending.pair, pending.numbers) == (_key(pair), _numbers(pair))
+def _is_same(begun: PendingAttempt | MergePreparation, pair: Pair) -> bool:
+    """Return whether a pair is that of an attempt, with the same filters."""
+    return (begun.pair, begun.numbers) == (_key(pair), _numbers(pair))
 
 
 def _mixtures(pair: Pair) -> Maps:

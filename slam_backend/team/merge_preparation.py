@@ -1,12 +1,12 @@
 """Preparation of a merge of large maps beside the two groups, so that no step takes long.
 
-Once the joint graph of two groups is certain enough, their joint filter is made of both as they are in one step, is
-smoothed in slices, checked, and filled with its landmarks part by part, while the groups go on. Then it replays their
-inputs since that step, several in each step, and replaces them when it has caught up, as after an undo.
+Once the joint graph of two groups is certain enough, their joint filter is made from their present filters. While the
+groups go on, it is smoothed in slices, checked, and filled with its landmarks part by part. Then it replays the inputs
+since it was made, several in each step, and replaces the groups' filters when it has caught up, as after an undo.
 """
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Self
 
@@ -15,7 +15,6 @@ import numpy as np
 from slam_backend.core.read_only import as_constant, with_constants
 from slam_backend.core.validation import IntArray
 from slam_backend.fastslam.filter import FastSlam
-from slam_backend.fastslam.particle_maps import present_slots
 from slam_backend.maps.alignment import Alignment, AlignmentOptions
 from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.team.branches import Branch, ReplayedStep, replay
@@ -29,10 +28,11 @@ from slam_backend.team.shared_records import SharedRecords
 FIRST_WAIT = 10  # steps before the joint filter is made, so that the attempt does not fall into the same decision
 PACE = 4  # steps from one piece of the work to the next
 REPLAYED = 4  # steps of input that the joint filter replays in each step, which itself adds one
-PATIENCE = 100  # steps out of contact, in all, after which the merge is given up
+PATIENCE = 100  # steps out of contact, in all, beyond which the merge is given up
 SPARED_IDS = 1000  # landmarks that the first group may find meanwhile; ids of the joint map lie beyond theirs
 
 Pair = tuple[Group, Group]
+Maps = tuple[LandmarkMap, LandmarkMap]
 
 
 @dataclass(slots=True, eq=False)
@@ -49,7 +49,7 @@ class MergePreparation:
         apart: Steps out of contact so far.
         joint: Branch of the joint filter; None until it is made, and after a refusal.
         renamed: (n, 2) int64 rows (id in b, id in the joint map) of the landmarks that b had then; None until then.
-        end_of_ids: First id of the joint map that is not left to landmarks of a.
+        end_of_common: First id that was not given to a landmark of a then; the next `SPARED_IDS` are left to a.
         oldest: First step that the joint filter has to replay; None until it is made.
         uncertainty: Relative uncertainty of the motion by the trial, see `transform_uncertainty`; NaN before it.
         replayed: Steps replayed by the joint filter so far.
@@ -58,32 +58,25 @@ class MergePreparation:
 
     pair: PairKey
     numbers: tuple[int, int]
-    maps: tuple[LandmarkMap, LandmarkMap]
+    maps: Maps
     alignment: Alignment
     unsmoothed: Alignment | None
     wait: int = FIRST_WAIT
     apart: int = 0
     joint: Branch | None = None
     renamed: IntArray | None = None
-    end_of_ids: int = 0
+    end_of_common: int = 0
     oldest: int | None = None
     uncertainty: float = math.nan
     replayed: list[ReplayedStep] = field(default_factory=list)
     ahead: int = 0
-    _work: Iterator[None] = field(default_factory=lambda: iter(()))
+    _work: Generator[None, None, None] = field(default_factory=lambda: (None for _ in ()))
 
     @classmethod
     def of(cls, plan: MergePlan, unsmoothed: Alignment | None) -> Self:
         """Begin to prepare a merge."""
         a, b = plan.groups
         return cls((a.robots, b.robots), (a.trunk.number, b.trunk.number), plan.maps, plan.alignment, unsmoothed)
-
-    def is_of(self, pair: Pair) -> bool:
-        """Return whether two groups are those of the merge, with the same filters."""
-        return all(
-            (group.robots, group.trunk.number) == known
-            for group, known in zip(pair, zip(self.pair, self.numbers, strict=True), strict=True)
-        )
 
     # ------------------------------------------------------------------ one step
 
@@ -105,7 +98,7 @@ class MergePreparation:
         """
         if not in_contact:
             self.apart += 1
-            return self.apart > PATIENCE and self._give_up()
+            return self.apart > PATIENCE and self.give_up()
         if self.wait > 1:
             self.wait -= 1
             return False
@@ -122,13 +115,13 @@ class MergePreparation:
         """Return the plan of the merge of two groups with which the joint filter has caught up."""
         assert self.joint is not None
         assert self.renamed is not None
-        alignment = _with_present_rows(self.alignment, self.maps, pair)
-        return MergePlan(
-            pair, self.maps, alignment, prepared=PreparedTrunk(self.joint, self.renamed, tuple(self.replayed))
-        )
+        maps = pair[0].trunk.filter.map("mixture"), pair[1].trunk.filter.map("mixture")
+        prepared = PreparedTrunk(self.joint, self.renamed, self.end_of_common, tuple(self.replayed))
+        return MergePlan(pair, maps, _with_rows_of(maps, self.alignment, self.maps), prepared=prepared)
 
-    def _give_up(self) -> bool:
+    def give_up(self) -> bool:
         """End without a merge and without a result of the trial; returns True."""
+        self._work.close()
         self.joint, self.uncertainty = None, math.nan
         return True
 
@@ -146,25 +139,27 @@ class MergePreparation:
         joint, self.renamed = merge_filters(
             a, b, self.alignment, pairs[held], rng, pairing=pairing, on_trial=True, spared=SPARED_IDS
         )
-        self.end_of_ids = a.state.maps.next_id + SPARED_IDS
+        self.end_of_common = a.state.maps.next_id
         self.joint = joint_trunk(pair, joint, self.renamed, records.new_number())
         self.oldest = 1 + min(self.joint.last_steps.values())
         self._work = self._trial(joint, self.renamed, merging, options)
 
     def _trial(
         self, joint: FastSlam, renamed: IntArray, merging: MergeOptions, options: AlignmentOptions
-    ) -> Iterator[None]:
+    ) -> Generator[None, None, None]:
         """Smooth and check the joint filter and write its landmarks, a piece of the work before each of the yields."""
-        has_failed = False
-        for report in joint.rejuvenate_in_slices():
-            has_failed = report is not None and bool(report.reason)
+        joint.request_rejuvenation()
+        smoother, report = joint.state.rejuvenation, None
+        assert smoother is not None
+        while report is None:
+            report = joint.state.rejuvenate(smoother)
             yield
         self.uncertainty = math.inf
-        if not has_failed:
+        if not report.reason:
             self.alignment, self.uncertainty = judge_trial(
                 joint, len(self.pair[0]), self.maps, renamed, self.alignment, merging, options
             )
-        if merging.min_sigmas * self.uncertainty > merging.max_uncertainty:
+        if merging.min_sigmas * self.uncertainty > merging.prepared_uncertainty:
             self.joint = None
             return
         joint.reorder(np.argsort(self.pair[0] + self.pair[1]))
@@ -183,8 +178,8 @@ class MergePreparation:
     def _catch_up(self, pair: Pair, joint: Branch, records: SharedRecords) -> bool:
         """Replay steps that the groups have processed, and return whether the joint filter is up to date."""
         a, b = (group.trunk for group in pair)
-        if a.filter.state.maps.next_id > self.end_of_ids:
-            return self._give_up()
+        if a.filter.state.maps.next_id > self.end_of_common + SPARED_IDS:
+            return self.give_up()
         known = a.last_steps | b.last_steps
         wanted = {robot: last for robot, last in known.items() if last > joint.last_steps[robot]}
         done = replay(joint, records.log, wanted, REPLAYED)
@@ -204,7 +199,7 @@ class MergePreparation:
             "maps": self.maps,
             "alignment": self.alignment,
             "unsmoothed": self.unsmoothed,
-            "counts": (self.wait, self.apart, self.ahead, self.end_of_ids),
+            "counts": (self.wait, self.apart, self.ahead, self.end_of_common),
             "oldest": self.oldest,
             "joint": None if self.joint is None else self.joint.get_state(),
             "renamed": None if self.renamed is None else as_constant(self.renamed),
@@ -219,22 +214,21 @@ class MergePreparation:
     @classmethod
     def from_state(cls, state: Mapping[str, Any]) -> Self:
         """Build a preparation from `get_state`."""
-        wait, apart, ahead, end_of_ids = state["counts"]
+        wait, apart, ahead, end_of_common = state["counts"]
         joint = None if state["joint"] is None else Branch.from_state(state["joint"])
         renamed = None if state["renamed"] is None else as_constant(state["renamed"])
         return cls(
             state["pair"], state["numbers"], state["maps"], state["alignment"], state["unsmoothed"], wait, apart, joint,
-            renamed, end_of_ids, state["oldest"], state["uncertainty"], list(with_constants(state["replayed"])), ahead,
+            renamed, end_of_common, state["oldest"], state["uncertainty"], list(with_constants(state["replayed"])),
+            ahead,
         )  # fmt: skip
 
 
-def _with_present_rows(alignment: Alignment, maps: tuple[LandmarkMap, LandmarkMap], pair: Pair) -> Alignment:
-    """Return an alignment whose inliers, rows of earlier maps of two groups, are rows of their present `map`."""
-    rows, is_present = np.empty_like(alignment.inliers), np.ones(len(alignment.inliers), np.bool_)
-    for side, (earlier, group) in enumerate(zip(maps, pair, strict=True)):
-        state = group.trunk.filter.state
-        ids, now = earlier.ids[alignment.inliers[:, side]], state.maps.ids[present_slots(state.maps, state.best, 1)]
-        rows[:, side] = np.searchsorted(now, ids)
-        is_present &= np.isin(ids, now)
+def _with_rows_of(now: Maps, alignment: Alignment, before: Maps) -> Alignment:
+    """Return an alignment of earlier maps of two groups, with rows of the present ones as inliers."""
+    inliers = alignment.inliers
+    ids = np.column_stack([landmarks.ids[inliers[:, side]] for side, landmarks in enumerate(before)])
+    is_present = np.isin(ids[:, 0], now[0].ids) & np.isin(ids[:, 1], now[1].ids)
+    rows = [np.searchsorted(landmarks.ids, ids[is_present, side]) for side, landmarks in enumerate(now)]
     x, y, theta = alignment.transform.tolist()
-    return Alignment(True, "", x, y, theta, alignment.covariance, rows[is_present], alignment.ratio)
+    return Alignment(True, "", x, y, theta, alignment.covariance, np.column_stack(rows), alignment.ratio)

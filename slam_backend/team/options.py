@@ -59,3 +59,8 @@ class MergeOptions:
     def max_uncertainty(self) -> float:
         """Uncertainty, 1 = `min_sigmas`, above which no pair merges; infinite if any merges in the end."""
         return self.min_sigmas / self.min_sigmas_on_trial if self.min_sigmas_on_trial else math.inf
+
+    @property
+    def prepared_uncertainty(self) -> float:
+        """Uncertainty above which no merge is prepared, or goes on to be; one of at most 1 always passes."""
+        return max(self.max_uncertainty, 1.0)

@@ -13,7 +13,6 @@ from slam_backend.fastslam.options import FilterOptions
 from slam_backend.fastslam.state_checks import check_descriptors, check_filter, check_landmarks, last_step
 from slam_backend.fastslam.step_input import StepInput
 from slam_backend.maps.alignment_types import Alignment, AlignmentOptions
-from slam_backend.maps.fusion import check_inliers
 from slam_backend.smoother.log_arrays import REJECTED
 from slam_backend.team.branches import ReplayedStep
 from slam_backend.team.merge_monitor import MergeMonitor, PreMergeSnapshot
@@ -91,7 +90,7 @@ class TeamCheck:
         for where, group in check.named_items(f"{name}['groups']", state["groups"]):
             self._check_group(where, group)
         if "preparation" in state:
-            self._check_preparation(f"{name}['preparation']", state["preparation"])
+            self._check_preparation(f"{name}['preparation']", state["preparation"], state["groups"])
         trunks = [group["branches"][0]["robots"] for group in state["groups"]]
         if sorted(sum(trunks, ())) != list(range(self._count)) or trunks != sorted(trunks):
             check.refuse(f"{name}['groups']", "groups of all robots, ordered by their first robots", trunks)
@@ -124,9 +123,10 @@ class TeamCheck:
         parts = [side["robots"] for _, side in sides]
         if sorted(sum(parts, ())) != list(trunk["robots"]):
             check.refuse(f"{name}['sides']", f"parts of {trunk['robots']}", parts)
-        for of_side, replayed in check.named_items(f"{name}['replayed']", undoing["replayed"], len(parts)):
+        of_sides = check.named_items(f"{name}['replayed']", undoing["replayed"], len(parts))
+        for (of_side, replayed), robots in zip(of_sides, parts, strict=True):
             for where, done in check.named_items(of_side, replayed):
-                self._check_replayed(where, done)
+                self._check_replayed(where, done, len(robots))
         if all(monitor.number != undoing["number"] for monitor in trunk["monitors"]):
             return  # the joint filter has been replaced
         for where, side in sides:
@@ -135,16 +135,21 @@ class TeamCheck:
                 if last > trunk["last_steps"].get(robot, -1):
                     check.refuse(where, "sides that know no more steps than the joint filter", last)
 
-    def _check_preparation(self, name: str, state: Any) -> None:
-        """Refuse a value that is not the preparation of a merge."""
+    def _check_preparation(self, name: str, state: Any, groups: Sequence[Mapping[str, Any]]) -> None:
+        """Refuse a value that is not the preparation of a merge of two of these groups, or of earlier ones."""
         check.keys(name, state, PREPARATION)
         self._check_pair(f"{name}['pair']", state["pair"])
         check.integers(f"{name}['numbers']", state["numbers"])
         check.sequence(f"{name}['numbers']", state["numbers"], 2)
-        for where, landmarks in check.named_items(f"{name}['maps']", state["maps"], 2):
-            check_landmarks(where, landmarks)
         check.instance(f"{name}['alignment']", state["alignment"], Alignment)
-        check_inliers(state["alignment"].inliers, *map(len, state["maps"]))
+        if not state["alignment"].success:
+            check.refuse(f"{name}['alignment']", "a successful one", state["alignment"].reason)
+        for side, (where, landmarks) in enumerate(check.named_items(f"{name}['maps']", state["maps"], 2)):
+            check_landmarks(where, landmarks)
+            rows = state["alignment"].inliers[:, side]
+            check.indices(f"{name}['alignment'].inliers", rows, (None,), 0, len(landmarks) - 1)
+            if len(np.unique(rows)) < len(rows):
+                check.refuse(f"{name}['alignment'].inliers", "one-to-one pairs", "a repeated row")
         check.instance(f"{name}['unsmoothed']", state["unsmoothed"], Alignment, type(None))
         check.integers(f"{name}['counts']", state["counts"], 0, check.MAX_INT)
         check.sequence(f"{name}['counts']", state["counts"], 4)
@@ -152,24 +157,27 @@ class TeamCheck:
             check.indices(f"{name}['renamed']", state["renamed"], (None, 2), *check.LANDMARK)
         if not isinstance(state["uncertainty"], float) or state["uncertainty"] < 0.0:
             check.refuse(f"{name}['uncertainty']", "a float at least 0, or NaN", state["uncertainty"])
+        oldest, robots = state["oldest"], sorted(sum(state["pair"], ()))
+        if oldest is not None:
+            check.integer(f"{name}['oldest']", oldest, 0, self._step)
+            self._need_from(f"{name}['oldest']", oldest)
         for where, done in check.named_items(f"{name}['replayed']", state["replayed"]):
-            self._check_replayed(where, done)
-        if state["oldest"] is not None:
-            check.integer(f"{name}['oldest']", state["oldest"], 0, self._step)
-            self._need_from(f"{name}['oldest']", state["oldest"])
+            self._check_replayed(where, done, len(robots))
+            if oldest is None or done.step < oldest:
+                check.refuse(f"{where}.step", f"at least {oldest}", done.step)
         if state["joint"] is None:
             return
         self._check_branch(f"{name}['joint']", state["joint"])
-        if (
-            sorted(sum(state["pair"], ())) != list(state["joint"]["robots"])
-            or state["renamed"] is None
-            or state["oldest"] is None
-        ):
+        known = state["joint"]["last_steps"]
+        if robots != list(state["joint"]["robots"]) or state["renamed"] is None or oldest is None:
             check.refuse(f"{name}['joint']", f"the joint filter of {state['pair']}", state["joint"]["robots"])
-        if min(state["joint"]["last_steps"].values()) + 1 < state["oldest"]:
-            check.refuse(
-                f"{name}['joint']", f"no step before {state['oldest']} to replay", state["joint"]["last_steps"]
-            )
+        if min(known.values()) + 1 < oldest:
+            check.refuse(f"{name}['joint']", f"no step before {oldest} to replay", known)
+        for trunk in (group["branches"][0] for group in groups):
+            if trunk["number"] in state["numbers"]:
+                for robot, last in trunk["last_steps"].items():
+                    if known.get(robot, -1) > last:
+                        check.refuse(f"{name}['joint']", "a filter that knows no more steps than its groups", known)
 
     def _check_branch(self, name: str, branch: Any) -> None:
         """Refuse a value that is not a branch with a valid filter and monitors."""
@@ -265,17 +273,17 @@ class TeamCheck:
         check_masks(f"{name}.masks", inputs.masks, inputs.inputs)
         check.integers(f"{name}.inactive", inputs.inactive, 0, self._count - 1, frozenset)
 
-    def _check_replayed(self, name: str, done: Any) -> None:
-        """Refuse a value that is not a replayed step."""
+    def _check_replayed(self, name: str, done: Any, robots: int) -> None:
+        """Refuse a value that is not a replayed step of a filter of so many robots."""
         check.instance(name, done, ReplayedStep)
         check.integer(f"{name}.step", done.step, 0, self._step)
         check.robots(f"{name}.robots", done.robots, self._count)
         if self._inputs.get(done.step) is not done.inputs:
             self._check_inputs(f"{name}.inputs", done.inputs)
-        self._check_report(f"{name}.report", done.report, None)
+        self._check_report(f"{name}.report", done.report, robots)
 
-    def _check_report(self, name: str, report: Any, robots: int | None) -> None:
-        """Refuse a value that is not the step report of a filter of some robots; None: of any number."""
+    def _check_report(self, name: str, report: Any, robots: int) -> None:
+        """Refuse a value that is not the step report of a filter of so many robots."""
         check.instance(name, report, reports.StepReport)
         found = report.all_associations
         check.instance(f"{name}.all_associations", found, reports.Associations)
@@ -283,7 +291,7 @@ class TeamCheck:
         check_turns(f"{name}.all_associations.inputs", found.inputs, found.ids.shape[1], None)
         check_masks(f"{name}.all_associations.masks", found.masks, found.inputs)
         check.integers(f"{name}.rows", report.rows, -1, min(len(found.inputs), self._count) - 1)
-        if robots is not None and len(report.rows) != robots:
+        if len(report.rows) != robots:
             check.refuse(f"{name}.rows", f"a row for each of {robots} robots", report.rows)
         for part in ("num_created", "num_new", "num_matched", "num_rejected"):
             check.integer(f"{name}.{part}", getattr(report, part))

@@ -62,12 +62,10 @@ class TeamLooks:
         """Grow to the size S of the grids, unless the looks have it; views taken before are no longer updated."""
         if size > self.counts.shape[1]:
             before, shift = self.counts, (size - self.counts.shape[1]) // 2
-            self.counts = np.zeros((len(before), size, size), np.uint8)
+            self.counts = np.zeros((len(before), size, size), np.uint8)  # what is not written to takes no memory
             for k, (top, left, bottom, right) in enumerate(self.bounds.tolist()):
                 there = (k, slice(top + shift, bottom + shift), slice(left + shift, right + shift))
-                self.counts[there] = before[
-                    k, top:bottom, left:right
-                ]  # memory that nothing is written to costs nothing
+                self.counts[there] = before[k, top:bottom, left:right]
                 if bottom:
                     self.bounds[k] += shift
 

@@ -482,7 +482,12 @@ def test_groups_with_large_maps_merge_by_a_trial_once_their_graph_agrees_twice(m
     assert [event.kind for event in (last, merge)] == ["attempt", "merge"]
     assert {event.alignment.missed for event in refused} <= {"paths", "repeat", ""}
     assert merge.alignment is last.alignment
-    assert last.uncertainty <= 1e4
+    watch = team._groups[0].trunk.monitors[0]
+    rows = merge.alignment.inliers
+    for side in (0, 1):
+        assert rows[:, side].max() < len(watch.pre_merge_maps[side])
+    motion = mean_pose(team._groups[0].trunk.filter.state.starts[1, :, :8])
+    np.testing.assert_allclose(merge.alignment.transform, motion, atol=0.2)  # of the trial, some steps ago
 
 
 def test_a_trial_whose_merge_would_be_undone_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
