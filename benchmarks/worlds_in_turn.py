@@ -19,6 +19,7 @@ from training.bench.exploration.players import parted
 from training.bench.scale.trials import DECISION_LIMIT
 from training.episodes.config import RunConfig
 from vslam_env import warm_up
+from vslam_env.config import TICK
 from vslam_env.environment import ExplorationEnv
 
 BURST, EVERY = 10, 5  # steps in a burst, and from one snapshot to the next
@@ -73,7 +74,7 @@ def played(named: str, seed: int, robots: int, steps: int) -> Played:
     player = parted("frontier")
     config = RunConfig(world=world, robots=robots, policy=player.policy, action_type=player.action_type, seed=seed)
     env = ExplorationEnv(config.environment())
-    before = round(float(seconds) / (env.config.ticks_per_step * 0.1))
+    before = round(float(seconds) / (env.config.ticks_per_step * TICK))
     env.max_cycles = before + steps + 1
     result = Played(named, env, player.make(env, DECISION_LIMIT), seed)
     for _ in range(before):

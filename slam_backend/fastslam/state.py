@@ -370,16 +370,15 @@ class FilterState:
         Args:
             unused: Maps no longer in use, whose memory is taken if they fit.
         """
-        if self.unwritten is not None:
-            fits = (unused.num_particles, unused.log_odds_prior) == (self.num_particles, self.maps.log_odds_prior)
-            self.maps = unused if fits else ParticleMaps(self.num_particles, self.maps.log_odds_prior)
-            self.unwritten.write(self.maps)
-            self.unwritten = None
+        for _ in self.landmarks_in_parts(unused):
+            pass
 
-    def landmarks_in_parts(self) -> Iterator[None]:
-        """Write the landmarks that were left unwritten, if they were, a part before each of the yields."""
+    def landmarks_in_parts(self, unused: ParticleMaps | None = None) -> Iterator[None]:
+        """Do the same as `write_landmarks`, a part of the landmarks before each of the yields."""
         if self.unwritten is not None:
-            maps = ParticleMaps(self.num_particles, self.maps.log_odds_prior)
+            maps, kind = unused, (self.num_particles, self.maps.log_odds_prior)
+            if maps is None or (maps.num_particles, maps.log_odds_prior) != kind:
+                maps = ParticleMaps(*kind)
             yield from self.unwritten.write_in_parts(maps)
             self.maps, self.unwritten = maps, None
 

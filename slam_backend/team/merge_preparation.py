@@ -7,7 +7,7 @@ since it was made, several in each step, and replaces the groups' filters when i
 
 import math
 from collections.abc import Generator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
@@ -18,7 +18,7 @@ from slam_backend.fastslam.filter import FastSlam
 from slam_backend.maps.alignment import Alignment, AlignmentOptions
 from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.team.branches import Branch, ReplayedStep, replay
-from slam_backend.team.filter_merging.merging import merge_filters, pair_filters
+from slam_backend.team.filter_merging.merging import merge_filters
 from slam_backend.team.group_merging import MergePlan, PreparedTrunk, joint_trunk, judge_trial
 from slam_backend.team.groups import Group
 from slam_backend.team.merge_scheduler import PairKey
@@ -135,9 +135,8 @@ class MergePreparation:
         a, b = (group.trunk.filter for group in pair)
         pairs = np.column_stack([self.maps[i].ids[self.alignment.inliers[:, i]] for i in range(2)])
         held = np.isin(pairs[:, 0], a.state.maps.ids) & np.isin(pairs[:, 1], b.state.maps.ids)
-        pairing = pair_filters(a, b, self.alignment, pairs[held], rng, merging.merged_particles)
         joint, self.renamed = merge_filters(
-            a, b, self.alignment, pairs[held], rng, pairing=pairing, on_trial=True, spared=SPARED_IDS
+            a, b, self.alignment, pairs[held], rng, merging.merged_particles, on_trial=True, spared=SPARED_IDS
         )
         self.end_of_common = a.state.maps.next_id
         self.joint = joint_trunk(pair, joint, self.renamed, records.new_number())
@@ -230,5 +229,4 @@ def _with_rows_of(now: Maps, alignment: Alignment, before: Maps) -> Alignment:
     ids = np.column_stack([landmarks.ids[inliers[:, side]] for side, landmarks in enumerate(before)])
     is_present = np.isin(ids[:, 0], now[0].ids) & np.isin(ids[:, 1], now[1].ids)
     rows = [np.searchsorted(landmarks.ids, ids[is_present, side]) for side, landmarks in enumerate(now)]
-    x, y, theta = alignment.transform.tolist()
-    return Alignment(True, "", x, y, theta, alignment.covariance, np.column_stack(rows), alignment.ratio)
+    return replace(alignment, inliers=np.column_stack(rows))

@@ -20,6 +20,7 @@ from vslam_env.navigation._grid_kernels import (
     UNKNOWN,
     cell_index,
     margin_of,
+    widen_bounds,
 )
 from vslam_env.navigation._planning_kernels.candidates import is_settled
 from vslam_env.navigation._planning_kernels.costmap import PAD
@@ -179,10 +180,7 @@ def looks_of(scan: Any, directions: Any, reach: float, points: Any) -> int:
 def count_looks_at(looks: Any, bounds: Any, row: int, col: int, more: int) -> None:
     """Add to the looks at a cell, and widen the bounds (4,) of the cells with looks."""
     looks[row, col] = min(looks[row, col] + more, MOST_LOOKS)
-    if bounds[2] == 0:
-        bounds[0], bounds[1] = row, col
-    bounds[0], bounds[1] = min(bounds[0], row), min(bounds[1], col)
-    bounds[2], bounds[3] = max(bounds[2], row + 1), max(bounds[3], col + 1)
+    widen_bounds(bounds, row, col)
 
 
 @in_place

@@ -16,6 +16,7 @@ from vslam_env.navigation._grid_kernels.occupancy import (
     margin_of,
     merge_grid,
     reach_of_merge,
+    widen_bounds,
 )
 from vslam_env.navigation._grid_kernels.scan_update import NUM_PAINT_ROWS, update_from_scan
 from vslam_env.navigation._grid_kernels.team_update import clear_disc, mark_bump, update_grids
@@ -41,4 +42,5 @@ __all__ = [
     "reach_of_merge",
     "update_from_scan",
     "update_grids",
+    "widen_bounds",
 ]  # fmt: skip

@@ -67,15 +67,22 @@ def clamp_evidence(evidence: int) -> int:
 
 @device
 @in_place
+def widen_bounds(bounds: Any, row: int, col: int) -> None:
+    """Widen bounds (4,) of cells, zeros if there are none yet, by one."""
+    if bounds[2] == 0:
+        bounds[0], bounds[1], bounds[2], bounds[3] = row, col, row + 1, col + 1
+    bounds[0], bounds[1] = min(bounds[0], row), min(bounds[1], col)
+    bounds[2], bounds[3] = max(bounds[2], row + 1), max(bounds[3], col + 1)
+
+
+@device
+@in_place
 def set_state(grid: Grid, row: int, col: int, verdict: int) -> None:
     """Set the verdict on a cell; if it is a new one, note the change and widen the bounds."""
     cells, changes, bounds = grid.cells, grid.changes, grid.bounds
     if cells[row, col] != verdict:
         if cells[row, col] == UNKNOWN:
-            if bounds[2] == 0:
-                bounds[0], bounds[1], bounds[2], bounds[3] = row, col, row + 1, col + 1
-            bounds[0], bounds[1] = min(bounds[0], row), min(bounds[1], col)
-            bounds[2], bounds[3] = max(bounds[2], row + 1), max(bounds[3], col + 1)
+            widen_bounds(bounds, row, col)
         cells[row, col] = verdict
         if 0 <= changes[0] < len(changes) - 1:
             changes[0] += 1
