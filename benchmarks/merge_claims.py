@@ -13,6 +13,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
+from slam_backend.core.validation import check_int
 from slam_backend.geometry import between, wrap_angle
 from slam_backend.maps.alignment import Alignment
 from slam_backend.team import merge_attempt
@@ -69,6 +70,7 @@ def main(
     after: Annotated[float, typer.Option(help="Time [s] from which claims count in the summary.")] = 600.0,
 ) -> None:
     """Print the claims of each episode, and the median NEES of all and of merges."""
+    check_int("seeds", seeds, 1, "Use at least one episode.")
     warm_up(workers=1)
     claims: list[Claim] = []
     errors: list[tuple[float, float]] = []

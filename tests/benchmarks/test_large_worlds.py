@@ -25,6 +25,12 @@ def test_claims_are_those_of_all_attempts_whose_maps_align() -> None:
     assert merge_attempt._refused_if_uncertain is decide
 
 
+def test_claims_need_an_episode() -> None:
+    """No seeds at all are refused."""
+    with pytest.raises(ValueError, match="seeds: expected"):
+        merge_claims.main(seeds=0)
+
+
 def test_worlds_are_played_in_turn(capsys: pytest.CaptureFixture[str]) -> None:
     """Each line has a world; the last one's ratio is 1."""
     worlds_in_turn.main(["office:extent=30@3", "loops@2"], seed=1, robots=2, steps=10)
