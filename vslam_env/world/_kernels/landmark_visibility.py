@@ -9,7 +9,7 @@ from slam_backend.core.jit import device, in_place, jit
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from vslam_env.world._kernels.ray_casting import EPSILON, ray_to_disc, ray_to_wall, walls_in_wedge
 
-GROUP = 64  # successive landmarks, which lie on few walls, whose bounds are compared with the range at once
+GROUP = 16  # successive landmarks, which lie side by side, whose bounds are compared with the range at once
 TOUCH = 1e-6  # [m] what a ray meets this close to its target does not hide the target
 
 
@@ -24,6 +24,49 @@ def _hidden(x: float, y: float, dx: float, dy: float, own_wall: int, walls: Floa
             if t * length < length - TOUCH:
                 return True
     return False
+
+
+@device
+@in_place
+def rows_in_view(
+    x: float, y: float, cosine: float, sine: float, marks: FloatArray, bounds: FloatArray, limits: FloatArray,
+    rows: IntArray,
+) -> int:  # fmt: skip
+    """List the landmarks in view of a camera at (x, y), ignoring occlusion, in ascending order.
+
+    Args:
+        x, y: Camera [m], world frame.
+        cosine, sine: Direction of its axis.
+        marks, bounds, limits: Landmarks, bounds of their groups, and limits of view, see `detect`.
+        rows: (N,) int64. Written to: indices of these landmarks.
+
+    Returns:
+        Number of these landmarks.
+    """
+    _, _, height, max_range, tan_half, tan_vertical, cos_incidence = limits
+    in_image = 0
+    for group in range(len(bounds)):
+        low_x, low_y, high_x, high_y = bounds[group]
+        apart = max(low_x - x, x - high_x, low_y - y, y - high_y)
+        if apart > max_range:
+            continue
+        first, end = group * GROUP, min((group + 1) * GROUP, marks.shape[1])
+        for n in range(first, end):
+            dx, dy, dz = marks[0, n] - x, marks[1, n] - y, marks[2, n] - height
+            ahead, left = cosine * dx + sine * dy, cosine * dy - sine * dx
+            rows[n] = (ahead > TOUCH) & (abs(left) <= tan_half * ahead) & (abs(dz) <= tan_vertical * ahead)
+        for n in range(first, end):  # without branches, for none could be foreseen
+            flag = rows[n]
+            rows[in_image] = n
+            in_image += flag
+    count = 0
+    for i in range(in_image):
+        n = rows[i]
+        dx, dy, dz = marks[0, n] - x, marks[1, n] - y, marks[2, n] - height
+        distance = np.sqrt(dx * dx + dy * dy + dz * dz)
+        rows[count] = n
+        count += not (distance > max_range or -(dx * marks[3, n] + dy * marks[4, n]) <= cos_incidence * distance)
+    return count
 
 
 @jit
@@ -53,7 +96,7 @@ def detect(
             (4, S) float64 [m], world frame. Walls, by rows as well.
             Radius of the robots [m]; they are as tall as their cameras.
             (7,) float64. See `view_limits`.
-        keys: (K, N) float64, uniform. Key of each landmark for each robot.
+        keys: (K, N) float64, uniform. Key of each landmark for each robot; those out of view are not read.
         detection_probability: Probability that a visible landmark is detected.
         num_false: (K,) int64. Places that false points take in the frame of each robot; changed to B where larger.
         chosen: (K, B) int64. Written to: the chosen landmarks of each robot.
@@ -63,7 +106,7 @@ def detect(
         Number of chosen landmarks, and number of false points.
     """
     marks, bounds, own_walls, walls, robot_radius, limits = sight
-    forward, aside, height, max_range, tan_half, tan_vertical, cos_incidence = limits
+    forward, aside, _, max_range, tan_half, _, _ = limits
     near, near_rows = np.empty((walls.shape[1], 4)), np.empty(walls.shape[1], np.int64)
     rows = np.empty(marks.shape[1], np.int64)
     total = extra = 0
@@ -71,21 +114,7 @@ def detect(
         c, s = np.cos(poses[k, 2]), np.sin(poses[k, 2])
         eye_x, eye_y = poses[k, 0] + c * forward - s * aside, poses[k, 1] + s * forward + c * aside
         num_near = walls_in_wedge(eye_x, eye_y, c, s, walls, tan_half + EPSILON, max_range, near, near_rows)
-        num_rows = 0
-        for group in range(len(bounds)):
-            low_x, low_y, high_x, high_y = bounds[group]
-            apart = max(low_x - eye_x, eye_x - high_x, low_y - eye_y, eye_y - high_y)
-            if apart > max_range:
-                continue
-            first, end = group * GROUP, min((group + 1) * GROUP, marks.shape[1])
-            for n in range(first, end):
-                dx, dy, dz = marks[0, n] - eye_x, marks[1, n] - eye_y, marks[2, n] - height
-                ahead, left = c * dx + s * dy, c * dy - s * dx
-                rows[n] = (ahead > TOUCH) & (abs(left) <= tan_half * ahead) & (abs(dz) <= tan_vertical * ahead)
-            for n in range(first, end):  # without branches, for none could be foreseen
-                flag = rows[n]
-                rows[num_rows] = n
-                num_rows += flag
+        num_rows = rows_in_view(eye_x, eye_y, c, s, marks, bounds, limits, rows)
 
         num_false[k] = min(num_false[k], chosen.shape[1])
         places, count, own_keys, own = chosen.shape[1] - num_false[k], 0, keys[k], chosen[k]
@@ -93,11 +122,8 @@ def detect(
             is_worse = count == places and (count == 0 or own_keys[n] >= own_keys[own[count - 1]])
             if own_keys[n] >= detection_probability or is_worse:
                 continue
-            dx, dy, dz = marks[0, n] - eye_x, marks[1, n] - eye_y, marks[2, n] - height
+            dx, dy = marks[0, n] - eye_x, marks[1, n] - eye_y
             ahead, left = c * dx + s * dy, c * dy - s * dx
-            distance = np.sqrt(dx * dx + dy * dy + dz * dz)
-            if distance > max_range or -(dx * marks[3, n] + dy * marks[4, n]) <= cos_incidence * distance:
-                continue
             if _hidden(0.0, 0.0, ahead, left, own_walls[n], near[:num_near], near_rows):
                 continue
             length, free = np.sqrt(ahead * ahead + left * left), True
