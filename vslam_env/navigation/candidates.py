@@ -47,6 +47,7 @@ CANDIDATE_FEATURES = (
 FIRST_KIND = NUM_DESCRIBED  # column of the first kind
 WHOLE_CELLS = 100_000  # cells of a known part, 63 x 63 m, that is searched wholly at every update
 SHARE_CELLS = 40_000  # cells of a larger one that an update searches beyond what is near, in the mean
+VERY_LARGE_CELLS = 202_500  # cells of a known part, 90 x 90 m, beyond which this share is halved
 NEAR = 18.0  # [m] from the robot along x and y that are searched at every update of a larger one
 
 
@@ -92,7 +93,8 @@ class TeamCandidates:
 
     An update costs what is near: where more than 63 x 63 m are known most updates search only within 18 m of the robot,
     and candidates farther away, with their lengths and gains, stay as they were. All known floor is searched at every
-    n-th update, robots in turn, n the known area over 40 x 40 m; and as soon as no frontier is left.
+    n-th update, robots in turn, n the known area over 40 x 40 m, twice that where more than 90 x 90 m are known; and as
+    soon as no frontier is left.
 
     Args:
         num_robots: Number of robots K.
@@ -143,7 +145,8 @@ class TeamCandidates:
         """Return the distance [m] from a robot along x and y that the present update searches; inf: everywhere."""
         top, left, bottom, right = bounds.tolist()
         known = (bottom - top) * (right - left)
-        period = 1 if known <= WHOLE_CELLS else -(-known // SHARE_CELLS)
+        share = SHARE_CELLS if known <= VERY_LARGE_CELLS else SHARE_CELLS // 2
+        period = 1 if known <= WHOLE_CELLS else -(-known // share)
         return math.inf if self._updates[robot] % period == robot % period else NEAR
 
     def rows(self, robot: int) -> FloatArray:

@@ -90,14 +90,21 @@ def test_near_updates_find_what_a_whole_search_finds_nearby(monkeypatch: pytest.
     np.testing.assert_array_equal(found, expected[near])
 
 
-def test_distant_candidates_stay_until_all_is_searched(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A distant frontier that is gone stays a candidate, as it was, until the next search over all known floor."""
+@pytest.mark.parametrize("very_large", [False, True])
+def test_distant_candidates_stay_until_all_is_searched(very_large: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A distant frontier that is gone stays a candidate, as it was, until the next search over all known floor.
+
+    In very large areas that comes after twice as many updates.
+    """
+    period = 2 * PERIOD if very_large else PERIOD
+    if very_large:
+        monkeypatch.setattr(candidates, "VERY_LARGE_CELLS", 0)
     robot = Robot(crossing())
-    for _ in range(PERIOD):
+    for _ in range(period):
         before = robot.update(-9.0)
     np.testing.assert_array_equal(before, reference(crossing(), -9.0, monkeypatch))
     robot.know(cells := crossing(blind=(-9.0, 21.0)))
-    for _ in range(PERIOD - 1):
+    for _ in range(period - 1):
         rows = robot.update(-9.0)
         np.testing.assert_array_equal(rows, before[1:])  # the near one is gone at once
     np.testing.assert_array_equal(robot.update(-9.0), reference(cells, -9.0, monkeypatch))
