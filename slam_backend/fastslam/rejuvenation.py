@@ -20,7 +20,7 @@ from slam_backend.smoother.graph_building import InitialPoses, LandmarkPositions
 from slam_backend.smoother.joint_graphs import merge_thinned
 from slam_backend.smoother.log_arrays import LogArrays
 from slam_backend.smoother.optimizer import NO_POSE
-from slam_backend.smoother.options import SmoothingOptions
+from slam_backend.smoother.options import SmoothingOptions, extra_keys
 from slam_backend.smoother.reassociation import LandmarkTable, RejectedMeasurements, reassociate
 from slam_backend.smoother.rejuvenation import Draft, LandmarkDescriptors, Particles, Rejuvenation, Smoother, rejuvenate
 from slam_backend.smoother.sampling import PathLandmarks
@@ -182,6 +182,8 @@ def joint_graph(
 MIN_CLOSURE_MATCHES = 3  # matches with landmarks not seen for long that count as a loop closure in one step
 MIN_INTERVAL_FRACTION = 5  # a loop closure shortens the interval to a fifth at most
 MIN_ROWS = 8  # least steps of each log in a slice, so that the work keeps up with the input
+# Factor on the steps of a slice where `extra_keys` allows more keyframes: its cost is mainly that of the graph's size.
+LARGE_SLICE_FACTOR = 2
 LARGE_GRAPH = 2000  # landmarks; those of worlds of 30 m are some 500
 MAX_FAILURES = 2  # failed optimisations in a row, without slices, before measurements are dropped
 SCHEDULE = ("_asked", "_waited", "_read", "_closed", "_failures", "_exact", "_last_closing", "steps")
@@ -205,10 +207,12 @@ class RejuvenationScheduler:
         self.starts_at_mode: FloatArray | None = None
         self._options = options
         self._every = options.rejuvenate_every
-        self._share = max(MIN_ROWS, (options.smoothing.slice_steps or 0) // num_robots)  # steps of a robot in a slice
         self._noiseless = options.motion.is_noiseless
-        self._graph: SlamGraph | None = None  # at its mode
-        self._oldest = -1  # least of the robots' last steps in the graph
+        self._graph: SlamGraph | None  # at its mode
+        self._oldest: int  # least of the robots' last steps in the graph
+        self._least_share = max(MIN_ROWS, (options.smoothing.slice_steps or 0) // num_robots)
+        self._share: int  # steps of a robot in a slice
+        self._set_graph(None)
         self._draft: Draft | None = None  # the graph with new steps, before convergence
         self._asked = False  # rejuvenation requested
         self._waited = 0  # steps since the last rejuvenation
@@ -343,9 +347,9 @@ class RejuvenationScheduler:
         if (draft := self._draft) is not None:
             outcome = smoother.optimise_slice(draft)
             return self._finish_slice(draft.graph, outcome, lambda: log_tails(logs, graph, draft.graph), smoother)
-        share, waiting = self._share, max_pending_steps(logs, graph)
-        if waiting > 2 * share or not self.is_due:
-            if waiting < share:
+        share, waiting, is_due = self._share, max_pending_steps(logs, graph), self.is_due
+        if waiting > 2 * self._least_share or not is_due:  # so that few steps are left to the draw
+            if waiting < share and not is_due:
                 return None
             taken = [log_head(log, share) for log in self._new_log_rows(logs, graph, maps, best)]
             outcome = smoother.add_logs(graph, taken, self._guesses, landmark_positions(maps, best))
@@ -443,16 +447,18 @@ class RejuvenationScheduler:
         if any(map(len, logs)):
             self._accept(smoother.without_measurements(graph, logs))
             return _failed(tried, f"{reason}; measurements since the last rejuvenation are dropped")
-        self._graph = None
+        self._set_graph(None)
         return _failed(tried, f"{reason}; the smoother restarts from the logs")
 
     def _note_starts(self, result: Rejuvenation) -> None:
         """Keep how certain the starts are at the mode."""
         self.starts_at_mode = None if result.particles is None else result.particles.starts_at_mode
 
-    def _set_graph(self, graph: SlamGraph) -> None:
-        """Set the graph and its oldest step."""
-        self._graph, self._oldest = graph, min(graph.latest.tolist())
+    def _set_graph(self, graph: SlamGraph | None) -> None:
+        """Set the graph, its oldest step, and how many steps a slice takes."""
+        self._graph, self._oldest = graph, -1 if graph is None else min(graph.latest.tolist())
+        is_large = graph is not None and extra_keys(len(graph.landmark_ids), graph.latest) > 0
+        self._share = (LARGE_SLICE_FACTOR if is_large else 1) * self._least_share
 
     def _accept(self, graph: SlamGraph) -> None:
         """Continue from a graph at its mode."""
@@ -490,9 +496,7 @@ class RejuvenationScheduler:
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Restore the state from `get_state`."""
-        self._graph = None
-        if state["graph"] is not None:
-            self._set_graph(SlamGraph.of_mapping(state["graph"]))
+        self._set_graph(None if state["graph"] is None else SlamGraph.of_mapping(state["graph"]))
         self._draft = None
         if state["draft"] is not None:
             graph, damping, steps = state["draft"]

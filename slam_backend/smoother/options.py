@@ -37,8 +37,9 @@ class SmoothingOptions:
         more_draws: Factor on M for a second draw where the first one misses `least_ess` by less than this factor; M of
             these paths are then resampled. 1: no second draw. Where `extra_keys` raises the limit of
             keyframes, weights are tempered until they reach `least_ess` instead.
-        slice_steps: New steps, of all robots together but at least eight of each, that one slice adds to the graph; no
-            step of the filter then does more than one slice of the work. None: all work in the step in which it is due.
+        slice_steps: New steps, of all robots together but at least eight of each, that one slice adds to the graph;
+            twice these where `extra_keys` raises the limit of keyframes. No step of the filter then does more than
+            one slice of the work. None: all work in the step in which it is due.
         rigid_within: Limit [m] of the odometry's scatter since the last keyframe (root mean square of position and of
             heading at 3 m) up to which a new step is attached to it rigidly; 0: each step with measurements becomes a
             keyframe.

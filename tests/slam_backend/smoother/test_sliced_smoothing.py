@@ -1,6 +1,6 @@
 """Smoothing in slices, one per step: the result of smoothing at once, with bounded work per step."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from builders.comparison import assert_same
 from builders.runs import TIGHT, camera_of, graph_of, logs_of, small_run, upper
+from builders.teams import large_maps
 from builders.worlds import EXACT_MOTION
 from hypothesis import given
 from hypothesis import strategies as st
@@ -21,6 +22,7 @@ from slam_backend.smoother import rejuvenation
 from slam_backend.smoother.graph import SlamGraph
 from slam_backend.smoother.graph_building import InitialPoses, LandmarkPositions, extend_graph, log_head
 from slam_backend.smoother.graph_reduction import MAX_FRAMES, reduce_keyframes, relinearise
+from slam_backend.smoother.log_arrays import LogArrays
 from slam_backend.smoother.optimizer import optimize
 from slam_backend.smoother.options import SmoothingOptions
 from slam_backend.smoother.rejuvenation import Draft, Smoother
@@ -77,6 +79,27 @@ def test_the_work_per_step_is_bounded(monkeypatch):
         drawn += [] if report is None else [report.reason]
     assert len(drawn) >= 3
     assert set(drawn) == {""}
+
+
+@pytest.mark.parametrize("large", [False, True])
+def test_slices_of_large_maps_take_more_steps(large: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A slice takes the stated number of steps, and twice as many where the limit of keyframes has grown."""
+    if large:
+        large_maps(monkeypatch)
+    taken, add_logs = [], Smoother.add_logs
+
+    def noted(self: Smoother, graph: SlamGraph, logs: Sequence[LogArrays], *rest: Any) -> SlamGraph | Draft | str:
+        taken.append(int(logs[0].steps[-1] - graph.latest[0]))
+        return add_logs(self, graph, logs, *rest)
+
+    monkeypatch.setattr(Smoother, "add_logs", noted)
+    run = small_run(length=30.0)
+    slam = run.build_filter(30, "fastslam2", 1, rejuvenate_every=1000, smoothing=IN_SLICES)
+    for reading in run.readings():
+        slam.step(**reading)
+    assert taken[0] == 8  # while there is no map yet
+    assert set(taken[1:]) == {2 * 8 if large else 8}
+    assert len(taken) > 3
 
 
 def test_particles_sampled_in_slices_are_as_accurate():
