@@ -91,8 +91,8 @@ class LandmarkFactors(NamedTuple):
     Attributes:
         keys, landmarks: (s,) int64.
         starts: (l + 1,) int64. Offsets: factors of landmark i are starts[i] to starts[i + 1].
-        frozen: (s,) bool.
-        centres, infos, slopes: (s, 3), (s, 6), (s, 3) float64. See `_kernels.factors`.
+        condensed: (s,) bool.
+        linearisation_points, information, gradients: (s, 3), (s, 6), (s, 3) float64. See `_kernels.factors`.
         counts: (s,) int64. Measurements in each.
         of_points: (n,) int64. Sighting of each raw measurement.
         squares: (n,) float64. Squared Mahalanobis distance of each, where it was last linearised.
