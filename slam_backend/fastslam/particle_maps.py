@@ -13,7 +13,7 @@ import mmap
 import sys
 import weakref
 from contextlib import suppress
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,7 +44,8 @@ def zeros_aligned(shape: tuple[int, ...], dtype: Any) -> Any:
     return array
 
 
-LARGE = 1 << 25  # bytes of values from which memory grows where it is, on Linux; the allocator uses smaller ones again
+GROWN = 1 << 23  # bytes from which values that must grow move to `GrowingMemory`, on Linux; worlds of 30 m stay below
+LARGE = 1 << 25  # the same for new values: the allocator uses smaller blocks again
 
 
 class GrowingMemory:
@@ -108,7 +109,7 @@ class MapStore:
         values: (rows * 9 * P,) float64 [m, m^2], map frame, each row
             [block][x, y, z, Sxx, Sxy, Sxz, Syy, Syz, Szz][lane].
         counts: (rows, P) int32. Matches of the landmark in the particle, its creation included; 0: not present.
-        table: (6, slots) int64, see `SlotRows`.
+        table: (7, slots) int64, see `SlotRows`.
         maps: (maps, P) int32. users: (maps,) int64, how many slots read by each.
         odds: (slots, P) float64. Log-odds that the landmark exists, read through its map as a row is; (0, P) without.
         descriptors: (slots, d) float32. heads: (h, slots) every (d / h)-th component of them, `FAR` where free.
@@ -288,7 +289,8 @@ class MapStore:
             self.values = self._memory.array(size if is_grown else old)
             if is_grown:
                 return
-        self._memory = GrowingMemory(size) if 8 * size >= LARGE and sys.platform == "linux" else None
+        is_large = 8 * size >= (GROWN if old else LARGE)
+        self._memory = GrowingMemory(size) if is_large and sys.platform == "linux" else None
         values = empty_aligned((size,), np.float64) if self._memory is None else self._memory.array(size)
         values[:old] = self.values
         self.values = values
@@ -419,6 +421,39 @@ class ParticleMaps(MapStore):
         if self.log_odds_prior is not None:
             self.odds[:n, :m] = self.log_odds_prior if odds is None else odds
         self._set_descriptor_prefixes(n)
+
+    @classmethod
+    def packed(
+        cls, values: FloatArray, counts: IntArray, descriptors: NDArray[np.float32], ids: IntArray,
+        identities: IntArray, next_id: int,
+    ) -> Self:  # fmt: skip
+        """Return the landmarks of a single particle, to be read only, in as little memory as they need.
+
+        Landmarks share rows: a row holds `LANES` of them, and ancestor map 1 + i reads lane i. No descriptor prefixes
+        are written, so that such maps serve no data association, and their state is no valid snapshot of a filter.
+        Existence must not be estimated.
+
+        Args:
+            values: (n, 9) float64 [m, m^2], map frame.
+            counts: (n,) measurement counts, 0 where the particle lacks the landmark.
+            descriptors, ids, identities, next_id: See `load_metadata`.
+        """
+        self, n, slots = cls(1), len(ids), np.arange(len(ids))
+        rows = -(-n // LANES)
+        self._grow_slots(max(n, 1), descriptors.shape[1])
+        self._grow_rows(max(rows, 1))
+        self.tops[:] = 0, 0, next_id
+        self.row_of[:n], self.map_of[:n] = slots // LANES, 1 + slots % LANES
+        self.maps = np.zeros((1 + LANES, self.padded), np.int32)
+        self.maps[1:, 0] = np.arange(LANES)
+        self.users = np.bincount(self.map_of[:n], minlength=1 + LANES)
+        self.ids[:n], self.identities[:n], self.descriptors[:n] = ids, identities, descriptors
+        self.counts[:] = 0
+        self.counts[self.row_of[:n], slots % LANES] = counts
+        whole = np.zeros((rows * LANES, 9))
+        whole[:n] = values
+        self.blocks[:rows, 0] = whole.reshape(rows, LANES, 9).transpose(0, 2, 1)
+        return self
 
     # ------------------------------------------------------------------ snapshots
 

@@ -18,7 +18,7 @@ from slam_backend.fastslam.filter import FastSlam
 from slam_backend.maps.alignment import Alignment, AlignmentOptions
 from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.team.branches import Branch, ReplayedStep, replay
-from slam_backend.team.filter_merging.merging import merge_filters
+from slam_backend.team.filter_merging.merging import merge_filters, pair_filters
 from slam_backend.team.group_merging import MergePlan, PreparedTrunk, joint_trunk, judge_trial
 from slam_backend.team.groups import Group
 from slam_backend.team.merge_scheduler import PairKey
@@ -29,6 +29,7 @@ FIRST_WAIT = 10  # steps before the joint filter is made, so that the attempt do
 PACE = 4  # steps from one piece of the work to the next
 REPLAYED = 4  # steps of input that the joint filter replays in each step, which itself adds one
 PATIENCE = 100  # steps out of contact, in all, beyond which the merge is given up
+MOST_PAIRS = 500  # common landmarks by which particles are paired: the smoother then draws other paths anyway
 SPARED_IDS = 1000  # landmarks that the first group may find meanwhile; ids of the joint map lie beyond theirs
 
 Pair = tuple[Group, Group]
@@ -135,8 +136,11 @@ class MergePreparation:
         a, b = (group.trunk.filter for group in pair)
         pairs = np.column_stack([self.maps[i].ids[self.alignment.inliers[:, i]] for i in range(2)])
         held = np.isin(pairs[:, 0], a.state.maps.ids) & np.isin(pairs[:, 1], b.state.maps.ids)
+        pairs = pairs[held]
+        some = pairs[:: max(-(-len(pairs) // MOST_PAIRS), 1)]
+        pairing = pair_filters(a, b, self.alignment, some, rng, merging.merged_particles)
         joint, self.renamed = merge_filters(
-            a, b, self.alignment, pairs[held], rng, merging.merged_particles, on_trial=True, spared=SPARED_IDS
+            a, b, self.alignment, pairs, rng, pairing=pairing, on_trial=True, spared=SPARED_IDS
         )
         self.end_of_common = a.state.maps.next_id
         self.joint = joint_trunk(pair, joint, self.renamed, records.new_number())

@@ -168,7 +168,8 @@ def write_joint(
         motion: (M, 3) motion of b's landmarks in each particle.
         extra: Variance added to each side first [m^2].
         scales: (n,) factors of the covariances, applied next [-].
-        blocks: (>= n, P / lanes, 9, lanes) of the joint map, see `MapStore`; the first n are written.
+        blocks: (>= n, P / lanes, 9, lanes) of the joint map, see `MapStore`, or (n, 1, 9, 1) for a single particle; the
+            first n are written.
 
     Raises:
         ValueError: If two estimates of a landmark are exact along one direction.

@@ -80,7 +80,7 @@ def merge_filters(
         rng: Generator for the pairing and the draws of T.
         num_particles: Number of particles of the joint filter; None: the larger of the two.
         known: Whether the motion is drawn from the alignment alone, ignoring the common landmarks.
-        pairing: Result of `pair_filters` for these arguments; None: a new draw.
+        pairing: Result of `pair_filters` for these filters and all or some of the pairs; None: a new draw.
         on_trial: Whether the joint filter is to be rejuvenated at once, or dropped: then it has only the landmarks of
             the most probable particle, which the smoother starts from; see `FilterState.write_landmarks`.
         spared: See `renaming`.
@@ -123,19 +123,15 @@ def merge_filters(
         odds = np.concatenate([odds_a, odds_b[exclusive]])[held]
     descriptors = stack_descriptors(descriptors, descriptors_b[exclusive])[held]
     best = int(joint.path_log_weights.argmax())
+    columns = descriptors, np.concatenate([ids_a, new_ids])[held], names[held]
+    next_id = a.state.maps.next_id + spared + len(exclusive)
     if on_trial:
         joint.maps = ParticleMaps(1, joint.maps.log_odds_prior)
         odds = None if odds is None else mean_odds(odds, kept)
         kept = kept[:, [best]]
-        joint.maps.reserve(len(held), descriptors.shape[1])  # a trial gets no new landmarks
-    joint.maps.load_metadata(
-        kept,
-        descriptors,
-        np.concatenate([ids_a, new_ids])[held],
-        names[held],
-        a.state.maps.next_id + spared + len(exclusive),
-        odds,
-    )
+    is_packed = on_trial and odds is None and joint.num_particles > 1
+    if not is_packed:
+        joint.maps.load_metadata(kept, *columns, next_id, odds)
     # Each map takes half of the extra variance.
     scales = np.full(len(counts), scale)
     if len(named):
@@ -144,7 +140,10 @@ def merge_filters(
     if on_trial:
         of_a, of_b = Landmarks.of(a.state.maps, from_a[[best]]), Landmarks.of(b.state.maps, from_b[[best]])
         motion = motion[[best]]
-    write_joint(of_a, of_b, rows_a[held], rows_b[held], motion, 0.5 * extra, scales[held], joint.maps.blocks)
+    values = np.empty((len(held), 1, 9, 1)) if is_packed else joint.maps.blocks
+    write_joint(of_a, of_b, rows_a[held], rows_b[held], motion, 0.5 * extra, scales[held], values)
+    if is_packed:
+        joint.maps = ParticleMaps.packed(values.reshape(-1, 9), kept[:, 0], *columns, next_id)
     joint.finish_join(a.state, b.state, renamed)
     return FastSlam.from_filter_state(joint), renamed
 

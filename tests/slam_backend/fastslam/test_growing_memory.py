@@ -28,12 +28,24 @@ def test_numbers_stay_when_memory_grows() -> None:
 
 
 @LINUX
+def test_new_values_stay_in_the_allocator_longer_than_values_that_grow(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Below the limit for new values, memory of its own comes with the first growth."""
+    monkeypatch.setattr(particle_maps, "GROWN", 1)
+    maps = ParticleMaps(20)
+    maps.reserve(200, 8)
+    assert maps._memory is None
+    maps.reserve(2000, 8)
+    assert maps._memory is not None
+
+
+@LINUX
 @pytest.mark.parametrize("is_held", [False, True])
 def test_large_maps_grow_as_small_ones_do(is_held: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """Values and counts are equal, in copies, too, whether memory grows where it is or must be copied."""
     states = []
     for least in (1 << 40, 1):
-        monkeypatch.setattr(particle_maps, "LARGE", least)
+        for name in ("GROWN", "LARGE"):
+            monkeypatch.setattr(particle_maps, name, least)
         maps, rng, held = ParticleMaps(20), np.random.default_rng(3), []
         for number in range(3):
             maps.reserve(200 * (number + 1), 8)

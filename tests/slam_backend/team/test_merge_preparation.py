@@ -24,6 +24,7 @@ from slam_backend.maps.alignment import Alignment
 from slam_backend.team import merge_preparation
 from slam_backend.team import team as team_module
 from slam_backend.team.branches import Branch, replay
+from slam_backend.team.groups import Group
 from slam_backend.team.merge_preparation import FIRST_WAIT, PATIENCE, MergePreparation
 from slam_backend.team.merge_scheduler import AttemptOptions
 from slam_backend.team.options import MergeOptions
@@ -108,10 +109,29 @@ def test_the_joint_filter_is_that_of_a_merge_that_replays_the_inputs_since(monke
     assert team._groups[0].trunk.last_steps == dict.fromkeys((0, 1), team._step - 1)
 
 
-def test_a_merge_that_was_prepared_is_right_and_watched() -> None:
-    """Its motion is right, its inliers are rows of the maps just before it, and later landmarks are noticed."""
+@pytest.mark.parametrize("most", [merge_preparation.MOST_PAIRS, 8])
+def test_a_merge_that_was_prepared_is_right_and_watched(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its motion is right, its inliers are rows of the maps just before it, and later landmarks are noticed.
+
+    All common landmarks are joined, even if only some of them pair the particles.
+    """
+    common: list[tuple[int, int]] = []
+    join = MergePreparation._join
+
+    def noted(self: MergePreparation, pair: tuple[Group, Group], *args: Any) -> None:
+        ids = [self.maps[i].ids[self.alignment.inliers[:, i]] for i in range(2)]
+        held = [np.isin(ids[i], pair[i].trunk.filter.state.maps.ids) for i in range(2)]
+        join(self, pair, *args)
+        assert self.renamed is not None
+        joined = np.count_nonzero(self.renamed[:, 1] < self.end_of_common)
+        common.append((int(np.count_nonzero(held[0] & held[1])), int(joined)))
+
+    monkeypatch.setattr(MergePreparation, "_join", noted)
+    monkeypatch.setattr(merge_preparation, "MOST_PAIRS", most)
     simulation, team = begun()
     reports = run_until_over(simulation, team)
+    ((num_common, num_joined),) = common
+    assert num_common == num_joined > 8
     attempt, merge = reports[-1].events
     assert merge.alignment is attempt.alignment
     assert math.isfinite(attempt.uncertainty)

@@ -100,8 +100,9 @@ def join(a: Side, b: Side, motion: FloatArray, extra: float, scales: FloatArray,
         motion: (M, 3) from b's map frame to a's, of each particle.
         extra: Added to all variances of either side first [m^2].
         scales: (n,) factor on the covariances of each then [-].
-        lanes: Particles in a block.
-        tiles: (>= n, blocks, 9, lanes), of which the first n are written; zeros where a particle holds neither.
+        lanes: Particles in a block of either side.
+        tiles: (>= n, blocks, 9, width) for blocks of `width` particles, of which the first n are written; zeros where a
+            particle holds neither.
 
     Returns:
         Whether all went well: not if two estimates are exact along one direction.
@@ -111,8 +112,8 @@ def join(a: Side, b: Side, motion: FloatArray, extra: float, scales: FloatArray,
     for i in range(len(a.rows)):
         j, k, scale = a.rows[i], b.rows[i], scales[i]
         for block in range(tiles.shape[1]):
-            tile, first = tiles[i, block], block * lanes
-            for lane in range(lanes):
+            tile, first = tiles[i, block], block * tiles.shape[3]
+            for lane in range(tiles.shape[3]):
                 p = first + lane
                 there = p < len(motion)
                 in_a, in_b = there and j >= 0 and a.counts[j, p] > 0, there and k >= 0 and b.counts[k, p] > 0
