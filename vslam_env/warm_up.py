@@ -78,10 +78,8 @@ def _run_all_paths(extras: Collection[str]) -> None:
     for _ in range(STEPS):
         valid = {agent: env.belief(agent).candidates.valid for agent in env.agents}
         env.step({agent: 1 + int(slots.argmax()) if slots.any() else 0 for agent, slots in valid.items()})
-    many = np.full(MANY_KEYS, 1.0)
-    marks = Landmarks(
-        many[:, None] * (9.0, 4.0, 0.0), many[:, None] * (-1.0, 0.0), np.ones(MANY_KEYS, int), many[:, None]
-    )
+    ones = np.ones((MANY_KEYS, 1))  # many landmarks, whose keys are drawn otherwise
+    marks = Landmarks(ones * (9.0, 4.0, 0.0), ones * (-1.0, 0.0), np.ones(MANY_KEYS, int), ones.astype(np.float32))
     LandmarkSensor(sensor, WALLS, marks).measure(STARTS, np.random.default_rng(0))
     if "planners" in extras:
         belief = env.belief("robot_0")

@@ -182,7 +182,7 @@ def joint_graph(
 MIN_CLOSURE_MATCHES = 3  # matches with landmarks not seen for long that count as a loop closure in one step
 MIN_INTERVAL_FRACTION = 5  # a loop closure shortens the interval to a fifth at most
 MIN_ROWS = 8  # least steps of each log in a slice, so that the work keeps up with the input
-# Factor on the steps of a slice where `extra_keys` allows more keyframes: its cost is mainly that of the graph's size.
+# Factor on the steps of a slice where `extra_keys` allows more keyframes: its cost then depends mainly on the graph.
 LARGE_SLICE_FACTOR = 2
 LARGE_GRAPH = 2000  # landmarks; those of worlds of 30 m are some 500
 MAX_FAILURES = 2  # failed optimisations in a row, without slices, before measurements are dropped
