@@ -24,7 +24,7 @@ from slam_backend.core.read_only import as_read_only, is_read_only
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.fastslam import _kernels
 from slam_backend.fastslam._kernels import LANES
-from slam_backend.fastslam._kernels.records import SLOT
+from slam_backend.fastslam._kernels.records import PLACE, SLOT
 from slam_backend.maps.landmark_map import MapSummaryRows
 
 
@@ -113,6 +113,7 @@ class MapStore:
         maps: (maps, P) int32. users: (maps,) int64, how many slots read by each.
         odds: (slots, P) float64. Log-odds that the landmark exists, read through its map as a row is; (0, P) without.
         descriptors: (slots, d) float32. heads: (h, slots) every (d / h)-th component of them, `FAR` where free.
+        places: (3, slots) float32. Where landmarks are, see `PlaceRows`; not part of a state.
         free_rows: A stack; `tops` = (its height, that of the free slots, the name of the next landmark).
     """
 
@@ -133,6 +134,7 @@ class MapStore:
         self.table: IntArray = np.zeros((7, 0), dtype=np.int64)
         self.descriptors: NDArray[np.float32] = np.zeros((0, 0), dtype=np.float32)
         self.heads: NDArray[np.float32] = np.zeros((0, 0), dtype=np.float32)
+        self.places: NDArray[np.float32] = np.zeros((3, 0), dtype=np.float32)
         self._free_maps = 0
         self._copied = _NOTHING_COPIED  # slots of the last state, and its arrays while others keep them; not part of it
         self.free_rows: IntArray = np.zeros(0, dtype=np.int64)
@@ -177,8 +179,8 @@ class MapStore:
     def nbytes(self) -> int:
         """Memory in use [bytes]."""
         arrays = (
-            self.values, self.counts, self.maps, self.users, self.table, self.descriptors, self.heads, self.free_rows,
-            self.odds,
+            self.values, self.counts, self.maps, self.users, self.table, self.descriptors, self.heads, self.places,
+            self.free_rows, self.odds,
         )  # fmt: skip
         return sum(array.nbytes for array in arrays)
 
@@ -187,7 +189,7 @@ class MapStore:
         """The arrays as kernels take them."""
         return _kernels.MapArrays(
             self.values, self.counts, self.odds, self.table, self.maps, self.users, self.free_rows, self.tops,
-            self.descriptors, self.heads,
+            self.descriptors, self.heads, self.places,
         )  # fmt: skip
 
     @property
@@ -255,6 +257,9 @@ class MapStore:
         if old and len(self.heads):
             heads[:, :old] = self.heads
         self.heads = heads
+        places = np.full((len(self.places), old + extra), _kernels.FAR)
+        places[:, :old] = self.places
+        self.places = places
         if self.log_odds_prior is not None:
             odds = zeros_aligned((old + extra, self.padded), np.float64)
             odds[:old] = self.odds
@@ -295,8 +300,9 @@ class MapStore:
         values[:old] = self.values
         self.values = values
 
-    def _set_descriptor_prefixes(self, n: int) -> None:
-        """Write the heads of the first n slots and mark the others free."""
+    def _prepare_search(self, n: int) -> None:
+        """Write the heads of the first n slots, let their places be computed again, and mark the others free."""
+        self.places[PLACE.x, :n], self.places[PLACE.x, n:] = -_kernels.FAR, _kernels.FAR
         if len(self.heads):
             self.heads[:, :n] = self.descriptors[:n, :: self.descriptors.shape[1] // len(self.heads)].T
             self.heads[:, n:] = _kernels.FAR
@@ -420,7 +426,7 @@ class ParticleMaps(MapStore):
         self.descriptors[:n] = descriptors
         if self.log_odds_prior is not None:
             self.odds[:n, :m] = self.log_odds_prior if odds is None else odds
-        self._set_descriptor_prefixes(n)
+        self._prepare_search(n)
 
     @classmethod
     def packed(
@@ -527,7 +533,7 @@ class ParticleMaps(MapStore):
             self.odds[:n] = state["odds"]
         for name in ("map_of", "ids", "identities", "last_seen", "descriptors"):
             getattr(self, name)[:n] = state[name]
-        self._set_descriptor_prefixes(n)
+        self._prepare_search(n)
         self.maps = np.concatenate([np.zeros((1, self.padded), dtype=np.int32), maps])
         self.users = np.bincount(state["map_of"], minlength=len(maps) + 1).astype(np.int64)
         self.users[0], self._free_maps = 0, 0

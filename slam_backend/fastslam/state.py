@@ -290,8 +290,8 @@ class FilterState:
                 low, high, is_over, now, self.packed_options, robots.array, inputs.inputs_table, inputs.moves, normals,
                 self.pose_arrays, self.bias_covariances, self.propagated_only, self.weight_arrays,
                 self.gauge_covariance, maps.values, maps.counts, maps.odds, maps.table, maps.maps, maps.users,
-                maps.free_rows, maps.tops, maps.descriptors, maps.heads, inputs.measurements, inputs.descriptors,
-                inputs.names,
+                maps.free_rows, maps.tops, maps.descriptors, maps.heads, maps.places, inputs.measurements,
+                inputs.descriptors, inputs.names,
                 self._associations, self._mahalanobis_sq, associations, means, covariances,
                 pending.noted[len(pending.steps)], pending.measured, pending.num_measured, fastslam1,
             )  # fmt: skip

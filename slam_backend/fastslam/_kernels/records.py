@@ -25,6 +25,7 @@ class MapArrays(NamedTuple):
         tops: (3,). Heights of the stacks of free rows and of free slots, and the id of the next landmark.
         descriptors: (slots, d).
         heads: (h, slots). Every (d / h)-th component of the descriptors, `FAR` where the slot is free.
+        places: (3, slots). Where the landmarks are, see `PlaceRows`.
     """
 
     values: FloatArray
@@ -37,6 +38,22 @@ class MapArrays(NamedTuple):
     tops: IntArray
     descriptors: Float32Array
     heads: Float32Array
+    places: Float32Array
+
+
+class PlaceRows(NamedTuple):
+    """Rows of the places (3, slots) of landmarks in the first particles, which stand for all.
+
+    They follow from the values as these are stored, and are computed when they are needed.
+
+    Attributes:
+        x, y: Centre [m], map frame. x is `FAR` where the slot is free, and -`FAR` where it must be computed again.
+        sigma: Square root of Sxx + Syy and of the squared half widths over these particles [m].
+    """
+
+    x: int = 0
+    y: int = 1
+    sigma: int = 2
 
 
 class SlotRows(NamedTuple):
@@ -95,7 +112,7 @@ class RobotParts(NamedTuple):
     covariances: int = 4
 
 
-SLOT, WEIGHT, ROBOT = SlotRows(), WeightRows(), RobotParts()
+PLACE, SLOT, WEIGHT, ROBOT = PlaceRows(), SlotRows(), WeightRows(), RobotParts()
 
 
 class Poses(NamedTuple):

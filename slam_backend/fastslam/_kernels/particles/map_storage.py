@@ -13,6 +13,7 @@ from slam_backend.fastslam._kernels.layout import (
     IDS,
     LANES,
     MAP_OF,
+    PLACE_X,
     ROW_OF,
     TILE,
 )
@@ -84,6 +85,7 @@ def register_new(new_slots: IntArray, frame: Frame, maps: MapArrays) -> None:
             continue
         ids[slot] = maps.tops[2]
         maps.table[CHANGED, slot] = 1
+        maps.places[PLACE_X, slot] = -FAR
         maps.tops[2] += 1
         identities[slot] = frame.identities[b] if frame.identified else -1
         size = frame.descriptors.shape[1]
@@ -106,6 +108,7 @@ def free_slot(slot: int, maps: MapArrays) -> None:
     maps.table[IDS, slot] = -1
     for k in range(maps.heads.shape[0]):
         maps.heads[k, slot] = FAR
+    maps.places[PLACE_X, slot] = FAR
     maps.free_rows[maps.tops[0]] = maps.table[ROW_OF, slot]
     maps.table[FREE_SLOTS, maps.tops[1]] = slot
     maps.tops[0] += 1

@@ -10,11 +10,13 @@ from slam_backend.core.validation import FloatArray, Int32Array, IntArray
 from slam_backend.fastslam._kernels.layout import (
     BLOCK,
     CHANGED,
+    FAR,
     IDS,
     LANES,
     LOG_WEIGHTS,
     MAP_OF,
     PATH_LOG_WEIGHTS,
+    PLACE_X,
     ROW_OF,
     TILE,
 )
@@ -142,6 +144,7 @@ def apply_resampling(slots: IntArray, maps: MapArrays) -> None:
     for k in range(len(slots)):
         slot = slots[k]
         maps.table[CHANGED, slot] = 1
+        maps.places[PLACE_X, slot] = -FAR
         e = map_of[slot]
         if e == 0:
             continue
