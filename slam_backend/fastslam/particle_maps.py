@@ -13,7 +13,7 @@ import mmap
 import sys
 import weakref
 from contextlib import suppress
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -372,12 +372,11 @@ class ParticleMaps(MapStore):
         """Return the log-odds (n,) of the slots (n,) of particle m. A copy."""
         return np.asarray(self.odds[slots, self.columns_of(m, slots)])
 
-    def dense_odds(self, slots: IntArray) -> FloatArray | None:
-        """Return the log-odds (n, M) of slots (n,) in all particles, None if existence is not estimated. A copy."""
-        if self.log_odds_prior is None:
-            return None
-        self.refresh(slots)
-        return self.odds[slots][:, : self.num_particles]
+    def odds_and_counts(self, slots: IntArray) -> tuple[FloatArray, NDArray[np.int32]]:
+        """Return log-odds of existence, if it is estimated, and counts, (n, M) each, of slots (n,). Copies."""
+        of, own = self.map_of[slots, None], np.arange(self.num_particles)
+        places = np.where(of > 0, self.maps[of, own], own)
+        return self.odds[slots[:, None], places], self.counts[self.row_of[slots, None], places]
 
     def release(self, slots: IntArray) -> None:
         """Forget the landmarks of slots (n,), up to date, that no particle holds."""
@@ -428,38 +427,39 @@ class ParticleMaps(MapStore):
             self.odds[:n, :m] = self.log_odds_prior if odds is None else odds
         self._prepare_search(n)
 
-    @classmethod
-    def packed(
-        cls, values: FloatArray, counts: IntArray, descriptors: NDArray[np.float32], ids: IntArray,
-        identities: IntArray, next_id: int,
-    ) -> Self:  # fmt: skip
-        """Return the landmarks of a single particle, to be read only, in as little memory as they need.
+    def load_packed(
+        self, values: FloatArray, counts: IntArray, descriptors: NDArray[np.float32], ids: IntArray,
+        identities: IntArray, next_id: int, odds: FloatArray | None,
+    ) -> None:  # fmt: skip
+        """Take the landmarks of a single particle, to be read or replaced only, in as little memory as they need.
 
         Landmarks share rows: a row holds `LANES` of them, and ancestor map 1 + i reads lane i. No descriptor prefixes
         are written, so that such maps serve no data association, and their state is no valid snapshot of a filter.
-        Existence must not be estimated.
 
         Args:
             values: (n, 9) float64 [m, m^2], map frame.
             counts: (n,) measurement counts, 0 where the particle lacks the landmark.
             descriptors, ids, identities, next_id: See `load_metadata`.
+            odds: (n,) log-odds of existence; None if it is not estimated.
         """
-        self, n, slots = cls(1), len(ids), np.arange(len(ids))
-        rows = -(-n // LANES)
+        n, slots = len(ids), np.arange(len(ids))
+        rows, lanes = -(-n // LANES), slots % LANES
+        self._clear(1)
         self._grow_slots(max(n, 1), descriptors.shape[1])
         self._grow_rows(max(rows, 1))
         self.tops[:] = 0, 0, next_id
-        self.row_of[:n], self.map_of[:n] = slots // LANES, 1 + slots % LANES
+        self.row_of[:n], self.map_of[:n] = slots // LANES, 1 + lanes
         self.maps = np.zeros((1 + LANES, self.padded), np.int32)
         self.maps[1:, 0] = np.arange(LANES)
         self.users = np.bincount(self.map_of[:n], minlength=1 + LANES)
         self.ids[:n], self.identities[:n], self.descriptors[:n] = ids, identities, descriptors
         self.counts[:] = 0
-        self.counts[self.row_of[:n], slots % LANES] = counts
+        self.counts[self.row_of[:n], lanes] = counts
+        if odds is not None:
+            self.odds[slots, lanes] = odds
         whole = np.zeros((rows * LANES, 9))
         whole[:n] = values
         self.blocks[:rows, 0] = whole.reshape(rows, LANES, 9).transpose(0, 2, 1)
-        return self
 
     # ------------------------------------------------------------------ snapshots
 

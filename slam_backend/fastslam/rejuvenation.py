@@ -111,9 +111,7 @@ class NewLandmarks(NamedTuple):
         order, names = particles.ids.argsort(), maps.ids[slots]
         _, of_slots, at = np.intersect1d(names, particles.ids[order], assume_unique=True, return_indices=True)
         slots, rows = slots[of_slots], order[at]
-        odds = maps.dense_odds(slots)
-        if odds is not None:
-            odds = mean_odds(odds, maps.dense(slots)[1])
+        odds = None if maps.log_odds_prior is None else mean_odds(*maps.odds_and_counts(slots))
         return cls(
             particles.counts[rows, None], maps.descriptors[slots], maps.ids[slots], maps.identities[slots],
             maps.last_seen[slots], maps.next_id, odds, particles.landmarks, rows, walk,

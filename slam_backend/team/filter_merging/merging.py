@@ -125,12 +125,7 @@ def merge_filters(
     best = int(joint.path_log_weights.argmax())
     columns = descriptors, np.concatenate([ids_a, new_ids])[held], names[held]
     next_id = a.state.maps.next_id + spared + len(exclusive)
-    if on_trial:
-        joint.maps = ParticleMaps(1, joint.maps.log_odds_prior)
-        odds = None if odds is None else mean_odds(odds, kept)
-        kept = kept[:, [best]]
-    is_packed = on_trial and odds is None and joint.num_particles > 1
-    if not is_packed:
+    if not on_trial:
         joint.maps.load_metadata(kept, *columns, next_id, odds)
     # Each map takes half of the extra variance.
     scales = np.full(len(counts), scale)
@@ -140,10 +135,12 @@ def merge_filters(
     if on_trial:
         of_a, of_b = Landmarks.of(a.state.maps, from_a[[best]]), Landmarks.of(b.state.maps, from_b[[best]])
         motion = motion[[best]]
-    values = np.empty((len(held), 1, 9, 1)) if is_packed else joint.maps.blocks
+    values = np.empty((len(held), 1, 9, 1)) if on_trial else joint.maps.blocks
     write_joint(of_a, of_b, rows_a[held], rows_b[held], motion, 0.5 * extra, scales[held], values)
-    if is_packed:
-        joint.maps = ParticleMaps.packed(values.reshape(-1, 9), kept[:, 0], *columns, next_id)
+    if on_trial:
+        odds = None if odds is None else mean_odds(odds, kept)[:, 0]
+        joint.maps = ParticleMaps(1, joint.maps.log_odds_prior)
+        joint.maps.load_packed(values.reshape(-1, 9), kept[:, best], *columns, next_id, odds)
     joint.finish_join(a.state, b.state, renamed)
     return FastSlam.from_filter_state(joint), renamed
 

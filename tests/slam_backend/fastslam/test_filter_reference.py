@@ -96,7 +96,7 @@ def assert_same_particles(slam: FastSlam, plain: ReferenceFastSlam) -> None:
     np.testing.assert_allclose(np.where(held, means, 0.0), expected_means, **CLOSE)
     np.testing.assert_allclose(np.where(held, covariances, 0.0), expected_covariances, **CLOSE)
     if slam.options.existence is not None:
-        log_odds = slam.state.maps.dense_odds(slam.state.maps.used_slots())
+        log_odds, _ = slam.state.maps.odds_and_counts(slam.state.maps.used_slots())
         for m, particle in enumerate(plain.particles):
             for name, landmark in particle.landmarks.items():
                 assert log_odds[rows[name], m] == pytest.approx(landmark.log_odds, abs=1e-9)

@@ -315,16 +315,18 @@ def test_landmarks_at_one_place_do_not_change_the_rotation() -> None:
 
 
 @pytest.mark.parametrize("n", [0, 1, LANES - 1, LANES, LANES + 1, 200])
-def test_packed_landmarks_of_one_particle_read_like_others(n: int) -> None:
+@pytest.mark.parametrize("prior", [None, -0.4])
+def test_packed_landmarks_of_one_particle_read_like_others(n: int, prior: float | None) -> None:
     """Maps that share rows give the same landmarks in a fraction of the memory; so do their copies."""
     rng = np.random.default_rng(n)
     values, counts = rng.standard_normal((n, 9)), rng.integers(0, 4, n)
     ids, identities = np.sort(rng.permutation(3 * n)[:n]), rng.integers(-1, 50, n)
     descriptors = rng.standard_normal((n, 16 if n else 0)).astype(np.float32)
-    plain = ParticleMaps(1)
-    plain.load_metadata(counts[:, None], descriptors, ids, identities, 3 * n)
+    odds = rng.standard_normal(n) if prior is not None else None
+    plain, packed = ParticleMaps(1, prior), ParticleMaps(1, prior)
+    plain.load_metadata(counts[:, None], descriptors, ids, identities, 3 * n, None if odds is None else odds[:, None])
     plain.blocks[:n, 0, :, 0] = values
-    packed = ParticleMaps.packed(values, counts, descriptors, ids, identities, 3 * n)
+    packed.load_packed(values, counts, descriptors, ids, identities, 3 * n, odds)
     for maps in (packed, copy.deepcopy(packed), pickle.loads(pickle.dumps(packed))):
         for least in (1, 2):
             for found, expected in zip(best_map(maps, 0, least), best_map(plain, 0, least), strict=True):
@@ -336,4 +338,8 @@ def test_packed_landmarks_of_one_particle_read_like_others(n: int) -> None:
                 np.testing.assert_array_equal(found[: ends[0]], expected[: ends[0]])
         np.testing.assert_array_equal(maps.identities[maps.used_slots()], identities)
         assert maps.next_id == 3 * n
+        if odds is not None:
+            slots = maps.used_slots()
+            np.testing.assert_array_equal(maps.odds_of_particle(0, slots), odds)
+            np.testing.assert_array_equal(maps.odds_and_counts(slots), [odds[:, None], counts[:, None]])
     assert packed.values.size == 9 * LANES * max(-(-n // LANES), 1)
