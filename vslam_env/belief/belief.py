@@ -20,6 +20,7 @@ from slam_backend.smoother.options import SmoothingOptions
 from slam_backend.team.merge_scheduler import AttemptOptions
 from slam_backend.team.options import MergeOptions
 from vslam_env.navigation import CandidateGains, CandidateKind, OccupancyGrid
+from vslam_env.navigation.global_grids import GlobalGrids
 
 
 def default_filter_options() -> FilterOptions:
@@ -221,8 +222,7 @@ class BeliefBatch(NamedTuple):
         points: Poses, with one row per robot and columns for the team up to the last known robot.
         map_summaries: Summaries of the confirmed landmarks in the map frames.
         cells: (n, S, S) uint8. Cells of the occupancy grids.
-        looks: (n, S, S) uint8. Looks of the robots at walls.
-        bounds: (n, 4) int32. Bounds of the known parts of the grids, see `GridStorage`.
+        global_grids: Pictures of all that was seen.
         features: (n, C, F) float32, robot frames. Features of the candidates; a new array.
         seconds_left: Time until the episode is truncated [s].
     """
@@ -231,8 +231,7 @@ class BeliefBatch(NamedTuple):
     points: TeamPoses
     map_summaries: TeamMapSummaries
     cells: NDArray[np.uint8]
-    looks: NDArray[np.uint8]
-    bounds: NDArray[np.int32]
+    global_grids: GlobalGrids
     features: NDArray[np.float32]
     seconds_left: float
 
@@ -253,8 +252,7 @@ class BeliefBatch(NamedTuple):
             points=points,
             map_summaries=TeamMapSummaries.from_maps([belief.group_map.summary]),
             cells=belief.grid.cells[None],
-            looks=belief.looks[None],
-            bounds=belief.grid.bounds[None],
+            global_grids=GlobalGrids.of(belief.grid, belief.looks),
             features=belief.candidates.features[None].copy(),
             seconds_left=belief.seconds_left,
         )

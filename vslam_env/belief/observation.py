@@ -40,7 +40,7 @@ from vslam_env.belief._observation_kernels import (
     write_observations,
 )
 from vslam_env.belief.belief import Belief, BeliefBatch
-from vslam_env.navigation._view_kernels import COARSE, NUM_COARSE, write_global_grid
+from vslam_env.navigation._view_kernels import COARSE, NUM_COARSE
 from vslam_env.navigation.candidates import CANDIDATE_FEATURES, FIRST_KIND, NUM_CANDIDATES
 
 NUM_ACTIONS = 1 + NUM_CANDIDATES
@@ -81,9 +81,7 @@ def observe_team(view: BeliefBatch, scans: FloatArray, goal_actions: bool) -> li
     pictures = np.empty((count, len(CHANNELS), SIZE, SIZE), np.uint8)
     points, ((places, names), parts) = view.points, view.map_summaries
     counts, time_left = np.empty((count, len(COUNT_BINS)), np.float32), min(view.seconds_left, MAX_SECONDS_LEFT)
-    overviews, frames = np.empty((count, NUM_COARSE, COARSE, COARSE), np.uint8), np.empty((count, 3), np.float32)
-    for i in range(count):
-        write_global_grid(view.cells[i], view.looks[i], view.bounds[i], overviews[i], frames[i])
+    global_grids, frames = view.global_grids.pictures.copy(), view.global_grids.frames.copy()
     arrays = poses, deviations, stats, pictures, ranges, candidates, teammates, present, counts
     write_observations(view.robots, points.poses, points.beliefs, places, names, parts, view.cells, scans, arrays)
     observations: list[Observation] = []
@@ -99,7 +97,7 @@ def observe_team(view: BeliefBatch, scans: FloatArray, goal_actions: bool) -> li
             "teammates_mask": present[i],
             "landmark_counts": counts[i],
             "time_left": np.array([time_left], np.float32),
-            "global_grid": overviews[i],
+            "global_grid": global_grids[i],
             "global_grid_frame": frames[i],
         }
         if goal_actions:

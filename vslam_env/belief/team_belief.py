@@ -28,6 +28,7 @@ from vslam_env.navigation import CANDIDATE_FEATURES, CandidateKind, OccupancyGri
 from vslam_env.navigation._planning_kernels import FrontierColumns
 from vslam_env.navigation._view_kernels import write_goals
 from vslam_env.navigation.candidates import SLOT_KINDS
+from vslam_env.navigation.global_grids import GlobalGrids
 
 __all__ = ["Belief", "BeliefConfig", "Candidates", "RobotHardware", "TeamBelief", "Teammate"]
 
@@ -72,6 +73,7 @@ class TeamBelief:
         camera = config.filter.camera
         self._grids = SharedGrids(num_robots, body, camera)
         self.grids = self._grids.team
+        self._global_grids = GlobalGrids(num_robots)
         self._candidates = TeamCandidates(num_robots, (camera.half_fov, camera.max_range, body.radius))
         self._rendezvous = Rendezvous(num_robots)
         self._goals = np.full((num_robots, 2), np.nan)  # of each robot in its own start frame
@@ -215,7 +217,8 @@ class TeamBelief:
     def view(self) -> BeliefBatch:
         """Return the observable part of all robots' beliefs, sharing memory with the grids."""
         grids = self.grids
-        of_grids = grids.cells, self._grids.looks.counts, grids.bounds
+        self._global_grids.update(grids, self._grids.looks)
+        of_grids = grids.cells, self._global_grids
         return BeliefBatch(
             self._robots, self.points, self.map_summaries, *of_grids, self._features(), self._seconds_left
         )

@@ -138,7 +138,7 @@ class TeamCandidates:
             ways = frontiers.renew(cells, bounds, poses[robot], robot)
         gains = self._gains[robot], self._views[robot]
         slots = self._rows[robot], self._visits[robot], *gains, self._lengths[robot], robot, self._updates[robot]
-        seen = looks.counts[robot], looks.bounds[robot]
+        seen = looks.counts[robot], looks.bounds[robot], looks.stale[robot]
         renew_candidates(cells, bounds, seen, ways, landmarks, poses[robot], self._camera, places, slots)
 
     def _reach(self, robot: int, bounds: NDArray[np.int32]) -> float:

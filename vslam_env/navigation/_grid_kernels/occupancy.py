@@ -24,6 +24,8 @@ HIT = 3
 MOST_FREE, MOST_OCCUPIED = -8, 12
 
 MOST_CHANGES = 4096  # a grid keeps so many; a scan makes a hundred at most
+STALE = 16  # cells along a side of the parts in which changes are noted for pictures of the whole
+NUM_STALE = LARGEST_SIZE // STALE
 
 
 class Grid(NamedTuple):
@@ -37,12 +39,14 @@ class Grid(NamedTuple):
         changes: (1 + n,) int32. Number of changed verdicts, -1 if it is not known; then the places of these cells, see
             `place_of`.
         bounds: (4,) int32. First row and column of what is known, and one past the last ones; zeros if nothing is.
+        stale: (n, n) uint8. 1 where a verdict has changed in a part of the largest grid, see `mark_stale`.
     """
 
     evidence: NDArray[np.int8]
     cells: NDArray[np.uint8]
     changes: NDArray[np.int32]
     bounds: NDArray[np.int32]
+    stale: NDArray[np.uint8]
 
 
 @inline
@@ -56,6 +60,13 @@ def place_of(row: int, col: int, size: int) -> int:
     """Return the flat index in the largest grid of a cell of a grid of a size."""
     inset = (LARGEST_SIZE - size) // 2
     return (row + inset) * LARGEST_SIZE + col + inset
+
+
+@inline
+def mark_stale(stale: Any, row: int, col: int, size: int) -> None:
+    """Note that something has changed at a cell of a grid of a size."""
+    inset = (LARGEST_SIZE - size) // 2
+    stale[(row + inset) // STALE, (col + inset) // STALE] = 1
 
 
 @inline
@@ -84,6 +95,7 @@ def set_state(grid: Grid, row: int, col: int, verdict: int) -> None:
         if cells[row, col] == UNKNOWN:
             widen_bounds(bounds, row, col)
         cells[row, col] = verdict
+        mark_stale(grid.stale, row, col, len(cells))
         if 0 <= changes[0] < len(changes) - 1:
             changes[0] += 1
             changes[changes[0]] = place_of(row, col, len(cells))

@@ -36,7 +36,7 @@ from slam_backend.fastslam._kernels.layout import (
 from slam_backend.fastslam._kernels.records import Candidates, Frame, MapArrays, Motion, Outcome, Poses, Rules
 
 RUN = 64  # descriptors compared in one run
-LARGE_MAP = 3000  # landmarks above which a frame is compared with those in reach alone
+LARGE_MAP = 1000  # landmarks above which a frame is compared with those in reach alone
 SAMPLE = 8  # particles that tell where a landmark is: as many as lie in a line of memory
 SCATTER = 10.0  # [m]; by how much the other particles may disagree with these
 
