@@ -25,9 +25,16 @@ from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.fastslam.reports import StepReport
 from slam_backend.geometry import transform_points
 from slam_backend.maps import _kernels as kernels
-from slam_backend.maps.alignment import DISTINCT_ROTATION, DISTINCT_TRANSLATION, Alignment, AlignmentOptions, align_maps
-from slam_backend.maps.correspondences import has_enough_candidates, match_table
+from slam_backend.maps.alignment import (
+    DISTINCT_ROTATION,
+    DISTINCT_TRANSLATION,
+    Alignment,
+    AlignmentOptions,
+    align_candidates,
+)
+from slam_backend.maps.correspondences import candidates, has_enough_candidates, match_table, too_many
 from slam_backend.maps.landmark_map import LandmarkMap, unchecked_map
+from slam_backend.maps.near_pairs import Appearance, NearPairs, near_pairs
 from slam_backend.team.options import MergeOptions
 
 
@@ -89,6 +96,7 @@ class MergeMonitor:
     pre_merge_maps: tuple[LandmarkMap, LandmarkMap]
     exclusive_landmarks: tuple[set[int], set[int]]
     steps: int = field(default=0)
+    _near: NearPairs | None = field(default=None, init=False, repr=False)  # of the last check, and no part of a state
 
     def copy(self, new_ids: Mapping[int, int] | None = None) -> "MergeMonitor":
         """Return an independent monitor, with landmarks renamed if needed; constant parts are shared."""
@@ -118,13 +126,17 @@ class MergeMonitor:
             return True
         ids = joint.ids.tolist()
         masks = [np.fromiter(map(found.__contains__, ids), np.bool_, len(ids)) for found in self.exclusive_landmarks]
-        descriptors = [joint.descriptors[mask] for mask in masks]
-        if min(map(len, descriptors)) < options.min_inliers:
+        found = [Appearance(joint.ids[mask], joint.descriptors[mask]) for mask in masks]
+        if min(len(side.ids) for side in found) < options.min_inliers:
             return False
-        if not has_enough_candidates(descriptors[0], descriptors[1], options):
+        self._near = near_pairs(found[0], found[1], options, self._near)
+        if not has_enough_candidates(found[0].descriptors, found[1].descriptors, options, self._near):
             return False
-        parts = [joint.subset(mask) for mask in masks]
-        rival = align_maps(parts[0], parts[1], options=options)
+        parts = joint.subset(masks[0]), joint.subset(masks[1])
+        if too_many(*parts, options):
+            return False
+        pairs = candidates(*parts, options, self._near)
+        rival = align_candidates(*parts, pairs, "ransac", np.random.default_rng(0), options)
         if not rival.success or self._joined(options) > options.max_ratio * len(rival.inliers):
             return False
         return is_significant_motion(rival.transform, parts[1].means[rival.inliers[:, 1]])
