@@ -113,7 +113,7 @@ class MapStore:
         maps: (maps, P) int32. users: (maps,) int64, how many slots read by each.
         odds: (slots, P) float64. Log-odds that the landmark exists, read through its map as a row is; (0, P) without.
         descriptors: (slots, d) float32. heads: (h, slots) every (d / h)-th component of them, `FAR` where free.
-        places: (3, slots) float32. Where landmarks are, see `PlaceRows`; not part of a state.
+        places: (3, slots) float32. Positions of the landmarks, see `PlaceRows`; not part of a state.
         free_rows: A stack; `tops` = (its height, that of the free slots, the name of the next landmark).
     """
 

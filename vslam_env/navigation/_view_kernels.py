@@ -897,7 +897,7 @@ def _draw_global_grid(
     Args:
         cells, looks, bounds: See `write_global_grid`.
         is_whole: Whether all is drawn; else the bounds and the size of the grid must be those of the last time.
-        stale_cells, stale_looks: (n, n) uint8. Where anything has changed since, see `mark_stale`.
+        stale_cells, stale_looks: (n, n) uint8. 1 in the parts that have changed since, see `mark_stale`.
         picture, frame: See `write_global_grid`.
     """
     size = len(cells)
@@ -987,8 +987,8 @@ def update_global_grids(
     """Bring the pictures of K grids up to date, at a cost that follows what has changed unless their bounds have.
 
     Args:
-        cells, looks, bounds: As in `write_global_grid`, with one dimension more.
-        stale_cells, stale_looks: (K, n, n) uint8. Where anything has changed since the last time; set to 0.
+        cells, looks, bounds: Arrays of K grids, see `write_global_grid`.
+        stale_cells, stale_looks: (K, n, n) uint8. 1 in the parts that have changed since the last time; set to 0.
         drawn: (K, 5) int32. Size and bounds of the grids at the last time; changed.
         pictures, frames: (K, 3, 48, 48) uint8 and (K, 3) float32, see `write_global_grid`; changed.
     """

@@ -39,7 +39,7 @@ class GlobalGrids:
 
         Args:
             grids: Grids of the robots, always the same ones.
-            looks: Their looks, of the same size.
+            looks: Looks of the robots, of the same size.
         """
         update_global_grids(
             grids.cells, looks.counts, grids.bounds, grids.stale, looks.stale, self._drawn, self.pictures, self.frames

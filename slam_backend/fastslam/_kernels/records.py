@@ -25,7 +25,7 @@ class MapArrays(NamedTuple):
         tops: (3,). Heights of the stacks of free rows and of free slots, and the id of the next landmark.
         descriptors: (slots, d).
         heads: (h, slots). Every (d / h)-th component of the descriptors, `FAR` where the slot is free.
-        places: (3, slots). Where the landmarks are, see `PlaceRows`.
+        places: (3, slots). Positions of the landmarks, see `PlaceRows`.
     """
 
     values: FloatArray

@@ -129,7 +129,7 @@ def assert_alike(
     Args:
         scatter, largest_sigma, options: See `filter_with`.
         sigma, strangers: See `drive`.
-        farther: By what factor some landmarks are farther than others of their looks that are first seen.
+        farther: Factor by which some landmarks are farther than others of their looks, which are seen first [-].
     """
     rng = np.random.default_rng(7)
     points = np.column_stack([rng.uniform(-60.0, 60.0, (1500, 2)), rng.uniform(-0.5, 0.5, 1500)])
