@@ -12,6 +12,7 @@ import math
 import mmap
 import sys
 import weakref
+from collections.abc import Iterator
 from contextlib import suppress
 from typing import Any
 
@@ -467,11 +468,15 @@ class ParticleMaps(MapStore):
         """Return the attributes for copies and pickles, which share no arrays with states."""
         return vars(self) | {"_copied": _NOTHING_COPIED, "_memory": None}
 
-    def get_state(self) -> dict[str, Any]:
+    def get_state(self, for_copy: bool = False) -> dict[str, Any]:
         """Return the complete state of the maps, compact; `values` may be shared with other states and are read-only.
 
         They are a tuple of arrays (n, 9 P): one with all landmarks, or of more than `WHOLE` landmarks one for each
         `CHUNK`, so that those of landmarks that were not written since the last state need not be copied.
+
+        Args:
+            for_copy: Whether the state is restored at once, into other maps: `values` then are an iterator over such
+                arrays, so that only one of them takes memory at a time.
         """
         used = self.used_slots()
         of, rows = self.map_of[used], self.row_of[used]
@@ -481,7 +486,7 @@ class ParticleMaps(MapStore):
         number[live] = np.arange(1, len(live) + 1)
         return {
             "num_particles": self.num_particles,
-            "values": self._copied_values(used),
+            "values": self._values_in_parts(used) if for_copy else self._copied_values(used),
             "counts": np.take(self.counts, rows, axis=0),
             "odds": None if self.log_odds_prior is None else np.take(self.odds, used, axis=0),
             "maps": np.take(self.maps, live, axis=0),
@@ -492,6 +497,12 @@ class ParticleMaps(MapStore):
             "descriptors": self.descriptors[used],
             "next_id": self.next_id,
         }
+
+    def _values_in_parts(self, used: IntArray) -> Iterator[FloatArray]:
+        """Yield copies of the values of used slots, `CHUNK` landmarks at a time."""
+        values, rows = self.values.reshape(-1, 9 * self.padded), self.row_of[used]
+        for first in range(0, len(rows), CHUNK):
+            yield np.take(values, rows[first : first + CHUNK], axis=0)
 
     def _copied_values(self, used: IntArray) -> tuple[FloatArray, ...]:
         """Return the values of used slots, read-only; arrays of the last state that still hold are taken over."""
@@ -526,7 +537,7 @@ class ParticleMaps(MapStore):
             values[first : first + len(part)] = part
             first += len(part)
         self.table[SLOT.changed] = 0
-        if all(map(is_read_only, parts)):
+        if isinstance(parts, tuple) and all(map(is_read_only, parts)):
             self._copied = np.arange(n), list(map(weakref.ref, parts))
         self.counts[:n] = state["counts"]
         if self.log_odds_prior is not None:

@@ -467,11 +467,15 @@ class FilterState:
 
     # ------------------------------------------------------------------ snapshots
 
-    def get_state(self) -> dict[str, Any]:
-        """Return the complete state of the filter, its random stream included; shared parts are read-only."""
+    def get_state(self, for_copy: bool = False) -> dict[str, Any]:
+        """Return the complete state of the filter, its random stream included; shared parts are read-only.
+
+        Args:
+            for_copy: See `ParticleMaps.get_state`.
+        """
         logs = tuple(log.get_state() for log in self.logs)  # first, as it also updates the smoother
         state: dict[str, Any] = {name: getattr(self, name).copy() for name in KEPT}
-        state |= {"steps": self.next_step, "estimates": self.estimates.copy(), "maps": self.maps.get_state()}
+        state |= {"steps": self.next_step, "estimates": self.estimates.copy(), "maps": self.maps.get_state(for_copy)}
         state |= {"logs": logs, "consistency": self.consistency.get_state()}
         if self.rejuvenation is not None:
             state["rejuvenation"] = self.rejuvenation.get_state()

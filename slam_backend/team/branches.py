@@ -119,6 +119,7 @@ def restored_filter(state: Mapping[str, Any], at_hand: FastSlam | None = None) -
     """Return a filter with a state from `FastSlam.get_state`; reuse of a given one is faster than construction."""
     slam = at_hand if at_hand is not None else FastSlam.from_options(len(state["poses"]), state["options"])
     slam.restore_checked(state)
+    slam.may_smooth = True  # as in a new one
     return slam
 
 
@@ -188,10 +189,20 @@ def _silent_report(branch: Branch, rows: RobotRows, associations: Associations) 
     return StepReport(associations, rows.rows, 0, 0, 0, 0, ess, float("nan"), False)
 
 
-def fork(branch: Branch, active_robots: tuple[int, ...], number: int, rng: np.random.Generator) -> Branch:
-    """Copy a branch for robots that lose contact with it; the copy has its own random stream."""
+def fork(
+    branch: Branch, active_robots: tuple[int, ...], number: int, rng: np.random.Generator, at_hand: FastSlam | None
+) -> Branch:
+    """Copy a branch for robots that lose contact with it; the copy has its own random stream.
+
+    Args:
+        branch: The branch.
+        active_robots: Robots of the copy.
+        number: Number of its map.
+        rng: Generator that seeds its random stream.
+        at_hand: Filter that is no longer needed, whose memory the copy takes; or None.
+    """
     stream = np.random.default_rng(rng.integers(2**63, size=4)).bit_generator.state
-    slam = restored_filter(branch.filter.get_state() | {"rng": stream})
+    slam = restored_filter(branch.filter.state.get_state(for_copy=True) | {"rng": stream}, at_hand)
     return Branch(
         robots=branch.robots,
         active_robots=active_robots,

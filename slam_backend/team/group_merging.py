@@ -361,7 +361,7 @@ def _reassign_branch(branch: Branch, separated: list[Group], records: SharedReco
     homes = [group for group in separated if any(robot in group.robots for robot in branch.active_robots)]
     for group in homes[1:]:
         members = tuple(robot for robot in branch.active_robots if robot in group.robots)
-        copied = fork(branch, members, records.new_number(), records.rng)
+        copied = fork(branch, members, records.new_number(), records.rng, records.take_spare())
         records.copied(branch.number, copied.number)
         group.branches.append(copied)
     branch.active_robots = tuple(robot for robot in branch.active_robots if robot in homes[0].robots)

@@ -52,7 +52,7 @@ class Group:
             return
         for branch in list(self.branches):
             for part in split_by_component(branch.active_robots, networks)[1:]:
-                copied = fork(branch, part, records.new_number(), records.rng)
+                copied = fork(branch, part, records.new_number(), records.rng, records.take_spare())
                 records.copied(branch.number, copied.number)
                 branch.active_robots = tuple(robot for robot in branch.active_robots if robot not in part)
                 self.branches.append(copied)
@@ -94,6 +94,7 @@ class Group:
                 records.exchange.record_return(main.active_robots[0], known, counts, size)
                 main.active_robots = tuple(sorted(main.active_robots + other.active_robots))
                 self.branches = [branch for branch in self.branches if branch is not other]
+                records.spare = other.filter
 
     def _rank(self, branch: Branch) -> tuple[bool, int, int, int]:
         """Return the sort key of branches in contact: the trunk first, then the one with the most merges."""

@@ -88,3 +88,16 @@ def test_values_divided_in_another_way_are_refused() -> None:
     maps = state["maps"] | {"values": (np.concatenate(state["maps"]["values"]),)}
     with pytest.raises(ValueError, match=r"state\['maps'\]\['values'\]"):
         slam.set_state(state | {"maps": maps})
+
+
+@pytest.mark.usefixtures("small_chunks")
+def test_maps_are_copied_part_by_part() -> None:
+    """A state for a copy gives the same maps as any other, and neither takes nor changes what states share."""
+    slam, readings = large_filter()
+    shared = slam.get_state()["maps"]
+    copied = particle_maps.ParticleMaps(slam.num_particles)
+    copied.set_state(slam.state.maps.get_state(for_copy=True))
+    assert_same(copied.get_state(), shared)
+    assert all(one is other for one, other in zip(slam.get_state()["maps"]["values"], shared["values"], strict=True))
+    slam.step(*readings[0])
+    assert_same(copied.get_state(), shared)

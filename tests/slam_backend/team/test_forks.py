@@ -261,3 +261,25 @@ def test_a_team_with_forks_continues_from_a_snapshot_bit_for_bit(steps_before: i
         live(team, readings_of(simulation, 1), contacts)
     check_snapshot(simulation, team, plan[steps_before - 20 :])
     assert branches(team) == {(0, 1, 2)}
+
+
+@pytest.mark.parametrize("options", [{}, {"rejuvenate_every": 6}, {"existence": ExistenceModel()}])
+def test_a_fork_in_the_memory_of_the_last_one_does_the_same(options: dict[str, Any]) -> None:
+    """A filter that is no longer needed leaves nothing behind in the next fork, nor in states and copies."""
+    simulation = SimulatedTeam(seed=4)
+    team = merged_team(simulation, 20, **options)
+    other = copy.deepcopy(team)
+    for apart in ((0, 1), (1, 2), (0, 2)):
+        for contacts, steps in ((links(3, apart), 12), (None, 6)):
+            readings = readings_of(simulation, steps)
+            spare = team._records.spare
+            live(team, readings, contacts)
+            live(other, readings, contacts)
+            assert_same(team.get_state(), other.get_state())
+            forks = [branch.filter for group in team._groups for branch in group.branches[1:]]
+            assert len(forks) == (contacts is not None)
+            assert all(fork is spare for fork in forks if spare is not None)
+        assert branches(team) == {(0, 1, 2)}
+        assert team._records.spare is not None
+        assert copy.deepcopy(team)._records.spare is None
+        other._records.spare = None
