@@ -258,7 +258,8 @@ class MapStore:
         if old and len(self.heads):
             heads[:, :old] = self.heads
         self.heads = heads
-        places = np.full((len(self.places), old + extra), _kernels.FAR)
+        places = np.zeros((len(self.places), old + extra), np.float32)
+        places[PLACE.x, old:] = _kernels.FAR
         places[:, :old] = self.places
         self.places = places
         if self.log_odds_prior is not None:
