@@ -96,9 +96,8 @@ class MergeMonitor:
     pre_merge_maps: tuple[LandmarkMap, LandmarkMap]
     exclusive_landmarks: tuple[set[int], set[int]]
     steps: int = field(default=0)
-    _near: NearPairs | None = field(
-        default=None, init=False, repr=False
-    )  # pairs of the last check; not part of a state
+    # Pairs of landmarks with near descriptors in the last check; not part of a state.
+    _near: NearPairs | None = field(default=None, init=False, repr=False)
 
     def copy(self, new_ids: Mapping[int, int] | None = None) -> "MergeMonitor":
         """Return an independent monitor, with landmarks renamed if needed; constant parts are shared."""

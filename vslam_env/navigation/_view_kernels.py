@@ -17,7 +17,7 @@ from vslam_env.navigation._grid_kernels import (
     LARGEST_HALF_WIDTH,
     LARGEST_SIZE,
     OCCUPIED,
-    STALE,
+    TILE,
     UNKNOWN,
     cell_index,
     margin_of,
@@ -189,22 +189,15 @@ def count_looks_at(looks: Any, bounds: Any, stale: Any, row: int, col: int, more
 
 @in_place
 def paint_looks(
-    looks: Any,
-    bounds: Any,
-    stale: Any,
-    shared: Any,
-    poses: Any,
-    scans: Any,
-    directions: Any,
-    reach: float,
+    looks: Any, bounds: Any, stale: Any, shared: Any, poses: Any, scans: Any, directions: Any, reach: float,
     points: Any,
-) -> None:
+) -> None:  # fmt: skip
     """Count the looks of a tick, once a scan and cell.
 
     Args:
         looks: (K, S, S) uint8. Looks of the grids of K robots; changed.
         bounds: (K, 4) int32. Bounds of those that are not zero, as in `GridStorage`; changed.
-        stale: (K, n, n) uint8. Parts in which looks have changed; written.
+        stale: (K, n, n) uint8. Tiles in which looks have changed, see `mark_stale`; written.
         shared: (K, K) int64. See `TeamGrids.update`.
         poses: (K, K, 3) [m, m, rad]. See there.
         scans: (K, R) [m]. See there.
@@ -236,7 +229,7 @@ def merge_looks(
     """Add the looks (S', S') uint8 of another grid, whose start pose in this one is (x, y, theta), to looks (S, S).
 
     Bounds (4,) int32 of the part of either that is not zero are given, as in `GridStorage`; those of looks change, and
-    the parts that have changed are marked.
+    the tiles that have changed are marked.
     """
     c, s = math.cos(theta), math.sin(theta)
     size, others = len(looks), len(other)
@@ -522,7 +515,7 @@ def keep_revisits(
 ) -> None:  # fmt: skip
     """Keep the revisit candidates (m, 5) with something left to gain, and empty the other slots.
 
-    Looks (S, S), their bounds (4,) and the parts that have changed are given together. Values (n,) of targets (n, 6)
+    Looks (S, S), their bounds (4,) and the tiles that have changed are given together. Values (n,) of targets (n, 6)
     that candidates cover become 0. Distant candidates, a mask (m,), stay as they are.
     """
     looks, looks_bounds, stale = seen
@@ -709,7 +702,7 @@ def renew_candidates(
         cells: (S, S) uint8. Cells of the robot's grid.
         bounds: (4,) int32. Bounds of its known part.
         seen: Looks of the grid (S, S) uint8, of which those at walls that cannot be seen are set to the largest number;
-            their bounds (4,) int32; and the parts that have changed, see `TeamLooks`, written.
+            their bounds (4,) int32; and the tiles that have changed, see `TeamLooks`, written.
         ways: Paths from the robot, of `dijkstra`. Where they cover a part of the known floor, candidates of which they
             tell nothing (`is_settled`) stay as they are.
         landmarks: All landmarks of the robot's map (n, 4), their counts (n, 2), and the motion (3,) from the map frame
@@ -867,23 +860,23 @@ def _mark_stale_blocks(
     """Write 1 for the blocks of a row of the picture in which anything may have changed, or just beside, else 0.
 
     Args:
-        stale_cells, stale_looks: (n, n) uint8. Parts that have changed, see `mark_stale`.
+        stale_cells, stale_looks: (n, n) uint8. Tiles that have changed, see `mark_stale`.
         top, bottom: First row of the blocks, and one past the last, in the largest grid.
         left: First column of the first block, in the largest grid.
         scale: Columns of a block.
         columns: (n,) uint8. Workspace.
         blocks: (>= 48,) uint8. Output.
     """
-    last_part = len(stale_cells) - 1
-    begin, end = max(left - 1, 0) // STALE, min((left + COARSE * scale) // STALE, last_part) + 1
+    last_tile = len(stale_cells) - 1
+    begin, end = max(left - 1, 0) // TILE, min((left + COARSE * scale) // TILE, last_tile) + 1
     columns[begin:end] = 0
-    for row in range(max(top - 1, 0) // STALE, min(bottom // STALE, last_part) + 1):
-        for part in range(begin, end):
-            columns[part] |= stale_cells[row, part] | stale_looks[row, part]
+    for row in range(max(top - 1, 0) // TILE, min(bottom // TILE, last_tile) + 1):
+        for tile in range(begin, end):
+            columns[tile] |= stale_cells[row, tile] | stale_looks[row, tile]
     for block in range(COARSE):
         first, is_stale = left + block * scale, 0
-        for part in range(max(first - 1, 0) // STALE, min((first + scale) // STALE, last_part) + 1):
-            is_stale |= columns[part]
+        for tile in range(max(first - 1, 0) // TILE, min((first + scale) // TILE, last_tile) + 1):
+            is_stale |= columns[tile]
         blocks[block] = is_stale
 
 
@@ -897,7 +890,7 @@ def _draw_global_grid(
     Args:
         cells, looks, bounds: See `write_global_grid`.
         is_whole: Whether all is drawn; else the bounds and the size of the grid must be those of the last time.
-        stale_cells, stale_looks: (n, n) uint8. 1 in the parts that have changed since, see `mark_stale`.
+        stale_cells, stale_looks: (n, n) uint8. 1 for the tiles that have changed since, see `mark_stale`.
         picture, frame: See `write_global_grid`.
     """
     size = len(cells)
@@ -914,7 +907,7 @@ def _draw_global_grid(
     for k in range(len(shades)):
         shades[k] = k * 255 // (scale * scale)
     counts, columns = np.empty((4, width), np.uint16), np.empty(width + 2, np.uint16)
-    sums, parts = np.empty((4, COARSE), np.int32), np.empty(len(stale_cells), np.uint8)
+    sums, tiles = np.empty((4, COARSE), np.int32), np.empty(len(stale_cells), np.uint8)
     blocks = np.ones(COARSE + 1, np.uint8)
     blocks[COARSE] = 0
     if is_whole:
@@ -924,7 +917,7 @@ def _draw_global_grid(
         if begin >= end:
             continue
         if not is_whole:
-            _mark_stale_blocks(stale_cells, stale_looks, begin + inset, end + inset, left + inset, scale, parts, blocks)
+            _mark_stale_blocks(stale_cells, stale_looks, begin + inset, end + inset, left + inset, scale, tiles, blocks)
         c = 0
         while c < COARSE:
             if blocks[c] == 0:
@@ -988,7 +981,7 @@ def update_global_grids(
 
     Args:
         cells, looks, bounds: Arrays of K grids, see `write_global_grid`.
-        stale_cells, stale_looks: (K, n, n) uint8. 1 in the parts that have changed since the last time; set to 0.
+        stale_cells, stale_looks: (K, n, n) uint8. 1 for the tiles that have changed since the last time; set to 0.
         drawn: (K, 5) int32. Size and bounds of the grids at the last time; changed.
         pictures, frames: (K, 3, 48, 48) uint8 and (K, 3) float32, see `write_global_grid`; changed.
     """

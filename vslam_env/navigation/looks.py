@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from slam_backend.core import state_checks as check
 from slam_backend.core.validation import FloatArray, IntArray
-from vslam_env.navigation._grid_kernels import GRID_SIZE, NUM_STALE
+from vslam_env.navigation._grid_kernels import GRID_SIZE, NUM_TILES
 from vslam_env.navigation._view_kernels import merge_looks, paint_looks
 from vslam_env.navigation.grid_storage import check_corner, known_bounds, margin
 from vslam_env.navigation.validation import pose_floats, ray_directions
@@ -35,7 +35,7 @@ class TeamLooks:
     Attributes:
         counts: (K, S, S) uint8. Looks at each cell; a new array when the looks grow.
         bounds: (K, 4) int32. Bounds of the cells with looks, as in `GridStorage`.
-        stale: (K, n, n) uint8. Parts in which looks have changed, as in `GridStorage`.
+        stale: (K, n, n) uint8. 1 for the tiles in which looks have changed, as in `GridStorage`.
     """
 
     def __init__(self, num_robots: int, angles: FloatArray, half_fov: float, reach: float) -> None:
@@ -44,7 +44,7 @@ class TeamLooks:
         self._directions[:, np.abs(angles) > half_fov + SLACK] = 0.0
         self.counts: NDArray[np.uint8] = np.zeros((num_robots, GRID_SIZE, GRID_SIZE), np.uint8)
         self.bounds: NDArray[np.int32] = np.zeros((num_robots, 4), np.int32)
-        self.stale: NDArray[np.uint8] = np.ones((num_robots, NUM_STALE, NUM_STALE), np.uint8)
+        self.stale: NDArray[np.uint8] = np.ones((num_robots, NUM_TILES, NUM_TILES), np.uint8)
 
     def update(self, shared: IntArray, poses: FloatArray, scans: FloatArray, size: int) -> None:
         """Count the looks of a tick; see `TeamGrids.update` for the arguments.

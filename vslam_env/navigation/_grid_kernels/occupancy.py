@@ -24,8 +24,8 @@ HIT = 3
 MOST_FREE, MOST_OCCUPIED = -8, 12
 
 MOST_CHANGES = 4096  # a grid keeps so many; a scan makes a hundred at most
-STALE = 16  # cells along a side of the parts in which changes are noted for pictures of the whole
-NUM_STALE = LARGEST_SIZE // STALE
+TILE = 16  # cells along a side of the tiles in which changes are noted, for pictures of the whole
+NUM_TILES = LARGEST_SIZE // TILE
 
 
 class Grid(NamedTuple):
@@ -39,7 +39,8 @@ class Grid(NamedTuple):
         changes: (1 + n,) int32. Number of changed verdicts, -1 if it is not known; then the places of these cells, see
             `place_of`.
         bounds: (4,) int32. First row and column of what is known, and one past the last ones; zeros if nothing is.
-        stale: (n, n) uint8. 1 where a verdict has changed in a part of the largest grid, see `mark_stale`.
+        stale: (n, n) uint8. 1 for the tiles of the largest grid in which a verdict has changed. Like `changes`, they
+            are for one reader, which clears them: coverage asks which cells have changed, pictures of the whole where.
     """
 
     evidence: NDArray[np.int8]
@@ -64,9 +65,9 @@ def place_of(row: int, col: int, size: int) -> int:
 
 @inline
 def mark_stale(stale: Any, row: int, col: int, size: int) -> None:
-    """Note that something has changed at a cell of a grid of a size."""
+    """Mark the tile (of n x n) that contains a cell of a grid of a size: something has changed there."""
     inset = (LARGEST_SIZE - size) // 2
-    stale[(row + inset) // STALE, (col + inset) // STALE] = 1
+    stale[(row + inset) // TILE, (col + inset) // TILE] = 1
 
 
 @inline
