@@ -14,12 +14,13 @@ from slam_backend.core.validation import argument_error
 
 MOST_PIXELS = 50_000_000  # 350 x 350 m of a ROS map with cells of 5 cm
 MOST_MEGABYTES = 512
+FORMATS = ("PNG", "JPEG", "PPM", "BMP", "WEBP", "GIF")  # libtiff prints lines of its own
 
 Pixels = NDArray[np.uint8]
 
 
 def read_image(path: str | PathLike[str], name: str = "path", hint: str = "Save it as PNG.") -> tuple[Pixels, Pixels]:
-    """Read an image file in any format that Pillow knows: PNG, JPEG, PGM, BMP, TIFF, WebP.
+    """Read an image file: PNG, JPEG, PGM, PPM, BMP, WebP or GIF.
 
     Values of PGM files are scaled by their largest value. Of 16 bits the upper 8 are kept, or the lower 8 where no
     value uses the upper ones. The orientation that a camera noted is applied.
@@ -42,10 +43,10 @@ def read_image(path: str | PathLike[str], name: str = "path", hint: str = "Save 
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # Pillow's own limit of pixels, and remarks on metadata
-            with Image.open(io.BytesIO(content)) as image:
+            with Image.open(io.BytesIO(content), formats=FORMATS) as image:
                 width, height = image.size
                 if width * height > MOST_PIXELS:
-                    raise _TooLargeError(f"an image of {width} x {height} px")
+                    raise _TooLargeError(f"a size of {width} x {height} px")
                 image.load()
                 return _colours(ImageOps.exif_transpose(image))
     except _TooLargeError as error:
@@ -53,7 +54,7 @@ def read_image(path: str | PathLike[str], name: str = "path", hint: str = "Save 
         raise argument_error(name, expected, str(error), f"Scale down or crop {str(path)!r}.") from None
     except Image.DecompressionBombError as error:  # raised by Pillow before the size is known here
         expected = f"an image of at most {MOST_PIXELS / 1e6:.0f} million pixels"
-        raise argument_error(name, expected, "a larger one", f"Scale down or crop {str(path)!r}.") from error
+        raise argument_error(name, expected, "a larger image", f"Scale down or crop {str(path)!r}.") from error
     except UnidentifiedImageError as error:
         raise argument_error(name, "an image file", Path(path), hint) from error
     except Exception as error:  # decoders raise errors of many kinds for damaged files
@@ -82,12 +83,12 @@ def grey_levels(colours: Pixels) -> Pixels:
     return np.asarray(cv2.cvtColor(colours, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
 
 
-def blend_over_white(grey: Pixels, opacity: Pixels) -> Pixels:
-    """Return grey levels (H, W) uint8 on a white page."""
+def blend_over_white(pixels: Pixels, opacity: Pixels) -> Pixels:
+    """Return grey levels (H, W) or colours (H, W, 3) uint8 on a white page, given their opacity (H, W) uint8."""
     if opacity.min(initial=255) == 255:
-        return grey
-    share = opacity.astype(np.uint16)
-    return ((grey * share + 255 * (255 - share) + 127) // 255).astype(np.uint8)
+        return pixels
+    share = opacity.astype(np.uint16).reshape(opacity.shape + (1,) * (pixels.ndim - 2))
+    return ((pixels * share + 255 * (255 - share) + 127) // 255).astype(np.uint8)
 
 
 def _colours(image: Any) -> tuple[Pixels, Pixels]:

@@ -18,6 +18,10 @@ Source = Annotated[
 FirstSeed = Annotated[int, typer.Option(help="First world seed.")]
 Seeds = Annotated[int, typer.Option(help="Number of world seeds.")]
 Robots = Annotated[int, typer.Option(help="Number of robots to place.")]
+Outside = Annotated[
+    str | None,
+    typer.Option(help="drop or keep the free space around the building of a plan.", show_default="drop"),
+]
 
 
 @worlds.command("list")
@@ -50,7 +54,7 @@ def list_worlds(seeds: Annotated[int, typer.Option(help="Number of worlds measur
 @worlds.command("preview")
 def preview(
     world: Source, out: Annotated[Path, typer.Option(help="PNG file to write.")] = Path("worlds.png"),
-    first_seed: FirstSeed = 0, seeds: Seeds = 4, robots: Robots = 3,
+    first_seed: FirstSeed = 0, seeds: Seeds = 4, robots: Robots = 3, outside: Outside = None,
 ) -> None:  # fmt: skip
     """Draw the worlds of some seeds, with landmarks and start poses, into one picture."""
     import imageio.v3 as imageio
@@ -64,13 +68,15 @@ def preview(
         raise argument_error("out", "a name that ends in .png", out, "Pictures are written as PNG.")
     check_writable(out, "out")
     with compilation_progress(Console(stderr=True)):
-        picture = contact_sheet(world, first_seed, seeds, robots)
+        picture = contact_sheet(_with_outside(world, outside), first_seed, seeds, robots)
     write_file(out, imageio.imwrite("<bytes>", picture, extension=".png"), "out")
     Console(highlight=False).print(f"Picture: {out}", soft_wrap=True)
 
 
 @worlds.command("validate")
-def validate(world: Source, first_seed: FirstSeed = 0, seeds: Seeds = 20, robots: Robots = 3) -> None:
+def validate(
+    world: Source, first_seed: FirstSeed = 0, seeds: Seeds = 20, robots: Robots = 3, outside: Outside = None
+) -> None:
     """Build the worlds of some seeds and place robots in them; a failure gives exit status 2."""
     from rich.table import Table
 
@@ -79,15 +85,16 @@ def validate(world: Source, first_seed: FirstSeed = 0, seeds: Seeds = 20, robots
 
     check_int("seeds", seeds, 1, "Use at least one world.")
     check_int("first_seed", first_seed, 0, "Use 0 or a positive number.")
-    found = survey_all(world, range(first_seed, first_seed + seeds), robots)
+    found = survey_all(_with_outside(world, outside), range(first_seed, first_seed + seeds), robots)
     table = Table("figure", "least", "most", title=f"{found[0].name}: {seeds} of {seeds} worlds are valid")
+    gaps = [("smallest distance between starts, m", [each.start_gap_m for each in found])] if robots > 1 else []
     for title, values in (
         ("walls", [float(each.walls) for each in found]),
         ("observable landmarks", [float(each.landmarks) for each in found]),
         ("floor, m²", [each.floor_m2 for each in found]),
         ("width, m", [each.width_m for each in found]),
         ("height, m", [each.height_m for each in found]),
-        ("smallest distance between starts, m", [each.start_gap_m for each in found]),
+        *gaps,
     ):
         table.add_row(title, f"{min(values):.4g}", f"{max(values):.4g}")
     Console().print(table)
@@ -103,6 +110,7 @@ def import_world(
     tolerance_px: Annotated[
         float, typer.Option(help="Tolerance of the polygon approximation of outlines in pixels.")
     ] = 1.0,
+    outside: Outside = None,
 ) -> None:
     """Trace the walls of a map and write them as .json, which can be edited."""
     from slam_backend.core.validation import argument_error
@@ -112,9 +120,11 @@ def import_world(
         if metres_per_pixel is not None:
             hint = "Change resolution in the file instead."
             raise argument_error("metres_per_pixel", "no value for a ROS map", metres_per_pixel, hint)
-        traced = load_ros_map(plan, tolerance_px)
+        traced = load_ros_map(plan, tolerance_px, outside=outside or "drop")
     else:
-        traced = load_floorplan(plan, 0.045 if metres_per_pixel is None else metres_per_pixel, tolerance_px)
+        traced = load_floorplan(
+            plan, 0.045 if metres_per_pixel is None else metres_per_pixel, tolerance_px, outside=outside or "drop"
+        )
     FreeSpace(traced)  # refuses a world without room for a robot
     if out.suffix.lower() != ".json":
         raise argument_error("out", "a name that ends in .json", out, "The suffix determines the format.")
@@ -122,6 +132,11 @@ def import_world(
     x_min, y_min, x_max, y_max = traced.bounds
     size = f"{x_max - x_min:.1f} x {y_max - y_min:.1f} m"
     Console(highlight=False).print(f"{out}: {len(traced.walls)} walls, {size}", soft_wrap=True)
+
+
+def _with_outside(world: str, outside: str | None) -> str:
+    """Add the option `--outside` to the path of a plan."""
+    return world if outside is None else f"{world}:outside={outside}"
 
 
 def _span(values: list[int]) -> str:

@@ -1,7 +1,8 @@
 """Construction of worlds from names, paths and functions."""
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import lru_cache
 from inspect import signature
 from pathlib import Path
@@ -9,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.core.validation import argument_error, is_built_in
+from slam_backend.core.text_files import existing_file
+from slam_backend.core.validation import argument_error, check_choice, is_built_in
 from vslam_env.world.generators.campus import campus
 from vslam_env.world.generators.fig5 import fig5
 from vslam_env.world.generators.hall import hall
@@ -17,8 +19,8 @@ from vslam_env.world.generators.loops import loops
 from vslam_env.world.generators.maze import maze
 from vslam_env.world.generators.office import office
 from vslam_env.world.generators.rooms import rooms
-from vslam_env.world.loaders.floorplan import existing, load_floorplan, load_walls_json
-from vslam_env.world.loaders.ros_map import load_ros_map
+from vslam_env.world.loaders.floorplan import OUTSIDE, load_floorplan, load_walls_json
+from vslam_env.world.loaders.ros_map import image_of_ros_map, load_ros_map
 from vslam_env.world.loaders.splits import files_of_split
 from vslam_env.world.spec import World
 
@@ -36,9 +38,15 @@ WORLD_FAMILIES: dict[str, Callable[..., World]] = {
 }
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm")
 MAP_SUFFIXES = (".yaml", ".yml")
-PLAN_OPTIONS = ("metres_per_pixel", "tolerance_px")
+PLAN_OPTIONS = ("metres_per_pixel", "tolerance_px", "outside")  # parameters of loaders that a path may set
 NAME_AND_OPTIONS = re.compile(r"(.*?)((?::[a-z_]+=[^:=]*)*)", re.DOTALL)
-FILE_SUFFIXES = (*IMAGE_SUFFIXES, *MAP_SUFFIXES, ".json")
+LOADERS: dict[str, Callable[..., World]] = {
+    **dict.fromkeys(IMAGE_SUFFIXES, load_floorplan),
+    **dict.fromkeys(MAP_SUFFIXES, load_ros_map),
+    ".json": load_walls_json,
+}
+Options = dict[str, float | str]
+Stamp = tuple[str, int, int, int]
 
 
 def make_world(world: WorldSource, rng: np.random.Generator, split: str | None = None) -> World:
@@ -47,8 +55,8 @@ def make_world(world: WorldSource, rng: np.random.Generator, split: str | None =
     Args:
         world: Family name (see `WORLD_FAMILIES`); path of a floor plan (.png, .jpg, .pgm), of a ROS map (.yaml), of a
             .json file of walls, or of a folder of such files to draw from; `World`; or a function of `rng` that returns
-            a `World`. Options follow the name of a family or the path of floor plans:
-            `"rooms:extent=120:room=10"`, `"plan.png:metres_per_pixel=0.1"`.
+            a `World`. Options follow the name of a family or the path of plans: `"rooms:extent=120:room=10"`,
+            `"plan.png:metres_per_pixel=0.1"`, `"map.yaml:outside=keep"`.
         rng: Source of all draws.
         split: Split of the files in a folder, see `splits`; ignored for other sources.
 
@@ -78,10 +86,11 @@ def check_source(world: object) -> None:
     if isinstance(world, (str, Path)):
         name, options = _parted(str(world))
         if name not in WORLD_FAMILIES:
-            files = _files(name)
-            if options and not any(file.suffix.lower() in IMAGE_SUFFIXES for file in files):
-                hint = "ROS maps and files of walls contain their scale."
-                raise argument_error("world", "no options for a path without a floor plan", str(world), hint)
+            loaders = {LOADERS[file.suffix.lower()] for file in _files(name)}
+            for option in options:
+                if not any(option in _options_of(loader) for loader in loaders):
+                    hint = "ROS maps and files of walls contain their scale."
+                    raise argument_error("world", f"no option {option!r} for files of this kind", str(world), hint)
     elif isinstance(world, World):
         return
     elif callable(world):
@@ -119,7 +128,7 @@ def portable_source(world: str) -> str:
     return world if _parted(world)[0] in WORLD_FAMILIES else str(Path(world).resolve())
 
 
-def _parted(world: str) -> tuple[str, dict[str, float]]:
+def _parted(world: str) -> tuple[str, Options]:
     """Part a family or path from its options, such as `:extent=120:room=10`.
 
     Raises:
@@ -128,40 +137,61 @@ def _parted(world: str) -> tuple[str, dict[str, float]]:
     found = NAME_AND_OPTIONS.fullmatch(world)
     name, text = found.groups() if found else (world, "")
     known = PLAN_OPTIONS if name not in WORLD_FAMILIES else tuple(signature(WORLD_FAMILIES[name]).parameters)[1:]
-    options: dict[str, float] = {}
+    options: Options = {}
     for option in text.split(":")[1:]:
         key, value = option.split("=")
         if key not in known or key in options:
             hint = f"Options: {', '.join(known)}, each once." if known else "This family has no options."
             raise argument_error("world", f"options that {name!r} has", world, hint)
         try:
-            options[key] = float(value)
+            options[key] = check_choice("world: outside", value, OUTSIDE) if key == "outside" else float(value)
         except ValueError as error:
+            if key == "outside":
+                raise
             raise argument_error("world", f"a number for {key!r}", world, f"Write {name}:{key}=...") from error
     return name, options
 
 
-def _load(world: str, options: Mapping[str, float], rng: np.random.Generator, split: str | None) -> World:
+def _load(world: str, options: Options, rng: np.random.Generator, split: str | None) -> World:
     """Load the world at a path, or a random one of a folder."""
     files = _files(world)
     if Path(world).is_dir() and split is not None:
         files = files_of_split(files, split)
     path = files[int(rng.integers(len(files)))] if Path(world).is_dir() else files[0]
-    return _read(path, path.stat().st_mtime_ns, tuple(options.items()))
+    with _file_named(path):
+        used = (path, image_of_ros_map(path)) if path.suffix.lower() in MAP_SUFFIXES else (path,)
+    return _read(path, tuple(_stamp(file) for file in used), tuple(options.items()))
+
+
+def _stamp(file: Path) -> Stamp:
+    """Return what changes when a file is edited or replaced."""
+    status = file.stat()
+    return str(file), status.st_mtime_ns, status.st_size, status.st_ino
 
 
 @lru_cache(maxsize=64)
-def _read(path: Path, changed: int, options: tuple[tuple[str, float], ...]) -> World:
-    """Load a file, cached by path, time of change and options of floor plans; errors name the file."""
-    suffix = path.suffix.lower()
+def _read(path: Path, stamps: tuple[Stamp, ...], options: tuple[tuple[str, float | str], ...]) -> World:
+    """Load a file, cached by its options and by the stamps of all files that it is read from."""
+    loader = LOADERS[path.suffix.lower()]
+    known = _options_of(loader)
+    with _file_named(path):
+        return loader(path, **{name: value for name, value in options if name in known})
+
+
+@contextmanager
+def _file_named(path: Path) -> Iterator[None]:
+    """Add the path to errors that do not name it."""
     try:
-        if suffix in MAP_SUFFIXES:
-            return load_ros_map(path)
-        return load_walls_json(path) if suffix == ".json" else load_floorplan(path, **dict(options))
+        yield
     except ValueError as error:
         if str(path) in str(error):
             raise
         raise ValueError(f"{error} The file is {path}.") from error
+
+
+def _options_of(loader: Callable[..., World]) -> tuple[str, ...]:
+    """Return the options that a path may set of a loader of files."""
+    return tuple(name for name in PLAN_OPTIONS if name in signature(loader).parameters)
 
 
 def _files(world: str) -> list[Path]:
@@ -172,18 +202,18 @@ def _files(world: str) -> list[Path]:
     except OSError as error:  # e.g. a name too long for the system
         raise argument_error("world", "a file", Path(path), f"Check the path: {error.strerror}.") from error
     if is_folder and world != "":  # Path("") is the current folder
-        files = sorted(p for p in path.iterdir() if p.suffix.lower() in FILE_SUFFIXES)
+        files = sorted(p for p in path.iterdir() if p.suffix.lower() in LOADERS)
         maps = {file.stem for file in files if file.suffix.lower() in MAP_SUFFIXES}
         files = [file for file in files if file.stem not in maps or file.suffix.lower() not in IMAGE_SUFFIXES]
         if not files:
             hint = "Add .png, .jpg, .pgm, .yaml or .json files."
             raise argument_error("world", "a folder with floor plans", Path(path), hint)
         return files
-    if path.suffix.lower() not in FILE_SUFFIXES:
+    if path.suffix.lower() not in LOADERS:
         names = ", ".join(repr(name) for name in WORLD_FAMILIES)
         hint = "Check the spelling, or that the file ends in .png, .jpg, .pgm, .yaml or .json."
         if world.split(":")[0] in WORLD_FAMILIES:
             hint = "Write options as in rooms:extent=60:room=10."
         expected = f"one of {names}, or a path of an image, a .yaml or .json file or a folder"
         raise argument_error("world", expected, world, hint)
-    return [existing(path)]
+    return [existing_file(path, "world")]

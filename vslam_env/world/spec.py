@@ -12,7 +12,21 @@ from slam_backend.core.validation import FloatArray, IntArray, argument_error, c
 SHORTEST_WALL = 1e-3  # [m] below, the direction is ill-defined
 LARGEST_EXTENT = 200.0  # [m] limits the size of the free-space raster
 LONGEST = 1e6  # limit of vector components: squares fit in float32
+MOST_WALLS = 30_000  # rooms of 2.5 m in 200 m have 22,801
+MOST_LANDMARKS = 100_000
 FARTHEST_PLACE = 1e8  # [m] from the origin: map frames on earth fit, and differences keep micrometres
+
+
+def check_counts(walls: Any, landmarks: Any = ()) -> None:
+    """Refuse more walls or landmarks than can be simulated, before memory is taken for them.
+
+    Raises:
+        ValueError: If there are more than `MOST_WALLS` or `MOST_LANDMARKS`.
+    """
+    hint = "Simplify the plan, for example with a larger tolerance_px, or cut it into several worlds."
+    for name, rows, most in (("walls", walls, MOST_WALLS), ("landmarks", landmarks, MOST_LANDMARKS)):
+        if hasattr(rows, "__len__") and len(rows) > most:
+            raise argument_error(f"world.{name}", f"at most {most:,} {name}", f"a number of {len(rows):,}", hint)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,6 +50,7 @@ class Landmarks:
 
     def __post_init__(self) -> None:
         hint = "Give one row per landmark."
+        check_counts((), self.positions)
         positions: Any = check_array("landmarks.positions", self.positions, (None, 3), hint, within=FARTHEST_PLACE)
         normals: Any = check_array("landmarks.normals", self.normals, (len(positions), 2), hint, within=LONGEST)
         walls: Any = check_array("landmarks.walls", self.walls, (len(positions),), hint, dtype=np.int64)
@@ -70,8 +85,8 @@ class World:
             environment.
 
     Raises:
-        ValueError: If there is no wall, a wall has no length, the world spans more than 200 m, a number is not
-            finite, or a wall index of a landmark is invalid.
+        ValueError: If there is no wall, a wall has no length, the world spans more than 200 m or has more than
+            30,000 walls, a number is not finite, or a wall index of a landmark is invalid.
 
     >>> World("room", [[0, 0, 4, 0], [4, 0, 4, 3], [4, 3, 0, 3], [0, 3, 0, 0]]).bounds
     (0.0, 0.0, 4.0, 3.0)
@@ -86,6 +101,7 @@ class World:
         if not isinstance(self.name, str):
             raise argument_error("world.name", "a string", self.name, "Give the world a name.")
         hint = "Give rows x1 y1 x2 y2 in metres."
+        check_counts(self.walls)
         walls: Any = check_array("world.walls", self.walls, (None, 4), hint, within=FARTHEST_PLACE)
         if not len(walls):
             raise argument_error("world.walls", "at least one wall", "no rows", hint)

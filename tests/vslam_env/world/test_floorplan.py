@@ -100,6 +100,112 @@ def test_a_tolerance_that_leaves_no_walls_is_refused(tmp_path: Path) -> None:
         load_floorplan(room, tolerance_px=1e9)
 
 
+def building(margin: int) -> Any:
+    """A plan of a room of 60 x 40 pixels with walls of two pixels, on a white page with a margin."""
+    walls = np.pad(np.full((40, 60), 255), 2)
+    return np.pad(walls, margin, constant_values=255)
+
+
+@pytest.mark.parametrize("margin", [1, 30, 300])
+def test_a_building_on_a_page_is_the_world(tmp_path: Path, caplog: pytest.LogCaptureFixture, margin: int) -> None:
+    """Of a closed plan on a white page the inside is the world, whatever the margin; `outside="keep"` overrides."""
+    path = write(tmp_path / "plan.png", building(margin))
+    low, width, height = 0.1 * (margin + 2), 6.0, 4.0
+    assert load_floorplan(path, 0.1).bounds == pytest.approx((low, low, low + width, low + height))
+    is_page_larger = margin > 20
+    assert ("24 m² enclosed by walls are the world" in caplog.text) == is_page_larger
+    caplog.clear()
+    kept = make_world(f"{path}:metres_per_pixel=0.1:outside=keep", np.random.default_rng(0))
+    assert kept.bounds[0] == pytest.approx(0.0 if is_page_larger else low)
+    assert not caplog.text
+
+
+def test_a_transparent_page_is_white(tmp_path: Path) -> None:
+    """Black walls on a transparent page, with any colour under the transparency, give the same world as on white."""
+    levels = building(300)
+    opaque = load_floorplan(write(tmp_path / "white.png", levels), 0.1)
+    pixels = np.zeros((*levels.shape, 4))
+    pixels[..., 3] = 255 - levels
+    clear = load_floorplan(write(tmp_path / "clear.png", pixels), 0.1)
+    np.testing.assert_array_equal(clear.walls, opaque.walls)
+
+
+@pytest.mark.parametrize("sides", ["left", "left and right", "one corner", "two corners"])
+def test_rooms_that_the_edge_cuts_stay(tmp_path: Path, caplog: pytest.LogCaptureFixture, sides: str) -> None:
+    """A hall that the picture's edge cuts is the world, although a closed room stands in it."""
+    image = np.zeros((200, 300))
+    image[20:180, 20:280] = 255
+    room = np.pad(np.full((30, 30), 255), 2)
+    image[80:114, 100:134] = room
+    image[40:60, : 300 if "right" in sides else 100] = 255
+    if "corner" in sides:
+        image[: 60 if "one" in sides else 200, :60] = 255
+    world = load_floorplan(write(tmp_path / "cut.png", image), 0.1)
+    assert world.bounds[0] == pytest.approx(0.0)
+    assert area_inside(world, 0.1) == pytest.approx(0.01 * ((image > 0).sum() - 900), rel=0.02)
+    assert not caplog.text
+
+
+def test_open_floor_is_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Where floor reaches the edge and surrounds nothing but pillars, one line says that the edge becomes a wall."""
+    image = np.full((100, 150), 255)
+    image[40:60, 40:60] = 0
+    image[45:55, 45:55] = 255  # a hollow pillar of one square metre
+    world = load_floorplan(write(tmp_path / "open.png", image), 0.1)
+    assert world.bounds == pytest.approx((0.0, 0.0, 15.0, 10.0))
+    assert caplog.text.count("edge, which becomes a wall") == 1
+    caplog.clear()
+    load_floorplan(tmp_path / "open.png", 0.1, outside="keep")
+    assert not caplog.text
+
+
+def test_a_marked_outside_is_kept(tmp_path: Path) -> None:
+    """A coloured start cell outside of a building says that the outside is meant."""
+    image = np.repeat(building(60)[:, :, None], 3, axis=2)
+    image[5:12, 5:12] = (0, 216, 255)
+    assert load_floorplan(write(tmp_path / "yard.png", image), 0.1).bounds[0] == pytest.approx(0.0)
+
+
+@pytest.mark.parametrize(
+    "option", ["outside=perhaps", "outside=", "metres_per_pixel=keep", "tolerance_px=1:tolerance_px=2"]
+)
+def test_bad_options_of_plans_are_refused(tmp_path: Path, option: str) -> None:
+    """An option with a wrong value is refused with its name."""
+    path = write(tmp_path / "plan.png", building(2))
+    with pytest.raises(ValueError, match=r"^world.*: expected .*, got '"):
+        make_world(f"{path}:{option}", np.random.default_rng(0))
+
+
+def test_options_that_no_file_takes_are_refused(tmp_path: Path) -> None:
+    """A ROS map takes `outside` but no scale, and a file of walls no option."""
+    path = write_map(tmp_path)
+    rng = np.random.default_rng(0)
+    assert make_world(f"{path}:outside=keep", rng).bounds == make_world(path, rng).bounds
+    with pytest.raises(ValueError, match="no option 'metres_per_pixel' for files of this kind"):
+        make_world(f"{path}:metres_per_pixel=0.1", rng)
+
+
+@pytest.mark.parametrize("suffix", [".yaml", ".pgm"])
+def test_an_edited_file_is_read_again(tmp_path: Path, suffix: str) -> None:
+    """A map is read again in the same process when its YAML file or its image has changed."""
+    rng = np.random.default_rng(0)
+    path = write_map(tmp_path)
+    first = make_world(path, rng)
+    assert make_world(path, rng) is first
+    if suffix == ".pgm":
+        write_map(tmp_path, np.pad(np.full((60, 60), 254), 10))
+    else:
+        write_map(tmp_path, resolution=0.1)
+    assert make_world(path, rng).bounds != first.bounds
+
+
+def test_too_many_walls_are_refused_before_they_are_read(tmp_path: Path) -> None:
+    """A file of walls has a limit, which the error names."""
+    (tmp_path / "many.json").write_text(json.dumps({"walls": [[0, 0, 1, 1]] * 30_001}))
+    with pytest.raises(ValueError, match=r"world\.walls: expected at most 30,000 walls, got a number of 30,001"):
+        make_world(tmp_path / "many.json", np.random.default_rng(0))
+
+
 def test_dungeon_plans_are_traced_whole(data_dir: Path) -> None:
     """Every sixth dungeon plan becomes a few walls, keeps its free area, and has room for three robots."""
     for path in sorted((data_dir / "dungeon_maps" / "train").glob("*.png"))[::6]:
@@ -227,6 +333,31 @@ def test_raw_maps_hold_percentages(tmp_path: Path) -> None:
         assert lax.bounds[2] - lax.bounds[0] == pytest.approx(60 * 0.05)
 
 
+@pytest.mark.parametrize("thresh", ["5e-2", "0.05", "+.5E-1"])
+def test_numbers_are_read_as_ros_reads_them(tmp_path: Path, thresh: str) -> None:
+    """An exponent needs no decimal point."""
+    assert load_ros_map(write_map(tmp_path, resolution=thresh)).bounds == load_ros_map(write_map(tmp_path)).bounds
+
+
+def test_unknown_stays_unknown_in_trinary_maps(tmp_path: Path) -> None:
+    """With the `free_thresh` that ROS 2's map saver writes, unknown cells (205) are still not free."""
+    strict = load_ros_map(write_map(tmp_path))
+    assert load_ros_map(write_map(tmp_path, free_thresh=0.25, occupied_thresh=0.65)).bounds == strict.bounds
+    scale = load_ros_map(write_map(tmp_path, free_thresh=0.25, mode="scale", occupied_thresh=0.65), outside="keep")
+    assert scale.bounds == pytest.approx((-2.0, 1.0, 3.0, 5.0))
+
+
+def test_transparent_cells_are_unknown(tmp_path: Path) -> None:
+    """Free cells that are transparent are not free."""
+    pixels = np.full((80, 100, 4), 254)
+    pixels[..., 3] = 0
+    pixels[9:51, 19:81] = (0, 0, 0, 255)
+    pixels[10:50, 20:80] = 254
+    path = write_map(tmp_path, image="map.png")
+    write(tmp_path / "map.png", pixels)
+    assert load_ros_map(path).bounds == load_ros_map(write_map(tmp_path)).bounds
+
+
 def test_a_folder_counts_a_map_once(tmp_path: Path) -> None:
     """The image of a YAML file is no plan of its own in a folder; names ending in .yaml are maps."""
     path = write_map(tmp_path)
@@ -247,8 +378,8 @@ def test_an_imported_map_comes_back(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changed", "says"),
     [
-        ({"image": "gone.pgm"}, r"world: expected a file, got '.*Check the path"),
-        ({"image": "map.yaml"}, "world: expected an image that OpenCV can read"),
+        ({"image": "gone.pgm"}, r"world: expected a file, got '.*gone.pgm'. Check the path"),
+        ({"image": "map.yaml"}, "world: expected an image file"),
         ({"image": 3}, "world: expected a path as image"),
         ({"resolution": 0}, r"world: map\.yaml resolution: expected a finite number > 0, got 0"),
         ({"resolution": "fine"}, "resolution: expected a finite number"),
@@ -262,7 +393,9 @@ def test_an_imported_map_comes_back(tmp_path: Path) -> None:
         ({"resolution": 0.001}, r"expected free space for robots of radius 0\.2 m"),
         ({"negate": "'false'"}, "negate: expected 0 or 1, got 'false'"),
         ({"negate": 2}, "negate: expected 0 or 1, got 2"),
-        ({"negate": "{"}, "world: expected a YAML file, got a syntax error"),
+        ({"negate": "{"}, r"world: expected a file in YAML, got a syntax error: .* line 5, column 19 of .*map\.yaml"),
+        ({"image": '"*m"'}, "world: expected a file, got"),
+        ({"origin": "*m"}, r"an alias, which is not followed\. Correct line 3, column 9"),
     ],
 )
 def test_bad_maps_are_refused(tmp_path: Path, changed: dict[str, Any], says: str) -> None:

@@ -252,7 +252,7 @@ def test_options_of_a_plan_set_its_scale(tmp_path: Path) -> None:
         ),
         ("plan.png:metres_per_pixel=-1", r"^metres_per_pixel: expected a finite number > 0"),
         ("plan.png:extent=60", r"Options: metres_per_pixel, tolerance_px"),
-        ("room.json:metres_per_pixel=1", r"^world: expected no options for a path without a floor plan"),
+        ("room.json:metres_per_pixel=1", r"^world: expected no option 'metres_per_pixel' for files of this kind"),
     ],
 )
 def test_bad_sizes_and_scales_are_refused(source: str, says: str, tmp_path: Path, monkeypatch: Any) -> None:

@@ -1,16 +1,18 @@
 """Loaders of floor plans, from images and JSON files of walls."""
 
 import json
-from os import PathLike
+import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from slam_backend.core.files import write_file
+from slam_backend.core.image_files import blend_over_white, grey_levels, read_image
 from slam_backend.core.lazy_import import LazyModule
-from slam_backend.core.validation import FloatArray, argument_error, check_float
-from vslam_env.world.spec import LARGEST_EXTENT, World
+from slam_backend.core.text_files import existing_file, read_json
+from slam_backend.core.validation import FloatArray, argument_error, check_choice, check_float
+from vslam_env.world.spec import LARGEST_EXTENT, World, check_counts
 
 if TYPE_CHECKING:
     import cv2
@@ -20,33 +22,45 @@ else:
 BRIGHT_SHARE = 0.85  # separates grey 195 from 128, white from black, and 254 from "unknown" 205 in ROS maps
 COLOURED = 60  # least range of the channels of a coloured marker such as a yellow start cell
 UPSAMPLING = 3
+LEAST_BUILDING = 4.0  # [m^2] area of an enclosed part that makes the floor around it the outside
 FORMAT = 1  # version of JSON files of walls
+OUTSIDE = ("drop", "keep")
+
+LOGGER = logging.getLogger(__name__)
 
 
 def load_floorplan(
-    path: str | Path, metres_per_pixel: float = 0.045, tolerance_px: float = 1.0, robot_radius: float = 0.2
+    path: str | Path,
+    metres_per_pixel: float = 0.045,
+    tolerance_px: float = 1.0,
+    robot_radius: float = 0.2,
+    outside: str = "drop",
 ) -> World:
     """Trace the walls of a floor plan.
 
     Pixels at least 85 % as bright as the brightest grey of the plan and coloured pixels are free; all others are wall.
-    The connected part with the coloured cell is kept, or else the largest one; its outline and the outlines of its
-    holes become walls. The origin of the world is the lower left corner of the image, y upwards.
+    Transparent pixels are white. The connected part with the coloured cell is kept, or else the largest one; its
+    outline and the outlines of its holes become walls. The origin of the world is the lower left corner of the image,
+    y upwards.
 
     Args:
-        path: PNG, JPEG, PGM or any other format that OpenCV reads.
+        path: PNG, JPEG, PGM or another image, see `slam_backend.core.image_files`.
         metres_per_pixel: Side of a pixel [m]. With 0.045, corridors of 640 x 480 dungeon plans (32 px) are 1.4 m wide,
             and the plans 29 x 22 m.
         tolerance_px: Largest deviation of the walls from the traced outlines [px].
         robot_radius: Radius of a robot that must fit into the free space [m].
+        outside: "drop" or "keep" free space around a building, see `floor_part`.
 
     Raises:
         ValueError: If the file is missing or not an image, or its free space is too small.
     """
     metres_per_pixel = check_float("metres_per_pixel", metres_per_pixel, "Give the side of a pixel.", above=0.0)
     tolerance_px = check_float("tolerance_px", tolerance_px, "Give pixels.", at_least=0.0)
-    path = existing(path)
-    free = _free_part(read_image(path, cv2.IMREAD_COLOR), str(path))
-    return World(path.stem, trace(free, metres_per_pixel, tolerance_px, robot_radius, str(path)))
+    path = existing_file(path, "world")
+    image = blend_over_white(*read_image(path, "world", "Save the plan as PNG."))
+    free, marked = _free_pixels(image, str(path))
+    part = floor_part(free, metres_per_pixel, str(path), outside, marked)
+    return World(path.stem, trace(part, metres_per_pixel, tolerance_px, robot_radius, str(path)))
 
 
 def trace(free: Any, metres_per_pixel: float, tolerance_px: float, robot_radius: float, path: str) -> FloatArray:
@@ -100,12 +114,9 @@ def load_walls_json(path: str | Path) -> World:
     Raises:
         ValueError: If the file is missing, not JSON, of another `format`, lacks `walls`, or has unknown keys.
     """
-    path = existing(path)
+    path = existing_file(path, "world")
     hint = 'Write {"walls": [[x1, y1, x2, y2], ...]}, in metres; "start_poses" and "name" are optional.'
-    try:
-        content: Any = json.loads(path.read_text(encoding="utf-8-sig"))
-    except (ValueError, RecursionError) as error:
-        raise argument_error("world", "a JSON file", f"a syntax error in {path}: {error}", hint) from error
+    content = read_json(path, "world", hint)
     if not isinstance(content, dict) or "walls" not in content:
         got = sorted(content) if isinstance(content, dict) else content
         raise argument_error("world", f"an object with the key 'walls' in {path}", got, hint)
@@ -115,6 +126,7 @@ def load_walls_json(path: str | Path) -> World:
     unknown = sorted(set(content) - {"format", "walls", "start_poses", "name"})
     if unknown:
         raise argument_error("world", f"no other keys in {path}", unknown[0], hint)
+    check_counts(content["walls"])
     return World(content.get("name", path.stem), content["walls"], start_poses=content.get("start_poses"))
 
 
@@ -134,50 +146,12 @@ def save_walls_json(world: World, path: str | Path) -> None:
     write_file(path, json.dumps(content, indent=1) + "\n")
 
 
-def read_image(path: Path, flags: int) -> Any:
-    """Read an image with OpenCV.
-
-    Args:
-        path: Path of the file.
-        flags: Flags of `cv2.imread`, for example `cv2.IMREAD_COLOR`.
-
-    Returns:
-        (H, W) or (H, W, 3) uint8, BGR.
-
-    Raises:
-        ValueError: If the file is not an image.
-    """
-    image = cv2.imread(str(path), flags)
-    if image is None:
-        raise argument_error("world", "an image that OpenCV can read", Path(path), "Save the plan as PNG.")
-    return image
-
-
-def existing(path: str | Path) -> Path:
-    """Return the path of an existing file.
-
-    Raises:
-        ValueError: If the file does not exist.
-    """
-    if not isinstance(path, (str, PathLike)):
-        raise argument_error("world", "a path", path, "Give a string or a Path.")
-    path = Path(path)
-    try:
-        exists = path.is_file()
-    except OSError as error:  # e.g. a name too long for the system
-        hint = f"Check the path: {error.strerror}."
-        raise argument_error("world", "a file", Path(path), hint) from error
-    if not exists:
-        raise argument_error("world", "a file", Path(path), "Check the path: the file does not exist.")
-    return path
-
-
-def _free_part(image: Any, path: str) -> Any:
-    """Return the free part (H, W) uint8, 1 = free, of an image (H, W, 3) uint8."""
+def _free_pixels(image: Any, path: str) -> tuple[Any, Any]:
+    """Return the free and the coloured pixels (H, W) bool of an image (H, W, 3) uint8."""
     blue, green, red = cv2.split(image)
     strongest, weakest = cv2.max(cv2.max(blue, green), red), cv2.min(cv2.min(blue, green), red)
     coloured = cv2.subtract(strongest, weakest) > COLOURED
-    grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    grey = grey_levels(image)
     levels = grey[~coloured]
     brightest = float(levels.max()) if levels.size else 0.0
     if not levels.size or levels.min() >= BRIGHT_SHARE * brightest:
@@ -187,24 +161,52 @@ def _free_part(image: Any, path: str) -> Any:
             f"no free space distinct from walls in {path}",
             "Draw free space white and walls black.",
         )
-    return largest_part((grey >= BRIGHT_SHARE * brightest) | coloured, coloured)
+    return (grey >= BRIGHT_SHARE * brightest) | coloured, coloured
 
 
-def largest_part(free: Any, marked_cells: Any = None) -> Any:
-    """Return the largest 4-connected component of a mask, or the one with the most marked cells.
+def floor_part(free: Any, metres_per_pixel: float, path: str, outside: str = "drop", marked: Any = None) -> Any:
+    """Return the 4-connected part of the free pixels that is the floor of the world.
+
+    It is the part with the most marked pixels, or else the largest one. Free space at three or four corners of the
+    image is the outside of the building: unless `outside` is "keep", it gives way to the largest other part of at
+    least 4 m^2, and a message says so. If there is no such part, a message says that the edge of the image becomes a
+    wall. Rooms that the edge cuts reach fewer corners.
 
     Args:
-        free: (H, W) bool. Mask.
-        marked_cells: (H, W) bool. Marked cells, if any.
+        free: (H, W) bool. Free pixels.
+        metres_per_pixel: Side of a pixel [m].
+        path: Path for messages.
+        outside: "drop" or "keep".
+        marked: (H, W) bool. Marked pixels, if any.
 
     Returns:
-        (H, W) uint8. 1 in the component, else 0.
+        (H, W) uint8. 1 in the part, else 0.
+
+    Raises:
+        ValueError: If `outside` is another word.
     """
+    check_choice("outside", outside, OUTSIDE)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(free.astype(np.uint8), connectivity=4)
-    marked = np.zeros(count) if marked_cells is None else np.bincount(labels[marked_cells], minlength=count)
-    sizes = stats[:, cv2.CC_STAT_AREA].astype(np.int64)
-    sizes[0] = marked[0] = 0
-    part = int(np.argmax(marked if marked.any() else sizes))
+    votes = np.zeros(count) if marked is None else np.bincount(labels[marked], minlength=count)
+    areas = stats[:, cv2.CC_STAT_AREA].astype(np.int64)
+    areas[0] = votes[0] = 0
+    part = int(np.argmax(votes if votes.any() else areas))
+    corners = labels[[0, 0, -1, -1], [0, -1, 0, -1]]
+    is_outside = np.count_nonzero(corners == part) >= 3 and not votes.any()
+    if is_outside and outside == "drop":
+        enclosed = areas.copy()
+        enclosed[part] = 0
+        largest = int(np.argmax(enclosed))
+        square_metres = enclosed[largest] * metres_per_pixel**2
+        if square_metres >= LEAST_BUILDING:
+            part = largest
+            words = "%s: %.0f m² enclosed by walls are the world, and the floor around them is outside; "
+            words += "outside=keep uses all of it"
+            LOGGER.warning(words, path, square_metres)
+        else:
+            words = "%s: the floor reaches the image's edge, which becomes a wall; draw closed outer walls, or say "
+            words += "outside=keep"
+            LOGGER.warning(words, path)
     return (labels == part).astype(np.uint8)
 
 

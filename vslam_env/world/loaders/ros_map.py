@@ -1,59 +1,80 @@
 """Loader of ROS maps: a YAML file and an image."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-import yaml
 
-from slam_backend.core.lazy_import import LazyModule
+from slam_backend.core.image_files import grey_levels, read_image
+from slam_backend.core.text_files import existing_file, read_yaml
 from slam_backend.core.validation import argument_error, check_array, check_choice, check_float
 from slam_backend.geometry import transform_points
-from vslam_env.world.loaders.floorplan import existing, largest_part, read_image, trace
+from vslam_env.world.loaders.floorplan import floor_part, trace
 from vslam_env.world.spec import World
 
-if TYPE_CHECKING:
-    import cv2
-else:
-    cv2 = LazyModule("cv2")  # takes as long to import as numpy
-
+UNKNOWN = 205  # level of unknown cells in maps that map_saver writes, whatever `free_thresh` it adds
 MODES = ("trinary", "scale", "raw")
 HINT = "Write image, resolution, origin, negate, occupied_thresh and free_thresh, like map_saver."
 
 
-def load_ros_map(path: str | Path, tolerance_px: float = 1.0, robot_radius: float = 0.2) -> World:
+def load_ros_map(
+    path: str | Path, tolerance_px: float = 1.0, robot_radius: float = 0.2, outside: str = "drop"
+) -> World:
     """Trace the walls of a map in the format of ROS's map_server.
 
     A pixel of value v is occupied with probability (255 - v) / 255, or v / 255 if `negate` is set; with `mode: raw` the
     probability is v per cent, or 255 - v per cent, and unknown above 100. Pixels below `free_thresh` are free; the
-    modes `trinary` and `scale` differ only for other pixels. All other pixels, including unknown ones, are wall. The
-    largest free part is kept. The world frame is the map frame: `origin` is the pose of the image's lower left corner
-    (http://wiki.ros.org/map_server).
+    modes `trinary` and `scale` differ only for other pixels. In a trinary map the level 205 is unknown, although the
+    `free_thresh` of 0.25 that ROS 2 writes lies above its probability; transparent pixels are unknown in all modes. All
+    other pixels, including unknown ones, are wall. The largest free part is kept. The world frame is the map frame:
+    `origin` is the pose of the image's lower left corner (http://wiki.ros.org/map_server).
 
     Args:
         path: Path of the YAML file; its `image` is relative to this file or absolute.
         tolerance_px: Largest deviation of the walls from the traced outlines [px].
         robot_radius: Radius of a robot that must fit into the free space [m].
+        outside: "drop" or "keep" free space around a building, see `floor_part`.
 
     Raises:
         ValueError: If a file is missing or malformed, or there is no free space.
     """
-    path = existing(path)
+    path = existing_file(path, "world")
     tolerance_px = check_float("tolerance_px", tolerance_px, "Give pixels.", at_least=0.0)
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise argument_error("world", "a YAML file", f"a syntax error in {path}", HINT) from error
-    settings = _checked(content, str(path))
-    image = read_image(existing(path.parent / settings["image"]), cv2.IMREAD_GRAYSCALE).astype(np.float64)
-    levels = 255.0 - image if settings["negate"] else image
-    occupied = levels / 100.0 if settings["mode"] == "raw" else (255.0 - levels) / 255.0
-    free = occupied < settings["free_thresh"]
+    settings = _read_settings(path)
+    resolution = settings["resolution"]
+    free = _free_pixels(*read_image(existing_file(path.parent / settings["image"], "world"), "world"), settings)
     if not free.any():
         hint = "Check mode, negate and free_thresh."
         raise argument_error("world", "a map with free space", f"no free space in {path}", hint)
-    walls = trace(largest_part(free), settings["resolution"], tolerance_px, robot_radius, str(path))
+    part = floor_part(free, resolution, str(path), outside)
+    walls = trace(part, resolution, tolerance_px, robot_radius, str(path))
     return World(path.stem, transform_points(settings["origin"], walls.reshape(-1, 2)).reshape(-1, 4))
+
+
+def image_of_ros_map(path: Path) -> Path:
+    """Return the path of the image that a YAML file names.
+
+    Raises:
+        ValueError: If the YAML file is malformed or the image is missing.
+    """
+    return existing_file(path.parent / _read_settings(path)["image"], "world")
+
+
+def _free_pixels(colours: Any, opacity: Any, settings: dict[str, Any]) -> Any:
+    """Return the free pixels (H, W) bool of an image."""
+    level = np.arange(256.0)
+    if settings["negate"]:
+        level = 255.0 - level
+    occupied = level / 100.0 if settings["mode"] == "raw" else (255.0 - level) / 255.0
+    is_free = occupied < settings["free_thresh"]
+    if settings["mode"] == "trinary":
+        is_free &= level != UNKNOWN
+    return is_free[grey_levels(colours)] & (opacity > 127)
+
+
+def _read_settings(path: Path) -> dict[str, Any]:
+    """Return the validated content of a YAML file."""
+    return _checked(read_yaml(path, "world", HINT), str(path))
 
 
 def _checked(content: Any, path: str) -> dict[str, Any]:
