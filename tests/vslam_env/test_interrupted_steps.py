@@ -70,7 +70,7 @@ def _meeting(**options: Any) -> ExplorationEnv:
 
 @pytest.mark.parametrize("cure", ["reset", "set_state"])
 def test_an_interrupted_step_is_not_continued(cure: str) -> None:
-    """After an interrupt at any line the state is whole, or step and copies refuse until it is; numbers never change."""
+    """After an interrupt at any line the state is whole, or steps and copies are refused; numbers never change."""
     env = _meeting()
     env.reset(seed=1)
     begin = env.get_state()
