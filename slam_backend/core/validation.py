@@ -47,6 +47,11 @@ def argument_error(name: str, expected: str, got: object, hint: str) -> ValueErr
     return ValueError(f"{name}: expected {expected}, got {text}. {hint}")
 
 
+def is_argument_error(error: Exception) -> bool:
+    """Return whether an error is one of `argument_error`, meant for the user; all others are faults."""
+    return isinstance(error, ValueError) and ": expected " in str(error)
+
+
 def _short_text(got: object) -> str:
     """Return the `repr` of something, or its type where that fails."""
     try:

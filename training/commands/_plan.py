@@ -13,6 +13,7 @@ from rich.console import Console
 from training.bench.config import ExplorationBenchConfig, ExplorationTrial, PlanBenchConfig
 from training.commands._progress import TrialSet, run_trial_sets, trial_progress
 from training.commands._run_folder import Call
+from training.experiments.console import print_error
 
 if TYPE_CHECKING:  # numerical modules are imported when the command runs, so that --help is fast
     from training.bench.exploration.plan import Plan
@@ -82,7 +83,7 @@ def run_plan(call: Call[ExplorationBenchConfig], name: str | None, workers: int,
     folder.write_text(EPISODES_CSV, episodes_csv(rows))
     if rows and not write_parquet(folder.path / EPISODES_PARQUET, rows):
         text = f"{EPISODES_PARQUET} is not written: it needs pip install 'vslam-env[parquet]'."
-        console.print(text, soft_wrap=True, markup=False)
+        console.print(text, soft_wrap=True)
     folder.write_text("tables.md", markdown(plan, rows, config.policies or plan.policies))
     draw_plan(folder.path / "plan.png", rows)
     call.finish()
@@ -192,7 +193,7 @@ def verify_rows(call: Call[ExplorationBenchConfig], folder: Path, count: int, wo
             with closing(played) as repeated:
                 for again in repeated:
                     if FAILED in again:
-                        call.console.print(f"[red]error[/] {again[FAILED]}", soft_wrap=True)
+                        print_error(again[FAILED], call.console)
                         raise typer.Exit(2)
                     trial = trial_of(again, kind)
                     found.append(compare(rows[trial], again))
@@ -206,7 +207,7 @@ def verify_rows(call: Call[ExplorationBenchConfig], folder: Path, count: int, wo
     changed = sorted({row["policy"] for row in found if row["is_other_policy"]})
     if changed:
         text = f"The file of {', '.join(changed)} is another one than when the episodes were played."
-        call.console.print(text, soft_wrap=True, markup=False)
+        call.console.print(text, soft_wrap=True)
     if any(row["is_equal"] is False for row in found):
         raise typer.Exit(1)
 
