@@ -52,9 +52,10 @@ class Call(Generic[ConfigT]):
 
         Raises:
             ValueError: If `json` cannot be written, the file cannot be read or belongs to another command, or the log
-                is missing.
+                is missing, or the file names a custom policy that the options do not name.
         """
         from slam_backend.core.files import check_writable
+        from training.experiments.named_policies import check_configuration
         from training.experiments.run_folder import read_config
 
         if self.json not in (None, STDOUT) and self.json.parent != self.out:  # the run folder is created later
@@ -62,6 +63,7 @@ class Call(Generic[ConfigT]):
         values: dict[str, Any] = {}
         if self.file is not None:
             values, values["seed"] = read_config(self.file, self.command)
+            check_configuration(values, self.given)
         values = self.kind.merged(values, {**self.quick, **self.given})
         if self.log is not None:
             values["path"] = find_log(values.get("path"), *self.log)

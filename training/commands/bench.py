@@ -246,8 +246,8 @@ def bench_exploration(
     from training.bench.exploration.trials import TRIALS_FILE, check_same_policies, play
     from training.experiments.run_folder import plain
 
-    check_same_policies(call.out)
     trials = call.config.trials()
+    check_same_policies(call.out, call.config.policies)
     firsts = {(t.policy, t.world, t.robots): t for t in reversed(trials)}.values()
     config = call.config
     checks = (
