@@ -65,6 +65,30 @@ VECTOR_SIZE = sum(int(np.prod(SHAPES[name])) for name in VECTORS)
 PICTURE_SIZE = CHANNELS[1] * (48 // (PATCHES[0] * PATCHES[1])) ** 2
 
 
+def weight_shapes() -> dict[str, tuple[int, ...]]:
+    """Return the shapes of all weights, by the layer names of the learner."""
+    side, second = PATCHES
+    layers: dict[str, tuple[int, ...]] = {
+        "picture.0": (CHANNELS[0], SHAPES["local_grid"][0], side, side),
+        "picture.2": (CHANNELS[1], CHANNELS[0], second, second),
+        "robot": (WIDTH, PICTURE_SIZE + VECTOR_SIZE),
+        "candidate": (WIDTH, SHAPES["candidates"][1]),
+        "teammate": (WIDTH, SHAPES["teammates"][1]),
+        "last_norm": (WIDTH,),
+        "query": (WIDTH, WIDTH),
+        "key": (WIDTH, WIDTH),
+        "stay": (1, WIDTH),
+    }
+    for layer in range(NUM_LAYERS):
+        parts: dict[str, tuple[int, ...]] = {
+            "norm": (WIDTH,), "query_key_value": (3 * WIDTH, WIDTH), "out": (WIDTH, WIDTH), "feed_norm": (WIDTH,),
+            "feed_in": (FEED_WIDTH, WIDTH), "feed_out": (WIDTH, FEED_WIDTH),
+        }  # fmt: skip
+        layers |= {f"layers.{layer}.{name}": shape for name, shape in parts.items()}
+    weights = {f"{name}.weight": shape for name, shape in layers.items()}
+    return weights | {f"{name}.bias": shape[:1] for name, shape in layers.items()}
+
+
 def logits(weights: Weights, observations: Mapping[str, NDArray[Any]]) -> Float32Array:
     """Return the logit of each action, (n, 1 + C) float32; `INVALID` for invalid ones.
 

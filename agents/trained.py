@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.goal_network import NAMES, SHAPES, Weights, logits
+from agents.goal_network import NAMES, SHAPES, Weights, logits, weight_shapes
 from slam_backend.core.array_files import read_arrays
 from slam_backend.core.files import write_file
 from slam_backend.core.validation import argument_error
@@ -121,8 +121,8 @@ def load_model(path: str | Path, argument: str = "model") -> tuple[Weights, dict
     try:
         arrays: dict[str, NDArray[Any]] = dict(read_arrays(file))
         about = json.loads(str(arrays.pop(ABOUT)))
-        version, digest = about["format"], about["weights"]
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        version, digest, _ = about["format"], about["weights"], about.keys()
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         hint = f"{str(file)!r} cannot be read. Copy it again, or train again."
         raise argument_error(argument, expected, "a broken file", hint) from error
     if version != FORMAT:
@@ -132,7 +132,29 @@ def load_model(path: str | Path, argument: str = "model") -> tuple[Weights, dict
         raise argument_error(
             argument, expected, "a broken file", f"{str(file)!r} was changed. Copy it again, or train again."
         )
+    _check_weights(argument, file, arrays)
+    if not isinstance(about.get("environment"), str):
+        hint = f"{str(file)!r} was made by another program. Train again."
+        raise argument_error(argument, "the environment of its training", "no text 'environment'", hint)
     return arrays, about
+
+
+def _check_weights(argument: str, file: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Refuse weights that are not those of the network: others, missing ones, other shapes, or no finite numbers.
+
+    Raises:
+        ValueError: If they are not; the message names the first.
+    """
+    shapes, hint = weight_shapes(), f"{str(file)!r} was made by another program. Train again."
+    for name in (*shapes, *arrays):
+        expected = f"weights {name[:60]!r} of shape {shapes.get(name)}, float32" if name in shapes else "no others"
+        if name not in shapes or name not in arrays:
+            got = f"no {name!r}" if name in shapes else name
+            raise argument_error(argument, expected, got, hint)
+        if arrays[name].shape != shapes[name] or arrays[name].dtype != np.float32:
+            raise argument_error(argument, expected, f"shape {arrays[name].shape}, {arrays[name].dtype}", hint)
+        if not np.isfinite(arrays[name]).all():
+            raise argument_error(argument, f"finite numbers in {name!r}", "NaN or infinity", hint)
 
 
 def _digest(weights: Mapping[str, NDArray[Any]]) -> str:

@@ -8,8 +8,6 @@ from signal import Signals
 from typing import Annotated, NoReturn
 
 import typer
-from rich.console import Console
-from rich.markup import escape
 
 from training.commands.bench import bench
 from training.commands.drive import drive_by_hand
@@ -21,6 +19,7 @@ from training.commands.run import run
 from training.commands.train import train
 from training.commands.warm_up import warm_up
 from training.commands.worlds import worlds
+from training.experiments.console import make_console, print_error
 from training.experiments.interrupt import signals_answered
 from training.experiments.logs import LogLevel, begin_logging
 
@@ -72,6 +71,7 @@ def main() -> None:
 
     A command stopped by SIGINT or SIGTERM, at once or after finishing its current work, exits with 128 + signal number.
     """
+    os.environ["MPLBACKEND"] = "agg"  # that of a notebook may not exist here; matplotlib reads it when it is imported
     with signals_answered() as handler:
         try:
             app(prog_name="vslam")
@@ -79,11 +79,12 @@ def main() -> None:
             if handler.number is None or end.code == BAD_INPUT:
                 raise
             if end.code == INTERRUPTED:
-                Console(stderr=True).print(f"Stopped by {Signals(handler.number).name}.", highlight=False)
+                make_console(stderr=True).print(f"Stopped by {Signals(handler.number).name}.")
             sys.exit(128 + handler.number)
         except ValueError as error:
-            # Errors in the project's format are meant for the user; all others are faults and keep their traceback.
-            if ": expected " not in str(error):
+            from slam_backend.core.validation import is_argument_error  # a slow import
+
+            if not is_argument_error(error):
                 raise
             _refuse(str(error))
         except OSError as error:
@@ -99,7 +100,7 @@ def main() -> None:
 
 def _refuse(text: str) -> NoReturn:
     """Exit with one line on stderr."""
-    Console(stderr=True, soft_wrap=True, highlight=False).print(f"[red]error[/] {escape(text)}")
+    print_error(text)
     sys.exit(BAD_INPUT)
 
 

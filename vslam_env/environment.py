@@ -97,6 +97,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         self._reads_beliefs = any(map(reads_beliefs, self._terms))
         self._root: np.random.SeedSequence | None = None
         self._episode: Episode | None = None
+        self._is_whole = True  # False while the episode changes, and after a change that was cut short
         self._cycle = 0
         self._team_metrics: TeamMetrics  # set at a reset
         self._window = Window(self.metadata["name"])
@@ -138,12 +139,16 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
             )
         episode = Episode(self.config, scenario, self._tap)
         episode.begin()
-        self._team_metrics = episode.team_metrics(self._reads_beliefs)
+        metrics = episode.team_metrics(self._reads_beliefs)
+        self._is_whole = False
         self._root, self._episode, self._drivers = root, episode, ActionExecutor(self.config)
+        self._team_metrics = metrics
         self.agents = self.possible_agents[:]
         self._cycle = 0
         nothing = dict.fromkeys((term.name for term in self._terms), self._nothing)
-        return self._observe(self._episode, nothing, [0] * len(self.agents))
+        results = self._observe(self._episode, nothing, [0] * len(self.agents))
+        self._is_whole = True
+        return results
 
     def step(
         self, actions: Mapping[AgentID, Any]
@@ -167,13 +172,17 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
 
         Raises:
             ValueError: If an agent is unknown or missing, or an action is outside its space; nothing is changed then.
-            RuntimeError: Before the first reset, or after the end of the episode.
+            RuntimeError: Before the first reset, after the end of the episode, or after a step that was cut short by
+                an exception, such as KeyboardInterrupt; `reset` and `set_state` then start from a whole state.
         """
         episode = self._running_episode("step")
+        if not self._is_whole:
+            raise RuntimeError(_not_whole("step"))
         if not self.agents:
             raise RuntimeError("step: expected a running episode, got one that has ended. Call reset() first.")
         agents = self.agents
         chosen = checked_actions(actions, agents, self.config.action_type)
+        self._is_whole = False
         invalid = self._drivers.execute(episode, chosen)
         before = self._team_metrics
         self._team_metrics = episode.team_metrics(self._reads_beliefs)
@@ -196,6 +205,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         )
         if terminated or truncated:
             self.agents = []
+        self._is_whole = True
         if self.render_mode == "human":
             self.render()
         return results
@@ -318,7 +328,12 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         An environment that restores it returns the same bytes for the same actions. Constant arrays are shared and
         read-only; all others are copied. `vslam_env.save_state` writes the state to disk. The recorder, the window and
         the internal state of custom reward terms are not included.
+
+        Raises:
+            RuntimeError: After a step that was cut short by an exception.
         """
+        if not self._is_whole:
+            raise RuntimeError(_not_whole("get_state"))
         episode = self._episode
         return {
             "version": state_version(),
@@ -342,19 +357,21 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
             ValueError: If the state is malformed, or from another version or configuration; the environment is then
                 unchanged.
         """
+        episode = self._episode if self._is_whole else None  # the parts of an episode cut short are not reused
         with refuse_malformed("state"):
             state = check_state(state, self.config, self._objects)
-            root, scenario = check_parts(state, self.config, self._episode, self._reads_beliefs)
+            root, scenario = check_parts(state, self.config, episode, self._reads_beliefs)
+        self._is_whole = False
         self._root, self.agents = root, []
         if scenario is None:
             self._episode = None
-            return
-        if self._episode is None:
-            self._episode = Episode(self.config, scenario, self._tap)
-        self._episode.set_state(state["episode"], scenario)
-        self._drivers = ActionExecutor(self.config)
-        self._drivers.set_state(state["drivers"])
-        self._team_metrics, self._cycle, self.agents = state["team_metrics"], state["cycle"], list(state["agents"])
+        else:
+            self._episode = Episode(self.config, scenario, self._tap) if episode is None else episode
+            self._episode.set_state(state["episode"], scenario)
+            self._drivers = ActionExecutor(self.config)
+            self._drivers.set_state(state["drivers"])
+            self._team_metrics, self._cycle, self.agents = state["team_metrics"], state["cycle"], list(state["agents"])
+        self._is_whole = True
 
     def clone(self) -> "ExplorationEnv":
         """Return an independent environment in the same state, without window and recorder."""
@@ -396,6 +413,11 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         if not isinstance(agent, str) or agent not in self.possible_agents:
             raise argument_error("agent", f"one of {self.possible_agents}", agent, "Use a name of possible_agents.")
         return self.possible_agents.index(agent)
+
+
+def _not_whole(name: str) -> str:
+    """Return the message of a method that needs a whole state."""
+    return f"{name}: expected a whole state, got that of a step cut short by an exception. Call reset() or set_state()."
 
 
 def _unpickled(arguments: tuple[Any, ...], max_cycles: int, state: EnvState) -> ExplorationEnv:

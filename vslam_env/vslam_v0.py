@@ -1,11 +1,13 @@
 """Version 0 of the environment, with PettingZoo's constructors `parallel_env`, `env` and `raw_env`."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
 from typing import Any
 
 from pettingzoo import AECEnv
-from pettingzoo.utils.conversions import parallel_to_aec
+from pettingzoo.utils.conversions import parallel_to_aec_wrapper
 from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
 from slam_backend.core.validation import argument_error
@@ -110,10 +112,35 @@ def parallel_env(
     return ExplorationEnv(config, world=world, reward=reward, render_mode=render_mode)
 
 
+class _TurnBasedEnv(parallel_to_aec_wrapper[str, Any, Any]):  # type: ignore[misc]   # its types are not checked
+    """PettingZoo's turn-based form of a parallel environment, whose interrupted steps and resets are not continued."""
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
+        """Reset; see `ExplorationEnv.reset`."""
+        with self._whole_or_marked():
+            super().reset(seed, options)
+
+    def step(self, action: Any) -> None:
+        """Take the action of an agent, and step when all agents have one; see `ExplorationEnv.step`."""
+        with self._whole_or_marked():
+            super().step(action)
+
+    @contextmanager
+    def _whole_or_marked(self) -> Iterator[None]:
+        """Mark the parallel environment as cut short by an interrupt; it marks its own errors itself."""
+        try:
+            yield
+        except Exception:
+            raise
+        except BaseException:
+            self.env.unwrapped._is_whole = False
+            raise
+
+
 @wraps(parallel_env, assigned=())  # only the signature
 def raw_env(*args: Any, **kwargs: Any) -> AECEnv[str, Any, Any]:
     """Make the turn-based (AEC) environment, unwrapped; see `parallel_env` for the arguments."""
-    return parallel_to_aec(parallel_env(*args, **kwargs))
+    return OrderEnforcingWrapper(_TurnBasedEnv(parallel_env(*args, **kwargs)))
 
 
 @wraps(parallel_env, assigned=())

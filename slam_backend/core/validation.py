@@ -1,8 +1,10 @@
 """Argument checks with one form of error: argument, expected value, value received, and hint."""
 
 import math
+from collections.abc import Iterator
 from functools import wraps
 from inspect import isbuiltin, signature
+from itertools import islice
 from numbers import Real
 from pathlib import PurePath
 from typing import Any, TypeVar
@@ -21,6 +23,10 @@ BoolArray = NDArray[np.bool_]
 WRITTEN_IN_PYTHON = 1 << 9  # Py_TPFLAGS_HEAPTYPE of a class
 MOST = 10**9  # limit of steps and other counts: kernels hold such numbers, and no run needs more
 NUMBERS = "biuf"  # dtype kinds of real numbers
+MOST_SHOWN = 80  # letters of a value in an error
+MOST_SAID = 2000  # letters of each other part, which may name what a file contains
+MOST_SHOWN_BYTES = 1 << 14  # of an array whose numbers are formatted
+DEEPEST_SHOWN = 20  # levels of nested lists and dicts
 
 
 def argument_error(name: str, expected: str, got: object, hint: str) -> ValueError:
@@ -29,8 +35,10 @@ def argument_error(name: str, expected: str, got: object, hint: str) -> ValueErr
     Args:
         name: The argument as the caller wrote it, e.g. `"num_particles"`.
         expected: Description of accepted values, e.g. `"an int >= 1"`.
-        got: Value received; shown as its `repr`, shortened to 80 characters, or as a whole path.
+        got: Value received; shown as its `repr`, of which no more than 80 characters are made, or as a whole path.
         hint: Advice, a full sentence.
+
+    No part is longer than `MOST_SAID`, whatever a file contains.
 
     Returns:
         The exception, for the caller to raise.
@@ -38,21 +46,57 @@ def argument_error(name: str, expected: str, got: object, hint: str) -> ValueErr
     >>> print(argument_error("num_particles", "an int >= 1", 0, "Use at least one particle."))
     num_particles: expected an int >= 1, got 0. Use at least one particle.
     """
+    name, expected, hint = (_cut(text, MOST_SAID) for text in (name, expected, hint))
     if isinstance(got, PurePath):
-        return ValueError(f"{name}: expected {expected}, got {str(got)!r}. {hint}")
+        return ValueError(f"{name}: expected {expected}, got {str(got)[:MOST_SAID]!r}. {hint}")
     described = isinstance(got, str) and got.startswith(("shape ", "an array ", "a ", "'", "no ", "NaN"))
-    text = str(got) if described else _short_text(got)
-    if len(text) > 80:
-        text = text[:77] + "..."
+    text = _cut(str(got) if described else _short_text(got), MOST_SHOWN)
     return ValueError(f"{name}: expected {expected}, got {text}. {hint}")
 
 
+def _cut(text: str, most: int) -> str:
+    return text if len(text) <= most else text[: most - 3] + "..."
+
+
+def is_argument_error(error: Exception) -> bool:
+    """Return whether an error is one of `argument_error`, meant for the user; all others are faults."""
+    return isinstance(error, ValueError) and ": expected " in str(error)
+
+
 def _short_text(got: object) -> str:
-    """Return the `repr` of something, or its type where that fails."""
+    """Return the beginning of the `repr` of something, or its type where that fails."""
+    text = ""
     try:
-        return repr(got)
+        for piece in _pieces(got, 0):
+            text += piece
+            if len(text) > MOST_SHOWN:
+                break
+        return text
     except Exception:  # an int of 5000 digits has none, and an object of the caller may raise anything
         return f"a {type(got).__name__} that cannot be shown"
+
+
+def _pieces(value: object, depth: int) -> Iterator[str]:
+    """Yield the parts of the `repr` of something, made one by one, so that none is made of what is not shown."""
+    if isinstance(value, (str, bytes)):
+        yield repr(value[: MOST_SHOWN + 1])
+    elif isinstance(value, np.ndarray) and value.nbytes > MOST_SHOWN_BYTES:
+        yield f"an array of {value.dtype} of shape {value.shape}"
+    elif type(value) not in (list, tuple, set, dict) or not value:
+        yield repr(value)
+    elif depth == DEEPEST_SHOWN:
+        yield "..."
+    else:
+        entries: Any = value
+        begin, end = "[]" if isinstance(value, list) else "()" if isinstance(value, tuple) else "{}"
+        yield begin
+        for index, entry in enumerate(islice(entries, MOST_SHOWN)):
+            yield ", " if index else ""
+            yield from _pieces(entry, depth + 1)
+            if isinstance(value, dict):
+                yield ": "
+                yield from _pieces(entries[entry], depth + 1)
+        yield f",{end}" if isinstance(value, tuple) and len(value) == 1 else end
 
 
 def check_kind(name: str, value: Any, kind: type[T], hint: str = "") -> T:

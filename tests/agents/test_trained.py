@@ -26,7 +26,7 @@ from agents.goal_network import (
     logits,
 )
 from agents.registry import LEARNED
-from agents.trained import FORMAT, OWN_GOAL, TrainedGoalPolicy, check_observation, load_model, save_model
+from agents.trained import FORMAT, OWN_GOAL, TrainedGoalPolicy, _digest, check_observation, load_model, save_model
 from vslam_env import CANDIDATE_FEATURES, NUM_CANDIDATES, vslam_v0
 from vslam_env.belief.observation import action_mask, observation_space
 
@@ -250,6 +250,45 @@ def test_damaged_models_are_refused(tmp_path: Path) -> None:
     np.savez(file, **arrays | {"about": np.array(json.dumps(about))})
     with pytest.raises(ValueError, match=r"expected one of format 3, got a model of format 4. .* wrote it, 9.9"):
         load_model(file)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "says"),
+    [
+        ("stay.bias", None, r"expected weights 'stay.bias' of shape \(1,\), float32, got no 'stay.bias'"),
+        (
+            "robot.weight",
+            lambda values: values[:, :-1],
+            r"'robot.weight' of shape \(64, 559\), .* \(64, 558\)",
+        ),
+        ("key.bias", lambda values: values.astype(np.float64), r"'key.bias' .* got shape \(64,\), float64"),
+        ("key.bias", lambda values: values * np.nan, r"expected finite numbers in 'key.bias', got NaN or infinity"),
+        ("layers.1.out.bias", lambda values: values + np.inf, r"finite numbers in 'layers.1.out.bias'"),
+        ("another", lambda values: np.zeros(2), r"expected no others, got 'another'"),
+    ],
+)
+def test_weights_of_another_network_are_refused(name: str, change: Any, says: str, tmp_path: Path) -> None:
+    """A model with a valid digest, but other names, shapes, types or no finite numbers, is refused with the first."""
+    weights = _weights()
+    values = weights.pop(name, None)
+    if change is not None:
+        weights[name] = change(values)
+    arrays = {each: np.asarray(array) for each, array in weights.items()}
+    about = {"format": FORMAT, "weights": _digest(arrays), **ABOUT}
+    np.savez(tmp_path / "model.npz", about=np.array(json.dumps(about)), **arrays)
+    with pytest.raises(ValueError, match=f"^model: .*{says}"):
+        load_model(tmp_path)
+
+
+def test_models_without_their_environment_are_refused(tmp_path: Path) -> None:
+    """A model says in what environment it was trained; other metadata are refused, however they are nested."""
+    save_model(tmp_path / "model.npz", _weights(), {"environment": 3})
+    with pytest.raises(ValueError, match="model: expected the environment of its training"):
+        load_model(tmp_path)
+    for text in ("[" * 50_000, "[3]", '"text"', '{"format": 3}'):
+        np.savez(tmp_path / "model.npz", about=np.array(text))
+        with pytest.raises(ValueError, match=r"model: .* got a broken file"):
+            load_model(tmp_path)
 
 
 def test_other_spaces_are_refused() -> None:

@@ -2,6 +2,7 @@
 
 import copy
 import inspect
+import tracemalloc
 from collections.abc import Callable
 from dataclasses import is_dataclass
 from fractions import Fraction
@@ -628,3 +629,47 @@ def test_numbers_of_an_array_are_those_that_its_type_can_hold() -> None:
     given = np.zeros((3, 2))
     assert not np.shares_memory(given, check_array("x", given, (None, 2), CURE))
     assert np.isnan(check_array("x", [[NAN, 1]], (1, 2), CURE, finite=False)).any()
+
+
+class _Unshown(str):
+    """Text of which only a beginning may be shown."""
+
+    def __repr__(self) -> str:
+        raise AssertionError("the whole text was shown")
+
+    def __getitem__(self, part: Any) -> str:
+        return str.__getitem__(self, part)
+
+
+HUGE = "x" * 5_000_000
+
+
+@pytest.mark.parametrize(
+    "got",
+    [
+        HUGE, HUGE.encode(), _Unshown(HUGE), [HUGE], (HUGE,), {HUGE: 1}, {"a": {HUGE: HUGE}}, {HUGE},
+        list(range(10**6)),
+        dict.fromkeys(range(10**6)), np.zeros(10**6), np.array([HUGE]), "'" + HUGE, 10**5000,
+    ],
+    ids=lambda got: type(got).__name__,
+)  # fmt: skip
+def test_errors_are_short_whatever_came(got: object) -> None:
+    """The text of an error has a limit, and no more is made of a value than is shown."""
+    tracemalloc.start()
+    text = str(argument_error("gate", "a number", got, CURE))
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert len(text) < 250
+    assert "\n" not in text
+    if not (isinstance(got, str) and got.startswith("'")):
+        assert most < 1_000_000
+    for parts in ((HUGE, "a number", CURE), ("gate", HUGE, CURE), ("gate", "a number", HUGE)):
+        assert len(str(argument_error(parts[0], parts[1], 3, parts[2]))) < 2500
+
+
+@pytest.mark.parametrize(
+    "got", [(1,), (), [], {}, set(), {"a": [1, (2, {3})]}, {1}, "it's", b"b", None, [[[]]], np.eye(2)]
+)
+def test_short_values_are_shown_as_they_are(got: object) -> None:
+    """Values with a short `repr` are shown by it."""
+    assert f"got {got!r}. " in str(argument_error("gate", "a number", got, CURE))

@@ -13,6 +13,7 @@ from rich.console import Console
 from training.bench.config import ExplorationBenchConfig, ExplorationTrial, PlanBenchConfig
 from training.commands._progress import TrialSet, run_trial_sets, trial_progress
 from training.commands._run_folder import Call
+from training.experiments.console import print_error
 
 if TYPE_CHECKING:  # numerical modules are imported when the command runs, so that --help is fast
     from training.bench.exploration.plan import Plan
@@ -53,13 +54,15 @@ def run_plan(call: Call[ExplorationBenchConfig], name: str | None, workers: int,
     from training.bench.exploration.plan_report import aggregate, draw_plan, episodes_csv, markdown, write_parquet
     from training.bench.exploration.players import parted
     from training.bench.exploration.trials import TRIALS_FILE, check_same_policies, play
+    from training.experiments.named_policies import check_named
     from training.experiments.numerics import PORTABLE, variables_for
     from training.experiments.run_folder import plain
 
     config, plan = _configured(call, name)
     _check_same_plan(call.out, plan)
-    check_same_policies(call.out)
     trials = plan.trials(config.policies, config.quick)
+    check_named((trial.policy for trial in trials), call.given.get("policies"))
+    check_same_policies(call.out, {trial.policy for trial in trials})
     bench = PlanBench(plan, config.decision_limit)
     firsts = {(t.policy, t.family, t.robots): t for t in reversed(trials) if t.part == trials[0].part}.values()
     console, folder = call.begin(
@@ -82,7 +85,7 @@ def run_plan(call: Call[ExplorationBenchConfig], name: str | None, workers: int,
     folder.write_text(EPISODES_CSV, episodes_csv(rows))
     if rows and not write_parquet(folder.path / EPISODES_PARQUET, rows):
         text = f"{EPISODES_PARQUET} is not written: it needs pip install 'vslam-env[parquet]'."
-        console.print(text, soft_wrap=True, markup=False)
+        console.print(text, soft_wrap=True)
     folder.write_text("tables.md", markdown(plan, rows, config.policies or plan.policies))
     draw_plan(folder.path / "plan.png", rows)
     call.finish()
@@ -114,6 +117,7 @@ def _configured(call: Call[ExplorationBenchConfig], name: str | None) -> "tuple[
     """
     from slam_backend.core.validation import argument_error
     from training.bench.exploration.plan import Plan
+    from training.experiments.named_policies import check_configuration
     from training.experiments.run_folder import read_config
 
     for option in call.given:
@@ -121,6 +125,7 @@ def _configured(call: Call[ExplorationBenchConfig], name: str | None) -> "tuple[
             hint = "Omit it, or write a plan of your own."
             raise argument_error(option, "no value with --plan, which fixes it", call.given[option], hint)
     earlier = read_config(call.file, COMMAND)[0] if call.file is not None else {}
+    check_configuration(earlier, call.given)
     values = earlier | {key: call.given[key] for key in OPEN if key in call.given}
     values |= {"plan": name} if name is not None else {}
     values |= {"quick": True} if call.quick else {}
@@ -164,6 +169,7 @@ def verify_rows(call: Call[ExplorationBenchConfig], folder: Path, count: int, wo
     from training.bench.exploration.plan import Plan, PlanBench, PlanTrial
     from training.bench.exploration.trials import TRIALS_FILE, Bench, play
     from training.bench.exploration.verification import HEADINGS, choose, compare, keep, table_rows
+    from training.experiments.named_policies import check_named
     from training.experiments.numerics import variables_for
     from training.experiments.run_folder import CONFIG_FILE, RunFolder, installed_versions, read_config
     from training.experiments.statistics import grouped
@@ -171,6 +177,7 @@ def verify_rows(call: Call[ExplorationBenchConfig], folder: Path, count: int, wo
     from training.experiments.trial_store import FAILED, finished_trials, run_in_processes, trial_of
 
     values, seed = read_config(folder, COMMAND, "verify")
+    check_named(values.get("policies") or (), call.given.get("policies"))
     bench: Bench
     kind: type[Any] = ExplorationTrial
     if "plan" in values:
@@ -183,6 +190,7 @@ def verify_rows(call: Call[ExplorationBenchConfig], folder: Path, count: int, wo
     if not chosen or any("digest" not in row for row in chosen):
         hint = f"Check {str(folder / CONFIG_FILE)!r}, or play its episodes again with this release."
         raise argument_error("verify", "a run folder whose episodes have digests", "none", hint)
+    check_named((row["policy"] for row in chosen), call.given.get("policies"))
     found = []
     with trial_progress(call.console, len(chosen), timed=False) as (advance, interrupted):
         for (where,), own in grouped(chosen, ("machine",)).items():
@@ -192,7 +200,7 @@ def verify_rows(call: Call[ExplorationBenchConfig], folder: Path, count: int, wo
             with closing(played) as repeated:
                 for again in repeated:
                     if FAILED in again:
-                        call.console.print(f"[red]error[/] {again[FAILED]}", soft_wrap=True)
+                        print_error(again[FAILED], call.console)
                         raise typer.Exit(2)
                     trial = trial_of(again, kind)
                     found.append(compare(rows[trial], again))
@@ -206,7 +214,7 @@ def verify_rows(call: Call[ExplorationBenchConfig], folder: Path, count: int, wo
     changed = sorted({row["policy"] for row in found if row["is_other_policy"]})
     if changed:
         text = f"The file of {', '.join(changed)} is another one than when the episodes were played."
-        call.console.print(text, soft_wrap=True, markup=False)
+        call.console.print(text, soft_wrap=True)
     if any(row["is_equal"] is False for row in found):
         raise typer.Exit(1)
 

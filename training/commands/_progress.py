@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
-from rich.markup import escape
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from training.experiments.console import print_error, text_column
 from training.experiments.logs import LOGGER
 
 if TYPE_CHECKING:  # numerical modules are imported when a command runs, so that --help is fast
@@ -37,7 +37,7 @@ def trial_progress(
     from training.experiments.interrupt import interrupt_flag
 
     columns = (
-        TextColumn("{task.description}"), BarColumn(20), TaskProgressColumn(), TimeElapsedColumn(),
+        text_column("{task.description}"), BarColumn(20), TaskProgressColumn(), TimeElapsedColumn(),
         TimeRemainingColumn(),
     )  # fmt: skip
     with (
@@ -99,7 +99,7 @@ def run_trial_sets(
                 trial = trial_of(row, part.kind)
                 if FAILED in row:
                     if row[FAILED] not in part.failures:  # once, even if it fails in each trial
-                        console.print(f"[red]error[/] {escape(row[FAILED])}", soft_wrap=True, highlight=False)
+                        print_error(row[FAILED], console)
                     part.failures.append(row[FAILED])
                     advance("failed", part.cost(trial))
                     return
@@ -135,11 +135,11 @@ def share_progress(console: Console, text: str, *more: str, **fields: Any) -> It
         A function of the completed fraction, in [0, 1], and of changed fields.
     """
     columns = (
-        TextColumn(text), BarColumn(), TextColumn("{task.percentage:>3.0f} %"), *map(TextColumn, more),
-        TimeElapsedColumn(), TimeRemainingColumn(),
+        text_column("{task.description}"), BarColumn(), text_column("{task.percentage:>3.0f} %"),
+        *map(text_column, more), TimeElapsedColumn(), TimeRemainingColumn(),
     )  # fmt: skip
     with Progress(*columns, console=console) as progress:
-        task = progress.add_task("", total=1.0, **fields)
+        task = progress.add_task(text, total=1.0, **fields)
 
         def update(share: float, **changed: Any) -> None:
             progress.update(task, completed=share, **changed)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, redirect_stdout, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TextIO, TypeVar
 
@@ -15,6 +15,7 @@ from rich.console import Console
 
 from training.experiments.compilation import prepare
 from training.experiments.config import ExperimentConfig
+from training.experiments.console import make_console
 from training.experiments.logs import LOGGER
 from training.replay.config import find_log
 
@@ -41,7 +42,7 @@ class Call(Generic[ConfigT]):
     # Default of `path` below the data folder, and the expected content, worded for an error
     log: tuple[Path, str] | None = None
     continues: bool = False  # Whether `out` may be the folder of the same run, stopped early
-    console: Console = field(default_factory=partial(Console, highlight=False))  # Console for the output
+    console: Console = field(default_factory=make_console)  # Console for the output
     folder: "RunFolder" = field(init=False)  # Run folder; set by `begin`
     metrics: dict[str, Any] = field(init=False)  # Metrics as written; set by `write`
 
@@ -51,9 +52,10 @@ class Call(Generic[ConfigT]):
 
         Raises:
             ValueError: If `json` cannot be written, the file cannot be read or belongs to another command, or the log
-                is missing.
+                is missing, or the file names a custom policy that the options do not name.
         """
         from slam_backend.core.files import check_writable
+        from training.experiments.named_policies import check_configuration
         from training.experiments.run_folder import read_config
 
         if self.json not in (None, STDOUT) and self.json.parent != self.out:  # the run folder is created later
@@ -61,6 +63,7 @@ class Call(Generic[ConfigT]):
         values: dict[str, Any] = {}
         if self.file is not None:
             values, values["seed"] = read_config(self.file, self.command)
+            check_configuration(values, self.given)
         values = self.kind.merged(values, {**self.quick, **self.given})
         if self.log is not None:
             values["path"] = find_log(values.get("path"), *self.log)

@@ -6,8 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.markup import escape
 
 from training.bench.config import (
     AccuracyConfig,
@@ -39,6 +37,7 @@ from training.commands._plan import (
 from training.commands._progress import TrialSet, run_trial_sets, share_progress, trial_progress
 from training.commands._run_folder import Call
 from training.commands.replay import MRCLAM_LOG
+from training.experiments.console import print_error
 from training.rl.config import require_extra
 
 if TYPE_CHECKING:  # numerical modules are imported when the command runs, so that --help is fast
@@ -176,9 +175,8 @@ def bench_stereo(
         draw_stereo(folder.path / "stereo.png", result)
     call.finish()
     if result.get("failed"):
-        errors = Console(stderr=True, soft_wrap=True, highlight=False)
         for name, why in result["failed"].items():
-            errors.print(f"[red]error[/] {escape(f'{name}: {why}')}")
+            print_error(f"{name}: {why}")
         raise typer.Exit(2)
 
 
@@ -248,8 +246,8 @@ def bench_exploration(
     from training.bench.exploration.trials import TRIALS_FILE, check_same_policies, play
     from training.experiments.run_folder import plain
 
-    check_same_policies(call.out)
     trials = call.config.trials()
+    check_same_policies(call.out, call.config.policies)
     firsts = {(t.policy, t.world, t.robots): t for t in reversed(trials)}.values()
     config = call.config
     checks = (

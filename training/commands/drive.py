@@ -4,9 +4,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from training.experiments.compilation import prepare
+from training.experiments.console import make_console
 
 EPISODE_S = 600.0  # [s]
 
@@ -24,7 +24,7 @@ def drive_by_hand(
         int | None, typer.Option(help="Length of the episode in ticks of 0.1 s.", show_default="600 s")
     ] = None,
     max_seconds: Annotated[
-        float | None, typer.Option(help="Length of the episode [s], instead of max_cycles.", show_default="600")
+        float | None, typer.Option(help="Length of the episode \\[s], instead of max_cycles.", show_default="600")
     ] = None,
     record: Annotated[Path | None, typer.Option(help="Record a video to this .mp4 file.", show_default=False)] = None,
 ) -> None:
@@ -56,7 +56,7 @@ def drive_by_hand(
     if reason:
         raise argument_error("drive", "a display for a window", reason.split(".")[0], reason.split(". ", 1)[1] + ".")
     prepare()
-    console = Console(highlight=False)
+    console = make_console()
     console.print(KEYS)
     window = Window("vslam drive")
     with ExitStack() as stack:

@@ -59,7 +59,7 @@ def fig2(call: Call[Fig2Config], check: Check = False) -> None:
     for claim in claims:
         held = "holds" if claim["holds"] else "does not hold"
         shown = f"{number(claim['measured'])}, at most {claim['at_most']:g}: {held}"
-        console.print(f"{claim['claim']}: {shown}", highlight=False, markup=False)
+        console.print(f"{claim['claim']}: {shown}")
     text = f"At {poor['share_too_little']} stages the maps share too little; false alignments of ours: {poor['false']}."
     console.print(text)
     call.write({"summary": lines, "claims": claims} | poor)

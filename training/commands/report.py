@@ -4,9 +4,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from training.commands._run_folder import claim_stdout, write_json
+from training.experiments.console import make_console
 
 Open = Annotated[bool, typer.Option("--open", help="Open the page in the browser.")]
 
@@ -55,7 +55,7 @@ def compare(
             raise argument_error("out", "a name that ends in .html", out, "Pages are written as HTML.")
         check_writable(out, "out")
     found = compare_folders(one, other)
-    print_comparison(Console(highlight=False), found)
+    print_comparison(make_console(), found)
     if json is not None:
         write_json(json, to_json(plain(found.to_mapping())))
     if show and out is None:
@@ -66,7 +66,7 @@ def compare(
 
 def _finish(page: Path, show: bool) -> None:
     """Print the path of a page, and open it if requested."""
-    Console(highlight=False).print(f"Report: {page}", soft_wrap=True)
+    make_console().print(f"Report: {page}", soft_wrap=True)
     if show:
         import webbrowser
 

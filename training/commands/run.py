@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, TimeRemainingColumn
 from rich.progress import Progress as Bar
 
 from training.commands._options import options
 from training.commands._run_folder import Call
 from training.episodes.config import RunConfig
+from training.experiments.console import text_column
 
 if TYPE_CHECKING:  # numerical modules are imported when the command runs, so that --help is fast
     from training.episodes.runner import EpisodeRecord, MergeRecord, Progress
@@ -150,8 +151,8 @@ def _run_with_progress(
 def live_progress(console: Console, num_steps: int, agents: Sequence[str]) -> Iterator[Callable[["Progress"], None]]:
     """Show a bar with the metrics of a running episode, and a line for each merge; yield the callback for a step."""
     columns = (
-        TextColumn("{task.fields[time]:6.1f} s"), BarColumn(20), TextColumn("E {task.fields[errors]} m"),
-        TextColumn("coverage {task.fields[coverage]:2.0f} %"), TextColumn("{task.fields[groups]} maps"),
+        text_column("{task.fields[time]:6.1f} s"), BarColumn(20), text_column("E {task.fields[errors]} m"),
+        text_column("coverage {task.fields[coverage]:2.0f} %"), text_column("{task.fields[groups]} maps"),
         TimeRemainingColumn(),
     )  # fmt: skip
     with Bar(*columns, console=console) as bar:

@@ -12,6 +12,7 @@ from rich.console import Console
 from training.commands._options import options
 from training.commands._run_folder import Call
 from training.experiments.compilation import prepare
+from training.experiments.console import text_column
 from training.rl.config import SPLIT_TRAIN, TrainConfig, require_extra
 
 if TYPE_CHECKING:  # numerical modules are imported when the command runs, so that --help is fast
@@ -125,13 +126,13 @@ def _run_live(console: Console, training: "Training") -> tuple[bool, float]:
     import time
     from contextlib import ExitStack
 
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
 
     from training.experiments.interrupt import interrupt_flag
 
     columns = (
-        TextColumn("{task.completed:,.0f} of {task.total:,.0f}"), BarColumn(None), TextColumn("{task.fields[status]}"),
-        TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(),
+        text_column("{task.completed:,.0f} of {task.total:,.0f}"), BarColumn(None),
+        text_column("{task.fields[status]}"), TimeElapsedColumn(), text_column("left"), TimeRemainingColumn(),
     )  # fmt: skip
     config, begin = training.config, time.perf_counter()
     total, done = config.updates * config.rollout, len(training.rows) * config.rollout
@@ -167,13 +168,13 @@ def _imitate_live(console: Console, imitation: "Imitation") -> tuple[bool, float
     """
     import time
 
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
 
     from training.experiments.interrupt import interrupt_flag
 
     columns = (
-        TextColumn("{task.description}"), BarColumn(None), TextColumn("{task.fields[status]}"), TimeElapsedColumn(),
-        TextColumn("left"), TimeRemainingColumn(),
+        text_column("{task.description}"), BarColumn(None), text_column("{task.fields[status]}"), TimeElapsedColumn(),
+        text_column("left"), TimeRemainingColumn(),
     )  # fmt: skip
     begin = time.perf_counter()
     epochs, config = imitation.config.epochs * (imitation.config.rounds or 0), imitation.config

@@ -3,7 +3,8 @@
 from typing import Annotated
 
 import typer
-from rich.console import Console
+
+from training.experiments.console import make_console
 
 
 def warm_up(
@@ -17,7 +18,7 @@ def warm_up(
     from slam_backend.core.jit import IS_PLAIN
     from training.experiments.compilation import compilation_progress
 
-    with compilation_progress(Console(stderr=True)) as progress:
+    with compilation_progress(make_console(stderr=True)) as progress:
         seconds = vslam_env.warm_up(everything=everything, workers=workers, progress=progress)
     if not seconds:
-        Console().print("There is nothing to compile." if IS_PLAIN else "All kernels are in the cache.")
+        make_console().print("There is nothing to compile." if IS_PLAIN else "All kernels are in the cache.")

@@ -5,7 +5,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
+
+from training.experiments.console import make_console
 
 worlds = typer.Typer(help="List, preview, check and import worlds.", no_args_is_help=True)
 
@@ -43,7 +44,7 @@ def list_worlds(seeds: Annotated[int, typer.Option(help="Number of worlds measur
             f"{_span([round(world.floor_m2) for world in found])} m²",
             f"{_span([round(world.width_m) for world in found])} x {_span([round(w.height_m) for w in found])} m",
         )  # fmt: skip
-    console = Console(highlight=False)
+    console = make_console()
     console.print(table)
     for split, (first, end) in SPLITS.items():
         console.print(f"{split}: world seeds {first} to {end - 1}")
@@ -67,10 +68,10 @@ def preview(
     if out.suffix.lower() != ".png":
         raise argument_error("out", "a name that ends in .png", out, "Pictures are written as PNG.")
     check_writable(out, "out")
-    with compilation_progress(Console(stderr=True)):
+    with compilation_progress(make_console(stderr=True)):
         picture = contact_sheet(_with_outside(world, outside), first_seed, seeds, robots)
     write_file(out, imageio.imwrite("<bytes>", picture, extension=".png"), "out")
-    Console(highlight=False).print(f"Picture: {out}", soft_wrap=True)
+    make_console().print(f"Picture: {out}", soft_wrap=True)
 
 
 @worlds.command("validate")
@@ -97,7 +98,7 @@ def validate(
         *gaps,
     ):
         table.add_row(title, f"{min(values):.4g}", f"{max(values):.4g}")
-    Console().print(table)
+    make_console().print(table)
 
 
 @worlds.command("import")
@@ -131,7 +132,7 @@ def import_world(
     save_walls_json(traced, out)
     x_min, y_min, x_max, y_max = traced.bounds
     size = f"{x_max - x_min:.1f} x {y_max - y_min:.1f} m"
-    Console(highlight=False).print(f"{out}: {len(traced.walls)} walls, {size}", soft_wrap=True)
+    make_console().print(f"{out}: {len(traced.walls)} walls, {size}", soft_wrap=True)
 
 
 def _with_outside(world: str, outside: str | None) -> str:

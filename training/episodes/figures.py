@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from slam_backend.core.validation import BoolArray, FloatArray
 from slam_backend.geometry import compose, rotate_covariances, transform_points
 from training.episodes.runner import EpisodeRecord, MergeRecord
-from training.experiments.plotting import rgb, save_png
+from training.experiments.plotting import picture, rgb, save_png
 from training.experiments.tables import E_NOTHING
 from vslam_env.rendering import Scene
 from vslam_env.rendering.canvas import CHI_SQUARE_95
@@ -27,6 +27,7 @@ TEXT_SIZE = 8.0  # [pt]
 LETTER = 0.56 * TEXT_SIZE / 72.0  # mean width of a letter of this size [in]
 
 
+@picture
 def draw_maps(record: EpisodeRecord, path: Path) -> None:
     """Save a plot of the map of each robot before its first merge, and of all maps at the end.
 
@@ -75,6 +76,7 @@ def draw_maps(record: EpisodeRecord, path: Path) -> None:
     save_png(figure, path, 150)
 
 
+@picture
 def draw_errors(record: EpisodeRecord, path: Path) -> None:
     """Save a plot of the map error of each robot and of the coverage over time, with merges as vertical lines.
 

@@ -9,6 +9,8 @@ from rich.console import Console
 from rich.live import Live
 from rich.spinner import Spinner
 
+from training.experiments.console import make_console
+
 
 @contextmanager
 def compilation_progress(console: Console) -> Iterator[Callable[[int, int, float], None]]:
@@ -55,8 +57,8 @@ def prepare(*first_steps: Callable[[], object]) -> None:
     from slam_backend.core.compilation.messages import MESSAGE, log_compilation
     from vslam_env.warm_up import warm_up
 
-    with compilation_progress(Console(stderr=True)) as progress:
+    with compilation_progress(make_console(stderr=True)) as progress:
         for step in first_steps:
             step()
         warm_up(progress=progress)
-    log_compilation(lambda: Console(stderr=True).print(MESSAGE, highlight=False))  # kernels that only some runs need
+    log_compilation(lambda: make_console(stderr=True).print(MESSAGE))  # kernels that only some runs need

@@ -3,8 +3,9 @@
 import logging
 from typing import Literal
 
-from rich.console import Console
 from rich.logging import RichHandler
+
+from training.experiments.console import make_console
 
 LogLevel = Literal["debug", "info", "warning", "error"]
 PACKAGES = ("slam_backend", "vslam_env", "agents", "training")
@@ -14,7 +15,7 @@ LOGGER = logging.getLogger("training")
 def begin_logging(level: LogLevel) -> None:
     """Show messages of this project's packages from a level on; those of other packages are not affected."""
     handler = RichHandler(
-        console=Console(stderr=True), show_path=False, markup=False, highlighter=None, log_time_format="%H:%M:%S"
+        console=make_console(stderr=True), show_path=False, markup=False, highlighter=None, log_time_format="%H:%M:%S"
     )
     for package in PACKAGES:
         logger = logging.getLogger(package)

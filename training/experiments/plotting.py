@@ -1,9 +1,12 @@
 """Plots as small PNG files, and common plot elements."""
 
+from collections.abc import Callable
+from functools import wraps
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec
 
+import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -11,10 +14,37 @@ from matplotlib.patches import Ellipse
 from PIL import Image
 
 from slam_backend.core.files import write_file
-from slam_backend.core.validation import FloatArray
+from slam_backend.core.validation import FloatArray, is_argument_error
+from training.experiments.console import print_warning
+
+P = ParamSpec("P")
 
 CHI_SQUARE_95 = 5.991  # two degrees of freedom
+MOST_LETTERS = 200  # of an error's text
 COLOURS = 256  # enough for lines, points and text edges; reduces files to a quarter
+
+
+def picture(draw: Callable[P, None]) -> Callable[P, None]:
+    """Let a function draw a picture with settings of its own; a decorator.
+
+    The user's settings of matplotlib have no effect on it, and a picture that cannot be drawn costs one line on stderr.
+    A file that cannot be written is an error.
+    """
+
+    @wraps(draw)
+    def drawn(*values: P.args, **named: P.kwargs) -> None:
+        try:
+            with mpl.rc_context():
+                mpl.rcdefaults()
+                draw(*values, **named)
+        except Exception as error:
+            if is_argument_error(error):
+                raise
+            file = next(value for value in (*values, *named.values()) if isinstance(value, Path))
+            what = " ".join(f"{type(error).__name__}: {error}".split())
+            print_warning(f"{file.name} is not drawn: {what[:MOST_LETTERS]}")
+
+    return drawn
 
 
 def save_png(figure: Figure, file: Path, dpi: int) -> None:

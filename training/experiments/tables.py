@@ -7,8 +7,8 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from rich.box import SIMPLE_HEAD
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 LARGE = 1e5  # numbers from here on have an exponent
 CUTOFF_M = 1.0  # errors of landmarks are cut here in the map error E [m]
@@ -30,11 +30,13 @@ def number(value: float | None, digits: int = 2, factor: float = 1.0) -> str:
 
 def console_table(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]] = ()) -> Table:
     """Return a table for the console; title, headings and rows are shown verbatim, without markup."""
-    table = Table(title=escape(title), box=SIMPLE_HEAD, title_justify="left", padding=(0, 1), collapse_padding=True)
+    table = Table(
+        title=Text(title, "table.title"), box=SIMPLE_HEAD, title_justify="left", padding=(0, 1), collapse_padding=True
+    )
     for column, heading in enumerate(headings):
-        table.add_column(escape(heading), justify="left" if column == 0 else "right", overflow="fold")
+        table.add_column(Text(heading), justify="left" if column == 0 else "right", overflow="fold")
     for row in rows:
-        table.add_row(*map(escape, row))
+        table.add_row(*map(Text, row))
     return table
 
 

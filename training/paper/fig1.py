@@ -17,7 +17,7 @@ from slam_backend.core.validation import FloatArray, IntArray
 from training.bench.accuracy.batch_problem import BatchProblem
 from training.bench.accuracy.runs import STEP, StereoRun, simulate_run
 from training.bench.accuracy.world import Office
-from training.experiments.plotting import rgb, save_png
+from training.experiments.plotting import picture, rgb, save_png
 from training.paper.config import Fig1Config
 from training.paper.fig6.trials import FILTER_OPTIONS, REGIMES
 from vslam_env.rendering.palette import FAINT_INK, TRUE_LANDMARK, WALL, robot_colour
@@ -93,6 +93,7 @@ def path_errors(run: StereoRun, clouds: Clouds) -> list[dict[str, float]]:
     ]
 
 
+@picture
 def draw_fig1(file: Path, run: StereoRun, panels: Sequence[tuple[str, str, Clouds]]) -> None:
     """Draw the panels one below the other, for the width of a text column, into a PNG file.
 

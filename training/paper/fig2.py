@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from slam_backend.core.validation import FloatArray
 from slam_backend.geometry import wrap_angle
 from slam_backend.maps.alignment import DISTINCT_ROTATION, DISTINCT_TRANSLATION, align_maps, propose_motion
-from training.experiments.plotting import add_legend, save_png
+from training.experiments.plotting import add_legend, picture, save_png
 from training.experiments.tables import csv_text
 from training.paper.map_pairs import map_alone, simulate_pair, true_motion
 
@@ -149,6 +149,7 @@ def to_csv(rows: Iterable[Mapping[str, Any]]) -> str:
     return csv_text(headings, lines)
 
 
+@picture
 def draw_fig2(file: Path, lines: Sequence[Mapping[str, Any]]) -> None:
     """Draw medians as lines and 90 % quantiles as error bars, on a log scale, into a PNG file."""
     with mpl.rc_context({"font.size": 9}):

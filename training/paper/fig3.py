@@ -16,7 +16,7 @@ from slam_backend.maps.alignment import Alignment, align_maps, candidate_matches
 from slam_backend.maps.alignment_types import AlignmentOptions
 from slam_backend.maps.fusion import fuse_maps, move_covariances
 from slam_backend.maps.landmark_map import LandmarkMap
-from training.experiments.plotting import CHI_SQUARE_95, ellipse_95, save_png
+from training.experiments.plotting import CHI_SQUARE_95, ellipse_95, picture, save_png
 from training.experiments.tables import csv_text
 from training.paper.config import PairConfig
 from training.paper.map_pairs import Stage, map_alone, simulate_pair, true_motion
@@ -120,6 +120,7 @@ def ellipses_csv(fused: FusedLandmarks) -> str:
     return csv_text(headings, rows)
 
 
+@picture
 def draw_fig3(file: Path, pair: AlignedPair) -> None:
     """Draw both maps in their own frames with lines between matches, and the aligned maps, into a PNG file."""
     map_a, map_b = pair.maps
@@ -156,6 +157,7 @@ def draw_fig3(file: Path, pair: AlignedPair) -> None:
         save_png(figure, file, 120)
 
 
+@picture
 def draw_fig4(file: Path, fused: FusedLandmarks) -> None:
     """Draw the 95 % ellipses of several landmarks before and after fusion, one per column, into a PNG file."""
     count = len(fused.names)

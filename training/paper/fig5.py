@@ -11,7 +11,7 @@ from matplotlib.patches import Wedge
 
 from agents.registry import make_policy
 from slam_backend.core.validation import BoolArray, FloatArray
-from training.experiments.plotting import save_png
+from training.experiments.plotting import picture, save_png
 from training.experiments.tables import csv_text
 from training.paper.config import Fig5Config
 from vslam_env import EnvConfig, vslam_v0
@@ -105,6 +105,7 @@ def _visibility(env: ExplorationEnv) -> Fig5:
     )  # fmt: skip
 
 
+@picture
 def draw_fig5(file: Path, found: Fig5) -> None:
     """Draw the figure into a PNG file."""
     low, high = found.walls.reshape(-1, 2).min(axis=0), found.walls.reshape(-1, 2).max(axis=0)

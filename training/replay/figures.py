@@ -12,7 +12,7 @@ from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.geometry import compose, inverse, transform_points
 from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.readers.mrclam import MrclamLog
-from training.experiments.plotting import ellipse_95, save_png
+from training.experiments.plotting import ellipse_95, picture, save_png
 from training.replay.metrics import AlignedMap, PathScore, align_to_truth
 from training.replay.mrclam import Replay
 from training.replay.single_robot import OneReplay, PositionScore
@@ -27,6 +27,7 @@ WIDTH = 8.0  # [in]
 OFTEN = 10  # measurements from which a landmark is drawn opaque
 
 
+@picture
 def draw_replay(file: Path, log: MrclamLog, replay: Replay, paths: Sequence[PathScore | None]) -> None:
     """Draw the replay into a PNG file.
 
@@ -48,6 +49,7 @@ def draw_replay(file: Path, log: MrclamLog, replay: Replay, paths: Sequence[Path
         save_png(figure, file, 110)
 
 
+@picture
 def draw_joint_map(
     file: Path, log: MrclamLog, replay: Replay, paths: Sequence[PathScore | None], group: tuple[int, ...]
 ) -> None:
@@ -133,6 +135,7 @@ def _finish(ax: Axes, log: MrclamLog, title: str) -> None:
     ax.legend(fontsize=7, loc="best", framealpha=0.8)
 
 
+@picture
 def draw_one(
     file: Path, title: str, result: OneReplay, paths: tuple[FloatArray, FloatArray],
     scores: tuple[PositionScore, PositionScore] | None = None, truth: FloatArray | None = None,

@@ -9,10 +9,12 @@ from slam_backend.core.files import write_file
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.frontend.images import Image
 from slam_backend.geometry import inverse, transform_points
+from training.experiments.plotting import picture
 
 KNOWN, NEW, REFUSED, EXPECTED = (90, 200, 90), (60, 170, 250), (70, 70, 230), (230, 190, 90)  # blue, green, red
 
 
+@picture
 def draw_frame(
     file: Path, image: Image, pixels: FloatArray, ids: IntArray, counts: dict[int, int], expected: FloatArray
 ) -> None:
@@ -33,6 +35,7 @@ def draw_frame(
     _write(file, canvas)
 
 
+@picture
 def draw_matches(file: Path, left: Image, right: Image, a: FloatArray, b: FloatArray, right_ones: IntArray) -> None:
     """Draw two images, one above the other, with lines between matched points (n, 2) [px].
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import threading
 import time
 from collections.abc import Callable
@@ -9,7 +10,6 @@ from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from types import TracebackType
 from typing import Any, Self
-from urllib.parse import parse_qs, urlsplit
 
 from slam_backend.core.validation import argument_error
 from training.episodes.runner import Progress
@@ -17,6 +17,8 @@ from training.report.content import Content
 from training.report.page import render
 
 HOST = "127.0.0.1"
+OWN = re.compile(r"(127\.0\.0\.1|localhost\.?|\[::1\])(:[0-9]{1,5})?", re.IGNORECASE)  # names of this machine
+VERSION = re.compile(r"after=([0-9]{1,9})")
 ANSWER_S = 5.0  # longest wait of a request for new content [s]
 WATCHED_S = 2.0 * ANSWER_S  # content is made as long as the last request is not older [s]
 SHARE = 0.1  # share of the time that making content may take
@@ -153,6 +155,9 @@ class _Server(ThreadingHTTPServer):
     daemon_threads = True
     allow_reuse_address = os.name != "nt"  # on Windows two servers could otherwise share a port
 
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Print nothing: the terminal belongs to the progress of the run."""
+
 
 def _handler_of(view: LiveView) -> type[BaseHTTPRequestHandler]:
     class Handler(BaseHTTPRequestHandler):
@@ -160,15 +165,14 @@ def _handler_of(view: LiveView) -> type[BaseHTTPRequestHandler]:
 
         def do_GET(self) -> None:
             """Answer a request."""
-            host = (self.headers.get("Host") or "").rsplit(":", 1)[0]
-            path, query = urlsplit(self.path).path, parse_qs(urlsplit(self.path).query)
-            after = (query.get("after") or ["0"])[0]
-            if host not in (HOST, "localhost"):  # another site's name that leads here
+            path, _, query = self.path.partition("?")
+            after = VERSION.fullmatch(query or "after=0")
+            if not OWN.fullmatch(self.headers.get("Host") or ""):  # another site's name that leads here
                 self.send_error(HTTPStatus.FORBIDDEN)
             elif path == "/":
                 self._send(view.page(), "text/html; charset=utf-8")
-            elif path == "/content" and after.isdecimal():
-                version, text = view.answer(int(after))
+            elif path == "/content" and after:
+                version, text = view.answer(int(after[1]))
                 self._send(text, "application/json")
                 view.delivered(version)
             else:
@@ -187,10 +191,10 @@ def _handler_of(view: LiveView) -> type[BaseHTTPRequestHandler]:
             """Print nothing: stderr belongs to the progress of the run."""
 
         def handle(self) -> None:
-            """Handle requests; a page that is closed meanwhile is no error."""
+            """Handle requests; what a page asks, or that it is closed meanwhile, is no error of the run."""
             try:
                 super().handle()
-            except ConnectionError:
+            except (ConnectionError, ValueError):  # ValueError: bytes that are no request
                 self.close_connection = True
 
     return Handler

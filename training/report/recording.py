@@ -110,12 +110,59 @@ class Recording:
             arrays: dict[str, NDArray[Any]] = dict(read_arrays(file))
             about = json.loads(arrays.pop("about").tobytes().decode())
             if about["format"] == FORMAT:
-                return cls(about=about, **arrays)
+                return cls(about=about, **arrays)._checked()
         except Exception as error:
             raise argument_error("folder", "a recording of an episode", "a broken file", hint) from error
         raise argument_error(
             "folder", f"a recording of format {FORMAT}", f"a recording of format {about['format']}", hint
         )
+
+    def _checked(self) -> Self:
+        """Return the recording, or raise a `ValueError` if its parts do not fit together."""
+        names, events = self.about.get("names"), self.about.get("events", [])
+        is_named = isinstance(names, list) and all(isinstance(name, str) for name in names)
+        if not is_named or not isinstance(events, list) or not all(isinstance(event, dict) for event in events):
+            raise ValueError("names or events are missing")
+        sizes = {"F": len(self.times), "K": len(names or ()), "J": len(self.keyframes)}
+        if not len(self.times) or not sizes["K"]:
+            raise ValueError("it has no step or no robot")
+        for name, letters in LAYOUT.items():
+            array = getattr(self, name)
+            if array.dtype.kind not in "biuf" or array.ndim != len(letters):
+                raise ValueError(f"{name} is no array of {len(letters)} axes")
+            for letter, size in zip(letters, array.shape, strict=True):
+                if len(array) and size != (int(letter) if letter.isdigit() else sizes.setdefault(letter, size)):
+                    raise ValueError(f"{name} has another shape")
+            if np.isinf(array).any() or (name in KNOWN and np.isnan(array).any()):
+                raise ValueError(f"{name} is not finite")
+            if (name in WHOLE_NUMBERS or name in PARTS) and ((array < 0).any() or (array != np.floor(array)).any()):
+                raise ValueError(f"{name} are no counts")
+        for name, rows in PARTS.items():
+            ends = getattr(self, name).ravel()
+            if (np.diff(ends) < 0).any() or (ends[-1] if len(ends) else 0) != len(getattr(self, rows)):
+                raise ValueError(f"{name} do not divide {rows}")
+        if (np.diff(self.times) < 0.0).any() or (np.diff(self.keyframes) <= 0).any():
+            raise ValueError("steps are out of order")
+        if (self.keyframes >= sizes["F"]).any() or (self.frames >= sizes["K"]).any():
+            raise ValueError("steps or robots do not exist")
+        cells, ends = np.prod(self.grid_boxes[..., 2:], axis=-1).ravel(), self.grid_ends.ravel().astype(np.int64)
+        runs = np.concatenate([[0], np.cumsum(self.grid_runs.astype(np.int64))])[np.concatenate([[0], ends])]
+        if len(ends) and not np.array_equal(np.diff(runs), cells):
+            raise ValueError("grids do not fill their boxes")
+        return self
+
+
+# Shapes of the arrays, by their sizes: F, K and J as in `Recording`, other letters of one array each. An array that is
+# not recorded has no rows. Those of `KNOWN` hold finite numbers, the others also NaN for what is not known.
+LAYOUT = {
+    "times": "F", "estimate": "FK3", "truth": "FK3", "reckoned": "FK3", "covariances": "FK3", "frames": "FK",
+    "scores": "FK4", "coverage": "F", "sights": "n2", "sight_ends": "FK", "walls": "s4", "landmarks": "l2",
+    "keyframes": "J", "map_points": "m5", "map_ends": "JK", "grid_values": "g", "grid_runs": "g", "grid_ends": "JK",
+    "grid_boxes": "JK4", "starts": "K3", "candidates": "c4", "candidate_ends": "JK",
+}  # fmt: skip
+KNOWN = ("times", "walls", "starts", "grid_boxes")
+WHOLE_NUMBERS = ("frames", "keyframes", "grid_runs", "grid_values")
+PARTS = {"sight_ends": "sights", "map_ends": "map_points", "grid_ends": "grid_runs", "candidate_ends": "candidates"}
 
 
 def _end_of(arrays: Sequence[NDArray[Any]], shape: tuple[int, int]) -> IntArray:

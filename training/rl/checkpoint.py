@@ -54,7 +54,9 @@ def read_checkpoint(file: Path) -> dict[str, Any]:
             raise ValueError("another kind of file")
         mark = json.loads(head[len(MAGIC) :])
         size, digest, version, versions = (mark[name] for name in ("bytes", "sha256", "format", "versions"))
-    except (ValueError, KeyError, TypeError) as error:
+        if not isinstance(versions, dict):
+            raise ValueError("no versions")
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise argument_error(
             "resume", expected, "a broken file", f"{str(file)!r} is not a checkpoint. Train again."
         ) from error
@@ -69,9 +71,9 @@ def read_checkpoint(file: Path) -> dict[str, Any]:
             raise argument_error("resume", f"a checkpoint made with {package} {here}", versions.get(package), hint)
     try:
         content = decode(packed, ENV_KINDS)
-        if not isinstance(content, dict) or not all(isinstance(name, str) for name in content):
-            raise ValueError("it has no named parts")
-    except ValueError as error:
+        if not isinstance(content, dict) or not {"config", "seed"} <= set(content):
+            raise ValueError("it has no configuration and seed")
+    except (ValueError, TypeError, RecursionError) as error:
         hint = f"{str(file)!r} was made by another program. Train again. Error: {error}."
         raise argument_error("resume", expected, "a broken file", hint) from error
     return content

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from slam_backend.core.validation import FloatArray
-from training.experiments.plotting import save_png
+from training.experiments.plotting import picture, save_png
 from training.experiments.tables import csv_text
 
 Row = Mapping[str, float]
@@ -41,6 +41,7 @@ def _mean(rows: Sequence[Row]) -> dict[str, Any]:
     return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
 
 
+@picture
 def draw_learning(file: Path, rows: Sequence[Mapping[str, float]]) -> None:
     """Plot each metric by rollout, with its running mean over a tenth of the rollouts, into a PNG file."""
     steps = np.array([row["steps"] for row in rows])
@@ -59,6 +60,7 @@ def draw_learning(file: Path, rows: Sequence[Mapping[str, float]]) -> None:
         save_png(figure, file, 120)
 
 
+@picture
 def draw_imitation(file: Path, rows: Sequence[Mapping[str, float]]) -> None:
     """Plot each metric of an imitation by epoch, with a line where a round begins, into a PNG file."""
     epochs = np.arange(1, len(rows) + 1)

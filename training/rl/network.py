@@ -238,3 +238,13 @@ def actor_part(state: Mapping[str, Any]) -> dict[str, NDArray[np.float32]]:
         if part in ("features_extractor", "mlp_extractor") and not layer.startswith("value_"):
             found[layer] = np.array(values, np.float32)
     return found
+
+
+def check_finite(policy: GoalPolicy) -> None:
+    """Refuse parameters that are not finite, of which nothing can be learned.
+
+    Raises:
+        ValueError: If there are any.
+    """
+    if not all(bool(torch.isfinite(values).all()) for values in policy.parameters()):
+        raise ValueError("weights with NaN or infinity")

@@ -17,6 +17,7 @@ from training.rl.callbacks import Row, TrainingCallback
 from training.rl.checkpoint import CHECKPOINT_FILE, read_checkpoint, write_checkpoint
 from training.rl.config import SPLIT_TRAIN, SPLIT_TRY, TrainConfig
 from training.rl.learner import GoalPPO
+from training.rl.network import check_finite
 from training.rl.true_state import WithTrueState
 from training.vec_env import make_vec_env
 
@@ -129,6 +130,7 @@ class Training:
         """Load the parts of a checkpoint."""
         model, draws = self.model, kept["draws"]
         model.set_state(as_tensors(kept["learner"]))
+        check_finite(model.trained)
         model.num_timesteps, model._n_updates, model._current_progress_remaining = kept["counts"]
         model._last_obs, model._last_episode_starts = kept["last"]
         self.env.set_state(kept["environments"])

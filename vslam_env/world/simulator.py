@@ -1,6 +1,7 @@
 """Physics simulator: disc robots that follow velocity commands among walls, with contacts solved by pymunk."""
 
 from typing import Any
+from weakref import finalize
 
 import numpy as np
 import pymunk
@@ -82,24 +83,17 @@ class Simulator:
         self.radius = check_float("radius", radius, "Give the radius of a robot in metres.", above=0.0)
         self.tick = check_float("tick", tick, "Give seconds.", above=0.0)
         self._walls = world.walls.copy()
-        self._space = pymunk.Space()
-        self._space.collision_slop = SLOP
-        self._space.collision_persistence = 1  # contacts are dropped in the first substep without them
-        ground = self._space.static_body
-        self._space.add(*(pymunk.Segment(ground, (a, b), (c, d), 0.0) for a, b, c, d in world.walls.tolist()))
-        self._bodies = []
         self.poses = check_array("start_poses", start_poses, (None, 3), "Give one row x y theta for each robot.")
         self._shape = len(self.poses), 2  # shape of commands
         self._reach = np.empty(len(self.poses))
         _, _, x_max, y_max = world.bounds
         spacing = 4.0 * (radius + SKIN)
-        self._parking = [(x_max + spacing * (2 + robot), y_max + spacing) for robot in range(len(self.poses))]
-        for place in self._parking:
-            body = pymunk.Body(1.0, float("inf"))
-            body.position = place
-            self._space.add(body, pymunk.Circle(body, radius + SKIN))
-            self._bodies.append(body)
-        self.bumped = self._no_bumps = as_read_only(np.zeros(len(self._bodies), dtype=np.bool_))
+        parking = [(x_max + spacing * (2 + robot), y_max + spacing) for robot in range(len(self.poses))]
+        self._contacts = _ContactSpace()
+        # Also when Python ends: pymunk's objects call Python when they are freed, which crashes after its end.
+        finalize(self, self._contacts.close)
+        self._contacts.build(self._walls, parking, radius + SKIN, self.tick)
+        self.bumped = self._no_bumps = as_read_only(np.zeros(len(self.poses), dtype=np.bool_))
 
     def step(self, commands: Any) -> bool:
         """Drive all robots for one tick.
@@ -116,14 +110,14 @@ class Simulator:
         is_array = type(commands) is np.ndarray and commands.dtype == np.float64 and commands.flags.carray
         if not (is_array and commands.shape == self._shape):
             commands = self._checked(commands)
-        goals = np.empty((len(self._bodies), 3))
+        goals = np.empty((len(self.poses), 3))
         clear = _drive_freely(self.poses, commands, self.tick, self._walls, self.radius + SKIN, goals, self._reach)
         if clear:
             self.bumped = self._no_bumps
         else:
             self._checked(commands)  # commands beyond MAX_SPEED are never clear
             motion = goals[:, :2] - self.poses[:, :2]
-            goals[:, :2] = self._move_in_contact(motion)
+            goals[:, :2] = self._contacts.move(self.poses[:, :2], motion)
             achieved = np.sum((goals[:, :2] - self.poses[:, :2]) * motion, axis=1)
             self.bumped = as_read_only(achieved < (1.0 - SHORTFALL) * np.sum(motion * motion, axis=1))
         self.poses = goals
@@ -133,36 +127,74 @@ class Simulator:
         """Return validated commands (K, 2), or raise."""
         return check_array("commands", commands, self._shape, "Give (v, omega) for each robot.", within=MAX_SPEED)
 
-    def _move_in_contact(self, motion: FloatArray) -> FloatArray:
-        """Move the bodies by `motion` (K, 2) [m] as far as contacts allow; return their positions (K, 2) [m].
-
-        pymunk moves bodies before it solves contacts. The first step therefore starts from rest, with the command
-        applied as a force, so that existing contacts act before any motion.
-        """
-        longest = float(np.hypot(motion[:, 0], motion[:, 1]).max())
-        substeps = max(2, int(np.ceil(longest / LONGEST_SUBSTEP)))
-        duration = self.tick / substeps
-        for body, (x, y), (dx, dy) in zip(self._bodies, self.poses[:, :2].tolist(), motion.tolist(), strict=True):
-            body.position = x, y
-            body.velocity = 0.0, 0.0
-            body.mass = STANDING_MASS if dx == dy == 0.0 else 1.0
-            body.force = body.mass * dx / (self.tick * duration), body.mass * dy / (self.tick * duration)
-        self._space.collision_bias = (1.0 - CORRECTION) ** (1.0 / duration)  # share of a penetration left after 1 s
-        for _ in range(substeps + 1):
-            self._space.step(duration)
-        after = np.array([body.position for body in self._bodies])
-        for body, place in zip(self._bodies, self._parking, strict=True):
-            body.position = place
-        self._space.step(duration)
-        return after
-
     def get_state(self) -> dict[str, Any]:
         """Return a copy of the complete state."""
         return {"poses": self.poses.copy(), "bumped": self.bumped.copy()}
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Restore a state of `get_state` and continue it exactly."""
-        robots = len(self._bodies)
+        robots = len(self.poses)
         hint = "Pass what get_state returned for the same number of robots."
         self.poses = check_array("state['poses']", state["poses"], (robots, 3), hint)
         self.bumped = as_read_only(check_array("state['bumped']", state["bumped"], (robots,), hint, dtype=np.bool_))
+
+
+class _ContactSpace:
+    """Chipmunk space with the walls and the bodies of the robots."""
+
+    def __init__(self) -> None:
+        self._space: pymunk.Space | None = pymunk.Space()
+        self._bodies: list[pymunk.Body] = []
+        self._parking: list[tuple[float, float]] = []
+
+    def build(self, walls: FloatArray, parking: list[tuple[float, float]], radius: float, tick: float) -> None:
+        """Add walls (S, 4) [m], and bodies of a radius [m], each at its place [m] outside the walls."""
+        space = self._open_space()
+        space.collision_slop = SLOP
+        space.collision_persistence = 1  # contacts are dropped in the first substep without them
+        ground = space.static_body
+        space.add(*(pymunk.Segment(ground, (a, b), (c, d), 0.0) for a, b, c, d in walls.tolist()))
+        self._parking, self._tick = parking, tick
+        for place in parking:
+            body = pymunk.Body(1.0, float("inf"))
+            body.position = place
+            space.add(body, pymunk.Circle(body, radius))
+            self._bodies.append(body)
+
+    def move(self, places: FloatArray, motion: FloatArray) -> FloatArray:
+        """Move the bodies from their places by `motion` (K, 2) [m] as far as contacts allow; return their places.
+
+        pymunk moves bodies before it solves contacts. The first step therefore starts from rest, with the command
+        applied as a force, so that existing contacts act before any motion.
+        """
+        space = self._open_space()
+        longest = float(np.hypot(motion[:, 0], motion[:, 1]).max())
+        substeps = max(2, int(np.ceil(longest / LONGEST_SUBSTEP)))
+        duration = self._tick / substeps
+        for body, (x, y), (dx, dy) in zip(self._bodies, places.tolist(), motion.tolist(), strict=True):
+            body.position = x, y
+            body.velocity = 0.0, 0.0
+            body.mass = STANDING_MASS if dx == dy == 0.0 else 1.0
+            body.force = body.mass * dx / (self._tick * duration), body.mass * dy / (self._tick * duration)
+        space.collision_bias = (1.0 - CORRECTION) ** (1.0 / duration)  # share of a penetration left after 1 s
+        for _ in range(substeps + 1):
+            space.step(duration)
+        after = np.array([body.position for body in self._bodies])
+        for body, place in zip(self._bodies, self._parking, strict=True):
+            body.position = place
+        space.step(duration)
+        return after
+
+    def close(self) -> None:
+        """Free the space: shapes before the bodies to which they point, and these before their space."""
+        space, self._space = self._space, None
+        if space is not None:
+            space.remove(*space.shapes)
+            space.remove(*space.bodies)
+            self._bodies.clear()
+
+    def _open_space(self) -> pymunk.Space:
+        """Return the space, or raise after `close`."""
+        if self._space is None:
+            raise RuntimeError("step: expected a running interpreter, got one that ends. Step environments before.")
+        return self._space

@@ -1,7 +1,8 @@
 import os
 import subprocess
 import sys
-from importlib.metadata import version
+import tomllib
+from importlib.metadata import EntryPoint, version
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ from typer.main import get_command
 
 import vslam_env
 from training import cli
+from vslam_env import __main__ as entry
 
 
 def test_a_fault_of_the_program_keeps_its_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -34,6 +36,31 @@ def test_modules_run_the_command(module: str) -> None:
         done = subprocess.run([sys.executable, "-m", module, *arguments], capture_output=True, text=True)
         assert done.returncode == status
         assert says in done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("name", ["agents", "training"])
+@pytest.mark.parametrize("form", ["{}.py", "{}/__init__.py"])
+def test_a_module_that_hides_a_package_is_named_and_not_run(name: str, form: str, tmp_path: Path) -> None:
+    """A user's own `training.py` in the current folder, or a package on the path, gives one line with its path."""
+    file = tmp_path / "a folder" / form.format(name)
+    file.parent.mkdir(parents=True)
+    file.write_text("raise SystemExit('it was run')\n", encoding="utf-8")
+    root = str(Path(cli.__file__).parents[1])
+    shown = file.parent if file.name == "__init__.py" else file
+    for place, path in ((tmp_path / "a folder", root), (tmp_path, f"{tmp_path / 'a folder'}{os.pathsep}{root}")):
+        command = [sys.executable, "-m", "vslam_env", "worlds", "list"]
+        done = subprocess.run(command, cwd=place, env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True)
+        assert (done.returncode, done.stdout) == (2, "")
+        (line,) = done.stderr.splitlines()
+        assert line.startswith(f"error {name}: expected this project's package")
+        assert repr(str(shown)) in line
+        assert "Rename" in line
+
+
+def test_the_command_starts_where_names_are_checked() -> None:
+    """The declared command is the entry point that looks for hidden packages."""
+    declared = tomllib.loads((Path(cli.__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8"))
+    assert EntryPoint("vslam", declared["project"]["scripts"]["vslam"], "console_scripts").load() is entry.main
 
 
 def test_help_needs_no_heavy_import() -> None:

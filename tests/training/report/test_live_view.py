@@ -73,6 +73,43 @@ def test_only_this_machine_is_answered(running: tuple[LiveView, list[str]]) -> N
             assert error.value.code == code
 
 
+@pytest.mark.parametrize("host", ["LOCALHOST", "localhost.", "localhost:8765", "127.0.0.1:1", "[::1]", "[::1]:80"])
+def test_all_names_of_this_machine_are_answered(running: tuple[LiveView, list[str]], host: str) -> None:
+    """Letters, the final dot of a full name, and the port make no difference."""
+    assert "<title>first</title>" in fetched(running[0], "", host)
+
+
+def test_no_request_prints_or_ends_the_server(
+    running: tuple[LiveView, list[str]], capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Requests without sense are refused, and the terminal shows nothing of them."""
+    view, _ = running
+    port = int(view.address.rsplit(":", 1)[1].strip("/"))
+    host = b"Host: 127.0.0.1\r\n\r\n"
+    queries = [
+        b"after=" + b"9" * 5000,
+        b"after=" + b"1" * 12,
+        "after=\u0663".encode(),
+        b"after=-1",
+        b"after=%31",
+        b"after",
+    ]
+    for request in (
+        *(b"GET /content?" + query + b" HTTP/1.1\r\n" + host for query in queries),
+        b"GET http://[bad/ HTTP/1.1\r\n" + host, b"GET //[ HTTP/1.1\r\n" + host, b"\x16\x03\x01\x00\xff\r\n\r\n",
+        b"GET / HTTP/9.9\r\n" + host, b"GET / HTTP/1.1\r\nHost: [\r\n\r\n",
+        b"GET / HTTP/1.1\r\n" + b"A: b\r\n" * 200 + host,
+        b"POST / HTTP/1.1\r\n" + host, b"GET /" + b"a" * 70_000 + b" HTTP/1.1\r\n" + host, b"GET\r\n\r\n", b"",
+    ):  # fmt: skip
+        with socket.create_connection(("127.0.0.1", port), timeout=20.0) as connection:
+            connection.sendall(request)
+            connection.shutdown(socket.SHUT_WR)
+            while connection.recv(1 << 16):
+                pass
+    assert "<title>first</title>" in fetched(view, "")
+    assert capfd.readouterr() == ("", "")
+
+
 def test_content_is_made_only_while_a_page_is_open(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without a request no step is packed; the speed is kept by waiting."""
     made: list[int] = []

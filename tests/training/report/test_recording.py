@@ -102,6 +102,34 @@ def test_files_restore_a_recording(episode: Any, tmp_path: Path) -> None:
         Recording.load(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("times", lambda a: a[:-1]), ("times", lambda a: a[::-1]), ("times", lambda a: a * np.nan),
+        ("estimate", lambda a: a[:, :1]), ("truth", lambda a: a + np.inf), ("scores", lambda a: a[..., :3]),
+        ("frames", lambda a: a + 2), ("sight_ends", lambda a: a + 1), ("sight_ends", lambda a: a[:-1]),
+        ("map_ends", lambda a: a[::-1]), ("keyframes", lambda a: a + 1000), ("keyframes", lambda a: -a),
+        ("grid_runs", lambda a: a + 1), ("grid_boxes", lambda a: a + np.inf), ("starts", lambda a: a[:1]),
+        ("candidates", lambda a: a[:, :2]), ("walls", lambda a: a.astype("U9")), ("another", lambda a: np.zeros(3)),
+        ("estimate", None), ("about", lambda a: np.frombuffer(b'{"format": 1}', np.uint8)),
+        ("about", lambda a: np.frombuffer(b"[" * 50_000, np.uint8)),
+        ("about", lambda a: np.frombuffer(b'{"format": 1, "names": ["a"], "events": [3]}', np.uint8)),
+    ],
+)  # fmt: skip
+def test_recordings_whose_parts_do_not_fit_are_refused(episode: Any, name: str, change: Any, tmp_path: Path) -> None:
+    """An intact file with other names, shapes, indices or no finite numbers is refused in one line."""
+    _, _, recording = episode
+    file = recording.save(tmp_path)
+    with np.load(file) as stored:
+        arrays = dict(stored)
+    values = arrays.pop(name, None)
+    if change is not None:
+        arrays[name] = change(values)
+    np.savez(file, **arrays)
+    with pytest.raises(ValueError, match=r"^folder: expected a recording of an episode, got a broken file"):
+        Recording.load(tmp_path)
+
+
 def test_the_parts_of_the_error_add_up(episode: Any) -> None:
     """Missed, false and wrongly placed landmarks give the mean of E^2; without a map only missed ones count."""
     _, _, recording = episode

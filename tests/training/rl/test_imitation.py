@@ -128,6 +128,8 @@ def test_foreign_and_damaged_labels_are_refused(tmp_path: Path) -> None:
     for changed in (
         {"scan": arrays["scan"][:, :16]}, {"scan": arrays["scan"][0]}, {"preferences": arrays["preferences"][:, :17]},
         {"local_grid": arrays["local_grid"][:, :, :5]}, {"chosen": arrays["chosen"] + 33},
+        {"chosen": arrays["chosen"].astype(np.int64) - 99},
+        {"preferences": arrays["preferences"] * np.float16(np.nan)}, {"scan": arrays["scan"] | np.uint8(0x7C)},
     ):  # fmt: skip
         np.savez(file, **arrays | changed)
         with pytest.raises(ValueError, match=r"labels: .* got .another file.\. .* has other arrays"):

@@ -31,7 +31,7 @@ from slam_backend.core.state_codec import decode, encode
 from training.cli import app
 from training.rl.checkpoint import CHECKPOINT_FILE, FORMAT, MAGIC, read_checkpoint, write_checkpoint
 from training.rl.config import TrainConfig
-from training.rl.network import GoalPolicy
+from training.rl.network import GoalPolicy, check_finite
 from training.rl.trainer import Training, as_arrays, as_tensors, check_device, stored_checkpoint
 from training.vec_env import ExplorationVecEnv
 from vslam_env import NUM_CANDIDATES
@@ -328,3 +328,26 @@ def test_commands_train_resume_evaluate_and_run(tmp_path: Path, monkeypatch: pyt
     assert result.exit_code == 0, result.output
     assert json.loads((played / "metrics.json").read_text())["config"]["action_type"] == "goal"
     assert tomllib.loads((played / "environment.toml").read_text())["decision_ticks"] == SMOKE.decision_ticks == 20
+
+
+def test_checkpoints_of_other_programs_are_refused(tmp_path: Path) -> None:
+    """An intact file without configuration and seed, or with a head that is no description, is refused in one line."""
+    file = tmp_path / CHECKPOINT_FILE
+    write_checkpoint(file, {"seed": 1})
+    with pytest.raises(ValueError, match=r"^resume: expected the checkpoint .* it has no configuration and seed"):
+        read_checkpoint(file)
+    head = {"format": FORMAT, "bytes": 0, "sha256": "", "versions": []}
+    for text in (b"[" * 50_000, b"[3]", json.dumps(head).encode()):
+        file.write_bytes(MAGIC + text + b"\n")
+        with pytest.raises(ValueError, match=r"^resume: expected the checkpoint .* is not a checkpoint"):
+            read_checkpoint(file)
+
+
+def test_policies_with_parameters_that_are_not_finite_are_refused() -> None:
+    """A single NaN is found, wherever it is."""
+    policy = GoalPolicy(SPACE, spaces.Discrete(1 + NUM_CANDIDATES), lambda left: 1e-3)
+    check_finite(policy)
+    with torch.no_grad():
+        policy.value_net.bias[0] = torch.nan
+    with pytest.raises(ValueError, match="NaN"):
+        check_finite(policy)

@@ -1,5 +1,8 @@
 """How robots truly move and bump, and what odometry and scan say of it."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from hypothesis import example, given
@@ -235,3 +238,27 @@ def test_readings_stay_in_their_interval() -> None:
     ranges = scan.measure(np.zeros((1, 3)), np.random.default_rng(2))
     assert ranges.min() >= 0.0
     assert ranges.max() <= 8.0
+
+
+HELD = """
+import sys
+import numpy as np
+from vslam_env.world import Simulator, World
+
+walls = np.array([[0.0, 0.0, 6.0, 0.0], [6.0, 0.0, 6.0, 5.0], [6.0, 5.0, 0.0, 5.0], [0.0, 5.0, 0.0, 0.0]])
+simulator = Simulator(World("room", walls), np.array([[0.3, 0.5, 3.1], [3.0, 3.0, 0.0]]))
+for _ in range(5):
+    simulator.step([[0.5, 0.0], [0.5, 0.1]])
+assert simulator.bumped[0]
+
+def hook(event, arguments):
+    simulator
+
+sys.addaudithook(hook)
+"""
+
+
+def test_a_simulator_held_to_the_end_of_python_ends_with_it() -> None:
+    """Python frees objects that audit hooks hold when nothing of it is left; the process ends quietly all the same."""
+    ended = subprocess.run([sys.executable, "-c", HELD], capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stderr) == (0, "")

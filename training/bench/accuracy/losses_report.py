@@ -11,7 +11,7 @@ from rich.console import Console
 
 from slam_backend.core.validation import FloatArray
 from training.bench.accuracy.losses import ESTIMATES, LADDER, LOSSES
-from training.experiments.plotting import save_png
+from training.experiments.plotting import picture, save_png
 from training.experiments.statistics import grouped, interval
 from training.experiments.tables import console_table, number, titled_markdown
 
@@ -147,6 +147,7 @@ def condition_name(line: Mapping[str, Any]) -> str:
     return ", ".join(parts)
 
 
+@picture
 def draw_losses(file: Path, lines: Sequence[Line]) -> None:
     """Draw a bar for each condition into a PNG file: from the error of batch ML to the filter's, loss by loss."""
     with mpl.rc_context({"font.size": 9}):

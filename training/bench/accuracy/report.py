@@ -13,7 +13,7 @@ from rich.console import Console
 
 from slam_backend.core.validation import FloatArray
 from training.bench.accuracy.trials import FILTERS
-from training.experiments.plotting import add_legend, save_png
+from training.experiments.plotting import add_legend, picture, save_png
 from training.experiments.statistics import grouped, interval
 from training.experiments.tables import console_table, markdown_table, number
 
@@ -155,6 +155,7 @@ def _cell(
     return f"{number(value, digits, factor)} ({number(low, digits, factor)}-{number(high, digits, factor)})"
 
 
+@picture
 def draw_accuracy(file: Path, lines: Sequence[Mapping[str, Any]]) -> None:
     """Draw one row of panels for each condition into a PNG file: means over seeds with 95 % bootstrap intervals."""
     groups = conditions(lines)

@@ -13,7 +13,7 @@ from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 from rich.console import Console
 from scipy.stats import chi2
 
-from training.experiments.plotting import add_legend, save_png
+from training.experiments.plotting import add_legend, picture, save_png
 from training.experiments.statistics import CONFIDENCE, grouped
 from training.experiments.tables import console_table, number, titled_markdown
 
@@ -129,6 +129,7 @@ def _times(line: Mapping[str, Any]) -> list[str]:
     return [f"{line['median_ms']:.1f}", f"{line['p95_ms']:.1f}"]
 
 
+@picture
 def draw_alignment(file: Path, lines: Sequence[Mapping[str, Any]]) -> None:
     """Draw a row of panels for each share of common landmarks into a PNG file."""
     grid = [line for line in lines if line["kind"] == "grid" and line["overlap"] is not None]

@@ -22,7 +22,7 @@ from training.bench.exploration.aggregate import (
 )
 from training.bench.exploration.plan import BASE_PART, FLOOR_PLANS, Plan, PlanTrial
 from training.bench.exploration.report import COLOURS, STYLES, label
-from training.experiments.plotting import save_png
+from training.experiments.plotting import picture, save_png
 from training.experiments.statistics import grouped
 from training.experiments.tables import E_SCALE, csv_text, markdown_table, number
 
@@ -173,6 +173,7 @@ def write_parquet(file: Path, rows: Rows) -> bool:
     return True
 
 
+@picture
 def draw_plan(file: Path, rows: Rows) -> None:
     """Draw profiles of E in the base part, and E over team sizes and particles, as far as played, into a PNG file."""
     parts = {BASE_PART: _draw_profiles, TEAM_SIZE: _draw_team_sizes}

@@ -14,7 +14,7 @@ from agents.trained import MODEL_FILE
 from training.bench.config import NO_ORACLE
 from training.bench.exploration.trials import CURVES, TEAM
 from training.experiments.labels import parted_label
-from training.experiments.plotting import save_png
+from training.experiments.plotting import picture, save_png
 from training.experiments.statistics import format_ci, grouped, mean_ci, mean_curves, paired_difference, summarise_means
 from training.experiments.tables import E_SCALE, console_table, csv_text, markdown_table
 
@@ -232,6 +232,7 @@ def _difference_rows(differences: Rows, names: Sequence[str], stacked: bool) -> 
     ]
 
 
+@picture
 def draw_exploration(file: Path, curves: Rows) -> None:
     """Draw a row of panels for each world and number of robots into a PNG file: means over seeds, 95 % intervals."""
     places = grouped(curves, ("world", "robots"))

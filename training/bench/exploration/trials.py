@@ -2,7 +2,7 @@
 
 import json
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -106,8 +106,12 @@ def play(config: Bench, trial: Any) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def check_same_policies(out: Path | None) -> None:
+def check_same_policies(out: Path | None, policies: Collection[str]) -> None:
     """Refuse to resume a folder whose episodes were played with another version of a custom policy or model.
+
+    Args:
+        out: Run folder; None: a new one.
+        policies: Labels of the policies of this run; episodes of others are not looked at.
 
     Raises:
         ValueError: If the file of a policy has changed since.
@@ -120,7 +124,7 @@ def check_same_policies(out: Path | None) -> None:
         with suppress(json.JSONDecodeError, TypeError, KeyError):  # `finished_trials` reports damage
             row = json.loads(line)
             policy, before = row["policy"], row["policy_digest"]
-            if now.setdefault(policy, parted(policy).source_digest()) != before:
+            if policy in policies and now.setdefault(policy, parted(policy).source_digest()) != before:
                 hint = "Choose another folder, or restore the file."
                 raise argument_error("out", f"episodes of {policy!r} as it is now", "episodes of another version", hint)
 

@@ -14,7 +14,7 @@ from rich.table import Table
 
 from slam_backend.core.validation import FloatArray
 from training.bench.filter.bench import STATE_LOAD
-from training.experiments.plotting import save_png
+from training.experiments.plotting import picture, save_png
 from training.experiments.tables import console_table
 from training.experiments.timing import print_caveats
 
@@ -87,6 +87,7 @@ def _ms(value: float) -> str:
     return f"{value:.3f}" if value < 1.0 else f"{value:.2f}" if value < 10.0 else f"{value:.1f}"
 
 
+@picture
 def draw_speed(file: Path, result: Mapping[str, Any]) -> None:
     """Draw the time of a step over N, M and K into a PNG file."""
     figure = Figure(figsize=(12.0, 5.0), layout="constrained")

@@ -12,7 +12,7 @@ from rich.console import Console
 from training.bench.exploration.report import COLOURS, STYLES, Column
 from training.bench.exploration.trials import TEAM
 from training.bench.scale.trials import CURVES
-from training.experiments.plotting import save_png
+from training.experiments.plotting import picture, save_png
 from training.experiments.statistics import grouped, mean_curves, summarise_means
 from training.experiments.tables import console_table, markdown_table
 
@@ -78,6 +78,7 @@ def markdown(lines: Rows) -> str:
     return "\n".join(parts)
 
 
+@picture
 def draw_scale(file: Path, lines: Rows, over_time: Rows) -> None:
     """Draw coverage and steps over time, and costs and errors over the extent, into a PNG file."""
     figure = Figure(figsize=(12.0, 6.0), layout="constrained")

@@ -6,7 +6,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from training.experiments.plotting import save_png
+from training.experiments.plotting import picture, save_png
 from training.experiments.tables import number, titled_markdown
 
 MEASURES = ("min_ms", "median_ms", "processor_ms")
@@ -114,6 +114,7 @@ def _rigs(rows: Sequence[dict[str, Any]]) -> str:
     return titled_markdown("Stereo pairs with a calibration: mean number of matches after each check", columns, lines)
 
 
+@picture
 def draw_stereo(file: Path, result: dict[str, Any]) -> None:
     """Draw outliers after each match check, and recall by angle and by distance, into a PNG file."""
     figure = Figure(figsize=(13.0, 4.2), layout="constrained")

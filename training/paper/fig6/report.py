@@ -11,10 +11,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator
 from rich.console import Console
-from rich.markup import escape
+from rich.text import Text
 
 from slam_backend.core.validation import FloatArray
-from training.experiments.plotting import rgb, save_png
+from training.experiments.plotting import picture, rgb, save_png
 from training.experiments.tables import console_table, number
 from training.paper.fig6.claims import Claim
 from training.paper.fig6.trials import BOUND, REGIMES
@@ -37,15 +37,13 @@ def print_result(
         table = console_table(f"Map error, K={many} over K={few} (95 %)", ("regime", "M", "not aligned", "aligned"))
         for row in ratios:
             name = f"{REGIMES[row['regime']].title}, {row['proposal']}"
-            table.add_row(
-                escape(name), str(row["particles"] or "-"), *(_interval(row[key]) for key in ("raw", "aligned"))
-            )
+            table.add_row(name, str(row["particles"] or "-"), *(_interval(row[key]) for key in ("raw", "aligned")))
         console.print(table)
     if claims:
         table = console_table("The paper's claims", ("claim", "ratio (95 %)", ""))
         for claim in claims:
-            verdict = "holds" if claim.holds else "[red]does not hold[/]"
-            table.add_row(escape(claim.claim), _interval(claim.to_mapping()), verdict)
+            verdict = "holds" if claim.holds else Text("does not hold", "red")
+            table.add_row(claim.claim, _interval(claim.to_mapping()), verdict)
         console.print(table)
 
 
@@ -58,7 +56,7 @@ def _print_points(console: Console, title: str, lines: Sequence[Mapping[str, Any
     table = console_table(f"{title}, {max(line['seeds'] for line in lines)} seeds", ("M",))
     for name, *_ in parts:
         for k in robots:
-            table.add_column(escape(f"{name}\nK={k}"), justify="right")
+            table.add_column(f"{name}\nK={k}", justify="right")
     for m in dict.fromkeys(line["particles"] for line in lines):
         own = {line["robots"]: line for line in lines if line["particles"] == m}
         cells = [_cell(own.get(k), figure, digits, bool(wide)) for _, figure, digits, wide in parts for k in robots]
@@ -81,6 +79,7 @@ def _interval(found: Mapping[str, Any]) -> str:
     return number(found["ratio"]) + ends
 
 
+@picture
 def draw_fig6(file: Path, lines: Lines) -> None:
     """Draw the figure into a PNG file: means over seeds with 95 % bootstrap intervals."""
     timed = [line for line in lines if line["median_ms"] is not None]

@@ -23,7 +23,7 @@ from training.rl.checkpoint import CHECKPOINT_FILE, write_checkpoint
 from training.rl.config import SPLIT_TRAIN, SPLIT_TRY, TrainConfig
 from training.rl.imitation.collection import collect, make_taught_envs
 from training.rl.imitation.labels import Labels, joined, read_labels, write_labels
-from training.rl.network import GoalPolicy, actor_part
+from training.rl.network import GoalPolicy, actor_part, check_finite
 from training.rl.trainer import BOARD, as_arrays, as_tensors, check_device
 from training.vec_env import ExplorationVecEnv
 from vslam_env.belief.observation import observation_space
@@ -122,6 +122,7 @@ class Imitation:
         """
         try:
             self.policy.load_state_dict(as_tensors(kept["policy"]))
+            check_finite(self.policy)
             self.policy.optimizer.load_state_dict(as_tensors(kept["optimizer"]))
             self.rows = [dict(row) for row in kept["rows"]]
             self._best, self._best_weights = kept["best"]

@@ -135,8 +135,10 @@ def _unpacked(arrays: Mapping[str, NDArray[Any]]) -> Labels:
     """Return the labels of the arrays in a file."""
     chosen, preferences = arrays["chosen"].astype(np.int64), arrays["preferences"].astype(np.float32)
     n, num_actions = len(chosen), SHAPES["action_mask"][0]
-    if preferences.shape != (n, num_actions) or chosen.ndim != 1 or (chosen >= num_actions).any():
+    if preferences.shape != (n, num_actions) or chosen.ndim != 1 or ((chosen < 0) | (chosen >= num_actions)).any():
         raise ValueError("labels of other actions")
+    if not (preferences <= 0.0).all() or not np.isfinite(preferences[np.arange(n), chosen]).all():  # False for NaN
+        raise ValueError("preferences that are no logarithms")
     packed: dict[str, NDArray[Any]] = {}
     for name, shape in SHAPES.items():
         axis, expected = BIT_AXES.get(name), [n, *shape]
@@ -146,6 +148,8 @@ def _unpacked(arrays: Mapping[str, NDArray[Any]]) -> Labels:
         dtype = np.float16 if axis is None else np.uint8
         if packed[name].dtype != dtype or packed[name].shape != tuple(expected):
             raise ValueError(f"{name} of another shape")
+        if not np.isfinite(packed[name]).all():
+            raise ValueError(f"{name} with NaN or infinity")
     return Labels(packed, chosen, preferences)
 
 
