@@ -5,8 +5,6 @@ from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
-from slam_backend.core.validation import argument_error
-
 FOLDER = Path(__file__).resolve().parents[1]  # of this project's packages
 PLAIN_NAMES = ("agents", "training")  # packages that another file or package may hide
 BAD_INPUT = 2
@@ -30,14 +28,14 @@ def check_package(name: str) -> None:
     Raises:
         ValueError: If Python would load another module, or none.
     """
-    expected, hint = f"this project's package {str(FOLDER / name)!r}", "Install vslam-env again."
     found = find_spec(name)
-    if found is None:
-        raise argument_error(name, expected, "no module", hint)
-    file = Path(found.origin or next(iter(found.submodule_search_locations or ()), ""))  # of a folder without origin
-    if file.resolve() != FOLDER / name / "__init__.py":
+    file = None if found is None else Path(found.origin or next(iter(found.submodule_search_locations or ()), ""))
+    if file is None or file.resolve() != FOLDER / name / "__init__.py":
+        place = "no module" if file is None else repr(str(file.parent if file.name == "__init__.py" else file))
         hint = "Rename the latter, or call vslam from another folder, or install it into an environment of its own."
-        raise argument_error(name, expected, file.parent if file.name == "__init__.py" else file, hint)
+        hint = "Install vslam-env again." if file is None else hint
+        # The form of `argument_error`, whose module imports numpy.
+        raise ValueError(f"{name}: expected this project's package {str(FOLDER / name)!r}, got {place}. {hint}")
 
 
 if __name__ == "__main__":

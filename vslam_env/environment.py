@@ -503,6 +503,6 @@ def build_observations(
 
 def _signatures_of(config: EnvConfig) -> dict[str, list[str]]:
     """Return the signatures of the kernels that an environment needs."""
-    from vslam_env.warm_up import signatures_of  # which imports this module
+    from vslam_env._warm_up import signatures_of  # which imports this module
 
     return signatures_of(config)

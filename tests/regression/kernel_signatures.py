@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 from slam_backend.core.compilation.compiler import SIGNATURES, compiled_signatures
-from vslam_env.warm_up import warm_up
+from vslam_env._warm_up import warm_up
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("slam_backend", "vslam_env")

@@ -55,7 +55,7 @@ def prepare(*first_steps: Callable[[], object]) -> None:
         first_steps: Functions called in order before all kernels are compiled, so that bad input is reported early.
     """
     from slam_backend.core.compilation.messages import MESSAGE, log_compilation
-    from vslam_env.warm_up import warm_up
+    from vslam_env._warm_up import warm_up
 
     with compilation_progress(make_console(stderr=True)) as progress:
         for step in first_steps:
