@@ -44,7 +44,6 @@ def run(
     """Let robots with unknown starts explore a building, map it, and merge their maps."""
     import webbrowser
 
-    from agents.registry import action_types, model_file
     from slam_backend.trajectory import Trajectory
     from training.episodes.figures import draw_errors, draw_maps
     from training.episodes.metrics import score_episode
@@ -59,18 +58,13 @@ def run(
 
     if rerun is not None:
         check_rerun(rerun)
-    policy = call.given.get("policy")
-    if "action_type" not in call.given and policy is not None:
-        known = action_types(policy)
-        if model_file(policy) is not None or "continuous" not in known:  # models have learned from goal actions
-            call.given["action_type"] = known[0]
     chosen = call.config
     env = chosen.make_env()
     policies = chosen.make_policies(env)
     # Detect a world that cannot be built before the folder is created.
     with ExitStack() as stack:
         view = stack.enter_context(LiveView(port, speed)) if live else None
-        console, folder = call.begin(lambda: _first_steps(env, policies, chosen.seed))
+        console, folder = call.begin(lambda: _first_steps(env, policies, chosen))
         folder.write_text("environment.toml", env.config.replace(world=folder.config["world"]).to_toml())
         recorder = EpisodeRecorder(env, chosen.num_steps, chosen.step_s, policies.goals)
         interrupted = stack.enter_context(interrupt_flag())
@@ -108,12 +102,14 @@ def run(
         webbrowser.open((folder.path / REPORT_FILE).resolve().as_uri())
 
 
-def _first_steps(env: Any, policies: Any, seed: int) -> None:
+def _first_steps(env: Any, policies: Any, config: RunConfig) -> None:
     """Run the first two steps of the episode, which use all kernels except those of merging."""
     from training.episodes.runner import run_episode
 
     steps = iter(range(2))
-    run_episode(env, policies, seed, should_stop=lambda: next(steps, None) is None)
+    run_episode(
+        env, policies, config.seed, should_stop=lambda: next(steps, None) is None, options=config.reset_options()
+    )
 
 
 def _run_with_progress(
@@ -140,7 +136,7 @@ def _run_with_progress(
                 picture = draw_frame(with_video_time_merges(env.scene(), env.events, pace.speedup), VIDEO_SIZE)
                 writer.add(with_camera_images(picture, env.episode.frames[0], IMAGE_WIDTH) if eyes else picture)
 
-        record = run_episode(env, policies, config.seed, on_step, interrupted)
+        record = run_episode(env, policies, config.seed, on_step, interrupted, config.reset_options())
     if not record.complete:
         console.print(f"Stopped at {record.times[-1]:.1f} s; the results cover the run until then.")
     return record

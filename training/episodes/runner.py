@@ -93,6 +93,7 @@ class Progress:
 def run_episode(
     env: ExplorationEnv, policies: Mapping[str, Policy] | GuardedTeam, seed: int,
     on_step: Callable[[Progress], None] = lambda progress: None, should_stop: Callable[[], bool] = lambda: False,
+    options: Mapping[str, Any] | None = None,
 ) -> EpisodeRecord:  # fmt: skip
     """Run one episode to its end, or until `should_stop`.
 
@@ -101,6 +102,7 @@ def run_episode(
         policies: Policy of each agent, or all of them; policies see observations and beliefs, never infos.
         seed: Seed of the reset and of the policies' random draws, which are independent streams.
         on_step: Function called after the reset and after each step; it may inspect the environment.
+        options: Options of the reset.
 
     Raises:
         ValueError: If an agent has no policy, or a policy fails (`PolicyError`).
@@ -126,7 +128,7 @@ def run_episode(
 
     env.recorder = record
     try:
-        observations, infos = env.reset(seed=seed)
+        observations, infos = env.reset(seed=seed, options=options)
         team.reset()
         log = _Log(env, infos)
         on_step(Progress(0, 0.0, infos, ()))
