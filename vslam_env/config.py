@@ -12,6 +12,7 @@ from typing import Any, Literal, Self, TypeVar
 import numpy as np
 import tomli_w
 
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import argument_error, check_choice, check_float, check_int, did_you_mean
 from vslam_env.belief.belief import BeliefConfig
 from vslam_env.sensors import LandmarkSensorConfig, ScanConfig, StereoSensorConfig
@@ -144,6 +145,7 @@ def replace_limit(changes: Mapping[str, Any]) -> dict[str, Any]:
     return (dict.fromkeys(LIMITS) if len(given) == 1 else {}) | dict(changes)
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EnvConfig:
     """Configuration of an environment, with separate true and assumed noise.

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from agents.policy import Policy
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import FloatArray, IntArray, argument_error
 from slam_backend.fastslam.consistency import Consistency
 from slam_backend.fastslam.reports import MergeEvent
@@ -50,6 +51,7 @@ class MergeRecord:
         return is_false_merge(self.error_m, self.error_deg)
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, eq=False)
 class EpisodeRecord:
     """Record of an episode of K robots and T steps."""

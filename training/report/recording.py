@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from slam_backend.core.array_files import read_arrays
 from slam_backend.core.files import write_file
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import FloatArray, IntArray, argument_error
 from slam_backend.fastslam.reports import MergeEvent
 from slam_backend.geometry import compose, rotate_covariances
@@ -41,6 +42,7 @@ def _empty(*shape: int) -> Callable[[], Array]:
     return partial(np.zeros, shape)
 
 
+@short_repr
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Recording:
     """F recorded steps of K robots, J of them with maps, grids and candidates; all in the world frame.

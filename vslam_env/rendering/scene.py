@@ -2,9 +2,11 @@
 
 from dataclasses import dataclass
 
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import FloatArray
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, eq=False)
 class RobotView:
     """True and estimated poses and map of one robot.
@@ -49,6 +51,7 @@ class MergeFlash:
     robots_b: tuple[int, ...]
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
     """Content of one frame.

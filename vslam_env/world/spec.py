@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.core.read_only import as_read_only
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_array
 
 SHORTEST_WALL = 1e-3  # [m] below, the direction is ill-defined
@@ -15,6 +16,7 @@ LONGEST = 1e6  # limit of vector components: squares fit in float32
 FARTHEST_PLACE = 1e8  # [m] from the origin: map frames on earth fit, and differences keep micrometres
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, eq=False)
 class Landmarks:
     """Point landmarks on the faces of walls.
@@ -58,6 +60,7 @@ class Landmarks:
         return len(self.positions)
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, eq=False)
 class World:
     """Two-dimensional floor plan in metres.
