@@ -34,7 +34,7 @@ def public_records() -> Iterator[type[Any]]:
 
 @pytest.mark.parametrize("kind", dict.fromkeys((*CONFIGURATIONS, *public_records())), ids=lambda kind: kind.__name__)
 def test_all_configurations_and_public_records_have_a_short_repr(kind: type[Any]) -> None:
-    """No public object prints its arrays, or settings that nobody changed."""
+    """No public object prints its arrays, or unchanged settings."""
     assert kind.__repr__ is SHORT
 
 
