@@ -27,6 +27,7 @@ from vslam_env.config import TICK
 from vslam_env.environment import ExplorationEnv
 from vslam_env.navigation import CandidateKind
 from vslam_env.navigation.occupancy_grid import CELL, centre_of
+from vslam_env.rendering.palette import shared_by
 
 RECORDING_FILE = "recording.npz"
 FORMAT = 1
@@ -255,9 +256,9 @@ class EpisodeRecorder:
         if with_maps:
             self._enter(keyframes=len(self._steps) - 1)
             goals = self._goals()
-            owners = {belief.frame: robot for robot, belief in reversed(list(enumerate(beliefs)))}
+            owners = shared_by([belief.frame for belief in beliefs])
             for robot, (start, belief) in enumerate(zip(starts, beliefs, strict=True)):
-                self._record_map(start, belief, owners[belief.frame] == robot, goals.get(self._agents[robot]))
+                self._record_map(start, belief, owners[robot] == robot, goals.get(self._agents[robot]))
 
     def _record_map(self, start: FloatArray, belief: Belief, is_owner: bool, goal: FloatArray | None) -> None:
         """Record the map and grid of a robot, unless another robot has them, its candidates and its goal."""

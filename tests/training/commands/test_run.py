@@ -10,12 +10,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from rich.console import Console
 
 from slam_backend.geometry import between, compose
 from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.trajectory import Trajectory
 from training.commands.run import describe, errors_in_short, live_progress
+from training.episodes import figures
 from training.episodes.config import EPISODE_S, RunConfig
 from training.episodes.figures import LETTER, draw_errors, draw_maps, place_labels, turns
 from training.episodes.metrics import score_episode
@@ -163,8 +165,21 @@ def test_a_merge_is_false_beyond_half_a_metre_or_five_degrees(error_m: float, er
     assert describe(merge).startswith("   1.2 s  maps of 0 and 1, 2 merged on 9 landmarks, error")
 
 
-def test_figures_are_drawn_for_any_team(record: EpisodeRecord, tmp_path: Path) -> None:
-    """One robot or five, merged or not, and a run stopped at once: all give two plots."""
+def test_figures_are_drawn_for_any_team(record: EpisodeRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One robot or eight, merged or not, and a run stopped at once: all give two plots with their whole legends."""
+    written = figures.save_png
+
+    def check_legend(figure: Figure, file: Path, dpi: int) -> None:
+        written(figure, file, dpi)
+        owners = [figure, *figure.subfigs]
+        (legend,) = (legend for owner in owners for legend in owner.legends)
+        box = legend.get_window_extent()
+        assert figure.bbox.padded(1.0).contains(*box.min)
+        assert figure.bbox.padded(1.0).contains(*box.max)
+        axes = [each for owner in owners for each in owner.axes if each.get_visible()]
+        assert not any(box.overlaps(each.get_window_extent()) for each in axes)
+
+    monkeypatch.setattr(figures, "save_png", check_legend)
 
     def cut(robots: int, rows: int) -> EpisodeRecord:
         chosen = [k % 2 for k in range(robots)]
@@ -178,7 +193,7 @@ def test_figures_are_drawn_for_any_team(record: EpisodeRecord, tmp_path: Path) -
             merges=record.merges * (robots - 1),
         )  # fmt: skip
 
-    for robots, rows in ((1, 1), (1, STEPS), (5, STEPS)):
+    for robots, rows in ((1, 1), (1, STEPS), (8, STEPS)):
         for draw in (draw_maps, draw_errors):
             file = tmp_path / f"{draw.__name__}-{robots}-{rows}.png"
             draw(cut(robots, rows), file)
