@@ -262,7 +262,7 @@ def test_tables_of_eight_robots_fit_into_80_columns(record: EpisodeRecord) -> No
     assert max(map(len, lines)) <= 80
     rows = [line.split() for line in lines if line.split()[:1] in ([str(robot)] for robot in range(8))]
     assert [len(cells) for cells in rows] == [5] * 8 + [7] * 8
-    assert rows[8][3] == "12.345"
+    assert rows[8][3] == "12.3"
 
 
 def test_the_bar_of_eight_robots_has_mean_and_range() -> None:
