@@ -147,11 +147,11 @@ def live_progress(console: Console, num_steps: int, agents: Sequence[str]) -> It
     """Show a bar with the metrics of a running episode, and a line for each merge; yield the callback for a step."""
     columns = (
         TextColumn("{task.fields[time]:6.1f} s"), BarColumn(20), TextColumn("E {task.fields[errors]} m"),
-        TextColumn("coverage {task.fields[coverage]:2.0f} %"), TextColumn("{task.fields[groups]} maps"),
+        TextColumn("coverage {task.fields[coverage]:2.0f} %"), TextColumn("{task.fields[maps]}"),
         TimeRemainingColumn(),
     )  # fmt: skip
     with Bar(*columns, console=console) as bar:
-        task = bar.add_task("run", total=num_steps, time=0.0, errors="-", coverage=0.0, groups=len(agents))
+        task = bar.add_task("run", total=num_steps, time=0.0, errors="-", coverage=0.0, maps=_count_maps(len(agents)))
 
         def show(progress: "Progress") -> None:
             for merge in progress.new_merges:
@@ -161,10 +161,14 @@ def live_progress(console: Console, num_steps: int, agents: Sequence[str]) -> It
                 bar.update(
                     task, completed=progress.step, time=progress.time,
                     errors=errors_in_short([info["map_error"] for info in infos]),
-                    coverage=100.0 * infos[0]["coverage"], groups=len({info["group"] for info in infos}),
+                    coverage=100.0 * infos[0]["coverage"], maps=_count_maps(len({info["group"] for info in infos})),
                 )  # fmt: skip
 
         yield show
+
+
+def _count_maps(number: int) -> str:
+    return "1 map" if number == 1 else f"{number} maps"
 
 
 def errors_in_short(errors: Sequence[float]) -> str:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.table import Table
 
-from training.experiments.tables import ATE_NOTE, E_SCALE, NIS_NOTE, console_table, heading, in_words, number
+from training.experiments.tables import ATE_NOTE, E_SCALE, MAPS_NOTE, NIS_NOTE, console_table, heading, in_words, number
 
 if TYPE_CHECKING:  # numerical modules are imported when the command runs, so that --help is fast
     from slam_backend.fastslam.consistency import Consistency
@@ -45,14 +45,18 @@ def print_tables(console: Console, metrics: Mapping[str, Any]) -> None:
         console.print(note)
     if metrics["merges"]:
         console.print(_merges(metrics["merges"]))
+        console.print(MAPS_NOTE)
     else:
         console.print("No merge.")
     print_refusals(console, metrics["refusals"])
+    print_groups(console, metrics)
+    console.print(f"Coverage: {number(metrics['coverage'], 1, 100.0)} % of the floor in {metrics['duration_s']:.0f} s.")
+
+
+def print_groups(console: Console, metrics: Mapping[str, Any]) -> None:
+    """Print the groups at the end, and the number of merge attempts."""
     groups = "; ".join(", ".join(map(str, group)) for group in metrics["groups"])
-    console.print(
-        f"Groups at the end: {groups}.  Coverage: {metrics['coverage']:.1%} in {metrics['duration_s']:.0f} s.  "
-        f"Alignment attempts: {metrics['attempts']}."
-    )
+    console.print(f"Groups of robots with a common map at the end: {groups}.  Merge attempts: {metrics['attempts']}.")
 
 
 def figures(row: Mapping[str, Any], columns: Mapping[str, int]) -> list[str]:

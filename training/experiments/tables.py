@@ -21,12 +21,12 @@ E_SCALE = f"E: map error; 0 m = perfect map, {E_NOTHING:.2f} m = nothing found; 
 
 ATE_NOTE = (
     "ATE: root mean square distance between a path and the true one, from the true start or after the best fit; "
-    "odometry: dead reckoning, without landmarks."
+    "odometry: dead reckoning, without landmarks, with its error at the end relative to the path."
 )
-MAPS_NOTE = "Maps are named by their robots."
+MAPS_NOTE = "Maps are named by their robots; landmarks: those that both maps have."
 NIS_NOTE = (
     "NIS: normalised innovation squared; its mean is about 3 (2 without heights) if covariances are right, and smaller "
-    "if they are cautious."
+    "if they are cautious; at most 5 % of frames should exceed its 95 % bound."
 )
 # Words, unit and factor of metrics whose names do not say enough
 WORDS: dict[str, tuple[str, str, float]] = {
@@ -37,15 +37,15 @@ WORDS: dict[str, tuple[str, str, float]] = {
     "ate_aligned_m": ("ATE after fit", "m", 1.0), "ate_start_m": ("ATE from start", "m", 1.0),
     "dead_reckoning_ate_aligned_m": ("odometry's ATE after fit", "m", 1.0),
     "dead_reckoning_ate_start_m": ("odometry's ATE from start", "m", 1.0),
-    "dead_reckoning_end_percent": ("odometry's end error", "% of path", 1.0), "path_m": ("path length", "m", 1.0),
+    "dead_reckoning_end_percent": ("odometry's end error", "%", 1.0), "path_m": ("path length", "m", 1.0),
     "robots_a": ("first map", "", 1.0), "robots_b": ("second map", "", 1.0),
-    "landmarks": ("common landmarks", "", 1.0), "false": ("false merge", "", 1.0), "undone_s": ("undone at", "s", 1.0),
+    "undone_s": ("undone at", "s", 1.0),
     "attempts": ("merge attempts", "", 1.0), "refused": ("refusals", "", 1.0), "last_reason": ("last refusal", "", 1.0),
     "last_step": ("last refusal at step", "", 1.0), "missed": ("bound missed", "", 1.0),
     "excess": ("value over bound", "", 1.0), "apart": ("separate at the end", "", 1.0),
-    "nis_mean": ("mean NIS", "", 1.0), "nis_share": ("NIS beyond 95 %", "% of frames", 100.0),
-    "ess_share": ("few particles left", "% of frames", 100.0),
-    "rejected_share": ("most measurements rejected", "% of frames", 100.0),
+    "nis_mean": ("mean NIS", "", 1.0), "nis_share": ("frames beyond the NIS bound", "%", 100.0),
+    "ess_share": ("frames with few particles", "%", 100.0),
+    "rejected_share": ("frames mostly rejected", "%", 100.0),
 }  # fmt: skip
 UNITS = {"_m": "m", "_deg": "deg", "_s": "s", "_percent": "%", "_ms": "ms"}
 INITIALS = ("ate", "rmse", "rms", "nis", "ess", "anees", "nees")
@@ -68,7 +68,7 @@ def heading(metric: str) -> str:
     """Return the heading of a metric's column, with its unit.
 
     >>> heading("map_rmse_m"), heading("ess_share"), heading("policy")
-    ('map RMSE [m]', 'few particles left [% of frames]', 'policy')
+    ('map RMSE [m]', 'frames with few particles [%]', 'policy')
     """
     words, unit, _ = in_words(metric)
     return f"{words} [{unit}]" if unit else words

@@ -28,7 +28,8 @@ CURVES_FILE = "curves.csv"
 NOT_TABLES = ("config", "versions")
 TITLES = {  # of tables, with notes
     "robots": ("maps and paths of the robots", ATE_NOTE), "merges": ("merges", MAPS_NOTE),
-    "refusals": ("merge attempts by pair of maps", MAPS_NOTE), "consistency": ("consistency of the filters", NIS_NOTE),
+    "refusals": ("merge attempts by pair of maps", "Maps are named by their robots."),
+    "consistency": ("consistency of the filters", NIS_NOTE),
 }  # fmt: skip
 SHADES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7A5430", "#46464C")
 
