@@ -22,6 +22,8 @@ pytestmark = [
     # the suite remarks that named observations are no plain arrays
     pytest.mark.filterwarnings("ignore:Observation is not a NumPy array"),
     pytest.mark.filterwarnings("ignore:Observation space for each agent probably should be"),
+    # the suite resets with options that no environment knows
+    pytest.mark.filterwarnings("ignore:reset ignores the option 'options'"),
     # a state holds places in the world, and worlds may be of any size
     pytest.mark.filterwarnings("ignore:Environment's (min|max)imum state space value is"),
 ]
