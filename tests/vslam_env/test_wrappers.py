@@ -36,6 +36,7 @@ def _episode(env: Any) -> tuple[list[Any], list[Any]]:
 
 
 @pytest.mark.parametrize("observation_type", ["dict", "flat"])
+@pytest.mark.filterwarnings("ignore:reset ignores the option 'options'")  # the suite invents it
 def test_wrapped_environments_pass_the_suite(observation_type: str) -> None:
     """PettingZoo's suite passes without masks in observations: it samples with masks of int8 only."""
     from pettingzoo.test import parallel_api_test
