@@ -10,7 +10,7 @@ from traceback import extract_tb
 from typing import Any
 
 from agents.policy import Policy
-from slam_backend.core.validation import argument_error, check_choice, is_built_in
+from slam_backend.core.validation import argument_error, check_choice, did_you_mean, is_built_in
 
 ACTION_TYPES = ("continuous", "discrete", "goal")
 EXPECTED = "MODULE:NAME of a policy"
@@ -82,7 +82,8 @@ def _find(name: str) -> Any:
         raise argument_error("policy", EXPECTED, f"no module {module!r}", hint) from error
     made = getattr(found, factory, None)
     if not callable(made):
-        raise argument_error("policy", EXPECTED, f"no class or function {factory!r} in {module}", "Check the name.")
+        hint = did_you_mean(factory, vars(found)) + "Check the name."
+        raise argument_error("policy", EXPECTED, f"no class or function {factory!r} in {module}", hint)
     if not _may_make_policies(made):
         raise argument_error("policy", EXPECTED, f"no policy factory: {name}", NEEDED)
     return made

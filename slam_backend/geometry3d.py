@@ -7,12 +7,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import BoolArray, FloatArray, argument_error, check_array, check_float, check_int
 
 MINIMAL = 3  # points of a minimal sample
 THINNEST = 1e-3  # m; a triangle of smaller height does not determine the rotation about its long side
 
 
+@short_repr
 class RigidFit(NamedTuple):
     """A rigid motion, p_a = rotation p_b + translation.
 

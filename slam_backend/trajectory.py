@@ -8,12 +8,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from slam_backend.core.files import checked_path, write_file
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import FloatArray, argument_error, check_array
 from slam_backend.geometry import wrap_angle
 
 PLANAR_TOLERANCE = 1e-6
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, eq=False)
 class Trajectory:
     """The poses of one robot over time, in one frame. The arrays are read-only copies of the arguments.

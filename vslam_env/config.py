@@ -3,7 +3,8 @@
 import dataclasses
 import json
 import math
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, Self, TypeVar
@@ -11,7 +12,8 @@ from typing import Any, Literal, Self, TypeVar
 import numpy as np
 import tomli_w
 
-from slam_backend.core.validation import argument_error, check_choice, check_float, check_int
+from slam_backend.core.short_repr import short_repr
+from slam_backend.core.validation import argument_error, check_choice, check_float, check_int, did_you_mean
 from vslam_env.belief.belief import BeliefConfig
 from vslam_env.sensors import LandmarkSensorConfig, ScanConfig, StereoSensorConfig
 from vslam_env.world import SPLITS, LandmarkConfig, OdometryNoise
@@ -41,9 +43,20 @@ def validate(cls: type[T], values: Mapping[str, Any]) -> T:
             raise cause from None
         name = ".".join(str(part) for part in first["loc"])
         if first["type"] == "unexpected_keyword_argument":
-            raise argument_error(name, "a known field", first["input"], "Check the spelling.") from None
+            *outer, wrong = first["loc"]
+            known = _fields_beside(values, outer, wrong)
+            hint = f"{did_you_mean(wrong, known)}The fields are {', '.join(known)}."
+            raise argument_error(name, "a known field", first["input"], hint) from None
         expected = first["msg"].removeprefix("Input should be ")
-        raise argument_error(name, expected, first["input"], "Correct this value.") from None
+        hint = did_you_mean(first["input"], re.findall(r"'(\w+)'", expected)) + "Correct this value."
+        raise argument_error(name, expected, first["input"], hint) from None
+
+
+def _fields_beside(values: Mapping[str, Any], outer: Sequence[int | str], wrong: int | str) -> list[str]:
+    """Return the names beside a wrong one in nested dicts that contain all defaults."""
+    for key in outer:
+        values = values[key]  # type: ignore[index]   # as pydantic has named it
+    return [name for name in values if name != wrong]
 
 
 def to_plain(value: Any) -> Any:
@@ -132,6 +145,7 @@ def replace_limit(changes: Mapping[str, Any]) -> dict[str, Any]:
     return (dict.fromkeys(LIMITS) if len(given) == 1 else {}) | dict(changes)
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EnvConfig:
     """Configuration of an environment, with separate true and assumed noise.

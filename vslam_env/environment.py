@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import warnings
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, ClassVar
@@ -13,7 +14,7 @@ from pettingzoo import ParallelEnv
 
 from slam_backend.core.compilation import ahead
 from slam_backend.core.state_checks import refuse_malformed
-from slam_backend.core.validation import FloatArray, argument_error, check_choice, check_int
+from slam_backend.core.validation import FloatArray, argument_error, check_choice, check_int, did_you_mean
 from slam_backend.fastslam.reports import MergeEvent
 from vslam_env.actions import action_space, checked_actions
 from vslam_env.belief.observation import flatten, observation_space, observe_team
@@ -34,6 +35,8 @@ from vslam_env.world import World, WorldSource, check_source, is_single_layout
 
 AgentID = str
 STATE_PER_ROBOT = 12
+RESET_OPTIONS = ("world_seed", "start_poses")
+PROBE = "options"  # option with which the test suite of PettingZoo resets any environment
 RENDER_MODES = ("human", "rgb_array")
 # Kernels of rejuvenations and merges, which the first steps do not call
 LATER = ("slam_backend.smoother.", "slam_backend.maps.", "slam_backend.team.")
@@ -113,7 +116,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         Args:
             seed: Seed of this and all following episodes; None: continue the seed sequence, or start an arbitrary one.
             options: `"world_seed"`: int, seed of layout and textures only. `"start_poses"`: (K, 3) [m, m, rad], world
-                frame. Other keys are ignored.
+                frame. Any other key causes a warning.
 
         Returns:
             Observations and infos by agent.
@@ -129,6 +132,10 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         options = {} if options is None else options
         if not isinstance(options, Mapping):
             raise argument_error("options", "a dict or None", options, "For example {'world_seed': 3}.")
+        for name in options:
+            if name not in RESET_OPTIONS and name != PROBE:  # wrappers may pass theirs, so that it is no error
+                hint = f"{did_you_mean(name, RESET_OPTIONS)}Options are {' and '.join(RESET_OPTIONS)}."
+                warnings.warn(f"reset ignores the option {name!r}. {hint}", stacklevel=2)
         world_seed = options.get("world_seed")
         if world_seed is not None:
             check_int("options['world_seed']", world_seed, 0, "Give an int >= 0.")

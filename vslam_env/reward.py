@@ -14,7 +14,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from slam_backend.core.validation import argument_error, check_array, check_float
+from slam_backend.core.validation import argument_error, check_array, check_float, choice_error
 from vslam_env.evaluation.information import information
 from vslam_env.evaluation.team_metrics import RobotMetrics, TeamMetrics
 
@@ -139,8 +139,7 @@ def make_terms(reward: RewardSpec) -> tuple[RewardTerm, ...]:
     if isinstance(reward, Mapping):
         for name in reward:
             if name not in TERMS:
-                names = "one of " + ", ".join(repr(known) for known in TERMS)
-                raise argument_error("reward", names, name, "Choose one of these names, or pass a custom term.")
+                raise choice_error("reward", name, TERMS, "Choose one of these names, or pass a custom term.")
         hint = "Give the weight of the term."
         return tuple(_NamedTerm(n, check_float(f"reward[{n!r}]", weight, hint)) for n, weight in reward.items())
     if not isinstance(reward, (list, tuple)):

@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from agents.goal_choice import SWITCH_RATIO
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.geometry import compose, inverse, transform_points
 from vslam_env.belief.team_belief import Belief
@@ -26,6 +27,7 @@ SIGHT = 8.0  # [m] assumed range of view
 NO_PATH = 1e4  # [m] stands for the length of a path that a robot does not know
 
 
+@short_repr
 @dataclass(frozen=True, eq=False)
 class Targets:
     """Frontiers and robots of one group; all places in the start frame of the first robot.

@@ -1,7 +1,7 @@
 """Argument checks with one form of error: argument, expected value, value received, and hint."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import wraps
 from inspect import isbuiltin, signature
 from itertools import islice
@@ -22,6 +22,7 @@ BoolArray = NDArray[np.bool_]
 
 WRITTEN_IN_PYTHON = 1 << 9  # Py_TPFLAGS_HEAPTYPE of a class
 MOST = 10**9  # limit of steps and other counts: kernels hold such numbers, and no run needs more
+LONGEST_NAME = 100  # characters that are compared with known names; the time grows with the square
 NUMBERS = "biuf"  # dtype kinds of real numbers
 MOST_SHOWN = 80  # letters of a value in an error
 MOST_SAID = 2000  # letters of each other part, which may name what a file contains
@@ -126,12 +127,12 @@ def known_names(kind: type[T]) -> type[T]:
     """Make a class refuse unknown keyword arguments with a list of the known ones; a class decorator.
 
     >>> @known_names
-    ... class Gate:
+    ... class Box:
     ...     def __init__(self, width: float = 1.0) -> None: ...
-    >>> Gate(widht=2.0)
+    >>> Box(widht=2.0)
     Traceback (most recent call last):
     ...
-    ValueError: widht: expected a known argument, got a name that Gate does not have. It has width.
+    ValueError: widht: expected a known argument, got a name that Box does not have. Did you mean 'width'? It has width.
     """
     begin: Any = kind.__init__
     known = tuple(signature(begin).parameters)[1:]  # without self
@@ -140,7 +141,8 @@ def known_names(kind: type[T]) -> type[T]:
     def checked(self: Any, *values: Any, **named: Any) -> None:
         for name in named:
             if name not in known:
-                got, hint = f"a name that {kind.__name__} does not have", f"It has {', '.join(known)}."
+                got = f"a name that {kind.__name__} does not have"
+                hint = f"{did_you_mean(name, known)}It has {', '.join(known)}."
                 raise argument_error(name, "a known argument", got, hint)
         begin(self, *values, **named)
 
@@ -236,8 +238,44 @@ def check_choice(name: str, value: Any, choices: tuple[str, ...], hint: str = "C
         ValueError: As `argument_error` words it.
     """
     if not isinstance(value, str) or value not in choices:
-        raise argument_error(name, "one of " + ", ".join(repr(c) for c in choices), value, hint)
+        raise choice_error(name, value, choices, hint)
     return value
+
+
+def choice_error(
+    name: str, value: Any, choices: Iterable[str], hint: str = "Choose one of these names.", others: str = ""
+) -> ValueError:
+    """Build the error for a name that does not exist: it lists the names that do, and asks for the nearest one.
+
+    Args:
+        name: The argument as the caller wrote it.
+        value: Value received.
+        choices: Accepted names.
+        hint: Advice, a full sentence.
+        others: Values accepted besides, after a comma.
+
+    >>> print(choice_error("world", "ofice", ("office", "maze")))
+    world: expected one of 'office', 'maze', got 'ofice'. Did you mean 'office'? Choose one of these names.
+    """
+    known = tuple(choices)
+    return argument_error(
+        name, f"one of {', '.join(map(repr, known))}{others}", value, did_you_mean(value, known) + hint
+    )
+
+
+def did_you_mean(value: Any, names: Iterable[str]) -> str:
+    """Return a question for the name nearest to a misspelt one, followed by a space; empty if none is near.
+
+    >>> did_you_mean("Fronteir", ("frontier", "random_walk")), did_you_mean("teh_best", ("frontier", "random_walk"))
+    ("Did you mean 'frontier'? ", '')
+    """
+    from difflib import get_close_matches  # only errors need it
+
+    if not isinstance(value, str) or len(value) > LONGEST_NAME:
+        return ""
+    exact = {name.lower().replace("-", "_"): name for name in names}
+    near = get_close_matches(value.lower().replace("-", "_"), exact, n=1, cutoff=0.65)
+    return f"Did you mean {exact[near[0]]!r}? " if near else ""
 
 
 def check_array(

@@ -18,6 +18,7 @@ from math import exp, floor, log
 import numpy as np
 from numpy.typing import NDArray
 
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import MOST, FloatArray, IntArray, argument_error, check_float, check_int, known_names
 from slam_backend.fastslam._kernels.records import ViewBounds, Viewpoint
 from slam_backend.fastslam._kernels.update import existence as kernels
@@ -25,6 +26,7 @@ from slam_backend.fastslam.particle_maps import ParticleMaps
 from slam_backend.models.camera import StereoCamera
 
 
+@short_repr
 @known_names
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExistenceModel:

@@ -5,6 +5,7 @@ from typing import Literal
 
 import numpy as np
 
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import (
     MOST,
     FloatArray,
@@ -26,6 +27,7 @@ MAX_ROBOTS, MAX_PARTICLES = 1_000, 1_000_000  # beyond any memory
 CALIBRATED_NOISE = 0.005  # [m]; chosen on simulated stereo runs, see docs/reference/smoother.md
 
 
+@short_repr
 @known_names
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FilterOptions:

@@ -7,11 +7,13 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
 import numpy as np
 
 from slam_backend.core.read_only import Act, as_constant, as_read_only, map_arrays
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.fastslam._kernels import REJECTED, STATIONARY
 from slam_backend.fastslam.step_input import NO_INPUT, RobotInput, StepInput
 
 
+@short_repr
 class Associations(NamedTuple):
     """Data association of N robots' measurements in one step; read-only.
 
@@ -98,6 +100,7 @@ if TYPE_CHECKING:
     from slam_backend.maps.alignment import Alignment
 
 
+@short_repr
 class PoseEstimate(NamedTuple):
     """Gaussian summary of a robot's pose.
 
@@ -110,6 +113,7 @@ class PoseEstimate(NamedTuple):
     covariance: FloatArray
 
 
+@short_repr
 class BiasEstimate(NamedTuple):
     """Gaussian summary of a robot's odometry bias, see `OdometryModel`.
 
@@ -122,6 +126,7 @@ class BiasEstimate(NamedTuple):
     covariance: FloatArray
 
 
+@short_repr
 class PoseEstimates(NamedTuple):
     """Gaussian summaries of the poses of several robots, all in one frame or each in its own.
 
@@ -142,6 +147,7 @@ class PoseEstimates(NamedTuple):
         return PoseEstimate(self.means[robot].copy(), self.covariances[robot].copy())
 
 
+@short_repr
 class StepReport(NamedTuple):
     """Outcome of one step of `FastSlam`.
 
@@ -204,6 +210,7 @@ class RejuvenationReport:
     num_keys: int
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, eq=False)
 class MergeEvent:
     """Attempt to align two groups' maps, merge, or undo of a merge.
@@ -229,6 +236,7 @@ class MergeEvent:
     uncertainty: float = float("nan")
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, eq=False)
 class LandmarkIdMap:
     """Renaming of the landmark ids of two groups to ids of their joint map.
@@ -271,6 +279,7 @@ class MapReleased:
     number: int
 
 
+@short_repr
 class LandmarksCreated(NamedTuple):
     """Landmarks that a robot's measurements of one step created in a map.
 
@@ -301,6 +310,7 @@ class MergeUndone:
 MapChange = MapForked | MapReleased | LandmarksCreated | MergeUndone | LandmarkIdMap
 
 
+@short_repr
 class TeamReport(NamedTuple):
     """Outcome of one step of `TeamSlam`.
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from slam_backend.core.jit import jit
 from slam_backend.core.lazy_import import LazyModule
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import MOST, Float32Array, FloatArray, IntArray, check_float, check_int, known_names
 from slam_backend.frontend.images import Image, check_image
 
@@ -23,6 +24,7 @@ LARGEST_WINDOW = 1000  # [px]
 SENSITIVITY = 0.04  # k of det - k trace^2
 
 
+@short_repr
 @known_names
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CornerOptions:
@@ -59,6 +61,7 @@ class CornerOptions:
             check_float(f"corners.{name}", value, "Give a minimum response.", at_least=1e-30, at_most=1e30)
 
 
+@short_repr
 class Corners(NamedTuple):
     """Corners of an image, best first.
 

@@ -6,6 +6,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.frontend.descriptors import nearest
 from slam_backend.geometry3d import ransac_rigid
@@ -17,6 +18,7 @@ HUBER = 1.5  # standard deviations beyond which a residual loses weight
 LEAST = 6  # minimum number of inliers; fewer may agree by chance
 
 
+@short_repr
 class CameraMotion(NamedTuple):
     """The motion of a camera from an earlier to a later frame.
 

@@ -15,6 +15,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from slam_backend.core.read_only import as_read_only
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import (
     MOST,
     BoolArray,
@@ -39,6 +40,7 @@ LEAST_SCALE, LARGEST_SCALE = 1.0, 8.0  # px; limits for windows of constant phys
 SWAPPED = 12  # points at negative disparity, three times the number at positive, above which images count as swapped
 
 
+@short_repr
 @known_names
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrontEndOptions:
@@ -95,6 +97,7 @@ class FrontEndOptions:
             check_int("front_end.max_measurements", self.max_measurements, 1, "Use None to keep all.", MOST)
 
 
+@short_repr
 class StereoMatches(NamedTuple):
     """Corners of both images matched by descriptor, with the results of all checks.
 
@@ -115,6 +118,7 @@ class StereoMatches(NamedTuple):
     passed: BoolArray
 
 
+@short_repr
 class StereoFrame(NamedTuple):
     """Measurements of one pair of images.
 

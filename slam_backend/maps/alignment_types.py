@@ -9,6 +9,7 @@ from typing import Any, Literal, Self
 import numpy as np
 
 from slam_backend.core.read_only import as_read_only
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import (
     MOST,
     FloatArray,
@@ -54,6 +55,7 @@ MAX_SIMILAR = 10_000  # same limit as for pairs without appearance
 FEWEST_INLIERS = 3  # a motion can be made to fit any two matches: only a third is evidence
 
 
+@short_repr
 @known_names
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AlignmentOptions:
@@ -113,6 +115,7 @@ class AlignmentOptions:
         check_int("options.max_samples", self.max_samples, 1, "Allow at least one sample.", MOST)
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, eq=False)
 class Alignment:
     """The motion from map b to map a, p_a = R(theta) p_b + t, or a refusal.

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from slam_backend.core.array_files import read_arrays
 from slam_backend.core.files import checked_path, write_file
 from slam_backend.core.read_only import as_read_only
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_array, check_int
 from slam_backend.geometry import rotate_covariances, transform_points
 
@@ -20,6 +21,7 @@ FORMAT_VERSION = 1
 FIELDS = ("means", "covariances", "descriptors", "counts", "ids")
 
 
+@short_repr
 class MapSummary(NamedTuple):
     """Summary of a map without descriptors and full covariances, cheap enough for every step.
 
@@ -92,6 +94,7 @@ class TeamMapSummaries(NamedTuple):
         return self.rows.part(*self.parts[robot])
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, eq=False)
 class LandmarkMap:
     """The landmarks l_k = (mu_k, Sigma_k, d_k) of one map (Sec. 3.2), all in the same frame.

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from slam_backend.core.jit import jit
 from slam_backend.core.read_only import as_read_only
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_array, check_float
 
 FALSE, UNCOUNTED = -1, -2
@@ -33,6 +34,7 @@ class GospaResult:
     false: int
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, eq=False)
 class MapScore:
     """Error of matched landmarks, with recall and precision.

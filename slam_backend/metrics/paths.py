@@ -5,10 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import FloatArray, argument_error, check_array, check_int
 from slam_backend.geometry import between, rotation, transform_points
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, eq=False)
 class AteResult:
     """The absolute trajectory error: root mean square distance between estimated and true positions.

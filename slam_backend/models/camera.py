@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import FloatArray, argument_error, check_array, check_float, check_int, known_names
 
 MAX_POINT_DISTANCE = 1e4  # [m]; beyond the range of any camera, and far below the overflow of covariances
@@ -15,6 +16,7 @@ MAX_MOUNT_DISTANCE = 1e3  # [m]
 ROBOT_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
+@short_repr
 @known_names
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StereoCamera:

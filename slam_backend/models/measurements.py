@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.core.read_only import as_read_only
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_array
 from slam_backend.fastslam import _kernels
 
@@ -15,6 +16,7 @@ LEAST_VARIANCE, LARGEST_VARIANCE = 1e-14, 1e12  # [m^2]; keeps differences of lo
 LARGEST_CONDITION = 1e8  # about 1 / sqrt(machine epsilon); beyond it float64 updates lose positive definiteness
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, eq=False)
 class Measurements:
     """The measurements z_t = (v_t, d_t) of one frame (Sec. 2.2).
@@ -68,6 +70,7 @@ class Measurements:
         return cls(np.empty((0, 3)), np.empty((0, descriptor_size), dtype=np.float32))
 
 
+@short_repr
 class TeamMeasurements(NamedTuple):
     """Concatenated frames of several robots, without covariances.
 

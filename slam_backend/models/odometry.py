@@ -5,12 +5,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import FloatArray, check_float, known_names
 from slam_backend.geometry import compose
 
 LARGEST_SIGMA = 1e3  # [m, rad], or either per metre or radian; more carries no information
 
 
+@short_repr
 @known_names
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OdometryModel:

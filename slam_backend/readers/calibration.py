@@ -8,6 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import Float32Array, FloatArray, argument_error, check_array, check_float
 from slam_backend.frontend.images import Image, check_image
 from slam_backend.models.camera import StereoCamera
@@ -15,6 +16,7 @@ from slam_backend.models.camera import StereoCamera
 SMOOTH_ROTATION = 1e-4  # largest deviation of a rotation matrix from orthogonality
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, eq=False)
 class RectifiedPair:
     """Calibration of a rectified pair, with parallel optical axes and common rows.
@@ -34,6 +36,7 @@ class RectifiedPair:
         return StereoCamera(focal_px=self.focal_px, baseline=self.baseline, width=width, height=height, **changes)
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraCalibration:
     """Calibration of one pinhole camera with radial and tangential distortion.

@@ -16,6 +16,7 @@ import numpy as np
 
 from slam_backend.core.array_files import read_arrays
 from slam_backend.core.files import checked_path
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_float
 from slam_backend.models.camera import ROBOT_FROM_CAMERA, StereoCamera
 from slam_backend.models.measurements import Measurements
@@ -26,6 +27,7 @@ KEYS = ("time_stamps", "features", "linear_velocity", "rotational_velocity", "K"
 ABSENT = -1.0  # pixels of a track in frames that do not show it
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, eq=False)
 class KittiLog:
     """Log of a car with a stereo pair and an inertial unit. The arrays are read-only.
@@ -204,6 +206,7 @@ MAD = 1.4826  # ratio of standard deviation to median absolute deviation of a Ga
 DEPTHS_KNOWN_TO = 0.2  # largest relative error of depths; beyond it the error of a point is not Gaussian
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, eq=False)
 class KittiSteps:
     """Drive as steps at the times of its frames.

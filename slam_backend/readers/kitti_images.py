@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 
 from slam_backend.core.files import checked_path
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import FloatArray, argument_error, check_float
 from slam_backend.frontend.images import Image
 from slam_backend.readers.calibration import Rectified, RectifiedPair, Rectifier, load_kitti_calibration
@@ -17,6 +18,7 @@ CAMERA_FOLDERS = (("image_0", "image_1"), ("image_l", "image_r"))  # folders of 
 PERIOD = 0.1  # [s] between frames without given times: KITTI's cameras run at 10 Hz
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, eq=False)
 class KittiImages:
     """Stereo images of a drive.

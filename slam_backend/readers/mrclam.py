@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from slam_backend.core.files import checked_path
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray, argument_error, check_float
 from slam_backend.models.measurements import Measurements
 from slam_backend.readers.conversions import integrate_commands
@@ -17,6 +18,7 @@ from slam_backend.trajectory import Trajectory
 ROBOTS = (1, 2, 3, 4, 5)  # subject numbers of the robots
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, eq=False)
 class MrclamRobot:
     """Readings of one robot, and its true path. The arrays are read-only.
@@ -35,6 +37,7 @@ class MrclamRobot:
     truth: Trajectory | None
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, eq=False)
 class MrclamLog:
     """A log of several robots among landmarks with barcodes. The arrays are read-only.
@@ -249,6 +252,7 @@ def _bad_line(file: Path, number: int, line: str, columns: tuple[str, ...], rule
     return argument_error("path", expected, repr(line.strip()), f"Correct line {number} of {file}.")
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SightingNoise:
     """Assumed errors of one sighting; the defaults are twice the errors observed in this data set.
@@ -281,6 +285,7 @@ class SightingNoise:
         return np.stack([along, *(np.full(len(ranges), v**2) for v in (self.bearing, self.height))], axis=-1)
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Drive:
     """Response of a robot to its commands; by default it follows them exactly.
@@ -305,6 +310,7 @@ class Drive:
         return np.asarray(commands * [1.0, self.speed, self.turn] + [self.delay, 0.0, 0.0])
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, eq=False)
 class RobotSteps:
     """Readings of one robot, step by step.
@@ -322,6 +328,7 @@ class RobotSteps:
     measurements: tuple[Measurements | None, ...]
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, eq=False)
 class MrclamSteps:
     """Log as steps at common times.

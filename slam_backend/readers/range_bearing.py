@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_array, check_float
 from slam_backend.geometry import between
 from slam_backend.models.measurements import Measurements
@@ -17,6 +18,7 @@ from slam_backend.readers.tables import MOST_JITTER, sorted_note, steps_back, ti
 MAX_STEPS = 1_000_000
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, eq=False)
 class RangeBearingSteps:
     """One robot's log as steps at common times.

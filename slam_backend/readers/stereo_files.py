@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import argument_error, check_float
 from slam_backend.readers.calibration import Rectified, Rectifier, load_euroc_calibration, load_kitti_calibration
 from slam_backend.readers.kitti import read_truth
@@ -14,6 +15,7 @@ from slam_backend.readers.kitti_images import KittiImages, read_grey, read_times
 LEAST_PAIRS = 2
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StereoFiles:
     """Names of the files of a stereo log, within its folder unless they are absolute paths.

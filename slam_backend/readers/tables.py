@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_choice
 
 MOST_JITTER = 1.0  # [s]; multi-threaded loggers swap rows by tenths of a second only
@@ -59,6 +60,7 @@ def sorted_note(words: list[str]) -> tuple[str, ...]:
 DELIMITERS = (",", ";", "\t")
 
 
+@short_repr
 class CsvTable(NamedTuple):
     """Columns of a CSV file with n rows.
 

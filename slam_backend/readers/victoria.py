@@ -13,6 +13,7 @@ import numpy as np
 from scipy.io import loadmat
 
 from slam_backend.core.files import checked_path
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import FloatArray, argument_error, check_float
 from slam_backend.geometry import between
 from slam_backend.models.measurements import Measurements
@@ -26,6 +27,7 @@ MAX_STEERING = 1.0  # [rad], beyond the steering angle of any car
 MILLISECONDS = 1000.0  # milliseconds per second, for the files of controls and GPS
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, eq=False)
 class VictoriaLog:
     """Log of a car-like vehicle among trees. The arrays are read-only, in order of time, with a common clock.
@@ -168,6 +170,7 @@ ENCODER = 0.76  # H, distance of the rear left wheel from the middle of the axle
 SENSOR = (3.78, 0.5, 0.0)  # (a, b) and height, which is arbitrary for a planar sensor
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TreeNoise:
     """Assumed errors of one reading of a tree.
@@ -192,6 +195,7 @@ class TreeNoise:
             check_float(f"sensor.{name}", getattr(self, name), "Give a standard deviation.", above=0.0)
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, eq=False)
 class VictoriaSteps:
     """Log as steps at the times of its scans.

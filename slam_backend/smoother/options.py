@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import MOST, IntArray, check_float, check_int, known_names
 
 MANY_LANDMARKS, LANDMARKS_PER_KEY = 2700, 15  # beyond so many landmarks one more keyframe for every 15,
@@ -11,6 +12,7 @@ MANY_STEPS, MANY_ROBOTS, STEPS_PER_KEY = 6000, 3, 50  # beyond so many steps of 
 LEAST_LANDMARKS_PER_KEY = 5  # but at most one for every 5 landmarks: a run in the same place needs no more
 
 
+@short_repr
 @known_names
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SmoothingOptions:

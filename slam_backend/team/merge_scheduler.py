@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from slam_backend.core.read_only import as_constant, with_constants
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import MOST, BoolArray, FloatArray, IntArray, argument_error, check_int, known_names
 from slam_backend.geometry import wrap_angle
 from slam_backend.maps.alignment import (
@@ -23,6 +24,7 @@ MIN_LOG_GROWTH = 0.125  # least share of new entries in the logs before they are
 MIN_IMPROVEMENT = 0.7  # waiting helps if the uncertainty falls below this share of its last value
 
 
+@short_repr
 @known_names
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AttemptOptions:

@@ -3,10 +3,12 @@
 import math
 from dataclasses import dataclass
 
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import MOST, argument_error, check_float, check_int, known_names
 from slam_backend.fastslam.options import MAX_PARTICLES
 
 
+@short_repr
 @known_names
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MergeOptions:

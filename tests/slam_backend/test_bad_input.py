@@ -25,6 +25,7 @@ from slam_backend.core.validation import (
     check_choice,
     check_float,
     check_int,
+    did_you_mean,
     is_built_in,
     known_names,
 )
@@ -140,6 +141,24 @@ def test_unknown_options_are_refused_with_those_that_there_are(kind: type[Any]) 
     first = next(iter(inspect.signature(kind).parameters))
     with pytest.raises(ValueError, match=rf"It has (.*, )?{first}(,|\.)"):
         kind(foo=1)
+
+
+@pytest.mark.parametrize("kind", [FastSlam, *OPTIONS], ids=lambda kind: kind.__name__)
+def test_misspelt_options_get_the_nearest_one(kind: type[Any]) -> None:
+    """Whatever option lacks a letter, the error asks whether it was meant."""
+    for name in inspect.signature(kind).parameters:
+        if kind not in (SightingNoise, TreeNoise) and len(name) > 3:
+            with pytest.raises(ValueError, match=rf"Did you mean '{name}'\? It has "):
+                kind(**{name[:-2] + name[-1]: 1})
+
+
+def test_only_near_names_are_suggested() -> None:
+    """Case and hyphens do not matter; other names, values of other types and long texts get no suggestion."""
+    names = ("random_goals", "frontier", "Office")
+    assert did_you_mean("Random-Gaols", names) == "Did you mean 'random_goals'? "
+    assert did_you_mean("office", names) == "Did you mean 'Office'? "
+    for other in ("maze", "", 3, None, "frontier" * 1000):
+        assert did_you_mean(other, names) == ""
 
 
 def test_valid_values_pass() -> None:

@@ -125,6 +125,18 @@ PARTS = {
 }
 
 
+def test_misspelt_names_get_the_nearest_one() -> None:
+    """A field at any depth, a choice and a reward term are refused with the name that is probably meant."""
+    for changes, meant in (
+        ({"robot_radus": 0.1}, "robot_radius"), ({"belief": {"filter": {"num_particle": 5}}}, "num_particles"),
+        ({"sensor": "sterio"}, "stereo"), ({"action_type": "goals"}, "goal"),
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=rf"Did you mean '{meant}'\?"):
+            EnvConfig().replace(**changes)
+    with pytest.raises(ValueError, match=r"got 'map_eror'\. Did you mean 'map_error'\?"):
+        small_env(reward={"map_eror": 1.0})
+
+
 @pytest.mark.parametrize("begins", PARTS)
 def test_parts_of_a_configuration_are_checked_when_it_is_made(begins: str) -> None:
     """Not at a reset, nor in a step."""

@@ -8,7 +8,7 @@ import pytest
 from builders.environments import MEETING, room, small_env, turning
 
 from slam_backend.geometry import between, compose, inverse
-from vslam_env import World
+from vslam_env import World, vslam_v0
 from vslam_env.actions import DISCRETE_COMMANDS, checked_actions
 
 BARE = World("bare", [[0, 0, 9, 0], [9, 0, 9, 7], [9, 7, 0, 7], [0, 7, 0, 0]])
@@ -157,10 +157,20 @@ def test_masked_goals_act_as_staying() -> None:
     assert all(np.array_equal(results[0][name], results[1][name]) for name in results[0])
 
 
+@pytest.mark.parametrize("make", [vslam_v0.parallel_env, vslam_v0.env])
+def test_an_unknown_option_of_a_reset_causes_a_warning(make: Any) -> None:
+    """Whatever the interface, it names the nearest known option and all of them; the episode begins."""
+    env = make(world="fig5", num_robots=2, num_particles=5)
+    says = r"ignores the option 'start_pose'\. Did you mean 'start_poses'\? Options are world_seed and start_poses\."
+    with pytest.warns(UserWarning, match=says):
+        env.reset(seed=0, options={"start_pose": MEETING, "world_seed": 3})
+    assert len(env.agents) == 2
+
+
 def test_reset_takes_the_first_frame() -> None:
     """After a reset robots have seen their first frame at the origin of their start frames; they stand as asked."""
     env = small_env()
-    observations, infos = env.reset(seed=0, options={"start_poses": MEETING, "unknown": 3})
+    observations, infos = env.reset(seed=0, options={"start_poses": MEETING})
     assert np.allclose(env.true_start_poses, MEETING)
     assert np.array_equal(env.true_poses, env.true_start_poses)
     for robot, agent in enumerate(env.agents):

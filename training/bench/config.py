@@ -132,7 +132,7 @@ class AccuracyConfig(ExperimentConfig):
 
     def check(self) -> None:
         """Refuse combinations without a valid trial, and options that have no effect."""
-        from slam_backend.core.validation import argument_error
+        from slam_backend.core.validation import argument_error, check_choice
 
         idle: tuple[str, ...] = EPISODES_ONLY
         hint = "Give --worlds, too."
@@ -148,10 +148,7 @@ class AccuracyConfig(ExperimentConfig):
                 )  # fmt: skip
         known = STEREO_PRESETS if self.worlds is None else ENV_PRESETS
         for preset in self.presets or ():
-            if preset not in known:
-                raise argument_error(
-                    "presets", f"one of {', '.join(map(repr, known))}", preset, "Choose one of these names."
-                )  # fmt: skip
+            check_choice("presets", preset, tuple(known))
         if self.worlds is None:
             self.trials()
             return

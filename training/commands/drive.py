@@ -12,14 +12,18 @@ EPISODE_S = 600.0  # [s]
 
 
 def drive_by_hand(
-    world: Annotated[str, typer.Option(help="World family or path; see vslam worlds list.")] = "office",
+    world: Annotated[
+        str | None, typer.Option(help="World family or path; see vslam worlds list.", show_default="office")
+    ] = None,
     world_split: Annotated[
         str | None, typer.Option(help="Split of the worlds: train, validation or test.", show_default="any")
     ] = None,
     robots: Annotated[int, typer.Option(help="Number of robots, 1 to 8.")] = 3,
     policy: Annotated[str, typer.Option(help="Policy of the other robots, or none.")] = "frontier",
     seed: Annotated[int, typer.Option(help="Seed of the episode.")] = 0,
-    preset: Annotated[str, typer.Option(help="Noise preset: easy, standard or hard.")] = "standard",
+    preset: Annotated[
+        str, typer.Option(help="Noise preset: easy, standard or hard; large: standard noise in 120 x 120 m.")
+    ] = "standard",
     max_cycles: Annotated[
         int | None, typer.Option(help="Length of the episode in ticks of 0.1 s.", show_default="600 s")
     ] = None,
@@ -46,6 +50,7 @@ def drive_by_hand(
         world=world,
         world_split=world_split,
         num_robots=robots,
+        action_type="continuous",
         preset=preset,
         max_cycles=max_cycles,
         max_seconds=max_seconds,

@@ -10,8 +10,8 @@ from rich.console import Console
 from training.commands._options import options
 from training.commands._progress import share_progress
 from training.commands._run_folder import Call
-from training.episodes.tables import print_consistency, print_refusals, write_maps
-from training.experiments.tables import E_SCALE, console_table, number
+from training.episodes.tables import figures, print_consistency, print_groups, print_refusals, write_maps
+from training.experiments.tables import ATE_NOTE, E_SCALE, console_table, heading, number
 from training.replay.config import (
     KITTI,
     MRCLAM,
@@ -114,23 +114,18 @@ def _replay_live(console: Console, log: "MrclamLog", config: MrclamConfig) -> "R
 
 def _print_tables(console: Console, metrics: dict[str, Any], with_poses: set[int]) -> None:
     """Print the available errors of paths, maps and merges."""
-    aligned, start = "after the best rigid fit", "from the true start, no fit"
-    paths = {
-        f"path (m),\n{aligned}": "ate_aligned_m", "odometry,\nfitted too": "dead_reckoning_ate_aligned_m",
-        f"path (m),\n{start}": "ate_start_m", "odometry,\nno fit": "dead_reckoning_ate_start_m",
-    }  # fmt: skip
-    maps = {
-        f"RMSE (m),\n{aligned}": "map_rmse_m", "recall": "map_recall", "precision": "map_precision",
-        f"E (m),\n{start}": "map_error",
-    }  # fmt: skip
-    for title, columns in (("Paths", paths), ("Maps", maps)):
-        rows = [row for row in metrics["robots"] if any(row[key] is not None for key in columns.values())]
-        shown = {name: key for name, key in columns.items() if any(row[key] is not None for row in rows)}
+    paths = dict.fromkeys(
+        ("ate_aligned_m", "dead_reckoning_ate_aligned_m", "ate_start_m", "dead_reckoning_ate_start_m"), 2
+    )
+    maps = {"map_rmse_aligned_m": 2, "map_recall": 0, "map_precision": 0, "map_error": 2}
+    for title, columns, note in (("Paths", paths, ATE_NOTE), ("Maps", maps, E_SCALE)):
+        rows = [row for row in metrics["robots"] if any(row[key] is not None for key in columns)]
+        shown = {key: digits for key, digits in columns.items() if any(row[key] is not None for row in rows)}
         if rows:
-            cells = [[str(row["robot"]), *(number(row[key]) for key in shown.values())] for row in rows]
-            console.print(console_table(title, ("robot", *shown), cells))
-            if "map_error" in shown.values():
-                console.print(E_SCALE)
+            cells = [[str(row["robot"]), *figures(row, shown)] for row in rows]
+            console.print(console_table(title, ("robot", *map(heading, shown)), cells))
+            if title == "Paths" or "map_error" in shown:
+                console.print(note)
         unknown = [row["robot"] for row in metrics["robots"] if row not in rows]
         missed = [robot for robot in unknown if title == "Paths" and robot in with_poses]
         for robots, why in (
@@ -139,17 +134,15 @@ def _print_tables(console: Console, metrics: dict[str, Any], with_poses: set[int
         ):
             if robots:
                 console.print(f"{title} of robots {', '.join(map(str, robots))}: {why}.")
-    errors = {"error (m)": "error_m", "error (°)": "error_deg"}
-    errors = {name: key for name, key in errors.items() if any(row[key] is not None for row in metrics["merges"])}
+    errors = {key: 2 for key in ("error_m", "error_deg") if any(row[key] is not None for row in metrics["merges"])}
     merges = []
     for row in metrics["merges"]:
         sides = [", ".join(map(str, row[side])) for side in ("robots_a", "robots_b")]
-        off = [number(row[key]) for key in errors.values()]
-        merges.append([f"{row['time_s']:.1f}", *sides, str(row["landmarks"]), *off])
-    headings = ("time (s)", "group", "with", "shared landmarks", *errors)
+        merges.append([f"{row['time_s']:.1f}", *sides, str(row["landmarks"]), *figures(row, errors)])
+    headings = list(map(heading, ("time_s", "robots_a", "robots_b", "landmarks", *errors)))
     console.print(console_table("Merges", headings, merges) if merges else "No merge.")
     print_refusals(console, metrics["refusals"])
-    console.print("Groups at the end: " + "; ".join(", ".join(map(str, group)) for group in metrics["groups"]))
+    print_groups(console, metrics)
 
 
 @replay.command("victoria")

@@ -45,7 +45,6 @@ def run(
     """Let robots with unknown starts explore a building, map it, and merge their maps."""
     import webbrowser
 
-    from agents.registry import action_types, model_file
     from slam_backend.trajectory import Trajectory
     from training.episodes.figures import draw_errors, draw_maps
     from training.episodes.metrics import score_episode
@@ -60,18 +59,13 @@ def run(
 
     if rerun is not None:
         check_rerun(rerun)
-    policy = call.given.get("policy")
-    if "action_type" not in call.given and policy is not None:
-        known = action_types(policy)
-        if model_file(policy) is not None or "continuous" not in known:  # models have learned from goal actions
-            call.given["action_type"] = known[0]
     chosen = call.config
     env = chosen.make_env()
     policies = chosen.make_policies(env)
     # Detect a world that cannot be built before the folder is created.
     with ExitStack() as stack:
         view = stack.enter_context(LiveView(port, speed)) if live else None
-        console, folder = call.begin(lambda: _first_steps(env, policies, chosen.seed))
+        console, folder = call.begin(lambda: _first_steps(env, policies, chosen))
         folder.write_text("environment.toml", env.config.replace(world=folder.config["world"]).to_toml())
         recorder = EpisodeRecorder(env, chosen.num_steps, chosen.step_s, policies.goals)
         interrupted = stack.enter_context(interrupt_flag())
@@ -109,12 +103,14 @@ def run(
         webbrowser.open((folder.path / REPORT_FILE).resolve().as_uri())
 
 
-def _first_steps(env: Any, policies: Any, seed: int) -> None:
+def _first_steps(env: Any, policies: Any, config: RunConfig) -> None:
     """Run the first two steps of the episode, which use all kernels except those of merging."""
     from training.episodes.runner import run_episode
 
     steps = iter(range(2))
-    run_episode(env, policies, seed, should_stop=lambda: next(steps, None) is None)
+    run_episode(
+        env, policies, config.seed, should_stop=lambda: next(steps, None) is None, options=config.reset_options()
+    )
 
 
 def _run_with_progress(
@@ -141,7 +137,7 @@ def _run_with_progress(
                 picture = draw_frame(with_video_time_merges(env.scene(), env.events, pace.speedup), VIDEO_SIZE)
                 writer.add(with_camera_images(picture, env.episode.frames[0], IMAGE_WIDTH) if eyes else picture)
 
-        record = run_episode(env, policies, config.seed, on_step, interrupted)
+        record = run_episode(env, policies, config.seed, on_step, interrupted, config.reset_options())
     if not record.complete:
         console.print(f"Stopped at {record.times[-1]:.1f} s; the results cover the run until then.")
     return record
@@ -152,11 +148,11 @@ def live_progress(console: Console, num_steps: int, agents: Sequence[str]) -> It
     """Show a bar with the metrics of a running episode, and a line for each merge; yield the callback for a step."""
     columns = (
         text_column("{task.fields[time]:6.1f} s"), BarColumn(20), text_column("E {task.fields[errors]} m"),
-        text_column("coverage {task.fields[coverage]:2.0f} %"), text_column("{task.fields[groups]} maps"),
+        text_column("coverage {task.fields[coverage]:2.0f} %"), text_column("{task.fields[maps]}"),
         TimeRemainingColumn(),
     )  # fmt: skip
     with Bar(*columns, console=console) as bar:
-        task = bar.add_task("run", total=num_steps, time=0.0, errors="-", coverage=0.0, groups=len(agents))
+        task = bar.add_task("run", total=num_steps, time=0.0, errors="-", coverage=0.0, maps=_count_maps(len(agents)))
 
         def show(progress: "Progress") -> None:
             for merge in progress.new_merges:
@@ -166,10 +162,14 @@ def live_progress(console: Console, num_steps: int, agents: Sequence[str]) -> It
                 bar.update(
                     task, completed=progress.step, time=progress.time,
                     errors=errors_in_short([info["map_error"] for info in infos]),
-                    coverage=100.0 * infos[0]["coverage"], groups=len({info["group"] for info in infos}),
+                    coverage=100.0 * infos[0]["coverage"], maps=_count_maps(len({info["group"] for info in infos})),
                 )  # fmt: skip
 
         yield show
+
+
+def _count_maps(number: int) -> str:
+    return "1 map" if number == 1 else f"{number} maps"
 
 
 def errors_in_short(errors: Sequence[float]) -> str:

@@ -4,13 +4,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from training.experiments.config import ONE_PARTICLE, ActionType, ExperimentConfig, NoisePreset, Sensor, option
+from training.experiments.config import ONE_PARTICLE, ActionType, ExperimentConfig, Preset, Sensor, option
 
 if TYPE_CHECKING:  # numerical modules are imported when a command runs, so that --help is fast
     from training.episodes.guard import GuardedTeam
     from vslam_env.config import EnvConfig
     from vslam_env.environment import ExplorationEnv
 
+POSES = "Write them like 2,3,0; 5,3,1.57."
 EPISODE_S = 180.0  # enough for three robots to explore the office and to overlap their maps [s]
 
 
@@ -39,24 +40,49 @@ class RunConfig(ExperimentConfig):
         None, "Ticks between rejuvenations of the particles; 0: never.", shown="50", ge=0,
         hint="Give a number of ticks, or 0 for never.",
     )  # fmt: skip
-    preset: NoisePreset = option("standard", "Noise preset: easy, standard or hard.")
+    preset: Preset = option(
+        "standard", "Noise preset: easy, standard or hard; large: standard noise, and 1800 s in 120 x 120 m with goals."
+    )
     sensor: Sensor = option("landmark", "Sensor: landmark, or stereo (rendered images).")
+    start_poses: str | None = option(
+        None, 'Start poses of all robots, "x,y,theta; x,y,theta; ..." [m, m, rad], world frame.', shown="random",
+        hint=POSES,
+    )  # fmt: skip
     decision_limit: float = option(
         30.0, "Longest time of a decision [s]; a slower policy ends the run.", gt=0.0, hint="Give seconds."
     )
 
     def check(self) -> None:
-        """Refuse two limits of the episode."""
+        """Refuse two limits of the episode, and start poses of other robots."""
         from vslam_env.config import check_one_limit
 
         check_one_limit(self.max_cycles, self.max_seconds)
+        self.reset_options()
+
+    @classmethod
+    def implied(cls, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the values of the preset, and the action type that the policy needs."""
+        from agents.registry import action_types, model_file
+        from vslam_env.config import LIMITS
+        from vslam_env.presets import LARGE
+
+        found = {name: value for name, value in LARGE.items() if values.get("preset") == "large"}
+        if any(name in values for name in LIMITS):
+            found.pop("max_seconds", None)
+        policy = values.get("policy")
+        if policy is not None:
+            known = action_types(policy)
+            # Models have learned from goal actions.
+            if model_file(policy) is not None or found.get("action_type", "continuous") not in known:
+                found["action_type"] = known[0]
+        return found
 
     @classmethod
     def merged(cls, earlier: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
         """Return plain values in which a given limit of the episode removes the other one of an earlier run."""
         from vslam_env.config import replace_limit
 
-        return {**earlier, **replace_limit(given)}
+        return {**earlier, **replace_limit({**cls.implied(given), **given})}
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values that repeat this run from any folder, except the seed."""
@@ -103,6 +129,25 @@ class RunConfig(ExperimentConfig):
         if self.max_cycles is not None:
             return {"max_cycles": self.max_cycles}
         return {"max_seconds": EPISODE_S if self.max_seconds is None else self.max_seconds}
+
+    def reset_options(self) -> dict[str, Any]:
+        """Return the options of `env.reset`.
+
+        Raises:
+            ValueError: If the start poses are not three numbers for each robot.
+        """
+        from slam_backend.core.validation import argument_error
+
+        if self.start_poses is None:
+            return {}
+        try:
+            poses = [[float(number) for number in pose.split(",")] for pose in self.start_poses.split(";")]
+        except ValueError as error:
+            raise argument_error("start_poses", "numbers x,y,theta; x,y,theta; ...", self.start_poses, POSES) from error
+        if [len(pose) for pose in poses] != [3] * self.robots:
+            expected = f"a pose x,y,theta of each of {self.robots} robots, with a semicolon between them"
+            raise argument_error("start_poses", expected, self.start_poses, "Add poses, or change --robots.")
+        return {"start_poses": poses}
 
     def environment(self) -> "EnvConfig":
         """Return the configuration of the environment."""

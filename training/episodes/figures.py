@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection, LineCollection
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, SubFigure
 from matplotlib.lines import Line2D
 
 from slam_backend.core.validation import BoolArray, FloatArray
@@ -29,10 +29,10 @@ LETTER = 0.56 * TEXT_SIZE / 72.0  # mean width of a letter of this size [in]
 
 @picture
 def draw_maps(record: EpisodeRecord, path: Path) -> None:
-    """Save a plot of the map of each robot before its first merge, and of all maps at the end.
+    """Save a plot of the map of each robot before its first merge, and of the map of each group at the end.
 
-    Each map is placed by the true start pose of its robot, without any fit, so that deviations from the walls are
-    estimation errors.
+    Each map is placed by the true start pose of its robot, of a group by that of its first one, without any fit, so
+    that deviations from the walls are estimation errors.
     """
     robots = range(len(record.infos))
     columns = min(len(robots), COLUMNS)
@@ -59,11 +59,9 @@ def draw_maps(record: EpisodeRecord, path: Path) -> None:
         axes.set_title(f"robot {robot} alone, {when}", fontsize=9, color=rgb(INK))
     main = lower.subplots()
     _draw_truth(main, record.scene, 1.5)
-    for robot in robots:
-        view = record.scene.robots[robot]
-        later = sum(other.group == view.group for other in record.scene.robots[robot + 1 :])
-        area = 6.0 + 8.0 * later  # concentric dots of robots that share a map
-        _draw_landmarks(main, view.landmark_means, view.landmark_covariances, robot_colour(robot), area)
+    for first in dict.fromkeys(record.scene.map_owners):
+        view = record.scene.robots[first]
+        _draw_landmarks(main, view.landmark_means, view.landmark_covariances, robot_colour(first), 8.0)
     for robot in robots:
         _draw_paths(main, record, robot, record.times[-1])
     groups = "  ".join("{" + ", ".join(map(str, group)) + "}" for group in record.groups)
@@ -72,7 +70,7 @@ def draw_maps(record: EpisodeRecord, path: Path) -> None:
         fontsize=11, color=rgb(INK),
     )  # fmt: skip
     _draw_scale_bar(main)
-    _add_map_legend(main)
+    _add_map_legend(lower)
     save_png(figure, path, 150)
 
 
@@ -115,7 +113,7 @@ def draw_errors(record: EpisodeRecord, path: Path) -> None:
     )  # fmt: skip
     top.set_ylim(0.0, height)
     top.set_ylabel("map error E [m]")
-    top.legend(frameon=False, fontsize=TEXT_SIZE, loc="lower left", ncols=min(len(record.map_errors), COLUMNS))
+    figure.legend(frameon=False, fontsize=TEXT_SIZE, loc="outside upper left", ncols=len(record.map_errors))
     bottom.set_ylim(0.0, 100.0)
     bottom.set_ylabel("coverage [%]")
     bottom.set_xlabel("time [s]")
@@ -185,21 +183,29 @@ def _draw_scale_bar(axes: Axes) -> None:
     )  # fmt: skip
 
 
-def _add_map_legend(axes: Axes) -> None:
+def _add_map_legend(figure: SubFigure) -> None:
     """Add a legend of lines and marks below the axes; the robots' colours are those of the panels above."""
     grey = rgb(FAINT_INK)
     handles = [
         Line2D([], [], color=rgb(WALL), linewidth=2.0, label="wall"),
         Line2D([], [], linestyle="", marker="o", markersize=2.4, color=rgb(TRUE_LANDMARK), label="true landmark"),
-        Line2D([], [], linestyle="", marker="o", markersize=5.0, color=grey, label="estimated, with 95 % ellipse"),
+        Line2D(
+            [],
+            [],
+            linestyle="",
+            marker="o",
+            markersize=5.0,
+            color=grey,
+            label="estimated landmark with 95 % ellipse, in the colour of its map's first robot",
+        ),
         Line2D([], [], color=grey, alpha=0.3, linewidth=4.0, label="true path"),
         Line2D([], [], color=grey, linewidth=1.2, label="estimated path"),
         Line2D([], [], color=grey, linewidth=1.0, linestyle=":", label="odometry only"),
         Line2D([], [], linestyle="", marker="o", markerfacecolor="white", color=grey, label="start"),
     ]
-    axes.legend(
-        handles=handles, loc="upper center", bbox_to_anchor=(0.5, 0.0), ncols=len(handles), frameon=False,
-        fontsize=TEXT_SIZE, handletextpad=0.5, columnspacing=1.2,
+    figure.legend(
+        handles=handles, loc="outside lower center", ncols=4, frameon=False, fontsize=TEXT_SIZE, handletextpad=0.5,
+        columnspacing=1.2,
     )  # fmt: skip
 
 

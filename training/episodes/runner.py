@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from agents.policy import Policy
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import FloatArray, IntArray, argument_error
 from slam_backend.fastslam.consistency import Consistency
 from slam_backend.fastslam.reports import MergeEvent
@@ -50,6 +51,7 @@ class MergeRecord:
         return is_false_merge(self.error_m, self.error_deg)
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, eq=False)
 class EpisodeRecord:
     """Record of an episode of K robots and T steps."""
@@ -93,6 +95,7 @@ class Progress:
 def run_episode(
     env: ExplorationEnv, policies: Mapping[str, Policy] | GuardedTeam, seed: int,
     on_step: Callable[[Progress], None] = lambda progress: None, should_stop: Callable[[], bool] = lambda: False,
+    options: Mapping[str, Any] | None = None,
 ) -> EpisodeRecord:  # fmt: skip
     """Run one episode to its end, or until `should_stop`.
 
@@ -101,6 +104,7 @@ def run_episode(
         policies: Policy of each agent, or all of them; policies see observations and beliefs, never infos.
         seed: Seed of the reset and of the policies' random draws, which are independent streams.
         on_step: Function called after the reset and after each step; it may inspect the environment.
+        options: Options of the reset.
 
     Raises:
         ValueError: If an agent has no policy, or a policy fails (`PolicyError`).
@@ -126,7 +130,7 @@ def run_episode(
 
     env.recorder = record
     try:
-        observations, infos = env.reset(seed=seed)
+        observations, infos = env.reset(seed=seed, options=options)
         team.reset()
         log = _Log(env, infos)
         on_step(Progress(0, 0.0, infos, ()))

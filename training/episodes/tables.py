@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.table import Table
 
-from training.experiments.tables import E_SCALE, console_table, number
+from training.experiments.tables import ATE_NOTE, E_SCALE, MAPS_NOTE, NIS_NOTE, console_table, heading, in_words, number
 
 if TYPE_CHECKING:  # numerical modules are imported when the command runs, so that --help is fast
     from slam_backend.fastslam.consistency import Consistency
@@ -14,16 +14,13 @@ if TYPE_CHECKING:  # numerical modules are imported when the command runs, so th
     from slam_backend.maps.landmark_map import LandmarkMap
     from training.experiments.run_folder import RunFolder
 
-# Columns of the tables: heading, metric, digits, factor
-MAPS = (
-    ("E [m]", "map_error", 3, 1.0), ("RMSE [m]", "map_rmse_m", 3, 1.0), ("recall [%]", "map_recall", 1, 100.0),
-    ("precision [%]", "map_precision", 1, 100.0),
-)  # fmt: skip
-PATHS = (
-    ("ATE [m],\naligned", "ate_aligned_m", 3, 1.0), ("odometry's", "dead_reckoning_ate_aligned_m", 3, 1.0),
-    ("ATE [m],\nstart frame", "ate_start_m", 3, 1.0), ("odometry's", "dead_reckoning_ate_start_m", 3, 1.0),
-    ("path [m]", "path_m", 1, 1.0), ("odometry's\nend error [%]", "dead_reckoning_end_percent", 1, 1.0),
-)  # fmt: skip
+# Metrics in the columns of the tables, with their digits
+MAPS = {"map_error": 3, "map_rmse_m": 3, "map_recall": 1, "map_precision": 1}
+PATHS = {
+    "ate_aligned_m": 3, "dead_reckoning_ate_aligned_m": 3, "ate_start_m": 3, "dead_reckoning_ate_start_m": 3,
+    "path_m": 1, "dead_reckoning_end_percent": 1,
+}  # fmt: skip
+CONSISTENCY = {"nis_mean": 2, "nis_share": 1, "ess_share": 1, "rejected_share": 1}
 
 MISSED = {
     "translation": "The standard deviation of the translation exceeded its bound.",
@@ -32,7 +29,6 @@ MISSED = {
     "paths": "The uncertainty of the paths left the transform between the starts uncertain beyond the bound.",
     "repeat": "Two consecutive attempts gave transforms that differ by more than the bound.",
 }
-COLUMNS = ("robot", "mean NIS", "NIS beyond 95 %", "few particles", "mostly rejected", "verdict")
 CAUTIOUS = 1.0  # mean NIS below which covariances are at least twice too large, even in the plane
 UPPER = ("xx", "xy", "xz", "yy", "yz", "zz")
 MAP_COLUMNS = ("id", "count", "x_m", "y_m", "z_m", *(f"cov_{pair}_m2" for pair in UPPER))
@@ -41,38 +37,46 @@ MAP_COLUMNS = ("id", "count", "x_m", "y_m", "z_m", *(f"cov_{pair}_m2" for pair i
 def print_tables(console: Console, metrics: Mapping[str, Any]) -> None:
     """Print the metrics of robots and team, a row for each, then the merges."""
     lines = {str(robot): row for robot, row in enumerate(metrics["robots"])} | {"team": metrics["team"]}
-    for title, columns in (("Maps, each in its robot's start frame", MAPS), ("Paths", PATHS)):
-        rows = [
-            [name, *(number(row[key], digits, factor) for _, key, digits, factor in columns)]
-            for name, row in lines.items()
-        ]
-        console.print(console_table(title, ("robot", *(heading for heading, *_ in columns)), rows))
-        if columns is MAPS:
-            console.print(E_SCALE)
+    for title, columns, note in (
+        ("Maps, each in its robot's start frame", MAPS, E_SCALE), ("Paths", PATHS, ATE_NOTE),
+    ):  # fmt: skip
+        rows = [[name, *figures(row, columns)] for name, row in lines.items()]
+        console.print(console_table(title, ("robot", *map(heading, columns)), rows))
+        console.print(note)
     if metrics["merges"]:
         console.print(_merges(metrics["merges"]))
+        console.print(MAPS_NOTE)
     else:
         console.print("No merge.")
     print_refusals(console, metrics["refusals"])
+    print_groups(console, metrics)
+    console.print(f"Coverage: {number(metrics['coverage'], 1, 100.0)} % of the floor in {metrics['duration_s']:.0f} s.")
+
+
+def print_groups(console: Console, metrics: Mapping[str, Any]) -> None:
+    """Print the groups at the end, and the number of merge attempts."""
     groups = "; ".join(", ".join(map(str, group)) for group in metrics["groups"])
-    console.print(
-        f"Groups at the end: {groups}.  Coverage: {metrics['coverage']:.1%} in {metrics['duration_s']:.0f} s.  "
-        f"Alignment attempts: {metrics['attempts']}."
-    )
+    console.print(f"Groups of robots with a common map at the end: {groups}.  Merge attempts: {metrics['attempts']}.")
+
+
+def figures(row: Mapping[str, Any], columns: Mapping[str, int]) -> list[str]:
+    """Return the cells of some metrics, given with their digits, in the units of their headings."""
+    return [number(row[metric], digits, in_words(metric)[2]) for metric, digits in columns.items()]
 
 
 def _merges(rows: list[Mapping[str, Any]]) -> Table:
     """Return the table of merges."""
-    headings = ("time [s]", "robots", "with", "landmarks", "error [m]", "error [deg]", "verdict")
+    metrics = ("time_s", "robots_a", "robots_b", "landmarks", "error_m", "error_deg", "verdict")
     cells = []
     for row in rows:
         sides = [", ".join(map(str, row[side])) for side in ("robots_a", "robots_b")]
-        errors = f"{row['error_m']:.3f}", f"{row['error_deg']:.2f}"
+        errors = number(row["error_m"], 3), number(row["error_deg"], 2)
         verdict = "false" if row["false"] else ""
         if row["undone_s"] is not None:
             verdict += f"{', ' if verdict else ''}undone at {row['undone_s']:.1f} s"
         cells.append([f"{row['time_s']:.1f}", *sides, str(row["landmarks"]), *errors, verdict])
-    return console_table("Merges, compared with the true transform between the start poses", headings, cells)
+    title = "Merges, compared with the true transform between the start poses"
+    return console_table(title, list(map(heading, metrics)), cells)
 
 
 def pair_rows(
@@ -120,10 +124,10 @@ def print_refusals(console: Console, rows: Sequence[Mapping[str, Any]]) -> None:
     for row in shown:
         sides = [", ".join(map(str, row[side])) for side in ("robots_a", "robots_b")]
         reasons = ", ".join(f"{reason} ({count})" for reason, count in row["refused"].items())
-        cells.append([*sides, str(row["attempts"]), reasons, _last(row), "apart" if row["apart"] else "one map"])
+        cells.append([*sides, str(row["attempts"]), reasons, _last(row), "yes" if row["apart"] else "no"])
     title = "Refused merge attempts (with the factor by which a bound was missed)"
-    headings = ("robots", "with", "attempts", "reason", "last", "at the end")
-    console.print(console_table(title, headings, cells))
+    metrics = ("robots_a", "robots_b", "attempts", "refused", "last_reason", "apart")
+    console.print(console_table(title, list(map(heading, metrics)), cells))
     for reason in dict.fromkeys(row["last_reason"] for row in shown if row["apart"] and row["last_reason"]):
         console.print(f"{reason}: {HINTS[reason]}")
     for missed in dict.fromkeys(row["missed"] for row in shown if row["apart"] and row["missed"]):
@@ -160,10 +164,10 @@ def print_consistency(console: Console, rows: Sequence[Mapping[str, Any]]) -> No
     """Print the result of `consistency_rows`, with NaN as None, and each warning once."""
     cells = []
     for row in rows:
-        shares = (f"{100.0 * row[key]:.1f} %" for key in ("nis_share", "ess_share", "rejected_share"))
-        cells.append([str(row["robot"]), number(row["nis_mean"]), *shares, _verdict(row)])
-    title = "Consistency: errors relative to the estimated covariances (shares of frames)"
-    console.print(console_table(title, COLUMNS, cells))
+        cells.append([str(row["robot"]), *figures(row, CONSISTENCY), _verdict(row)])
+    title = "Consistency: errors relative to the estimated covariances"
+    console.print(console_table(title, ("robot", *map(heading, CONSISTENCY), "verdict"), cells))
+    console.print(NIS_NOTE)
     texts: dict[str, list[str]] = {}
     for row in rows:
         for warning in row["warnings"]:

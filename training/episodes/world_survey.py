@@ -4,7 +4,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,10 +11,13 @@ from slam_backend.core.validation import check_int
 from vslam_env import vslam_v0
 from vslam_env.config import EnvConfig
 from vslam_env.rendering import draw_frame
+from vslam_env.rendering.canvas import write
+from vslam_env.rendering.palette import INK, PAPER
 from vslam_env.simulation.scenario import sample_scenario
 from vslam_env.world import FreeSpace
 
 TILE = (640, 480)  # [px]
+TITLE_PX = 32  # height of the title above a tile
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,9 +81,9 @@ def contact_sheet(world: str, first_seed: int, count: int, robots: int) -> NDArr
     tiles: list[Any] = []
     for seed in range(first_seed, first_seed + count):
         env.reset(seed=seed, options={"world_seed": seed})
-        tile = draw_frame(env.scene(), TILE)
-        cv2.putText(tile, f"seed {seed}", (70, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (90, 90, 90), 1, cv2.LINE_AA)
-        tiles.append(tile)
+        title = np.full((TITLE_PX, TILE[0], 3), PAPER, np.uint8)
+        write(title, f"seed {seed}", 16.0, 0.5 * TITLE_PX, 0.4 * TITLE_PX, INK)
+        tiles.append(np.vstack([title, draw_frame(env.scene(), TILE)]))
     columns = int(np.ceil(np.sqrt(count)))
     blank = np.full_like(tiles[0], 255)
     tiles += [blank] * (-count % columns)

@@ -3,7 +3,7 @@
 The modules that define configurations import no numerical library, so that `--help` is fast.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from importlib import import_module
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Self, Union, get_args, get_origin
@@ -26,6 +26,7 @@ NonNegative = Annotated[int, Field(ge=0)]
 RobotCount = Annotated[int, Field(ge=1, le=8)]
 ActionType = Literal["continuous", "discrete", "goal"]
 NoisePreset = Literal["easy", "standard", "hard"]
+Preset = Literal["easy", "standard", "hard", "large"]
 Sensor = Literal["landmark", "stereo"]
 Proposal = Literal["fastslam2", "fastslam1"]
 Descriptor = Literal["usurf", "sift", "orb"]
@@ -77,7 +78,7 @@ def table(path: str) -> Any:
             raise _error(field, f"a table of {', '.join(names)}", value, "Write it as a table.")
         for name in value:
             if name not in names:
-                raise _error(field, f"names among {', '.join(names)}", name, "Correct the name.")
+                raise _unknown_name(field, name, names)
         return kind(**value)
 
     return Annotated[Any, BeforeValidator(build), Field(validate_default=True)]
@@ -130,14 +131,19 @@ class ExperimentConfig(Checked):
         return cls(**cls.completed(values))
 
     @classmethod
+    def implied(cls, values: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Return further plain values that given ones imply, such as those of a preset."""
+        return {}
+
+    @classmethod
     def completed(cls, values: Mapping[str, Any]) -> Mapping[str, Any]:
         """Return plain values with omitted values filled in, where these depend on other values."""
-        return values
+        return {**cls.implied(values), **values}
 
     @classmethod
     def merged(cls, earlier: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the plain values of an earlier run, overridden by given ones."""
-        return {**earlier, **given}
+        """Return the plain values of an earlier run, overridden by given ones and what these imply."""
+        return {**earlier, **cls.implied(given), **given}
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values that repeat the command, except the seed."""
@@ -170,8 +176,7 @@ def _one_line_error(kind: type[Checked], error: ValidationError) -> ValueError:
     found = error.errors()
     for each in found:
         if each["type"] == "extra_forbidden":
-            names = ", ".join(kind.model_fields)
-            return _error("config", f"names among {names}", str(each["loc"][0]), "Correct the name.")
+            return _unknown_name("config", str(each["loc"][0]), kind.model_fields)
     first, value = found[0], found[0]["input"]
     cause = first.get("ctx", {}).get("error")
     if cause is not None and str(cause):
@@ -186,10 +191,10 @@ def _one_line_error(kind: type[Checked], error: ValidationError) -> ValueError:
     if first["type"] == "missing":
         return _error(name, "a value", "none", hint)
     if get_origin(leaf) is Literal:
-        expected, hint = f"one of {', '.join(map(repr, get_args(leaf)))}", "Choose one of these names."
-    else:
-        expected = _range(leaf, [*constraints, *field.metadata])
-    return _error(name, expected, value, hint)
+        from slam_backend.core.validation import choice_error
+
+        return choice_error(name, value, get_args(leaf))
+    return _error(name, _range(leaf, [*constraints, *field.metadata]), value, hint)
 
 
 def _range(kind: Any, constraints: list[Any]) -> str:
@@ -202,6 +207,14 @@ def _range(kind: Any, constraints: list[Any]) -> str:
     signs = {"gt": ">", "ge": ">=", "le": "<="}
     limits = " and ".join(f"{signs[name]} {bound:g}" for name, bound in bounds.items())
     return f"{'an int' if kind is int else 'a finite number'} {limits}".rstrip()
+
+
+def _unknown_name(name: str, wrong: Any, known: Iterable[str]) -> ValueError:
+    """Return the error of a name in a table that has none such."""
+    from slam_backend.core.validation import did_you_mean
+
+    expected = f"names among {', '.join(known)}"
+    return _error(name, expected, wrong, f"{did_you_mean(wrong, known)}Correct the name.")
 
 
 def _error(name: str, expected: str, got: Any, hint: str) -> ValueError:

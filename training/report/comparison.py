@@ -11,8 +11,18 @@ from rich.console import Console
 from slam_backend.core.validation import argument_error
 from training.experiments.run_folder import plain
 from training.experiments.statistics import interval, paired_difference
-from training.experiments.tables import console_table, number
-from training.report.content import CURVES_FILE, Content, curve_charts, heading, label, read_curves, read_folder, table
+from training.experiments.tables import console_table, heading, in_words, number
+from training.report.content import (
+    CURVES_FILE,
+    Content,
+    as_is,
+    curve_charts,
+    in_unit,
+    label,
+    read_curves,
+    read_folder,
+    table,
+)
 from training.report.packing import Packer
 from training.report.page import render
 from training.report.recording import RECORDING_FILE, SCORES, Recording
@@ -167,7 +177,7 @@ def print_comparison(console: Console, found: Comparison) -> None:
     for where in dict.fromkeys(row.where for row in found.differences):
         own = [row for row in found.differences if row.where == where]
         cells = [
-            [heading(row.metric), number(row.one, 3), number(row.other, 3), number(row.difference, 3), _ends(row)]
+            [heading(row.metric), *(_number(row, each) for each in (row.one, row.other, row.difference)), _ends(row)]
             for row in own
         ]
         seeds = {row.seeds for row in own if row.seeds is not None}
@@ -178,7 +188,11 @@ def print_comparison(console: Console, found: Comparison) -> None:
 
 
 def _ends(row: Difference) -> str:
-    return "-" if row.low is None else f"{number(row.low, 3)} .. {number(row.high, 3)}"
+    return "-" if row.low is None else f"{_number(row, row.low)} .. {_number(row, row.high)}"
+
+
+def _number(row: Difference, value: float | None) -> str:
+    return number(value, 3, in_words(row.metric)[2])
 
 
 def comparison_page(found: Comparison) -> str:
@@ -190,14 +204,23 @@ def comparison_page(found: Comparison) -> str:
     options = [{"option": name, one: a, other: b} for name, a, b in found.options]
     rows = [
         {
-            "run": row.where, "metric": heading(row.metric), one: row.one, other: row.other,
-            "difference": row.difference, "difference_low": row.low, "difference_high": row.high, "seeds": row.seeds,
+            "run": row.where, "metric": heading(row.metric),
+            **{
+                name: in_unit(row.metric, value)
+                for name, value in (
+                    (one, row.one), (other, row.other), ("difference", row.difference),
+                    ("difference_low", row.low), ("difference_high", row.high),
+                )
+            },
+            "seeds": row.seeds,
         }
         for row in found.differences
     ]  # fmt: skip
     unused = [name for name in ("run", "seeds") if all(row[name] in ("", None) for row in rows)]
     rows = [{name: value for name, value in row.items() if name not in unused} for row in rows]
-    content.tables = [table("metrics", plain(rows))] + ([table("options that differ", options)] if options else [])
+    content.tables = [table("metrics", "", plain(rows), as_is)] + (
+        [table("options that differ", "", options, as_is)] if options else []
+    )
     return render(content)
 
 

@@ -5,7 +5,7 @@ import csv
 import json
 import math
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,21 +15,22 @@ import numpy as np
 from slam_backend.core.validation import FloatArray, argument_error
 from training.experiments.labels import parted_label
 from training.experiments.run_folder import CONFIG_FILE, METRICS_FILE
-from training.experiments.tables import E_SCALE
+from training.experiments.tables import ATE_NOTE, E_SCALE, MAPS_NOTE, NIS_NOTE, heading, in_words, significant
 from training.report.packing import Packer
 from training.report.recording import RECORDING_FILE, Recording, axes_95
 from vslam_env.navigation import CELL, FREE, OCCUPIED, CandidateKind
 from vslam_env.rendering.palette import robot_colour
 
-NEGLIGIBLE = 1e-9  # smaller numbers are shown as 0
 MOST_ROWS = 2000  # of a table
 MOST_PICTURES = 1_500_000  # bytes of all pictures
 CELLS = 12_000_000  # of all grids of a page, as they are decoded
 CURVES_FILE = "curves.csv"
-UNITS = {"_m": "m", "_deg": "degrees", "_s": "s", "_percent": "%", "_ms": "ms"}
-METRES = {"map_error": "map error E", "pose_error": "position error", "return": "return"}  # without a suffix
-INITIALS = ("ate", "rmse", "rms", "nis", "ess", "anees", "nees")
 NOT_TABLES = ("config", "versions")
+TITLES = {  # of tables, with notes
+    "robots": ("maps and paths of the robots", ATE_NOTE), "merges": ("merges", MAPS_NOTE),
+    "refusals": ("merge attempts by pair of maps", "Maps are named by their robots."),
+    "consistency": ("consistency of the filters", NIS_NOTE),
+}  # fmt: skip
 SHADES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7A5430", "#46464C")
 
 
@@ -88,7 +89,7 @@ def folder_content(folder: Path) -> Content:
     content.about = [("command", command), ("seed", str(config.get("seed", "")))]
     content.about += [(name, str(versions[name])) for name in ("vslam-env", "python", "numpy") if name in versions]
     content.about += [
-        (heading(name), _text(value)) for name, value in metrics.items()
+        (heading(name), _text(in_unit(name, value))) for name, value in metrics.items()
         if isinstance(value, int | float | str | bool) and name != "seed"
     ]  # fmt: skip
     if (folder / RECORDING_FILE).is_file():
@@ -121,13 +122,13 @@ def _add_recording(content: Content, recording: Recording) -> None:
 
 
 def _text(value: Any) -> str:
-    """Return a value for the reader: floats have four significant digits."""
-    if value is None or value in ([], {}):
+    """Return a value for the reader."""
+    if value is None or value in ("", [], {}):
         return "-"
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
-        return f"{value:.4g}" if abs(value) >= NEGLIGIBLE else "0"
+        return significant(value)
     if isinstance(value, list):
         return ", ".join(map(_text, value))
     if isinstance(value, Mapping) and value:
@@ -266,13 +267,13 @@ def curve_charts(rows: Sequence[Mapping[str, str]], packer: Packer) -> list[dict
         where = ", ".join(f"{key} {Path(value).name}" for key, value in zip(keys, where_key, strict=False))
         for figure in figures:
             lines = []
+            title, unit, factor = in_words(figure)
             for name, of_line in own.items():
                 line: dict[str, Any] = {"name": label(name), "colour": SHADES[order.get(name, 0) % len(SHADES)]}
                 ends = [end for end in ("", "_low", "_high") if f"{figure}{end}" in columns]
-                arrays = [packer.add([_number(row[f"{figure}{end}"]) for row in of_line]) for end in ends]
+                arrays = [packer.add([factor * _number(row[f"{figure}{end}"]) for row in of_line]) for end in ends]
                 line |= dict(zip(("y", "low", "high"), arrays, strict=False))
                 lines.append(line | {"x": packer.add([_number(row["time_s"]) for row in of_line])})
-            title, unit = _with_unit(figure)
             charts.append({"title": f"{title}: {where}" if where else title, "unit": unit, "lines": lines, "note": ""})
     return charts
 
@@ -290,18 +291,6 @@ def _number(text: str) -> float:
         return math.nan
 
 
-def _with_unit(name: str) -> tuple[str, str]:
-    """Return a metric's name in words, and its unit.
-
-    >>> _with_unit("map_rmse_m"), _with_unit("coverage")
-    (('map RMSE', 'm'), ('coverage', ''))
-    """
-    if name in METRES:
-        return METRES[name], "m"
-    stem, unit = next(((name.removesuffix(end), unit) for end, unit in UNITS.items() if name.endswith(end)), (name, ""))
-    return " ".join(word.upper() if word in INITIALS else word for word in stem.split("_")), unit
-
-
 def _tables(metrics: Mapping[str, Any]) -> Iterable[dict[str, Any]]:
     """Yield a table for each list of rows in the metrics."""
     for name, rows in metrics.items():
@@ -310,43 +299,62 @@ def _tables(metrics: Mapping[str, Any]) -> Iterable[dict[str, Any]]:
         if all(isinstance(row, Mapping) for row in rows):
             if name == "robots" and isinstance(metrics.get("team"), Mapping):
                 rows = [*rows, {"robot": "team", **metrics["team"]}]
-            yield table(name.replace("_", " "), rows)
+            yield table(*TITLES.get(name, (name.replace("_", " "), "")), rows)
 
 
-def table(title: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return a table of rows: a metric and the ends of its interval share a column; curves are left out."""
+def table(
+    title: str, note: str, rows: Sequence[Mapping[str, Any]], words: Callable[[str], tuple[str, str, float]] = in_words
+) -> dict[str, Any]:
+    """Return a table of rows: a metric and the ends of its interval share a column.
+
+    Curves and columns without any value are left out.
+
+    Args:
+        words: Function that returns words, unit and factor of a column.
+    """
     names = list(dict.fromkeys(name for row in rows for name in row))
     shown = [
         name for name in names
         if not (name.endswith(("_low", "_high")) and name.rsplit("_", 1)[0] in names)
         and not any(isinstance(row.get(name), Mapping) and _is_long(row[name]) for row in rows)
+        and any(row.get(name) not in (None, "", [], {}) for row in rows)
     ]  # fmt: skip
-    cells = [[_cell(row, name) for name in shown] for row in rows[:MOST_ROWS]]
-    note = f"The first {MOST_ROWS} of {len(rows)} rows." if len(rows) > MOST_ROWS else ""
+    columns = {name: words(name) for name in shown}
+    cells = [[_cell(row, name, factor) for name, (_, _, factor) in columns.items()] for row in rows[:MOST_ROWS]]
+    first = f"The first {MOST_ROWS} of {len(rows)} rows." if len(rows) > MOST_ROWS else ""
     has_error = any(row.get("map_error") is not None for row in rows)
-    note = " ".join(filter(None, (note, E_SCALE if has_error else "")))
-    return {"title": title, "note": note, "headings": [heading(name) for name in shown], "rows": cells}
+    note = " ".join(filter(None, (first, note, E_SCALE if has_error else "")))
+    return {
+        "title": title,
+        "note": note,
+        "headings": [f"{text} [{unit}]" if unit else text for text, unit, _ in columns.values()],
+        "rows": cells,
+    }
 
 
-def heading(name: str) -> str:
-    """Return the heading of a metric, with its unit.
+def in_unit(name: str, value: Any) -> Any:
+    """Return the value of a metric in the unit of its heading."""
+    return _scaled(value, in_words(name)[2])
 
-    >>> heading("map_rmse_m"), heading("map_error"), heading("policy")
-    ('map RMSE [m]', 'map error E [m]', 'policy')
-    """
-    words, unit = _with_unit(name)
-    return f"{words} [{unit}]" if unit else words
+
+def _scaled(value: Any, factor: float) -> Any:
+    return factor * value if factor != 1.0 and isinstance(value, int | float) else value
 
 
 def _is_long(value: Mapping[str, Any]) -> bool:
     return any(isinstance(item, list) for item in value.values())
 
 
-def _cell(row: Mapping[str, Any], name: str) -> list[Any]:
+def as_is(name: str) -> tuple[str, str, float]:
+    """Return a column's name as its words."""
+    return name, "", 1.0
+
+
+def _cell(row: Mapping[str, Any], name: str, factor: float) -> list[Any]:
     """Return the text of a cell, and the value by which rows are sorted."""
     value = row.get(name)
-    text = _text(value)
-    low, high = row.get(f"{name}_low"), row.get(f"{name}_high")
+    text = _text(_scaled(value, factor))
+    low, high = (_scaled(row.get(f"{name}{end}"), factor) for end in ("_low", "_high"))
     if low is not None and high is not None:
         text += f"\n({_text(low)} .. {_text(high)})"
     is_number = isinstance(value, int | float) and not isinstance(value, bool)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from slam_backend.core.array_files import read_arrays
 from slam_backend.core.files import write_file
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import FloatArray, IntArray, argument_error
 from slam_backend.fastslam.reports import MergeEvent
 from slam_backend.geometry import compose, rotate_covariances
@@ -26,6 +27,7 @@ from vslam_env.config import TICK
 from vslam_env.environment import ExplorationEnv
 from vslam_env.navigation import CandidateKind
 from vslam_env.navigation.occupancy_grid import CELL, centre_of
+from vslam_env.rendering.palette import shared_by
 
 RECORDING_FILE = "recording.npz"
 FORMAT = 1
@@ -41,6 +43,7 @@ def _empty(*shape: int) -> Callable[[], Array]:
     return partial(np.zeros, shape)
 
 
+@short_repr
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Recording:
     """F recorded steps of K robots, J of them with maps, grids and candidates; all in the world frame.
@@ -300,9 +303,9 @@ class EpisodeRecorder:
         if with_maps:
             self._enter(keyframes=len(self._steps) - 1)
             goals = self._goals()
-            owners = {belief.frame: robot for robot, belief in reversed(list(enumerate(beliefs)))}
+            owners = shared_by([belief.frame for belief in beliefs])
             for robot, (start, belief) in enumerate(zip(starts, beliefs, strict=True)):
-                self._record_map(start, belief, owners[belief.frame] == robot, goals.get(self._agents[robot]))
+                self._record_map(start, belief, owners[robot] == robot, goals.get(self._agents[robot]))
 
     def _record_map(self, start: FloatArray, belief: Belief, is_owner: bool, goal: FloatArray | None) -> None:
         """Record the map and grid of a robot, unless another robot has them, its candidates and its goal."""

@@ -126,9 +126,9 @@ class TrainConfig(ExperimentConfig):
             raise argument_error("rounds", f"at most one per rollout, {self.updates}", self.rounds, hint)
 
     @classmethod
-    def completed(cls, values: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Fill in omitted values from the preset."""
-        return {**TRAIN_PRESETS.get(str(values.get("preset", "quick")), {}), **values}
+    def implied(cls, values: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Return the values of the preset."""
+        return TRAIN_PRESETS.get(str(values.get("preset")), {})
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values that repeat this training from any folder, except the seed."""

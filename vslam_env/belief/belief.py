@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.core.read_only import as_read_only
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import MOST, BoolArray, FloatArray, IntArray, check_int
 from slam_backend.fastslam.options import FilterOptions
 from slam_backend.fastslam.relative_poses import TeamPoses
@@ -59,6 +60,7 @@ def motion_without_smoother(motion: OdometryModel) -> OdometryModel:
     )  # fmt: skip
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BeliefConfig:
     """Configuration of beliefs: assumed noise, filters, map alignment and merging.
@@ -83,6 +85,7 @@ class BeliefConfig:
         check_int("belief.confirm_after", self.confirm_after, 1, "Use 1 to count all landmarks.", MOST)
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RobotHardware:
     """Hardware parameters known to each robot.
@@ -98,6 +101,7 @@ class RobotHardware:
     scan_range: float
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, eq=False)
 class Teammate:
     """Estimate of another robot of the same group, in the start frame of the believing robot.
@@ -123,6 +127,7 @@ class Teammate:
         return position_sigma(self.covariance)
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidates:
     """C slots with places to go to, see `TeamCandidates`; renewed once a second, with `goal` actions at decisions.
@@ -163,6 +168,7 @@ class Candidates:
         return np.flatnonzero(self.kinds == kind)
 
 
+@short_repr
 @dataclass(frozen=True, eq=False)
 class Belief:
     """Belief of one robot after a tick, in its own start frame and without ground truth.
@@ -214,6 +220,7 @@ class Belief:
         return self.group_map.moved(self.start_from_group)
 
 
+@short_repr
 class BeliefBatch(NamedTuple):
     """Observable part of n robots' beliefs, without copies: valid until the next step.
 

@@ -6,10 +6,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray, argument_error, check_array
 from slam_backend.models.measurements import Measurements, TeamMeasurements
 
 
+@short_repr
 class Readings(NamedTuple):
     """Readings of one robot's sensors and radio in one tick.
 
@@ -38,6 +40,7 @@ class Readings(NamedTuple):
     goal: FloatArray | None = None
 
 
+@short_repr
 class TeamReadings(NamedTuple):
     """`Readings` of all K robots in one tick, stacked by kind.
 

@@ -5,11 +5,13 @@ from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import FloatArray, IntArray
 
 Row = TypeVar("Row", covariant=True)  # sequence of one number per robot
 
 
+@short_repr
 class RobotMetrics(NamedTuple, Generic[Row]):
     """Metrics of all robots, one row per metric; `score_team` writes the first eight, `Episode` the others."""
 
@@ -27,6 +29,7 @@ class RobotMetrics(NamedTuple, Generic[Row]):
     own_recalls: Row
 
 
+@short_repr
 class RobotCounts(NamedTuple):
     """Counts of all robots; see `TeamMetrics`."""
 
@@ -34,6 +37,7 @@ class RobotCounts(NamedTuple):
     bytes_sent: tuple[int, ...]
 
 
+@short_repr
 class BeliefSummary(NamedTuple):
     """Belief of a robot as far as reward terms may read it, with the true landmarks that it refers to; read-only.
 
@@ -51,6 +55,7 @@ class BeliefSummary(NamedTuple):
     landmark_claims: IntArray
 
 
+@short_repr
 class TeamMetrics(NamedTuple):
     """Metrics of a team at one tick, computed from ground truth.
 

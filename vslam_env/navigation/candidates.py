@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import FloatArray, IntArray
 from vslam_env.navigation._view_kernels import (
     NUM_DESCRIBED,
@@ -66,6 +67,7 @@ SLOT_KINDS: IntArray = np.repeat(
 ).astype(np.int64)
 
 
+@short_repr
 class CandidateGains(NamedTuple):
     """What there is to gain at candidates, each (C,) float64; zeros in empty slots.
 

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slam_backend.core import state_checks as check
+from slam_backend.core.short_repr import described
 from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_float
 from vslam_env.navigation import _grid_kernels as _painting
 from vslam_env.navigation._grid_kernels import CELL, FREE, GRID_SIZE, HALF_WIDTH, OCCUPIED, UNKNOWN, Grid
@@ -74,6 +75,9 @@ class OccupancyGrid:
         grid = cls.__new__(cls)
         grid._storage, grid._row, grid._read_only = storage, row, read_only
         return grid
+
+    def __repr__(self) -> str:
+        return described(self, ("cells", "bounds"))
 
     @property
     def _grid(self) -> Grid:

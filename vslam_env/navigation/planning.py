@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slam_backend.core.jit import in_place
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_float
 from vslam_env.navigation._grid_kernels import LARGEST_HALF_WIDTH
 from vslam_env.navigation._planning_kernels import (
@@ -48,6 +49,7 @@ def known_part(cells: Cells) -> tuple[NDArray[np.uint8], NDArray[np.int32]]:
     return cells, known_bounds(cells)
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Frontiers:
     """Frontiers in ascending order of path length.
@@ -103,6 +105,7 @@ FACED = 0.05  # [rad]
 SWEPT_FROM, SWEPT_WITHIN = 0.6, 1.0  # [m] before the end, and [rad] of heading error, in which robots look aside
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DistanceMap:
     """Cheapest paths from one position to all known free floor.

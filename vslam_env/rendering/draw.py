@@ -30,8 +30,8 @@ def draw_frame(scene: Scene, size: tuple[int, int] = (960, 720)) -> Image:
     """Draw a scene, with a scale bar in the header.
 
     The truth is grey or faint: walls, landmarks, paths and filled bodies. Estimates have the robot's colour: dots with
-    95 % ellipses are its map, the outlined disc and the particle cloud its pose. Members of a group have a halo of the
-    same colour. A merge flashes for `merge_effect.FLASH_TICKS` ticks.
+    95 % ellipses are its map, the outlined disc and the particle cloud its pose. A group has one map and halos in the
+    colour of its first robot. A merge flashes for `merge_effect.FLASH_TICKS` ticks.
 
     Args:
         scene: Content of the picture in the world frame.
@@ -51,8 +51,8 @@ def draw_frame(scene: Scene, size: tuple[int, int] = (960, 720)) -> Image:
     plot = image[top:bottom]
     view = Viewport.around(_extent(scene), width, bottom - top)
     _draw_truth(plot, view, scene, unit)
-    for index, robot in enumerate(scene.robots):
-        _draw_map(plot, view, robot, palette.robot_colour(index), unit)
+    for first in dict.fromkeys(scene.map_owners):
+        _draw_map(plot, view, scene.robots[first], robot_colour(first), unit)
     for index, robot in enumerate(scene.robots):
         _draw_belief(plot, view, robot, robot_colour(index), unit, scene.robot_radius)
     draw_flashes(plot, view, scene, unit)
@@ -128,11 +128,11 @@ def _outline(plot: Image, view: Viewport, pose: FloatArray, radius: float, colou
 def _draw_bodies(plot: Image, view: Viewport, scene: Scene, unit: float) -> None:
     """Draw the true robots; members of larger groups with a halo in the colour of the group's first robot."""
     radius = max(scene.robot_radius * view.scale, 5.0 * unit)
-    groups = [robot.group for robot in scene.robots]
+    owners = scene.map_owners
     for index, robot in enumerate(scene.robots):
         colour, centre = robot_colour(index), view.pixels(robot.true_pose)
-        if groups.count(robot.group) > 1:
-            accent = robot_colour(groups.index(robot.group))
+        if owners.count(owners[index]) > 1:
+            accent = robot_colour(owners[index])
             for reach in (2.1, 1.6):
                 translucent_fill(plot, centre[None], reach * radius, accent, 0.18)
         disc(plot, centre, radius + max(1.0, 1.5 * unit), palette.PAPER)

@@ -22,7 +22,7 @@ def draw_header(strip: Image, scene: Scene, scale: float) -> None:
     size, middle, edge = 0.26 * height, 0.47 * height, 0.4 * height
     write(strip, f"{scene.time:.1f} s", edge, middle, size, palette.INK)
     _scale_bar(strip, 2.0 * edge + text_width("9999.9 s", size), middle, size, scale)
-    maps = len({robot.group for robot in scene.robots})
+    maps = len(set(scene.map_owners))
     words = f"{maps} map{'s' * (maps != 1)} of {len(scene.robots)} robot{'s' * (len(scene.robots) != 1)}"
     write(strip, words, 0.5 * (width - text_width(words, size)), middle, size, palette.INK)
     percent = f"coverage {100.0 * scene.coverage:.0f} %"
@@ -74,11 +74,11 @@ def draw_footer(strip: Image, scene: Scene) -> None:
     strip[0] = palette.RULE
     if not scene.robots:
         return
-    labels = [robot.group for robot in scene.robots]
-    groups = [[i for i, label in enumerate(labels) if label == wanted] for wanted in dict.fromkeys(labels)]
+    owners = scene.map_owners
+    groups = [[i for i, owner in enumerate(owners) if owner == first] for first in dict.fromkeys(owners)]
     gap = 0.14 * height
-    card = min((width - gap) / len(labels) - gap, 4.6 * height)
-    left = 0.5 * (width - len(labels) * (card + gap) + gap)
+    card = min((width - gap) / len(owners) - gap, 4.6 * height)
+    left = 0.5 * (width - len(owners) * (card + gap) + gap)
     for members in groups:
         plate = len(members) * (card + gap) - gap
         accent = robot_colour(members[0]) if len(members) > 1 else palette.RULE

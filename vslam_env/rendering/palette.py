@@ -1,5 +1,7 @@
 """Colours (RGB), distinguishable with colour vision deficiency."""
 
+from collections.abc import Hashable, Sequence
+
 import numpy as np
 
 Colour = tuple[int, int, int]
@@ -29,6 +31,18 @@ ROBOTS: tuple[Colour, ...] = (
 def robot_colour(index: int) -> Colour:
     """Return the colour (RGB) of the robot with an index >= 0; colours repeat after eight."""
     return ROBOTS[index % len(ROBOTS)]
+
+
+def shared_by(groups: Sequence[Hashable]) -> tuple[int, ...]:
+    """Return, for each robot, the first robot of its group, which has the group's colour: a shared map is drawn once.
+
+    Args:
+        groups: Label of each robot's group.
+
+    >>> shared_by([5, 1, 5])
+    (0, 1, 0)
+    """
+    return tuple(groups.index(group) for group in groups)
 
 
 def mix(colour: Colour, other: Colour, share: float) -> Colour:

@@ -2,9 +2,12 @@
 
 from dataclasses import dataclass
 
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import FloatArray
+from vslam_env.rendering.palette import shared_by
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, eq=False)
 class RobotView:
     """True and estimated poses and map of one robot.
@@ -49,6 +52,7 @@ class MergeFlash:
     robots_b: tuple[int, ...]
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
     """Content of one frame.
@@ -74,3 +78,8 @@ class Scene:
     merges: tuple[MergeFlash, ...]
     map_errors: tuple[float, ...]
     coverage: float
+
+    @property
+    def map_owners(self) -> tuple[int, ...]:
+        """First robot of each robot's group, whose map is drawn, in its colour, for the group."""
+        return shared_by([robot.group for robot in self.robots])

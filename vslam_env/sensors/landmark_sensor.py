@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from slam_backend.core.read_only import as_read_only
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import (
     BoolArray,
     FloatArray,
@@ -35,6 +36,7 @@ MAX_POINTS = 10_000  # limit per frame
 MANY_KEYS = 8192  # from which those of landmarks out of view are not drawn
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LandmarkSensorConfig:
     """True noise and limits of the cameras; the assumed noise is part of `BeliefConfig`.
@@ -73,6 +75,7 @@ class LandmarkSensorConfig:
         return min(FARTHEST, BEYOND * self.camera.max_range)
 
 
+@short_repr
 class SensorFrame(NamedTuple):
     """Measurements of one camera in one tick, with the true association.
 
@@ -85,6 +88,7 @@ class SensorFrame(NamedTuple):
     true_ids: IntArray
 
 
+@short_repr
 class TeamSensorFrames(NamedTuple):
     """The frames of all robots in one tick.
 

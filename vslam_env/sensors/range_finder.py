@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from slam_backend.core.read_only import as_read_only
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import FloatArray, check_array, check_float, check_int
 from slam_backend.models.camera import StereoCamera
 from vslam_env.world._kernels import cast_scans
@@ -13,6 +14,7 @@ from vslam_env.world.visibility import as_coordinate_rows, ray_fan
 MOST_RAYS = 100_000  # limit per robot
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScanConfig:
     """Field of view, range and true noise of the range finder.

@@ -6,6 +6,7 @@ from typing import Any, Self
 import numpy as np
 
 from slam_backend.core.read_only import as_constant, as_read_only
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import FloatArray, argument_error
 from vslam_env.config import EnvConfig
 from vslam_env.evaluation.coverage import CoverageCells
@@ -17,6 +18,7 @@ from vslam_env.simulation.memory import available_memory, check_memory
 from vslam_env.world import FreeSpace, World, WorldSource, draw_bias, draw_world_seed, make_world, place_landmarks
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, weakref_slot=True, kw_only=True, eq=False)
 class Scenario:
     """World, start poses and sensors of an episode, shared with its snapshots; arrays are read-only.

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import FloatArray, argument_error, check_float, check_int
 from vslam_env.world.freespace import FreeSpace
 from vslam_env.world.spec import Landmarks, World
@@ -14,6 +15,7 @@ CORNER = 0.05  # [m] distance of landmarks from the ends of their wall
 LOOK = 0.12  # [m] a face is visible if the point this far in front of it lies in the free space
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LandmarkConfig:
     """Density, positions and appearance of landmarks.

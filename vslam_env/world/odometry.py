@@ -6,11 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam_backend.core.jit import in_place
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import FloatArray, check_float
 
 LARGEST_SIGMA = 100.0  # per metre; limits the readings to what filters accept
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OdometryNoise:
     """True noise of odometry, proportional to the distance d travelled in a tick.

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from slam_backend.core.text_files import existing_file
-from slam_backend.core.validation import argument_error, check_choice, is_built_in
+from slam_backend.core.validation import argument_error, check_choice, choice_error, did_you_mean, is_built_in
 from vslam_env.world.generators.campus import campus
 from vslam_env.world.generators.fig5 import fig5
 from vslam_env.world.generators.hall import hall
@@ -136,13 +136,16 @@ def _parted(world: str) -> tuple[str, Options]:
     """
     found = NAME_AND_OPTIONS.fullmatch(world)
     name, text = found.groups() if found else (world, "")
+    if text and name not in WORLD_FAMILIES:
+        _files(name)  # the name is wrong before its options are
     known = PLAN_OPTIONS if name not in WORLD_FAMILIES else tuple(signature(WORLD_FAMILIES[name]).parameters)[1:]
     options: Options = {}
     for option in text.split(":")[1:]:
         key, value = option.split("=")
         if key not in known or key in options:
             hint = f"Options: {', '.join(known)}, each once." if known else "This family has no options."
-            raise argument_error("world", f"options that {name!r} has", world, hint)
+            near = "" if key in known else did_you_mean(key, known)
+            raise argument_error("world", f"options that {name!r} has", world, near + hint)
         try:
             options[key] = check_choice("world: outside", value, OUTSIDE) if key == "outside" else float(value)
         except ValueError as error:
@@ -210,10 +213,9 @@ def _files(world: str) -> list[Path]:
             raise argument_error("world", "a folder with floor plans", Path(path), hint)
         return files
     if path.suffix.lower() not in LOADERS:
-        names = ", ".join(repr(name) for name in WORLD_FAMILIES)
         hint = "Check the spelling, or that the file ends in .png, .jpg, .pgm, .yaml or .json."
         if world.split(":")[0] in WORLD_FAMILIES:
             hint = "Write options as in rooms:extent=60:room=10."
-        expected = f"one of {names}, or a path of an image, a .yaml or .json file or a folder"
-        raise argument_error("world", expected, world, hint)
+        others = ", or a path of an image, a .yaml or .json file or a folder"
+        raise choice_error("world", world, WORLD_FAMILIES, hint, others)
     return [existing_file(path, "world")]

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.core.read_only import as_read_only
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_array
 
 SHORTEST_WALL = 1e-3  # [m] below, the direction is ill-defined
@@ -29,6 +30,7 @@ def check_counts(walls: Any, landmarks: Any = ()) -> None:
             raise argument_error(f"world.{name}", f"at most {most:,} {name}", f"a number of {len(rows):,}", hint)
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, eq=False)
 class Landmarks:
     """Point landmarks on the faces of walls.
@@ -73,6 +75,7 @@ class Landmarks:
         return len(self.positions)
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, eq=False)
 class World:
     """Two-dimensional floor plan in metres.

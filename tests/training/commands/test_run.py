@@ -10,12 +10,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from rich.console import Console
 
 from slam_backend.geometry import between, compose
 from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.trajectory import Trajectory
 from training.commands.run import describe, errors_in_short, live_progress
+from training.episodes import figures
 from training.episodes.config import EPISODE_S, RunConfig
 from training.episodes.figures import LETTER, draw_errors, draw_maps, place_labels, turns
 from training.episodes.metrics import score_episode
@@ -23,6 +25,7 @@ from training.episodes.runner import EpisodeRecord, MergeRecord, Progress, run_e
 from training.episodes.tables import print_tables
 from vslam_env import vslam_v0
 from vslam_env.config import EnvConfig
+from vslam_env.presets import preset_config
 from vslam_env.world import World
 
 # A room of 7 x 5 m in which two robots see the same wall from different places.
@@ -162,8 +165,21 @@ def test_a_merge_is_false_beyond_half_a_metre_or_five_degrees(error_m: float, er
     assert describe(merge).startswith("   1.2 s  maps of 0 and 1, 2 merged on 9 landmarks, error")
 
 
-def test_figures_are_drawn_for_any_team(record: EpisodeRecord, tmp_path: Path) -> None:
-    """One robot or five, merged or not, and a run stopped at once: all give two plots."""
+def test_figures_are_drawn_for_any_team(record: EpisodeRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One robot or eight, merged or not, and a run stopped at once: all give two plots with their whole legends."""
+    written = figures.save_png
+
+    def check_legend(figure: Figure, file: Path, dpi: int) -> None:
+        written(figure, file, dpi)
+        owners = [figure, *figure.subfigs]
+        (legend,) = (legend for owner in owners for legend in owner.legends)
+        box = legend.get_window_extent()
+        assert figure.bbox.padded(1.0).contains(*box.min)
+        assert figure.bbox.padded(1.0).contains(*box.max)
+        axes = [each for owner in owners for each in owner.axes if each.get_visible()]
+        assert not any(box.overlaps(each.get_window_extent()) for each in axes)
+
+    monkeypatch.setattr(figures, "save_png", check_legend)
 
     def cut(robots: int, rows: int) -> EpisodeRecord:
         chosen = [k % 2 for k in range(robots)]
@@ -177,7 +193,7 @@ def test_figures_are_drawn_for_any_team(record: EpisodeRecord, tmp_path: Path) -
             merges=record.merges * (robots - 1),
         )  # fmt: skip
 
-    for robots, rows in ((1, 1), (1, STEPS), (5, STEPS)):
+    for robots, rows in ((1, 1), (1, STEPS), (8, STEPS)):
         for draw in (draw_maps, draw_errors):
             file = tmp_path / f"{draw.__name__}-{robots}-{rows}.png"
             draw(cut(robots, rows), file)
@@ -246,7 +262,7 @@ def test_tables_of_eight_robots_fit_into_80_columns(record: EpisodeRecord) -> No
     assert max(map(len, lines)) <= 80
     rows = [line.split() for line in lines if line.split()[:1] in ([str(robot)] for robot in range(8))]
     assert [len(cells) for cells in rows] == [5] * 8 + [7] * 8
-    assert rows[8][3] == "12.345"
+    assert rows[8][3] == "12.3"
 
 
 def test_the_bar_of_eight_robots_has_mean_and_range() -> None:
@@ -306,6 +322,35 @@ def test_policies_determine_the_default_action_type(
     metrics = json.loads(Path("run/metrics.json").read_text())
     assert (metrics["config"]["policy"], metrics["config"]["action_type"]) == (policy, action_type)
     assert (metrics["robots"][0]["path_m"] == 0.0) is (action_type == "discrete")
+
+
+def test_the_large_preset_brings_its_world_length_and_actions(vslam: Any, tmp_path: Path) -> None:
+    """`--preset large` runs as `parallel_env(preset="large")` does; given options and the needs of a policy win."""
+    large = RunConfig.from_mapping({"preset": "large"})
+    assert large.environment() == preset_config("large")
+    assert RunConfig.from_mapping({"preset": "large", "max_cycles": 7, "world": "maze"}).num_steps == 7
+    assert RunConfig.from_mapping({"preset": "large", "policy": "random_walk"}).action_type == "continuous"
+    assert RunConfig.from_mapping(RunConfig.merged(RunConfig(max_cycles=9).to_mapping(), {"preset": "large"})) == large
+    few = ("--max-seconds", "2", "--robots", "2", "--particles", "5", "--no-video", "--world", "fig5")
+    assert vslam("run", "--preset", "large", *few, "--out", str(tmp_path / "run")).status == 0
+    config = json.loads((tmp_path / "run" / "metrics.json").read_text())["config"]
+    assert (config["preset"], config["action_type"], config["world"]) == ("large", "goal", "fig5")
+
+
+def test_start_poses_of_the_command_line_are_those_of_the_run(vslam: Any, tmp_path: Path) -> None:
+    """Robots begin there, also in a repetition from the run folder; a place in a wall is refused by name."""
+    starts = [[3.0, 3.0, 0.5], [8.0, 4.0, -1.0]]
+    few = ("--world", "fig5", "--robots", "2", "--max-cycles", "3", "--particles", "5", "--no-video")
+    given = ("--start-poses", "3,3,.5; 8, 4, -1")
+    assert vslam("run", *few, *given, "--out", str(tmp_path / "one")).status == 0
+    assert vslam("run", "--config", str(tmp_path / "one"), "--no-video", "--out", str(tmp_path / "two")).status == 0
+    for folder in ("one", "two"):
+        paths = [Trajectory.load_tum(tmp_path / folder / f"robot{k}_truth.tum") for k in range(2)]
+        np.testing.assert_allclose([path.poses[0] for path in paths], starts, atol=1e-6)
+    refused = vslam("run", *few, "--start-poses", "3,3,0; -9,4,0", "--out", str(tmp_path / "three"))
+    assert refused.status == 2
+    assert "start_poses[1]: expected a reachable place" in refused.err
+    assert not (tmp_path / "three").exists()
 
 
 def test_a_policy_that_never_returns_ends_the_run_with_one_line(

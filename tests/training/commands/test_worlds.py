@@ -9,7 +9,9 @@ import pytest
 from typer.testing import CliRunner
 
 from training.cli import app
-from training.episodes.world_survey import contact_sheet, survey
+from training.episodes.world_survey import TILE, TITLE_PX, contact_sheet, survey
+from vslam_env import vslam_v0
+from vslam_env.rendering import draw_frame
 from vslam_env.world import WORLD_FAMILIES, load_walls_json
 
 runner = CliRunner()
@@ -34,9 +36,13 @@ def test_list_names_all_families() -> None:
 def test_preview_draws_one_tile_per_seed(tmp_path: Path) -> None:
     """Three worlds give two by two tiles, the last one blank; the same seeds give the same picture."""
     sheet = contact_sheet("fig5", 3, 3, 2)
-    assert sheet.shape == (960, 1280, 3)
-    assert (sheet[480:, 640:] == 255).all()
-    assert sheet[:480, :640].std() > 5.0
+    assert sheet.shape == (960 + 2 * TITLE_PX, 1280, 3)
+    below = 480 + TITLE_PX
+    assert (sheet[below:, 640:] == 255).all()
+    env = vslam_v0.parallel_env(world="fig5", num_robots=2)
+    env.reset(seed=3, options={"world_seed": 3})
+    np.testing.assert_array_equal(sheet[TITLE_PX:below, :640], draw_frame(env.scene(), TILE))  # no title on it
+    assert 0 < (sheet[:TITLE_PX, :640] < 128).sum() < 3000
     out = tmp_path / "worlds.png"
     result = runner.invoke(app, ["worlds", "preview", "fig5", "--first-seed", "3", "--seeds", "3", "--robots", "2",
                                  "--out", str(out)])  # fmt: skip

@@ -20,7 +20,7 @@ from training.paper.fig6.trials import REGIMES
 from training.replay import config as replay
 from training.rl.config import TRAIN_PRESETS, EvaluateConfig, TrainConfig
 from vslam_env.config import ACTION_TYPES, MAX_ROBOTS, SENSORS
-from vslam_env.presets import NOISE_PRESETS
+from vslam_env.presets import NOISE_PRESETS, PRESETS
 from vslam_env.world import SPLITS
 
 # Required values of each class, and a value that differs from its default.
@@ -122,6 +122,11 @@ BAD: dict[type[ExperimentConfig], dict[str, dict[Any, str]]] = {
         "robots": {0: ROBOTS, 9: ROBOTS}, "sensor": {"sonar": "one of 'landmark', 'stereo'"},
         "action_type": {"jump": "one of 'continuous', 'discrete', 'goal'"}, "max_cycles": {0: AT_LEAST_1},
         "rejuvenate_every": {-1: AT_LEAST_0}, "max_seconds": {0.0: ABOVE_0},
+        "preset": {"stand": "one of 'easy', 'standard', 'hard', 'large'"},
+        "start_poses": {
+            "1,2": "a pose x,y,theta of each of 3 robots", "1,2,3; 4,5,6": "a pose x,y,theta of each of 3 robots",
+            "1,2,north": "numbers x,y,theta", "": "numbers x,y,theta",
+        },
     },
 }  # fmt: skip
 # Fields whose options have other names, which errors use.
@@ -162,7 +167,9 @@ def test_run_folders_restore_the_configuration(kind: type[ExperimentConfig], tmp
 @pytest.mark.parametrize("kind", KINDS)
 def test_misspelt_names_are_reported_with_the_valid_ones(kind: type[ExperimentConfig]) -> None:
     """Unknown names are reported, not ignored."""
-    with pytest.raises(ValueError, match=r"^config: expected names among .*seed.*, got 'sede'\. Correct the name\."):
+    with pytest.raises(
+        ValueError, match=r"^config: expected names among .*seed.*, got 'sede'\. Did you mean 'seed'\? C"
+    ):
         kind.from_mapping(CASES[kind] | {"sede": 1})
 
 
@@ -179,6 +186,22 @@ def test_bad_values_are_refused_by_name(kind: type[ExperimentConfig], name: str,
     assert "\n" not in text
 
 
+def test_misspelt_choices_and_names_get_the_nearest_one() -> None:
+    """A value with choices, and a name in a table, are refused with the one that is probably meant."""
+    with pytest.raises(ValueError, match=r"got 'lrage'\. Did you mean 'large'\?"):
+        RunConfig(preset="lrage")
+    with pytest.raises(ValueError, match=r"got 'sigma_alnog'\. Did you mean 'sigma_along'\?"):
+        replay.VictoriaConfig(path="log", motion={"sigma_alnog": 1.0})
+
+
+def test_a_preset_given_for_an_earlier_run_brings_its_values() -> None:
+    """What a given preset implies overrides the configuration of an earlier run, and is overridden by options."""
+    earlier = TrainConfig().to_mapping()
+    repeated = TrainConfig.from_mapping(TrainConfig.merged(earlier, {"preset": "smoke", "envs": 4}))
+    assert repeated == TrainConfig.from_mapping({"preset": "smoke", "envs": 4})
+    assert repeated.world == "fig5"
+
+
 def test_a_table_of_another_package_is_checked_there() -> None:
     """An unknown name and a bad number in a table are refused by both names."""
     with pytest.raises(ValueError, match=r"motion: expected names among sigma_along, .* got 'sigma'"):
@@ -193,6 +216,7 @@ def test_choices_match_the_packages() -> None:
     assert get_args(experiments.Descriptor) == DESCRIPTORS
     assert get_args(experiments.ActionType) == ACTION_TYPES
     assert get_args(experiments.NoisePreset) == NOISE_PRESETS
+    assert get_args(experiments.Preset) == PRESETS
     assert get_args(experiments.Sensor) == SENSORS
     assert get_args(bench.AlignmentMethod) == METHODS
     assert get_args(bench.Method) == trials.METHODS

@@ -142,7 +142,7 @@ def test_the_map_error_states_its_cutoff(tmp_path: Path, monkeypatch: pytest.Mon
     write_log(tmp_path, noise=0.0)
     monkeypatch.chdir(tmp_path)
     said = vslam("replay", "mrclam", "--path", ".", "--duration", "5", "--particles", "2", "--out", "run")
-    assert "E (m)," in said.out
+    assert "map error E" in said.out
     assert "0.71 m = nothing found" in said.out
     assert "errors are cut at 1 m." in said.out
 

@@ -1,5 +1,6 @@
 """Reports in a headless browser: no error, playback moves, tables and charts appear."""
 
+import json
 import re
 import shutil
 import subprocess
@@ -67,6 +68,37 @@ def test_playback_moves(run: Path, tmp_path: Path) -> None:
     assert clock(moved) > 1.0
     rows = [re.findall(r"<td>(?:<span[^>]*></span>)?([^<]*)</td>", text) for text in (still, moved)]
     assert rows[0] != rows[1]
+
+
+PROBE = """
+<body><iframe width="{width}" height="{height}"></iframe><script>
+const frame = document.querySelector("iframe");
+frame.srcdoc = {page};
+setTimeout(() => {{
+  const inside = frame.contentDocument;
+  const of = (name) => [...inside.querySelectorAll(name)].map((each) => each.getBoundingClientRect());
+  const found = {{
+    wide: inside.documentElement.scrollWidth, controls: of("#controls")[0].bottom, stage: of("#stage")[0].bottom,
+    columns: new Set(of(".chart").map((box) => Math.round(box.left))).size,
+  }};
+  document.body.append(JSON.stringify(found));
+  document.body.dataset.ready = "yes";
+}}, 2000);
+</script></body>
+"""
+
+
+@pytest.mark.parametrize(("width", "height", "columns"), [(390, 844, 1), (1280, 720, 2)])
+def test_a_page_fits_its_screen(run: Path, tmp_path: Path, width: int, height: int, columns: int) -> None:
+    """On a phone and a desktop nothing is wider than the screen; the controls are on it, below the picture."""
+    page = json.dumps(write_report(run).read_text(encoding="utf-8")).replace("</", "<\\/")
+    probe = tmp_path / "probe.html"
+    probe.write_text(PROBE.format(width=width, height=height, page=page), encoding="utf-8")
+    document = shown(probe, "", tmp_path, seconds=5.0)
+    found = json.loads(re.findall(r"{\"wide.*?}", document)[-1])
+    assert found["wide"] <= width
+    assert found["stage"] < found["controls"] <= height
+    assert found["columns"] == columns
 
 
 def test_benches_have_tables_and_curves(tmp_path: Path) -> None:

@@ -131,11 +131,39 @@ def test_tables_join_intervals_and_leave_curves_out() -> None:
         {"policy": "a", "map_error": 0.5, "map_error_low": 0.4, "map_error_high": 0.625, "curves": {"time_s": [0]}},
         {"policy": "b", "map_error": None, "map_error_low": None, "map_error_high": None, "right": True},
     ]
-    made = table("summary", rows)
+    made = table("summary", "", rows)
     assert made["headings"] == ["policy", "map error E [m]", "right"]
     assert made["rows"][0] == [["a", "a"], ["0.5\n(0.4 .. 0.625)", 0.5], ["-", None]]
     assert made["rows"][1] == [["b", "b"], ["-", None], ["yes", "yes"]]
     assert "0.71 m = nothing found" in made["note"]
+
+
+def test_columns_have_words_units_and_three_digits() -> None:
+    """No heading is a key of `metrics.json`; shares are percentages; empty columns are left out."""
+    rows: list[dict[str, Any]] = [
+        {"robots_a": [0, 2], "ess_share": 0.0123456, "path_m": 1234.567, "frames": 12345, "excess": None, "missed": ""},
+        {"robots_a": [1], "ess_share": 1.0, "path_m": 0.123456, "frames": 7, "excess": None, "missed": ""},
+    ]
+    made = table("some", "", rows)
+    assert made["headings"] == ["first map", "frames with few particles [%]", "path length [m]", "frames"]
+    assert [[text for text, _ in row] for row in made["rows"]] == [
+        ["0, 2", "1.23", "1235", "12345"], ["1", "100", "0.123", "7"],
+    ]  # fmt: skip
+
+
+def test_tables_of_a_run_have_no_keys_as_headings(run: Path) -> None:
+    """All columns of robots, merges, attempts and consistency have words, and no more than three digits."""
+    tables = Page(write_report(run).read_text()).data["tables"]
+    keys = {key for rows in json.loads((run / METRICS_FILE).read_text()).values() if isinstance(rows, list)
+            for row in rows if isinstance(row, dict) for key in row}  # fmt: skip
+    unchanged = {"robot", "frames", "step", "warnings", "landmarks", "false"}
+    for made in tables:
+        for title in made["headings"]:
+            assert title.split(" [")[0] not in {key.replace("_", " ") for key in keys} - unchanged
+        for row in made["rows"]:
+            for text, value in row:
+                if isinstance(value, float):
+                    assert len(text.lstrip("-0.").replace(".", "")) <= 3 or value >= 1000
 
 
 def test_curves_have_a_line_for_each_policy() -> None:

@@ -147,6 +147,26 @@ def test_only_the_grouping_counts_not_its_labels() -> None:
     assert (apart != joined).any()
 
 
+def test_a_shared_map_is_drawn_once_in_the_colour_of_its_first_robot() -> None:
+    """Of a group only the map of the first robot counts; a robot with a map of its own has its own colour."""
+    team = tuple(make_robot(3.0 + 2.0 * k, 4.0, group, landmarks=1) for k, group in enumerate((5, 5, 1)))
+    team = tuple(
+        replace(robot, landmark_means=np.array([[2.0, 8.0 + k, 0.0]]), landmark_covariances=np.zeros((1, 3, 3)))
+        for k, robot in enumerate(team)
+    )
+    scene = make_scene(team)
+    assert scene.map_owners == (0, 0, 2)
+    size = (650, 550)
+    frame = draw_frame(scene, size)
+    strips = [round(h * max(min(650 / 960, 550 / 720), 0.4)) for h in (46, 64)]
+    view = Viewport.around(np.array([[0.0, 0.0], [13.0, 11.0]]), 650, 550 - sum(strips))
+    for robot, is_drawn in ((0, True), (1, False), (2, True)):
+        column, row = view.pixels(team[robot].landmark_means)[0].astype(int)
+        assert np.allclose(frame[row + strips[0], column], robot_colour(robot), atol=25) is is_drawn
+    moved = replace(team[1], landmark_means=np.array([[9.0, 9.0, 0.0]]))
+    np.testing.assert_array_equal(draw_frame(make_scene((team[0], moved, team[2])), size), frame)
+
+
 @given(st.floats(20.0, 40.0), st.floats(20.0, 40.0), st.floats(1.5, 9.0), st.floats(0.1, 0.9))
 def test_a_translucent_disc_covers_its_area(x: float, y: float, radius: float, opacity: float) -> None:
     """A translucent disc takes away, summed over pixels, its area times its opacity, wherever it lies."""

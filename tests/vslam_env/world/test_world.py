@@ -244,6 +244,10 @@ def test_options_of_a_plan_set_its_scale(tmp_path: Path) -> None:
         ("campus:extent=nan", r"^extent: expected a finite number"),
         ("rooms:side=3", r"^world: expected options that 'rooms' has, got 'rooms:side=3'\. Options: extent, room"),
         ("rooms:extent=40:extent=50", r"^world: expected options that 'rooms' has"),
+        ("rooms:extnt=40", r"^world: expected options that 'rooms' has, .* Did you mean 'extent'\? Options: "),
+        ("ofice", r"^world: expected one of 'office', .*, got 'ofice'\. Did you mean 'office'\? Check"),
+        ("ofice:extent=60", r"^world: expected one of 'office', .*, got 'ofice'\. Did you mean 'office'\? Check"),
+        ("nowhere:extent=60", r"^world: expected one of 'office', .*, got 'nowhere'\. Check"),
         ("maze:extent=40", r"This family has no options"),
         ("rooms:extent=wide", r"^world: expected a number for 'extent', got 'rooms:extent=wide'"),
         (

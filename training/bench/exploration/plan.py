@@ -10,7 +10,7 @@ from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
-from slam_backend.core.validation import argument_error
+from slam_backend.core.validation import argument_error, choice_error
 from training.bench.config import ALL_ORACLES, ORACLES, world_split
 from training.bench.exploration.players import parted
 from training.experiments.config import Checked, NoisePreset, Positive, RobotCount
@@ -90,8 +90,8 @@ class Plan(Checked):
         if not file.is_file():
             file = Path(source)
         if not file.is_file():
-            known = ", ".join(repr(path.stem) for path in sorted(PLANS.glob("*.toml")))
-            raise argument_error("plan", f"one of {known}, or the path of a TOML file", source, "Check the spelling.")
+            known = [path.stem for path in sorted(PLANS.glob("*.toml"))]
+            raise choice_error("plan", source, known, "Check the spelling.", ", or the path of a TOML file")
         try:
             return cls(**tomllib.loads(file.read_text(encoding="utf-8")))
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:

@@ -132,6 +132,7 @@
     if (data.walls.length) include(data.walls, 4, [[0, 1], [2, 3]]);
     else { include(data.estimate, 3, [[0, 1]]); include(data.truth, 3, [[0, 1]]); include(data.landmarks, 2, [[0, 1]]); }
     if (!isFinite(box[0])) box.splice(0, 4, -1, -1, 1, 1);
+    canvas.style.aspectRatio = Math.max(box[2] - box[0], 1) / Math.max(box[3] - box[1], 1); // no empty space on a phone
 
     function fit() {
       state.zoom = 1;
@@ -140,7 +141,7 @@
     }
     function scale() {
       const wide = Math.max(box[2] - box[0], 1), tall = Math.max(box[3] - box[1], 1);
-      return state.zoom * Math.min((canvas.width - 40) / wide, (canvas.height - 40) / tall);
+      return state.zoom * Math.min((canvas.width - 40) / wide, (canvas.height - 64 * (window.devicePixelRatio || 1)) / tall); // room for the scale bar
     }
     const px = (x, s) => (x - state.x) * s + canvas.width / 2;
     const py = (y, s) => canvas.height / 2 - (y - state.y) * s;
@@ -358,7 +359,7 @@
     });
     const hasTruth = data.truth.some((value) => !isNaN(value));
     document.getElementById("robots").append(
-      make("tr", {}, ...["", data.errors.length ? "E [m]" : "", hasTruth ? "pose error [m]" : "", data.frames.length ? "map of" : ""].map((text) => make("th", {}, text))), ...rows,
+      make("tr", {}, ...["", data.errors.length ? "E [m]" : "", hasTruth ? "pose error [m]" : "", data.frames.length ? "map of robots" : ""].map((text) => make("th", {}, text))), ...rows,
     );
     let events = [], items = [];
     const list = document.getElementById("events"), refusals = document.getElementById("refusals");
@@ -385,7 +386,7 @@
         const at = i * count + robot, p = 3 * at;
         const off = Math.hypot(data.estimate[p] - data.truth[p], data.estimate[p + 1] - data.truth[p + 1]);
         row.cells[1].textContent = data.errors.length ? data.errors[at].toFixed(2) : "";
-        row.cells[2].textContent = isNaN(off) ? "" : off.toFixed(3);
+        row.cells[2].textContent = isNaN(off) ? "" : off.toFixed(off < 1 ? 3 : off < 10 ? 2 : 1);
         if (data.frames.length) {
           const group = names.map((_, other) => other).filter((other) => data.frames[i * count + other] === data.frames[at]);
           row.cells[3].textContent = group.join(", ");

@@ -7,6 +7,7 @@ import numpy as np
 
 from slam_backend.core.lazy_import import LazyModule
 from slam_backend.core.read_only import as_read_only
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import Float32Array, FloatArray, IntArray, check_float, check_int
 from slam_backend.frontend.images import Image
 from slam_backend.models.camera import StereoCamera
@@ -23,6 +24,7 @@ else:
 VIEW = 60.0  # [m] farther walls are not drawn
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ImagingConfig:
     """Noise, exposure and sampling of images.

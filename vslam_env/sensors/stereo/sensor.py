@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray, argument_error, check_float
 from slam_backend.frontend import CornerOptions, FrontEndOptions, StereoFrame, StereoFrontEnd
 from slam_backend.frontend.images import LARGEST, SMALLEST, Image
@@ -31,6 +32,7 @@ def default_front_end() -> FrontEndOptions:
     return FrontEndOptions(max_measurements=20, window=0.6)
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StereoSensorConfig:
     """Configuration of rendered stereo cameras: textures, imaging and front end.
@@ -76,6 +78,7 @@ class StereoSensorConfig:
         return self.camera.max_range
 
 
+@short_repr
 class RenderedFrame(NamedTuple):
     """Images of one robot in one tick, and the measurements from them.
 
@@ -93,6 +96,7 @@ class RenderedFrame(NamedTuple):
     seen: StereoFrame
 
 
+@short_repr
 class TeamRenderedFrames(NamedTuple):
     """The frames of all robots in one tick, with the fields of `RenderedFrame` by robot."""
 

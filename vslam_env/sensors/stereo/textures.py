@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from slam_backend.core.lazy_import import LazyModule
 from slam_backend.core.read_only import as_constant, as_read_only
+from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_array, check_choice, check_float
 from slam_backend.frontend.images import Image
 
@@ -25,6 +26,7 @@ POSTER = 0.6  # side of a poster [m]
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm")
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TextureConfig:
     """Style and resolution of the wall textures.
@@ -62,6 +64,7 @@ class TextureConfig:
             raise argument_error("textures.images", "a folder as a string, or None", self.images, "Give a path.")
 
 
+@short_repr
 @dataclass(frozen=True, slots=True, eq=False)
 class WallTextures:
     """Textures of all faces as integral images; read-only.
