@@ -53,11 +53,11 @@ SUMS, LISTS = ("frames", "begun", "quiet", "nis", "matched"), ("counts", "eviden
 ADVICE = {  # diagnosis and advice by sign
     "nis": (
         "the innovations exceed their predicted covariances, the filter is over-confident",
-        "Assume more odometry noise or more measurement noise, set rejuvenate_every, or use more particles.",
+        "Assume more odometry noise or measurement noise, lower rejuvenate_every, or use more particles.",
     ),
     "ess": (
         "less than a tenth of the particles carry all the weight",
-        "Use more particles, set rejuvenate_every, or assume more measurement noise.",
+        "Use more particles, lower rejuvenate_every, or assume more measurement noise.",
     ),
     "rejected": (
         "most measurements match no landmark and start none",

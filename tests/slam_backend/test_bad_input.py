@@ -165,6 +165,7 @@ FLAT = np.diag([1.0, 1.0, 0.0])
 POINTS, LOOKS = [[0.0, 0.1, 2.0], [1.0, 0.0, 3.0]], np.eye(2, 5, dtype=np.float32)
 GRID = np.arange(36.0).reshape(12, 3)
 GREY = np.zeros((30, 30), np.uint8)
+PLAIN = FilterOptions(rejuvenate_every=None)
 NO_PAIRS = np.empty((0, 2), np.int64)
 aligned = partial(Alignment, True, "", 1.0, 0.0, 0.0, np.eye(3))
 CALLS: dict[str, list[Callable[[], Any]]] = {
@@ -179,7 +180,10 @@ CALLS: dict[str, list[Callable[[], Any]]] = {
     "num_robots: expected an int >= 1": [
         *(partial(FastSlam, bad) for bad in (0, 1.0, True)),
         *(partial(TeamSlam, bad) for bad in (0, -2, 2.5, True, None)),
-        lambda: ReferenceFastSlam(0, FilterOptions()),
+        lambda: ReferenceFastSlam(0, PLAIN),
+    ],
+    "options.rejuvenate_every: expected None, got 50. The reference has no smoother": [
+        lambda: ReferenceFastSlam(1, FilterOptions())
     ],
     "num_robots: expected an int <= 1000": [partial(kind, 10**400) for kind in (FastSlam, TeamSlam)],
     "seed: expected an int >= 0": [
@@ -196,10 +200,10 @@ CALLS: dict[str, list[Callable[[], Any]]] = {
     "merging: expected MergeOptions": [partial(TeamSlam, 2, merging=200)],
     "estimate: expected one of 'best', 'mixture'": [
         lambda: FastSlam().map("mean"),
-        lambda: ReferenceFastSlam(1, FilterOptions()).map("worst"),  # type: ignore[arg-type]
+        lambda: ReferenceFastSlam(1, PLAIN).map("worst"),  # type: ignore[arg-type]
     ],
     "odometry: expected": [
-        lambda: ReferenceFastSlam(2, FilterOptions()).step([None], [None, None]),
+        lambda: ReferenceFastSlam(2, PLAIN).step([None], [None, None]),
         lambda: dead_reckoning(np.zeros(3), np.zeros((4, 2))),
     ],
     "rng: expected": [lambda: align_maps(MAP, MAP, rng=7)],  # type: ignore[arg-type]
