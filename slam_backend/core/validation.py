@@ -21,6 +21,7 @@ BoolArray = NDArray[np.bool_]
 WRITTEN_IN_PYTHON = 1 << 9  # Py_TPFLAGS_HEAPTYPE of a class
 MOST = 10**9  # limit of steps and other counts: kernels hold such numbers, and no run needs more
 NUMBERS = "biuf"  # dtype kinds of real numbers
+NUMBERS_ALONE: Any = "1.25" if np.lib.NumpyVersion(np.__version__) >= "2.0.0" else False  # 0.1, not np.float64(0.1)
 
 
 def argument_error(name: str, expected: str, got: object, hint: str) -> ValueError:
@@ -35,7 +36,7 @@ def argument_error(name: str, expected: str, got: object, hint: str) -> ValueErr
     Returns:
         The exception, for the caller to raise.
 
-    >>> print(argument_error("num_particles", "an int >= 1", 0, "Use at least one particle."))
+    >>> print(argument_error("num_particles", "an int >= 1", np.int64(0), "Use at least one particle."))
     num_particles: expected an int >= 1, got 0. Use at least one particle.
     """
     if isinstance(got, PurePath):
@@ -50,7 +51,8 @@ def argument_error(name: str, expected: str, got: object, hint: str) -> ValueErr
 def _short_text(got: object) -> str:
     """Return the `repr` of something, or its type where that fails."""
     try:
-        return repr(got)
+        with np.printoptions(legacy=NUMBERS_ALONE):
+            return repr(got)
     except Exception:  # an int of 5000 digits has none, and an object of the caller may raise anything
         return f"a {type(got).__name__} that cannot be shown"
 

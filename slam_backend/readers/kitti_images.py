@@ -3,10 +3,11 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from slam_backend.core.files import checked_path
+from slam_backend.core.image_files import read_grey_image
+from slam_backend.core.text_files import data_lines, existing_file, line_error, parse_numbers, read_text
 from slam_backend.core.validation import FloatArray, argument_error, check_float
 from slam_backend.frontend.images import Image
 from slam_backend.readers.calibration import Rectified, RectifiedPair, Rectifier, load_kitti_calibration
@@ -47,7 +48,7 @@ class KittiImages:
         Raises:
             ValueError: If a file is not an image, or has another size than the others.
         """
-        pair = read_grey(self.left[frame]), read_grey(self.right[frame])
+        pair = read_grey_image(self.left[frame]), read_grey_image(self.right[frame])
         return pair if self.rig is None else self.rig.rectify(*pair)
 
 
@@ -83,10 +84,8 @@ def load_kitti_images(path: str | Path, truth: str | Path | None = None, duratio
     if duration is not None:
         end = times[0] + check_float("duration", duration, "Give seconds.", above=0.0)
         keep = max(2, int(np.searchsorted(times, end, side="right")))
-    file = folder / "poses.txt" if truth is None else Path(truth)
-    if truth is not None and not file.is_file():
-        raise argument_error("truth", "a file of true poses", "no such file", f"Check {str(file)!r}.")
-    height, width = read_grey(left[0]).shape
+    file = folder / "poses.txt" if truth is None else existing_file(truth, "truth", "a file of true poses")
+    height, width = read_grey_image(left[0]).shape
     return KittiImages(
         times=times[:keep],
         left=tuple(left[:keep]),
@@ -96,19 +95,6 @@ def load_kitti_images(path: str | Path, truth: str | Path | None = None, duratio
         height=height,
         truth=read_truth(file, times) if file.is_file() else None,
     )
-
-
-def read_grey(file: Path) -> Image:
-    """Read an image file as grey levels (H, W) uint8.
-
-    Raises:
-        ValueError: If the file is not an image.
-    """
-    image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
-    if image is None:
-        got = "a file of another kind" if file.is_file() else "no such file"
-        raise argument_error("path", "an image file", got, f"Get {str(file)!r} again.")
-    return np.asarray(image, dtype=np.uint8)
 
 
 def _eyes(folder: Path) -> tuple[Path, Path] | None:
@@ -127,11 +113,13 @@ def read_times(file: Path | None, count: int) -> FloatArray:
     """
     if file is None:
         return np.arange(count, dtype=np.float64) * PERIOD
-    try:
-        times = np.array([float(word) for word in file.read_text("utf-8").split()])
-    except (OSError, ValueError):
-        times = np.empty(0)
-    if len(times) < count or not np.isfinite(times).all() or not (np.diff(times) > 0.0).all():
-        expected = f"{file.name} with {count} rising times"
-        raise argument_error("path", expected, "another file", f"Correct {str(file)!r}: seconds, one for each image.")
-    return times[:count]
+    times: list[float] = []
+    for number, line in data_lines(read_text(file, kind="a file of times")):
+        found = parse_numbers(line.split())
+        if found is None or not np.isfinite(found).all() or (np.diff([*times[-1:], *found]) <= 0.0).any():
+            raise line_error("path", "rising times in seconds", line, file, number)
+        times += found
+    if len(times) < count:
+        expected, hint = f"{file.name} with {count} times, one for each image", f"Check {str(file)!r}."
+        raise argument_error("path", expected, f"a file of {len(times)}", hint)
+    return np.array(times[:count])

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from slam_backend.core.files import checked_path
+from slam_backend.core.text_files import data_lines, existing_file, line_error, parse_numbers, read_text
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray, argument_error, check_float
 from slam_backend.models.measurements import Measurements
 from slam_backend.readers.conversions import integrate_commands
@@ -90,9 +91,7 @@ def load_mrclam(
     if truth is not None and len(numbers) != 1:
         hint = "Name the robot whose poses these are with robots."
         raise argument_error("truth", "a file of one robot's poses", f"a log of robots {numbers}", hint)
-    if truth is not None and not Path(truth).is_file():
-        raise argument_error("truth", "a file of true poses", "no such file", f"Check {str(truth)!r}.")
-    truths = {numbers[0]: Path(truth)} if truth is not None else {}
+    truths = {} if truth is None else {numbers[0]: existing_file(truth, "truth", "a file of true poses")}
     sorted_files: list[str] = []
     logs = [_read_robot(folder, robot, subject_of, truths.get(robot), sorted_files) for robot in numbers]
     notes = sorted_note(sorted_files) + tuple(note for log in logs for note in _overlap_notes(log))
@@ -190,26 +189,23 @@ def _read_table(file: Path, columns: tuple[str, ...], empty: bool = False) -> tu
             per column; if subjects or barcodes are not whole, ranges not positive, or times go back by more than
             `MOST_JITTER`.
     """
-    if not file.is_file():
-        raise argument_error("path", f"a folder with {file.name}", "no such file", f"Check {str(file)!r}.")
-    lines = file.read_text(encoding="utf-8", errors="replace").split("\n")
+    expected = f"{len(columns)} numbers ({' '.join(columns)})"
+    lines = list(data_lines(read_text(file, kind="a file of the MR.CLAM log")))
+    if lines and _names(lines[0][1]):
+        del lines[0]
     rows: list[list[float]] = []
-    numbers: list[int] = []
-    for number, line in enumerate(lines, start=1):
-        body = line.partition("#")[0]
-        if body.strip() and not (number == 1 and _names(body)):
-            row = _parse(body)
-            if row is None or len(row) != len(columns):
-                raise _bad_line(file, number, line, columns, "")
-            rows.append(row)
-            numbers.append(number)
+    for number, line in lines:
+        row = parse_numbers(line.split(",") if "," in line else line.split())
+        if row is None or len(row) != len(columns):
+            raise line_error("path", expected, line, file, number)
+        rows.append(row)
     if not rows and not empty:
         raise argument_error("path", f"rows ({' '.join(columns)})", "no rows", f"{file} is empty: get it again.")
     table = np.array(rows, dtype=np.float64).reshape(-1, len(columns))
     for rule, broken in _faults(table, columns):
         if broken.any():
-            number = numbers[int(np.argmax(broken))]
-            raise _bad_line(file, number, lines[number - 1], columns, f" with {rule}")
+            number, line = lines[int(np.argmax(broken))]
+            raise line_error("path", f"{expected} with {rule}", line, file, number)
     if columns[0] != "time":
         return table, ""
     order, words = time_order(file.name, table[:, 0])
@@ -230,23 +226,7 @@ def _faults(table: FloatArray, columns: tuple[str, ...]) -> Iterator[tuple[str, 
 
 def _names(body: str) -> bool:
     """Return whether a line is a header: words separated by commas, none of them a number."""
-    return "," in body and all(_parse(word) is None for word in body.split(","))
-
-
-def _parse(body: str) -> list[float] | None:
-    """Return the numbers of a line, or None if a word is not a number."""
-    if "_" in body:  # Python accepts 1_000, which is damage in a log
-        return None
-    try:
-        return [float(word) for word in (body.split(",") if "," in body else body.split())]
-    except ValueError:
-        return None
-
-
-def _bad_line(file: Path, number: int, line: str, columns: tuple[str, ...], rule: str) -> ValueError:
-    """Return the error of a malformed line of a file."""
-    expected = f"{len(columns)} numbers ({' '.join(columns)}){rule}"
-    return argument_error("path", expected, repr(line.strip()), f"Correct line {number} of {file}.")
+    return "," in body and all(parse_numbers([word]) is None for word in body.split(","))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

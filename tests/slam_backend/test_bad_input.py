@@ -548,6 +548,18 @@ def test_an_error_says_argument_expected_got_and_cure() -> None:
     assert "..." in long
 
 
+@pytest.mark.parametrize(
+    ("got", "shown"),
+    [
+        (np.float64(0.1), "0.1"), (np.float32(0.1), "0.1"), (np.int8(3), "3"), (np.bool_(True), "True"),
+        ([np.float64(0.5), 2], "[0.5, 2]"), ({"x": (np.int64(1),)}, "{'x': (1,)}"),
+    ],
+)  # fmt: skip
+def test_numbers_are_shown_without_their_type(got: object, shown: str) -> None:
+    """Numbers of NumPy, also within containers, look like those of Python."""
+    assert f", got {shown}. " in str(argument_error("gate", "a number", got, CURE))
+
+
 def test_built_in_callables_are_known() -> None:
     """What Python or an extension brings is distinguished from what is written in Python."""
 

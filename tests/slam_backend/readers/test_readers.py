@@ -184,6 +184,19 @@ def test_columns_come_in_the_order_asked_for(tmp_path: Path) -> None:
     assert table.labels.tolist() == [["a b"], ["c"]]
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "sep=;\ntime;v\n1;2\n", '"sep=;"\ntime;v\n1;2\n', "# of a robot\n# time in s\n\ntime,v\n1,2\n",
+        '# it\'s "so"\ntime,v,note\n1,2,"a, b\n# c"\n', '"time", "v"\n"1", "2"\n', "SEP=;\ntime;v;w\n1;2;0,5\n",
+        '# old, names\n# time, v\n1,2\n', "time,v,\n1,2,\n",
+    ],
+)  # fmt: skip
+def test_tables_of_other_programs_are_read(text: str, tmp_path: Path) -> None:
+    """Excel's line `sep=`, comments above the names, quotes and line breaks within them leave the numbers alone."""
+    assert read_csv(_file(tmp_path, text), ("time", "v")).numbers.tolist() == [[1.0, 2.0]]
+
+
 @pytest.mark.parametrize("sign", [",", ";", "\t"])
 def test_delimiters_are_found(sign: str, tmp_path: Path) -> None:
     """Commas, semicolons and tabs delimit, as the first line shows; labels may be none, and quoted."""
