@@ -13,6 +13,7 @@ from slam_backend.core.text_files import data_lines, line_error, parse_numbers, 
 from slam_backend.core.validation import FloatArray, argument_error, check_array
 from slam_backend.geometry import wrap_angle
 
+LONGEST_HOLD = 0.25  # [s] for which an end of a trajectory applies beyond it
 DECIMAL = 1e-4  # last digit of quaternions that are written with four decimals
 LEAST_NORM, MOST_NORM = 1.0 - 1e-3, 1.0 + 1e-3  # of quaternions with three decimals and more
 
@@ -59,20 +60,24 @@ class Trajectory:
     def at(self, times: ArrayLike) -> FloatArray:
         """Return interpolated poses: positions along straight lines, headings along the shorter arc.
 
+        The first and the last pose also apply to times outside by up to one usual interval between poses, at most
+        `LONGEST_HOLD`.
+
         Args:
-            times: (...) float64 [s], between the first and the last time.
+            times: (...) float64 [s].
 
         Returns:
             (..., 3) poses [m, m, rad].
 
         Raises:
-            ValueError: If a time lies outside the recorded range.
+            ValueError: If a time lies further outside the recorded range.
         """
         try:
             wanted = np.asarray(times, dtype=np.float64)
         except (TypeError, ValueError) as error:
             raise argument_error("times", "numbers", times, "Give times in seconds.") from error
-        outside = ~((wanted >= self.times[0]) & (wanted <= self.times[-1]))
+        reach = min(float(np.median(np.diff(self.times))), LONGEST_HOLD) if len(self) > 1 else 0.0
+        outside = ~((wanted >= self.times[0] - reach) & (wanted <= self.times[-1] + reach))
         if outside.any():
             raise argument_error(
                 "times",
@@ -80,6 +85,7 @@ class Trajectory:
                 float(wanted[outside][0]),
                 "Cut the times to the recorded range.",
             )
+        wanted = np.clip(wanted, self.times[0], self.times[-1])
         right = np.clip(np.searchsorted(self.times, wanted, side="left"), min(1, len(self) - 1), len(self) - 1)
         left = np.maximum(right - 1, 0)
         span = np.where(right > left, self.times[right] - self.times[left], 1.0)

@@ -16,6 +16,7 @@ from slam_backend.trajectory import Trajectory
 
 CAMERA_FOLDERS = (("image_0", "image_1"), ("image_l", "image_r"))  # folders of the left and the right camera
 PERIOD = 0.1  # [s] between frames without given times: KITTI's cameras run at 10 Hz
+MOST_PERIOD = 5.0  # [s] between frames; above it times are milliseconds or nanoseconds
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,7 +110,7 @@ def read_times(file: Path | None, count: int) -> FloatArray:
     """Return the times (count,) [s] of the images; without a file they are `PERIOD` apart.
 
     Raises:
-        ValueError: If the file has fewer numbers, or they do not increase strictly.
+        ValueError: If the file has fewer numbers, they do not increase strictly, or they are not seconds.
     """
     if file is None:
         return np.arange(count, dtype=np.float64) * PERIOD
@@ -122,4 +123,6 @@ def read_times(file: Path | None, count: int) -> FloatArray:
     if len(times) < count:
         expected, hint = f"{file.name} with {count} times, one for each image", f"Check {str(file)!r}."
         raise argument_error("path", expected, f"a file of {len(times)}", hint)
+    if (usual := float(np.median(np.diff(times)))) > MOST_PERIOD:
+        raise argument_error("path", f"{file.name} in seconds", f"a median of {usual:g} s", f"Correct {str(file)!r}.")
     return np.array(times[:count])

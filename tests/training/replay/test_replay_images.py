@@ -140,6 +140,9 @@ def test_times_and_duration(drive: Path) -> None:
             ValueError, match=r"path: expected times\.txt with 6 times, one for each image, got a file of 3"
         ):
             load_kitti_images(drive)
+        (drive / "times.txt").write_text("0 100 200 300 400 500\n")
+        with pytest.raises(ValueError, match=r"path: expected times\.txt in seconds, got a median of 100 s"):
+            load_kitti_images(drive)
         (drive / "times.txt").write_text("0 1 2\n3\n3 4\n")
         with pytest.raises(
             ValueError, match=r"path: expected rising times .*got '3 4'\. Correct line 3 of .*times\.txt"
