@@ -33,7 +33,6 @@ MISSED = {
     "repeat": "Two consecutive attempts gave transforms that differ by more than the bound.",
 }
 COLUMNS = ("robot", "mean NIS", "NIS beyond 95 %", "few particles", "mostly rejected", "verdict")
-CAUTIOUS = 1.0  # mean NIS below which covariances are at least twice too large, even in the plane
 UPPER = ("xx", "xy", "xz", "yy", "yz", "zz")
 MAP_COLUMNS = ("id", "count", "x_m", "y_m", "z_m", *(f"cov_{pair}_m2" for pair in UPPER))
 
@@ -161,7 +160,7 @@ def print_consistency(console: Console, rows: Sequence[Mapping[str, Any]]) -> No
     cells = []
     for row in rows:
         shares = (f"{100.0 * row[key]:.1f} %" for key in ("nis_share", "ess_share", "rejected_share"))
-        cells.append([str(row["robot"]), number(row["nis_mean"]), *shares, _verdict(row)])
+        cells.append([str(row["robot"]), number(row["nis_mean"]), *shares, row["verdict"]])
     title = "Consistency: errors relative to the estimated covariances (shares of frames)"
     console.print(console_table(title, COLUMNS, cells))
     texts: dict[str, list[str]] = {}
@@ -170,14 +169,6 @@ def print_consistency(console: Console, rows: Sequence[Mapping[str, Any]]) -> No
             texts.setdefault(warning["text"], []).append(str(row["robot"]))
     for text, robots in texts.items():
         console.print(f"Warning, robot {', '.join(robots)}: {text}")
-
-
-def _verdict(row: Mapping[str, Any]) -> str:
-    """Return the verdict of a row, in one or two words."""
-    if row["warnings"]:
-        return "inconsistent"
-    is_cautious = row["nis_mean"] is not None and row["nis_mean"] < CAUTIOUS
-    return "cautious" if is_cautious else "consistent"
 
 
 def write_maps(folder: "RunFolder", maps: "Mapping[str, LandmarkMap]") -> str:
