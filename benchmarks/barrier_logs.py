@@ -236,8 +236,8 @@ CONDITIONS: dict[str, dict[str, Any]] = {
     "0.1 m/s, 10 degrees/s": {"speed": 0.1, "turn": math.radians(10.0)},
 }
 FILTERS: dict[str, dict[str, Any]] = {
-    "100 particles": {},
-    "1,000 particles": {"num_particles": 1000},
+    "100 particles": {"rejuvenate_every": None},
+    "1,000 particles": {"num_particles": 1000, "rejuvenate_every": None},
     "rejuvenated": {"rejuvenate_every": 100},
 }
 

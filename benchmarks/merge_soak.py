@@ -69,7 +69,7 @@ class Setting:
     Attributes:
         forced: Whether wrong merges are forced.
         shift: Shift of forced merges [m]; None: the wrong transform with the best fit.
-        rejuvenate_every: Interval of rejuvenations; None: the filters' default.
+        rejuvenate_every: Interval of rejuvenations; None: never in aisles, the default in environments.
         straighten: Whether maps are smoothed before a merge.
         sure, min_sigmas_on_trial: Required certainty of a transform, see `MergeOptions`; None: the default.
     """
@@ -196,7 +196,7 @@ def play_aisles(seed: int, cycles: int, setting: Setting) -> RunOutcomes:
     team = TeamSlam(
         robots, seed=seed, attempts=AttemptOptions(enabled=not setting.forced),
         merging=MergeOptions(**setting.merging), num_particles=50, camera=camera, motion=noise.motion,
-        **setting.filter,
+        rejuvenate_every=setting.rejuvenate_every,
     )  # fmt: skip
     starts = run.true_paths[:, 0]
     ground_truth = GroundTruthAssociation(
@@ -312,7 +312,8 @@ def main(
     forced: Annotated[bool, typer.Option(help="Force wrong merges.")] = False,
     shift: Annotated[float | None, typer.Option(help="Shift of forced merges in metres, without rotation.")] = None,
     rejuvenate_every: Annotated[
-        int | None, typer.Option(help="Steps between rejuvenations of a filter.", show_default="the default")
+        int | None,
+        typer.Option(help="Steps between rejuvenations of a filter.", show_default="never; 50 in environments"),
     ] = None,
     straighten: Annotated[bool, typer.Option(help="Smooth maps before a merge.")] = True,
     sure: Annotated[

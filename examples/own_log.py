@@ -40,9 +40,7 @@ def run(folder: Path, picture: Path) -> dict[str, AteResult]:
         print(note)
 
     # Gates for known identities: no position is unlikely enough to reject an identity.
-    slam = FastSlam(
-        num_particles=100, motion=MOTION, position_gate=1e4, new_landmark_gate=1e6, rejuvenate_every=50, seed=0
-    )
+    slam = FastSlam(num_particles=100, motion=MOTION, position_gate=1e4, new_landmark_gate=1e6, seed=0)
     path = np.zeros((len(steps.times), 3))
     for k, (moved, frame) in enumerate(zip(steps.odometry, steps.measurements, strict=True)):
         slam.step([moved if k else None], [frame])

@@ -1,5 +1,6 @@
 """Trajectories: interpolation, dead reckoning and the TUM file format."""
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
@@ -7,12 +8,15 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from slam_backend.core.files import checked_path, write_file
+from slam_backend.core.files import write_file
 from slam_backend.core.short_repr import short_repr
+from slam_backend.core.text_files import data_lines, line_error, parse_numbers, read_text
 from slam_backend.core.validation import FloatArray, argument_error, check_array
 from slam_backend.geometry import wrap_angle
 
-PLANAR_TOLERANCE = 1e-6
+LONGEST_HOLD = 0.25  # [s] for which an end of a trajectory applies beyond it
+DECIMAL = 1e-4  # last digit of quaternions that are written with four decimals
+LEAST_NORM, MOST_NORM = 1.0 - 1e-3, 1.0 + 1e-3  # of quaternions with three decimals and more
 
 
 @short_repr
@@ -45,7 +49,7 @@ class Trajectory:
             raise argument_error(
                 "times",
                 "strictly increasing times",
-                f"a time {times[later]!r} after {times[later - 1]!r} at index {later}",
+                f"a time {times[later]} after {times[later - 1]} at index {later}",
                 "Sort the poses by time and drop repeated ones.",
             )
         for name, array in (("times", times), ("poses", poses)):
@@ -58,20 +62,24 @@ class Trajectory:
     def at(self, times: ArrayLike) -> FloatArray:
         """Return interpolated poses: positions along straight lines, headings along the shorter arc.
 
+        The first and the last pose also apply to times outside by up to one usual interval between poses, at most
+        `LONGEST_HOLD`.
+
         Args:
-            times: (...) float64 [s], between the first and the last time.
+            times: (...) float64 [s].
 
         Returns:
             (..., 3) poses [m, m, rad].
 
         Raises:
-            ValueError: If a time lies outside the recorded range.
+            ValueError: If a time lies further outside the recorded range.
         """
         try:
             wanted = np.asarray(times, dtype=np.float64)
         except (TypeError, ValueError) as error:
             raise argument_error("times", "numbers", times, "Give times in seconds.") from error
-        outside = ~((wanted >= self.times[0]) & (wanted <= self.times[-1]))
+        reach = min(float(np.median(np.diff(self.times))), LONGEST_HOLD) if len(self) > 1 else 0.0
+        outside = ~((wanted >= self.times[0] - reach) & (wanted <= self.times[-1] + reach))
         if outside.any():
             raise argument_error(
                 "times",
@@ -79,6 +87,7 @@ class Trajectory:
                 float(wanted[outside][0]),
                 "Cut the times to the recorded range.",
             )
+        wanted = np.clip(wanted, self.times[0], self.times[-1])
         right = np.clip(np.searchsorted(self.times, wanted, side="left"), min(1, len(self) - 1), len(self) - 1)
         left = np.maximum(right - 1, 0)
         span = np.where(right > left, self.times[right] - self.times[left], 1.0)
@@ -107,40 +116,31 @@ class Trajectory:
 
     @classmethod
     def load_tum(cls, path: str | Path) -> Self:
-        """Read a planar path; lines that start with `#` and empty lines are skipped.
+        """Read a planar path; comments after `#` and empty lines are skipped.
+
+        Quaternions may be rounded to four decimals, and tilts that this could explain count as none.
 
         Raises:
-            ValueError: If the file is missing, a line is malformed, a rotation is not about the vertical, or times do
-                not increase.
+            ValueError: If the file is missing or has no poses, a line is malformed, a rotation is not about the
+                vertical, or times do not increase; the message names file and line.
         """
-        path = checked_path(path)
-        if not path.is_file():
-            raise argument_error("path", "a TUM trajectory file", "no such file", f"Check the path {str(path)!r}.")
-        times, poses = [], []
-        lines = Path(path).read_text(encoding="utf-8", errors="replace").splitlines()
-        for number, line in enumerate(lines, start=1):
-            if line.strip() and not line.lstrip().startswith("#"):
-                time, pose = _parse_tum_line(line, f"{path}, line {number}")
-                times.append(time)
-                poses.append(pose)
-        return cls(np.array(times), np.array(poses).reshape(-1, 3))
-
-
-def _parse_tum_line(line: str, where: str) -> tuple[float, tuple[float, float, float]]:
-    """Return the time and the planar pose of one line, or raise an error that names its place `where`."""
-    expected, hint = "time tx ty tz qx qy qz qw", f"Correct {where}."
-    try:
-        values = np.array([float(word) for word in line.split()])
-    except ValueError as error:
-        raise argument_error("path", expected, repr(line), hint) from error
-    if len(values) != 8 or not np.isfinite(values).all():
-        raise argument_error("path", f"8 finite numbers {expected}", repr(line), hint)
-    time, x, y, _, qx, qy, qz, qw = (float(v) for v in values)
-    if abs(np.linalg.norm(values[4:]) - 1.0) > 1e-3:
-        raise argument_error("path", "a unit quaternion qx qy qz qw", repr(line), hint)
-    if max(abs(qx), abs(qy)) > PLANAR_TOLERANCE:
-        raise argument_error("path", "a rotation about the vertical (qx = qy = 0)", repr(line), hint)
-    return time, (x, y, float(wrap_angle(2.0 * np.arctan2(qz, qw))))
+        rows: list[tuple[float, float, float, float]] = []
+        for number, line in data_lines(read_text(path, kind="a TUM trajectory file")):
+            values = parse_numbers(line.split())
+            if values is None or len(values) != 8 or not np.isfinite(values).all():
+                raise line_error("path", "8 finite numbers time tx ty tz qx qy qz qw", line, path, number)
+            time, x, y, _, qx, qy, qz, qw = values
+            if not LEAST_NORM <= math.hypot(qx, qy, qz, qw) <= MOST_NORM:
+                raise line_error("path", "a unit quaternion qx qy qz qw", line, path, number)
+            if max(abs(qx), abs(qy)) > DECIMAL:
+                raise line_error("path", "a rotation about the vertical (qx = qy = 0)", line, path, number)
+            if rows and time <= rows[-1][0]:
+                raise line_error("path", f"a time after {rows[-1][0]}", line, path, number)
+            rows.append((time, x, y, float(wrap_angle(2.0 * np.arctan2(qz, qw)))))
+        if not rows:
+            raise argument_error("path", "a TUM trajectory file with poses", "no pose", f"Check {str(path)!r}.")
+        table = np.array(rows)
+        return cls(table[:, 0], table[:, 1:])
 
 
 def dead_reckoning(start_pose: ArrayLike, odometry: ArrayLike) -> FloatArray:

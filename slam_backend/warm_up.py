@@ -117,7 +117,7 @@ def run_all_paths(extras: Collection[str]) -> float:
         for is_second in (True, False) if "fastslam1" in extras else (True,):
             for frame in (plain, given):
                 proposal: Literal["fastslam2", "fastslam1"] = "fastslam2" if is_second else "fastslam1"
-                slam = FastSlam(2, num_particles=4, proposal=proposal, resample_threshold=1.0)
+                slam = FastSlam(2, num_particles=4, proposal=proposal, resample_threshold=1.0, rejuvenate_every=None)
                 slam.step([None, None], [frame, None])
                 for _ in range(STEPS):
                     slam.step([move, None], [frame, frame])
@@ -130,7 +130,7 @@ def run_all_paths(extras: Collection[str]) -> float:
             smoothing.step([move], [plain])
         smoothing.set_state(smoothing.get_state())
         if "existence" in extras:
-            slam = FastSlam(num_particles=4, existence=ExistenceModel(), resample_threshold=1.0)
+            slam = FastSlam(num_particles=4, existence=ExistenceModel(), resample_threshold=1.0, rejuvenate_every=None)
             for _ in range(STEPS):
                 slam.step([move], [plain])
             slam.set_state(slam.get_state())

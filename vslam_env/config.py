@@ -13,6 +13,7 @@ import numpy as np
 import tomli_w
 
 from slam_backend.core.short_repr import short_repr
+from slam_backend.core.text_files import parse_toml, read_toml
 from slam_backend.core.validation import argument_error, check_choice, check_float, check_int, did_you_mean
 from vslam_env.belief.belief import BeliefConfig
 from vslam_env.sensors import LandmarkSensorConfig, ScanConfig, StereoSensorConfig
@@ -318,26 +319,14 @@ class EnvConfig:
         Omitted fields, also in nested tables, have the value of the `standard` preset; a missing `format` means the
         current one.
         """
-        import tomllib  # a slow import
-
-        try:
-            values = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-        except (OSError, TypeError, ValueError) as error:  # path, encoding or syntax
-            raise argument_error("config", "a readable TOML file", str(path), f"The reader says: {error}.") from error
-        return cls._of_file(values)
+        return cls._of_file(read_toml(path, "config"))
 
     @classmethod
     def from_toml_text(cls, text: str) -> Self:
         """Build a configuration from a text of `to_toml`."""
         if not isinstance(text, str):
             raise argument_error("config", "TOML as text", text, "Pass what to_toml returned, or use from_toml.")
-        import tomllib
-
-        try:
-            values = tomllib.loads(text)
-        except tomllib.TOMLDecodeError as error:
-            raise argument_error("config", "TOML", text, f"The reader says: {error}.") from error
-        return cls._of_file(values)
+        return cls._of_file(parse_toml(text, "config", "the text"))
 
     @classmethod
     def _of_file(cls, values: dict[str, Any]) -> Self:

@@ -47,7 +47,7 @@ for time, pose in zip(times[::5], truth[::5], strict=True):
 # %%
 steps = range_bearing_steps(logged, seen, names, sigma_range=0.1, sigma_bearing=0.02, dt=0.25)
 motion = OdometryModel(sigma_along=0.1, sigma_across=0.05, sigma_heading=0.2, sigma_turn=0.1, floor_heading=0.003)
-slam = FastSlam(motion=motion, position_gate=1e4, new_landmark_gate=1e6, rejuvenate_every=50, seed=0)
+slam = FastSlam(motion=motion, position_gate=1e4, new_landmark_gate=1e6, seed=0)
 path = np.zeros((len(steps.times), 3))
 for step, (moved, frame) in enumerate(zip(steps.odometry, steps.measurements, strict=True)):
     slam.step([moved if step else None], [frame])

@@ -7,7 +7,7 @@ limited in size before memory is taken, and no content runs code.
 import codecs
 import json
 import re
-from collections.abc import Hashable
+from collections.abc import Hashable, Iterable, Iterator
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -100,6 +100,37 @@ def read_text(
         hint = f"Save the file in UTF-8; see {where}."
         raise argument_error(name, f"{kind} in UTF-8", "a file in another encoding", hint) from error
     return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def data_lines(text: str) -> Iterator[tuple[int, str]]:
+    r"""Yield number and content of each line of `read_text` with more than a comment, which begins with `#`.
+
+    >>> list(data_lines("# x y\n1 2  # start\n\n3 4"))
+    [(2, '1 2'), (4, '3 4')]
+    """
+    for number, line in enumerate(text.split("\n"), start=1):
+        if body := line.partition("#")[0].strip():
+            yield number, body
+
+
+def parse_numbers(words: Iterable[str]) -> list[float] | None:
+    """Return the numbers that words write, or None if one of them does not write any.
+
+    >>> parse_numbers("1 -2.5e3".split()), parse_numbers("1_000 2".split())
+    ([1.0, -2500.0], None)
+    """
+    found = list(words)
+    if any("_" in word for word in found):  # Python accepts 1_000, which is damage in a log
+        return None
+    try:
+        return [float(word) for word in found]
+    except ValueError:
+        return None
+
+
+def line_error(name: str, expected: str, got: str, path: str | PathLike[str], line: int) -> ValueError:
+    """Return the error of a line, or a part `got` of it, in a file that an argument names."""
+    return argument_error(name, expected, repr(got), f"Correct {place(path, line)}.")
 
 
 def read_json(path: str | PathLike[str], name: str, hint: str) -> Any:

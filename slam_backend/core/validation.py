@@ -28,6 +28,7 @@ MOST_SHOWN = 80  # letters of a value in an error
 MOST_SAID = 2000  # letters of each other part, which may name what a file contains
 MOST_SHOWN_BYTES = 1 << 14  # of an array whose numbers are formatted
 DEEPEST_SHOWN = 20  # levels of nested lists and dicts
+NUMBERS_ALONE: Any = "1.25" if np.lib.NumpyVersion(np.__version__) >= "2.0.0" else False  # 0.1, not np.float64(0.1)
 
 
 def argument_error(name: str, expected: str, got: object, hint: str) -> ValueError:
@@ -44,7 +45,7 @@ def argument_error(name: str, expected: str, got: object, hint: str) -> ValueErr
     Returns:
         The exception, for the caller to raise.
 
-    >>> print(argument_error("num_particles", "an int >= 1", 0, "Use at least one particle."))
+    >>> print(argument_error("num_particles", "an int >= 1", np.int64(0), "Use at least one particle."))
     num_particles: expected an int >= 1, got 0. Use at least one particle.
     """
     name, expected, hint = (_cut(text, MOST_SAID) for text in (name, expected, hint))
@@ -68,11 +69,12 @@ def _short_text(got: object) -> str:
     """Return the beginning of the `repr` of something, or its type where that fails."""
     text = ""
     try:
-        for piece in _pieces(got, 0):
-            text += piece
-            if len(text) > MOST_SHOWN:
-                break
-        return text
+        with np.printoptions(legacy=NUMBERS_ALONE):
+            for piece in _pieces(got, 0):
+                text += piece
+                if len(text) > MOST_SHOWN:
+                    break
+            return text
     except Exception:  # an int of 5000 digits has none, and an object of the caller may raise anything
         return f"a {type(got).__name__} that cannot be shown"
 

@@ -50,14 +50,23 @@ WEIGHTS = tuple(SHARE / len(BETS) / SIGN_OF.count(sign) for sign in SIGN_OF for 
 THRESHOLD = len(SIGNS) / FALSE_ALARM_RATE
 HIGHEST = 1e6 * THRESHOLD  # limit of the evidence
 SUMS, LISTS = ("frames", "begun", "quiet", "nis", "matched"), ("counts", "evidence", "since")
+CAUTIOUS = 1.0  # mean NIS below which covariances are at least twice too large, even in the plane
+OVER_CONFIDENT = 3.0  # mean NIS above which covariances are too small, even in space
+VERDICTS = {  # words for a filter, with their conditions; the first one that holds applies
+    "inconsistent": "a warning",
+    "unknown": "no measurement has matched a landmark",
+    "over-confident": f"mean NIS above {OVER_CONFIDENT:g}",
+    "cautious": f"mean NIS below {CAUTIOUS:g}",
+    "consistent": f"mean NIS from {CAUTIOUS:g} to {OVER_CONFIDENT:g}",
+}
 ADVICE = {  # diagnosis and advice by sign
     "nis": (
         "the innovations exceed their predicted covariances, the filter is over-confident",
-        "Assume more odometry noise or more measurement noise, set rejuvenate_every, or use more particles.",
+        "Assume more odometry noise or measurement noise, lower rejuvenate_every, or use more particles.",
     ),
     "ess": (
         "less than a tenth of the particles carry all the weight",
-        "Use more particles, set rejuvenate_every, or assume more measurement noise.",
+        "Use more particles, lower rejuvenate_every, or assume more measurement noise.",
     ),
     "rejected": (
         "most measurements match no landmark and start none",
@@ -108,9 +117,19 @@ class Consistency:
     rejected_share: float
     warnings: tuple[ConsistencyWarning, ...]
 
+    @property
+    def verdict(self) -> str:
+        """Key of `VERDICTS`."""
+        conditions = (
+            bool(self.warnings), math.isnan(self.nis_mean), self.nis_mean > OVER_CONFIDENT, self.nis_mean < CAUTIOUS,
+            True,
+        )  # fmt: skip
+        return next(word for word, holds in zip(VERDICTS, conditions, strict=True) if holds)
+
     def to_mapping(self) -> dict[str, Any]:
-        """Return the fields as plain numbers and texts."""
+        """Return the fields and the verdict as plain numbers and texts."""
         return {
+            "verdict": self.verdict,
             "frames": self.frames,
             "nis_mean": self.nis_mean,
             "nis_share": self.nis_share,

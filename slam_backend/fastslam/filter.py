@@ -18,7 +18,7 @@ from slam_backend.fastslam import _kernels
 from slam_backend.fastslam.consistency import Consistency
 from slam_backend.fastslam.estimates import map_mixture
 from slam_backend.fastslam.existence import ExistenceModel
-from slam_backend.fastslam.options import FilterOptions
+from slam_backend.fastslam.options import REJUVENATE_EVERY, FilterOptions
 from slam_backend.fastslam.particle_maps import best_map, present_slots, write_summary
 from slam_backend.fastslam.rejuvenation import RejuvenationScheduler
 from slam_backend.fastslam.relative_poses import TeamPoses, membership_table
@@ -81,7 +81,7 @@ class FastSlam:
         one_to_one: bool = True,
         landmark_noise: float | None = None,
         existence: ExistenceModel | None = None,
-        rejuvenate_every: int | None = None,
+        rejuvenate_every: int | None = REJUVENATE_EVERY,
         smoothing: SmoothingOptions | None = None,
         seed: int | np.random.SeedSequence | np.random.Generator = 0,
         initial_poses: ArrayLike | None = None,

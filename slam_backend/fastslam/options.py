@@ -25,6 +25,7 @@ from slam_backend.smoother.options import SmoothingOptions
 PROPOSALS = ("fastslam2", "fastslam1")
 MAX_ROBOTS, MAX_PARTICLES = 1_000, 1_000_000  # beyond any memory
 CALIBRATED_NOISE = 0.005  # [m]; chosen on simulated stereo runs, see docs/reference/smoother.md
+REJUVENATE_EVERY = 50  # steps; 0.94 times the pose errors of every 100 in environments
 
 
 @short_repr
@@ -64,8 +65,8 @@ class FilterOptions:
         existence: Detection model that updates the probability of existence of landmarks; particles delete improbable
             ones. None: landmarks are never deleted.
         rejuvenate_every: Steps after which particles are sampled from the smoother's posterior of whole paths; also at
-            the first step after a merge, and sooner after a loop closure. None: never, except that a `TeamSlam`
-            smooths both sides before a merge (`MergeOptions.smooth_first`).
+            the first step after a merge, and sooner after a loop closure. None: never, as in the paper, except that a
+            `TeamSlam` smooths both sides before a merge (`MergeOptions.smooth_first`).
         smoothing: Options of the smoother.
     """
 
@@ -87,7 +88,7 @@ class FilterOptions:
     one_to_one: bool = True
     landmark_noise: float | None = None
     existence: ExistenceModel | None = None
-    rejuvenate_every: int | None = None
+    rejuvenate_every: int | None = REJUVENATE_EVERY
     smoothing: SmoothingOptions = field(default_factory=SmoothingOptions)
 
     def __post_init__(self) -> None:

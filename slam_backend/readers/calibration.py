@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from slam_backend.core.short_repr import short_repr
+from slam_backend.core.text_files import data_lines, parse_numbers, read_text
 from slam_backend.core.validation import Float32Array, FloatArray, argument_error, check_array, check_float
 from slam_backend.frontend.images import Image, check_image
 from slam_backend.models.camera import StereoCamera
@@ -187,14 +188,8 @@ def load_kitti_calibration(path: str | Path) -> RectifiedPair:
         ValueError: If the file is missing, lacks two such matrices, or these are not a rectified pair.
     """
     file = Path(path)
-    rows = []
-    for line in _text(file).splitlines():
-        try:
-            numbers = [float(word) for word in line.split(":", 1)[-1].split()]
-        except ValueError:
-            numbers = []
-        if len(numbers) == 12:
-            rows.append(numbers)
+    found = (parse_numbers(line.split(":", 1)[-1].split()) for _, line in data_lines(_text(file)))
+    rows = [numbers for numbers in found if numbers is not None and len(numbers) == 12]
     if len(rows) < 2 or not np.isfinite(rows).all():
         expected = f"{file.name} with two matrices of 12 numbers"
         raise argument_error("calibration", expected, f"a file with {len(rows)}", f"Get {str(file)!r} again.")
@@ -252,11 +247,7 @@ def load_euroc_camera(path: str | Path) -> CameraCalibration:
 
 def _text(file: Path) -> str:
     """Return the text of a file."""
-    try:
-        return file.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        hint = f"Check {str(file)!r}."
-        raise argument_error("calibration", "a readable file of a calibration", "no such file", hint) from error
+    return read_text(file, "calibration", "a file of a calibration")
 
 
 def _numbers(file: Path, text: str, key: str, counts: tuple[int, ...]) -> FloatArray:
@@ -267,8 +258,7 @@ def _numbers(file: Path, text: str, key: str, counts: tuple[int, ...]) -> FloatA
         expected = f"{file.name} with {counts[0]} numbers {key!r}"
         raise argument_error("calibration", expected, f"a list of {len(words)}", f"Get {str(file)!r} again.")
     hint = f"Correct {key!r} in {str(file)!r}."
-    try:
-        numbers = [float(word) for word in words]
-    except ValueError as error:
-        raise argument_error("calibration", f"numbers after {key!r}", words, hint) from error
+    numbers = parse_numbers(words)
+    if numbers is None:
+        raise argument_error("calibration", f"numbers after {key!r}", words, hint)
     return np.asarray(check_array("calibration", numbers, (len(words),), hint))

@@ -17,6 +17,7 @@ import numpy as np
 from slam_backend.core.array_files import read_arrays
 from slam_backend.core.files import checked_path
 from slam_backend.core.short_repr import short_repr
+from slam_backend.core.text_files import data_lines, existing_file, line_error, parse_numbers, read_text
 from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_float
 from slam_backend.models.camera import ROBOT_FROM_CAMERA, StereoCamera
 from slam_backend.models.measurements import Measurements
@@ -149,9 +150,7 @@ def _find_truth(file: Path, truth: str | Path | None) -> Path | None:
     if truth is None:
         found = sorted((file.parent / "poses").glob("*.txt"))
         return found[0] if len(found) == 1 else None
-    if not Path(truth).is_file():
-        raise argument_error("truth", "a file of true poses", "no such file", f"Check {str(truth)!r}.")
-    return Path(truth)
+    return existing_file(truth, "truth", "a file of true poses")
 
 
 def _read(file: Path) -> dict[str, FloatArray]:
@@ -180,16 +179,16 @@ def read_truth(file: Path, times: FloatArray) -> Trajectory:
     Raises:
         ValueError: If the file has another format.
     """
-    expected = f"{file.name} with rows of 12 numbers, or 13 with a time, one for each frame"
-    hint = f"Correct {str(file)!r}."
-    try:
-        rows = np.array([[float(w) for w in line.split()] for line in file.read_text("utf-8").splitlines() if line])
-    except ValueError as error:
-        raise argument_error("truth", expected, "a row of another kind", hint) from error
-    shaped = rows.ndim == 2 and rows.shape[1] in (12, 13) and 1 < len(rows) <= len(times)
-    if not shaped or not np.isfinite(rows).all():
-        raise argument_error("truth", expected, f"an array {rows.shape} for {len(times)} frames", hint)
-    matrices = rows[:, -12:].reshape(-1, 3, 4)
+    rows: list[list[float]] = []
+    for number, line in data_lines(read_text(file, "truth", "a file of true poses")):
+        row = parse_numbers(line.split())
+        if row is None or len(row) not in (12, 13) or not np.isfinite(row).all():
+            raise line_error("truth", "12 finite numbers, or 13 with a time", line, file, number)
+        rows.append(row[-12:])
+    if not 1 < len(rows) <= len(times):
+        expected = f"{file.name} with a row for each of {len(times)} frames"
+        raise argument_error("truth", expected, f"a file of {len(rows)}", f"Check {str(file)!r}.")
+    matrices = np.array(rows).reshape(-1, 3, 4)
     heading = np.arctan2(-matrices[:, 0, 2], matrices[:, 2, 2])
     return Trajectory(times[: len(rows)], np.stack([matrices[:, 2, 3], -matrices[:, 0, 3], heading], axis=-1))
 

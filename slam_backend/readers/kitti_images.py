@@ -3,11 +3,12 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from slam_backend.core.files import checked_path
+from slam_backend.core.image_files import read_grey_image
 from slam_backend.core.short_repr import short_repr
+from slam_backend.core.text_files import data_lines, existing_file, line_error, parse_numbers, read_text
 from slam_backend.core.validation import FloatArray, argument_error, check_float
 from slam_backend.frontend.images import Image
 from slam_backend.readers.calibration import Rectified, RectifiedPair, Rectifier, load_kitti_calibration
@@ -16,6 +17,7 @@ from slam_backend.trajectory import Trajectory
 
 CAMERA_FOLDERS = (("image_0", "image_1"), ("image_l", "image_r"))  # folders of the left and the right camera
 PERIOD = 0.1  # [s] between frames without given times: KITTI's cameras run at 10 Hz
+MOST_PERIOD = 5.0  # [s] between frames; above it times are milliseconds or nanoseconds
 
 
 @short_repr
@@ -49,7 +51,7 @@ class KittiImages:
         Raises:
             ValueError: If a file is not an image, or has another size than the others.
         """
-        pair = read_grey(self.left[frame]), read_grey(self.right[frame])
+        pair = read_grey_image(self.left[frame]), read_grey_image(self.right[frame])
         return pair if self.rig is None else self.rig.rectify(*pair)
 
 
@@ -85,10 +87,8 @@ def load_kitti_images(path: str | Path, truth: str | Path | None = None, duratio
     if duration is not None:
         end = times[0] + check_float("duration", duration, "Give seconds.", above=0.0)
         keep = max(2, int(np.searchsorted(times, end, side="right")))
-    file = folder / "poses.txt" if truth is None else Path(truth)
-    if truth is not None and not file.is_file():
-        raise argument_error("truth", "a file of true poses", "no such file", f"Check {str(file)!r}.")
-    height, width = read_grey(left[0]).shape
+    file = folder / "poses.txt" if truth is None else existing_file(truth, "truth", "a file of true poses")
+    height, width = read_grey_image(left[0]).shape
     return KittiImages(
         times=times[:keep],
         left=tuple(left[:keep]),
@@ -98,19 +98,6 @@ def load_kitti_images(path: str | Path, truth: str | Path | None = None, duratio
         height=height,
         truth=read_truth(file, times) if file.is_file() else None,
     )
-
-
-def read_grey(file: Path) -> Image:
-    """Read an image file as grey levels (H, W) uint8.
-
-    Raises:
-        ValueError: If the file is not an image.
-    """
-    image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
-    if image is None:
-        got = "a file of another kind" if file.is_file() else "no such file"
-        raise argument_error("path", "an image file", got, f"Get {str(file)!r} again.")
-    return np.asarray(image, dtype=np.uint8)
 
 
 def _eyes(folder: Path) -> tuple[Path, Path] | None:
@@ -125,15 +112,19 @@ def read_times(file: Path | None, count: int) -> FloatArray:
     """Return the times (count,) [s] of the images; without a file they are `PERIOD` apart.
 
     Raises:
-        ValueError: If the file has fewer numbers, or they do not increase strictly.
+        ValueError: If the file has fewer numbers, they do not increase strictly, or they are not seconds.
     """
     if file is None:
         return np.arange(count, dtype=np.float64) * PERIOD
-    try:
-        times = np.array([float(word) for word in file.read_text("utf-8").split()])
-    except (OSError, ValueError):
-        times = np.empty(0)
-    if len(times) < count or not np.isfinite(times).all() or not (np.diff(times) > 0.0).all():
-        expected = f"{file.name} with {count} rising times"
-        raise argument_error("path", expected, "another file", f"Correct {str(file)!r}: seconds, one for each image.")
-    return times[:count]
+    times: list[float] = []
+    for number, line in data_lines(read_text(file, kind="a file of times")):
+        found = parse_numbers(line.split())
+        if found is None or not np.isfinite(found).all() or (np.diff([*times[-1:], *found]) <= 0.0).any():
+            raise line_error("path", "rising times in seconds", line, file, number)
+        times += found
+    if len(times) < count:
+        expected, hint = f"{file.name} with {count} times, one for each image", f"Check {str(file)!r}."
+        raise argument_error("path", expected, f"a file of {len(times)}", hint)
+    if (usual := float(np.median(np.diff(times)))) > MOST_PERIOD:
+        raise argument_error("path", f"{file.name} in seconds", f"a median of {usual:g} s", f"Correct {str(file)!r}.")
+    return np.array(times[:count])

@@ -8,14 +8,17 @@ import numpy as np
 
 from slam_backend.core.files import checked_path
 from slam_backend.core.short_repr import short_repr
+from slam_backend.core.text_files import data_lines, existing_file, line_error, parse_numbers, read_text
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray, argument_error, check_float
 from slam_backend.models.measurements import Measurements
-from slam_backend.readers.conversions import integrate_commands
+from slam_backend.readers.conversions import HOLD, integrate_commands
+from slam_backend.readers.plausibility import MOST_BEARING, check_rate, repetition_note, unit_notes
 from slam_backend.readers.range_bearing import even_times, frames_at, motions
 from slam_backend.readers.tables import MOST_JITTER, sorted_note, steps_back, time_order
 from slam_backend.trajectory import Trajectory
 
 ROBOTS = (1, 2, 3, 4, 5)  # subject numbers of the robots
+STEP = 0.25  # [s] between steps by default
 
 
 @short_repr
@@ -46,7 +49,7 @@ class MrclamLog:
         robots: One entry per requested robot, in that order.
         subjects: (N,) int64. Subject numbers of the landmarks with a barcode, ascending.
         positions: (N, 2) float64 [m]. True positions of the landmarks, world frame; None if unknown.
-        notes: Lines about files that were sorted by time, and about implausible times.
+        notes: Lines about files that were sorted by time, and about what is implausible.
     """
 
     robots: tuple[MrclamRobot, ...]
@@ -79,8 +82,9 @@ def load_mrclam(
 
     Raises:
         ValueError: If the folder or a file is missing, a line is malformed (the message names file and line), a time
-            lies more than `MOST_JITTER` back, all sightings are earlier than a robot's odometry, a robot is unknown,
-            `Landmark_Groundtruth.dat` lacks a landmark, or `truth` is given for several robots.
+            lies more than `MOST_JITTER` back, commands are usually more than `HOLD` apart, all sightings
+            are earlier than a robot's odometry, a robot is unknown, `Landmark_Groundtruth.dat` lacks a landmark, or
+            `truth` is given for several robots.
     """
     folder = checked_path(path)
     if not folder.is_dir():
@@ -93,12 +97,10 @@ def load_mrclam(
     if truth is not None and len(numbers) != 1:
         hint = "Name the robot whose poses these are with robots."
         raise argument_error("truth", "a file of one robot's poses", f"a log of robots {numbers}", hint)
-    if truth is not None and not Path(truth).is_file():
-        raise argument_error("truth", "a file of true poses", "no such file", f"Check {str(truth)!r}.")
-    truths = {numbers[0]: Path(truth)} if truth is not None else {}
+    truths = {} if truth is None else {numbers[0]: existing_file(truth, "truth", "a file of true poses")}
     sorted_files: list[str] = []
     logs = [_read_robot(folder, robot, subject_of, truths.get(robot), sorted_files) for robot in numbers]
-    notes = sorted_note(sorted_files) + tuple(note for log in logs for note in _overlap_notes(log))
+    notes = sorted_note(sorted_files) + tuple(f"Robot {log.robot}: {note}" for log in logs for note in _notes(log))
     if duration is not None:
         seconds = check_float("duration", duration, "Give seconds, or None for the whole log.", above=0.0)
         start = min(log.commands[0, 0] for log in logs)
@@ -109,16 +111,18 @@ def load_mrclam(
     return MrclamLog(tuple(logs), subjects, positions, notes)
 
 
-def _overlap_notes(log: MrclamRobot) -> Iterator[str]:
-    """Yield a line for each kind of reading whose times do not overlap a robot's odometry, perhaps by another clock."""
+def _notes(log: MrclamRobot) -> Iterator[str]:
+    """Yield a line for each kind of reading that does not overlap a robot's odometry in time, or is implausible."""
     first, last = log.commands[0, 0], log.commands[-1, 0]
     stamps = {"sightings": log.sightings[:, 0], "true poses": np.empty(0) if log.truth is None else log.truth.times}
     for name, times in stamps.items():
         if len(times) and (times[0] > last or times[-1] < first):
             yield (
-                f"Robot {log.robot}: no overlap of its {name} ({times[0]:.1f} to {times[-1]:.1f} s) with its odometry "
+                f"no overlap of its {name} ({times[0]:.1f} to {times[-1]:.1f} s) with its odometry "
                 f"({first:.1f} to {last:.1f} s): check that their times are of one clock."
             )
+    yield from repetition_note(log.sightings[:, 0], log.sightings[:, 1].astype(np.int64))
+    yield from unit_notes(log.commands, log.sightings[:, [0, 2, 3]], HOLD, STEP)
 
 
 def _read_positions(file: Path, subjects: IntArray) -> FloatArray | None:
@@ -155,6 +159,7 @@ def _read_robot(
     """Read the files of one robot, without sightings of robots, and append the remarks about sorting."""
     commands, words = _read_table(folder / f"Robot{robot}_Odometry.dat", ("time", "velocity", "angular_velocity"))
     sorted_files.append(words)
+    check_rate("path", commands[:, 0], HOLD, f"Give times in seconds in {folder / f'Robot{robot}_Odometry.dat'}.")
     columns = ("time", "barcode", "range", "bearing")
     rows, words = _read_table(folder / f"Robot{robot}_Measurement.dat", columns, empty=True)
     sorted_files.append(words)
@@ -193,26 +198,23 @@ def _read_table(file: Path, columns: tuple[str, ...], empty: bool = False) -> tu
             per column; if subjects or barcodes are not whole, ranges not positive, or times go back by more than
             `MOST_JITTER`.
     """
-    if not file.is_file():
-        raise argument_error("path", f"a folder with {file.name}", "no such file", f"Check {str(file)!r}.")
-    lines = file.read_text(encoding="utf-8", errors="replace").split("\n")
+    expected = f"{len(columns)} numbers ({' '.join(columns)})"
+    lines = list(data_lines(read_text(file, kind="a file of the MR.CLAM log")))
+    if lines and _names(lines[0][1]):
+        del lines[0]
     rows: list[list[float]] = []
-    numbers: list[int] = []
-    for number, line in enumerate(lines, start=1):
-        body = line.partition("#")[0]
-        if body.strip() and not (number == 1 and _names(body)):
-            row = _parse(body)
-            if row is None or len(row) != len(columns):
-                raise _bad_line(file, number, line, columns, "")
-            rows.append(row)
-            numbers.append(number)
+    for number, line in lines:
+        row = parse_numbers(line.split(",") if "," in line else line.split())
+        if row is None or len(row) != len(columns):
+            raise line_error("path", expected, line, file, number)
+        rows.append(row)
     if not rows and not empty:
         raise argument_error("path", f"rows ({' '.join(columns)})", "no rows", f"{file} is empty: get it again.")
     table = np.array(rows, dtype=np.float64).reshape(-1, len(columns))
     for rule, broken in _faults(table, columns):
         if broken.any():
-            number = numbers[int(np.argmax(broken))]
-            raise _bad_line(file, number, lines[number - 1], columns, f" with {rule}")
+            number, line = lines[int(np.argmax(broken))]
+            raise line_error("path", f"{expected} with {rule}", line, file, number)
     if columns[0] != "time":
         return table, ""
     order, words = time_order(file.name, table[:, 0])
@@ -227,29 +229,15 @@ def _faults(table: FloatArray, columns: tuple[str, ...]) -> Iterator[tuple[str, 
             yield f"a whole {name}", column != np.round(column)
         elif name == "range":
             yield "a range > 0", column <= 0.0
+        elif name == "bearing":
+            yield "a bearing within +-2 pi", np.abs(column) > MOST_BEARING
         elif name == "time":
             yield f"a time at most {MOST_JITTER:g} s before that of a line above", steps_back(column) > MOST_JITTER
 
 
 def _names(body: str) -> bool:
     """Return whether a line is a header: words separated by commas, none of them a number."""
-    return "," in body and all(_parse(word) is None for word in body.split(","))
-
-
-def _parse(body: str) -> list[float] | None:
-    """Return the numbers of a line, or None if a word is not a number."""
-    if "_" in body:  # Python accepts 1_000, which is damage in a log
-        return None
-    try:
-        return [float(word) for word in (body.split(",") if "," in body else body.split())]
-    except ValueError:
-        return None
-
-
-def _bad_line(file: Path, number: int, line: str, columns: tuple[str, ...], rule: str) -> ValueError:
-    """Return the error of a malformed line of a file."""
-    expected = f"{len(columns)} numbers ({' '.join(columns)}){rule}"
-    return argument_error("path", expected, repr(line.strip()), f"Correct line {number} of {file}.")
+    return "," in body and all(parse_numbers([word]) is None for word in body.split(","))
 
 
 @short_repr
@@ -343,7 +331,7 @@ class MrclamSteps:
 
 
 def to_filter_steps(
-    log: MrclamLog, dt: float = 0.25, noise: SightingNoise | None = None, drive: Drive | None = None
+    log: MrclamLog, dt: float = STEP, noise: SightingNoise | None = None, drive: Drive | None = None
 ) -> MrclamSteps:
     """Resample a log at common times, from its earliest command to its last reading.
 

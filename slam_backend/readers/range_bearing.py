@@ -13,9 +13,12 @@ from slam_backend.core.validation import FloatArray, IntArray, argument_error, c
 from slam_backend.geometry import between
 from slam_backend.models.measurements import Measurements
 from slam_backend.readers.conversions import HOLD, integrate_commands, points_from_polar
+from slam_backend.readers.plausibility import MOST_BEARING, check_precision, check_rate, repetition_note, unit_notes
 from slam_backend.readers.tables import MOST_JITTER, sorted_note, steps_back, time_order
 
 MAX_STEPS = 1_000_000
+ROUNDING = 1e-6  # share of a step by which its time may be rounded
+DT_HINT = "Give seconds between steps."
 
 
 @short_repr
@@ -24,13 +27,14 @@ class RangeBearingSteps:
     """One robot's log as steps at common times.
 
     Attributes:
-        times: (T,) float64 [s]. Evenly spaced times.
+        times: (T,) float64 [s]. Evenly spaced times, none after the last reading.
         odometry: (T, 3) float64 [m, m, rad]. Motion since the previous step, in the previous robot frame; the first is
             zero.
         measurements: T entries; None for a step without sightings. Points in the camera frame with covariances.
             Descriptors are one-hot by `names`, or all equal without identities.
         names: (N,) Identities in ascending order, the columns of the descriptors; empty without identities.
-        notes: Lines about rows that were sorted by time.
+        notes: Lines about rows that were sorted by time, about landmarks that a frame has twice, about gaps between
+            velocities, and about quantities whose unit is implausible.
     """
 
     times: FloatArray
@@ -69,16 +73,23 @@ def range_bearing_steps(
         hold: Longest effect of a velocity [s].
 
     Raises:
-        ValueError: If an array is empty or has a wrong shape, a number is not finite, a range is not positive, a time
-            lies more than `MOST_JITTER` back, no sighting lies between the first and the last velocity, a standard
-            deviation or `dt` is not positive, or there are more than a million steps.
+        ValueError: If an array is empty or has a wrong shape, a number is not finite, a range is not positive, a
+            bearing is more than a full turn, a time lies more than `MOST_JITTER` back, times are too coarse or
+            velocities usually further apart than `hold`, no sighting lies between the first and the last velocity, a
+            standard deviation or `dt` is not positive, or there are more than a million steps.
     """
     check_float("hold", hold, "Give seconds.", above=0.0)
+    check_float("dt", dt, DT_HINT, above=0.0)
     driven, _, driven_words = _table("velocities", velocities, "Give rows (time, velocity, angular velocity).")
     seen, order, seen_words = _table("sightings", sightings, "Give rows (time, range, bearing).")
     if (seen[:, 1] <= 0.0).any():
         least = float(seen[:, 1].min())
         raise argument_error("sightings", "ranges > 0 m", least, "Drop readings without an echo.")
+    if (largest := float(np.abs(seen[:, 2]).max())) > MOST_BEARING:
+        raise argument_error("sightings", "bearings within +-2 pi", largest, "Give radians.")
+    check_precision("velocities", velocities, driven[:, 0], dt)
+    check_precision("sightings", sightings, seen[:, 0], dt)
+    check_rate("velocities", driven[:, 0], hold, "Give times in seconds; set hold if velocities are logged rarely.")
     first, last = driven[0, 0], driven[-1, 0]
     if not ((seen[:, 0] >= first) & (seen[:, 0] <= last + hold)).any():
         among = f"times among those of the velocities, {first:.3f} to {last:.3f} s"
@@ -86,13 +97,16 @@ def range_bearing_steps(
         raise argument_error("sightings", among, got, "Give both in seconds of one clock.")
     names, column = _identities(identities, len(seen))
     column = column[order]
-    times = even_times(min(first, seen[0, 0]), max(last, seen[-1, 0]), dt)
+    end = max(last, seen[-1, 0])
+    times = even_times(min(first, seen[0, 0]), end, dt)
+    times = np.minimum(times[times <= end + ROUNDING * dt], end)
     sigmas = {"sigma_range": sigma_range, "sigma_bearing": sigma_bearing, "sigma_height": sigma_height}
     variances = np.stack([_variances(name, sigma, len(seen))[order] for name, sigma in sigmas.items()], axis=-1)
     if len(names):
         descriptors, labels = np.eye(len(names), dtype=np.float32)[column], column
     else:
         descriptors, labels = np.ones((len(seen), 1), dtype=np.float32), np.arange(len(seen))
+    repeated = repetition_note(seen[:, 0], names[column]) if len(names) else ()
 
     def pose_at(wanted: FloatArray) -> FloatArray:
         return integrate_commands(driven, wanted, hold)
@@ -102,7 +116,7 @@ def range_bearing_steps(
         motions(pose_at(times)),
         frames_at(times, pose_at, seen, variances, descriptors, labels),
         names,
-        sorted_note([driven_words, seen_words]),
+        (*sorted_note([driven_words, seen_words]), *repeated, *unit_notes(driven, seen, hold, dt)),
     )
 
 
@@ -115,7 +129,7 @@ def even_times(start: float, end: float, dt: float) -> FloatArray:
     >>> even_times(1.0, 1.8, 0.5).tolist()
     [1.0, 1.5, 2.0]
     """
-    dt = check_float("dt", dt, "Give seconds between steps.", above=0.0)
+    dt = check_float("dt", dt, DT_HINT, above=0.0)
     if (end - start) / dt > MAX_STEPS:
         hint = "Take longer steps, and give all times in seconds of one clock."
         raise argument_error("dt", f"at most {MAX_STEPS:,} steps", (end - start) / dt, hint)

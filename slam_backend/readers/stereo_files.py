@@ -6,11 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
+from slam_backend.core.image_files import read_grey_image
 from slam_backend.core.short_repr import short_repr
+from slam_backend.core.text_files import existing_file
 from slam_backend.core.validation import argument_error, check_float
 from slam_backend.readers.calibration import Rectified, Rectifier, load_euroc_calibration, load_kitti_calibration
 from slam_backend.readers.kitti import read_truth
-from slam_backend.readers.kitti_images import KittiImages, read_grey, read_times
+from slam_backend.readers.kitti_images import KittiImages, read_times
 
 LEAST_PAIRS = 2
 
@@ -87,14 +89,16 @@ def load_stereo_images(folder: str | Path, files: StereoFiles, duration: float |
     """
     left, right = find_pairs(folder, files)
     count = len(left)
-    times = read_times(None if files.times is None else _existing("times", Path(folder), files.times), count)
+    named = None if files.times is None else existing_file(Path(folder) / files.times, "times", "a file of times")
+    times = read_times(named, count)
     keep = count
     if duration is not None:
         end = times[0] + check_float("duration", duration, "Give seconds.", above=0.0)
         keep = max(LEAST_PAIRS, int(np.searchsorted(times, end, side="right")))
-    height, width = read_grey(left[0]).shape
+    height, width = read_grey_image(left[0]).shape
     rig = load_rig(folder, files.calibration, (width, height))
-    truth = None if files.truth is None else read_truth(_existing("truth", Path(folder), files.truth), times)
+    poses = truth_file(folder, files)
+    truth = None if poses is None else read_truth(poses, times)
     return KittiImages(times[:keep], left[:keep], right[:keep], rig.pair, width, height, truth, rig)
 
 
@@ -104,7 +108,8 @@ def truth_file(folder: str | Path, files: StereoFiles) -> Path | None:
     Raises:
         ValueError: If the named file does not exist.
     """
-    return None if files.truth is None else _existing("truth", Path(folder), files.truth)
+    named = files.truth
+    return None if named is None else existing_file(Path(folder) / named, "truth", "a file of true poses")
 
 
 def _images(folder: Path, option: str, names: str) -> tuple[Path, ...]:
@@ -117,11 +122,9 @@ def _images(folder: Path, option: str, names: str) -> tuple[Path, ...]:
         found = sorted((file for file in root.glob(pattern) if file.is_file()), key=_by_numbers)
     else:
         found = [folder / name for name in _words(names)]
-    if not found or not all(file.is_file() for file in found):
-        missing = next((str(file) for file in found if not file.is_file()), str(folder / names))
-        raise argument_error(
-            "path", "an image file", "no such file", f"Check {missing!r}, or name yours with --{option}."
-        )
+    missing = folder / names if not found else next((file for file in found if not file.is_file()), None)
+    if missing is not None:
+        raise argument_error("path", "an image file", missing, f"It does not exist: name yours with --{option}.")
     return tuple(found)
 
 
@@ -133,12 +136,3 @@ def _by_numbers(file: Path) -> list[tuple[int, str]]:
 def _words(names: str) -> list[str]:
     """Return the names separated by commas."""
     return [name.strip() for name in names.split(",") if name.strip()]
-
-
-def _existing(option: str, folder: Path, name: str) -> Path:
-    """Return the path of an existing file, or raise."""
-    place = folder / name
-    if not place.is_file():
-        what = {"times": "a file of the times of the frames", "truth": "a file of true poses"}[option]
-        raise argument_error(option, what, "no such file", f"Check {str(place)!r}.")
-    return place

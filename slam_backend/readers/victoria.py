@@ -17,7 +17,7 @@ from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import FloatArray, argument_error, check_float
 from slam_backend.geometry import between
 from slam_backend.models.measurements import Measurements
-from slam_backend.readers.conversions import integrate_commands, points_from_polar
+from slam_backend.readers.conversions import HOLD, integrate_commands, points_from_polar
 from slam_backend.readers.tables import MOST_JITTER, sorted_note, steps_back, time_order
 
 CONTROLS_FILE = "aa3_dr.mat"
@@ -62,7 +62,8 @@ def load_victoria(path: str | Path, duration: float | None = None) -> VictoriaLo
 
     Raises:
         ValueError: If the folder, a file or a variable is missing, a file cannot be read, numbers are not finite or
-            impossible, lengths disagree, or a time lies more than `MOST_JITTER` back; the message names the file.
+            impossible, lengths disagree, no scan lies among the controls, or a time lies more than
+            `MOST_JITTER` back; the message names the file.
     """
     folder = checked_path(path)
     if not folder.is_dir():
@@ -81,6 +82,9 @@ def load_victoria(path: str | Path, duration: float | None = None) -> VictoriaLo
         expected = f"a cell array zt with one cell for each of {len(times)} times"
         raise _bad(folder / TREES_FILE, expected, "a different one")
     scans = [_trees(folder / TREES_FILE, number, cell) for number, cell in enumerate(cells)]
+    if not ((times >= controls[0, 0]) & (times <= controls[-1, 0] + HOLD)).any():
+        expected = f"times TLsr in seconds among those of the controls, {controls[0, 0]:.1f} to {controls[-1, 0]:.1f} s"
+        raise _bad(folder / TREES_FILE, expected, f"a log of scans from {times[0]:.1f} to {times[-1]:.1f} s")
     order, trees_words = time_order(TREES_FILE, times)
     _, first = np.unique(times[order], return_index=True)
     times, scans = times[order[first]], [scans[number] for number in order[first]]

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from slam_backend.core.validation import (
     FloatArray,
     IntArray,
+    argument_error,
     check_array,
     check_choice,
     check_int,
@@ -40,14 +41,14 @@ class ReferenceFastSlam:
 
     Args:
         num_robots: K.
-        options: Options of the filter, as for `FastSlam`.
+        options: Options of the filter, as for `FastSlam`, without rejuvenation.
         seed: Seed of the random stream.
         initial_poses: (K, 3) [m, m, rad], map frame. None: all at the origin.
 
     Raises:
         ValueError: If an argument is out of its range; the text names it.
 
-    >>> slam = ReferenceFastSlam(1, FilterOptions(num_particles=7))
+    >>> slam = ReferenceFastSlam(1, FilterOptions(num_particles=7, rejuvenate_every=None))
     >>> slam.step([None], [Measurements([[0.0, 0.0, 2.0]], [[1.0, 0.0]])]).num_new
     1
     >>> slam.map().means.round(3).tolist()
@@ -63,6 +64,9 @@ class ReferenceFastSlam:
     ) -> None:
         k = check_int("num_robots", num_robots, 1, "Use at least one robot.", MAX_ROBOTS)
         check_kind("options", options, FilterOptions)
+        if options.rejuvenate_every is not None:
+            hint = "The reference has no smoother; build FilterOptions(rejuvenate_every=None)."
+            raise argument_error("options.rejuvenate_every", "None", options.rejuvenate_every, hint)
         given = np.zeros((k, 3)) if initial_poses is None else initial_poses
         starts = check_array("initial_poses", given, (k, 3), "Give one pose (x, y, theta) per robot.")
         poses = [wrapped(start) for start in starts]

@@ -1,5 +1,6 @@
 """Filters whose exact answer is known, filters that have resampled, and what a filter holds."""
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,7 @@ NAMES_B = np.array([7, 4, 3, 2, 8, 1, 0])  # 0 to 4 are common to both
 PAIRS = np.array([[0, 6], [1, 5], [2, 3], [3, 2], [4, 1]])  # seen from the start, an id is a place in the frame
 MOVE = np.array([1.0, 0.2, 0.15])
 WIDE_MOTION = OdometryModel(sigma_along=0.05, sigma_across=0.02, sigma_heading=0.05, sigma_turn=0.02)
+plain_filter = partial(FastSlam, rejuvenate_every=None)  # without a smoother, as in the paper
 
 
 def looks(names: IntArray) -> NDArray[np.float32]:
@@ -61,7 +63,7 @@ def map_once(
             landmarks after each; 0: it sees them all from its start.
         claimed_sigma: Noise that the filter assumes; None: the true one.
     """
-    slam = FastSlam(1, num_particles, motion=WIDE_MOTION, proposal="fastslam1", seed=rng)
+    slam = plain_filter(1, num_particles, motion=WIDE_MOTION, proposal="fastslam1", seed=rng)
     pose = start
     shares = max(moves, 1)
     for share in range(shares):
@@ -101,7 +103,7 @@ def known_alignment(sigma: float = 0.01, offset: tuple[float, float, float] = (0
 def filter_after_some_steps(num_particles: int, seed: int) -> tuple[FastSlam, np.ndarray, np.ndarray]:
     """Return a filter that has resampled at twelve steps, and points (14, 3) and looks (14, 14) of its world."""
     rng = np.random.default_rng(seed)
-    slam = FastSlam(num_particles=num_particles, seed=seed, resample_threshold=1.0)
+    slam = plain_filter(num_particles=num_particles, seed=seed, resample_threshold=1.0)
     points = np.column_stack([rng.uniform(-2.0, 2.0, 14), rng.uniform(-1.0, 1.0, 14), rng.uniform(2.0, 6.0, 14)])
     looks = np.linalg.qr(rng.standard_normal((14, 14)))[0].astype(np.float32)
     for step in range(12):

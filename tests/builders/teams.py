@@ -91,8 +91,14 @@ class SimulatedTeam:
         return Measurements(TRUE_CAMERA.triangulate(pixels), looks / np.linalg.norm(looks, axis=1, keepdims=True))
 
     def build(self, **options: object) -> TeamSlam:
-        """Return a team that assumes the noise of this simulation, with few particles."""
-        settings = {"seed": self.seed, "num_particles": 30, "camera": ASSUMED_CAMERA, "motion": MOTION} | options
+        """Return a team that assumes the noise of this simulation, with few particles, not rejuvenated."""
+        settings = {
+            "seed": self.seed,
+            "num_particles": 30,
+            "camera": ASSUMED_CAMERA,
+            "motion": MOTION,
+            "rejuvenate_every": None,
+        } | options
         return TeamSlam(self.num_robots, **settings)  # type: ignore[arg-type]
 
     def run(self, team: TeamSlam, steps: int, contacts: object = None) -> list[TeamReport]:
@@ -179,7 +185,7 @@ SIGMA = 1e-4
 def standing_team(num_robots: int = 3, seed: int = 0) -> TeamSlam:
     """Robots at `STARTS` that have seen the common landmarks, and one more each, from where they stand."""
     rng = np.random.default_rng(seed)
-    team = TeamSlam(num_robots, seed=seed, num_particles=7)
+    team = TeamSlam(num_robots, seed=seed, num_particles=7, rejuvenate_every=None)
     names = [np.append(COMMON, 5 + robot) for robot in range(num_robots)]
     frames = []
     for robot, seen in enumerate(names):

@@ -273,10 +273,12 @@ CALLS: dict[str, list[Callable[[], Any]]] = {
     ],
     "world: expected a file": [partial(ExplorationEnv, EnvConfig(world="nowhere.json"))],
     "config: expected an EnvConfig": [partial(small_env, config=7)],
-    "config: expected a readable TOML file": [
-        partial(small_env, config="nowhere.toml"), *(partial(EnvConfig.from_toml, bad) for bad in ("a\0.toml", None)),
+    "config: expected a TOML file": [partial(small_env, config="nowhere.toml")],
+    "config: expected the path of a TOML file": [
+        partial(EnvConfig.from_toml, "a\0.toml"), partial(EnvConfig.from_toml, None),
     ],
-    "config: expected TOML": [partial(EnvConfig.from_toml_text, bad) for bad in ("[x", 3)],
+    "config: expected TOML as text": [partial(EnvConfig.from_toml_text, 3)],
+    "config: expected a file in TOML, got a syntax error": [partial(EnvConfig.from_toml_text, "[x")],
     "max_cycles: expected an int >= 1": [
         partial(lambda bad: setattr(small_env(), "max_cycles", bad), bad) for bad in ("x", None)
     ],

@@ -11,11 +11,12 @@ from vslam_env.presets import PRESETS
 @pytest.mark.parametrize("name", PRESETS)
 @pytest.mark.parametrize("sensor", ["landmark", "stereo"])
 def test_toml_round_trip(name: str, sensor: str, tmp_path: Path) -> None:
-    """A configuration survives the way through a TOML file unchanged."""
+    """A configuration survives the way through a TOML file unchanged, also one that Windows has saved."""
     config = preset_config(name, sensor).replace(num_robots=2, decision_ticks=3, reward={"coverage": 0.5})
     path = tmp_path / "config.toml"
-    path.write_text(config.to_toml(), encoding="utf-8")
-    assert EnvConfig.from_toml(path) == config
+    for encoding, end in (("utf-8", "\n"), ("utf-8-sig", "\r\n"), ("utf-16", "\r\n")):
+        path.write_text(config.to_toml(), encoding=encoding, newline=end)
+        assert EnvConfig.from_toml(path) == config
 
 
 def test_presets_are_ordered() -> None:

@@ -50,6 +50,7 @@ def is_plan_run(call: Call[ExplorationBenchConfig]) -> bool:
 
 def run_plan(call: Call[ExplorationBenchConfig], name: str | None, workers: int, cluster: str | None) -> None:
     """Play the episodes of a plan that the run folder does not contain yet, and write its tables."""
+    from slam_backend.core.text_files import read_text
     from training.bench.exploration.plan import PLAN_COPY, PlanBench, PlanTrial
     from training.bench.exploration.plan_report import aggregate, draw_plan, episodes_csv, markdown, write_parquet
     from training.bench.exploration.players import parted
@@ -70,7 +71,7 @@ def run_plan(call: Call[ExplorationBenchConfig], name: str | None, workers: int,
         config=config,
     )
     if (file := Path(config.plan)).is_file():
-        folder.write_text(PLAN_COPY, file.read_text(encoding="utf-8"))
+        folder.write_text(PLAN_COPY, read_text(file, "plan", "a TOML file"))
     if missing := plan.missing_floor_plans():
         text = f"Floor plans are left out: VSLAM_DATA does not contain {len(missing)} of {len(plan.floor_plans)}."
         console.print(text, soft_wrap=True)

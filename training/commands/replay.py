@@ -72,6 +72,8 @@ def replay_mrclam(call: Call[MrclamConfig]) -> None:
     scores = plain(summarise(result, log, paths))
     _print_tables(console, scores, {own.robot for own in log.robots if own.truth is not None})
     print_consistency(console, scores["consistency"])
+    for note in scores["notes"][len(log.notes) :]:
+        console.print(note, soft_wrap=True)
     if counts := _rejuvenations(scores["rejuvenations"]):
         console.print(counts)
     speed = float(result.times[-1] - result.times[0]) / result.seconds

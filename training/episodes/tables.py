@@ -29,7 +29,6 @@ MISSED = {
     "paths": "The uncertainty of the paths left the transform between the starts uncertain beyond the bound.",
     "repeat": "Two consecutive attempts gave transforms that differ by more than the bound.",
 }
-CAUTIOUS = 1.0  # mean NIS below which covariances are at least twice too large, even in the plane
 UPPER = ("xx", "xy", "xz", "yy", "yz", "zz")
 MAP_COLUMNS = ("id", "count", "x_m", "y_m", "z_m", *(f"cov_{pair}_m2" for pair in UPPER))
 
@@ -164,7 +163,7 @@ def print_consistency(console: Console, rows: Sequence[Mapping[str, Any]]) -> No
     """Print the result of `consistency_rows`, with NaN as None, and each warning once."""
     cells = []
     for row in rows:
-        cells.append([str(row["robot"]), *figures(row, CONSISTENCY), _verdict(row)])
+        cells.append([str(row["robot"]), *figures(row, CONSISTENCY), row["verdict"]])
     title = "Consistency: errors relative to the estimated covariances"
     console.print(console_table(title, ("robot", *map(heading, CONSISTENCY), "verdict"), cells))
     console.print(NIS_NOTE)
@@ -174,14 +173,6 @@ def print_consistency(console: Console, rows: Sequence[Mapping[str, Any]]) -> No
             texts.setdefault(warning["text"], []).append(str(row["robot"]))
     for text, robots in texts.items():
         console.print(f"Warning, robot {', '.join(robots)}: {text}")
-
-
-def _verdict(row: Mapping[str, Any]) -> str:
-    """Return the verdict of a row, in one or two words."""
-    if row["warnings"]:
-        return "inconsistent"
-    is_cautious = row["nis_mean"] is not None and row["nis_mean"] < CAUTIOUS
-    return "cautious" if is_cautious else "consistent"
 
 
 def write_maps(folder: "RunFolder", maps: "Mapping[str, LandmarkMap]") -> str:

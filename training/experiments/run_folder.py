@@ -4,7 +4,6 @@ import json
 import math
 import platform
 import tempfile
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
@@ -15,6 +14,7 @@ import numpy as np
 import tomli_w
 
 from slam_backend.core.files import write_file
+from slam_backend.core.text_files import read_toml
 from slam_backend.core.validation import argument_error, check_int
 from slam_backend.trajectory import Trajectory
 
@@ -81,10 +81,7 @@ def read_config(path: Path, command: str, option: str = "config") -> tuple[dict[
     expected = f"the {CONFIG_FILE} of an earlier run"
     if not file.is_file():
         raise argument_error(option, expected, "no such file", f"Check {str(file)!r}.")
-    try:
-        content = tomllib.loads(file.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise argument_error(option, expected, "a broken file", f"Correct {str(file)!r}. Error: {error}.") from error
+    content = read_toml(file, option)
     if (found := content.get("format", FORMAT)) != FORMAT or type(found) is not int:
         hint = f"Use the release that wrote {str(file)!r}."
         raise argument_error(option, f"one of format {FORMAT}", f"a run folder of format {found!r}", hint)
@@ -99,7 +96,7 @@ def read_config(path: Path, command: str, option: str = "config") -> tuple[dict[
 def read_versions(path: Path) -> dict[str, str]:
     """Read the versions of Python and packages of an earlier run, whose configuration `read_config` accepts."""
     file = path / CONFIG_FILE if path.is_dir() else path
-    return dict(tomllib.loads(file.read_text(encoding="utf-8")).get("versions", {}))
+    return dict(read_toml(file, "config").get("versions", {}))
 
 
 def plain(value: Any) -> Any:

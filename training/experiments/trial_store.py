@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from slam_backend.core.files import append_text
+from slam_backend.core.text_files import read_text
 from slam_backend.core.validation import argument_error
 from training.experiments.cluster import SINGLE_THREAD, connected
 from training.experiments.interrupt import begin_worker, signals_held
@@ -53,7 +54,7 @@ def finished_trials(folder: RunFolder, name: str, kind: type[TrialT]) -> dict[Tr
     if not file.is_file():
         return {}
     rows = []
-    for line in file.read_text(encoding="utf-8").splitlines():
+    for line in read_text(file, "out", "a file of trials").splitlines():
         try:
             rows.append(json.loads(line))
         except json.JSONDecodeError:

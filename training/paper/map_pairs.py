@@ -59,7 +59,9 @@ def map_alone(run: StereoRun, particles: int, seed: int, every: float) -> Iterat
     noise = run.spec.noise
     streams = np.random.SeedSequence(seed).spawn(ROBOTS)
     filters = [
-        FastSlam(1, num_particles=particles, camera=noise.camera, motion=noise.motion, seed=stream)
+        FastSlam(
+            1, num_particles=particles, camera=noise.camera, motion=noise.motion, rejuvenate_every=None, seed=stream
+        )
         for stream in streams
     ]
     behind: list[dict[int, int]] = [{} for _ in range(ROBOTS)]

@@ -15,6 +15,7 @@ from slam_backend.trajectory import Trajectory
 from training.episodes.metrics import merge_row
 from training.episodes.tables import consistency_rows, pair_rows
 from training.replay.mrclam import Replay
+from training.replay.truth_check import wrong_landmark_notes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,14 +70,30 @@ def align_to_truth(landmarks: LandmarkMap, claims: IntArray, log: MrclamLog) -> 
     """
     if log.positions is None:
         return None
-    by_count = np.argsort(-landmarks.counts, kind="stable")
-    barcodes, first = np.unique(claims[by_count], return_index=True)
+    barcodes, most_seen = _most_seen(landmarks, claims)
     if len(barcodes) < 2:
         return None
-    most_seen = by_count[first]
     fit = align_se2(log.positions[barcodes], landmarks.means[most_seen, :2])
     moved = landmarks.moved(fit)
     return AlignedMap(fit, moved, claims, map_rmse(_flat(moved.means), _flat(log.positions), claims))
+
+
+def _most_seen(landmarks: LandmarkMap, claims: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the true landmarks (n,) that a map claims, ascending, and the index of the most-seen landmark of each."""
+    by_count = np.argsort(-landmarks.counts, kind="stable")
+    barcodes, first = np.unique(claims[by_count], return_index=True)
+    return barcodes, by_count[first]
+
+
+def truth_notes(replay: Replay, log: MrclamLog) -> tuple[str, ...]:
+    """Return lines about true landmarks that contradict all others, in most of the groups' maps."""
+    if log.positions is None:
+        return ()
+    maps = []
+    for own, claims in ((replay.maps[group[0]], replay.claims[group[0]]) for group in replay.groups):
+        barcodes, rows = _most_seen(own, claims)
+        maps.append(dict(zip(barcodes.tolist(), own.means[rows], strict=True)))
+    return tuple(wrong_landmark_notes(log.positions, maps, log.subjects.tolist()))
 
 
 def motion_error(
@@ -136,7 +153,7 @@ def summarise(replay: Replay, log: MrclamLog, paths: Sequence[PathScore | None])
         "robots": robots, "merges": merges, "groups": named, "coverage": nan,
         "attempts": replay.attempts, "refusals": pair_rows(replay.pairs, replay.groups, numbers),
         "rejuvenations": replay.rejuvenations, "duration_s": duration,
-        "notes": log.notes,
+        "notes": (*log.notes, *truth_notes(replay, log)),
         "consistency": consistency_rows(numbers, replay.consistency),
     }  # fmt: skip
 

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from slam_backend.core.image_files import read_grey_image
+from slam_backend.core.text_files import data_lines, line_error, parse_numbers, read_text
 from slam_backend.core.validation import FloatArray, argument_error
 from slam_backend.frontend import DESCRIPTOR_TYPES, CornerOptions, FrontEndOptions, StereoFrame, StereoFrontEnd
 from slam_backend.frontend.images import Image
@@ -16,7 +18,6 @@ from slam_backend.geometry3d import rotation_angle
 from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.models.camera import ROBOT_FROM_CAMERA, StereoCamera
 from slam_backend.readers.calibration import Rectified, Rectifier
-from slam_backend.readers.kitti_images import read_grey
 from slam_backend.readers.stereo_files import StereoFiles, find_pairs, load_rig, truth_file
 from training.replay.config import PairsConfig
 
@@ -67,7 +68,7 @@ def load_pairs(path: str | Path, files: StereoFiles = FILES) -> RoomPairs:
     if len(left) != PAIRS:
         got = f"a folder with {len(left)}"
         raise argument_error("path", "two stereo pairs", got, "Replay a drive with `vslam replay stereo`.")
-    images = [(read_grey(one), read_grey(other)) for one, other in zip(left, right, strict=True)]
+    images = [(read_grey_image(one), read_grey_image(other)) for one, other in zip(left, right, strict=True)]
     height, width = images[0][0].shape
     file, usual = truth_file(path, files), Path(path) / POSES_FILE
     file = usual if file is None and usual.is_file() else file
@@ -129,16 +130,12 @@ def summarise_pairs(results: Mapping[str, PairsResult]) -> dict[str, Any]:
 
 def _read_poses(file: Path) -> tuple[FloatArray, FloatArray]:
     """Read two poses: image, quaternion w x y z, position x y z; or a 3 x 4 matrix, optionally after a time."""
-    rows = [line.split() for line in file.read_text("utf-8").splitlines() if line and not line.startswith("#")]
-    try:
-        values = np.array(rows, dtype=np.float64)
-    except ValueError:
-        values = np.empty(0)
-    if values.shape not in ((2, 8), (2, 12), (2, 13)) or not np.isfinite(values).all():
-        expected = f"{file.name} with two rows of 8 or 12 numbers"
-        raise argument_error("path", expected, "a different one", f"Correct {str(file)!r}.")
     poses = []
-    for row in values:
+    for number, line in data_lines(read_text(file, kind="a file of two poses")):
+        values = parse_numbers(line.split())
+        if values is None or len(values) not in (8, 12, 13) or not np.isfinite(values).all():
+            raise line_error("path", "8 or 12 finite numbers", line, file, number)
+        row = np.array(values)
         pose = np.eye(4)
         if len(row) > 8:
             pose[:3] = row[-12:].reshape(3, 4)
@@ -147,4 +144,6 @@ def _read_poses(file: Path) -> tuple[FloatArray, FloatArray]:
         pose[:3, :3] = Rotation.from_quat(row[[2, 3, 4, 1]]).as_matrix()
         pose[:3, 3] = row[5:]
         poses.append(pose)
+    if len(poses) != PAIRS:
+        raise argument_error("path", f"{file.name} with two poses", f"a file of {len(poses)}", f"Check {str(file)!r}.")
     return poses[0], poses[1]

@@ -2,9 +2,8 @@
 
 import base64
 import csv
-import json
+import io
 import math
-import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from slam_backend.core.text_files import read_json, read_text, read_toml
 from slam_backend.core.validation import FloatArray, argument_error
 from training.experiments.labels import parted_label
 from training.experiments.run_folder import CONFIG_FILE, METRICS_FILE
@@ -62,17 +62,12 @@ def read_folder(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     Raises:
         ValueError: If the folder is not a run folder, or a file is damaged.
     """
-    file = folder / CONFIG_FILE
+    file, metrics_file = folder / CONFIG_FILE, folder / METRICS_FILE
     if not file.is_file():
         hint = f"Check {str(folder)!r}."
         raise argument_error("folder", "the folder of a run, with config.toml", "no such folder", hint)
-    try:
-        config = tomllib.loads(file.read_text(encoding="utf-8"))
-        metrics_file = folder / METRICS_FILE
-        metrics = json.loads(metrics_file.read_text(encoding="utf-8")) if metrics_file.is_file() else {}
-    except (tomllib.TOMLDecodeError, json.JSONDecodeError, UnicodeDecodeError) as error:
-        hint = f"Correct or remove the file in {str(folder)!r}. Error: {error}."
-        raise argument_error("folder", "the folder of a run", "a broken file", hint) from error
+    config = read_toml(file, "folder")
+    metrics = read_json(metrics_file, "folder", "Or remove it.") if metrics_file.is_file() else {}
     return config, metrics if isinstance(metrics, dict) else {}
 
 
@@ -112,7 +107,7 @@ def _begin(folder: Path, command: str) -> Content:
     return Content(
         title=f"vslam {command}: {folder.resolve().name}",
         command=f"vslam {command} --config {folder / CONFIG_FILE}",
-        config=(folder / CONFIG_FILE).read_text(encoding="utf-8"),
+        config=read_text(folder / CONFIG_FILE, "folder"),
     )
 
 
@@ -242,7 +237,7 @@ def read_curves(file: Path) -> list[dict[str, str]]:
     """Return the rows of a CSV file of curves over `time_s`; none if it is missing or has other content."""
     if not file.is_file():
         return []
-    rows = list(csv.DictReader(file.read_text(encoding="utf-8").splitlines()))
+    rows = list(csv.DictReader(io.StringIO(read_text(file, "folder", "a CSV file"))))
     return rows if rows and "time_s" in rows[0] else []
 
 

@@ -31,8 +31,7 @@ def default_filter_options() -> FilterOptions:
     (docs/lab/accuracy.md). The odometry is that of wheels: it hardly slips sideways, and its error of the turn grows
     with the distance, not with the turn; the prior of its biases is the true one. Position errors and maps are better
     with these values than with the defaults of `OdometryModel`, and the median NEES of poses is nearer to the ideal
-    (docs/explanation/accuracy_limits.md). Rejuvenation every 50 ticks gives 0.94 times the pose errors of every 100;
-    for its effect and cost see docs/explanation/smoothing.md.
+    (docs/explanation/accuracy_limits.md).
     """
     true = StereoCamera()
     return FilterOptions(
@@ -41,7 +40,6 @@ def default_filter_options() -> FilterOptions:
             bias_scale=0.02, bias_heading=math.radians(0.5),
         ),
         camera=StereoCamera(sigma_px=1.5 * true.sigma_px, sigma_disparity_px=1.5 * true.sigma_disparity_px),
-        rejuvenate_every=50,
         smoothing=SmoothingOptions(max_keys=180, further_keys=0, slice_steps=90, rigid_within=0.007),
     )  # fmt: skip
 

@@ -1,6 +1,6 @@
 """A filter that claims too much is warned of, an honest one hardly ever is, and the test is part of the state."""
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -8,7 +8,16 @@ import pytest
 from builders.teams import MOTION, NEVER, SimulatedTeam, links, merged_team
 
 from slam_backend.core.validation import FloatArray
-from slam_backend.fastslam.consistency import FALSE_ALARM_RATE, LOW_ESS, NIS_BOUNDS, USUAL, ConsistencyTest
+from slam_backend.fastslam.consistency import (
+    FALSE_ALARM_RATE,
+    LOW_ESS,
+    NIS_BOUNDS,
+    USUAL,
+    VERDICTS,
+    Consistency,
+    ConsistencyTest,
+    ConsistencyWarning,
+)
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.models.odometry import OdometryModel
 
@@ -84,6 +93,21 @@ def test_an_underconfident_filter_gives_no_warning() -> None:
     told = life(0, assumed=2.0).consistency
     assert told.nis_mean < 3.0
     assert told.warnings == ()
+
+
+@pytest.mark.parametrize(
+    ("nis_mean", "verdict"),
+    [
+        (4.1, "over-confident"), (3.001, "over-confident"), (3.0, "consistent"), (1.0, "consistent"),
+        (0.999, "cautious"), (float("nan"), "unknown"),
+    ],
+)  # fmt: skip
+def test_a_verdict_follows_the_mean_nis_and_warnings(nis_mean: float, verdict: str) -> None:
+    """Without warnings the mean decides; a warning makes any filter inconsistent."""
+    told = Consistency(100, nis_mean, 0.0, 0.0, 0.0, ())
+    assert told.verdict == told.to_mapping()["verdict"] == verdict
+    assert verdict in VERDICTS
+    assert replace(told, warnings=(ConsistencyWarning("ess", 3, 0.5),)).verdict == "inconsistent"
 
 
 def test_the_consistency_test_continues_from_a_state() -> None:

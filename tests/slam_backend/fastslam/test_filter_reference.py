@@ -129,7 +129,8 @@ def assert_same(slam: FastSlam, plain: ReferenceFastSlam) -> None:
 
 
 def both(num_robots: int, seed: int, starts: Any = None, **choices: Any) -> tuple[FastSlam, WatchedPlainFastSlam]:
-    """Build the two filters."""
+    """Build the two filters, not rejuvenated."""
+    choices = {"rejuvenate_every": None} | choices
     slam = FastSlam(num_robots, seed=seed, initial_poses=starts, **choices)
     return slam, WatchedPlainFastSlam(num_robots, FilterOptions(**choices), seed, starts)
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from builders.comparison import assert_same
-from builders.filters import arrays_of, contents, dense, load_landmarks, map_of
+from builders.filters import arrays_of, contents, dense, load_landmarks, map_of, plain_filter
 from builders.worlds import StereoWorld
 
 from slam_backend.core.validation import IntArray
@@ -36,7 +36,7 @@ def inputs(steps: int, seed: int = 0, noise: float = 1.0) -> list[tuple[Any, Any
 
 def filter_after(steps: int, num_particles: int = 11, **changes: Any) -> FastSlam:
     """Return a filter that has lived through some steps."""
-    slam = FastSlam(num_particles=num_particles, seed=3, camera=CAMERA, **changes)
+    slam = plain_filter(num_particles=num_particles, seed=3, camera=CAMERA, **changes)
     for odometry, frames in inputs(steps):
         slam.step(odometry, frames)
     return slam
@@ -44,7 +44,7 @@ def filter_after(steps: int, num_particles: int = 11, **changes: Any) -> FastSla
 
 def without_resampling(state: dict[str, Any]) -> FastSlam:
     """Return a filter that goes on from a snapshot but never resamples."""
-    slam = FastSlam()
+    slam = plain_filter()
     slam.set_state(state | {"options": replace(state["options"], resample_threshold=0.0)})
     return slam
 
@@ -78,7 +78,7 @@ def test_a_resampled_particle_copies_all_of_its_parent(scheme: str) -> None:
 
     Robot 1 sees nothing: its Gaussians are not sampled, and go along too.
     """
-    slam = FastSlam(2, 70, CAMERA, resampling=scheme, resample_threshold=1.0)
+    slam = plain_filter(2, 70, CAMERA, resampling=scheme, resample_threshold=1.0)
     slam.state.starts[1, :2, :70] += np.random.default_rng(1).normal(size=(2, 70))  # as after a merge
     copies = 0
     for odometry, frames in inputs(12, seed=2):
@@ -103,7 +103,7 @@ def test_a_resampled_particle_copies_all_of_its_parent(scheme: str) -> None:
 def test_landmarks_out_of_view_follow_every_resampling(proposal: Any, scheme: str) -> None:
     """A filter whose maps are read after each resampling, and one left alone over many, hold the same in the end."""
     options: Any = {"proposal": proposal, "resampling": scheme, "resample_threshold": 1.0}
-    read, alone = (FastSlam(1, 70, CAMERA, **options) for _ in range(2))
+    read, alone = (plain_filter(1, 70, CAMERA, **options) for _ in range(2))
     unseen = 0
     for odometry, frames in inputs(16, noise=2.0):
         for slam in (read, alone):
@@ -223,7 +223,7 @@ def test_a_restored_filter_continues_bit_for_bit(proposal: Any, scheme: str) -> 
     later = inputs(12)[5:]
     reports = [slam.step(odometry, frames) for odometry, frames in later]
     expected, expected_state = contents(slam), slam.get_state()
-    for snapshot, restored in ((state, slam), (pickle.loads(pickled), FastSlam(3, 2))):
+    for snapshot, restored in ((state, slam), (pickle.loads(pickled), plain_filter(3, 2))):
         restored.set_state(snapshot)
         assert_same([restored.step(odometry, frames) for odometry, frames in later], reports)
         assert_same(contents(restored), expected)
@@ -243,15 +243,15 @@ def test_a_filter_continues_bit_for_bit_through_many_snapshots(proposal: Any) ->
         "new_landmark_radius": 0.0,
         "resample_threshold": 0.9,
     }
-    slam, looks = FastSlam(2, 70, CAMERA, seed=3, **options), StereoWorld(np.random.default_rng(1)).descriptors
-    restored = FastSlam()
+    slam, looks = plain_filter(2, 70, CAMERA, seed=3, **options), StereoWorld(np.random.default_rng(1)).descriptors
+    restored = plain_filter()
     restored.set_state(slam.get_state())
     for step, (odometry, frames) in enumerate(inputs(40, seed=1, noise=3.0)):
         names = None if step % 3 else [(frames[0].descriptors @ looks.T).argmax(axis=1), None]
         arguments = ([*odometry, MOVE], [*frames, frames[0] if step % 4 == 0 else None], names)
         assert_same(restored.step(*arguments), slam.step(*arguments))
         state = restored.get_state()
-        restored = FastSlam(1 + step % 2, 70)
+        restored = plain_filter(1 + step % 2, 70)
         restored.set_state(state)
         if step % 2:
             restored.map("mixture")
@@ -274,7 +274,7 @@ def arrays_in(nest: Any) -> list[Any]:
 @PROPOSALS
 def test_a_snapshot_shares_no_writable_array(proposal: Any) -> None:
     """Neither steps of the filter or of one restored from it, nor writing to what they hand out, reach a snapshot."""
-    slam, other = filter_after(5, proposal=proposal), FastSlam()
+    slam, other = filter_after(5, proposal=proposal), plain_filter()
     state = slam.get_state()
     kept = copy.deepcopy(state)
     other.set_state(state)
@@ -291,11 +291,11 @@ def test_a_snapshot_shares_no_writable_array(proposal: Any) -> None:
 def test_a_restored_filter_draws_from_a_stream_of_its_own(stream: Any) -> None:
     """Restoring neither rewinds the generator that was given as a seed, nor lets draws of others disturb the filter."""
     rng = np.random.Generator(stream(7))
-    slam = FastSlam(seed=rng)
+    slam = plain_filter(seed=rng)
     state = slam.get_state()
     slam.step([MOVE], [None])
     expected, drawn = contents(slam), copy.deepcopy(rng.bit_generator.state)
-    for restored in (slam, FastSlam()):
+    for restored in (slam, plain_filter()):
         restored.set_state(state)
         assert_same(rng.bit_generator.state, drawn)
         rng.random()

@@ -119,7 +119,7 @@ def test_a_false_merge_of_landmarks_with_ids_is_undone_with_all_ids_unique() -> 
 
 def filter_of(kind: Any, proposal: Any) -> Any:
     """Return a filter of three particles, compiled or plain."""
-    options = FilterOptions(num_particles=3, proposal=proposal)
+    options = FilterOptions(num_particles=3, proposal=proposal, rejuvenate_every=None)
     return kind.from_options(1, options, 0) if kind is FastSlam else kind(1, options, 0)
 
 

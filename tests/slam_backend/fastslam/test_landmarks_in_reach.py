@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from builders.filters import plain_filter
 
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.fastslam._kernels.association.candidates import LARGE_MAP
@@ -42,7 +43,7 @@ def filter_with(
         options: See `FastSlam`.
     """
     rng = np.random.default_rng(seed)
-    slam = FastSlam(seed=5, **({"motion": MOTION, "num_particles": 60} | options))
+    slam = plain_filter(seed=5, **({"motion": MOTION, "num_particles": 60} | options))
     state, num, m = slam.state, len(points) + others, slam.num_particles
     values = np.zeros((num, 9, m))
     values[: len(points), :3] = points[:, :, None] + 0.05 * rng.standard_normal((len(points), 3, m))
@@ -170,7 +171,7 @@ def test_a_snapshot_of_a_large_map_goes_on_in_the_same_way() -> None:
     slam = filter_with(points, kinds, OTHERS, 3, 0.1, 0.5)
     slam.state.maps.release(np.arange(1000, 1100))
     drive(slam, points, kinds, 1, None)
-    other = FastSlam(num_particles=60, motion=MOTION, seed=9)
+    other = plain_filter(num_particles=60, motion=MOTION, seed=9)
     other.set_state(slam.get_state())
     assert drive(slam, points, kinds, 2, None) == drive(other, points, kinds, 2, None)
     a, b = slam.state.maps, other.state.maps

@@ -118,6 +118,18 @@ def test_interpolation_takes_the_shorter_arc() -> None:
     np.testing.assert_allclose(path.at(0.75)[2], np.deg2rad(-175.0))
 
 
+def test_the_ends_of_a_trajectory_hold_for_one_interval() -> None:
+    """An end applies beyond it for one usual interval, at most a quarter of a second; later times are refused."""
+    for times, reach in (([0.0, 0.1, 0.2], 0.1), ([0.0, 2.0, 4.0], 0.25), ([3.0], 0.0)):
+        path = Trajectory(times, [[time, 1.0, 0.5] for time in times])
+        begin, end = times[0], times[-1]
+        outside = path.at([begin - 0.99 * reach, end + 0.99 * reach])
+        np.testing.assert_allclose(outside, [[begin, 1.0, 0.5], [end, 1.0, 0.5]])
+        for wrong in (begin - reach - 0.01, end + reach + 0.01, np.nan):
+            with pytest.raises(ValueError, match="times: expected times from"):
+                path.at(wrong)
+
+
 def test_interpolation_passes_through_its_poses() -> None:
     """At a recorded time the recorded pose comes back, whatever the shape of the question."""
     times, poses = np.array([1.0, 1.5, 4.0, 4.1]), np.arange(12.0).reshape(4, 3) / 4.0

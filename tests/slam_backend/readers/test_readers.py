@@ -22,7 +22,7 @@ from slam_backend.readers.victoria import (
     load_victoria,
     to_filter_steps,
 )
-from slam_backend.trajectory import dead_reckoning
+from slam_backend.trajectory import Trajectory, dead_reckoning
 
 
 def test_files_become_arrays_in_seconds_metres_and_radians(tmp_path: Path) -> None:
@@ -117,7 +117,7 @@ def test_exact_readings_give_exact_landmarks() -> None:
     names = ["right", "left", "left", "right"]
     seen = [_sighting(time, stand[name]) for time, name in zip((10.1, 10.7, 11.3, 12.2), names, strict=True)]
     steps = range_bearing_steps(DRIVEN, seen, names, **SIGMAS, dt=0.5)
-    assert steps.times.tolist() == [10.0, 10.5, 11.0, 11.5, 12.0, 12.5]
+    assert steps.times.tolist() == [10.0, 10.5, 11.0, 11.5, 12.0]
     assert steps.names.tolist() == ["left", "right"]
     np.testing.assert_allclose(
         dead_reckoning(np.zeros(3), steps.odometry[1:]), integrate_commands(DRIVEN, steps.times), atol=1e-12
@@ -155,6 +155,53 @@ def test_without_identities_all_descriptors_are_equal() -> None:
     assert frame.descriptors.tolist() == [[1.0]] * 3
 
 
+@pytest.mark.parametrize(
+    ("velocities", "ranges", "note"),
+    [
+        ([1.0, 1.0, 1.0], 2.0, ""), ([1.0, 300.0, 1.0], 2.0, "Median speed 150: check that it is in metres"),
+        ([1.0, 0.3, 40.0], 2.0, "Median turn rate 8: check that it is in radians per second."),
+        ([1.0, 1.0, 1.0], 2e3, "Median range 2000: check that it is in metres."),
+        ([60.0, 1.0, 1.0], 2.0, "1 gap of more than 1.5 s between velocities, up to 2.0 s: the robot is assumed"),
+    ],
+)  # fmt: skip
+def test_implausible_units_are_noted(velocities: list[float], ranges: float, note: str) -> None:
+    """Quantities that hardly are in their unit are named, but steps are made: the robot may be that fast."""
+    driven = np.array([[10.0, 0.5, 0.2], [11.0, 0.5, 0.2], [12.0, 0.5, 0.0]]) * [1.0, *velocities[1:]]
+    driven[1:, 0] += velocities[0] > 1.0
+    steps = range_bearing_steps(driven, [(10.0, ranges, 0.0), (12.0, ranges, 0.1)], **SIGMAS)
+    assert len(steps.notes) == bool(note)
+    assert all(line.startswith(note) for line in steps.notes)
+
+
+def test_rare_sightings_are_noted() -> None:
+    """Sightings far apart may be the sensor's, or times in milliseconds with quick odometry."""
+    driven = np.column_stack([np.arange(0.0, 300.0), np.ones(300), np.zeros(300)])
+    seen = [(0.0, 1.0, 0.0), (100.0, 1.0, 0.0), (250.0, 1.0, 0.0)]
+    expected = "Median time between sightings 125: check that it is in seconds."
+    assert range_bearing_steps(driven, seen, **SIGMAS).notes == (expected,)
+
+
+def test_a_landmark_twice_in_a_frame_is_noted() -> None:
+    """Sightings of one landmark at one time are counted, and the first of them named; at other times they are usual."""
+    seen = [(10.0, 2.0, 0.0), (10.0, 2.5, 0.1), (10.0, 2.0, 0.4), (10.1, 2.0, 0.0), (11.0, 2.0, 0.0), (11.0, 2.0, 0.0)]
+    steps = range_bearing_steps(DRIVEN, seen, ["a", "b", "b", "a", "c", "c"], **SIGMAS)
+    expected = (
+        "2 sightings of a landmark that its frame has already, of which only the first counts: see b at 10.000 s."
+    )
+    assert steps.notes == (expected,)
+    assert range_bearing_steps(DRIVEN, seen, **SIGMAS).notes == ()
+
+
+@pytest.mark.parametrize("dt", [0.1, 0.25, 0.3, 0.7, 5.0])
+def test_a_truth_of_the_whole_log_is_known_at_all_steps(dt: float) -> None:
+    """No step is later than the log, nor earlier by a step than its end."""
+    driven = np.column_stack([np.linspace(10.0, 12.0, 21), np.ones(21), np.zeros(21)])
+    steps = range_bearing_steps(driven, [(10.0, 2.0, 0.0)], **SIGMAS, dt=dt)
+    assert 12.0 - dt < steps.times[-1] <= 12.0
+    truth = Trajectory(driven[:, 0], integrate_commands(driven, driven[:, 0]))
+    np.testing.assert_allclose(truth.at(steps.times), integrate_commands(driven, steps.times), atol=1e-9)
+
+
 def test_rows_a_little_back_in_time_are_sorted() -> None:
     """Rows out of order give the steps of rows in order; identities and deviations stay with their sightings."""
     names, seen = [3, 1, 2], [_sighting(t, (4.0, 1.0)) for t in (10.2, 10.6, 11.1)]
@@ -182,6 +229,19 @@ def test_columns_come_in_the_order_asked_for(tmp_path: Path) -> None:
     table = read_csv(file, ("x", "time"), labels=("name",))
     assert table.numbers.tolist() == [[2.0, 1.5], [-0.3, 2.5]]
     assert table.labels.tolist() == [["a b"], ["c"]]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "sep=;\ntime;v\n1;2\n", '"sep=;"\ntime;v\n1;2\n', "# of a robot\n# time in s\n\ntime,v\n1,2\n",
+        '# it\'s "so"\ntime,v,note\n1,2,"a, b\n# c"\n', '"time", "v"\n"1", "2"\n', "SEP=;\ntime;v;w\n1;2;0,5\n",
+        '# old, names\n# time, v\n1,2\n', "time,v,\n1,2,\n",
+    ],
+)  # fmt: skip
+def test_tables_of_other_programs_are_read(text: str, tmp_path: Path) -> None:
+    """Excel's line `sep=`, comments above the names, quotes and line breaks within them leave the numbers alone."""
+    assert read_csv(_file(tmp_path, text), ("time", "v")).numbers.tolist() == [[1.0, 2.0]]
 
 
 @pytest.mark.parametrize("sign", [",", ";", "\t"])

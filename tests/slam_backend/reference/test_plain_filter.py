@@ -198,7 +198,7 @@ def blind_walk(seed: int, num_particles: int) -> tuple[ReferenceFastSlam, Stereo
     """Return a filter whose robot saw landmarks at the start and then walked a full circle blind; its true pose."""
     world = StereoWorld(np.random.default_rng(100))
     motion = OdometryModel(floor_position=0.01, floor_heading=0.005)
-    options = FilterOptions(num_particles=num_particles, camera=world.camera, motion=motion)
+    options = FilterOptions(num_particles=num_particles, camera=world.camera, motion=motion, rejuvenate_every=None)
     slam, pose = ReferenceFastSlam(1, options, seed), np.zeros(3)
     slam.step([None], [world.measure(pose, world.visible(pose))])
     for _ in range(21):

@@ -9,14 +9,17 @@ from builders.worlds import EXACT_MOTION
 
 from slam_backend.fastslam.existence import ExistenceModel
 from slam_backend.fastslam.filter import FastSlam
+from slam_backend.fastslam.options import REJUVENATE_EVERY
 from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.models.measurements import Measurements
 from slam_backend.smoother import optimizer as solving
 from slam_backend.smoother import rejuvenation
 from slam_backend.smoother.options import SmoothingOptions
 from slam_backend.smoother.sampling import sample_transition_variances
+from slam_backend.team.team import TeamSlam
 from training.bench.accuracy.runs import RunSpec, simulate_run
 from training.bench.accuracy.trials import follow, score
+from vslam_env.belief.belief import default_filter_options
 
 EVERY = 8
 
@@ -37,6 +40,20 @@ def test_particles_are_rejuvenated_at_the_interval():
             assert report.reason == ""
             assert 0.8 * 30 < report.ess <= 30.0
             assert np.ptp(slam.particles(0)[0], axis=0).min() > 0.0
+
+
+def test_filters_and_teams_are_rejuvenated_by_default_and_never_with_none():
+    """After 50 steps, as in environments, a filter built without options is rejuvenated; those of a team in turn."""
+    assert default_filter_options().rejuvenate_every == REJUVENATE_EVERY
+    frame = Measurements([[0.5, 0.0, 3.0], [-0.5, 0.1, 4.0], [0.1, -0.2, 5.0]], np.eye(3, dtype=np.float32))
+    for options, expected in (({}, [REJUVENATE_EVERY]), ({"rejuvenate_every": None}, [])):
+        slam, team = FastSlam(**options), TeamSlam(1, **options)
+        alone, grouped = [], []
+        for step in range(1, REJUVENATE_EVERY + 10):
+            alone += [step] * (slam.step([np.zeros(3)], [frame]).rejuvenation is not None)
+            grouped += [step] * bool(team.step([np.zeros(3)], [frame]).rejuvenations)
+        assert alone == expected
+        assert len(grouped) == len(expected)
 
 
 def test_a_rejuvenation_waits_for_enough_measurements():

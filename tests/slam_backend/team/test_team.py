@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 from builders.comparison import assert_same
-from builders.filters import LANDMARKS, frame_of, starts_of
-from builders.teams import ASSUMED_CAMERA, MOTION, SIGMA, STARTS, SimulatedTeam, hand_made, standing_team
+from builders.filters import LANDMARKS, frame_of, plain_filter, starts_of
+from builders.teams import SIGMA, STARTS, SimulatedTeam, hand_made, standing_team
 
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.options import FilterOptions
@@ -181,7 +181,7 @@ def test_robots_without_contact_do_not_influence_each_other() -> None:
     """Robot 0 of a team that never meets does what it does in a team of one, bit for bit."""
     simulation = SimulatedTeam(seed=4)
     team = simulation.build()
-    alone = TeamSlam(1, seed=4, num_particles=30, camera=ASSUMED_CAMERA, motion=MOTION)
+    alone = SimulatedTeam(1, seed=4).build()
     for _ in range(40):
         odometry, frames = simulation.read()
         team.step(odometry, frames, ALONE)
@@ -213,7 +213,7 @@ def test_weights_multiply_by_the_chain_rule() -> None:
     rng = np.random.default_rng(5)
     starts = np.array([[0.0, 0.0, 0.0], [0.5, -0.4, 0.2]])
     local = [transform_points(inverse(start), LANDMARKS[names]) for start in starts]
-    slam = FastSlam(2, 1, initial_poses=starts, proposal="fastslam1")
+    slam = plain_filter(2, 1, initial_poses=starts, proposal="fastslam1")
     still = np.zeros((2, 3))
     slam.step([None, None], [frame_of(local[0], names, sigma_map), None], identities=[names, None], poses=still)
     before = slam.state.path_log_weights[0]

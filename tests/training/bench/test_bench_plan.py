@@ -150,7 +150,7 @@ def test_floor_plans_are_found_by_their_content(tmp_path: Path, monkeypatch: pyt
         ('"hall"', '"floor plans"', "floor_plans: expected at least 2, got 0"),
         ("duration", "length", "config: expected names among name, split, duration"),
         ("robots = [1]", "robots = [9]", "robots: expected an int from 1 to 8, got 9"),
-        ("= [", "= ", "plan: expected a TOML file"),
+        ("= [", "= ", "plan: expected a file in TOML"),
     ],
 )
 def test_bad_plans_are_refused(old: str, new: str, says: str, tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from slam_backend.trajectory import Trajectory
-from training.experiments.run_folder import METRICS_FILE, RunFolder, plain, read_config
+from training.experiments.run_folder import METRICS_FILE, RunFolder, plain, read_config, read_versions
 from training.experiments.trial_store import finished_trials
 
 
@@ -83,7 +83,7 @@ def test_paths_are_written_as_tum(tmp_path: Path) -> None:
     ("text", "message"),
     [
         (None, r"config: expected the config\.toml of an earlier run, got no such file\. Check '.*config\.toml'"),
-        ("seed = = 1", r"got a broken file\. Correct '.*config\.toml'"),
+        ("seed = = 1", r"got a syntax error: .*Correct line 1, column 8 of .*config\.toml"),
         ('command = "run"', r"config: expected a run of 'replay mrclam', got 'run'"),
         ('command = "replay mrclam"', r"config: expected a table \[config\] and an int seed"),
     ],
@@ -95,6 +95,15 @@ def test_invalid_configs_are_refused(tmp_path: Path, text: str | None, message: 
         file.write_text(text)
     with pytest.raises(ValueError, match=message):
         read_config(file, "replay mrclam")
+
+
+def test_configs_are_read_as_editors_save_them(tmp_path: Path) -> None:
+    """A byte order mark and lines that end with CRLF change nothing."""
+    folder = RunFolder.create(tmp_path / "run", "run", {"world": "office"}, seed=3)
+    expected, text = read_config(folder.path, "run"), (folder.path / "config.toml").read_text()
+    (folder.path / "config.toml").write_text(text, encoding="utf-8-sig", newline="\r\n")
+    assert read_config(folder.path, "run") == expected
+    assert read_versions(folder.path) == folder.versions
 
 
 def test_write_errors_name_the_option(tmp_path: Path) -> None:

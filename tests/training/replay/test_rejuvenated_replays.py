@@ -96,6 +96,7 @@ def test_replays_report_consistency(command: str, vslam: Any, tmp_path: Path) ->
     rows = json.loads((run / "metrics.json").read_text())["consistency"]
     assert len(rows) == len(json.loads((run / "metrics.json").read_text())["robots"])
     assert all(row["frames"] > 0 and 0.0 <= row["nis_share"] <= 1.0 for row in rows)
+    assert all(row["verdict"] in done.out for row in rows)
     assert "Consistency" in done.out
     for row in rows:
         for warning in row["warnings"]:

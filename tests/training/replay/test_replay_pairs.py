@@ -77,8 +77,13 @@ def test_without_poses_there_are_no_errors(room: Path) -> None:
         result = align_pairs(load_pairs(room), PairsConfig(path=str(room)))
         assert result.motion is not None
         assert np.isnan(result.error_m)
+        (room / "poses_dev.txt").write_text("# nothing\n")
+        with pytest.raises(ValueError, match=r"path: expected poses_dev\.txt with two poses, got a file of 0"):
+            load_pairs(room)
         (room / "poses_dev.txt").write_text("0 1 0 0 0 1 2\n")
-        with pytest.raises(ValueError, match=r"path: expected poses_dev\.txt with two rows of 8 or 12 numbers"):
+        with pytest.raises(
+            ValueError, match=r"path: expected 8 or 12 finite numbers, got .*Correct line 1 of .*poses_dev\.txt"
+        ):
             load_pairs(room)
     finally:
         (room / "poses_dev.txt").write_text(poses)
@@ -88,7 +93,9 @@ def test_missing_files_are_named(room: Path, tmp_path: Path) -> None:
     """A missing folder, image or calibration is refused."""
     with pytest.raises(ValueError, match="path: expected a folder with two stereo pairs, got no such folder"):
         load_pairs(tmp_path / "none")
-    with pytest.raises(ValueError, match="path: expected an image file, got no such file"):
+    with pytest.raises(
+        ValueError, match=r"path: expected an image file, got .* It does not exist: name yours with --left"
+    ):
         load_pairs(tmp_path)
     with pytest.raises(ValueError, match="descriptor: expected one of"):
         PairsConfig.from_mapping({"path": str(room), "descriptor": "surf"})
@@ -152,10 +159,10 @@ def test_missing_poses_are_reported(room: Path, tmp_path: Path) -> None:
     ("options", "message"),
     [
         (("--left", "left_img_0.png"), "path: expected two or more pairs of images, got a folder with 1 "),
-        (("--right", "none*.png"), "path: expected an image file, got no such file. Check "),
-        (("--calibration", "none.yaml,none.yaml"), "calibration: expected a readable file of a calibration"),
+        (("--right", "none*.png"), "It does not exist: name yours with --right."),
+        (("--calibration", "none.yaml,none.yaml"), "calibration: expected a file of a calibration, got '"),
         (("--calibration", "a,b,c"), "calibration: expected one file or two, got 'a,b,c'"),
-        (("--truth", "none.txt"), "truth: expected a file of true poses, got no such file"),
+        (("--truth", "none.txt"), "truth: expected a file of true poses, got '"),
         (("--times", "times.txt"), "times: expected a drive of three pairs or more, got a folder with two pairs"),
     ],
 )

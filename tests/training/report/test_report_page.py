@@ -214,8 +214,8 @@ def test_grids_of_large_worlds_are_thinned(run: Path, monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize(("name", "text", "error"), [
-    ("config.toml", "= broken", "folder: expected the folder of a run, got a broken file"),
-    (METRICS_FILE, "{", "folder: expected the folder of a run, got a broken file"),
+    ("config.toml", "= broken", "folder: expected a file in TOML, got a syntax error"),
+    (METRICS_FILE, "{", "folder: expected a file in JSON, got a syntax error"),
     (RECORDING_FILE, "x", "folder: expected a recording of an episode, got a broken file"),
 ])  # fmt: skip
 def test_damaged_folders_are_refused(name: str, text: str, error: str, run: Path) -> None:

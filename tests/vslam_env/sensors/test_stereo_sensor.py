@@ -408,3 +408,6 @@ def test_photographs_cover_walls(tmp_path: Path) -> None:
     doubled = np.concatenate([photograph, photograph], axis=1)
     shifts = [k for k in range(200) if np.array_equal(doubled[:, k : k + 167], picture)]
     assert len(shifts) == 1
+    (tmp_path / "two.png").write_bytes((tmp_path / "one.png").read_bytes()[:200])
+    with pytest.raises(ValueError, match=r"textures\.images: expected an intact image file, got .*two\.png"):
+        draw_textures(WALLS, np.random.default_rng(1), config)

@@ -127,11 +127,14 @@ class StereoRun:
         self, num_particles: int = 100, proposal: Literal["fastslam2", "fastslam1"] = "fastslam2",
         seed: int | np.random.SeedSequence = 0, **options: Any,
     ) -> FastSlam:  # fmt: skip
-        """Return a filter that assumes the true noise and starts all robots at their true poses in the world frame."""
+        """Return a filter that assumes the true noise and starts all robots at their true poses in the world frame.
+
+        It is not rejuvenated, unless the options say so.
+        """
         noise = self.spec.noise
         chosen: dict[str, Any] = {
             "num_particles": num_particles, "proposal": proposal, "camera": noise.camera, "motion": noise.motion,
-            "seed": seed, "initial_poses": self.true_paths[:, 0],
+            "rejuvenate_every": None, "seed": seed, "initial_poses": self.true_paths[:, 0],
         }  # fmt: skip
         return FastSlam(self.spec.robots, **(chosen | options))
 

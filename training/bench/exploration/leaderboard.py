@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from slam_backend.core.text_files import read_text
 from slam_backend.core.validation import argument_error
 from training.bench.exploration.plan import BASE_PART, FLOOR_PLANS, Plan
 from training.bench.exploration.plan_report import incomplete, markdown, read_episodes
@@ -60,8 +61,8 @@ def kept_episodes(folder: Path) -> list[dict[str, Any]] | None:
     file = next((folder / name for name in EPISODES if (folder / name).is_file()), None)
     if file is None:
         return None
-    content = file.read_bytes()
-    return read_episodes((gzip.decompress(content) if file.suffix == ".gz" else content).decode())
+    is_packed = file.suffix == ".gz"
+    return read_episodes(gzip.decompress(file.read_bytes()).decode() if is_packed else read_text(file, "folders"))
 
 
 def played_rows(results: Sequence[Results]) -> list[Mapping[str, Any]]:

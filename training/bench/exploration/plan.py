@@ -2,7 +2,6 @@
 
 import hashlib
 import os
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -10,6 +9,7 @@ from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
+from slam_backend.core.text_files import read_toml
 from slam_backend.core.validation import argument_error, choice_error
 from training.bench.config import ALL_ORACLES, ORACLES, world_split
 from training.bench.exploration.players import parted
@@ -92,11 +92,9 @@ class Plan(Checked):
         if not file.is_file():
             known = [path.stem for path in sorted(PLANS.glob("*.toml"))]
             raise choice_error("plan", source, known, "Check the spelling.", ", or the path of a TOML file")
+        values = read_toml(file, "plan")
         try:
-            return cls(**tomllib.loads(file.read_text(encoding="utf-8")))
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            hint = f"Correct {str(file)!r}. The reader says: {error}."
-            raise argument_error("plan", "a TOML file", "a file with other content", hint) from error
+            return cls(**values)
         except ValueError as error:
             raise ValueError(f"plan {str(file)!r}: {error}") from error
 

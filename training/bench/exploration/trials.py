@@ -10,6 +10,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from slam_backend.core.text_files import read_text
 from slam_backend.core.validation import BoolArray, FloatArray, argument_error
 from slam_backend.geometry import compose
 from slam_backend.metrics import MapErrorParts, map_error_parts
@@ -120,7 +121,7 @@ def check_same_policies(out: Path | None, policies: Collection[str]) -> None:
     if file is None or not file.is_file():
         return
     now: dict[str, str] = {}
-    for line in file.read_text(encoding="utf-8").splitlines():
+    for line in read_text(file, "out", "a file of trials").splitlines():
         with suppress(json.JSONDecodeError, TypeError, KeyError):  # `finished_trials` reports damage
             row = json.loads(line)
             policy, before = row["policy"], row["policy_digest"]

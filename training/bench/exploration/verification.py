@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from slam_backend.core.files import append_text
+from slam_backend.core.text_files import read_text
 from training.bench.exploration.report import label
 from training.experiments.statistics import format_ci, grouped, mean_ci
 
@@ -71,7 +72,8 @@ def table_rows(comparisons: Rows) -> list[list[str]]:
 def last_outcomes(folder: Path) -> dict[str, list[int]]:
     """Return the `outcome_counts` of each policy's last verification date in a run folder, an episode once."""
     file = folder / VERIFIED_FILE
-    lines = [json.loads(text) for text in file.read_text(encoding="utf-8").splitlines()] if file.is_file() else []
+    text = read_text(file, "folders", "a file of comparisons") if file.is_file() else ""
+    lines = [json.loads(line) for line in text.splitlines()]
     found: dict[str, list[int]] = {}
     for (policy,), own in grouped(lines, ("policy",)).items():
         last = max(line["date"] for line in own)

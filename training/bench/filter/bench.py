@@ -6,6 +6,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
+from dataclasses import fields
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ import numpy as np
 
 from slam_backend.core.validation import IntArray
 from slam_backend.fastslam.filter import FastSlam
+from slam_backend.fastslam.options import FilterOptions
 from slam_backend.fastslam.reports import StepReport
 from training.bench.config import FilterBenchConfig
 from training.bench.filter.workload import LARGE_LOADS, FilterLoad, LoadStep, LoadWorld
@@ -69,11 +71,8 @@ def time_state(load: FilterLoad) -> dict[str, Any]:
 def filled_filter(world: LoadWorld) -> tuple[FastSlam, IntArray]:
     """Return a filter whose particles contain all landmarks, and the landmark ids in the filter (N,)."""
     load = world.load
-    options = load.options
-    slam = FastSlam(
-        load.robots, load.particles, proposal=load.proposal, resample_threshold=options.resample_threshold,
-        seed=load.seed, initial_poses=world.starts,
-    )  # fmt: skip
+    chosen = {field.name: getattr(load.options, field.name) for field in fields(FilterOptions)}
+    slam = FastSlam(load.robots, **chosen, seed=load.seed, initial_poses=world.starts)
     ids = np.full(load.landmarks, -1)
     for step in world.mapping(SWEEPS):
         created = slam.step(step.odometry, step.frames, step.names).created[0]

@@ -46,8 +46,10 @@ class FilterLoad(Checked):
 
     @property
     def options(self) -> FilterOptions:
-        """Options of the filter: it assumes the true noise, and resamples at every step."""
-        return FilterOptions(num_particles=self.particles, proposal=self.proposal, resample_threshold=1.0)
+        """Options of the filter: it assumes the true noise, resamples at every step, and is not rejuvenated."""
+        return FilterOptions(
+            num_particles=self.particles, proposal=self.proposal, resample_threshold=1.0, rejuvenate_every=None
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -14,6 +14,8 @@ from typing import Any
 import cv2
 import numpy as np
 
+from slam_backend.core.image_files import read_grey_image
+from slam_backend.core.text_files import parse_numbers, read_text
 from slam_backend.core.validation import Float32Array, FloatArray, argument_error
 from slam_backend.frontend import (
     DESCRIPTOR_TYPES,
@@ -27,7 +29,6 @@ from slam_backend.frontend.descriptors import describe_points, nearest
 from slam_backend.frontend.images import Image
 from slam_backend.models.camera import StereoCamera
 from slam_backend.readers.calibration import CameraCalibration, Rectifier
-from slam_backend.readers.kitti_images import read_grey
 from slam_backend.readers.stereo_files import load_rig
 from training.bench.stereo.quality import guard_rows
 
@@ -136,7 +137,7 @@ def rig_rows(folder: Path, descriptors: Sequence[str]) -> list[dict[str, Any]]:
     """
     left, right = _eyes(folder)
     chosen = np.unique(np.linspace(0, len(left) - 1, min(len(left), MOST_PAIRS)).round().astype(int))
-    pairs = [(read_grey(left[n]), read_grey(right[n])) for n in chosen]
+    pairs = [(read_grey_image(left[n]), read_grey_image(right[n])) for n in chosen]
     height, width = pairs[0][0].shape
     rig = load_rig(folder, _calibration(folder), (width, height))
     span = rig.pair.focal_px * rig.pair.baseline
@@ -192,8 +193,8 @@ def _eyes(folder: Path) -> tuple[list[Path], list[Path]]:
 
 def aloe_rows(folder: Path, descriptor: Any) -> list[dict[str, Any]]:
     """Return errors before and after each match check on the aloe pair, whose true disparities are whole pixels."""
-    left, right = (read_grey(folder / f"aloe{eye}.jpg") for eye in "LR")
-    true = read_grey(folder / "aloeGT.png").astype(np.float64)
+    left, right = (read_grey_image(folder / f"aloe{eye}.jpg") for eye in "LR")
+    true = read_grey_image(folder / "aloeGT.png").astype(np.float64)
     height, width = left.shape
     nearest_m, farthest = ALOE_SPAN / ALOE_DISPARITIES[1], ALOE_SPAN / ALOE_DISPARITIES[0]
     camera = StereoCamera(focal_px=3740.0, baseline=0.16, width=width, height=height, max_range=farthest)
@@ -216,7 +217,7 @@ def chessboard(folder: Path) -> dict[str, Any]:
     """
     images, left_points, right_points = [], [], []
     for number in (1, 2, 3, 4, 5, 6, 7, 8, 9, 11, 12, 13, 14):
-        pair = [read_grey(folder / f"{eye}{number:02d}.jpg") for eye in ("left", "right")]
+        pair = [read_grey_image(folder / f"{eye}{number:02d}.jpg") for eye in ("left", "right")]
         found = [_board(image) for image in pair]
         if found[0] is not None and found[1] is not None:
             images.append(pair)
@@ -287,7 +288,7 @@ def planar_rows(file: Path) -> list[dict[str, Any]]:
     """
     name = file.name.removesuffix(MODEL)
     model = _homography(file)
-    a, b = (read_grey(_image(file.parent, f"{name}{side}")) for side in "AB")
+    a, b = (read_grey_image(_image(file.parent, f"{name}{side}")) for side in "AB")
     rows = []
     for way in (*DESCRIPTOR_TYPES, "sift_own", "orb_own"):
         (at_a, described_a), (at_b, described_b) = (_described(image, way) for image in (a, b))
@@ -306,10 +307,8 @@ def planar_rows(file: Path) -> list[dict[str, Any]]:
 
 def _homography(file: Path) -> FloatArray:
     """Return the homography (3, 3) from a file of nine numbers."""
-    try:
-        numbers = np.array(file.read_text(encoding="utf-8").replace(",", " ").split(), dtype=np.float64)
-    except (OSError, ValueError):
-        numbers = np.empty(0)
+    text = read_text(file, "real", "a file of a homography")
+    numbers = np.array(parse_numbers(text.replace(",", " ").split()) or [])
     if numbers.shape != (9,) or not np.isfinite(numbers).all() or abs(np.linalg.det(numbers.reshape(3, 3))) == 0.0:
         raise argument_error(
             "real", f"{file.name} with a 3 x 3 homography", "a different one", f"Correct {str(file)!r}."

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from slam_backend.core.image_files import read_grey_image
 from slam_backend.core.lazy_import import LazyModule
 from slam_backend.core.read_only import as_constant, as_read_only
 from slam_backend.core.short_repr import short_repr
@@ -162,15 +163,14 @@ def load_photographs(folder: str | Path, rows: int) -> list[Image]:
     """Read the images of a folder in grey levels, scaled to a height of `rows` texels.
 
     Raises:
-        ValueError: If the folder contains no images.
+        ValueError: If the folder contains no images, or a damaged one.
     """
     files = sorted(file for file in Path(folder).glob("*") if file.suffix.lower() in IMAGE_SUFFIXES)
     photographs = []
     for file in files:
-        image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
-        if image is not None:
-            size = max(1, image.shape[1] * rows // image.shape[0]), rows
-            photographs.append(np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8))
+        image = read_grey_image(file, "textures.images")
+        size = max(1, image.shape[1] * rows // image.shape[0]), rows
+        photographs.append(np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8))
     if not photographs:
         raise argument_error("textures.images", "a folder with images", Path(folder), "Give PNG or JPEG files.")
     return photographs
