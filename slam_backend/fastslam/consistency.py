@@ -51,7 +51,7 @@ THRESHOLD = len(SIGNS) / FALSE_ALARM_RATE
 HIGHEST = 1e6 * THRESHOLD  # limit of the evidence
 SUMS, LISTS = ("frames", "begun", "quiet", "nis", "matched"), ("counts", "evidence", "since")
 CAUTIOUS = 1.0  # mean NIS below which covariances are at least twice too large, even in the plane
-OVER_CONFIDENT = 3.0  # mean NIS above which covariances are too small, even in space
+OVER_CONFIDENT = 4.0  # mean NIS, ideally 3, above which covariances are at least a quarter too small, even in space
 VERDICTS = {  # words for a filter, with their conditions; the first one that holds applies
     "inconsistent": "a warning",
     "unknown": "no measurement has matched a landmark",

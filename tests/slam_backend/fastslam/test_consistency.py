@@ -98,7 +98,7 @@ def test_an_underconfident_filter_gives_no_warning() -> None:
 @pytest.mark.parametrize(
     ("nis_mean", "verdict"),
     [
-        (4.1, "over-confident"), (3.001, "over-confident"), (3.0, "consistent"), (1.0, "consistent"),
+        (4.1, "over-confident"), (4.001, "over-confident"), (4.0, "consistent"), (1.0, "consistent"),
         (0.999, "cautious"), (float("nan"), "unknown"),
     ],
 )  # fmt: skip
