@@ -70,9 +70,9 @@ def _merges(rows: list[Mapping[str, Any]]) -> Table:
     for row in rows:
         sides = [", ".join(map(str, row[side])) for side in ("robots_a", "robots_b")]
         errors = number(row["error_m"], 3), number(row["error_deg"], 2)
-        verdict = "false" if row["false"] else ""
+        verdict = "false" if row["false"] else "right"
         if row["undone_s"] is not None:
-            verdict += f"{', ' if verdict else ''}undone at {row['undone_s']:.1f} s"
+            verdict += f", undone at {row['undone_s']:.1f} s"
         cells.append([f"{row['time_s']:.1f}", *sides, str(row["landmarks"]), *errors, verdict])
     title = "Merges, compared with the true transform between the start poses"
     return console_table(title, list(map(heading, metrics)), cells)
