@@ -22,7 +22,6 @@ from slam_backend.fastslam.options import FilterOptions
 from slam_backend.fastslam.state_checks import are_linked
 from slam_backend.frontend import StereoFrontEnd
 from slam_backend.geometry import inverse
-from slam_backend.maps.alignment import align_maps
 from slam_backend.metrics.maps import map_error
 from slam_backend.models.camera import StereoCamera
 from slam_backend.models.measurements import Measurements, TeamMeasurements
@@ -39,7 +38,6 @@ from slam_backend.team.team import TeamSlam
 EXTRAS = {
     "fastslam1": (),
     "existence": ("slam_backend.fastslam._kernels.update.existence.",),
-    "clique": ("slam_backend.maps._kernels.max_clique.",),
     "images": ("slam_backend.frontend.",),
     "planners": ("vslam_env.navigation.tours.", "vslam_env.navigation._planning_kernels.path_lengths."),
 }
@@ -151,8 +149,6 @@ def run_all_paths(extras: Collection[str]) -> float:
         team.team_poses(), team.map_summaries()
         landmarks = team.map(0)
         map_error(landmarks.means, ids, points)
-        if "clique" in extras:
-            align_maps(landmarks, landmarks, "clique")
         if "images" in extras:
             _measure_images()
     return watch.seconds

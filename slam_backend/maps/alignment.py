@@ -44,7 +44,8 @@ __all__ = [
     "propose_motion",
 ]  # fmt: skip
 
-METHODS = ("ransac", "svd", "icp", "impicp", "gnc", "clique")
+METHODS = ("ransac", "svd", "icp", "impicp")
+REMOVED = ("gnc", "clique")  # methods of version 0.3
 
 
 def candidate_matches(map_a: LandmarkMap, map_b: LandmarkMap, options: AlignmentOptions) -> IntArray:
@@ -88,9 +89,7 @@ def align_maps(
         map_b: Map in frame b.
         method: `"ransac"`: search over pairs of candidate matches, each hypothesis locally optimised. `"svd"`: closed
             form over all candidates. `"icp"`: pairs of closest landmarks, starting from `"svd"`. `"impicp"`: ICP from
-            two starts. `"gnc"`: truncated least squares by graduated non-convexity. `"clique"`: largest set of
-            candidates that agree pairwise. `initial_estimates` and `max_clique` name the sources;
-            `docs/explanation/alignment.md` compares the methods.
+            two starts. `initial_estimates` names the sources; `docs/explanation/alignment.md` compares the methods.
         rng: Generator of the search order; None: a fixed order. The same generator state gives the same result.
         options: Gates and refusal limits; None: the defaults.
 
@@ -190,7 +189,8 @@ def _checked(
     options: AlignmentOptions | None,
 ) -> tuple[AlignmentOptions, np.random.Generator]:
     """Return options and generator, or raise if an argument has the wrong type."""
-    check_choice("method", method, METHODS)
+    hint = "ransac replaces it: it is right wherever that was." if method in REMOVED else "Choose one of these names."
+    check_choice("method", method, METHODS, hint)
     options = AlignmentOptions() if options is None else options
     for name, value, kind in (
         ("map_a", map_a, LandmarkMap), ("map_b", map_b, LandmarkMap), ("options", options, AlignmentOptions)
@@ -218,15 +218,10 @@ def _propose(
     Methods that cannot choose between similar landmarks use the distinctive candidates, if there are enough.
     """
     floor, gate = options.position_floor**2, options.position_gate
-    if method not in ("ransac", "clique") and np.count_nonzero(distinctive) >= options.min_inliers:
+    if method != "ransac" and np.count_nonzero(distinctive) >= options.min_inliers:
         matches, table = matches[distinctive], table[distinctive]
     if method == "ransac":
         return hypotheses[hypotheses[:, 4].argmax(), :3].copy() if len(hypotheses) else None
-    if method == "gnc":
-        return proposals.gnc_tls(table, floor, gate)
-    if method == "clique":
-        unlike = np.linalg.norm(map_a.descriptors[matches[:, 0]] - map_b.descriptors[matches[:, 1]], axis=1)
-        return proposals.clique_estimate(table, matches, unlike, floor, gate)
     if method == "impicp":
         return proposals.improved_icp(map_a, map_b, matches, table, floor, gate)
     fit = align_se2(*kernels.planar_points(table))

@@ -151,7 +151,7 @@ def merge_falsely(env: Any) -> None:
 def align_and_fuse() -> str:
     """Align and fuse simulated pairs of maps by each method; return a digest of the results."""
     digest = hashlib.sha256()
-    for method in ("ransac", "svd", "icp", "impicp", "gnc", "clique"):
+    for method in ("ransac", "svd", "icp", "impicp"):
         for seed in range(4):
             rng = np.random.default_rng(seed)
             one, other = pair_of_maps(rng, 40)

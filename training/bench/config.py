@@ -37,7 +37,7 @@ if TYPE_CHECKING:  # numerical modules are imported when a command runs, so that
 
 Method = Literal["dead_reckoning", "batch_ml", "ideal_online", "fastslam1", "fastslam2", "fastslam2+existence",
                  "fastslam2+rejuvenation"]  # fmt: skip
-AlignmentMethod = Literal["ransac", "svd", "icp", "impicp", "gnc", "clique"]
+AlignmentMethod = Literal["ransac", "svd", "icp", "impicp"]
 # (overlap, outliers): of 200 landmarks in each map, 20 true pairs allow up to 180 wrong ones, 200 allow none.
 GRID = (
     (1.0, 0.0), (0.5, 0.0), (0.5, 0.5), (0.25, 0.0), (0.25, 0.5), (0.25, 0.75), (0.1, 0.0), (0.1, 0.5), (0.1, 0.8),
@@ -259,8 +259,8 @@ class AlignmentBenchConfig(ExperimentConfig):
     """Alignment benchmark: a grid of cells, and the hard sets U and I, whose trials are divided among their cases."""
 
     methods: tuple[AlignmentMethod, ...] = option(
-        ("ransac", "svd", "icp", "impicp", "gnc", "clique"),
-        "Methods: ransac, svd, icp, impicp, gnc, clique.",
+        ("ransac", "svd", "icp", "impicp"),
+        "Methods: ransac, svd, icp, impicp.",
         shown="all",
     )
     seeds: int = option(500, "Number of trials of each grid cell and method.", ge=1, hint="Use at least one trial.")

@@ -6,13 +6,10 @@ import numpy as np
 import pytest
 from builders.kernels import python_entry
 from builders.maps import D, blurred, unit
-from hypothesis import given
-from hypothesis import strategies as st
 
 from slam_backend.geometry import between, inverse, transform_points
 from slam_backend.maps import _kernels as kernels
 from slam_backend.maps import initial_estimates as proposals
-from slam_backend.maps._kernels import max_clique as cliques
 from slam_backend.maps.alignment import (
     METHODS,
     REASONS,
@@ -51,83 +48,7 @@ def off(found: np.ndarray | None, truth: np.ndarray) -> float:
     return float(np.abs(between(truth, found)).sum())
 
 
-def largest_clique_plainly(agrees: np.ndarray) -> int:
-    """Return the size of the largest clique, by trying all (Bron and Kerbosch)."""
-
-    def extend(size: int, left: set[int]) -> int:
-        best = size
-        for v in sorted(left):
-            left = left - {v}
-            best = max(best, extend(size + 1, left & set(np.flatnonzero(agrees[v]).tolist())))
-        return best
-
-    return extend(0, set(range(len(agrees))))
-
-
-@given(n=st.integers(0, 90), density=st.floats(0.0, 1.0), seed=st.integers(0, 9999))
-def test_the_search_returns_a_clique(n: int, density: float, seed: int) -> None:
-    """Whatever the graph and however early the search stops, members agree pairwise; one vertex is always found."""
-    upper = np.triu(np.random.default_rng(seed).random((n, n)) < density, 1)
-    agrees = upper | upper.T
-    for limit in (n, 2000):
-        found = cliques.largest_clique(agrees, limit)
-        inside = agrees[np.ix_(found, found)]
-        assert inside.sum() == len(found) * (len(found) - 1)
-        assert bool(len(found)) == bool(n)
-
-
-@pytest.mark.parametrize("density", [0.1, 0.4, 0.7])
-def test_no_clique_is_larger_than_the_one_found(density: float) -> None:
-    """On graphs of more than one word of bits the size equals that of a plain search through all cliques."""
-    for seed in range(4):
-        n = int(70 * (1.0 - density))
-        upper = np.triu(np.random.default_rng(seed).random((n + 5, n + 5)) < density, 1)
-        agrees = upper | upper.T
-        assert len(cliques.largest_clique(agrees, 10**6)) == largest_clique_plainly(agrees)
-
-
-def test_a_clique_across_words_of_bits_is_found_whole() -> None:
-    """A planted set of 30 among 300 vertices comes back exactly."""
-    rng = np.random.default_rng(5)
-    upper = np.triu(rng.random((300, 300)) < 0.05, 1)
-    planted = np.sort(rng.permutation(300)[:30])
-    agrees = upper | upper.T
-    agrees[np.ix_(planted, planted)] = True
-    np.fill_diagonal(agrees, False)
-    np.testing.assert_array_equal(cliques.largest_clique(agrees, 20_000), planted)
-
-
-def test_agreement_is_that_of_distances_in_units_of_their_noise() -> None:
-    """The compiled test equals the plain one: difference of distances, variance along either direction, one-to-one."""
-    rng = np.random.default_rng(6)
-    n, floor, gate = 25, 0.01, 9.0
-    table = np.zeros((n, 18))
-    table[:, :6] = rng.uniform(0.0, 4.0, (n, 6))
-    sigmas = []
-    for offset in (6, 12):
-        roots = 0.2 * rng.standard_normal((n, 3, 3))
-        full = roots @ roots.transpose(0, 2, 1)
-        table[:, offset : offset + 6] = full[:, *np.triu_indices(3)]
-        sigmas.append(full[:, :2, :2])
-    matches = np.column_stack([np.arange(n), np.arange(n)])
-    matches[3, 0] = matches[4, 0]
-    matches[7, 1] = matches[9, 1]
-    found = cliques.agreement(table, matches, floor, gate)
-    for i in range(n):
-        for j in range(n):
-            lengths, variance = [], 2.0 * floor
-            for first, sigma in ((0, sigmas[0]), (3, sigmas[1])):
-                across = table[j, first : first + 2] - table[i, first : first + 2]
-                lengths.append(np.linalg.norm(across))
-                if i != j:
-                    way = across / lengths[-1]
-                    variance += way @ (sigma[i] + sigma[j]) @ way
-            apart = (matches[i] != matches[j]).all()
-            assert found[i, j] == (apart and (lengths[0] - lengths[1]) ** 2 <= gate * variance), (i, j)
-    assert 0.05 < found.mean() < 0.9
-
-
-@pytest.mark.parametrize(("method", "wrong"), [("icp", 8), ("impicp", 8), ("gnc", 60), ("clique", 85), ("ransac", 85)])
+@pytest.mark.parametrize(("method", "wrong"), [("icp", 8), ("impicp", 8), ("ransac", 85)])
 def test_methods_find_the_motion_among_wrong_matches(method: str, wrong: int) -> None:
     """Of 100 matches so many may be wrong; the closed form alone is then far off."""
     for seed in range(5):
@@ -159,25 +80,6 @@ def test_closest_points_need_a_start_and_the_better_of_two_is_kept() -> None:
             met[method] += off(propose_motion(a, replace(b, descriptors=looks), method), TURNED) < 0.1
     assert met["impicp"] > met["icp"]
     assert met["impicp"] == 20
-
-
-def test_graduated_non_convexity_minimises_truncated_squares() -> None:
-    """With half of the matches wrong, its truncated cost is no larger than that of the truth."""
-    rng = np.random.default_rng(8)
-    a = landmark_map(rng, rng.uniform(0.0, [20.0, 15.0, 1.5], (60, 3)))
-    b = seen_from(a, TURNED, 30, rng)
-    a_points, b_points = a.means[:, :2], b.means[:, :2]
-    table = np.zeros((60, 18))
-    table[:, :3], table[:, 3:6] = a.means, b.means
-    variance, gate = 8e-4, 11.34
-    found = proposals.gnc_tls(table, variance, gate)
-
-    def cost(pose: np.ndarray) -> float:
-        squares = ((a_points - transform_points(pose, b_points)) ** 2).sum(axis=1) / variance
-        return float(np.minimum(squares, gate).sum())
-
-    assert cost(found) <= cost(TURNED)
-    assert off(found, TURNED) < 0.02
 
 
 def test_one_far_match_cannot_turn_the_others() -> None:
@@ -337,12 +239,11 @@ def test_near_descriptors_are_found_whatever_their_first_components(size: int, l
     assert surely > 100
 
 
-@pytest.mark.parametrize("method", ["ransac", "clique", "gnc"])
-def test_geometry_distinguishes_similar_landmarks(method: str) -> None:
+def test_geometry_distinguishes_similar_landmarks() -> None:
     """Where three of all landmarks look the same hardly any stands out, and yet nearly all common ones are found."""
     a, b = threefold(np.random.default_rng(17), 120, 50)
-    assert align_maps(a, b, method, options=AlignmentOptions(max_similar=0)).reason == "too few candidates"
-    found = align_maps(a, b, method)
+    assert align_maps(a, b, options=AlignmentOptions(max_similar=0)).reason == "too few candidates"
+    found = align_maps(a, b)
     assert found.success, found.reason
     assert off(found.transform, TURNED) < 0.05
     assert 48 <= len(found.inliers) <= 51
@@ -357,16 +258,15 @@ def test_similar_landmarks_elsewhere_are_not_matched() -> None:
         assert align_maps(a, b).reason == "too few inliers"
 
 
-@pytest.mark.parametrize("method", ["ransac", "clique"])
-def test_maps_are_aligned_by_geometry_alone(method: str) -> None:
+def test_maps_are_aligned_by_geometry_alone() -> None:
     """Where all landmarks look the same, any two of one height may be the same, and each is taken once."""
     rng = np.random.default_rng(12)
     a = landmark_map(rng, rng.uniform(0.0, [15.0, 10.0, 0.0], (16, 3)), np.ones((16, 1)))
     b = seen_from(a, TURNED, 2, rng)
-    assert align_maps(a, b, method).reason == "too few candidates"
+    assert align_maps(a, b).reason == "too few candidates"
     options = AlignmentOptions(appearance=False)
     assert len(candidate_matches(a, b, options)) == 256
-    found = align_maps(a, b, method, options=options)
+    found = align_maps(a, b, options=options)
     assert found.success, found.reason
     assert off(found.transform, TURNED) < 0.05
     assert len(found.inliers) == 14
@@ -381,6 +281,14 @@ def test_a_symmetric_place_is_ambiguous_by_geometry_alone() -> None:
     found = align_maps(a, a.moved(TURNED), options=AlignmentOptions(appearance=False))
     assert found.reason == "ambiguous"
     assert found.ratio > 0.9
+
+
+@pytest.mark.parametrize("method", ["gnc", "clique"])
+def test_removed_methods_name_their_replacement(method: str) -> None:
+    """Methods of version 0.3 that are gone are refused with what replaces them."""
+    a = landmark_map(np.random.default_rng(0), np.eye(3))
+    with pytest.raises(ValueError, match=r"method: expected one of .* ransac replaces it"):
+        align_maps(a, a, method)
 
 
 POOR_MAPS = {

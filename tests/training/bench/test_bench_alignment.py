@@ -108,7 +108,7 @@ def test_errors_are_relative_to_the_bound_and_refusals_are_failures() -> None:
 
 def test_a_trial_repeats() -> None:
     """The same trial gives the same results, except times, whatever ran before it."""
-    trial = Trial(kind="I", case="area", overlap=0.0, outliers=0.0, method="clique", seed=103)
+    trial = Trial(kind="I", case="area", overlap=0.0, outliers=0.0, method="impicp", seed=103)
     first = play(trial)
     play(Trial(kind="U", case="half alike", overlap=0.0, outliers=0.0, method="svd", seed=9))
     again = play(trial)
@@ -118,7 +118,7 @@ def test_a_trial_repeats() -> None:
 
 def test_all_methods_have_the_same_trials() -> None:
     """Trials are ordered by cell and seed, each once for each method; U and I never share the maps of a seed."""
-    config = AlignmentBenchConfig(methods=("ransac", "gnc"), seeds=3, hard=10, seed=100)
+    config = AlignmentBenchConfig(methods=("ransac", "icp"), seeds=3, hard=10, seed=100)
     trials = config.trials()
     assert len(trials) == len(set(trials)) == 2 * (3 * len(GRID) + 20)
     assert {trial.case for trial in trials if trial.kind == "I"} == set(IDENTIFIABLE)
@@ -128,7 +128,7 @@ def test_all_methods_have_the_same_trials() -> None:
 def test_the_command_writes_tables_figure_and_trials(vslam: Any, tmp_path: Path) -> None:
     """A small benchmark writes its tables; when resumed in the same folder, no trial runs twice."""
     out, copy = tmp_path / "bench", tmp_path / "copy.json"
-    options = ("--methods", "ransac,gnc", "--seeds", "1", "--hard", "9", "--first-seed", "100", "--out", str(out))
+    options = ("--methods", "ransac,icp", "--seeds", "1", "--hard", "9", "--first-seed", "100", "--out", str(out))
     said = vslam("bench", "alignment", *options, "--json", str(copy))
     assert said.status == 0
     assert "Maps that can barely be aligned" in said.out

@@ -20,7 +20,7 @@ HEADINGS = (
     "after [s]", "barcodes", "method", "pairs", "aligned", "false", "median [m]", "worst [m]", "median [°]",
     "worst [°]",
 )  # fmt: skip
-METHODS = ("ransac", "clique")
+METHODS = ("ransac",)
 ENOUGH_SHARED = 5  # shared landmarks from which maps should be alignable by barcodes
 # Maps are deformed by tenths of a metre, early ones more.
 OPTIONS = AlignmentOptions(position_floor=0.3, min_inliers=ENOUGH_SHARED, max_sigma_heading=0.05)

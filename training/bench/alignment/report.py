@@ -31,9 +31,9 @@ HEADINGS = {
 }
 # Safe for colour-blind readers
 COLOURS = {
-    "ransac": "#0072B2", "clique": "#009E73", "gnc": "#CC79A7", "impicp": "#E69F00", "icp": "#D55E00", "svd": "#7f7f7f",
+    "ransac": "#0072B2", "impicp": "#E69F00", "icp": "#D55E00", "svd": "#7f7f7f",
 }  # fmt: skip
-MARKERS = {"ransac": "o", "clique": "s", "gnc": "^", "impicp": "D", "icp": "v", "svd": "x"}
+MARKERS = {"ransac": "o", "impicp": "D", "icp": "v", "svd": "x"}
 PANELS = (
     ("right", "share right [%]"), ("translation", "translation error / bound"), ("rotation", "rotation error / bound"),
     ("median_ms", "computing time, median [ms]"),

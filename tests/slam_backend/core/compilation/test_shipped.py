@@ -18,7 +18,7 @@ from slam_backend.core.compilation.wheel import build_wheel
 
 ROOT = Path(__file__).parents[4]
 LEVEL = "x86-64-v3"
-METHODS = ("ransac", "clique")
+METHODS = ("ransac", "icp")
 IS_LEVEL = LEVELS[LEVEL] <= host_features()
 PART = "slam_backend.maps."  # kernels that the wheel of these tests holds: all that an alignment calls
 # Aligns two maps after it has compiled some kernels in a given order; prints the result's bytes, and how many kernels
@@ -136,7 +136,7 @@ def test_shipped_kernels_compile_nothing_and_give_the_same_bytes(site: Path, tmp
 @pytest.mark.slow
 def test_the_order_of_compilation_decides_nothing(tmp_path: Path) -> None:
     """Kernels compiled backwards, by one process, give the bytes of those that several processes compile forwards."""
-    names = [name for name in recorded_signatures("slam_backend") if name.startswith(PART) and "clique" not in name]
+    names = [name for name in recorded_signatures("slam_backend") if name.startswith(PART)]
     backwards = [f"{name} {words}" for name in reversed(names) for words in recorded_signatures("slam_backend")[name]]
     there, _ = python(ALIGN, "\n".join(backwards), "ransac", NUMBA_CACHE_DIR=str(tmp_path))
     here, _ = python(ALIGN, "", "ransac")
