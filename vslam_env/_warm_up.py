@@ -17,9 +17,8 @@ from slam_backend.warm_up import EXTRAS, extras_of, needed, run_all_paths
 from vslam_env.config import EnvConfig
 from vslam_env.environment import ExplorationEnv
 from vslam_env.navigation import cells_of, distance_map, lengths_between, open_tour, sees, share_places, tour_length
-from vslam_env.sensors import LandmarkSensor, LandmarkSensorConfig
-from vslam_env.sensors.landmark_sensor import MANY_KEYS
-from vslam_env.world import Landmarks, World
+from vslam_env.sensors import LandmarkSensorConfig
+from vslam_env.world import World
 
 WALLS = np.array([[0.0, 0.0, 9.0, 0.0], [9.0, 0.0, 9.0, 9.0], [9.0, 9.0, 0.0, 9.0], [0.0, 9.0, 0.0, 0.0]])
 STARTS = np.array([[3.0, 4.0, 0.0], [3.0, 5.0, 0.1]])  # side by side, facing the same wall
@@ -78,9 +77,6 @@ def _run_all_paths(extras: Collection[str]) -> None:
     for _ in range(STEPS):
         valid = {agent: env.belief(agent).candidates.valid for agent in env.agents}
         env.step({agent: 1 + int(slots.argmax()) if slots.any() else 0 for agent, slots in valid.items()})
-    ones = np.ones((MANY_KEYS, 1))  # many landmarks, whose keys are drawn otherwise
-    marks = Landmarks(ones * (9.0, 4.0, 0.0), ones * (-1.0, 0.0), np.ones(MANY_KEYS, int), ones.astype(np.float32))
-    LandmarkSensor(sensor, WALLS, marks).measure(STARTS, np.random.default_rng(0))
     if "planners" in extras:
         belief = env.belief("robot_0")
         ways, places = distance_map(belief.grid.cells, belief.pose[:2]), np.zeros((2, 2))

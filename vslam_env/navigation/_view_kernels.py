@@ -17,11 +17,9 @@ from vslam_env.navigation._grid_kernels import (
     LARGEST_HALF_WIDTH,
     LARGEST_SIZE,
     OCCUPIED,
-    TILE,
     UNKNOWN,
     cell_index,
     margin_of,
-    mark_stale,
     widen_bounds,
 )
 from vslam_env.navigation._planning_kernels.candidates import is_settled
@@ -179,17 +177,15 @@ def looks_of(scan: Any, directions: Any, reach: float, points: Any) -> int:
 
 @device
 @in_place
-def count_looks_at(looks: Any, bounds: Any, stale: Any, row: int, col: int, more: int) -> None:
-    """Add to the looks at a cell, widen the bounds (4,) of the cells with looks, and note changes that may matter."""
-    if looks[row, col] < LOOKED:
-        mark_stale(stale, row, col, len(looks))
+def count_looks_at(looks: Any, bounds: Any, row: int, col: int, more: int) -> None:
+    """Add to the looks at a cell, and widen the bounds (4,) of the cells with looks."""
     looks[row, col] = min(looks[row, col] + more, MOST_LOOKS)
     widen_bounds(bounds, row, col)
 
 
 @in_place
 def paint_looks(
-    looks: Any, bounds: Any, stale: Any, shared: Any, poses: Any, scans: Any, directions: Any, reach: float,
+    looks: Any, bounds: Any, shared: Any, poses: Any, scans: Any, directions: Any, reach: float,
     points: Any,
 ) -> None:  # fmt: skip
     """Count the looks of a tick, once a scan and cell.
@@ -197,7 +193,6 @@ def paint_looks(
     Args:
         looks: (K, S, S) uint8. Looks of the grids of K robots; changed.
         bounds: (K, 4) int32. Bounds of those that are not zero, as in `GridStorage`; changed.
-        stale: (K, n, n) uint8. Tiles in which looks have changed, see `mark_stale`; written.
         shared: (K, K) int64. See `TeamGrids.update`.
         poses: (K, K, 3) [m, m, rad]. See there.
         scans: (K, R) [m]. See there.
@@ -218,18 +213,15 @@ def paint_looks(
                 row = to_index(y + s * points[k, 0] + c * points[k, 1], size)
                 col = to_index(x + c * points[k, 0] - s * points[k, 1], size)
                 if 0 <= row < size and 0 <= col < size and (row != last_row or col != last_col):
-                    count_looks_at(looks[owner], bounds[owner], stale[owner], row, col, 1)
+                    count_looks_at(looks[owner], bounds[owner], row, col, 1)
                     last_row, last_col = row, col
 
 
 @in_place
-def merge_looks(
-    looks: Any, bounds: Any, stale: Any, other: Any, others_bounds: Any, x: float, y: float, theta: float
-) -> None:
+def merge_looks(looks: Any, bounds: Any, other: Any, others_bounds: Any, x: float, y: float, theta: float) -> None:
     """Add the looks (S', S') uint8 of another grid, whose start pose in this one is (x, y, theta), to looks (S, S).
 
-    Bounds (4,) int32 of the part of either that is not zero are given, as in `GridStorage`; those of looks change, and
-    the tiles that have changed are marked.
+    Bounds (4,) int32 of the part of either that is not zero are given, as in `GridStorage`; those of looks change.
     """
     c, s = math.cos(theta), math.sin(theta)
     size, others = len(looks), len(other)
@@ -239,7 +231,7 @@ def merge_looks(
                 u, v = to_coordinate(other_col, others), to_coordinate(other_row, others)
                 row, col = to_index(y + s * u + c * v, size), to_index(x + c * u - s * v, size)
                 if 0 <= row < size and 0 <= col < size:
-                    count_looks_at(looks, bounds, stale, row, col, other[other_row, other_col])
+                    count_looks_at(looks, bounds, row, col, other[other_row, other_col])
 
 
 @device
@@ -455,13 +447,13 @@ def path_lengths_to(parents: Any, row: int, col: int, corner: Any, sure: Any) ->
 
 @device
 @in_place
-def give_up(looks: Any, bounds: Any, stale: Any, target: Any) -> None:
+def give_up(looks: Any, bounds: Any, target: Any) -> None:
     """Count the cells around a target that cannot be seen as looked at as often as possible."""
     size = len(looks)
     row, col = to_index(target[1], size), to_index(target[0], size)
     for r in range(max(row - GIVEN_UP, 0), min(row + GIVEN_UP + 1, size)):
         for c in range(max(col - GIVEN_UP, 0), min(col + GIVEN_UP + 1, size)):
-            count_looks_at(looks, bounds, stale, r, c, MOST_LOOKS)
+            count_looks_at(looks, bounds, r, c, MOST_LOOKS)
 
 
 @device
@@ -510,15 +502,15 @@ def worth_seeing(cells: Any, looks: Any, bounds: Any, places: Any, counts: Any, 
 @device
 @jit
 def keep_revisits(
-    cells: Any, seen: tuple[Any, Any, Any], pose: Any, camera: Any, targets: Any, values: Any, rows: Any, visits: Any,
+    cells: Any, seen: tuple[Any, Any], pose: Any, camera: Any, targets: Any, values: Any, rows: Any, visits: Any,
     distant: Any,
 ) -> None:  # fmt: skip
     """Keep the revisit candidates (m, 5) with something left to gain, and empty the other slots.
 
-    Looks (S, S), their bounds (4,) and the tiles that have changed are given together. Values (n,) of targets (n, 6)
+    Looks (S, S) and their bounds (4,) are given together. Values (n,) of targets (n, 6)
     that candidates cover become 0. Distant candidates, a mask (m,), stay as they are.
     """
-    looks, looks_bounds, stale = seen
+    looks, looks_bounds = seen
     for i in range(len(rows)):
         if np.isnan(rows[i, X]) or distant[i]:
             continue
@@ -531,7 +523,7 @@ def keep_revisits(
                 continue
             if is_in_view(bin_of(math.atan2(targets[t, 1] - rows[i, Y], targets[t, 0] - rows[i, X])), heading):
                 if visits[i] >= PATIENCE:
-                    give_up(looks, looks_bounds, stale, targets[t])
+                    give_up(looks, looks_bounds, targets[t])
                 else:
                     gain += values[t]
                 values[t] = 0.0
@@ -692,7 +684,7 @@ def measure_teammates(
 
 @jit
 def renew_candidates(
-    cells: Any, bounds: Any, seen: tuple[Any, Any, Any], ways: tuple[Any, Any, Any, Any, int, int],
+    cells: Any, bounds: Any, seen: tuple[Any, Any], ways: tuple[Any, Any, Any, Any, int, int],
     landmarks: tuple[Any, Any, Any], poses: Any, camera: Any, places: Any,
     slots: tuple[Any, Any, Any, Any, Any, int, int],
 ) -> None:  # fmt: skip
@@ -702,7 +694,7 @@ def renew_candidates(
         cells: (S, S) uint8. Cells of the robot's grid.
         bounds: (4,) int32. Bounds of its known part.
         seen: Looks of the grid (S, S) uint8, of which those at walls that cannot be seen are set to the largest number;
-            their bounds (4,) int32; and the tiles that have changed, see `TeamLooks`, written.
+            and their bounds (4,) int32, see `TeamLooks`.
         ways: Paths from the robot, of `dijkstra`. Where they cover a part of the known floor, candidates of which they
             tell nothing (`is_settled`) stay as they are.
         landmarks: All landmarks of the robot's map (n, 4), their counts (n, 2), and the motion (3,) from the map frame
@@ -716,7 +708,7 @@ def renew_candidates(
             unreachable; all changed; the row of the robot in `poses`; the number of the update: the gains of a
             candidate that stays are computed in every fourth one, new places to look from are sought in every second.
     """
-    looks, _, _ = seen
+    looks, _ = seen
     rows, visits, gains, views, lengths, robot, update = slots
     size, num_places = len(cells), len(places)
     first_revisit, first_rendezvous = len(rows) - num_places - len(visits), len(rows) - num_places
@@ -852,111 +844,6 @@ COARSE = 48  # cells along a side of the global grid, as of the local one, so th
 NUM_COARSE = 3  # channels: free, occupied, walls looked at
 
 
-@device
-@in_place
-def _mark_stale_blocks(
-    stale_cells: Any, stale_looks: Any, top: int, bottom: int, left: int, scale: int, columns: Any, blocks: Any
-) -> None:
-    """Write 1 for the blocks of a row of the picture in which anything may have changed, or just beside, else 0.
-
-    Args:
-        stale_cells, stale_looks: (n, n) uint8. Tiles that have changed, see `mark_stale`.
-        top, bottom: First row of the blocks, and one past the last, in the largest grid.
-        left: First column of the first block, in the largest grid.
-        scale: Columns of a block.
-        columns: (n,) uint8. Workspace.
-        blocks: (>= 48,) uint8. Output.
-    """
-    last_tile = len(stale_cells) - 1
-    begin, end = max(left - 1, 0) // TILE, min((left + COARSE * scale) // TILE, last_tile) + 1
-    columns[begin:end] = 0
-    for row in range(max(top - 1, 0) // TILE, min(bottom // TILE, last_tile) + 1):
-        for tile in range(begin, end):
-            columns[tile] |= stale_cells[row, tile] | stale_looks[row, tile]
-    for block in range(COARSE):
-        first, is_stale = left + block * scale, 0
-        for tile in range(max(first - 1, 0) // TILE, min((first + scale) // TILE, last_tile) + 1):
-            is_stale |= columns[tile]
-        blocks[block] = is_stale
-
-
-@device
-@jit
-def _draw_global_grid(
-    cells: Any, looks: Any, bounds: Any, is_whole: bool, stale_cells: Any, stale_looks: Any, picture: Any, frame: Any
-) -> None:
-    """Write the picture of a grid, or draw again what may have changed.
-
-    Args:
-        cells, looks, bounds: See `write_global_grid`.
-        is_whole: Whether all is drawn; else the bounds and the size of the grid must be those of the last time.
-        stale_cells, stale_looks: (n, n) uint8. 1 for the tiles that have changed since, see `mark_stale`.
-        picture, frame: See `write_global_grid`.
-    """
-    size = len(cells)
-    height, width = bounds[2] - bounds[0], bounds[3] - bounds[1]
-    scale = max((max(height, width) + COARSE - 1) // COARSE, 1)
-    top, left = bounds[0] - (COARSE * scale - height) // 2, bounds[1] - (COARSE * scale - width) // 2
-    first, last = max(bounds[1], 1), min(bounds[3], size - 1)
-    first_row, last_row = max(bounds[0], 1), min(bounds[2], size - 1)
-    width, inset = max(last - first, 0), (LARGEST_SIZE - size) // 2
-    flags, unseen, places = np.empty(width, np.uint8), np.empty(width, np.uint8), np.empty(width, np.int32)
-    for i in range(width):
-        places[i] = (first + i - left) // scale
-    shades = np.empty(scale * scale + 1, np.uint8)  # instead of a division per cell
-    for k in range(len(shades)):
-        shades[k] = k * 255 // (scale * scale)
-    counts, columns = np.empty((4, width), np.uint16), np.empty(width + 2, np.uint16)
-    sums, tiles = np.empty((4, COARSE), np.int32), np.empty(len(stale_cells), np.uint8)
-    blocks = np.ones(COARSE + 1, np.uint8)
-    blocks[COARSE] = 0
-    if is_whole:
-        picture[:] = 0
-    for r in range(COARSE):
-        begin, end = max(top + r * scale, first_row), min(top + (r + 1) * scale, last_row)
-        if begin >= end:
-            continue
-        if not is_whole:
-            _mark_stale_blocks(stale_cells, stale_looks, begin + inset, end + inset, left + inset, scale, tiles, blocks)
-        c = 0
-        while c < COARSE:
-            if blocks[c] == 0:
-                c += 1
-                continue
-            low = c
-            while blocks[c] > 0:
-                c += 1
-            picture[:, r, low:c] = 0
-            start, stop = max(left + low * scale, first), min(left + c * scale, last)
-            if start >= stop:
-                continue
-            num = stop - start
-            free, occupied, borders, looked = counts[0, :num], counts[1, :num], counts[2, :num], counts[3, :num]
-            own, own_unseen, own_columns = flags[:num], unseen[:num], columns[: num + 2]
-            for i in range(num):
-                free[i] = occupied[i] = borders[i] = looked[i] = 0
-            for row in range(begin, end):
-                mark_borders(cells, row, start, stop, own)
-                mark_unseen(own, looks, row, start, own_columns, own_unseen)
-                here = cells[row, start:stop]
-                for i in range(num):  # without branches: this becomes vector code
-                    free[i] += here[i] == FREE
-                    occupied[i] += here[i] == OCCUPIED
-                    borders[i] += own[i]
-                    looked[i] += own[i] - own_unseen[i]
-            sums[:, low:c] = 0
-            for k in range(4):
-                for i in range(num):
-                    sums[k, places[start - first + i]] += counts[k, i]
-            for block in range(low, c):
-                picture[0, r, block], picture[1, r, block] = shades[sums[0, block]], shades[sums[1, block]]
-                if sums[2, block] > 0:
-                    picture[2, r, block] = sums[3, block] * 255 // sums[2, block]
-    frame[0] = to_coordinate(left, size) + 0.5 * (COARSE * scale - 1) * CELL
-    frame[1] = to_coordinate(top, size) + 0.5 * (COARSE * scale - 1) * CELL
-    frame[2] = scale * CELL
-
-
 @jit
 def write_global_grid(cells: Any, looks: Any, bounds: Any, picture: Any, frame: Any) -> None:
     """Write the known part of a grid at the finest resolution at which it fits, by whole multiples of a cell.
@@ -969,31 +856,52 @@ def write_global_grid(cells: Any, looks: Any, bounds: Any, picture: Any, frame: 
             the share of border cells that were looked at, times 255.
         frame: (3,) float32. Output: x and y of the picture's middle in the start frame, and size of its cells [m].
     """
-    none = np.empty((0, 0), np.uint8)
-    _draw_global_grid(cells, looks, bounds, True, none, none, picture, frame)
+    size = len(cells)
+    height, width = bounds[2] - bounds[0], bounds[3] - bounds[1]
+    scale = max((max(height, width) + COARSE - 1) // COARSE, 1)
+    top, left = bounds[0] - (COARSE * scale - height) // 2, bounds[1] - (COARSE * scale - width) // 2
+    first, last = max(bounds[1], 1), min(bounds[3], size - 1)
+    first_row, last_row = max(bounds[0], 1), min(bounds[2], size - 1)
+    num = max(last - first, 0)
+    places, shades = np.empty(num, np.int32), np.empty(scale * scale + 1, np.uint8)
+    for i in range(num):
+        places[i] = (first + i - left) // scale
+    for k in range(len(shades)):  # instead of a division per cell
+        shades[k] = k * 255 // (scale * scale)
+    borders, unseen, columns = np.empty(num, np.uint8), np.empty(num, np.uint8), np.empty(num + 2, np.uint16)
+    counts, sums = np.empty((4, num), np.uint16), np.empty((4, COARSE), np.int32)
+    free, occupied, at_wall, looked = counts[0], counts[1], counts[2], counts[3]
+    picture[:] = 0
+    for r in range(COARSE):
+        begin, end = max(top + r * scale, first_row), min(top + (r + 1) * scale, last_row)
+        if begin >= end or num == 0:
+            continue
+        for i in range(num):
+            free[i] = occupied[i] = at_wall[i] = looked[i] = 0
+        for row in range(begin, end):
+            mark_borders(cells, row, first, last, borders)
+            mark_unseen(borders, looks, row, first, columns, unseen)
+            here = cells[row, first:last]
+            for i in range(num):  # without branches: this becomes vector code
+                free[i] += here[i] == FREE
+                occupied[i] += here[i] == OCCUPIED
+                at_wall[i] += borders[i]
+                looked[i] += borders[i] - unseen[i]
+        sums[:] = 0
+        for k in range(4):
+            for i in range(num):
+                sums[k, places[i]] += counts[k, i]
+        for block in range(COARSE):
+            picture[0, r, block], picture[1, r, block] = shades[sums[0, block]], shades[sums[1, block]]
+            if sums[2, block] > 0:
+                picture[2, r, block] = sums[3, block] * 255 // sums[2, block]
+    frame[0] = to_coordinate(left, size) + 0.5 * (COARSE * scale - 1) * CELL
+    frame[1] = to_coordinate(top, size) + 0.5 * (COARSE * scale - 1) * CELL
+    frame[2] = scale * CELL
 
 
 @jit
-def update_global_grids(
-    cells: Any, looks: Any, bounds: Any, stale_cells: Any, stale_looks: Any, drawn: Any, pictures: Any, frames: Any
-) -> None:
-    """Bring the pictures of K grids up to date, at a cost that follows what has changed unless their bounds have.
-
-    Args:
-        cells, looks, bounds: Arrays of K grids, see `write_global_grid`.
-        stale_cells, stale_looks: (K, n, n) uint8. 1 for the tiles that have changed since the last time; set to 0.
-        drawn: (K, 5) int32. Size and bounds of the grids at the last time; changed.
-        pictures, frames: (K, 3, 48, 48) uint8 and (K, 3) float32, see `write_global_grid`; changed.
-    """
+def write_global_grids(cells: Any, looks: Any, bounds: Any, pictures: Any, frames: Any) -> None:
+    """Write the pictures of K grids; arguments as those of `write_global_grid`, with an axis of K before."""
     for robot in range(len(cells)):
-        is_whole = drawn[robot, 0] != len(cells[robot])
-        for k in range(4):
-            is_whole |= drawn[robot, 1 + k] != bounds[robot, k]
-            drawn[robot, 1 + k] = bounds[robot, k]
-        drawn[robot, 0] = len(cells[robot])
-        _draw_global_grid(
-            cells[robot], looks[robot], bounds[robot], is_whole, stale_cells[robot], stale_looks[robot],
-            pictures[robot], frames[robot],
-        )  # fmt: skip
-        stale_cells[robot] = 0
-        stale_looks[robot] = 0
+        write_global_grid(cells[robot], looks[robot], bounds[robot], pictures[robot], frames[robot])

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import FloatArray, IntArray
+from vslam_env.navigation._grid_kernels import CELL
 from vslam_env.navigation._view_kernels import (
     NUM_DESCRIBED,
     NUM_GAINS,
@@ -46,10 +47,6 @@ CANDIDATE_FEATURES = (
 """Names of the columns of the candidates in observations."""
 
 FIRST_KIND = NUM_DESCRIBED  # column of the first kind
-WHOLE_CELLS = 100_000  # cells of a known part, 63 x 63 m, that is searched wholly at every update
-SHARE_CELLS = 40_000  # cells of a larger one that an update searches beyond what is near, in the mean
-VERY_LARGE_CELLS = 202_500  # cells of a known part, 90 x 90 m, beyond which this share is halved
-NEAR = 18.0  # [m] from the robot along x and y that are searched at every update of a larger one
 
 
 class CandidateKind(IntEnum):
@@ -93,20 +90,24 @@ class TeamCandidates:
     Slots 0 to 15 hold frontiers (`CandidateSlots`), 16 to 27 places to look from again, 28 to 31 rendezvous. A
     candidate keeps its slot while it lives: a place to look from again, while something is left to gain there.
 
-    An update costs what is near: where more than 63 x 63 m are known most updates search only within 18 m of the robot,
-    and candidates farther away, with their lengths and gains, stay as they were. All known floor is searched at every
-    n-th update, robots in turn, n the known area over 40 x 40 m, twice that where more than 90 x 90 m are known; and as
-    soon as no frontier is left.
+    An update costs what is near: it searches within `near` of the robot, and candidates farther away, with their
+    lengths and gains, stay as they were. All known floor is searched at every n-th update, robots in turn, n the known
+    area over `share`, rounded up, and as soon as no frontier is left.
 
     Args:
         num_robots: Number of robots K.
         camera: Half the field of view [rad], range [m], and radius of the robots [m].
+        near: Distance from the robot along x and y that every update searches [m].
+        share: Area that an update searches beyond what is near, in the mean [m^2].
 
     Attributes:
         frontiers: Frontier slots of each robot.
     """
 
-    def __init__(self, num_robots: int, camera: tuple[float, float, float]) -> None:
+    def __init__(
+        self, num_robots: int, camera: tuple[float, float, float], near: float = 18.0, share: float = 1600.0
+    ) -> None:
+        self._near, self._share = near, share
         self._camera = np.array(camera)
         self._rows = np.full((num_robots, NUM_CANDIDATES, NUM_COLUMNS), np.nan)
         self._gains = np.zeros((num_robots, NUM_CANDIDATES, NUM_GAINS))
@@ -140,16 +141,14 @@ class TeamCandidates:
             ways = frontiers.renew(cells, bounds, poses[robot], robot)
         gains = self._gains[robot], self._views[robot]
         slots = self._rows[robot], self._visits[robot], *gains, self._lengths[robot], robot, self._updates[robot]
-        seen = looks.counts[robot], looks.bounds[robot], looks.stale[robot]
+        seen = looks.counts[robot], looks.bounds[robot]
         renew_candidates(cells, bounds, seen, ways, landmarks, poses[robot], self._camera, places, slots)
 
     def _reach(self, robot: int, bounds: NDArray[np.int32]) -> float:
         """Return the distance [m] from a robot along x and y that the present update searches; inf: everywhere."""
         top, left, bottom, right = bounds.tolist()
-        known = (bottom - top) * (right - left)
-        share = SHARE_CELLS if known <= VERY_LARGE_CELLS else SHARE_CELLS // 2
-        period = 1 if known <= WHOLE_CELLS else -(-known // share)
-        return math.inf if self._updates[robot] % period == robot % period else NEAR
+        period = max(1, math.ceil((bottom - top) * (right - left) * CELL**2 / self._share))
+        return math.inf if self._updates[robot] % period == robot % period else self._near
 
     def rows(self, robot: int) -> FloatArray:
         """Return the candidates (32, 5) of a robot, columns as in `FrontierColumns`; NaN in empty slots. A view."""

@@ -5,7 +5,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from vslam_env.navigation._view_kernels import COARSE, NUM_COARSE, update_global_grids, write_global_grid
+from vslam_env.navigation._view_kernels import COARSE, NUM_COARSE, write_global_grid, write_global_grids
 from vslam_env.navigation.looks import TeamLooks
 from vslam_env.navigation.occupancy_grid import OccupancyGrid
 from vslam_env.navigation.team_grids import TeamGrids
@@ -25,7 +25,6 @@ class GlobalGrids:
     def __init__(self, num_robots: int) -> None:
         self.pictures: NDArray[np.uint8] = np.zeros((num_robots, NUM_COARSE, COARSE, COARSE), np.uint8)
         self.frames: NDArray[np.float32] = np.zeros((num_robots, 3), np.float32)
-        self._drawn = np.full((num_robots, 5), -1, np.int32)
 
     @classmethod
     def of(cls, grid: OccupancyGrid, looks: NDArray[np.uint8]) -> Self:
@@ -35,12 +34,5 @@ class GlobalGrids:
         return self
 
     def update(self, grids: TeamGrids, looks: TeamLooks) -> None:
-        """Draw again what has changed in grids and looks since the last time, and clear their notes of it.
-
-        Args:
-            grids: Grids of the robots, always the same ones.
-            looks: Looks of the robots, of the same size.
-        """
-        update_global_grids(
-            grids.cells, looks.counts, grids.bounds, grids.stale, looks.stale, self._drawn, self.pictures, self.frames
-        )
+        """Draw the grids of the robots with their looks, which have the same size."""
+        write_global_grids(grids.cells, looks.counts, grids.bounds, self.pictures, self.frames)

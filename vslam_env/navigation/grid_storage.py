@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from slam_backend.core import state_checks as check
 from slam_backend.core.read_only import as_read_only
-from vslam_env.navigation._grid_kernels import CELL, GRID_SIZE, LARGEST_SIZE, MOST_CHANGES, NUM_TILES, Grid
+from vslam_env.navigation._grid_kernels import CELL, GRID_SIZE, LARGEST_SIZE, MOST_CHANGES, Grid
 
 GRID_SIZES = (GRID_SIZE, 600, 1200, 2400, LARGEST_SIZE)  # by doubling, up to 400 m on each side of the start
 
@@ -29,8 +29,6 @@ class GridStorage:
             any cell may have changed, as initially.
         bounds: (K, 4) int32. First row and column of the known part of each grid, and one past the last ones; zeros if
             nothing is known.
-        stale: (K, n, n) uint8. 1 for the tiles of each grid, see `mark_stale`, in which cells have changed state since
-            the reader last set them to 0.
         views: Arrays of each grid.
         read_only_cells: Read-only views (S, S) of the cells of each grid.
     """
@@ -38,13 +36,12 @@ class GridStorage:
     def __init__(self, num_grids: int) -> None:
         self.changes = np.full((num_grids, 1 + MOST_CHANGES), -1, np.int32)
         self.bounds = np.zeros((num_grids, 4), np.int32)
-        self.stale = np.ones((num_grids, NUM_TILES, NUM_TILES), np.uint8)
         self._adopt(*_empty(num_grids, GRID_SIZE))
 
     def _adopt(self, evidence: NDArray[np.int8], cells: NDArray[np.uint8]) -> None:
         """Use given arrays for evidence and cells."""
         self.evidence, self.cells = evidence, cells
-        self.views = list(map(Grid, evidence, cells, self.changes, self.bounds, self.stale))
+        self.views = list(map(Grid, evidence, cells, self.changes, self.bounds))
         self.read_only_cells = [as_read_only(view.cells) for view in self.views]
 
     @property
@@ -55,7 +52,7 @@ class GridStorage:
     @property
     def arrays(self) -> Grid:
         """The arrays of all grids."""
-        return Grid(self.evidence, self.cells, self.changes, self.bounds, self.stale)
+        return Grid(self.evidence, self.cells, self.changes, self.bounds)
 
     def reserve(self, needed: int) -> None:
         """Grow until the grids reach a number of cells from their middle in each direction, or are the largest ones.

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from slam_backend.core import state_checks as check
 from slam_backend.core.validation import FloatArray, IntArray
-from vslam_env.navigation._grid_kernels import GRID_SIZE, NUM_TILES
+from vslam_env.navigation._grid_kernels import GRID_SIZE
 from vslam_env.navigation._view_kernels import merge_looks, paint_looks
 from vslam_env.navigation.grid_storage import check_corner, known_bounds, margin
 from vslam_env.navigation.validation import pose_floats, ray_directions
@@ -35,7 +35,6 @@ class TeamLooks:
     Attributes:
         counts: (K, S, S) uint8. Looks at each cell; a new array when the looks grow.
         bounds: (K, 4) int32. Bounds of the cells with looks, as in `GridStorage`.
-        stale: (K, n, n) uint8. 1 for the tiles in which looks have changed, as in `GridStorage`.
     """
 
     def __init__(self, num_robots: int, angles: FloatArray, half_fov: float, reach: float) -> None:
@@ -44,7 +43,6 @@ class TeamLooks:
         self._directions[:, np.abs(angles) > half_fov + SLACK] = 0.0
         self.counts: NDArray[np.uint8] = np.zeros((num_robots, GRID_SIZE, GRID_SIZE), np.uint8)
         self.bounds: NDArray[np.int32] = np.zeros((num_robots, 4), np.int32)
-        self.stale: NDArray[np.uint8] = np.ones((num_robots, NUM_TILES, NUM_TILES), np.uint8)
 
     def update(self, shared: IntArray, poses: FloatArray, scans: FloatArray, size: int) -> None:
         """Count the looks of a tick; see `TeamGrids.update` for the arguments.
@@ -53,14 +51,14 @@ class TeamLooks:
             size: Number of cells S along a side of the grids, to which the looks grow.
         """
         self.reserve(size)
-        arrays = self.counts, self.bounds, self.stale
-        paint_looks(*arrays, shared, poses, scans, self._directions, self._reach, self._points)
+        paint_looks(
+            self.counts, self.bounds, shared, poses, scans, self._directions, self._reach, self._points
+        )  # fmt: skip
 
     def merge(self, robot: int, other: NDArray[np.uint8], self_from_other: ArrayLike) -> None:
         """Add another robot's looks (S', S') uint8; its start pose in this robot's frame is (3,) [m, m, rad]."""
         motion = pose_floats(self_from_other, "self_from_other")
-        arrays = self.counts[robot], self.bounds[robot], self.stale[robot]
-        merge_looks(*arrays, other, known_bounds(other), *motion)
+        merge_looks(self.counts[robot], self.bounds[robot], other, known_bounds(other), *motion)
 
     def reserve(self, size: int) -> None:
         """Grow to the size S of the grids, unless the looks have it; views taken before are no longer updated."""
@@ -84,7 +82,7 @@ class TeamLooks:
         """Restore a state of `get_state` into looks that have the size of the grids."""
         shift, (row, col) = margin(self.counts.shape[1]), state["corner"]
         height, width = state["counts"].shape
-        self.counts[robot], self.stale[robot] = 0, 1
+        self.counts[robot] = 0
         looks = self.counts[robot, row + shift : row + shift + height, col + shift : col + shift + width]
         looks[:] = state["counts"]
         self.bounds[robot] = known_bounds(state["counts"])

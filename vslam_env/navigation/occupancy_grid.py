@@ -204,7 +204,6 @@ class OccupancyGrid:
         grid.evidence[there] = evidence
         grid.cells[there] = _CELL_STATES[evidence.view(np.uint8)]
         grid.changes[0] = -1
-        grid.stale[:] = 1
         known = known_bounds(grid.cells[there])
         grid.bounds[:] = known + np.array([top, left, top, left], np.int32) if known[2] else 0
 

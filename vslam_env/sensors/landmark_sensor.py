@@ -1,6 +1,5 @@
 """Landmark sensor: noisy measurements of the landmarks in view of each camera."""
 
-import math
 from dataclasses import dataclass, field
 from operator import itemgetter
 from typing import NamedTuple
@@ -21,7 +20,6 @@ from slam_backend.core.validation import (
 from slam_backend.models.camera import StereoCamera
 from slam_backend.models.measurements import Measurements, TeamMeasurements
 from vslam_env.sensors._landmark_kernels import BEYOND, FARTHEST, measure, sample_clutter
-from vslam_env.sensors._stream_kernels import draw_keys_in_view, limbs
 from vslam_env.world._kernels import detect
 from vslam_env.world.spec import Landmarks
 from vslam_env.world.visibility import (
@@ -33,7 +31,6 @@ from vslam_env.world.visibility import (
 )
 
 MAX_POINTS = 10_000  # limit per frame
-MANY_KEYS = 8192  # from which those of landmarks out of view are not drawn
 
 
 @short_repr
@@ -173,7 +170,7 @@ class LandmarkSensor:
         """
         config, robots, (most, size) = self.config, len(poses), self._frame_shape
         num_false = rng.poisson(config.false_points, robots)
-        keys = self._draw_keys(poses, rng)
+        keys = rng.random((len(poses), len(self._points)))
         ids, ends = np.empty((robots, most), np.int64), np.empty(robots, np.int64)
         ids.fill(-1)
         total, extra = detect(poses, self._sight, keys, config.detection_probability, num_false, ids, ends)
@@ -188,21 +185,6 @@ class LandmarkSensor:
         if count < total:
             points, descriptors = points[:count], descriptors[:count]
         return TeamSensorFrames(TeamMeasurements(points, descriptors, ends), ids)
-
-    def _draw_keys(self, poses: FloatArray, rng: np.random.Generator) -> FloatArray:
-        """Return what `rng.random` gives for all robots and landmarks (K, N), and leave `rng` as that does.
-
-        Where they are many, the keys of landmarks out of view, which `detect` does not read, are not drawn.
-        """
-        shape, stream = (len(poses), len(self._points)), rng.bit_generator
-        if math.prod(shape) < MANY_KEYS or not isinstance(stream, np.random.PCG64):
-            return rng.random(shape)
-        before, keys = stream.state, np.empty(shape)
-        increment, state = limbs(before["state"]["inc"]), limbs(before["state"]["state"])
-        draw_keys_in_view(poses, self._sight, increment, state, keys)
-        stream.advance(keys.size)
-        stream.state = {**before, "state": stream.state["state"]}  # `advance` drops the buffered half of a number
-        return keys
 
     def _sample_clutter(self, count: int, rng: np.random.Generator) -> FloatArray:
         """Draw false points and their descriptors (count, 3 + d)."""

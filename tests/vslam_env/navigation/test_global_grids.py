@@ -58,20 +58,3 @@ def test_pictures_follow_scans_merges_and_restored_states(seed: int) -> None:
             assert_drawn(pictures, grids, looks)
     assert {0, 1, 2} <= kinds
     assert grids.size > 600
-
-
-def test_only_what_has_changed_is_drawn_again() -> None:
-    """A part of the picture that nothing touched keeps what it shows, even if that was wrong."""
-    grids, looks, pictures = TeamGrids(1), TeamLooks(1, ANGLES, HALF_FOV, REACH), GlobalGrids(1)
-    scans, still = np.full((1, len(ANGLES)), 5.0), np.zeros(1, bool)
-    for x in (-20.0, 20.0):
-        grids.update(np.ones((1, 1), np.int64), np.array([[[x, 0.0, 0.0]]]), scans, still, *HARDWARE)
-    pictures.update(grids, looks)
-    pictures.pictures[:] = 77
-    grids.update(np.ones((1, 1), np.int64), np.array([[[20.0, 0.0, 0.0]]]), scans * 0.6, still, *HARDWARE)
-    pictures.update(grids, looks)
-    drawn = (pictures.pictures[0] != 77).any(axis=0)
-    assert drawn[:, COARSE // 2 :].any()
-    assert not drawn[:, : COARSE // 2].any()
-    grids.update(np.ones((1, 1), np.int64), np.array([[[26.0, 0.0, 0.0]]]), scans, still, *HARDWARE)
-    assert_drawn(pictures, grids, looks)

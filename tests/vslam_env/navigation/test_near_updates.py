@@ -12,7 +12,6 @@ from vslam_env.navigation import (
     TeamCandidates,
     TeamGrids,
     TeamLooks,
-    candidates,
     cell_of,
 )
 
@@ -20,14 +19,8 @@ CAMERA = (0.46, 8.0, 0.2)
 NO_LANDMARKS = np.empty((0, 4)), np.empty((0, 2), np.int64), np.zeros(3)
 NO_PLACES = np.full((4, 3), np.nan)
 NEAR, PERIOD = 12.0, 5
-
-
-@pytest.fixture(autouse=True)
-def small_limits(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let grids of a few hundred square metres count as large."""
-    monkeypatch.setattr(candidates, "NEAR", NEAR)
-    monkeypatch.setattr(candidates, "WHOLE_CELLS", 0)
-    monkeypatch.setattr(candidates, "SHARE_CELLS", 290 * 42 // PERIOD + 10)
+SHARE = 0.2**2 * (290 * 42 // PERIOD + 10)  # [m^2], so that a few hundred square metres are searched in parts
+WHOLE = 1e9
 
 
 def crossing(blind: tuple[float, ...] = ()) -> np.ndarray:
@@ -51,8 +44,9 @@ def crossing(blind: tuple[float, ...] = ()) -> np.ndarray:
 class Robot:
     """Candidates of robots that know the same cells; the first one is looked at."""
 
-    def __init__(self, cells: np.ndarray, num_robots: int = 1) -> None:
-        self.grids, self.candidates = TeamGrids(num_robots), TeamCandidates(num_robots, CAMERA)
+    def __init__(self, cells: np.ndarray, num_robots: int = 1, share: float = SHARE) -> None:
+        self.grids = TeamGrids(num_robots)
+        self.candidates = TeamCandidates(num_robots, CAMERA, NEAR, share)
         self.looks = TeamLooks(num_robots, np.zeros(1), 0.46, 8.0)
         self.looks.counts[:] = 255
         self.know(cells)
@@ -72,42 +66,33 @@ class Robot:
         return rows[rows[:, 0].argsort()]
 
 
-def reference(cells: np.ndarray, x: float, monkeypatch: pytest.MonkeyPatch) -> np.ndarray:
+def reference(cells: np.ndarray, x: float) -> np.ndarray:
     """Return the frontiers that a search over all known floor finds."""
-    with monkeypatch.context() as patched:
-        patched.setattr(candidates, "WHOLE_CELLS", 10**9)
-        return Robot(cells).update(x)
+    return Robot(cells, share=WHOLE).update(x)
 
 
-def test_near_updates_find_what_a_whole_search_finds_nearby(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_near_updates_find_what_a_whole_search_finds_nearby() -> None:
     """Frontiers that appear near the robot are found at once, with the same goals and lengths."""
     robot = Robot(crossing(blind=(-9.0, 9.0, 21.0)))
     assert len(robot.update(-9.0)) == 0
     robot.know(cells := crossing())
-    found, expected = robot.update(-9.0), reference(cells, -9.0, monkeypatch)
+    found, expected = robot.update(-9.0), reference(cells, -9.0)
     near = np.abs(expected[:, 0] + 9.0) < 7.0
     assert 0 < near.sum() < len(expected)
     np.testing.assert_array_equal(found, expected[near])
 
 
-@pytest.mark.parametrize("very_large", [False, True])
-def test_distant_candidates_stay_until_all_is_searched(very_large: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A distant frontier that is gone stays a candidate, as it was, until the next search over all known floor.
-
-    In very large areas that comes after twice as many updates.
-    """
-    period = 2 * PERIOD if very_large else PERIOD
-    if very_large:
-        monkeypatch.setattr(candidates, "VERY_LARGE_CELLS", 0)
+def test_distant_candidates_stay_until_all_is_searched() -> None:
+    """A distant frontier that is gone stays a candidate, as it was, until the next search over all known floor."""
     robot = Robot(crossing())
-    for _ in range(period):
+    for _ in range(PERIOD):
         before = robot.update(-9.0)
-    np.testing.assert_array_equal(before, reference(crossing(), -9.0, monkeypatch))
+    np.testing.assert_array_equal(before, reference(crossing(), -9.0))
     robot.know(cells := crossing(blind=(-9.0, 21.0)))
-    for _ in range(period - 1):
+    for _ in range(PERIOD - 1):
         rows = robot.update(-9.0)
         np.testing.assert_array_equal(rows, before[1:])  # the near one is gone at once
-    np.testing.assert_array_equal(robot.update(-9.0), reference(cells, -9.0, monkeypatch))
+    np.testing.assert_array_equal(robot.update(-9.0), reference(cells, -9.0))
 
 
 def test_all_known_floor_is_searched_when_no_frontier_is_left() -> None:

@@ -1,6 +1,5 @@
 """The landmark sensor sees what a camera would see, with the errors it is said to have."""
 
-from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +11,7 @@ from slam_backend import FastSlam
 from slam_backend.fastslam._kernels import MIN_DEPTH
 from slam_backend.geometry import compose
 from slam_backend.models.camera import StereoCamera
-from vslam_env.sensors import LandmarkSensor, LandmarkSensorConfig, landmark_sensor
+from vslam_env.sensors import LandmarkSensor, LandmarkSensorConfig
 from vslam_env.sensors._landmark_kernels import NEAREST, measure, sample_clutter
 from vslam_env.sensors.landmark_sensor import shuffle_clutter
 from vslam_env.world import FreeSpace, Landmarks, World, make_world, place_landmarks
@@ -196,36 +195,6 @@ def test_each_robot_detects_what_it_sees_as_false_points_leave_places(size: int)
             detected = np.flatnonzero(seen & (own < 0.8))
             expected = detected[np.argsort(own[detected])][:left]
             assert names[:count].tolist() == expected.tolist()
-
-
-@given(st.integers(0, 2**32), st.integers(1, 4), st.integers(1, 200), st.integers(0, 2))
-@settings(max_examples=50)
-def test_keys_of_what_is_in_view_are_those_that_all_landmarks_would_get(
-    seed: int, robots: int, number: int, halves: int
-) -> None:
-    """Where they are many, frames and the state of the stream are those of drawing the keys of all landmarks."""
-    rng = np.random.default_rng(seed)
-    rows = np.stack([rng.uniform(-2.8, 2.8, number), rng.uniform(-0.5, 0.5, number)], axis=1)
-    sensor = LandmarkSensor(LandmarkSensorConfig(false_points=0.5), WALL, on_wall(rows.tolist(), 200))
-    poses = np.stack([rng.uniform(-6, 4, robots), rng.uniform(-3, 3, robots), rng.uniform(-1, 1, robots)], axis=1)
-    rng.integers(2**32, size=halves, dtype=np.uint32)  # after one, half of a number is kept for the next
-    other = deepcopy(rng)
-    with pytest.MonkeyPatch.context() as patched:
-        expected = sensor.measure(poses, other)
-        patched.setattr(landmark_sensor, "MANY_KEYS", 0)
-        found = sensor.measure(poses, rng)
-    assert rng.bit_generator.state == other.bit_generator.state
-    for name in ("points", "descriptors", "offsets"):
-        np.testing.assert_array_equal(getattr(found.measurements, name), getattr(expected.measurements, name))
-    assert [ids.tolist() for ids in found.true_ids] == [ids.tolist() for ids in expected.true_ids]
-
-
-def test_streams_of_other_kinds_draw_all_keys(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With many landmarks any bit generator will do."""
-    sensor = LandmarkSensor(PERFECT, WALL, on_wall([[0.0, 0.0]]))
-    monkeypatch.setattr(landmark_sensor, "MANY_KEYS", 0)
-    frame = sensor.measure(np.zeros((1, 3)), np.random.Generator(np.random.Philox(1)))
-    assert frame.true_ids[0].tolist() == [0]
 
 
 def test_descriptor_noise_has_the_stated_length() -> None:

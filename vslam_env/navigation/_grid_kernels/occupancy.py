@@ -24,8 +24,6 @@ HIT = 3
 MOST_FREE, MOST_OCCUPIED = -8, 12
 
 MOST_CHANGES = 4096  # a grid keeps so many; a scan makes a hundred at most
-TILE = 16  # cells along a side of the tiles in which changes are noted, for pictures of the whole
-NUM_TILES = LARGEST_SIZE // TILE
 
 
 class Grid(NamedTuple):
@@ -39,15 +37,12 @@ class Grid(NamedTuple):
         changes: (1 + n,) int32. Number of changed verdicts, -1 if it is not known; then the places of these cells, see
             `place_of`.
         bounds: (4,) int32. First row and column of what is known, and one past the last ones; zeros if nothing is.
-        stale: (n, n) uint8. 1 for the tiles of the largest grid in which a verdict has changed. Like `changes`, they
-            are for one reader, which clears them: coverage asks which cells have changed, pictures of the whole where.
     """
 
     evidence: NDArray[np.int8]
     cells: NDArray[np.uint8]
     changes: NDArray[np.int32]
     bounds: NDArray[np.int32]
-    stale: NDArray[np.uint8]
 
 
 @inline
@@ -61,13 +56,6 @@ def place_of(row: int, col: int, size: int) -> int:
     """Return the flat index in the largest grid of a cell of a grid of a size."""
     inset = (LARGEST_SIZE - size) // 2
     return (row + inset) * LARGEST_SIZE + col + inset
-
-
-@inline
-def mark_stale(stale: Any, row: int, col: int, size: int) -> None:
-    """Mark the tile (of n x n) that contains a cell of a grid of a size: something has changed there."""
-    inset = (LARGEST_SIZE - size) // 2
-    stale[(row + inset) // TILE, (col + inset) // TILE] = 1
 
 
 @inline
@@ -96,7 +84,6 @@ def set_state(grid: Grid, row: int, col: int, verdict: int) -> None:
         if cells[row, col] == UNKNOWN:
             widen_bounds(bounds, row, col)
         cells[row, col] = verdict
-        mark_stale(grid.stale, row, col, len(cells))
         if 0 <= changes[0] < len(changes) - 1:
             changes[0] += 1
             changes[changes[0]] = place_of(row, col, len(cells))
