@@ -71,7 +71,7 @@ class Setting:
         shift: Shift of forced merges [m]; None: the wrong transform with the best fit.
         rejuvenate_every: Interval of rejuvenations; None: never in aisles, the default in environments.
         straighten: Whether maps are smoothed before a merge.
-        sure, min_sigmas_on_trial: Required certainty of a transform, see `MergeOptions`; None: the default.
+        sure, least_sigmas: Required certainty of a transform, see `MergeOptions`; None: the default.
     """
 
     forced: bool = False
@@ -79,15 +79,13 @@ class Setting:
     rejuvenate_every: int | None = None
     straighten: bool = True
     sure: float = MergeOptions().min_sigmas
-    min_sigmas_on_trial: float | None = None
+    least_sigmas: float | None = None
 
     @property
     def merging(self) -> dict[str, Any]:
         """Merge options."""
         options = {"smooth_first": self.straighten, "min_sigmas": self.sure}
-        return (
-            options if self.min_sigmas_on_trial is None else options | {"min_sigmas_on_trial": self.min_sigmas_on_trial}
-        )
+        return options if self.least_sigmas is None else options | {"least_sigmas": self.least_sigmas}
 
     @property
     def filter(self) -> dict[str, Any]:
@@ -319,7 +317,7 @@ def main(
     sure: Annotated[
         float, typer.Option(help="Required certainty of a merge in standard deviations; 0: none.")
     ] = MergeOptions().min_sigmas,
-    min_sigmas_on_trial: Annotated[
+    least_sigmas: Annotated[
         float | None, typer.Option(help="Value for MergeOptions; 0: no trials.", show_default="the default")
     ] = None,
     world: Annotated[list[str] | None, typer.Option(help="World family, floor plan, or folder of floor plans.")] = None,
@@ -342,7 +340,7 @@ def main(
         check_writable(json_file, "json")
     setting = Setting(
         forced=forced, shift=shift, rejuvenate_every=rejuvenate_every, straighten=straighten, sure=sure,
-        min_sigmas_on_trial=min_sigmas_on_trial,
+        least_sigmas=least_sigmas,
     )  # fmt: skip
     console = Console(highlight=False, soft_wrap=True)
     merges: list[MergeOutcome] = []

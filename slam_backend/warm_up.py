@@ -22,6 +22,7 @@ from slam_backend.fastslam.options import FilterOptions
 from slam_backend.fastslam.state_checks import are_linked
 from slam_backend.frontend import StereoFrontEnd
 from slam_backend.geometry import inverse
+from slam_backend.maps.alignment import align_maps
 from slam_backend.metrics.maps import map_error
 from slam_backend.models.camera import StereoCamera
 from slam_backend.models.measurements import Measurements, TeamMeasurements
@@ -121,10 +122,10 @@ def run_all_paths(extras: Collection[str]) -> float:
                     slam.step([move, None], [frame, frame])
                 slam.step([None, None], [frame, frame], [ids, some_ids], [still, None])
                 slam.step([move, move], [None, None])
-        few_keys = SmoothingOptions(max_keys=2, recent_keys=1)  # logs are added in parts, between which keys are joined
+        few_keys = SmoothingOptions(incremental=True, max_keys=2, recent_keys=1)  # keys are joined between slices
         biased = OdometryModel(bias_scale=0.02)
-        smoothing = FastSlam(num_particles=4, motion=biased, rejuvenate_every=STEPS + 1, smoothing=few_keys)
-        for _ in range(2 * (STEPS + 1)):
+        smoothing = FastSlam(num_particles=4, motion=biased, rejuvenate_every=3 * STEPS, smoothing=few_keys)
+        for _ in range(4 * STEPS):
             smoothing.step([move], [plain])
         smoothing.set_state(smoothing.get_state())
         if "existence" in extras:
@@ -141,13 +142,15 @@ def run_all_paths(extras: Collection[str]) -> float:
         inverse(np.zeros((2, 3)))  # of starts in a fixed gauge
         find_only(points, descriptors, points, descriptors, 1.0, 1.0, ids.copy())
         gauge.move(np.zeros((1, 3, 1)), np.zeros((1, 3)), np.zeros((1, 3, 1)))  # of unknown starts
-        team = TeamSlam(2, num_particles=4, attempts=AttemptOptions(every=1), merging=MergeOptions(watch_every=1))
+        attempts, merging = AttemptOptions(every=1), MergeOptions(watch_every=1)
+        team = TeamSlam(2, num_particles=4, rejuvenate_every=None, attempts=attempts, merging=merging)
         for _ in range(STEPS):
             team.step([None, None], [plain, plain])
         both = np.tile(points, (2, 1)), np.tile(descriptors, (2, 1))
         team.step(np.zeros((2, 3)), TeamMeasurements(*both, np.array([LANDMARKS, 2 * LANDMARKS])))
         team.team_poses(), team.map_summaries()
         landmarks = team.map(0)
+        align_maps(landmarks, landmarks)
         map_error(landmarks.means, ids, points)
         if "images" in extras:
             _measure_images()

@@ -15,6 +15,8 @@ import tomli_w
 from slam_backend.core.short_repr import short_repr
 from slam_backend.core.text_files import parse_toml, read_toml
 from slam_backend.core.validation import argument_error, check_choice, check_float, check_int, did_you_mean
+from slam_backend.smoother.options import SmoothingOptions
+from slam_backend.team.options import MergeOptions
 from vslam_env.belief.belief import BeliefConfig
 from vslam_env.sensors import LandmarkSensorConfig, ScanConfig, StereoSensorConfig
 from vslam_env.world import SPLITS, LandmarkConfig, OdometryNoise
@@ -46,7 +48,8 @@ def validate(cls: type[T], values: Mapping[str, Any]) -> T:
         if first["type"] == "unexpected_keyword_argument":
             *outer, wrong = first["loc"]
             known = _fields_beside(values, outer, wrong)
-            hint = f"{did_you_mean(wrong, known)}The fields are {', '.join(known)}."
+            advice = GONE.get(str(wrong), did_you_mean(wrong, known).rstrip())
+            hint = f"{advice} The fields are {', '.join(known)}.".lstrip()
             raise argument_error(name, "a known field", first["input"], hint) from None
         expected = first["msg"].removeprefix("Input should be ")
         hint = did_you_mean(first["input"], re.findall(r"'(\w+)'", expected)) + "Correct this value."
@@ -111,7 +114,8 @@ def num_cycles(max_seconds: float, step_s: float) -> int:
     return max(1, math.ceil(round(max_seconds / step_s, 6)))  # 1.1 / 0.1 is slightly more than 11
 
 
-FORMAT = 1  # version of TOML files; raised when the meaning of a field changes
+FORMAT = 2  # version of TOML files; raised when the meaning of a field changes
+GONE = SmoothingOptions.GONE | MergeOptions.GONE  # advice by the names of fields of earlier versions
 ACTION_TYPES = ("continuous", "discrete", "goal")
 OBSERVATION_TYPES = ("dict", "flat")
 SENSORS = ("landmark", "stereo")

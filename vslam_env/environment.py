@@ -183,8 +183,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
                 an exception, such as KeyboardInterrupt; `reset` and `set_state` then start from a whole state.
         """
         episode = self._running_episode("step")
-        if not self._is_whole:
-            raise RuntimeError(_not_whole("step"))
+        self.check_whole("step")
         if not self.agents:
             raise RuntimeError("step: expected a running episode, got one that has ended. Call reset() first.")
         agents = self.agents
@@ -339,8 +338,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         Raises:
             RuntimeError: After a step that was cut short by an exception.
         """
-        if not self._is_whole:
-            raise RuntimeError(_not_whole("get_state"))
+        self.check_whole("get_state")
         episode = self._episode
         return {
             "version": state_version(),
@@ -379,6 +377,12 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
             self._drivers.set_state(state["drivers"])
             self._team_metrics, self._cycle, self.agents = state["team_metrics"], state["cycle"], list(state["agents"])
         self._is_whole = True
+
+    def check_whole(self, name: str) -> None:
+        """Raise a RuntimeError, as of the method `name`, after a step that was cut short by an exception."""
+        if not self._is_whole:
+            got = "that of a step cut short by an exception. Call reset() or set_state()."
+            raise RuntimeError(f"{name}: expected a whole state, got {got}")
 
     def clone(self) -> "ExplorationEnv":
         """Return an independent environment in the same state, without window and recorder."""
@@ -420,11 +424,6 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         if not isinstance(agent, str) or agent not in self.possible_agents:
             raise argument_error("agent", f"one of {self.possible_agents}", agent, "Use a name of possible_agents.")
         return self.possible_agents.index(agent)
-
-
-def _not_whole(name: str) -> str:
-    """Return the message of a method that needs a whole state."""
-    return f"{name}: expected a whole state, got that of a step cut short by an exception. Call reset() or set_state()."
 
 
 def _unpickled(arguments: tuple[Any, ...], max_cycles: int, state: EnvState) -> ExplorationEnv:

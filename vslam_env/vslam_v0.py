@@ -122,6 +122,7 @@ class _TurnBasedEnv(parallel_to_aec_wrapper[str, Any, Any]):  # type: ignore[mis
 
     def step(self, action: Any) -> None:
         """Take the action of an agent, and step when all agents have one; see `ExplorationEnv.step`."""
+        self.env.unwrapped.check_whole("step")  # whichever agent is next
         with self._whole_or_marked():
             super().step(action)
 

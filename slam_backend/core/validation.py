@@ -128,6 +128,8 @@ def is_built_in(maker: object) -> bool:
 def known_names(kind: type[T]) -> type[T]:
     """Make a class refuse unknown keyword arguments with a list of the known ones; a class decorator.
 
+    Its attribute `GONE`, if it has one, gives advice by the names of arguments of earlier versions.
+
     >>> @known_names
     ... class Box:
     ...     def __init__(self, width: float = 1.0) -> None: ...
@@ -144,7 +146,8 @@ def known_names(kind: type[T]) -> type[T]:
         for name in named:
             if name not in known:
                 got = f"a name that {kind.__name__} does not have"
-                hint = f"{did_you_mean(name, known)}It has {', '.join(known)}."
+                advice = getattr(kind, "GONE", {}).get(name, did_you_mean(name, known).rstrip())
+                hint = f"{advice} It has {', '.join(known)}.".lstrip()
                 raise argument_error(name, "a known argument", got, hint)
         begin(self, *values, **named)
 

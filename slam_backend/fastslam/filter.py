@@ -219,14 +219,12 @@ class FastSlam:
         return report
 
     @property
-    def smooths_incrementally(self) -> bool:
-        """Whether the filter has a smoother that works in slices."""
-        return self.state.rejuvenation is not None and self.options.smoothing.slice_steps is not None
-
-    @property
-    def smooths_large_graph(self) -> bool:
-        """Whether the smoother's graph has so many landmarks that each slice of its work is costly."""
-        return self.state.rejuvenation is not None and self.state.rejuvenation.has_large_graph
+    def can_rejuvenate(self) -> bool:
+        """Whether the filter has a smoother, and no pose that was given as exact disables it."""
+        if self.state.rejuvenation is None:
+            return False
+        self.state.update_logs()  # which says whether poses were given as exact
+        return not self.state.rejuvenation.is_disabled
 
     def request_rejuvenation(self) -> None:
         """Request a rejuvenation as soon as possible, in slices if the smoother works incrementally."""
@@ -375,9 +373,7 @@ class FastSlam:
         state = self.state
         if estimate == "best":
             return unchecked_map(*best_map(state.maps, state.best, min_count))
-        every = [state.maps] if state.unwritten is None else state.unwritten.in_parts(state.num_particles)
-        parts = [map_mixture(maps, state.best, state.log_weights, state.gauge_covariance, min_count) for maps in every]
-        return unchecked_map(*(parts[0] if len(parts) == 1 else map(np.concatenate, zip(*parts, strict=True))))
+        return unchecked_map(*map_mixture(state.maps, state.best, state.log_weights, state.gauge_covariance, min_count))
 
     def descriptors(self) -> NDArray[np.float32]:
         """Return the descriptors (n, d) of the landmarks of `map()`. A copy."""

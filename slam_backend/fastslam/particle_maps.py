@@ -9,11 +9,6 @@ particle are at its own place. Thus no two particles share values that one of th
 """
 
 import math
-import mmap
-import sys
-import weakref
-from collections.abc import Iterator
-from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -21,11 +16,10 @@ from numpy.typing import NDArray
 
 from slam_backend.core.jit import LINE
 from slam_backend.core.packed_symmetric import UNPACK_INDEX
-from slam_backend.core.read_only import as_read_only, is_read_only
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.fastslam import _kernels
 from slam_backend.fastslam._kernels import LANES
-from slam_backend.fastslam._kernels.records import PLACE, SLOT
+from slam_backend.fastslam._kernels.records import SLOT
 from slam_backend.maps.landmark_map import MapSummaryRows
 
 
@@ -45,46 +39,6 @@ def zeros_aligned(shape: tuple[int, ...], dtype: Any) -> Any:
     return array
 
 
-GROWN = 1 << 23  # bytes from which values that must grow move to `GrowingMemory`, on Linux; worlds of 30 m stay below
-LARGE = 1 << 25  # the same for new values: the allocator uses smaller blocks again
-
-
-class GrowingMemory:
-    """Memory of float64 numbers that the system moves instead of copying it, as the pages of a process can be.
-
-    New pages are costly: the system clears each when it is first written.
-
-    Args:
-        size: Number of float64 numbers.
-    """
-
-    def __init__(self, size: int) -> None:
-        self._pages = mmap.mmap(-1, 8 * size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
-        self._prefer_huge_pages()
-
-    def array(self, size: int) -> FloatArray:
-        """Return the first `size` numbers, aligned to a cache line. A view."""
-        return np.frombuffer(self._pages, np.float64, size)
-
-    def reserve(self, size: int) -> bool:
-        """Provide `size` numbers, the first of them as before; return whether that is possible.
-
-        No array of the memory may be in use.
-        """
-        if 8 * size > len(self._pages):
-            try:
-                self._pages.resize(8 * size)
-            except (BufferError, OSError):
-                return False
-            self._prefer_huge_pages()
-        return True
-
-    def _prefer_huge_pages(self) -> None:
-        """Ask for pages of 2 MB, as numpy does for large arrays."""
-        with suppress(OSError):  # a system without them
-            self._pages.madvise(mmap.MADV_HUGEPAGE)
-
-
 def _num_heads(descriptor_size: int) -> int:
     """Return how many components of a descriptor are compared first: half of a long descriptor.
 
@@ -92,10 +46,6 @@ def _num_heads(descriptor_size: int) -> int:
     be candidates, with half of them one in thirty.
     """
     return descriptor_size // 2 if descriptor_size >= 32 and descriptor_size % 2 == 0 else descriptor_size
-
-
-Copied = tuple[IntArray, list["weakref.ref[FloatArray]"]]
-_NOTHING_COPIED: Copied = np.zeros(0, np.int64), []
 
 
 class MapStore:
@@ -110,11 +60,10 @@ class MapStore:
         values: (rows * 9 * P,) float64 [m, m^2], map frame, each row
             [block][x, y, z, Sxx, Sxy, Sxz, Syy, Syz, Szz][lane].
         counts: (rows, P) int32. Matches of the landmark in the particle, its creation included; 0: not present.
-        table: (7, slots) int64, see `SlotRows`.
+        table: (6, slots) int64, see `SlotRows`.
         maps: (maps, P) int32. users: (maps,) int64, how many slots read by each.
         odds: (slots, P) float64. Log-odds that the landmark exists, read through its map as a row is; (0, P) without.
         descriptors: (slots, d) float32. heads: (h, slots) every (d / h)-th component of them, `FAR` where free.
-        places: (3, slots) float32. Positions of the landmarks, see `PlaceRows`; not part of a state.
         free_rows: A stack; `tops` = (its height, that of the free slots, the name of the next landmark).
     """
 
@@ -127,17 +76,14 @@ class MapStore:
         self.num_particles = num_particles
         self.padded = -(-num_particles // LANES) * LANES
         self.values: FloatArray = empty_aligned((0,), np.float64)
-        self._memory: GrowingMemory | None = None  # of large `values`
         self.counts: NDArray[np.int32] = empty_aligned((0, self.padded), np.int32)
         self.odds: FloatArray = empty_aligned((0, self.padded), np.float64)
         self.maps: NDArray[np.int32] = np.zeros((1, self.padded), dtype=np.int32)
         self.users: IntArray = np.zeros(1, dtype=np.int64)
-        self.table: IntArray = np.zeros((7, 0), dtype=np.int64)
+        self.table: IntArray = np.zeros((6, 0), dtype=np.int64)
         self.descriptors: NDArray[np.float32] = np.zeros((0, 0), dtype=np.float32)
         self.heads: NDArray[np.float32] = np.zeros((0, 0), dtype=np.float32)
-        self.places: NDArray[np.float32] = np.zeros((3, 0), dtype=np.float32)
         self._free_maps = 0
-        self._copied = _NOTHING_COPIED  # slots of the last state, and its arrays while others keep them; not part of it
         self.free_rows: IntArray = np.zeros(0, dtype=np.int64)
         self.tops: IntArray = np.zeros(3, dtype=np.int64)
 
@@ -180,7 +126,7 @@ class MapStore:
     def nbytes(self) -> int:
         """Memory in use [bytes]."""
         arrays = (
-            self.values, self.counts, self.maps, self.users, self.table, self.descriptors, self.heads, self.places,
+            self.values, self.counts, self.maps, self.users, self.table, self.descriptors, self.heads,
             self.free_rows, self.odds,
         )  # fmt: skip
         return sum(array.nbytes for array in arrays)
@@ -190,7 +136,7 @@ class MapStore:
         """The arrays as kernels take them."""
         return _kernels.MapArrays(
             self.values, self.counts, self.odds, self.table, self.maps, self.users, self.free_rows, self.tops,
-            self.descriptors, self.heads, self.places,
+            self.descriptors, self.heads,
         )  # fmt: skip
 
     @property
@@ -228,13 +174,10 @@ class MapStore:
             descriptor_size: Length d of the descriptors.
         """
         if min(len(self.ids), len(self.counts)) < new or self.descriptors.shape[1] != descriptor_size:
-            memory = self._memory
             self._clear(self.num_particles)
-            self._memory = memory
             if new or descriptor_size:
                 self._grow_slots(max(64, new), descriptor_size)
                 self._grow_rows(max(64, new + new // 2 + 1))
-        self._copied = _NOTHING_COPIED
         slots, rows = len(self.ids), len(self.counts)
         self.row_of[:new], self.map_of[:new] = np.arange(new), 0
         self.ids[new:] = self.identities[new:] = -1
@@ -258,10 +201,6 @@ class MapStore:
         if old and len(self.heads):
             heads[:, :old] = self.heads
         self.heads = heads
-        places = np.zeros((len(self.places), old + extra), np.float32)
-        places[PLACE.x, old:] = _kernels.FAR
-        places[:, :old] = self.places
-        self.places = places
         if self.log_odds_prior is not None:
             odds = zeros_aligned((old + extra, self.padded), np.float64)
             odds[:old] = self.odds
@@ -276,7 +215,9 @@ class MapStore:
     def _grow_rows(self, extra: int) -> None:
         """Add `extra` rows, uninitialised."""
         old, padded = len(self.counts), self.padded
-        self._grow_values((old + extra) * 9 * padded)
+        values = empty_aligned(((old + extra) * 9 * padded,), np.float64)
+        values[: len(self.values)] = self.values
+        self.values = values
         counts = empty_aligned((old + extra, padded), np.int32)
         counts[:old] = self.counts
         self.counts = counts
@@ -287,31 +228,12 @@ class MapStore:
         self.free_rows = free
         self.tops[0] = extra + top
 
-    def _grow_values(self, size: int) -> None:
-        """Provide `size` values, the first of them as before, the others uninitialised."""
-        old = len(self.values)
-        if self._memory is not None:
-            self.values = empty_aligned((0,), np.float64)
-            is_grown = self._memory.reserve(size)
-            self.values = self._memory.array(size if is_grown else old)
-            if is_grown:
-                return
-        is_large = 8 * size >= (GROWN if old else LARGE)
-        self._memory = GrowingMemory(size) if is_large and sys.platform == "linux" else None
-        values = empty_aligned((size,), np.float64) if self._memory is None else self._memory.array(size)
-        values[:old] = self.values
-        self.values = values
-
     def _prepare_search(self, n: int) -> None:
-        """Write the heads of the first n slots, let their places be computed again, and mark the others free."""
-        self.places[PLACE.x, :n], self.places[PLACE.x, n:] = -_kernels.FAR, _kernels.FAR
+        """Write the heads of the first n slots, and mark the others free."""
         if len(self.heads):
             self.heads[:, :n] = self.descriptors[:n, :: self.descriptors.shape[1] // len(self.heads)].T
             self.heads[:, n:] = _kernels.FAR
 
-
-WHOLE = 512  # landmarks up to which the values of a snapshot are one array
-CHUNK = 128  # landmarks of an array in larger snapshots
 
 MAX_MAPS = 512  # limit of ancestor maps; beyond it the slots of the least used maps are refreshed
 MAPS_KEPT = (  # parts of a state
@@ -429,56 +351,10 @@ class ParticleMaps(MapStore):
             self.odds[:n, :m] = self.log_odds_prior if odds is None else odds
         self._prepare_search(n)
 
-    def load_packed(
-        self, values: FloatArray, counts: IntArray, descriptors: NDArray[np.float32], ids: IntArray,
-        identities: IntArray, next_id: int, odds: FloatArray | None,
-    ) -> None:  # fmt: skip
-        """Take the landmarks of a single particle, to be read or replaced only, in as little memory as they need.
-
-        Landmarks share rows: a row holds `LANES` of them, and ancestor map 1 + i reads lane i. No descriptor prefixes
-        are written, so that such maps serve no data association, and their state is no valid snapshot of a filter.
-
-        Args:
-            values: (n, 9) float64 [m, m^2], map frame.
-            counts: (n,) measurement counts, 0 where the particle lacks the landmark.
-            descriptors, ids, identities, next_id: See `load_metadata`.
-            odds: (n,) log-odds of existence; None if it is not estimated.
-        """
-        n, slots = len(ids), np.arange(len(ids))
-        rows, lanes = -(-n // LANES), slots % LANES
-        self._clear(1)
-        self._grow_slots(max(n, 1), descriptors.shape[1])
-        self._grow_rows(max(rows, 1))
-        self.tops[:] = 0, 0, next_id
-        self.row_of[:n], self.map_of[:n] = slots // LANES, 1 + lanes
-        self.maps = np.zeros((1 + LANES, self.padded), np.int32)
-        self.maps[1:, 0] = np.arange(LANES)
-        self.users = np.bincount(self.map_of[:n], minlength=1 + LANES)
-        self.ids[:n], self.identities[:n], self.descriptors[:n] = ids, identities, descriptors
-        self.counts[:] = 0
-        self.counts[self.row_of[:n], lanes] = counts
-        if odds is not None:
-            self.odds[slots, lanes] = odds
-        whole = np.zeros((rows * LANES, 9))
-        whole[:n] = values
-        self.blocks[:rows, 0] = whole.reshape(rows, LANES, 9).transpose(0, 2, 1)
-
     # ------------------------------------------------------------------ snapshots
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Return the attributes for copies and pickles, which share no arrays with states."""
-        return vars(self) | {"_copied": _NOTHING_COPIED, "_memory": None}
-
-    def get_state(self, for_copy: bool = False) -> dict[str, Any]:
-        """Return the complete state of the maps, compact; `values` may be shared with other states and are read-only.
-
-        They are a tuple of arrays (n, 9 P): one with all landmarks, or of more than `WHOLE` landmarks one for each
-        `CHUNK`, so that those of landmarks that were not written since the last state need not be copied.
-
-        Args:
-            for_copy: Whether the state is restored at once, into other maps: `values` then are an iterator over such
-                arrays, so that only one of them takes memory at a time.
-        """
+    def get_state(self) -> dict[str, Any]:
+        """Return the complete state of the maps, compact. Nothing is shared."""
         used = self.used_slots()
         of, rows = self.map_of[used], self.row_of[used]
         live, first = np.unique(of[of > 0], return_index=True)
@@ -487,7 +363,7 @@ class ParticleMaps(MapStore):
         number[live] = np.arange(1, len(live) + 1)
         return {
             "num_particles": self.num_particles,
-            "values": self._values_in_parts(used) if for_copy else self._copied_values(used),
+            "values": np.take(self.values.reshape(-1, 9 * self.padded), rows, axis=0),
             "counts": np.take(self.counts, rows, axis=0),
             "odds": None if self.log_odds_prior is None else np.take(self.odds, used, axis=0),
             "maps": np.take(self.maps, live, axis=0),
@@ -499,47 +375,13 @@ class ParticleMaps(MapStore):
             "next_id": self.next_id,
         }
 
-    def _values_in_parts(self, used: IntArray) -> Iterator[FloatArray]:
-        """Yield copies of the values of used slots, `CHUNK` landmarks at a time."""
-        values, rows = self.values.reshape(-1, 9 * self.padded), self.row_of[used]
-        for first in range(0, len(rows), CHUNK):
-            yield np.take(values, rows[first : first + CHUNK], axis=0)
-
-    def _copied_values(self, used: IntArray) -> tuple[FloatArray, ...]:
-        """Return the values of used slots, read-only; arrays of the last state that still hold are taken over."""
-        values, changed = self.values.reshape(-1, 9 * self.padded), self.table[SLOT.changed]
-        before, copied = self._copied
-        both = min(len(before), len(used))
-        stale = changed[used] > 0
-        stale[:both] |= used[:both] != before[:both]
-        stale[both:] = True
-        sizes = chunk_sizes(len(used))
-        firsts: IntArray = np.cumsum(sizes, dtype=np.int64) - np.array(sizes)
-        written = np.logical_or.reduceat(stale, firsts).tolist() if len(used) else [True]
-        parts = []
-        for chunk, (first, size) in enumerate(zip(firsts.tolist(), sizes, strict=True)):
-            part = copied[chunk]() if chunk < len(copied) and not written[chunk] else None
-            if part is None or len(part) != size:
-                part = as_read_only(np.take(values, self.row_of[used[first : first + size]], axis=0))
-            parts.append(part)
-        changed[:] = 0
-        self._copied = used, list(map(weakref.ref, parts))
-        return tuple(parts)
-
     def set_state(self, state: dict[str, Any]) -> None:
         """Restore the maps from `get_state`; allocated rows are reused."""
         n, m, maps = len(state["ids"]), int(state["num_particles"]), state["maps"]
         if m != self.num_particles:
             self._clear(m)
         self._begin(n, state["descriptors"].shape[1])
-        values, parts = self.values.reshape(-1, 9 * self.padded), state["values"]
-        first = 0
-        for part in parts:
-            values[first : first + len(part)] = part
-            first += len(part)
-        self.table[SLOT.changed] = 0
-        if isinstance(parts, tuple) and all(map(is_read_only, parts)):
-            self._copied = np.arange(n), list(map(weakref.ref, parts))
+        self.values.reshape(-1, 9 * self.padded)[:n] = state["values"]
         self.counts[:n] = state["counts"]
         if self.log_odds_prior is not None:
             self.odds[:n] = state["odds"]
@@ -550,15 +392,6 @@ class ParticleMaps(MapStore):
         self.users = np.bincount(state["map_of"], minlength=len(maps) + 1).astype(np.int64)
         self.users[0], self._free_maps = 0, 0
         self.tops[2] = state["next_id"]
-
-
-def chunk_sizes(n: int) -> list[int]:
-    """Return how many landmarks each array of values in a state of n landmarks has.
-
-    >>> chunk_sizes(0), chunk_sizes(512), chunk_sizes(2100)[-2:]
-    ([0], [512], [128, 52])
-    """
-    return [n] if n <= WHOLE else [min(CHUNK, n - first) for first in range(0, n, CHUNK)]
 
 
 def write_summary(maps: ParticleMaps, m: int, min_count: int, rows: MapSummaryRows, first: int) -> int:

@@ -1,6 +1,6 @@
 """Rejuvenation of a filter: schedule and inputs of the smoother, and replacement of the particles by its samples."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -19,14 +19,10 @@ from slam_backend.smoother.graph import SlamGraph, mean_pose, scattered
 from slam_backend.smoother.graph_building import InitialPoses, LandmarkPositions, log_head
 from slam_backend.smoother.joint_graphs import merge_thinned
 from slam_backend.smoother.log_arrays import LogArrays
-from slam_backend.smoother.optimizer import NO_POSE
-from slam_backend.smoother.options import SmoothingOptions, extra_keys
+from slam_backend.smoother.options import SmoothingOptions
 from slam_backend.smoother.reassociation import LandmarkTable, RejectedMeasurements, reassociate
-from slam_backend.smoother.rejuvenation import Draft, LandmarkDescriptors, Particles, Rejuvenation, Smoother, rejuvenate
+from slam_backend.smoother.rejuvenation import Draft, LandmarkDescriptors, Particles, Rejuvenation, Smoother
 from slam_backend.smoother.sampling import PathLandmarks
-
-PART = 512  # landmarks of all particles that are written at once where they are read only once
-PIECE = 1024  # landmarks of all particles that are written in one step where they are written over several
 
 
 def landmark_positions(maps: ParticleMaps, best: int) -> LandmarkPositions:
@@ -117,33 +113,12 @@ class NewLandmarks(NamedTuple):
             maps.last_seen[slots], maps.next_id, odds, particles.landmarks, rows, walk,
         )  # fmt: skip
 
-    def write(self, maps: ParticleMaps, part: slice = slice(None)) -> None:
-        """Replace all landmarks of all particles by these, or by a part of them."""
-        self._begin(maps, part)
-        self.landmarks.write(self.rows[part], self.walk, maps.blocks)  # the walk: (7) of docs/reference/smoother.md
-
-    def write_in_parts(self, maps: ParticleMaps) -> Iterator[None]:
-        """Replace all landmarks of all particles by these, `PIECE` of them before each of the yields."""
-        self._begin(maps, slice(None))
-        for first in range(0, len(self.ids), PIECE):
-            part = slice(first, first + PIECE)
-            self.landmarks.write(self.rows[part], self.walk, maps.blocks[part])
-            yield
-
-    def _begin(self, maps: ParticleMaps, part: slice) -> None:
-        """Replace all landmarks but for positions and covariances."""
-        odds = None if self.odds is None else self.odds[part]
+    def write(self, maps: ParticleMaps) -> None:
+        """Replace all landmarks of all particles by these."""
         maps.load_metadata(
-            self.counts[part], self.descriptors[part], self.ids[part], self.identities[part], self.next_id, odds,
-            self.last_seen[part],
+            self.counts, self.descriptors, self.ids, self.identities, self.next_id, self.odds, self.last_seen
         )  # fmt: skip
-
-    def in_parts(self, num_particles: int) -> Iterator[ParticleMaps]:
-        """Yield maps of M particles with `PART` landmarks at a time; each takes the memory of the last."""
-        maps = ParticleMaps(num_particles)
-        for first in range(0, max(len(self.ids), 1), PART):
-            self._replace(odds=None).write(maps, slice(first, first + PART))
-            yield maps
+        self.landmarks.write(self.rows, self.walk, maps.blocks)  # the walk: (7) of docs/reference/smoother.md
 
 
 def mean_odds(odds: FloatArray, counts: NDArray[np.integer[Any]]) -> FloatArray:
@@ -180,11 +155,7 @@ def joint_graph(
 MIN_CLOSURE_MATCHES = 3  # matches with landmarks not seen for long that count as a loop closure in one step
 MIN_INTERVAL_FRACTION = 5  # a loop closure shortens the interval to a fifth at most
 MIN_ROWS = 8  # least steps of each log in a slice, so that the work keeps up with the input
-# Factor on the steps of a slice where `extra_keys` allows more keyframes: its cost then depends mainly on the graph.
-LARGE_SLICE_FACTOR = 2
-LARGE_GRAPH = 2000  # landmarks; those of worlds of 30 m are some 500
-MAX_FAILURES = 2  # failed optimisations in a row, without slices, before measurements are dropped
-SCHEDULE = ("_asked", "_waited", "_read", "_closed", "_failures", "_exact", "_last_closing", "steps")
+SCHEDULE = ("_asked", "_waited", "_read", "_closed", "_exact", "_last_closing", "steps")
 
 
 class RejuvenationScheduler:
@@ -196,19 +167,17 @@ class RejuvenationScheduler:
 
     Attributes:
         steps: Number of steps recorded.
-        starts_at_mode: See `Particles`, of the last rejuvenation; None before one. Not part of the state.
     """
 
     def __init__(self, options: FilterOptions, num_robots: int) -> None:
         assert options.rejuvenate_every is not None
         self.steps = 0
-        self.starts_at_mode: FloatArray | None = None
         self._options = options
         self._every = options.rejuvenate_every
         self._noiseless = options.motion.is_noiseless
         self._graph: SlamGraph | None  # at its mode
         self._oldest: int  # least of the robots' last steps in the graph
-        self._least_share = max(MIN_ROWS, (options.smoothing.slice_steps or 0) // num_robots)
+        self._num_robots = num_robots
         self._share: int  # steps of a robot in a slice
         self._set_graph(None)
         self._draft: Draft | None = None  # the graph with new steps, before convergence
@@ -216,7 +185,6 @@ class RejuvenationScheduler:
         self._waited = 0  # steps since the last rejuvenation
         self._read = 0  # measurements since then
         self._closed = False  # loop closure since then
-        self._failures = 0  # failed optimisations in a row
         self._exact = False  # an exact pose disables rejuvenation for good
         self._last_closing = 0  # last step with matches of landmarks not seen for long
         self._guesses = [InitialPoses.empty() for _ in range(num_robots)]
@@ -289,11 +257,6 @@ class RejuvenationScheduler:
         sightings = 0 if self._graph is None else self._graph.num_sightings - smoothing.free_sightings
         return haste * smoothing.effort * self._read >= sightings
 
-    @property
-    def has_large_graph(self) -> bool:
-        """Whether the graph has so many landmarks that each slice of work is costly."""
-        return self._graph is not None and len(self._graph.landmark_ids) > LARGE_GRAPH
-
     def is_waiting(self, step: int) -> bool:
         """Return whether nothing is due after a step for any content of the logs; a fast check before `is_idle`."""
         if self._graph is None or self._draft is not None or step - self._oldest >= self._share:
@@ -304,7 +267,7 @@ class RejuvenationScheduler:
         """Return whether neither a rejuvenation nor a slice of work is due now."""
         if self.is_due:
             return False
-        if self._exact or self._noiseless or self._options.smoothing.slice_steps is None:
+        if self._exact or self._noiseless or not self._options.smoothing.incremental:
             return True
         if self._graph is None or self._draft is not None:
             return False
@@ -319,7 +282,10 @@ class RejuvenationScheduler:
         self, logs: Sequence[RobotLog], starts: FloatArray, held: BoolArray, maps: ParticleMaps, best: int,
         camera: FloatArray, rng: np.random.Generator,
     ) -> Rejuvenation | None:  # fmt: skip
-        """Run what is due, at once or as one slice; return None if there is nothing to report.
+        """Do one slice of what is due, or all of it if the smoother is not incremental.
+
+        Returns:
+            The outcome of a rejuvenation; None if there is nothing to report yet.
 
         Args:
             logs: Log of each robot.
@@ -338,15 +304,23 @@ class RejuvenationScheduler:
             self._restart_interval()
             return _failed(graph, reason)
         smoother = Smoother(options.motion, camera, options.smoothing, rng)
-        if options.smoothing.slice_steps is None:
-            new = self._new_log_rows(logs, graph, maps, best)
-            return self._run_at_once(graph, new, smoother, starts.shape[2], maps, best)
         self._set_graph(graph)
+        while True:
+            result = self._run_slice(logs, smoother, starts.shape[2], maps, best)
+            if result is not None or options.smoothing.incremental:
+                return result
+
+    def _run_slice(
+        self, logs: Sequence[RobotLog], smoother: Smoother, num_particles: int, maps: ParticleMaps, best: int
+    ) -> Rejuvenation | None:
+        """Do one slice of work; arguments as of `run`."""
+        graph = self._graph
+        assert graph is not None
         if (draft := self._draft) is not None:
             outcome = smoother.optimise_slice(draft)
             return self._finish_slice(draft.graph, outcome, lambda: log_tails(logs, graph, draft.graph), smoother)
         share, waiting, is_due = self._share, max_pending_steps(logs, graph), self.is_due
-        if waiting > 2 * self._least_share or not is_due:  # so that few steps are left to the draw
+        if waiting > 2 * share or not is_due:  # so that few steps are left to the draw
             if waiting < share and not is_due:
                 return None
             taken = [log_head(log, share) for log in self._new_log_rows(logs, graph, maps, best)]
@@ -355,11 +329,10 @@ class RejuvenationScheduler:
         last = self._new_log_rows(logs, graph, maps, best)
         positions = landmark_positions(maps, best)
         descriptors = landmark_descriptors(maps, self._options.descriptor_gate)
-        drawn = smoother.draw(graph, last, self._guesses, positions, starts.shape[2], descriptors)
+        drawn = smoother.draw(graph, last, self._guesses, positions, num_particles, descriptors)
         if isinstance(drawn, Rejuvenation):
             self._restart_interval()
             self._accept(drawn.graph)
-            self._note_starts(drawn)
             return drawn
         return self._finish_slice(graph, drawn, lambda: last, smoother)
 
@@ -396,32 +369,13 @@ class RejuvenationScheduler:
         options = self._options.smoothing
         graph, motion = joint_graph(graph_a, graph_b, starts, frames, renamed, camera, options)
         self._set_graph(graph)
-        self._draft = None if options.slice_steps is None else Draft(graph=graph)
+        self._draft = Draft(graph=graph)
         self._guesses = a._guesses + [InitialPoses(steps, compose(motion, poses)) for steps, poses in b._guesses]
         self._refused = [dict(refused) for refused in (*a._refused, *b._refused)]
         self._read, self._exact = a._read + b._read, a._exact or b._exact
         self._waited = self._every
 
     # ------------------------------------------------------------------ results
-
-    def _run_at_once(
-        self, graph: SlamGraph, logs: Sequence[LogArrays], smoother: Smoother, num_particles: int, maps: ParticleMaps,
-        best: int,
-    ) -> Rejuvenation:  # fmt: skip
-        """Smooth all logs at once."""
-        result = rejuvenate(
-            graph, logs, smoother.motion, smoother.camera, num_particles, smoother.rng, smoother.options,
-            self._guesses, landmark_descriptors(maps, self._options.descriptor_gate), landmark_positions(maps, best),
-        )  # fmt: skip
-        self._restart_interval()
-        self._note_starts(result)
-        if np.isfinite(result.ess) or result.reason == NO_POSE:
-            self._accept(result.graph)
-        else:
-            self._failures += 1
-            if self._failures == MAX_FAILURES:
-                return self._reset_after_failure(graph, graph, logs, smoother, result.reason)
-        return result
 
     def _finish_slice(
         self, tried: SlamGraph, outcome: SlamGraph | Draft | str, logs: Callable[[], Sequence[LogArrays]],
@@ -448,20 +402,15 @@ class RejuvenationScheduler:
         self._set_graph(None)
         return _failed(tried, f"{reason}; the smoother restarts from the logs")
 
-    def _note_starts(self, result: Rejuvenation) -> None:
-        """Keep how certain the starts are at the mode."""
-        self.starts_at_mode = None if result.particles is None else result.particles.starts_at_mode
-
     def _set_graph(self, graph: SlamGraph | None) -> None:
         """Set the graph, its oldest step, and how many steps a slice takes."""
         self._graph, self._oldest = graph, -1 if graph is None else min(graph.latest.tolist())
-        is_large = graph is not None and extra_keys(len(graph.landmark_ids), graph.latest) > 0
-        self._share = (LARGE_SLICE_FACTOR if is_large else 1) * self._least_share
+        new = 0 if graph is None else int(self._options.smoothing.slice_share * graph.num_keys)
+        self._share = max(MIN_ROWS, new // self._num_robots)
 
     def _accept(self, graph: SlamGraph) -> None:
         """Continue from a graph at its mode."""
         self._set_graph(graph)
-        self._failures = 0
         for robot, latest in enumerate(graph.latest.tolist()):
             self._guesses[robot] = self._guesses[robot].after(latest)
             for step in [step for step in self._refused[robot] if step <= latest]:

@@ -242,11 +242,9 @@ class LandmarkIdMap:
     """Renaming of the landmark ids of two groups to ids of their joint map.
 
     Attributes:
-        robots_a: Group a before the merge; its landmark ids stay. Landmarks that it found while a merge of large maps
-            was prepared are found again, under new ids, in `TeamReport.map_changes`.
+        robots_a: Group a before the merge; its landmark ids stay.
         robots_b: Group b before the merge.
         ids_b: (k, 2) int64, read-only. Rows (id in b's map, id in the joint map); fused landmarks get the id of a.
-            Without landmarks that b found during such a preparation.
         maps: Numbers of a's map, of b's and of the joint one. The first two are kept until their `MapReleased`: an undo
             restores them.
     """
@@ -319,8 +317,7 @@ class TeamReport(NamedTuple):
         all_associations: Data association of all measurements; `associations` and `created` are parts of it.
         groups: The groups after this step.
         events: This step's attempts, merges and undos, in order.
-        id_maps: Landmark renaming of each merge of this step, in order; apply them after `created`. Landmarks found
-            while a merge was prepared are in `map_changes` alone.
+        id_maps: Landmark renaming of each merge of this step, in order; apply them after `created`.
         maps: Number of each robot's map after this step. Before the first step they are 0, 1, ...
         map_changes: All changes of maps in this step, in order, replays and `created` included: the complete record for
             keeping track of landmarks.

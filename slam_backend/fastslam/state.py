@@ -1,7 +1,7 @@
 """State of a filter, and the operations that change it: step, resampling, rejuvenation and merge."""
 
 import copy
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -134,8 +134,7 @@ class FilterState:
             represent, as their frame was fixed when they were sampled from smoothed paths; estimates include it.
         start_covariances: (K, 3, 3) float64 [m, m, rad], start frames. Covariance of each robot's start pose that the
             particles do not represent; poses in the start frame include it.
-        maps: Landmarks of all particles; in a trial merge those of the most probable one, as the only particle.
-        unwritten: Landmarks of all particles after a trial merge, until they are written into `maps`; None otherwise.
+        maps: Landmarks of all particles.
         estimates: Poses of all robots over all particles; updated in each step.
         best: Index of the most probable particle, by accumulated log-weight (Eq. 12).
         starts_at_origin: Whether all robots started at the origin, as in a filter without merges.
@@ -161,7 +160,6 @@ class FilterState:
         self.existence = None if existence is None else ExistenceUpdate(existence, options.camera)
         self.rejuvenation = None if options.rejuvenate_every is None else RejuvenationScheduler(options, k)
         self.maps = ParticleMaps(m, None if existence is None else existence.log_odds_prior)
-        self.unwritten: NewLandmarks | None = None
         padded = self.maps.padded
         self.pose_arrays: FloatArray = zeros_aligned((6, k, 3, padded), np.float64)
         self.weight_arrays: FloatArray = zeros_aligned((4, padded), np.float64)
@@ -290,7 +288,7 @@ class FilterState:
                 low, high, is_over, now, self.packed_options, robots.array, inputs.inputs_table, inputs.moves, normals,
                 self.pose_arrays, self.bias_covariances, self.propagated_only, self.weight_arrays,
                 self.gauge_covariance, maps.values, maps.counts, maps.odds, maps.table, maps.maps, maps.users,
-                maps.free_rows, maps.tops, maps.descriptors, maps.heads, maps.places, inputs.measurements,
+                maps.free_rows, maps.tops, maps.descriptors, maps.heads, inputs.measurements,
                 inputs.descriptors, inputs.names,
                 self._associations, self._mahalanobis_sq, associations, means, covariances,
                 pending.noted[len(pending.steps)], pending.measured, pending.num_measured, fastslam1,
@@ -331,7 +329,7 @@ class FilterState:
             return None
         starts = self.starts[:, :, : self.num_particles]
         result = smoother.run(
-            self.logs, starts, self._held_starts, self.maps, self._best_in_maps, self.packed_camera, self.rng
+            self.logs, starts, self._held_starts, self.maps, self.best, self.packed_camera, self.rng
         )  # fmt: skip
         if result is None:
             return None
@@ -342,11 +340,7 @@ class FilterState:
     def _replace_particles(self, new: Particles) -> None:
         """Replace the M particles by samples of smoothed paths, with landmarks of the most probable particle so far."""
         m = self.num_particles
-        landmarks = NewLandmarks.of(self.maps, self._best_in_maps, new, self.options.landmark_walk)
-        if self.maps.num_particles == m:
-            landmarks.write(self.maps)
-        else:
-            self.unwritten = landmarks
+        NewLandmarks.of(self.maps, self.best, new, self.options.landmark_walk).write(self.maps)
         self.poses[:, :, :m], self.starts[:, :, :m], self.biases[:, :, :m] = new.poses, new.starts, new.biases
         self.bias_covariances[0], self.bias_covariances[1] = new.bias_covariances, 0.0
         self._refresh_starts()
@@ -360,34 +354,15 @@ class FilterState:
         self.estimates.means[:], self.estimates.covariances[:] = new.means, new.covariances
 
     @property
-    def _best_in_maps(self) -> int:
-        """Index of the most probable particle in `maps`, where it may be alone."""
-        return self.best if self.maps.num_particles == self.num_particles else 0
-
-    def write_landmarks(self, unused: ParticleMaps) -> None:
-        """Write the landmarks of all particles that were left unwritten, if they were.
-
-        Args:
-            unused: Maps no longer in use, whose memory is taken if they fit.
-        """
-        for _ in self.landmarks_in_parts(unused):
-            pass
-
-    def landmarks_in_parts(self, unused: ParticleMaps | None = None) -> Iterator[None]:
-        """Do the same as `write_landmarks`, a part of the landmarks before each of the yields."""
-        if self.unwritten is not None:
-            maps, kind = unused, (self.num_particles, self.maps.log_odds_prior)
-            if maps is None or (maps.num_particles, maps.log_odds_prior) != kind:
-                maps = ParticleMaps(*kind)
-            yield from self.unwritten.write_in_parts(maps)
-            self.maps, self.unwritten = maps, None
-
-    @property
     def logs(self) -> list[RobotLog]:
         """Log of each robot, up to date."""
+        self.update_logs()
+        return self._logs
+
+    def update_logs(self) -> None:
+        """Bring the logs up to date, and what the smoother knows of them."""
         if self._pending.steps:
             self._pending.flush(self._logs, self.rejuvenation)
-        return self._logs
 
     # ------------------------------------------------------------------ merging
 
@@ -467,15 +442,11 @@ class FilterState:
 
     # ------------------------------------------------------------------ snapshots
 
-    def get_state(self, for_copy: bool = False) -> dict[str, Any]:
-        """Return the complete state of the filter, its random stream included; shared parts are read-only.
-
-        Args:
-            for_copy: See `ParticleMaps.get_state`.
-        """
+    def get_state(self) -> dict[str, Any]:
+        """Return the complete state of the filter, its random stream included; shared parts are read-only."""
         logs = tuple(log.get_state() for log in self.logs)  # first, as it also updates the smoother
         state: dict[str, Any] = {name: getattr(self, name).copy() for name in KEPT}
-        state |= {"steps": self.next_step, "estimates": self.estimates.copy(), "maps": self.maps.get_state(for_copy)}
+        state |= {"steps": self.next_step, "estimates": self.estimates.copy(), "maps": self.maps.get_state()}
         state |= {"logs": logs, "consistency": self.consistency.get_state()}
         if self.rejuvenation is not None:
             state["rejuvenation"] = self.rejuvenation.get_state()

@@ -14,7 +14,7 @@ from slam_backend.fastslam._kernels import LANES
 from slam_backend.fastslam.consistency import LISTS, RENEWED, SIGN_OF, SIGNS, SUMS, WEIGHTS
 from slam_backend.fastslam.existence import ExistenceUpdate
 from slam_backend.fastslam.options import MAX_ROBOTS, FilterOptions, pack_options
-from slam_backend.fastslam.particle_maps import MAPS_KEPT, chunk_sizes
+from slam_backend.fastslam.particle_maps import MAPS_KEPT
 from slam_backend.fastslam.rejuvenation import SCHEDULE
 from slam_backend.fastslam.reports import PoseEstimates
 from slam_backend.fastslam.run_log import ROWS
@@ -160,15 +160,10 @@ def check_maps(name: str, maps: Any, m: int, options: FilterOptions) -> None:
     n = check.indices(f"{name}['ids']", maps["ids"], (None,), 0, maps["next_id"] - 1)
     check.ascending(f"{name}['ids']", maps["ids"])
     check.indices(f"{name}['counts']", maps["counts"], (n, padded), *check.LANDMARK, m, check.INT32)
-    sizes, first = chunk_sizes(n), 0
-    for (part_name, part), size in zip(
-        check.named_items(f"{name}['values']", maps["values"], len(sizes)), sizes, strict=True
-    ):
-        check.array(part_name, part, check.FLOAT64, (size, 9 * padded))
-        held = as_read_only(part), as_read_only(maps["counts"])[first : first + size]
-        if size and count_bad_values(*held, m, check.MAX_DISTANCE, check.LARGEST):
-            check.refuse(part_name, "finite means and positive variances", "a Gaussian out of range")
-        first += size
+    check.array(f"{name}['values']", maps["values"], check.FLOAT64, (n, 9 * padded))
+    held = as_read_only(maps["values"]), as_read_only(maps["counts"])
+    if n and count_bad_values(*held, m, check.MAX_DISTANCE, check.LARGEST):
+        check.refuse(f"{name}['values']", "finite means and positive variances", "a Gaussian out of range")
     check.indices(f"{name}['maps']", maps["maps"], (None, padded), 0, m - 1, m, check.INT32)
     check.indices(f"{name}['maps']", maps["maps"], (None, padded), 0, padded - 1, dtype=check.INT32)  # all lanes
     check.indices(f"{name}['map_of']", maps["map_of"], (n,), 0, len(maps["maps"]))

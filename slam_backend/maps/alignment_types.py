@@ -44,7 +44,7 @@ HINTS: dict[str, str] = {  # hints by refusal reason
     "mirrored": "The mirror image fits better: check the sign of the measured coordinates.",
     "poorly spread": "The shared landmarks are too close together: let robots see more of the same places.",
     "too uncertain": "The path of a robot to the shared landmarks is too uncertain: close loops or set"
-    " `rejuvenate_every`; or accept it, with a lower `MergeOptions.min_sigmas_on_trial` if the paths are uncertain, or"
+    " `rejuvenate_every`; or accept it, with a lower `MergeOptions.least_sigmas` if the paths are uncertain, or"
     " a higher `AlignmentOptions.max_sigma_position` or `max_sigma_heading` if the landmarks are.",
 }
 BOUNDS = ("translation", "rotation", "one match", "paths", "repeat")  # possible bounds of a "too uncertain" refusal

@@ -13,13 +13,9 @@ from slam_backend.smoother import _kernels
 from slam_backend.smoother._kernels import NONE, Keys, LandmarkFactors, Points
 from slam_backend.smoother.graph import SlamGraph, mapped
 from slam_backend.smoother.optimizer import MapEstimate, gathered, linearise
-from slam_backend.smoother.options import SmoothingOptions, extra_keys, keyframe_limit
+from slam_backend.smoother.options import SmoothingOptions, keyframe_limit
 
 MAX_FRAMES = 100  # frames of a recent key with raw measurements: a robot that waits adds frames to the same key
-# Share of the variance of a rigid motion that is added, in large maps (`extra_keys`), to the odometry after it, and,
-# times the number n of the sightings that move, to each of them. 1 would be cautious: all n together then tell no more
-# about the motion than was known. With this share claims agree with errors (docs/lab/scale.md).
-WIDENED = 0.5
 CONTRADICTION = 2.0  # factor on the kernel's squared distance: measurements beyond it are dropped
 
 
@@ -52,12 +48,10 @@ def reduce_keyframes(
     keys = mapped(graph.part(Keys), np.copy)
     if most_keys is None:
         most_keys = keyframe_limit(options, len(graph.landmark_ids), graph.latest)
-    widened = WIDENED if extra_keys(len(graph.landmark_ids), graph.latest) else 0.0
-    left, roots, numbers, offsets, spreads = _kernels.merge_keys(
-        fresh, sighted, most_keys + graph.num_biases, keys, graph.biases_of_odometry(), widened
+    left, roots, numbers, offsets = _kernels.merge_keys(
+        fresh, sighted, most_keys + graph.num_biases, keys, graph.biases_of_odometry()
     )
-    widths = widened * spreads * np.bincount(seen.keys[rows], minlength=graph.num_keys)
-    frozen = _kernels.add_sightings(rows, seen, roots, numbers, offsets, widths)
+    frozen = _kernels.add_sightings(rows, seen, roots, numbers, offsets)
     fewer = graph.with_columns(
         **{name: column[:left] for name, column in keys._asdict().items()},
         **frozen._asdict(),

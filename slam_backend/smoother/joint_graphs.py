@@ -11,8 +11,8 @@ from slam_backend.smoother.graph import SlamGraph
 from slam_backend.smoother.graph_building import merge_graphs
 from slam_backend.smoother.graph_reduction import reduce_keyframes
 from slam_backend.smoother.optimizer import optimize
-from slam_backend.smoother.options import SmoothingOptions, extra_keys, keyframe_limit
-from slam_backend.smoother.rejuvenation import DRAFT_TOLERANCE, is_large
+from slam_backend.smoother.options import SmoothingOptions, keyframe_limit
+from slam_backend.smoother.rejuvenation import DRAFT_TOLERANCE
 
 
 class RelativeStart(NamedTuple):
@@ -39,12 +39,8 @@ def relative_start(
         renamed, camera, options: See `merge_thinned`.
 
     Returns:
-        None where no mode is found, and in small maps and short runs, whose limit of keyframes has not grown
-        (`extra_keys`): their particles tell more.
+        None where no mode is found.
     """
-    landmarks, latest = _joint_size(graph_a, graph_b, renamed)
-    if not (extra_keys(landmarks, latest) and is_large(landmarks, latest)):
-        return None
     graph = merge_thinned(graph_a, graph_b, motion, renamed, None, camera, options)
     mode = optimize(graph, camera, options, looseness=DRAFT_TOLERANCE)
     if mode.reason:
@@ -62,12 +58,12 @@ def merge_thinned(
     Args:
         graph_a, graph_b, motion, renamed, uncertainty: Arguments of `merge_graphs`.
         camera: (7,) as kernels take it.
-        options: Options of the smoother. With slices and too many keyframes, each graph is first reduced to its share.
+        options: Options of the smoother. With too many keyframes, each graph is first reduced to its share.
     """
     landmarks, latest = _joint_size(graph_a, graph_b, renamed)
     most_keys = keyframe_limit(options, landmarks, latest)
     num_keys = sum(graph.num_keys - graph.num_biases for graph in (graph_a, graph_b))
-    if options.slice_steps is not None and num_keys > most_keys:
+    if num_keys > most_keys:
         graph_a, graph_b = (_thinned(graph, most_keys, len(latest), camera, options) for graph in (graph_a, graph_b))
     return merge_graphs(graph_a, graph_b, motion, renamed, uncertainty)
 

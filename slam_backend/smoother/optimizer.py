@@ -16,7 +16,7 @@ from slam_backend.smoother._kernels import (
     Points,
 )
 from slam_backend.smoother.graph import SlamGraph
-from slam_backend.smoother.options import MANY_LANDMARKS, SmoothingOptions
+from slam_backend.smoother.options import SmoothingOptions
 
 
 def gathered(graph: SlamGraph) -> LandmarkFactors:
@@ -46,8 +46,7 @@ def linearise(
 
 FIRST_DAMPING, MAX_DAMPING = 1e-4, 1e8
 LARGEST_STEP = 1e3  # [m, rad]; larger steps count as divergence
-LONG_COLUMNS = 16  # mean blocks per column, weighted by length, above which draws are cheaper than the inverse
-FEW_POSES = 10  # landmarks of a large map that are seen from at most so many poses are eliminated first
+FEW_POSES = 10  # landmarks that are seen from at most so many poses are eliminated first
 NO_POSE = "no pose to seek"  # reason if all poses are fixed
 SLOW_PROGRESS = 10.0  # factor on the tolerance in the last iteration of the options
 
@@ -101,17 +100,6 @@ class MapEstimate(NamedTuple):
         """Return the joint covariance (3 r, 3 r) [m, m, rad] of r unknown keys (r,) of a successful estimate."""
         assert self.system is not None
         return self.system.covariance(self.columns[keys])
-
-    @property
-    def crowded(self) -> bool:
-        """Whether drawing paths is faster than computing `transition_variances`, because the factor's columns are long.
-
-        The cost of draws grows with the sum of the columns' lengths, that of `transition_variances` with the sum of
-        their squares.
-        """
-        assert self.system is not None
-        pattern = self.system.pattern
-        return pattern.squares > LONG_COLUMNS * len(pattern.rows)
 
     def transition_variances(self) -> FloatArray:
         """Return the variances (k,) [m^2] of the motions from the previous keys, headings weighted by `LEVER`."""
@@ -193,8 +181,7 @@ class NormalEquations:
         num, k = size + len(graph.landmark_ids), graph.num_keys
         self.num_poses = size
         self.biases = graph.biases_of_odometry()
-        few = FEW_POSES if len(graph.landmark_ids) > MANY_LANDMARKS else 0
-        self.pattern = _kernels.lay_out(columns, graph.parents, self.biases, sightings, num, few)
+        self.pattern = _kernels.lay_out(columns, graph.parents, self.biases, sightings, num, FEW_POSES)
         cross = np.empty((len(sightings.keys), 3, 3))
         self.equations = EquationBlocks(
             np.empty((k, 2)), np.empty((num, 6)), np.empty((k, 3, 3)), cross, np.empty((len(self.biases), 3, 3)),

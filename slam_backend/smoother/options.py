@@ -1,15 +1,10 @@
 """Options of the smoother that rejuvenates a particle filter."""
 
 from dataclasses import dataclass
-
-import numpy as np
+from typing import ClassVar
 
 from slam_backend.core.short_repr import short_repr
-from slam_backend.core.validation import MOST, IntArray, check_float, check_int, known_names
-
-MANY_LANDMARKS, LANDMARKS_PER_KEY = 2700, 15  # beyond so many landmarks one more keyframe for every 15,
-MANY_STEPS, MANY_ROBOTS, STEPS_PER_KEY = 6000, 3, 50  # beyond so many steps of a robot, or of 3, for every 50,
-LEAST_LANDMARKS_PER_KEY = 5  # but at most one for every 5 landmarks: a run in the same place needs no more
+from slam_backend.core.validation import MOST, IntArray, argument_error, check_float, check_int, known_names
 
 
 @short_repr
@@ -19,10 +14,11 @@ class SmoothingOptions:
     """Options of a rejuvenation.
 
     Attributes:
-        max_keys: Maximum number of keyframes of one robot; beyond it the most rigid neighbours are joined. Large maps
-            and long runs may have more, see `extra_keys`. Memory grows with the product of keyframes and landmarks in
-            view, effort hardly faster than the keyframes.
+        max_keys: Number of keyframes of one robot beyond which the most rigid neighbours are joined, in a short run.
+            Memory grows with the product of keyframes and landmarks in view, effort hardly faster than the keyframes.
         further_keys: Additional keyframes for each further robot of the filter.
+        steps_per_key: The number of keyframes grows by one for so many steps of all robots together,
+        landmarks_per_key: up to one for so many landmarks: a run in the same place needs no more; see `keyframe_limit`.
         recent_keys: Newest keyframes, of all robots together, that keep their raw measurements, relinearised at each
             rejuvenation.
         kernel: Squared Mahalanobis distance of a measurement (3 degrees of freedom) above which the robust kernel
@@ -35,13 +31,12 @@ class SmoothingOptions:
             `rejuvenate_every`, until the measurements since the last one times this factor reach the number of
             sightings to process, less `free_sightings`.
         free_sightings: Number of sightings that `effort` does not count.
-        least_ess: Share of M that the effective sample size of the importance weights must reach.
-        more_draws: Factor on M for a second draw where the first one misses `least_ess` by less than this factor; M of
-            these paths are then resampled. 1: no second draw. Where `extra_keys` raises the limit of
-            keyframes, weights are tempered until they reach `least_ess` instead.
-        slice_steps: New steps, of all robots together but at least eight of each, that one slice adds to the graph;
-            twice these where `extra_keys` raises the limit of keyframes. No step of the filter then does more than
-            one slice of the work. None: all work in the step in which it is due.
+        least_ess: Share of M that the effective sample size of the importance weights must reach; weights of draws
+            that miss it are tempered until they do.
+        incremental: Whether a step of the filter does at most one slice of the work. False: all slices are done in the
+            step in which a rejuvenation is due.
+        slice_share: Number of new steps, of all robots together but at least eight of each, that one slice adds to the
+            graph, over the keyframes of the graph: the mean effort per step then does not depend on its size.
         rigid_within: Limit [m] of the odometry's scatter since the last keyframe (root mean square of position and of
             heading at 3 m) up to which a new step is attached to it rigidly; 0: each step with measurements becomes a
             keyframe.
@@ -50,8 +45,15 @@ class SmoothingOptions:
             particles are drawn only where three iterations reach it: below 0.001 that may be late or rare.
     """
 
+    GONE: ClassVar[dict[str, str]] = {
+        "slice_steps": "Use incremental=True; slice_share sets the size of the slices.",
+        "more_draws": "Weights are tempered instead, see least_ess.",
+    }
+
     max_keys: int = 120
     further_keys: int = 30
+    steps_per_key: int = 50
+    landmarks_per_key: int = 5
     recent_keys: int = 60
     kernel: float = 16.0
     noise_scale: float = 1.0
@@ -59,8 +61,8 @@ class SmoothingOptions:
     effort: float = 1.5
     free_sightings: int = 3000
     least_ess: float = 0.3
-    more_draws: int = 8
-    slice_steps: int | None = None
+    incremental: bool = False
+    slice_share: float = 0.5
     rigid_within: float = 0.0
     max_iterations: int = 15
     tolerance: float = 0.1
@@ -69,9 +71,11 @@ class SmoothingOptions:
         check_int("max_keys", self.max_keys, 2, "At least two poses are needed to smooth.", MOST)
         check_int("further_keys", self.further_keys, 0, "Use 0 to share the keyframes of one robot.", MOST)
         check_int("recent_keys", self.recent_keys, 1, "The newest keyframe always keeps its measurements.", MOST)
-        check_int("more_draws", self.more_draws, 1, "Use 1 to draw M paths only.", MOST)
-        if self.slice_steps is not None:
-            check_int("slice_steps", self.slice_steps, 1, "Use 90, or None to do all work at once.", MOST)
+        check_int("steps_per_key", self.steps_per_key, 1, "Use 50.", MOST)
+        check_int("landmarks_per_key", self.landmarks_per_key, 1, "Use 5.", MOST)
+        if not isinstance(self.incremental, bool):
+            raise argument_error("incremental", "True or False", self.incremental, "Give a bool.")
+        check_float("slice_share", self.slice_share, "Use 0.5.", above=0.0)
         check_float("rigid_within", self.rigid_within, "Use 0.01, or 0 for a keyframe at each step.", at_least=0.0)
         check_int("max_iterations", self.max_iterations, 1, "Ten are usually enough.", MOST)
         check_float("effort", self.effort, "Use 1.5; larger values cost more time.", above=0.0)
@@ -82,31 +86,17 @@ class SmoothingOptions:
         check_float("tolerance", self.tolerance, "Use 0.1.", above=0.0)
         check_float("least_ess", self.least_ess, "Give a share of M.", at_least=0.0, at_most=1.0)
 
-    def most_keys(self, num_robots: int) -> int:
-        """Return the maximum number of keyframes of K robots together, without those of `extra_keys`."""
-        return self.max_keys + (num_robots - 1) * self.further_keys
-
 
 def keyframe_limit(options: SmoothingOptions, num_landmarks: int, latest: IntArray) -> int:
     """Return the maximum number of keyframes of K robots together.
+
+    Few keyframes for a long way are joined over long distances, and their relative poses, linearised once, claim a
+    certainty that they do not have. A run in the same place revisits what its keyframes see.
 
     Args:
         options: Options of the smoother.
         num_landmarks: Number of landmarks of the graph.
         latest: (K,) int64. Last step of each robot.
     """
-    return options.most_keys(len(latest)) + extra_keys(num_landmarks, latest)
-
-
-def extra_keys(num_landmarks: int, latest: IntArray) -> int:
-    """Return by how much the limit of keyframes grows in large maps and long runs; bounded where the map is.
-
-    Few keyframes for a long way are joined over long distances, and their relative poses, linearised once, claim a
-    certainty that they do not have (docs/lab/scale.md).
-
-    Args:
-        num_landmarks, latest: See `keyframe_limit`.
-    """
-    large = max(num_landmarks - MANY_LANDMARKS, 0) // LANDMARKS_PER_KEY
-    steps = max(int(np.maximum(latest - MANY_STEPS, 0).sum()), int(latest.sum()) - MANY_ROBOTS * MANY_STEPS)
-    return min(large + steps // STEPS_PER_KEY, num_landmarks // LEAST_LANDMARKS_PER_KEY)
+    grown = min(int(latest.sum()) // options.steps_per_key, num_landmarks // options.landmarks_per_key)
+    return options.max_keys + (len(latest) - 1) * options.further_keys + max(grown, 0)

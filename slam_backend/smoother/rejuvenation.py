@@ -6,6 +6,7 @@ keys; or, if the graph is at its mode, adds the newest keys, completes the desce
 is a graph and the damping of the next iteration.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -21,24 +22,20 @@ from slam_backend.smoother._kernels import Keys
 from slam_backend.smoother.duplicates import find_duplicates, without_duplicates
 from slam_backend.smoother.gauge import fix_gauge, fix_start, move
 from slam_backend.smoother.graph import SlamGraph
-from slam_backend.smoother.graph_building import InitialPoses, LandmarkPositions, extend_graph, log_head
+from slam_backend.smoother.graph_building import InitialPoses, LandmarkPositions, extend_graph
 from slam_backend.smoother.graph_reduction import reduce_keyframes, relinearise, without_unused_frames
-from slam_backend.smoother.log_arrays import EXACT, REJECTED, LogArrays
+from slam_backend.smoother.log_arrays import REJECTED, LogArrays
 from slam_backend.smoother.optimizer import NO_POSE, MapEstimate, optimize
-from slam_backend.smoother.options import SmoothingOptions, extra_keys, keyframe_limit
+from slam_backend.smoother.options import SmoothingOptions, keyframe_limit
 from slam_backend.smoother.sampling import (
     PathLandmarks,
     PathSamples,
     lane_rows,
     replay,
-    sample_more_paths,
     sample_paths,
-    sample_transition_variances,
     tempered,
 )
 
-LARGE_MAP = 1000  # landmarks; teams in worlds of 30 m know some 500
-LONG_RUN = 2000  # steps; 200 s in environments
 DRAFT_TOLERANCE = 10.0  # factor on the tolerance of descents without draws
 
 
@@ -73,8 +70,6 @@ class Particles(NamedTuple):
         bias_covariances: (K, 3, 3) float64. Covariance of each bias given the path; zeros where there is none.
         frame: (3, 3) float64 [m, m, rad]. Covariance of the gauge, a motion of the whole map; not in the particles.
         start_scatters: (K, 3, 3) float64 [m, m, rad], start frames. Covariance of each start; not in the particles.
-        starts_at_mode: (K, 3, 3) float64 [m, m, rad], map frame. Covariance of each start under the Gaussian about the
-            mode, zeros for known starts; None if the graph has at most `LARGE_MAP` landmarks or `LONG_RUN` steps.
     """
 
     poses: FloatArray
@@ -90,7 +85,6 @@ class Particles(NamedTuple):
     bias_covariances: FloatArray
     frame: FloatArray
     start_scatters: FloatArray
-    starts_at_mode: FloatArray | None
 
 
 class Rejuvenation(NamedTuple):
@@ -111,88 +105,29 @@ class Rejuvenation(NamedTuple):
     particles: Particles | None
 
 
-def rejuvenate(
-    graph: SlamGraph,
-    logs: Sequence[LogArrays],
-    motion: OdometryModel,
-    camera: FloatArray,
-    num_particles: int,
-    rng: np.random.Generator,
-    options: SmoothingOptions,
-    guesses: Sequence[InitialPoses] | None = None,
-    appearance: LandmarkDescriptors | None = None,
-    places: LandmarkPositions | None = None,
-) -> Rejuvenation:
-    """Add the robots' new steps to the graph, smooth, and draw particles.
-
-    A long log is added in parts, each with an effort of about `most_keys` poses. Failures that can occur in a run raise
-    nothing; the result's `reason` names them.
-
-    Args:
-        graph: Graph of the last attempt, or `SlamGraph.at_starts`.
-        logs: One log per robot, with the steps after `graph.latest`.
-        motion: Noise of the odometry.
-        camera: (7,) focal length, baseline, sigma_px, sigma_disparity, mount.
-        num_particles: M.
-        rng: Source of the draws.
-        options: Options of the smoother.
-        guesses: Initial poses of each robot after some of the new steps.
-        appearance: Descriptors to detect duplicate landmarks. None: no detection.
-        places: Initial landmark positions from the filter, see `extend_graph`.
-
-    Returns:
-        The graph for the next attempt, and M particles or the reason for their lack.
-    """
-    if any((log.kinds == EXACT).any() for log in logs):
-        return Rejuvenation(graph, "poses that were given as exact", float("nan"), 0, None)
-    share = max(1, 2 * keyframe_limit(options, len(graph.landmark_ids), graph.latest) // len(logs))
-    rest = list(logs)
-    while True:
-        last = all(len(log) <= share for log in rest)
-        first = [log_head(log, share) for log in rest]
-        grown = extend_graph(graph, first, motion, camera[4:], guesses, options.rigid_within, places)
-        mode = optimize(grown, camera, options, looseness=1.0 if last else DRAFT_TOLERANCE)
-        if mode.reason == NO_POSE:
-            unmoved = at_given_poses(grown, camera, options)
-            if last:
-                return unmoved
-            graph = unmoved.graph
-        elif mode.reason:
-            return Rejuvenation(graph, mode.reason, float("nan"), mode.iterations, None)
-        elif last:
-            return sample_particles(grown, mode, camera, num_particles, rng, options, appearance)
-        else:
-            graph = relinearised_and_reduced(grown, mode, camera, options, rng)
-        rest = [log.since(int(graph.latest[i]) + 1) for i, log in enumerate(rest)]
-
-
 def at_given_poses(graph: SlamGraph, camera: FloatArray, options: SmoothingOptions) -> Rejuvenation:
     """Return a refusal because no pose is unknown yet; all measurements are kept for later attempts.
 
     Args:
         graph: Graph with all steps of the logs, and landmarks at the filter's positions.
-        camera, options: Same arguments as `rejuvenate`.
+        camera, options: See `Smoother`.
     """
     return Rejuvenation(reduce_keyframes(graph, camera, options), NO_POSE, float("nan"), 0, None)
 
 
 def relinearised_and_reduced(
-    graph: SlamGraph, mode: MapEstimate, camera: FloatArray, options: SmoothingOptions, rng: np.random.Generator
+    graph: SlamGraph, mode: MapEstimate, camera: FloatArray, options: SmoothingOptions
 ) -> SlamGraph:
     """Return the graph at its mode; if it has too many keys, those with the smallest relative variances are joined.
 
     Args:
         graph: Graph of the mode.
         mode: MAP estimate with an empty `reason`.
-        camera, options: Same arguments as `rejuvenate`.
-        rng: Source of draws, where sampling the variances is cheaper than computing them.
+        camera, options: See `Smoother`.
     """
     if graph.num_keys <= keyframe_limit(options, len(graph.landmark_ids), graph.latest) + graph.num_biases:
         return relinearise(graph, mode)
-    transition_variances = (
-        sample_transition_variances(graph, mode, rng) if mode.crowded else mode.transition_variances()
-    )
-    return reduce_keyframes(relinearise(graph, mode, transition_variances), camera, options, mode.sightings)
+    return reduce_keyframes(relinearise(graph, mode, mode.transition_variances()), camera, options, mode.sightings)
 
 
 def sample_particles(
@@ -209,18 +144,15 @@ def sample_particles(
     Args:
         grown: Graph with all steps of the logs.
         mode: MAP estimate of the graph with an empty `reason`.
-        camera, num_particles, rng, options, appearance: Same arguments as `rejuvenate`.
+        camera, rng, options: See `Smoother`.
+        num_particles: M.
+        appearance: Descriptors to detect duplicate landmarks. None: no detection.
     """
     draws = sample_paths(grown, mode, num_particles, rng)
-    chosen, ess = draws, draws.sample_size
-    needed = options.least_ess * num_particles
-    if ess < needed and extra_keys(len(grown.landmark_ids), grown.latest):
-        chosen, ess = tempered(draws, needed), needed
-    elif needed > ess >= needed / options.more_draws:
-        chosen, size = sample_more_paths(grown, mode, options.more_draws * num_particles, draws, rng)
-        ess = min(size, float(num_particles))
+    ess, needed = draws.sample_size, options.least_ess * num_particles
+    chosen = tempered(draws, needed) if ess < needed else draws
     graph = reduce_keyframes(relinearise(grown, mode, draws.transition_variances), camera, options, mode.sightings)
-    if not ess >= needed:
+    if math.isnan(ess):
         return Rejuvenation(graph, f"an effective sample size of {ess:.1f}", ess, mode.iterations, None)
     if appearance is not None and len(appearance.ids):
         duplicates = find_duplicates(grown, mode, draws, _descriptors(grown, appearance), appearance.gate)
@@ -235,11 +167,6 @@ def _descriptors(graph: SlamGraph, appearance: LandmarkDescriptors) -> NDArray[n
     result = appearance.descriptors[at]
     result[appearance.ids[at] != graph.landmark_ids] = np.nan
     return result
-
-
-def is_large(num_landmarks: int, latest: IntArray) -> bool:
-    """Return whether a map is so large, and the latest of its paths (K,) so long, that few drawn paths carry weight."""
-    return bool(num_landmarks > LARGE_MAP and latest.max() > LONG_RUN)
 
 
 def _particles(graph: SlamGraph, mode: MapEstimate, draws: PathSamples) -> Particles:
@@ -274,10 +201,7 @@ def _particles(graph: SlamGraph, mode: MapEstimate, draws: PathSamples) -> Parti
         move(draws.poses, held.motions, moved)
         paths, poses, frame = lane_rows(moved), held.poses, held.scatter
     unknown = (mode.columns[graph.first_keys] >= 0).nonzero()[0].tolist()
-    at_mode = np.zeros((len(means), 3, 3)) if is_large(len(graph.landmark_ids), graph.latest) else None
     for index in unknown:
-        if at_mode is not None:
-            at_mode[index] = mode.covariance(graph.first_keys[index : index + 1])
         start = starts[index : index + 1]
         if held is not None:
             move(start, held.motions, start)
@@ -288,7 +212,7 @@ def _particles(graph: SlamGraph, mode: MapEstimate, draws: PathSamples) -> Parti
     return Particles(
         poses, starts, np.log(np.maximum(weights, 1e-300)), densities, graph.landmark_ids[rows],
         PathLandmarks(paths, mode, rows), counts[rows], means, covariances, biases, bias_covariances, frame,
-        start_scatters, at_mode,
+        start_scatters,
     )  # fmt: skip
 
 
@@ -352,7 +276,8 @@ class Smoother(NamedTuple):
         Returns:
             The graph on convergence, the new state before it, or the reason of a failure.
         """
-        mode = optimize(draft.graph, self.camera, self.options, STEPS, draft.damping, SLICE_TOLERANCE)
+        most = self._most(STEPS, draft.steps)
+        mode = optimize(draft.graph, self.camera, self.options, most, draft.damping, SLICE_TOLERANCE)
         return self._after(draft, mode)
 
     def draw(
@@ -366,6 +291,9 @@ class Smoother(NamedTuple):
     ) -> Rejuvenation | SlamGraph | Draft | str:
         """Add the logs' last rows to the graph, and draw particles if `LAST_STEPS` iterations reach convergence.
 
+        If no rows are left, slices have brought the graph to its mode: all iterations are done, and draws are refused
+        if they do not reach it, as slices after them would end there again.
+
         Args:
             graph, logs, guesses, places: Same arguments as `add_logs`.
             num_particles: M.
@@ -376,11 +304,14 @@ class Smoother(NamedTuple):
         """
         grown = extend_graph(graph, logs, self.motion, self.camera[4:], guesses, self.options.rigid_within, places)
         draft = Draft(graph=grown)
-        mode = optimize(grown, self.camera, self.options, LAST_STEPS)
+        is_last = not any(map(len, logs))
+        mode = optimize(grown, self.camera, self.options, None if is_last else self._most(LAST_STEPS))
         if not mode.reason:
             return sample_particles(grown, mode, self.camera, num_particles, self.rng, self.options, appearance)
         if mode.reason == NO_POSE:
             return at_given_poses(grown, self.camera, self.options)
+        if is_last and mode.unfinished:
+            return Rejuvenation(graph, mode.reason, float("nan"), mode.iterations, None)
         return self._after(draft, mode)
 
     def without_measurements(self, graph: SlamGraph, logs: Sequence[LogArrays]) -> SlamGraph:
@@ -388,10 +319,14 @@ class Smoother(NamedTuple):
         blind = [replace(log, ids=np.full_like(log.ids, REJECTED)) for log in logs]
         return extend_graph(graph, blind, self.motion, self.camera[4:], rigid_within=self.options.rigid_within)
 
+    def _most(self, steps: int, done: int = 0) -> int:
+        """Return the number of iterations of a slice, within those of the options that are left."""
+        return min(steps, self.options.max_iterations - done)
+
     def _after(self, draft: Draft, mode: MapEstimate) -> SlamGraph | Draft | str:
         """Return the result of `optimise_slice` after its iterations."""
         if not mode.reason:
-            return relinearised_and_reduced(draft.graph, mode, self.camera, self.options, self.rng)
+            return relinearised_and_reduced(draft.graph, mode, self.camera, self.options)
         if mode.reason == NO_POSE:
             return at_given_poses(draft.graph, self.camera, self.options).graph
         steps = draft.steps + mode.iterations

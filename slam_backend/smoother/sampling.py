@@ -12,7 +12,6 @@ import numpy as np
 
 from slam_backend.core.jit import jit
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
-from slam_backend.resampling import systematic
 from slam_backend.smoother import _kernels
 from slam_backend.smoother._kernels import LANES, POSE_ROWS, Keys, LandmarkFactors
 from slam_backend.smoother.graph import SlamGraph
@@ -166,27 +165,6 @@ def _retracted(graph: SlamGraph, mode: MapEstimate, poses: FloatArray) -> FloatA
     return retract_on_se2(mode.poses, graph.parents, poses - mode.poses[:, :, None])
 
 
-def sample_more_paths(
-    graph: SlamGraph, mode: MapEstimate, num_drawn: int, first: PathSamples, rng: np.random.Generator
-) -> tuple[PathSamples, float]:
-    """Draw and weigh more paths as those of `sample_paths` were drawn, and resample fewer of them.
-
-    Args:
-        graph, mode, rng: Same arguments as `sample_paths`.
-        num_drawn: Number of weighed paths.
-        first: Result of `sample_paths`. It says whether these paths are retracted, and how many are resampled.
-
-    Returns:
-        Paths with equal weights, and the effective sample size of the weighed ones.
-    """
-    num_particles = len(first.weights)
-    poses, log_proposals = mode.paths(num_drawn, rng)
-    poses = _retracted(graph, mode, poses) if first.is_retracted else poses
-    drawn = importance_weights(graph, mode, poses, log_proposals)
-    poses = np.take(poses, systematic(drawn.weights, rng, num_particles), axis=2)
-    return PathSamples.weighed(poses, np.zeros(num_particles), drawn.transition_variances), drawn.sample_size
-
-
 HALVINGS = 30  # of the interval of powers
 
 
@@ -207,18 +185,6 @@ def tempered(draws: PathSamples, sample_size: float) -> PathSamples:
         low, high = (power, high) if _kernels.normalise(power * logs, weights) >= sample_size else (low, power)
     size = _kernels.normalise(low * logs, weights)
     return draws._replace(log_weights=low * logs, weights=weights, sample_size=size)
-
-
-def sample_transition_variances(graph: SlamGraph, mode: MapEstimate, rng: np.random.Generator) -> FloatArray:
-    """Return the variances (k,) [m^2] of motions from the previous keys over `LANES` paths, each to about 14 %.
-
-    Args:
-        graph: Odometry and measurements.
-        mode: MAP estimate of the graph, with the factored information matrix.
-        rng: Source of the draws.
-    """
-    paths, _ = mode.paths(LANES, rng)
-    return odometry_log_density(graph, mode, lane_rows(paths), LANES)[1]
 
 
 def importance_weights(

@@ -19,9 +19,7 @@ from slam_backend.fastslam.step_input import InputBuffer, RobotRows, StepInput, 
 from slam_backend.team.merge_monitor import MergeMonitor
 
 MAX_REPLAYED = 20  # buffered steps that a filter replays per tick
-# Each robot's filter may smooth in one of this many steps; a joint filter in the turns of all its robots, unless its
-# graph is large.
-TURNS = 4
+TURNS = 4  # each robot's filter may smooth in one of this many steps; a joint filter in the turns of all its robots
 
 
 @dataclass(slots=True, eq=False)
@@ -175,7 +173,7 @@ def process_step(
         branch.report = report = _silent_report(branch, rows, associations)
         return report
     slam = branch.filter
-    slam.may_smooth = step % TURNS in batches and (not slam.smooths_large_graph or step % TURNS == min(batches))
+    slam.may_smooth = step % TURNS in batches
     branch.report = report = slam.step_checked(inputs, rows, associations, buffer, step)
     if report.num_created:
         for monitor in branch.monitors:
@@ -202,7 +200,7 @@ def fork(
         at_hand: Filter that is no longer needed, whose memory the copy takes; or None.
     """
     stream = np.random.default_rng(rng.integers(2**63, size=4)).bit_generator.state
-    slam = restored_filter(branch.filter.state.get_state(for_copy=True) | {"rng": stream}, at_hand)
+    slam = restored_filter(branch.filter.state.get_state() | {"rng": stream}, at_hand)
     return Branch(
         robots=branch.robots,
         active_robots=active_robots,

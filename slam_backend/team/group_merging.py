@@ -1,7 +1,7 @@
 """Merging of two groups, detection of inconsistent merges, and separation of the groups before a merge."""
 
 import math
-from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -14,10 +14,9 @@ from slam_backend.geometry import rotate_covariances
 from slam_backend.maps.alignment import DISTINCT_ROTATION, DISTINCT_TRANSLATION, Alignment, AlignmentOptions
 from slam_backend.maps.fusion import check_inliers
 from slam_backend.maps.landmark_map import LandmarkMap
-from slam_backend.smoother.graph import SlamGraph, mean_pose, scattered
-from slam_backend.smoother.joint_graphs import relative_start
-from slam_backend.smoother.options import MANY_STEPS
-from slam_backend.team.branches import Branch, ReplayedStep, fork
+from slam_backend.smoother.graph import SlamGraph
+from slam_backend.smoother.joint_graphs import RelativeStart, relative_start
+from slam_backend.team.branches import Branch, fork
 from slam_backend.team.filter_merging.landmarks import merge_by_identity, renaming
 from slam_backend.team.filter_merging.merging import merge_filters, pair_filters, transform_covariance
 from slam_backend.team.filter_merging.pairing import Pairing
@@ -26,48 +25,18 @@ from slam_backend.team.merge_monitor import (
     MergeMonitor,
     PreMergeSnapshot,
     begin_monitoring,
-    deformed_fraction,
-    renamed_map,
 )
 from slam_backend.team.merge_rollback import MergeRollback
 from slam_backend.team.options import MergeOptions
 from slam_backend.team.shared_records import SharedRecords
 
 
-def smoothed_maps(group_a: Group, group_b: Group) -> tuple[LandmarkMap, LandmarkMap] | None:
-    """Rejuvenate both joint filters from their smoothed paths.
-
-    A filter whose smoother finds no better paths does not change.
-
-    Returns:
-        Present maps of both with mixture covariances; None if neither filter has changed.
-    """
-    filters = group_a.trunk.filter, group_b.trunk.filter
-    reports = [slam.rejuvenate() for slam in filters]
-    return None if all(report.reason for report in reports) else (filters[0].map("mixture"), filters[1].map("mixture"))
-
-
 def smoothed_graphs(a: FastSlam, b: FastSlam) -> tuple[SlamGraph, SlamGraph] | None:
     """Return the graphs of the smoothers of two filters; None if one has not smoothed yet, or cannot any more."""
-    smoothers = (slam.state.rejuvenation for slam in (a, b))
-    graphs = [None if smoother is None or smoother.is_disabled else smoother.graph for smoother in smoothers]
-    return None if graphs[0] is None or graphs[1] is None else (graphs[0], graphs[1])
-
-
-class PreparedTrunk(NamedTuple):
-    """Branch of a joint filter, made some steps before the merge.
-
-    Attributes:
-        branch: The branch.
-        renamed: (n, 2) int64 rows (id in b, id in the joint map) of the landmarks that b had then.
-        end_of_common: Ids in the joint map below this one are those of landmarks that a had then.
-        replayed: Steps replayed since.
-    """
-
-    branch: Branch
-    renamed: IntArray
-    end_of_common: int
-    replayed: Sequence[ReplayedStep] = ()
+    of_a, of_b = (slam.state.rejuvenation if slam.can_rejuvenate else None for slam in (a, b))
+    if of_a is None or of_b is None or of_a.graph is None or of_b.graph is None:
+        return None
+    return of_a.graph, of_b.graph
 
 
 class MergePlan(NamedTuple):
@@ -78,16 +47,12 @@ class MergePlan(NamedTuple):
         maps: Maps of their joint filters, with mixture covariances.
         alignment: Motion from b's map frame to a's; `inliers` are rows of the maps.
         pairing: Pairing of the joint filters' particles, if drawn already.
-        joint: Result of `merge_filters`, if merged already.
-        prepared: Branch of the joint filter that has caught up with both groups, if it was prepared.
     """
 
     groups: tuple[Group, Group]
     maps: tuple[LandmarkMap, LandmarkMap]
     alignment: Alignment
     pairing: Pairing | None = None
-    joint: tuple[FastSlam, IntArray] | None = None
-    prepared: PreparedTrunk | None = None
 
     @classmethod
     def of(cls, group_a: Group, group_b: Group, alignment: Alignment) -> Self:
@@ -111,129 +76,46 @@ class MergePlan(NamedTuple):
         rows = self.alignment.inliers
         return np.column_stack([self.maps[0].ids[rows[:, 0]], self.maps[1].ids[rows[:, 1]]])
 
-    def by_graphs(self) -> tuple[Self, float] | None:
-        """Estimate the motion by the joint graph of both groups alone, as a trial does before it draws particles.
+    def with_motion(self, merging: MergeOptions, rng: np.random.Generator) -> tuple[Self, float]:
+        """Return the plan with the motion between the maps as the robots' whole paths tell it, and its uncertainty.
+
+        Each map constrains the other robots' paths between their starts and the common landmarks, so that the joint
+        graph of both groups may know their relative start well where neither map does. Without smoothers, or if the
+        joint graph has no mode, particles of both groups are paired as in a merge, and their scatter tells.
+
+        Args:
+            merging: Options of merges.
+            rng: Generator for the pairing.
 
         Returns:
-            The plan with the motion at the mode, and its uncertainty, see `transform_uncertainty`; that of a trial
-            hardly falls below it. None where `relative_start` is.
+            The plan, and the standard deviation of the motion in its least certain direction over 0.5 m, or in heading
+            over 5 degrees, whichever is more [-].
         """
+        start = self._relative_start()
+        if start is None:
+            pairing = pair_filters(*self.filters, self.alignment, self.pairs, rng, merging.merged_particles)
+            plan = self._replace(pairing=pairing)
+            return plan, transform_uncertainty(plan)
+        x, y, theta = start.motion.tolist()
+        found = replace(self.alignment, tx=x, ty=y, theta=theta, covariance=start.covariance)
+        return self._replace(alignment=found), _relative_uncertainty(start.covariance)
+
+    def _relative_start(self) -> RelativeStart | None:
+        """Return the motion at the mode of the joint graph of both groups; None if there is none."""
         graphs = smoothed_graphs(*self.filters)
         if graphs is None:
             return None
         of_a, of_b = (slam.state.maps for slam in self.filters)
         renamed = renaming(of_a, of_b, np.concatenate(merge_by_identity(of_a, of_b, self.pairs)))
-        state, found = self.filters[0].state, self.alignment
-        start = relative_start(*graphs, found.transform, renamed, state.packed_camera, state.options.smoothing)
-        if start is None:
-            return None
-        covariance = _variance_factor(np.concatenate([graph.latest for graph in graphs])) * start.covariance
-        x, y, theta = start.motion.tolist()
-        alignment = Alignment(True, "", x, y, theta, covariance, found.inliers, found.ratio)
-        return self._replace(alignment=alignment), _relative_uncertainty(covariance)
-
-    def with_pairing(self, merging: MergeOptions, rng: np.random.Generator) -> Self:
-        """Return the plan with the particles paired by draws from `rng`, as in a merge."""
-        pairing = pair_filters(*self.filters, self.alignment, self.pairs, rng, merging.merged_particles)
-        return self._replace(pairing=pairing)
-
-    def on_trial(
-        self, merging: MergeOptions, options: AlignmentOptions, rng: np.random.Generator
-    ) -> tuple[Self, float] | None:
-        """Merge both filters into one and rejuvenate it from its smoothed paths; the filters do not change.
-
-        Each map constrains the other robots' paths between their starts and the common landmarks. The joint filter may
-        therefore know the relative start of the groups well where neither map does.
-
-        Args:
-            merging, options: Options of merges and alignments.
-            rng: Generator for the draws.
-
-        Returns:
-            The plan with the result of `judge_trial`. None if the smoother fails.
-        """
-        a, b = self.filters
-        joint, renamed = merge_filters(
-            a, b, self.alignment, self.pairs, rng, merging.merged_particles, pairing=self.pairing, on_trial=True
-        )
-        if joint.rejuvenate().reason:
-            return None
-        found, uncertainty = judge_trial(joint, a.num_robots, self.maps, renamed, self.alignment, merging, options)
-        return self._replace(alignment=found, joint=(joint, renamed)), uncertainty
-
-
-def judge_trial(
-    joint: FastSlam, robot: int, maps: tuple[LandmarkMap, LandmarkMap], renamed: IntArray, alignment: Alignment,
-    merging: MergeOptions, options: AlignmentOptions,
-) -> tuple[Alignment, float]:  # fmt: skip
-    """Return the motion between two maps by a joint filter that was rejuvenated on trial, and how uncertain it is.
-
-    Args:
-        joint: The joint filter, a's robots first.
-        robot: Index of b's first robot, whose start defines b's frame.
-        maps: Maps of a and b before, with mixture covariances.
-        renamed: (n, 2) int64 rows (id in b, id in the joint map).
-        alignment: Alignment by which they were merged.
-        merging, options: Options of merges and alignments.
-
-    Returns:
-        The alignment with this motion, and its uncertainty, see `transform_uncertainty`; infinite if the shape of the
-        joint map is inconsistent.
-    """
-    starts = joint.state.starts[robot, :, : joint.num_particles]
-    motion = mean_pose(starts)
-    start = rotate_covariances(float(motion[2]), joint.state.start_covariances[robot])
-    covariance = scattered(starts) + start
-    _kernels.add_gauge_covariance(joint.state.gauge_covariance, motion[None], covariance[None])
-    covariance = _cautious(covariance, joint, robot)
-    x, y, theta = motion.tolist()
-    found = Alignment(True, "", x, y, theta, covariance, alignment.inliers, alignment.ratio)
-    before, after = (maps[0], renamed_map(maps[1], dict(renamed.tolist()))), joint.map("mixture")
-    deformed = any(deformed_fraction(old, after, options) > merging.max_deformed for old in before)
-    return found, math.inf if deformed else _relative_uncertainty(covariance)
-
-
-# Factor by which the standard deviations of a start in a large map are too small, as keyframes have been joined: with
-# 2,000 instead of 180 per robot they are 1.3 times as large after eight minutes (docs/lab/scale.md).
-JOINED_KEYFRAMES = 1.3
-# The same for what has been joined since the smoother widens it (`graph_reduction.WIDENED`): claims agree with errors,
-# and merges at 2.4 standard deviations instead of 3 come in time.
-WIDENED_KEYFRAMES = 0.8
-
-
-def _cautious(covariance: FloatArray, joint: FastSlam, robot: int) -> FloatArray:
-    """Return the covariance of a robot's start, or in large maps that of the Gaussian at the mode, if that is larger.
-
-    Along long paths few samples carry weight, and the scatter of these few understates the uncertainty.
-    """
-    smoother = joint.state.rejuvenation
-    if smoother is None or smoother.starts_at_mode is None or smoother.graph is None:
-        return covariance
-    larger: FloatArray = max(covariance, smoother.starts_at_mode[robot], key=_relative_uncertainty)
-    return _variance_factor(smoother.graph.latest) * larger
-
-
-def _variance_factor(latest: IntArray) -> float:
-    """Return the factor on covariances of starts in a large map, the mean of two by their shares of a run.
-
-    Keyframes joined in the first `MANY_STEPS` steps may not be widened, later ones are.
-
-    Args:
-        latest: (K,) int64. Last step of each robot.
-    """
-    before = min(MANY_STEPS * len(latest) / max(int(latest.sum()), 1), 1.0)
-    return before * JOINED_KEYFRAMES**2 + (1.0 - before) * WIDENED_KEYFRAMES**2
+        state = self.filters[0].state
+        return relative_start(*graphs, self.alignment.transform, renamed, state.packed_camera, state.options.smoothing)
 
 
 def transform_uncertainty(plan: MergePlan) -> float:
-    """Return the uncertainty of the motion between two maps over the paired particles of a merge.
+    """Return the uncertainty of the motion over the paired particles of a plan, see `MergePlan.with_motion`.
 
     The errors of landmarks in one map are correlated where its paths are uncertain, which neither their covariances nor
     the alignment's include. The scatter of the motion over particles does; gauge covariances are added.
-
-    Returns:
-        The standard deviation of the motion in its least certain direction over 0.5 m, or in heading over 5 degrees,
-        whichever is more [-].
     """
     assert plan.pairing is not None
     a, b = plan.filters
@@ -268,47 +150,23 @@ def merge_groups(
     """
     group_a, group_b = plan.groups
     a, b = group_a.trunk, group_b.trunk
-    prepared = plan.prepared
-    if prepared is None:
-        joint, renamed = plan.joint or merge_filters(
-            a.filter, b.filter, plan.alignment, plan.pairs, rng, merging.merged_particles, known, plan.pairing
-        )
-        joint.reorder(np.argsort(a.robots + b.robots))
-        branch = joint_trunk(plan.groups, joint, renamed, records.new_number())
-        prepared = PreparedTrunk(branch, renamed, a.filter.state.maps.next_id)
-    trunk, renamed, end_of_common, replayed = prepared
-    trunk.active_robots, trunk.epoch = tuple(sorted(a.active_robots + b.active_robots)), epoch
-    watched = {monitor.number for monitor in (*a.monitors, *b.monitors)}
-    trunk.monitors = [monitor for monitor in trunk.monitors if monitor.number in watched]  # some ended meanwhile
-    if merging.watch_steps:
-        sides = PreMergeSnapshot.of(a.get_state()), PreMergeSnapshot.of(b.get_state())
-        common = renamed[renamed[:, 1] < end_of_common, ::-1]
-        fresh = begin_monitoring(trunk.number, plan.alignment, sides, plan.maps, renamed, common)
-        for done in replayed:
-            fresh.update(trunk.robots, done.report)
-        trunk.monitors.append(fresh)
-    trunk.filter.state.write_landmarks(a.filter.state.maps)
-    id_map = LandmarkIdMap(a.robots, b.robots, renamed, (a.number, b.number, trunk.number))
-    records.entries.append(id_map)
-    records.note_replay(trunk.number, replayed)
-    return Group(trunk, [*group_a.branches[1:], *group_b.branches[1:]]), id_map
-
-
-def joint_trunk(groups: tuple[Group, Group], joint: FastSlam, renamed: IntArray, number: int) -> Branch:
-    """Return the branch of the joint filter of two groups, which still uses none of its robots' inputs.
-
-    Args:
-        groups: Groups a and b.
-        joint: Joint filter of their robots, in any order.
-        renamed: (n, 2) int64 rows (id in b, id in the joint map).
-        number: Number of the joint map.
-    """
-    a, b = (group.trunk for group in groups)
+    joint, renamed = merge_filters(
+        a.filter, b.filter, plan.alignment, plan.pairs, rng, merging.merged_particles, known, plan.pairing
+    )
+    joint.reorder(np.argsort(a.robots + b.robots))
+    active = tuple(sorted(a.active_robots + b.active_robots))
+    number = records.new_number()
+    trunk = Branch(tuple(sorted(a.robots + b.robots)), active, joint, a.last_steps | b.last_steps, number, epoch)
     new_ids = dict(renamed.tolist())
     older = [*(monitor.copy() for monitor in a.monitors), *(monitor.copy(new_ids) for monitor in b.monitors)]
-    trunk = Branch(tuple(sorted(a.robots + b.robots)), (), joint, a.last_steps | b.last_steps, number)
     trunk.monitors = sorted(older, key=lambda monitor: monitor.number)
-    return trunk
+    if merging.watch_steps:
+        sides = PreMergeSnapshot.of(a.get_state()), PreMergeSnapshot.of(b.get_state())
+        common = renamed[renamed[:, 1] < a.filter.state.maps.next_id, ::-1]
+        trunk.monitors.append(begin_monitoring(number, plan.alignment, sides, plan.maps, renamed, common))
+    id_map = LandmarkIdMap(a.robots, b.robots, renamed, (a.number, b.number, number))
+    records.entries.append(id_map)
+    return Group(trunk, [*group_a.branches[1:], *group_b.branches[1:]]), id_map
 
 
 def find_inconsistent_merge(trunk: Branch, merging: MergeOptions, options: AlignmentOptions) -> MergeMonitor | None:

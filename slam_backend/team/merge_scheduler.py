@@ -104,7 +104,7 @@ class MergeScheduler:
         self._near: dict[PairKey, NearPairs] = {}  # results of `near_pairs`; not part of the state
         self._blocks: list[tuple[PairKey, int]] = []  # blocked pairs, and the step when the block ends
         self._uncertainties: dict[tuple[int, int], float] = {}  # least uncertainty by robots of both sides
-        self._trials: dict[tuple[int, int], FloatArray] = {}  # last motion by the robots that define the frames
+        self._motions: dict[tuple[int, int], FloatArray] = {}  # last motion by the robots that define the frames
         self.pending_attempt: PendingAttempt | None = None
 
     def is_due(self, step: int) -> bool:
@@ -177,19 +177,18 @@ class MergeScheduler:
         return uncertainty > 1.0 and (uncertainty > limit or uncertainty < MIN_IMPROVEMENT * before)
 
     def change(self, pair: PairKey, motion: FloatArray) -> float:
-        """Return the change of the motion since the last trial of two groups, and record this motion.
+        """Return the change of the motion since the last attempt of two groups, and record this motion.
 
         Args:
             pair: Groups of the attempt.
-            motion: (3,) [m, m, rad] between the frames of the two groups, estimated by their joint filter on trial.
+            motion: (3,) [m, m, rad] between the frames of the two groups, by their joint graph.
 
         Returns:
-            The shift over 0.25 m or the turn over 2.5 degrees, whichever is more; infinite without an earlier trial of
-            these frames.
+            The shift over 0.25 m or the turn over 2.5 degrees, whichever is more; infinite without an earlier attempt.
         """
         frames = pair[0][0], pair[1][0]
-        before = self._trials.get(frames)
-        self._trials[frames] = as_constant(motion)
+        before = self._motions.get(frames)
+        self._motions[frames] = as_constant(motion)
         if before is None:
             return math.inf
         x, y, turn = (motion - before).tolist()
@@ -197,7 +196,7 @@ class MergeScheduler:
             math.hypot(x, y) / (0.5 * DISTINCT_TRANSLATION), abs(float(wrap_angle(turn))) / (0.5 * DISTINCT_ROTATION)
         )
 
-    def record(self, pair: PairKey, step: int, success: bool, smoothed: bool = False, in_slices: bool = False) -> None:
+    def record(self, pair: PairKey, step: int, success: bool, smoothed: bool = False) -> None:
         """Record an attempt of the pair that `choose` returned: its candidate matches, and its next wait.
 
         Args:
@@ -205,9 +204,7 @@ class MergeScheduler:
             step: Step of the attempt.
             success: Whether the groups merge.
             smoothed: Whether the logs were smoothed for the attempt, as the candidates fitted; the next attempt then
-                needs no new ones. The cost of smoothing may grow with the logs, so that a refused pair waits until an
-                eighth of them is new: the total cost is then at most a multiple of the last one.
-            in_slices: Whether the smoothers work in slices, so that the cost is bounded; the wait then is, too.
+                needs no new ones, but waits until an eighth of the logs is new.
         """
         if success:
             gone = set(pair[0]) | set(pair[1])
@@ -218,7 +215,7 @@ class MergeScheduler:
         record.tried = set() if smoothed else self._proposed.get(pair, set())
         record.last_step = step
         growth = math.ceil(MIN_LOG_GROWTH * step) if smoothed else 0
-        record.next_step = step + max(record.wait, min(growth, self._options.longest_wait) if in_slices else growth)
+        record.next_step = step + max(record.wait, min(growth, self._options.longest_wait))
         record.wait = min(2 * record.wait, self._options.longest_wait)
 
     def block(self, pair: PairKey, until: int) -> None:
@@ -229,7 +226,7 @@ class MergeScheduler:
         """Return the options and a copy of the memory; arrays are read-only."""
         records = {pair: record.copy() for pair, record in self._records.items()}
         memory: dict[str, Any] = {"records": records, "blocks": tuple(self._blocks)}
-        memory |= {"uncertainties": dict(self._uncertainties), "trials": dict(self._trials)}
+        memory |= {"uncertainties": dict(self._uncertainties), "motions": dict(self._motions)}
         fixed = {"options": self._options, "alignment": self._alignment, "pending_attempt": self.pending_attempt}
         return fixed | memory
 
@@ -239,7 +236,7 @@ class MergeScheduler:
         self.pending_attempt = state["pending_attempt"]
         self._records = {pair: record.copy() for pair, record in state["records"].items()}
         self._blocks = list(state["blocks"])
-        self._uncertainties, self._trials = dict(state["uncertainties"]), dict(with_constants(state["trials"]))
+        self._uncertainties, self._motions = dict(state["uncertainties"]), dict(with_constants(state["motions"]))
 
 
 def _touches(pair: PairKey, blocked: PairKey) -> bool:

@@ -19,7 +19,7 @@ from slam_backend.team.merge_monitor import MergeMonitor, PreMergeSnapshot
 from slam_backend.team.merge_scheduler import AttemptOptions, AttemptRecord, PendingAttempt
 from slam_backend.team.options import MergeOptions
 
-BY_ROBOTS = ("uncertainties", "trials")  # parts of the schedule with an entry for each pair of robots
+BY_ROBOTS = ("uncertainties", "motions")  # parts of the schedule with an entry for each pair of robots
 KEYS = ("step", "epoch", "rng", "events", "groups", "numbers", "alignment", "merging", "schedule", "records")
 BRANCH = (
     "robots",
@@ -33,10 +33,6 @@ BRANCH = (
     "split_from",
     "split_counts",
 )
-PREPARATION = (
-    "pair", "numbers", "maps", "alignment", "unsmoothed", "counts", "oldest", "joint", "renamed", "uncertainty",
-    "replayed",
-)  # fmt: skip
 KINDS = ("attempt", "merge", "undo")
 
 
@@ -89,8 +85,6 @@ class TeamCheck:
         self._check_schedule(f"{name}['schedule']", state["schedule"])
         for where, group in check.named_items(f"{name}['groups']", state["groups"]):
             self._check_group(where, group)
-        if "preparation" in state:
-            self._check_preparation(f"{name}['preparation']", state["preparation"], state["groups"])
         trunks = [group["branches"][0]["robots"] for group in state["groups"]]
         if sorted(sum(trunks, ())) != list(range(self._count)) or trunks != sorted(trunks):
             check.refuse(f"{name}['groups']", "groups of all robots, ordered by their first robots", trunks)
@@ -134,50 +128,6 @@ class TeamCheck:
                 self._need_from(where, last + 1)
                 if last > trunk["last_steps"].get(robot, -1):
                     check.refuse(where, "sides that know no more steps than the joint filter", last)
-
-    def _check_preparation(self, name: str, state: Any, groups: Sequence[Mapping[str, Any]]) -> None:
-        """Refuse a value that is not the preparation of a merge of two of these groups, or of earlier ones."""
-        check.keys(name, state, PREPARATION)
-        self._check_pair(f"{name}['pair']", state["pair"])
-        check.integers(f"{name}['numbers']", state["numbers"])
-        check.sequence(f"{name}['numbers']", state["numbers"], 2)
-        check.instance(f"{name}['alignment']", state["alignment"], Alignment)
-        if not state["alignment"].success:
-            check.refuse(f"{name}['alignment']", "a successful one", state["alignment"].reason)
-        for side, (where, landmarks) in enumerate(check.named_items(f"{name}['maps']", state["maps"], 2)):
-            check_landmarks(where, landmarks)
-            rows = state["alignment"].inliers[:, side]
-            check.indices(f"{name}['alignment'].inliers", rows, (None,), 0, len(landmarks) - 1)
-            if len(np.unique(rows)) < len(rows):
-                check.refuse(f"{name}['alignment'].inliers", "one-to-one pairs", "a repeated row")
-        check.instance(f"{name}['unsmoothed']", state["unsmoothed"], Alignment, type(None))
-        check.integers(f"{name}['counts']", state["counts"], 0, check.MAX_INT)
-        check.sequence(f"{name}['counts']", state["counts"], 4)
-        if state["renamed"] is not None:
-            check.indices(f"{name}['renamed']", state["renamed"], (None, 2), *check.LANDMARK)
-        if not isinstance(state["uncertainty"], float) or state["uncertainty"] < 0.0:
-            check.refuse(f"{name}['uncertainty']", "a float at least 0, or NaN", state["uncertainty"])
-        oldest, robots = state["oldest"], sorted(sum(state["pair"], ()))
-        if oldest is not None:
-            check.integer(f"{name}['oldest']", oldest, 0, self._step)
-            self._need_from(f"{name}['oldest']", oldest)
-        for where, done in check.named_items(f"{name}['replayed']", state["replayed"]):
-            self._check_replayed(where, done, len(robots))
-            if oldest is None or done.step < oldest:
-                check.refuse(f"{where}.step", f"at least {oldest}", done.step)
-        if state["joint"] is None:
-            return
-        self._check_branch(f"{name}['joint']", state["joint"])
-        known = state["joint"]["last_steps"]
-        if robots != list(state["joint"]["robots"]) or state["renamed"] is None or oldest is None:
-            check.refuse(f"{name}['joint']", f"the joint filter of {state['pair']}", state["joint"]["robots"])
-        if min(known.values()) + 1 < oldest:
-            check.refuse(f"{name}['joint']", f"no step before {oldest} to replay", known)
-        for trunk in (group["branches"][0] for group in groups):
-            if trunk["number"] in state["numbers"]:
-                for robot, last in trunk["last_steps"].items():
-                    if known.get(robot, -1) > last:
-                        check.refuse(f"{name}['joint']", "a filter that knows no more steps than its groups", known)
 
     def _check_branch(self, name: str, branch: Any) -> None:
         """Refuse a value that is not a branch with a valid filter and monitors."""
@@ -399,8 +349,8 @@ class TeamCheck:
         for uncertainty in schedule["uncertainties"].values():
             if not (isinstance(uncertainty, float) and uncertainty >= 0.0):
                 check.refuse(f"{name}['uncertainties']", "a float at least 0", uncertainty)
-        for motion in schedule["trials"].values():
-            check.floats(f"{name}['trials']", motion, (3,))
+        for motion in schedule["motions"].values():
+            check.floats(f"{name}['motions']", motion, (3,))
 
     def _check_pair(self, name: str, pair: Any) -> None:
         """Refuse a value that is not two groups of robots."""

@@ -44,7 +44,6 @@ from slam_backend.team.filter_merging.merging import inverse_alignment
 from slam_backend.team.group_merging import MergePlan, find_inconsistent_merge, merge_groups, separate_groups
 from slam_backend.team.groups import Group, TeamTopology
 from slam_backend.team.merge_attempt import run_attempt
-from slam_backend.team.merge_preparation import MergePreparation
 from slam_backend.team.merge_rollback import MergeRollback
 from slam_backend.team.merge_scheduler import AttemptOptions, MergeScheduler
 from slam_backend.team.options import MergeOptions
@@ -108,7 +107,6 @@ class TeamSlam:
         ]
         self._groups, self._records, self._num_robots = groups, SharedRecords(count, of_forks), count
         self._events: list[MergeEvent] = []
-        self._preparation: MergePreparation | None = None
         self._together = contact_components(None, count)
         self._numbers = frozenset(range(count))
         self._refresh_topology()
@@ -154,17 +152,16 @@ class TeamSlam:
         records, before = self._records, len(self._events)
         if contacts is not None or topology.is_split:
             topology = self._update_groups(networks)
-        if self._oldest_replayed is not None:
+        if topology.oldest is not None:
             records.log.record(self._step, inputs)
         associations, rejuvenations = self._advance(topology, inputs)
         if topology.has_monitors:
             self._check_merges()
-        is_due = self._preparation is not None or self._schedule.is_due(self._step)
-        id_maps = self._attempt(networks) if is_due else ()
+        id_maps = self._attempt(networks) if self._schedule.is_due(self._step) else ()
         if self._is_stale:
             self._refresh_topology()
             topology = self.topology
-        oldest = self._step + 1 if self._oldest_replayed is None else self._oldest_replayed
+        oldest = self._step + 1 if topology.oldest is None else topology.oldest
         if topology is not self._last_topology:
             self._note_dropped(topology)
             records.log.forget_before(oldest)
@@ -175,14 +172,6 @@ class TeamSlam:
         records.entries.clear()
         self._step += 1
         return report
-
-    @property
-    def _oldest_replayed(self) -> int | None:
-        """First step that a filter may have to replay; None: none."""
-        oldest, preparation = self.topology.oldest, self._preparation
-        if preparation is None or preparation.oldest is None:
-            return oldest
-        return preparation.oldest if oldest is None else min(oldest, preparation.oldest)
 
     def _update_groups(self, networks: IntArray) -> TeamTopology:
         """Update the contacts of each group, and return the topology."""
@@ -307,10 +296,7 @@ class TeamSlam:
     def _attempt(self, networks: IntArray) -> tuple[LandmarkIdMap, ...]:
         """Run an attempt, and merge the groups if it succeeds."""
         options = self._schedule, self._alignment, self._merging
-        before = self._preparation
-        tried = run_attempt(self._groups, networks, self._step, *options, self._records, self._rng, before)
-        if tried.preparation is not before:
-            self._preparation, self._is_stale = tried.preparation, True
+        tried = run_attempt(self._groups, networks, self._step, *options, self._records, self._rng)
         if tried.event is not None:
             self._events.append(tried.event)
         return () if tried.plan is None else (self._merge(tried.plan),)
@@ -552,7 +538,7 @@ class TeamSlam:
 
         Snapshots kept for an undo, inputs and reports are shared and read-only, all else is copied.
         """
-        state: dict[str, Any] = {
+        return {
             "step": self._step,
             "epoch": self._epoch,
             "rng": copy.deepcopy(self._rng.bit_generator.state),
@@ -564,7 +550,6 @@ class TeamSlam:
             "schedule": self._schedule.get_state(),
             "records": self._records.get_state(),
         }
-        return state if self._preparation is None else state | {"preparation": self._preparation.get_state()}
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Restore a state from `get_state`; the team then continues identically.
@@ -589,4 +574,3 @@ class TeamSlam:
         self._alignment, self._merging = state["alignment"], state["merging"]
         self._schedule.set_state(state["schedule"])
         self._records.set_state(state["records"])
-        self._preparation = MergePreparation.from_state(state["preparation"]) if "preparation" in state else None

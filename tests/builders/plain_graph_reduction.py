@@ -9,10 +9,10 @@ from slam_backend.core.packed_symmetric import UNPACK_INDEX, UPPER
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.geometry import between, compose, rotation
 from slam_backend.smoother._kernels import LandmarkFactors, Points
-from slam_backend.smoother.graph import LEVER, NONE, SlamGraph
-from slam_backend.smoother.graph_reduction import CONTRADICTION, WIDENED
+from slam_backend.smoother.graph import NONE, SlamGraph
+from slam_backend.smoother.graph_reduction import CONTRADICTION
 from slam_backend.smoother.optimizer import gathered, linearise
-from slam_backend.smoother.options import SmoothingOptions, extra_keys, keyframe_limit
+from slam_backend.smoother.options import SmoothingOptions, keyframe_limit
 
 
 def chained(
@@ -35,8 +35,7 @@ def plain_reduced(graph: SlamGraph, camera: FloatArray, options: SmoothingOption
     representatives, slack = _representatives(
         condensed, graph.transition_variances, fresh, keyframe_limit(options, len(graph.landmark_ids), graph.latest)
     )
-    share = WIDENED if extra_keys(len(graph.landmark_ids), graph.latest) else 0.0
-    return plain_compacted(_joined(replace(condensed, rigid_variances=slack), representatives, share))
+    return plain_compacted(_joined(replace(condensed, rigid_variances=slack), representatives))
 
 
 def plain_compacted(graph: SlamGraph) -> SlamGraph:
@@ -147,13 +146,9 @@ def _representatives(
     return representative, slack
 
 
-def _joined(graph: SlamGraph, representative: IntArray, share: float) -> SlamGraph:
+def _joined(graph: SlamGraph, representative: IntArray) -> SlamGraph:
     """Move all that hangs on a key to the one it now stands rigidly to."""
     kept = representative == np.arange(len(representative))
-    spreads = np.zeros(len(kept))
-    for key in np.flatnonzero(~kept & (representative != NONE)):
-        spreads[key] = graph.transition_variances[key] + spreads[representative[key]]
-    graph = _widened(graph, share * spreads)
     root = np.maximum(representative, 0)
     while (representative[root] != root).any():
         root = representative[root]
@@ -185,25 +180,6 @@ def _joined(graph: SlamGraph, representative: IntArray, share: float) -> SlamGra
         first_keys=number[graph.first_keys],
         last_keys=number[graph.last_keys],
     )
-
-
-def _widened(graph: SlamGraph, variances: FloatArray) -> SlamGraph:
-    """Add the noise of rigid motions with variances (k,) to what was measured after them.
-
-    Noise of a pose moves a landmark at (x, y) by J = ((1, 0, -y), (0, 1, x)), and nothing up or down.
-    """
-    parts = np.diag([0.25, 0.25, 0.5 / LEVER**2])
-    noises = graph.odometry_covariances + variances[np.maximum(graph.parents, 0)][:, None, None] * parts
-    infos, slopes = graph.information.copy(), graph.gradients.copy()
-    numbers = np.bincount(graph.condensed_keys, minlength=graph.num_keys)
-    for row, key in enumerate(graph.condensed_keys):
-        x, y, _ = graph.linearisation_points[row]
-        by_pose = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 0.0]])
-        noise = numbers[key] * variances[key] * by_pose @ parts @ by_pose.T
-        info = infos[row][UNPACK_INDEX]
-        lost = np.linalg.inv(np.eye(3) + info @ noise)
-        infos[row], slopes[row] = (lost @ info)[*UPPER], lost @ slopes[row]
-    return replace(graph, odometry_covariances=noises, information=infos, gradients=slopes)
 
 
 def _moved(graph: SlamGraph, rows: IntArray, offsets: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -29,10 +29,10 @@ DEAREST = {
     "num_rays": 100, "density": 5.0, "descriptor_size": 100, "max_measurements": 50, "false_points": 20.0,
     "width": 200, "height": 150, "most": 300, "block": 15, "spacing": 30, "border": 40, "cell": 100, "iterations": 20,
     "parts": 4, "polygons": 20.0, "posters": 2.0, "max_samples": 20_000, "max_keys": 200, "further_keys": 50,
-    "recent_keys": 100, "more_draws": 10, "max_iterations": 30, "slice_steps": 100,
+    "recent_keys": 100, "max_iterations": 30, "steps_per_key": 100, "landmarks_per_key": 20,
 }  # fmt: skip
 CHEAPEST = {"texel": 0.02, "min_spacing": 0.02}
-OPTIONAL_INTS = ("decision_ticks", "merged_particles", "rejuvenate_every", "frame_limit", "slice_steps")
+OPTIONAL_INTS = ("decision_ticks", "merged_particles", "rejuvenate_every", "frame_limit")
 EXTREMES = (0.0, 5e-324, 1e-300, 1e-100, 1e-30, 1e-12, 1e-9, 1e-6, 1e6, 1e9, 1e12, 1e30, 1e100, 1e300, 1.7e308)
 WHOLE_EXTREMES = (0, 1, 2, 3, 10**6, 2**31, 2**63, 10**30)
 

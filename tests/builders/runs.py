@@ -1,5 +1,6 @@
 """Short runs as logs and graphs, and the cost of a smoother written plainly."""
 
+from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -9,9 +10,11 @@ from slam_backend.fastslam.run_log import RobotLog
 from slam_backend.geometry import between, inverse, transform_points, wrap_angle
 from slam_backend.models.odometry import OdometryModel
 from slam_backend.smoother.graph import SlamGraph
-from slam_backend.smoother.graph_building import extend_graph
+from slam_backend.smoother.graph_building import NO_LANDMARK_POSITIONS, InitialPoses, extend_graph
+from slam_backend.smoother.log_arrays import LogArrays
 from slam_backend.smoother.optimizer import MapEstimate
 from slam_backend.smoother.options import SmoothingOptions
+from slam_backend.smoother.rejuvenation import Draft, LandmarkDescriptors, Rejuvenation, Smoother
 from training.bench.accuracy.batch_problem import BatchProblem
 from training.bench.accuracy.runs import RunSpec, StereoRun, simulate_run
 
@@ -53,6 +56,27 @@ def graph_of(run: StereoRun, skip: tuple[int, ...] = (), motion: OdometryModel |
     start = SlamGraph.at_starts(run.true_paths[:, 0], motion)
     logs = [log.arrays() for log in logs_of(run, skip)]
     return extend_graph(start, logs, motion, np.array(run.spec.noise.camera.mount))
+
+
+NAMELESS = LandmarkDescriptors(np.zeros(0, dtype=np.int64), np.zeros((0, 0), dtype=np.float32), 0.0)
+
+
+def rejuvenate(
+    graph: SlamGraph, logs: Sequence[LogArrays], motion: OdometryModel, camera: FloatArray, num_particles: int,
+    rng: np.random.Generator, options: SmoothingOptions,
+) -> Rejuvenation:  # fmt: skip
+    """Add logs to a graph and draw particles: in the first slice, or after those that the descent still needs."""
+    smoother = Smoother(motion, camera, options, rng)
+    result: Rejuvenation | SlamGraph | Draft | str = graph
+    while not isinstance(result, Rejuvenation):
+        assert not isinstance(result, str), result
+        if isinstance(result, Draft):
+            result = smoother.optimise_slice(result)
+            continue
+        rest = [log.since(int(latest) + 1) for log, latest in zip(logs, result.latest, strict=True)]
+        guesses = [InitialPoses.empty() for _ in logs]
+        result = smoother.draw(result, rest, guesses, NO_LANDMARK_POSITIONS, num_particles, NAMELESS)
+    return result
 
 
 BIASED = OdometryModel(bias_scale=0.03, bias_heading=0.02, bias_turn=0.05)  # assumed noise with a bias

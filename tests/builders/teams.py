@@ -4,10 +4,8 @@ import copy
 import pickle
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
-import pytest
 from builders.comparison import assert_same
 from builders.filters import LANDMARKS, frame_of
 
@@ -18,8 +16,6 @@ from slam_backend.maps.alignment import Alignment
 from slam_backend.models.camera import StereoCamera
 from slam_backend.models.measurements import Measurements
 from slam_backend.models.odometry import OdometryModel
-from slam_backend.smoother import options, rejuvenation
-from slam_backend.smoother.options import SmoothingOptions
 from slam_backend.team.merge_scheduler import AttemptOptions
 from slam_backend.team.team import TeamSlam
 
@@ -116,16 +112,6 @@ class SimulatedTeam:
             for robot in range(self.num_robots)
         ]
         return np.hypot(*(np.array(believed) - self.poses)[:, :2].T)
-
-
-IN_SLICES: Any = {"num_particles": 8, "rejuvenate_every": 1000, "smoothing": SmoothingOptions(slice_steps=20)}
-
-
-def large_maps(patch: pytest.MonkeyPatch) -> None:
-    """Let all maps and runs count as large, so that the joint graph decides about attempts, and merges are prepared."""
-    for module, name in ((options, "MANY_LANDMARKS"), (rejuvenation, "LARGE_MAP"), (rejuvenation, "LONG_RUN")):
-        patch.setattr(module, name, 0)
-    patch.setattr(options, "LANDMARKS_PER_KEY", 1)
 
 
 NEVER = AttemptOptions(enabled=False)

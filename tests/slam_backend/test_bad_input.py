@@ -82,14 +82,15 @@ OPTIONS: dict[type[Any], tuple[str, dict[str, str | list[Any]]]] = {
     }),
     MergeOptions: ("merging.", {
         "merged_particles": "1..1000000", "min_sigmas": FROM_ZERO,
-        "min_sigmas_on_trial": FROM_ZERO, "watch_steps": "0..1e9",
+        "least_sigmas": FROM_ZERO, "watch_steps": "0..1e9",
         "watch_every": COUNT, "blocked_steps": "0..1e9", "max_deformed": SHARE, "smooth_first": [1],
     }),
     OdometryModel: ("motion.", dict.fromkeys(OdometryModel.__slots__, SIGMA)),
     SmoothingOptions: ("", {
         "max_keys": "2..1e9", "further_keys": "0..1e9", "recent_keys": COUNT, "kernel": FROM_ZERO,
         "noise_scale": POSITIVE, "closure_after": "0..1e9", "effort": POSITIVE, "free_sightings": "0..1e9",
-        "least_ess": SHARE, "more_draws": COUNT, "slice_steps": COUNT, "rigid_within": FROM_ZERO,
+        "least_ess": SHARE, "incremental": [1], "slice_share": POSITIVE, "steps_per_key": COUNT,
+        "landmarks_per_key": COUNT, "rigid_within": FROM_ZERO,
         "max_iterations": COUNT, "tolerance": POSITIVE,
     }),
     StereoCamera: ("camera.", {

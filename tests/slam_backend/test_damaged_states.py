@@ -21,7 +21,7 @@ from slam_backend.team.team import TeamSlam
 
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")  # overflows of what is out of place do no harm
 
-SLICED = {"existence": ExistenceModel(), "rejuvenate_every": 8, "smoothing": SmoothingOptions(slice_steps=12)}
+SLICED = {"existence": ExistenceModel(), "rejuvenate_every": 8, "smoothing": SmoothingOptions(incremental=True)}
 FORKED = links(3, (0, 2))
 
 Subject = tuple[FastSlam | TeamSlam, list[Any]]
@@ -72,7 +72,7 @@ def team_in_an_undo() -> Subject:
 def team_in_an_attempt() -> Subject:
     """Return a team that smooths two maps to align them again."""
     simulation = SimulatedTeam(3, seed=101)
-    smoothing = SmoothingOptions(slice_steps=12)
+    smoothing = SmoothingOptions(incremental=True)
     attempts = AttemptOptions(every=5)
     team = simulation.build(num_particles=10, rejuvenate_every=20, smoothing=smoothing, attempts=attempts)
     while team._schedule.pending_attempt is None:

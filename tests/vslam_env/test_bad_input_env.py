@@ -235,7 +235,7 @@ CALLS: dict[str, list[Callable[[], Any]]] = {
         *(partial(make_world, name, np.random.default_rng(0)) for name in ("missing.png", "missing.json")),
         partial(load_floorplan, "x" * 5000 + ".png"),
     ],
-    "world: expected a path, got": [partial(load_floorplan, None), partial(load_walls_json, 3)],
+    "world: expected the path of a file, got": [partial(load_floorplan, None), partial(load_walls_json, 3)],
     "metres_per_pixel: expected a finite number > 0": [partial(load_floorplan, "plan.png", metres_per_pixel=-1)],
     "path: expected": [partial(save_walls_json, CLOSET, to) for to in (None, Path("nowhere") / "copy.json")],
     "world: expected walls that enclose free space for a disc": [begin(world=BOX), begin(world=NARROW)],
@@ -343,9 +343,9 @@ def test_arguments_without_sense_are_refused_by_name(begins: str) -> None:
 
 
 FILES: dict[str, list[tuple[str, bytes]]] = {
-    "world: expected an image that OpenCV can read": [("plan.png", b"no picture")],
-    "world: expected a JSON file": [("plan.json", b"{"), ("plan.json", b"[" * 100_000)],
-    "world: expected a YAML file, got a syntax error": [("map.yaml", b"image: [1, 2")],
+    "world: expected an image file": [("plan.png", b"no picture")],
+    "world: expected a file in JSON": [("plan.json", b"{"), ("plan.json", b"[" * 100_000)],
+    "world: expected a file in YAML, got a syntax error": [("map.yaml", b"image: [1, 2")],
     "world: expected a mapping with the key 'image'": [("map.yaml", b"resolution: 1"), ("map.yaml", b"[1, 2]")],
     "world.walls: expected": [
         ("plan.json", b'{"walls": ' + walls + b"}")

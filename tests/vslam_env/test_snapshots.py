@@ -14,7 +14,6 @@ import pytest
 from builders.comparison import assert_same, digest
 from builders.damage import Trap
 from builders.environments import MEETING, small_env, wander
-from builders.teams import large_maps
 
 from slam_backend.core.state_codec import encode
 from slam_backend.team import team
@@ -117,9 +116,8 @@ def test_before_and_after_a_merge() -> None:
         assert _go_on(env, 50) == second
 
 
-def test_during_the_preparation_of_a_merge(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """States taken while a merge of large maps is prepared continue bit for bit, and taking them changes nothing."""
-    large_maps(monkeypatch)
+def test_during_an_attempt(tmp_path: Path) -> None:
+    """States taken while an attempt waits for smoothed maps continue bit for bit; taking them changes nothing."""
     quiet, env = _begun(), _begun()
     slam, rng = env.episode.belief._team, np.random.default_rng(3)
     snapshots: list[tuple[int, ExplorationEnv]] = []
@@ -129,9 +127,9 @@ def test_during_the_preparation_of_a_merge(monkeypatch: pytest.MonkeyPatch, tmp_
         quiet.step(actions)
         env.step(actions)
         taken.append(actions)
-        if slam._preparation is not None and len(taken) % 5 == 0:
+        if slam._schedule.pending_attempt is not None:
             snapshots.append((len(taken), _through_disk(env, tmp_path)))
-    assert len(snapshots) > 6
+    assert len(snapshots) >= 3
     for begun, other in [(len(taken), quiet), *snapshots]:
         for actions in taken[begun:]:
             other.step(actions)
@@ -151,11 +149,10 @@ def _sometimes_inconsistent(trunk: Branch, *_: Any) -> MergeMonitor | None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("world", "robots", "seed"), [("loops", 3, 0), ("hall", 3, 2), ("office", 4, 3)])
-def test_prepared_merges_that_are_undone_in_a_lossy_network(
+def test_merges_that_are_undone_in_a_lossy_network(
     world: str, robots: int, seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Copies taken at any time continue bit for bit, and the records of maps, grids and inputs stay complete."""
-    large_maps(monkeypatch)
     monkeypatch.setattr(team, "find_inconsistent_merge", _sometimes_inconsistent)
     rng = np.random.default_rng(seed)
     config = EnvConfig().replace(

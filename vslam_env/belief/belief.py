@@ -40,7 +40,7 @@ def default_filter_options() -> FilterOptions:
             bias_scale=0.02, bias_heading=math.radians(0.5),
         ),
         camera=StereoCamera(sigma_px=1.5 * true.sigma_px, sigma_disparity_px=1.5 * true.sigma_disparity_px),
-        smoothing=SmoothingOptions(max_keys=180, further_keys=0, slice_steps=90, rigid_within=0.007),
+        smoothing=SmoothingOptions(max_keys=120, further_keys=0, incremental=True, rigid_within=0.007),
     )  # fmt: skip
 
 
@@ -67,8 +67,8 @@ class BeliefConfig:
         filter: Options of each FastSLAM filter; its camera and motion model hold the assumed noise.
         alignment: Criteria for accepting an alignment of two maps.
         attempts: Schedule of the merge attempts.
-        merging: Options of merges and their rollback. By default uncertain alignments lead to a trial merge
-            (`MergeOptions.min_sigmas_on_trial`), since maps are scored in the robots' own start frames.
+        merging: Options of merges and their rollback. By default robots whose starts are not known at three standard
+            deviations do not merge (`MergeOptions.least_sigmas`): maps are scored in the robots' own start frames.
         confirm_after: Number of measurements after which a landmark belongs to a robot's map; a landmark measured only
             once may be a false point.
     """
@@ -76,7 +76,7 @@ class BeliefConfig:
     filter: FilterOptions = field(default_factory=default_filter_options)
     alignment: AlignmentOptions = field(default_factory=AlignmentOptions)
     attempts: AttemptOptions = field(default_factory=AttemptOptions)
-    merging: MergeOptions = field(default_factory=lambda: MergeOptions(min_sigmas_on_trial=3.0))
+    merging: MergeOptions = field(default_factory=lambda: MergeOptions(least_sigmas=3.0))
     confirm_after: int = 2
 
     def __post_init__(self) -> None:

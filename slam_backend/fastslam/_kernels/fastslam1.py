@@ -60,7 +60,7 @@ def update_fastslam1(
         outcome: Results, written.
     """
     num, padded, new_slots = len(frame.points), robot.samples.shape[1], outcome.new_slots
-    candidates, unique = find_candidates(robot, motion, frame, maps, rules)
+    candidates, unique = find_candidates(frame, maps, rules)
     apply_resampling(unique, maps)
     starts, slots, row_of = candidates.starts, candidates.slots, maps.table[ROW_OF]
     match, mask = np.empty((num, LANES)), stack_array(LANES)

@@ -66,7 +66,7 @@ def update_fastslam2(
         outcome: Results, written.
     """
     num, new_slots = len(frame.points), outcome.new_slots
-    candidates, unique = find_candidates(robot, motion, frame, maps, rules)
+    candidates, unique = find_candidates(frame, maps, rules)
     for q in range(len(candidates.descriptor_costs)):
         candidates.descriptor_costs[q] /= rules.descriptor_variance
     apply_resampling(unique, maps)

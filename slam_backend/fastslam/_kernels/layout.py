@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from slam_backend.fastslam._kernels.records import PLACE, ROBOT, SLOT, WEIGHT
+from slam_backend.fastslam._kernels.records import ROBOT, SLOT, WEIGHT
 
 # Lanes of a block: whole vectors of four numbers. At most 4 % are padding for 50, 100, 200 or 1000 particles.
 LANES = 52
@@ -13,7 +13,7 @@ REJECTED = -1  # in place of a slot or id
 NO_MATCH, NEW_LANDMARK = -1.0, -2.0
 MIN_DEPTH = 0.05  # [m]; smallest depth at which a landmark is predicted
 MAX_DISTANCE = float(np.finfo(np.float64).max)  # largest finite squared distance
-FAR = np.float32(1e18)  # entry of the descriptors and places of free slots, far from any other
+FAR = np.float32(1e18)  # entry of the descriptors of free slots, far from any other
 LOG_2PI = math.log(2.0 * math.pi)
 
 # Rows of the workspace.
@@ -51,8 +51,7 @@ CANDIDATE_ROWS = 17
 
 POSES, STARTS, MEANS, BIASES, COVARIANCES = ROBOT
 LOG_WEIGHTS, PATH_LOG_WEIGHTS, WEIGHTS, LOG_LIKELIHOOD = WEIGHT
-PLACE_X, PLACE_Y, PLACE_SIGMA = PLACE
-ROW_OF, MAP_OF, IDS, IDENTITIES, LAST_SEEN, FREE_SLOTS, CHANGED = SLOT
+ROW_OF, MAP_OF, IDS, IDENTITIES, LAST_SEEN, FREE_SLOTS = SLOT
 MOTION_KIND, BEGIN, END, COVARIANCES_GIVEN, HAS_IDS, COUNT = range(6)  # columns of `StepInput.inputs_table`
 NO_READING, STATIONARY, MOVED, EXACT_POSE = range(
     4

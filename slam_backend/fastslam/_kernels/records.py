@@ -18,14 +18,13 @@ class MapArrays(NamedTuple):
         values: (rows * 9 * P,) [m, m^2], map frame, each row [block][x, y, z, Sxx, Sxy, Sxz, Syy, Syz, Szz][lane].
         counts: (rows, P). Number of matches of the landmark in the particle, its start included; 0: it lacks it.
         odds: (slots, P) log-odds of existence; (0, P) where existence is not kept.
-        table: (7, slots), see `SlotRows`.
+        table: (6, slots), see `SlotRows`.
         maps: (maps, P). Ancestor maps; map 0 stands for the identity.
         users: (maps,). Number of slots read by each map.
         free_rows: (rows,). Stack of free rows.
         tops: (3,). Heights of the stacks of free rows and of free slots, and the id of the next landmark.
         descriptors: (slots, d).
         heads: (h, slots). Every (d / h)-th component of the descriptors, `FAR` where the slot is free.
-        places: (3, slots). Positions of the landmarks, see `PlaceRows`.
     """
 
     values: FloatArray
@@ -38,26 +37,10 @@ class MapArrays(NamedTuple):
     tops: IntArray
     descriptors: Float32Array
     heads: Float32Array
-    places: Float32Array
-
-
-class PlaceRows(NamedTuple):
-    """Rows of the places (3, slots) of landmarks in the first particles, which stand for all.
-
-    They follow from the values as these are stored, and are computed when they are needed.
-
-    Attributes:
-        x, y: Centre [m], map frame. x is `FAR` where the slot is free, and -`FAR` where it must be computed again.
-        sigma: Square root of Sxx + Syy and of the squared half widths over these particles [m].
-    """
-
-    x: int = 0
-    y: int = 1
-    sigma: int = 2
 
 
 class SlotRows(NamedTuple):
-    """Rows of the table (7, slots) of a map's slots.
+    """Rows of the table (6, slots) of a map's slots.
 
     Attributes:
         row_of: Row of each slot in the storage.
@@ -66,7 +49,6 @@ class SlotRows(NamedTuple):
         identities: The caller's identity of the landmark, -1 = none.
         last_seen: Step of the smoother in which the most probable particle last matched the landmark, 0 = never.
         free_slots: Stack of free slots.
-        changed: 1 where the values of the slot may have been written since the last snapshot.
     """
 
     row_of: int = 0
@@ -75,7 +57,6 @@ class SlotRows(NamedTuple):
     identities: int = 3
     last_seen: int = 4
     free_slots: int = 5
-    changed: int = 6
 
 
 class WeightRows(NamedTuple):
@@ -112,7 +93,7 @@ class RobotParts(NamedTuple):
     covariances: int = 4
 
 
-PLACE, SLOT, WEIGHT, ROBOT = PlaceRows(), SlotRows(), WeightRows(), RobotParts()
+SLOT, WEIGHT, ROBOT = SlotRows(), WeightRows(), RobotParts()
 
 
 class Poses(NamedTuple):

@@ -167,7 +167,6 @@ def step_robots(
     robots: FloatArray, biases: FloatArray, propagated_only: IntArray, weights: FloatArray, gauge: FloatArray,
     values: FloatArray, counts: Int32Array, odds: FloatArray, table: IntArray, ancestors: Int32Array, users: IntArray,
     free_rows: IntArray, tops: IntArray, stored: Float32Array, heads: Float32Array,
-    places: Float32Array,
     measurements: FloatArray, descriptors: Float32Array, names: IntArray,
     found: Int32Array, distances: FloatArray, associations: IntArray,
     mean: FloatArray, covariance: FloatArray, noted: FloatArray, measured: FloatArray, num_measured: int,
@@ -193,7 +192,7 @@ def step_robots(
         propagated_only: (K,) 1 where that was propagated since the last sighting, else 0.
         weights: (4, P), see `layout`, read and written up to M.
         gauge: (3, 3) covariance of a motion of the whole map that particles do not show, or zeros.
-        values, ..., places: Landmarks, see `MapArrays`. n + 1 rows and n slots are free.
+        values, ..., heads: Landmarks, see `MapArrays`. n + 1 rows and n slots are free.
         measurements: (n, 9) [m, m^2] points and, of the robots that have them, covariances, as in `to_robot_axes`.
         descriptors: (n, d).
         names: (n,) the caller's names, of the robots that have them; or (0,).
@@ -211,7 +210,7 @@ def step_robots(
     num_robots, num_particles = len(rows), normals.shape[1]
     poses, means = robots[POSES], robots[MEANS]
     covariances = robots[COVARIANCES:].reshape((num_robots, 6, robots.shape[3]))
-    maps = MapArrays(values, counts, odds, table, ancestors, users, free_rows, tops, stored, heads, places)
+    maps = MapArrays(values, counts, odds, table, ancestors, users, free_rows, tops, stored, heads)
     camera, recovery = assumed[CAMERA : CAMERA + 7], assumed[RECOVERY : RECOVERY + 3]
     points, noises = measurements[:, :3], measurements[:, 3:]
     work, still, move, sigmas, drawn = stack_array(WORK_SIZE), stack_array(3), stack_array(3), stack_array(3), -1

@@ -121,8 +121,8 @@ def absorb_odometry(
 
 @jit
 def merge_keys(
-    fresh: BoolArray, sighted: BoolArray, most_keys: int, keys: Keys, biases: IntArray, share: float
-) -> tuple[int, IntArray, IntArray, FloatArray, FloatArray]:
+    fresh: BoolArray, sighted: BoolArray, most_keys: int, keys: Keys, biases: IntArray
+) -> tuple[int, IntArray, IntArray, FloatArray]:
     """Leave few enough keys, and say where the others stand to them; odometry is carried there.
 
     Old keys from which nothing was measured are chained away if they have a successor. Then, as long as there are too
@@ -138,12 +138,11 @@ def merge_keys(
             left, whose odometry begins at another one that is left, by its new number.
         biases: (k,) key of the bias of each key's odometry, `NONE` if it has none; (0,) without biases. The
             information of a removed key's odometry about its bias is added to the prior of the bias.
-        share: Share of the variance of a rigid motion that the odometry after it takes over.
 
     Returns:
         Number of keys that are left; (k,) the key to which each stands rigidly, itself if it is left, `NONE` if it was
         chained away; (k,) new number of each that is left, `NONE` of the others; (k, 3) pose of each seen from the key
-        to which it stands; (k,) variance [m^2] of that motion, as `transition_variances`, 0 of those that are left.
+        to which it stands.
     """
     robots, poses, previous, motions, noises, jacobians, costs, rigid = keys
     k = len(robots)
@@ -184,13 +183,11 @@ def merge_keys(
         if after >= 0:
             before[after] = a
         left -= 1
-    number, spreads = 0, np.zeros(k)
+    number = 0
     for b in range(k):
         if roots[b] == b:
             numbers[b] = number
             number += 1
-        elif roots[b] != NONE:
-            spreads[b] = costs[b] + spreads[roots[b]]
     for b in range(k):
         if roots[b] == b or roots[b] == NONE:
             continue
@@ -221,8 +218,6 @@ def merge_keys(
             previous[b] = numbers[roots[a]]
             if roots[a] != a:
                 put_before(offsets[a], motions[b], noises[b])
-                for i in range(3):
-                    noises[b, i, i] += share * spreads[a] * _portion(i)
                 c, s = math.cos(offsets[a, 2]), math.sin(offsets[a, 2])
                 for i in range(3):
                     x, y = jacobians[b, 0, i], jacobians[b, 1, i]
@@ -236,45 +231,12 @@ def merge_keys(
             costs[b],
             rigid[b],
         )
-    return number, roots, numbers, offsets, spreads
-
-
-@inline
-def _portion(axis: int) -> float:
-    """Return which part of a variance, headings at `LEVER`, is that of x or y [-], or of the heading [1/m^2]."""
-    return 0.25 if axis < 2 else 0.5 / LEVER**2
-
-
-@inline
-def _widen(x: float, y: float, variance: float, info: FloatArray, slope: FloatArray) -> None:
-    """Add the noise N of the pose from which a landmark was seen to a form, in place; its minimum stays where it is.
-
-    The information L becomes (L^-1 + N)^-1 = (1 + L N)^-1 L, and the slope (1 + L N)^-1 times itself.
-
-    Args:
-        x, y: Place of the landmark in the frame of the pose [m].
-        variance: Variance of the pose [m^2], headings at `LEVER`.
-        info, slope: (6,), (3,) the form.
-    """
-    side, turn = variance * _portion(0), variance * _portion(2)
-    n00, n01, n11 = side + turn * y * y, -turn * x * y, side + turn * x * x
-    m00, m01 = 1.0 + info[0] * n00 + info[1] * n01, info[0] * n01 + info[1] * n11
-    m10, m11 = info[1] * n00 + info[3] * n01, 1.0 + info[1] * n01 + info[3] * n11
-    m20, m21 = info[2] * n00 + info[4] * n01, info[2] * n01 + info[4] * n11
-    det = m00 * m11 - m01 * m10
-    l00, l01, l02, l11, l12, l22 = info[0], info[1], info[2], info[3], info[4], info[5]
-    info[0] = (m11 * l00 - m01 * l01) / det
-    info[1] = 0.5 * ((m11 * l01 - m01 * l11) / det + (m00 * l01 - m10 * l00) / det)
-    info[2], info[3] = (m11 * l02 - m01 * l12) / det, (m00 * l11 - m10 * l01) / det
-    info[4] = (m00 * l12 - m10 * l02) / det
-    info[5] = l22 - m20 * info[2] - m21 * info[4]
-    g0, g1 = (m11 * slope[0] - m01 * slope[1]) / det, (m00 * slope[1] - m10 * slope[0]) / det
-    slope[0], slope[1], slope[2] = g0, g1, slope[2] - m20 * g0 - m21 * g1
+    return number, roots, numbers, offsets
 
 
 @jit
 def add_sightings(
-    rows: IntArray, seen: LandmarkFactors, roots: IntArray, numbers: IntArray, offsets: FloatArray, widths: FloatArray
+    rows: IntArray, seen: LandmarkFactors, roots: IntArray, numbers: IntArray, offsets: FloatArray
 ) -> Condensed:
     """Move sightings to the keys to which theirs stand rigidly, add up the forms of each pair, and return the sums.
 
@@ -284,7 +246,6 @@ def add_sightings(
         rows: (n,) which sightings, those of a landmark one after the other; reordered: by key in each landmark.
         seen: All sightings.
         roots, numbers, offsets: Results of `merge_keys`; keys of the sums have their new numbers.
-        widths: (k,) variance [m^2] of the motion to each key, headings at `LEVER`, that its sightings get as noise.
     """
     n, keys, landmarks, counts = len(rows), seen.keys, seen.landmarks, seen.counts
     centres, infos, slopes = seen.linearisation_points, seen.information, seen.gradients
@@ -305,10 +266,6 @@ def add_sightings(
             slope[i] = slopes[row, i]
         for i in range(6):
             info[i] = own[i] = infos[row, i]
-        if widths[keys[row]] > 0.0:
-            _widen(x, y, widths[keys[row]], own, slope)
-            for i in range(6):
-                info[i] = own[i]
         g0, g1, g2 = slope[0], slope[1], slope[2]
         if roots[keys[row]] != keys[row]:
             c, s = math.cos(offset[2]), math.sin(offset[2])

@@ -141,7 +141,6 @@ class SymbolicFactor(NamedTuple):
             `bias_links`, negative if it is transposed there, 0 if there is none.
         row_tops, row_columns, row_places: (N + 1,), (filled,), (filled,) the same blocks row by row.
         drawn: Number of nodes that `draw` samples.
-        squares: Sum of the squares of the columns' lengths.
     """
 
     order: IntArray
@@ -155,7 +154,6 @@ class SymbolicFactor(NamedTuple):
     row_columns: IntArray
     row_places: IntArray
     drawn: int
-    squares: int
 
 
 class CholeskyFactor(NamedTuple):

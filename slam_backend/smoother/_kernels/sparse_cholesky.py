@@ -235,10 +235,9 @@ def lay_out(
             own = columns[keys[q]]
             if own >= 0:
                 cross_places[q] = _place(tops, rows, ranks[own // 3], ranks[first_landmark + landmark])
-    drawn, squares = 0, 0
+    drawn = 0
     for j in range(num):
         drawn += order[j] < first_landmark or row_tops[j] < row_tops[j + 1]
-        squares += (tops[j + 1] - tops[j]) * (tops[j + 1] - tops[j])
     return SymbolicFactor(
         order,
         ranks,
@@ -251,7 +250,6 @@ def lay_out(
         row_columns,
         row_places,
         drawn,
-        squares,
     )
 
 

@@ -109,7 +109,7 @@ def merge_by_identity(a: ParticleMaps, b: ParticleMaps, pairs: IntArray) -> tupl
     return kept, np.array(named, dtype=np.int64).reshape(-1, 2)
 
 
-def renaming(a: ParticleMaps, b: ParticleMaps, pairs: IntArray, spared: int = 0) -> IntArray:
+def renaming(a: ParticleMaps, b: ParticleMaps, pairs: IntArray) -> IntArray:
     """Return the ids of b's landmarks in the joint map with a: (n, 2) int64 rows (id in b, id in the joint map).
 
     Common landmarks, the first rows, have the id of a; the others get new ones.
@@ -117,10 +117,9 @@ def renaming(a: ParticleMaps, b: ParticleMaps, pairs: IntArray, spared: int = 0)
     Args:
         a, b: Landmarks of the filters.
         pairs: (k, 2) int64 rows (id in a, id in b) of the common landmarks, one-to-one.
-        spared: Number of ids that are left to landmarks which a finds later.
     """
     others = np.setdiff1d(b.ids[b.used_slots()], pairs[:, 1])
-    new = np.column_stack([others, a.next_id + spared + np.arange(len(others))])
+    new = np.column_stack([others, a.next_id + np.arange(len(others))])
     return np.concatenate([pairs[:, ::-1], new]).astype(np.int64)
 
 

@@ -24,8 +24,6 @@ import numpy as np
 
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.fastslam.filter import FastSlam
-from slam_backend.fastslam.particle_maps import ParticleMaps
-from slam_backend.fastslam.rejuvenation import mean_odds
 from slam_backend.fastslam.state import FilterState
 from slam_backend.geometry import inverse, wrap_angle
 from slam_backend.maps.alignment import Alignment
@@ -64,8 +62,6 @@ def merge_filters(
     num_particles: int | None = None,
     known: bool = False,
     pairing: Pairing | None = None,
-    on_trial: bool = False,
-    spared: int = 0,
 ) -> tuple[FastSlam, IntArray]:
     """Merge two filters into a joint one in a's map frame (Secs. 3.2 and 4).
 
@@ -81,9 +77,6 @@ def merge_filters(
         num_particles: Number of particles of the joint filter; None: the larger of the two.
         known: Whether the motion is drawn from the alignment alone, ignoring the common landmarks.
         pairing: Result of `pair_filters` for these filters and all or some of the pairs; None: a new draw.
-        on_trial: Whether the joint filter is to be rejuvenated at once, or dropped: then it has only the landmarks of
-            the most probable particle, which the smoother starts from; see `FilterState.write_landmarks`.
-        spared: See `renaming`.
 
     Returns:
         The joint filter, a's robots first; and (n, 2) int64 rows (id in b, id in the joint map) of all of b's
@@ -113,7 +106,7 @@ def merge_filters(
     rows_a[n_a:], rows_b[n_a:], rows_b[shared_a] = -1, exclusive, shared_b
     counts, names = joint_counts(of_a, of_b, rows_a, rows_b), np.concatenate([identities, of_b.identities[exclusive]])
     drop_repeated_identities(counts, names)
-    renamed = renaming(a.state.maps, b.state.maps, pairs, spared)
+    renamed = renaming(a.state.maps, b.state.maps, pairs)
     new_ids = renamed[len(pairs) :, 1]
     held = np.flatnonzero((counts > 0).any(axis=1))
     kept, odds, model = counts[held], None, a.options.existence
@@ -122,25 +115,14 @@ def merge_filters(
         fuse_odds(model, odds_a, of_a.counts, shared_a, odds_b, of_b.counts, shared_b)
         odds = np.concatenate([odds_a, odds_b[exclusive]])[held]
     descriptors = stack_descriptors(descriptors, descriptors_b[exclusive])[held]
-    best = int(joint.path_log_weights.argmax())
     columns = descriptors, np.concatenate([ids_a, new_ids])[held], names[held]
-    next_id = a.state.maps.next_id + spared + len(exclusive)
-    if not on_trial:
-        joint.maps.load_metadata(kept, *columns, next_id, odds)
+    joint.maps.load_metadata(kept, *columns, a.state.maps.next_id + len(exclusive), odds)
     # Each map takes half of the extra variance.
     scales = np.full(len(counts), scale)
     if len(named):
         sides = Landmarks.of(a.state.maps, from_a, named[:, 0]), Landmarks.of(b.state.maps, from_b, named[:, 1])
         scales[np.searchsorted(ids_a, named[:, 0])] = np.maximum(scale, birge_ratios(*sides, motion, 0.5 * extra))
-    if on_trial:
-        of_a, of_b = Landmarks.of(a.state.maps, from_a[[best]]), Landmarks.of(b.state.maps, from_b[[best]])
-        motion = motion[[best]]
-    values = np.empty((len(held), 1, 9, 1)) if on_trial else joint.maps.blocks
-    write_joint(of_a, of_b, rows_a[held], rows_b[held], motion, 0.5 * extra, scales[held], values)
-    if on_trial:
-        odds = None if odds is None else mean_odds(odds, kept)[:, 0]
-        joint.maps = ParticleMaps(1, joint.maps.log_odds_prior)
-        joint.maps.load_packed(values.reshape(-1, 9), kept[:, best], *columns, next_id, odds)
+    write_joint(of_a, of_b, rows_a[held], rows_b[held], motion, 0.5 * extra, scales[held], joint.maps.blocks)
     joint.finish_join(a.state, b.state, renamed)
     return FastSlam.from_filter_state(joint), renamed
 

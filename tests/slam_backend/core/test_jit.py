@@ -162,6 +162,7 @@ from slam_backend.fastslam.existence import ExistenceModel
 from slam_backend.team.merge_scheduler import AttemptOptions
 from slam_backend.models.measurements import TeamMeasurements
 from slam_backend.team.options import MergeOptions
+from slam_backend.maps.alignment import align_maps
 from slam_backend.metrics.maps import map_error
 from slam_backend.smoother.options import SmoothingOptions
 from slam_backend.warm_up import warm_up
@@ -207,7 +208,7 @@ for size in (1, 3, 9, 30, 30, 30):
 team.step(np.zeros((2, 3)), TeamMeasurements(np.tile(points, (2, 1)), np.tile(looks, (2, 1)), np.array([30, 60])))
 assert len(team.groups) == 1
 team.team_poses(), team.map_summaries()
-slices = SmoothingOptions(slice_steps=20, rigid_within=0.01, max_keys=12, further_keys=4, recent_keys=6)
+slices = SmoothingOptions(incremental=True, rigid_within=0.01, max_keys=12, further_keys=4, recent_keys=6)
 for smoothing in (slices, SmoothingOptions()):
     simulation = SimulatedTeam(2, seed=100)
     smoothed = simulation.build(
@@ -217,6 +218,7 @@ for smoothing in (slices, SmoothingOptions()):
     told = simulation.run(smoothed, 100)
     assert len(smoothed.groups) == 1
     assert any(report.rejuvenations for report in told if len(report.groups) == 1)
+align_maps(team.map(0), team.map(1))
 map_error(team.map(0).means, rng.permutation(len(team.map(0))), np.asfortranarray(points))
 for late in sorted(versions() - before):
     print(*late)

@@ -1,8 +1,6 @@
 """Maps over all particles, of the best one, and of pairs of them: compiled as in the plain definition."""
 
-import copy
 import math
-import pickle
 
 import numpy as np
 import pytest
@@ -312,34 +310,3 @@ def test_landmarks_at_one_place_do_not_change_the_rotation() -> None:
     none = np.zeros(2, np.int64)
     motions = fit(values, held, values, held, none, none, np.array([0.3, 0.2, 0.1]), 0.0, 3)[0]
     np.testing.assert_allclose(motions, [[0.0, 0.0, 0.1]] * 2, atol=1e-12)
-
-
-@pytest.mark.parametrize("n", [0, 1, LANES - 1, LANES, LANES + 1, 200])
-@pytest.mark.parametrize("prior", [None, -0.4])
-def test_packed_landmarks_of_one_particle_read_like_others(n: int, prior: float | None) -> None:
-    """Maps that share rows give the same landmarks in a fraction of the memory; so do their copies."""
-    rng = np.random.default_rng(n)
-    values, counts = rng.standard_normal((n, 9)), rng.integers(0, 4, n)
-    ids, identities = np.sort(rng.permutation(3 * n)[:n]), rng.integers(-1, 50, n)
-    descriptors = rng.standard_normal((n, 16 if n else 0)).astype(np.float32)
-    odds = rng.standard_normal(n) if prior is not None else None
-    plain, packed = ParticleMaps(1, prior), ParticleMaps(1, prior)
-    plain.load_metadata(counts[:, None], descriptors, ids, identities, 3 * n, None if odds is None else odds[:, None])
-    plain.blocks[:n, 0, :, 0] = values
-    packed.load_packed(values, counts, descriptors, ids, identities, 3 * n, odds)
-    for maps in (packed, copy.deepcopy(packed), pickle.loads(pickle.dumps(packed))):
-        for least in (1, 2):
-            for found, expected in zip(best_map(maps, 0, least), best_map(plain, 0, least), strict=True):
-                np.testing.assert_array_equal(found, expected)
-            rows = [MapSummaryRows.allocate(n), MapSummaryRows.allocate(n)]
-            ends = [write_summary(of, 0, least, part, 0) for of, part in zip((maps, plain), rows, strict=True)]
-            assert ends[0] == ends[1]
-            for found, expected in zip(*rows, strict=True):
-                np.testing.assert_array_equal(found[: ends[0]], expected[: ends[0]])
-        np.testing.assert_array_equal(maps.identities[maps.used_slots()], identities)
-        assert maps.next_id == 3 * n
-        if odds is not None:
-            slots = maps.used_slots()
-            np.testing.assert_array_equal(maps.odds_of_particle(0, slots), odds)
-            np.testing.assert_array_equal(maps.odds_and_counts(slots), [odds[:, None], counts[:, None]])
-    assert packed.values.size == 9 * LANES * max(-(-n // LANES), 1)

@@ -251,7 +251,7 @@ def test_without_the_gauge_fix_the_frame_drifts_between_rejuvenations(monkeypatc
 
     def thrown() -> float:
         squares = []
-        for seed in (102, 103, 104):
+        for seed in range(102, 110):
             _, poses, drawn = open_run(seed)
             steps = [np.hypot(*between(a, b)[:2]) for a, b in pairwise(poses)]
             squares += [(steps[step - 1] - np.median(steps)) ** 2 for step in drawn]
@@ -259,4 +259,4 @@ def test_without_the_gauge_fix_the_frame_drifts_between_rejuvenations(monkeypatc
 
     held = thrown()
     monkeypatch.setattr(rejuvenation, "fix_gauge", lambda *arguments: None)
-    assert held < 0.6 * thrown()
+    assert held < 0.9 * thrown()

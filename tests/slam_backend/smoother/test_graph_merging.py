@@ -9,7 +9,7 @@ from builders.teams import NEVER, SimulatedTeam, check_snapshot, false_alignment
 
 from slam_backend.geometry import between, compose
 from slam_backend.maps.alignment import AlignmentOptions
-from slam_backend.smoother import options, rejuvenation
+from slam_backend.smoother import rejuvenation
 from slam_backend.smoother.graph import NONE, SlamGraph, scattered
 from slam_backend.smoother.graph_building import extend_graph, merge_graphs
 from slam_backend.smoother.joint_graphs import relative_start
@@ -100,19 +100,12 @@ def test_a_third_robot_joins_later():
     assert_same_posterior(merge_graphs(graphs[0][0], pair, motion(0, 1), names), whole, run)
 
 
-def test_the_relative_start_is_that_of_the_joint_mode(monkeypatch):
-    """Motion and covariance are those of the dense inverse; small maps and short runs get none."""
+def test_the_relative_start_is_that_of_the_joint_mode():
+    """Motion and covariance are those of the dense inverse, in a run of any length."""
     run = small_run(2, seed=104, length=8.0)
     (a, _), (b, renamed) = group_graph(run, [0]), group_graph(run, [1], OFFSET)
     motion = compose(np.array([0.15, -0.1, 0.04]), between(run.true_paths[0, 0], run.true_paths[1, 0]))
-    known = a, b, motion, renamed, camera_of(run), SmoothingOptions(kernel=0.0)
-    assert relative_start(*known) is None
-    monkeypatch.setattr(options, "MANY_LANDMARKS", 1)
-    monkeypatch.setattr(options, "LANDMARKS_PER_KEY", 1)
-    assert relative_start(*known) is None
-    monkeypatch.setattr(rejuvenation, "LARGE_MAP", 1)
-    monkeypatch.setattr(rejuvenation, "LONG_RUN", 1)
-    found = relative_start(*known)
+    found = relative_start(a, b, motion, renamed, camera_of(run), SmoothingOptions(kernel=0.0))
     both = merge_graphs(a, b, motion, renamed)
     mode = optimize(both, camera_of(run), TIGHT)
     key = both.first_keys[1]
@@ -123,13 +116,10 @@ def test_the_relative_start_is_that_of_the_joint_mode(monkeypatch):
     assert np.hypot(*(found.motion - motion)[:2]) > 0.05  # it began elsewhere
 
 
-def test_a_joint_graph_without_a_mode_tells_no_start(monkeypatch):
+def test_a_joint_graph_without_a_mode_tells_no_start():
     """Where the descent fails, no motion is claimed."""
     run = small_run(2, seed=104)
     (a, _), (b, renamed) = group_graph(run, [0]), group_graph(run, [1], OFFSET)
-    for module, name in ((options, "MANY_LANDMARKS"), (rejuvenation, "LARGE_MAP"), (rejuvenation, "LONG_RUN")):
-        monkeypatch.setattr(module, name, 1)
-    monkeypatch.setattr(options, "LANDMARKS_PER_KEY", 1)
     known = renamed, camera_of(run), SmoothingOptions(max_iterations=1)
     assert relative_start(a, b, np.array([3.0, -2.0, 2.0]), *known) is None
 
@@ -187,19 +177,19 @@ def test_scatter_is_the_covariance_about_the_mean_direction():
     np.testing.assert_allclose(scattered(poses), np.cov(poses, bias=True), atol=1e-3)
 
 
-def build(simulation, every=20, slice_steps=None):
+def build(simulation, every=20, incremental=False):
     """Return a team that merges early."""
     return simulation.build(
         alignment=AlignmentOptions(min_inliers=9), attempts=AttemptOptions(every=20, new_candidates=2),
-        rejuvenate_every=every, smoothing=SmoothingOptions(slice_steps=slice_steps),
+        rejuvenate_every=every, smoothing=SmoothingOptions(incremental=incremental),
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("slice_steps", [None, 24])
-def test_a_merged_team_is_rejuvenated_and_knows_where_it_started(slice_steps):
+@pytest.mark.parametrize("incremental", [False, True])
+def test_a_merged_team_is_rejuvenated_and_knows_where_it_started(incremental):
     """Soon after a merge the joint filter is smoothed, at once or in slices; the other starts are then known."""
     simulation = SimulatedTeam(seed=101)
-    team = build(simulation, slice_steps=slice_steps)
+    team = build(simulation, incremental=incremental)
     joint = []
     for _ in range(100):
         told = team.step(*simulation.read()).rejuvenations
@@ -229,11 +219,11 @@ def test_starts_are_constant_between_rejuvenations():
     assert stayed > 30
 
 
-@pytest.mark.parametrize(("every", "slice_steps"), [(None, None), (20, None), (20, 12)])
-def test_a_snapshot_of_a_team_continues_through_merges_and_rejuvenations(every, slice_steps):
+@pytest.mark.parametrize(("every", "incremental"), [(None, False), (20, False), (20, True)])
+def test_a_snapshot_of_a_team_continues_through_merges_and_rejuvenations(every, incremental):
     """A restored team gives, bit for bit, the results of the original, its smoothers included."""
     simulation = SimulatedTeam(seed=101)
-    team = build(simulation, every, slice_steps)
+    team = build(simulation, every, incremental)
     simulation.run(team, 50)
     reports = check_snapshot(simulation, team, [None] * 40)
     assert any(report.id_maps for report in reports)
@@ -242,7 +232,7 @@ def test_a_snapshot_of_a_team_continues_through_merges_and_rejuvenations(every, 
 def test_a_merge_continues_from_the_smoothed_graphs_of_both_groups():
     """Just after a merge the joint smoother has all that the groups' smoothers had: nothing is done again."""
     simulation = SimulatedTeam(seed=101)
-    team = build(simulation, slice_steps=12)
+    team = build(simulation, incremental=True)
     before = {}
     for _ in range(90):
         known = {group: state["latest"] for group, state in before.items()}
@@ -265,7 +255,7 @@ def smoother_of(group):
 def test_no_two_filters_work_on_their_smoothers_in_one_step(monkeypatch):
     """Robots that do not look for each other have steps of their own in which their filters may smooth."""
     simulation = SimulatedTeam(seed=101)
-    smoothing = SmoothingOptions(slice_steps=4)
+    smoothing = SmoothingOptions(incremental=True, slice_share=0.01)
     team = simulation.build(attempts=AttemptOptions(enabled=False), rejuvenate_every=20, smoothing=smoothing)
     worked = []
 
@@ -279,29 +269,31 @@ def test_no_two_filters_work_on_their_smoothers_in_one_step(monkeypatch):
     assert len(set(worked)) == len(worked)
 
 
-def test_joint_filters_of_long_runs_keep_more_keyframes(monkeypatch):
+@pytest.mark.parametrize("incremental", [False, True])
+def test_joint_filters_of_longer_runs_keep_more_keyframes(incremental):
     """Two groups with many keyframes are reduced to their shares of the limit, which grows with the run."""
-    smoothing = SmoothingOptions(slice_steps=16, max_keys=20, further_keys=0, recent_keys=4)
 
-    def joint_keys():
+    def joint_keys(steps_per_key):
+        smoothing = SmoothingOptions(
+            incremental=incremental, max_keys=20, further_keys=0, recent_keys=4, steps_per_key=steps_per_key
+        )
         simulation = SimulatedTeam(num_robots=2, seed=101)
         team = simulation.build(attempts=NEVER, rejuvenate_every=20, smoothing=smoothing)
         simulation.run(team, 80)
-        alone = [len(smoother_of(group)["poses"]) for group in team._groups]
+        alone = [smoother_of(group) for group in team._groups]
         team.merge(0, 1, false_alignment(simulation, team, np.zeros(3)))
-        return sum(alone), len(smoother_of(team._groups[0])["poses"])
+        latest = np.concatenate([graph["latest"] for graph in alone])
+        return sum(len(graph["poses"]) for graph in alone), len(smoother_of(team._groups[0])["poses"]), latest.sum()
 
-    alone, joint = joint_keys()
+    alone, joint, _ = joint_keys(10**6)
     assert joint <= 20 + 1 < alone  # each share of the limit may be exceeded by the newest keyframes
-    monkeypatch.setattr(options, "MANY_STEPS", 40)
-    monkeypatch.setattr(options, "STEPS_PER_KEY", 16)
-    alone, joint = joint_keys()
-    assert 20 + 1 < joint <= 20 + (80 - 40) * 2 // 16 + 1 < alone
+    alone, joint, steps = joint_keys(16)
+    assert 20 + 1 < joint <= 20 + steps // 16 + 1 < alone
 
 
 def test_after_an_undo_smoothers_are_as_if_they_had_never_been_joined():
     """Filters with all that their smoothers know are bit for bit those of a team that never merged, and stay so."""
-    smoothing = SmoothingOptions(slice_steps=16, max_keys=40)
+    smoothing = SmoothingOptions(incremental=True, max_keys=40)
     (simulation, team), (other, twin) = (
         (run, run.build(attempts=NEVER, rejuvenate_every=20, smoothing=smoothing))
         for run in (SimulatedTeam(num_robots=2, seed=101) for _ in range(2))

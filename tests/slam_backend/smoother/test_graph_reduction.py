@@ -1,20 +1,17 @@
 """Graph reduction: joining and dropping keyframes, and condensing their measurements."""
 
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
-from builders import plain_graph_reduction
 from builders.plain_graph_reduction import chained, plain_reduced
-from builders.runs import TIGHT, camera_of, graph_of, logs_of, small_run, upper
+from builders.runs import TIGHT, camera_of, graph_of, logs_of, rejuvenate, small_run, upper
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from slam_backend.fastslam.run_log import RobotLog
 from slam_backend.geometry import between, compose, transform_points, wrap_angle
 from slam_backend.models.odometry import OdometryModel
-from slam_backend.smoother import graph_reduction
 from slam_backend.smoother._kernels import (
     Condensed,
     Frames,
@@ -26,12 +23,17 @@ from slam_backend.smoother._kernels import (
     number_landmarks,
 )
 from slam_backend.smoother.graph import LEVER, SlamGraph
-from slam_backend.smoother.graph_building import NO_LANDMARK_POSITIONS, InitialPoses, LandmarkPositions, extend_graph
+from slam_backend.smoother.graph_building import (
+    NO_LANDMARK_POSITIONS,
+    InitialPoses,
+    LandmarkPositions,
+    extend_graph,
+    log_head,
+)
 from slam_backend.smoother.graph_reduction import reduce_keyframes, relinearise
 from slam_backend.smoother.log_arrays import ODOMETRY, REJECTED, STATIONARY
 from slam_backend.smoother.optimizer import optimize
 from slam_backend.smoother.options import SmoothingOptions, keyframe_limit
-from slam_backend.smoother.rejuvenation import rejuvenate
 from slam_backend.smoother.sampling import lane_rows, replay, sample_paths
 from training.bench.accuracy.runs import RunSpec, simulate_run
 
@@ -135,7 +137,7 @@ def test_a_long_run_stays_bounded():
     run = small_run(length=30.0)
     logs = logs_of(run)
     graph, sizes = SlamGraph.at_starts(run.true_paths[:, 0]), []
-    options = SmoothingOptions(max_keys=30, recent_keys=12)
+    options = SmoothingOptions(max_keys=30, recent_keys=12, steps_per_key=10**6)
     arrays = logs[0].arrays()
     for last in range(10, run.num_steps, 10):
         part = _until(arrays.since(int(graph.latest[0]) + 1), last)
@@ -154,9 +156,7 @@ def test_the_keyframe_limit_grows_with_the_number_of_robots():
     """Two robots may have more keys than one, and have them; without further ones they share those of one."""
     run = small_run(robots=2, length=10.0)
     for further, most in ((0, 20), (6, 26)):
-        options = SmoothingOptions(max_keys=20, further_keys=further, recent_keys=8)
-        assert options.most_keys(1) == 20
-        assert options.most_keys(2) == most
+        options = SmoothingOptions(max_keys=20, further_keys=further, recent_keys=8, steps_per_key=10**6)
         result = rejuvenate(
             SlamGraph.at_starts(run.true_paths[:, 0]), [log.arrays() for log in logs_of(run)], run.spec.noise.motion,
             camera_of(run), 20, np.random.default_rng(3), options,
@@ -164,13 +164,34 @@ def test_the_keyframe_limit_grows_with_the_number_of_robots():
         assert result.graph.num_keys == most
 
 
-def test_the_keyframe_limit_grows_with_large_maps_and_long_runs():
-    """Up to 2,700 landmarks and 6,000 steps it is that of the options; beyond, it grows as far as the map is large."""
-    options = SmoothingOptions(max_keys=20, further_keys=5)
-    assert keyframe_limit(options, 2700, np.array([6000, 6000])) == 25
-    assert keyframe_limit(options, 2700 + 150, np.array([6000, 6000])) == 25 + 10
-    assert keyframe_limit(options, 2700 + 150, np.array([6000 + 500, 6000 + 250])) == 25 + 10 + 15
-    assert keyframe_limit(options, 100, np.array([10**9, 10**9])) == 25 + 20
+@pytest.mark.parametrize("robots", [1, 2, 3])
+def test_the_keyframe_limit_grows_with_the_run_up_to_a_share_of_the_map(robots):
+    """One more key for so many steps of all robots together, whichever walked them, up to one for so many landmarks."""
+    options = SmoothingOptions(max_keys=20, further_keys=5, steps_per_key=8, landmarks_per_key=3)
+    base, latest = 20 + 5 * (robots - 1), np.full(robots, 160)
+    alone = np.append(np.zeros(robots - 1, dtype=np.int64), 160 * robots)
+    for walked in (latest, alone):
+        assert keyframe_limit(options, 10**6, walked) == base + 20 * robots
+        assert keyframe_limit(options, 3 * 20 * robots - 1, walked) == base + 20 * robots - 1
+        assert keyframe_limit(options, 0, walked) == base
+    assert keyframe_limit(options, 10**6, np.full(robots, -1)) == base  # before the first step
+
+
+def test_a_longer_run_keeps_more_keyframes():
+    """The graph grows as its limit does, by one rule from the first step on; without new landmarks it stays."""
+    run = small_run(length=15.0)
+    log, start = logs_of(run)[0].arrays(), SlamGraph.at_starts(run.true_paths[:, 0])
+    kept = {}
+    for landmarks_per_key in (1, 10**6):
+        options = SmoothingOptions(max_keys=10, recent_keys=5, steps_per_key=4, landmarks_per_key=landmarks_per_key)
+        graph = start
+        for upto in (20, 40, 60):
+            part = log_head(log, upto).since(int(graph.latest[0]) + 1)
+            graph = rejuvenate(
+                graph, [part], run.spec.noise.motion, camera_of(run), 9, np.random.default_rng(3), options
+            ).graph
+            kept[landmarks_per_key, upto] = graph.num_keys
+    assert kept == {(1, 20): 14, (1, 40): 19, (1, 60): 24} | {(10**6, upto): 10 for upto in (20, 40, 60)}
 
 
 def test_using_a_graph_does_not_change_it():
@@ -193,15 +214,9 @@ def test_using_a_graph_does_not_change_it():
 
 
 @pytest.mark.parametrize("max_keys", [3, 14, 30, 1000])
-@pytest.mark.parametrize(("kernel", "widened"), [(0.0, False), (0.2, False), (0.2, True)])
-def test_keys_are_joined_as_by_the_plain_program(max_keys, kernel, widened, monkeypatch):
-    """Kernels leave the same keys as numpy: blind ones, measurements that contradict, and joining twice included.
-
-    In large maps they widen what they join.
-    """
-    for module in (graph_reduction, plain_graph_reduction) if widened else ():
-        monkeypatch.setattr(module, "extra_keys", lambda *_: 1)
-        monkeypatch.setattr(module, "WIDENED", 5.0)
+@pytest.mark.parametrize("kernel", [0.0, 0.2])
+def test_keys_are_joined_as_by_the_plain_program(max_keys, kernel):
+    """Kernels leave the same keys as numpy: blind ones, measurements that contradict, and joining twice included."""
     run = small_run(2, length=8.0)
     options = SmoothingOptions(max_keys=max_keys, further_keys=0, recent_keys=6, kernel=kernel)
     graph = graph_of(run, skip=(3, 4, 7))
@@ -219,26 +234,6 @@ def test_keys_are_joined_as_by_the_plain_program(max_keys, kernel, widened, monk
             np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-7, err_msg=name)
         options = replace(options, max_keys=max(2, max_keys - 2))
         graph = found
-
-
-def test_widened_keyframes_claim_no_more_than_before(monkeypatch):
-    """Each share leaves the mode where it was, and claims less; the newest poses are then known less than all say."""
-    run = small_run()
-    graph = graph_of(run)
-    mode = optimize(graph, camera_of(run), TIGHT)
-    graph = relinearise(graph, mode, mode.transition_variances())
-    monkeypatch.setattr(graph_reduction, "extra_keys", lambda *_: 1)
-    claims = []
-    for share in (0.0, 0.2, 1.0):
-        monkeypatch.setattr(graph_reduction, "WIDENED", share)
-        fewer = reduce_keyframes(graph, camera_of(run), limits(9, 3))
-        again = optimize(fewer, camera_of(run), TIGHT)
-        assert again.reason == ""
-        np.testing.assert_allclose(again.poses[fewer.last_keys][:, :2], mode.poses[graph.last_keys][:, :2], atol=0.02)
-        claims.append(again.covariance(fewer.last_keys))
-    for certain, other in pairwise(claims):
-        assert np.linalg.eigvalsh(other - certain)[0] > 0.0
-    assert np.linalg.eigvalsh(claims[-1] - mode.covariance(graph.last_keys))[0] > 0.0
 
 
 OLD = 4  # keys and frames of others before

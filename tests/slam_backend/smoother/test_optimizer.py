@@ -12,6 +12,7 @@ from builders.runs import (
     logs_of,
     plain_cost,
     problem_of,
+    rejuvenate,
     small_run,
     upper,
 )  # fmt: skip
@@ -28,7 +29,6 @@ from slam_backend.smoother.graph_building import InitialPoses, LandmarkPositions
 from slam_backend.smoother.graph_reduction import relinearise
 from slam_backend.smoother.optimizer import optimize
 from slam_backend.smoother.options import SmoothingOptions
-from slam_backend.smoother.rejuvenation import rejuvenate
 from training.bench.accuracy.batch_ml import batch_ml
 from training.bench.accuracy.runs import NoisePreset, RunSpec, simulate_run
 
@@ -97,7 +97,7 @@ def test_a_long_log_taken_in_at_once_ends_where_short_ones_do():
     """Added in parts within one call, or in many calls: the newest poses agree within a share of their uncertainty."""
     run = small_run(length=15.0)
     log = logs_of(run)[0].arrays()
-    options = SmoothingOptions(max_keys=40, recent_keys=20)
+    options = SmoothingOptions(max_keys=40, recent_keys=20, steps_per_key=10**6)
     motion, camera = run.spec.noise.motion, camera_of(run)
     start = SlamGraph.at_starts(run.true_paths[:, 0])
     whole = rejuvenate(start, [log], motion, camera, 50, np.random.default_rng(1), options)
@@ -359,7 +359,7 @@ def test_an_increment_moves_poses_as_stated():
     change, poses, landmarks = (rng.normal(size=(n, 3)) for n in (5, 4, 2))
     columns, order, none = np.array([FREE, 0, 3, 6]), np.arange(5), np.zeros(0, dtype=np.int64)
     tops, empty = np.zeros(6, dtype=np.int64), np.zeros((0, 3))
-    pattern = SymbolicFactor(order, order, tops, none, none, none, none, tops, none, none, 5, 0)
+    pattern = SymbolicFactor(order, order, tops, none, none, none, none, tops, none, none, 5)
     factor = CholeskyFactor(
         np.tile([1.0, 0.0, 1.0, 0.0, 0.0, 1.0], (5, 1)), np.zeros((0, 9)), order
     )  # of unit matrices

@@ -13,7 +13,6 @@ from slam_backend.fastslam._kernels import LANES as FILTER_LANES
 from slam_backend.fastslam.run_log import RobotLog
 from slam_backend.geometry import between, compose
 from slam_backend.models.odometry import OdometryModel
-from slam_backend.resampling import systematic
 from slam_backend.smoother._kernels import LANES, normalise, weigh_deviations
 from slam_backend.smoother.graph import SlamGraph
 from slam_backend.smoother.graph_building import extend_graph
@@ -29,9 +28,7 @@ from slam_backend.smoother.sampling import (
     odometry_log_density,
     replay,
     retract_on_se2,
-    sample_more_paths,
     sample_paths,
-    sample_transition_variances,
     tempered,
 )
 
@@ -67,23 +64,6 @@ def linear_toy(steps: int = 6) -> tuple[SlamGraph, MapEstimate]:
         log.append(step, move if step else None, points=seen, ids=np.arange(3), covariances=upper)
     graph = extend_graph(SlamGraph.at_starts(np.zeros((1, 3))), [log.arrays()], LINEAR, MOUNT)
     return graph, optimize(graph, CAMERA, TIGHT)
-
-
-@pytest.mark.parametrize("turn", [0.0, 0.1])  # with uncertain headings the paths are retracted
-def test_resampled_paths_are_those_of_all_draws(turn):
-    """Paths resampled of more draws equal those of all draws, to the bit, where both retract paths or neither does."""
-    graph, mode = linear_toy() if turn == 0.0 else wandering(turn)
-    rng, other = np.random.default_rng(4), np.random.default_rng(4)
-    first = sample_paths(graph, mode, 70, np.random.default_rng(5))
-    assert first.is_retracted == (turn > 0.0)
-    every = sample_paths(graph, mode, 8 * 70, rng)
-    ancestors = systematic(every.weights, rng, 70)
-    chosen, size = sample_more_paths(graph, mode, 8 * 70, first, other)
-    assert size == every.sample_size
-    np.testing.assert_array_equal(chosen.poses, every.poses[:, :, ancestors])
-    np.testing.assert_array_equal(chosen.weights, np.full(70, chosen.weights[0]))
-    np.testing.assert_array_equal(chosen.transition_variances, every.transition_variances)
-    assert rng.bit_generator.state == other.bit_generator.state
 
 
 def test_where_all_is_linear_the_weights_are_constant():
@@ -226,7 +206,7 @@ def test_drawn_spreads_are_those_of_the_inverse():
     graph = graph_of(run)
     mode = optimize(graph, camera_of(run), TIGHT)
     rng = np.random.default_rng(8)
-    found = np.array([sample_transition_variances(graph, mode, rng) for _ in range(60)])
+    found = np.array([sample_paths(graph, mode, 60, rng).transition_variances for _ in range(60)])
     linked = graph.parents >= 0
     ratios = found[:, linked] / mode.transition_variances()[linked]
     assert not found[:, ~linked].any()

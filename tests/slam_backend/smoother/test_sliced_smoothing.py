@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from builders.comparison import assert_same
 from builders.runs import TIGHT, camera_of, graph_of, logs_of, small_run, upper
-from builders.teams import large_maps
 from builders.worlds import EXACT_MOTION
 from hypothesis import given
 from hypothesis import strategies as st
@@ -23,13 +22,14 @@ from slam_backend.smoother.graph import SlamGraph
 from slam_backend.smoother.graph_building import InitialPoses, LandmarkPositions, extend_graph, log_head
 from slam_backend.smoother.graph_reduction import MAX_FRAMES, reduce_keyframes, relinearise
 from slam_backend.smoother.log_arrays import LogArrays
-from slam_backend.smoother.optimizer import optimize
-from slam_backend.smoother.options import SmoothingOptions
+from slam_backend.smoother.optimizer import MapEstimate, optimize
+from slam_backend.smoother.options import SmoothingOptions, keyframe_limit
 from slam_backend.smoother.rejuvenation import Draft, Smoother
 from training.bench.accuracy.runs import StereoRun
 
 NOWHERE = LandmarkPositions(np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
-IN_SLICES = SmoothingOptions(slice_steps=8, max_keys=20, recent_keys=8)
+# Slices of eight steps of each robot: the least
+IN_SLICES = SmoothingOptions(incremental=True, slice_share=0.01, max_keys=20, recent_keys=8)
 IN_MANY = replace(IN_SLICES, tolerance=1e-9)  # no descent ends in the slice in which it begins
 
 
@@ -66,7 +66,8 @@ def test_the_work_per_step_is_bounded(monkeypatch):
 
     def noted(graph, *arguments):
         mode = optimize(graph, *arguments)
-        solved.append((graph.num_keys, mode.iterations))
+        limit = keyframe_limit(IN_SLICES, len(graph.landmark_ids), graph.latest)
+        solved.append((graph.num_keys - limit, mode.iterations))
         return mode
 
     monkeypatch.setattr(rejuvenation, "optimize", noted)
@@ -75,37 +76,59 @@ def test_the_work_per_step_is_bounded(monkeypatch):
         solved.clear()
         report = slam.step(**reading).rejuvenation
         assert len(solved) <= 1
-        assert all(keys <= 20 + 2 * 8 and steps <= rejuvenation.LAST_STEPS for keys, steps in solved)
+        assert all(surplus <= 2 * 8 and steps <= rejuvenation.LAST_STEPS for surplus, steps in solved)
         drawn += [] if report is None else [report.reason]
     assert len(drawn) >= 3
     assert set(drawn) == {""}
 
 
-@pytest.mark.parametrize("large", [False, True])
-def test_slices_of_large_maps_take_more_steps(large: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A slice takes the stated number of steps, and twice as many where the limit of keyframes has grown."""
-    if large:
-        large_maps(monkeypatch)
+@pytest.mark.parametrize("share", [0.01, 0.5, 0.8])
+def test_slices_grow_with_the_graph(share: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each slice takes its share of the keys as new steps, and at least eight, from the first step on."""
     taken, add_logs = [], Smoother.add_logs
 
     def noted(self: Smoother, graph: SlamGraph, logs: Sequence[LogArrays], *rest: Any) -> SlamGraph | Draft | str:
-        taken.append(int(logs[0].steps[-1] - graph.latest[0]))
+        taken.append((int(logs[0].steps[-1] - graph.latest[0]), graph.num_keys))
         return add_logs(self, graph, logs, *rest)
 
     monkeypatch.setattr(Smoother, "add_logs", noted)
     run = small_run(length=30.0)
-    slam = run.build_filter(30, "fastslam2", 1, rejuvenate_every=1000, smoothing=IN_SLICES)
+    smoothing = replace(IN_SLICES, slice_share=share)
+    slam = run.build_filter(30, "fastslam2", 1, rejuvenate_every=1000, smoothing=smoothing)
     for reading in run.readings():
         slam.step(**reading)
-    assert taken[0] == 8  # while there is no map yet
-    assert set(taken[1:]) == {2 * 8 if large else 8}
+    assert [steps for steps, _ in taken] == [max(8, int(share * keys)) for _, keys in taken]
     assert len(taken) > 3
+
+
+def test_all_slices_in_one_step_are_those_of_many() -> None:
+    """A filter that smooths all at once is bit for bit one that does slice after slice of the same work."""
+    run = small_run(2, length=8.0)
+    found = []
+    for incremental in (False, True):
+        smoothing = SmoothingOptions(incremental=incremental, slice_share=0.01, max_keys=20, recent_keys=8)
+        slam = run.build_filter(20, "fastslam2", 1, rejuvenate_every=1000, smoothing=smoothing)
+        slam.may_smooth = False
+        for reading in run.readings():
+            slam.step(**reading)
+        slices, work = 0, slam.state.rejuvenate
+        smoother = slam.state.rejuvenation
+        assert smoother is not None
+        smoother.request()
+        while (report := work(smoother)) is None:
+            slices += 1
+        assert report.reason == ""
+        assert (slices > 1) == incremental
+        state = slam.get_state()
+        found.append({name: value for name, value in state.items() if name != "options"})
+    assert_same(*found)
 
 
 def test_particles_sampled_in_slices_are_as_accurate():
     """In slices or at once, in the same step, the newest poses agree within a share of their uncertainty."""
     run = small_run(length=8.0)
-    sliced = run.build_filter(200, "fastslam2", 1, rejuvenate_every=26, smoothing=SmoothingOptions(slice_steps=8))
+    smoothing = SmoothingOptions(incremental=True, slice_share=0.01)
+    sliced = run.build_filter(200, "fastslam2", 1, rejuvenate_every=26, smoothing=smoothing)
     readings = iter(run.readings())
     steps = next(step for step, reading in enumerate(readings, 1) if sliced.step(**reading).rejuvenation is not None)
     whole = run.build_filter(200, "fastslam2", 1, rejuvenate_every=steps)
@@ -146,11 +169,11 @@ def test_snapshots_hold_an_unfinished_descent():
     assert any(draft is None for draft in drafts[10:])
 
 
-@pytest.mark.parametrize("slice_steps", [None, 8])
-def test_a_failing_descent_does_not_block_the_smoother(slice_steps):
+@pytest.mark.parametrize("incremental", [False, True])
+def test_a_failing_descent_does_not_block_the_smoother(incremental):
     """What cannot be smoothed is left out, the report says so, and the smoother continues with new input."""
     run = small_run(length=8.0)
-    smoothing = SmoothingOptions(max_iterations=1, tolerance=1e-5, slice_steps=slice_steps)
+    smoothing = SmoothingOptions(max_iterations=1, tolerance=1e-5, incremental=incremental)
     slam = run.build_filter(20, "fastslam2", 1, landmark_noise=0.0, rejuvenate_every=6, smoothing=smoothing)
     reasons = [slam.step(**reading).rejuvenation for reading in run.readings()]
     told = [report.reason for report in reasons if report is not None]
@@ -158,6 +181,29 @@ def test_a_failing_descent_does_not_block_the_smoother(slice_steps):
     graph: Mapping[str, np.ndarray] = slam.get_state()["rejuvenation"]["graph"]
     assert graph["latest"][0] > 6
     assert len(slam.get_state()["rejuvenation"]["guesses"][0][0]) <= 2 * 6
+
+
+@pytest.mark.parametrize(("seed", "kernel", "tolerance"), [(139, 0.3, 1e-6), (150, 4.0, 1e-6), (101, 16.0, 1e-300)])
+def test_a_slow_descent_is_not_repeated_within_a_step(
+    seed: int, kernel: float, tolerance: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Once all keys are at the mode of slices, one descent decides: a rejuvenation at once has bounded work."""
+    run, solved = small_run(length=12.0, seed=seed), []
+    smoothing = SmoothingOptions(kernel=kernel, tolerance=tolerance, max_keys=20, recent_keys=8)
+    slam = run.build_filter(20, "fastslam2", 1, rejuvenate_every=12, smoothing=smoothing)
+
+    def noted(*arguments: Any) -> MapEstimate:
+        solved.append(optimize(*arguments))
+        assert solved[-1].iterations <= smoothing.max_iterations
+        return solved[-1]
+
+    monkeypatch.setattr(rejuvenation, "optimize", noted)
+    tried = 0
+    for reading in run.readings():
+        solved.clear()
+        tried += slam.step(**reading).rejuvenation is not None
+        assert sum(mode.iterations for mode in solved) <= rejuvenation.LAST_STEPS + 2 * smoothing.max_iterations
+    assert tried >= 3
 
 
 def test_slices_wait_if_there_is_nothing_to_smooth():
@@ -189,11 +235,11 @@ def filter_of(run: StereoRun, **options: Any) -> FastSlam:
     return run.build_filter(30, "fastslam2", 1, rejuvenate_every=EVERY, **options)
 
 
-@pytest.mark.parametrize("slice_steps", [None, 4])
-def test_a_stationary_robot_is_rejuvenated_once_it_moves(slice_steps: int | None) -> None:
+@pytest.mark.parametrize("incremental", [False, True])
+def test_a_stationary_robot_is_rejuvenated_once_it_moves(incremental: bool) -> None:
     """Without motion there is no pose to estimate, which is reported once per interval."""
     run = small_run()
-    slam = filter_of(run, smoothing=SmoothingOptions(slice_steps=slice_steps, **FEW_KEYS))
+    slam = filter_of(run, smoothing=SmoothingOptions(incremental=incremental, **FEW_KEYS))
     waited = [slam.step(**reading).rejuvenation for reading in at_rest(run, 0, 60)]
     moved = [slam.step(**reading).rejuvenation for reading in list(run.readings())[1:]]
     assert [told.reason for told in waited if told is not None] == 6 * ["no pose to seek"]
@@ -243,11 +289,11 @@ def test_many_frames_of_one_key_are_condensed_at_the_mode() -> None:
     np.testing.assert_allclose(one.T @ one, same.T @ same, rtol=1e-6, atol=1e-3)
 
 
-@pytest.mark.parametrize("slice_steps", [None, 4])
-def test_a_filter_restored_while_it_waits_continues_bit_for_bit(slice_steps: int | None) -> None:
+@pytest.mark.parametrize("incremental", [False, True])
+def test_a_filter_restored_while_it_waits_continues_bit_for_bit(incremental: bool) -> None:
     """A snapshot holds the measurements made at rest, condensed or not."""
     run = small_run()
-    slam = filter_of(run, smoothing=SmoothingOptions(slice_steps=slice_steps, **FEW_KEYS))
+    slam = filter_of(run, smoothing=SmoothingOptions(incremental=incremental, **FEW_KEYS))
     for reading in at_rest(run, 0, 47):
         slam.step(**reading)
     other = FastSlam(1, num_particles=3, seed=9)

@@ -7,21 +7,26 @@ import pytest
 from builders.runs import BIASED, TIGHT, camera_of, graph_of, small_run
 
 from slam_backend.core.validation import FloatArray
-from slam_backend.fastslam.run_log import RobotLog
 from slam_backend.geometry import between
 from slam_backend.models.odometry import OdometryModel
-from slam_backend.smoother import _kernels, optimizer
+from slam_backend.smoother import _kernels
 from slam_backend.smoother.graph import LEVER, NONE, SlamGraph
-from slam_backend.smoother.graph_building import extend_graph
 from slam_backend.smoother.graph_reduction import reduce_keyframes, relinearise
-from slam_backend.smoother.optimizer import MapEstimate, gathered, optimize
+from slam_backend.smoother.optimizer import MapEstimate, NormalEquations, gathered, optimize
 from slam_backend.smoother.options import SmoothingOptions
+
+
+def order_again(system: NormalEquations, graph: SlamGraph, size: int, few: int) -> None:
+    """Factor the equations again, landmarks of at most `few` poses first."""
+    system.pattern = _kernels.lay_out(system.columns, graph.parents, system.biases, system.sightings, size, few)
+    system.factor = system.factor._replace(values=np.empty((len(system.pattern.rows), 9)))
+    assert system.factorise(0.0)
 
 
 class Problem(NamedTuple):
     """A graph, its mode, and the dense information of its poses and landmarks, (N, 3, N, 3).
 
-    Landmarks of at most `few` poses are eliminated first, as in large maps.
+    Landmarks of at most `few` poses are eliminated first.
     """
 
     graph: SlamGraph
@@ -32,13 +37,6 @@ class Problem(NamedTuple):
 
 def problem(robots: int, max_keys: int, motion: OdometryModel | None = None, few: int = 0) -> Problem:
     """Return one of each kind: raw and frozen sightings, poses that are given, landmarks that poses share."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(optimizer, "MANY_LANDMARKS", 0 if few else 10**6)
-        patch.setattr(optimizer, "FEW_POSES", few)
-        return _problem(robots, max_keys, motion, few)
-
-
-def _problem(robots: int, max_keys: int, motion: OdometryModel | None, few: int) -> Problem:
     run = small_run(robots)
     camera = camera_of(run)
     options = SmoothingOptions(max_keys=max_keys, further_keys=0, recent_keys=6, kernel=0.0)
@@ -50,6 +48,7 @@ def _problem(robots: int, max_keys: int, motion: OdometryModel | None, few: int)
     assert system is not None
     n = system.num_poses
     size = n + len(graph.landmarks)
+    order_again(system, graph, size, few)
     dense = np.zeros((size, 3, size, 3))
     for node, block in enumerate(system.equations.blocks):
         dense[node, :, node] = block[[[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
@@ -98,7 +97,7 @@ def information(posed: Problem) -> FloatArray:
 def test_a_node_with_the_fewest_neighbours_goes_first(posed):
     """The order is that of the textbook with sets for neighbours, and so is what it fills in.
 
-    In large maps that is so after the landmarks of few poses.
+    That is so after the landmarks of few poses.
     """
     size = len(posed.dense)
     near = [set(np.flatnonzero(row)) - {i} for i, row in enumerate(np.abs(posed.dense).sum(axis=(1, 3)) > 0)]
@@ -203,26 +202,11 @@ def test_relative_pose_covariances_agree_with_the_dense_covariance(posed):
         assert found[b] == pytest.approx(scatter[0] + scatter[1] + LEVER**2 * scatter[2], rel=1e-5)
 
 
-def test_a_graph_is_dense_if_all_poses_see_all_landmarks(posed):
-    """Then the columns of the factor are long, other than in a run past landmarks that come and go."""
-    assert not posed.mode.crowded
-    rng, points = np.random.default_rng(5), np.random.default_rng(6).uniform(2.0, 4.0, (40, 3))
-    log = RobotLog()
-    for step in range(40):
-        log.append(
-            step, np.zeros(3) if step else None, points=points + 0.01 * rng.normal(size=(40, 3)), ids=np.arange(40)
-        )
-    graph = extend_graph(SlamGraph.at_starts(np.zeros((1, 3))), [log.arrays()], OdometryModel(), np.zeros(3))
-    mode = optimize(graph, camera_of(small_run()), TIGHT)
-    assert mode.crowded
-
-
-def test_a_symbolic_factor_lists_sampled_nodes_and_column_lengths(posed):
-    """Poses are drawn, and landmarks for which a pose waits; lengths are those of the columns."""
+def test_a_symbolic_factor_lists_sampled_nodes(posed):
+    """Poses are drawn, and landmarks for which a pose waits."""
     assert posed.mode.system is not None
     p, num_poses = posed.mode.system.pattern, posed.mode.system.num_poses
     assert p.drawn == sum(node < num_poses or rank in p.rows for rank, node in enumerate(p.order.tolist()))
-    assert p.squares == (np.diff(p.tops) ** 2).sum()
 
 
 def test_densities_of_paths_are_the_dense_ones(posed):

@@ -69,24 +69,13 @@ def test_a_pair_whose_logs_were_smoothed_waits_until_an_eighth_is_new() -> None:
         assert plan.choose(same, step + wait) == FIRST
 
 
-def test_a_pair_smoothed_in_slices_does_not_wait_longer_than_the_longest_wait() -> None:
+def test_a_pair_whose_logs_were_smoothed_does_not_wait_longer_than_the_longest_wait() -> None:
     """Refused 4,000 steps on it tries again after 200, and with few steps as early as any other."""
-    for step, in_slices, wait in ((3_999, False, 500), (3_999, True, 200), (799, True, 100), (24, True, 25)):
+    for step, wait in ((3_999, 200), (799, 100), (24, 25)):
         plan = schedule()
-        plan.record(FIRST, step, success=False, smoothed=True, in_slices=in_slices)
+        plan.record(FIRST, step, success=False, smoothed=True)
         assert not plan.may_try(FIRST, step + wait - 1)
         assert plan.may_try(FIRST, step + wait)
-
-
-def test_smoothing_for_a_pair_that_is_always_refused_costs_a_multiple_of_the_log() -> None:
-    """Where an attempt costs as much as all that was read, all of them cost less than ten times it, however long."""
-    for end in (2_000, 20_000):
-        plan, total = schedule(every=1), 0
-        for step in range(end):
-            if plan.may_try(FIRST, step):
-                plan.record(FIRST, step, success=False, smoothed=True)
-                total += step
-        assert total < 10 * end
 
 
 def test_an_uncertain_pair_waits_while_its_uncertainty_falls() -> None:

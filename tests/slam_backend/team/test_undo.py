@@ -13,6 +13,7 @@ from slam_backend.fastslam.reports import MapReleased, MergeUndone, TeamReport
 from slam_backend.geometry import inverse
 from slam_backend.maps.alignment import AlignmentOptions, align_maps
 from slam_backend.maps.landmark_map import LandmarkMap
+from slam_backend.smoother.options import SmoothingOptions
 from slam_backend.team import merge_rollback as undoing
 from slam_backend.team.branches import MAX_REPLAYED
 from slam_backend.team.merge_monitor import deformed_fraction
@@ -227,9 +228,12 @@ def test_only_deformation_counts_as_motion_of_landmarks() -> None:
 # ---------------------------------------------------------------------- snapshots
 
 
-def test_a_team_continues_from_a_snapshot_bit_for_bit_through_an_undo() -> None:
+@pytest.mark.parametrize("every", [None, 20])
+@pytest.mark.parametrize("incremental", [False, True])
+def test_a_team_continues_from_a_snapshot_bit_for_bit_through_an_undo(every: int | None, incremental: bool) -> None:
     """A team restored while two merges are monitored, one of them false, continues like the original."""
-    simulation, team = driven(3, 104)
+    smoothing = SmoothingOptions(incremental=incremental)
+    simulation, team = driven(3, 104, rejuvenate_every=every, smoothing=smoothing)
     team.merge(0, 1, false_alignment(simulation, team, FAR))
     team.merge(0, 2, true_alignment(simulation, team, 0, 2))
     simulation.run(team, 4)

@@ -64,7 +64,7 @@ def test_a_run_is_written_and_repeats_itself(tmp_path: Path, monkeypatch: pytest
     write_log(log, noise=1.0)
     monkeypatch.setenv("VSLAM_DATA", str(tmp_path))
     monkeypatch.chdir(tmp_path)
-    options = ("--path", "log", "--duration", "20", "--particles", "7", "--seed", "5")
+    options = ("--path", "log", "--duration", "30", "--particles", "7", "--seed", "5")
     for arguments in (
         (*options, "--out", str(first), "--json", str(tmp_path / "copy.json")),
         ("--config", str(first), "--out", str(second)),
@@ -123,7 +123,7 @@ def test_missing_ground_truth_is_reported(tmp_path: Path, monkeypatch: pytest.Mo
     (tmp_path / "Robot5_Odometry.dat").write_text("\n".join([rows[1], rows[0], *rows[2:]]))
     monkeypatch.chdir(tmp_path)
     options = ("--particles", "7", "--seed", "5", "--out", "run")
-    said = vslam("replay", "mrclam", "--path", ".", "--duration", "20", *options)
+    said = vslam("replay", "mrclam", "--path", ".", "--duration", "30", *options)
     assert said.status == 0
     assert "Paths of robots 2, 5: no ground truth in this folder." in said.out
     assert "Maps of robots 2, 5: no ground truth in this folder." in said.out

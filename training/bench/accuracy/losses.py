@@ -103,7 +103,7 @@ def play(config: AccuracyConfig, trial: EpisodeTrial) -> dict[str, Any]:
 def with_all_keyframes(options: FilterOptions) -> FilterOptions:
     """Return filter options with each tick with measurements as a keyframe, without slices or limits of effort."""
     whole = replace(
-        options.smoothing, max_keys=MOST, further_keys=0, recent_keys=MOST, rigid_within=0.0, slice_steps=None,
+        options.smoothing, max_keys=MOST, further_keys=0, recent_keys=MOST, rigid_within=0.0, incremental=False,
         free_sightings=MOST,
     )  # fmt: skip
     return replace(options, smoothing=whole)

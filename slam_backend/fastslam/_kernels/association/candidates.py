@@ -1,17 +1,14 @@
 """Candidate landmarks of a measurement, by descriptor or identity, for all particles; how they compete for it."""
 
-import math
-
 import numpy as np
 
 from slam_backend.core.jit import device, jit_fma, simd, simd_inline, stack_array
 from slam_backend.core.simd_math import WIDE, added_up, log_of
-from slam_backend.core.validation import BoolArray, Float32Array, FloatArray, IntArray
+from slam_backend.core.validation import Float32Array, FloatArray, IntArray
 from slam_backend.fastslam._kernels.layout import (
     BEST_COST,
     CHOSEN,
     DEAD_ZONE,
-    FAR,
     IDENTITIES,
     IDS,
     LANES,
@@ -19,9 +16,6 @@ from slam_backend.fastslam._kernels.layout import (
     LOG_BEST,
     NEW_LANDMARK,
     NO_MATCH,
-    PLACE_SIGMA,
-    PLACE_X,
-    PLACE_Y,
     Q_D,
     Q_DEPTH,
     Q_DET_POSE,
@@ -31,138 +25,17 @@ from slam_backend.fastslam._kernels.layout import (
     ROW_OF,
     SECOND_COST,
     TAKEN,
-    TILE,
 )
-from slam_backend.fastslam._kernels.records import Candidates, Frame, MapArrays, Motion, Outcome, Poses, Rules
+from slam_backend.fastslam._kernels.records import Candidates, Frame, MapArrays, Outcome, Rules
 
 RUN = 64  # descriptors compared in one run
-LARGE_MAP = 1000  # landmarks above which a frame is compared with those in reach alone
-SAMPLE = 8  # particles that tell where a landmark is: as many as lie in a line of memory
-SCATTER = 10.0  # [m]; by how much the other particles may disagree with these
-
-
-@device
-@simd
-def _area_in_reach(
-    robot: Poses, motion: Motion, frame: Frame, rules: Rules
-) -> tuple[float, float, float, float, float]:  # fmt: skip
-    """Return where landmarks may lie that a frame can match, or that can keep it from starting new ones.
-
-    These have a squared distance D up to k^2, the end of the dead zone, in some particle, or lie near a measurement. So
-    they are no farther along the line of sight than what was measured by k sigmas of the measurement, of the pose and
-    of the landmark, the last of which the caller adds. Excepted are landmarks at right angles to the heading, whose D
-    is small at any distance since the camera's model is linearised at a depth near zero; out of reach they are ignored.
-
-    Args:
-        robot: Poses before the motion.
-        motion: Motion of the robot.
-        frame: Measurements.
-        rules: Thresholds.
-
-    Returns:
-        Centre (2) and half widths (2) [m] of a rectangle, map frame, within which a landmark without uncertainty must
-        lie, and k.
-    """
-    num_particles, camera = len(motion.normals), frame.camera
-    least_x, most_x, least_y, most_y, variance = np.inf, -np.inf, np.inf, -np.inf, 0.0
-    for poses in (robot.samples, robot.means):
-        for m in range(num_particles):
-            x, y = poses[0, m], poses[1, m]
-            least_x, most_x = min(least_x, x), max(most_x, x)
-            least_y, most_y = min(least_y, y), max(most_y, y)
-    for m in range(num_particles):
-        variance = max(variance, robot.covariances[0, m] + robot.covariances[3, m])
-    k, farthest = math.sqrt(max(rules.new_landmark_gate, rules.position_gate)), 0.0
-    blur = k * camera[3] / (camera[0] * camera[1])  # k sigmas of the disparity, as a difference of 1 / depth [1/m]
-    for b in range(len(frame.points)):
-        ahead, left = frame.points[b, 0], frame.points[b, 1]
-        distance = math.hypot(ahead, left)
-        if frame.given:
-            distance += k * math.sqrt(frame.noises[b, 0] + frame.noises[b, 3])
-        else:
-            distance = distance / (1.0 - blur * ahead) if blur * ahead < 1.0 else np.inf
-        farthest = max(farthest, distance)
-    odometry, sigmas = motion.odometry, motion.sigmas
-    moved = math.hypot(odometry[0], odometry[1]) + k * math.hypot(sigmas[0], sigmas[1])
-    prior = k * max(math.sqrt(variance), math.sqrt(2.0) * rules.recovery[0])
-    reach = farthest + math.hypot(camera[4], camera[5]) + moved + prior + rules.new_landmark_radius + SCATTER
-    return (
-        0.5 * (least_x + most_x), 0.5 * (least_y + most_y),
-        0.5 * (most_x - least_x) + reach, 0.5 * (most_y - least_y) + reach, k,
-    )  # fmt: skip
-
-
-@device
-@simd
-def _locate(slot: int, maps: MapArrays) -> None:
-    """Compute where a landmark is, from what was last written: resampling changes only the ancestor maps."""
-    places, row, padded = maps.places, maps.table[ROW_OF, slot], maps.counts.shape[1]
-    first = 0
-    while first < padded - 1 and maps.counts[row, first] == 0:
-        first += 1
-    least_x, most_x, least_y, most_y, variance = np.inf, -np.inf, np.inf, -np.inf, 0.0
-    for lane in range(first, min(max(SAMPLE, first + 1), padded)):
-        if maps.counts[row, lane] > 0:
-            at = row * 9 * padded + lane // LANES * TILE + lane % LANES
-            x, y = maps.values[at], maps.values[at + LANES]
-            least_x, most_x = min(least_x, x), max(most_x, x)
-            least_y, most_y = min(least_y, y), max(most_y, y)
-            variance = max(variance, maps.values[at + 3 * LANES] + maps.values[at + 6 * LANES])
-    half_x, half_y = 0.5 * (most_x - least_x), 0.5 * (most_y - least_y)
-    places[PLACE_X, slot], places[PLACE_Y, slot] = least_x + half_x, least_y + half_y
-    places[PLACE_SIGMA, slot] = math.sqrt(variance + half_x * half_x + half_y * half_y)
-
-
-@device
-@simd
-def _slots_in_reach(
-    n: int, maps: MapArrays, area: tuple[float, float, float, float, float], near: BoolArray, runs: IntArray
-) -> int:  # fmt: skip
-    """Find the landmarks in reach of a frame; return the number of runs of slots that hold them.
-
-    Args:
-        n: Number of slots.
-        maps: Landmarks; places that may have changed are computed.
-        area: See `_area_in_reach`.
-        near: (n,), written: where a landmark is in reach.
-        runs: (2, n / `RUN` + 1), written: first and last slot + 1 of runs that hold any.
-    """
-    x, y, width, height = np.float32(area[0]), np.float32(area[1]), np.float32(area[2]), np.float32(area[3])
-    k, count = np.float32(area[4]), 0
-    for first in range(0, n, RUN):
-        end = min(first + RUN, n)
-        own, total = near[first:end], 0
-        xs, ys, sigmas = (
-            maps.places[PLACE_X, first:end],
-            maps.places[PLACE_Y, first:end],
-            maps.places[PLACE_SIGMA, first:end],
-        )
-        for i in range(len(own)):
-            total += 1 if xs[i] == -FAR else 0
-        if total > 0:
-            for i in range(len(own)):
-                if xs[i] == -FAR:
-                    _locate(first + i, maps)
-        total = 0
-        for i in range(len(own)):
-            more = k * sigmas[i]
-            own[i] = (abs(xs[i] - x) - more <= width) & (abs(ys[i] - y) - more <= height)
-            total += 1 if own[i] else 0
-        if total > 0:
-            if count > 0 and runs[1, count - 1] == first:
-                count -= 1
-            else:
-                runs[0, count] = first
-            runs[1, count] = end
-            count += 1
-    return count
 
 
 @device
 @simd
 def _near_heads(
     measured: Float32Array, b: int, heads: Float32Array, stride: int, limit: float, partial: Float32Array,
-    first: int, hits: IntArray, count: int,
+    hits: IntArray,
 ) -> int:  # fmt: skip
     """Find stored descriptors near a measured one, by every `stride`-th component; return their number.
 
@@ -171,27 +44,24 @@ def _near_heads(
         heads: (h, slots) components of the stored descriptors.
         stride: Step between the components compared.
         limit: Largest squared distance.
-        partial: (n,), written: the squared distances of the n slots from `first` on.
-        first: The first slot.
-        hits: (> count + n,), written from `count` on: the slots up to the limit, ascending. Runs without one are
-            skipped.
-        count: Number of hits before.
+        partial: (n,), written: the squared distances of the first n slots.
+        hits: (> n,), written: the slots up to the limit, ascending. Runs without one are skipped.
     """
-    n = len(partial)
+    n, count = len(partial), 0
     for slot in range(n):
         partial[slot] = np.float32(0.0)
     whole = heads.shape[0] // 4 * 4
     for k in range(0, whole, 4):
         v0, v1 = measured[b, k * stride], measured[b, (k + 1) * stride]
         v2, v3 = measured[b, (k + 2) * stride], measured[b, (k + 3) * stride]
-        row0, row1 = heads[k, first : first + n], heads[k + 1, first : first + n]
-        row2, row3 = heads[k + 2, first : first + n], heads[k + 3, first : first + n]
+        row0, row1 = heads[k, :n], heads[k + 1, :n]
+        row2, row3 = heads[k + 2, :n], heads[k + 3, :n]
         for slot in range(n):
             d0, d1, d2, d3 = v0 - row0[slot], v1 - row1[slot], v2 - row2[slot], v3 - row3[slot]
             partial[slot] += (d0 * d0 + d1 * d1) + (d2 * d2 + d3 * d3)
     for k in range(whole, heads.shape[0]):
         value = measured[b, k * stride]
-        row = heads[k, first : first + n]
+        row = heads[k, :n]
         for slot in range(n):
             difference = value - row[slot]
             partial[slot] += difference * difference
@@ -203,7 +73,7 @@ def _near_heads(
             inside += 1 if run[i] <= most else 0
         if inside > 0:  # without branches, for none could be foreseen
             for i in range(len(run)):
-                hits[count] = first + begin + i
+                hits[count] = begin + i
                 count += 1 if run[i] <= most else 0
     return count
 
@@ -229,20 +99,15 @@ def _squared_distance(measured: Float32Array, b: int, stored: Float32Array, slot
 
 @device
 @jit_fma
-def find_candidates(
-    robot: Poses, motion: Motion, frame: Frame, maps: MapArrays, rules: Rules
-) -> tuple[Candidates, IntArray]:
+def find_candidates(frame: Frame, maps: MapArrays, rules: Rules) -> tuple[Candidates, IntArray]:
     """List for each measurement the landmarks that may have caused it, nearest descriptor first.
 
     Some components alone rule most landmarks out, for all particles at once; the others are compared in full. Equal
-    distances are ordered by the ids of the landmarks. In a map of more than `LARGE_MAP` landmarks none is a candidate
-    that lies so far from where the robot may be that no particle could match it.
+    distances are ordered by the ids of the landmarks.
 
     Args:
-        robot: Poses before the motion.
-        motion: Motion of the robot.
         frame: Measurements of the robot.
-        maps: Landmarks; their places are brought up to date.
+        maps: Landmarks.
         rules: Thresholds, of which E0 is the largest admitted squared distance of descriptors.
 
     Returns:
@@ -255,23 +120,15 @@ def find_candidates(
         maps.table[IDS],
     )
     num, n, gate = measured.shape[0], len(ids), rules.descriptor_gate
-    is_large = len(ids) - maps.tops[1] > LARGE_MAP and not frame.identified
     while n > 0 and ids[n - 1] < 0:
         n -= 1
     stride = measured.shape[1] // max(maps.heads.shape[0], 1)
     limit = 1.0001 * gate + 1e-4  # rounding of single precision decides nothing
-    near, runs, num_runs = np.empty(n if is_large else 0, np.bool_), np.empty((2, n // RUN + 1), np.int64), 1
-    runs[0, 0], runs[1, 0] = 0, n
-    if is_large:
-        num_runs = _slots_in_reach(n, maps, _area_in_reach(robot, motion, frame, rules), near, runs)
-    num_compared = 0
-    for k in range(num_runs):
-        num_compared += runs[1, k] - runs[0, k]
-    most = num * num_compared
+    most = num * n
     starts = np.zeros(num + 1, dtype=np.int64)
     listed, squares = np.empty((4, most), dtype=np.int64), np.empty(most)  # as far as they are written to
     slots, owners, same, unique = listed[0], listed[1], listed[2], listed[3]
-    partial, hits = np.empty(num_compared, dtype=np.float32), np.empty(num_compared + 1, dtype=np.int64)
+    partial, hits = np.empty(n, dtype=np.float32), np.empty(n + 1, dtype=np.int64)
     last = np.empty(n, dtype=np.int64)
     total = 0
     for b in range(num):
@@ -283,14 +140,10 @@ def find_candidates(
                     hits[count] = slot
                     count += 1
         else:
-            count = 0
-            for k in range(num_runs):
-                first = runs[0, k]
-                own = partial[: runs[1, k] - first]
-                count = _near_heads(measured, b, maps.heads, stride, limit, own, first, hits, count)
+            count = _near_heads(measured, b, maps.heads, stride, limit, partial, hits)
         for k in range(count):
             slot = hits[k]
-            if ids[slot] < 0 or (is_large and not near[slot]):
+            if ids[slot] < 0:
                 continue
             e = _squared_distance(measured, b, maps.descriptors, slot)
             if e > gate and not frame.identified:

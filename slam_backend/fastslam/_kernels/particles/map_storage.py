@@ -6,14 +6,12 @@ from slam_backend.core.jit import device, in_place, inline, simd, simd_inline
 from slam_backend.core.validation import FloatArray, Int32Array, IntArray
 from slam_backend.fastslam._kernels.layout import (
     BLOCK,
-    CHANGED,
     FAR,
     FREE_SLOTS,
     IDENTITIES,
     IDS,
     LANES,
     MAP_OF,
-    PLACE_X,
     ROW_OF,
     TILE,
 )
@@ -84,8 +82,6 @@ def register_new(new_slots: IntArray, frame: Frame, maps: MapArrays) -> None:
         if slot < 0:
             continue
         ids[slot] = maps.tops[2]
-        maps.table[CHANGED, slot] = 1
-        maps.places[PLACE_X, slot] = -FAR
         maps.tops[2] += 1
         identities[slot] = frame.identities[b] if frame.identified else -1
         size = frame.descriptors.shape[1]
@@ -108,7 +104,6 @@ def free_slot(slot: int, maps: MapArrays) -> None:
     maps.table[IDS, slot] = -1
     for k in range(maps.heads.shape[0]):
         maps.heads[k, slot] = FAR
-    maps.places[PLACE_X, slot] = FAR
     maps.free_rows[maps.tops[0]] = maps.table[ROW_OF, slot]
     maps.table[FREE_SLOTS, maps.tops[1]] = slot
     maps.tops[0] += 1

@@ -9,14 +9,11 @@ from slam_backend.core.jit import device, in_place, simd
 from slam_backend.core.validation import FloatArray, Int32Array, IntArray
 from slam_backend.fastslam._kernels.layout import (
     BLOCK,
-    CHANGED,
-    FAR,
     IDS,
     LANES,
     LOG_WEIGHTS,
     MAP_OF,
     PATH_LOG_WEIGHTS,
-    PLACE_X,
     ROW_OF,
     TILE,
 )
@@ -135,16 +132,13 @@ def _copy_row(
 def apply_resampling(slots: IntArray, maps: MapArrays) -> None:
     """Bring landmarks up to date: copy each particle's values from where its ancestor left them to its own place.
 
-    One free row is needed: the row that a landmark leaves is taken by the next, while it is still in the cache. The
-    landmarks are marked as changed, for only those that were brought up to date are written.
+    One free row is needed: the row that a landmark leaves is taken by the next, while it is still in the cache.
     """
     row_of, map_of, tops = maps.table[ROW_OF], maps.table[MAP_OF], maps.tops
     padded = maps.counts.shape[1]
     size = 9 * padded
     for k in range(len(slots)):
         slot = slots[k]
-        maps.table[CHANGED, slot] = 1
-        maps.places[PLACE_X, slot] = -FAR
         e = map_of[slot]
         if e == 0:
             continue

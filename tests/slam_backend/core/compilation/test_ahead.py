@@ -117,14 +117,14 @@ def test_a_waiting_program_compiles_what_it_will_call_soon(tmp_path: Path, monke
 
 
 def test_first_steps_call_no_kernel_that_comes_last() -> None:
-    """What environments expect to call later is not called in the first ten steps, and there is such a kernel."""
+    """What environments expect to call later is not called before the first slice of smoothing; such kernels exist."""
     code = """
 from slam_backend.core.compilation.compiler import compiled_signatures, recorded_signatures
 from vslam_env import vslam_v0
 from vslam_env.environment import LATER
 env = vslam_v0.parallel_env()
 env.reset(seed=0)
-for _ in range(10):
+for _ in range(7):
     env.step({agent: env.action_space(agent).sample() for agent in env.agents})
 called = [name for package in ("slam_backend", "vslam_env") for name in compiled_signatures(package)]
 recorded = recorded_signatures("slam_backend", "vslam_env")
