@@ -305,21 +305,23 @@ class RejuvenationScheduler:
             return _failed(graph, reason)
         smoother = Smoother(options.motion, camera, options.smoothing, rng)
         self._set_graph(graph)
+        is_due = self.is_due  # before slices add the sightings that `effort` weighs
         while True:
-            result = self._run_slice(logs, smoother, starts.shape[2], maps, best)
+            result = self._run_slice(logs, smoother, starts.shape[2], maps, best, is_due)
             if result is not None or options.smoothing.incremental:
                 return result
 
     def _run_slice(
-        self, logs: Sequence[RobotLog], smoother: Smoother, num_particles: int, maps: ParticleMaps, best: int
-    ) -> Rejuvenation | None:
-        """Do one slice of work; arguments as of `run`."""
+        self, logs: Sequence[RobotLog], smoother: Smoother, num_particles: int, maps: ParticleMaps, best: int,
+        is_due: bool,
+    ) -> Rejuvenation | None:  # fmt: skip
+        """Do one slice of work; arguments as of `run`, and whether a rejuvenation is due."""
         graph = self._graph
         assert graph is not None
         if (draft := self._draft) is not None:
             outcome = smoother.optimise_slice(draft)
             return self._finish_slice(draft.graph, outcome, lambda: log_tails(logs, graph, draft.graph), smoother)
-        share, waiting, is_due = self._share, max_pending_steps(logs, graph), self.is_due
+        share, waiting = self._share, max_pending_steps(logs, graph)
         if waiting > 2 * share or not is_due:  # so that few steps are left to the draw
             if waiting < share and not is_due:
                 return None

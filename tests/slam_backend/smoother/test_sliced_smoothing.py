@@ -12,6 +12,7 @@ from builders.worlds import EXACT_MOTION
 from hypothesis import given
 from hypothesis import strategies as st
 
+from slam_backend.fastslam import rejuvenation as scheduler
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.run_log import RobotLog
 from slam_backend.geometry import wrap_angle
@@ -339,3 +340,20 @@ def test_initial_poses_are_looked_up_and_dropped_by_step(known, asked, last):
         found = left.at(np.array(asked, dtype=np.int64))
         np.testing.assert_array_equal(found, np.array(expected).reshape(-1, 3))
         assert left.steps.tolist() == [step for step in known if step > first]
+
+
+def test_a_rejuvenation_in_one_step_ends_whatever_its_slices_add(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is due at the beginning is done, though the sightings that slices add would let a later one wait."""
+    counted, count = [], scheduler.max_pending_steps
+
+    def watched(*arguments: Any) -> int:
+        counted.append(1)
+        assert len(counted) < 1000
+        return count(*arguments)
+
+    monkeypatch.setattr(scheduler, "max_pending_steps", watched)
+    run = small_run(length=12.0)
+    smoothing = SmoothingOptions(effort=0.2, free_sightings=0, max_keys=10, recent_keys=5)
+    slam = run.build_filter(20, "fastslam2", 1, rejuvenate_every=30, smoothing=smoothing)
+    reports = [slam.step(**reading).rejuvenation for reading in run.readings()]
+    assert [report.reason for report in reports if report is not None] == [""]
