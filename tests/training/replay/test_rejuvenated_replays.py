@@ -9,8 +9,9 @@ from typing import Any
 import pytest
 from small_logs import write_drive, write_log, write_park
 
-from slam_backend.fastslam import rejuvenation as _rejuvenation_step
+from slam_backend.fastslam.rejuvenation import RejuvenationScheduler
 from slam_backend.fastslam.reports import RejuvenationReport
+from slam_backend.smoother.rejuvenation import Rejuvenation
 from training.commands.replay import _rejuvenations
 from training.episodes.config import RunConfig
 from training.replay.config import REJUVENATE_EVERY, ImagesConfig, KittiConfig, MrclamConfig, VictoriaConfig
@@ -36,15 +37,15 @@ def estimates(folder: Path) -> list[bytes]:
 def reasons(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Return the list of refusals of attempts, "" for success; attempts of the warm-up are left out."""
     said: list[str] = []
-    usual = _rejuvenation_step.rejuvenate
+    usual = RejuvenationScheduler.run
 
-    def rejuvenate(*arguments: Any) -> Any:
-        result = usual(*arguments)
-        if arguments[4] == PARTICLES:
+    def run(scheduler: RejuvenationScheduler, logs: Any, starts: Any, *rest: Any) -> Rejuvenation | None:
+        result = usual(scheduler, logs, starts, *rest)
+        if result is not None and starts.shape[2] == PARTICLES:
             said.append(result.reason)
         return result
 
-    monkeypatch.setattr(_rejuvenation_step, "rejuvenate", rejuvenate)
+    monkeypatch.setattr(RejuvenationScheduler, "run", run)
     return said
 
 
