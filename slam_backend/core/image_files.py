@@ -39,31 +39,24 @@ def read_image(path: str | PathLike[str], name: str = "path", hint: str = "Save 
     """
     from PIL import Image, ImageOps, UnidentifiedImageError
 
-    content = read_bytes(path, name, "an image file", MOST_MEGABYTES)
+    content, size = read_bytes(path, name, "an image file", MOST_MEGABYTES), "a larger image"
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # Pillow's own limit of pixels, and remarks on metadata
             with Image.open(io.BytesIO(content), formats=FORMATS) as image:
-                width, height = image.size
-                if width * height > MOST_PIXELS:
-                    raise _TooLargeError(f"a size of {width} x {height} px")
+                size = f"a size of {image.width} x {image.height} px"
+                if image.width * image.height > MOST_PIXELS:
+                    raise Image.DecompressionBombError
                 image.load()
                 return _colours(ImageOps.exif_transpose(image))
-    except _TooLargeError as error:
+    except Image.DecompressionBombError as error:  # of Pillow, too, before the size is known
         expected = f"an image of at most {MOST_PIXELS / 1e6:.0f} million pixels"
-        raise argument_error(name, expected, str(error), f"Scale down or crop {str(path)!r}.") from None
-    except Image.DecompressionBombError as error:  # raised by Pillow before the size is known here
-        expected = f"an image of at most {MOST_PIXELS / 1e6:.0f} million pixels"
-        raise argument_error(name, expected, "a larger image", f"Scale down or crop {str(path)!r}.") from error
+        raise argument_error(name, expected, size, f"Scale down or crop {str(path)!r}.") from error
     except UnidentifiedImageError as error:
         raise argument_error(name, "an image file", Path(path), hint) from error
     except Exception as error:  # decoders raise errors of many kinds for damaged files
         reason = str(error).partition("\n")[0] or type(error).__name__
         raise argument_error(name, "an intact image file", Path(path), f"The reader says: {reason}. {hint}") from error
-
-
-class _TooLargeError(Exception):
-    """Image with too many pixels."""
 
 
 def read_grey_image(path: str | PathLike[str], name: str = "path", hint: str = "Save it as PNG.") -> Pixels:

@@ -8,10 +8,12 @@ import codecs
 import json
 import re
 from collections.abc import Hashable, Iterable, Iterator
+from functools import cache
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
+from slam_backend.core.files import checked_path
 from slam_backend.core.validation import argument_error
 
 MOST_MEGABYTES = 1024  # of a log; a million rows of TUM take 100
@@ -46,9 +48,7 @@ def existing_file(path: str | PathLike[str], name: str = "path", kind: str = "a 
     Raises:
         ValueError: If there is no such file.
     """
-    if not isinstance(path, (str, PathLike)) or "\0" in str(path):
-        raise argument_error(name, f"the path of {kind}", path, "Give a string or a Path.")
-    path = Path(path)
+    path = checked_path(path, name)
     try:
         exists = path.is_file()
     except OSError as error:  # e.g. a name too long for the system
@@ -211,13 +211,9 @@ def read_yaml(path: str | PathLike[str], name: str, hint: str) -> Any:
         raise _syntax_error(name, "YAML", str(error).splitlines()[0], str(path), hint) from error
 
 
-_LOADERS: list[Any] = []  # the class of loaders, built once at first use, when PyYAML is imported
-
-
+@cache  # the class is built at first use, when PyYAML is imported
 def _yaml_loader() -> Any:
     """Return the class of loaders of `read_yaml`."""
-    if _LOADERS:
-        return _LOADERS[0]
     import yaml
 
     class Loader(yaml.SafeLoader):  # type: ignore[misc]   # no type information is published
@@ -252,7 +248,6 @@ def _yaml_loader() -> Any:
     decimal = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?$|[-+]?\.(inf|Inf|INF)$|\.(nan|NaN|NAN)$")
     Loader.add_implicit_resolver(numbers[1], decimal, list("-+0123456789."))
     Loader.add_constructor(numbers[0], lambda loader, node: int(loader.construct_scalar(node)))
-    _LOADERS.append(Loader)
     return Loader
 
 

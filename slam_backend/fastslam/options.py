@@ -65,8 +65,7 @@ class FilterOptions:
         existence: Detection model that updates the probability of existence of landmarks; particles delete improbable
             ones. None: landmarks are never deleted.
         rejuvenate_every: Steps after which particles are sampled from the smoother's posterior of whole paths; also at
-            the first step after a merge, and sooner after a loop closure. None: never, as in the paper, except that a
-            `TeamSlam` smooths both sides before a merge (`MergeOptions.smooth_first`).
+            the first step after a merge, and sooner after a loop closure. None: never, as in the paper.
         smoothing: Options of the smoother.
     """
 

@@ -17,9 +17,9 @@ class MergeOptions:
 
     Attributes:
         merged_particles: Number of particles of the joint filter; None: the larger of the two.
-        smooth_first: Whether both sides are rejuvenated from the posterior of whole paths before a merge
-            (`FastSlam.rejuvenate`; over several steps, if smoothers work in slices), and their maps must align again.
-            False: maps are used without smoothing.
+        smooth_first: Whether both sides, if they have smoothers, are rejuvenated from the posterior of whole paths
+            before a merge (`FastSlam.rejuvenate`; over several steps, if smoothers work in slices), and must align
+            again. False: maps are used without smoothing.
         min_sigmas: A merge needs 0.5 m and 5 degrees to be at least this many standard deviations of the motion between
             the maps, by the joint graph of both groups, or by the particles of a merge if they have no smoothers.
             Otherwise the attempt is refused as too uncertain, as long as waiting helps. 0: no such refusal.

@@ -23,7 +23,7 @@ from training.experiments.config import (
     option_arguments,
     setting,
 )
-from training.experiments.labels import check_labels, parted_label
+from training.experiments.policy_names import check_labels, parted_label
 from training.replay.config import MRCLAM, log_path
 
 if TYPE_CHECKING:  # numerical modules are imported when a command runs, so that --help is fast

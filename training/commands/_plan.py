@@ -55,8 +55,8 @@ def run_plan(call: Call[ExplorationBenchConfig], name: str | None, workers: int,
     from training.bench.exploration.plan_report import aggregate, draw_plan, episodes_csv, markdown, write_parquet
     from training.bench.exploration.players import parted
     from training.bench.exploration.trials import TRIALS_FILE, check_same_policies, play
-    from training.experiments.named_policies import check_named
     from training.experiments.numerics import PORTABLE, variables_for
+    from training.experiments.policy_names import check_named
     from training.experiments.run_folder import plain
 
     config, plan = _configured(call, name)
@@ -118,7 +118,7 @@ def _configured(call: Call[ExplorationBenchConfig], name: str | None) -> "tuple[
     """
     from slam_backend.core.validation import argument_error
     from training.bench.exploration.plan import Plan
-    from training.experiments.named_policies import check_configuration
+    from training.experiments.policy_names import check_configuration
     from training.experiments.run_folder import read_config
 
     for option in call.given:
@@ -170,8 +170,8 @@ def verify_rows(call: Call[ExplorationBenchConfig], folder: Path, count: int, wo
     from training.bench.exploration.plan import Plan, PlanBench, PlanTrial
     from training.bench.exploration.trials import TRIALS_FILE, Bench, play
     from training.bench.exploration.verification import HEADINGS, choose, compare, keep, table_rows
-    from training.experiments.named_policies import check_named
     from training.experiments.numerics import variables_for
+    from training.experiments.policy_names import check_named
     from training.experiments.run_folder import CONFIG_FILE, RunFolder, installed_versions, read_config
     from training.experiments.statistics import grouped
     from training.experiments.tables import console_table

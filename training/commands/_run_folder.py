@@ -55,7 +55,7 @@ class Call(Generic[ConfigT]):
                 is missing, or the file names a custom policy that the options do not name.
         """
         from slam_backend.core.files import check_writable
-        from training.experiments.named_policies import check_configuration
+        from training.experiments.policy_names import check_configuration
         from training.experiments.run_folder import read_config
 
         if self.json not in (None, STDOUT) and self.json.parent != self.out:  # the run folder is created later

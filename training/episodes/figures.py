@@ -186,18 +186,11 @@ def _draw_scale_bar(axes: Axes) -> None:
 def _add_map_legend(figure: SubFigure) -> None:
     """Add a legend of lines and marks below the axes; the robots' colours are those of the panels above."""
     grey = rgb(FAINT_INK)
+    estimated = "estimated landmark with 95 % ellipse, in the colour of its map's first robot"
     handles = [
         Line2D([], [], color=rgb(WALL), linewidth=2.0, label="wall"),
         Line2D([], [], linestyle="", marker="o", markersize=2.4, color=rgb(TRUE_LANDMARK), label="true landmark"),
-        Line2D(
-            [],
-            [],
-            linestyle="",
-            marker="o",
-            markersize=5.0,
-            color=grey,
-            label="estimated landmark with 95 % ellipse, in the colour of its map's first robot",
-        ),
+        Line2D([], [], linestyle="", marker="o", markersize=5.0, color=grey, label=estimated),
         Line2D([], [], color=grey, alpha=0.3, linewidth=4.0, label="true path"),
         Line2D([], [], color=grey, linewidth=1.2, label="estimated path"),
         Line2D([], [], color=grey, linewidth=1.0, linestyle=":", label="odometry only"),

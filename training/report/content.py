@@ -13,7 +13,7 @@ import numpy as np
 
 from slam_backend.core.text_files import read_json, read_text, read_toml
 from slam_backend.core.validation import FloatArray, argument_error
-from training.experiments.labels import parted_label
+from training.experiments.policy_names import parted_label
 from training.experiments.run_folder import CONFIG_FILE, METRICS_FILE
 from training.experiments.tables import ATE_NOTE, E_SCALE, MAPS_NOTE, NIS_NOTE, heading, in_words, significant
 from training.report.packing import Packer

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import Field
 
 from training.experiments.config import ExperimentConfig, NoisePreset, Positive, first_seed, option, setting
-from training.experiments.labels import check_labels, parted_label
+from training.experiments.policy_names import check_labels, parted_label
 
 if TYPE_CHECKING:  # numerical modules are imported when a command runs, so that --help is fast
     from vslam_env.config import EnvConfig

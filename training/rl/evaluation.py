@@ -12,7 +12,7 @@ from agents.policy import Policy
 from agents.registry import make_policy
 from agents.trained import TrainedGoalPolicy, load_model
 from training.episodes.runner import run_episode
-from training.experiments.labels import parted_label
+from training.experiments.policy_names import parted_label
 from training.experiments.statistics import format_ci, mean_ci, paired_difference, summarise_means
 from training.experiments.tables import E_SCALE, console_table
 from training.rl.config import MODEL, EvaluateConfig, EvaluateTrial

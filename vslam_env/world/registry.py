@@ -146,11 +146,12 @@ def _parted(world: str) -> tuple[str, Options]:
             hint = f"Options: {', '.join(known)}, each once." if known else "This family has no options."
             near = "" if key in known else did_you_mean(key, known)
             raise argument_error("world", f"options that {name!r} has", world, near + hint)
+        if key == "outside":
+            options[key] = check_choice("world: outside", value, OUTSIDE)
+            continue
         try:
-            options[key] = check_choice("world: outside", value, OUTSIDE) if key == "outside" else float(value)
+            options[key] = float(value)
         except ValueError as error:
-            if key == "outside":
-                raise
             raise argument_error("world", f"a number for {key!r}", world, f"Write {name}:{key}=...") from error
     return name, options
 

@@ -28,11 +28,6 @@ class Estimate:
     # (K, 3) float64. Odometry biases: relative distance, turn per metre [rad/m] and per radian [rad/rad]; None: none.
     biases: FloatArray | None = None
 
-    @property
-    def world_paths(self) -> FloatArray:
-        """(K, T, 3) float64 [m, m, rad], world frame. Paths."""
-        return self.paths if self.bases is None else compose(self.bases[:, None], self.paths)
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sights:

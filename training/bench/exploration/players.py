@@ -8,7 +8,7 @@ from agents.plugins import is_plugin, plugin_file
 from agents.registry import action_types, make_policy, make_team_policy, model_file
 from slam_backend.core.validation import check_choice
 from training.episodes.guard import GuardedTeam
-from training.experiments.labels import parted_label
+from training.experiments.policy_names import parted_label
 from vslam_env.environment import ExplorationEnv
 
 ROBOT, TEAM, BOUND = "robot", "team", "bound"

@@ -13,8 +13,8 @@ from agents.plugins import is_plugin
 from agents.trained import MODEL_FILE
 from training.bench.config import NO_ORACLE
 from training.bench.exploration.trials import CURVES, TEAM
-from training.experiments.labels import parted_label
 from training.experiments.plotting import picture, save_png
+from training.experiments.policy_names import parted_label
 from training.experiments.statistics import format_ci, grouped, mean_ci, mean_curves, paired_difference, summarise_means
 from training.experiments.tables import E_SCALE, console_table, csv_text, markdown_table
 
