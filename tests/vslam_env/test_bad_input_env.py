@@ -274,7 +274,7 @@ CALLS: dict[str, list[Callable[[], Any]]] = {
     "world: expected a file": [partial(ExplorationEnv, EnvConfig(world="nowhere.json"))],
     "config: expected an EnvConfig": [partial(small_env, config=7)],
     "config: expected a TOML file": [partial(small_env, config="nowhere.toml")],
-    "config: expected the path of a TOML file": [
+    "config: expected the path of a file": [
         partial(EnvConfig.from_toml, "a\0.toml"), partial(EnvConfig.from_toml, None),
     ],
     "config: expected TOML as text": [partial(EnvConfig.from_toml_text, 3)],
