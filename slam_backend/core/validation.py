@@ -1,17 +1,18 @@
 """Argument checks with one form of error: argument, expected value, value received, and hint."""
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import wraps
 from inspect import isbuiltin, signature
 from itertools import islice
 from numbers import Real
 from pathlib import PurePath
-from typing import Any, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+P = ParamSpec("P")
 T = TypeVar("T")
 
 FloatArray = NDArray[np.float64]
@@ -153,6 +154,19 @@ def known_names(kind: type[T]) -> type[T]:
 
     kind.__init__ = checked  # type: ignore[method-assign]
     return kind
+
+
+def with_fields_of(kind: type) -> Callable[[Callable[P, T]], Callable[P, T]]:
+    """Show the fields of a dataclass in the signature of a function in place of its `**options`; a decorator."""
+
+    def shown(function: Callable[P, T]) -> Callable[P, T]:
+        own = signature(function)
+        fields = [each.replace(kind=each.KEYWORD_ONLY) for each in signature(kind).parameters.values()]
+        named = [each for each in own.parameters.values() if each.kind != each.VAR_KEYWORD]
+        function.__signature__ = own.replace(parameters=named + fields)  # type: ignore[attr-defined]
+        return function
+
+    return shown
 
 
 def check_int(name: str, value: Any, minimum: int, hint: str, maximum: int | None = None) -> int:

@@ -8,7 +8,7 @@ landmarks. Then the joint particles are resampled.
 import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,16 +25,16 @@ from slam_backend.core.validation import (
     check_int,
     check_seed,
     known_names,
+    with_fields_of,
 )
 from slam_backend.fastslam import _kernels
 from slam_backend.fastslam._kernels import EXACT_POSE, NO_READING, add_gauge_covariance
 from slam_backend.fastslam._kernels.records import ROBOT, WEIGHT
 from slam_backend.fastslam.consistency import Consistency, ConsistencyTest
 from slam_backend.fastslam.estimates import map_mixture, pose_mixtures
-from slam_backend.fastslam.existence import ExistenceModel, ExistenceUpdate
+from slam_backend.fastslam.existence import ExistenceUpdate
 from slam_backend.fastslam.options import (
     MAX_ROBOTS,
-    REJUVENATE_EVERY,
     FilterOptions,
     pack_options,
     packed_camera,
@@ -57,11 +57,9 @@ from slam_backend.fastslam.state_checks import KEPT, check_filter, last_step
 from slam_backend.fastslam.step_input import MAX_POSE, RobotRows, StepInput, rows_of, validate_step
 from slam_backend.geometry import between, compose, wrap_angle
 from slam_backend.maps.landmark_map import LandmarkMap, MapSummary, MapSummaryRows, unchecked_map
-from slam_backend.models.camera import StereoCamera
 from slam_backend.models.measurements import Measurements
-from slam_backend.models.odometry import OdometryModel
+from slam_backend.reference.filter import ReferenceFastSlam
 from slam_backend.resampling import RESAMPLING
-from slam_backend.smoother.options import SmoothingOptions
 from slam_backend.smoother.rejuvenation import Particles
 
 NO_WEIGHTS = np.empty(0)  # unused where all particles start at the same pose
@@ -90,12 +88,15 @@ class StepSummary(NamedTuple):
 class FastSlam:
     """Visual FastSLAM for one robot, or jointly for several that share a map frame.
 
-    All arguments but these three are fields of `FilterOptions`, which describes them.
+    `slam_backend.reference` is the same filter to read: one particle and one landmark at a time.
 
     Args:
         num_robots: K. Each particle holds K poses and one map (Eq. 19).
         seed: Seed of the filter's own random stream: an int, a `numpy.random.SeedSequence` or a Generator.
         initial_poses: (K, 3) [m, m, rad], map frame. None: all at the origin.
+        backend: "compiled", or "reference": the filter to read, which has `step`, `pose`, `particles` and `map` only,
+            without rejuvenation, and is hundreds of times slower.
+        **options: Fields of `FilterOptions`.
 
     Arrays of particles are padded to P lanes; lanes beyond M are unused. Poses are in the map frame.
 
@@ -131,58 +132,34 @@ class FastSlam:
         [[2.0, 0.0, 0.0]]
     """
 
+    @with_fields_of(FilterOptions)
     def __init__(
         self,
         num_robots: int = 1,
-        num_particles: int = 100,
-        camera: StereoCamera | None = None,
-        motion: OdometryModel | None = None,
-        proposal: Literal["fastslam2", "fastslam1"] = "fastslam2",
-        resampling: str = "systematic",
-        resample_threshold: float = 0.5,
-        position_gate: float = 11.34,
-        descriptor_gate: float = 0.45,
-        new_landmark_gate: float = 25.0,
-        new_landmark_radius: float = 1.0,
-        recovery_position: float = 0.5,
-        recovery_heading: float = 0.1,
-        descriptor_sigma: float = 0.1,
-        ambiguity_margin: float = 6.0,
-        new_landmark_density: float = 0.01,
-        one_to_one: bool = True,
-        landmark_noise: float | None = None,
-        existence: ExistenceModel | None = None,
-        rejuvenate_every: int | None = REJUVENATE_EVERY,
-        smoothing: SmoothingOptions | None = None,
+        *,
         seed: int | np.random.SeedSequence | np.random.Generator = 0,
         initial_poses: ArrayLike | None = None,
+        backend: Literal["compiled", "reference"] = "compiled",
+        **options: Any,
     ) -> None:
-        options = FilterOptions(
-            num_particles=num_particles,
-            camera=StereoCamera() if camera is None else camera,
-            motion=OdometryModel() if motion is None else motion,
-            proposal=proposal,
-            resampling=resampling,
-            resample_threshold=resample_threshold,
-            position_gate=position_gate,
-            descriptor_gate=descriptor_gate,
-            new_landmark_gate=new_landmark_gate,
-            new_landmark_radius=new_landmark_radius,
-            recovery_position=recovery_position,
-            recovery_heading=recovery_heading,
-            descriptor_sigma=descriptor_sigma,
-            ambiguity_margin=ambiguity_margin,
-            new_landmark_density=new_landmark_density,
-            one_to_one=one_to_one,
-            landmark_noise=landmark_noise,
-            existence=existence,
-            rejuvenate_every=rejuvenate_every,
-            smoothing=SmoothingOptions() if smoothing is None else smoothing,
-        )
-        self._allocate(num_robots, options, seed)
+        if check_choice("backend", backend, ("compiled", "reference")) == "reference":
+            chosen = FilterOptions(**{"rejuvenate_every": None} | options)
+            self._reference: ReferenceFastSlam | None = ReferenceFastSlam(num_robots, chosen, seed, initial_poses)
+            return
+        self._allocate(num_robots, FilterOptions(**options), seed)
         if initial_poses is not None:
             hint = "Give one pose (x, y, theta) per robot."
             self._start_at(check_array("initial_poses", initial_poses, (num_robots, 3), hint, within=MAX_POSE))
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            """Refuse what the readable filter does not have."""
+            if self.__dict__.get("_reference") is None:
+                raise AttributeError(f"'FastSlam' has no attribute '{name}'")
+            raise AttributeError(
+                'the readable filter has step, pose, particles and map() only: use FastSlam(..., backend="compiled")'
+            )
 
     @classmethod
     def from_options(
@@ -204,6 +181,7 @@ class FastSlam:
 
     def _allocate(self, num_robots: int, options: FilterOptions, seed: Any, num_particles: int | None = None) -> None:
         """Provide the arrays and parts of a filter, robots at the origin; None: as many particles as `options` say."""
+        self._reference = None
         k = check_int("num_robots", num_robots, 1, "Use at least one robot.", MAX_ROBOTS)
         m = options.num_particles if num_particles is None else num_particles
         existence = options.existence
@@ -329,6 +307,8 @@ class FastSlam:
         Raises:
             ValueError: If an argument is ill-formed; the filter is then unchanged.
         """
+        if self._reference is not None:
+            return self._reference.step(odometry, measurements, identities, poses)
         count, size = self.num_robots, self.descriptor_size
         inputs = validate_step(count, size, self.options.camera, odometry, measurements, identities, poses)
         return self.step_checked(inputs, rows_of(tuple(range(count))), *Associations.allocate(inputs))
@@ -576,10 +556,15 @@ class FastSlam:
 
         They are those of the mixture of N(x^, P^) before sampling, which has less variance than the samples.
         """
+        if self._reference is not None:
+            return self._reference.pose(robot)
         return self.estimates.of(self._check_robot(robot))
 
     def particles(self, robot: int = 0) -> tuple[FloatArray, FloatArray]:
         """Return a robot's poses (M, 3) [m, m, rad], map frame, and the normalised log-weights (M,). Copies."""
+        if self._reference is not None:
+            particles = self._reference.particles
+            return np.array([p.poses[robot] for p in particles]), np.array([p.log_weight for p in particles])
         return self._columns(self.poses[self._check_robot(robot)]), self.log_weights.copy()
 
     def start_pose(self, robot: int = 0) -> FloatArray:
@@ -641,6 +626,8 @@ class FastSlam:
             ValueError: If `estimate` is neither.
         """
         check_choice("estimate", estimate, ("best", "mixture"))
+        if self._reference is not None and min_count == 1:
+            return self._reference.map(estimate)
         maps, best = self.maps, self.best_particle
         if estimate == "best":
             return unchecked_map(*best_map(maps, best, min_count))

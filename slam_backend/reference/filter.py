@@ -65,7 +65,7 @@ class ReferenceFastSlam:
         k = check_int("num_robots", num_robots, 1, "Use at least one robot.", MAX_ROBOTS)
         check_kind("options", options, FilterOptions)
         if options.rejuvenate_every is not None:
-            hint = "The reference has no smoother; build FilterOptions(rejuvenate_every=None)."
+            hint = 'The reference has no smoother; use rejuvenate_every=None, or FastSlam(..., backend="compiled").'
             raise argument_error("options.rejuvenate_every", "None", options.rejuvenate_every, hint)
         given = np.zeros((k, 3)) if initial_poses is None else initial_poses
         starts = check_array("initial_poses", given, (k, 3), "Give one pose (x, y, theta) per robot.")

@@ -63,7 +63,7 @@ def map_once(
             landmarks after each; 0: it sees them all from its start.
         claimed_sigma: Noise that the filter assumes; None: the true one.
     """
-    slam = plain_filter(1, num_particles, motion=WIDE_MOTION, proposal="fastslam1", seed=rng)
+    slam = plain_filter(1, num_particles=num_particles, motion=WIDE_MOTION, proposal="fastslam1", seed=rng)
     pose = start
     shares = max(moves, 1)
     for share in range(shares):

@@ -421,7 +421,7 @@ CONTACTS = {
 }
 SUBJECTS: dict[str, Callable[[], FastSlam | TeamSlam]] = {
     **{
-        proposal: partial(FastSlam, 2, 5, proposal=proposal, seed=1, resample_threshold=1.0)
+        proposal: partial(FastSlam, 2, num_particles=5, proposal=proposal, seed=1, resample_threshold=1.0)
         for proposal in ("fastslam2", "fastslam1")
     },
     "team": partial(TeamSlam, 2, num_particles=5, seed=1),
@@ -454,13 +454,14 @@ def test_the_first_frames_of_two_robots_have_to_agree_on_descriptors() -> None:
     """The size of the descriptors is checked within a step, too."""
     other = Measurements([[0.0, 0.0, 1.0]], [[1.0, 0.0]])
     refused(
-        lambda: FastSlam(2, 3).step([None, None], [FRAME, other]), "measurements[1].descriptors: expected vectors of"
+        lambda: FastSlam(2, num_particles=3).step([None, None], [FRAME, other]),
+        "measurements[1].descriptors: expected vectors of",
     )
 
 
 def test_empty_input_is_no_error() -> None:
     """Robots that neither moved nor saw anything, frames without points, and frames rejected whole, are accepted."""
-    slam = FastSlam(2, 3)
+    slam = FastSlam(2, num_particles=3)
     for frames, names in (
         ([None, None], None),
         ([Measurements.empty(5), Measurements.empty(7)], None),
@@ -490,7 +491,7 @@ def test_a_refused_step_of_a_log_leaves_no_trace() -> None:
 @pytest.mark.parametrize("robot", [3, -1, 1.0, True, np.True_, None, "0", np.array([0, 1])])
 def test_robots_that_are_not_there_are_refused(robot: Any) -> None:
     """Robots are counted from 0 to K - 1, in every question; an index that numpy made is an index."""
-    slam, team = FastSlam(3, 3), TeamSlam(3, num_particles=3)
+    slam, team = FastSlam(3, num_particles=3), TeamSlam(3, num_particles=3)
     for ask in (slam.pose, slam.particles, slam.start_pose, team.pose, team.particles, team.map, team.start_from_group):
         refused(lambda ask=ask: ask(robot), "robot: expected an index from 0 to 2, got")
     assert team.pose(np.int64(2)).mean.shape == slam.pose(np.int64(2)).mean.shape == (3,)
@@ -520,7 +521,7 @@ def test_a_refused_merge_leaves_the_team_as_it_was(begins: str) -> None:
 @pytest.mark.parametrize("smoothed", [False, True])
 def test_states_without_a_part_are_refused_by_its_name(smoothed: bool) -> None:
     """`set_state` takes what `get_state` gave, and else leaves a filter as it is."""
-    slam = FastSlam(1, 3, rejuvenate_every=10 if smoothed else None)
+    slam = FastSlam(1, num_particles=3, rejuvenate_every=10 if smoothed else None)
     state = slam.get_state()
 
     def without(table: dict[str, Any], name: str) -> dict[str, Any]:

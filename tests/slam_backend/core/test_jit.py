@@ -182,7 +182,7 @@ looks = np.linalg.qr(rng.normal(size=(64, 64)))[0][:30].astype(np.float32)
 for proposal in ("fastslam1", "fastslam2"):
     for robots, particles, threshold in ((1, 5, 0.5), (3, 33, 1.0)):
         options = dict(one_to_one=robots > 1, existence=ExistenceModel() if robots > 1 else None)
-        slam = FastSlam(robots, particles, proposal=proposal, resample_threshold=threshold, **options)
+        slam = FastSlam(robots, num_particles=particles, proposal=proposal, resample_threshold=threshold, **options)
         for size in (1, 30, 0, 2):
             seen = rng.permutation(30)[:size]
             frame = Measurements(points[seen], looks[seen])
@@ -198,7 +198,7 @@ for proposal in ("fastslam1", "fastslam2"):
         slam.set_state(slam.get_state())
         slam.map("mixture")
         slam.step([None] * robots, [frame] * robots)
-slam = FastSlam(1, 40, resample_threshold=1.0, existence=ExistenceModel())
+slam = FastSlam(1, num_particles=40, resample_threshold=1.0, existence=ExistenceModel())
 for size in (30, *(5 for _ in range(20))):
     slam.step([np.zeros(3)], [Measurements(points[:size], looks[:size])])
 assert slam.num_landmarks < 30  # some are given up
@@ -325,7 +325,7 @@ def classes_of(hint: Any) -> set[type]:
 
 @pytest.mark.parametrize(
     "described",
-    [FastSlam.__init__, FastSlam.step, FastSlam.rejuvenate, FilterOptions, StepReport, TeamSlam.__init__],
+    [FastSlam.from_options, FastSlam.step, FastSlam.rejuvenate, FilterOptions, StepReport, TeamSlam.__init__],
 )
 def test_arguments_and_results_of_a_filter_are_public_names(described: Any) -> None:
     """Every argument and result type is a name of `slam_backend`."""

@@ -197,7 +197,7 @@ def frame(*which: int) -> Measurements:
 
 def standing(existence: ExistenceModel, robots: int = 1, particles: int = 5, **changes: Any) -> FastSlam:
     """Return a filter of robots at the origin, whose odometry has no noise."""
-    return FastSlam(robots, particles, motion=EXACT_MOTION, existence=existence, seed=1, **changes)
+    return FastSlam(robots, num_particles=particles, motion=EXACT_MOTION, existence=existence, seed=1, **changes)
 
 
 def circle(steps: int) -> list[tuple[list[FloatArray], list[Measurements]]]:
@@ -403,7 +403,7 @@ def test_landmarks_doubted_by_both_filters_are_deleted_at_the_next_miss() -> Non
 def test_a_merge_with_a_filter_that_keeps_no_existence_starts_its_landmarks_at_the_prior() -> None:
     """The joint filter has the options of the first: with a model, the second's landmarks get its prior; else none."""
     model = ExistenceModel(prior=0.3)
-    a, b = standing(model), FastSlam(1, 5, motion=EXACT_MOTION, seed=2)
+    a, b = standing(model), FastSlam(1, num_particles=5, motion=EXACT_MOTION, seed=2)
     for slam, seen in ((a, frame(0, 1)), (b, frame(1, 2))):
         slam.step([None], [seen])
         slam.step([None], [seen])

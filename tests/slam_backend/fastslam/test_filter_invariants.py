@@ -72,7 +72,14 @@ def test_no_noise_means_no_error(proposal: Any, num_robots: int, sigma: float | 
 
     starts = np.array([[0.0, 0.0, 0.0], [0.4, -0.3, 2.0]])[:num_robots]
     slam = plain_filter(
-        num_robots, 5, world.camera, EXACT_MOTION, proposal, seed=0, initial_poses=starts, new_landmark_gate=11.34
+        num_robots,
+        num_particles=5,
+        camera=world.camera,
+        motion=EXACT_MOTION,
+        proposal=proposal,
+        seed=0,
+        initial_poses=starts,
+        new_landmark_gate=11.34,
     )
     poses = starts.copy()
     for _ in range(60):
@@ -117,7 +124,7 @@ def test_known_poses_make_it_independent_least_squares(proposal: Any) -> None:
     """With exact poses and linear measurements a landmark is the information-weighted mean of what was measured."""
     rng = np.random.default_rng(8)
     camera = StereoCamera(mount=(0.2, 0.1, 0.4))
-    slam = plain_filter(1, 3, camera, proposal=proposal)
+    slam = plain_filter(1, num_particles=3, camera=camera, proposal=proposal)
     landmark = np.array([4.0, 1.0, 0.7])
     frames = []
     for _ in range(30):
@@ -137,7 +144,7 @@ def test_a_second_robot_corrects_what_the_first_has_just_updated(proposal: Any) 
     """Algorithm 1, l. 16-18: current values, not those of t-1. Three looks in two steps weigh as three looks."""
     rng = np.random.default_rng(3)
     camera = StereoCamera()
-    slam = plain_filter(2, 3, camera, proposal=proposal)
+    slam = plain_filter(2, num_particles=3, camera=camera, proposal=proposal)
     landmark = np.array([3.0, 0.5, 0.2])
     poses = rng.uniform([-1.0, -1.0, -1.0], [1.0, 1.0, 1.0], (3, 3))
     frames = [(pose, seen_from(rng, landmark, pose, camera)) for pose in poses]
@@ -155,7 +162,8 @@ def test_weights_multiply_over_the_measurements_of_a_frame(proposal: Any) -> Non
     rng = np.random.default_rng(6)
     points = np.array([[0.0, 0.0, 2.0], [1.0, 0.2, 3.0], [-1.0, 0.1, 4.0]])
     noise = np.array([np.diag(row) for row in rng.uniform(0.01, 0.04, (3, 3))])
-    slam = plain_filter(1, 2, camera, proposal=proposal, resample_threshold=0.0, new_landmark_density=0.3)
+    options = {"camera": camera, "resample_threshold": 0.0, "new_landmark_density": 0.3}
+    slam = plain_filter(1, num_particles=2, proposal=proposal, **options)
     slam.step([None], [Measurements(points, np.eye(3), noise)], identities=[[1, 2, 3]], poses=[np.zeros(3)])
     np.testing.assert_allclose(slam.path_log_weights, 3.0 * np.log(0.3))  # l. 32: p0 for each new landmark
     again = points + rng.normal(0.0, 0.1, (3, 3))
@@ -169,8 +177,8 @@ def test_k_robots_make_the_map_of_one_robot_with_their_measurements(proposal: An
     """At equal total measurements and known poses, three robots make exactly the map of one."""
     world = StereoWorld(np.random.default_rng(2))
     together, alone = (
-        plain_filter(3, 2, world.camera, proposal=proposal),
-        plain_filter(1, 2, world.camera, proposal=proposal),
+        plain_filter(3, num_particles=2, camera=world.camera, proposal=proposal),
+        plain_filter(1, num_particles=2, camera=world.camera, proposal=proposal),
     )
     for turn in np.linspace(0.0, 6.0, 13):
         pose = np.array([0.1, 0.2, turn])
@@ -191,7 +199,7 @@ def test_points_without_appearance_are_matched_by_names_or_by_place_alone(propos
     points = np.array([[0.0, 0.0, 2.0], [1.5, 0.2, 3.0]])
     frame = Measurements(points, np.empty((2, 0), dtype=np.float32))
     for names in (None, [[4, 5]]):
-        slam = plain_filter(1, 5, camera, proposal=proposal)
+        slam = plain_filter(1, num_particles=5, camera=camera, proposal=proposal)
         slam.step([None], [frame], names)
         start = slam.nbytes
         for _ in range(20):
@@ -212,7 +220,7 @@ def test_covariances_stay_symmetric_and_positive_and_never_grow(proposal: Any) -
     """Hundreds of updates leave them positive definite, and none adds uncertainty."""
     camera = StereoCamera()
     rng = np.random.default_rng(5)
-    slam = plain_filter(1, 1, camera, proposal=proposal)
+    slam = plain_filter(1, num_particles=1, camera=camera, proposal=proposal)
     landmark = np.array([[4.0, 1.0, 0.5], [2.0, -0.5, -0.1]])
     before: LandmarkMap | None = None
     for step in range(400):
@@ -237,7 +245,9 @@ def test_covariances_stay_positive_definite_where_depth_is_all_but_unknown(propo
     """Landmarks seen from all sides by a very poor camera, and predicted far beyond its range, stay definite."""
     camera = StereoCamera(sigma_px=0.4, sigma_disparity_px=50.0)
     rng = np.random.default_rng(5)
-    slam = plain_filter(1, 1, camera, proposal=proposal, position_gate=1e12, new_landmark_gate=1e12)
+    slam = plain_filter(
+        1, num_particles=1, camera=camera, proposal=proposal, position_gate=1e12, new_landmark_gate=1e12
+    )
     for step in range(200):
         bearing, away = rng.uniform(-np.pi, np.pi), 10.0 ** rng.uniform(0.0, 2.7) if step else 3.0
         pose = np.array([-away * np.cos(bearing), -away * np.sin(bearing), bearing + rng.uniform(-0.3, 0.3)])
@@ -251,7 +261,7 @@ def test_covariances_stay_positive_definite_where_depth_is_all_but_unknown(propo
 def test_weights_never_underflow(proposal: Any) -> None:
     """After a thousand steps without resampling the weights are finite and sum to one."""
     world = StereoWorld(np.random.default_rng(0), 9)
-    slam = plain_filter(1, 5, world.camera, proposal=proposal, resample_threshold=0.0, seed=1)
+    slam = plain_filter(1, num_particles=5, camera=world.camera, proposal=proposal, resample_threshold=0.0, seed=1)
     drive(slam, world, 1000)
     assert np.isfinite(slam.log_weights).all()
     assert np.isfinite(slam.path_log_weights).all()
@@ -284,7 +294,7 @@ def test_thousands_of_measurements_in_a_step(proposal: Any, given: bool) -> None
     looks /= np.linalg.norm(looks, axis=1, keepdims=True)
     points = rng.uniform([-4.0, -3.0, 1.0], [4.0, 3.0, 8.0], (3000, 3))
     frame = Measurements(points, looks, np.array([1e-4 * np.eye(3)] * 3000) if given else None)
-    slam = plain_filter(2, 3, proposal=proposal)
+    slam = plain_filter(2, num_particles=3, proposal=proposal)
     first = slam.step([None, None], [frame, None], poses=[np.zeros(3), None])
     assert (first.num_new, slam.map_size) == (3000, 3000)
     again = slam.step([None, DRIVEN], [frame, frame], poses=[np.zeros(3), np.zeros(3)])
@@ -300,7 +310,7 @@ def test_a_landmark_at_the_camera_centre_is_one_like_others_with_given_covarianc
     """Seen from ahead, from its very place and from beyond, it is the mean of what was measured."""
     camera = StereoCamera(mount=(0.2, -0.1, 0.3))
     rng = np.random.default_rng(3)
-    slam = plain_filter(1, 4, camera, proposal=proposal)
+    slam = plain_filter(1, num_particles=4, camera=camera, proposal=proposal)
     seen = []
     for ahead in (2.0, 1.0, 0.0, 0.0, -0.5, -2.0):
         point = np.array([0.0, 0.0, ahead]) + (0.05 * rng.standard_normal(3) if ahead else 0.0)
@@ -318,7 +328,7 @@ def test_a_landmark_at_the_camera_centre_is_one_like_others_with_given_covarianc
 def test_driving_through_a_landmark(proposal: Any) -> None:
     """A robot with noisy odometry that passes through a landmark holds one landmark, near where it is."""
     rng = np.random.default_rng(4)
-    slam = plain_filter(1, 50, proposal=proposal, seed=2)
+    slam = plain_filter(1, num_particles=50, proposal=proposal, seed=2)
     for step in range(21):
         point = np.array([0.0, 0.0, 1.0 - 0.1 * step]) + 0.02 * rng.standard_normal(3)
         frame = Measurements([point], np.eye(1, 5), 4e-4 * np.eye(3)[None])
@@ -331,7 +341,7 @@ def test_driving_through_a_landmark(proposal: Any) -> None:
 @PROPOSALS
 def test_a_landmark_at_the_camera_centre_cannot_be_seen_by_the_camera(proposal: Any) -> None:
     """What the camera model says of it is undefined: a stereo frame leaves it alone, even if the caller names it."""
-    slam = plain_filter(1, 4, proposal=proposal)
+    slam = plain_filter(1, num_particles=4, proposal=proposal)
     noise = 0.0025 * np.eye(3)[None]
     slam.step([None], [Measurements(np.zeros((1, 3)), np.eye(1, 5), noise)], identities=[[9]])
     before = slam.map()
@@ -361,7 +371,7 @@ def test_extreme_readings_leave_the_filter_valid(proposal: Any, point: Any, nois
     """Far points, tiny and huge covariances and long jumps, among ordinary readings, leave the filter sound."""
     covariances = None if noise is None else noise * np.eye(3)[None]
     extreme = Measurements([point], np.eye(1, 5), covariances)
-    slam = plain_filter(2, 6, proposal=proposal, seed=3)
+    slam = plain_filter(2, num_particles=6, proposal=proposal, seed=3)
     for step in range(40):
         odd = step % 4 == 3
         slam.step([move if odd else DRIVEN, DRIVEN], [extreme if odd else FRAME, FRAME if odd else extreme])

@@ -56,7 +56,7 @@ def test_jacobians_of_the_plain_model(is_given: bool, pose: FloatArray, point: F
 def mapped(pose: FloatArray, point: FloatArray, is_given: bool, motion: OdometryModel) -> tuple[FastSlam, FloatArray]:
     """Return a filter that knows one landmark, measured once without error from a known pose, and its covariance."""
     covariance = 0.01 * np.eye(3) if is_given else CAMERA.covariance(point)
-    slam = plain_filter(1, 1, CAMERA, motion)
+    slam = plain_filter(1, num_particles=1, camera=CAMERA, motion=motion)
     slam.step([None], [Measurements(point[None], LOOK, covariance[None] if is_given else None)], [[0]], [pose])
     to_map = turn_about_vertical(pose[2]) @ ROBOT_FROM_CAMERA
     return slam, to_map @ covariance @ to_map.T

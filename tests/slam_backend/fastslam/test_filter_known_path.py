@@ -58,7 +58,7 @@ def test_stereo_on_a_known_path_makes_it_independent_ekfs(proposal: Any) -> None
     Those of `fastslam2` are iterated for a landmark's first sightings.
     """
     world = StereoWorld(np.random.default_rng(21))
-    slam = plain_filter(2, 3, world.camera, proposal=proposal)
+    slam = plain_filter(2, num_particles=3, camera=world.camera, proposal=proposal)
     filters: dict[int, StereoEkf] = {}
     poses = np.array([[0.0, 0.0, 0.0], [0.4, -0.3, 2.0]])
     for _ in range(40):
@@ -85,7 +85,7 @@ def watch_one_landmark(
     proposal: Any, sigma: float, landmark_noise: float | None, steps: int, **options: Any
 ) -> FastSlam:
     """Let a robot that stands at a known pose see one landmark again and again, with a covariance of sigma^2 I."""
-    slam = plain_filter(1, 3, CAMERA, proposal=proposal, landmark_noise=landmark_noise, **options)
+    slam = plain_filter(1, num_particles=3, camera=CAMERA, proposal=proposal, landmark_noise=landmark_noise, **options)
     frame = Measurements([[0.1, 0.2, 3.0]], np.eye(1, 3), [sigma**2 * np.eye(3)])
     for _ in range(steps):
         slam.step([None], [frame], identities=[[0]], poses=[np.zeros(3)])
@@ -142,7 +142,7 @@ def test_covariances_stay_positive_definite_whatever_the_noise(proposal: Any, ki
     """
     rng = np.random.default_rng(4)
     landmark = np.array([3.0, 0.5, 0.2])
-    slam = plain_filter(1, 2, CAMERA, proposal=proposal, resample_threshold=0.0)
+    slam = plain_filter(1, num_particles=2, camera=CAMERA, proposal=proposal, resample_threshold=0.0)
     for step in range(2000):
         pose = rng.uniform([-1.0, -1.0, -3.0], [1.0, 1.0, 3.0])
         axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]

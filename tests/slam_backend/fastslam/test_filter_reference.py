@@ -335,3 +335,28 @@ def test_a_pose_that_explains_each_measurement_by_itself_is_not_taken(happened: 
     assert happened["lost"] == happened["unconfirmed"] == 2
     assert report.num_matched == 0
     assert np.linalg.norm(slam.pose().mean) < 0.01
+
+
+def test_the_readable_backend_gives_the_same_numbers() -> None:
+    """Both backends of the class agree on steps, poses, particles and maps; what only one has names that one."""
+    compiled, readable = (
+        FastSlam(2, num_particles=5, seed=3, rejuvenate_every=None, backend=backend)
+        for backend in ("compiled", "reference")
+    )
+    world = SmallWorld(np.random.default_rng(3), 2, 5, 0.5, 0.0, 0.0)
+    for _ in range(4):
+        readings = world.read()
+        found, expected = (slam.step(readings.odometry, readings.frames) for slam in (compiled, readable))
+        for one, other in zip(found.associations, expected.associations, strict=True):
+            np.testing.assert_array_equal(one, other)
+    for robot in range(2):
+        assert_same_pose(compiled.pose(robot).mean, readable.pose(robot).mean)
+        assert_same_pose(compiled.particles(robot)[0], readable.particles(robot)[0])
+        np.testing.assert_allclose(compiled.particles(robot)[1], readable.particles(robot)[1], **CLOSE)
+    for estimate in ("best", "mixture"):
+        assert_same_map(compiled.map(estimate), readable.map(estimate))
+    for missing in (readable.get_state, readable.rejuvenate, lambda: readable.maps, lambda: readable.map(min_count=2)):
+        with pytest.raises(AttributeError, match='backend="compiled"'):
+            missing()
+    with pytest.raises(ValueError, match='backend="compiled"'):
+        FastSlam(backend="reference", rejuvenate_every=5)

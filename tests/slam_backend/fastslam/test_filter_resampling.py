@@ -78,7 +78,7 @@ def test_a_resampled_particle_copies_all_of_its_parent(scheme: str) -> None:
 
     Robot 1 sees nothing: its Gaussians are not sampled, and go along too.
     """
-    slam = plain_filter(2, 70, CAMERA, resampling=scheme, resample_threshold=1.0)
+    slam = plain_filter(2, num_particles=70, camera=CAMERA, resampling=scheme, resample_threshold=1.0)
     slam.starts[1, :2, :70] += np.random.default_rng(1).normal(size=(2, 70))  # as after a merge
     copies = 0
     for odometry, frames in inputs(12, seed=2):
@@ -103,7 +103,7 @@ def test_a_resampled_particle_copies_all_of_its_parent(scheme: str) -> None:
 def test_landmarks_out_of_view_follow_every_resampling(proposal: Any, scheme: str) -> None:
     """A filter whose maps are read after each resampling, and one left alone over many, hold the same in the end."""
     options: Any = {"proposal": proposal, "resampling": scheme, "resample_threshold": 1.0}
-    read, alone = (plain_filter(1, 70, CAMERA, **options) for _ in range(2))
+    read, alone = (plain_filter(1, num_particles=70, camera=CAMERA, **options) for _ in range(2))
     unseen = 0
     for odometry, frames in inputs(16, noise=2.0):
         for slam in (read, alone):
@@ -221,7 +221,7 @@ def test_a_restored_filter_continues_bit_for_bit(proposal: Any, scheme: str) -> 
     later = inputs(12)[5:]
     reports = [slam.step(odometry, frames) for odometry, frames in later]
     expected, expected_state = contents(slam), slam.get_state()
-    for snapshot, restored in ((state, slam), (pickle.loads(pickled), plain_filter(3, 2))):
+    for snapshot, restored in ((state, slam), (pickle.loads(pickled), plain_filter(3, num_particles=2))):
         restored.set_state(snapshot)
         assert_same([restored.step(odometry, frames) for odometry, frames in later], reports)
         assert_same(contents(restored), expected)
@@ -241,7 +241,10 @@ def test_a_filter_continues_bit_for_bit_through_many_snapshots(proposal: Any) ->
         "new_landmark_radius": 0.0,
         "resample_threshold": 0.9,
     }
-    slam, looks = plain_filter(2, 70, CAMERA, seed=3, **options), StereoWorld(np.random.default_rng(1)).descriptors
+    slam, looks = (
+        plain_filter(2, num_particles=70, camera=CAMERA, seed=3, **options),
+        StereoWorld(np.random.default_rng(1)).descriptors,
+    )
     restored = plain_filter()
     restored.set_state(slam.get_state())
     for step, (odometry, frames) in enumerate(inputs(40, seed=1, noise=3.0)):
@@ -249,7 +252,7 @@ def test_a_filter_continues_bit_for_bit_through_many_snapshots(proposal: Any) ->
         arguments = ([*odometry, MOVE], [*frames, frames[0] if step % 4 == 0 else None], names)
         assert_same(restored.step(*arguments), slam.step(*arguments))
         state = restored.get_state()
-        restored = plain_filter(1 + step % 2, 70)
+        restored = plain_filter(1 + step % 2, num_particles=70)
         restored.set_state(state)
         if step % 2:
             restored.map("mixture")

@@ -44,7 +44,7 @@ def test_innovations_and_map_at_known_poses(proposal: Any) -> None:
     total, matched = 0.0, 0
     for seed in range(8):
         world = StereoWorld(np.random.default_rng(seed))
-        slam = plain_filter(1, 2, world.camera, proposal=proposal)
+        slam = plain_filter(1, num_particles=2, camera=world.camera, proposal=proposal)
         for step in range(60):
             pose = np.array([0.5 * np.cos(0.1 * step), 0.5 * np.sin(0.1 * step), 0.4 * step])
             names = world.visible(pose)
@@ -69,7 +69,7 @@ def test_information_in_place_of_a_covariance_is_detected() -> None:
     points = rng.uniform([-1.0, -0.8, 2.0], [1.0, 0.8, 4.0], (400, 3))
     noise = np.array([np.diag(row) for row in rng.uniform(0.001, 0.01, (400, 3))])
     measured = points + rng.standard_normal((400, 3)) * np.sqrt(np.diagonal(noise, axis1=1, axis2=2))
-    slam = plain_filter(1, 1, camera, initial_poses=[pose])
+    slam = plain_filter(1, num_particles=1, camera=camera, initial_poses=[pose])
     slam.step([None], [Measurements(measured, rng.normal(size=(400, 5)), noise)], identities=[range(400)])
     true = transform_points(pose, camera.robot_from_camera(points))
     result = slam.map()
@@ -92,7 +92,7 @@ def test_the_reported_nis_is_the_innovation_under_its_whole_covariance(
     sigmas = motion.sigmas(move)
     for seed in range(30):
         rng = np.random.default_rng(seed)
-        slam = plain_filter(1, 3, CAMERA, motion, seed=seed)
+        slam = plain_filter(1, num_particles=3, camera=CAMERA, motion=motion, seed=seed)
         pose = compose(np.zeros(3), move + rng.standard_normal(3) * sigmas)
         points = []
         for place in (np.zeros(3), pose):
@@ -120,7 +120,7 @@ def test_mixture_covariances_include_the_path_uncertainty() -> None:
     best, mixture = [], []
     rng = np.random.default_rng(31)
     for run in range(120):
-        slam = plain_filter(1, 300, world.camera, motion, "fastslam1", seed=run)
+        slam = plain_filter(1, num_particles=300, camera=world.camera, motion=motion, proposal="fastslam1", seed=run)
         odometry = np.array([1.5, 0.0, 0.3])
         pose = compose(np.zeros(3), odometry + rng.standard_normal(3) * motion.sigmas(odometry))
         slam.step([odometry], [world.measure(pose, world.visible(pose)[:1])])
@@ -149,7 +149,7 @@ def test_one_landmark_seen_from_a_known_path(proposal: Any) -> None:
     rng = np.random.default_rng(0)
     squares, errors, covariances = [], [], []
     for _ in range(60):
-        slam = plain_filter(1, 2, CAMERA, proposal=proposal)
+        slam = plain_filter(1, num_particles=2, camera=CAMERA, proposal=proposal)
         run = []
         for step in range(25):
             pose = rng.uniform([-1.0, -1.0, -3.0], [1.0, 1.0, 3.0])
@@ -176,7 +176,7 @@ def test_a_position_refined_by_one_landmark(num_robots: int) -> None:
     pose_squares, innovation_squares = [], []
     for seed in range(500):
         run = simulate(seed, 1, 0.08, num_landmarks=1)
-        slam = plain_filter(num_robots, 3, CAMERA, MOTION, seed=seed)
+        slam = plain_filter(num_robots, num_particles=3, camera=CAMERA, motion=MOTION, seed=seed)
         idle: list[Any] = [None] * (num_robots - 1)
         slam.step([*idle, None], [*idle, run.frames[0]], identities=[*idle, [7]])
         report = slam.step([*idle, run.odometry[0]], [*idle, run.frames[1]], identities=[*idle, [7]])
@@ -191,7 +191,9 @@ def test_a_position_refined_by_one_landmark(num_robots: int) -> None:
 
 def drive(run: LinearRun, proposal: Any, seed: int) -> FastSlam:
     """Return a filter of 500 particles after a run, identities known."""
-    slam = plain_filter(1, 500, CAMERA, MOTION, proposal, seed=seed, resample_threshold=0.7)
+    slam = plain_filter(
+        1, num_particles=500, camera=CAMERA, motion=MOTION, proposal=proposal, seed=seed, resample_threshold=0.7
+    )
     names = [list(range(len(run.frames[0])))]
     slam.step([None], [run.frames[0]], identities=names)
     for odometry, frame in zip(run.odometry, run.frames[1:], strict=True):
@@ -236,7 +238,7 @@ MOVE = np.array([0.25, 0.02, 0.3])  # 21 steps are one turn
 def run(seed: int, num_particles: int, steps: int) -> tuple[FloatArray, float]:
     """Drive in circles, associations unknown; return NEES / 3 of the pose at each step, and the mean NIS / 3."""
     world = StereoWorld(np.random.default_rng(seed))
-    slam = plain_filter(1, num_particles, world.camera, seed=seed)
+    slam = plain_filter(1, num_particles=num_particles, camera=world.camera, seed=seed)
     pose = np.zeros(3)
     slam.step([None], [world.measure(pose, world.visible(pose))])
     errors, covariances, innovations = [], [], []

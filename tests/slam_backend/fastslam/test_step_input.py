@@ -127,7 +127,7 @@ def test_team_frames_equal_frames_per_robot(counts: list[int], spoilt: bool, see
 @pytest.mark.parametrize("proposal", ["fastslam2", "fastslam1"])
 def test_other_robots_in_the_table_change_nothing(proposal: Any) -> None:
     """A filter makes the same of what its robots read, bit for bit, whether others stand in the table or not."""
-    alone, beside = (FastSlam(2, 12, proposal=proposal, seed=4, rejuvenate_every=7) for _ in range(2))
+    alone, beside = (FastSlam(2, num_particles=12, proposal=proposal, seed=4, rejuvenate_every=7) for _ in range(2))
     for step in range(25):
         own, others = [reading(10 * step), reading(10 * step + 1)], [reading(10 * step + k) for k in range(2, 5)]
         if any(mine[3] is not None for mine in own):
@@ -142,7 +142,7 @@ def test_logs_do_not_depend_on_when_they_are_read() -> None:
 
     In some steps one of its robots is not heard, and in others there is one more robot in the table.
     """
-    watched, unwatched = (FastSlam(2, 12, seed=4, rejuvenate_every=50) for _ in range(2))
+    watched, unwatched = (FastSlam(2, num_particles=12, seed=4, rejuvenate_every=50) for _ in range(2))
     for step in range(80):
         heard, num_robots = (0, 1 if step % 7 else -1), 2 if step % 5 else 3
         rows = checked([reading(10 * step + k) for k in range(num_robots)])

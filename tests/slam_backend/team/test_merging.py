@@ -216,7 +216,7 @@ def test_a_known_motion_is_taken_whatever_the_landmarks_say() -> None:
 def test_a_filter_without_landmarks_joins_by_the_alignment_alone(empty_first: bool) -> None:
     """A robot that has seen nothing yet brings its pose, and nothing is lost."""
     full, _ = both()
-    blank = FastSlam(1, 7, seed=1)
+    blank = FastSlam(1, num_particles=7, seed=1)
     a, b = (blank, full) if empty_first else (full, blank)
     joint, _ = merge_filters(a, b, known_alignment(sigma=1e-6), NO_PAIRS, np.random.default_rng(1))
     assert len(joint.map()) == 7
@@ -275,7 +275,7 @@ def test_the_uncertainty_of_b_s_pose_is_turned_with_its_map() -> None:
 
     Both are those of 400 particles: entries agree to a third of the largest variance of position.
     """
-    b = FastSlam(1, 400, motion=OdometryModel(sigma_along=0.4, sigma_across=0.01), seed=3)
+    b = FastSlam(1, num_particles=400, motion=OdometryModel(sigma_along=0.4, sigma_across=0.01), seed=3)
     names = np.array([4])
     b.step([None], [frame_of(LANDMARKS[names], names, 1.0)])
     b.step([np.array([1.0, 0.0, 0.0])], [frame_of(LANDMARKS[names] - [1.0, 0.0, 0.0], names, 1.0)])
@@ -293,7 +293,7 @@ def test_the_uncertainty_of_b_s_pose_is_turned_with_its_map() -> None:
 def test_a_merge_does_not_sample_unsampled_motion() -> None:
     """Its Gaussians are those without the merge, rotated: a merge is no measurement, and samples nothing."""
     names = np.array([4])
-    a, b = (FastSlam(1, 7, motion=WIDE_MOTION, seed=seed) for seed in range(2))
+    a, b = (FastSlam(1, num_particles=7, motion=WIDE_MOTION, seed=seed) for seed in range(2))
     for slam in (a, b):
         slam.step([None], [frame_of(LANDMARKS[names], names, 0.1)])
     b.step([MOVE], [None])

@@ -194,7 +194,7 @@ def test_a_robot_matches_what_another_has_just_mapped() -> None:
     """In one step, a later robot of a joint filter finds the landmark that an earlier one has just created (l. 9)."""
     names = np.array([3])
     starts = np.array([[0.0, 0.0, 0.0], [0.5, -0.4, 0.2]])
-    slam = FastSlam(2, 7, initial_poses=starts)
+    slam = FastSlam(2, num_particles=7, initial_poses=starts)
     frames = [frame_of(transform_points(inverse(start), LANDMARKS[names]), names, 0.02) for start in starts]
     report = slam.step([None, None], frames)
     assert report.num_new == 1
@@ -213,7 +213,7 @@ def test_weights_multiply_by_the_chain_rule() -> None:
     rng = np.random.default_rng(5)
     starts = np.array([[0.0, 0.0, 0.0], [0.5, -0.4, 0.2]])
     local = [transform_points(inverse(start), LANDMARKS[names]) for start in starts]
-    slam = plain_filter(2, 1, initial_poses=starts, proposal="fastslam1")
+    slam = plain_filter(2, num_particles=1, initial_poses=starts, proposal="fastslam1")
     still = np.zeros((2, 3))
     slam.step([None, None], [frame_of(local[0], names, sigma_map), None], identities=[names, None], poses=still)
     before = slam.path_log_weights[0]
