@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from slam_backend.core.validation import FloatArray
-from slam_backend.fastslam.reports import MergeEvent
 from slam_backend.geometry import between
 from slam_backend.team.merge_monitor import deformed_fraction
+from slam_backend.team.reports import MergeEvent
 from slam_backend.team.team import TeamSlam
 from training.episodes.runner import is_false_merge
 from vslam_env.evaluation.map_scores import FALSE, GroundTruthAssociation

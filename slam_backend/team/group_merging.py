@@ -9,7 +9,6 @@ import numpy as np
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.fastslam import _kernels
 from slam_backend.fastslam.filter import FastSlam
-from slam_backend.fastslam.reports import LandmarkIdMap, MergeUndone
 from slam_backend.geometry import rotate_covariances
 from slam_backend.maps.alignment import DISTINCT_ROTATION, DISTINCT_TRANSLATION, Alignment, AlignmentOptions
 from slam_backend.maps.fusion import check_inliers
@@ -28,6 +27,7 @@ from slam_backend.team.merge_monitor import (
 )
 from slam_backend.team.merge_rollback import MergeRollback
 from slam_backend.team.options import MergeOptions
+from slam_backend.team.reports import LandmarkIdMap, MergeUndone
 from slam_backend.team.shared_records import SharedRecords
 
 

@@ -12,7 +12,6 @@ import numpy as np
 
 from slam_backend.core.validation import IntArray
 from slam_backend.fastslam.particle_maps import present_slots
-from slam_backend.fastslam.reports import MergeEvent
 from slam_backend.maps.alignment import Alignment, AlignmentOptions, align_candidates
 from slam_backend.maps.correspondences import has_enough_candidates
 from slam_backend.maps.landmark_map import LandmarkMap
@@ -21,6 +20,7 @@ from slam_backend.team.group_merging import MergePlan
 from slam_backend.team.groups import Group
 from slam_backend.team.merge_scheduler import MergeScheduler, PairKey, PendingAttempt
 from slam_backend.team.options import MergeOptions
+from slam_backend.team.reports import MergeEvent
 from slam_backend.team.shared_records import SharedRecords
 
 LEAST_KEPT = 0.8  # least share of the inliers before smoothing that must remain after it

@@ -14,6 +14,7 @@ from slam_backend.fastslam.state_checks import check_descriptors, check_filter, 
 from slam_backend.fastslam.step_input import StepInput
 from slam_backend.maps.alignment_types import Alignment, AlignmentOptions
 from slam_backend.smoother.log_arrays import REJECTED
+from slam_backend.team import reports as team_reports
 from slam_backend.team.branches import ReplayedStep
 from slam_backend.team.merge_monitor import MergeMonitor, PreMergeSnapshot
 from slam_backend.team.merge_scheduler import AttemptOptions, AttemptRecord, PendingAttempt
@@ -284,27 +285,27 @@ class TeamCheck:
     def _check_entry(self, name: str, entry: Any) -> None:
         """Refuse a value that is not a change of maps."""
         kind = type(entry)
-        if kind is reports.LandmarksCreated:
+        if kind is team_reports.LandmarksCreated:
             numbers: tuple[Any, ...] = (entry.number,)
             check.integer(f"{name}.robot", entry.robot, 0, self._count - 1)
             check.integer(f"{name}.step", entry.step, 0, self._step)
             check.indices(f"{name}.ids", entry.ids, (None,), REJECTED, check.MAX_LANDMARKS)
-        elif kind is reports.LandmarkIdMap:
+        elif kind is team_reports.LandmarkIdMap:
             numbers = entry.maps
             check.indices(f"{name}.ids_b", entry.ids_b, (None, 2), *check.LANDMARK)
             check.robots(f"{name}.robots_a", entry.robots_a, self._count)
             check.robots(f"{name}.robots_b", entry.robots_b, self._count)
-        elif kind is reports.MapForked:
+        elif kind is team_reports.MapForked:
             numbers = entry.source, entry.copy
-        elif kind is reports.MergeUndone:
+        elif kind is team_reports.MergeUndone:
             numbers = entry.maps
         else:
-            check.instance(name, entry, reports.MapReleased)
+            check.instance(name, entry, team_reports.MapReleased)
             numbers = (entry.number,)
         check.integers(name, numbers, 0, self._next_number - 1)
 
     def _check_event(self, name: str, event: Any) -> None:
-        check.instance(name, event, reports.MergeEvent)
+        check.instance(name, event, team_reports.MergeEvent)
         check.integer(f"{name}.step", event.step, 0, self._step)
         if event.kind not in KINDS:
             check.refuse(f"{name}.kind", f"one of {KINDS}", event.kind)

@@ -23,19 +23,10 @@ from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.options import MAX_ROBOTS, FilterOptions
 from slam_backend.fastslam.particle_maps import write_summary
 from slam_backend.fastslam.relative_poses import TeamPoses
-from slam_backend.fastslam.reports import (
-    Associations,
-    LandmarkIdMap,
-    MapReleased,
-    MergeEvent,
-    PoseEstimate,
-    RejuvenationReport,
-    TeamReport,
-)
+from slam_backend.fastslam.reports import Associations, PoseEstimate, RejuvenationReport
 from slam_backend.fastslam.step_input import StepInput, validate_step
 from slam_backend.geometry import inverse
 from slam_backend.maps.alignment import Alignment, AlignmentOptions
-from slam_backend.maps.alignment_types import PairAttempts, count_attempts, refusals_of
 from slam_backend.maps.landmark_map import LandmarkMap, TeamMapSummaries
 from slam_backend.models.measurements import Measurements, TeamMeasurements
 from slam_backend.team.branches import Branch, process_step, restored_filter
@@ -47,6 +38,15 @@ from slam_backend.team.merge_attempt import run_attempt
 from slam_backend.team.merge_rollback import MergeRollback
 from slam_backend.team.merge_scheduler import AttemptOptions, MergeScheduler
 from slam_backend.team.options import MergeOptions
+from slam_backend.team.reports import (
+    LandmarkIdMap,
+    MapReleased,
+    MergeEvent,
+    PairAttempts,
+    TeamReport,
+    count_attempts,
+    refusals_of,
+)
 from slam_backend.team.shared_records import SharedRecords
 from slam_backend.team.state_checks import TeamCheck
 

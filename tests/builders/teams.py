@@ -10,13 +10,13 @@ from builders.comparison import assert_same
 from builders.filters import LANDMARKS, frame_of
 
 from slam_backend.core.validation import BoolArray, FloatArray
-from slam_backend.fastslam.reports import TeamReport
 from slam_backend.geometry import between, compose, inverse, transform_points
 from slam_backend.maps.alignment import Alignment
 from slam_backend.models.camera import StereoCamera
 from slam_backend.models.measurements import Measurements
 from slam_backend.models.odometry import OdometryModel
 from slam_backend.team.merge_scheduler import AttemptOptions
+from slam_backend.team.reports import TeamReport
 from slam_backend.team.team import TeamSlam
 
 TRUE_CAMERA = StereoCamera()

@@ -12,13 +12,13 @@ from slam_backend.core.validation import Float32Array, FloatArray, argument_erro
 from slam_backend.fastslam.consistency import Consistency
 from slam_backend.fastslam.options import FilterOptions
 from slam_backend.fastslam.relative_poses import TeamPoses
-from slam_backend.fastslam.reports import LandmarkIdMap, MergeEvent, TeamReport
 from slam_backend.fastslam.step_input import StepInput
 from slam_backend.geometry import rotate_covariances
 from slam_backend.maps.alignment import Alignment
 from slam_backend.maps.landmark_map import LandmarkMap, TeamMapSummaries
 from slam_backend.team.merge_scheduler import AttemptOptions
 from slam_backend.team.options import MergeOptions
+from slam_backend.team.reports import LandmarkIdMap, MergeEvent, TeamReport
 from slam_backend.team.team import TeamSlam
 from vslam_env.belief.belief import Belief, BeliefBatch, BeliefConfig, Candidates, RobotHardware, Teammate
 from vslam_env.belief.readings import Readings, TeamReadings

@@ -8,16 +8,16 @@ from builders.filters import looks
 from builders.teams import driven
 
 from slam_backend.core.validation import FloatArray
-from slam_backend.fastslam.reports import MergeEvent
 from slam_backend.geometry import rotate_covariances, rotation, transform_points
 from slam_backend.maps import near_pairs
 from slam_backend.maps._kernels import descriptor_matching
 from slam_backend.maps.alignment import REASONS, Alignment, AlignmentOptions, align_maps
-from slam_backend.maps.alignment_types import BOUNDS, HINTS, count_attempts, refusals_of
+from slam_backend.maps.alignment_types import BOUNDS, HINTS
 from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.team.merge_monitor import MergeMonitor, deformed_fraction
 from slam_backend.team.merge_scheduler import AttemptOptions
 from slam_backend.team.options import MergeOptions
+from slam_backend.team.reports import MergeEvent, count_attempts, refusals_of
 
 FOUND = Alignment(True, "", 1.0, 2.0, 0.1, 1e-3 * np.eye(3), np.zeros((1, 2), np.int64), 0.0)
 

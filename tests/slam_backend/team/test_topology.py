@@ -22,12 +22,12 @@ from slam_backend.fastslam._kernels.particles.pose_estimates import (
 from slam_backend.fastslam.estimates import pose_mixtures
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.relative_poses import SIGMAS, TeamPoses, membership_table
-from slam_backend.fastslam.reports import TeamReport
 from slam_backend.geometry import between, compose, inverse, rotate_covariances, rotation, wrap_angle
 from slam_backend.models.measurements import Measurements
 from slam_backend.team.branches import Branch
 from slam_backend.team.groups import TeamTopology
 from slam_backend.team.options import MergeOptions
+from slam_backend.team.reports import TeamReport
 from slam_backend.team.team import TeamSlam
 
 

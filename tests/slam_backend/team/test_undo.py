@@ -9,7 +9,6 @@ from builders.comparison import assert_same
 from builders.filters import contents
 from builders.teams import NEVER, SimulatedTeam, check_snapshot, driven, false_alignment, links, true_alignment
 
-from slam_backend.fastslam.reports import MapReleased, MergeUndone, TeamReport
 from slam_backend.geometry import inverse
 from slam_backend.maps.alignment import AlignmentOptions, align_maps
 from slam_backend.maps.landmark_map import LandmarkMap
@@ -20,6 +19,7 @@ from slam_backend.team.merge_monitor import deformed_fraction
 from slam_backend.team.merge_rollback import MergeRollback
 from slam_backend.team.merge_scheduler import AttemptOptions
 from slam_backend.team.options import MergeOptions
+from slam_backend.team.reports import MapReleased, MergeUndone, TeamReport
 from slam_backend.team.team import TeamSlam
 
 METRE = np.array([1.0, 0.0, 0.0])
