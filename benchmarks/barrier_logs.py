@@ -184,7 +184,7 @@ def live(log: BarrierLog, seed: int, **options: Any) -> dict[str, float]:
     for step, (move, frame, names) in enumerate(zip(log.odometry, log.frames, log.identities, strict=True)):
         slam.step([move if step else None], [frame], [names])
     consistency = slam.consistency
-    maps = slam.state.maps
+    maps = slam.maps
     means = maps.dense(maps.used_slots())[0][:, :3]
     return {
         "map": map_error(log, slam),
@@ -196,7 +196,7 @@ def live(log: BarrierLog, seed: int, **options: Any) -> dict[str, float]:
 
 def map_error(log: BarrierLog, slam: FastSlam) -> float:
     """Return the RMS error [m] of a filter's map after the best fit; landmarks have known identities."""
-    landmarks, maps = slam.map(), slam.state.maps
+    landmarks, maps = slam.map(), slam.maps
     slots = maps.used_slots()
     names = maps.identities[slots][np.searchsorted(maps.ids[slots], landmarks.ids)]
     true = log.landmarks[names]

@@ -5,36 +5,85 @@ one moves, matches its measurements to the map as updated by the robots before i
 landmarks. Then the joint particles are resampled.
 """
 
+import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from slam_backend.core.state_checks import HINT, refuse_malformed
-from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_array, check_choice, known_names
+from slam_backend.core.state_checks import HINT, refuse_malformed, restore_generator
+from slam_backend.core.validation import (
+    BoolArray,
+    FloatArray,
+    Int32Array,
+    IntArray,
+    argument_error,
+    check_array,
+    check_choice,
+    check_int,
+    check_seed,
+    known_names,
+)
 from slam_backend.fastslam import _kernels
-from slam_backend.fastslam.consistency import Consistency
-from slam_backend.fastslam.estimates import map_mixture
-from slam_backend.fastslam.existence import ExistenceModel
-from slam_backend.fastslam.options import REJUVENATE_EVERY, FilterOptions
-from slam_backend.fastslam.particle_maps import best_map, present_slots, write_summary
-from slam_backend.fastslam.rejuvenation import RejuvenationScheduler
+from slam_backend.fastslam._kernels import EXACT_POSE, NO_READING, add_gauge_covariance
+from slam_backend.fastslam._kernels.records import ROBOT, WEIGHT
+from slam_backend.fastslam.consistency import Consistency, ConsistencyTest
+from slam_backend.fastslam.estimates import map_mixture, pose_mixtures
+from slam_backend.fastslam.existence import ExistenceModel, ExistenceUpdate
+from slam_backend.fastslam.options import (
+    MAX_ROBOTS,
+    REJUVENATE_EVERY,
+    FilterOptions,
+    pack_options,
+    packed_camera,
+    robot_batches,
+)
+from slam_backend.fastslam.particle_maps import ParticleMaps, best_map, present_slots, write_summary, zeros_aligned
+from slam_backend.fastslam.pending_steps import LONGEST, PendingSteps, record_rejected
+from slam_backend.fastslam.rejuvenation import NewLandmarks, RejuvenationScheduler
 from slam_backend.fastslam.relative_poses import TeamPoses, membership_table
-from slam_backend.fastslam.reports import Associations, BiasEstimate, PoseEstimate, RejuvenationReport, StepReport
+from slam_backend.fastslam.reports import (
+    Associations,
+    BiasEstimate,
+    PoseEstimate,
+    PoseEstimates,
+    RejuvenationReport,
+    StepReport,
+)
 from slam_backend.fastslam.run_log import RobotLog
-from slam_backend.fastslam.state import FilterState
-from slam_backend.fastslam.state_checks import check_filter, last_step
+from slam_backend.fastslam.state_checks import KEPT, check_filter, last_step
 from slam_backend.fastslam.step_input import MAX_POSE, RobotRows, StepInput, rows_of, validate_step
-from slam_backend.geometry import between
+from slam_backend.geometry import between, compose, wrap_angle
 from slam_backend.maps.landmark_map import LandmarkMap, MapSummary, MapSummaryRows, unchecked_map
 from slam_backend.models.camera import StereoCamera
 from slam_backend.models.measurements import Measurements
 from slam_backend.models.odometry import OdometryModel
+from slam_backend.resampling import RESAMPLING
 from slam_backend.smoother.options import SmoothingOptions
+from slam_backend.smoother.rejuvenation import Particles
 
 NO_WEIGHTS = np.empty(0)  # unused where all particles start at the same pose
+
+
+class StepSummary(NamedTuple):
+    """Outcome of a step without the association of each measurement.
+
+    Attributes:
+        long_unseen: Number of measurements matched to landmarks not seen for long.
+        created, new, matched, rejected, ess, nis: See `StepReport`.
+        needs_resampling: Whether the effective sample size fell below the threshold of resampling.
+    """
+
+    long_unseen: int
+    created: int
+    new: int
+    matched: int
+    rejected: int
+    ess: float
+    nis: float
+    needs_resampling: bool
 
 
 @known_names
@@ -47,6 +96,28 @@ class FastSlam:
         num_robots: K. Each particle holds K poses and one map (Eq. 19).
         seed: Seed of the filter's own random stream: an int, a `numpy.random.SeedSequence` or a Generator.
         initial_poses: (K, 3) [m, m, rad], map frame. None: all at the origin.
+
+    Arrays of particles are padded to P lanes; lanes beyond M are unused. Poses are in the map frame.
+
+    Attributes:
+        options: Assumptions and decision rules of the filter.
+        best_particle: Index of the most probable particle, by accumulated log-weight (Eq. 12).
+        pose_arrays: (6, K, 3, P) float64: `poses`, `starts`, `means`, `biases`, and in the last two `covariances`.
+        weight_arrays: (4, P) float64: `log_weights`, `path_log_weights`, `mixture_weights`, and a step's increments.
+        bias_covariances: (2, K, 3, 3) float64. Covariance of each robot's odometry bias given its path, the same in all
+            particles; and covariance of pose (rows, robot axes) and bias where N(x^, P^) was only propagated.
+        propagated_only: (K,) int64. 1 where N(x^, P^) was only propagated since the last match, else 0.
+        gauge_covariance: (3, 3) float64 [m, m, rad]. Covariance of a motion of the whole map that the particles do not
+            represent, as their frame was fixed when they were sampled from smoothed paths; estimates include it.
+        start_covariances: (K, 3, 3) float64 [m, m, rad], start frames. Covariance of each robot's start pose that the
+            particles do not represent; poses in the start frame include it.
+        maps: Landmarks of all particles.
+        estimates: Poses of all robots over all particles; updated in each step.
+        starts_at_origin: Whether all robots started at the origin, as in a filter without merges.
+        next_step: Number of the next step.
+        rejuvenation: Schedule and graph of the smoother, or None.
+        may_smooth: Whether a step may give time to the smoother.
+        rng: Random stream of the filter.
 
     Raises:
         ValueError: If an argument is out of its range; the text names it.
@@ -108,11 +179,10 @@ class FastSlam:
             rejuvenate_every=rejuvenate_every,
             smoothing=SmoothingOptions() if smoothing is None else smoothing,
         )
-        self.state = FilterState(num_robots, options, seed)
-        self.may_smooth = True
+        self._allocate(num_robots, options, seed)
         if initial_poses is not None:
             hint = "Give one pose (x, y, theta) per robot."
-            self.state.start_at(check_array("initial_poses", initial_poses, (num_robots, 3), hint, within=MAX_POSE))
+            self._start_at(check_array("initial_poses", initial_poses, (num_robots, 3), hint, within=MAX_POSE))
 
     @classmethod
     def from_options(
@@ -128,15 +198,110 @@ class FastSlam:
         Raises:
             ValueError: If `num_robots` or `seed` is out of its range.
         """
-        return cls.from_filter_state(FilterState(num_robots, options, seed))
-
-    @classmethod
-    def from_filter_state(cls, state: FilterState) -> "FastSlam":
-        """Return a filter with a given state."""
         self = cls.__new__(cls)
-        self.state = state
-        self.may_smooth = True
+        self._allocate(num_robots, options, seed)
         return self
+
+    def _allocate(self, num_robots: int, options: FilterOptions, seed: Any, num_particles: int | None = None) -> None:
+        """Provide the arrays and parts of a filter, robots at the origin; None: as many particles as `options` say."""
+        k = check_int("num_robots", num_robots, 1, "Use at least one robot.", MAX_ROBOTS)
+        m = options.num_particles if num_particles is None else num_particles
+        existence = options.existence
+        self.options = options
+        self.rng = np.random.default_rng(check_seed(seed))
+        self.packed_options = pack_options(options)
+        self.packed_camera = packed_camera(options.camera)
+        self._existence = None if existence is None else ExistenceUpdate(existence, options.camera)
+        self.rejuvenation = None if options.rejuvenate_every is None else RejuvenationScheduler(options, k)
+        self.maps = ParticleMaps(m, None if existence is None else existence.log_odds_prior)
+        padded = self.maps.padded
+        self.pose_arrays: FloatArray = zeros_aligned((6, k, 3, padded), np.float64)
+        self.weight_arrays: FloatArray = zeros_aligned((4, padded), np.float64)
+        self.log_weights[:] = -np.log(m)
+        self.mixture_weights[:] = 1.0 / m
+        self.bias_covariances: FloatArray = np.zeros((2, k, 3, 3))
+        self.bias_covariances[0] = options.motion.bias_covariance
+        self.propagated_only: IntArray = np.zeros(k, np.int64)
+        self.gauge_covariance: FloatArray = np.zeros((3, 3))
+        self.start_covariances: FloatArray = np.zeros((k, 3, 3))
+        self.starts_at_origin = True
+        self.best_particle = 0
+        self.next_step = 0
+        self._consistency = ConsistencyTest()
+        self.estimates = self._mixtures()
+        self._batches = robot_batches(k, existence is not None)  # robots of each kernel call: one by one with existence
+        self._logs = [RobotLog() for _ in range(k)]
+        self._pending = PendingSteps(k)
+        self._associations: Int32Array = np.empty((0, padded), np.int32)  # work space of `update_fastslam2`
+        self._mahalanobis_sq: FloatArray = np.empty((0, padded))
+        self.may_smooth = True
+
+    def _start_at(self, poses: FloatArray) -> None:
+        """Set the start poses (K, 3) [m, m, rad], map frame, without uncertainty."""
+        self.poses[:] = poses[:, :, None]
+        self.poses[:, 2] = wrap_angle(self.poses[:, 2])
+        self.starts[:] = self.means[:] = self.poses
+        self._refresh_starts()
+        self.estimates = self._mixtures()
+
+    # ------------------------------------------------------------------ arrays of all particles
+
+    @property
+    def poses(self) -> FloatArray:
+        """Poses x_t^[m] of the robots, (K, 3, P) [m, m, rad]."""
+        return np.asarray(self.pose_arrays[ROBOT.poses])
+
+    @property
+    def starts(self) -> FloatArray:
+        """Start poses of the robots, (K, 3, P) [m, m, rad]; they spread at a merge."""
+        return np.asarray(self.pose_arrays[ROBOT.starts])
+
+    @property
+    def means(self) -> FloatArray:
+        """Means of N(x^, P^), each particle's pose before sampling, (K, 3, P) [m, m, rad]."""
+        return np.asarray(self.pose_arrays[ROBOT.means])
+
+    @property
+    def biases(self) -> FloatArray:
+        """Means of the robots' odometry biases given the paths, (K, 3, P) [m/m, rad/m, rad/rad]."""
+        return np.asarray(self.pose_arrays[ROBOT.biases])
+
+    @property
+    def covariances(self) -> FloatArray:
+        """Covariances of N(x^, P^), (K, 6, P), upper triangles."""
+        return self.pose_arrays[ROBOT.covariances :].reshape(self.num_robots, 6, -1)
+
+    @property
+    def log_weights(self) -> FloatArray:
+        """Log-weights since the last resampling, normalised, (M,)."""
+        return np.asarray(self.weight_arrays[WEIGHT.log_weights, : self.num_particles])
+
+    @property
+    def path_log_weights(self) -> FloatArray:
+        """Log-weights accumulated along the ancestral line (Eq. 12), (M,)."""
+        return np.asarray(self.weight_arrays[WEIGHT.path_log_weights, : self.num_particles])
+
+    @property
+    def mixture_weights(self) -> FloatArray:
+        """Weights after the last step, before resampling, summing to 1, (M,): those of `estimates`."""
+        return np.asarray(self.weight_arrays[WEIGHT.weights, : self.num_particles])
+
+    @property
+    def _held_starts(self) -> BoolArray:
+        """Whether each start pose has a covariance that the particles do not represent, (K,)."""
+        return np.asarray(self.start_covariances[:, 2, 2] > 0.0)
+
+    def _mixtures(self) -> PoseEstimates:
+        """Return the robots' pose estimates over all particles, map frame. Fresh arrays."""
+        return pose_mixtures(self.means, self.covariances, self.mixture_weights)
+
+    def _refresh_starts(self) -> None:
+        """Recompute `starts_at_origin` from the start poses."""
+        self.starts_at_origin = not self.starts[:, :, : self.num_particles].any()
+
+    def _refresh_best_particle(self) -> None:
+        """Recompute `best_particle` from the accumulated weights."""
+        self.best_particle = int(self.path_log_weights.argmax())
 
     # ------------------------------------------------------------------ one step
 
@@ -186,21 +351,92 @@ class FastSlam:
                 are written.
             step: Number of the step in the logs; None: the next one.
         """
-        state = self.state
         if step is not None:
-            state.next_step = step
-        long_unseen, created, new, matched, rejected, ess, nis, needs_resampling = state.update(
+            self.next_step = step
+        long_unseen, created, new, matched, rejected, ess, nis, needs_resampling = self._update(
             inputs, robot_rows, associations_buffer
         )
         if needs_resampling:
-            state.resample()
+            self.resample()
         report = StepReport(associations, robot_rows.rows, created, new, matched, rejected, ess, nis, needs_resampling)
-        if (smoother := state.rejuvenation) is not None:
+        if (smoother := self.rejuvenation) is not None:
             smoother.record_step(new + matched, long_unseen)
-            is_busy = self.may_smooth and not smoother.is_waiting(state.next_step - 1)
-            if is_busy and (news := state.rejuvenate(smoother)) is not None:
+            is_busy = self.may_smooth and not smoother.is_waiting(self.next_step - 1)
+            if is_busy and (news := self._smooth(smoother)) is not None:
                 return report._replace(rejuvenation=news)
         return report
+
+    def _update(self, inputs: StepInput, robots: RobotRows, associations: IntArray) -> StepSummary:
+        """Move all robots, match their measurements, weigh and update (Algorithm 1, l. 6-8).
+
+        A robot without input draws no random number.
+
+        Args:
+            inputs: Input of these robots, and perhaps of others.
+            robots: Rows of these robots in `inputs`.
+            associations: (2, n) int64, written: data association of their measurements, see `Associations`.
+        """
+        maps, pending = self.maps, self._pending
+        active = used = 0
+        for robot, row in robots.active:
+            kind, begin, end, _, _, _ = inputs.inputs[row]
+            active, used = active + (kind != NO_READING), used + end - begin
+            if kind == EXACT_POSE:
+                self._set_exact_pose(robot, inputs.moves[row])
+        if used:
+            maps.reserve(used, inputs.descriptors.shape[1])
+            if len(self._associations) < len(inputs.measurements):
+                shape = 2 * len(inputs.measurements), maps.padded
+                self._associations, self._mahalanobis_sq = np.empty(shape, np.int32), np.empty(shape)
+        if len(pending.steps) == LONGEST:
+            pending.flush(self._logs, self.rejuvenation)
+        pending.reserve(used)
+        now = 0 if self.rejuvenation is None else self.rejuvenation.steps + 1
+        normals = self.rng.standard_normal((active, maps.num_particles, 3))
+        means, covariances = self.estimates
+        deleted: list[IntArray] = []
+        fastslam1 = None if self.options.proposal == "fastslam2" else 1
+        for low, high, is_over in self._batches:
+            summary = _kernels.step_robots(
+                low, high, is_over, now, self.packed_options, robots.array, inputs.inputs_table, inputs.moves, normals,
+                self.pose_arrays, self.bias_covariances, self.propagated_only, self.weight_arrays,
+                self.gauge_covariance, maps.values, maps.counts, maps.odds, maps.table, maps.maps, maps.users,
+                maps.free_rows, maps.tops, maps.descriptors, maps.heads, inputs.measurements,
+                inputs.descriptors, inputs.names,
+                self._associations, self._mahalanobis_sq, associations, means, covariances,
+                pending.noted[len(pending.steps)], pending.measured, pending.num_measured, fastslam1,
+            )  # fmt: skip
+            if self._existence is not None and not is_over and (row := robots.rows[low]) >= 0:
+                _, begin, end, _, _, count = inputs.inputs[row]
+                if count >= 0:
+                    _, started = associations  # by slot, until the step is over
+                    found, new_slots = self._associations[begin:end], started[begin:end]
+                    deleted.append(self._existence.update(maps, self.poses[low], self.best_particle, found, new_slots))
+        self.best_particle, long_unseen, created, new, matched, rejected, ess, nis, needs_resampling = summary
+        pending.steps.append(self.next_step)
+        pending.num_measured += used
+        if used:
+            self._consistency.update(self.next_step, nis, ess / self.num_particles, used, used - new - matched)
+        if rejected and self.rejuvenation is not None:
+            record_rejected(self.rejuvenation, self.next_step, inputs, robots, associations)
+        self.next_step += 1
+        for slots in deleted:  # last, as the ids are needed until here
+            maps.release(slots)
+        return StepSummary(long_unseen, created, new, matched, rejected, ess, nis, needs_resampling)
+
+    def _set_exact_pose(self, robot: int, pose: FloatArray) -> None:
+        """Set a robot's pose in all particles to an exact one (3,) [m, m, rad] in its own start frame."""
+        count = self.num_particles
+        self.poses[robot, :, :count] = compose(self.starts[robot, :, :count].T.copy(), pose).T
+        self.gauge_covariance.fill(0.0)
+        self.start_covariances[robot] = 0.0
+
+    def resample(self) -> None:
+        """Resample the particles in proportion to their weights."""
+        ancestors = RESAMPLING[self.options.resampling](self.mixture_weights, self.rng, self.num_particles)
+        self.best_particle = self.maps.resample(ancestors, self.pose_arrays, self.weight_arrays)
+
+    # ------------------------------------------------------------------ rejuvenation
 
     def rejuvenate(self) -> RejuvenationReport:
         """Sample the particles from the posterior of whole paths now, whether or not `rejuvenate_every` is set.
@@ -210,109 +446,145 @@ class FastSlam:
         Returns:
             The outcome; if it has a reason, the particles are unchanged.
         """
-        smoother = self.state.rejuvenation
+        smoother = self.rejuvenation
         if smoother is None:
             smoother = RejuvenationScheduler(replace(self.options, rejuvenate_every=1), self.num_robots)
         smoother.request()
-        while (report := self.state.rejuvenate(smoother)) is None:
+        while (report := self._smooth(smoother)) is None:
             pass
         return report
 
     @property
     def can_rejuvenate(self) -> bool:
         """Whether the filter has a smoother, and no pose that was given as exact disables it."""
-        if self.state.rejuvenation is None:
+        if self.rejuvenation is None:
             return False
-        self.state.update_logs()  # which says whether poses were given as exact
-        return not self.state.rejuvenation.is_disabled
+        self.update_logs()  # which says whether poses were given as exact
+        return not self.rejuvenation.is_disabled
 
     def request_rejuvenation(self) -> None:
         """Request a rejuvenation as soon as possible, in slices if the smoother works incrementally."""
-        if self.state.rejuvenation is not None:
-            self.state.rejuvenation.request()
+        if self.rejuvenation is not None:
+            self.rejuvenation.request()
 
     @property
     def rejuvenation_requested(self) -> bool:
         """Whether `request_rejuvenation` was called and the rejuvenation is still outstanding."""
-        return self.state.rejuvenation is not None and self.state.rejuvenation.requested
+        return self.rejuvenation is not None and self.rejuvenation.requested
+
+    def _smooth(self, smoother: RejuvenationScheduler) -> RejuvenationReport | None:
+        """Sample the particles from the smoothed paths, if due; return None if there is nothing to report."""
+        if smoother.is_idle(self.logs):
+            return None
+        starts = self.starts[:, :, : self.num_particles]
+        result = smoother.run(
+            self.logs, starts, self._held_starts, self.maps, self.best_particle, self.packed_camera, self.rng
+        )  # fmt: skip
+        if result is None:
+            return None
+        if result.particles is not None:
+            self._replace_particles(result.particles)
+        return RejuvenationReport(result.reason, result.ess, result.iterations, result.graph.num_keys)
+
+    def _replace_particles(self, new: Particles) -> None:
+        """Replace the M particles by samples of smoothed paths, with landmarks of the most probable particle so far."""
+        m = self.num_particles
+        NewLandmarks.of(self.maps, self.best_particle, new, self.options.landmark_walk).write(self.maps)
+        self.poses[:, :, :m], self.starts[:, :, :m], self.biases[:, :, :m] = new.poses, new.starts, new.biases
+        self.bias_covariances[0], self.bias_covariances[1] = new.bias_covariances, 0.0
+        self._refresh_starts()
+        self.means[:] = self.poses
+        self.covariances.fill(0.0)
+        self.gauge_covariance[:], self.start_covariances[:] = new.frame, new.start_scatters
+        self.propagated_only.fill(0)
+        self.log_weights[:], self.path_log_weights[:] = new.log_weights, new.log_densities
+        self._refresh_best_particle()
+        self.mixture_weights[:] = np.exp(new.log_weights)
+        self.estimates.means[:], self.estimates.covariances[:] = new.means, new.covariances
+
+    @property
+    def logs(self) -> list[RobotLog]:
+        """Log of each robot, up to date."""
+        self.update_logs()
+        return self._logs
+
+    def update_logs(self) -> None:
+        """Bring the logs up to date, and what the smoother knows of them."""
+        if self._pending.steps:
+            self._pending.flush(self._logs, self.rejuvenation)
 
     # ------------------------------------------------------------------ estimates
 
     @property
-    def options(self) -> FilterOptions:
-        """Assumptions and decision rules of the filter."""
-        return self.state.options
+    def state(self) -> "FastSlam":
+        """The filter itself: alias for code of version 0.3, where the parts of a filter belonged to its state."""
+        return self
 
     @property
     def num_robots(self) -> int:
         """Number of robots, K."""
-        return self.state.num_robots
+        return int(self.pose_arrays.shape[1])
 
     @property
     def num_particles(self) -> int:
         """Number of particles, M."""
-        return self.state.num_particles
-
-    @property
-    def best_particle(self) -> int:
-        """Index of the most probable particle, by accumulated log-weight (Eq. 12)."""
-        return self.state.best
+        return self.maps.num_particles
 
     @property
     def num_landmarks(self) -> int:
         """Number of landmarks that at least one particle holds."""
-        return int(np.count_nonzero(self.state.maps.ids >= 0))
+        return int(np.count_nonzero(self.maps.ids >= 0))
 
     @property
     def map_size(self) -> int:
         """Number of landmarks that the most probable particle holds: the length of `map()`."""
-        slots = np.flatnonzero(self.state.maps.ids >= 0)
-        return int(np.count_nonzero(self.state.maps.of_particle(self.state.best, slots)[1]))
+        slots = np.flatnonzero(self.maps.ids >= 0)
+        return int(np.count_nonzero(self.maps.of_particle(self.best_particle, slots)[1]))
 
     @property
     def map_capacity(self) -> int:
         """Largest number of landmarks that fit in the allocated arrays."""
-        return int(self.state.maps.table.shape[1])
+        return int(self.maps.table.shape[1])
 
     @property
     def descriptor_size(self) -> int:
         """Length of the descriptors in the map, 0 before the first one."""
-        return int(self.state.maps.descriptors.shape[1])
+        return int(self.maps.descriptors.shape[1])
 
     @property
     def consistency(self) -> Consistency:
         """Consistency of the filter in its frames so far, with advice if it is inconsistent."""
-        return self.state.consistency.report()
+        return self._consistency.report()
 
     def log(self, robot: int = 0) -> RobotLog:
         """Return a copy of a robot's log: odometry, measured points and their data association."""
-        return self.state.logs[self._check_robot(robot)].copy()
+        return self.logs[self._check_robot(robot)].copy()
 
     @property
     def nbytes(self) -> int:
         """Memory of the particles [bytes]: mostly (72 + 4) per particle and landmark."""
-        state = self.state
-        return state.maps.nbytes + state.pose_arrays.nbytes + state.log_weights.nbytes + state.path_log_weights.nbytes
+        of_particles = self.pose_arrays, self.log_weights, self.path_log_weights
+        return self.maps.nbytes + sum(array.nbytes for array in of_particles)
 
     @property
     def weights(self) -> FloatArray:
         """(M,) weights, summing to 1. A copy."""
-        return np.asarray(np.exp(self.state.log_weights))
+        return np.asarray(np.exp(self.log_weights))
 
     def pose(self, robot: int = 0) -> PoseEstimate:
         """Return the mean and covariance of a robot's pose [m, m, rad] over all particles, map frame. Copies.
 
         They are those of the mixture of N(x^, P^) before sampling, which has less variance than the samples.
         """
-        return self.state.estimates.of(self._check_robot(robot))
+        return self.estimates.of(self._check_robot(robot))
 
     def particles(self, robot: int = 0) -> tuple[FloatArray, FloatArray]:
         """Return a robot's poses (M, 3) [m, m, rad], map frame, and the normalised log-weights (M,). Copies."""
-        return self._columns(self.state.poses[self._check_robot(robot)]), self.state.log_weights.copy()
+        return self._columns(self.poses[self._check_robot(robot)]), self.log_weights.copy()
 
     def start_pose(self, robot: int = 0) -> FloatArray:
         """Return the start pose (3,) [m, m, rad] of a robot, map frame, in the most probable particle. A copy."""
-        return np.array(self.state.starts[self._check_robot(robot), :, self.state.best])
+        return np.array(self.starts[self._check_robot(robot), :, self.best_particle])
 
     def pose_from_start(self, robot: int = 0) -> PoseEstimate:
         """Return the mean and covariance of a robot's pose [m, m, rad] in its own start frame. Copies.
@@ -329,10 +601,9 @@ class FastSlam:
         self, names: tuple[int, ...], active_robots: tuple[int, ...], ess: float, points: TeamPoses
     ) -> None:
         """Write the poses of the robots in `active_robots`; `names` are the team's indices of all, `ess` is copied."""
-        state = self.state
-        weights = NO_WEIGHTS if state.starts_at_origin else np.exp(state.log_weights)
+        weights = NO_WEIGHTS if self.starts_at_origin else self.weights
         _kernels.write_team_poses(
-            state.pose_arrays, state.start_covariances, weights, state.best, *state.estimates,
+            self.pose_arrays, self.start_covariances, weights, self.best_particle, *self.estimates,
             membership_table(names, active_robots), points.poses, points.beliefs,
         )  # fmt: skip
         for robot in names:
@@ -341,20 +612,20 @@ class FastSlam:
 
     def particles_from_start(self, robot: int = 0) -> FloatArray:
         """Return a robot's poses (M, 3) [m, m, rad], each relative to its start pose in the same particle."""
-        starts = self._columns(self.state.starts[self._check_robot(robot)])
-        return between(starts, self._columns(self.state.poses[robot]))
+        starts = self._columns(self.starts[self._check_robot(robot)])
+        return between(starts, self._columns(self.poses[robot]))
 
     def _columns(self, rows: FloatArray) -> FloatArray:
         """Return (M, c) of padded rows (c, P). A copy."""
-        return rows[:, : self.state.num_particles].T.copy()
+        return rows[:, : self.num_particles].T.copy()
 
     def odometry_bias(self, robot: int = 0) -> BiasEstimate:
         """Return mean and covariance of a robot's odometry bias over all particles, zeros if the model has none."""
         index, count = self._check_robot(robot), self.num_particles
-        means = self.state.biases[index, :, :count]
+        means = self.biases[index, :, :count]
         mean = means @ self.weights
         off = means - mean[:, None]
-        return BiasEstimate(mean, (off * self.weights) @ off.T + self.state.bias_covariances[0, index])
+        return BiasEstimate(mean, (off * self.weights) @ off.T + self.bias_covariances[0, index])
 
     def map(self, estimate: Literal["best", "mixture"] = "best", min_count: int = 1) -> LandmarkMap:
         """Return the map [m, m^2] in the map frame, landmarks by ascending id. A copy.
@@ -370,19 +641,19 @@ class FastSlam:
             ValueError: If `estimate` is neither.
         """
         check_choice("estimate", estimate, ("best", "mixture"))
-        state = self.state
+        maps, best = self.maps, self.best_particle
         if estimate == "best":
-            return unchecked_map(*best_map(state.maps, state.best, min_count))
-        return unchecked_map(*map_mixture(state.maps, state.best, state.log_weights, state.gauge_covariance, min_count))
+            return unchecked_map(*best_map(maps, best, min_count))
+        return unchecked_map(*map_mixture(maps, best, self.log_weights, self.gauge_covariance, min_count))
 
     def descriptors(self) -> NDArray[np.float32]:
         """Return the descriptors (n, d) of the landmarks of `map()`. A copy."""
-        return np.asarray(self.state.maps.descriptors[present_slots(self.state.maps, self.state.best, 1)])
+        return np.asarray(self.maps.descriptors[present_slots(self.maps, self.best_particle, 1)])
 
     def map_summary(self, min_count: int = 1) -> MapSummary:
         """Return the summary of `map(min_count=min_count)`, much faster. Fresh arrays."""
         rows = MapSummaryRows.allocate(self.map_capacity)
-        return rows.part(0, write_summary(self.state.maps, self.state.best, min_count, rows, 0))
+        return rows.part(0, write_summary(self.maps, self.best_particle, min_count, rows, 0))
 
     def existence(self) -> tuple[IntArray, FloatArray]:
         """Return the ids (n,) of the landmarks of `map()`, ascending, and the probability (n,) that each exists.
@@ -390,10 +661,10 @@ class FastSlam:
         Raises:
             ValueError: If the filter was built without `existence`.
         """
-        if self.state.existence is None:
+        if self._existence is None:
             hint = "Build the filter with existence=ExistenceModel()."
             raise argument_error("existence", "a filter that estimates it", "a filter that does not", hint)
-        maps, best = self.state.maps, self.state.best
+        maps, best = self.maps, self.best_particle
         slots = maps.used_slots()
         slots = slots[maps.of_particle(best, slots)[1] > 0]
         return maps.ids[slots], 1.0 / (1.0 + np.exp(-maps.odds_of_particle(best, slots)))
@@ -404,15 +675,58 @@ class FastSlam:
             raise argument_error("robot", f"an index from 0 to {self.num_robots - 1}", robot, "Count robots from 0.")
         return int(robot)
 
-    # ------------------------------------------------------------------ snapshots
+    # ------------------------------------------------------------------ merging
 
     def reorder(self, order: IntArray) -> None:
         """Renumber the robots: robot i is the former `order[i]`; (K,) a permutation."""
-        self.state.reorder(order)
+        for array in (
+            self.poses,
+            self.starts,
+            self.means,
+            self.biases,
+            self.covariances,
+            *self.bias_covariances,
+            self.start_covariances,
+            self.propagated_only,
+        ):
+            array[:] = array[order]
+        self._logs = [self.logs[robot] for robot in order]
+        self.estimates = PoseEstimates(*(of_all[order] for of_all in self.estimates))
+        if self.rejuvenation is not None:
+            self.rejuvenation.reorder(order)
+
+    def finish_join(self, a: "FastSlam", b: "FastSlam", renamed: IntArray) -> None:
+        """Join the step counts, warnings, logs and smoothers of two groups, once the joint map is loaded.
+
+        Args:
+            a, b: Filter of each group.
+            renamed: (n, 2) int64 rows (id in b, id in the joint map) of all of b's landmarks.
+        """
+        self._refresh_starts()
+        self._refresh_best_particle()
+        self.next_step = max(a.next_step, b.next_step)
+        self._consistency = ConsistencyTest.joined(a._consistency, b._consistency)
+        self.estimates = self._mixtures()
+        if self.gauge_covariance.any():
+            add_gauge_covariance(self.gauge_covariance, *self.estimates)
+        self._logs = [log.copy() for log in a.logs] + [log.renamed(renamed[:, 0], renamed[:, 1]) for log in b.logs]
+        if self.rejuvenation is not None and a.rejuvenation is not None and b.rejuvenation is not None:
+            starts = [slam.starts[:, :, : slam.num_particles] for slam in (a, b, self)]
+            frames = a.gauge_covariance, b.gauge_covariance
+            held = a._held_starts, b._held_starts
+            self.rejuvenation.join(a.rejuvenation, b.rejuvenation, starts, held, frames, renamed, self.packed_camera)
+
+    # ------------------------------------------------------------------ snapshots
 
     def get_state(self) -> dict[str, Any]:
-        """Return the complete state of the filter, its random stream included. Nothing is shared."""
-        return self.state.get_state()
+        """Return the complete state of the filter, its random stream included; shared parts are read-only."""
+        logs = tuple(log.get_state() for log in self.logs)  # first, as it also updates the smoother
+        state: dict[str, Any] = {name: array.copy() for name, array in self._kept.items()}
+        state |= {"steps": self.next_step, "estimates": self.estimates.copy(), "maps": self.maps.get_state()}
+        state |= {"logs": logs, "consistency": self._consistency.get_state()}
+        if self.rejuvenation is not None:
+            state["rejuvenation"] = self.rejuvenation.get_state()
+        return state | {"options": self.options, "rng": copy.deepcopy(self.rng.bit_generator.state)}
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Restore a state from `get_state`; the filter then continues identically.
@@ -427,8 +741,25 @@ class FastSlam:
         self.restore_checked(state)
 
     def restore_checked(self, state: Mapping[str, Any]) -> None:
-        """Restore a state that was validated."""
-        previous = self.state
-        self.state = FilterState.restored(state, previous)
-        if self.state is not previous:
-            self.may_smooth = True
+        """Restore a state that was validated, in the arrays at hand if they fit."""
+        fits = state["poses"].shape == self.poses.shape and len(state["weights"]) == self.num_particles
+        if not fits or state["options"] != self.options:
+            self._allocate(len(state["poses"]), state["options"], 0, len(state["weights"]))
+        for name, array in self._kept.items():
+            array[:] = state[name]
+        self._refresh_starts()
+        self._refresh_best_particle()
+        self.maps.set_state(state["maps"])
+        self._pending.clear()
+        for log, logged in zip(self._logs, state["logs"], strict=True):
+            log.set_state(logged)
+        if self.rejuvenation is not None:
+            self.rejuvenation.set_state(state["rejuvenation"])
+        self._consistency.set_state(state["consistency"])
+        self.next_step, self.estimates = state["steps"], state["estimates"].copy()
+        self.rng = restore_generator(state["rng"])  # a new one: the old one may be shared or of another kind
+
+    @property
+    def _kept(self) -> dict[str, NDArray[Any]]:
+        """Arrays that make up a state, by their names in it."""
+        return {name: self.mixture_weights if name == "weights" else getattr(self, name) for name in KEPT}

@@ -257,7 +257,7 @@ class ParticleMaps(MapStore):
 
         Args:
             ancestors: (M,) ascending.
-            of_robots, of_particles: Pose and weight arrays of the filter, see `FilterState`.
+            of_robots, of_particles: Pose and weight arrays of the filter, see `FastSlam`.
         """
         if not self._free_maps:
             self._make_maps()

@@ -290,7 +290,7 @@ class RejuvenationScheduler:
         Args:
             logs: Log of each robot.
             starts: (K, 3, M) start poses, map frame.
-            held: (K,) whether each start pose has a covariance in `FilterState.start_covariances`.
+            held: (K,) whether each start pose has a covariance in `FastSlam.start_covariances`.
             maps: Maps of the present particles, or of the most probable one alone; not changed.
             best: Index of the most probable particle in `maps`.
             camera: (7,) as kernels take it.
@@ -359,7 +359,7 @@ class RejuvenationScheduler:
             a, b: Schedulers of the groups; they do not change.
             starts: Start poses, three arrays (K, 3, M): of the robots of a, in a's frame; of b, in b's; of both, a's
                 first, in a's.
-            held: (K,) of a, of b: whether each start pose has a covariance in `FilterState.start_covariances`.
+            held: (K,) of a, of b: whether each start pose has a covariance in `FastSlam.start_covariances`.
             frames: Gauge covariances (3, 3) of a's and b's maps, not represented by the particles.
             renamed: (n, 2) rows (name in b, name in the joint map).
             camera: (7,) as kernels take it.

@@ -200,7 +200,7 @@ def fork(
         at_hand: Filter that is no longer needed, whose memory the copy takes; or None.
     """
     stream = np.random.default_rng(rng.integers(2**63, size=4)).bit_generator.state
-    slam = restored_filter(branch.filter.state.get_state() | {"rng": stream}, at_hand)
+    slam = restored_filter(branch.filter.get_state() | {"rng": stream}, at_hand)
     return Branch(
         robots=branch.robots,
         active_robots=active_robots,

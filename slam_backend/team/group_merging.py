@@ -33,7 +33,7 @@ from slam_backend.team.shared_records import SharedRecords
 
 def smoothed_graphs(a: FastSlam, b: FastSlam) -> tuple[SlamGraph, SlamGraph] | None:
     """Return the graphs of the smoothers of two filters; None if one has not smoothed yet, or cannot any more."""
-    of_a, of_b = (slam.state.rejuvenation if slam.can_rejuvenate else None for slam in (a, b))
+    of_a, of_b = (slam.rejuvenation if slam.can_rejuvenate else None for slam in (a, b))
     if of_a is None or of_b is None or of_a.graph is None or of_b.graph is None:
         return None
     return of_a.graph, of_b.graph
@@ -105,10 +105,10 @@ class MergePlan(NamedTuple):
         graphs = smoothed_graphs(*self.filters)
         if graphs is None:
             return None
-        of_a, of_b = (slam.state.maps for slam in self.filters)
+        of_a, of_b = (slam.maps for slam in self.filters)
         renamed = renaming(of_a, of_b, np.concatenate(merge_by_identity(of_a, of_b, self.pairs)))
-        state = self.filters[0].state
-        return relative_start(*graphs, self.alignment.transform, renamed, state.packed_camera, state.options.smoothing)
+        slam = self.filters[0]
+        return relative_start(*graphs, self.alignment.transform, renamed, slam.packed_camera, slam.options.smoothing)
 
 
 def transform_uncertainty(plan: MergePlan) -> float:
@@ -120,7 +120,7 @@ def transform_uncertainty(plan: MergePlan) -> float:
     assert plan.pairing is not None
     a, b = plan.filters
     covariance = transform_covariance(plan.pairing.motion, plan.alignment)
-    covariance += _gauge_covariance(a.state.gauge_covariance, b.state.gauge_covariance, plan.alignment)
+    covariance += _gauge_covariance(a.gauge_covariance, b.gauge_covariance, plan.alignment)
     return _relative_uncertainty(covariance)
 
 
@@ -162,7 +162,7 @@ def merge_groups(
     trunk.monitors = sorted(older, key=lambda monitor: monitor.number)
     if merging.watch_steps:
         sides = PreMergeSnapshot.of(a.get_state()), PreMergeSnapshot.of(b.get_state())
-        common = renamed[renamed[:, 1] < a.filter.state.maps.next_id, ::-1]
+        common = renamed[renamed[:, 1] < a.filter.maps.next_id, ::-1]
         trunk.monitors.append(begin_monitoring(number, plan.alignment, sides, plan.maps, renamed, common))
     id_map = LandmarkIdMap(a.robots, b.robots, renamed, (a.number, b.number, number))
     records.entries.append(id_map)

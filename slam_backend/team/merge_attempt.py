@@ -107,9 +107,9 @@ def _start(
 
 def _appearance(group: Group) -> Appearance:
     """Return the landmarks of a group's `map`."""
-    state = group.trunk.filter.state
-    slots = present_slots(state.maps, state.best, 1)
-    return Appearance(state.maps.ids[slots], state.maps.descriptors[slots])
+    slam = group.trunk.filter
+    slots = present_slots(slam.maps, slam.best_particle, 1)
+    return Appearance(slam.maps.ids[slots], slam.maps.descriptors[slots])
 
 
 def _may_align(

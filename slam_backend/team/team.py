@@ -485,7 +485,7 @@ class TeamSlam:
         (rows, parts), last = summaries, 0
         for branch in self.topology.branches:
             slam = branch.filter
-            first, last = last, write_summary(slam.state.maps, slam.state.best, min_count, rows, last)
+            first, last = last, write_summary(slam.maps, slam.best_particle, min_count, rows, last)
             for robot in branch.active_robots:
                 parts[robot, 0], parts[robot, 1] = first, last
         if last > len(rows.counts_and_ids):

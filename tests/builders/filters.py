@@ -78,7 +78,7 @@ def map_once(
 
 def names_of(slam: FastSlam) -> dict[int, int]:
     """Return the true name of each landmark that a filter holds, by its id."""
-    maps = slam.state.maps
+    maps = slam.maps
     slots = maps.used_slots()
     return dict(zip(maps.ids[slots].tolist(), maps.identities[slots].tolist(), strict=True))
 
@@ -116,15 +116,15 @@ def filter_after_some_steps(num_particles: int, seed: int) -> tuple[FastSlam, np
 def filter_with_gaps(num_particles: int, seed: int) -> FastSlam:
     """Return a filter whose particles have resampled at different times, and do not all hold the same landmarks."""
     slam, _, _ = filter_after_some_steps(num_particles, seed)
-    slots = slam.state.maps.used_slots()
-    slam.state.maps.refresh(slots[::2])
-    slam.state.maps.counts[slam.state.maps.row_of[slots[::2]], 1::3] = 0
+    slots = slam.maps.used_slots()
+    slam.maps.refresh(slots[::2])
+    slam.maps.counts[slam.maps.row_of[slots[::2]], 1::3] = 0
     return slam
 
 
 def dense(slam: FastSlam) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return ids (n,), means (n, 3, M) [m], covariances (n, 6, M) [m^2] and counts (n, M), 0 where one lacks it."""
-    maps = slam.state.maps
+    maps = slam.maps
     slots = maps.used_slots()
     values, counts = maps.dense(slots)
     return maps.ids[slots], values[:, :3], values[:, 3:], counts.astype(np.int64)
@@ -169,7 +169,7 @@ def load_landmarks(maps: ParticleMaps, values: FloatArray, *names: Any) -> None:
 
 def arrays_of(slam: FastSlam) -> dict[str, Any]:
     """Return all arrays that a filter works with, by owner and name: not copies."""
-    owners = {"filter": slam.state, "maps": slam.state.maps}
+    owners = {"filter": slam, "maps": slam.maps}
     return {
         f"{owner}.{name}": value
         for owner, holder in owners.items()

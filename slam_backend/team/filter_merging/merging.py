@@ -24,7 +24,7 @@ import numpy as np
 
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.fastslam.filter import FastSlam
-from slam_backend.fastslam.state import FilterState
+from slam_backend.fastslam.joining import joined_filter
 from slam_backend.geometry import inverse, wrap_angle
 from slam_backend.maps.alignment import Alignment
 from slam_backend.maps.fusion import fuse_descriptors
@@ -85,11 +85,11 @@ def merge_filters(
     if pairing is None:
         pairing = pair_filters(a, b, alignment, pairs, rng, num_particles, known)
     from_a, from_b, motion, evidence, extra, scale = pairing
-    fitting, named = merge_by_identity(a.state.maps, b.state.maps, pairs)
+    fitting, named = merge_by_identity(a.maps, b.maps, pairs)
     pairs = np.concatenate([fitting, named])
-    joint = FilterState.joined(a.state, from_a, b.state, from_b, motion, evidence, rng)
+    joint = joined_filter(a, from_a, b, from_b, motion, evidence, rng)
 
-    of_a, of_b = Landmarks.of(a.state.maps, from_a), Landmarks.of(b.state.maps, from_b)
+    of_a, of_b = Landmarks.of(a.maps, from_a), Landmarks.of(b.maps, from_b)
     ids_a, ids_b = of_a.ids, of_b.ids
     shared_a, shared_b = np.searchsorted(ids_a, pairs[:, 0]), np.searchsorted(ids_b, pairs[:, 1])
     descriptors, identities, descriptors_b = of_a.descriptors, of_a.identities, of_b.descriptors
@@ -106,7 +106,7 @@ def merge_filters(
     rows_a[n_a:], rows_b[n_a:], rows_b[shared_a] = -1, exclusive, shared_b
     counts, names = joint_counts(of_a, of_b, rows_a, rows_b), np.concatenate([identities, of_b.identities[exclusive]])
     drop_repeated_identities(counts, names)
-    renamed = renaming(a.state.maps, b.state.maps, pairs)
+    renamed = renaming(a.maps, b.maps, pairs)
     new_ids = renamed[len(pairs) :, 1]
     held = np.flatnonzero((counts > 0).any(axis=1))
     kept, odds, model = counts[held], None, a.options.existence
@@ -116,15 +116,15 @@ def merge_filters(
         odds = np.concatenate([odds_a, odds_b[exclusive]])[held]
     descriptors = stack_descriptors(descriptors, descriptors_b[exclusive])[held]
     columns = descriptors, np.concatenate([ids_a, new_ids])[held], names[held]
-    joint.maps.load_metadata(kept, *columns, a.state.maps.next_id + len(exclusive), odds)
+    joint.maps.load_metadata(kept, *columns, a.maps.next_id + len(exclusive), odds)
     # Each map takes half of the extra variance.
     scales = np.full(len(counts), scale)
     if len(named):
-        sides = Landmarks.of(a.state.maps, from_a, named[:, 0]), Landmarks.of(b.state.maps, from_b, named[:, 1])
+        sides = Landmarks.of(a.maps, from_a, named[:, 0]), Landmarks.of(b.maps, from_b, named[:, 1])
         scales[np.searchsorted(ids_a, named[:, 0])] = np.maximum(scale, birge_ratios(*sides, motion, 0.5 * extra))
     write_joint(of_a, of_b, rows_a[held], rows_b[held], motion, 0.5 * extra, scales[held], joint.maps.blocks)
-    joint.finish_join(a.state, b.state, renamed)
-    return FastSlam.from_filter_state(joint), renamed
+    joint.finish_join(a, b, renamed)
+    return joint, renamed
 
 
 def pair_filters(
@@ -137,8 +137,8 @@ def pair_filters(
         a, b, alignment, pairs, rng, num_particles, known: Arguments of `merge_filters`, which makes this draw first.
     """
     count = max(a.num_particles, b.num_particles) if num_particles is None else num_particles
-    pairs, _ = merge_by_identity(a.state.maps, b.state.maps, pairs)
-    common_a, common_b = Landmarks.of(a.state.maps, ids=pairs[:, 0]), Landmarks.of(b.state.maps, ids=pairs[:, 1])
+    pairs, _ = merge_by_identity(a.maps, b.maps, pairs)
+    common_a, common_b = Landmarks.of(a.maps, ids=pairs[:, 0]), Landmarks.of(b.maps, ids=pairs[:, 1])
     return pair_particles(a.weights, common_a, b.weights, common_b, alignment, count, rng, known)
 
 

@@ -145,7 +145,7 @@ def test_diagnostics_are_per_robot_and_a_merge_keeps_warnings() -> None:
     before = [team.consistency(robot) for robot in range(2)]
     assert [row["warnings"] for row in team.diagnostics] == [float(len(one.warnings)) for one in before]
     assert all(one.warnings for one in before)
-    joint = ConsistencyTest.joined(*(group.trunk.filter.state.consistency for group in team._groups)).report()
+    joint = ConsistencyTest.joined(*(group.trunk.filter._consistency for group in team._groups)).report()
     assert joint.frames == sum(each.frames for each in before)
     assert joint.nis_share == pytest.approx(sum(each.nis_share * each.frames for each in before) / joint.frames)
     assert {one.sign for one in joint.warnings} == {one.sign for each in before for one in each.warnings}

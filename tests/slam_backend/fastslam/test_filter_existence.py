@@ -316,10 +316,10 @@ def test_memory_of_deleted_landmarks_is_reused(proposal: Any) -> None:
         slam.step([None], [Measurements(POINTS[step % 3 : step % 3 + 1], looks[step : step + 1])])
         held.append(slam.num_landmarks)
         if step == 20:
-            memory = slam.state.maps.nbytes
+            memory = slam.maps.nbytes
     assert max(held) == ExistenceModel().misses_to_delete(0.0)
-    assert slam.state.maps.nbytes == memory
-    assert slam.state.maps.next_id == 200
+    assert slam.maps.nbytes == memory
+    assert slam.maps.next_id == 200
 
 
 @pytest.mark.parametrize("delete_below", [0.01, 0.05])

@@ -157,11 +157,11 @@ def test_weights_multiply_over_the_measurements_of_a_frame(proposal: Any) -> Non
     noise = np.array([np.diag(row) for row in rng.uniform(0.01, 0.04, (3, 3))])
     slam = plain_filter(1, 2, camera, proposal=proposal, resample_threshold=0.0, new_landmark_density=0.3)
     slam.step([None], [Measurements(points, np.eye(3), noise)], identities=[[1, 2, 3]], poses=[np.zeros(3)])
-    np.testing.assert_allclose(slam.state.path_log_weights, 3.0 * np.log(0.3))  # l. 32: p0 for each new landmark
+    np.testing.assert_allclose(slam.path_log_weights, 3.0 * np.log(0.3))  # l. 32: p0 for each new landmark
     again = points + rng.normal(0.0, 0.1, (3, 3))
     slam.step([None], [Measurements(again, np.eye(3), noise)], identities=[[1, 2, 3]], poses=[np.zeros(3)])
     expected = [stats.multivariate_normal(v, 2.0 * r).logpdf(w) for v, w, r in zip(points, again, noise, strict=True)]
-    np.testing.assert_allclose(slam.state.path_log_weights - 3.0 * np.log(0.3), np.sum(expected))
+    np.testing.assert_allclose(slam.path_log_weights - 3.0 * np.log(0.3), np.sum(expected))
 
 
 @PROPOSALS
@@ -253,8 +253,8 @@ def test_weights_never_underflow(proposal: Any) -> None:
     world = StereoWorld(np.random.default_rng(0), 9)
     slam = plain_filter(1, 5, world.camera, proposal=proposal, resample_threshold=0.0, seed=1)
     drive(slam, world, 1000)
-    assert np.isfinite(slam.state.log_weights).all()
-    assert np.isfinite(slam.state.path_log_weights).all()
+    assert np.isfinite(slam.log_weights).all()
+    assert np.isfinite(slam.path_log_weights).all()
     assert slam.weights.sum() == pytest.approx(1.0, abs=1e-12)
     assert 1.0 <= slam.step([None], [None]).ess <= 5.0
 

@@ -96,7 +96,7 @@ def assert_same_particles(slam: FastSlam, plain: ReferenceFastSlam) -> None:
     np.testing.assert_allclose(np.where(held, means, 0.0), expected_means, **CLOSE)
     np.testing.assert_allclose(np.where(held, covariances, 0.0), expected_covariances, **CLOSE)
     if slam.options.existence is not None:
-        log_odds, _ = slam.state.maps.odds_and_counts(slam.state.maps.used_slots())
+        log_odds, _ = slam.maps.odds_and_counts(slam.maps.used_slots())
         for m, particle in enumerate(plain.particles):
             for name, landmark in particle.landmarks.items():
                 assert log_odds[rows[name], m] == pytest.approx(landmark.log_odds, abs=1e-9)
@@ -117,10 +117,10 @@ def assert_same(slam: FastSlam, plain: ReferenceFastSlam) -> None:
         assert_same_pose(poses, np.array([particle.poses[robot] for particle in plain.particles]))
         np.testing.assert_allclose(log_weights, [particle.log_weight for particle in plain.particles], **weighted)
         assert_same_pose(slam.pose(robot).mean, plain.pose(robot).mean, weighted)
-        biases = slam.state.biases[robot, :, : slam.num_particles].T
+        biases = slam.biases[robot, :, : slam.num_particles].T
         np.testing.assert_allclose(biases, [particle.biases[robot] for particle in plain.particles], **CLOSE)
         bias = plain.biases[robot]
-        np.testing.assert_allclose(slam.state.bias_covariances[:, robot], [bias.covariance, bias.cross], **CLOSE)
+        np.testing.assert_allclose(slam.bias_covariances[:, robot], [bias.covariance, bias.cross], **CLOSE)
         np.testing.assert_allclose(slam.pose(robot).covariance, plain.pose(robot).covariance, **weighted)
     best = slam.best_particle
     assert best in plain.equally_probable()

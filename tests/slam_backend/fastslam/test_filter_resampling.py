@@ -66,9 +66,9 @@ def test_accumulated_weights_follow_the_ancestral_line(proposal: Any) -> None:
         twin.step(odometry, frames)
         slam.step(odometry, frames)
         parents = parents_of(slam, twin)
-        np.testing.assert_array_equal(slam.state.path_log_weights, twin.state.path_log_weights[parents])
+        np.testing.assert_array_equal(slam.path_log_weights, twin.path_log_weights[parents])
         np.testing.assert_allclose(slam.weights, 1.0 / 11.0)
-        strangers += int(np.sum(slam.state.path_log_weights != twin.state.path_log_weights))
+        strangers += int(np.sum(slam.path_log_weights != twin.path_log_weights))
     assert strangers > 10, "the indices have changed their meaning many times"
 
 
@@ -79,7 +79,7 @@ def test_a_resampled_particle_copies_all_of_its_parent(scheme: str) -> None:
     Robot 1 sees nothing: its Gaussians are not sampled, and go along too.
     """
     slam = plain_filter(2, 70, CAMERA, resampling=scheme, resample_threshold=1.0)
-    slam.state.starts[1, :2, :70] += np.random.default_rng(1).normal(size=(2, 70))  # as after a merge
+    slam.starts[1, :2, :70] += np.random.default_rng(1).normal(size=(2, 70))  # as after a merge
     copies = 0
     for odometry, frames in inputs(12, seed=2):
         twin = without_resampling(slam.get_state())
@@ -112,9 +112,7 @@ def test_landmarks_out_of_view_follow_every_resampling(proposal: Any, scheme: st
         unseen += alone.map_size - len(frames[0])
         assert report.resampled
     assert unseen > 70
-    assert len(np.unique(alone.state.maps.map_of)) > 4, (
-        "landmarks last seen before one, two, three and more resamplings"
-    )
+    assert len(np.unique(alone.maps.map_of)) > 4, "landmarks last seen before one, two, three and more resamplings"
     assert_same(contents(alone), contents(read))
 
 
@@ -138,10 +136,10 @@ def test_survivors_keep_their_places(scheme: str) -> None:
 def test_weights_are_kept_until_the_particles_are_resampled() -> None:
     """Without resampling a step multiplies the weights of before; with it they start from 1/M."""
     slam = filter_after(3, resample_threshold=0.0)
-    before, paths = slam.particles()[1], slam.state.path_log_weights.copy()
+    before, paths = slam.particles()[1], slam.path_log_weights.copy()
     odometry, frames = inputs(4)[3]
     slam.step(odometry, frames)
-    gained = slam.state.path_log_weights - paths
+    gained = slam.path_log_weights - paths
     expected = before + gained
     np.testing.assert_allclose(slam.particles()[1], expected - np.logaddexp.reduce(expected), atol=1e-12)
 
@@ -175,7 +173,7 @@ def test_writing_a_particle_changes_no_other_particle(proposal: Any, scheme: str
 def test_a_landmark_is_updated_in_the_particle_that_holds_it_only(proposal: Any, num_particles: int) -> None:
     """Where one particle alone holds a landmark, its update leaves all that is kept for the others alone."""
     slam = filter_after(8, num_particles, resample_threshold=1.0, proposal=proposal)
-    maps = slam.state.maps
+    maps = slam.maps
     slots = maps.used_slots()
     values, counts = maps.dense(slots)
     row = int(np.flatnonzero((counts > 0).all(axis=1))[-1])  # the newest lies ahead of the robot
@@ -186,7 +184,7 @@ def test_a_landmark_is_updated_in_the_particle_that_holds_it_only(proposal: Any,
     slam = without_resampling(slam.get_state())
     ids, means, covariances, counts = dense(slam)
     poses = slam.particles()[0]
-    look = slam.state.maps.descriptors[slam.state.maps.used_slots()[row]][None]
+    look = slam.maps.descriptors[slam.maps.used_slots()[row]][None]
     report = slam.step([None], [Measurements([[-0.1, -0.2, 3.0]], look)], identities=[[5]])
     now_ids, now_means, now_covariances, now_counts = dense(slam)
     np.testing.assert_array_equal(now_ids, [*ids, report.created[0][0]])
@@ -255,7 +253,7 @@ def test_a_filter_continues_bit_for_bit_through_many_snapshots(proposal: Any) ->
         restored.set_state(state)
         if step % 2:
             restored.map("mixture")
-    assert slam.state.maps.next_id - slam.num_landmarks > 10, "landmarks have been forgotten"
+    assert slam.maps.next_id - slam.num_landmarks > 10, "landmarks have been forgotten"
     assert_same(restored.map("mixture"), slam.map("mixture"))
     assert_same(contents(restored), contents(slam))
 
@@ -278,7 +276,7 @@ def test_a_snapshot_shares_no_writable_array(proposal: Any) -> None:
     state = slam.get_state()
     kept = copy.deepcopy(state)
     other.set_state(state)
-    in_use = [a for one in (slam, other) for a in [*arrays_of(one).values(), *arrays_in(one.state.estimates)]]
+    in_use = [a for one in (slam, other) for a in [*arrays_of(one).values(), *arrays_in(one.estimates)]]
     for array in arrays_in(state):
         assert not any(held.flags.writeable and np.shares_memory(array, held) for held in in_use)
     for odometry, frames in inputs(8)[5:]:

@@ -23,12 +23,12 @@ SCATTER = np.array([[3e-2, 1e-3, 2e-3], [1e-3, 2e-2, -1e-3], [2e-3, -1e-3, 5e-3]
 
 def plain_mixture(slam: FastSlam, min_count: int) -> LandmarkMap:
     """Return the same map by sums over all that `dense` copies."""
-    maps, best = slam.state.maps, slam.best_particle
+    maps, best = slam.maps, slam.best_particle
     slots = maps.used_slots()
     counts = maps.of_particle(best, slots)[1]
     slots, counts = slots[counts >= min_count], counts[counts >= min_count]
     dense, times = maps.dense(slots)
-    weights = np.exp(slam.state.log_weights) * (times > 0)
+    weights = np.exp(slam.log_weights) * (times > 0)
     weights /= weights.sum(axis=1, keepdims=True)
     mixed = np.einsum("ncm,nm->nc", dense, weights)
     offsets = dense[:, :3] - mixed[:, :3, None]
@@ -48,7 +48,7 @@ def test_the_kernel_agrees_with_plain_sums() -> None:
     for num_particles, seed in ((1, 5), (8, 6), (70, 7)):
         slam = filter_with_gaps(num_particles, seed)
         for least in (1, 2):
-            raw = map_mixture(slam.state.maps, slam.best_particle, slam.state.log_weights, SCATTER, least)
+            raw = map_mixture(slam.maps, slam.best_particle, slam.log_weights, SCATTER, least)
             np.testing.assert_array_equal(raw[1], raw[1].transpose(0, 2, 1))
             found = LandmarkMap(*raw)
             plain = plain_mixture(slam, least)
@@ -63,10 +63,10 @@ def test_the_kernel_agrees_with_plain_sums() -> None:
 def test_computing_a_mixture_changes_nothing() -> None:
     """Maps that wait to be brought up to date still wait afterwards."""
     slam = filter_with_gaps(33, 8)
-    before = slam.state.maps.get_state()
+    before = slam.maps.get_state()
     assert before["map_of"].any()
     slam.map("mixture")
-    after = slam.state.maps.get_state()
+    after = slam.maps.get_state()
     for name in ("map_of", "maps", "counts"):
         np.testing.assert_array_equal(after[name], before[name])
     np.testing.assert_array_equal(np.concatenate(after["values"]), np.concatenate(before["values"]))
@@ -75,12 +75,12 @@ def test_computing_a_mixture_changes_nothing() -> None:
 def test_slots_that_no_particle_holds_are_not_read() -> None:
     """Slots with a count of zero may hold any values."""
     slam = filter_with_gaps(33, 9)
-    asked = slam.state.maps, slam.best_particle, slam.state.log_weights, SCATTER, 1
+    asked = slam.maps, slam.best_particle, slam.log_weights, SCATTER, 1
     before = map_mixture(*asked)
-    counts = slam.state.maps.counts
-    tiles = slam.state.maps.values.reshape(len(counts), -1, 9, LANES)
+    counts = slam.maps.counts
+    tiles = slam.maps.values.reshape(len(counts), -1, 9, LANES)
     unheld = np.broadcast_to(counts.reshape(len(counts), -1, 1, LANES) == 0, tiles.shape)
-    assert unheld[slam.state.maps.table[ROW_OF, slam.state.maps.used_slots()]].any()
+    assert unheld[slam.maps.table[ROW_OF, slam.maps.used_slots()]].any()
     tiles[unheld] = np.nan
     for one, other in zip(before, map_mixture(*asked), strict=True):
         np.testing.assert_array_equal(one, other)
@@ -89,7 +89,7 @@ def test_slots_that_no_particle_holds_are_not_read() -> None:
 def _filter_after_some_steps() -> FastSlam:
     """Return a filter that has resampled, and in which landmarks came and went."""
     slam, points, looks = filter_after_some_steps(70, seed=3)
-    slam.state.maps.release(slam.state.maps.used_slots()[[2, 5]])
+    slam.maps.release(slam.maps.used_slots()[[2, 5]])
     extra = Measurements(points[:2] + np.array([0.0, 0.0, 3.0]), -looks[:2])
     slam.step([None], [extra])
     return slam
@@ -98,7 +98,7 @@ def _filter_after_some_steps() -> FastSlam:
 def test_the_gather_agrees_with_fancy_indexing() -> None:
     """For each of 70 particles and any least count: the same landmarks, by ascending id, with the same bits."""
     slam = _filter_after_some_steps()
-    maps = slam.state.maps
+    maps = slam.maps
     slots = maps.used_slots()
     assert not (np.diff(slots) > 0).all()  # slots were used again: ids do not ascend with them
     for m in range(70):
@@ -130,7 +130,7 @@ def test_a_map_summary_reports_its_number_of_rows(room: int) -> None:
     size = len(expected.ids)
     assert 9 - 3 < size < 100 - 3
     rows = MapSummaryRows(np.full((room, 4), -7.0), np.full((room, 2), -7))
-    assert write_summary(slam.state.maps, slam.best_particle, 2, rows, 3) == 3 + size
+    assert write_summary(slam.maps, slam.best_particle, 2, rows, 3) == 3 + size
     for got in rows:
         assert (got[:3] == -7).all()
         assert (got[3 + size :] == -7).all()
@@ -174,7 +174,7 @@ def plain_join(
 @pytest.mark.parametrize("sizes", [(33, 70), (5, 5)])
 def test_the_join_agrees_with_matrices(sizes: tuple[int, int]) -> None:
     """Of landmarks that both sides, one, or no particle of a side holds: the same numbers, with the same counts."""
-    maps = [filter_with_gaps(size, 11 + size).state.maps for size in sizes]
+    maps = [filter_with_gaps(size, 11 + size).maps for size in sizes]
     rng = np.random.default_rng(3)
     a, b = (Landmarks.of(side, rng.integers(0, side.num_particles, 40)) for side in maps)
     rows_a, rows_b = np.array([*range(len(a.slots)), -1, -1]), np.full(len(a.slots) + 2, -1)
@@ -197,7 +197,7 @@ def test_the_join_agrees_with_matrices(sizes: tuple[int, int]) -> None:
 
 def test_landmarks_are_read_wherever_they_lie() -> None:
     """Values of some landmarks in any order, of all particles: those of the copies that each particle gives."""
-    maps = filter_with_gaps(33, 21).state.maps
+    maps = filter_with_gaps(33, 21).maps
     names = maps.ids[maps.used_slots()][[4, 0, 3]]
     some = Landmarks.of(maps, ids=names)
     np.testing.assert_array_equal(some.ids, names)

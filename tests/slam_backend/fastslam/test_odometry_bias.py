@@ -64,8 +64,8 @@ def test_the_bias_of_a_particle_is_its_gaussian_given_the_path(proposal):
     readings, paths = drive(slam, 9, np.array([0.05, -0.08, 0.04]))
     for m in (0, 6):
         mean, covariance = regression(readings, paths[:, m], [[step] for step in range(9)])
-        np.testing.assert_allclose(slam.state.biases[0, :, m], mean, atol=5e-4)  # second order in the bias
-        np.testing.assert_allclose(slam.state.bias_covariances[0, 0], covariance, rtol=0.01, atol=1e-6)
+        np.testing.assert_allclose(slam.biases[0, :, m], mean, atol=5e-4)  # second order in the bias
+        np.testing.assert_allclose(slam.bias_covariances[0, 0], covariance, rtol=0.01, atol=1e-6)
 
 
 def test_a_stretch_without_measurements_counts_as_one_motion():
@@ -76,9 +76,9 @@ def test_a_stretch_without_measurements_counts_as_one_motion():
     chains = [[0], [1], [2], [3, 4, 5, 6, 7], [8]]
     for m in (0, 6):
         mean, covariance = regression(readings, paths[:, m], chains)
-        np.testing.assert_allclose(slam.state.biases[0, :, m], mean, atol=3e-3)  # second order in the bias
-        np.testing.assert_allclose(slam.state.bias_covariances[0, 0], covariance, rtol=0.05, atol=3e-6)
-    assert not slam.state.bias_covariances[1].any()
+        np.testing.assert_allclose(slam.biases[0, :, m], mean, atol=3e-3)  # second order in the bias
+        np.testing.assert_allclose(slam.bias_covariances[0, 0], covariance, rtol=0.05, atol=3e-6)
+    assert not slam.bias_covariances[1].any()
 
 
 def test_uncertainty_without_measurements_grows_with_the_bias():
@@ -97,8 +97,8 @@ def test_a_model_without_biases_leaves_the_filter_as_it_was():
     """Zero standard deviations change no bit, and no bias is ever learnt."""
     slam = FastSlam(num_particles=5, motion=OdometryModel(), seed=3)
     drive(slam, 5, np.zeros(3))
-    assert not slam.state.biases.any()
-    assert not slam.state.bias_covariances.any()
+    assert not slam.biases.any()
+    assert not slam.bias_covariances.any()
 
 
 def test_biases_are_found_with_honest_uncertainty():
@@ -138,5 +138,5 @@ def test_a_run_with_biases_continues_bit_exactly():
 
     whole, halves = run(-1), run(9)
     for name in ("poses", "biases", "bias_covariances", "weights"):
-        np.testing.assert_array_equal(getattr(whole.state, name), getattr(halves.state, name))
-    assert whole.state.biases.any()
+        np.testing.assert_array_equal(getattr(whole, name), getattr(halves, name))
+    assert whole.biases.any()

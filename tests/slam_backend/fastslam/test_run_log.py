@@ -17,8 +17,8 @@ from slam_backend.fastslam._kernels.layout import ESTIMATE, LOGGED, LOGGED_KIND,
 from slam_backend.fastslam._kernels.run_log import guesses_of
 from slam_backend.fastslam._kernels.step import log_step
 from slam_backend.fastslam.filter import FastSlam
+from slam_backend.fastslam.pending_steps import LONGEST, ROOM
 from slam_backend.fastslam.run_log import MEASUREMENTS, ROWS, RobotLog
-from slam_backend.fastslam.state import LONGEST, ROOM
 from slam_backend.models.measurements import Measurements
 from slam_backend.smoother.log_arrays import EXACT, ODOMETRY, STATIONARY
 

@@ -197,7 +197,7 @@ def test_reported_covariances_include_the_gauge_covariance():
     off[:, 2] = wrap_angle(off[:, 2])
     shown = np.asarray(slam.weights * off.T @ off)
     both = shown[None].copy()
-    add_gauge_covariance(slam.state.gauge_covariance, said.mean[None], both)
+    add_gauge_covariance(slam.gauge_covariance, said.mean[None], both)
     assert np.trace(shown[:2, :2]) < np.trace(said.covariance[:2, :2])
     np.testing.assert_allclose(np.sqrt(np.diag(both[0])), np.sqrt(np.diag(said.covariance)), rtol=0.25)
 
@@ -206,8 +206,8 @@ def test_starts_that_are_given_stay_and_an_exact_pose_needs_no_share():
     """All particles keep given starts; once a pose is given as exact, the gauge covariance is zero."""
     slam, _, drawn = open_run()
     assert drawn
-    assert slam.state.gauge_covariance.any()
-    starts = slam.state.starts[0, :, : slam.num_particles]
+    assert slam.gauge_covariance.any()
+    starts = slam.starts[0, :, : slam.num_particles]
     np.testing.assert_array_equal(starts, np.repeat(starts[:, :1], slam.num_particles, axis=1))
     slam.step([None], [None], poses=[np.array([1.0, 2.0, 0.3])])
     np.testing.assert_allclose(slam.pose().covariance, 0.0, atol=1e-12)
@@ -238,8 +238,8 @@ def test_mixture_maps_include_the_gauge_covariance():
     slopes = np.zeros((len(widened), 3, 3))
     slopes[:, 0, 0] = slopes[:, 1, 1] = 1.0
     slopes[:, 0, 2], slopes[:, 1, 2] = -widened.means[:, 1], widened.means[:, 0]
-    share = slopes @ slam.state.gauge_covariance @ slopes.transpose(0, 2, 1)
-    slam.state.gauge_covariance[:] = 0.0
+    share = slopes @ slam.gauge_covariance @ slopes.transpose(0, 2, 1)
+    slam.gauge_covariance[:] = 0.0
     narrow = slam.map("mixture")
     np.testing.assert_array_equal(widened.means, narrow.means)
     np.testing.assert_allclose(widened.covariances - narrow.covariances, share, atol=1e-12)

@@ -58,7 +58,7 @@ def test_a_rejuvenation_waits_for_enough_measurements():
     run = small_run()
     slam = rejuvenated(run, every=2, smoothing=SmoothingOptions(effort=0.5, free_sightings=0))
     tried = [slam.step(**reading).rejuvenation is not None for reading in run.readings()]
-    graph = slam.state.rejuvenation.get_state()["graph"]
+    graph = slam.rejuvenation.get_state()["graph"]
     assert tried[1]  # at first there is nothing to redo
     assert np.diff(np.flatnonzero(tried)).max() > 2
     assert len(graph["points"]) > 0
@@ -102,9 +102,9 @@ def test_the_reports_say_when_a_landmark_was_seen_last():
             slam = twin
         report = slam.step(reading["odometry"], [with_false_points(reading["measurements"][0], rng)])
         seen |= {name: step for name in report.associations[0].tolist() if name >= 0}
-        slots = slam.state.maps.used_slots()
-        names = slam.state.maps.ids[slots].tolist()
-        assert slam.state.maps.last_seen[slots].tolist() == [seen.get(name, 0) for name in names]
+        slots = slam.maps.used_slots()
+        names = slam.maps.ids[slots].tolist()
+        assert slam.maps.last_seen[slots].tolist() == [seen.get(name, 0) for name in names]
         taken_over += sum(owners.get(slot, name) != name for slot, name in zip(slots, names, strict=True))
         owners |= dict(zip(slots, names, strict=True))
         renewed += report.rejuvenation is not None
@@ -120,9 +120,9 @@ def test_after_a_rejuvenation_all_particles_hold_the_same_landmarks():
         slam.step(**reading)
     ids, _, covariances, counts = dense(slam)
     seen = np.bincount(np.concatenate([names[0] for names in run.names]))
-    slots = slam.state.maps.used_slots()
-    np.testing.assert_array_equal(slam.state.maps.ids[slots], ids)
-    np.testing.assert_array_equal(counts, np.repeat(seen[slam.state.maps.identities[slots]][:, None], 30, axis=1))
+    slots = slam.maps.used_slots()
+    np.testing.assert_array_equal(slam.maps.ids[slots], ids)
+    np.testing.assert_array_equal(counts, np.repeat(seen[slam.maps.identities[slots]][:, None], 30, axis=1))
     full = covariances.transpose(0, 2, 1)[..., [[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
     assert np.linalg.eigvalsh(full).min() > 0.0
 
@@ -138,8 +138,8 @@ def test_landmarks_without_sightings_are_deleted(left, monkeypatch):
         landmarks = new.landmarks._replace(rows=new.landmarks.rows[:left])
         renew_all(new._replace(ids=new.ids[:left], landmarks=landmarks, counts=new.counts[:left]))
 
-    renew_all = slam.state._replace_particles
-    monkeypatch.setattr(slam.state, "_replace_particles", renew)
+    renew_all = slam._replace_particles
+    monkeypatch.setattr(slam, "_replace_particles", renew)
     readings = list(run.readings())
     for reading in readings[:EVERY]:
         slam.step(**reading)

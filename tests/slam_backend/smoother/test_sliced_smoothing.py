@@ -112,8 +112,8 @@ def test_all_slices_in_one_step_are_those_of_many() -> None:
         slam.may_smooth = False
         for reading in run.readings():
             slam.step(**reading)
-        slices, work = 0, slam.state.rejuvenate
-        smoother = slam.state.rejuvenation
+        slices, work = 0, slam._smooth
+        smoother = slam.rejuvenation
         assert smoother is not None
         smoother.request()
         while (report := work(smoother)) is None:

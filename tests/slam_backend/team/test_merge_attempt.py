@@ -79,7 +79,7 @@ def test_a_filter_that_never_rejuvenates_by_itself_can_be_rejuvenated() -> None:
         slam = team_with_deformed_maps(111, NEVER, rejuvenate_every=every)[1]._find(0)[0].filter
         before = slam.map()
         assert slam.rejuvenate().reason == ""
-        assert (slam.state.rejuvenation is None) == (every is None)
+        assert (slam.rejuvenation is None) == (every is None)
         after = slam.map()
         moved = after.means[np.isin(after.ids, before.ids)] - before.means[np.isin(before.ids, after.ids)]
         assert np.abs(moved).max() > 0.01
@@ -199,7 +199,7 @@ def test_the_predicted_scatter_of_motions_is_that_of_the_merged_particles() -> N
     motion = pair_filters(a, b, alignment, pairs, np.random.default_rng(2)).motion
     foretold = transform_covariance(motion, alignment)
     joint, _ = merge_filters(a, b, alignment, pairs, np.random.default_rng(2))
-    starts = joint.state.starts[1, :, : joint.num_particles].T
+    starts = joint.starts[1, :, : joint.num_particles].T
     np.testing.assert_allclose(foretold, np.cov(starts.T, bias=True), atol=1e-12)
 
 
@@ -343,8 +343,8 @@ def test_the_joint_graph_tells_the_motion_and_its_uncertainty(incremental: bool)
     off = between(joint.start_pose(1), found.alignment.transform)
     assert off @ np.linalg.solve(covariance, off) < 1.0
     start = joint.start_pose(1)
-    claimed = rotate_covariances(start[2], joint.state.start_covariances[1])
-    add_gauge_covariance(joint.state.gauge_covariance, start[None], claimed[None])
+    claimed = rotate_covariances(start[2], joint.start_covariances[1])
+    add_gauge_covariance(joint.gauge_covariance, start[None], claimed[None])
     np.testing.assert_allclose(np.diag(claimed), np.diag(covariance), rtol=0.5)
 
 
@@ -445,7 +445,7 @@ def test_the_uncertainty_of_paired_particles_includes_the_gauge_covariance() -> 
     position, heading = math.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1]), math.sqrt(covariance[2, 2])
 
     for slam, frame in zip((a, b), frames, strict=True):
-        slam.state.gauge_covariance[:] = frame
+        slam.gauge_covariance[:] = frame
     after = transform_uncertainty(plan)
     np.testing.assert_allclose(after, max(position / DISTINCT_TRANSLATION, heading / DISTINCT_ROTATION), rtol=0.03)
     assert after > 1.5 * before

@@ -116,7 +116,7 @@ def test_ids_of_a_stay_and_those_of_b_are_renamed_one_to_one() -> None:
 def test_a_fused_landmark_keeps_the_callers_id() -> None:
     """Where a's landmark has no name of the caller's, the fused one takes that of b."""
     a, b = both()
-    a.state.maps.identities[a.state.maps.ids == 2] = -1
+    a.maps.identities[a.maps.ids == 2] = -1
     joint, _ = merge_filters(a, b, known_alignment(), PAIRS, np.random.default_rng(1))
     assert names_of(joint)[2] == NAMES_A[2]
 
@@ -175,7 +175,7 @@ def test_descriptors_are_averaged_by_counts_and_keep_their_length() -> None:
     a, b = both()
     for _ in range(2):
         a.step([None], [frame_of(LANDMARKS[NAMES_A], NAMES_A, 0.01)], identities=[NAMES_A])
-    b.state.maps.descriptors[b.state.maps.ids == 1] = looks(np.array([12]))  # b's view of landmark 4
+    b.maps.descriptors[b.maps.ids == 1] = looks(np.array([12]))  # b's view of landmark 4
     joint, _ = merge_filters(a, b, known_alignment(), PAIRS, np.random.default_rng(1))
     fused = joint.map().descriptors[4]
     expected = 3 * looks(np.array([4]))[0] + looks(np.array([12]))[0]
@@ -241,9 +241,9 @@ def test_uninitialised_rows_are_never_read(monkeypatch: pytest.MonkeyPatch) -> N
         merged = joint.get_state()
         for _ in range(3):
             joint.step([MOVE, MOVE], [new_frame(), new_frame()])
-            joint.state.resample()
+            joint.resample()
         joint.rejuvenate()
-        joint.state.maps.reserve(len(joint.state.maps.ids), joint.descriptor_size)
+        joint.maps.reserve(len(joint.maps.ids), joint.descriptor_size)
         joint.step([MOVE, None], [new_frame(), None])
         states.append([a.get_state(), b.get_state(), merged, joint.get_state()])
     assert_same(*states)
@@ -311,16 +311,16 @@ def test_accumulated_weights_of_both_filters_add_up() -> None:
     rng = np.random.default_rng(2)
     a = map_once(NAMES_A, np.zeros(3), 0.05, rng, 50, moves=1)
     b = map_once(NAMES_B, A_FROM_B, 0.05, rng, 50, moves=1)
-    a.state.path_log_weights[:], b.state.path_log_weights[:] = rng.normal(size=(2, 50))
+    a.path_log_weights[:], b.path_log_weights[:] = rng.normal(size=(2, 50))
     joint, _ = merge_filters(a, b, known_alignment(), PAIRS, np.random.default_rng(1))
-    pasts = a.state.path_log_weights[parents_of(joint, 0, a)] + b.state.path_log_weights[parents_of(joint, 1, b)]
-    np.testing.assert_allclose(np.ptp(joint.state.path_log_weights - pasts), 0.0, atol=1e-6)
+    pasts = a.path_log_weights[parents_of(joint, 0, a)] + b.path_log_weights[parents_of(joint, 1, b)]
+    np.testing.assert_allclose(np.ptp(joint.path_log_weights - pasts), 0.0, atol=1e-6)
 
 
 def test_pairs_whose_maps_fit_each_other_survive() -> None:
     """Particles of b in which a common landmark stands ten deviations off do not outlive the merge."""
     a, b = both(sigma=0.05, particles=(50, 50))
-    maps = b.state.maps
+    maps = b.maps
     slots = maps.used_slots()
     values, counts = maps.dense(slots)
     values[1, 0, 35:] += 0.5  # landmark 1 of b is one of the common ones

@@ -156,7 +156,7 @@ def test_contradictions_add_variance_up_to_a_bound_and_scale_beyond(sigma: float
     """
     rng = np.random.default_rng(5)
     a, b = contradicting(sigma, claimed, rng)
-    a.state.maps.blocks[a.state.maps.row_of[5], :, 3:] *= 900.0  # a's own landmark 5
+    a.maps.blocks[a.maps.row_of[5], :, 3:] *= 900.0  # a's own landmark 5
     map_a, map_b = a.map(), b.map()
     joint, _ = merge_filters(a, b, known_alignment(), PAIRS, rng)
     rows_a, rows_b = PAIRS.T

@@ -217,7 +217,7 @@ def test_weights_multiply_by_the_chain_rule() -> None:
     slam = plain_filter(2, 1, initial_poses=starts, proposal="fastslam1")
     still = np.zeros((2, 3))
     slam.step([None, None], [frame_of(local[0], names, sigma_map), None], identities=[names, None], poses=still)
-    before = slam.state.path_log_weights[0]
+    before = slam.path_log_weights[0]
     errors = sigma * rng.normal(size=(2, 1, 3))
     frames = [frame_of(points + error, names, sigma) for points, error in zip(local, errors, strict=True)]
     slam.step([None, None], frames, identities=[names, names], poses=still)
@@ -225,7 +225,7 @@ def test_weights_multiply_by_the_chain_rule() -> None:
     stacked = np.ravel(turned)
     joint = np.kron(np.full((2, 2), sigma_map**2), np.eye(3)) + sigma**2 * np.eye(6)
     expected = -0.5 * (stacked @ np.linalg.solve(joint, stacked) + np.linalg.slogdet(2 * np.pi * joint)[1])
-    assert slam.state.path_log_weights[0] - before == pytest.approx(expected, rel=1e-9)
+    assert slam.path_log_weights[0] - before == pytest.approx(expected, rel=1e-9)
 
 
 def test_a_joint_filter_takes_robots_in_the_order_of_the_team() -> None:

@@ -19,7 +19,7 @@ def test_a_map_with_all_landmarks_needs_about_what_is_estimated() -> None:
     """The estimate is twice the values and counts of a filter's landmarks, apart from rounding up to lanes and room."""
     slam = FastSlam(num_particles=200)
     points = np.column_stack([np.linspace(-2.0, 2.0, 400), np.zeros(400), np.full(400, 3.0)])
-    maps = slam.state.maps
+    maps = slam.maps
     maps.reserve(len(points), 64)
     bytes_used = maps.values.nbytes + maps.counts.nbytes - LINE
     assert 0.4 < bytes_used / memory.required_memory(len(points), 200) < 0.7
