@@ -167,8 +167,8 @@ class EpisodeCheck:
             check.refuse(f"{name}['team']", f"descriptors of length {landmarks.descriptors.shape[1]}", sizes)
         config, given = self._config.belief, belief["team"]
         attempts, merging = merge_options(config, not self._config.oracle_merge)
-        found = [*team.options, given["alignment"], given["schedule"]["alignment"], given["schedule"]["options"]]
-        wanted = [config.filter] * len(team.options) + [config.alignment, config.alignment, attempts]
+        found = [*team.options, given["schedule"]["alignment"], given["schedule"]["options"]]
+        wanted = [config.filter] * len(team.options) + [config.alignment, attempts]
         if [*found, given["merging"]] != [*wanted, merging]:
             check.refuse(f"{name}['team']", "options of the environment's configuration", "others")
         updates = {} if own is None else own.grid_updates
@@ -347,16 +347,12 @@ MOST_MEASURED = 1000  # most landmarks that all robots together create in a tick
 
 
 def branches_of(team: Mapping[str, Any]) -> Iterable[Mapping[str, Any]]:
-    """Yield each branch of a team's state once, including those that a rollback would restore."""
-    waiting = [branch for group in team["groups"] for branch in group["branches"]]
-    waiting += [side for group in team["groups"] if group["undoing"] is not None for side in group["undoing"]["sides"]]
-    done: set[int] = set()
-    while waiting:
-        branch = waiting.pop()
-        if id(branch) not in done:
-            done.add(id(branch))
-            yield branch
-            waiting += [side.trunk for watch in branch["monitors"] for side in watch.sides]
+    """Yield each branch of a team's state, including those that an undo would restore."""
+    for group in team["groups"]:
+        yield from group["branches"]
+    for process in team["processes"]:
+        yield from process.get("sides", ())
+        yield from process.get("trunks", ())
 
 
 def check_streams(name: str, streams: Any) -> None:

@@ -163,6 +163,14 @@ def false_alignment(simulation: SimulatedTeam, team: TeamSlam, offset: FloatArra
     return Alignment(True, "", *motion, 1e-3 * np.eye(3), np.array(pairs), 0.0)
 
 
+def begin_undo(team: TeamSlam) -> None:
+    """Begin to undo the oldest merge of the first group."""
+    group = team._groups[0]
+    process = team._merges.joined[group.merge_numbers[0]]
+    assert process.joined is not None
+    process.phase = team._merges.rollback(process.joined, group)
+
+
 STARTS = np.array([[0.5, -1.0, 0.3], [4.0, 3.0, 2.0], [9.0, 1.0, -2.5], [2.0, 6.0, -1.2]])  # world
 COMMON = np.arange(5)  # names of the landmarks that all robots see first, so that these have ids 0 to 4 in every map
 SIGMA = 1e-4

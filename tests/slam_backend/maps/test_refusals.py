@@ -107,9 +107,8 @@ def watched(joined: int, turned: int = 0) -> tuple[MergeMonitor, LandmarkMap]:
     means = np.concatenate([places, places + np.array([1.0, 0.0, 0.0])])
     names = looks(np.tile(np.arange(TWICE), 2))
     joint = LandmarkMap(means, np.tile(1e-3 * np.eye(3), (2 * TWICE, 1, 1)), names)
-    alignment = Alignment(True, "", 0.0, 0.0, 0.0, 1e-4 * np.eye(3), np.empty((0, 2), np.int64), 0.0)
     own, before = (set(range(TWICE)), set(range(TWICE, 2 * TWICE))), (joined_map(joined), joined_map(joined, turned))
-    return MergeMonitor(2, alignment, (None, None), before, own), joint  # type: ignore[arg-type]
+    return MergeMonitor(2, ((0,), (1,)), before, own), joint
 
 
 @pytest.mark.parametrize(("joined", "contradicted"), [(0, True), (7, True), (8, False), (60, False)])
