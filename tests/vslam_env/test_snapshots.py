@@ -384,7 +384,7 @@ def test_a_file_restores_sharing_and_write_protection(tmp_path: Path) -> None:
     assert encode(loaded, ENV_KINDS) == encode(state, ENV_KINDS)
     team = loaded["episode"]["belief"]["team"]
     event = next(event for event in team["events"] if event.kind == "merge")
-    assert team["groups"][0]["branches"][0]["monitors"][0].alignment is event.alignment
+    assert team["processes"][0]["alignment"] is event.alignment
 
 
 def test_files_are_whole_or_not_there(tmp_path: Path) -> None:
