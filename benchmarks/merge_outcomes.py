@@ -155,7 +155,7 @@ class Follower:
 
     def note(self, step: int) -> None:
         """Update the records after a step."""
-        if step % self._team._merging.watch_every == 0:
+        if step % self._team._merges.merging.watch_every == 0:
             self._weigh()
         for i, event in enumerate(self._team.events):
             if event.kind == "merge" and step - event.step <= WINDOW:

@@ -307,18 +307,18 @@ class TeamSlam:
         for robot in range(self.num_robots):
             branch, index = self._find(robot)
             report = branch.report
-            found = np.empty(0, np.int64) if report is None else report.associations[index]
-            made = np.empty(0, np.int64) if report is None else report.created[index]
-            new = int(np.count_nonzero((found >= 0) & (found == made)))
+            associated = np.empty(0, np.int64) if report is None else report.associations[index]
+            created = np.empty(0, np.int64) if report is None else report.created[index]
+            new = int(np.count_nonzero((associated >= 0) & (associated == created)))
             summary = branch.filter.consistency
             rows.append(
                 {
                     "ess": self.ess(robot),
                     "nis": float("nan") if report is None else report.nis,
                     "landmarks": float(branch.filter.map_size),
-                    "accepted": float(np.count_nonzero(found >= 0) - new),
+                    "accepted": float(np.count_nonzero(associated >= 0) - new),
                     "new": float(new),
-                    "rejected": float(np.count_nonzero(found < 0)),
+                    "rejected": float(np.count_nonzero(associated < 0)),
                     "nis_mean": summary.nis_mean,
                     "nis_share": summary.nis_share,
                     "ess_share": summary.ess_share,
@@ -440,12 +440,12 @@ class TeamSlam:
         Args:
             into: Earlier result, overwritten. None: fresh arrays.
         """
-        points = TeamPoses(self._num_robots) if into is None else into
+        poses = TeamPoses(self._num_robots) if into is None else into
         for branch in self.topology.branches:
             slam, report = branch.filter, branch.report
             ess = 1.0 if report is None else report.ess / slam.num_particles
-            slam.write_team_poses(branch.robots, branch.active_robots, ess, points)
-        return points
+            slam.write_team_poses(branch.robots, branch.active_robots, ess, poses)
+        return poses
 
     def _group_of(self, robot: int) -> Group:
         """Return the robot's group."""
