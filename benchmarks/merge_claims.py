@@ -16,7 +16,7 @@ import typer
 from slam_backend.core.validation import check_int
 from slam_backend.geometry import between, wrap_angle
 from slam_backend.maps.alignment import Alignment
-from slam_backend.team import merge_attempt
+from slam_backend.team import merge
 from slam_backend.team.groups import Group
 from training.bench.config import ScaleBenchConfig
 from training.bench.exploration.players import parted
@@ -32,7 +32,7 @@ def claims_of(config: ScaleBenchConfig) -> tuple[list[Claim], list[tuple[float, 
     """Play the first trial; return its claims, and the error [m, degrees] of each merge."""
     trial, claims, now = config.trials()[0], [], [0.0]
     env = ExplorationEnv(config.environment(trial))
-    decide = merge_attempt._refused_if_uncertain
+    decide = merge.refused_if_uncertain
 
     def noted(found: Alignment, pair: tuple[Group, Group], *args: Any) -> Alignment:
         decided = decide(found, pair, *args)
@@ -53,11 +53,11 @@ def claims_of(config: ScaleBenchConfig) -> tuple[list[Claim], list[tuple[float, 
     def watch(progress: Progress) -> None:
         now[0] = progress.time
 
-    merge_attempt._refused_if_uncertain = noted
+    merge.refused_if_uncertain = noted
     try:
         record = run_episode(env, parted(config.policy).make(env, DECISION_LIMIT), trial.seed, watch)
     finally:
-        merge_attempt._refused_if_uncertain = decide
+        merge.refused_if_uncertain = decide
     return claims, [(merge.error_m, merge.error_deg) for merge in record.merges]
 
 

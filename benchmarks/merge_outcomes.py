@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from slam_backend.core.validation import FloatArray
-from slam_backend.fastslam.reports import MergeEvent
 from slam_backend.geometry import between
 from slam_backend.team.merge_monitor import deformed_fraction
+from slam_backend.team.reports import MergeEvent
 from slam_backend.team.team import TeamSlam
 from training.episodes.runner import is_false_merge
 from vslam_env.evaluation.map_scores import FALSE, GroundTruthAssociation
@@ -155,7 +155,7 @@ class Follower:
 
     def note(self, step: int) -> None:
         """Update the records after a step."""
-        if step % self._team._merging.watch_every == 0:
+        if step % self._team._merges.merging.watch_every == 0:
             self._weigh()
         for i, event in enumerate(self._team.events):
             if event.kind == "merge" and step - event.step <= WINDOW:
@@ -168,14 +168,16 @@ class Follower:
 
     def _weigh(self) -> None:
         """Record the shares of landmarks out of place in the maps of monitored merges."""
-        numbers = {id(event.alignment): i for i, event in enumerate(self._team.events) if event.kind == "merge"}
+        of_event = {id(event.alignment): i for i, event in enumerate(self._team.events) if event.kind == "merge"}
+        options = self._team._merges.schedule.alignment
+        merges = {joined.number: of_event[id(joined.alignment)] for joined in self._team._merges.watched}
         for group in self._team._groups:
             if not group.trunk.monitors:
                 continue
             joint = group.trunk.filter.map("mixture")
             for watch in group.trunk.monitors:
-                i = numbers[id(watch.alignment)]
-                share = max(deformed_fraction(old, joint, self._team._alignment) for old in watch.pre_merge_maps)
+                i = merges[watch.number]
+                share = max(deformed_fraction(old, joint, options) for old in watch.pre_merge_maps)
                 self.moved[i] = max(share, self.moved.get(i, 0.0))
 
     def current_error(self, merge: MergeEvent) -> tuple[float, float]:
@@ -187,11 +189,10 @@ class Follower:
 
     def _share_of_wrong_pairs(self, merge: MergeEvent) -> float:
         """Return the share of wrong pairs of a new merge; pairs with false points are wrong."""
-        watches = (watch for group in self._team._groups for watch in group.trunk.monitors)
-        sides = next(watch.sides for watch in watches if watch.alignment is merge.alignment)
+        sides = next(one.sides for one in self._team._merges.watched if one.alignment is merge.alignment)
         claims = []
         for side, joined, rows in zip(sides, self._team.merged_maps(merge), merge.alignment.inliers.T, strict=True):
-            claims.append(self._ground_truth.claims_of(side.trunk["number"], joined.ids[rows]))
+            claims.append(self._ground_truth.claims_of(side["number"], joined.ids[rows]))
         return float(np.mean((claims[0] != claims[1]) | (claims[0] == FALSE))) if len(claims[0]) else float("nan")
 
 

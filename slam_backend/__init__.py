@@ -8,16 +8,7 @@ from slam_backend.fastslam.consistency import Consistency
 from slam_backend.fastslam.existence import ExistenceModel
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.options import FilterOptions
-from slam_backend.fastslam.reports import (
-    Associations,
-    BiasEstimate,
-    LandmarkIdMap,
-    MergeEvent,
-    PoseEstimate,
-    RejuvenationReport,
-    StepReport,
-    TeamReport,
-)
+from slam_backend.fastslam.reports import Associations, BiasEstimate, PoseEstimate, RejuvenationReport, StepReport
 from slam_backend.maps.alignment import Alignment, AlignmentOptions, align_maps
 from slam_backend.maps.fusion import fuse_landmarks, fuse_maps
 from slam_backend.maps.landmark_map import LandmarkMap
@@ -27,6 +18,7 @@ from slam_backend.models.odometry import OdometryModel
 from slam_backend.smoother.options import SmoothingOptions
 from slam_backend.team.merge_scheduler import AttemptOptions
 from slam_backend.team.options import MergeOptions
+from slam_backend.team.reports import LandmarkIdMap, MergeEvent, TeamReport
 from slam_backend.team.team import TeamSlam
 from slam_backend.trajectory import Trajectory
 from slam_backend.warm_up import warm_up

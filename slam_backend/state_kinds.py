@@ -15,9 +15,10 @@ from slam_backend.models.odometry import OdometryModel
 from slam_backend.smoother.log_arrays import LogArrays
 from slam_backend.smoother.options import SmoothingOptions
 from slam_backend.smoother.reassociation import RejectedMeasurements
+from slam_backend.team import reports as team_reports
 from slam_backend.team.branches import ReplayedStep
-from slam_backend.team.merge_monitor import MergeMonitor, PreMergeSnapshot
-from slam_backend.team.merge_scheduler import AttemptOptions, AttemptRecord, PendingAttempt
+from slam_backend.team.merge_monitor import MergeMonitor
+from slam_backend.team.merge_scheduler import AttemptOptions, AttemptRecord
 from slam_backend.team.options import MergeOptions
 
 CONFIGURATIONS = (
@@ -25,11 +26,10 @@ CONFIGURATIONS = (
     SmoothingOptions, StereoCamera,
 )  # fmt: skip
 RECORDS = (
-    Alignment, AttemptRecord, LogArrays, Measurements, RejectedMeasurements, ReplayedStep, PreMergeSnapshot, StepInput,
-    PendingAttempt, TeamMeasurements, MergeMonitor, reports.Associations, reports.LandmarksCreated, reports.MapForked,
-    reports.MapReleased,
-    reports.MergeEvent, reports.MergeUndone, reports.PoseEstimates, reports.RejuvenationReport, reports.LandmarkIdMap,
-    reports.StepReport,
+    Alignment, AttemptRecord, LogArrays, Measurements, RejectedMeasurements, ReplayedStep, StepInput,
+    TeamMeasurements, MergeMonitor, reports.Associations, reports.PoseEstimates,
+    reports.RejuvenationReport, reports.StepReport, team_reports.LandmarkIdMap, team_reports.LandmarksCreated,
+    team_reports.MapForked, team_reports.MapReleased, team_reports.MergeEvent, team_reports.MergeUndone,
 )  # fmt: skip
 
 

@@ -15,7 +15,7 @@ from pettingzoo import ParallelEnv
 from slam_backend.core.compilation import ahead
 from slam_backend.core.state_checks import refuse_malformed
 from slam_backend.core.validation import FloatArray, argument_error, check_choice, check_int, did_you_mean
-from slam_backend.fastslam.reports import MergeEvent
+from slam_backend.team.reports import MergeEvent
 from vslam_env.actions import action_space, checked_actions
 from vslam_env.belief.observation import flatten, observation_space, observe_team
 from vslam_env.belief.readings import Readings, TeamReadings

@@ -23,7 +23,7 @@ from vslam_env.state_checks import EpisodeCheck, check_drivers, check_team_metri
 from vslam_env.state_kinds import ENV_KINDS
 from vslam_env.world import WorldSource
 
-STATE_FORMAT = 37  # raised when the content of states changes; exact continuation needs the same version
+STATE_FORMAT = 38  # raised when the content of states changes; exact continuation needs the same version
 MAGIC = b"vslam_env state "
 KEYS = ("version", "config", "objects", "root", "agents", "cycle", "episode", "drivers", "team_metrics")
 

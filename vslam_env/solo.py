@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.core.validation import argument_error, check_int
-from slam_backend.fastslam.reports import MergeEvent
+from slam_backend.team.reports import MergeEvent
 from vslam_env.belief.team_belief import Belief
 from vslam_env.config import EnvConfig
 from vslam_env.environment import ExplorationEnv

@@ -6,17 +6,20 @@ from typing import Any
 import numpy as np
 
 from slam_backend.core import state_checks as check
-from slam_backend.fastslam.reports import LandmarkIdMap, LandmarksCreated
+from slam_backend.core.state import accepted
 from slam_backend.fastslam.state_checks import check_descriptors
 from slam_backend.frontend import StereoFrame
 from slam_backend.models.measurements import Measurements, TeamMeasurements
+from slam_backend.team.reports import LandmarkIdMap, LandmarksCreated
 from slam_backend.team.state_checks import TeamCheck
 from vslam_env.belief.readings import TeamReadings
+from vslam_env.belief.rendezvous import Rendezvous
 from vslam_env.belief.shared_grids import NEVER_MET, GridSnapshot, GridUpdate
 from vslam_env.belief.team_belief import merge_options
 from vslam_env.config import EnvConfig
-from vslam_env.evaluation.coverage import CoverageCells
+from vslam_env.evaluation.coverage import CoverageCells, CoverageTracker
 from vslam_env.evaluation.map_scores import UNUSED
+from vslam_env.evaluation.recall_credits import RecallCredits
 from vslam_env.evaluation.team_metrics import BeliefSummary, RobotCounts, RobotMetrics, TeamMetrics
 from vslam_env.navigation._grid_kernels import LARGEST_HALF_WIDTH as HALF_WIDTH
 from vslam_env.navigation._view_kernels import NUM_GAINS
@@ -80,15 +83,10 @@ class EpisodeCheck:
         check_streams(f"{name}['streams']", state["streams"])
         self._check_belief(f"{name}['belief']", state["belief"], scenario)
         self._check_ground_truth(f"{name}['ground_truth']", state["ground_truth"], scenario, state["belief"]["team"])
-        cells = len(scenario.coverage.cells)
-        check.keys(f"{name}['coverage']", state["coverage"], ("ever", "found"))
-        check.array(f"{name}['coverage']['ever']", state["coverage"]["ever"], check.BOOL, (cells,))
-        check.indices(f"{name}['coverage']['found']", state["coverage"]["found"], (count,), 0, cells)
         landmarks = int(np.count_nonzero(scenario.observable_landmarks))
-        check.keys(f"{name}['credits']", state["credits"], ("shares", "credited", "measured"))
-        check.floats(f"{name}['credits']['shares']", state["credits"]["shares"], (count,), 0.0, 1.0)
-        check.array(f"{name}['credits']['credited']", state["credits"]["credited"], check.BOOL, (landmarks,))
-        check.array(f"{name}['credits']['measured']", state["credits"]["measured"], check.BOOL, (count, landmarks))
+        sizes = {"K": count, "CELLS": len(scenario.coverage.cells), "LANDMARKS": landmarks}
+        for part, kind in (("coverage", CoverageTracker), ("credits", RecallCredits)):
+            accepted(kind, f"{name}[{part!r}]", dict(state[part]), sizes)
         (of_collisions, collisions), *others = check.named_items(f"{name}['counts']", state["counts"], 3)
         check.integers(of_collisions, collisions)
         check.sequence(of_collisions, collisions, count)
@@ -169,16 +167,14 @@ class EpisodeCheck:
             check.refuse(f"{name}['team']", f"descriptors of length {landmarks.descriptors.shape[1]}", sizes)
         config, given = self._config.belief, belief["team"]
         attempts, merging = merge_options(config, not self._config.oracle_merge)
-        found = [*team.options, given["alignment"], given["schedule"]["alignment"], given["schedule"]["options"]]
-        wanted = [config.filter] * len(team.options) + [config.alignment, config.alignment, attempts]
+        found = [*team.options, given["schedule"]["alignment"], given["schedule"]["options"]]
+        wanted = [config.filter] * len(team.options) + [config.alignment, attempts]
         if [*found, given["merging"]] != [*wanted, merging]:
             check.refuse(f"{name}['team']", "options of the environment's configuration", "others")
         updates = {} if own is None else own.grid_updates
         self._check_grids(f"{name}['grids']", belief["grids"], updates)
         check_candidates(f"{name}['candidates']", belief["candidates"], self._count)
-        check.keys(f"{name}['rendezvous']", belief["rendezvous"], ("visited",))
-        visited = belief["rendezvous"]["visited"]
-        check.array(f"{name}['rendezvous']['visited']", visited, check.BOOL, (self._count, self._count))
+        accepted(Rendezvous, f"{name}['rendezvous']", dict(belief["rendezvous"]), {"K": self._count})
         check_goals(f"{name}['goals']", belief["goals"], self._count)
 
     def _check_grids(self, name: str, grids: Any, known: Mapping[int, GridUpdate]) -> None:
@@ -351,16 +347,12 @@ MOST_MEASURED = 1000  # most landmarks that all robots together create in a tick
 
 
 def branches_of(team: Mapping[str, Any]) -> Iterable[Mapping[str, Any]]:
-    """Yield each branch of a team's state once, including those that a rollback would restore."""
-    waiting = [branch for group in team["groups"] for branch in group["branches"]]
-    waiting += [side for group in team["groups"] if group["undoing"] is not None for side in group["undoing"]["sides"]]
-    done: set[int] = set()
-    while waiting:
-        branch = waiting.pop()
-        if id(branch) not in done:
-            done.add(id(branch))
-            yield branch
-            waiting += [side.trunk for watch in branch["monitors"] for side in watch.sides]
+    """Yield each branch of a team's state, including those that an undo would restore."""
+    for group in team["groups"]:
+        yield from group["branches"]
+    for process in team["processes"]:
+        yield from process.get("sides", ())
+        yield from process.get("trunks", ())
 
 
 def check_streams(name: str, streams: Any) -> None:

@@ -1,12 +1,12 @@
-"""Reports of filters and teams: associations, pose estimates, step reports, merge events. All frozen."""
+"""Reports of filters: associations, pose estimates, step reports. All frozen."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import numpy as np
 
-from slam_backend.core.read_only import Act, as_constant, as_read_only, map_arrays
+from slam_backend.core.read_only import Act, as_read_only, map_arrays
 from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.fastslam._kernels import REJECTED, STATIONARY
@@ -94,10 +94,6 @@ class Associations(NamedTuple):
         every: IntArray = np.full(len(self.masks[row]), REJECTED)
         every[self.masks[row]] = used
         return every
-
-
-if TYPE_CHECKING:
-    from slam_backend.maps.alignment import Alignment
 
 
 @short_repr
@@ -208,140 +204,3 @@ class RejuvenationReport:
     ess: float
     iterations: int
     num_keys: int
-
-
-@short_repr
-@dataclass(frozen=True, slots=True, eq=False)
-class MergeEvent:
-    """Attempt to align two groups' maps, merge, or undo of a merge.
-
-    Attributes:
-        step: Number of the team's step (the first is 0).
-        kind: Kind of the event.
-        robots_a: Group whose map frame stays.
-        robots_b: The other group.
-        alignment: `map` of group a from `map` of group b; refused attempts carry the reason.
-        unsmoothed_alignment: Alignment of the filters' own maps, if the attempt smoothed the maps and `alignment` is
-            that of the smoothed ones; else None.
-        uncertainty: Uncertainty of the motion between aligned maps over the particles of the merge, relative to the
-            limit for a merge; beyond 1 the merge may be deferred. NaN if not computed.
-    """
-
-    step: int
-    kind: Literal["attempt", "merge", "undo"]
-    robots_a: tuple[int, ...]
-    robots_b: tuple[int, ...]
-    alignment: "Alignment"
-    unsmoothed_alignment: "Alignment | None" = None
-    uncertainty: float = float("nan")
-
-
-@short_repr
-@dataclass(frozen=True, slots=True, eq=False)
-class LandmarkIdMap:
-    """Renaming of the landmark ids of two groups to ids of their joint map.
-
-    Attributes:
-        robots_a: Group a before the merge; its landmark ids stay.
-        robots_b: Group b before the merge.
-        ids_b: (k, 2) int64, read-only. Rows (id in b's map, id in the joint map); fused landmarks get the id of a.
-        maps: Numbers of a's map, of b's and of the joint one. The first two are kept until their `MapReleased`: an undo
-            restores them.
-    """
-
-    robots_a: tuple[int, ...]
-    robots_b: tuple[int, ...]
-    ids_b: IntArray
-    maps: tuple[int, int, int]
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "ids_b", as_constant(self.ids_b))
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Make copies and unpickled objects read-only, too."""
-        return LandmarkIdMap, (self.robots_a, self.robots_b, self.ids_b, self.maps)
-
-
-@dataclass(frozen=True, slots=True)
-class MapForked:
-    """Fork of a filter: map number `copy` starts as a copy of map number `source`."""
-
-    source: int
-    copy: int
-
-
-@dataclass(frozen=True, slots=True)
-class MapReleased:
-    """End of map number `number`."""
-
-    number: int
-
-
-@short_repr
-class LandmarksCreated(NamedTuple):
-    """Landmarks that a robot's measurements of one step created in a map.
-
-    Attributes:
-        number: Number of the map.
-        robot: Index of the robot.
-        step: Step of the measurements; in a replay earlier than the step of the report.
-        ids: (n,) int64, read-only. Id of the landmark that each measurement created, -1 = none.
-    """
-
-    number: int
-    robot: int
-    step: int
-    ids: IntArray
-
-
-@dataclass(frozen=True, slots=True)
-class MergeUndone:
-    """Undo of a merge: the two maps before it are restored, and the joint one ends.
-
-    Attributes:
-        maps: Numbers of a's map, of b's and of the joint one, as in its `LandmarkIdMap`.
-    """
-
-    maps: tuple[int, int, int]
-
-
-MapChange = MapForked | MapReleased | LandmarksCreated | MergeUndone | LandmarkIdMap
-
-
-@short_repr
-class TeamReport(NamedTuple):
-    """Outcome of one step of `TeamSlam`.
-
-    Attributes:
-        step: Number of this step (the first is 0).
-        all_associations: Data association of all measurements; `associations` and `created` are parts of it.
-        groups: The groups after this step.
-        events: This step's attempts, merges and undos, in order.
-        id_maps: Landmark renaming of each merge of this step, in order; apply them after `created`.
-        maps: Number of each robot's map after this step. Before the first step they are 0, 1, ...
-        map_changes: All changes of maps in this step, in order, replays and `created` included: the complete record for
-            keeping track of landmarks.
-        oldest_step: First step that may still be replayed; 1 + `step` if none.
-        rejuvenations: Pairs of robots and outcome, for each filter with a rejuvenation, or a failure of its smoother,
-            in this step.
-    """
-
-    step: int
-    all_associations: Associations
-    groups: tuple[tuple[int, ...], ...]
-    events: tuple[MergeEvent, ...]
-    id_maps: tuple[LandmarkIdMap, ...]
-    maps: tuple[int, ...]
-    map_changes: tuple[MapChange, ...]
-    oldest_step: int
-    rejuvenations: tuple[tuple[tuple[int, ...], RejuvenationReport], ...] = ()
-
-    @property
-    def associations(self) -> tuple[IntArray, ...]:
-        """Per robot (n_i,) int64, as in `StepReport`; ids of the robot's map BEFORE this step's merges and undos."""
-        return tuple([self.all_associations.associated(robot) for robot in range(len(self.maps))])
-
-    @property
-    def created(self) -> tuple[IntArray, ...]:
-        """Per robot (n_i,) int64, as in `StepReport`; ids as in `associations`."""
-        return tuple([self.all_associations.created(robot) for robot in range(len(self.maps))])

@@ -96,17 +96,15 @@ class InputBuffer:
     @property
     def buffered(self) -> Mapping[int, StepInput]:
         """Inputs of the buffered steps, by number; read-only."""
-        self._steps = {step: with_read_only(inputs) for step, inputs in self._steps.items()}  # rarer than `record`
         return self._steps
 
     def record(self, step: int, inputs: StepInput) -> None:
         """Add the inputs of a step, later than all before; the caller does not write to them afterwards."""
-        self._steps[step] = inputs
+        self._steps[step] = with_read_only(inputs)
 
     def read(self, step: int) -> StepInput:
         """Return the inputs of a buffered step; read-only."""
-        self._steps[step] = inputs = with_read_only(self._steps[step])
-        return inputs
+        return self._steps[step]
 
     def forget_before(self, step: int) -> None:
         """Remove the steps before this one."""

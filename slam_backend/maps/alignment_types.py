@@ -1,8 +1,6 @@
 """Options, results and refusal reasons of map alignment."""
 
 import math
-from collections import Counter
-from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any, Literal, Self
 
@@ -20,7 +18,6 @@ from slam_backend.core.validation import (
     check_int,
     known_names,
 )
-from slam_backend.fastslam.reports import MergeEvent
 
 Reason = Literal[
     "", "too few candidates", "too many candidates", "too few inliers", "ambiguous", "mirrored", "poorly spread",
@@ -175,74 +172,3 @@ class Alignment:
         """Return a refusal: NaN motion and covariance, no inliers."""
         nan, none = math.nan, np.empty((0, 2), np.int64)
         return cls(False, reason, nan, nan, nan, np.full((3, 3), nan), none, ratio, missed, excess)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PairAttempts:
-    """Attempts of one pair of groups to align their maps.
-
-    Attributes:
-        robots_a: Robots of the first group at that time.
-        robots_b: Robots of the second group.
-        attempts: Number of attempts.
-        refusals: Number of refused attempts by reason, in the order of `REASONS`.
-        last_reason: Reason of the last refusal; empty if there was none.
-        last_step: Step of the last refusal; None if there was none.
-        missed: Bound that the last refusal missed, see `Alignment.missed`.
-        excess: Value of that bound over its limit, see `Alignment.excess`.
-    """
-
-    robots_a: tuple[int, ...]
-    robots_b: tuple[int, ...]
-    attempts: int
-    refusals: Mapping[str, int]
-    last_reason: str
-    last_step: int | None
-    missed: str
-    excess: float
-
-
-def count_attempts(events: Iterable[MergeEvent]) -> tuple[PairAttempts, ...]:
-    """Return the attempts of each pair of groups, in order of their first attempts.
-
-    Args:
-        events: All events of a team, in order; merges and undos are ignored.
-    """
-    tried: dict[tuple[tuple[int, ...], tuple[int, ...]], list[MergeEvent]] = {}
-    for event in events:
-        if event.kind == "attempt":
-            tried.setdefault((event.robots_a, event.robots_b), []).append(event)
-    return tuple(_of_pair(attempts) for attempts in tried.values())
-
-
-def refusals_of(events: Iterable[MergeEvent], robot: int) -> dict[str, float]:
-    """Return the number of attempts of a robot's groups, and the number of refusals for each reason.
-
-    Args:
-        events: All events of a team.
-        robot: Index of the robot.
-
-    Returns:
-        `attempts`, and for each of `REASONS` a key such as `refused_too_uncertain`.
-    """
-    attempts = [event for event in events if event.kind == "attempt" and robot in event.robots_a + event.robots_b]
-    counts = Counter(event.alignment.reason for event in attempts)
-    refusals = {f"refused_{reason.replace(' ', '_')}": float(counts[reason]) for reason in REASONS}
-    return {"attempts": float(len(attempts))} | refusals
-
-
-def _of_pair(events: list[MergeEvent]) -> PairAttempts:
-    """Return the summary of one pair's attempts, at least one."""
-    refused = [event for event in events if not event.alignment.success]
-    counts = Counter(event.alignment.reason for event in refused)
-    last = refused[-1] if refused else None
-    return PairAttempts(
-        robots_a=events[0].robots_a,
-        robots_b=events[0].robots_b,
-        attempts=len(events),
-        refusals={reason: counts[reason] for reason in REASONS if counts[reason]},
-        last_reason=last.alignment.reason if last else "",
-        last_step=last.step if last else None,
-        missed=last.alignment.missed if last else "",
-        excess=last.alignment.excess if last else float("nan"),
-    )

@@ -51,6 +51,11 @@ class Branch:
     split_from: int | None = None
     split_counts: dict[int, int] = field(default_factory=dict)
 
+    @property
+    def merge_numbers(self) -> list[int]:
+        """Numbers of the merges that the filter monitors, oldest first."""
+        return [monitor.number for monitor in self.monitors]
+
     def known_landmarks(self, main: "Branch", replayed: Sequence["ReplayedStep"]) -> dict[int, int]:
         """Return the landmarks of the filter they return to that the robots know, those just created included.
 

@@ -79,11 +79,15 @@ class TrafficCounter:
             report: Report of the step; its robots with a row are in contact.
             descriptor_size: d.
         """
-        found = report.all_associations
+        associations = report.all_associations
         for robot in report.rows:
             if robot >= 0:
-                updated = len(found.associated_ids(robot)) if report.num_rejected else found.num_measurements(robot)
-                created = len(found.created_ids(robot)) if report.num_created else 0
+                updated = (
+                    len(associations.associated_ids(robot))
+                    if report.num_rejected
+                    else associations.num_measurements(robot)
+                )
+                created = len(associations.created_ids(robot)) if report.num_created else 0
                 self.sent[robot] += POSE_BYTES + updated * LANDMARK_BYTES + created * 4 * descriptor_size
 
     def record_replay(self, replayed: Sequence[ReplayedStep]) -> None:

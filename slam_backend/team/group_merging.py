@@ -1,15 +1,16 @@
-"""Merging of two groups, detection of inconsistent merges, and separation of the groups before a merge."""
+"""Merging of two groups, and their separation when the merge is undone."""
 
 import math
-from dataclasses import replace
-from typing import NamedTuple, Self
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
+from slam_backend.core.read_only import with_constants, with_read_only
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.fastslam import _kernels
 from slam_backend.fastslam.filter import FastSlam
-from slam_backend.fastslam.reports import LandmarkIdMap, MergeUndone
 from slam_backend.geometry import rotate_covariances
 from slam_backend.maps.alignment import DISTINCT_ROTATION, DISTINCT_TRANSLATION, Alignment, AlignmentOptions
 from slam_backend.maps.fusion import check_inliers
@@ -21,13 +22,10 @@ from slam_backend.team.filter_merging.landmarks import merge_by_identity, renami
 from slam_backend.team.filter_merging.merging import merge_filters, pair_filters, transform_covariance
 from slam_backend.team.filter_merging.pairing import Pairing
 from slam_backend.team.groups import Group
-from slam_backend.team.merge_monitor import (
-    MergeMonitor,
-    PreMergeSnapshot,
-    begin_monitoring,
-)
-from slam_backend.team.merge_rollback import MergeRollback
+from slam_backend.team.merge_monitor import begin_monitoring
+from slam_backend.team.merge_scheduler import PairKey
 from slam_backend.team.options import MergeOptions
+from slam_backend.team.reports import LandmarkIdMap
 from slam_backend.team.shared_records import SharedRecords
 
 
@@ -40,19 +38,17 @@ def smoothed_graphs(a: FastSlam, b: FastSlam) -> tuple[SlamGraph, SlamGraph] | N
 
 
 class MergePlan(NamedTuple):
-    """Two groups with an alignment of their maps, ready to merge.
+    """Two groups with an alignment of their maps.
 
     Attributes:
         groups: Group whose map frame and landmark ids stay, and the other.
         maps: Maps of their joint filters, with mixture covariances.
         alignment: Motion from b's map frame to a's; `inliers` are rows of the maps.
-        pairing: Pairing of the joint filters' particles, if drawn already.
     """
 
     groups: tuple[Group, Group]
     maps: tuple[LandmarkMap, LandmarkMap]
     alignment: Alignment
-    pairing: Pairing | None = None
 
     @classmethod
     def of(cls, group_a: Group, group_b: Group, alignment: Alignment) -> Self:
@@ -76,83 +72,115 @@ class MergePlan(NamedTuple):
         rows = self.alignment.inliers
         return np.column_stack([self.maps[0].ids[rows[:, 0]], self.maps[1].ids[rows[:, 1]]])
 
-    def with_motion(self, merging: MergeOptions, rng: np.random.Generator) -> tuple[Self, float]:
-        """Return the plan with the motion between the maps as the robots' whole paths tell it, and its uncertainty.
+    def pair_particles(self, merging: MergeOptions, rng: np.random.Generator, known: bool = False) -> Pairing:
+        """Draw the pairs of particles of the joint filter; see `merge_filters` for `known`."""
+        return pair_filters(*self.filters, self.alignment, self.pairs, rng, merging.merged_particles, known)
+
+    def relative_start(self) -> RelativeStart | None:
+        """Return the motion at the mode of the joint graph of both groups; None without smoothers or a mode.
 
         Each map constrains the other robots' paths between their starts and the common landmarks, so that the joint
-        graph of both groups may know their relative start well where neither map does. Without smoothers, or if the
-        joint graph has no mode, particles of both groups are paired as in a merge, and their scatter tells.
-
-        Args:
-            merging: Options of merges.
-            rng: Generator for the pairing.
-
-        Returns:
-            The plan, and the standard deviation of the motion in its least certain direction over 0.5 m, or in heading
-            over 5 degrees, whichever is more [-].
+        graph of both groups may know their relative start well where neither map does.
         """
-        start = self._relative_start()
-        if start is None:
-            pairing = pair_filters(*self.filters, self.alignment, self.pairs, rng, merging.merged_particles)
-            plan = self._replace(pairing=pairing)
-            return plan, transform_uncertainty(plan)
-        x, y, theta = start.motion.tolist()
-        found = replace(self.alignment, tx=x, ty=y, theta=theta, covariance=start.covariance)
-        return self._replace(alignment=found), _relative_uncertainty(start.covariance)
-
-    def _relative_start(self) -> RelativeStart | None:
-        """Return the motion at the mode of the joint graph of both groups; None if there is none."""
         graphs = smoothed_graphs(*self.filters)
         if graphs is None:
             return None
-        of_a, of_b = (slam.maps for slam in self.filters)
-        renamed = renaming(of_a, of_b, np.concatenate(merge_by_identity(of_a, of_b, self.pairs)))
+        maps_a, maps_b = (slam.maps for slam in self.filters)
+        renamed = renaming(maps_a, maps_b, np.concatenate(merge_by_identity(maps_a, maps_b, self.pairs)))
         slam = self.filters[0]
         return relative_start(*graphs, self.alignment.transform, renamed, slam.packed_camera, slam.options.smoothing)
 
+    def with_motion(self, start: RelativeStart) -> Self:
+        """Return the plan with the motion of the joint graph."""
+        x, y, theta = start.motion.tolist()
+        return self._replace(alignment=replace(self.alignment, tx=x, ty=y, theta=theta, covariance=start.covariance))
 
-def transform_uncertainty(plan: MergePlan) -> float:
-    """Return the uncertainty of the motion over the paired particles of a plan, see `MergePlan.with_motion`.
+
+def transform_uncertainty(plan: MergePlan, pairing: Pairing) -> float:
+    """Return the `relative_uncertainty` of the motion between two groups over paired particles.
 
     The errors of landmarks in one map are correlated where its paths are uncertain, which neither their covariances nor
     the alignment's include. The scatter of the motion over particles does; gauge covariances are added.
     """
-    assert plan.pairing is not None
     a, b = plan.filters
-    covariance = transform_covariance(plan.pairing.motion, plan.alignment)
+    covariance = transform_covariance(pairing.motion, plan.alignment)
     covariance += _gauge_covariance(a.gauge_covariance, b.gauge_covariance, plan.alignment)
-    return _relative_uncertainty(covariance)
+    return relative_uncertainty(covariance)
 
 
-def _relative_uncertainty(covariance: FloatArray) -> float:
-    """Return the largest standard deviation of a motion relative to that of a distinct motion."""
+def relative_uncertainty(covariance: FloatArray) -> float:
+    """Return the uncertainty of a motion relative to the limits of a false merge.
+
+    It is the standard deviation in the least certain direction over 0.5 m, or in heading over 5 degrees, whichever is
+    more [-].
+    """
     position, heading = math.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1]), math.sqrt(covariance[2, 2])
     return max(position / DISTINCT_TRANSLATION, heading / DISTINCT_ROTATION)
 
 
-def merge_groups(
-    plan: MergePlan,
-    merging: MergeOptions,
-    records: SharedRecords,
-    rng: np.random.Generator,
+@dataclass(frozen=True, slots=True, eq=False)
+class JoinedGroups:
+    """Two groups that have been joined, and what it takes to separate them.
+
+    Attributes:
+        number: Number of the joint map when it began; it names the merge.
+        alignment: Alignment by which they were joined.
+        sides: States of their trunks just before, with monitors of earlier merges; arrays are read-only.
+    """
+
+    number: int
+    alignment: Alignment
+    sides: tuple[Mapping[str, Any], Mapping[str, Any]]
+
+    @classmethod
+    def of(cls, plan: MergePlan, number: int) -> Self:
+        """Return what it takes to separate the groups of a plan that have been joined to map `number`."""
+        a, b = (with_read_only(group.trunk.get_state()) for group in plan.groups)
+        return cls(number, plan.alignment, (a, b))
+
+    def get_state(self) -> dict[str, Any]:
+        """Return all of it; the states of the sides are shared."""
+        return {"number": self.number, "alignment": self.alignment, "sides": self.sides}
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Any]) -> Self:
+        """Build it from `get_state`, with arrays that cannot change."""
+        return cls(state["number"], state["alignment"], with_constants(state["sides"]))
+
+    @property
+    def oldest_step(self) -> int:
+        """First step that a separation would replay."""
+        oldest: int = min(last for side in self.sides for last in side["last_steps"].values())
+        return 1 + oldest
+
+    @property
+    def map_numbers(self) -> tuple[int, int]:
+        """Numbers of the maps that a separation would restore."""
+        return self.sides[0]["number"], self.sides[1]["number"]
+
+    @property
+    def pair(self) -> PairKey:
+        """Robots of both groups."""
+        return self.sides[0]["robots"], self.sides[1]["robots"]
+
+
+def join_groups(
+    plan: MergePlan, pairing: Pairing, merging: MergeOptions, records: SharedRecords, rng: np.random.Generator,
     epoch: int,
-    known: bool = False,
-) -> tuple[Group, LandmarkIdMap]:
-    """Merge the joint filters of two groups; robots out of contact keep their forks. The merge is then monitored.
+) -> tuple[Group, LandmarkIdMap]:  # fmt: skip
+    """Merge the joint filters of two groups; robots out of contact keep their forks.
 
     Args:
         plan: Plan of the merge; its groups are not to be used afterwards.
+        pairing: Pairing of the joint filters' particles.
         merging: Options of merges.
         records: Records of the team.
-        rng: Generator for pairing and draws.
+        rng: Generator that seeds the joint filter's own stream.
         epoch: Epoch of the joint filter.
-        known: Whether the motion is known from the alignment, see `merge_filters`.
     """
     group_a, group_b = plan.groups
     a, b = group_a.trunk, group_b.trunk
-    joint, renamed = merge_filters(
-        a.filter, b.filter, plan.alignment, plan.pairs, rng, merging.merged_particles, known, plan.pairing
-    )
+    joint, renamed = merge_filters(a.filter, b.filter, plan.alignment, plan.pairs, rng, pairing=pairing)
     joint.reorder(np.argsort(a.robots + b.robots))
     active = tuple(sorted(a.active_robots + b.active_robots))
     number = records.new_number()
@@ -161,54 +189,42 @@ def merge_groups(
     older = [*(monitor.copy() for monitor in a.monitors), *(monitor.copy(new_ids) for monitor in b.monitors)]
     trunk.monitors = sorted(older, key=lambda monitor: monitor.number)
     if merging.watch_steps:
-        sides = PreMergeSnapshot.of(a.get_state()), PreMergeSnapshot.of(b.get_state())
-        common = renamed[renamed[:, 1] < a.filter.maps.next_id, ::-1]
-        trunk.monitors.append(begin_monitoring(number, plan.alignment, sides, plan.maps, renamed, common))
+        common = renamed[renamed[:, 1] < a.filter.maps.next_id, 1]
+        trunk.monitors.append(begin_monitoring(number, (a.robots, b.robots), plan.maps, renamed, common))
     id_map = LandmarkIdMap(a.robots, b.robots, renamed, (a.number, b.number, number))
     records.entries.append(id_map)
     return Group(trunk, [*group_a.branches[1:], *group_b.branches[1:]]), id_map
 
 
-def find_inconsistent_merge(trunk: Branch, merging: MergeOptions, options: AlignmentOptions) -> MergeMonitor | None:
-    """Return the oldest merge that contradicts the evidence and can be undone now, with those on top of it.
+def is_refuted(number: int, trunk: Branch, merging: MergeOptions, options: AlignmentOptions) -> bool:
+    """Return whether a merge that a filter monitors contradicts the evidence and can be undone now.
 
-    To be undone, each of them needs robots of both sides in contact.
+    To be undone, this merge and those on top of it need robots of both sides in contact.
     """
-    monitors = [
-        w for w in trunk.monitors if w.steps <= merging.watch_steps and w.both_sides_connected(trunk.active_robots)
-    ]
-    if not monitors:
-        return None
-    joint = trunk.filter.map("mixture")
-    for monitor in monitors:
-        above = [newer for newer in trunk.monitors if newer.number > monitor.number]
-        if all(newer.both_sides_connected(trunk.active_robots) for newer in above) and monitor.is_inconsistent(
-            joint, merging, options
-        ):
-            return monitor
-    return None
+    place = [monitor.number for monitor in trunk.monitors].index(number)
+    monitor = trunk.monitors[place]
+    return (
+        monitor.steps <= merging.watch_steps
+        and all(each.both_sides_connected(trunk.active_robots) for each in trunk.monitors[place:])
+        and monitor.is_inconsistent(trunk.filter.map("mixture"), merging, options)
+    )
 
 
-def separate_groups(group: Group, undoing: MergeRollback, records: SharedRecords, epoch: int) -> list[Group]:
-    """Undo a merge of a group, and those on top of it: all sides continue as if they had never merged.
+def separate_groups(group: Group, trunks: Sequence[Branch], epoch: int, records: SharedRecords) -> list[Group]:
+    """Return the groups of some trunks, which continue as if they had never been merged.
 
     Robots out of contact keep their forks until they return.
 
     Args:
-        group: The group; not to be used afterwards.
-        undoing: Rollback of the group's merge; its sides have caught up with the group's joint filter.
-        records: Records of the team.
+        group: The joint group; not to be used afterwards.
+        trunks: Trunks from before its merges that have caught up with its own.
         epoch: Epoch of the separated filters.
+        records: Records of the team.
     """
-    now = group.trunk
-    for monitor in undoing.merges(now):
-        number_a, number_b = (side.trunk["number"] for side in monitor.sides)
-        records.entries.append(MergeUndone((number_a, number_b, monitor.number)))
-    separated = []
-    for trunk, replayed in zip(undoing.sides, undoing.replayed, strict=True):
-        trunk.active_robots, trunk.epoch = tuple(robot for robot in trunk.robots if robot in now.active_robots), epoch
-        records.note_replay(trunk.number, replayed)
-        separated.append(Group(trunk))
+    active = set(group.trunk.active_robots)
+    for trunk in trunks:
+        trunk.active_robots, trunk.epoch = tuple(robot for robot in trunk.robots if robot in active), epoch
+    separated = [Group(trunk) for trunk in trunks]
     for branch in group.branches[1:]:
         _reassign_branch(branch, separated, records)
     return separated

@@ -8,8 +8,6 @@ import numpy as np
 from slam_backend.core.validation import IntArray
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.team.branches import Branch, StepRouting, fork, landmark_counts, missing, replay, split_by_component
-from slam_backend.team.merge_monitor import MergeMonitor
-from slam_backend.team.merge_rollback import MergeRollback
 from slam_backend.team.shared_records import SharedRecords
 
 
@@ -22,12 +20,10 @@ class Group:
 
     Attributes:
         branches: The trunk, then the forks. Each robot uses exactly one of them.
-        undoing: Rollback of a merge in progress, or None.
     """
 
     def __init__(self, trunk: Branch, forks: Sequence[Branch] = ()) -> None:
         self.branches = [trunk, *forks]
-        self.undoing: MergeRollback | None = None
 
     @property
     def trunk(self) -> Branch:
@@ -38,6 +34,11 @@ class Group:
     def robots(self) -> tuple[int, ...]:
         """All robots of the group."""
         return self.branches[0].robots
+
+    @property
+    def merge_numbers(self) -> list[int]:
+        """Numbers of the merges that the joint filter monitors, oldest first."""
+        return self.branches[0].merge_numbers
 
     # ------------------------------------------------------------------ loss and return of contact
 
@@ -100,46 +101,38 @@ class Group:
         """Return the sort key of branches in contact: the trunk first, then the one with the most merges."""
         return branch is self.trunk, branch.epoch, len(branch.active_robots), -branch.active_robots[0]
 
+    def drop_monitors(self, watch_steps: int) -> bool:
+        """End the monitoring of merges after so many steps, oldest first; return whether any ended."""
+        ended = False
+        for branch in self.branches:
+            while branch.monitors and branch.monitors[0].steps >= watch_steps:
+                branch.monitors.pop(0)
+                ended = True
+        return ended
+
     # ------------------------------------------------------------------ snapshots
 
     def steps_unknown(self) -> list[int]:
-        """Return the first steps that filters may have to replay; empty if all are up to date."""
-        held = [
+        """Return the first steps that filters may have to replay for robots that return; empty if none."""
+        return [
             1 + last
             for branch in self.branches
             for robot, last in branch.last_steps.items()
             if robot not in branch.active_robots
         ]
-        return held + [side.oldest for branch in self.branches for monitor in branch.monitors for side in monitor.sides]
-
-    def numbers(self) -> set[int]:
-        """Return the numbers of all maps that the group uses or may restore."""
-        monitors = [monitor for branch in self.branches for monitor in branch.monitors]
-        return {branch.number for branch in self.branches}.union(*map(_numbers, monitors))
 
     def get_state(self) -> dict[str, Any]:
         """Return the complete state of the group."""
-        return {
-            "branches": tuple(branch.get_state() for branch in self.branches),
-            "undoing": None if self.undoing is None else self.undoing.get_state(),
-        }
+        return {"branches": tuple(branch.get_state() for branch in self.branches)}
 
     @classmethod
     def from_state(cls, state: Mapping[str, Any], at_hand: Mapping[tuple[int, ...], FastSlam] | None = None) -> "Group":
         """Build a group from `get_state`; a given filter with the trunk's robots is reused."""
         at_hand = {} if at_hand is None else at_hand
         trunk, *forks = state["branches"]
-        group = cls(
+        return cls(
             Branch.from_state(trunk, at_hand.get(trunk["robots"])), [Branch.from_state(branch) for branch in forks]
         )
-        group.undoing = None if state["undoing"] is None else MergeRollback.from_state(state["undoing"])
-        return group
-
-
-def _numbers(monitor: MergeMonitor) -> set[int]:
-    """Return the numbers of the maps that an undo of a merge would restore."""
-    older = [_numbers(one) for side in monitor.sides for one in side.monitors]
-    return {side.trunk["number"] for side in monitor.sides}.union(*older)
 
 
 class TeamTopology(NamedTuple):
@@ -156,7 +149,6 @@ class TeamTopology(NamedTuple):
         numbers: Numbers of all maps that are in use or may be restored.
         oldest: First step that a filter may have to replay; None: none.
         is_split: Whether some robots are out of contact with their group's joint filter.
-        has_monitors: Whether a merge can still be undone, or is being undone.
     """
 
     groups: tuple[tuple[int, ...], ...]
@@ -169,15 +161,19 @@ class TeamTopology(NamedTuple):
     numbers: frozenset[int]
     oldest: int | None
     is_split: bool
-    has_monitors: bool
 
     @classmethod
-    def of(cls, groups: Sequence[Group]) -> Self:
-        """Return the topology of some groups."""
+    def of(cls, groups: Sequence[Group], restorable: Sequence[tuple[int, set[int]]]) -> Self:
+        """Return the topology of some groups.
+
+        Args:
+            groups: The groups.
+            restorable: First step to replay and the numbers of the restored maps, if a merge is undone, of each merge.
+        """
         owned = [(group, branch) for group in groups for branch in group.branches]
         by_robot = {r: (group, branch, branch.robots.index(r)) for group, branch in owned for r in branch.active_robots}
         places = tuple(by_robot[robot] for robot in sorted(by_robot))
-        oldest = [step for group in groups for step in group.steps_unknown()]
+        oldest = [step for group in groups for step in group.steps_unknown()] + [step for step, _ in restorable]
         return cls(
             groups=tuple(group.robots for group in groups),
             branches=tuple(branch for _, branch in owned),
@@ -186,8 +182,7 @@ class TeamTopology(NamedTuple):
             known_robots=tuple(branch.robots for _, branch, _ in places),
             same_filter=tuple(branch.active_robots for _, branch, _ in places),
             maps=tuple(branch.number for _, branch, _ in places),
-            numbers=frozenset[int]().union(*(group.numbers() for group in groups)),
+            numbers=frozenset(branch.number for _, branch in owned).union(*(numbers for _, numbers in restorable)),
             oldest=min(oldest, default=None),
             is_split=len(owned) > len(groups),
-            has_monitors=any(branch.monitors or group.undoing is not None for group, branch in owned),
         )

@@ -12,7 +12,6 @@ from slam_backend.geometry import wrap_angle
 from slam_backend.maps.alignment import (
     DISTINCT_ROTATION,
     DISTINCT_TRANSLATION,
-    Alignment,
     AlignmentOptions,
 )
 from slam_backend.maps.correspondences import candidates, too_many
@@ -66,51 +65,28 @@ class AttemptRecord:
         return replace(self, tried=set(self.tried))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PendingAttempt:
-    """Attempt whose unsmoothed maps align, and which continues when the filters have smoothed them.
-
-    Attributes:
-        pair: Groups of the attempt.
-        numbers: Numbers of both joint filters' maps; the attempt ends if they change.
-        alignment: Alignment of the unsmoothed maps.
-        since: Step in which it began.
-        ready: Whether both maps are smoothed; the attempt continues one step later.
-    """
-
-    pair: PairKey
-    numbers: tuple[int, int]
-    alignment: Alignment
-    since: int
-    ready: bool = False
-
-
 class MergeScheduler:
     """Scheduler of attempts, with a memory of past ones.
 
     Args:
         options: Options of the schedule.
         alignment: Options of alignments, with the gate of candidate matches and the least number of inliers.
-
-    Attributes:
-        pending_attempt: Attempt that waits for smoothed maps, or None.
     """
 
     def __init__(self, options: AttemptOptions, alignment: AlignmentOptions) -> None:
         self._options = options
-        self._alignment = alignment
+        self.alignment = alignment
         self._records: dict[PairKey, AttemptRecord] = {}
         self._proposed: dict[PairKey, set[tuple[int, int]]] = {}
         self._near: dict[PairKey, NearPairs] = {}  # results of `near_pairs`; not part of the state
         self._blocks: list[tuple[PairKey, int]] = []  # blocked pairs, and the step when the block ends
         self._uncertainties: dict[tuple[int, int], float] = {}  # least uncertainty by robots of both sides
         self._motions: dict[tuple[int, int], FloatArray] = {}  # last motion by the robots that define the frames
-        self.pending_attempt: PendingAttempt | None = None
 
     def is_due(self, step: int) -> bool:
-        """Return whether a pair may try at this step, or an attempt is pending."""
+        """Return whether a pair may try at this step."""
         options = self._options
-        return self.pending_attempt is not None or (options.enabled and step % options.every == options.every - 1)
+        return options.enabled and step % options.every == options.every - 1
 
     def may_try(self, pair: PairKey, step: int) -> bool:
         """Return whether the pair's wait is over, and no block applies."""
@@ -127,15 +103,15 @@ class MergeScheduler:
         earlier = [key for key in self._near if one | other >= {*key[0], *key[1]}]
         known = {key: self._near.pop(key) for key in earlier}
         fitting = [near for key, near in known.items() if one.issuperset(key[0]) and other.issuperset(key[1])]
-        found = near_pairs(a, b, self._alignment, max(fitting, key=lambda near: len(near.rows), default=None))
-        if found is not None:
-            self._near[pair] = found
-        return found
+        near = near_pairs(a, b, self.alignment, max(fitting, key=lambda near: len(near.rows), default=None))
+        if near is not None:
+            self._near[pair] = near
+        return near
 
     def candidates(self, pair: PairKey, map_a: LandmarkMap, map_b: LandmarkMap) -> tuple[IntArray, BoolArray]:
         """Return the result of `correspondences.candidates` for two groups' maps."""
         a, b = (Appearance(landmarks.ids, landmarks.descriptors) for landmarks in (map_a, map_b))
-        return candidates(map_a, map_b, self._alignment, self.near_pairs(pair, a, b))
+        return candidates(map_a, map_b, self.alignment, self.near_pairs(pair, a, b))
 
     def choose(self, maps: Mapping[PairKey, tuple[LandmarkMap, LandmarkMap]], step: int) -> PairKey | None:
         """Return the pair with the most new candidate matches, if it has enough for an attempt; the first of equals."""
@@ -145,18 +121,18 @@ class MergeScheduler:
         for pair, (map_a, map_b) in maps.items():
             if not len(map_a) or not len(map_b):
                 continue  # an empty map has no descriptor length yet
-            if too_many(map_a, map_b, self._alignment):
+            if too_many(map_a, map_b, self.alignment):
                 continue
             rows = self.candidates(pair, map_a, map_b)[0]
-            if len(rows) < self._alignment.min_inliers:
+            if len(rows) < self.alignment.min_inliers:
                 continue
-            found = set(zip(map_a.ids[rows[:, 0]].tolist(), map_b.ids[rows[:, 1]].tolist(), strict=True))
+            matches = set(zip(map_a.ids[rows[:, 0]].tolist(), map_b.ids[rows[:, 1]].tolist(), strict=True))
             record = self._records.get(pair)
             stale = record is None or step - record.last_step > self._options.longest_wait
-            new = len(found if record is None or stale else found - record.tried)
+            new = len(matches if record is None or stale else matches - record.tried)
             if new >= self._options.new_candidates and new > most:
                 best, most = pair, new
-                self._proposed = {pair: found}
+                self._proposed = {pair: matches}
         return best
 
     def should_defer(self, pair: PairKey, uncertainty: float, limit: float = math.inf) -> bool:
@@ -227,13 +203,11 @@ class MergeScheduler:
         records = {pair: record.copy() for pair, record in self._records.items()}
         memory: dict[str, Any] = {"records": records, "blocks": tuple(self._blocks)}
         memory |= {"uncertainties": dict(self._uncertainties), "motions": dict(self._motions)}
-        fixed = {"options": self._options, "alignment": self._alignment, "pending_attempt": self.pending_attempt}
-        return fixed | memory
+        return {"options": self._options, "alignment": self.alignment} | memory
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Restore options and memory from `get_state`."""
-        self._options, self._alignment, self._near = state["options"], state["alignment"], {}
-        self.pending_attempt = state["pending_attempt"]
+        self._options, self.alignment, self._near = state["options"], state["alignment"], {}
         self._records = {pair: record.copy() for pair, record in state["records"].items()}
         self._blocks = list(state["blocks"])
         self._uncertainties, self._motions = dict(state["uncertainties"]), dict(with_constants(state["motions"]))

@@ -8,10 +8,11 @@ import numpy as np
 
 from slam_backend.core.read_only import as_read_only, with_constants
 from slam_backend.fastslam.filter import FastSlam
-from slam_backend.fastslam.reports import LandmarksCreated, MapChange, MapForked, StepReport
+from slam_backend.fastslam.reports import StepReport
 from slam_backend.fastslam.step_input import InputBuffer
 from slam_backend.team.branches import ReplayedStep
 from slam_backend.team.communication import TrafficCounter
+from slam_backend.team.reports import LandmarksCreated, MapChange, MapForked
 
 
 class SharedRecords:

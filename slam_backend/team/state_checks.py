@@ -14,13 +14,15 @@ from slam_backend.fastslam.state_checks import check_descriptors, check_filter, 
 from slam_backend.fastslam.step_input import StepInput
 from slam_backend.maps.alignment_types import Alignment, AlignmentOptions
 from slam_backend.smoother.log_arrays import REJECTED
+from slam_backend.team import reports as team_reports
 from slam_backend.team.branches import ReplayedStep
-from slam_backend.team.merge_monitor import MergeMonitor, PreMergeSnapshot
-from slam_backend.team.merge_scheduler import AttemptOptions, AttemptRecord, PendingAttempt
+from slam_backend.team.merge import STORED
+from slam_backend.team.merge_monitor import MergeMonitor
+from slam_backend.team.merge_scheduler import AttemptOptions, AttemptRecord, PairKey
 from slam_backend.team.options import MergeOptions
 
 BY_ROBOTS = ("uncertainties", "motions")  # parts of the schedule with an entry for each pair of robots
-KEYS = ("step", "epoch", "rng", "events", "groups", "numbers", "alignment", "merging", "schedule", "records")
+KEYS = ("step", "groups", "numbers", "records", "epoch", "rng", "events", "merging", "schedule", "processes")
 BRANCH = (
     "robots",
     "active_robots",
@@ -55,7 +57,7 @@ class TeamCheck:
         self._inputs: Mapping[int, StepInput] = {}
         self.descriptor_sizes: set[int] = set()
         self.options: list[FilterOptions] = []
-        self._done: set[int] = set()  # `id` of the snapshots checked, as merges share them
+        self._merges: dict[int, PairKey] = {}  # robots of the merges checked so far, by the number of the joint map
 
     def check(self, name: str, state: Any) -> None:
         """Refuse a value that is not a valid state of a team of K robots.
@@ -65,7 +67,7 @@ class TeamCheck:
         """
         check.keys(name, state, KEYS)
         for of_group, group in check.named_items(f"{name}['groups']", state["groups"]):
-            check.keys(of_group, group, ("branches", "undoing"))
+            check.keys(of_group, group, ("branches",))
             for where, branch in check.named_items(f"{of_group}['branches']", group["branches"]):
                 check.keys(where, branch, BRANCH)
                 check.instance(f"{where}['robots']", branch["robots"], tuple)
@@ -75,7 +77,6 @@ class TeamCheck:
         check.integer(f"{name}['step']", state["step"])
         check.integer(f"{name}['epoch']", state["epoch"])
         check.generator(f"{name}['rng']", state["rng"])
-        check.options(f"{name}['alignment']", state["alignment"], AlignmentOptions)
         check.options(f"{name}['merging']", state["merging"], MergeOptions)
         self._step = state["step"]
         self._check_records(f"{name}['records']", state["records"])
@@ -83,8 +84,10 @@ class TeamCheck:
             self._check_event(where, event)
         check.integers(f"{name}['numbers']", state["numbers"], 0, self._next_number - 1, list)
         self._check_schedule(f"{name}['schedule']", state["schedule"])
+        self._check_processes(f"{name}['processes']", state["processes"])
         for where, group in check.named_items(f"{name}['groups']", state["groups"]):
             self._check_group(where, group)
+        self._check_undoing(f"{name}['processes']", state)
         trunks = [group["branches"][0]["robots"] for group in state["groups"]]
         if sorted(sum(trunks, ())) != list(range(self._count)) or trunks != sorted(trunks):
             check.refuse(f"{name}['groups']", "groups of all robots, ordered by their first robots", trunks)
@@ -104,30 +107,63 @@ class TeamCheck:
         trunk = group["branches"][0]
         if sorted(active_robots) != list(trunk["robots"]):
             check.refuse(f"{name}['branches']", f"branches with each of {trunk['robots']} active in one", active_robots)
-        if group["undoing"] is not None:
-            self._check_undoing(f"{name}['undoing']", group["undoing"], trunk)
 
-    def _check_undoing(self, name: str, undoing: Any, trunk: Mapping[str, Any]) -> None:
-        """Refuse a value that is not the rollback of a merge that the trunk monitors."""
-        check.keys(name, undoing, ("number", "sides", "replayed"))
-        check.integer(f"{name}['number']", undoing["number"], 0, self._next_number - 1)
-        sides = check.named_items(f"{name}['sides']", undoing["sides"])
-        for where, side in sides:
-            self._check_branch(where, side)
-        parts = [side["robots"] for _, side in sides]
-        if sorted(sum(parts, ())) != list(trunk["robots"]):
-            check.refuse(f"{name}['sides']", f"parts of {trunk['robots']}", parts)
-        of_sides = check.named_items(f"{name}['replayed']", undoing["replayed"], len(parts))
-        for (of_side, replayed), robots in zip(of_sides, parts, strict=True):
-            for where, done in check.named_items(of_side, replayed):
-                self._check_replayed(where, done, len(robots))
-        if all(monitor.number != undoing["number"] for monitor in trunk["monitors"]):
-            return  # the joint filter has been replaced
-        for where, side in sides:
-            for robot, last in side["last_steps"].items():
-                self._need_from(where, last + 1)
-                if last > trunk["last_steps"].get(robot, -1):
-                    check.refuse(where, "sides that know no more steps than the joint filter", last)
+    # ------------------------------------------------------------------ merges
+
+    def _check_processes(self, name: str, processes: Any) -> None:
+        """Refuse values that are not the processes of merges, in order of time so that sides need only earlier ones."""
+        for where, process in check.named_items(name, processes):
+            check.keys(where, process, ("pair", "phase"))
+            self._check_pair(f"{where}['pair']", process["pair"])
+            if process["phase"] not in STORED:
+                check.refuse(f"{where}['phase']", f"one of {', '.join(STORED)}", process["phase"])
+            if process["phase"] == "smoothing":
+                check.keys(where, process, ("numbers", "unsmoothed", "since", "ready"))
+                check.integers(f"{where}['numbers']", process["numbers"])
+                check.sequence(f"{where}['numbers']", process["numbers"], 2)
+                check.instance(f"{where}['unsmoothed']", process["unsmoothed"], Alignment)
+                check.integer(f"{where}['since']", process["since"], 0, self._step)
+                check.boolean(f"{where}['ready']", process["ready"])
+                continue
+            check.keys(where, process, ("number", "alignment", "sides"))
+            check.integer(f"{where}['number']", process["number"], 0, self._next_number - 1)
+            check.instance(f"{where}['alignment']", process["alignment"], Alignment)
+            if any(process["number"] <= earlier for earlier in self._merges):
+                check.refuse(f"{where}['number']", "merges from the oldest to the newest", process["number"])
+            sides = check.named_items(f"{where}['sides']", process["sides"], 2)
+            for of_side, side in sides:
+                self._check_branch(of_side, side)
+                for last in side["last_steps"].values():
+                    self._need_from(of_side, last + 1)
+            parts = tuple(side["robots"] for _, side in sides)
+            if set(parts[0]) & set(parts[1]) or process["pair"] != parts:
+                check.refuse(f"{where}['sides']", f"those of {process['pair']}", parts)
+            self._merges[process["number"]] = parts
+
+    def _check_undoing(self, name: str, state: Mapping[str, Any]) -> None:
+        """Refuse rollbacks of merges that do not fit their groups."""
+        trunks = {group["branches"][0]["robots"]: group["branches"][0] for group in state["groups"]}
+        for where, process in check.named_items(name, state["processes"]):
+            if process["phase"] != "undoing":
+                continue
+            check.keys(where, process, ("robots", "trunks", "replayed"))
+            if process["robots"] not in trunks:
+                check.refuse(f"{where}['robots']", "robots of a group", process["robots"])
+            joint = trunks.pop(process["robots"])
+            sides = check.named_items(f"{where}['trunks']", process["trunks"])
+            for of_side, side in sides:
+                self._check_branch(of_side, side)
+                for robot, last in side["last_steps"].items():
+                    self._need_from(of_side, last + 1)
+                    if last > joint["last_steps"].get(robot, -1):
+                        check.refuse(of_side, "sides that know no more steps than the joint filter", last)
+            parts = [side["robots"] for _, side in sides]
+            if sorted(sum(parts, ())) != list(joint["robots"]):
+                check.refuse(f"{where}['trunks']", f"parts of {joint['robots']}", parts)
+            replayed = check.named_items(f"{where}['replayed']", process["replayed"], len(parts))
+            for (of_side, steps), robots in zip(replayed, parts, strict=True):
+                for of_step, done in check.named_items(of_side, steps):
+                    self._check_replayed(of_step, done, len(robots))
 
     def _check_branch(self, name: str, branch: Any) -> None:
         """Refuse a value that is not a branch with a valid filter and monitors."""
@@ -170,9 +206,6 @@ class TeamCheck:
                 self._need_from(name, last + 1)
             elif last != self._step - 1 and self._step:
                 check.refuse(f"{name}['last_steps']", f"{self._step - 1} for an active robot", last)
-        for monitor in branch["monitors"]:
-            for side in monitor.sides:
-                self._need_from(name, side.oldest)
 
     def _need_from(self, name: str, first: int) -> None:
         """Refuse a state in which a step from `first` on is not buffered."""
@@ -184,21 +217,13 @@ class TeamCheck:
         check.instance(name, monitor, MergeMonitor)
         check.integer(f"{name}.number", monitor.number, 0, self._next_number - 1)
         check.integer(f"{name}.steps", monitor.steps)
-        check.instance(f"{name}.alignment", monitor.alignment, Alignment)
         for where, landmarks in check.named_items(f"{name}.pre_merge_maps", monitor.pre_merge_maps, 2):
             check_landmarks(where, landmarks)
         for where, exclusive in check.named_items(f"{name}.exclusive_landmarks", monitor.exclusive_landmarks, 2):
             check.integers(where, exclusive, *check.LANDMARK, set)
-        for where, side in check.named_items(f"{name}.sides", monitor.sides, 2):
-            check.instance(where, side, PreMergeSnapshot)
-            if id(side) not in self._done:
-                self._done.add(id(side))
-                self._check_branch(f"{where}.trunk", side.trunk)
-            earliest = [1 + min(side.trunk["last_steps"].values()), *(s.oldest for w in side.monitors for s in w.sides)]
-            check.integer(f"{where}.oldest", side.oldest, 0, min(earliest))
-        one, two = (side.robots for side in monitor.sides)
-        if set(one) & set(two) or not {*one, *two} <= set(robots):
-            check.refuse(f"{name}.sides", f"two parts of {robots}", (one, two))
+        pair = self._merges.get(monitor.number)
+        if pair is None or monitor.pair != pair or not {*pair[0], *pair[1]} <= set(robots):
+            check.refuse(f"{name}.pair", f"the robots of a merge among {robots}", monitor.pair)
 
     # ------------------------------------------------------------------ inputs and reports
 
@@ -284,27 +309,27 @@ class TeamCheck:
     def _check_entry(self, name: str, entry: Any) -> None:
         """Refuse a value that is not a change of maps."""
         kind = type(entry)
-        if kind is reports.LandmarksCreated:
+        if kind is team_reports.LandmarksCreated:
             numbers: tuple[Any, ...] = (entry.number,)
             check.integer(f"{name}.robot", entry.robot, 0, self._count - 1)
             check.integer(f"{name}.step", entry.step, 0, self._step)
             check.indices(f"{name}.ids", entry.ids, (None,), REJECTED, check.MAX_LANDMARKS)
-        elif kind is reports.LandmarkIdMap:
+        elif kind is team_reports.LandmarkIdMap:
             numbers = entry.maps
             check.indices(f"{name}.ids_b", entry.ids_b, (None, 2), *check.LANDMARK)
             check.robots(f"{name}.robots_a", entry.robots_a, self._count)
             check.robots(f"{name}.robots_b", entry.robots_b, self._count)
-        elif kind is reports.MapForked:
+        elif kind is team_reports.MapForked:
             numbers = entry.source, entry.copy
-        elif kind is reports.MergeUndone:
+        elif kind is team_reports.MergeUndone:
             numbers = entry.maps
         else:
-            check.instance(name, entry, reports.MapReleased)
+            check.instance(name, entry, team_reports.MapReleased)
             numbers = (entry.number,)
         check.integers(name, numbers, 0, self._next_number - 1)
 
     def _check_event(self, name: str, event: Any) -> None:
-        check.instance(name, event, reports.MergeEvent)
+        check.instance(name, event, team_reports.MergeEvent)
         check.integer(f"{name}.step", event.step, 0, self._step)
         if event.kind not in KINDS:
             check.refuse(f"{name}.kind", f"one of {KINDS}", event.kind)
@@ -315,18 +340,9 @@ class TeamCheck:
             check.instance(f"{name}.unsmoothed_alignment", event.unsmoothed_alignment, Alignment)
 
     def _check_schedule(self, name: str, schedule: Any) -> None:
-        check.keys(name, schedule, ("options", "alignment", "pending_attempt", "records", "blocks", *BY_ROBOTS))
+        check.keys(name, schedule, ("options", "alignment", "records", "blocks", *BY_ROBOTS))
         check.options(f"{name}['options']", schedule["options"], AttemptOptions)
         check.options(f"{name}['alignment']", schedule["alignment"], AlignmentOptions)
-        pending, where = schedule["pending_attempt"], f"{name}['pending_attempt']"
-        if pending is not None:
-            check.instance(where, pending, PendingAttempt)
-            self._check_pair(f"{where}.pair", pending.pair)
-            check.integers(f"{where}.numbers", pending.numbers)
-            check.sequence(f"{where}.numbers", pending.numbers, 2)
-            check.instance(f"{where}.alignment", pending.alignment, Alignment)
-            check.integer(f"{where}.since", pending.since, 0, self._step)
-            check.boolean(f"{where}.ready", pending.ready)
         check.instance(f"{name}['records']", schedule["records"], dict)
         for pair, record in schedule["records"].items():
             self._check_pair(f"{name}['records']", pair)

@@ -8,7 +8,6 @@ its maps contradict each other, and if so it undoes the merge. Robots that lose 
 the joint filter; on their return the joint filter replays their inputs.
 """
 
-import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from typing import Any, Literal
@@ -23,30 +22,29 @@ from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.options import MAX_ROBOTS, FilterOptions
 from slam_backend.fastslam.particle_maps import write_summary
 from slam_backend.fastslam.relative_poses import TeamPoses
-from slam_backend.fastslam.reports import (
-    Associations,
-    LandmarkIdMap,
-    MapReleased,
-    MergeEvent,
-    PoseEstimate,
-    RejuvenationReport,
-    TeamReport,
-)
+from slam_backend.fastslam.reports import Associations, PoseEstimate, RejuvenationReport
 from slam_backend.fastslam.step_input import StepInput, validate_step
 from slam_backend.geometry import inverse
 from slam_backend.maps.alignment import Alignment, AlignmentOptions
-from slam_backend.maps.alignment_types import PairAttempts, count_attempts, refusals_of
 from slam_backend.maps.landmark_map import LandmarkMap, TeamMapSummaries
 from slam_backend.models.measurements import Measurements, TeamMeasurements
 from slam_backend.team.branches import Branch, process_step, restored_filter
 from slam_backend.team.communication import TrafficCounter, check_contacts, contact_components
 from slam_backend.team.filter_merging.merging import inverse_alignment
-from slam_backend.team.group_merging import MergePlan, find_inconsistent_merge, merge_groups, separate_groups
+from slam_backend.team.group_merging import MergePlan
 from slam_backend.team.groups import Group, TeamTopology
-from slam_backend.team.merge_attempt import run_attempt
-from slam_backend.team.merge_rollback import MergeRollback
+from slam_backend.team.merge import TeamMerges
 from slam_backend.team.merge_scheduler import AttemptOptions, MergeScheduler
 from slam_backend.team.options import MergeOptions
+from slam_backend.team.reports import (
+    LandmarkIdMap,
+    MapReleased,
+    MergeEvent,
+    PairAttempts,
+    TeamReport,
+    count_attempts,
+    refusals_of,
+)
 from slam_backend.team.shared_records import SharedRecords
 from slam_backend.team.state_checks import TeamCheck
 
@@ -97,22 +95,21 @@ class TeamSlam:
             )
         sequence = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(check_seed(seed))
         stream, *streams, of_forks = sequence.spawn(2 + count)
-        self._rng = np.random.default_rng(stream)
-        self._alignment = AlignmentOptions() if alignment is None else alignment
-        self._merging = MergeOptions() if merging is None else merging
-        self._schedule = MergeScheduler(AttemptOptions() if attempts is None else attempts, self._alignment)
+        schedule = MergeScheduler(
+            AttemptOptions() if attempts is None else attempts, AlignmentOptions() if alignment is None else alignment
+        )
         groups = [
             Group(Branch((robot,), (robot,), FastSlam.from_options(1, options, rng), {robot: -1}, robot))
             for robot, rng in enumerate(map(np.random.default_rng, streams))
         ]
-        self._groups, self._records, self._num_robots = groups, SharedRecords(count, of_forks), count
-        self._events: list[MergeEvent] = []
+        self._num_robots, self._groups, self._records = count, groups, SharedRecords(count, of_forks)
+        merging = MergeOptions() if merging is None else merging
+        self._merges = TeamMerges(groups, self._records, schedule, merging, np.random.default_rng(stream))
         self._together = contact_components(None, count)
         self._numbers = frozenset(range(count))
         self._refresh_topology()
         self._last_topology: TeamTopology | None = None
         self._step = 0
-        self._epoch = 0
         self._size = 0
 
     # ------------------------------------------------------------------ one step
@@ -149,23 +146,23 @@ class TeamSlam:
         topology, size = self.topology, self._size or self._descriptor_size()
         camera = topology.branches[0].filter.options.camera
         inputs = validate_step(count, size, camera, odometry, measurements, identities, poses)
-        records, before = self._records, len(self._events)
+        records, before = self._records, len(self._merges.events)
         if contacts is not None or topology.is_split:
             topology = self._update_groups(networks)
         if topology.oldest is not None:
             records.log.record(self._step, inputs)
         associations, rejuvenations = self._advance(topology, inputs)
-        if topology.has_monitors:
-            self._check_merges()
-        id_maps = self._attempt(networks) if self._schedule.is_due(self._step) else ()
-        if self._is_stale:
+        num_changes = len(records.entries)
+        self._merges.advance(self._step, networks)
+        id_maps = tuple(change for change in records.entries[num_changes:] if isinstance(change, LandmarkIdMap))
+        if self._merges.is_stale:
             self._refresh_topology()
             topology = self.topology
         oldest = self._step + 1 if topology.oldest is None else topology.oldest
         if topology is not self._last_topology:
             self._note_dropped(topology)
             records.log.forget_before(oldest)
-        events, entries = tuple(self._events[before:]), tuple(records.entries)
+        events, entries = tuple(self._merges.events[before:]), tuple(records.entries)
         report = TeamReport(
             self._step, associations, topology.groups, events, id_maps, topology.maps, entries, oldest, rejuvenations
         )
@@ -243,63 +240,9 @@ class TeamSlam:
             raise argument_error("alignment", "a successful Alignment", got, "Align the two maps first.")
         if groups[1].robots < groups[0].robots:
             groups, alignment = groups[::-1], inverse_alignment(alignment)
-        id_map = self._merge(MergePlan.of(*groups, alignment), known)
+        id_map = self._merges.merge(MergePlan.of(*groups, alignment), self._step, known)
         self._refresh_topology()
         return id_map
-
-    def _merge(self, plan: MergePlan, known: bool = False) -> LandmarkIdMap:
-        """Merge two groups as planned, and record it."""
-        epoch = self._epoch + 1
-        joint, id_map = merge_groups(plan, self._merging, self._records, self._rng, epoch, known)
-        self._epoch = epoch
-        self._events.append(MergeEvent(self._step, "merge", id_map.robots_a, id_map.robots_b, plan.alignment))
-        self._replace(plan.groups, [joint])
-        return id_map
-
-    def _replace(self, old: Sequence[Group], new: Sequence[Group]) -> None:
-        """Replace some groups by others."""
-        self._groups = [group for group in self._groups if all(group is not other for other in old)] + list(new)
-        self._groups.sort(key=lambda group: group.robots)
-        self._is_stale = True
-
-    def _check_merges(self) -> None:
-        """Check the merges that can still be undone, and undo inconsistent ones."""
-        due = self._step % self._merging.watch_every == 0
-        for group in list(self._groups):
-            if due and group.undoing is None:
-                found = find_inconsistent_merge(group.trunk, self._merging, self._alignment)
-                group.undoing = None if found is None else MergeRollback.of(group.trunk, found.number)
-            if group.undoing is not None:
-                self._undo(group, group.undoing)
-                continue
-            for branch in group.branches:
-                while branch.monitors and branch.monitors[0].steps >= self._merging.watch_steps:
-                    branch.monitors.pop(0)
-                    self._is_stale = True
-
-    def _undo(self, group: Group, undoing: MergeRollback) -> None:
-        """Continue the rollback of a merge; it ends when all sides have caught up and are in contact."""
-        merges = undoing.merges(group.trunk)
-        if not merges:  # the joint filter was replaced and no longer monitors the merge
-            group.undoing, self._is_stale = None, True
-            return
-        caught_up = undoing.catch_up(group.trunk, self._records.log)
-        if not caught_up or not all(monitor.both_sides_connected(group.trunk.active_robots) for monitor in merges):
-            return
-        self._epoch += 1
-        self._replace([group], separate_groups(group, undoing, self._records, self._epoch))
-        pairs = [(monitor.sides[0].robots, monitor.sides[1].robots) for monitor in merges]
-        for monitor, pair in zip(merges, pairs, strict=True):
-            self._events.append(MergeEvent(self._step, "undo", *pair, monitor.alignment))
-        self._schedule.block(pairs[-1], self._step + self._merging.blocked_steps)
-
-    def _attempt(self, networks: IntArray) -> tuple[LandmarkIdMap, ...]:
-        """Run an attempt, and merge the groups if it succeeds."""
-        options = self._schedule, self._alignment, self._merging
-        tried = run_attempt(self._groups, networks, self._step, *options, self._records, self._rng)
-        if tried.event is not None:
-            self._events.append(tried.event)
-        return () if tried.plan is None else (self._merge(tried.plan),)
 
     def _note_dropped(self, topology: TeamTopology) -> None:
         """Record the maps that have ended since the last topology."""
@@ -313,7 +256,7 @@ class TeamSlam:
 
     def _refresh_topology(self) -> None:
         """Recompute the assignment of robots to filters."""
-        self.topology, self._is_stale = TeamTopology.of(self._groups), False
+        self.topology = self._merges.topology()
 
     # ------------------------------------------------------------------ estimates
 
@@ -330,12 +273,12 @@ class TeamSlam:
     @property
     def events(self) -> tuple[MergeEvent, ...]:
         """All attempts, merges and undos so far, in order."""
-        return tuple(self._events)
+        return tuple(self._merges.events)
 
     @property
     def pair_attempts(self) -> tuple[PairAttempts, ...]:
         """Outcomes of the attempts of each pair of groups so far, with the reason of the last refusal."""
-        return count_attempts(self._events)
+        return count_attempts(self._merges.events)
 
     @property
     def bytes_sent(self) -> IntArray:
@@ -364,24 +307,24 @@ class TeamSlam:
         for robot in range(self.num_robots):
             branch, index = self._find(robot)
             report = branch.report
-            found = np.empty(0, np.int64) if report is None else report.associations[index]
-            made = np.empty(0, np.int64) if report is None else report.created[index]
-            new = int(np.count_nonzero((found >= 0) & (found == made)))
+            associated = np.empty(0, np.int64) if report is None else report.associations[index]
+            created = np.empty(0, np.int64) if report is None else report.created[index]
+            new = int(np.count_nonzero((associated >= 0) & (associated == created)))
             summary = branch.filter.consistency
             rows.append(
                 {
                     "ess": self.ess(robot),
                     "nis": float("nan") if report is None else report.nis,
                     "landmarks": float(branch.filter.map_size),
-                    "accepted": float(np.count_nonzero(found >= 0) - new),
+                    "accepted": float(np.count_nonzero(associated >= 0) - new),
                     "new": float(new),
-                    "rejected": float(np.count_nonzero(found < 0)),
+                    "rejected": float(np.count_nonzero(associated < 0)),
                     "nis_mean": summary.nis_mean,
                     "nis_share": summary.nis_share,
                     "ess_share": summary.ess_share,
                     "rejected_share": summary.rejected_share,
                     "warnings": float(len(summary.warnings)),
-                    **refusals_of(self._events, robot),
+                    **refusals_of(self._merges.events, robot),
                 }
             )
         return tuple(rows)
@@ -458,11 +401,10 @@ class TeamSlam:
             ValueError: If the event is not a merge that is still monitored.
         """
         check_kind("merge", merge, MergeEvent, "Give one of the events of a step's report.")
-        for group in self._groups:
-            for monitor in group.trunk.monitors:
-                if monitor.alignment is merge.alignment:
-                    map_a, map_b = (restored_filter(side.trunk["filter"]).map() for side in monitor.sides)
-                    return map_a, map_b
+        for joined in self._merges.watched:
+            if joined.alignment is merge.alignment:
+                map_a, map_b = (restored_filter(side["filter"]).map() for side in joined.sides)
+                return map_a, map_b
         expected, got = "a merge still monitored", f"the {merge.kind} of step {merge.step}"
         raise argument_error("merge", expected, got, "Call this in the step of the merge.")
 
@@ -498,12 +440,12 @@ class TeamSlam:
         Args:
             into: Earlier result, overwritten. None: fresh arrays.
         """
-        points = TeamPoses(self._num_robots) if into is None else into
+        poses = TeamPoses(self._num_robots) if into is None else into
         for branch in self.topology.branches:
             slam, report = branch.filter, branch.report
             ess = 1.0 if report is None else report.ess / slam.num_particles
-            slam.write_team_poses(branch.robots, branch.active_robots, ess, points)
-        return points
+            slam.write_team_poses(branch.robots, branch.active_robots, ess, poses)
+        return poses
 
     def _group_of(self, robot: int) -> Group:
         """Return the robot's group."""
@@ -540,15 +482,10 @@ class TeamSlam:
         """
         return {
             "step": self._step,
-            "epoch": self._epoch,
-            "rng": copy.deepcopy(self._rng.bit_generator.state),
-            "events": tuple(self._events),
             "groups": [group.get_state() for group in self._groups],
             "numbers": sorted(self._numbers),
-            "alignment": self._alignment,
-            "merging": self._merging,
-            "schedule": self._schedule.get_state(),
             "records": self._records.get_state(),
+            **self._merges.get_state(),
         }
 
     def set_state(self, state: Mapping[str, Any]) -> None:
@@ -563,14 +500,11 @@ class TeamSlam:
 
     def restore_checked(self, state: Mapping[str, Any]) -> None:
         """Restore a state that was validated."""
-        self._step, self._epoch = state["step"], state["epoch"]
-        self._rng.bit_generator.state = copy.deepcopy(state["rng"])
-        self._events = list(state["events"])
+        self._step = state["step"]
         at_hand = {group.robots: group.trunk.filter for group in self._groups}  # reuse is faster than construction
-        self._groups = [Group.from_state(group, at_hand) for group in state["groups"]]
+        self._groups[:] = [Group.from_state(group, at_hand) for group in state["groups"]]
+        self._merges.set_state(state)
+        self._records.set_state(state["records"])
         self._refresh_topology()
         self._last_topology, self._size = None, 0
         self._numbers = frozenset(state["numbers"])
-        self._alignment, self._merging = state["alignment"], state["merging"]
-        self._schedule.set_state(state["schedule"])
-        self._records.set_state(state["records"])

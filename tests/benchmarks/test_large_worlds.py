@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from builders.scripts import load_script
 
-from slam_backend.team import merge_attempt
+from slam_backend.team import merge
 from training.bench.config import ScaleBenchConfig
 
 FOLDER = Path(__file__).parents[2] / "benchmarks"
@@ -15,14 +15,14 @@ merge_claims, worlds_in_turn = (load_script(FOLDER / f"{name}.py") for name in (
 
 def test_claims_are_those_of_all_attempts_whose_maps_align() -> None:
     """Each merge has a claim, refused attempts have one, too, and errors are those of the merges."""
-    decide = merge_attempt._refused_if_uncertain
+    decide = merge.refused_if_uncertain
     config = ScaleBenchConfig(extents=(40.0,), robots=(3,), duration=120.0, seed=10001, seeds=1)
     claims, errors = merge_claims.claims_of(config)
     merged = [claim for claim in claims if claim["merged"]]
     assert len(merged) == len(errors) > 0
     assert [claim["error_m"] for claim in merged] == pytest.approx([error for error, _ in errors])
     assert all(math.isfinite(claim["nees"]) and claim["nees"] > 0.0 and claim["sigma_m"] > 0.0 for claim in claims)
-    assert merge_attempt._refused_if_uncertain is decide
+    assert merge.refused_if_uncertain is decide
 
 
 def test_claims_need_an_episode() -> None:

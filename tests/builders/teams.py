@@ -10,13 +10,13 @@ from builders.comparison import assert_same
 from builders.filters import LANDMARKS, frame_of
 
 from slam_backend.core.validation import BoolArray, FloatArray
-from slam_backend.fastslam.reports import TeamReport
 from slam_backend.geometry import between, compose, inverse, transform_points
 from slam_backend.maps.alignment import Alignment
 from slam_backend.models.camera import StereoCamera
 from slam_backend.models.measurements import Measurements
 from slam_backend.models.odometry import OdometryModel
 from slam_backend.team.merge_scheduler import AttemptOptions
+from slam_backend.team.reports import TeamReport
 from slam_backend.team.team import TeamSlam
 
 TRUE_CAMERA = StereoCamera()
@@ -161,6 +161,14 @@ def false_alignment(simulation: SimulatedTeam, team: TeamSlam, offset: FloatArra
         pairs.append((row, column))
         distances[row] = distances[:, column] = np.inf
     return Alignment(True, "", *motion, 1e-3 * np.eye(3), np.array(pairs), 0.0)
+
+
+def begin_undo(team: TeamSlam) -> None:
+    """Begin to undo the oldest merge of the first group."""
+    group = team._groups[0]
+    process = team._merges.joined[group.merge_numbers[0]]
+    assert process.joined is not None
+    process.phase = team._merges.rollback(process.joined, group)
 
 
 STARTS = np.array([[0.5, -1.0, 0.3], [4.0, 3.0, 2.0], [9.0, 1.0, -2.5], [2.0, 6.0, -1.2]])  # world

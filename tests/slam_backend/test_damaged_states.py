@@ -7,14 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 from builders.damage import at, replaced, try_damaged
-from builders.teams import SimulatedTeam, driven, links, true_alignment
+from builders.teams import SimulatedTeam, begin_undo, driven, links, true_alignment
 
 from slam_backend.core.state_codec import encode
 from slam_backend.fastslam.existence import ExistenceModel
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.smoother.options import SmoothingOptions
 from slam_backend.state_kinds import BACKEND_KINDS
-from slam_backend.team.merge_rollback import MergeRollback
 from slam_backend.team.merge_scheduler import AttemptOptions
 from slam_backend.team.options import MergeOptions
 from slam_backend.team.team import TeamSlam
@@ -63,8 +62,7 @@ def team_in_an_undo() -> Subject:
     """Return a team that takes back a merge."""
     simulation, team = merged(**SLICED, merging=MergeOptions(watch_every=10_000))
     simulation.run(team, 25)
-    group = team._groups[0]
-    group.undoing = MergeRollback.of(group.trunk, group.trunk.monitors[0].number)
+    begin_undo(team)
     simulation.run(team, 2)
     return team, [simulation.read() for _ in range(6)]
 
@@ -75,7 +73,7 @@ def team_in_an_attempt() -> Subject:
     smoothing = SmoothingOptions(incremental=True)
     attempts = AttemptOptions(every=5)
     team = simulation.build(num_particles=10, rejuvenate_every=20, smoothing=smoothing, attempts=attempts)
-    while team._schedule.pending_attempt is None:
+    while team._merges.attempt is None:
         simulation.run(team, 1)
     return team, [simulation.read() for _ in range(8)]
 

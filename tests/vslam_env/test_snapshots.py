@@ -16,9 +16,8 @@ from builders.damage import Trap
 from builders.environments import MEETING, small_env, wander
 
 from slam_backend.core.state_codec import encode
-from slam_backend.team import team
+from slam_backend.team import merge
 from slam_backend.team.branches import Branch
-from slam_backend.team.merge_monitor import MergeMonitor
 from vslam_env import EnvConfig, ExplorationEnv, load_state, save_state, vslam_v0
 from vslam_env.reward import RUNNING_COST
 from vslam_env.snapshots import STATE_FORMAT, check_state, state_version
@@ -127,7 +126,7 @@ def test_during_an_attempt(tmp_path: Path) -> None:
         quiet.step(actions)
         env.step(actions)
         taken.append(actions)
-        if slam._schedule.pending_attempt is not None:
+        if slam._merges.attempt is not None:
             snapshots.append((len(taken), _through_disk(env, tmp_path)))
     assert len(snapshots) >= 3
     for begun, other in [(len(taken), quiet), *snapshots]:
@@ -138,13 +137,11 @@ def test_during_an_attempt(tmp_path: Path) -> None:
         assert _go_on(other, 3) == _go_on(env.clone(), 3)
 
 
-def _sometimes_inconsistent(trunk: Branch, *_: Any) -> MergeMonitor | None:
-    """Return a merge that can be undone now, in some steps."""
-    connected = [monitor.both_sides_connected(trunk.active_robots) for monitor in trunk.monitors]
-    for i, monitor in enumerate(trunk.monitors):
-        if all(connected[i:]) and (13 * monitor.number + monitor.steps) % 97 < 5:
-            return monitor
-    return None
+def _sometimes_refuted(number: int, trunk: Branch, *_: Any) -> bool:
+    """Return whether a merge can be undone now, and the step is one of some."""
+    monitors = trunk.monitors[trunk.merge_numbers.index(number) :]
+    can_be_undone = all(monitor.both_sides_connected(trunk.active_robots) for monitor in monitors)
+    return can_be_undone and (13 * number + monitors[0].steps) % 97 < 5
 
 
 @pytest.mark.slow
@@ -153,7 +150,7 @@ def test_merges_that_are_undone_in_a_lossy_network(
     world: str, robots: int, seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Copies taken at any time continue bit for bit, and the records of maps, grids and inputs stay complete."""
-    monkeypatch.setattr(team, "find_inconsistent_merge", _sometimes_inconsistent)
+    monkeypatch.setattr(merge, "is_refuted", _sometimes_refuted)
     rng = np.random.default_rng(seed)
     config = EnvConfig().replace(
         world=world, num_robots=robots, action_type="goal", decision_ticks=3, comm_range=12.0, comm_loss=0.1,
@@ -387,7 +384,7 @@ def test_a_file_restores_sharing_and_write_protection(tmp_path: Path) -> None:
     assert encode(loaded, ENV_KINDS) == encode(state, ENV_KINDS)
     team = loaded["episode"]["belief"]["team"]
     event = next(event for event in team["events"] if event.kind == "merge")
-    assert team["groups"][0]["branches"][0]["monitors"][0].alignment is event.alignment
+    assert team["processes"][0]["alignment"] is event.alignment
 
 
 def test_files_are_whole_or_not_there(tmp_path: Path) -> None:

@@ -10,11 +10,10 @@ from agents.policy import Policy
 from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import FloatArray, IntArray, argument_error
 from slam_backend.fastslam.consistency import Consistency
-from slam_backend.fastslam.reports import MergeEvent
 from slam_backend.geometry import between, wrap_angle
-from slam_backend.maps.alignment_types import PairAttempts, count_attempts
 from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.metrics import nees
+from slam_backend.team.reports import MergeEvent, PairAttempts, count_attempts
 from slam_backend.trajectory import dead_reckoning
 from training.episodes.guard import GuardedTeam
 from training.experiments.logs import LOGGER

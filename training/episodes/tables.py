@@ -10,8 +10,8 @@ from training.experiments.tables import ATE_NOTE, E_SCALE, MAPS_NOTE, NIS_NOTE, 
 
 if TYPE_CHECKING:  # numerical modules are imported when the command runs, so that --help is fast
     from slam_backend.fastslam.consistency import Consistency
-    from slam_backend.maps.alignment_types import PairAttempts
     from slam_backend.maps.landmark_map import LandmarkMap
+    from slam_backend.team.reports import PairAttempts
     from training.experiments.run_folder import RunFolder
 
 # Metrics in the columns of the tables, with their digits

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from slam_backend.core.files import check_writable, move_file, resolved
 from slam_backend.core.validation import argument_error, check_float, check_int
-from slam_backend.fastslam.reports import MergeEvent
+from slam_backend.team.reports import MergeEvent
 from vslam_env.rendering import MergeFlash, Scene
 from vslam_env.rendering.merge_effect import FLASH_TICKS
 from vslam_env.sensors import RenderedFrame

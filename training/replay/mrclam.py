@@ -12,14 +12,13 @@ import numpy as np
 
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.fastslam.consistency import Consistency
-from slam_backend.fastslam.reports import MergeEvent, TeamReport
 from slam_backend.maps.alignment import AlignmentOptions
-from slam_backend.maps.alignment_types import PairAttempts
 from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.models.measurements import Measurements
 from slam_backend.models.odometry import OdometryModel
 from slam_backend.readers.mrclam import MrclamLog, to_filter_steps
 from slam_backend.team.merge_scheduler import AttemptOptions
+from slam_backend.team.reports import MergeEvent, PairAttempts, TeamReport
 from slam_backend.team.team import TeamSlam
 from training.replay.config import MRCLAM_MOTION, MrclamConfig
 from training.replay.single_robot import PLANAR_GATE, RejuvenationCount, is_stage

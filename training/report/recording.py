@@ -16,9 +16,9 @@ from slam_backend.core.array_files import read_arrays
 from slam_backend.core.files import write_file
 from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import FloatArray, IntArray, argument_error
-from slam_backend.fastslam.reports import MergeEvent
 from slam_backend.geometry import compose, rotate_covariances
 from slam_backend.maps.landmark_map import LandmarkMap
+from slam_backend.team.reports import MergeEvent
 from training.episodes.runner import EpisodeRecord, MergeRecord, Progress, describe_event
 from training.experiments.plotting import CHI_SQUARE_95
 from training.experiments.run_folder import plain

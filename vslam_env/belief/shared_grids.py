@@ -10,9 +10,9 @@ import numpy as np
 from slam_backend.core.read_only import as_constant, as_read_only, with_constants, with_read_only
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.fastslam.relative_poses import TeamPoses
-from slam_backend.fastslam.reports import LandmarkIdMap, MapReleased, MergeUndone, TeamReport
 from slam_backend.geometry import compose, inverse
 from slam_backend.models.camera import StereoCamera
+from slam_backend.team.reports import LandmarkIdMap, MapReleased, MergeUndone, TeamReport
 from vslam_env.belief.belief import RobotHardware
 from vslam_env.navigation import OccupancyGrid, TeamGrids, TeamLooks, ray_directions
 from vslam_env.navigation.looks import looks_reach

@@ -8,17 +8,18 @@ from typing import Any
 import numpy as np
 
 from slam_backend.core.read_only import as_read_only
+from slam_backend.core.state import accepted, restore, take
 from slam_backend.core.validation import Float32Array, FloatArray, argument_error
 from slam_backend.fastslam.consistency import Consistency
 from slam_backend.fastslam.options import FilterOptions
 from slam_backend.fastslam.relative_poses import TeamPoses
-from slam_backend.fastslam.reports import LandmarkIdMap, MergeEvent, TeamReport
 from slam_backend.fastslam.step_input import StepInput
 from slam_backend.geometry import rotate_covariances
 from slam_backend.maps.alignment import Alignment
 from slam_backend.maps.landmark_map import LandmarkMap, TeamMapSummaries
 from slam_backend.team.merge_scheduler import AttemptOptions
 from slam_backend.team.options import MergeOptions
+from slam_backend.team.reports import LandmarkIdMap, MergeEvent, TeamReport
 from slam_backend.team.team import TeamSlam
 from vslam_env.belief.belief import Belief, BeliefBatch, BeliefConfig, Candidates, RobotHardware, Teammate
 from vslam_env.belief.readings import Readings, TeamReadings
@@ -240,7 +241,7 @@ class TeamBelief:
             "team": self._team.get_state(),
             "grids": self._grids.get_state(),
             "candidates": self._candidates.get_state(),
-            "rendezvous": self._rendezvous.get_state(),
+            "rendezvous": take(self._rendezvous),
             "goals": self._goals.copy(),
         }
 
@@ -250,7 +251,7 @@ class TeamBelief:
         self._tick = state["tick"]
         self._grids.set_state(state["grids"])
         self._candidates.set_state(state["candidates"])
-        self._rendezvous.set_state(state["rendezvous"])
+        restore(self._rendezvous, accepted(Rendezvous, "state", state["rendezvous"]))
         self._goals = state["goals"].copy()
         self._refresh_poses()
 

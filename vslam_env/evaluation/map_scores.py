@@ -11,8 +11,8 @@ from slam_backend.core.jit import in_place
 from slam_backend.core.read_only import with_constants, with_read_only
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray, check_float
 from slam_backend.fastslam.relative_poses import OWN, SIGMAS, START, TeamPoses
-from slam_backend.fastslam.reports import LandmarkIdMap, LandmarksCreated, MapForked, MapReleased, TeamReport
 from slam_backend.maps.landmark_map import TeamMapSummaries
+from slam_backend.team.reports import LandmarkIdMap, LandmarksCreated, MapForked, MapReleased, TeamReport
 
 FALSE, UNCOUNTED = -1, -2  # claims of false landmarks, and of true ones that are not scored
 ACCURATE_WITHIN = 0.5  # [m] error below which a landmark counts as accurate

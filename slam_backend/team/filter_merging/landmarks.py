@@ -100,13 +100,13 @@ def merge_by_identity(a: ParticleMaps, b: ParticleMaps, pairs: IntArray) -> tupl
     known = np.intersect1d(names_a[names_a >= 0], names_b[names_b >= 0])
     of_a, of_b = names_a[np.searchsorted(ids_a, pairs[:, 0])], names_b[np.searchsorted(ids_b, pairs[:, 1])]
     differ = (of_a != of_b) & (np.isin(of_a, known) | np.isin(of_b, known) | ((of_a >= 0) & (of_b >= 0)))
-    kept = pairs[~differ]
+    fitting = pairs[~differ]
     named = []
     for name in known.tolist():
-        free_a = np.setdiff1d(ids_a[names_a == name], kept[:, 0]).tolist()
-        free_b = np.setdiff1d(ids_b[names_b == name], kept[:, 1]).tolist()
+        free_a = np.setdiff1d(ids_a[names_a == name], fitting[:, 0]).tolist()
+        free_b = np.setdiff1d(ids_b[names_b == name], fitting[:, 1]).tolist()
         named += list(zip(free_a, free_b, strict=False))  # particles may hold one name under several ids, each once
-    return kept, np.array(named, dtype=np.int64).reshape(-1, 2)
+    return fitting, np.array(named, dtype=np.int64).reshape(-1, 2)
 
 
 def renaming(a: ParticleMaps, b: ParticleMaps, pairs: IntArray) -> IntArray:
@@ -128,16 +128,16 @@ def _used(*both: ParticleMaps) -> list[tuple[ParticleMaps, IntArray]]:
     return [(maps, maps.used_slots()) for maps in both]
 
 
-def drop_repeated_identities(counts: IntArray, names: IntArray) -> None:
+def drop_repeated_identities(counts: IntArray, identities: IntArray) -> None:
     """Keep in each particle only the first of several landmarks with one name.
 
     Args:
         counts: (n, M) measurements of landmarks in particles, set to 0 where a particle loses one.
-        names: (n,) the caller's own, -1 = none.
+        identities: (n,) the caller's own, -1 = none.
     """
-    found, times = np.unique(names[names >= 0], return_counts=True)
-    for name in found[times > 1].tolist():
-        rows = np.flatnonzero(names == name)
+    repeated, times = np.unique(identities[identities >= 0], return_counts=True)
+    for identity in repeated[times > 1].tolist():
+        rows = np.flatnonzero(identities == identity)
         held = counts[rows] > 0
         counts[rows] *= held & (np.cumsum(held, axis=0) == 1)
 

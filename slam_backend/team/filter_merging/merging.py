@@ -98,25 +98,26 @@ def merge_filters(
         descriptors[shared_a] = fuse_descriptors(
             descriptors[shared_a], np.maximum(seen_a, 1), descriptors_b[shared_b], np.maximum(seen_b, 1)
         )
-        names = identities[shared_a]
-        identities[shared_a] = np.where(names < 0, of_b.identities[shared_b], names)
+        identities_a = identities[shared_a]
+        identities[shared_a] = np.where(identities_a < 0, of_b.identities[shared_b], identities_a)
     exclusive = np.setdiff1d(np.arange(len(ids_b)), shared_b)  # b's landmarks that a lacks
     n_a, n = len(ids_a), len(ids_a) + len(exclusive)
     rows_a, rows_b = np.arange(n), np.full(n, -1)
     rows_a[n_a:], rows_b[n_a:], rows_b[shared_a] = -1, exclusive, shared_b
-    counts, names = joint_counts(of_a, of_b, rows_a, rows_b), np.concatenate([identities, of_b.identities[exclusive]])
-    drop_repeated_identities(counts, names)
+    counts = joint_counts(of_a, of_b, rows_a, rows_b)
+    identities = np.concatenate([identities, of_b.identities[exclusive]])
+    drop_repeated_identities(counts, identities)
     renamed = renaming(a.maps, b.maps, pairs)
     new_ids = renamed[len(pairs) :, 1]
     held = np.flatnonzero((counts > 0).any(axis=1))
-    kept, odds, model = counts[held], None, a.options.existence
+    odds, model = None, a.options.existence
     if model is not None:
         odds_a, odds_b = of_a.odds(model), of_b.odds(model)
         fuse_odds(model, odds_a, of_a.counts, shared_a, odds_b, of_b.counts, shared_b)
         odds = np.concatenate([odds_a, odds_b[exclusive]])[held]
     descriptors = stack_descriptors(descriptors, descriptors_b[exclusive])[held]
-    columns = descriptors, np.concatenate([ids_a, new_ids])[held], names[held]
-    joint.maps.load_metadata(kept, *columns, a.maps.next_id + len(exclusive), odds)
+    columns = descriptors, np.concatenate([ids_a, new_ids])[held], identities[held]
+    joint.maps.load_metadata(counts[held], *columns, a.maps.next_id + len(exclusive), odds)
     # Each map takes half of the extra variance.
     scales = np.full(len(counts), scale)
     if len(named):

@@ -8,16 +8,16 @@ from builders.filters import looks
 from builders.teams import driven
 
 from slam_backend.core.validation import FloatArray
-from slam_backend.fastslam.reports import MergeEvent
 from slam_backend.geometry import rotate_covariances, rotation, transform_points
 from slam_backend.maps import near_pairs
 from slam_backend.maps._kernels import descriptor_matching
 from slam_backend.maps.alignment import REASONS, Alignment, AlignmentOptions, align_maps
-from slam_backend.maps.alignment_types import BOUNDS, HINTS, count_attempts, refusals_of
+from slam_backend.maps.alignment_types import BOUNDS, HINTS
 from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.team.merge_monitor import MergeMonitor, deformed_fraction
 from slam_backend.team.merge_scheduler import AttemptOptions
 from slam_backend.team.options import MergeOptions
+from slam_backend.team.reports import MergeEvent, count_attempts, refusals_of
 
 FOUND = Alignment(True, "", 1.0, 2.0, 0.1, 1e-3 * np.eye(3), np.zeros((1, 2), np.int64), 0.0)
 
@@ -107,9 +107,8 @@ def watched(joined: int, turned: int = 0) -> tuple[MergeMonitor, LandmarkMap]:
     means = np.concatenate([places, places + np.array([1.0, 0.0, 0.0])])
     names = looks(np.tile(np.arange(TWICE), 2))
     joint = LandmarkMap(means, np.tile(1e-3 * np.eye(3), (2 * TWICE, 1, 1)), names)
-    alignment = Alignment(True, "", 0.0, 0.0, 0.0, 1e-4 * np.eye(3), np.empty((0, 2), np.int64), 0.0)
     own, before = (set(range(TWICE)), set(range(TWICE, 2 * TWICE))), (joined_map(joined), joined_map(joined, turned))
-    return MergeMonitor(2, alignment, (None, None), before, own), joint  # type: ignore[arg-type]
+    return MergeMonitor(2, ((0,), (1,)), before, own), joint
 
 
 @pytest.mark.parametrize(("joined", "contradicted"), [(0, True), (7, True), (8, False), (60, False)])

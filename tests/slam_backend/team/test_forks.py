@@ -11,11 +11,11 @@ from builders.teams import SIZE, SimulatedTeam, check_snapshot, driven, links, m
 from scipy import stats
 
 from slam_backend.fastslam.existence import ExistenceModel
-from slam_backend.fastslam.reports import LandmarksCreated
 from slam_backend.geometry import between, wrap_angle
 from slam_backend.team.branches import MAX_REPLAYED
 from slam_backend.team.communication import LANDMARK_BYTES, POINT_BYTES, POSE_BYTES, contact_components
 from slam_backend.team.options import MergeOptions
+from slam_backend.team.reports import LandmarksCreated
 from slam_backend.team.team import TeamSlam
 
 FINAL = MergeOptions(watch_steps=0)

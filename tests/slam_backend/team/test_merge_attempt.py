@@ -16,11 +16,12 @@ from slam_backend.geometry import between, compose, rotate_covariances
 from slam_backend.maps.alignment import DISTINCT_ROTATION, DISTINCT_TRANSLATION, AlignmentOptions, align_maps
 from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.smoother.options import SmoothingOptions
-from slam_backend.team import merge_attempt
+from slam_backend.team import merge
 from slam_backend.team.communication import LANDMARK_BYTES
 from slam_backend.team.filter_merging.merging import merge_filters, pair_filters, transform_covariance
-from slam_backend.team.group_merging import MergePlan, transform_uncertainty
-from slam_backend.team.merge_attempt import MOST_STEPS
+from slam_backend.team.group_merging import MergePlan, relative_uncertainty, transform_uncertainty
+from slam_backend.team.merge import MAX_SMOOTHING_STEPS as MOST_STEPS
+from slam_backend.team.merge import Smoothing
 from slam_backend.team.merge_scheduler import AttemptOptions
 from slam_backend.team.options import MergeOptions
 from slam_backend.team.team import TeamSlam
@@ -47,7 +48,7 @@ def attempt_begun(seed: int, incremental: bool, **options: Any) -> tuple[Simulat
     smoothing = SmoothingOptions(incremental=incremental)
     known = {"attempts": AT_LAST, "rejuvenate_every": 1000, "smoothing": smoothing} | options
     simulation, team = team_with_deformed_maps(seed, **known)
-    assert team._schedule.pending_attempt is not None
+    assert team._merges.attempt is not None
     assert team.events == ()
     return simulation, team
 
@@ -92,11 +93,12 @@ def test_a_filter_that_never_rejuvenates_by_itself_can_be_rejuvenated() -> None:
 def test_an_attempt_continues_once_both_maps_are_smoothed(incremental: bool) -> None:
     """In the step after the second filter has drawn new particles the maps align again, and merge by that."""
     simulation, team = attempt_begun(112, incremental, merging=ANYHOW)
-    pending = team._schedule.pending_attempt
-    assert pending is not None
+    assert team._merges.attempt is not None
+    smoothing = team._merges.attempt.phase
+    assert isinstance(smoothing, Smoothing)
     drawn: dict[int, int] = {}
     for step in range(STEPS, STEPS + SOON):
-        rng, filters = copy.deepcopy(team._rng), [team._find(robot)[0].filter for robot in range(2)]
+        rng, filters = copy.deepcopy(team._merges.rng), [team._find(robot)[0].filter for robot in range(2)]
         report = simulation.run(team, 1)[0]
         drawn |= {robot: step for robots, _ in report.rejuvenations for robot in robots if len(robots) == 1}
         if team.events:
@@ -105,11 +107,11 @@ def test_an_attempt_continues_once_both_maps_are_smoothed(incremental: bool) -> 
     assert [attempt.kind, merge.kind] == ["attempt", "merge"]
     assert attempt.step == merge.step == 1 + max(drawn.values())
     assert sorted(drawn) == [0, 1]
-    assert_same(attempt.unsmoothed_alignment, pending.alignment)
+    assert_same(attempt.unsmoothed_alignment, smoothing.unsmoothed)
     watch = team._find(0)[0].monitors[0]
     assert_same(align_maps(*watch.pre_merge_maps, rng=rng), merge.alignment)
     assert_same(team.merged_maps(merge), tuple(slam.map() for slam in filters))
-    assert team._schedule.pending_attempt is None
+    assert team._merges.attempt is None
 
 
 @pytest.mark.slow
@@ -143,19 +145,19 @@ def test_maps_that_no_longer_fit_are_not_merged() -> None:
     assert event.unsmoothed_alignment.success
     assert np.isnan(event.uncertainty)
     assert team.groups == ((0,), (1,))
-    assert not team._schedule.may_try(((0,), (1,)), event.step + 1)
+    assert not team._merges.schedule.may_try(((0,), (1,)), event.step + 1)
 
 
 @pytest.mark.parametrize("every", [4, 2])
 def test_maps_that_agree_less_after_smoothing_are_not_merged(every: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """A diverged smoother is not trusted: the attempt is refused."""
-    original = merge_attempt._mixtures
+    original = merge.mixture_maps
 
     def lost(pair: Any) -> tuple[LandmarkMap, LandmarkMap]:
         maps = original(pair)
         return maps[0].subset(np.flatnonzero(np.arange(len(maps[0])) % every)), maps[1]
 
-    monkeypatch.setattr(merge_attempt, "_mixtures", lost)
+    monkeypatch.setattr(merge, "mixture_maps", lost)
     _, team = attempt_ended(112)
     (event,) = team.events
     assert event.alignment.reason == "too few inliers"
@@ -242,7 +244,7 @@ def test_an_attempt_continues_from_a_snapshot(incremental: bool) -> None:
     """A team restored while an attempt waits does the same, bit for bit, as the one that went on, and merges."""
     simulation, team = attempt_begun(115, incremental)
     simulation.run(team, 1)
-    assert team._schedule.pending_attempt is not None
+    assert team._merges.attempt is not None
     check_snapshot(simulation, team, [None] * SOON)
     assert [event.kind for event in team.events] == ["attempt", "merge"]
 
@@ -254,7 +256,7 @@ def test_an_attempt_survives_a_temporary_loss_of_contact(apart: int, incremental
     simulation, team = attempt_begun(112, incremental)
     simulation.run(team, apart, links(2))
     assert team.events == ()
-    assert (team._schedule.pending_attempt is None) == (apart == MOST_STEPS)
+    assert (team._merges.attempt is None) == (apart == MOST_STEPS)
     simulation.run(team, 1)
     assert [event.kind for event in team.events] == ([] if apart == MOST_STEPS else ["attempt", "merge"])
     simulation.run(team, STEPS + SOON - apart)
@@ -327,11 +329,11 @@ def smoothed_pair(**options: Any) -> tuple[SimulatedTeam, TeamSlam]:
 def test_the_joint_graph_tells_the_motion_and_its_uncertainty(incremental: bool) -> None:
     """They are those of the joint filter after the merge, once it is smoothed; nothing is drawn, no filter changes."""
     _, team = smoothed_pair(smoothing=SmoothingOptions(incremental=incremental))
-    plan, rng = planned(team), np.random.default_rng(1)
-    before, drawn = [contents(slam) for slam in plan.filters], copy.deepcopy(rng.bit_generator.state)
-    found, uncertainty = plan.with_motion(MergeOptions(), rng)
-    assert found.pairing is None
-    assert_same(rng.bit_generator.state, drawn)
+    plan = planned(team)
+    before = [contents(slam) for slam in plan.filters]
+    start = plan.relative_start()
+    assert start is not None
+    found, uncertainty = plan.with_motion(start), relative_uncertainty(start.covariance)
     for slam, kept in zip(plan.filters, before, strict=True):
         assert_same(contents(slam), kept)
     assert_same(found.alignment.inliers, plan.alignment.inliers)
@@ -342,24 +344,20 @@ def test_the_joint_graph_tells_the_motion_and_its_uncertainty(incremental: bool)
     assert not joint.rejuvenate().reason
     off = between(joint.start_pose(1), found.alignment.transform)
     assert off @ np.linalg.solve(covariance, off) < 1.0
-    start = joint.start_pose(1)
-    claimed = rotate_covariances(start[2], joint.start_covariances[1])
-    add_gauge_covariance(joint.gauge_covariance, start[None], claimed[None])
+    pose = joint.start_pose(1)
+    claimed = rotate_covariances(pose[2], joint.start_covariances[1])
+    add_gauge_covariance(joint.gauge_covariance, pose[None], claimed[None])
     np.testing.assert_allclose(np.diag(claimed), np.diag(covariance), rtol=0.5)
 
 
-def test_without_smoothed_graphs_paired_particles_tell_the_motion() -> None:
+def test_without_smoothed_graphs_there_is_no_motion_of_a_joint_graph() -> None:
     """A filter without a smoother, or one that has not worked yet, has no graph; so has one with exact poses."""
     _, smoothed = smoothed_pair()
     exact = smoothed._find(1)[0].filter
     exact.step([None], [None], poses=[exact.pose().mean])
     teams = [driven(2, 112, FEW_STEPS, num_particles=8, rejuvenate_every=every)[1] for every in (None, 1000)]
     for team in (*teams, smoothed):
-        plan = planned(team)
-        found, uncertainty = plan.with_motion(MergeOptions(), np.random.default_rng(2))
-        assert found.pairing is not None
-        assert found.alignment is plan.alignment
-        assert uncertainty == transform_uncertainty(found)
+        assert planned(team).relative_start() is None
 
 
 @WAYS
@@ -381,8 +379,8 @@ def test_a_refused_attempt_draws_nothing_for_the_merge() -> None:
     _, alone = team_with_deformed_maps(112, NEVER)
     _, team = team_with_deformed_maps(112, AT_LAST, merging=merging)
     assert [event.alignment.missed for event in team.events] == ["paths"]
-    align_maps(*both_maps(alone), rng=alone._rng)
-    assert_same(team._rng.bit_generator.state, alone._rng.bit_generator.state)
+    align_maps(*both_maps(alone), rng=alone._merges.rng)
+    assert_same(team._merges.rng.bit_generator.state, alone._merges.rng.bit_generator.state)
     for robot in range(2):
         assert_same(*(contents(each._find(robot)[0].filter) for each in (team, alone)))
 
@@ -409,7 +407,7 @@ def test_without_a_least_certainty_a_pair_merges_in_the_end_by_its_maps(incremen
     """Where waiting does not help any uncertainty is accepted; the merge then begins from the alignment of the maps."""
     simulation, team = attempts_made(112, incremental, MergeOptions(min_sigmas=NEVER_SURE))
     while len(team.groups) > 1 and team._step < 400:
-        rng = copy.deepcopy(team._rng)
+        rng = copy.deepcopy(team._merges.rng)
         simulation.run(team, 1)
     *refused, last, merge = team.events
     assert len(refused) >= 1
@@ -433,10 +431,10 @@ def test_the_uncertainty_of_paired_particles_includes_the_gauge_covariance() -> 
     simulation, team = driven(2, 3, 60, num_particles=13)
     alignment = false_alignment(simulation, team, np.zeros(3))
     a, b = (group.trunk.filter for group in team._groups)
-    plan, _ = MergePlan.of(*team._groups, alignment).with_motion(MergeOptions(), team._rng)
-    assert plan.pairing is not None
-    covariance = transform_covariance(plan.pairing.motion, alignment)
-    before = transform_uncertainty(plan)
+    plan = MergePlan.of(*team._groups, alignment)
+    pairing = plan.pair_particles(MergeOptions(), np.random.default_rng(1))
+    covariance = transform_covariance(pairing.motion, alignment)
+    before = transform_uncertainty(plan, pairing)
 
     rng = np.random.default_rng(0)
     frames = [np.diag([3e-2, 1e-2, 9e-3]), np.diag([1e-2, 5e-2, 4e-3])]
@@ -446,6 +444,6 @@ def test_the_uncertainty_of_paired_particles_includes_the_gauge_covariance() -> 
 
     for slam, frame in zip((a, b), frames, strict=True):
         slam.gauge_covariance[:] = frame
-    after = transform_uncertainty(plan)
+    after = transform_uncertainty(plan, pairing)
     np.testing.assert_allclose(after, max(position / DISTINCT_TRANSLATION, heading / DISTINCT_ROTATION), rtol=0.03)
     assert after > 1.5 * before

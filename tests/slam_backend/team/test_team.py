@@ -11,11 +11,12 @@ from builders.teams import SIGMA, STARTS, SimulatedTeam, hand_made, standing_tea
 
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.options import FilterOptions
-from slam_backend.fastslam.reports import PoseEstimate, TeamReport
+from slam_backend.fastslam.reports import PoseEstimate
 from slam_backend.geometry import between, compose, inverse, transform_points, wrap_angle
 from slam_backend.maps.alignment import align_maps
 from slam_backend.maps.alignment_types import REASONS
 from slam_backend.team.merge_scheduler import AttemptOptions
+from slam_backend.team.reports import TeamReport
 from slam_backend.team.team import TeamSlam
 
 ALONE = np.eye(3, dtype=bool)

@@ -22,24 +22,29 @@ from slam_backend.fastslam._kernels.particles.pose_estimates import (
 from slam_backend.fastslam.estimates import pose_mixtures
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.relative_poses import SIGMAS, TeamPoses, membership_table
-from slam_backend.fastslam.reports import TeamReport
 from slam_backend.geometry import between, compose, inverse, rotate_covariances, rotation, wrap_angle
 from slam_backend.models.measurements import Measurements
 from slam_backend.team.branches import Branch
-from slam_backend.team.groups import TeamTopology
 from slam_backend.team.options import MergeOptions
+from slam_backend.team.reports import TeamReport
 from slam_backend.team.team import TeamSlam
 
 
-def oldest_unknown(branch: Branch, now: int) -> int:
+def oldest_unknown(team: TeamSlam, branch: Branch, now: int) -> int:
     """Return the first step that a filter may still have to take in; the next one if there is none."""
     held = [1 + last for robot, last in branch.last_steps.items() if robot not in branch.active_robots]
-    return min([now + 1, *held, *(side.oldest for watch in branch.monitors for side in watch.sides)])
+    waiting, undone = list(branch.merge_numbers), []
+    while waiting:
+        joined = team._merges.joined[waiting.pop()].joined
+        assert joined is not None
+        undone.append(joined.oldest_step)
+        waiting += [monitor.number for side in joined.sides for monitor in side["monitors"]]
+    return min([now + 1, *held, *undone])
 
 
 def check(team: TeamSlam, report: TeamReport) -> None:
     """Check that a team's topology, and what its report says of that, are as the groups have it now."""
-    assert team.topology == TeamTopology.of(team._groups)
+    assert team.topology == team._merges.topology()
     assert team.topology is team.topology
     branches = [branch for group in team._groups for branch in group.branches]
     for robot, (group, branch, place) in enumerate(team.topology.places):
@@ -47,7 +52,7 @@ def check(team: TeamSlam, report: TeamReport) -> None:
         assert branch.robots[place] == robot
         assert branch in group.branches
     assert (report.groups, report.maps) == (team.groups, tuple(branch.number for _, branch, _ in team.topology.places))
-    assert report.oldest_step == min(oldest_unknown(branch, report.step) for branch in branches)
+    assert report.oldest_step == min(oldest_unknown(team, branch, report.step) for branch in branches)
 
 
 def run(simulation: SimulatedTeam, team: TeamSlam, steps: int, contacts: object = None) -> list[str]:
@@ -66,7 +71,7 @@ def test_merges_forks_returns_undos_and_ends_of_monitoring_change_the_topology()
     run(simulation, team, 80)
     assert team.topology is alone
     team.merge(0, 1, false_alignment(simulation, team, np.array([3.0, -2.0, 0.5])))
-    assert team.topology == TeamTopology.of(team._groups)
+    assert team.topology == team._merges.topology()
     assert any("undo" in run(simulation, team, 1) for _ in range(100))
     assert team.topology.same_filter == ((0,), (1,), (2,))
     team.merge(0, 2, true_alignment(simulation, team, 0, 2))
@@ -93,7 +98,7 @@ def test_a_restored_team_has_the_topology_of_its_state() -> None:
     assert team.topology.groups == ((0, 1), (2,))
     for one in (team, other):
         one.set_state(state)
-        assert one.topology == TeamTopology.of(one._groups)
+        assert one.topology == one._merges.topology()
         assert one.topology.groups == ((0,), (1,), (2,))
 
 

@@ -7,19 +7,27 @@ import numpy as np
 import pytest
 from builders.comparison import assert_same
 from builders.filters import contents
-from builders.teams import NEVER, SimulatedTeam, check_snapshot, driven, false_alignment, links, true_alignment
+from builders.teams import (
+    NEVER,
+    SimulatedTeam,
+    begin_undo,
+    check_snapshot,
+    driven,
+    false_alignment,
+    links,
+    true_alignment,
+)
 
-from slam_backend.fastslam.reports import MapReleased, MergeUndone, TeamReport
 from slam_backend.geometry import inverse
 from slam_backend.maps.alignment import AlignmentOptions, align_maps
 from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.smoother.options import SmoothingOptions
-from slam_backend.team import merge_rollback as undoing
+from slam_backend.team import merge as undoing
 from slam_backend.team.branches import MAX_REPLAYED
 from slam_backend.team.merge_monitor import deformed_fraction
-from slam_backend.team.merge_rollback import MergeRollback
 from slam_backend.team.merge_scheduler import AttemptOptions
 from slam_backend.team.options import MergeOptions
+from slam_backend.team.reports import MapReleased, MergeUndone, TeamReport
 from slam_backend.team.team import TeamSlam
 
 METRE = np.array([1.0, 0.0, 0.0])
@@ -96,8 +104,8 @@ def test_a_later_merge_is_undone_with_an_earlier_false_one() -> None:
     for robot in range(3):
         assert_same(contents(team._find(robot)[0].filter), contents(twin._find(robot)[0].filter))
     step = team._step
-    assert not team._schedule.may_try(((0,), (1,)), step)
-    assert team._schedule.may_try(((0, 1), (2,)), step)
+    assert not team._merges.schedule.may_try(((0,), (1,)), step)
+    assert team._merges.schedule.may_try(((0, 1), (2,)), step)
 
 
 def test_a_false_merge_is_undone_without_an_earlier_right_one() -> None:
@@ -249,10 +257,9 @@ def test_a_team_continues_from_a_snapshot_bit_for_bit_through_an_undo(every: int
 UNWATCHED = MergeOptions(watch_every=10_000)  # only what a test doubts is undone
 
 
-def doubted(team: TeamSlam) -> None:
-    """Begin to take back the oldest merge of the first group."""
-    group = team._groups[0]
-    group.undoing = MergeRollback.of(group.trunk, group.trunk.monitors[0].number)
+def is_undoing(team: TeamSlam) -> bool:
+    """Return whether a merge is being undone."""
+    return any(isinstance(process.phase, undoing.Undoing) for process in team._merges.joined.values())
 
 
 def taken_in(monkeypatch: pytest.MonkeyPatch) -> list[int]:
@@ -277,7 +284,7 @@ def test_an_undo_takes_in_few_steps_at_a_time(monkeypatch: pytest.MonkeyPatch) -
     team.merge(0, 1, false_alignment(simulation, team, FAR))
     simulation.run(team, 30)
     other.run(twin, 30)
-    doubted(team)
+    begin_undo(team)
     for tick in range(1, 5):
         before = len(steps)
         simulation.run(team, 1)
@@ -295,7 +302,7 @@ def test_an_undo_waits_for_contact_and_continues_from_a_snapshot() -> None:
     simulation, team = driven(2, 101, merging=UNWATCHED)
     team.merge(0, 1, false_alignment(simulation, team, FAR))
     simulation.run(team, 30)
-    doubted(team)
+    begin_undo(team)
     simulation.run(team, 1)
     reports = check_snapshot(simulation, team, [links(2)] * 20 + [None] * 8)
     assert [i >= 20 for i, report in enumerate(reports) if report.events] == [True]
@@ -310,12 +317,12 @@ def test_a_group_with_a_rollback_in_progress_does_not_merge() -> None:
     simulation.run(team, 80, links(3))
     team.merge(0, 1, false_alignment(simulation, team, FAR))
     simulation.run(team, 30, links(3, (0, 1)))
-    doubted(team)
+    begin_undo(team)
     simulation.run(team, 2)
     assert [event.kind for event in team.events] == ["merge"]
     team.merge(0, 2, true_alignment(simulation, team, 0, 2))
-    assert team._groups[0].undoing is None
-    doubted(team)
+    assert not is_undoing(team)
+    begin_undo(team)
     simulation.run(team, 20)
     assert kinds(team)[:4] == ["merge", "merge", "undo", "undo"]
     assert [event.robots_a for event in team.events[:4]] == [(0,), (0, 1), (0, 1), (0,)]
@@ -326,8 +333,8 @@ def test_an_undo_ends_with_the_monitoring_of_the_merge() -> None:
     simulation, team = driven(2, 101, merging=UNWATCHED)
     team.merge(0, 1, false_alignment(simulation, team, FAR))
     simulation.run(team, 30)
-    doubted(team)
+    begin_undo(team)
     team._groups[0].trunk.monitors.clear()
     simulation.run(team, 1)
-    assert team._groups[0].undoing is None
+    assert not is_undoing(team)
     assert kinds(team) == ["merge"]

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from slam_backend.maps.alignment_types import PairAttempts
+from slam_backend.team.reports import PairAttempts
 from training.episodes.tables import pair_rows, print_refusals
 from training.experiments.run_folder import plain
 

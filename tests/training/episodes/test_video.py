@@ -5,8 +5,8 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 
-from slam_backend.fastslam.reports import MergeEvent
 from slam_backend.maps.alignment import Alignment
+from slam_backend.team.reports import MergeEvent
 from training.episodes.video import LONGEST_S, VideoWriter, choose_pace, with_video_time_merges
 from vslam_env.rendering import Scene
 

@@ -6,18 +6,13 @@ from typing import Any
 import numpy as np
 from builders.environments import MEETING, scored, small_env, standing_at, turning
 
+from slam_backend.core.state import restore, take
 from slam_backend.core.validation import IntArray
-from slam_backend.fastslam.reports import (
-    Associations,
-    LandmarkIdMap,
-    LandmarksCreated,
-    MapForked,
-    MapReleased,
-    TeamReport,
-)
+from slam_backend.fastslam.reports import Associations
 from slam_backend.geometry import compose, inverse, transform_points, wrap_angle
 from slam_backend.maps.landmark_map import LandmarkMap, TeamMapSummaries
 from slam_backend.metrics import map_error, map_rmse
+from slam_backend.team.reports import LandmarkIdMap, LandmarksCreated, MapForked, MapReleased, TeamReport
 from vslam_env.evaluation.coverage import CoverageCells, CoverageTracker
 from vslam_env.evaluation.map_scores import GroundTruthAssociation
 from vslam_env.navigation import FREE, OccupancyGrid, TeamGrids, cell_of
@@ -251,7 +246,7 @@ def test_newly_covered_cells_agree_with_a_plain_count() -> None:
             pose = np.append(rng.uniform(-3.0, 3.0, 2), rng.uniform(-3.0, 3.0))
             grid.update_from_scan(pose, rng.uniform(0.5, 3.0, 32), angles)
         if turn == 30:
-            coverage.set_state(coverage.get_state())
+            restore(coverage, take(coverage))
         positions = rng.uniform(0.0, 8.0, (3, 2))
         said = np.empty(3)
         share = coverage.update(team, positions, said)

@@ -8,9 +8,9 @@ from builders.environments import MEETING, WALLS, small_env, turning
 from hypothesis import given
 from hypothesis import strategies as st
 
-from slam_backend.fastslam.reports import MergeEvent
 from slam_backend.geometry import between
 from slam_backend.maps.alignment import Alignment
+from slam_backend.team.reports import MergeEvent
 from vslam_env import ExplorationEnv
 from vslam_env.belief.observation import observe
 from vslam_env.belief.team_belief import TeamBelief

@@ -10,8 +10,8 @@ from agents.policy import Policy
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.fastslam.options import FilterOptions
 from slam_backend.fastslam.relative_poses import TeamPoses
-from slam_backend.fastslam.reports import LandmarkIdMap, LandmarksCreated, MapForked, MergeUndone, TeamReport
 from slam_backend.geometry import between
+from slam_backend.team.reports import LandmarkIdMap, LandmarksCreated, MapForked, MergeUndone, TeamReport
 from slam_backend.team.team import TeamSlam
 from slam_backend.trajectory import dead_reckoning
 from training.episodes.guard import GuardedTeam

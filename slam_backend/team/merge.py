@@ -1,0 +1,522 @@
+"""Merges of groups as processes with phases, and their owner in a team."""
+
+import copy
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar
+
+import numpy as np
+
+from slam_backend.core.read_only import with_constants
+from slam_backend.core.state_checks import refuse_malformed
+from slam_backend.core.validation import IntArray
+from slam_backend.fastslam.state_checks import check_filter
+from slam_backend.maps.alignment import Alignment
+from slam_backend.team.branches import MAX_REPLAYED, Branch, ReplayedStep, replay
+from slam_backend.team.filter_merging.pairing import Pairing
+from slam_backend.team.group_merging import (
+    JoinedGroups,
+    MergePlan,
+    is_refuted,
+    join_groups,
+    relative_uncertainty,
+    separate_groups,
+    transform_uncertainty,
+)
+from slam_backend.team.groups import Group, TeamTopology
+from slam_backend.team.merge_attempt import (
+    GroupPair,
+    MapPair,
+    align_pair,
+    align_smoothed,
+    are_connected,
+    choose_pair,
+    key_of,
+    map_numbers,
+    mixture_maps,
+    pairs_of,
+    refused_if_uncertain,
+    representatives,
+)
+from slam_backend.team.merge_monitor import MergeMonitor, are_both_connected
+from slam_backend.team.merge_scheduler import MergeScheduler, PairKey
+from slam_backend.team.options import MergeOptions
+from slam_backend.team.reports import LandmarkIdMap, MergeEvent, MergeUndone
+from slam_backend.team.shared_records import SharedRecords
+
+MAX_SMOOTHING_STEPS = 40  # longest wait for smoothed maps and contact; then the maps are used as they are
+MIN_REPLAYED = 2  # least input steps replayed per side and step of the team, which itself adds one
+
+
+@dataclass(slots=True, eq=False)
+class MergeProcess:
+    """One merge of two groups, from the first alignment of their maps to its end.
+
+    | phase | what happens in it | what ends it | next phase |
+    |---|---|---|---|
+    | attempt | The maps of the pair with the most new candidate matches are aligned. | an alignment | smoothing; trial without smoothers |
+    | | | a refusal | refused |
+    | smoothing | Both filters smooth, some work in each step. | both are smooth or 40 steps have passed, and they are in contact | trial, in the next step |
+    | | | a filter is replaced, or there is no contact after 40 steps | abandoned |
+    | trial | Smoothed maps are aligned again; the joint graph of both groups, or particles, tell how uncertain the motion is. | motion known well enough, or waiting does not help | watched; final if merges are not monitored |
+    | | | a refusal | refused |
+    | watched | The filters are one. Steps with robots of both sides in contact count; each 20 steps, shape and place are tested. | a test fails while both sides are in contact | undoing |
+    | | | 200 counted steps, and the end of earlier merges of the group | final |
+    | undoing | The joint filter goes on. The filters from before the merge replay the inputs since then, 20 steps at a time. | they have caught up, and all sides are in contact | undone |
+    | | | the group merges again, or a fork without the monitor replaces its filter | watched |
+    | undone | The separate filters go on. Forks that split from the joint one still know its map. | the last of these forks returns | final |
+    | refused | The pair waits for 25 to 200 steps. | | |
+    | abandoned | The pair may try again at once. | | |
+    | final | Nothing is left of what it takes to undo the merge. | | |
+
+    Attempt and trial take no time. An undo of a merge undoes those on top of it, too.
+
+    Attributes:
+        pair: Robots of both groups; the map frame of the first one stays.
+        phase: Present phase, with what it needs.
+    """  # noqa: E501
+
+    pair: PairKey
+    phase: "Phase"
+
+    def advance(self, team: "TeamMerges") -> None:
+        """Do a step's part of the phase, and enter the next one if it ends."""
+        before = self.phase
+        self.phase = before.advance(team)
+        if isinstance(self.phase, (Trial, Undoing)) and self.phase is not before:
+            self.phase = self.phase.advance(team)  # these begin in the step in which they are entered
+
+    @property
+    def joined(self) -> JoinedGroups | None:
+        """What it takes to undo the merge; None in phases without."""
+        return self.phase.joined if isinstance(self.phase, (Watched, Undoing, Undone)) else None
+
+    @property
+    def oldest_step(self) -> int | None:
+        """First step that an undo would replay; None if there will be none."""
+        return None if self.joined is None else self.joined.oldest_step
+
+    def get_state(self) -> dict[str, Any]:
+        """Return the complete state of the process."""
+        assert isinstance(self.phase, (Smoothing, Watched, Undoing, Undone))  # the others end in the step they begin
+        return {"pair": self.pair, "phase": self.phase.name, **self.phase.get_state()}
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Any]) -> "MergeProcess":
+        """Build a process from `get_state`."""
+        return cls(state["pair"], STORED[state["phase"]].from_state(state))
+
+
+# ---------------------------------------------------------------------- before the merge
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Attempt:
+    """Alignment of two groups' maps as they are."""
+
+    name: ClassVar[str] = "attempt"
+    groups: GroupPair
+    maps: MapPair
+
+    def advance(self, team: "TeamMerges") -> "Phase":
+        """Align the maps."""
+        alignment = align_pair(self.groups, self.maps, team.schedule, team.rng)
+        team.records.exchange.record_maps(*representatives(self.groups), *self.maps)
+        can_smooth = all(group.trunk.filter.can_rejuvenate for group in self.groups)
+        if not (alignment.success and team.merging.smooth_first and can_smooth):
+            return Trial(MergePlan(self.groups, self.maps, alignment), None)
+        for group in self.groups:
+            group.trunk.filter.request_rejuvenation()
+        return Smoothing(map_numbers(self.groups), alignment, team.step)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Smoothing:
+    """Smoothing of both maps, which are then aligned again.
+
+    Attributes:
+        numbers: Numbers of both joint filters' maps.
+        unsmoothed: Alignment of the maps as they were.
+        since: Step in which it began.
+        ready: Whether both maps are smoothed; the trial comes one step later, which limits the work per step.
+    """
+
+    name: ClassVar[str] = "smoothing"
+    numbers: tuple[int, int]
+    unsmoothed: Alignment
+    since: int
+    ready: bool = False
+
+    def advance(self, team: "TeamMerges") -> "Phase":
+        """Wait for the smoothers, which work in the filters' steps."""
+        groups = next((pair for pair in pairs_of(team.free_groups) if map_numbers(pair) == self.numbers), None)
+        is_late = team.step - self.since >= MAX_SMOOTHING_STEPS
+        if groups is None or (is_late and not are_connected(groups, team.networks)):
+            return ABANDONED
+        if not (self.ready and are_connected(groups, team.networks)):
+            is_smooth = not any(group.trunk.filter.rejuvenation_requested for group in groups)
+            return replace(self, ready=self.ready or is_late or is_smooth)
+        maps = mixture_maps(groups)
+        alignment = align_smoothed(groups, maps, self.unsmoothed, team.schedule, team.rng)
+        team.records.exchange.record_smoothed(*representatives(groups), *maps)
+        return Trial(MergePlan(groups, maps, alignment), self.unsmoothed)
+
+    def get_state(self) -> dict[str, Any]:
+        """Return what the phase holds."""
+        return {"numbers": self.numbers, "unsmoothed": self.unsmoothed, "since": self.since, "ready": self.ready}
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Any]) -> "Smoothing":
+        """Build the phase from the state of a process."""
+        return cls(state["numbers"], state["unsmoothed"], state["since"], state["ready"])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trial:
+    """Decision about the merge, by the uncertainty of the motion between the maps.
+
+    Attributes:
+        plan: Groups, maps and alignment, which may be a refusal.
+        unsmoothed: Alignment of the unsmoothed maps, if these were smoothed.
+    """
+
+    name: ClassVar[str] = "trial"
+    plan: MergePlan
+    unsmoothed: Alignment | None
+
+    def advance(self, team: "TeamMerges") -> "Phase":
+        """Merge the groups if the motion is known well enough."""
+        merging, plan, alignment = team.merging, self.plan, self.plan.alignment
+        uncertainty, pairing, before = float("nan"), None, team.rng.bit_generator.state
+        if alignment.success and merging.min_sigmas:
+            start = plan.relative_start()
+            if start is None:
+                pairing = plan.pair_particles(merging, team.rng)
+                motion, relative = plan, transform_uncertainty(plan, pairing)
+            else:
+                motion, relative = plan.with_motion(start), relative_uncertainty(start.covariance)
+            uncertainty = merging.min_sigmas * relative
+            plan = motion if uncertainty <= merging.trusted_uncertainty else plan
+            change = team.schedule.change(key_of(plan.groups), motion.alignment.transform)
+            alignment = refused_if_uncertain(plan.alignment, plan.groups, uncertainty, change, team.schedule, merging)
+        key = key_of(plan.groups)
+        team.schedule.record(key, team.step, alignment.success, self.unsmoothed is not None)
+        team.events.append(MergeEvent(team.step, "attempt", *key, alignment, self.unsmoothed, uncertainty))
+        if not alignment.success:
+            team.rng.bit_generator.state = before  # the draws for the merge are dropped
+            return REFUSED
+        if pairing is None:
+            pairing = plan.pair_particles(merging, team.rng)
+        return team.join(plan, pairing)[1]
+
+
+# ---------------------------------------------------------------------- after the merge
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Watched:
+    """Monitoring of a merge that can be undone."""
+
+    name: ClassVar[str] = "watched"
+    joined: JoinedGroups
+
+    def advance(self, team: "TeamMerges") -> "Phase":
+        """Test the merge, if a test is due."""
+        is_due = team.step % team.merging.watch_every == 0
+        group = next(group for group in team.groups if self.joined.number in group.merge_numbers)
+        if not (is_due and is_refuted(self.joined.number, group.trunk, team.merging, team.schedule.alignment)):
+            return self
+        return team.rollback(self.joined, group)
+
+    def get_state(self) -> dict[str, Any]:
+        """Return what the phase holds."""
+        return self.joined.get_state()
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Any]) -> "Watched":
+        """Build the phase from the state of a process."""
+        return cls(JoinedGroups.from_state(state))
+
+
+@dataclass(slots=True, eq=False)
+class Undoing:
+    """Rollback of a merge and of those on top of it, over several steps, which bounds the replayed input per step.
+
+    Attributes:
+        joined: Groups that the merge joined.
+        robots: Robots of the group.
+        trunks: Trunks from before the merges, on their way to the present. Their robots still use the joint filter.
+        replayed: Steps replayed by each of them so far.
+    """
+
+    name: ClassVar[str] = "undoing"
+    joined: JoinedGroups
+    robots: tuple[int, ...]
+    trunks: list[Branch]
+    replayed: list[list[ReplayedStep]]
+
+    def advance(self, team: "TeamMerges") -> "Phase":
+        """Replay some steps, and separate the groups when all sides have caught up and are in contact."""
+        group = next(group for group in team.groups if group.robots == self.robots)
+        if self.joined.number not in group.merge_numbers:
+            team.is_stale = True
+            return Watched(self.joined)
+        merges = list(team.merges_down_to(self.joined.number, group.trunk.monitors))
+        has_caught_up = self._catch_up(group.trunk, team.records)
+        active_robots = group.trunk.active_robots
+        if not has_caught_up or not all(are_both_connected(each.pair, active_robots) for each in merges):
+            return self
+        team.records.entries += [MergeUndone((*each.map_numbers, each.number)) for each in merges]
+        for trunk, replayed in zip(self.trunks, self.replayed, strict=True):
+            team.records.note_replay(trunk.number, replayed)
+        team.epoch += 1
+        team.replace([group], separate_groups(group, self.trunks, team.epoch, team.records))
+        for each in merges:
+            team.events.append(MergeEvent(team.step, "undo", *each.pair, each.alignment))
+            team.joined[each.number].phase = Undone(each)
+        team.schedule.block(self.joined.pair, team.step + team.merging.blocked_steps)
+        return Undone(self.joined)
+
+    def _catch_up(self, joint: Branch, records: SharedRecords) -> bool:
+        """Replay some steps that the joint filter has processed, and return whether all sides are up to date."""
+        share = max(MIN_REPLAYED, MAX_REPLAYED // len(self.trunks))
+        for trunk, replayed in zip(self.trunks, self.replayed, strict=True):
+            wanted = {robot: joint.last_steps[robot] for robot in trunk.robots}
+            replayed += replay(trunk, records.log, wanted, share)
+        return all(last >= joint.last_steps[robot] for trunk in self.trunks for robot, last in trunk.last_steps.items())
+
+    def get_state(self) -> dict[str, Any]:
+        """Return what the phase holds."""
+        trunks = tuple(trunk.get_state() for trunk in self.trunks)
+        replayed = tuple(tuple(steps) for steps in self.replayed)
+        return self.joined.get_state() | {"robots": self.robots, "trunks": trunks, "replayed": replayed}
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Any]) -> "Undoing":
+        """Build the phase from the state of a process."""
+        trunks = [Branch.from_state(trunk) for trunk in state["trunks"]]
+        replayed = [list(with_constants(steps)) for steps in state["replayed"]]
+        return cls(JoinedGroups.from_state(state), state["robots"], trunks, replayed)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Undone:
+    """Time after an undo in which forks of the joint filter remain."""
+
+    name: ClassVar[str] = "undone"
+    joined: JoinedGroups
+
+    def advance(self, team: "TeamMerges") -> "Phase":
+        """Wait for the robots of these forks."""
+        return self
+
+    def get_state(self) -> dict[str, Any]:
+        """Return what the phase holds."""
+        return self.joined.get_state()
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Any]) -> "Undone":
+        """Build the phase from the state of a process."""
+        return cls(JoinedGroups.from_state(state))
+
+
+@dataclass(frozen=True, slots=True)
+class Ended:
+    """End of a process, of which nothing is left."""
+
+    name: str
+
+    def advance(self, team: "TeamMerges") -> "Phase":
+        """Stay."""
+        return self
+
+
+REFUSED, ABANDONED, FINAL = Ended("refused"), Ended("abandoned"), Ended("final")
+Phase = Attempt | Smoothing | Trial | Watched | Undoing | Undone | Ended
+STORED: dict[str, Any] = {phase.name: phase for phase in (Smoothing, Watched, Undoing, Undone)}
+
+
+# ---------------------------------------------------------------------- all merges of a team
+
+
+@dataclass(slots=True, eq=False)
+class TeamMerges:
+    """Owner of the groups of a team and of their merges.
+
+    Attributes:
+        groups: Groups by ascending robots.
+        records: Records of the team.
+        schedule: Scheduler of attempts.
+        merging: Options of merges and of their undo.
+        rng: Generator of alignments and merges.
+        epoch: Number of merges and undos so far.
+        events: Attempts, merges and undos so far.
+        attempt: Process that smooths maps, or None: one pair tries at a time.
+        joined: Processes of merges that a filter still monitors, by the number of the joint map.
+        step: Present step.
+        networks: (K,) robots with the same number are in contact.
+        is_stale: Whether groups, branches or monitors have changed since the last `topology`.
+    """
+
+    groups: list[Group]
+    records: SharedRecords
+    schedule: MergeScheduler
+    merging: MergeOptions
+    rng: np.random.Generator
+    epoch: int = 0
+    events: list[MergeEvent] = field(default_factory=list)
+    attempt: MergeProcess | None = None
+    joined: dict[int, MergeProcess] = field(default_factory=dict)
+    step: int = 0
+    networks: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
+    is_stale: bool = False
+
+    def advance(self, step: int, networks: IntArray) -> None:
+        """Advance the merges of each group, then the attempt in progress, or a new one."""
+        self.step, self.networks = step, networks
+        if self.joined:
+            for group in list(self.groups):
+                self._advance_group(group)
+        if self.attempt is None and self.schedule.is_due(step):
+            self.attempt = self._new_attempt()
+        if self.attempt is not None:
+            process, self.attempt = self.attempt, None
+            process.advance(self)
+            self._keep(process)
+
+    def _advance_group(self, group: Group) -> None:
+        """Advance the undo in a group, or its merges, oldest first, until an undo begins."""
+        processes = [each for each in self.joined.values() if _robots_undoing(each) == group.robots]
+        is_undoing = bool(processes)
+        for process in processes or [self.joined[number] for number in group.merge_numbers]:
+            process.advance(self)
+            if is_undoing or not isinstance(process.phase, Watched):
+                return
+        self.is_stale |= group.drop_monitors(self.merging.watch_steps)
+
+    def _new_attempt(self) -> MergeProcess | None:
+        """Return the process of the pair that may try; None if no pair may."""
+        chosen = choose_pair(self.free_groups, self.networks, self.step, self.schedule)
+        return None if chosen is None else MergeProcess(key_of(chosen[0]), Attempt(*chosen))
+
+    def _keep(self, process: MergeProcess) -> None:
+        """Keep a process that goes on."""
+        if isinstance(process.phase, Smoothing):
+            self.attempt = process
+        elif process.joined is not None:
+            self.joined[process.joined.number] = process
+
+    @property
+    def free_groups(self) -> list[Group]:
+        """Groups without an undo in progress."""
+        busy = {_robots_undoing(process) for process in self.joined.values()}
+        return [group for group in self.groups if group.robots not in busy]
+
+    @property
+    def watched(self) -> list[JoinedGroups]:
+        """Merges that joint filters monitor, oldest first."""
+        numbers = sorted(number for group in self.groups for number in group.merge_numbers)
+        return [joined for number in numbers if (joined := self.joined[number].joined) is not None]
+
+    def merge(self, plan: MergePlan, step: int, known: bool = False) -> LandmarkIdMap:
+        """Merge two groups by a given alignment before a step, without an attempt; see `merge_filters` for `known`."""
+        self.step = step
+        for process in self.joined.values():
+            if isinstance(process.phase, Undoing) and process.phase.robots in key_of(plan.groups):
+                process.phase = Watched(process.phase.joined)
+        id_map, phase = self.join(plan, plan.pair_particles(self.merging, self.rng, known))
+        self._keep(MergeProcess(key_of(plan.groups), phase))
+        return id_map
+
+    def join(self, plan: MergePlan, pairing: Pairing) -> tuple[LandmarkIdMap, Phase]:
+        """Join two groups; return the renaming of landmarks, and the phase that follows."""
+        group, id_map = join_groups(plan, pairing, self.merging, self.records, self.rng, self.epoch + 1)
+        self.epoch += 1
+        self.events.append(MergeEvent(self.step, "merge", id_map.robots_a, id_map.robots_b, plan.alignment))
+        self.replace(plan.groups, [group])
+        is_final = self.merging.watch_steps == 0
+        return id_map, FINAL if is_final else Watched(JoinedGroups.of(plan, group.trunk.number))
+
+    def replace(self, old: Sequence[Group], new: Sequence[Group]) -> None:
+        """Replace some groups by others."""
+        self.groups[:] = [group for group in self.groups if all(group is not each for each in old)] + list(new)
+        self.groups.sort(key=lambda group: group.robots)
+        self.is_stale = True
+
+    def rollback(self, joined: JoinedGroups, group: Group) -> Undoing:
+        """Return the start of an undo of a group's merge.
+
+        Raises:
+            ValueError: If a filter from before it is damaged: states share the dicts that hold it with the team.
+        """
+        sides = list(self._sides_down_to(joined.number, group.trunk.monitors))
+        for side in sides:
+            with refuse_malformed("state"):
+                check_filter("state['filter']", side["filter"], (group.trunk.filter.options,))
+        return Undoing(joined, group.robots, [Branch.from_state(side) for side in sides], [[] for _ in sides])
+
+    def merges_down_to(self, number: int, monitors: Sequence[MergeMonitor]) -> Iterator[JoinedGroups]:
+        """Yield the merges to undo, the last one first, to undo the one that made map `number`."""
+        joined = self._newest(monitors)
+        yield joined
+        for side in joined.sides:
+            if any(monitor.number == number for monitor in side["monitors"]):
+                yield from self.merges_down_to(number, side["monitors"])
+
+    def _sides_down_to(self, number: int, monitors: Sequence[MergeMonitor]) -> Iterator[Mapping[str, Any]]:
+        """Yield the states of the trunks that remain when these merges are undone."""
+        for side in self._newest(monitors).sides:
+            if any(monitor.number == number for monitor in side["monitors"]):
+                yield from self._sides_down_to(number, side["monitors"])
+            else:
+                yield side
+
+    def _newest(self, monitors: Sequence[MergeMonitor]) -> JoinedGroups:
+        """Return the newest of some monitored merges."""
+        joined = self.joined[monitors[-1].number].joined
+        assert joined is not None
+        return joined
+
+    def topology(self) -> TeamTopology:
+        """Return the assignment of robots to filters, and end the processes of merges that no filter monitors."""
+        waiting = [number for group in self.groups for branch in group.branches for number in branch.merge_numbers]
+        monitored: set[int] = set()
+        while waiting:
+            number = waiting.pop()
+            if number not in monitored:
+                monitored.add(number)
+                joined = self.joined[number].joined
+                assert joined is not None
+                waiting += [monitor.number for side in joined.sides for monitor in side["monitors"]]
+        for number, process in list(self.joined.items()):
+            if number not in monitored and not isinstance(process.phase, Undoing):
+                self.joined.pop(number).phase = FINAL
+        self.is_stale = False
+        merges = [joined for number in monitored if (joined := self.joined[number].joined) is not None]
+        return TeamTopology.of(self.groups, [(joined.oldest_step, set(joined.map_numbers)) for joined in merges])
+
+    def get_state(self) -> dict[str, Any]:
+        """Return the complete state of the merges; groups and records have states of their own."""
+        processes = [*self.joined.values(), *([] if self.attempt is None else [self.attempt])]
+        return {
+            "epoch": self.epoch,
+            "rng": copy.deepcopy(self.rng.bit_generator.state),
+            "events": tuple(self.events),
+            "merging": self.merging,
+            "schedule": self.schedule.get_state(),
+            "processes": tuple(process.get_state() for process in processes),
+        }
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Restore a state from `get_state`."""
+        self.epoch, self.merging, self.events = state["epoch"], state["merging"], list(state["events"])
+        self.rng.bit_generator.state = copy.deepcopy(state["rng"])
+        self.schedule.set_state(state["schedule"])
+        self.attempt, self.joined = None, {}
+        for process in state["processes"]:
+            self._keep(MergeProcess.from_state(process))
+
+
+def _robots_undoing(process: MergeProcess) -> tuple[int, ...] | None:
+    """Return the robots of the group that undoes a merge; None in other phases."""
+    return process.phase.robots if isinstance(process.phase, Undoing) else None
