@@ -28,19 +28,10 @@ from vslam_env.navigation import (
     lengths_between,
     ray_directions,
 )
-from vslam_env.navigation._view_kernels import (
-    BINS,
-    COARSE,
-    FARTHEST,
-    LOOKED,
-    MOST_LOOKS,
-    NEAREST,
-    PATIENCE,
-    SPACING,
-    add_revisits,
-    view_gains,
-    write_global_grid,
-)
+from vslam_env.navigation._view_kernels import COARSE, write_global_grid
+from vslam_env.navigation._view_kernels.looks import LOOKED, MOST_LOOKS, NEAREST
+from vslam_env.navigation._view_kernels.revisits import BINS, FARTHEST, PATIENCE, SPACING, add_revisits
+from vslam_env.navigation._view_kernels.view_gains import view_gains
 from vslam_env.navigation.grid_storage import GRID_SIZES, LARGEST_SIZE, known_bounds, margin
 
 gains_of, places_of = python_entry(view_gains), python_entry(add_revisits)

@@ -97,6 +97,26 @@ def cell_index(coordinate: float, margin: int) -> int:
     return math.floor((coordinate + HALF_WIDTH) / CELL) + margin
 
 
+@inline
+def to_index(coordinate: float, size: int) -> int:
+    """Return the row or column of a coordinate [m] in a grid of some size, whose middle is the start."""
+    return cell_index(coordinate, margin_of(size))
+
+
+@inline
+def to_coordinate(index: int, size: int) -> float:
+    """Return the coordinate [m] of the centre of a row or column."""
+    return (index - margin_of(size) + 0.5) * CELL - HALF_WIDTH
+
+
+@inline
+def is_occupied(cells: Any, x: float, y: float) -> bool:
+    """Return whether a point [m] lies in an occupied cell of a grid."""
+    size = len(cells)
+    row, col = to_index(y, size), to_index(x, size)
+    return bool(0 <= row < size and 0 <= col < size and cells[row, col] == OCCUPIED)
+
+
 EDGE = 4  # cells around what is known that a grid keeps unknown, so that its size changes no frontier
 
 

@@ -17,7 +17,7 @@ MOST_NEAR = 1 + 2 * GOAL_STEPS * (GOAL_STEPS + 1)  # cells that so many steps le
 LOOKED_AT = 4  # added to the marks of cells while a goal is looked for
 SIGHT_CELLS = 3  # the unknown this near to a goal tells where to look from it
 
-HEADING, SIZE, LENGTH, NUM_COLUMNS = 2, 3, 4, 5  # columns of the rows that describe frontiers, see `FrontierColumns`
+X, Y, HEADING, SIZE, LENGTH, NUM_COLUMNS = range(6)  # columns of the rows of candidates, see `FrontierColumns`
 
 
 class FrontierColumns(NamedTuple):
