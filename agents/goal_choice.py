@@ -126,10 +126,10 @@ class DrivingPolicy:
 def own_share(belief: Belief, slots: IntArray) -> IntArray:
     """Return those of the slots to which no teammate is nearer, in a straight line; all of them if there are none."""
     candidates = belief.candidates
-    mates = np.array([mate.pose[:2] for mate in belief.teammates]).reshape(-1, 2)
-    gaps = np.linalg.norm(candidates.goals[slots, None] - mates[None], axis=-1)
-    own = slots[(gaps >= candidates.lengths[slots, None]).all(axis=1)]
-    return own if len(own) else slots
+    positions = np.array([mate.pose[:2] for mate in belief.teammates]).reshape(-1, 2)
+    gaps = np.linalg.norm(candidates.goals[slots, None] - positions[None], axis=-1)
+    nearer = slots[(gaps >= candidates.lengths[slots, None]).all(axis=1)]
+    return nearer if len(nearer) else slots
 
 
 def nearest_own_frontiers(belief: Belief, most: int) -> IntArray:

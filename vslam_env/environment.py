@@ -76,7 +76,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
             check_choice("render_mode", render_mode, RENDER_MODES, "Choose one of these, or None.")
         self.render_mode = render_mode
         self.max_cycles = config.num_cycles
-        self._tap = ReadingsHook()  # separate object, so that an episode does not keep its environment alive
+        self._hook = ReadingsHook()  # separate object, so that an episode does not keep its environment alive
         self._source: WorldSource = config.world if world is None else world
         check_source(self._source)
         if config.world_split is not None and is_single_layout(self._source):
@@ -144,11 +144,11 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
             scenario = sample_scenario(
                 self.config, self._source, root.spawn(1)[0], world_seed, options.get("start_poses")
             )
-        episode = Episode(self.config, scenario, self._tap)
+        episode = Episode(self.config, scenario, self._hook)
         episode.begin()
         metrics = episode.team_metrics(self._reads_beliefs)
         self._is_whole = False
-        self._root, self._episode, self._drivers = root, episode, ActionExecutor(self.config)
+        self._root, self._episode, self._executor = root, episode, ActionExecutor(self.config)
         self._team_metrics = metrics
         self.agents = self.possible_agents[:]
         self._cycle = 0
@@ -189,7 +189,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         agents = self.agents
         chosen = checked_actions(actions, agents, self.config.action_type)
         self._is_whole = False
-        invalid = self._drivers.execute(episode, chosen)
+        invalid = self._executor.execute(episode, chosen)
         before = self._team_metrics
         self._team_metrics = episode.team_metrics(self._reads_beliefs)
         self._cycle += 1
@@ -305,13 +305,13 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
     @property
     def recorder(self) -> Recorder | None:
         """Callback for the readings of every tick, including the reset; may be assigned."""
-        return self._tap.recorder
+        return self._hook.recorder
 
     @recorder.setter
     def recorder(self, recorder: Recorder | None) -> None:
         if recorder is not None and not callable(recorder):
             raise argument_error("recorder", "a function or None", recorder, "It receives a tuple of Readings.")
-        self._tap.recorder = recorder
+        self._hook.recorder = recorder
 
     @property
     def max_cycles(self) -> int:
@@ -348,7 +348,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
             "agents": tuple(self.agents),
             "cycle": 0 if episode is None else self._cycle,
             "episode": None if episode is None else episode.get_state(),
-            "drivers": [] if episode is None else self._drivers.get_state(),
+            "drivers": [] if episode is None else self._executor.get_state(),
             "team_metrics": None if episode is None else self._team_metrics,
         }
 
@@ -371,10 +371,10 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         if scenario is None:
             self._episode = None
         else:
-            self._episode = Episode(self.config, scenario, self._tap) if episode is None else episode
+            self._episode = Episode(self.config, scenario, self._hook) if episode is None else episode
             self._episode.set_state(state["episode"], scenario)
-            self._drivers = ActionExecutor(self.config)
-            self._drivers.set_state(state["drivers"])
+            self._executor = ActionExecutor(self.config)
+            self._executor.set_state(state["drivers"])
             self._team_metrics, self._cycle, self.agents = state["team_metrics"], state["cycle"], list(state["agents"])
         self._is_whole = True
 

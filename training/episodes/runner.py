@@ -235,10 +235,10 @@ class _Log:
         errors = np.stack(self._estimated, axis=1) - between(self._starts[:, None], np.stack(self._true, axis=1))
         errors[..., 2] = wrap_angle(errors[..., 2])
         covariances = np.stack(self._covariances, axis=1)
-        found = np.full(errors.shape[:-1], np.nan)
+        values = np.full(errors.shape[:-1], np.nan)
         uncertain = np.linalg.eigvalsh(covariances)[..., 0] > KNOWN**2
-        found[uncertain] = nees(errors[uncertain], covariances[uncertain])
-        return found
+        values[uncertain] = nees(errors[uncertain], covariances[uncertain])
+        return values
 
     def _enter(self, infos: Mapping[str, Mapping[str, Any]], tick: int) -> None:
         self._infos = infos

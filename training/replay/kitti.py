@@ -120,8 +120,8 @@ def mean_drift(path: FloatArray, truth: FloatArray) -> float:
         first, last = first[last < len(truth)], last[last < len(truth)]
         off = between(between(truth[first], truth[last]), between(path[first], path[last]))
         errors.append(np.hypot(off[:, 0], off[:, 1]) / length)
-    found = np.concatenate(errors)
-    return float(found.mean()) if len(found) else float("nan")
+    errors_together = np.concatenate(errors)
+    return float(errors_together.mean()) if len(errors_together) else float("nan")
 
 
 def find_loop(truth: FloatArray) -> tuple[int, int] | None:

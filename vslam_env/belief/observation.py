@@ -75,19 +75,21 @@ def observe_team(view: BeliefBatch, scans: FloatArray, goal_actions: bool) -> li
         New arrays by name for each robot, see `observe`.
     """
     count, candidates = len(view.robots), view.features
-    poses, deviations = np.empty((count, 3), np.float32), np.empty((count, 3), np.float32)
+    own_poses, deviations = np.empty((count, 3), np.float32), np.empty((count, 3), np.float32)
     stats, ranges = np.empty((count, 6), np.float32), np.empty(scans.shape, np.float32)
     teammates, present = np.empty((count, MAX_TEAMMATES, 5), np.float32), np.empty((count, MAX_TEAMMATES), np.int8)
     pictures = np.empty((count, len(CHANNELS), SIZE, SIZE), np.uint8)
-    points, ((places, names), parts) = view.points, view.map_summaries
+    team_poses, ((positions, counts_and_ids), parts) = view.team_poses, view.map_summaries
     counts, time_left = np.empty((count, len(COUNT_BINS)), np.float32), min(view.seconds_left, MAX_SECONDS_LEFT)
     global_grids, frames = view.global_grids.pictures.copy(), view.global_grids.frames.copy()
-    arrays = poses, deviations, stats, pictures, ranges, candidates, teammates, present, counts
-    write_observations(view.robots, points.poses, points.beliefs, places, names, parts, view.cells, scans, arrays)
+    arrays = own_poses, deviations, stats, pictures, ranges, candidates, teammates, present, counts
+    write_observations(
+        view.robots, team_poses.poses, team_poses.beliefs, positions, counts_and_ids, parts, view.cells, scans, arrays
+    )
     observations: list[Observation] = []
     for i in range(count):  # by index: iterating over arrays costs microseconds
         observation: Observation = {
-            "pose": poses[i],
+            "pose": own_poses[i],
             "pose_std": deviations[i],
             "map_stats": stats[i],
             "local_grid": pictures[i],

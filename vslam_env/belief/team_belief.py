@@ -48,7 +48,7 @@ class TeamBelief:
         attempts: Whether the team attempts merges itself; if not, merges from outside are final.
 
     Attributes:
-        points: Pose estimates; overwritten in the next step.
+        team_poses: Pose estimates; overwritten in the next step.
         known_groups: Robots known to share a map with each robot, itself included.
         exchange: Count of the bytes sent; read-only.
         grids: Occupancy grids of the robots; read-only.
@@ -85,10 +85,10 @@ class TeamBelief:
         self._confirm_after = config.confirm_after
         self._beliefs: dict[int, Belief] = {}  # beliefs of this tick, made on demand
         self._maps: dict[int, LandmarkMap] = {}  # maps of this tick by number
-        self.points = TeamPoses(num_robots)
-        self._outlines = TeamMapSummaries.allocate(num_robots, 0)  # of this tick, filled on demand
-        self._has_outlines = False
-        self._all_outlines = TeamMapSummaries.allocate(num_robots, 0)  # with unconfirmed landmarks
+        self.team_poses = TeamPoses(num_robots)
+        self._map_summaries = TeamMapSummaries.allocate(num_robots, 0)  # of this tick, filled on demand
+        self._has_summaries = False
+        self._whole_map_summaries = TeamMapSummaries.allocate(num_robots, 0)  # with unconfirmed landmarks
         self._refresh_poses()
 
     @property
@@ -109,7 +109,7 @@ class TeamBelief:
     @property
     def poses(self) -> FloatArray:
         """(K, 3) float64 [m, m, rad]. Copy of the pose estimates, each in the robot's own start frame."""
-        return self.points.own.copy()
+        return self.team_poses.own.copy()
 
     def step(self, readings: TeamReadings | Sequence[Readings]) -> TeamReport:
         """Update all beliefs with the readings of one tick, beginning with the reset.
@@ -137,20 +137,20 @@ class TeamBelief:
         )
         self._tick += 1
         self._refresh_poses()
-        points = self.points
-        self._grids.step(self._tick, report, self._topology.same_filter, points, readings.scans, readings.bumps)
+        team_poses = self.team_poses
+        self._grids.step(self._tick, report, self._topology.same_filter, team_poses, readings.scans, readings.bumps)
         if readings.goals is not None:
             self._goals = readings.goals
         turns = self._turns[self._tick % len(self._turns)] if self._tick else range(len(self._robots))
         if len(turns):
-            self._all_outlines = self._team.map_summaries(1, self._all_outlines)
+            self._whole_map_summaries = self._team.map_summaries(1, self._whole_map_summaries)
         for robot in turns:
-            first, last = self._all_outlines.parts[robot]
-            rows = self._all_outlines.rows
-            landmarks = rows.positions[first:last], rows.counts_and_ids[first:last], points.starts[robot]
+            first, last = self._whole_map_summaries.parts[robot]
+            rows = self._whole_map_summaries.rows
+            landmarks = rows.positions[first:last], rows.counts_and_ids[first:last], team_poses.starts[robot]
             known, shared = self._topology.known_robots[robot], self._grids.shared[robot]
-            places = self._rendezvous.update(robot, points, known, shared, landmarks)
-            self._candidates.update(robot, self.grids, self._grids.looks, points.poses, landmarks, places)
+            places = self._rendezvous.update(robot, team_poses, known, shared, landmarks)
+            self._candidates.update(robot, self.grids, self._grids.looks, team_poses.poses, landmarks, places)
         return report
 
     def merge(self, robot_a: int, robot_b: int, alignment: Alignment, known: bool = False) -> LandmarkIdMap:
@@ -158,7 +158,7 @@ class TeamBelief:
         id_map = self._team.merge(robot_a, robot_b, alignment, known)
         self._refresh_poses()
         self._grids.save_for_undo(self._tick + 1, id_map)
-        self._grids.share_on_contact(self._tick + 1, self._topology.same_filter, self.points.starts)
+        self._grids.share_on_contact(self._tick + 1, self._topology.same_filter, self.team_poses.starts)
         return id_map
 
     def rejuvenate(self) -> None:
@@ -188,10 +188,10 @@ class TeamBelief:
     @property
     def map_summaries(self) -> TeamMapSummaries:
         """Summaries of `group_map` for all robots, computed faster; valid until the next step."""
-        if not self._has_outlines:
-            self._outlines = self._team.map_summaries(self._confirm_after, self._outlines)
-            self._has_outlines = True
-        return self._outlines
+        if not self._has_summaries:
+            self._map_summaries = self._team.map_summaries(self._confirm_after, self._map_summaries)
+            self._has_summaries = True
+        return self._map_summaries
 
     def grid(self, robot: int) -> OccupancyGrid:
         """Return the occupancy grid of a robot, updated in later ticks."""
@@ -220,7 +220,7 @@ class TeamBelief:
         self._global_grids.update(grids, self._grids.looks)
         of_grids = grids.cells, self._global_grids
         return BeliefBatch(
-            self._robots, self.points, self.map_summaries, *of_grids, self._features(), self._seconds_left
+            self._robots, self.team_poses, self.map_summaries, *of_grids, self._features(), self._seconds_left
         )
 
     @property
@@ -258,10 +258,10 @@ class TeamBelief:
         """Update groups and poses after a step or a merge, and clear cached beliefs and maps."""
         self._topology = self._team.topology
         self.known_groups = self._topology.known_robots
-        self._team.team_poses(self.points)
+        self._team.team_poses(self.team_poses)
         self._beliefs.clear()
         self._maps.clear()
-        self._has_outlines = False
+        self._has_summaries = False
 
     def _others(self, robot: int) -> list[int]:
         """Return the other known members of a robot's group, ascending."""
@@ -270,17 +270,17 @@ class TeamBelief:
     def _known_goals(self) -> FloatArray:
         """Return the current goal (K, K, 2) [m] of robot j in the start frame of robot i; NaN: none, or not known."""
         goals = np.empty((len(self._robots), len(self._robots), 2))
-        write_goals(self.points.starts, self._goals, self._grids.shared, goals)
+        write_goals(self.team_poses.starts, self._goals, self._grids.shared, goals)
         return goals
 
     def _teammates(self, robot: int) -> tuple[Teammate, ...]:
         """Return a robot's teammates; those out of contact with their last known pose."""
-        points, team = self.points, self._team
-        turn, goals = float(points.starts[robot, 2]), self._known_goals()[robot]
+        team_poses, team = self.team_poses, self._team
+        turn, goals = float(team_poses.starts[robot, 2]), self._known_goals()[robot]
         others = self._others(robot)
         covariances = [rotate_covariances(turn, team.pose(mate, robot).covariance) for mate in others]
         return tuple(
-            Teammate(mate, points.poses[robot, mate], covariance, goals[mate])
+            Teammate(mate, team_poses.poses[robot, mate], covariance, goals[mate])
             for mate, covariance in zip(others, covariances, strict=True)
         )
 
@@ -304,27 +304,27 @@ class TeamBelief:
 
     def _features(self) -> Float32Array:
         """Return the features (K, C, F) float32 of all robots' candidates; a new array."""
-        return self._candidates.features(self.points.poses, self._known_goals())
+        return self._candidates.features(self.team_poses.poses, self._known_goals())
 
     def _make_belief(self, robot: int) -> Belief:
         """Build the belief of a robot."""
-        points, group = self.points, self._topology.known_robots[robot]
+        team_poses, group = self.team_poses, self._topology.known_robots[robot]
         return Belief(
             robot=robot,
             tick=self._tick,
             frame=group[0],
             group=group,
-            pose=points.own[robot],
-            covariance=points.covariances[robot],
+            pose=team_poses.own[robot],
+            covariance=team_poses.covariances[robot],
             particles=self._team.particles_from_start(robot),
             log_weights=self._team.particles(robot)[1],
-            ess=float(points.ess[robot]),
+            ess=float(team_poses.ess[robot]),
             grid=self._grids[robot].read_only_view(),
             candidates=self._make_candidates(robot),
             teammates=self._teammates(robot),
             looks=as_read_only(self._grids.looks.counts[robot]),
             seconds_left=self._seconds_left,
-            start_from_group=points.starts[robot],
+            start_from_group=team_poses.starts[robot],
             group_map=self.group_map(robot),
         )
 

@@ -24,7 +24,7 @@ UNUSED = -3  # claim of an unused landmark id
 @in_place
 def score_team(
     positions: Any,
-    ids: Any,
+    counts_and_ids: Any,
     map_rows: Any,
     ground_truth: tuple[Any, ...],
     beliefs: Any,
@@ -35,8 +35,8 @@ def score_team(
     """Write the errors of the robots' maps and poses, in their own start frames and without a fit.
 
     Args:
-        positions, ids, map_rows: (n, 4), (n, 2) int64, (K, 2) int64. Landmarks of all maps, and first and last row of
-            each robot's map; see `TeamMapSummaries`.
+        positions, counts_and_ids, map_rows: (n, 4), (n, 2) int64, (K, 2) int64. Landmarks of all maps, and first and
+            last row of each robot's map; see `TeamMapSummaries`.
         ground_truth: Claims of the landmarks, and the data to score them:
             (B, n) int64. Claim of each landmark id, map by map: a row of the true positions, `FALSE` or `UNCOUNTED`.
             (K,) int64. Row of each robot's map in these claims.
@@ -68,7 +68,7 @@ def score_team(
         smallest[:] = np.inf
         estimated = surplus = 0
         for i in range(map_rows[robot, 0], map_rows[robot, 1]):
-            claim = claims[claims_row[robot], ids[i, 1]]
+            claim = claims[claims_row[robot], counts_and_ids[i, 1]]
             estimated += claim != UNCOUNTED
             if claim == FALSE:
                 surplus += 1
@@ -172,7 +172,7 @@ class GroundTruthAssociation:
     def score(
         self,
         map_summaries: TeamMapSummaries,
-        points: TeamPoses,
+        team_poses: TeamPoses,
         true_starts: FloatArray,
         true_poses: FloatArray,
         scores: FloatArray,
@@ -181,14 +181,16 @@ class GroundTruthAssociation:
 
         Args:
             map_summaries: Summaries of the maps of the K robots, in their map frames.
-            points: Pose estimates of the robots.
+            team_poses: Pose estimates of the robots.
             true_starts: (K, 3) [m, m, rad], world frame. True start poses.
             true_poses: (K, 3) [m, m, rad], world frame. True current poses.
             scores: (8 or more, K) float64. Output: first rows of `TeamMetrics.per_robot`.
         """
-        (positions, ids), map_rows = map_summaries
+        (positions, counts_and_ids), map_rows = map_summaries
         ground_truth = self._claims, self._claims_row, self.true_positions, self.cutoff, self._smallest
-        score_team(positions, ids, map_rows, ground_truth, points.beliefs, true_starts, true_poses, scores)
+        score_team(
+            positions, counts_and_ids, map_rows, ground_truth, team_poses.beliefs, true_starts, true_poses, scores
+        )
 
     def get_state(self) -> dict[str, Any]:
         """Return a copy of the state; the true ids of measurements are shared and read-only."""

@@ -87,9 +87,9 @@ def find_frontiers(cells: Cells, start_xy: ArrayLike, radius: float = 0.2, ignor
     """
     points = positions_array(ignored, "ignored")
     rows = compute_frontiers(*known_part(cells), *_checked_start(start_xy, radius), points)
-    found = FrontierColumns.of(rows)
+    columns = FrontierColumns.of(rows)
     return Frontiers(
-        goals=found.goals, headings=found.heading.copy(), sizes=found.size.copy(), lengths=found.length.copy()
+        goals=columns.goals, headings=columns.heading.copy(), sizes=columns.size.copy(), lengths=columns.length.copy()
     )
 
 

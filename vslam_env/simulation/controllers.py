@@ -75,7 +75,7 @@ class ActionExecutor:
 
     def __init__(self, config: EnvConfig) -> None:
         self._action_type, self._ticks = config.action_type, config.ticks_per_step
-        self._drivers = [GoalController() for _ in range(config.num_robots)]
+        self._controllers = [GoalController() for _ in range(config.num_robots)]
 
     def execute(self, episode: Episode, chosen: Any) -> list[int]:
         """Advance an episode by the ticks of a step.
@@ -95,22 +95,22 @@ class ActionExecutor:
         candidates = [beliefs.candidate(robot, action - 1) if action else None for robot, action in enumerate(chosen)]
         poses = beliefs.poses
         goals = np.array([NOWHERE if candidate is None else candidate[0] for candidate in candidates])
-        for robot, (driver, candidate) in enumerate(zip(self._drivers, candidates, strict=True)):
-            driver.set_goal(candidate, poses[robot], beliefs.grid(robot))
+        for robot, (controller, candidate) in enumerate(zip(self._controllers, candidates, strict=True)):
+            controller.set_goal(candidate, poses[robot], beliefs.grid(robot))
         for _ in range(self._ticks):
             poses, bumps = beliefs.poses, episode.readings.bumps.tolist()
             commands = [
-                driver.command(poses[robot], beliefs.grid(robot), bumps[robot])
-                for robot, driver in enumerate(self._drivers)
+                controller.command(poses[robot], beliefs.grid(robot), bumps[robot])
+                for robot, controller in enumerate(self._controllers)
             ]
             episode.advance(np.array(commands), goals)
         return [int(action != 0 and candidate is None) for action, candidate in zip(chosen, candidates, strict=True)]
 
     def get_state(self) -> list[dict[str, Any]]:
         """Return the states of all controllers."""
-        return [driver.get_state() for driver in self._drivers]
+        return [controller.get_state() for controller in self._controllers]
 
     def set_state(self, state: Sequence[Mapping[str, Any]]) -> None:
         """Restore a state of `get_state`."""
-        for driver, driver_state in zip(self._drivers, state, strict=True):
-            driver.set_state(driver_state)
+        for controller, controller_state in zip(self._controllers, state, strict=True):
+            controller.set_state(controller_state)

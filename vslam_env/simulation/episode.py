@@ -101,7 +101,7 @@ class Episode:
 
     def __init__(self, config: EnvConfig, scenario: Scenario, hook: ReadingsHook | None = None) -> None:
         self._config = config
-        self._tap = ReadingsHook() if hook is None else hook
+        self._hook = ReadingsHook() if hook is None else hook
         self._all_hear_all = config.always_in_contact
         self._streams = {name: np.random.default_rng(0) for name in scenario.stream_states}
         self._given = ref(scenario)
@@ -120,8 +120,8 @@ class Episode:
 
         self.tick = 0
         self._collisions: tuple[int, ...] = (0,) * config.num_robots
-        self._figures = np.zeros((len(RobotMetrics._fields), config.num_robots))  # distances accumulate
-        rows: RobotMetrics[FloatArray] = RobotMetrics(*self._figures)
+        self._metrics = np.zeros((len(RobotMetrics._fields), config.num_robots))  # distances accumulate
+        rows: RobotMetrics[FloatArray] = RobotMetrics(*self._metrics)
         self._map_errors, self._discovered, self._distances = rows.map_errors, rows.discovered, rows.distances
         self._error_integrals, self._own_recalls = rows.error_integrals, rows.own_recalls
         self._integrates = RUNNING_COST in config.reward  # scoring every tick is slow
@@ -208,12 +208,12 @@ class Episode:
             self._credits.update(self.ground_truth.accurate)
             self._own_recalls[:] = self._credits.shares
         coverage = self._coverage.update(belief.grids, poses, self._discovered)
-        counts, figures = (
+        counts, metrics = (
             RobotCounts(self._collisions, tuple(belief.exchange.sent)),
-            RobotMetrics(*self._figures.tolist()),
+            RobotMetrics(*self._metrics.tolist()),
         )
         beliefs = tuple(map(self._summary, range(len(poses)))) if with_beliefs else ()
-        return TeamMetrics(figures, counts, coverage, len(self.merge_ticks), self.tick * TICK, beliefs)
+        return TeamMetrics(metrics, counts, coverage, len(self.merge_ticks), self.tick * TICK, beliefs)
 
     # ------------------------------------------------------------------ snapshots
 
@@ -258,12 +258,12 @@ class Episode:
     def _score(self, poses: FloatArray) -> None:
         """Score all maps and poses, given the true poses (K, 3), into the first rows of the metrics."""
         belief = self.belief
-        self.ground_truth.score(belief.map_summaries, belief.points, self.true_starts, poses, self._figures)
+        self.ground_truth.score(belief.map_summaries, belief.team_poses, self.true_starts, poses, self._metrics)
 
     def _summary(self, robot: int) -> BeliefSummary:
         """Return what reward terms may read of a robot's belief."""
         group_map, truth = self.belief.group_map(robot), self.ground_truth
-        covariance, claims = self.belief.points.covariances[robot], truth.true_ids(robot, group_map.ids)
+        covariance, claims = self.belief.team_poses.covariances[robot], truth.true_ids(robot, group_map.ids)
         return BeliefSummary(as_constant(covariance), group_map.counts, group_map.covariances, as_constant(claims))
 
     def _perceive(self, odometry: FloatArray | None, goals: FloatArray | None = None) -> None:
@@ -283,8 +283,8 @@ class Episode:
             frames.left if config.observe_images and isinstance(frames, TeamRenderedFrames) else None,
             goals,
         )
-        if self._tap.recorder is not None:
-            self._tap.recorder(self.readings.per_robot())
+        if self._hook.recorder is not None:
+            self._hook.recorder(self.readings.per_robot())
         report = self.belief.step(self.readings)
         self.ground_truth.record(report, frames.names)
         if self._gives_credit:
@@ -297,7 +297,7 @@ class Episode:
         if config.oracle_merge:
             self._merge_by_oracle(contact_components(in_contact, config.num_robots))
         self.true_path.append(as_constant(poses))
-        self.estimated_path.append(as_constant(self.belief.points.own))
+        self.estimated_path.append(as_constant(self.belief.team_poses.own))
 
     def _contacts(self, poses: FloatArray) -> BoolArray:
         """Return the matrix of contacts (K, K)."""

@@ -92,11 +92,11 @@ def describe(values: FloatArray) -> dict[str, float | None] | None:
     """
     if not len(values):
         return None
-    found: dict[str, float | None] = {"worst": float(values.max())}
+    summary: dict[str, float | None] = {"worst": float(values.max())}
     for name, statistic in (("mean", np.mean), ("median", np.median)):
-        found[name] = float(statistic(values))
-        found[f"{name}_low"], found[f"{name}_high"] = interval(values, statistic)
-    return found
+        summary[name] = float(statistic(values))
+        summary[f"{name}_low"], summary[f"{name}_high"] = interval(values, statistic)
+    return summary
 
 
 def table_rows(lines: Sequence[Mapping[str, Any]], columns: Sequence[Any]) -> tuple[list[str], list[list[str]]]:
@@ -143,13 +143,13 @@ def markdown(lines: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _cell(
-    found: Mapping[str, float | None] | None, statistic: str, factor: float, digits: int, with_interval: bool
+    summary: Mapping[str, float | None] | None, statistic: str, factor: float, digits: int, with_interval: bool
 ) -> str:
     """Format a statistic, with its interval if requested; unknown values give a dash."""
-    value = None if found is None else found[statistic]
-    if found is None or value is None:
+    value = None if summary is None else summary[statistic]
+    if summary is None or value is None:
         return "-"
-    low, high = (None, None) if not with_interval else (found[f"{statistic}_{end}"] for end in ("low", "high"))
+    low, high = (None, None) if not with_interval else (summary[f"{statistic}_{end}"] for end in ("low", "high"))
     if low is None or high is None:
         return number(value, digits, factor)
     return f"{number(value, digits, factor)} ({number(low, digits, factor)}-{number(high, digits, factor)})"

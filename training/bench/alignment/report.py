@@ -51,9 +51,9 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         wall-clock time, which other processes lengthen.
     """
     cells = grouped(rows, CELL)
-    for (kind, method), own in grouped(rows, ("kind", "method")).items():
-        cells[kind, None, None, None, method] = own
-    return [dict(zip(CELL, cell, strict=True)) | _describe(own) for cell, own in cells.items()]
+    for (kind, method), group in grouped(rows, ("kind", "method")).items():
+        cells[kind, None, None, None, method] = group
+    return [dict(zip(CELL, cell, strict=True)) | _describe(group) for cell, group in cells.items()]
 
 
 def _describe(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

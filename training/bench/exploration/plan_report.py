@@ -107,10 +107,10 @@ def incomplete(plan: Plan, rows: Rows, policies: Sequence[str]) -> list[str]:
 def aggregate(plan: Plan, rows: Rows) -> list[dict[str, Any]]:
     """Return a line for each part and policy: worlds, and interquartile means of the main metrics with intervals."""
     found = []
-    for (part, policy), own in grouped(rows, ("part", "policy")).items():
-        line: dict[str, Any] = {"part": part, "policy": policy, "episodes": len(own)}
+    for (part, policy), group in grouped(rows, ("part", "policy")).items():
+        line: dict[str, Any] = {"part": part, "policy": policy, "episodes": len(group)}
         for name in ("map_error", "mean_coverage", "below_50_s", "below_90_s", "map_recall", "ate_start_m"):
-            worlds = [np.array([row[name] for row in family]) for family in grouped(own, ("family",)).values()]
+            worlds = [np.array([row[name] for row in family]) for family in grouped(group, ("family",)).values()]
             line |= dict(zip((name, f"{name}_low", f"{name}_high"), stratified_ci(worlds, pooled(iqm)), strict=True))
         found.append(line)
     return found
@@ -202,8 +202,8 @@ def _draw_profiles(panel: Axes, base: Rows) -> None:
 
 def _draw_team_sizes(panel: Axes, sizes: Rows) -> None:
     """Draw E over the number of robots, a line per number of particles."""
-    for i, ((particles,), own) in enumerate(sorted(grouped(sizes, ("particles",)).items())):
-        teams = sorted(grouped(own, ("robots",)).items())
+    for i, ((particles,), group) in enumerate(sorted(grouped(sizes, ("particles",)).items())):
+        teams = sorted(grouped(group, ("robots",)).items())
         middle, low, high = np.array([_ci(each, "map_error") for _, each in teams]).T
         robots, colour = [count for (count,), _ in teams], COLOURS[i % len(COLOURS)]
         panel.plot(robots, middle, "o-", color=colour, label=f"{particles} particles", markersize=3)
@@ -324,7 +324,9 @@ def _ladder(rows: Rows, order: Sequence[str]) -> Section:
     lines = []
     for policy in order:
         told = [row for row in rows if (row["part"], row["policy"]) == (ORACLES, policy)]
-        by_oracle = {oracle: _values(own, policy, "map_error") for (oracle,), own in grouped(told, ("oracle",)).items()}
+        by_oracle = {
+            oracle: _values(group, policy, "map_error") for (oracle,), group in grouped(told, ("oracle",)).items()
+        }
         if "all" not in by_oracle:
             continue
         base = _values([row for row in rows if row["part"] == BASE_PART], policy, "map_error")

@@ -214,7 +214,7 @@ def robots_ratios(errors: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
     robots = sorted({row["robots"] for row in rows})
     if len(robots) < 2:
         return []
-    found = []
+    lines = []
     for regime, proposal, m in dict.fromkeys((row["regime"], row["proposal"], row["particles"]) for row in rows):
         line: dict[str, Any] = {"regime": regime, "proposal": proposal, "particles": m}
         line["robots"] = [robots[0], robots[-1]]
@@ -223,5 +223,5 @@ def robots_ratios(errors: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
                 error_by_seed(rows, figure, regime=regime, proposal=proposal, robots=k, particles=m)
                 for k in (robots[-1], robots[0])
             ))  # fmt: skip
-        found.append(line)
-    return found
+        lines.append(line)
+    return lines

@@ -73,10 +73,10 @@ def _cell(line: Mapping[str, Any] | None, figure: str, digits: int, with_interva
     return number(line[figure], digits) + ends
 
 
-def _interval(found: Mapping[str, Any]) -> str:
+def _interval(ratio: Mapping[str, Any]) -> str:
     """Format a ratio with its interval."""
-    ends = "" if found["low"] is None else f" ({number(found['low'])}-{number(found['high'])})"
-    return number(found["ratio"]) + ends
+    ends = "" if ratio["low"] is None else f" ({number(ratio['low'])}-{number(ratio['high'])})"
+    return number(ratio["ratio"]) + ends
 
 
 @picture

@@ -210,12 +210,12 @@ def merge_grid(grid: Grid, other: Any, known: Any, x: float, y: float, theta: fl
             other_x, other_y = (c * u + s * v + HALF_WIDTH) / CELL, (-s * u + c * v + HALF_WIDTH) / CELL
             top, bottom = math.floor(other_y - 0.25) + others, math.floor(other_y + 0.25) + others
             left, right = math.floor(other_x - 0.25) + others, math.floor(other_x + 0.25) + others
-            found = evidence_at(other, math.floor(other_y) + others, math.floor(other_x) + others)
+            evidence = evidence_at(other, math.floor(other_y) + others, math.floor(other_x) + others)
             wall = max(
                 max(evidence_at(other, top, left), evidence_at(other, top, right)),
                 max(evidence_at(other, bottom, left), evidence_at(other, bottom, right)),
             )
-            found = wall if wall > max(found, 0) else found
-            if found != 0:
-                grid.evidence[row, col] = clamp_evidence(grid.evidence[row, col] + found)
+            evidence = wall if wall > max(evidence, 0) else evidence
+            if evidence != 0:
+                grid.evidence[row, col] = clamp_evidence(grid.evidence[row, col] + evidence)
                 set_state(grid, row, col, OCCUPIED if grid.evidence[row, col] > 0 else FREE)
