@@ -120,10 +120,8 @@ class Episode:
 
         self.tick = 0
         self._collisions: tuple[int, ...] = (0,) * config.num_robots
-        self._metrics = np.zeros((len(RobotMetrics._fields), config.num_robots))  # distances accumulate
-        rows: RobotMetrics[FloatArray] = RobotMetrics(*self._metrics)
-        self._map_errors, self._discovered, self._distances = rows.map_errors, rows.discovered, rows.distances
-        self._error_integrals, self._own_recalls = rows.error_integrals, rows.own_recalls
+        rows = np.zeros((len(RobotMetrics._fields), config.num_robots))  # distances and error integrals accumulate
+        self._metrics: RobotMetrics[FloatArray] = RobotMetrics(*rows)
         self._integrates = RUNNING_COST in config.reward  # scoring every tick is slow
         self._gives_credit = OWN_RECALL in config.reward
         self.true_path: list[FloatArray] = []
@@ -181,11 +179,11 @@ class Episode:
         if simulator.step(commands):
             self._collisions = tuple(map(add, self._collisions, simulator.bumped.tolist()))
         self.tick += 1
-        odometry = read_odometry(before, simulator.poses, self.scenario.bias, noise, stream, self._distances)
+        odometry = read_odometry(before, simulator.poses, self.scenario.bias, noise, stream, self._metrics.distances)
         self._perceive(odometry, goals)
         if self._integrates:
             self._score(simulator.poses)
-            self._error_integrals += self._map_errors * TICK
+            self._metrics.error_integrals[:] += self._metrics.map_errors * TICK
 
     @property
     def overlap(self) -> float:
@@ -206,11 +204,11 @@ class Episode:
         self._score(poses)
         if self._gives_credit:
             self._credits.update(self.ground_truth.accurate)
-            self._own_recalls[:] = self._credits.shares
-        coverage = self._coverage.update(belief.grids, poses, self._discovered)
+            self._metrics.own_recalls[:] = self._credits.shares
+        coverage = self._coverage.update(belief.grids, poses, self._metrics.discovered)
         counts, metrics = (
             RobotCounts(self._collisions, tuple(belief.exchange.sent)),
-            RobotMetrics(*self._metrics.tolist()),
+            RobotMetrics(*[row.tolist() for row in self._metrics]),
         )
         beliefs = tuple(map(self._summary, range(len(poses)))) if with_beliefs else ()
         return TeamMetrics(metrics, counts, coverage, len(self.merge_ticks), self.tick * TICK, beliefs)
@@ -228,7 +226,7 @@ class Episode:
             "ground_truth": self.ground_truth.get_state(),
             "coverage": self._coverage.get_state(),
             "credits": self._credits.get_state(),
-            "counts": (self._collisions, self._distances.copy(), self._error_integrals.copy()),
+            "counts": (self._collisions, self._metrics.distances.copy(), self._metrics.error_integrals.copy()),
             "last": with_read_only((self.readings, self._frames)),
             "paths": (tuple(self.true_path), tuple(self.estimated_path), tuple(self.merge_ticks)),
         }
@@ -246,7 +244,7 @@ class Episode:
         self._coverage.set_state(state["coverage"])
         self._credits.set_state(state["credits"])
         self.tick = state["tick"]
-        self._collisions, self._distances[:], self._error_integrals[:] = state["counts"]
+        self._collisions, self._metrics.distances[:], self._metrics.error_integrals[:] = state["counts"]
         self.readings, self._frames = with_constants(state["last"])
         true_path, estimated_path, merge_ticks = state["paths"]
         self.true_path = path_of(true_path, self.true_path)
