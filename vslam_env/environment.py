@@ -330,7 +330,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
     @property
     def events(self) -> tuple[MergeEvent, ...]:
         """All merge attempts, merges and rollbacks since the reset, in order."""
-        return self._running_episode("events").belief.events
+        return self._running_episode("events").belief.team.events
 
     @property
     def readings(self) -> tuple[Readings, ...]:

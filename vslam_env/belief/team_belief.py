@@ -9,10 +9,9 @@ import numpy as np
 
 from slam_backend.core.read_only import as_read_only
 from slam_backend.core.validation import Float32Array, FloatArray, argument_error
-from slam_backend.fastslam.consistency import Consistency
 from slam_backend.fastslam.options import FilterOptions
 from slam_backend.fastslam.relative_poses import TeamPoses
-from slam_backend.fastslam.reports import LandmarkIdMap, MergeEvent, TeamReport
+from slam_backend.fastslam.reports import LandmarkIdMap, TeamReport
 from slam_backend.fastslam.step_input import StepInput
 from slam_backend.geometry import rotate_covariances
 from slam_backend.maps.alignment import Alignment
@@ -48,9 +47,9 @@ class TeamBelief:
         attempts: Whether the team attempts merges itself; if not, merges from outside are final.
 
     Attributes:
+        team: Filters of the team; it is changed by the methods of this class alone.
         team_poses: Pose estimates; overwritten in the next step.
         known_groups: Robots known to share a map with each robot, itself included.
-        exchange: Count of the bytes sent; read-only.
         grids: Occupancy grids of the robots; read-only.
     """
 
@@ -68,8 +67,7 @@ class TeamBelief:
             seed = np.random.SeedSequence(seed.entropy, spawn_key=seed.spawn_key)
         options = {f.name: getattr(config.filter, f.name) for f in fields(FilterOptions)}
         schedule, merging = merge_options(config, attempts)
-        self._team = TeamSlam(num_robots, config.alignment, seed, schedule, merging, **options)
-        self.exchange = self._team.exchange
+        self.team = TeamSlam(num_robots, config.alignment, seed, schedule, merging, **options)
         camera = config.filter.camera
         self._grids = SharedGrids(num_robots, body, camera)
         self.grids = self._grids.team
@@ -90,21 +88,6 @@ class TeamBelief:
         self._has_summaries = False
         self._whole_map_summaries = TeamMapSummaries.allocate(num_robots, 0)  # with unconfirmed landmarks
         self._refresh_poses()
-
-    @property
-    def num_robots(self) -> int:
-        """Number of robots K."""
-        return self._team.num_robots
-
-    @property
-    def groups(self) -> tuple[tuple[int, ...], ...]:
-        """Groups, each in ascending order of robots."""
-        return self._topology.groups
-
-    @property
-    def events(self) -> tuple[MergeEvent, ...]:
-        """All merge attempts, merges and rollbacks so far, in order."""
-        return self._team.events
 
     @property
     def poses(self) -> FloatArray:
@@ -128,7 +111,7 @@ class TeamBelief:
         if len(readings.bumps) != len(self._robots):
             got, hint = f"shape {readings.bumps.shape}", "Give one bool per robot."
             raise argument_error("readings.bumps", f"an array of shape ({len(self._robots)},)", got, hint)
-        report = self._team.step(
+        report = self.team.step(
             [None] * len(self._robots) if readings.odometry is None else readings.odometry,
             readings.measurements,
             readings.contacts,
@@ -143,7 +126,7 @@ class TeamBelief:
             self._goals = readings.goals
         turns = self._turns[self._tick % len(self._turns)] if self._tick else range(len(self._robots))
         if len(turns):
-            self._whole_map_summaries = self._team.map_summaries(1, self._whole_map_summaries)
+            self._whole_map_summaries = self.team.map_summaries(1, self._whole_map_summaries)
         for robot in turns:
             first, last = self._whole_map_summaries.parts[robot]
             rows = self._whole_map_summaries.rows
@@ -155,7 +138,7 @@ class TeamBelief:
 
     def merge(self, robot_a: int, robot_b: int, alignment: Alignment, known: bool = False) -> LandmarkIdMap:
         """Merge the groups of two robots with a given alignment of their filter maps; see `TeamSlam.merge`."""
-        id_map = self._team.merge(robot_a, robot_b, alignment, known)
+        id_map = self.team.merge(robot_a, robot_b, alignment, known)
         self._refresh_poses()
         self._grids.save_for_undo(self._tick + 1, id_map)
         self._grids.share_on_contact(self._tick + 1, self._topology.same_filter, self.team_poses.starts)
@@ -163,33 +146,25 @@ class TeamBelief:
 
     def rejuvenate(self) -> None:
         """Smooth paths and maps of all filters that have a smoother now; see `TeamSlam.rejuvenate`."""
-        self._team.rejuvenate()
+        self.team.rejuvenate()
         self._refresh_poses()
 
     def representative(self, group: tuple[int, ...]) -> int:
         """Return the first robot of a group that uses the joint filter, which merges need."""
-        return self._team.trunk_robots(group[0])[0]
-
-    def consistency(self, robot: int) -> Consistency:
-        """Return the consistency test of a robot's filter; see `FastSlam.consistency`."""
-        return self._team.consistency(robot)
-
-    def filter_map(self, robot: int) -> LandmarkMap:
-        """Return the whole map of a robot's group, including unconfirmed landmarks, in the group's map frame."""
-        return self._team.map(robot)
+        return self.team.trunk_robots(group[0])[0]
 
     def group_map(self, robot: int) -> LandmarkMap:
-        """Return the confirmed landmarks of a robot's group, in the group's map frame."""
+        """Return the confirmed landmarks of a robot's group, in the group's map frame; `team.map` has all."""
         number = self._topology.maps[robot]
         if number not in self._maps:
-            self._maps[number] = self._team.map(robot, min_count=self._confirm_after)
+            self._maps[number] = self.team.map(robot, min_count=self._confirm_after)
         return self._maps[number]
 
     @property
     def map_summaries(self) -> TeamMapSummaries:
         """Summaries of `group_map` for all robots, computed faster; valid until the next step."""
         if not self._has_summaries:
-            self._map_summaries = self._team.map_summaries(self._confirm_after, self._map_summaries)
+            self._map_summaries = self.team.map_summaries(self._confirm_after, self._map_summaries)
             self._has_summaries = True
         return self._map_summaries
 
@@ -226,7 +201,7 @@ class TeamBelief:
     @property
     def buffered_inputs(self) -> Mapping[int, StepInput]:
         """Buffered readings by step that some filter may still need; read-only."""
-        return self._team.buffered_inputs
+        return self.team.buffered_inputs
 
     @property
     def grid_updates(self) -> dict[int, GridUpdate]:
@@ -237,7 +212,7 @@ class TeamBelief:
         """Return the complete state of the beliefs."""
         return {
             "tick": self._tick,
-            "team": self._team.get_state(),
+            "team": self.team.get_state(),
             "grids": self._grids.get_state(),
             "candidates": self._candidates.get_state(),
             "rendezvous": self._rendezvous.get_state(),
@@ -246,7 +221,7 @@ class TeamBelief:
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Restore a validated state of `get_state`."""
-        self._team.restore_checked(state["team"])
+        self.team.restore_checked(state["team"])
         self._tick = state["tick"]
         self._grids.set_state(state["grids"])
         self._candidates.set_state(state["candidates"])
@@ -256,9 +231,9 @@ class TeamBelief:
 
     def _refresh_poses(self) -> None:
         """Update groups and poses after a step or a merge, and clear cached beliefs and maps."""
-        self._topology = self._team.topology
+        self._topology = self.team.topology
         self.known_groups = self._topology.known_robots
-        self._team.team_poses(self.team_poses)
+        self.team.team_poses(self.team_poses)
         self._beliefs.clear()
         self._maps.clear()
         self._has_summaries = False
@@ -275,7 +250,7 @@ class TeamBelief:
 
     def _teammates(self, robot: int) -> tuple[Teammate, ...]:
         """Return a robot's teammates; those out of contact with their last known pose."""
-        team_poses, team = self.team_poses, self._team
+        team_poses, team = self.team_poses, self.team
         turn, goals = float(team_poses.starts[robot, 2]), self._known_goals()[robot]
         others = self._others(robot)
         covariances = [rotate_covariances(turn, team.pose(mate, robot).covariance) for mate in others]
@@ -316,8 +291,8 @@ class TeamBelief:
             group=group,
             pose=team_poses.own[robot],
             covariance=team_poses.covariances[robot],
-            particles=self._team.particles_from_start(robot),
-            log_weights=self._team.particles(robot)[1],
+            particles=self.team.particles_from_start(robot),
+            log_weights=self.team.particles(robot)[1],
             ess=float(team_poses.ess[robot]),
             grid=self._grids[robot].read_only_view(),
             candidates=self._make_candidates(robot),

@@ -92,6 +92,7 @@ class Episode:
         body: Hardware of the robots.
         belief: Beliefs of the team.
         ground_truth: Ground-truth association of the estimated landmarks.
+        coverage: Floor that the robots have seen, as of the last `team_metrics`.
         tick: Ticks since the reset.
         readings: Readings of the last tick; unset before `begin`.
         true_path: True poses (K, 3) after each tick, world frame; read-only.
@@ -136,7 +137,7 @@ class Episode:
         self.world, self.true_starts, self.belief_seed = scenario.world, scenario.true_starts, scenario.belief_seed
         self._simulator = Simulator(scenario.world, scenario.true_starts, self._config.robot_radius, TICK)
         self.ground_truth = scenario.new_ground_truth(self._config.map_error_cutoff)
-        self._coverage = CoverageTracker(scenario.coverage)
+        self.coverage = CoverageTracker(scenario.coverage)
         self._credits = RecallCredits(self._config.num_robots, len(self.ground_truth.true_positions))
         for name, state in scenario.stream_states.items():
             self._streams[name].bit_generator.state = state
@@ -185,11 +186,6 @@ class Episode:
             self._score(simulator.poses)
             self._metrics.error_integrals[:] += self._metrics.map_errors * TICK
 
-    @property
-    def overlap(self) -> float:
-        """Share of the floor seen by the team that at least two robots have seen, as of the last `team_metrics`."""
-        return self._coverage.overlap
-
     def estimated_poses(self) -> FloatArray:
         """Return the estimated poses (K, 3) [m, m, rad], moved by the true start poses to the world frame."""
         return compose(self.true_starts, self.estimated_path[-1])
@@ -205,9 +201,9 @@ class Episode:
         if self._gives_credit:
             self._credits.update(self.ground_truth.accurate)
             self._metrics.own_recalls[:] = self._credits.shares
-        coverage = self._coverage.update(belief.grids, poses, self._metrics.discovered)
+        coverage = self.coverage.update(belief.grids, poses, self._metrics.discovered)
         counts, metrics = (
-            RobotCounts(self._collisions, tuple(belief.exchange.sent)),
+            RobotCounts(self._collisions, tuple(belief.team.exchange.sent)),
             RobotMetrics(*[row.tolist() for row in self._metrics]),
         )
         beliefs = tuple(map(self._summary, range(len(poses)))) if with_beliefs else ()
@@ -224,7 +220,7 @@ class Episode:
             "streams": {name: stream.bit_generator.state for name, stream in self._streams.items()},
             "belief": self.belief.get_state(),
             "ground_truth": self.ground_truth.get_state(),
-            "coverage": self._coverage.get_state(),
+            "coverage": self.coverage.get_state(),
             "credits": self._credits.get_state(),
             "counts": (self._collisions, self._metrics.distances.copy(), self._metrics.error_integrals.copy()),
             "last": with_read_only((self.readings, self._frames)),
@@ -241,7 +237,7 @@ class Episode:
             self._streams[name].bit_generator.state = stream
         self.belief.set_state(state["belief"])
         self.ground_truth.set_state(state["ground_truth"])
-        self._coverage.set_state(state["coverage"])
+        self.coverage.set_state(state["coverage"])
         self._credits.set_state(state["credits"])
         self.tick = state["tick"]
         self._collisions, self._metrics.distances[:], self._metrics.error_integrals[:] = state["counts"]
@@ -308,7 +304,7 @@ class Episode:
         merged = True
         while merged:
             merged = False
-            for a, b in combinations(self.belief.groups, 2):
+            for a, b in combinations(self.belief.team.groups, 2):
                 robots = self.belief.representative(a), self.belief.representative(b)
                 if networks[robots[0]] != networks[robots[1]]:
                     continue
@@ -324,4 +320,4 @@ class Episode:
     def _true_ids(self, group: tuple[int, ...]) -> IntArray:
         """Return the true landmark of each row of a group's filter map."""
         robot = self.belief.representative(group)
-        return self.ground_truth.true_ids(robot, self.belief.filter_map(robot).ids)
+        return self.ground_truth.true_ids(robot, self.belief.team.map(robot).ids)
