@@ -109,12 +109,14 @@ def replay_team(
     for step in range(num_steps):
         seen = [own.measurements[step] for own in readings.robots]
         rows = [_true_landmark_rows(frame) for frame in seen]
-        names = rows if config.identities == "given" else None
+        identities = rows if config.identities == "given" else None
         given = seen if config.identities == "given" else [_alike(frame) for frame in seen]
         groups = {robot: group for group in team.groups for robot in group}
         maps = {group: team.map(group[0]) for group in team.groups}
         started = time.perf_counter()
-        report = team.step([own.odometry[step] if step else None for own in readings.robots], given, contacts, names)
+        report = team.step(
+            [own.odometry[step] if step else None for own in readings.robots], given, contacts, identities
+        )
         seconds += time.perf_counter() - started
         for _, attempt in report.rejuvenations:
             rejuvenations.add(attempt)
