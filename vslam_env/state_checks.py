@@ -6,17 +6,20 @@ from typing import Any
 import numpy as np
 
 from slam_backend.core import state_checks as check
+from slam_backend.core.state import accepted
 from slam_backend.fastslam.reports import LandmarkIdMap, LandmarksCreated
 from slam_backend.fastslam.state_checks import check_descriptors
 from slam_backend.frontend import StereoFrame
 from slam_backend.models.measurements import Measurements, TeamMeasurements
 from slam_backend.team.state_checks import TeamCheck
 from vslam_env.belief.readings import TeamReadings
+from vslam_env.belief.rendezvous import Rendezvous
 from vslam_env.belief.shared_grids import NEVER_MET, GridSnapshot, GridUpdate
 from vslam_env.belief.team_belief import merge_options
 from vslam_env.config import EnvConfig
-from vslam_env.evaluation.coverage import CoverageCells
+from vslam_env.evaluation.coverage import CoverageCells, CoverageTracker
 from vslam_env.evaluation.map_scores import UNUSED
+from vslam_env.evaluation.recall_credits import RecallCredits
 from vslam_env.evaluation.team_metrics import BeliefSummary, RobotCounts, RobotMetrics, TeamMetrics
 from vslam_env.navigation._grid_kernels import LARGEST_HALF_WIDTH as HALF_WIDTH
 from vslam_env.navigation._view_kernels import NUM_GAINS
@@ -80,15 +83,10 @@ class EpisodeCheck:
         check_streams(f"{name}['streams']", state["streams"])
         self._check_belief(f"{name}['belief']", state["belief"], scenario)
         self._check_ground_truth(f"{name}['ground_truth']", state["ground_truth"], scenario, state["belief"]["team"])
-        cells = len(scenario.coverage.cells)
-        check.keys(f"{name}['coverage']", state["coverage"], ("ever", "found"))
-        check.array(f"{name}['coverage']['ever']", state["coverage"]["ever"], check.BOOL, (cells,))
-        check.indices(f"{name}['coverage']['found']", state["coverage"]["found"], (count,), 0, cells)
         landmarks = int(np.count_nonzero(scenario.observable_landmarks))
-        check.keys(f"{name}['credits']", state["credits"], ("shares", "credited", "measured"))
-        check.floats(f"{name}['credits']['shares']", state["credits"]["shares"], (count,), 0.0, 1.0)
-        check.array(f"{name}['credits']['credited']", state["credits"]["credited"], check.BOOL, (landmarks,))
-        check.array(f"{name}['credits']['measured']", state["credits"]["measured"], check.BOOL, (count, landmarks))
+        sizes = {"K": count, "CELLS": len(scenario.coverage.cells), "LANDMARKS": landmarks}
+        for part, kind in (("coverage", CoverageTracker), ("credits", RecallCredits)):
+            accepted(kind, f"{name}[{part!r}]", dict(state[part]), sizes)
         (of_collisions, collisions), *others = check.named_items(f"{name}['counts']", state["counts"], 3)
         check.integers(of_collisions, collisions)
         check.sequence(of_collisions, collisions, count)
@@ -176,9 +174,7 @@ class EpisodeCheck:
         updates = {} if own is None else own.grid_updates
         self._check_grids(f"{name}['grids']", belief["grids"], updates)
         check_candidates(f"{name}['candidates']", belief["candidates"], self._count)
-        check.keys(f"{name}['rendezvous']", belief["rendezvous"], ("visited",))
-        visited = belief["rendezvous"]["visited"]
-        check.array(f"{name}['rendezvous']['visited']", visited, check.BOOL, (self._count, self._count))
+        accepted(Rendezvous, f"{name}['rendezvous']", dict(belief["rendezvous"]), {"K": self._count})
         check_goals(f"{name}['goals']", belief["goals"], self._count)
 
     def _check_grids(self, name: str, grids: Any, known: Mapping[int, GridUpdate]) -> None:

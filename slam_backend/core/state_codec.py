@@ -12,7 +12,7 @@ and do not overlap: a tree takes about as much memory as its file has bytes.
 import json
 import math
 import struct
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import fields, is_dataclass
 from enum import Enum
 from pathlib import Path
@@ -152,7 +152,7 @@ class _Writer:
         """Return the row of a value that has parts, after writing the rows of its parts."""
         if cls is np.ndarray:
             return self._array(value)
-        if cls is dict:
+        if isinstance(value, Mapping):
             row: list[Any] = ["dict"]
             for key, part in value.items():
                 row += (self._at(key, key), self._at(key, part))

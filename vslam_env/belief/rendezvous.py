@@ -1,13 +1,13 @@
 """Places for rendezvous: where maps are likely to overlap before a merge, and where loops can be closed after it."""
 
 import math
-from collections.abc import Mapping
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
 from slam_backend.core.jit import in_place, jit, stack_array
+from slam_backend.core.state import BOOL, Array, State
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.fastslam.relative_poses import OWN, SIGMAS, START, TeamPoses
 from vslam_env.navigation.candidates import NUM_RENDEZVOUS, LandmarkRows
@@ -34,6 +34,8 @@ class Rendezvous:
         num_robots: Number of robots K.
     """
 
+    STATE = State(visited=Array(BOOL, "K K"))
+
     def __init__(self, num_robots: int) -> None:
         self._visited = np.zeros((num_robots, num_robots), np.bool_)
 
@@ -58,14 +60,6 @@ class Rendezvous:
         if len(group) < len(visited):
             richest_place(*landmarks, places[RICHEST])
         return places
-
-    def get_state(self) -> dict[str, Any]:
-        """Return a copy of the complete state."""
-        return {"visited": self._visited.copy()}
-
-    def set_state(self, state: Mapping[str, Any]) -> None:
-        """Restore a state of `get_state`."""
-        self._visited = state["visited"].copy()
 
 
 @lru_cache(maxsize=256)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from slam_backend.core.read_only import as_read_only
+from slam_backend.core.state import accepted, restore, take
 from slam_backend.core.validation import Float32Array, FloatArray, argument_error
 from slam_backend.fastslam.options import FilterOptions
 from slam_backend.fastslam.relative_poses import TeamPoses
@@ -215,7 +216,7 @@ class TeamBelief:
             "team": self.team.get_state(),
             "grids": self._grids.get_state(),
             "candidates": self._candidates.get_state(),
-            "rendezvous": self._rendezvous.get_state(),
+            "rendezvous": take(self._rendezvous),
             "goals": self._goals.copy(),
         }
 
@@ -225,7 +226,7 @@ class TeamBelief:
         self._tick = state["tick"]
         self._grids.set_state(state["grids"])
         self._candidates.set_state(state["candidates"])
-        self._rendezvous.set_state(state["rendezvous"])
+        restore(self._rendezvous, accepted(Rendezvous, "state", state["rendezvous"]))
         self._goals = state["goals"].copy()
         self._refresh_poses()
 

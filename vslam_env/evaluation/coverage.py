@@ -1,6 +1,5 @@
 """Coverage of the free floor by the robots' occupancy grids, and each robot's share in its discovery."""
 
-from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -8,6 +7,7 @@ from numpy.typing import NDArray
 
 from slam_backend.core.jit import device, in_place
 from slam_backend.core.read_only import as_constant, as_read_only
+from slam_backend.core.state import INT64, Array, State
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.geometry import inverse, transform_points
 from vslam_env.navigation import FREE, TeamGrids, cell_of
@@ -142,6 +142,8 @@ class CoverageTracker:
         cells: Floor cells in the robots' grids.
     """
 
+    STATE = State(ever=Array(INT64, "CELLS", 0, 1), found=Array(INT64, "K"))
+
     def __init__(self, cells: CoverageCells) -> None:
         self._meter = cells
         count = len(cells.cells)
@@ -152,6 +154,7 @@ class CoverageTracker:
             fresh=np.zeros(1 + count, np.int32),
             found=np.zeros(len(cells.bounds) - 1, np.int64),
         )
+        self._ever, self._found = self._tally.ever, self._tally.found
         self._covered = 0
         self._began = False
 
@@ -183,13 +186,8 @@ class CoverageTracker:
         """Share of the floor seen by any robot that at least two robots see in their own grids; 0 if none is seen."""
         return int(np.count_nonzero(self._tally.seers > 1)) / max(self._covered, 1)
 
-    def get_state(self) -> dict[str, Any]:
-        """Return a copy of the state that cannot be recomputed from the grids."""
-        return {"ever": self._tally.ever > 0, "found": self._tally.found.copy()}
-
-    def set_state(self, state: Mapping[str, Any]) -> None:
-        """Restore a state of `get_state`; all else follows from the grids' changes."""
-        self._tally.ever[:], self._tally.found[:] = state["ever"], state["found"]
+    def rebuild(self) -> None:
+        """Look at all floor cells again; all else follows from the grids' changes."""
         self._tally.fresh[0] = -1
 
 

@@ -1,10 +1,8 @@
 """Credits of landmarks: which robot was the first of the team to hold each one well by its own measurement."""
 
-from collections.abc import Mapping
-from typing import Any
-
 import numpy as np
 
+from slam_backend.core.state import BOOL, FLOAT64, Array, State
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 
 
@@ -22,6 +20,10 @@ class RecallCredits:
     Attributes:
         shares: (K,) float64. Share of the observable landmarks credited to each robot.
     """
+
+    STATE = State(
+        shares=Array(FLOAT64, "K", 0.0, 1.0), credited=Array(BOOL, "LANDMARKS"), measured=Array(BOOL, "K LANDMARKS")
+    )  # fmt: skip
 
     def __init__(self, num_robots: int, num_landmarks: int) -> None:
         self.shares: FloatArray = np.zeros(num_robots)
@@ -43,15 +45,3 @@ class RecallCredits:
         self.shares += (first / np.maximum(claimants, 1)).sum(axis=1) / len(self._credited)
         self._credited |= claimants > 0
         self._measured[:] = False
-
-    def get_state(self) -> dict[str, Any]:
-        """Return a copy of the complete state."""
-        return {"shares": self.shares.copy(), "credited": self._credited.copy(), "measured": self._measured.copy()}
-
-    def set_state(self, state: Mapping[str, Any]) -> None:
-        """Restore a state of `get_state`."""
-        self.shares[:], self._credited, self._measured = (
-            state["shares"],
-            state["credited"].copy(),
-            state["measured"].copy(),
-        )

@@ -10,6 +10,7 @@ from weakref import ref
 import numpy as np
 
 from slam_backend.core.read_only import as_constant, with_constants, with_read_only
+from slam_backend.core.state import accepted, restore, take
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.geometry import between, compose
 from slam_backend.maps.alignment import Alignment
@@ -220,8 +221,8 @@ class Episode:
             "streams": {name: stream.bit_generator.state for name, stream in self._streams.items()},
             "belief": self.belief.get_state(),
             "ground_truth": self.ground_truth.get_state(),
-            "coverage": self.coverage.get_state(),
-            "credits": self._credits.get_state(),
+            "coverage": take(self.coverage),
+            "credits": take(self._credits),
             "counts": (self._collisions, self._metrics.distances.copy(), self._metrics.error_integrals.copy()),
             "last": with_read_only((self.readings, self._frames)),
             "paths": (tuple(self.true_path), tuple(self.estimated_path), tuple(self.merge_ticks)),
@@ -237,8 +238,8 @@ class Episode:
             self._streams[name].bit_generator.state = stream
         self.belief.set_state(state["belief"])
         self.ground_truth.set_state(state["ground_truth"])
-        self.coverage.set_state(state["coverage"])
-        self._credits.set_state(state["credits"])
+        restore(self.coverage, accepted(CoverageTracker, "state", state["coverage"]))
+        restore(self._credits, accepted(RecallCredits, "state", state["credits"]))
         self.tick = state["tick"]
         self._collisions, self._metrics.distances[:], self._metrics.error_integrals[:] = state["counts"]
         self.readings, self._frames = with_constants(state["last"])

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from builders.environments import MEETING, scored, small_env, standing_at, turning
 
+from slam_backend.core.state import restore, take
 from slam_backend.core.validation import IntArray
 from slam_backend.fastslam.reports import (
     Associations,
@@ -251,7 +252,7 @@ def test_newly_covered_cells_agree_with_a_plain_count() -> None:
             pose = np.append(rng.uniform(-3.0, 3.0, 2), rng.uniform(-3.0, 3.0))
             grid.update_from_scan(pose, rng.uniform(0.5, 3.0, 32), angles)
         if turn == 30:
-            coverage.set_state(coverage.get_state())
+            restore(coverage, take(coverage))
         positions = rng.uniform(0.0, 8.0, (3, 2))
         said = np.empty(3)
         share = coverage.update(team, positions, said)
