@@ -224,8 +224,8 @@ class _Log:
             infos=tuple(dict(self._infos[agent]) for agent in self._agents),
             own_maps=tuple(maps[robot] for robot in range(len(self._agents))),
             alone_until=tuple(self._alone_until.get(robot) for robot in range(len(self._agents))),
-            map_claims=tuple(ground_truth.true_ids(robot, own.map.ids) for robot, own in last.items()),
-            maps=tuple(own.map for own in last.values()), true_landmarks=self._env.true_landmarks,
+            map_claims=tuple(ground_truth.true_ids(robot, belief.map.ids) for robot, belief in last.items()),
+            maps=tuple(belief.map for belief in last.values()), true_landmarks=self._env.true_landmarks,
             consistency=tuple(map(self._env.episode.belief.team.consistency, last)), scene=self._env.scene(),
             complete=not self._env.agents,
         )  # fmt: skip

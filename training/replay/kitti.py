@@ -135,5 +135,5 @@ def find_loop(truth: FloatArray) -> tuple[int, int] | None:
 
 def summarise(result: OneReplay, scored: DriveScore | None) -> dict[str, Any]:
     """Return the content of `metrics.json`; unknown values are NaN, including errors of the map."""
-    own = drive_metrics(scored, "dead_reckoning") | {"loop_error_m": scored.loop_error if scored else float("nan")}
-    return metrics_of(result, scored.scores if scored else None, own)
+    figures = drive_metrics(scored, "dead_reckoning") | {"loop_error_m": scored.loop_error if scored else float("nan")}
+    return metrics_of(result, scored.scores if scored else None, figures)

@@ -8,6 +8,7 @@ import pytest
 from builders.environments import MEETING, small_env, turning
 from builders.kernels import python_entry
 
+from slam_backend.core.state import restore, take
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.fastslam.relative_poses import TeamPoses
 from slam_backend.geometry import compose, inverse
@@ -466,7 +467,7 @@ def test_rendezvous_before_and_after_merges() -> None:
     np.testing.assert_allclose(places[2, :2], expected[1, :2], atol=1e-9)
     assert np.isnan(places[3]).all()
     other = Rendezvous(3)
-    other.set_state(rendezvous.get_state())
+    restore(other, take(rendezvous))
     lost = np.array([1, 0, 1])
     for each in (rendezvous, other):
         places = each.update(0, team_poses, (0, 1, 2), lost, landmarks)
