@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 from agents.policy import Policy
 from slam_backend.core.validation import FloatArray, IntArray
 from vslam_env.belief.team_belief import Belief, Candidates
-from vslam_env.navigation import CandidateKind, distance_map, follow_path, plan_path
+from vslam_env.navigation import CandidateKind, distance_map
+from vslam_env.navigation.driver import Driver
+from vslam_env.navigation.planning import MAX_SPEED, MAX_TURN
 
 SWITCH_RATIO = 0.5  # switch goals if the path is shorter than this share of the remaining path
 REPLAN_TICKS = 10
 FAR_SHARE = 0.3  # share of the reachable cells, farthest first, from which patrol goals are drawn
 ARRIVED = 0.5  # [m]
-MAX_SPEED, MAX_TURN = 1.0, 1.5  # [m/s], [rad/s]: speeds of a continuous action of 1
 UNREACHABLE = np.iinfo(np.int32).max  # unreachable, in `DistanceMap.cost`
 STAY, AHEAD, LEFT, RIGHT = 0, 1, 2, 3  # discrete actions
 SWEEP = 0.6  # [rad] to each side: walls of a corridor are seen within 60 degrees of incidence only if the camera turns
@@ -76,27 +77,27 @@ class DrivingPolicy:
         """Clear the state of the last episode."""
         self._chooser.reset()
         self._patrol: FloatArray | None = None
-        self._path: FloatArray | None = None
-        self._heading: float | None = None
+        self._driver = Driver()
         self._age = REPLAN_TICKS
 
     @property
     def goal(self) -> FloatArray | None:
         """(2,) float64 [m]. Place to which the robot drives, start frame; None: there is none."""
-        return None if self._path is None else self._path[-1]
+        path = self._driver.path
+        return None if path is None else path[-1]
 
     def act(self, observation: Any, belief: Belief, rng: np.random.Generator) -> int | NDArray[np.float32]:
         """Return the action that drives towards the goal."""
         self._age += 1
-        if self._path is None or self._age >= REPLAN_TICKS:
+        if self._driver.path is None or self._age >= REPLAN_TICKS:
             self._plan(observation, belief, rng)
-        if self._path is None:
+        if self._driver.path is None:
             speed, turn = 0.0, MAX_TURN  # turn on the spot until free floor is seen
         else:
             aside = 0.0
             if self._sweeps:
                 aside = SWEEP if belief.tick % (2 * SWEEP_TICKS) < SWEEP_TICKS else -SWEEP
-            speed, turn = follow_path(belief.pose, self._path, MAX_SPEED, MAX_TURN, self._heading, aside)
+            speed, turn = self._driver.command(belief.pose, belief.grid, aside=aside)
         if self._discrete:
             if abs(turn) >= TURN_FIRST or (speed == 0.0 and turn != 0.0):
                 return LEFT if turn > 0.0 else RIGHT
@@ -108,28 +109,28 @@ class DrivingPolicy:
         self._age = 0
         action = self._chooser.act(observation, belief, rng)
         slot = action - 1
-        goal: FloatArray | None
+        goal: tuple[FloatArray, float | None] | None
         if action > 0:
-            goal, self._heading = belief.candidates.goals[slot], float(belief.candidates.headings[slot])
+            goal = belief.candidates.goals[slot], float(belief.candidates.headings[slot])
         else:
             here = belief.pose[:2]
             if self._patrol is None or np.linalg.norm(self._patrol - here) < ARRIVED:
                 self._patrol = patrol_goal(belief, rng)
-            goal, self._heading = self._patrol, None
-        self._path = None if goal is None else plan_path(belief.grid, belief.pose[:2], goal)
-        if self._path is None:
+            goal = None if self._patrol is None else (self._patrol, None)
+        self._driver.set_goal(goal, belief.pose, belief.grid)
+        if self._driver.path is None:
             self._patrol = None
         elif action == 0:
-            self._patrol = self._path[-1]  # the nearest reachable point, if a wall was discovered at the goal
+            self._patrol = self.goal  # the nearest reachable point, if a wall was discovered at the goal
 
 
 def own_share(belief: Belief, slots: IntArray) -> IntArray:
     """Return those of the slots to which no teammate is nearer, in a straight line; all of them if there are none."""
     candidates = belief.candidates
-    mates = np.array([mate.pose[:2] for mate in belief.teammates]).reshape(-1, 2)
-    gaps = np.linalg.norm(candidates.goals[slots, None] - mates[None], axis=-1)
-    own = slots[(gaps >= candidates.lengths[slots, None]).all(axis=1)]
-    return own if len(own) else slots
+    positions = np.array([mate.pose[:2] for mate in belief.teammates]).reshape(-1, 2)
+    gaps = np.linalg.norm(candidates.goals[slots, None] - positions[None], axis=-1)
+    nearer = slots[(gaps >= candidates.lengths[slots, None]).all(axis=1)]
+    return nearer if len(nearer) else slots
 
 
 def nearest_own_frontiers(belief: Belief, most: int) -> IntArray:

@@ -76,13 +76,13 @@ def _find(name: str) -> Any:
     module, _, factory = name.partition(":")
     try:
         with _current_folder_first(), _one_line(module):
-            found = import_module(module)
+            imported = import_module(module)
     except ModuleNotFoundError as error:
         hint = "Name an installed module, or change into the folder that contains it."
         raise argument_error("policy", EXPECTED, f"no module {module!r}", hint) from error
-    made = getattr(found, factory, None)
+    made = getattr(imported, factory, None)
     if not callable(made):
-        hint = did_you_mean(factory, vars(found)) + "Check the name."
+        hint = did_you_mean(factory, vars(imported)) + "Check the name."
         raise argument_error("policy", EXPECTED, f"no class or function {factory!r} in {module}", hint)
     if not _may_make_policies(made):
         raise argument_error("policy", EXPECTED, f"no policy factory: {name}", NEEDED)

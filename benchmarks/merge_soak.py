@@ -117,7 +117,7 @@ def play_environment(seed: int, cycles: int, setting: Setting) -> RunOutcomes:
     rng = np.random.default_rng([seed, 18])
     policies = [make_policy("frontier", env.config.action_type) for _ in env.possible_agents]
     observations, _ = env.reset(seed=seed)
-    follower = Follower(env.episode.belief._team, env.episode.ground_truth, env.true_start_poses)
+    follower = Follower(env.episode.belief.team, env.episode.ground_truth, env.true_start_poses)
     while env.agents:
         if setting.forced and not env.events:
             force(env, rng, setting.shift)
@@ -141,7 +141,7 @@ def play_world(world: str, seed: int, setting: Setting) -> RunOutcomes:
     def note(progress: Progress) -> None:
         nonlocal follower
         if follower is None:
-            follower = Follower(env.episode.belief._team, env.episode.ground_truth, env.true_start_poses)
+            follower = Follower(env.episode.belief.team, env.episode.ground_truth, env.true_start_poses)
         else:
             follower.note(env.episode.tick - 1)
 
@@ -217,7 +217,7 @@ def play_aisles(seed: int, cycles: int, setting: Setting) -> RunOutcomes:
 def force(env: ExplorationEnv, rng: np.random.Generator, shift: float | None) -> None:
     """Force a wrong merge of robots 0 and 1, if their maps are large enough."""
     belief, ground_truth = env.episode.belief, env.episode.ground_truth
-    map_a, map_b = belief.filter_map(0), belief.filter_map(1)
+    map_a, map_b = belief.team.map(0), belief.team.map(1)
     if min(len(map_a), len(map_b)) < ENOUGH:
         return
     ground_truth.merge(belief.merge(0, 1, forced_alignment(env.true_start_poses, map_a, map_b, rng, shift)))

@@ -28,8 +28,8 @@ def check_package(name: str) -> None:
     Raises:
         ValueError: If Python would load another module, or none.
     """
-    found = find_spec(name)
-    file = None if found is None else Path(found.origin or next(iter(found.submodule_search_locations or ()), ""))
+    spec = find_spec(name)
+    file = None if spec is None else Path(spec.origin or next(iter(spec.submodule_search_locations or ()), ""))
     if file is None or file.resolve() != FOLDER / name / "__init__.py":
         place = "no module" if file is None else repr(str(file.parent if file.name == "__init__.py" else file))
         hint = "Rename the latter, or call vslam from another folder, or install it into an environment of its own."

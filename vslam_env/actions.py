@@ -8,8 +8,9 @@ from gymnasium import spaces
 
 from slam_backend.core.validation import FloatArray, argument_error, check_array
 from vslam_env.belief.observation import NUM_ACTIONS
+from vslam_env.navigation.planning import MAX_SPEED, MAX_TURN
 
-MAX_SPEED, MAX_REVERSE, MAX_TURN = 1.0, 0.3, 1.5  # [m/s], [m/s], [rad/s]
+MAX_REVERSE = 0.3  # [m/s]
 DISCRETE_COMMANDS = ((0.0, 0.0), (MAX_SPEED, 0.0), (0.0, MAX_TURN), (0.0, -MAX_TURN))  # stay ahead left right
 PAIR_HINT = "Give (speed, turn) in [-1, 1]."
 CLIP_HINT = f"{PAIR_HINT} Clip what a learner draws: gymnasium.wrappers.ClipAction, or clip_actions_v0 of SuperSuit."

@@ -335,10 +335,10 @@ class EnvConfig:
     @classmethod
     def _of_file(cls, values: dict[str, Any]) -> Self:
         """Build a configuration from the content of a TOML file, or raise if its format differs."""
-        found = values.pop("format", FORMAT)
-        if type(found) is not int or found != FORMAT:
+        number = values.pop("format", FORMAT)
+        if type(number) is not int or number != FORMAT:
             hint = "Use the release that wrote it, or set the values again."
-            raise argument_error("config", f"one of format {FORMAT}", f"a configuration of format {found!r}", hint)
+            raise argument_error("config", f"one of format {FORMAT}", f"a configuration of format {number!r}", hint)
         return cls.from_dict(with_none(values))
 
     def to_toml(self) -> str:

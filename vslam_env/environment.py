@@ -45,7 +45,67 @@ LATER = ("slam_backend.smoother.", "slam_backend.maps.", "slam_backend.team.")
 class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # PettingZoo has no type information
     """Multi-robot exploration of a building: robots with unknown starts build maps and merge them after alignment.
 
-    See `vslam_v0.parallel_env` for the arguments and `vslam_env.belief.observation` for the observations.
+    Numbers are the defaults of `EnvConfig`; `vslam_v0.parallel_env` takes the most common options as arguments. A tick
+    is 0.1 s, a step `decision_ticks` ticks: 1, or 10 with `goal` actions.
+
+    **World.** Each reset draws walls from the world family, landmarks on all wall faces (1.4 per metre, each with a
+    descriptor), starts at least 5 m apart without a shared view, and a bias of each robot's odometry. A robot is a disc
+    of 0.2 m radius with odometry, a camera that measures up to 5 landmarks per tick within 8 m, a range scan and a bump
+    sensor; all but the last are noisy. It does not know where the others started: each group of robots has a filter
+    and a map of its own, and groups in contact merge once their maps can be aligned.
+
+    **Actions.** Out-of-space actions raise an error before anything moves.
+
+    | `action_type` | space | meaning |
+    |---|---|---|
+    | `continuous` | `Box(-1, 1, (2,), float32)` | speed, -1: 0.3 m/s back, 1: 1 m/s ahead; turn, 1: 1.5 rad/s left |
+    | `discrete` | `Discrete(4)` | 0 stay, 1 ahead at 1 m/s, 2 turn left, 3 turn right at 1.5 rad/s |
+    | `goal` | `Discrete(33)` | 0 stay, k: drive to the last observation's candidate k - 1; acts as 0 where masked |
+
+    **Observations** are float32 unless said, in estimated frames, and depend on the robot's own readings and received
+    messages alone. The start frame is the robot's start pose; the robot frame has x ahead and y to the left.
+
+    | key | shape | content | bounds |
+    |---|---|---|---|
+    | `pose` | (3,) | x, y [m], theta [rad], start frame | +-400, pi |
+    | `pose_std` | (3,) | one sigma of each [m, m, rad] | 400, pi |
+    | `map_stats` | (6,) | landmarks; mean, largest sigma [m]; mean count; ESS/M; group size | 1e4, 10, 10, 1e4, 1, 8 |
+    | `local_grid` | (3, 48, 48) uint8 | free, occupied, landmarks; cells of 0.2 m, robot heading up | 0, 255 |
+    | `scan` | (32,) | ranges from right to left over the camera's field of view [m] | 0, 8 |
+    | `candidates` | (32, 17) | columns `CANDIDATE_FEATURES`, robot frame; zeros in empty slots | +-400 |
+    | `teammates` | (7, 5) | x, y [m], cos and sin of the heading, robot frame; one sigma of the position [m] | +-400 |
+    | `teammates_mask` | (7,) int8 | which rows hold a robot of the same group | 0, 1 |
+    | `landmark_counts` | (5,) | landmarks measured up to 2, 4, 8, 16, and more times | 0, 10000 |
+    | `time_left` | (1,) | until the episode is truncated [s] | 0, 1e6 |
+    | `global_grid` | (3, 48, 48) uint8 | shares of free, occupied and looked-at cells of all that was seen | 0, 255 |
+    | `global_grid_frame` | (3,) | x, y of its middle, start frame, and size of its cells [m] | +-400 |
+    | `action_mask` | (33,) int8 | `goal` actions only: which actions are valid | 0, 1 |
+
+    Rows of `teammates` belong to the other robots in ascending order, whatever their group; rows of robots outside the
+    group are zero. The sigma of a landmark is the root of its mean variance. Values are clipped to the bounds.
+
+    **Reward.** By default the decrease [m] of the robot's map error E, which compares its map in its own start frame
+    with the true landmarks and charges missed, false and duplicate ones (`slam_backend.metrics.map_error`): a map that
+    gets better pays, a wrong merge costs, and an episode returns the first E minus the last. `vslam_env.reward` has
+    further terms.
+
+    **End.** All agents truncate together after `max_cycles` steps, which are 100 s. They terminate together if
+    `stop_at_recall` is set and the map of each robot has that share of the landmarks.
+
+    >>> from vslam_env import vslam_v0
+    >>> env = vslam_v0.parallel_env("hall", num_robots=2, max_seconds=0.3)
+    >>> observations, infos = env.reset(seed=1)
+    >>> while env.agents:
+    ...     actions = {agent: env.action_space(agent).sample() for agent in env.agents}
+    ...     observations, rewards, terminations, truncations, infos = env.step(actions)
+    >>> truncations
+    {'robot_0': True, 'robot_1': True}
+
+    Args:
+        config: Configuration of the environment.
+        world: World or source of worlds; None: that of the configuration.
+        reward: Weights of terms by name, or custom terms; None: those of the configuration.
+        render_mode: `"human"`, `"rgb_array"` or None.
 
     Attributes:
         config: Configuration of the environment.
@@ -76,7 +136,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
             check_choice("render_mode", render_mode, RENDER_MODES, "Choose one of these, or None.")
         self.render_mode = render_mode
         self.max_cycles = config.num_cycles
-        self._tap = ReadingsHook()  # separate object, so that an episode does not keep its environment alive
+        self._hook = ReadingsHook()  # separate object, so that an episode does not keep its environment alive
         self._source: WorldSource = config.world if world is None else world
         check_source(self._source)
         if config.world_split is not None and is_single_layout(self._source):
@@ -144,11 +204,11 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
             scenario = sample_scenario(
                 self.config, self._source, root.spawn(1)[0], world_seed, options.get("start_poses")
             )
-        episode = Episode(self.config, scenario, self._tap)
+        episode = Episode(self.config, scenario, self._hook)
         episode.begin()
         metrics = episode.team_metrics(self._reads_beliefs)
         self._is_whole = False
-        self._root, self._episode, self._drivers = root, episode, ActionExecutor(self.config)
+        self._root, self._episode, self._executor = root, episode, ActionExecutor(self.config)
         self._team_metrics = metrics
         self.agents = self.possible_agents[:]
         self._cycle = 0
@@ -189,7 +249,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         agents = self.agents
         chosen = checked_actions(actions, agents, self.config.action_type)
         self._is_whole = False
-        invalid = self._drivers.execute(episode, chosen)
+        invalid = self._executor.execute(episode, chosen)
         before = self._team_metrics
         self._team_metrics = episode.team_metrics(self._reads_beliefs)
         self._cycle += 1
@@ -270,7 +330,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
     @property
     def events(self) -> tuple[MergeEvent, ...]:
         """All merge attempts, merges and rollbacks since the reset, in order."""
-        return self._running_episode("events").belief.events
+        return self._running_episode("events").belief.team.events
 
     @property
     def readings(self) -> tuple[Readings, ...]:
@@ -305,13 +365,13 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
     @property
     def recorder(self) -> Recorder | None:
         """Callback for the readings of every tick, including the reset; may be assigned."""
-        return self._tap.recorder
+        return self._hook.recorder
 
     @recorder.setter
     def recorder(self, recorder: Recorder | None) -> None:
         if recorder is not None and not callable(recorder):
             raise argument_error("recorder", "a function or None", recorder, "It receives a tuple of Readings.")
-        self._tap.recorder = recorder
+        self._hook.recorder = recorder
 
     @property
     def max_cycles(self) -> int:
@@ -348,7 +408,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
             "agents": tuple(self.agents),
             "cycle": 0 if episode is None else self._cycle,
             "episode": None if episode is None else episode.get_state(),
-            "drivers": [] if episode is None else self._drivers.get_state(),
+            "drivers": [] if episode is None else self._executor.get_state(),
             "team_metrics": None if episode is None else self._team_metrics,
         }
 
@@ -371,10 +431,10 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         if scenario is None:
             self._episode = None
         else:
-            self._episode = Episode(self.config, scenario, self._tap) if episode is None else episode
+            self._episode = Episode(self.config, scenario, self._hook) if episode is None else episode
             self._episode.set_state(state["episode"], scenario)
-            self._drivers = ActionExecutor(self.config)
-            self._drivers.set_state(state["drivers"])
+            self._executor = ActionExecutor(self.config)
+            self._executor.set_state(state["drivers"])
             self._team_metrics, self._cycle, self.agents = state["team_metrics"], state["cycle"], list(state["agents"])
         self._is_whole = True
 
@@ -490,7 +550,7 @@ def build_observations(
         flat: Whether an observation is one vector instead of named arrays.
 
     Returns:
-        New arrays by name, see `vslam_env.belief.observation`; if flat, one vector, or with masked actions
+        New arrays by name, see `ExplorationEnv`; if flat, one vector, or with masked actions
         `{"observation", "action_mask"}`.
     """
     if not isinstance(readings, TeamReadings):

@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import repeat
-from operator import add, mul, sub
+from operator import add, attrgetter, mul, sub
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from slam_backend.core.validation import argument_error, check_array, check_float, choice_error
 from vslam_env.evaluation.information import information
-from vslam_env.evaluation.team_metrics import RobotMetrics, TeamMetrics
+from vslam_env.evaluation.team_metrics import TeamMetrics
 
 __all__ = [
     "COSTS", "POTENTIALS", "RUNNING_COST", "TERMS", "RewardSpec", "RewardTerm", "TeamMetrics", "evaluate",
@@ -61,14 +61,14 @@ class _NamedTerm:
 
 def _rise_of(name: str) -> RewardFunction:
     """Return a reward function: the increase of a metric."""
-    row = RobotMetrics._fields.index(name)
-    return lambda before, after: list(map(sub, after.per_robot[row], before.per_robot[row]))
+    row = attrgetter(name)
+    return lambda before, after: list(map(sub, row(after.per_robot), row(before.per_robot)))
 
 
 def _fall_of(name: str) -> RewardFunction:
     """Return a reward function: the decrease of a metric."""
-    row = RobotMetrics._fields.index(name)
-    return lambda before, after: list(map(sub, before.per_robot[row], after.per_robot[row]))
+    row = attrgetter(name)
+    return lambda before, after: list(map(sub, row(before.per_robot), row(after.per_robot)))
 
 
 def _map_error_squared(before: TeamMetrics, after: TeamMetrics) -> list[float]:

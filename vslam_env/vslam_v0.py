@@ -43,7 +43,9 @@ def parallel_env(
     world_split: str | None = None,
     shared_reward: bool | None = None,
 ) -> ExplorationEnv:
-    """Make the parallel environment. Arguments that are None keep the value of the configuration or preset.
+    """Make the parallel environment, see `ExplorationEnv` for the task.
+
+    Arguments that are None keep the value of the configuration or preset.
 
     Args:
         world: `"office"` (default), `"maze"`, `"loops"`, `"hall"`, `"rooms"`, `"campus"`, `"fig5"`; the path of a floor
@@ -52,8 +54,7 @@ def parallel_env(
         num_robots: Number of robots, 1 to 8; default 3.
         sensor: `"landmark"` (default): simulated measurements. `"stereo"`: rendered images of textured walls, measured
             by the stereo front end.
-        action_type: `"continuous"` (default): (speed, turn) in [-1, 1], zeros stop. `"discrete"`: stay, ahead,
-            left, right. `"goal"`: 0 to stay, 1 to 32 to drive to a candidate of the last observation.
+        action_type: `"continuous"` (default), `"discrete"` or `"goal"`.
         decision_ticks: Ticks of 0.1 s per step; default 1, or 10 with `goal`.
         num_particles: Number of particles of each filter; default 100.
         max_cycles: Number of steps after which the episode is truncated; default: as many as `max_seconds` takes.

@@ -36,7 +36,8 @@ class DOptimality:
             self._held = None
             return None
         now = LEAST + float(d_optimality(belief.covariance + 1e-12 * np.eye(3)))
-        ahead = np.array([LEAST + d_optimality(found).mean() for found in predict_covariances(belief, slots)])
+        covariances = predict_covariances(belief, slots)
+        ahead = np.array([LEAST + d_optimality(along_path).mean() for along_path in covariances])
         lengths = np.where(slots == self._held, SWITCH_RATIO, 1.0) * candidates.lengths[slots]
         values = (0.5 + candidates.gains.unknown_area[slots]) / (REACH + lengths) * now / ahead
         self._held = int(slots[np.argmax(values)])

@@ -17,14 +17,14 @@ def distance_advantage(targets: Targets, rng: np.random.Generator) -> IntArray:
     """Return the target (K,) of each robot."""
     assigned = np.zeros(len(targets.lengths), np.int64)
     for robot in range(targets.num_deciding):
-        own, costs = advantage_costs(targets, robot)
-        if len(own):
-            assigned[robot] = own[np.argmin(costs)]
+        share, costs = advantage_costs(targets, robot)
+        if len(share):
+            assigned[robot] = share[np.argmin(costs)]
     return assigned
 
 
 def advantage_costs(targets: Targets, robot: int) -> tuple[IntArray, FloatArray]:
     """Return the targets (m,) int64 left to a robot, and the cost of each (m,) float64 [m]."""
-    own = targets.share(robot)
+    share = targets.share(robot)
     remoteness = targets.between.sum(axis=1) / max(1, len(targets.places) - 1)
-    return own, targets.lengths[robot, own] - REMOTENESS * remoteness[own]
+    return share, targets.lengths[robot, share] - REMOTENESS * remoteness[share]

@@ -22,8 +22,8 @@ def hungarian(targets: Targets, rng: np.random.Generator) -> IntArray:
     costs = np.where(robot_rooms[:, None] == rooms, SAME_ROOM * costs, costs)
     in_room, assigned = rooms[assign_all(costs)], np.full(len(costs), -1)
     for room in np.unique(in_room):
-        robots, own = np.flatnonzero(in_room == room), np.flatnonzero(target_rooms == room)
-        assigned[robots] = own[assign_all(targets.lengths[np.ix_(robots, own)])]
+        robots, targets_there = np.flatnonzero(in_room == room), np.flatnonzero(target_rooms == room)
+        assigned[robots] = targets_there[assign_all(targets.lengths[np.ix_(robots, targets_there)])]
     return assigned
 
 

@@ -17,7 +17,7 @@ def mtsp(targets: Targets, rng: np.random.Generator) -> IntArray:
     owners = share_places(targets.lengths, targets.between)
     assigned: IntArray = targets.lengths.argmin(axis=1)
     for robot, ways in enumerate(targets.lengths[: targets.num_deciding]):
-        own = np.flatnonzero(owners == robot)
-        if len(own):
-            assigned[robot] = own[open_tour(ways[own], targets.between[np.ix_(own, own)])[0]]
+        share = np.flatnonzero(owners == robot)
+        if len(share):
+            assigned[robot] = share[open_tour(ways[share], targets.between[np.ix_(share, share)])[0]]
     return assigned

@@ -68,8 +68,8 @@ def decide(belief: Belief, held: int | None) -> tuple[int | None, FloatArray]:
     if (can_reach & (candidates.kinds == CandidateKind.FRONTIER)).any():
         targets = own_targets(belief, held)
         assert targets is not None  # there is a frontier
-        own, costs = advantage_costs(targets, 0)
-        frontiers = targets.slots[0, own]
+        share, costs = advantage_costs(targets, 0)
+        frontiers = targets.slots[0, share]
         is_own = bool((targets.lengths.argmin(axis=0) == 0).any())
     if not is_own:
         rates, allowed = view_rates(belief, held), _left_views(belief, can_reach)

@@ -38,11 +38,11 @@ def predict_covariances(belief: Belief, slots: IntArray) -> list[FloatArray]:
     information = _information(np.concatenate(poses), ways, held.means[:, :2], held.covariances[:, :2, :2])
     # All paths advance together; shorter ones stay at their goals.
     longest = max(map(len, poses))
-    all_poses = np.stack([np.vstack([own, np.repeat(own[-1:], longest - len(own), axis=0)]) for own in poses])
+    all_poses = np.stack([np.vstack([ahead, np.repeat(ahead[-1:], longest - len(ahead), axis=0)]) for ahead in poses])
     gained = np.zeros((len(poses), longest, 3, 3))
     starts = np.cumsum([0, *map(len, poses)])
-    for k, own in enumerate(poses):
-        gained[k, : len(own)] = information[starts[k] : starts[k + 1]]
+    for k, ahead in enumerate(poses):
+        gained[k, : len(ahead)] = information[starts[k] : starts[k + 1]]
     before = np.concatenate([np.repeat(belief.pose[None, None], len(poses), axis=0), all_poses[:, :-1]], axis=1)
     jacobians, noise = _motions(before, all_poses)
     transposed = np.ascontiguousarray(jacobians.swapaxes(-1, -2))
@@ -53,7 +53,7 @@ def predict_covariances(belief: Belief, slots: IntArray) -> list[FloatArray]:
         covariance = np.asarray(np.linalg.inv(np.linalg.inv(covariance) + gained[:, step]), dtype=np.float64)
         covariance = np.asarray(0.5 * (covariance + covariance.transpose(0, 2, 1)), dtype=np.float64)
         together[:, step] = covariance
-    return [together[k, : len(own)] for k, own in enumerate(poses)]
+    return [together[k, : len(ahead)] for k, ahead in enumerate(poses)]
 
 
 def _information(poses: FloatArray, ways: DistanceMap, landmarks: FloatArray, covariances: FloatArray) -> FloatArray:

@@ -40,7 +40,7 @@ class RbpfGain:
             self._held = None
             return None
         before = np.linalg.slogdet(belief.covariance + 1e-12 * np.eye(3))[1]
-        after = np.linalg.slogdet([found[-1] for found in predict_covariances(belief, slots)])[1]
+        after = np.linalg.slogdet([covariances[-1] for covariances in predict_covariances(belief, slots)])[1]
         lengths = np.where(slots == self._held, SWITCH_RATIO, 1.0) * candidates.lengths[slots]
         gains = MAP_WEIGHT * AREA_NATS * candidates.gains.unknown_area[slots] + 0.5 * (before - after)
         self._held = int(slots[np.argmax(gains - COST * lengths)])

@@ -23,14 +23,14 @@ def tare(targets: Targets, rng: np.random.Generator) -> IntArray:
     covers = sees(targets.ways, targets.places, frontier_cells(targets.ways), COVER_RANGE)
     assigned: IntArray = targets.lengths.argmin(axis=1)
     for robot, ways in enumerate(targets.lengths[: targets.num_deciding]):
-        own = targets.share(robot)
-        if not len(own):
+        share = targets.share(robot)
+        if not len(share):
             continue
-        own_covers = covers[own]
-        own_covers = own_covers[:, own_covers.any(axis=0)]  # few of all cells, which shortens the draws
+        share_covers = covers[share]
+        share_covers = share_covers[:, share_covers.any(axis=0)]  # few of all cells, which shortens the draws
         shortest = np.inf
-        for _ in range(DRAWS if len(own) > 1 else 1):
-            drawn = own[draw_cover(own_covers, rng)]
+        for _ in range(DRAWS if len(share) > 1 else 1):
+            drawn = share[draw_cover(share_covers, rng)]
             pairs = targets.between[np.ix_(drawn, drawn)]
             tour = open_tour(ways[drawn], pairs)
             length = tour_length(tour, ways[drawn], pairs)

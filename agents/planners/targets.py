@@ -52,8 +52,8 @@ class Targets:
     @cached_property
     def between(self) -> FloatArray:
         """(n, n) float64 [m]. Lengths of the paths between the goals, symmetric; `NO_PATH`: none is known."""
-        found = np.minimum(lengths_between(self.ways, self.places, self.places), NO_PATH)
-        both = np.minimum(found, found.T)  # a path may differ from its reverse by a few centimetres
+        lengths = np.minimum(lengths_between(self.ways, self.places, self.places), NO_PATH)
+        both = np.minimum(lengths, lengths.T)  # a path may differ from its reverse by a few centimetres
         np.fill_diagonal(both, 0.0)
         return both
 
@@ -99,9 +99,9 @@ def own_targets(belief: Belief, held: int | None) -> Targets | None:
     lengths = np.where(np.isfinite(lengths), lengths, straight)  # a teammate whose place is known inaccurately
     if held is not None:
         lengths[0, slots == held] *= SWITCH_RATIO
-    own = np.full(lengths.shape, -1)
-    own[0] = slots
-    return Targets(ways, positions, places, lengths, own, 1)
+    slots_of = np.full(lengths.shape, -1)
+    slots_of[0] = slots
+    return Targets(ways, positions, places, lengths, slots_of, 1)
 
 
 def team_targets(beliefs: Sequence[Belief], held: Mapping[int, int | None]) -> Targets | None:
@@ -119,12 +119,12 @@ def team_targets(beliefs: Sequence[Belief], held: Mapping[int, int | None]) -> T
         first_from_own = compose(first.start_from_group, inverse(belief.start_from_group))
         positions.append(transform_points(first_from_own, belief.pose[None, :2])[0])
         slots = _nearest(belief)
-        found = transform_points(first_from_own, belief.candidates.goals[slots])
-        gaps = np.linalg.norm(places - found[:, None], axis=-1)  # to the frontiers of the robots before
+        goals = transform_points(first_from_own, belief.candidates.goals[slots])
+        gaps = np.linalg.norm(places - goals[:, None], axis=-1)  # to the frontiers of the robots before
         for i, slot in enumerate(slots):
             target = int(gaps[i].argmin()) if gaps.shape[1] and gaps[i].min() < SAME_TARGET else len(places)
             if target == len(places):
-                places = np.vstack([places, found[i]])
+                places = np.vstack([places, goals[i]])
             else:
                 gaps[:, target] = np.inf  # a robot has at most one frontier for each target
             length = float(belief.candidates.lengths[slot])
@@ -133,11 +133,11 @@ def team_targets(beliefs: Sequence[Belief], held: Mapping[int, int | None]) -> T
     if not len(places):
         return None
     lengths = np.full((len(beliefs), len(places)), NO_PATH)
-    own = np.full(lengths.shape, -1)
+    slots_of = np.full(lengths.shape, -1)
     for row, target, slot, length in entries:
-        lengths[row, target], own[row, target] = length, slot
+        lengths[row, target], slots_of[row, target] = length, slot
     ways = distance_map(first.grid, first.pose[:2])
-    return Targets(ways, np.array(positions), places, lengths, own, len(beliefs))
+    return Targets(ways, np.array(positions), places, lengths, slots_of, len(beliefs))
 
 
 def _nearest(belief: Belief) -> IntArray:

@@ -54,25 +54,25 @@ def turning(agents: list[str], speed: float = 0.25, turn: float = 0.4) -> dict[s
 
 def standing_at(starts: FloatArray) -> TeamPoses:
     """Return where robots with these starts (K, 3) stand: at the origin of their own frames, without doubt."""
-    points = TeamPoses(len(starts))
-    points.poses.fill(0.0)
-    points.beliefs.fill(0.0)
-    points.starts[:] = starts
-    return points
+    team_poses = TeamPoses(len(starts))
+    team_poses.poses.fill(0.0)
+    team_poses.beliefs.fill(0.0)
+    team_poses.starts[:] = starts
+    return team_poses
 
 
 def scored(
     ground_truth: GroundTruthAssociation,
-    outlines: TeamMapSummaries,
-    points: TeamPoses,
+    summaries: TeamMapSummaries,
+    team_poses: TeamPoses,
     true_starts: FloatArray,
     true_poses: FloatArray,
 ) -> TeamMetrics:
     """Return the scores of a team; all other metrics are NaN or 0."""
     robots = len(true_poses)
-    figures, nothing = np.full((len(RobotMetrics._fields), robots), np.nan), (0,) * robots
-    ground_truth.score(outlines, points, true_starts, true_poses, figures)
-    return TeamMetrics(RobotMetrics(*figures.tolist()), RobotCounts(nothing, nothing), 0.0, 0, 0.0)
+    metrics, nothing = np.full((len(RobotMetrics._fields), robots), np.nan), (0,) * robots
+    ground_truth.score(summaries, team_poses, true_starts, true_poses, RobotMetrics(*metrics))
+    return TeamMetrics(RobotMetrics(*metrics.tolist()), RobotCounts(nothing, nothing), 0.0, 0, 0.0)
 
 
 ANGLES = np.deg2rad(np.linspace(-26.5, 26.5, 32))

@@ -225,7 +225,7 @@ def test_an_oracle_merge_is_not_corrected_by_landmarks() -> None:
     for _ in range(60):
         env.step(turning(env.agents))
     assert env.events
-    assert np.allclose(env.episode.belief.points.starts[1], inverse(between(*MEETING)), atol=1e-3)
+    assert np.allclose(env.episode.belief.team_poses.starts[1], inverse(between(*MEETING)), atol=1e-3)
     infos = env.step(turning(env.agents))[4]
     assert np.allclose(infos["robot_0"]["map_rmse"], infos["robot_1"]["map_rmse"], atol=1e-3)
 

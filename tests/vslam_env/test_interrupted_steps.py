@@ -28,13 +28,14 @@ def _interrupted(call: Call, after: int) -> bool:
 
 
 def _traced(call: Call, interrupt: int = 0) -> int:
-    """Return the number of lines that a call runs, except where objects are freed: Python drops exceptions there."""
+    """Return the number of lines that a call runs, except where native code calls Python, which loses exceptions."""
     lines = 0
 
     def trace(frame: FrameType, event: str, argument: Any) -> Any:
         nonlocal lines
         code = frame.f_code
-        if "pymunk" in code.co_filename or code.co_filename.endswith("weakref.py") or code.co_name == "close":
+        file = code.co_filename
+        if "pymunk" in file or "numba" in file or file.endswith("weakref.py") or code.co_name == "close":
             return None
         lines += event == "line"
         if event == "line" and lines == interrupt:

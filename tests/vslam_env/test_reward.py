@@ -263,16 +263,16 @@ def test_a_map_that_is_placed_wrong_has_no_recall() -> None:
     books.record(TeamReport(0, Associations.from_arrays([ids], [ids]), ((0,),), (), (), (0,), entries, 1), [ids])
     held = LandmarkMap(truths[:2], np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 2)), ids=ids)
     for shift, placed in ((0.0, 2 / 3), (0.4, 2 / 3), (0.6, 0.0)):
-        outlines = TeamMapSummaries.from_maps([held.summary])
-        points = standing_at(np.array([[shift, 0.0, 0.0]]))
-        scores = scored(books, outlines, points, np.zeros((1, 3)), np.zeros((1, 3)))
+        summaries = TeamMapSummaries.from_maps([held.summary])
+        team_poses = standing_at(np.array([[shift, 0.0, 0.0]]))
+        scores = scored(books, summaries, team_poses, np.zeros((1, 3)), np.zeros((1, 3)))
         assert (scores.map_recalls[0], scores.accurate_recalls[0]) == (2 / 3, placed)
 
 
 def _merge(env: ExplorationEnv, shift: list[float]) -> None:
     """Merge the maps of two robots with the true transform, moved by a shift (3,)."""
     episode = env.episode
-    claims = [episode.ground_truth.true_ids(r, episode.belief.filter_map(r).ids) for r in range(2)]
+    claims = [episode.ground_truth.true_ids(r, episode.belief.team.map(r).ids) for r in range(2)]
     true = true_alignment(*claims, *episode.true_starts)
     assert true is not None
     inliers = np.empty((0, 2), np.int64) if any(shift) else true.inliers

@@ -118,7 +118,7 @@ def test_before_and_after_a_merge() -> None:
 def test_during_an_attempt(tmp_path: Path) -> None:
     """States taken while an attempt waits for smoothed maps continue bit for bit; taking them changes nothing."""
     quiet, env = _begun(), _begun()
-    slam, rng = env.episode.belief._team, np.random.default_rng(3)
+    slam, rng = env.episode.belief.team, np.random.default_rng(3)
     snapshots: list[tuple[int, ExplorationEnv]] = []
     taken: list[dict[str, Any]] = []
     while not any(event.kind == "merge" for event in env.events):

@@ -143,8 +143,8 @@ def _parameter(option: str, name: str, field: FieldInfo) -> Parameter:
     flags = [about["option"]] if about["option"].startswith("--") else []
     if about["also"]:
         flags = [f"--{option.replace('_', '-')}", about["also"]]
-    found = typer.Option(*flags, help=text, show_default=shown, autocompletion=_completion(field))
-    return _keyword(option, Annotated[kind | None, found])
+    declared = typer.Option(*flags, help=text, show_default=shown, autocompletion=_completion(field))
+    return _keyword(option, Annotated[kind | None, declared])
 
 
 def _completion(field: FieldInfo) -> Callable[[str], list[str]] | None:

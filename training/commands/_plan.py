@@ -192,10 +192,10 @@ def verify_rows(call: Call[ExplorationBenchConfig], folder: Path, count: int, wo
         hint = f"Check {str(folder / CONFIG_FILE)!r}, or play its episodes again with this release."
         raise argument_error("verify", "a run folder whose episodes have digests", "none", hint)
     check_named((row["policy"] for row in chosen), call.given.get("policies"))
-    found = []
+    outcomes = []
     with trial_progress(call.console, len(chosen), timed=False) as (advance, interrupted):
-        for (where,), own in grouped(chosen, ("machine",)).items():
-            rows = {trial_of(row, kind): row for row in own}
+        for (where,), group in grouped(chosen, ("machine",)).items():
+            rows = {trial_of(row, kind): row for row in group}
             going = takewhile(lambda _: not interrupted(), rows)
             played = run_in_processes(partial(play, bench), going, workers, variables_for(where))
             with closing(played) as repeated:
@@ -204,19 +204,19 @@ def verify_rows(call: Call[ExplorationBenchConfig], folder: Path, count: int, wo
                         print_error(again[FAILED], call.console)
                         raise typer.Exit(2)
                     trial = trial_of(again, kind)
-                    found.append(compare(rows[trial], again))
-                    keep(folder, found[-1], asdict(trial))
+                    outcomes.append(compare(rows[trial], again))
+                    keep(folder, outcomes[-1], asdict(trial))
                     advance(f"{trial.policy}, seed {trial.seed}")
-    call.console.print(console_table("Episodes played again", HEADINGS, table_rows(found)))
-    others = sorted({(row["stored_on"], row["machine"]) for row in found if row["is_equal"] is None})
+    call.console.print(console_table("Episodes played again", HEADINGS, table_rows(outcomes)))
+    others = sorted({(row["stored_on"], row["machine"]) for row in outcomes if row["is_equal"] is None})
     for stored_on, here in others:
         text = f"Other numerics or versions, so that last bits may differ: {stored_on}. Here: {here}."
         call.console.print(text, soft_wrap=True)
-    changed = sorted({row["policy"] for row in found if row["is_other_policy"]})
+    changed = sorted({row["policy"] for row in outcomes if row["is_other_policy"]})
     if changed:
         text = f"The file of {', '.join(changed)} is another one than when the episodes were played."
         call.console.print(text, soft_wrap=True)
-    if any(row["is_equal"] is False for row in found):
+    if any(row["is_equal"] is False for row in outcomes):
         raise typer.Exit(1)
 
 

@@ -96,13 +96,13 @@ def fig4(call: Call[PairConfig]) -> None:
 
     fused = fuse_pair(_align(call))
     areas = 1e4 * np.sqrt(np.linalg.det(fused.covariances[..., :2, :2]))
-    for name, one, two, both in zip(fused.names.tolist(), *areas, strict=True):
+    for name, one, two, both in zip(fused.true_ids.tolist(), *areas, strict=True):
         text = f"landmark {name}: {one:.2f} and {two:.2f} square centimetres before, {both:.2f} after fusion"
         call.console.print(text)
     call.folder.write_text("fig4.csv", ellipses_csv(fused))
     draw_fig4(call.folder.path / "fig4.png", fused)
     areas_cm2 = dict(zip(("map_1", "map_2", "fused"), areas, strict=True))
-    call.write({"names": fused.names, "sqrt_det_cm2": areas_cm2})
+    call.write({"names": fused.true_ids, "sqrt_det_cm2": areas_cm2})
     call.finish()
 
 

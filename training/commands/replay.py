@@ -68,9 +68,9 @@ def replay_mrclam(call: Call[MrclamConfig]) -> None:
     for note in log.notes:
         console.print(note, soft_wrap=True)
     result = _replay_live(console, log, chosen)
-    paths = [score_path(result, robot, own.truth) for robot, own in enumerate(log.robots)]
+    paths = [score_path(result, robot, robot_log.truth) for robot, robot_log in enumerate(log.robots)]
     scores = plain(summarise(result, log, paths))
-    _print_tables(console, scores, {own.robot for own in log.robots if own.truth is not None})
+    _print_tables(console, scores, {robot_log.robot for robot_log in log.robots if robot_log.truth is not None})
     print_consistency(console, scores["consistency"])
     for note in scores["notes"][len(log.notes) :]:
         console.print(note, soft_wrap=True)
@@ -78,11 +78,11 @@ def replay_mrclam(call: Call[MrclamConfig]) -> None:
         console.print(counts)
     speed = float(result.times[-1] - result.times[0]) / result.seconds
     console.print(f"Filter time: {result.seconds:.1f} s, {speed:.0f} times real time.")
-    for robot, own in enumerate(log.robots):
+    for robot, robot_log in enumerate(log.robots):
         for kind, poses in (("estimate", result.paths[robot]), ("dead_reckoning", result.reckoned[robot])):
-            folder.write_trajectory(f"robot{own.robot}_{kind}", Trajectory(result.times, poses))
-        if own.truth is not None:
-            folder.write_trajectory(f"robot{own.robot}_truth", own.truth)
+            folder.write_trajectory(f"robot{robot_log.robot}_{kind}", Trajectory(result.times, poses))
+        if robot_log.truth is not None:
+            folder.write_trajectory(f"robot{robot_log.robot}_truth", robot_log.truth)
     names = {group: "-".join(str(log.robots[robot].robot) for robot in group) for group in result.groups}
     maps = {names[group]: result.maps[group[0]] for group in result.groups}
     console.print(write_maps(folder, maps), soft_wrap=True)
@@ -100,7 +100,7 @@ def _replay_live(console: Console, log: "MrclamLog", config: MrclamConfig) -> "R
     """Run the replay under a progress bar, and print each merge when it happens."""
     from training.replay.mrclam import replay_team
 
-    names = [own.robot for own in log.robots]
+    names = [robot_log.robot for robot_log in log.robots]
     with share_progress(console, f"{len(names)} robots", "{task.fields[groups]} groups", groups=len(names)) as update:
 
         def on_step(done: float, report: Any) -> None:

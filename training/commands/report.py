@@ -54,14 +54,14 @@ def compare(
         if out.suffix.lower() != ".html":
             raise argument_error("out", "a name that ends in .html", out, "Pages are written as HTML.")
         check_writable(out, "out")
-    found = compare_folders(one, other)
-    print_comparison(make_console(), found)
+    comparison = compare_folders(one, other)
+    print_comparison(make_console(), comparison)
     if json is not None:
-        write_json(json, to_json(plain(found.to_mapping())))
+        write_json(json, to_json(plain(comparison.to_mapping())))
     if show and out is None:
         out = Path(tempfile.mkdtemp(prefix="vslam-")) / "compare.html"
     if out is not None:
-        _finish(write_file(out, comparison_page(found), "out"), show)
+        _finish(write_file(out, comparison_page(comparison), "out"), show)
 
 
 def _finish(page: Path, show: bool) -> None:

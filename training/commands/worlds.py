@@ -37,12 +37,12 @@ def list_worlds(seeds: Annotated[int, typer.Option(help="Number of worlds measur
     check_int("seeds", seeds, 1, "Use at least one world.")
     table = Table("family", "what", "walls", "landmarks", "floor", "size")
     for name, maker in WORLD_FAMILIES.items():
-        found = [survey(name, seed) for seed in range(seeds)]
+        surveys = [survey(name, seed) for seed in range(seeds)]
         what = (sys.modules[maker.__module__].__doc__ or "").split("\n")[0].rstrip(".")
         table.add_row(
-            name, what, _span([world.walls for world in found]), _span([world.landmarks for world in found]),
-            f"{_span([round(world.floor_m2) for world in found])} m²",
-            f"{_span([round(world.width_m) for world in found])} x {_span([round(w.height_m) for w in found])} m",
+            name, what, _span([world.walls for world in surveys]), _span([world.landmarks for world in surveys]),
+            f"{_span([round(world.floor_m2) for world in surveys])} m²",
+            f"{_span([round(world.width_m) for world in surveys])} x {_span([round(w.height_m) for w in surveys])} m",
         )  # fmt: skip
     console = make_console()
     console.print(table)
@@ -86,15 +86,15 @@ def validate(
 
     check_int("seeds", seeds, 1, "Use at least one world.")
     check_int("first_seed", first_seed, 0, "Use 0 or a positive number.")
-    found = survey_all(_with_outside(world, outside), range(first_seed, first_seed + seeds), robots)
-    table = Table("figure", "least", "most", title=f"{found[0].name}: {seeds} of {seeds} worlds are valid")
-    gaps = [("smallest distance between starts, m", [each.start_gap_m for each in found])] if robots > 1 else []
+    surveys = survey_all(_with_outside(world, outside), range(first_seed, first_seed + seeds), robots)
+    table = Table("figure", "least", "most", title=f"{surveys[0].name}: {seeds} of {seeds} worlds are valid")
+    gaps = [("smallest distance between starts, m", [each.start_gap_m for each in surveys])] if robots > 1 else []
     for title, values in (
-        ("walls", [float(each.walls) for each in found]),
-        ("observable landmarks", [float(each.landmarks) for each in found]),
-        ("floor, m²", [each.floor_m2 for each in found]),
-        ("width, m", [each.width_m for each in found]),
-        ("height, m", [each.height_m for each in found]),
+        ("walls", [float(each.walls) for each in surveys]),
+        ("observable landmarks", [float(each.landmarks) for each in surveys]),
+        ("floor, m²", [each.floor_m2 for each in surveys]),
+        ("width, m", [each.width_m for each in surveys]),
+        ("height, m", [each.height_m for each in surveys]),
         *gaps,
     ):
         table.add_row(title, f"{min(values):.4g}", f"{max(values):.4g}")

@@ -28,8 +28,8 @@ def episode_digest(record: EpisodeRecord) -> str:
         add(merge.robots_a, np.int64)
         add(merge.robots_b, np.int64)
         add([merge.error_m, merge.error_deg, -1.0 if merge.undone is None else merge.undone], np.float64)
-    for own, claims in zip(record.maps, record.map_claims, strict=True):
-        add(own.means, np.float64)
-        add(own.covariances, np.float64)
+    for landmark_map, claims in zip(record.maps, record.map_claims, strict=True):
+        add(landmark_map.means, np.float64)
+        add(landmark_map.covariances, np.float64)
         add(claims, np.int64)
     return digest.hexdigest()[:32]

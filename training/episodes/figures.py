@@ -156,7 +156,7 @@ def place_labels(times: Sequence[float], labels: Sequence[str], end: float, widt
     [(0, False), (1, False), (0, True)]
     """
     taken: list[list[tuple[float, float]]] = []
-    found = []
+    places = []
     for time, label in zip(times, labels, strict=True):
         at, length = width * time / end, LETTER * len(label) + 0.1
         is_left = at + length > width
@@ -167,8 +167,8 @@ def place_labels(times: Sequence[float], labels: Sequence[str], end: float, widt
         if row == len(taken):
             taken.append([])
         taken[row].append((begin, stop))
-        found.append((row, is_left))
-    return found
+        places.append((row, is_left))
+    return places
 
 
 def _draw_scale_bar(axes: Axes) -> None:

@@ -143,13 +143,13 @@ def run_episode(
         env.recorder = other
 
 
-def describe_event(event: MergeEvent, names: Sequence[int] | None = None) -> str:
+def describe_event(event: MergeEvent, numbers: Sequence[int] | None = None) -> str:
     """Describe an event of the team in one line.
 
     Args:
-        names: Numbers of the robots; None: their indices.
+        numbers: Numbers of the robots; None: their indices.
     """
-    sides = [", ".join(str(robot if names is None else names[robot]) for robot in side)
+    sides = [", ".join(str(robot if numbers is None else numbers[robot]) for robot in side)
              for side in (event.robots_a, event.robots_b)]  # fmt: skip
     both = f"{sides[0]} and {sides[1]}"
     shared = len(event.alignment.inliers)
@@ -217,15 +217,15 @@ class _Log:
         return EpisodeRecord(
             times=ticks * TICK, true_poses=np.stack(self._true, axis=1), estimated=np.stack(self._estimated, axis=1),
             reckoned=np.stack(reckoned), map_errors=np.array(self._errors).T, nees=self._nees(),
-            coverage=np.array(self._coverage), overlap=self._env.episode.overlap,
+            coverage=np.array(self._coverage), overlap=self._env.episode.coverage.overlap,
             merges=tuple(self._merges), attempts=sum(event.kind == "attempt" for event in self._env.events),
             pairs=count_attempts(self._env.events), groups=tuple(sorted({belief.group for belief in last.values()})),
             infos=tuple(dict(self._infos[agent]) for agent in self._agents),
             own_maps=tuple(maps[robot] for robot in range(len(self._agents))),
             alone_until=tuple(self._alone_until.get(robot) for robot in range(len(self._agents))),
-            map_claims=tuple(ground_truth.true_ids(robot, own.map.ids) for robot, own in last.items()),
-            maps=tuple(own.map for own in last.values()), true_landmarks=self._env.true_landmarks,
-            consistency=tuple(map(self._env.episode.belief.consistency, last)), scene=self._env.scene(),
+            map_claims=tuple(ground_truth.true_ids(robot, belief.map.ids) for robot, belief in last.items()),
+            maps=tuple(belief.map for belief in last.values()), true_landmarks=self._env.true_landmarks,
+            consistency=tuple(map(self._env.episode.belief.team.consistency, last)), scene=self._env.scene(),
             complete=not self._env.agents,
         )  # fmt: skip
 
@@ -234,10 +234,10 @@ class _Log:
         errors = np.stack(self._estimated, axis=1) - between(self._starts[:, None], np.stack(self._true, axis=1))
         errors[..., 2] = wrap_angle(errors[..., 2])
         covariances = np.stack(self._covariances, axis=1)
-        found = np.full(errors.shape[:-1], np.nan)
+        values = np.full(errors.shape[:-1], np.nan)
         uncertain = np.linalg.eigvalsh(covariances)[..., 0] > KNOWN**2
-        found[uncertain] = nees(errors[uncertain], covariances[uncertain])
-        return found
+        values[uncertain] = nees(errors[uncertain], covariances[uncertain])
+        return values
 
     def _enter(self, infos: Mapping[str, Mapping[str, Any]], tick: int) -> None:
         self._infos = infos

@@ -79,21 +79,21 @@ def _merges(rows: list[Mapping[str, Any]]) -> Table:
 
 
 def pair_rows(
-    pairs: "Sequence[PairAttempts] | None", groups: Sequence[Sequence[int]], names: Sequence[int] | None = None
+    pairs: "Sequence[PairAttempts] | None", groups: Sequence[Sequence[int]], numbers: Sequence[int] | None = None
 ) -> list[dict[str, Any]]:
     """Return one row for each pair of groups that attempted a merge, and for each final pair that never did.
 
     `apart` is whether the two share no map at the end; `last_step` counts filter steps.
 
     Args:
-        names: Number of each robot; None: its index.
+        numbers: Number of each robot; None: its index.
     """
     if pairs is None:
         return []
     group_of = {robot: group for group in groups for robot in group}
 
     def named(robots: Sequence[int]) -> list[int]:
-        return [robot if names is None else names[robot] for robot in robots]
+        return [robot if numbers is None else numbers[robot] for robot in robots]
 
     rows = [
         {

@@ -60,13 +60,13 @@ def survey_all(world: str, world_seeds: Iterable[int], robots: int) -> list[Worl
     Raises:
         ValueError: If that is impossible; the message gives the reason, a hint, and the seed.
     """
-    found = []
+    surveys = []
     for seed in world_seeds:
         try:
-            found.append(survey(world, seed, robots))
+            surveys.append(survey(world, seed, robots))
         except ValueError as error:
-            raise ValueError(f"{error} That was world seed {seed}, after {len(found)} valid ones.") from error
-    return found
+            raise ValueError(f"{error} That was world seed {seed}, after {len(surveys)} valid ones.") from error
+    return surveys
 
 
 def contact_sheet(world: str, first_seed: int, count: int, robots: int) -> NDArray[np.uint8]:

@@ -173,11 +173,11 @@ def value_type(annotation: Any) -> tuple[Any, list[Any]]:
 
 def _one_line_error(kind: type[Checked], error: ValidationError) -> ValueError:
     """Return the first validation error in the error format of the project."""
-    found = error.errors()
-    for each in found:
+    errors = error.errors()
+    for each in errors:
         if each["type"] == "extra_forbidden":
             return _unknown_name("config", str(each["loc"][0]), kind.model_fields)
-    first, value = found[0], found[0]["input"]
+    first, value = errors[0], errors[0]["input"]
     cause = first.get("ctx", {}).get("error")
     if cause is not None and str(cause):
         return ValueError(str(cause))

@@ -37,12 +37,12 @@ def variables_for(wanted: str) -> dict[str, str]:
     here = _vector_instructions()
     if not instructions or not set(instructions) <= set(here):
         return {}
-    found = {}
+    settings = {}
     if more := [name for name in here if name not in instructions]:
-        found[DISABLED] = " ".join(more)
+        settings[DISABLED] = " ".join(more)
     if core in NEEDED_BY_CORE and NEEDED_BY_CORE[core] in here and _blas_cores() != [core]:
-        found[CORE] = core
-    return found
+        settings[CORE] = core
+    return settings
 
 
 def _vector_instructions() -> list[str]:

@@ -20,8 +20,8 @@ def parted_label(text: str) -> tuple[str, str]:
     >>> parted_label("mine=look_again:LookAgain@discrete"), parted_label("runs/a=b/model.npz")
     (('mine', 'look_again:LookAgain@discrete'), ('', 'runs/a=b/model.npz'))
     """
-    found = None if Path(text).exists() else LABELLED.fullmatch(text)
-    return (found[1], found[2]) if found else ("", text)
+    match = None if Path(text).exists() else LABELLED.fullmatch(text)
+    return (match[1], match[2]) if match else ("", text)
 
 
 def check_labels(texts: Iterable[str]) -> None:

@@ -82,9 +82,9 @@ def read_config(path: Path, command: str, option: str = "config") -> tuple[dict[
     if not file.is_file():
         raise argument_error(option, expected, "no such file", f"Check {str(file)!r}.")
     content = read_toml(file, option)
-    if (found := content.get("format", FORMAT)) != FORMAT or type(found) is not int:
+    if (file_format := content.get("format", FORMAT)) != FORMAT or type(file_format) is not int:
         hint = f"Use the release that wrote {str(file)!r}."
-        raise argument_error(option, f"one of format {FORMAT}", f"a run folder of format {found!r}", hint)
+        raise argument_error(option, f"one of format {FORMAT}", f"a run folder of format {file_format!r}", hint)
     if content.get("command") != command:
         raise argument_error(option, f"a run of {command!r}", content.get("command"), "Use the command that wrote it.")
     config, seed = content.get("config"), content.get("seed")

@@ -58,10 +58,10 @@ def summarise_means(
 ) -> list[dict[str, Any]]:
     """Return one line for each group, in the order of first occurrence: `by`, `seeds`, and metrics by `mean_ci`."""
     lines = []
-    for key, own in grouped(rows, by).items():
-        line: dict[str, Any] = dict(zip(by, key, strict=True)) | {"seeds": len(own)}
+    for key, group in grouped(rows, by).items():
+        line: dict[str, Any] = dict(zip(by, key, strict=True)) | {"seeds": len(group)}
         for figure in figures:
-            line |= mean_ci(figure, [row[figure] for row in own])
+            line |= mean_ci(figure, [row[figure] for row in group])
         lines.append(line)
     return lines
 
@@ -71,14 +71,14 @@ def mean_curves(rows: Iterable[Mapping[str, Any]], by: Sequence[str], names: Seq
 
     Groups may have other times.
     """
-    found = []
-    for key, own in grouped(rows, by).items():
-        for point, when in enumerate(own[0]["curves"]["time_s"]):
+    lines = []
+    for key, group in grouped(rows, by).items():
+        for point, when in enumerate(group[0]["curves"]["time_s"]):
             line: dict[str, Any] = dict(zip(by, key, strict=True)) | {"time_s": when}
             for name in names:
-                line |= mean_ci(name, [row["curves"][name][point] for row in own])
-            found.append(line)
-    return found
+                line |= mean_ci(name, [row["curves"][name][point] for row in group])
+            lines.append(line)
+    return lines
 
 
 def paired_difference(own: Mapping[int, float], other: Mapping[int, float]) -> FloatArray:

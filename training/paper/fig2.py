@@ -157,13 +157,13 @@ def draw_fig2(file: Path, lines: Sequence[Mapping[str, Any]]) -> None:
         panels = figure.subplots(1, 2)
         for letter, axes, (name, label) in zip("ab", panels, LABELS.items(), strict=True):
             for place, method in enumerate(METHODS):
-                own = [line for line in lines if line["method"] == method and line[f"{name}_median"] is not None]
-                if not own:
+                chosen = [line for line in lines if line["method"] == method and line[f"{name}_median"] is not None]
+                if not chosen:
                     continue
-                middle = [line[f"{name}_median"] for line in own]
-                above = [max(line[f"{name}_p90"] - line[f"{name}_median"], 0.0) for line in own]
+                middle = [line[f"{name}_median"] for line in chosen]
+                above = [max(line[f"{name}_p90"] - line[f"{name}_median"], 0.0) for line in chosen]
                 axes.errorbar(
-                    [line["size"] + 3.0 * (place - 2) for line in own], middle, yerr=[[0.0] * len(own), above],
+                    [line["size"] + 3.0 * (place - 2) for line in chosen], middle, yerr=[[0.0] * len(chosen), above],
                     marker=MARKERS[method], ms=4.5, mfc="none", lw=1.2, elinewidth=0.7, capsize=2,
                     color=COLOURS[method], label=NAMES[method],
                 )  # fmt: skip

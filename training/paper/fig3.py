@@ -43,12 +43,12 @@ class AlignedPair:
 
     def figures(self) -> dict[str, Any]:
         """Return the number of matches, the number of true ones among them, and the errors of the transform."""
-        names_a, names_b = (own[rows] for own, rows in zip(self.stage.names, self.alignment.inliers.T, strict=True))
+        ids_a, ids_b = (ids[rows] for ids, rows in zip(self.stage.true_ids, self.alignment.inliers.T, strict=True))
         error = self.alignment.transform - self.truth
         return {
             "landmarks": [len(own) for own in self.maps], "shared": self.stage.shared,
             "candidates": len(self.candidates), "inliers": len(self.alignment.inliers),
-            "true_inliers": int(np.count_nonzero((names_a == names_b) & (names_a >= 0))),
+            "true_inliers": int(np.count_nonzero((ids_a == ids_b) & (ids_a >= 0))),
             "transform": self.alignment.transform.tolist(),
             "sigmas": np.sqrt(np.diag(self.alignment.covariance)).tolist(),
             "translation_error_m": float(np.hypot(error[0], error[1])),
@@ -64,35 +64,36 @@ def align_pair(config: PairConfig) -> AlignedPair:
     """
     run = simulate_pair(config.seed, config.length, config.landmarks)
     *_, stage = map_alone(run, config.particles, config.seed, config.length)
-    found = align_maps(*stage.maps, rng=np.random.default_rng(config.seed))
-    if not found.success:
+    alignment = align_maps(*stage.maps, rng=np.random.default_rng(config.seed))
+    if not alignment.success:
         hint = "Let the robots drive farther, or take another seed."
-        raise argument_error("length", "maps that can be aligned", f"a refusal: {found.reason}", hint)
-    return AlignedPair(stage, candidate_matches(*stage.maps, AlignmentOptions()), found, true_motion(run))
+        raise argument_error("length", "maps that can be aligned", f"a refusal: {alignment.reason}", hint)
+    return AlignedPair(stage, candidate_matches(*stage.maps, AlignmentOptions()), alignment, true_motion(run))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FusedLandmarks:
     """Several landmarks before and after fusion, frame of the first map."""
 
-    names: IntArray  # (n,) Numbers of the true landmarks
+    true_ids: IntArray  # (n,) Numbers of the true landmarks
     means: FloatArray  # (3, n, 3) float64 [m]. Means in the first map, the second map after alignment, the fused map.
     covariances: FloatArray  # (3, n, 3, 3) float64 [m^2]. Covariances; aligned ones include the transform's.
 
 
 def fuse_pair(pair: AlignedPair, shown: int = SHOWN) -> FusedLandmarks:
     """Fuse both maps, and return the shared landmarks with the largest fused uncertainty in the plane."""
-    (map_a, map_b), found = pair.maps, pair.alignment
-    rows_a, rows_b = found.inliers.T
-    fused = fuse_maps(map_a, map_b, found)
+    (map_a, map_b), alignment = pair.maps, pair.alignment
+    rows_a, rows_b = alignment.inliers.T
+    fused = fuse_maps(map_a, map_b, alignment)
     one, two = map_a.covariances[rows_a, :2, :2], map_b.covariances[rows_b, :2, :2]
     chosen = np.argsort(-np.linalg.det(one) * np.linalg.det(two), kind="stable")[:shown]
     a, b = rows_a[chosen], rows_b[chosen]
     return FusedLandmarks(
-        names=pair.stage.names[0][a],
-        means=np.array([map_a.means[a], transform_points(found.transform, map_b.means[b]), fused.means[a]]),
+        true_ids=pair.stage.true_ids[0][a],
+        means=np.array([map_a.means[a], transform_points(alignment.transform, map_b.means[b]), fused.means[a]]),
         covariances=np.array([
-            map_a.covariances[a], move_covariances(found, map_b.means[b], map_b.covariances[b]), fused.covariances[a],
+            map_a.covariances[a], move_covariances(alignment, map_b.means[b], map_b.covariances[b]),
+            fused.covariances[a],
         ]),
     )  # fmt: skip
 
@@ -104,8 +105,8 @@ def matches_csv(pair: AlignedPair) -> str:
     rows = []
     for a, b in pair.alignment.inliers.tolist():
         moved = transform_points(pair.alignment.transform, map_b.means[b])
-        names = int(pair.stage.names[0][a]), int(pair.stage.names[1][b])
-        rows.append([*names, *(f"{v:.4f}" for v in (*map_a.means[a], *map_b.means[b], *moved[:2]))])
+        true_ids = int(pair.stage.true_ids[0][a]), int(pair.stage.true_ids[1][b])
+        rows.append([*true_ids, *(f"{v:.4f}" for v in (*map_a.means[a], *map_b.means[b], *moved[:2]))])
     return csv_text(headings, rows)
 
 
@@ -114,9 +115,9 @@ def ellipses_csv(fused: FusedLandmarks) -> str:
     headings = ["landmark", "which", "x", "y", "z", "xx", "xy", "xz", "yy", "yz", "zz"]
     upper = np.triu_indices(3)
     rows = []
-    for i, name in enumerate(fused.names.tolist()):
+    for i, true_id in enumerate(fused.true_ids.tolist()):
         for kind, means, covariances in zip(("map 1", "map 2", "fused"), fused.means, fused.covariances, strict=True):
-            rows.append([name, kind, *(f"{v:.3e}" for v in (*means[i], *covariances[i][upper]))])
+            rows.append([true_id, kind, *(f"{v:.3e}" for v in (*means[i], *covariances[i][upper]))])
     return csv_text(headings, rows)
 
 
@@ -160,7 +161,7 @@ def draw_fig3(file: Path, pair: AlignedPair) -> None:
 @picture
 def draw_fig4(file: Path, fused: FusedLandmarks) -> None:
     """Draw the 95 % ellipses of several landmarks before and after fusion, one per column, into a PNG file."""
-    count = len(fused.names)
+    count = len(fused.true_ids)
     with mpl.rc_context({"font.size": 9}):
         figure = Figure(figsize=(3.6 * count, 7.2), layout="constrained")
         panels = figure.subplots(2, count, squeeze=False)
@@ -182,7 +183,7 @@ def draw_fig4(file: Path, fused: FusedLandmarks) -> None:
                 axes.set_xlim(middle[0] - reach, middle[0] + reach)
                 axes.set_ylim(middle[1] - reach, middle[1] + reach)
                 axes.set_aspect("equal")
-                axes.set_title(f"{title}: landmark {fused.names[column]}", loc="left")
+                axes.set_title(f"{title}: landmark {fused.true_ids[column]}", loc="left")
                 axes.set_xlabel("x [m]")
                 axes.grid(alpha=0.2)
             row[0].set_ylabel("y [m]")

@@ -106,24 +106,24 @@ def _visibility(env: ExplorationEnv) -> Fig5:
 
 
 @picture
-def draw_fig5(file: Path, found: Fig5) -> None:
+def draw_fig5(file: Path, fig5: Fig5) -> None:
     """Draw the figure into a PNG file."""
-    low, high = found.walls.reshape(-1, 2).min(axis=0), found.walls.reshape(-1, 2).max(axis=0)
+    low, high = fig5.walls.reshape(-1, 2).min(axis=0), fig5.walls.reshape(-1, 2).max(axis=0)
     ratio = (high[1] - low[1]) / (high[0] - low[0])
     figure = Figure(figsize=(WIDTH, WIDTH * ratio + 0.6), layout="constrained")
     axes = figure.subplots()
-    axes.add_collection(LineCollection(found.walls.reshape(-1, 2, 2).tolist(), colors=INK, linewidths=1.6))
-    axes.plot(*found.landmarks[:, :2].T, "o", color="0.62", markersize=2.2, zorder=3)
-    for robot, pose in enumerate(found.poses):
+    axes.add_collection(LineCollection(fig5.walls.reshape(-1, 2, 2).tolist(), colors=INK, linewidths=1.6))
+    axes.plot(*fig5.landmarks[:, :2].T, "o", color="0.62", markersize=2.2, zorder=3)
+    for robot, pose in enumerate(fig5.poses):
         colour = [channel / 255 for channel in robot_colour(robot)]
-        axes.plot(*found.paths[robot].T, color=colour, linewidth=0.9, alpha=0.6)
-        fan = np.degrees([pose[2] - found.half_fov, pose[2] + found.half_fov])
-        axes.add_patch(Wedge(tuple(pose[:2]), found.max_range, *fan, facecolor=colour, alpha=0.07, linewidth=0))
-        for mark in np.flatnonzero(found.seen[robot]):
-            width = 0.9 if found.measured[robot, mark] else 0.35
-            ends = np.vstack([pose[:2], found.landmarks[mark, :2]])
+        axes.plot(*fig5.paths[robot].T, color=colour, linewidth=0.9, alpha=0.6)
+        fan = np.degrees([pose[2] - fig5.half_fov, pose[2] + fig5.half_fov])
+        axes.add_patch(Wedge(tuple(pose[:2]), fig5.max_range, *fan, facecolor=colour, alpha=0.07, linewidth=0))
+        for mark in np.flatnonzero(fig5.seen[robot]):
+            width = 0.9 if fig5.measured[robot, mark] else 0.35
+            ends = np.vstack([pose[:2], fig5.landmarks[mark, :2]])
             axes.plot(*ends.T, "--", color=colour, linewidth=width, dashes=(4, 3), zorder=2)
-        hidden = found.landmarks[found.in_view[robot] & ~found.seen[robot]]
+        hidden = fig5.landmarks[fig5.in_view[robot] & ~fig5.seen[robot]]
         axes.plot(*hidden[:, :2].T, "x", color=colour, markersize=4.5, markeredgewidth=0.9, zorder=4)
         angles = pose[2] + np.array([0.0, 2.5, -2.5])
         body = pose[:2] + BODY * np.column_stack([np.cos(angles), np.sin(angles)])

@@ -25,12 +25,12 @@ class Stage:
     # Map of each robot, start frame; mixture covariances, which include the uncertainty of the path
     maps: tuple[LandmarkMap, LandmarkMap]
     # True landmark of each landmark in each map, (N,) int64; `FALSE_POINT`: none
-    names: tuple[IntArray, IntArray]
+    true_ids: tuple[IntArray, IntArray]
 
     @property
     def shared(self) -> int:
         """Number of true landmarks that both maps contain."""
-        held = [set(own[own != FALSE_POINT].tolist()) for own in self.names]
+        held = [set(ids[ids != FALSE_POINT].tolist()) for ids in self.true_ids]
         return len(held[0] & held[1])
 
 
@@ -75,8 +75,8 @@ def map_alone(run: StereoRun, particles: int, seed: int, every: float) -> Iterat
         last = step == run.num_steps - 1
         if last or (step and step % stride == 0):
             maps = [slam.map("mixture") for slam in filters]
-            own = [
+            true_ids = [
                 np.array([behind[robot].get(name, FALSE_POINT) for name in held.ids.tolist()], dtype=np.int64)
                 for robot, held in enumerate(maps)
             ]
-            yield Stage(step * STEP, (maps[0], maps[1]), (own[0], own[1]))
+            yield Stage(step * STEP, (maps[0], maps[1]), (true_ids[0], true_ids[1]))

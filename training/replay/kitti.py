@@ -120,8 +120,8 @@ def mean_drift(path: FloatArray, truth: FloatArray) -> float:
         first, last = first[last < len(truth)], last[last < len(truth)]
         off = between(between(truth[first], truth[last]), between(path[first], path[last]))
         errors.append(np.hypot(off[:, 0], off[:, 1]) / length)
-    found = np.concatenate(errors)
-    return float(found.mean()) if len(found) else float("nan")
+    errors_together = np.concatenate(errors)
+    return float(errors_together.mean()) if len(errors_together) else float("nan")
 
 
 def find_loop(truth: FloatArray) -> tuple[int, int] | None:
@@ -135,5 +135,5 @@ def find_loop(truth: FloatArray) -> tuple[int, int] | None:
 
 def summarise(result: OneReplay, scored: DriveScore | None) -> dict[str, Any]:
     """Return the content of `metrics.json`; unknown values are NaN, including errors of the map."""
-    own = drive_metrics(scored, "dead_reckoning") | {"loop_error_m": scored.loop_error if scored else float("nan")}
-    return metrics_of(result, scored.scores if scored else None, own)
+    figures = drive_metrics(scored, "dead_reckoning") | {"loop_error_m": scored.loop_error if scored else float("nan")}
+    return metrics_of(result, scored.scores if scored else None, figures)

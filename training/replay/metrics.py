@@ -90,9 +90,9 @@ def truth_notes(replay: Replay, log: MrclamLog) -> tuple[str, ...]:
     if log.positions is None:
         return ()
     maps = []
-    for own, claims in ((replay.maps[group[0]], replay.claims[group[0]]) for group in replay.groups):
-        barcodes, rows = _most_seen(own, claims)
-        maps.append(dict(zip(barcodes.tolist(), own.means[rows], strict=True)))
+    for landmark_map, claims in ((replay.maps[group[0]], replay.claims[group[0]]) for group in replay.groups):
+        barcodes, rows = _most_seen(landmark_map, claims)
+        maps.append(dict(zip(barcodes.tolist(), landmark_map.means[rows], strict=True)))
     return tuple(wrong_landmark_notes(log.positions, maps, log.subjects.tolist()))
 
 
@@ -104,7 +104,7 @@ def motion_error(
     The true transform relates the fits of the two maps to the true landmarks. The true start poses do not define it,
     because errors of the first steps rotate each map about its start.
     """
-    fits = [align_to_truth(own, named, log) for own, named in zip(maps, claims, strict=True)]
+    fits = [align_to_truth(held, named, log) for held, named in zip(maps, claims, strict=True)]
     if fits[0] is None or fits[1] is None:
         return None
     true = between(fits[0].world_from_map, fits[1].world_from_map)

@@ -106,14 +106,16 @@ def replay_team(
     stages: list[tuple[int, Mapping[int, LandmarkMap]]] = []
     attempts, seconds, rejuvenations = 0, 0.0, RejuvenationCount()
     for step in range(num_steps):
-        seen = [own.measurements[step] for own in readings.robots]
+        seen = [one.measurements[step] for one in readings.robots]
         rows = [_true_landmark_rows(frame) for frame in seen]
-        names = rows if config.identities == "given" else None
+        identities = rows if config.identities == "given" else None
         given = seen if config.identities == "given" else [_alike(frame) for frame in seen]
         groups = {robot: group for group in team.groups for robot in group}
         maps = {group: team.map(group[0]) for group in team.groups}
         started = time.perf_counter()
-        report = team.step([own.odometry[step] if step else None for own in readings.robots], given, contacts, names)
+        report = team.step(
+            [one.odometry[step] if step else None for one in readings.robots], given, contacts, identities
+        )
         seconds += time.perf_counter() - started
         for _, attempt in report.rejuvenations:
             rejuvenations.add(attempt)
@@ -125,7 +127,9 @@ def replay_team(
                 joined = [
                     _common_landmarks(new, maps[side]) for side, new in zip(sides, team.merged_maps(event), strict=True)
                 ]
-                claims = [ground_truth.true_ids(side[0], own.ids) for side, own in zip(sides, joined, strict=True)]
+                claims = [
+                    ground_truth.true_ids(side[0], side_map.ids) for side, side_map in zip(sides, joined, strict=True)
+                ]
                 merges.append(Merge(since, event, joined[0], joined[1], claims[0], claims[1]))
             if event.kind == "undo":
                 when = float(readings.times[step] - readings.times[0])
@@ -140,8 +144,8 @@ def replay_team(
     frames = np.array([team.start_from_group(robot) for robot in robots])
     maps_of = [team.map(robot) for robot in robots]
     return Replay(
-        times=readings.times, paths=paths, reckoned=np.array([own.reckoned for own in readings.robots]),
-        maps=tuple(own.moved(frame) for own, frame in zip(maps_of, frames, strict=True)),
+        times=readings.times, paths=paths, reckoned=np.array([one.reckoned for one in readings.robots]),
+        maps=tuple(held.moved(frame) for held, frame in zip(maps_of, frames, strict=True)),
         stages=tuple(stages),
         claims=tuple(ground_truth.true_ids(robot, maps_of[robot].ids) for robot in robots), start_from_group=frames,
         groups=team.groups, merges=tuple(merges), attempts=attempts, pairs=None if config.alone else team.pair_attempts,

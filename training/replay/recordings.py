@@ -107,14 +107,14 @@ def record_one(
             "placed": "in the start frame" if scores is None else "by a rigid fit of the path",
         },
         times=(result.times - result.times[0])[steps], estimate=placed[0], reckoned=placed[1], truth=known[steps],
-        **_maps([(step, {0: found.moved(fits[0])}) for step, found in result.stages], steps, 1),
+        **_maps([(step, {0: stage.moved(fits[0])}) for step, stage in result.stages], steps, 1),
     )  # fmt: skip
 
 
 def _true_poses(truth: Trajectory | None, times: FloatArray) -> FloatArray:
     """Return the true poses (n, 3) at some times; NaN where they are not known."""
-    found = np.full((len(times), 3), np.nan)
+    poses = np.full((len(times), 3), np.nan)
     if truth is not None:
         known = (times >= truth.times[0]) & (times <= truth.times[-1])
-        found[known] = truth.at(times[known])
-    return found
+        poses[known] = truth.at(times[known])
+    return poses

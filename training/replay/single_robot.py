@@ -160,7 +160,7 @@ def path_length(path: FloatArray) -> float:
 
 
 def metrics_of(
-    result: OneReplay, scores: tuple[PositionScore, PositionScore] | None, own: Mapping[str, Any], **more: Any
+    result: OneReplay, scores: tuple[PositionScore, PositionScore] | None, figures: Mapping[str, Any], **more: Any
 ) -> dict[str, Any]:
     """Return the content of `metrics.json`; unknown values are NaN, including errors of the map."""
     nan = float("nan")
@@ -170,7 +170,7 @@ def metrics_of(
             {
                 "ate_aligned_m": estimate[0], "ate_start_m": estimate[1], "dead_reckoning_ate_aligned_m": reckoned[0],
                 "dead_reckoning_ate_start_m": reckoned[1], "map_rmse_m": nan, "map_recall": nan, "map_precision": nan,
-                "map_error": nan, "path_m": path_length(result.path), **own,
+                "map_error": nan, "path_m": path_length(result.path), **figures,
             }
         ],
         "landmarks": len(result.landmarks), **more,

@@ -82,18 +82,18 @@ def compare_folders(one: Path, other: Path) -> Comparison:
         for name in dict.fromkeys([*sides[0], *sides[1]])
         if sides[0].get(name) != sides[1].get(name)
     )
-    found = _differences(metrics_a, metrics_b)
-    if not found:
+    differences = _differences(metrics_a, metrics_b)
+    if not differences:
         got = f"a run of {config_a.get('command')!r} and one of {config_b.get('command')!r}"
         raise argument_error("folders", "two run folders with metrics in common", got, "Compare runs of one command.")
-    return Comparison(folders=(one, other), names=names, options=options, differences=tuple(found))
+    return Comparison(folders=(one, other), names=names, options=options, differences=tuple(differences))
 
 
 def _options(config: Mapping[str, Any]) -> dict[str, str]:
     """Return command, seed, options and versions as texts."""
-    found = {name: str(config.get(name)) for name in ("command", "seed")}
-    found |= {str(name): str(value) for name, value in config.get("config", {}).items()}
-    return found | {f"version of {name}": str(value) for name, value in config.get("versions", {}).items()}
+    options = {name: str(config.get(name)) for name in ("command", "seed")}
+    options |= {str(name): str(value) for name, value in config.get("config", {}).items()}
+    return options | {f"version of {name}": str(value) for name, value in config.get("versions", {}).items()}
 
 
 def _differences(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[Difference]:
@@ -109,12 +109,12 @@ def _differences(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[Diffe
 def _of_run(metrics: Mapping[str, Any]) -> dict[str, float]:
     """Return the metrics of a run as means over its robots, with those of the team."""
     robots = [row for row in metrics.get("robots") or () if isinstance(row, Mapping)]
-    found: dict[str, float] = {}
+    means: dict[str, float] = {}
     for name in dict.fromkeys(name for row in robots for name in row if name not in KEYS):
         values = [row[name] for row in robots if _is_number(row.get(name))]
         if values:
-            found[name] = float(np.mean(values))
-    return found | {name: float(value) for name, value in metrics.items() if _is_number(value) and name not in KEYS}
+            means[name] = float(np.mean(values))
+    return means | {name: float(value) for name, value in metrics.items() if _is_number(value) and name not in KEYS}
 
 
 def _compare_rows(one: Rows, other: Rows) -> list[Difference]:
@@ -126,7 +126,7 @@ def _compare_rows(one: Rows, other: Rows) -> list[Difference]:
     sides = [_grouped(side, keys) for side in (one, other)]
     metrics = [name for name, value in one[0].items() if name not in KEYS and not name.endswith(("_low", "_high"))]
     shown = [name for name in keys if len(values[name][0] | values[name][1]) > 1]
-    found = []
+    lines = []
     for key, rows in sides[0].items():
         if key not in sides[1]:
             continue
@@ -148,8 +148,8 @@ def _compare_rows(one: Rows, other: Rows) -> list[Difference]:
             low, high = interval(more, np.mean)
             means = (float(np.mean([side[seed] for seed in common])) for side in (own, others))
             line = _plain_difference(where, name, *means)
-            found.append(Difference(**asdict(line) | {"low": low, "high": high, "seeds": len(common)}))
-    return found
+            lines.append(Difference(**asdict(line) | {"low": low, "high": high, "seeds": len(common)}))
+    return lines
 
 
 def _grouped(rows: Rows, keys: Sequence[str]) -> dict[tuple[str, ...], list[Mapping[str, Any]]]:
@@ -167,20 +167,20 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def print_comparison(console: Console, found: Comparison) -> None:
+def print_comparison(console: Console, comparison: Comparison) -> None:
     """Print the options that differ, and a table of the metrics for each thing that was run."""
-    one, other = found.names
-    if found.options:
-        console.print(console_table("Options that differ", ("option", one, other), found.options))
+    one, other = comparison.names
+    if comparison.options:
+        console.print(console_table("Options that differ", ("option", one, other), comparison.options))
     else:
         console.print("All options are equal.")
-    for where in dict.fromkeys(row.where for row in found.differences):
-        own = [row for row in found.differences if row.where == where]
+    for where in dict.fromkeys(row.where for row in comparison.differences):
+        rows = [row for row in comparison.differences if row.where == where]
         cells = [
             [heading(row.metric), *(_number(row, each) for each in (row.one, row.other, row.difference)), _ends(row)]
-            for row in own
+            for row in rows
         ]
-        seeds = {row.seeds for row in own if row.seeds is not None}
+        seeds = {row.seeds for row in rows if row.seeds is not None}
         columns = ["", one, other, "difference", f"95 % over {max(seeds)} seeds" if seeds else ""]
         if not seeds:
             cells, columns = [row[:-1] for row in cells], columns[:-1]
@@ -195,13 +195,13 @@ def _number(row: Difference, value: float | None) -> str:
     return number(value, 3, in_words(row.metric)[2])
 
 
-def comparison_page(found: Comparison) -> str:
+def comparison_page(comparison: Comparison) -> str:
     """Return a page with the comparison, and with the curves of both folders in common charts."""
-    one, other = found.names
+    one, other = comparison.names
     content = Content(title=f"{one} and {other}")
-    content.command = "vslam compare " + " ".join(map(str, found.folders))
-    content.charts = _charts(found, content.packer)
-    options = [{"option": name, one: a, other: b} for name, a, b in found.options]
+    content.command = "vslam compare " + " ".join(map(str, comparison.folders))
+    content.charts = _charts(comparison, content.packer)
+    options = [{"option": name, one: a, other: b} for name, a, b in comparison.options]
     rows = [
         {
             "run": row.where, "metric": heading(row.metric),
@@ -214,7 +214,7 @@ def comparison_page(found: Comparison) -> str:
             },
             "seeds": row.seeds,
         }
-        for row in found.differences
+        for row in comparison.differences
     ]  # fmt: skip
     unused = [name for name in ("run", "seeds") if all(row[name] in ("", None) for row in rows)]
     rows = [{name: value for name, value in row.items() if name not in unused} for row in rows]
@@ -224,24 +224,24 @@ def comparison_page(found: Comparison) -> str:
     return render(content)
 
 
-def _charts(found: Comparison, packer: Packer) -> list[dict[str, Any]]:
+def _charts(comparison: Comparison, packer: Packer) -> list[dict[str, Any]]:
     """Return the curves of both folders over time: of recordings, and of benches."""
     colours = ("#0072B2", "#D55E00")
     charts: list[dict[str, Any]] = []
-    if all((folder / RECORDING_FILE).is_file() for folder in found.folders):
-        curves = [_mean_curves(Recording.load(folder)) for folder in found.folders]
+    if all((folder / RECORDING_FILE).is_file() for folder in comparison.folders):
+        curves = [_mean_curves(Recording.load(folder)) for folder in comparison.folders]
         for title, unit in (("map error E, mean over robots", "m"), ("coverage", "%"), ("position error, mean", "m")):
             lines = [
                 {"name": name, "colour": colour, "x": packer.add(own["times"]), "y": packer.add(own[title])}
-                for name, colour, own in zip(found.names, colours, curves, strict=True) if title in own
+                for name, colour, own in zip(comparison.names, colours, curves, strict=True) if title in own
             ]  # fmt: skip
             if lines:
                 charts.append({"title": title, "unit": unit, "lines": lines, "note": ""})
-    rows = [read_curves(folder / CURVES_FILE) for folder in found.folders]
+    rows = [read_curves(folder / CURVES_FILE) for folder in comparison.folders]
     if all(rows) and rows[0][0].keys() == rows[1][0].keys() and "policy" in rows[0][0]:
         named = [
             {**row, "policy": f"{name}: {label(row['policy'])}"}
-            for name, own in zip(found.names, rows, strict=True) for row in own
+            for name, own in zip(comparison.names, rows, strict=True) for row in own
         ]  # fmt: skip
         charts += curve_charts(named, packer)
     return charts

@@ -329,14 +329,14 @@ class EpisodeRecorder:
         )  # fmt: skip
 
 
-def event_entry(event: MergeEvent, time: float, names: Sequence[int] | None = None) -> dict[str, Any]:
+def event_entry(event: MergeEvent, time: float, numbers: Sequence[int] | None = None) -> dict[str, Any]:
     """Return an event of the team as plain values.
 
     Args:
         time: Time of the event [s].
-        names: Numbers of the robots; None: their indices.
+        numbers: Numbers of the robots; None: their indices.
     """
     return {
         "time": round(time, 3), "kind": event.kind, "a": list(event.robots_a), "b": list(event.robots_b),
-        "success": event.kind != "attempt" or event.alignment.success, "text": describe_event(event, names),
+        "success": event.kind != "attempt" or event.alignment.success, "text": describe_event(event, numbers),
     }  # fmt: skip

@@ -235,13 +235,13 @@ class GoalPPO(MaskablePPO):  # type: ignore[misc]   # its types are not checked
         buffer = self.rollout_buffer
         named = {"old_log_probs": buffer.log_probs, "advantages": buffer.advantages, "returns": buffer.returns}
         observed = {name: array for name, array in buffer.observations.items() if name in USED}
-        found = {
+        decisions = {
             name: torch.as_tensor(buffer.swap_and_flatten(array), device=self.device)
             for name, array in (observed | named | {"actions": buffer.actions}).items()
         }
-        found |= {name: found[name].flatten() for name in named}
-        found["actions"] = found["actions"].long()
-        return found
+        decisions |= {name: decisions[name].flatten() for name in named}
+        decisions["actions"] = decisions["actions"].long()
+        return decisions
 
     def _losses(self, batch: Mapping[str, Any], clip: float) -> dict[str, Any]:
         """Return `loss`, its terms and what describes the update, each a mean over a minibatch."""

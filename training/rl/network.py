@@ -47,11 +47,11 @@ class Group(NamedTuple):
 
 def _groups(counts: Any) -> list[Group]:
     """Return groups of observations with numbers of tokens (n,) in ascending order."""
-    found = []
+    groups = []
     for part in counts.split(GROUP):
         is_token = torch.arange(int(part[-1]), device=part.device) < part.unsqueeze(1)
-        found.append(Group(is_token.flatten().nonzero().squeeze(1), ~is_token))
-    return found
+        groups.append(Group(is_token.flatten().nonzero().squeeze(1), ~is_token))
+    return groups
 
 
 class AttentionLayer(nn.Module):  # type: ignore[misc]   # its types are not checked
@@ -232,12 +232,12 @@ class GoalPolicy(MaskableMultiInputActorCriticPolicy):  # type: ignore[misc]
 
 def actor_part(state: Mapping[str, Any]) -> dict[str, NDArray[np.float32]]:
     """Return copies of the weights that `agents.goal_network` needs, by layer name, of a policy's state dict."""
-    found: dict[str, NDArray[np.float32]] = {}
+    weights: dict[str, NDArray[np.float32]] = {}
     for name, values in state.items():
         part, _, layer = name.partition(".")
         if part in ("features_extractor", "mlp_extractor") and not layer.startswith("value_"):
-            found[layer] = np.array(values, np.float32)
-    return found
+            weights[layer] = np.array(values, np.float32)
+    return weights
 
 
 def check_finite(policy: GoalPolicy) -> None:

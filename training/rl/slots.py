@@ -65,15 +65,15 @@ def stacked(layout: Layout, observations: Sequence[Any]) -> dict[str, NDArray[An
 
     One call joins the rows of each name: one assignment per row takes twice as long.
     """
-    found = {}
+    values = {}
     for name, rows in buffers(layout, len(observations)).items():
         parts = observations if name == WHOLE else [one[name] for one in observations]
         if rows.ndim == 1:
             rows[:] = parts
         else:
             np.concatenate(parts, out=rows.reshape(-1, *rows.shape[2:]))
-        found[name] = rows
-    return found
+        values[name] = rows
+    return values
 
 
 class SyncEnvs:
@@ -183,8 +183,8 @@ class SyncEnvs:
             for slot in chosen:
                 setattr(slot.env, name, *rest)
             return [None] * len(chosen)
-        found = [getattr(slot, name) for slot in chosen]
-        return found if command == "get" else [method(*rest[0], **rest[1]) for method in found]
+        values = [getattr(slot, name) for slot in chosen]
+        return values if command == "get" else [method(*rest[0], **rest[1]) for method in values]
 
     def close(self) -> None:
         """Close all environments."""

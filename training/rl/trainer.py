@@ -174,10 +174,10 @@ def check_device(device: str) -> str:
     if kind not in ("cpu", "cuda"):
         raise argument_error("device", "cpu, cuda or cuda:0", device, "Omit it to use the processor.")
     if kind == "cuda":
-        found = torch.cuda.device_count() if torch.cuda.is_available() else 0
-        if (torch.device(device).index or 0) >= found:
+        num_gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
+        if (torch.device(device).index or 0) >= num_gpus:
             hint = "Omit --device to use the processor, or install a torch build that supports the GPU."
-            raise argument_error("device", "a GPU that torch can use", f"a machine with {found} of them", hint)
+            raise argument_error("device", "a GPU that torch can use", f"a machine with {num_gpus} of them", hint)
     return device
 
 

@@ -111,10 +111,10 @@ class WorkerEnvs(ABC):
         for worker, theirs in asked.items():
             local = [slot - self._slots[worker].start for slot in theirs]
             self._send(worker, "ask", command, local, name, *rest)
-        found: dict[int, Any] = {}
+        results: dict[int, Any] = {}
         for worker, theirs in asked.items():
-            found |= dict(zip(theirs, self._answer(worker), strict=True))
-        return [found[slot] for slot in slots]
+            results |= dict(zip(theirs, self._answer(worker), strict=True))
+        return [results[slot] for slot in slots]
 
     @abstractmethod
     def close(self) -> None:

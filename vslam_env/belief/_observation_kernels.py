@@ -90,7 +90,7 @@ MAX_SECONDS_LEFT = 1e6
 
 @in_place
 def write_observations(
-    robots: Any, poses: Any, beliefs: Any, places: Any, names: Any, parts: Any, cells: Any, scans: Any,
+    robots: Any, poses: Any, beliefs: Any, positions: Any, counts_and_ids: Any, parts: Any, cells: Any, scans: Any,
     observed: tuple[Any, Any, Any, Any, Any, Any, Any, Any, Any],
 ) -> None:  # fmt: skip
     """Write what robots observe.
@@ -98,8 +98,8 @@ def write_observations(
     Args:
         robots: (n,) int64. Indices of the robots.
         poses, beliefs: (n, K, 3), (n, 16 + K). See `TeamPoses`.
-        places, names, parts: (N, 4), (N, 2) int64, (n, 2) int64. Landmarks of all maps, and the part of each robot; see
-            `TeamMapSummaries`.
+        positions, counts_and_ids, parts: (N, 4), (N, 2) int64, (n, 2) int64. Landmarks of all maps, and the part of
+            each robot; see `TeamMapSummaries`.
         cells: (n, S, S) uint8. Occupancy grids.
         scans: (n, R) float64 [m].
         observed: Written to, in the order of the table of `observation`: (n, 3), (n, 3) and (n, 6) float32;
@@ -141,12 +141,12 @@ def write_observations(
         times = 0
         landmark_counts[k] = 0.0
         for landmark in range(parts[k, 0], parts[k, 1]):
-            sigma = math.sqrt(places[landmark, 3] / 3.0)
+            sigma = math.sqrt(positions[landmark, 3] / 3.0)
             total += sigma
             largest = max(largest, sigma)
-            times += names[landmark, 0]
+            times += counts_and_ids[landmark, 0]
             count_bin = 0
-            while count_bin + 1 < len(COUNT_BINS) and names[landmark, 0] >= COUNT_BINS[count_bin + 1]:
+            while count_bin + 1 < len(COUNT_BINS) and counts_and_ids[landmark, 0] >= COUNT_BINS[count_bin + 1]:
                 count_bin += 1
             landmark_counts[k, count_bin] += 1.0
         held, stats = parts[k, 1] - parts[k, 0], map_stats[k]
@@ -159,4 +159,4 @@ def write_observations(
 
         for i in range(landmark_counts.shape[1]):
             landmark_counts[k, i] = _clip(landmark_counts[k, i], 0.0, MAP_STATS_LIMIT[0])
-        paint(cells[k], belief, places[parts[k, 0] : parts[k, 1]], local_grid[k])
+        paint(cells[k], belief, positions[parts[k, 0] : parts[k, 1]], local_grid[k])

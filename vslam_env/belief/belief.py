@@ -224,7 +224,7 @@ class BeliefBatch(NamedTuple):
 
     Attributes:
         robots: (n,) int64. Indices of the robots.
-        points: Poses, with one row per robot and columns for the team up to the last known robot.
+        team_poses: Poses, with one row per robot and columns for the team up to the last known robot.
         map_summaries: Summaries of the confirmed landmarks in the map frames.
         cells: (n, S, S) uint8. Cells of the occupancy grids.
         global_grids: Pictures of all that was seen.
@@ -233,7 +233,7 @@ class BeliefBatch(NamedTuple):
     """
 
     robots: IntArray
-    points: TeamPoses
+    team_poses: TeamPoses
     map_summaries: TeamMapSummaries
     cells: NDArray[np.uint8]
     global_grids: GlobalGrids
@@ -245,16 +245,16 @@ class BeliefBatch(NamedTuple):
         """Return the batch of a single belief."""
         known = {mate.robot: (mate.pose, mate.position_sigma) for mate in belief.teammates}
         known[belief.robot] = belief.pose, position_sigma(belief.covariance)
-        points = TeamPoses(1, max(known) + 1)
-        points.own[0], points.starts[0] = belief.pose, belief.start_from_group
-        points.covariances[0], points.ess[0] = belief.covariance, belief.ess
-        points.poses.fill(np.nan)
-        points.sigmas.fill(np.nan)
+        team_poses = TeamPoses(1, max(known) + 1)
+        team_poses.own[0], team_poses.starts[0] = belief.pose, belief.start_from_group
+        team_poses.covariances[0], team_poses.ess[0] = belief.covariance, belief.ess
+        team_poses.poses.fill(np.nan)
+        team_poses.sigmas.fill(np.nan)
         for robot, (pose, sigma) in known.items():
-            points.poses[0, robot], points.sigmas[0, robot] = pose, sigma
+            team_poses.poses[0, robot], team_poses.sigmas[0, robot] = pose, sigma
         return cls(
             robots=np.array([belief.robot]),
-            points=points,
+            team_poses=team_poses,
             map_summaries=TeamMapSummaries.from_maps([belief.group_map.summary]),
             cells=belief.grid.cells[None],
             global_grids=GlobalGrids.of(belief.grid, belief.looks),

@@ -1,24 +1,4 @@
-"""Observations of agents, computed from belief and scan, and their spaces.
-
-| key | shape | content, in estimated frames | bounds |
-|---|---|---|---|
-| `pose` | (3,) | x, y [m], theta [rad], start frame | +-400, pi |
-| `pose_std` | (3,) | one sigma of each [m, m, rad] | 400, pi |
-| `map_stats` | (6,) | landmarks; mean and largest one sigma [m]; mean count; ESS / M; group size | `MAP_STATS_LIMIT` |
-| `local_grid` | (3, 48, 48) uint8 | free, occupied, landmarks; cells of 0.2 m, robot heading up | 0, 255 |
-| `scan` | (R,) | ranges from right to left [m] | range of the scan |
-| `candidates` | (32, 17) | columns `CANDIDATE_FEATURES`, robot frame | +-400 |
-| `teammates` | (7, 5) | x, y [m], cos and sin of the heading, robot frame; one sigma of the position [m] | +-400 |
-| `teammates_mask` | (7,) int8 | which rows hold a robot of the same group | 0, 1 |
-| `landmark_counts` | (5,) | landmarks measured up to 2, 4, 8, 16, and more times | 0, 10000 |
-| `time_left` | (1,) | until the episode is truncated [s] | 0, 1e6 |
-| `global_grid` | (3, 48, 48) uint8 | shares of free, occupied and looked-at cells of all that was seen | 0, 255 |
-| `global_grid_frame` | (3,) | x, y of its middle, start frame, and size of its cells [m] | +-400 |
-| `action_mask` | (33,) int8 | `goal` actions only: which actions are valid | 0, 1 |
-
-Rows of `teammates` belong to the other robots in ascending order, whatever their group; rows of robots outside the
-group are zero. One sigma of a landmark is the root of its mean variance. Values are clipped to the bounds.
-"""
+"""Observations of agents, computed from belief and scan, and their spaces; `ExplorationEnv` lists the keys."""
 
 from typing import Any
 
@@ -58,7 +38,7 @@ def observe(belief: Belief, scan: FloatArray, goal_actions: bool) -> Observation
         goal_actions: Whether actions choose candidates and are masked.
 
     Returns:
-        New arrays by name, see the table of this module.
+        New arrays by name, see `vslam_env.environment.ExplorationEnv`.
     """
     return observe_team(BeliefBatch.of(belief), scan[None], goal_actions)[0]
 
@@ -75,19 +55,21 @@ def observe_team(view: BeliefBatch, scans: FloatArray, goal_actions: bool) -> li
         New arrays by name for each robot, see `observe`.
     """
     count, candidates = len(view.robots), view.features
-    poses, deviations = np.empty((count, 3), np.float32), np.empty((count, 3), np.float32)
+    own_poses, deviations = np.empty((count, 3), np.float32), np.empty((count, 3), np.float32)
     stats, ranges = np.empty((count, 6), np.float32), np.empty(scans.shape, np.float32)
     teammates, present = np.empty((count, MAX_TEAMMATES, 5), np.float32), np.empty((count, MAX_TEAMMATES), np.int8)
     pictures = np.empty((count, len(CHANNELS), SIZE, SIZE), np.uint8)
-    points, ((places, names), parts) = view.points, view.map_summaries
+    team_poses, ((positions, counts_and_ids), parts) = view.team_poses, view.map_summaries
     counts, time_left = np.empty((count, len(COUNT_BINS)), np.float32), min(view.seconds_left, MAX_SECONDS_LEFT)
     global_grids, frames = view.global_grids.pictures.copy(), view.global_grids.frames.copy()
-    arrays = poses, deviations, stats, pictures, ranges, candidates, teammates, present, counts
-    write_observations(view.robots, points.poses, points.beliefs, places, names, parts, view.cells, scans, arrays)
+    arrays = own_poses, deviations, stats, pictures, ranges, candidates, teammates, present, counts
+    write_observations(
+        view.robots, team_poses.poses, team_poses.beliefs, positions, counts_and_ids, parts, view.cells, scans, arrays
+    )
     observations: list[Observation] = []
     for i in range(count):  # by index: iterating over arrays costs microseconds
         observation: Observation = {
-            "pose": poses[i],
+            "pose": own_poses[i],
             "pose_std": deviations[i],
             "map_stats": stats[i],
             "local_grid": pictures[i],
@@ -114,7 +96,7 @@ def action_mask(candidates: NDArray[np.float32]) -> NDArray[np.int8]:
 
 
 def flatten(observation: Observation) -> NDArray[np.float32]:
-    """Return an observation without its action mask as one float32 vector in table order, grids from 0 to 1."""
+    """Return an observation without its action mask as one float32 vector, grids from 0 to 1."""
     parts = [
         (value / np.float32(GRID_ON) if name in GRIDS else value).ravel()
         for name, value in observation.items()

@@ -40,13 +40,13 @@ class Rendezvous:
         self._visited = np.zeros((num_robots, num_robots), np.bool_)
 
     def update(
-        self, robot: int, points: TeamPoses, group: tuple[int, ...], shared: IntArray, landmarks: LandmarkRows
+        self, robot: int, team_poses: TeamPoses, group: tuple[int, ...], shared: IntArray, landmarks: LandmarkRows
     ) -> FloatArray:
         """Return the places of a robot.
 
         Args:
             robot: Index of the robot.
-            points: Pose estimates.
+            team_poses: Pose estimates.
             group: Known group members of the robot.
             shared: (K,) int64. 1 for robots on the same filter.
             landmarks: All landmarks of the robot's map, see `TeamCandidates.update`.
@@ -56,7 +56,7 @@ class Rendezvous:
         """
         visited, places = self._visited[robot], np.full((NUM_RENDEZVOUS, 3), np.nan)
         member = member_mask(group, len(visited))
-        place_rendezvous(robot, points.beliefs, points.poses[robot], member, shared, visited, places)
+        place_rendezvous(robot, team_poses.beliefs, team_poses.poses[robot], member, shared, visited, places)
         if len(group) < len(visited):
             richest_place(*landmarks, places[RICHEST])
         return places

@@ -187,7 +187,7 @@ class SharedGrids:
         tick: int,
         report: TeamReport,
         mates: Sequence[tuple[int, ...]],
-        points: TeamPoses,
+        team_poses: TeamPoses,
         scans: FloatArray,
         bumps: BoolArray,
     ) -> None:
@@ -197,7 +197,7 @@ class SharedGrids:
             tick: Tick of the readings.
             report: Report of the filters on this tick.
             mates: Robots on the same filter, see `share_on_contact`.
-            points: Current pose estimates.
+            team_poses: Current pose estimates.
             scans: (K, R) float64 [m]. Scans of this tick.
             bumps: (K,) bool. True for robots that bumped into an obstacle.
 
@@ -207,11 +207,11 @@ class SharedGrids:
         if report.map_changes or self._strokes:
             self._apply_report(tick, report)
         if mates != self._mates:
-            self.share_on_contact(tick, mates, points.starts)
-        self.team.update(self._shared, points.poses, scans, bumps, *self._hardware)
-        self.looks.update(self._shared, points.poses, scans, self.team.size)
+            self.share_on_contact(tick, mates, team_poses.starts)
+        self.team.update(self._shared, team_poses.poses, scans, bumps, *self._hardware)
+        self.looks.update(self._shared, team_poses.poses, scans, self.team.size)
         if self._kept or self._oldest_parting is not None:
-            poses, scans, bumps = as_constant(points.poses), as_constant(scans), as_constant(bumps)
+            poses, scans, bumps = as_constant(team_poses.poses), as_constant(scans), as_constant(bumps)
             self._strokes.append(GridUpdate(tick, self._shared_then, poses, scans, bumps))
 
     def _apply_report(self, tick: int, report: TeamReport) -> None:

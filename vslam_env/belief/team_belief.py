@@ -10,7 +10,6 @@ import numpy as np
 from slam_backend.core.read_only import as_read_only
 from slam_backend.core.state import accepted, restore, take
 from slam_backend.core.validation import Float32Array, FloatArray, argument_error
-from slam_backend.fastslam.consistency import Consistency
 from slam_backend.fastslam.options import FilterOptions
 from slam_backend.fastslam.relative_poses import TeamPoses
 from slam_backend.fastslam.step_input import StepInput
@@ -19,7 +18,7 @@ from slam_backend.maps.alignment import Alignment
 from slam_backend.maps.landmark_map import LandmarkMap, TeamMapSummaries
 from slam_backend.team.merge_scheduler import AttemptOptions
 from slam_backend.team.options import MergeOptions
-from slam_backend.team.reports import LandmarkIdMap, MergeEvent, TeamReport
+from slam_backend.team.reports import LandmarkIdMap, TeamReport
 from slam_backend.team.team import TeamSlam
 from vslam_env.belief.belief import Belief, BeliefBatch, BeliefConfig, Candidates, RobotHardware, Teammate
 from vslam_env.belief.readings import Readings, TeamReadings
@@ -49,9 +48,9 @@ class TeamBelief:
         attempts: Whether the team attempts merges itself; if not, merges from outside are final.
 
     Attributes:
-        points: Pose estimates; overwritten in the next step.
+        team: Filters of the team; it is changed by the methods of this class alone.
+        team_poses: Pose estimates; overwritten in the next step.
         known_groups: Robots known to share a map with each robot, itself included.
-        exchange: Count of the bytes sent; read-only.
         grids: Occupancy grids of the robots; read-only.
     """
 
@@ -69,8 +68,7 @@ class TeamBelief:
             seed = np.random.SeedSequence(seed.entropy, spawn_key=seed.spawn_key)
         options = {f.name: getattr(config.filter, f.name) for f in fields(FilterOptions)}
         schedule, merging = merge_options(config, attempts)
-        self._team = TeamSlam(num_robots, config.alignment, seed, schedule, merging, **options)
-        self.exchange = self._team.exchange
+        self.team = TeamSlam(num_robots, config.alignment, seed, schedule, merging, **options)
         camera = config.filter.camera
         self._grids = SharedGrids(num_robots, body, camera)
         self.grids = self._grids.team
@@ -86,31 +84,16 @@ class TeamBelief:
         self._confirm_after = config.confirm_after
         self._beliefs: dict[int, Belief] = {}  # beliefs of this tick, made on demand
         self._maps: dict[int, LandmarkMap] = {}  # maps of this tick by number
-        self.points = TeamPoses(num_robots)
-        self._outlines = TeamMapSummaries.allocate(num_robots, 0)  # of this tick, filled on demand
-        self._has_outlines = False
-        self._all_outlines = TeamMapSummaries.allocate(num_robots, 0)  # with unconfirmed landmarks
+        self.team_poses = TeamPoses(num_robots)
+        self._map_summaries = TeamMapSummaries.allocate(num_robots, 0)  # of this tick, filled on demand
+        self._has_summaries = False
+        self._whole_map_summaries = TeamMapSummaries.allocate(num_robots, 0)  # with unconfirmed landmarks
         self._refresh_poses()
-
-    @property
-    def num_robots(self) -> int:
-        """Number of robots K."""
-        return self._team.num_robots
-
-    @property
-    def groups(self) -> tuple[tuple[int, ...], ...]:
-        """Groups, each in ascending order of robots."""
-        return self._topology.groups
-
-    @property
-    def events(self) -> tuple[MergeEvent, ...]:
-        """All merge attempts, merges and rollbacks so far, in order."""
-        return self._team.events
 
     @property
     def poses(self) -> FloatArray:
         """(K, 3) float64 [m, m, rad]. Copy of the pose estimates, each in the robot's own start frame."""
-        return self.points.own.copy()
+        return self.team_poses.own.copy()
 
     def step(self, readings: TeamReadings | Sequence[Readings]) -> TeamReport:
         """Update all beliefs with the readings of one tick, beginning with the reset.
@@ -129,7 +112,7 @@ class TeamBelief:
         if len(readings.bumps) != len(self._robots):
             got, hint = f"shape {readings.bumps.shape}", "Give one bool per robot."
             raise argument_error("readings.bumps", f"an array of shape ({len(self._robots)},)", got, hint)
-        report = self._team.step(
+        report = self.team.step(
             [None] * len(self._robots) if readings.odometry is None else readings.odometry,
             readings.measurements,
             readings.contacts,
@@ -138,61 +121,53 @@ class TeamBelief:
         )
         self._tick += 1
         self._refresh_poses()
-        points = self.points
-        self._grids.step(self._tick, report, self._topology.same_filter, points, readings.scans, readings.bumps)
+        team_poses = self.team_poses
+        self._grids.step(self._tick, report, self._topology.same_filter, team_poses, readings.scans, readings.bumps)
         if readings.goals is not None:
             self._goals = readings.goals
         turns = self._turns[self._tick % len(self._turns)] if self._tick else range(len(self._robots))
         if len(turns):
-            self._all_outlines = self._team.map_summaries(1, self._all_outlines)
+            self._whole_map_summaries = self.team.map_summaries(1, self._whole_map_summaries)
         for robot in turns:
-            first, last = self._all_outlines.parts[robot]
-            rows = self._all_outlines.rows
-            landmarks = rows.positions[first:last], rows.counts_and_ids[first:last], points.starts[robot]
+            first, last = self._whole_map_summaries.parts[robot]
+            rows = self._whole_map_summaries.rows
+            landmarks = rows.positions[first:last], rows.counts_and_ids[first:last], team_poses.starts[robot]
             known, shared = self._topology.known_robots[robot], self._grids.shared[robot]
-            places = self._rendezvous.update(robot, points, known, shared, landmarks)
-            self._candidates.update(robot, self.grids, self._grids.looks, points.poses, landmarks, places)
+            places = self._rendezvous.update(robot, team_poses, known, shared, landmarks)
+            self._candidates.update(robot, self.grids, self._grids.looks, team_poses.poses, landmarks, places)
         return report
 
     def merge(self, robot_a: int, robot_b: int, alignment: Alignment, known: bool = False) -> LandmarkIdMap:
         """Merge the groups of two robots with a given alignment of their filter maps; see `TeamSlam.merge`."""
-        id_map = self._team.merge(robot_a, robot_b, alignment, known)
+        id_map = self.team.merge(robot_a, robot_b, alignment, known)
         self._refresh_poses()
         self._grids.save_for_undo(self._tick + 1, id_map)
-        self._grids.share_on_contact(self._tick + 1, self._topology.same_filter, self.points.starts)
+        self._grids.share_on_contact(self._tick + 1, self._topology.same_filter, self.team_poses.starts)
         return id_map
 
     def rejuvenate(self) -> None:
         """Smooth paths and maps of all filters that have a smoother now; see `TeamSlam.rejuvenate`."""
-        self._team.rejuvenate()
+        self.team.rejuvenate()
         self._refresh_poses()
 
     def representative(self, group: tuple[int, ...]) -> int:
         """Return the first robot of a group that uses the joint filter, which merges need."""
-        return self._team.trunk_robots(group[0])[0]
-
-    def consistency(self, robot: int) -> Consistency:
-        """Return the consistency test of a robot's filter; see `FastSlam.consistency`."""
-        return self._team.consistency(robot)
-
-    def filter_map(self, robot: int) -> LandmarkMap:
-        """Return the whole map of a robot's group, including unconfirmed landmarks, in the group's map frame."""
-        return self._team.map(robot)
+        return self.team.trunk_robots(group[0])[0]
 
     def group_map(self, robot: int) -> LandmarkMap:
-        """Return the confirmed landmarks of a robot's group, in the group's map frame."""
+        """Return the confirmed landmarks of a robot's group, in the group's map frame; `team.map` has all."""
         number = self._topology.maps[robot]
         if number not in self._maps:
-            self._maps[number] = self._team.map(robot, min_count=self._confirm_after)
+            self._maps[number] = self.team.map(robot, min_count=self._confirm_after)
         return self._maps[number]
 
     @property
     def map_summaries(self) -> TeamMapSummaries:
         """Summaries of `group_map` for all robots, computed faster; valid until the next step."""
-        if not self._has_outlines:
-            self._outlines = self._team.map_summaries(self._confirm_after, self._outlines)
-            self._has_outlines = True
-        return self._outlines
+        if not self._has_summaries:
+            self._map_summaries = self.team.map_summaries(self._confirm_after, self._map_summaries)
+            self._has_summaries = True
+        return self._map_summaries
 
     def grid(self, robot: int) -> OccupancyGrid:
         """Return the occupancy grid of a robot, updated in later ticks."""
@@ -221,13 +196,13 @@ class TeamBelief:
         self._global_grids.update(grids, self._grids.looks)
         of_grids = grids.cells, self._global_grids
         return BeliefBatch(
-            self._robots, self.points, self.map_summaries, *of_grids, self._features(), self._seconds_left
+            self._robots, self.team_poses, self.map_summaries, *of_grids, self._features(), self._seconds_left
         )
 
     @property
     def buffered_inputs(self) -> Mapping[int, StepInput]:
         """Buffered readings by step that some filter may still need; read-only."""
-        return self._team.buffered_inputs
+        return self.team.buffered_inputs
 
     @property
     def grid_updates(self) -> dict[int, GridUpdate]:
@@ -238,7 +213,7 @@ class TeamBelief:
         """Return the complete state of the beliefs."""
         return {
             "tick": self._tick,
-            "team": self._team.get_state(),
+            "team": self.team.get_state(),
             "grids": self._grids.get_state(),
             "candidates": self._candidates.get_state(),
             "rendezvous": take(self._rendezvous),
@@ -247,7 +222,7 @@ class TeamBelief:
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Restore a validated state of `get_state`."""
-        self._team.restore_checked(state["team"])
+        self.team.restore_checked(state["team"])
         self._tick = state["tick"]
         self._grids.set_state(state["grids"])
         self._candidates.set_state(state["candidates"])
@@ -257,12 +232,12 @@ class TeamBelief:
 
     def _refresh_poses(self) -> None:
         """Update groups and poses after a step or a merge, and clear cached beliefs and maps."""
-        self._topology = self._team.topology
+        self._topology = self.team.topology
         self.known_groups = self._topology.known_robots
-        self._team.team_poses(self.points)
+        self.team.team_poses(self.team_poses)
         self._beliefs.clear()
         self._maps.clear()
-        self._has_outlines = False
+        self._has_summaries = False
 
     def _others(self, robot: int) -> list[int]:
         """Return the other known members of a robot's group, ascending."""
@@ -271,17 +246,17 @@ class TeamBelief:
     def _known_goals(self) -> FloatArray:
         """Return the current goal (K, K, 2) [m] of robot j in the start frame of robot i; NaN: none, or not known."""
         goals = np.empty((len(self._robots), len(self._robots), 2))
-        write_goals(self.points.starts, self._goals, self._grids.shared, goals)
+        write_goals(self.team_poses.starts, self._goals, self._grids.shared, goals)
         return goals
 
     def _teammates(self, robot: int) -> tuple[Teammate, ...]:
         """Return a robot's teammates; those out of contact with their last known pose."""
-        points, team = self.points, self._team
-        turn, goals = float(points.starts[robot, 2]), self._known_goals()[robot]
+        team_poses, team = self.team_poses, self.team
+        turn, goals = float(team_poses.starts[robot, 2]), self._known_goals()[robot]
         others = self._others(robot)
         covariances = [rotate_covariances(turn, team.pose(mate, robot).covariance) for mate in others]
         return tuple(
-            Teammate(mate, points.poses[robot, mate], covariance, goals[mate])
+            Teammate(mate, team_poses.poses[robot, mate], covariance, goals[mate])
             for mate, covariance in zip(others, covariances, strict=True)
         )
 
@@ -305,27 +280,27 @@ class TeamBelief:
 
     def _features(self) -> Float32Array:
         """Return the features (K, C, F) float32 of all robots' candidates; a new array."""
-        return self._candidates.features(self.points.poses, self._known_goals())
+        return self._candidates.features(self.team_poses.poses, self._known_goals())
 
     def _make_belief(self, robot: int) -> Belief:
         """Build the belief of a robot."""
-        points, group = self.points, self._topology.known_robots[robot]
+        team_poses, group = self.team_poses, self._topology.known_robots[robot]
         return Belief(
             robot=robot,
             tick=self._tick,
             frame=group[0],
             group=group,
-            pose=points.own[robot],
-            covariance=points.covariances[robot],
-            particles=self._team.particles_from_start(robot),
-            log_weights=self._team.particles(robot)[1],
-            ess=float(points.ess[robot]),
+            pose=team_poses.own[robot],
+            covariance=team_poses.covariances[robot],
+            particles=self.team.particles_from_start(robot),
+            log_weights=self.team.particles(robot)[1],
+            ess=float(team_poses.ess[robot]),
             grid=self._grids[robot].read_only_view(),
             candidates=self._make_candidates(robot),
             teammates=self._teammates(robot),
             looks=as_read_only(self._grids.looks.counts[robot]),
             seconds_left=self._seconds_left,
-            start_from_group=points.starts[robot],
+            start_from_group=team_poses.starts[robot],
             group_map=self.group_map(robot),
         )
 

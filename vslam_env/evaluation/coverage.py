@@ -127,10 +127,10 @@ class CoverageCells:
     """
 
     def __init__(self, free_area_cells: FloatArray, true_starts: FloatArray) -> None:
-        own = [_flat_cells(transform_points(inverse(start), free_area_cells)) for start in np.asarray(true_starts)]
+        parts = [_flat_cells(transform_points(inverse(start), free_area_cells)) for start in np.asarray(true_starts)]
         self.cells = as_constant(np.ascontiguousarray(free_area_cells))
-        self.laid = as_read_only(np.concatenate(own, axis=1))
-        self.bounds = as_read_only(np.cumsum([0, *(part.shape[1] for part in own)]))
+        self.laid = as_read_only(np.concatenate(parts, axis=1))
+        self.bounds = as_read_only(np.cumsum([0, *(part.shape[1] for part in parts)]))
 
 
 class CoverageTracker:

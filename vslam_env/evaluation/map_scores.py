@@ -13,6 +13,7 @@ from slam_backend.core.validation import BoolArray, FloatArray, IntArray, check_
 from slam_backend.fastslam.relative_poses import OWN, SIGMAS, START, TeamPoses
 from slam_backend.maps.landmark_map import TeamMapSummaries
 from slam_backend.team.reports import LandmarkIdMap, LandmarksCreated, MapForked, MapReleased, TeamReport
+from vslam_env.evaluation.team_metrics import RobotMetrics
 
 FALSE, UNCOUNTED = -1, -2  # claims of false landmarks, and of true ones that are not scored
 ACCURATE_WITHIN = 0.5  # [m] error below which a landmark counts as accurate
@@ -24,19 +25,19 @@ UNUSED = -3  # claim of an unused landmark id
 @in_place
 def score_team(
     positions: Any,
-    ids: Any,
+    counts_and_ids: Any,
     map_rows: Any,
     ground_truth: tuple[Any, ...],
     beliefs: Any,
     true_starts: Any,
     true_poses: Any,
-    scores: Any,
+    metrics: RobotMetrics[FloatArray],
 ) -> None:
     """Write the errors of the robots' maps and poses, in their own start frames and without a fit.
 
     Args:
-        positions, ids, map_rows: (n, 4), (n, 2) int64, (K, 2) int64. Landmarks of all maps, and first and last row of
-            each robot's map; see `TeamMapSummaries`.
+        positions, counts_and_ids, map_rows: (n, 4), (n, 2) int64, (K, 2) int64. Landmarks of all maps, and first and
+            last row of each robot's map; see `TeamMapSummaries`.
         ground_truth: Claims of the landmarks, and the data to score them:
             (B, n) int64. Claim of each landmark id, map by map: a row of the true positions, `FALSE` or `UNCOUNTED`.
             (K,) int64. Row of each robot's map in these claims.
@@ -46,21 +47,20 @@ def score_team(
             robot's map; inf without any.
         beliefs: (K, 16 + K). Array of `TeamPoses`.
         true_starts, true_poses: (K, 3) [m, m, rad], world frame. True start and current poses.
-        scores: (8 or more, K) float64. Output per robot: map error E [m], see `slam_backend.metrics.map_error`; RMSE
-            [m] of the matched landmarks, or the cutoff without a match; recall; precision; recall of landmarks with an
-            error below 0.5 m; errors of position [m] and heading [rad] in [0, pi]; estimated one sigma of the position
-            [m].
+        metrics: Rows (K,), see `TeamMetrics` and `slam_backend.metrics.map_error`. Output: those that compare maps and
+            poses with the truth.
     """
     claims, claims_row, truths, cutoff, smallest_errors = ground_truth
     for robot in range(len(beliefs)):
-        belief, start, true, score = beliefs[robot], true_starts[robot], true_poses[robot], scores[:, robot]
+        belief, start, true = beliefs[robot], true_starts[robot], true_poses[robot]
         smallest = smallest_errors[robot]
         c, s = math.cos(start[2]), math.sin(start[2])
         dx = start[0] + c * belief[OWN] - s * belief[OWN + 1] - true[0]
         dy = start[1] + s * belief[OWN] + c * belief[OWN + 1] - true[1]
         turned = start[2] + belief[OWN + 2] - true[2]
-        score[5], score[6] = math.hypot(dx, dy), abs((turned + math.pi) % (2.0 * math.pi) - math.pi)
-        score[7] = belief[SIGMAS + robot]
+        metrics.pose_errors[robot] = math.hypot(dx, dy)
+        metrics.heading_errors[robot] = abs((turned + math.pi) % (2.0 * math.pi) - math.pi)
+        metrics.pose_sigmas[robot] = belief[SIGMAS + robot]
 
         x0 = start[0] + c * belief[START] - s * belief[START + 1]
         y0 = start[1] + s * belief[START] + c * belief[START + 1]
@@ -68,7 +68,7 @@ def score_team(
         smallest[:] = np.inf
         estimated = surplus = 0
         for i in range(map_rows[robot, 0], map_rows[robot, 1]):
-            claim = claims[claims_row[robot], ids[i, 1]]
+            claim = claims[claims_row[robot], counts_and_ids[i, 1]]
             estimated += claim != UNCOUNTED
             if claim == FALSE:
                 surplus += 1
@@ -88,10 +88,10 @@ def score_team(
                 total += min(square, cutoff * cutoff)
             else:
                 total += 0.5 * cutoff * cutoff
-        score[0] = math.sqrt(total / len(truths))
-        score[1] = math.sqrt(squares / matched) if matched else cutoff
-        score[2], score[3] = matched / len(truths), matched / max(estimated, 1)
-        score[4] = accurate / len(truths)
+        metrics.map_errors[robot] = math.sqrt(total / len(truths))
+        metrics.map_rmses[robot] = math.sqrt(squares / matched) if matched else cutoff
+        metrics.map_recalls[robot], metrics.map_precisions[robot] = matched / len(truths), matched / max(estimated, 1)
+        metrics.accurate_recalls[robot] = accurate / len(truths)
 
 
 class GroundTruthAssociation:
@@ -172,23 +172,25 @@ class GroundTruthAssociation:
     def score(
         self,
         map_summaries: TeamMapSummaries,
-        points: TeamPoses,
+        team_poses: TeamPoses,
         true_starts: FloatArray,
         true_poses: FloatArray,
-        scores: FloatArray,
+        metrics: RobotMetrics[FloatArray],
     ) -> None:
         """Score the robots' maps and poses in their own start frames.
 
         Args:
             map_summaries: Summaries of the maps of the K robots, in their map frames.
-            points: Pose estimates of the robots.
+            team_poses: Pose estimates of the robots.
             true_starts: (K, 3) [m, m, rad], world frame. True start poses.
             true_poses: (K, 3) [m, m, rad], world frame. True current poses.
-            scores: (8 or more, K) float64. Output: first rows of `TeamMetrics.per_robot`.
+            metrics: Output, see `score_team`.
         """
-        (positions, ids), map_rows = map_summaries
+        (positions, counts_and_ids), map_rows = map_summaries
         ground_truth = self._claims, self._claims_row, self.true_positions, self.cutoff, self._smallest
-        score_team(positions, ids, map_rows, ground_truth, points.beliefs, true_starts, true_poses, scores)
+        score_team(
+            positions, counts_and_ids, map_rows, ground_truth, team_poses.beliefs, true_starts, true_poses, metrics
+        )
 
     def get_state(self) -> dict[str, Any]:
         """Return a copy of the state; the true ids of measurements are shared and read-only."""

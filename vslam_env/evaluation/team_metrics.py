@@ -1,9 +1,10 @@
 """Metrics of a team at one tick, computed from ground truth, and what rewards may read of its beliefs."""
 
 from collections.abc import Sequence
-from typing import Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import FloatArray, IntArray
@@ -13,7 +14,7 @@ Row = TypeVar("Row", covariant=True)  # sequence of one number per robot
 
 @short_repr
 class RobotMetrics(NamedTuple, Generic[Row]):
-    """Metrics of all robots, one row per metric; `score_team` writes the first eight, `Episode` the others."""
+    """Metrics of all robots, a row of one number per robot for each; `TeamMetrics` describes them."""
 
     map_errors: Row
     map_rmses: Row
@@ -31,7 +32,7 @@ class RobotMetrics(NamedTuple, Generic[Row]):
 
 @short_repr
 class RobotCounts(NamedTuple):
-    """Counts of all robots; see `TeamMetrics`."""
+    """Counts of all robots since the reset; `TeamMetrics` describes them."""
 
     collisions: tuple[int, ...]
     bytes_sent: tuple[int, ...]
@@ -59,13 +60,31 @@ class BeliefSummary(NamedTuple):
 class TeamMetrics(NamedTuple):
     """Metrics of a team at one tick, computed from ground truth.
 
+    The rows of `per_robot` and `counts` are attributes, too, as new arrays (K,): `metrics.map_errors`.
+
     Attributes:
         per_robot: Metrics of each robot, row by row.
-        counts: Counts of each robot since the reset.
+        counts: Counts of each robot since the reset, row by row.
         coverage: Share of the free floor seen by the team.
         merges: Number of merges since the reset.
         time: Simulated time since the reset [s].
         beliefs: Belief of each robot; empty unless a reward term reads beliefs, see `vslam_env.reward.RewardTerm`.
+        map_errors: (K,) float64 [m]. Map error E of each robot.
+        map_rmses: (K,) float64 [m]. RMSE of the matched landmarks; the cutoff of the map error without a match.
+        map_recalls: (K,) float64. Share of the true landmarks in each robot's map, whatever their error.
+        map_precisions: (K,) float64. Share of the landmarks in each map that are matched; of duplicates one counts.
+        accurate_recalls: (K,) float64. Share of the true landmarks in each robot's map with an error below 0.5 m.
+        pose_errors: (K,) float64 [m]. Position error of each robot.
+        heading_errors: (K,) float64 [rad]. Absolute heading error of each robot, in [0, pi].
+        pose_sigmas: (K,) float64 [m]. Estimated one sigma of each robot's position in its own start frame.
+        discovered: (K,) float64. Share of the free floor that each robot was nearest to when the team first saw it.
+        distances: (K,) float64 [m]. True distance travelled by each robot since the reset.
+        error_integrals: (K,) float64 [m s]. Time integral of each robot's map error E since the reset; zeros unless the
+            reward has the term `running_cost`, which requires scores at every tick.
+        own_recalls: (K,) float64. Share of the true landmarks that each robot was the first to hold well by its own
+            measurement, see `RecallCredits`; zeros unless the reward has the term `own_recall`.
+        collisions: (K,) int64. Number of ticks since the reset in which each robot's motion was blocked.
+        bytes_sent: (K,) int64. Bytes sent by each robot since the reset.
     """
 
     per_robot: RobotMetrics[Sequence[float]]
@@ -75,78 +94,9 @@ class TeamMetrics(NamedTuple):
     time: float
     beliefs: tuple[BeliefSummary, ...] = ()
 
-    @property
-    def map_errors(self) -> FloatArray:
-        """(K,) float64 [m]. Map error E of each robot."""
-        return np.array(self.per_robot.map_errors)
-
-    @property
-    def map_rmses(self) -> FloatArray:
-        """(K,) float64 [m]. RMSE of each robot's matched landmarks; the cutoff of the map error without a match."""
-        return np.array(self.per_robot.map_rmses)
-
-    @property
-    def map_recalls(self) -> FloatArray:
-        """(K,) float64. Share of the true landmarks in each robot's map, whatever their error."""
-        return np.array(self.per_robot.map_recalls)
-
-    @property
-    def map_precisions(self) -> FloatArray:
-        """(K,) float64. Share of the landmarks in each robot's map that are matched; of duplicates one counts."""
-        return np.array(self.per_robot.map_precisions)
-
-    @property
-    def accurate_recalls(self) -> FloatArray:
-        """(K,) float64. Share of the true landmarks in each robot's map with an error below 0.5 m."""
-        return np.array(self.per_robot.accurate_recalls)
-
-    @property
-    def pose_errors(self) -> FloatArray:
-        """(K,) float64 [m]. Position error of each robot."""
-        return np.array(self.per_robot.pose_errors)
-
-    @property
-    def heading_errors(self) -> FloatArray:
-        """(K,) float64 [rad]. Absolute heading error of each robot."""
-        return np.array(self.per_robot.heading_errors)
-
-    @property
-    def pose_sigmas(self) -> FloatArray:
-        """(K,) float64 [m]. Estimated one sigma of each robot's position in its own start frame."""
-        return np.array(self.per_robot.pose_sigmas)
-
-    @property
-    def discovered(self) -> FloatArray:
-        """(K,) float64. Share of the free floor that each robot was nearest to when the team first saw it."""
-        return np.array(self.per_robot.discovered)
-
-    @property
-    def distances(self) -> FloatArray:
-        """(K,) float64 [m]. True distance travelled by each robot since the reset."""
-        return np.array(self.per_robot.distances)
-
-    @property
-    def error_integrals(self) -> FloatArray:
-        """(K,) float64 [m s]. Time integral of each robot's map error E since the reset.
-
-        Zeros unless the reward has the term `running_cost`, which requires scores at every tick.
-        """
-        return np.array(self.per_robot.error_integrals)
-
-    @property
-    def own_recalls(self) -> FloatArray:
-        """(K,) float64. Share of the true landmarks that each robot was the first to hold well by its own measurement.
-
-        See `RecallCredits`. Zeros unless the reward has the term `own_recall`.
-        """
-        return np.array(self.per_robot.own_recalls)
-
-    @property
-    def collisions(self) -> IntArray:
-        """(K,) int64. Number of ticks since the reset in which each robot's motion was blocked."""
-        return np.array(self.counts.collisions, np.int64)
-
-    @property
-    def bytes_sent(self) -> IntArray:
-        """(K,) int64. Bytes sent by each robot since the reset."""
-        return np.array(self.counts.bytes_sent, np.int64)
+    def __getattr__(self, name: str) -> NDArray[Any]:
+        """Return a row of the metrics or counts as an array (K,)."""
+        for rows in (self.per_robot, self.counts):
+            if name in rows._fields:
+                return np.array(getattr(rows, name))
+        raise AttributeError(f"TeamMetrics has no attribute {name!r}")

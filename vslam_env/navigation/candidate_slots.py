@@ -120,11 +120,11 @@ class CandidateSlots:
             reach: Distance [m] from the robot along x and y beyond which candidates stay as they are.
         """
         slots = self._rows, self._visits
-        found, costs, is_clear, self._given_up, ways = update_slots(
+        frontiers, costs, is_clear, self._given_up, ways = update_slots(
             cells, bounds, ROBOT_RADIUS, poses, robot, *slots, self._given_up, float(reach)
         )
         if not is_clear:
-            fill_slots(_assign(costs), found, *slots)
+            fill_slots(_assign(costs), frontiers, *slots)
         return ways
 
     def get_state(self) -> dict[str, Any]:
@@ -140,9 +140,9 @@ class CandidateSlots:
 
 def _together(pose: ArrayLike, teammates: ArrayLike) -> FloatArray:
     """Return the pose (3,) of a robot and the positions (k, 2) of its teammates as poses (1 + k, 3), or raise."""
-    own, positions = pose_floats(pose), positions_array(teammates, "teammates")
+    robot_pose, positions = pose_floats(pose), positions_array(teammates, "teammates")
     poses = np.zeros((1 + len(positions), 3))
-    poses[0], poses[1:, :2] = own, positions
+    poses[0], poses[1:, :2] = robot_pose, positions
     return poses
 
 

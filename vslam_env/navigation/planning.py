@@ -87,15 +87,16 @@ def find_frontiers(cells: Cells, start_xy: ArrayLike, radius: float = 0.2, ignor
     """
     points = positions_array(ignored, "ignored")
     rows = compute_frontiers(*known_part(cells), *_checked_start(start_xy, radius), points)
-    found = FrontierColumns.of(rows)
+    columns = FrontierColumns.of(rows)
     return Frontiers(
-        goals=found.goals, headings=found.heading.copy(), sizes=found.size.copy(), lengths=found.length.copy()
+        goals=columns.goals, headings=columns.heading.copy(), sizes=columns.size.copy(), lengths=columns.length.copy()
     )
 
 
 DETOUR = 30.0  # [m] paths to a goal first pass the known floor this near to start and goal, along x and y
 MIN_RADIUS = 0.11  # [m] below, diagonal steps could cross inflated walls
 
+MAX_SPEED, MAX_TURN = 1.0, 1.5  # [m/s], [rad/s] of robots
 LOOKAHEAD = 0.4  # [m]
 TURN_GAIN = 3.0  # [1/s] times a tick of 0.1 s well below 1, so that the heading does not oscillate
 TURN_ONLY = 0.7  # [rad] heading error above which the robot turns in place
@@ -256,8 +257,8 @@ def _pursue(x: float, y: float, path: FloatArray) -> tuple[float, float, float]:
 def follow_path(
     pose: ArrayLike,
     path: ArrayLike,
-    max_speed: float = 1.0,
-    max_turn: float = 1.5,
+    max_speed: float = MAX_SPEED,
+    max_turn: float = MAX_TURN,
     final_heading: float | None = None,
     aside: float = 0.0,
 ) -> tuple[float, float]:

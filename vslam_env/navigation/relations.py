@@ -93,7 +93,7 @@ def rooms_of(ways: DistanceMap, places: ArrayLike, core: float = ROOM_CORE) -> I
 
 def _open_cells(ways: DistanceMap, places: ArrayLike) -> NDArray[np.int64]:
     """Return the open cells (n, 2) nearest to places (n, 2) [m]; -1 where there is none nearby."""
-    found = [
+    cells = [
         nearest_open(ways.box, ways.weights, row, col, OPEN_CELLS, 1) for row, col in ways.cells_of(places).tolist()
     ]
-    return np.array(found, np.int64).reshape(-1, 2)
+    return np.array(cells, np.int64).reshape(-1, 2)

@@ -172,12 +172,12 @@ def _share_places(first: Any, between: Any) -> Any:
 @jit
 def _length_of(robot: int, owner: Any, first: Any, between: Any) -> float:
     """Return the length of the tour of one robot through its places."""
-    own = np.flatnonzero(owner == robot)
-    if len(own) == 0:
+    stops = np.flatnonzero(owner == robot)
+    if len(stops) == 0:
         return 0.0
-    ways, pairs = np.empty(len(own)), np.empty((len(own), len(own)))
-    for i in range(len(own)):
-        ways[i] = first[robot, own[i]]
-        for j in range(len(own)):
-            pairs[i, j] = between[own[i], own[j]]
+    ways, pairs = np.empty(len(stops)), np.empty((len(stops), len(stops)))
+    for i in range(len(stops)):
+        ways[i] = first[robot, stops[i]]
+        for j in range(len(stops)):
+            pairs[i, j] = between[stops[i], stops[j]]
     return _tour_length(_open_tour(ways, pairs), ways, pairs)

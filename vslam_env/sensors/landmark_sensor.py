@@ -208,7 +208,7 @@ def shuffle_clutter(num_false: IntArray, keys: FloatArray, ids: IntArray, counts
     begin, next_false = 0, -1
     for row, num_true, more in zip(ids, counts.tolist(), num_false.tolist(), strict=True):
         points = [*row[:num_true].tolist(), *range(next_false, next_false - more, -1)]
-        own = keys[begin : begin + len(points)].tolist()
-        row[: len(points)] = [point for _, point in sorted(zip(own, points, strict=True), key=itemgetter(0))]
+        keys_of_robot = keys[begin : begin + len(points)].tolist()
+        row[: len(points)] = [point for _, point in sorted(zip(keys_of_robot, points, strict=True), key=itemgetter(0))]
         begin, next_false = begin + len(points), next_false - more
     counts += num_false

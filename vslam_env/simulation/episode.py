@@ -93,6 +93,7 @@ class Episode:
         body: Hardware of the robots.
         belief: Beliefs of the team.
         ground_truth: Ground-truth association of the estimated landmarks.
+        coverage: Floor that the robots have seen, as of the last `team_metrics`.
         tick: Ticks since the reset.
         readings: Readings of the last tick; unset before `begin`.
         true_path: True poses (K, 3) after each tick, world frame; read-only.
@@ -102,7 +103,7 @@ class Episode:
 
     def __init__(self, config: EnvConfig, scenario: Scenario, hook: ReadingsHook | None = None) -> None:
         self._config = config
-        self._tap = ReadingsHook() if hook is None else hook
+        self._hook = ReadingsHook() if hook is None else hook
         self._all_hear_all = config.always_in_contact
         self._streams = {name: np.random.default_rng(0) for name in scenario.stream_states}
         self._given = ref(scenario)
@@ -121,10 +122,8 @@ class Episode:
 
         self.tick = 0
         self._collisions: tuple[int, ...] = (0,) * config.num_robots
-        self._figures = np.zeros((len(RobotMetrics._fields), config.num_robots))  # distances accumulate
-        rows: RobotMetrics[FloatArray] = RobotMetrics(*self._figures)
-        self._map_errors, self._discovered, self._distances = rows.map_errors, rows.discovered, rows.distances
-        self._error_integrals, self._own_recalls = rows.error_integrals, rows.own_recalls
+        rows = np.zeros((len(RobotMetrics._fields), config.num_robots))  # distances and error integrals accumulate
+        self._metrics: RobotMetrics[FloatArray] = RobotMetrics(*rows)
         self._integrates = RUNNING_COST in config.reward  # scoring every tick is slow
         self._gives_credit = OWN_RECALL in config.reward
         self.true_path: list[FloatArray] = []
@@ -139,7 +138,7 @@ class Episode:
         self.world, self.true_starts, self.belief_seed = scenario.world, scenario.true_starts, scenario.belief_seed
         self._simulator = Simulator(scenario.world, scenario.true_starts, self._config.robot_radius, TICK)
         self.ground_truth = scenario.new_ground_truth(self._config.map_error_cutoff)
-        self._coverage = CoverageTracker(scenario.coverage)
+        self.coverage = CoverageTracker(scenario.coverage)
         self._credits = RecallCredits(self._config.num_robots, len(self.ground_truth.true_positions))
         for name, state in scenario.stream_states.items():
             self._streams[name].bit_generator.state = state
@@ -182,16 +181,11 @@ class Episode:
         if simulator.step(commands):
             self._collisions = tuple(map(add, self._collisions, simulator.bumped.tolist()))
         self.tick += 1
-        odometry = read_odometry(before, simulator.poses, self.scenario.bias, noise, stream, self._distances)
+        odometry = read_odometry(before, simulator.poses, self.scenario.bias, noise, stream, self._metrics.distances)
         self._perceive(odometry, goals)
         if self._integrates:
             self._score(simulator.poses)
-            self._error_integrals += self._map_errors * TICK
-
-    @property
-    def overlap(self) -> float:
-        """Share of the floor seen by the team that at least two robots have seen, as of the last `team_metrics`."""
-        return self._coverage.overlap
+            self._metrics.error_integrals[:] += self._metrics.map_errors * TICK
 
     def estimated_poses(self) -> FloatArray:
         """Return the estimated poses (K, 3) [m, m, rad], moved by the true start poses to the world frame."""
@@ -207,14 +201,14 @@ class Episode:
         self._score(poses)
         if self._gives_credit:
             self._credits.update(self.ground_truth.accurate)
-            self._own_recalls[:] = self._credits.shares
-        coverage = self._coverage.update(belief.grids, poses, self._discovered)
-        counts, figures = (
-            RobotCounts(self._collisions, tuple(belief.exchange.sent)),
-            RobotMetrics(*self._figures.tolist()),
+            self._metrics.own_recalls[:] = self._credits.shares
+        coverage = self.coverage.update(belief.grids, poses, self._metrics.discovered)
+        counts, metrics = (
+            RobotCounts(self._collisions, tuple(belief.team.exchange.sent)),
+            RobotMetrics(*[row.tolist() for row in self._metrics]),
         )
         beliefs = tuple(map(self._summary, range(len(poses)))) if with_beliefs else ()
-        return TeamMetrics(figures, counts, coverage, len(self.merge_ticks), self.tick * TICK, beliefs)
+        return TeamMetrics(metrics, counts, coverage, len(self.merge_ticks), self.tick * TICK, beliefs)
 
     # ------------------------------------------------------------------ snapshots
 
@@ -227,9 +221,9 @@ class Episode:
             "streams": {name: stream.bit_generator.state for name, stream in self._streams.items()},
             "belief": self.belief.get_state(),
             "ground_truth": self.ground_truth.get_state(),
-            "coverage": take(self._coverage),
+            "coverage": take(self.coverage),
             "credits": take(self._credits),
-            "counts": (self._collisions, self._distances.copy(), self._error_integrals.copy()),
+            "counts": (self._collisions, self._metrics.distances.copy(), self._metrics.error_integrals.copy()),
             "last": with_read_only((self.readings, self._frames)),
             "paths": (tuple(self.true_path), tuple(self.estimated_path), tuple(self.merge_ticks)),
         }
@@ -244,10 +238,10 @@ class Episode:
             self._streams[name].bit_generator.state = stream
         self.belief.set_state(state["belief"])
         self.ground_truth.set_state(state["ground_truth"])
-        restore(self._coverage, accepted(CoverageTracker, "state", state["coverage"]))
+        restore(self.coverage, accepted(CoverageTracker, "state", state["coverage"]))
         restore(self._credits, accepted(RecallCredits, "state", state["credits"]))
         self.tick = state["tick"]
-        self._collisions, self._distances[:], self._error_integrals[:] = state["counts"]
+        self._collisions, self._metrics.distances[:], self._metrics.error_integrals[:] = state["counts"]
         self.readings, self._frames = with_constants(state["last"])
         true_path, estimated_path, merge_ticks = state["paths"]
         self.true_path = path_of(true_path, self.true_path)
@@ -259,12 +253,12 @@ class Episode:
     def _score(self, poses: FloatArray) -> None:
         """Score all maps and poses, given the true poses (K, 3), into the first rows of the metrics."""
         belief = self.belief
-        self.ground_truth.score(belief.map_summaries, belief.points, self.true_starts, poses, self._figures)
+        self.ground_truth.score(belief.map_summaries, belief.team_poses, self.true_starts, poses, self._metrics)
 
     def _summary(self, robot: int) -> BeliefSummary:
         """Return what reward terms may read of a robot's belief."""
         group_map, truth = self.belief.group_map(robot), self.ground_truth
-        covariance, claims = self.belief.points.covariances[robot], truth.true_ids(robot, group_map.ids)
+        covariance, claims = self.belief.team_poses.covariances[robot], truth.true_ids(robot, group_map.ids)
         return BeliefSummary(as_constant(covariance), group_map.counts, group_map.covariances, as_constant(claims))
 
     def _perceive(self, odometry: FloatArray | None, goals: FloatArray | None = None) -> None:
@@ -284,8 +278,8 @@ class Episode:
             frames.left if config.observe_images and isinstance(frames, TeamRenderedFrames) else None,
             goals,
         )
-        if self._tap.recorder is not None:
-            self._tap.recorder(self.readings.per_robot())
+        if self._hook.recorder is not None:
+            self._hook.recorder(self.readings.per_robot())
         report = self.belief.step(self.readings)
         self.ground_truth.record(report, frames.names)
         if self._gives_credit:
@@ -298,7 +292,7 @@ class Episode:
         if config.oracle_merge:
             self._merge_by_oracle(contact_components(in_contact, config.num_robots))
         self.true_path.append(as_constant(poses))
-        self.estimated_path.append(as_constant(self.belief.points.own))
+        self.estimated_path.append(as_constant(self.belief.team_poses.own))
 
     def _contacts(self, poses: FloatArray) -> BoolArray:
         """Return the matrix of contacts (K, K)."""
@@ -311,7 +305,7 @@ class Episode:
         merged = True
         while merged:
             merged = False
-            for a, b in combinations(self.belief.groups, 2):
+            for a, b in combinations(self.belief.team.groups, 2):
                 robots = self.belief.representative(a), self.belief.representative(b)
                 if networks[robots[0]] != networks[robots[1]]:
                     continue
@@ -327,4 +321,4 @@ class Episode:
     def _true_ids(self, group: tuple[int, ...]) -> IntArray:
         """Return the true landmark of each row of a group's filter map."""
         robot = self.belief.representative(group)
-        return self.ground_truth.true_ids(robot, self.belief.filter_map(robot).ids)
+        return self.ground_truth.true_ids(robot, self.belief.team.map(robot).ids)

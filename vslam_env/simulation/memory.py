@@ -28,16 +28,16 @@ def available_memory(system: Path = SYSTEM, group: Path = GROUP, own: Path = OWN
     """
     try:
         fields = dict(line.split(":", 1) for line in system.read_text(encoding="ascii").splitlines())
-        found = 1024 * int(fields["MemAvailable"].split()[0])
+        available = 1024 * int(fields["MemAvailable"].split()[0])
     except (OSError, ValueError, KeyError, IndexError):
         return None
     try:
         limit, used = (int((group / name).read_text(encoding="ascii")) for name in ("memory.max", "memory.current"))
-        found = min(found, max(limit - used, 0))
+        available = min(available, max(limit - used, 0))
     except (OSError, ValueError):  # no group, or "max": no limit
         pass
     free = free_addresses(own)
-    return found if free is None else min(found, free)
+    return available if free is None else min(available, free)
 
 
 def check_memory(num_landmarks: int, num_particles: int, available: int | None) -> None:

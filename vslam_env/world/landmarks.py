@@ -136,11 +136,11 @@ def draw_descriptors(count: int, config: LandmarkConfig, rng: np.random.Generato
     """
     own_share = 0.5 * config.distinctness**2
     common = rng.standard_normal(config.descriptor_size)
-    own = rng.standard_normal((count, config.descriptor_size))
+    unique = rng.standard_normal((count, config.descriptor_size))
     common /= np.linalg.norm(common)
-    own -= np.outer(own @ common, common)
-    own /= np.linalg.norm(own, axis=1, keepdims=True)
-    descriptors = np.sqrt(1.0 - own_share) * common + np.sqrt(own_share) * own
+    unique -= np.outer(unique @ common, common)
+    unique /= np.linalg.norm(unique, axis=1, keepdims=True)
+    descriptors = np.sqrt(1.0 - own_share) * common + np.sqrt(own_share) * unique
     copies = rng.random(count) < config.repeated
     copies[0] = False  # at least one original to copy
     originals = np.flatnonzero(~copies)

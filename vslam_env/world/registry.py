@@ -134,8 +134,8 @@ def _parted(world: str) -> tuple[str, Options]:
     Raises:
         ValueError: If an option is unknown, repeated or not a number.
     """
-    found = NAME_AND_OPTIONS.fullmatch(world)
-    name, text = found.groups() if found else (world, "")
+    match = NAME_AND_OPTIONS.fullmatch(world)
+    name, text = match.groups() if match else (world, "")
     if text and name not in WORLD_FAMILIES:
         _files(name)  # the name is wrong before its options are
     known = PLAN_OPTIONS if name not in WORLD_FAMILIES else tuple(signature(WORLD_FAMILIES[name]).parameters)[1:]

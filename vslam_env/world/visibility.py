@@ -71,6 +71,6 @@ def visible_landmarks(
     sight = marks, bounds, landmarks.walls, as_coordinate_rows(walls), robot_radius, view
     chosen, counts, seen = np.empty(shape, np.int64), np.empty(len(poses), np.int64), np.zeros(shape, np.bool_)
     detect(poses, sight, np.zeros(shape), 1.0, np.zeros(len(poses), np.int64), chosen, counts)
-    for row, names, count in zip(seen, chosen, counts, strict=True):
-        row[names[:count]] = True
+    for row, landmarks_seen, count in zip(seen, chosen, counts, strict=True):
+        row[landmarks_seen[:count]] = True
     return seen

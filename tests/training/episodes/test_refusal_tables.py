@@ -34,7 +34,7 @@ def console() -> Console:
 
 def test_each_pair_of_groups_has_a_row() -> None:
     """Robots have their numbers; a pair is apart if the two share no map at the end."""
-    rows = plain(pair_rows(PAIRS, GROUPS, names=[4, 5, 6, 7]))
+    rows = plain(pair_rows(PAIRS, GROUPS, numbers=[4, 5, 6, 7]))
     assert rows[0] == {
         "robots_a": [4], "robots_b": [5], "attempts": 3, "refused": {"too uncertain": 2},
         "last_reason": "too uncertain", "last_step": 74, "missed": "paths", "excess": 2.5, "apart": False,

@@ -39,8 +39,8 @@ def test_stages_have_true_associations() -> None:
     map_a, map_b = stage.maps
     moved = transform_points(truth, map_b.means)
     apart = []
-    for row, name in enumerate(stage.names[0].tolist()):
-        for other in np.flatnonzero(stage.names[1] == name):
+    for row, name in enumerate(stage.true_ids[0].tolist()):
+        for other in np.flatnonzero(stage.true_ids[1] == name):
             if name != FALSE_POINT:
                 apart.append(np.linalg.norm(map_a.means[row] - moved[other]))
     assert np.median(apart) < 0.15
@@ -109,7 +109,7 @@ def test_the_estimated_transform_aligns_the_maps(pair: AlignedPair) -> None:
 def test_fusion_reduces_covariances(pair: AlignedPair) -> None:
     """Fusion never adds uncertainty, and the fused mean lies between both in Mahalanobis terms."""
     fused = fuse_pair(pair)
-    assert len(fused.names) == 3
+    assert len(fused.true_ids) == 3
     one, two, both = fused.covariances
     for other in (one, two):
         assert np.linalg.eigvalsh(other - both).min() > -1e-12

@@ -80,7 +80,7 @@ def test_read_only_arrays_cannot_be_made_writable() -> None:
     for _ in _episode(env):
         pass
     beliefs = [env.belief(agent) for agent in env.possible_agents]
-    maps = [belief.map for belief in beliefs] + [env.episode.belief.filter_map(0)]
+    maps = [belief.map for belief in beliefs] + [env.episode.belief.team.map(0)]
     kept = [beliefs, [belief.grid.cells for belief in beliefs], maps, env.events, env.world, env.readings]
     found = [array for array in _arrays(kept) if not array.flags.writeable]
     assert len(found) > 40
@@ -122,7 +122,7 @@ def test_a_belief_keeps_no_array_of_the_caller() -> None:
                 if array.flags.writeable:
                     array.fill(1)
         assert belief is not None
-        assert any(event.kind == "merge" for event in belief.events)
+        assert any(event.kind == "merge" for event in belief.team.events)
         states.append(belief.get_state())
     assert states[0]["grids"]["strokes"]
     for one, other in zip(*map(_arrays, states), strict=True):

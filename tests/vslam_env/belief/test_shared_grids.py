@@ -23,12 +23,12 @@ Mates = tuple[tuple[int, ...], ...]
 
 def stand(path: np.ndarray) -> TeamPoses:
     """Return where robots at true poses (3, 3) believe themselves and each other to be, who know it well."""
-    points = TeamPoses(3)
+    team_poses = TeamPoses(3)
     for own in range(3):
-        points.poses[own] = between(STARTS[own], path)
-        points.starts[own] = inverse(STARTS[own])  # the map frame is that of the building
-    points.own[:] = points.poses[np.arange(3), np.arange(3)]
-    return points
+        team_poses.poses[own] = between(STARTS[own], path)
+        team_poses.starts[own] = inverse(STARTS[own])  # the map frame is that of the building
+    team_poses.own[:] = team_poses.poses[np.arange(3), np.arange(3)]
+    return team_poses
 
 
 class Drive:
@@ -47,11 +47,14 @@ class Drive:
         way = self._rng.uniform([-0.05, -0.05, -0.2], [0.15, 0.05, 0.2], (3, 3))
         self._path = np.clip(compose(self._path, way), NEAR, FAR)
         scans = np.array([cast(building(), pose) for pose in self._path])
-        points, merges = stand(self._path), tuple(entry for entry in entries if isinstance(entry, LandmarkIdMap))
-        points.poses[0, 1], points.poses[1, 0] = compose(off, points.poses[0, 1]), compose(off, points.poses[1, 0])
+        team_poses, merges = stand(self._path), tuple(entry for entry in entries if isinstance(entry, LandmarkIdMap))
+        team_poses.poses[0, 1], team_poses.poses[1, 0] = (
+            compose(off, team_poses.poses[0, 1]),
+            compose(off, team_poses.poses[1, 0]),
+        )
         told = Associations.from_arrays([NOTHING], [NOTHING])
         report = TeamReport(self.tick, told, mates, (), merges, (0, 0, 0), entries, self.tick + 1)
-        self.grids.step(self.tick, report, mates, points, scans, np.zeros(3, np.bool_))
+        self.grids.step(self.tick, report, mates, team_poses, scans, np.zeros(3, np.bool_))
         self.tick += 1
 
     def cells(self) -> np.ndarray:
@@ -86,10 +89,10 @@ def test_meeting_again_without_new_scans_changes_nothing() -> None:
     for _ in range(20):
         drive.on(ALL)
     before, looks = drive.cells(), drive.grids.looks.counts.copy()
-    points = stand(STARTS)
+    team_poses = stand(STARTS)
     for tick in range(drive.tick, drive.tick + 50):
-        drive.grids.share_on_contact(tick, NONE, points.starts)
-        drive.grids.share_on_contact(tick, ALL, points.starts)
+        drive.grids.share_on_contact(tick, NONE, team_poses.starts)
+        drive.grids.share_on_contact(tick, ALL, team_poses.starts)
     assert (drive.cells() == before).all()
     assert (drive.grids.looks.counts == looks).all()
 
@@ -115,12 +118,12 @@ def test_restored_grids_continue_with_missed_scans() -> None:
         drive.on(mates)
     other = SharedGrids(3, BODY, StereoCamera())
     other.set_state(drive.grids.get_state())
-    points, nothing = stand(STARTS), np.full((3, len(ANGLES)), MAX_RANGE)
+    team_poses, nothing = stand(STARTS), np.full((3, len(ANGLES)), MAX_RANGE)
     report = TeamReport(
         drive.tick, Associations.from_arrays([NOTHING], [NOTHING]), ALL, (), (), (0, 0, 0), (), drive.tick + 1
     )
     for grids in (drive.grids, other):
-        grids.step(drive.tick, report, ALL, points, nothing, np.zeros(3, np.bool_))
+        grids.step(drive.tick, report, ALL, team_poses, nothing, np.zeros(3, np.bool_))
     for robot in range(3):
         assert (drive.grids[robot].cells == other[robot].cells).all()
     assert (drive.grids.looks.counts == other.looks.counts).all()

@@ -52,8 +52,8 @@ def _score(
     robots = len(ground_truth.get_state()["map_of"])
     maps, poses = [LandmarkMap.empty(2)] * robots, np.zeros((robots, 3))
     maps[robot], poses[robot] = held, world_from_group
-    outlines = TeamMapSummaries.from_maps([each.summary for each in maps])
-    scores = scored(ground_truth, outlines, standing_at(poses), np.zeros((robots, 3)), np.zeros((robots, 3)))
+    summaries = TeamMapSummaries.from_maps([each.summary for each in maps])
+    scores = scored(ground_truth, summaries, standing_at(poses), np.zeros((robots, 3)), np.zeros((robots, 3)))
     return SimpleNamespace(**{name: getattr(scores, name)[robot] for name in MAP_SCORES})
 
 
@@ -71,10 +71,10 @@ def test_maps_are_scored_at_the_true_start() -> None:
     starts, true_starts = rng.uniform(-2.0, 2.0, (2, 2, 3))
     held = [_map(rng.normal(TRUTHS[:3], 0.1), np.arange(3)), _map(rng.normal(TRUTHS[:2], 0.1), np.arange(2))]
     there = inverse(compose(true_starts, starts))
-    outlines = [
+    summaries = [
         each.summary._replace(means=transform_points(pose, each.means)) for each, pose in zip(held, there, strict=True)
     ]
-    rows, parts = TeamMapSummaries.from_maps(outlines[::-1])
+    rows, parts = TeamMapSummaries.from_maps(summaries[::-1])
     nowhere = np.zeros((2, 3))
     scores = scored(ground_truth, TeamMapSummaries(rows, parts[::-1].copy()), standing_at(starts), true_starts, nowhere)
     for robot in range(2):
@@ -166,15 +166,15 @@ def test_pose_errors_are_differences_of_placed_poses() -> None:
     """An estimated pose, laid at the true start, is compared with the true pose; beside it stands the own sigma."""
     rng = np.random.default_rng(4)
     starts, estimated, true = rng.uniform(-4.0, 4.0, (3, 20, 3))
-    points = standing_at(np.zeros((20, 3)))
-    points.own[:], points.sigmas[:] = estimated, rng.random((20, 20))
+    team_poses = standing_at(np.zeros((20, 3)))
+    team_poses.own[:], team_poses.sigmas[:] = estimated, rng.random((20, 20))
     ground_truth = GroundTruthAssociation(20, TRUTHS, COUNTABLE, 1.0)
-    outlines = TeamMapSummaries.from_maps([LandmarkMap.empty(2).summary] * 20)
-    scores = scored(ground_truth, outlines, points, starts, true)
+    summaries = TeamMapSummaries.from_maps([LandmarkMap.empty(2).summary] * 20)
+    scores = scored(ground_truth, summaries, team_poses, starts, true)
     placed = compose(starts, estimated)
     np.testing.assert_allclose(scores.pose_errors, np.linalg.norm(placed[:, :2] - true[:, :2], axis=1))
     np.testing.assert_allclose(scores.heading_errors, np.abs(wrap_angle(placed[:, 2] - true[:, 2])))
-    np.testing.assert_array_equal(scores.pose_sigmas, points.sigmas.diagonal())
+    np.testing.assert_array_equal(scores.pose_sigmas, team_poses.sigmas.diagonal())
 
 
 def test_infos_agree_with_the_own_start_frame() -> None:

@@ -8,6 +8,7 @@ import pytest
 from builders.environments import MEETING, small_env, turning
 from builders.kernels import python_entry
 
+from slam_backend.core.state import restore, take
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.fastslam.relative_poses import TeamPoses
 from slam_backend.geometry import compose, inverse
@@ -28,19 +29,10 @@ from vslam_env.navigation import (
     lengths_between,
     ray_directions,
 )
-from vslam_env.navigation._view_kernels import (
-    BINS,
-    COARSE,
-    FARTHEST,
-    LOOKED,
-    MOST_LOOKS,
-    NEAREST,
-    PATIENCE,
-    SPACING,
-    add_revisits,
-    view_gains,
-    write_global_grid,
-)
+from vslam_env.navigation._view_kernels import COARSE, write_global_grid
+from vslam_env.navigation._view_kernels.looks import LOOKED, MOST_LOOKS, NEAREST
+from vslam_env.navigation._view_kernels.revisits import BINS, FARTHEST, PATIENCE, SPACING, add_revisits
+from vslam_env.navigation._view_kernels.view_gains import view_gains
 from vslam_env.navigation.grid_storage import GRID_SIZES, LARGEST_SIZE, known_bounds, margin
 
 gains_of, places_of = python_entry(view_gains), python_entry(add_revisits)
@@ -442,29 +434,29 @@ def test_paths_far_from_known_landmarks_are_uncertain() -> None:
 
 def _points(starts: FloatArray, own: FloatArray, sigma: float = 0.0) -> TeamPoses:
     """Return pose estimates of robots in one map frame: starts (K, 3) and poses (K, 3) there."""
-    points = TeamPoses(len(starts))
-    points.beliefs.fill(0.0)
+    team_poses = TeamPoses(len(starts))
+    team_poses.beliefs.fill(0.0)
     for robot, start in enumerate(starts):
-        points.poses[robot] = compose(inverse(start), own)
-        points.starts[robot] = inverse(start)
-        points.own[robot] = points.poses[robot, robot]
-    points.sigmas.fill(sigma)
-    return points
+        team_poses.poses[robot] = compose(inverse(start), own)
+        team_poses.starts[robot] = inverse(start)
+        team_poses.own[robot] = team_poses.poses[robot, robot]
+    team_poses.sigmas.fill(sigma)
+    return team_poses
 
 
 def test_rendezvous_before_and_after_merges() -> None:
     """Alone: own start and richest area; merged: starts of teammates until visited; lost ones: their last place."""
     starts = np.array([[0.0, 0.0, 0.3], [5.0, 1.0, -1.0], [2.0, 6.0, 2.0]])
     own = np.array([[1.0, 1.0, 0.0], [6.0, 1.0, 0.0], [2.0, 4.0, 0.0]])
-    points, rendezvous = _points(starts, own), Rendezvous(3)
+    team_poses, rendezvous = _points(starts, own), Rendezvous(3)
     alone, both = np.array([1, 0, 0]), np.array([1, 1, 1])
     marks = np.array([[5.0, 5.0, 0.0, 0.1], [6.0, 5.0, 0.0, 0.1], [-9.0, 1.0, 0.0, 0.1]])
     landmarks = marks, np.full((3, 2), 5), np.zeros(3)
-    places = rendezvous.update(0, points, (0,), alone, landmarks)
+    places = rendezvous.update(0, team_poses, (0,), alone, landmarks)
     assert places[OWN_START].tolist() == [0.0, 0.0, 0.0]
     assert places[RICHEST] == pytest.approx([5.5, 5.0, math.atan2(5.0, 5.5)])
     assert np.isnan(places[2:]).all()
-    places = rendezvous.update(0, points, (0, 1, 2), both, landmarks)
+    places = rendezvous.update(0, team_poses, (0, 1, 2), both, landmarks)
     assert np.isnan(places[:2]).all()
     expected = compose(inverse(starts[0]), starts[1:])
     np.testing.assert_allclose(places[2:, :2], expected[:, :2], atol=1e-9)
@@ -475,11 +467,11 @@ def test_rendezvous_before_and_after_merges() -> None:
     np.testing.assert_allclose(places[2, :2], expected[1, :2], atol=1e-9)
     assert np.isnan(places[3]).all()
     other = Rendezvous(3)
-    other.set_state(rendezvous.get_state())
+    restore(other, take(rendezvous))
     lost = np.array([1, 0, 1])
     for each in (rendezvous, other):
-        places = each.update(0, points, (0, 1, 2), lost, landmarks)
-        np.testing.assert_allclose(places[2, :2], points.poses[0, 1, :2])
+        places = each.update(0, team_poses, (0, 1, 2), lost, landmarks)
+        np.testing.assert_allclose(places[2, :2], team_poses.poses[0, 1, :2])
         np.testing.assert_allclose(places[3, :2], expected[1, :2], atol=1e-9)
 
 

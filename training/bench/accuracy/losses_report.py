@@ -192,9 +192,9 @@ def _mean(values: Sequence[float | None]) -> float | None:
     return float(np.mean(known)) if known else None
 
 
-def _cell(found: Mapping[str, float | int | None], digits: int) -> str:
+def _cell(interval: Mapping[str, float | int | None], digits: int) -> str:
     """Format a geometric mean with its interval."""
-    text = number(found["mean"], digits)
-    if found["low"] is None:
+    text = number(interval["mean"], digits)
+    if interval["low"] is None:
         return text
-    return f"{text} ({number(found['low'], digits)}-{number(found['high'], digits)})"
+    return f"{text} ({number(interval['low'], digits)}-{number(interval['high'], digits)})"

@@ -92,11 +92,11 @@ def describe(values: FloatArray) -> dict[str, float | None] | None:
     """
     if not len(values):
         return None
-    found: dict[str, float | None] = {"worst": float(values.max())}
+    summary: dict[str, float | None] = {"worst": float(values.max())}
     for name, statistic in (("mean", np.mean), ("median", np.median)):
-        found[name] = float(statistic(values))
-        found[f"{name}_low"], found[f"{name}_high"] = interval(values, statistic)
-    return found
+        summary[name] = float(statistic(values))
+        summary[f"{name}_low"], summary[f"{name}_high"] = interval(values, statistic)
+    return summary
 
 
 def table_rows(lines: Sequence[Mapping[str, Any]], columns: Sequence[Any]) -> tuple[list[str], list[list[str]]]:
@@ -122,10 +122,10 @@ def conditions(lines: Sequence[Mapping[str, Any]]) -> dict[str, list[Mapping[str
 
 def print_tables(console: Console, lines: Sequence[Mapping[str, Any]]) -> None:
     """Print up to four tables for each condition."""
-    for title, own in conditions(lines).items():
-        seeds = max(line["seeds"] for line in own)
+    for title, group in conditions(lines).items():
+        seeds = max(line["seeds"] for line in group)
         for part, columns in PARTS.items():
-            headings, rows = table_rows(own, columns)
+            headings, rows = table_rows(group, columns)
             if rows:
                 console.print(console_table(f"{title}, {seeds} seeds: {part}", headings, rows))
 
@@ -133,23 +133,23 @@ def print_tables(console: Console, lines: Sequence[Mapping[str, Any]]) -> None:
 def markdown(lines: Sequence[Mapping[str, Any]]) -> str:
     """Return the same tables as Markdown."""
     parts = []
-    for title, own in conditions(lines).items():
-        parts.append(f"### {title[0].upper()}{title[1:]}, {max(line['seeds'] for line in own)} seeds\n")
+    for title, group in conditions(lines).items():
+        parts.append(f"### {title[0].upper()}{title[1:]}, {max(line['seeds'] for line in group)} seeds\n")
         for columns in PARTS.values():
-            headings, rows = table_rows(own, columns)
+            headings, rows = table_rows(group, columns)
             if rows:
                 parts.append(markdown_table(headings, rows))
     return "\n".join(parts)
 
 
 def _cell(
-    found: Mapping[str, float | None] | None, statistic: str, factor: float, digits: int, with_interval: bool
+    summary: Mapping[str, float | None] | None, statistic: str, factor: float, digits: int, with_interval: bool
 ) -> str:
     """Format a statistic, with its interval if requested; unknown values give a dash."""
-    value = None if found is None else found[statistic]
-    if found is None or value is None:
+    value = None if summary is None else summary[statistic]
+    if summary is None or value is None:
         return "-"
-    low, high = (None, None) if not with_interval else (found[f"{statistic}_{end}"] for end in ("low", "high"))
+    low, high = (None, None) if not with_interval else (summary[f"{statistic}_{end}"] for end in ("low", "high"))
     if low is None or high is None:
         return number(value, digits, factor)
     return f"{number(value, digits, factor)} ({number(low, digits, factor)}-{number(high, digits, factor)})"
@@ -162,9 +162,9 @@ def draw_accuracy(file: Path, lines: Sequence[Mapping[str, Any]]) -> None:
     with mpl.rc_context({"font.size": 9, "axes.titlesize": 9}):
         figure = Figure(figsize=(12.0, 3.6 * len(groups)), layout="constrained")
         axes = figure.subplots(len(groups), len(PANELS), squeeze=False)
-        for row, (title, own) in zip(axes, groups.items(), strict=True):
+        for row, (title, group) in zip(axes, groups.items(), strict=True):
             for panel, (key, label) in zip(row, PANELS, strict=True):
-                _draw_panel(panel, own, key, label)
+                _draw_panel(panel, group, key, label)
             row[0].set_title(title, loc="left")
         add_legend(figure, axes[0][0])
         save_png(figure, file, 110)
@@ -173,15 +173,15 @@ def draw_accuracy(file: Path, lines: Sequence[Mapping[str, Any]]) -> None:
 def _draw_panel(ax: Axes, lines: Sequence[Mapping[str, Any]], key: str, label: str) -> None:
     """Draw filters as curves over M, and methods without particles as level lines with their intervals."""
     for method in dict.fromkeys(line["method"] for line in lines):
-        own = [line for line in lines if line["method"] == method and line[key] is not None]
-        if not own:
+        group = [line for line in lines if line["method"] == method and line[key] is not None]
+        if not group:
             continue
-        mean = np.array([line[key]["mean"] for line in own])
-        ends = [[line[key][f"mean_{end}"] for line in own] for end in ("low", "high")]
+        mean = np.array([line[key]["mean"] for line in group])
+        ends = [[line[key][f"mean_{end}"] for line in group] for end in ("low", "high")]
         low, high = (np.where([v is None for v in e], mean, [v or 0.0 for v in e]) for e in ends)
         colour, name = COLOURS[method], NAMES[method]
         if method in FILTERS:
-            particles = [line["particles"] for line in own]
+            particles = [line["particles"] for line in group]
             ax.errorbar(
                 particles, mean, yerr=[np.maximum(mean - low, 0.0), np.maximum(high - mean, 0.0)], marker="o", ms=3.5,
                 lw=1.2, capsize=2.5, color=colour, label=name,

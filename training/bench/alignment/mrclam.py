@@ -63,12 +63,12 @@ def align_pairs(result: Replay, log: MrclamLog) -> list[dict[str, Any]]:
         shared = len(np.intersect1d(*claims))
         for barcodes, options in BARCODES.items():
             for method in METHODS:
-                found = align_maps(*maps, method, np.random.default_rng(0), options)
-                error = motion_error(found.transform, maps, claims, log) if found.success else None
+                alignment = align_maps(*maps, method, np.random.default_rng(0), options)
+                error = motion_error(alignment.transform, maps, claims, log) if alignment.success else None
                 rows.append(
                     {
                         "robots": [numbers[a], numbers[b]], "shared": shared, "barcodes": barcodes, "method": method,
-                        "accepted": found.success, "reason": found.reason, "inliers": len(found.inliers),
+                        "accepted": alignment.success, "reason": alignment.reason, "inliers": len(alignment.inliers),
                         "error_m": error[0] if error else None,
                         "error_deg": float(np.rad2deg(error[1])) if error else None,
                     }
@@ -84,12 +84,12 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         (error above 0.5 m or 5 degrees), `median_m`, `worst_m`, `median_deg`, `worst_deg` of the accepted ones.
     """
     lines = []
-    for (duration, barcodes, method), own in grouped(rows, ("duration_s", "barcodes", "method")).items():
-        apart = np.array([[row["error_m"], row["error_deg"]] for row in own if row["error_m"] is not None])
+    for (duration, barcodes, method), group in grouped(rows, ("duration_s", "barcodes", "method")).items():
+        apart = np.array([[row["error_m"], row["error_deg"]] for row in group if row["error_m"] is not None])
         line: dict[str, Any] = {
             "duration_s": duration, "barcodes": barcodes, "method": method,
-            "pairs": sum(row["shared"] >= ENOUGH_SHARED for row in own),
-            "accepted": sum(row["accepted"] for row in own), "false": 0,
+            "pairs": sum(row["shared"] >= ENOUGH_SHARED for row in group),
+            "accepted": sum(row["accepted"] for row in group), "false": 0,
         } | dict.fromkeys(("median_m", "worst_m", "median_deg", "worst_deg"))  # fmt: skip
         if len(apart):
             line["false"] = int(

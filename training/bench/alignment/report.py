@@ -51,9 +51,9 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         wall-clock time, which other processes lengthen.
     """
     cells = grouped(rows, CELL)
-    for (kind, method), own in grouped(rows, ("kind", "method")).items():
-        cells[kind, None, None, None, method] = own
-    return [dict(zip(CELL, cell, strict=True)) | _describe(own) for cell, own in cells.items()]
+    for (kind, method), group in grouped(rows, ("kind", "method")).items():
+        cells[kind, None, None, None, method] = group
+    return [dict(zip(CELL, cell, strict=True)) | _describe(group) for cell, group in cells.items()]
 
 
 def _describe(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -153,11 +153,11 @@ def draw_alignment(file: Path, lines: Sequence[Mapping[str, Any]]) -> None:
 def _draw_panel(ax: Axes, lines: Sequence[Mapping[str, Any]], key: str) -> None:
     """Draw one metric of all methods over the share of outliers; a method without success has no curve."""
     for method in dict.fromkeys(line["method"] for line in lines):
-        own = [line for line in lines if line["method"] == method and line[key] is not None]
+        chosen = [line for line in lines if line["method"] == method and line[key] is not None]
         factor = 100.0 if key == "right" else 1.0
         ax.plot(
-            [100.0 * line["outliers"] for line in own], [factor * line[key] for line in own], marker=MARKERS[method],
-            ms=5, mfc="none", lw=1.2, color=COLOURS[method], label=method,
+            [100.0 * line["outliers"] for line in chosen], [factor * line[key] for line in chosen],
+            marker=MARKERS[method], ms=5, mfc="none", lw=1.2, color=COLOURS[method], label=method,
         )  # fmt: skip
     if key == "right":
         ax.set_ylim(-5.0, 105.0)

@@ -64,20 +64,20 @@ def play(trial: Trial) -> dict[str, Any]:
     pair = maps_of(trial.kind, trial.case, trial.overlap, trial.outliers, trial.seed)
     rng = np.random.default_rng(trial.seed)
     begun, begun_cpu = time.perf_counter(), time.thread_time()
-    found = align_maps(pair.a, pair.b, trial.method, rng)
+    alignment = align_maps(pair.a, pair.b, trial.method, rng)
     seconds, cpu_seconds = time.perf_counter() - begun, time.thread_time() - begun_cpu
     row: dict[str, Any] = {name: getattr(trial, name) for name in Trial.__dataclass_fields__} | {
-        "success": found.success, "reason": found.reason, "ratio": found.ratio, "inliers": len(found.inliers),
-        "seconds": seconds, "cpu_seconds": cpu_seconds, "false": found.success,
+        "success": alignment.success, "reason": alignment.reason, "ratio": alignment.ratio,
+        "inliers": len(alignment.inliers), "seconds": seconds, "cpu_seconds": cpu_seconds, "false": alignment.success,
     }  # fmt: skip
-    if found.success and len(pair.pairs):
-        error = found.transform - pair.pose
+    if alignment.success and len(pair.pairs):
+        error = alignment.transform - pair.pose
         error[2] = wrap_angle(error[2])
         bound = pair.bound()
         row |= {
             "error_m": float(np.hypot(error[0], error[1])), "error_rad": abs(float(error[2])),
             "false": bool(np.hypot(error[0], error[1]) > DISTINCT_TRANSLATION or abs(error[2]) > DISTINCT_ROTATION),
-            "nees": float(error @ np.linalg.solve(found.covariance, error)),
+            "nees": float(error @ np.linalg.solve(alignment.covariance, error)),
             "bound_m2": float(bound[0, 0] + bound[1, 1]), "bound_rad2": float(bound[2, 2]),
         }  # fmt: skip
     return row

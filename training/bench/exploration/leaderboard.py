@@ -76,19 +76,19 @@ def played_rows(results: Sequence[Results]) -> list[Mapping[str, Any]]:
     """
     kept: dict[str, Sequence[Mapping[str, Any]]] = {}
     for each in results:
-        for (policy,), own in grouped(each.rows, ("policy",)).items():
-            sources = {row["policy_digest"] for row in (*kept.get(policy, []), *own)}
+        for (policy,), group in grouped(each.rows, ("policy",)).items():
+            sources = {row["policy_digest"] for row in (*kept.get(policy, []), *group)}
             if len(sources) > 1:
                 raise argument_error("folders", "one policy for each label", policy, "Give one of them a LABEL=.")
-            kept.setdefault(policy, _finished(each.plan, policy, own))
-    families = {policy: {row["family"] for row in own if row["part"] == BASE_PART} for policy, own in kept.items()}
+            kept.setdefault(policy, _finished(each.plan, policy, group))
+    families = {policy: {row["family"] for row in group if row["part"] == BASE_PART} for policy, group in kept.items()}
     all_families = set().union(*families.values())
     for policy, own_families in families.items():
         if missing := all_families - own_families:
             hint = "Set VSLAM_DATA, and resume the run." if FLOOR_PLANS in missing else "Resume the run."
             got = f"none of {policy!r} in {', '.join(sorted(missing))}"
             raise argument_error("folders", "episodes of all policies in the same families", got, hint)
-    return [row for own in kept.values() for row in own]
+    return [row for group in kept.values() for row in group]
 
 
 def leaderboard(results: Sequence[Results], figure: str) -> str:
@@ -104,8 +104,8 @@ def leaderboard(results: Sequence[Results], figure: str) -> str:
     rows = played_rows(results)
     verified = {policy: counts for each in results for policy, counts in each.verified.items()}
     shown = [
-        [label(policy), str(len(own)), *map(str, verified.get(policy, "-" * len(OUTCOMES)))]
-        for (policy,), own in grouped(rows, ("policy",)).items()
+        [label(policy), str(len(group)), *map(str, verified.get(policy, "-" * len(OUTCOMES)))]
+        for (policy,), group in grouped(rows, ("policy",)).items()
     ]
     headings = ("policy", "episodes", f"again: {OUTCOMES[0]}", *OUTCOMES[1:])
     machines = sorted({str(row["machine"]) for row in rows})

@@ -93,12 +93,12 @@ def incomplete(plan: Plan, rows: Rows, policies: Sequence[str]) -> list[str]:
     """
     found = []
     base = plan.all_parts()[BASE_PART]
-    own = [row for row in rows if row["part"] == BASE_PART]
-    has_plans = any(row["family"] == FLOOR_PLANS for row in own)
+    base_rows = [row for row in rows if row["part"] == BASE_PART]
+    has_plans = any(row["family"] == FLOOR_PLANS for row in base_rows)
     conditions = len(base.robots) * len(base.particles) * len(base.oracles) * base.seeds
     wanted = conditions * sum(world != FLOOR_PLANS or has_plans for world in base.worlds)
-    for policy in dict.fromkeys([*policies, *(row["policy"] for row in own)]):
-        played = sum(row["policy"] == policy for row in own)
+    for policy in dict.fromkeys([*policies, *(row["policy"] for row in base_rows)]):
+        played = sum(row["policy"] == policy for row in base_rows)
         if played < wanted:
             found.append(f"`{label(policy)}` has {played} of {wanted} episodes of the base part")
     return found
@@ -107,10 +107,10 @@ def incomplete(plan: Plan, rows: Rows, policies: Sequence[str]) -> list[str]:
 def aggregate(plan: Plan, rows: Rows) -> list[dict[str, Any]]:
     """Return a line for each part and policy: worlds, and interquartile means of the main metrics with intervals."""
     found = []
-    for (part, policy), own in grouped(rows, ("part", "policy")).items():
-        line: dict[str, Any] = {"part": part, "policy": policy, "episodes": len(own)}
+    for (part, policy), group in grouped(rows, ("part", "policy")).items():
+        line: dict[str, Any] = {"part": part, "policy": policy, "episodes": len(group)}
         for name in ("map_error", "mean_coverage", "below_50_s", "below_90_s", "map_recall", "ate_start_m"):
-            worlds = [np.array([row[name] for row in family]) for family in grouped(own, ("family",)).values()]
+            worlds = [np.array([row[name] for row in family]) for family in grouped(group, ("family",)).values()]
             line |= dict(zip((name, f"{name}_low", f"{name}_high"), stratified_ci(worlds, pooled(iqm)), strict=True))
         found.append(line)
     return found
@@ -202,8 +202,8 @@ def _draw_profiles(panel: Axes, base: Rows) -> None:
 
 def _draw_team_sizes(panel: Axes, sizes: Rows) -> None:
     """Draw E over the number of robots, a line per number of particles."""
-    for i, ((particles,), own) in enumerate(sorted(grouped(sizes, ("particles",)).items())):
-        teams = sorted(grouped(own, ("robots",)).items())
+    for i, ((particles,), group) in enumerate(sorted(grouped(sizes, ("particles",)).items())):
+        teams = sorted(grouped(group, ("robots",)).items())
         middle, low, high = np.array([_ci(each, "map_error") for _, each in teams]).T
         robots, colour = [count for (count,), _ in teams], COLOURS[i % len(COLOURS)]
         panel.plot(robots, middle, "o-", color=colour, label=f"{particles} particles", markersize=3)
@@ -225,11 +225,11 @@ def _overall(base: Rows, order: Sequence[str], first: str | None) -> Section:
     )  # fmt: skip
     lines = []
     for policy in order:
-        own = [row for row in base if row["policy"] == policy]
-        cells = [_with_ends(_ci(own, name), digits, factor) for _, name, digits, factor in columns[:2]]
+        played = [row for row in base if row["policy"] == policy]
+        cells = [_with_ends(_ci(played, name), digits, factor) for _, name, digits, factor in columns[:2]]
         cells += [number(float(_iqm(base, policy, name)), digits, factor) for _, name, digits, factor in columns[2:]]
         lines.append(
-            [label(policy), *cells, number(_mean(own, "decision_p99_ms"), 1), _improvement(base, policy, first)]
+            [label(policy), *cells, number(_mean(played, "decision_p99_ms"), 1), _improvement(base, policy, first)]
         )
     note = f"Interquartile means over {_worlds(base)} worlds, with 95 % intervals."
     if first is not None:
@@ -259,11 +259,11 @@ def _error_table(base: Rows, order: Sequence[str]) -> Section:
     """Return what the squared map error consists of."""
     lines = []
     for policy in order:
-        own = [row for row in base if row["policy"] == policy]
-        parts = [_mean(own, f"squared_{name}") for name in PARTS_OF_E]
+        played = [row for row in base if row["policy"] == policy]
+        parts = [_mean(played, f"squared_{name}") for name in PARTS_OF_E]
         lines.append([
             label(policy), *(number(part / sum(parts), 1, CM) for part in parts),
-            number(_mean(own, "map_rmse_m"), 1, CM), number(_mean(own, "map_precision"), 1, CM),
+            number(_mean(played, "map_rmse_m"), 1, CM), number(_mean(played, "map_precision"), 1, CM),
         ])  # fmt: skip
     note = "Shares of the mean of E^2 [%]; RMSE of the landmarks found, and the share of found ones that exist."
     headings = ["parts of E^2 [%]", *PARTS_OF_E, "RMSE [cm]", "precision [%]"]
@@ -275,13 +275,14 @@ def _merge_table(base: Rows, order: Sequence[str]) -> Section:
     reasons = sorted({reason for row in base for reason in row["refusals"]})
     lines = []
     for policy in order:
-        own = [row for row in base if row["policy"] == policy]
+        played = [row for row in base if row["policy"] == policy]
         names = ("right_merges", "false_merges", "undone_merges", "last_merge_s")
-        refused = [sum(row["refusals"].get(reason, 0) for row in own) / len(own) for reason in reasons]
+        refused = [sum(row["refusals"].get(reason, 0) for row in played) / len(played) for reason in reasons]
         lines.append([
-            label(policy), *map(number, (_mean(own, name) for name in names), (2, 2, 2, 0)),
-            number(_mean(own, "overlap"), 0, CM), number(_mean(own, "way_m"), 0), number(_mean(own, "balance"), 2),
-            number(_mean(own, "collisions"), 1, 0.1), number(_mean(own, "bytes_sent"), 0, 1e-3),
+            label(policy), *map(number, (_mean(played, name) for name in names), (2, 2, 2, 0)),
+            number(_mean(played, "overlap"), 0, CM), number(_mean(played, "way_m"), 0),
+            number(_mean(played, "balance"), 2),
+            number(_mean(played, "collisions"), 1, 0.1), number(_mean(played, "bytes_sent"), 0, 1e-3),
             *(number(share, 1) for share in refused),
         ])  # fmt: skip
     headings = [
@@ -324,7 +325,9 @@ def _ladder(rows: Rows, order: Sequence[str]) -> Section:
     lines = []
     for policy in order:
         told = [row for row in rows if (row["part"], row["policy"]) == (ORACLES, policy)]
-        by_oracle = {oracle: _values(own, policy, "map_error") for (oracle,), own in grouped(told, ("oracle",)).items()}
+        by_oracle = {
+            oracle: _values(group, policy, "map_error") for (oracle,), group in grouped(told, ("oracle",)).items()
+        }
         if "all" not in by_oracle:
             continue
         base = _values([row for row in rows if row["part"] == BASE_PART], policy, "map_error")

@@ -97,8 +97,8 @@ def compare_policies(rows: Rows) -> list[dict[str, Any]]:
     bootstrap over the seeds), `better`: the share of seeds in which the policy is better.
     """
     found = []
-    for place, own in grouped(rows, PLACE).items():
-        by_policy = grouped(own, ("policy",))
+    for place, group in grouped(rows, PLACE).items():
+        by_policy = grouped(group, ("policy",))
         (first,), *others = by_policy
         for (policy,) in others:
             line = dict(zip(PLACE, place, strict=True)) | {"policy": policy, "than": first}
@@ -109,8 +109,8 @@ def compare_policies(rows: Rows) -> list[dict[str, Any]]:
 def compare_oracles(rows: Rows) -> list[dict[str, Any]]:
     """Return the paired differences of each policy with and without an oracle, in the same form; `than` is `"none"`."""
     found = []
-    for (world, robots, policy), own in grouped(rows, ("world", "robots", "policy")).items():
-        by_oracle = grouped(own, ("oracle",))
+    for (world, robots, policy), group in grouped(rows, ("world", "robots", "policy")).items():
+        by_oracle = grouped(group, ("oracle",))
         for (oracle,) in by_oracle:
             if oracle != NO_ORACLE and (NO_ORACLE,) in by_oracle:
                 line = {"world": world, "robots": robots, "oracle": oracle, "policy": policy, "than": NO_ORACLE}
@@ -207,15 +207,15 @@ def _named(lines: Rows, between: str = ", ") -> list[tuple[str, Mapping[str, Any
 def _places(lines: Rows, policies: Rows, oracles: Rows) -> Iterator[tuple[str, Rows, list[tuple[str, Rows]]]]:
     """Yield for each world and number of robots a title, the lines, and the differences by heading."""
     place = ("world", "robots")
-    for (world, robots), own in grouped(lines, place).items():
-        seeds = sorted({line["seeds"] for line in own})
+    for (world, robots), group in grouped(lines, place).items():
+        seeds = sorted({line["seeds"] for line in group})
         count = f"{seeds[0]}-{seeds[-1]} seeds" if len(seeds) > 1 else f"{seeds[0]} seed{'s' if seeds[0] > 1 else ''}"
         comparisons: list[tuple[str, Rows]] = []
         if by_policy := grouped(policies, place).get((world, robots)):
             comparisons.append((f"paired difference to {label(by_policy[0]['than'])}", by_policy))
         if by_oracle := grouped(oracles, place).get((world, robots)):
             comparisons.append(("paired difference to no oracle", by_oracle))
-        yield f"{label(world)}, K={robots}, {count}", own, comparisons
+        yield f"{label(world)}, K={robots}, {count}", group, comparisons
 
 
 def _difference_rows(differences: Rows, names: Sequence[str], stacked: bool) -> list[list[str]]:
@@ -243,8 +243,8 @@ def draw_exploration(file: Path, curves: Rows) -> None:
     axes = figure.subplots(len(places), len(CURVE_PANELS), squeeze=False, sharex=True)
     for row, ((world, robots), here) in zip(axes, places.items(), strict=True):
         for panel, (name, (text, factor)) in zip(row, CURVE_PANELS.items(), strict=True):
-            for (policy, oracle), own in grouped(here, ("policy", "oracle")).items():
-                _draw_mean(panel, own, name, factor, colours[policy], styles[oracle])
+            for (policy, oracle), group in grouped(here, ("policy", "oracle")).items():
+                _draw_mean(panel, group, name, factor, colours[policy], styles[oracle])
             panel.set_ylabel(text)
             panel.set_ylim(0.0, 100.0 if name == "coverage" else None)
             panel.grid(alpha=0.2)

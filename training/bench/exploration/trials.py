@@ -138,8 +138,8 @@ def _first(reached: BoolArray) -> int:
 def _error_parts(record: EpisodeRecord, cutoff: float) -> dict[str, float]:
     """Return the means over robots of the parts of E^2 at the end [m^2]."""
     parts = [
-        map_error_parts(own.moved(start).means, claims, record.true_landmarks, cutoff)
-        for own, start, claims in zip(record.maps, record.true_poses[:, 0], record.map_claims, strict=True)
+        map_error_parts(landmark_map.moved(start).means, claims, record.true_landmarks, cutoff)
+        for landmark_map, start, claims in zip(record.maps, record.true_poses[:, 0], record.map_claims, strict=True)
     ]
     return {
         f"squared_{name}": float(mean) for name, mean in zip(MapErrorParts._fields, np.mean(parts, axis=0), strict=True)

@@ -25,10 +25,10 @@ NOT_COMPARED = ("digest", "policy_digest", "machine", "decision_ms", "decision_p
 
 def choose(rows: Rows, count: int, rng: np.random.Generator) -> list[Mapping[str, Any]]:
     """Return up to `count` random rows of each policy."""
-    found: list[Mapping[str, Any]] = []
-    for own in grouped(rows, ("policy",)).values():
-        found += [own[i] for i in sorted(rng.choice(len(own), min(count, len(own)), replace=False))]
-    return found
+    chosen: list[Mapping[str, Any]] = []
+    for group in grouped(rows, ("policy",)).values():
+        chosen += [group[i] for i in sorted(rng.choice(len(group), min(count, len(group)), replace=False))]
+    return chosen
 
 
 def compare(stored: Mapping[str, Any], again: Mapping[str, Any]) -> dict[str, Any]:
@@ -55,18 +55,18 @@ def keep(folder: Path, comparison: Mapping[str, Any], trial: Mapping[str, Any]) 
 
 def outcome_counts(comparisons: Rows) -> list[int]:
     """Return the numbers of comparisons with each of `OUTCOMES`: the second is found where last bits may differ."""
-    found = [OUTCOMES[_outcome(row)] for row in comparisons]
-    return [found.count(outcome) for outcome in OUTCOMES]
+    outcomes = [OUTCOMES[_outcome(row)] for row in comparisons]
+    return [outcomes.count(outcome) for outcome in OUTCOMES]
 
 
 def table_rows(comparisons: Rows) -> list[list[str]]:
     """Return the cells of a table of `HEADINGS`, a row per policy."""
-    found = []
-    for (policy,), own in grouped(comparisons, ("policy",)).items():
-        counts = outcome_counts(own)
-        more = [row["map_error_again"] - row["map_error"] for row in own]
-        found.append([label(policy), str(len(own)), *map(str, counts), format_ci(mean_ci("E", more), "E", 2, 100.0)])
-    return found
+    lines = []
+    for (policy,), group in grouped(comparisons, ("policy",)).items():
+        counts = outcome_counts(group)
+        more = [row["map_error_again"] - row["map_error"] for row in group]
+        lines.append([label(policy), str(len(group)), *map(str, counts), format_ci(mean_ci("E", more), "E", 2, 100.0)])
+    return lines
 
 
 def last_outcomes(folder: Path) -> dict[str, list[int]]:
@@ -74,12 +74,12 @@ def last_outcomes(folder: Path) -> dict[str, list[int]]:
     file = folder / VERIFIED_FILE
     text = read_text(file, "folders", "a file of comparisons") if file.is_file() else ""
     lines = [json.loads(line) for line in text.splitlines()]
-    found: dict[str, list[int]] = {}
-    for (policy,), own in grouped(lines, ("policy",)).items():
-        last = max(line["date"] for line in own)
-        of_last = {row["digest"]: row for row in own if row["date"] == last}
-        found[policy] = outcome_counts(list(of_last.values()))
-    return found
+    counts: dict[str, list[int]] = {}
+    for (policy,), group in grouped(lines, ("policy",)).items():
+        last = max(line["date"] for line in group)
+        of_last = {row["digest"]: row for row in group if row["date"] == last}
+        counts[policy] = outcome_counts(list(of_last.values()))
+    return counts
 
 
 def _outcome(comparison: Mapping[str, Any]) -> int:

@@ -87,15 +87,15 @@ def draw_scale(file: Path, lines: Rows, over_time: Rows) -> None:
     colours = {extent: COLOURS[i % len(COLOURS)] for i, extent in enumerate(extents)}
     styles = {count: STYLES[i % len(STYLES)] for i, count in enumerate(robots)}
     for panel, (name, (text, factor)) in zip(panels, OVER_TIME.items(), strict=False):
-        for (extent, count), own in grouped(over_time, ("extent", "robots")).items():
-            times = [line["time_s"] for line in own]
-            values = [np.nan if line[name] is None else factor * line[name] for line in own]
-            panel.plot(times, values, color=colours[extent], linestyle=styles[count], label=_label(own[0]))
+        for (extent, count), group in grouped(over_time, ("extent", "robots")).items():
+            times = [line["time_s"] for line in group]
+            values = [np.nan if line[name] is None else factor * line[name] for line in group]
+            panel.plot(times, values, color=colours[extent], linestyle=styles[count], label=_label(group[0]))
         _finish(panel, "time [s]", text)
     for panel, (name, (text, factor)) in zip(panels[len(OVER_TIME) :], OVER_EXTENT.items(), strict=True):
-        for (count,), own in grouped(lines, ("robots",)).items():
-            values = [factor * line[name] for line in own]
-            panel.plot([line["extent"] for line in own], values, "o", linestyle=styles[count], color="#444444")
+        for (count,), group in grouped(lines, ("robots",)).items():
+            values = [factor * line[name] for line in group]
+            panel.plot([line["extent"] for line in group], values, "o", linestyle=styles[count], color="#444444")
         _finish(panel, "extent [m]", text)
     handles, names = panels[0].get_legend_handles_labels()
     figure.legend(handles, names, loc="outside upper center", ncols=6, frameon=False, fontsize=8)

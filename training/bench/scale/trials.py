@@ -40,9 +40,9 @@ class TimedEnv(ExplorationEnv):
     def step(self, actions: Mapping[str, Any]) -> Any:
         """Execute the actions of all robots, see `ExplorationEnv.step`."""
         begin = time.process_time()
-        found = super().step(actions)
+        results = super().step(actions)
         self.seconds.append(time.process_time() - begin)
-        return found
+        return results
 
 
 def play(config: ScaleBenchConfig, trial: ScaleTrial) -> dict[str, Any]:

@@ -37,11 +37,11 @@ def speed_row(width: int, landmarks: int, walls: int, descriptor: Any, steps: in
     front_end, rng = StereoFrontEnd(camera, options), np.random.default_rng(seed)
     pose = np.array([1.5, 3.0, 0.5])
     view = scene.look(pose, rng)
-    found = len(front_end.measure(view.left, view.right).measurements)
+    num_landmarks = len(front_end.measure(view.left, view.right).measurements)
     render = _timed(lambda _: scene.look(pose, rng), steps)
     measure = _timed(lambda _: front_end.measure(view.left, view.right), steps)
     return {
-        "width": width, "height": camera.height, "walls": walls, "wanted": landmarks, "landmarks": found,
+        "width": width, "height": camera.height, "walls": walls, "wanted": landmarks, "landmarks": num_landmarks,
         "descriptor": descriptor, "render": render, "front_end": measure,
     }  # fmt: skip
 

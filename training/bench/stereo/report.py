@@ -95,9 +95,9 @@ def _planar(rows: Sequence[dict[str, Any]]) -> str:
     pairs = list(dict.fromkeys(row["pair"] for row in rows))
     lines = []
     for way in dict.fromkeys(row["way"] for row in rows):
-        own = {row["pair"]: row for row in rows if row["way"] == way}
-        right, matches = (sum(row[key] for row in own.values()) for key in ("right", "matches"))
-        cells = [f"{own[pair]['right']} / {own[pair]['matches']}" for pair in pairs]
+        by_pair = {row["pair"]: row for row in rows if row["way"] == way}
+        right, matches = (sum(row[key] for row in by_pair.values()) for key in ("right", "matches"))
+        cells = [f"{by_pair[pair]['right']} / {by_pair[pair]['matches']}" for pair in pairs]
         lines.append([NAMES[way], *cells, f"{100 * right / max(matches, 1):.0f} %"])
     return titled_markdown("Planar pairs: right matches / mutual matches", ["descriptor", *pairs, "score"], lines)
 

@@ -141,18 +141,18 @@ class Claim:
 
 def check_claims(errors: Sequence[Mapping[str, Any]], times: Sequence[Mapping[str, Any]]) -> list[Claim]:
     """Check the paper's claims on the trials of its regime, as far as there are any."""
-    own = [row for row in errors if all(row[name] == value for name, value in PAPER.items())]
-    numbers = sorted({row["particles"] for row in own})
-    robots = sorted({row["robots"] for row in own})
+    rows = [row for row in errors if all(row[name] == value for name, value in PAPER.items())]
+    numbers = sorted({row["particles"] for row in rows})
+    robots = sorted({row["robots"] for row in rows})
     claims = []
     for k in robots if len(numbers) > 1 else ():
         few, many = numbers[0], numbers[-1]
-        found = paired_ratio(*(error_by_seed(own, robots=k, particles=m) for m in (many, few)))
+        found = paired_ratio(*(error_by_seed(rows, robots=k, particles=m) for m in (many, few)))
         claims.append(Claim(claim=f"map error, K={k}: M={many} below M={few}", below=1.0, **found))
     if len(robots) > 1:
         one, most = robots[0], robots[-1]
         for m in (m for m in numbers if m >= ENOUGH):
-            found = paired_ratio(*(error_by_seed(own, robots=k, particles=m) for k in (most, one)))
+            found = paired_ratio(*(error_by_seed(rows, robots=k, particles=m) for k in (most, one)))
             limit = LARGEST_SHARE if m == AT else None
             name = f"map error, M={m}: K={most} below K={one}" + (f", at most {limit} of it" if limit else "")
             claims.append(Claim(claim=name, below=1.0, ratio_at_most=limit, **found))
@@ -214,7 +214,7 @@ def robots_ratios(errors: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
     robots = sorted({row["robots"] for row in rows})
     if len(robots) < 2:
         return []
-    found = []
+    lines = []
     for regime, proposal, m in dict.fromkeys((row["regime"], row["proposal"], row["particles"]) for row in rows):
         line: dict[str, Any] = {"regime": regime, "proposal": proposal, "particles": m}
         line["robots"] = [robots[0], robots[-1]]
@@ -223,5 +223,5 @@ def robots_ratios(errors: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
                 error_by_seed(rows, figure, regime=regime, proposal=proposal, robots=k, particles=m)
                 for k in (robots[-1], robots[0])
             ))  # fmt: skip
-        found.append(line)
-    return found
+        lines.append(line)
+    return lines

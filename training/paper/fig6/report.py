@@ -30,8 +30,8 @@ def print_result(
 ) -> None:
     """Print a table for each regime and proposal, one of the ratios, and the results of the claims."""
     for regime, proposal in dict.fromkeys((line["regime"], line["proposal"]) for line in lines):
-        own = [line for line in lines if (line["regime"], line["proposal"]) == (regime, proposal)]
-        _print_points(console, f"{REGIMES[regime].title}, {proposal}", own)
+        points = [line for line in lines if (line["regime"], line["proposal"]) == (regime, proposal)]
+        _print_points(console, f"{REGIMES[regime].title}, {proposal}", points)
     if ratios:
         few, many = ratios[0]["robots"]
         table = console_table(f"Map error, K={many} over K={few} (95 %)", ("regime", "M", "not aligned", "aligned"))
@@ -58,8 +58,10 @@ def _print_points(console: Console, title: str, lines: Sequence[Mapping[str, Any
         for k in robots:
             table.add_column(f"{name}\nK={k}", justify="right")
     for m in dict.fromkeys(line["particles"] for line in lines):
-        own = {line["robots"]: line for line in lines if line["particles"] == m}
-        cells = [_cell(own.get(k), figure, digits, bool(wide)) for _, figure, digits, wide in parts for k in robots]
+        of_robots = {line["robots"]: line for line in lines if line["particles"] == m}
+        cells = [
+            _cell(of_robots.get(k), figure, digits, bool(wide)) for _, figure, digits, wide in parts for k in robots
+        ]
         table.add_row(str(m or "-"), *cells)
     console.print(table)
 
@@ -73,10 +75,10 @@ def _cell(line: Mapping[str, Any] | None, figure: str, digits: int, with_interva
     return number(line[figure], digits) + ends
 
 
-def _interval(found: Mapping[str, Any]) -> str:
+def _interval(ratio: Mapping[str, Any]) -> str:
     """Format a ratio with its interval."""
-    ends = "" if found["low"] is None else f" ({number(found['low'])}-{number(found['high'])})"
-    return number(found["ratio"]) + ends
+    ends = "" if ratio["low"] is None else f" ({number(ratio['low'])}-{number(ratio['high'])})"
+    return number(ratio["ratio"]) + ends
 
 
 @picture

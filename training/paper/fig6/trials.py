@@ -162,14 +162,14 @@ def play_time(trial: TimeTrial) -> dict[str, Any]:
     runs = [_run_of(spec, trial.seed) for spec in trial.specs]
     filters = [_build(run, "fastslam1", trial.particles, trial.seed) for run in runs]
     times = time_in_turns(filters, runs)
-    found: dict[str, list[float]] = {"median_ms": [], "all_median_ms": [], "all_mean_ms": [], "measured": []}
+    columns: dict[str, list[float]] = {"median_ms": [], "all_median_ms": [], "all_mean_ms": [], "measured": []}
     for run, own in zip(runs, times, strict=True):
         full = full_steps(run)
-        found["median_ms"].append(float(np.median(own[full])) if full.any() else float("nan"))
-        found["all_median_ms"].append(float(np.median(own)))
-        found["all_mean_ms"].append(float(own.mean()))
-        found["measured"].append(float(_measured(run).mean()))
-    return asdict(trial) | found
+        columns["median_ms"].append(float(np.median(own[full])) if full.any() else float("nan"))
+        columns["all_median_ms"].append(float(np.median(own)))
+        columns["all_mean_ms"].append(float(own.mean()))
+        columns["measured"].append(float(_measured(run).mean()))
+    return asdict(trial) | columns
 
 
 def time_in_turns(filters: list[FastSlam], runs: list[StereoRun]) -> list[FloatArray]:

@@ -34,13 +34,13 @@ class TaughtEnv:
 
     def teacher_labels(self) -> list[tuple[int, Float32Array]]:
         """Return action and preferences (1 + C,) of the teacher for each robot."""
-        found = []
+        labels = []
         for agent in self._env.possible_agents:
             belief = self._env.belief(agent)
             held = np.flatnonzero(belief.candidates.own_goal)
             slot, preferences = decide(belief, int(held[0]) if len(held) else None)
-            found.append((0 if slot is None else 1 + slot, (preferences - preferences.max()).astype(np.float32)))
-        return found
+            labels.append((0 if slot is None else 1 + slot, (preferences - preferences.max()).astype(np.float32)))
+        return labels
 
 
 def make_taught_envs(

@@ -97,6 +97,26 @@ def cell_index(coordinate: float, margin: int) -> int:
     return math.floor((coordinate + HALF_WIDTH) / CELL) + margin
 
 
+@inline
+def to_index(coordinate: float, size: int) -> int:
+    """Return the row or column of a coordinate [m] in a grid of some size, whose middle is the start."""
+    return cell_index(coordinate, margin_of(size))
+
+
+@inline
+def to_coordinate(index: int, size: int) -> float:
+    """Return the coordinate [m] of the centre of a row or column."""
+    return (index - margin_of(size) + 0.5) * CELL - HALF_WIDTH
+
+
+@inline
+def is_occupied(cells: Any, x: float, y: float) -> bool:
+    """Return whether a point [m] lies in an occupied cell of a grid."""
+    size = len(cells)
+    row, col = to_index(y, size), to_index(x, size)
+    return bool(0 <= row < size and 0 <= col < size and cells[row, col] == OCCUPIED)
+
+
 EDGE = 4  # cells around what is known that a grid keeps unknown, so that its size changes no frontier
 
 
@@ -190,12 +210,12 @@ def merge_grid(grid: Grid, other: Any, known: Any, x: float, y: float, theta: fl
             other_x, other_y = (c * u + s * v + HALF_WIDTH) / CELL, (-s * u + c * v + HALF_WIDTH) / CELL
             top, bottom = math.floor(other_y - 0.25) + others, math.floor(other_y + 0.25) + others
             left, right = math.floor(other_x - 0.25) + others, math.floor(other_x + 0.25) + others
-            found = evidence_at(other, math.floor(other_y) + others, math.floor(other_x) + others)
+            evidence = evidence_at(other, math.floor(other_y) + others, math.floor(other_x) + others)
             wall = max(
                 max(evidence_at(other, top, left), evidence_at(other, top, right)),
                 max(evidence_at(other, bottom, left), evidence_at(other, bottom, right)),
             )
-            found = wall if wall > max(found, 0) else found
-            if found != 0:
-                grid.evidence[row, col] = clamp_evidence(grid.evidence[row, col] + found)
+            evidence = wall if wall > max(evidence, 0) else evidence
+            if evidence != 0:
+                grid.evidence[row, col] = clamp_evidence(grid.evidence[row, col] + evidence)
                 set_state(grid, row, col, OCCUPIED if grid.evidence[row, col] > 0 else FREE)

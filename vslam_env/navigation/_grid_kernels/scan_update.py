@@ -162,7 +162,7 @@ def _change_at_jump(told: Any, seen: Any, k: Any, u: float, v: float, change: in
 
 @device
 @in_place
-def update_from_geometry(grid: Grid, x: float, y: float, theta: float, room: FloatArray) -> None:
+def update_from_geometry(grid: Grid, x: float, y: float, theta: float, buffer: FloatArray) -> None:
     """Write what a scan says into a grid, visiting each cell between rays that reach its row once.
 
     Two neighbouring rays that see one surface span a triangle: a cell of it is free before the surface, occupied on
@@ -178,9 +178,9 @@ def update_from_geometry(grid: Grid, x: float, y: float, theta: float, room: Flo
         x: Place of the robot [m].
         y: See `x`.
         theta: Heading of the robot [rad].
-        room: (NUM_PAINT_ROWS, n + 1) float64. Survey of the scan, and below it room for the rays as the grid sees them.
+        buffer: (NUM_PAINT_ROWS, n + 1) float64. Survey of the scan; below it workspace, the rays in the grid.
     """
-    told, seen, count = room[:NUM_ROWS], room[NUM_ROWS:], room.shape[1] - 1
+    told, seen, count = buffer[:NUM_ROWS], buffer[NUM_ROWS:], buffer.shape[1] - 1
     all_passed = stack_array_of(MOST_PLACES, np.uint32)
     c, s = math.cos(theta), math.sin(theta)
     for along_x, along_y in ((ALONG_X, ALONG_Y), (NORMAL_X, NORMAL_Y)):
@@ -247,6 +247,6 @@ def update_from_scan(
     grid: Grid, x: float, y: float, theta: float, ranges: FloatArray, directions: FloatArray, max_range: float
 ) -> None:
     """Write one scan into a grid; arguments as in `survey` and `update_from_geometry`."""
-    room = np.empty((NUM_PAINT_ROWS, len(ranges) + 1))
-    scan_geometry(ranges, directions, max_range, room[:NUM_ROWS])
-    update_from_geometry(grid, x, y, theta, room)
+    buffer = np.empty((NUM_PAINT_ROWS, len(ranges) + 1))
+    scan_geometry(ranges, directions, max_range, buffer[:NUM_ROWS])
+    update_from_geometry(grid, x, y, theta, buffer)

@@ -62,7 +62,7 @@ def update_grids(
     directions: FloatArray,
     max_range: float,
     radius: float,
-    room: FloatArray,
+    buffer: FloatArray,
 ) -> tuple[int, int, int]:
     """Write what robots read in a tick: their scans, the floor that they cover, and their bumps.
 
@@ -75,7 +75,7 @@ def update_grids(
         directions: (2, R) float64.
         max_range: Range of the scans [m].
         radius: Radius of the robots [m].
-        room: See `update_from_geometry`.
+        buffer: See `update_from_geometry`.
 
     Returns:
         Owner and robot of a pose or a scan that is invalid, -1 if all are valid; and the number of cells that a grid
@@ -100,12 +100,12 @@ def update_grids(
     if needed > cells.shape[1] // 2:
         return -1, -1, needed
     for robot in range(len(scans)):
-        scan_geometry(scans[robot], directions, max_range, room[:NUM_ROWS])
+        scan_geometry(scans[robot], directions, max_range, buffer[:NUM_ROWS])
         for owner in range(len(shared)):
             if shared[owner, robot]:
                 grid = Grid(evidence[owner], cells[owner], changes[owner], bounds[owner])
                 x, y, theta = poses[owner, robot]
-                update_from_geometry(grid, x, y, theta, room)
+                update_from_geometry(grid, x, y, theta, buffer)
                 clear_disc(grid, x, y, radius)
                 if bumps[robot]:
                     mark_bump(grid, x, y, theta, radius)

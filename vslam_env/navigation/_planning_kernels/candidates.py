@@ -45,11 +45,11 @@ def is_settled(weights: Any, cost: Any, corner: Any, bounds: Any, row: int, col:
 
 @device
 @jit
-def with_distant(found: Any, rows: Any, ways: tuple[Any, Any, Any, Any, int, int], bounds: Any, size: int) -> Any:
+def with_distant(frontiers: Any, rows: Any, ways: tuple[Any, Any, Any, Any, int, int], bounds: Any, size: int) -> Any:
     """Return the frontiers (n, 5) that a search over a part found, and the candidates of which it tells nothing.
 
     Args:
-        found: (m, 5). Frontiers; those of which the search does not tell all are left out.
+        frontiers: (m, 5). Frontiers; those of which the search does not tell all are left out.
         rows: (k, 5). Candidates; NaN: none.
         ways: Paths of the search, of `dijkstra`.
         bounds: (4,) int32. Bounds of the known part of the grid.
@@ -57,19 +57,21 @@ def with_distant(found: Any, rows: Any, ways: tuple[Any, Any, Any, Any, int, int
     """
     _, weights, cost, _, row, col = ways
     corner = row, col
-    both, num, margin = np.empty((len(found) + len(rows), NUM_COLUMNS)), 0, margin_of(size)
-    for i in range(len(found)):
-        if is_settled(weights, cost, corner, bounds, cell_index(found[i, 1], margin), cell_index(found[i, 0], margin)):
-            both[num] = found[i]
+    both, num, margin = np.empty((len(frontiers) + len(rows), NUM_COLUMNS)), 0, margin_of(size)
+    for i in range(len(frontiers)):
+        if is_settled(
+            weights, cost, corner, bounds, cell_index(frontiers[i, 1], margin), cell_index(frontiers[i, 0], margin)
+        ):
+            both[num] = frontiers[i]
             num += 1
-    num_found = num
+    num_frontiers = num
     for i in range(len(rows)):
         if np.isnan(rows[i, 0]):
             continue
         if is_settled(weights, cost, corner, bounds, cell_index(rows[i, 1], margin), cell_index(rows[i, 0], margin)):
             continue
         is_new = True
-        for j in range(num_found):
+        for j in range(num_frontiers):
             is_new &= np.hypot(both[j, 0] - rows[i, 0], both[j, 1] - rows[i, 1]) >= SAME_GOAL
         if is_new:
             both[num] = rows[i]
@@ -101,15 +103,15 @@ def pair_distances(goals: Any, places: Any, costs: Any) -> bool:
 
 
 @jit
-def fill_slots(costs: Any, found: Any, rows: Any, visits: Any) -> None:
+def fill_slots(costs: Any, frontiers: Any, rows: Any, visits: Any) -> None:
     """Write the next rows (m, 5) and visits (m,) of slots: old candidates stay where they were, new ones fill the gaps.
 
-    Costs (m, n) are below `SAME_GOAL` for what is the same, at most once per row and column; `found` (n, 5).
+    Costs (m, n) are below `SAME_GOAL` for what is the same, at most once per row and column; `frontiers` (n, 5).
     """
     chosen = np.full(len(rows), -1, np.int64)
-    is_new = np.ones(len(found), np.bool_)
+    is_new = np.ones(len(frontiers), np.bool_)
     for slot in range(len(rows)):
-        for source in range(len(found)):
+        for source in range(len(frontiers)):
             if costs[slot, source] < SAME_GOAL:
                 chosen[slot], is_new[source] = source, False
 
@@ -119,14 +121,14 @@ def fill_slots(costs: Any, found: Any, rows: Any, visits: Any) -> None:
         source = chosen[slot]
         if source < 0:
             visits[slot] = 0
-            while new < len(found) and not is_new[new]:
+            while new < len(frontiers) and not is_new[new]:
                 new += 1
-            if new == len(found):
+            if new == len(frontiers):
                 continue
             source = new
             new += 1
         for column in range(NUM_COLUMNS):
-            rows[slot, column] = found[source, column]
+            rows[slot, column] = frontiers[source, column]
 
 
 @jit
@@ -169,11 +171,11 @@ def update_slots(
             given_up[-1, 0], given_up[-1, 1] = goal_x, goal_y
 
     ways = dijkstra(cells, bounds, x, y, radius, np.nan, np.nan, reach)
-    found = frontiers_reached(ways, len(cells), given_up)
+    frontiers = frontiers_reached(ways, len(cells), given_up)
     if reach < np.inf:
-        found = with_distant(found, rows, ways, bounds, len(cells))
-    costs = np.empty((len(rows), len(found)))
-    is_clear = pair_distances(rows, found, costs)
+        frontiers = with_distant(frontiers, rows, ways, bounds, len(cells))
+    costs = np.empty((len(rows), len(frontiers)))
+    is_clear = pair_distances(rows, frontiers, costs)
     if is_clear:
-        fill_slots(costs, found, rows, visits)
-    return found, costs, is_clear, given_up, ways
+        fill_slots(costs, frontiers, rows, visits)
+    return frontiers, costs, is_clear, given_up, ways

@@ -17,7 +17,7 @@ MOST_NEAR = 1 + 2 * GOAL_STEPS * (GOAL_STEPS + 1)  # cells that so many steps le
 LOOKED_AT = 4  # added to the marks of cells while a goal is looked for
 SIGHT_CELLS = 3  # the unknown this near to a goal tells where to look from it
 
-HEADING, SIZE, LENGTH, NUM_COLUMNS = 2, 3, 4, 5  # columns of the rows that describe frontiers, see `FrontierColumns`
+X, Y, HEADING, SIZE, LENGTH, NUM_COLUMNS = range(6)  # columns of the rows of candidates, see `FrontierColumns`
 
 
 class FrontierColumns(NamedTuple):
@@ -172,7 +172,7 @@ def frontiers_reached(ways: tuple[Any, Any, Any, Any, int, int], grid_size: int,
     for i in range(len(ignored)):
         _leave_out(mark, ignored[i, 0], ignored[i, 1], first_row + to_centre, first_col + to_centre)
 
-    found = np.empty((height * width // MIN_CELLS + 1, NUM_COLUMNS))
+    frontiers = np.empty((height * width // MIN_CELLS + 1, NUM_COLUMNS))
     count = 0
     whole = np.empty((height * width, 2), np.int64)
     piece = np.empty((MAX_CELLS, 2), np.int64)
@@ -206,13 +206,13 @@ def frontiers_reached(ways: tuple[Any, Any, Any, Any, int, int], grid_size: int,
                         if box[i, j] == UNKNOWN:
                             up, right = up + i - row, right + j - col
                 at = count
-                while at > 0 and found[at - 1, LENGTH] > length:
-                    found[at] = found[at - 1]
+                while at > 0 and frontiers[at - 1, LENGTH] > length:
+                    frontiers[at] = frontiers[at - 1]
                     at -= 1
-                found[at, 0] = (first_col + col + to_centre) * CELL - HALF_WIDTH
-                found[at, 1] = (first_row + row + to_centre) * CELL - HALF_WIDTH
-                found[at, HEADING] = math.atan2(up, right)
-                found[at, SIZE] = num * CELL
-                found[at, LENGTH] = length
+                frontiers[at, 0] = (first_col + col + to_centre) * CELL - HALF_WIDTH
+                frontiers[at, 1] = (first_row + row + to_centre) * CELL - HALF_WIDTH
+                frontiers[at, HEADING] = math.atan2(up, right)
+                frontiers[at, SIZE] = num * CELL
+                frontiers[at, LENGTH] = length
                 count += 1
-    return found[:count]
+    return frontiers[:count]

@@ -37,7 +37,7 @@ def _nearest(slope: float, local: FloatArray, robots: FloatArray, radius: float)
         Row of the wall (`NOTHING`: none, `ROBOT`: a disc first); metres ahead; and how far along the wall, in [0, 1],
         or how much the disc faces the ray.
     """
-    found, depth, along = NOTHING, np.inf, 0.0
+    surface, depth, along = NOTHING, np.inf, 0.0
     for i in range(len(local)):
         x1, y1 = local[i, 0], local[i, 1]
         ex, ey = local[i, 2] - x1, local[i, 3] - y1
@@ -49,7 +49,7 @@ def _nearest(slope: float, local: FloatArray, robots: FloatArray, radius: float)
             continue
         t = x1 + u * ex
         if NEAREST < t < depth:
-            found, depth, along = i, t, min(max(u, 0.0), 1.0)
+            surface, depth, along = i, t, min(max(u, 0.0), 1.0)
     length = np.sqrt(1.0 + slope * slope)
     for j in range(len(robots)):
         middle = (robots[j, 0] + slope * robots[j, 1]) / length
@@ -58,8 +58,8 @@ def _nearest(slope: float, local: FloatArray, robots: FloatArray, radius: float)
         if inside > 0.0:
             t = (middle - np.sqrt(inside)) / length
             if NEAREST < t < depth:
-                found, depth, along = ROBOT, t, np.sqrt(inside) / radius
-    return found, depth, along
+                surface, depth, along = ROBOT, t, np.sqrt(inside) / radius
+    return surface, depth, along
 
 
 @jit
@@ -179,14 +179,14 @@ def render(
         for part in range(parts):
             left_edge = column - 0.5 + part * share
             slope = -(left_edge + 0.5 * share - centre_x) / focal
-            found, depth, along = _nearest(slope, local, robots, radius)
-            if found == NOTHING:
+            surface, depth, along = _nearest(slope, local, robots, radius)
+            if surface == NOTHING:
                 for v in range(out.shape[1]):
                     out[column, v] += np.float32(share) * (CEILING if v < centre_y else FLOOR)
                 continue
             per_pixel = depth / focal / texel
             top = (ceiling - height) / texel - (centre_y + 0.5) * per_pixel
-            if found == ROBOT:
+            if surface == ROBOT:
                 shade = BODY * np.float32(1.0 + along)
                 crown = (ceiling - BODY_TOP) / texel
                 for v in range(out.shape[1]):
@@ -198,9 +198,9 @@ def render(
                         level = FLOOR
                     out[column, v] += np.float32(share) * level
                 continue
-            x1, y1 = local[found, 0], local[found, 1]
-            ex, ey = local[found, 2] - x1, local[found, 3] - y1
-            face = 2 * indices[found] + (0 if ex * y1 - ey * x1 < 0.0 else 1)
+            x1, y1 = local[surface, 0], local[surface, 1]
+            ex, ey = local[surface, 2] - x1, local[surface, 3] - y1
+            face = 2 * indices[surface] + (0 if ex * y1 - ey * x1 < 0.0 else 1)
             texels = float(faces.columns[face])
             ends = (0.0, 0.0)
             for side in range(2):

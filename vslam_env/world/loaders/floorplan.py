@@ -120,9 +120,9 @@ def load_walls_json(path: str | Path) -> World:
     if not isinstance(content, dict) or "walls" not in content:
         got = sorted(content) if isinstance(content, dict) else content
         raise argument_error("world", f"an object with the key 'walls' in {path}", got, hint)
-    if (found := content.get("format", FORMAT)) != FORMAT or type(found) is not int:
+    if (number := content.get("format", FORMAT)) != FORMAT or type(number) is not int:
         hint = "Use the release that wrote it, or write the walls again."
-        raise argument_error("world", f"one of format {FORMAT} in {path}", f"a world of format {found!r}", hint)
+        raise argument_error("world", f"one of format {FORMAT} in {path}", f"a world of format {number!r}", hint)
     unknown = sorted(set(content) - {"format", "walls", "start_poses", "name"})
     if unknown:
         raise argument_error("world", f"no other keys in {path}", unknown[0], hint)
