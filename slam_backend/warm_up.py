@@ -1,7 +1,6 @@
 """Compilation of the backend's kernels ahead of their first use."""
 
 from collections.abc import Collection
-from typing import Literal
 
 import numpy as np
 
@@ -37,13 +36,10 @@ from slam_backend.team.team import TeamSlam
 
 # Features that default options do not use, and the prefixes of the kernels that only these call, signature included.
 EXTRAS = {
-    "fastslam1": (),
     "existence": ("slam_backend.fastslam._kernels.update.existence.",),
     "images": ("slam_backend.frontend.",),
     "planners": ("vslam_env.navigation.tours.", "vslam_env.navigation._planning_kernels.path_lengths."),
 }
-STEP = "slam_backend.fastslam._kernels.step.step_robots"  # kernel of the filter's step
-FASTSLAM2 = "none"  # end of its signature without FastSLAM 1.0
 STEPS = 4
 LANDMARKS = 12  # more than an alignment needs
 
@@ -83,17 +79,13 @@ def warm_up(
 
 def extras_of(options: FilterOptions) -> set[str]:
     """Return the keys of `EXTRAS` that filters with these options need."""
-    wanted = {"fastslam1": options.proposal == "fastslam1", "existence": options.existence is not None}
-    return {name for name, is_wanted in wanted.items() if is_wanted}
+    return set() if options.existence is None else {"existence"}
 
 
 def needed(signatures: Signatures, extras: Collection[str]) -> dict[str, list[str]]:
     """Return the signatures without those that only other extras need."""
     left_out = tuple(start for extra, starts in EXTRAS.items() if extra not in extras for start in starts)
-    chosen = {name: list(words) for name, words in signatures.items() if not name.startswith(left_out)}
-    if "fastslam1" not in extras:
-        chosen[STEP] = [words for words in chosen[STEP] if words.endswith(FASTSLAM2)]
-    return chosen
+    return {name: list(words) for name, words in signatures.items() if not name.startswith(left_out)}
 
 
 def run_all_paths(extras: Collection[str]) -> float:
@@ -113,15 +105,13 @@ def run_all_paths(extras: Collection[str]) -> float:
         plain = Measurements(points, descriptors)
         given = Measurements(points, descriptors, np.tile(1e-4 * np.eye(3), (LANDMARKS, 1, 1)))
         move, still = np.array([0.0, 0.0, 0.01]), np.zeros(3)
-        for is_second in (True, False) if "fastslam1" in extras else (True,):
-            for frame in (plain, given):
-                proposal: Literal["fastslam2", "fastslam1"] = "fastslam2" if is_second else "fastslam1"
-                slam = FastSlam(2, num_particles=4, proposal=proposal, resample_threshold=1.0, rejuvenate_every=None)
-                slam.step([None, None], [frame, None])
-                for _ in range(STEPS):
-                    slam.step([move, None], [frame, frame])
-                slam.step([None, None], [frame, frame], [ids, some_ids], [still, None])
-                slam.step([move, move], [None, None])
+        for frame in (plain, given):
+            slam = FastSlam(2, num_particles=4, resample_threshold=1.0, rejuvenate_every=None)
+            slam.step([None, None], [frame, None])
+            for _ in range(STEPS):
+                slam.step([move, None], [frame, frame])
+            slam.step([None, None], [frame, frame], [ids, some_ids], [still, None])
+            slam.step([move, move], [None, None])
         few_keys = SmoothingOptions(incremental=True, max_keys=2, recent_keys=1)  # keys are joined between slices
         biased = OdometryModel(bias_scale=0.02)
         smoothing = FastSlam(num_particles=4, motion=biased, rejuvenate_every=3 * STEPS, smoothing=few_keys)

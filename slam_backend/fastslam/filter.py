@@ -8,7 +8,7 @@ landmarks. Then the joint particles are resampled.
 import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,14 +29,14 @@ from slam_backend.core.validation import (
 )
 from slam_backend.fastslam import _kernels
 from slam_backend.fastslam._kernels import EXACT_POSE, NO_READING, add_gauge_covariance
-from slam_backend.fastslam._kernels.records import ROBOT, WEIGHT
+from slam_backend.fastslam._kernels.records import ROBOT, WEIGHT, StepSummary
 from slam_backend.fastslam.consistency import Consistency, ConsistencyTest
 from slam_backend.fastslam.estimates import map_mixture, pose_mixtures
 from slam_backend.fastslam.existence import ExistenceUpdate
 from slam_backend.fastslam.options import (
     MAX_ROBOTS,
     FilterOptions,
-    pack_options,
+    kernel_options,
     packed_camera,
     robot_batches,
 )
@@ -63,25 +63,6 @@ from slam_backend.resampling import RESAMPLING
 from slam_backend.smoother.rejuvenation import Particles
 
 NO_WEIGHTS = np.empty(0)  # unused where all particles start at the same pose
-
-
-class StepSummary(NamedTuple):
-    """Outcome of a step without the association of each measurement.
-
-    Attributes:
-        long_unseen: Number of measurements matched to landmarks not seen for long.
-        created, new, matched, rejected, ess, nis: See `StepReport`.
-        needs_resampling: Whether the effective sample size fell below the threshold of resampling.
-    """
-
-    long_unseen: int
-    created: int
-    new: int
-    matched: int
-    rejected: int
-    ess: float
-    nis: float
-    needs_resampling: bool
 
 
 @known_names
@@ -187,7 +168,7 @@ class FastSlam:
         existence = options.existence
         self.options = options
         self.rng = np.random.default_rng(check_seed(seed))
-        self.packed_options = pack_options(options)
+        self._kernel_options = kernel_options(options)
         self.packed_camera = packed_camera(options.camera)
         self._existence = None if existence is None else ExistenceUpdate(existence, options.camera)
         self.rejuvenation = None if options.rejuvenate_every is None else RejuvenationScheduler(options, k)
@@ -333,14 +314,22 @@ class FastSlam:
         """
         if step is not None:
             self.next_step = step
-        long_unseen, created, new, matched, rejected, ess, nis, needs_resampling = self._update(
-            inputs, robot_rows, associations_buffer
-        )
-        if needs_resampling:
+        summary = self._update(inputs, robot_rows, associations_buffer)
+        if summary.needs_resampling:
             self.resample()
-        report = StepReport(associations, robot_rows.rows, created, new, matched, rejected, ess, nis, needs_resampling)
+        report = StepReport(
+            all_associations=associations,
+            rows=robot_rows.rows,
+            num_created=summary.created,
+            num_new=summary.new,
+            num_matched=summary.matched,
+            num_rejected=summary.rejected,
+            ess=summary.ess,
+            nis=summary.nis,
+            resampled=summary.needs_resampling,
+        )
         if (smoother := self.rejuvenation) is not None:
-            smoother.record_step(new + matched, long_unseen)
+            smoother.record_step(summary.new + summary.matched, summary.long_unseen)
             is_busy = self.may_smooth and not smoother.is_waiting(self.next_step - 1)
             if is_busy and (news := self._smooth(smoother)) is not None:
                 return report._replace(rejuvenation=news)
@@ -373,36 +362,40 @@ class FastSlam:
         pending.reserve(used)
         now = 0 if self.rejuvenation is None else self.rejuvenation.steps + 1
         normals = self.rng.standard_normal((active, maps.num_particles, 3))
-        means, covariances = self.estimates
         deleted: list[IntArray] = []
-        fastslam1 = None if self.options.proposal == "fastslam2" else 1
+        robot_arrays = (
+            self.pose_arrays, self.weight_arrays, self.bias_covariances, self.propagated_only, self.gauge_covariance,
+            *self.estimates,
+        )  # fmt: skip
+        given = (
+            robots.array, inputs.inputs_table, inputs.moves, normals, inputs.measurements, inputs.descriptors,
+            inputs.names,
+        )  # fmt: skip
+        results = (
+            self._associations, self._mahalanobis_sq, associations, pending.noted[len(pending.steps)], pending.measured
+        )  # fmt: skip
         for low, high, is_over in self._batches:
-            summary = _kernels.step_robots(
-                low, high, is_over, now, self.packed_options, robots.array, inputs.inputs_table, inputs.moves, normals,
-                self.pose_arrays, self.bias_covariances, self.propagated_only, self.weight_arrays,
-                self.gauge_covariance, maps.values, maps.counts, maps.odds, maps.table, maps.maps, maps.users,
-                maps.free_rows, maps.tops, maps.descriptors, maps.heads, inputs.measurements,
-                inputs.descriptors, inputs.names,
-                self._associations, self._mahalanobis_sq, associations, means, covariances,
-                pending.noted[len(pending.steps)], pending.measured, pending.num_measured, fastslam1,
-            )  # fmt: skip
+            part = low, high, is_over, now, pending.num_measured
+            fields = _kernels.step_robots(part, self._kernel_options, robot_arrays, tuple(maps.arrays), given, results)
             if self._existence is not None and not is_over and (row := robots.rows[low]) >= 0:
                 _, begin, end, _, _, count = inputs.inputs[row]
                 if count >= 0:
                     _, started = associations  # by slot, until the step is over
                     found, new_slots = self._associations[begin:end], started[begin:end]
                     deleted.append(self._existence.update(maps, self.poses[low], self.best_particle, found, new_slots))
-        self.best_particle, long_unseen, created, new, matched, rejected, ess, nis, needs_resampling = summary
+        summary = StepSummary(*fields)
+        self.best_particle = summary.best
         pending.steps.append(self.next_step)
         pending.num_measured += used
         if used:
-            self._consistency.update(self.next_step, nis, ess / self.num_particles, used, used - new - matched)
-        if rejected and self.rejuvenation is not None:
+            unmatched = used - summary.new - summary.matched
+            self._consistency.update(self.next_step, summary.nis, summary.ess / self.num_particles, used, unmatched)
+        if summary.rejected and self.rejuvenation is not None:
             record_rejected(self.rejuvenation, self.next_step, inputs, robots, associations)
         self.next_step += 1
         for slots in deleted:  # last, as the ids are needed until here
             maps.release(slots)
-        return StepSummary(long_unseen, created, new, matched, rejected, ess, nis, needs_resampling)
+        return summary
 
     def _set_exact_pose(self, robot: int, pose: FloatArray) -> None:
         """Set a robot's pose in all particles to an exact one (3,) [m, m, rad] in its own start frame."""

@@ -1,9 +1,10 @@
 """Options of a `FastSlam`: one frozen, validated record."""
 
-from dataclasses import astuple, dataclass, field
-from typing import Literal
+from dataclasses import astuple, dataclass, field, fields
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import (
@@ -145,23 +146,34 @@ def packed_camera(camera: StereoCamera) -> FloatArray:
     return np.array([camera.focal_px, camera.baseline, *sigmas, *camera.mount], np.float64)
 
 
-def pack_options(options: FilterOptions) -> FloatArray:
-    """Return the options of a filter as numbers, (30,) float64, named in `_kernels.layout`.
+NUMBERS = tuple(field.name for field in fields(FilterOptions) if field.type in ("float", "bool", float, bool))
+DERIVED = (
+    ("noise", np.float64, 6), ("bias_sigmas", np.float64, 3), ("camera", np.float64, 7),
+    ("descriptor_gate_squared", np.float64), ("descriptor_variance", np.float64), ("log_density", np.float64),
+    ("landmark_walk", np.float64), ("closure_after", np.float64), ("is_fastslam1", np.bool_),
+)  # fmt: skip
+KERNEL_OPTIONS = np.dtype((np.record, np.dtype([*((name, np.float64) for name in NUMBERS), *DERIVED], align=True)))
 
-    These are the noise of the odometry (9,), see `OdometryModel`; of the camera (7,) the focal length [px], the
-    baseline [m], the sigmas of image coordinates and of the disparity [px], and the mount [m]; the sigmas (3,)
-    [m, m, rad] of the prior for recovery; then one number each.
+
+def kernel_options(options: FilterOptions) -> NDArray[Any]:
+    """Return what kernels take of the options, (1,) `KERNEL_OPTIONS`: all numbers by their names, and what follows.
+
+    These are noise of the odometry and sigmas of its bias, see `OdometryModel`; `packed_camera`; E0 and the variance of
+    descriptors; log p0; the variance of a landmark's walk; and `SmoothingOptions.closure_after`.
     """
-    return np.array([
-        *astuple(options.motion),
-        *packed_camera(options.camera),
-        options.recovery_position, options.recovery_position, options.recovery_heading,
-        options.descriptor_gate**2, options.descriptor_sigma**2, options.position_gate, options.new_landmark_gate,
-        options.new_landmark_radius, options.ambiguity_margin,
-        np.log(options.new_landmark_density), options.landmark_walk,
-        options.one_to_one,
-        options.smoothing.closure_after, options.resample_threshold,
-    ], np.float64)  # fmt: skip
+    packed: NDArray[Any] = np.zeros(1, KERNEL_OPTIONS)
+    for name in NUMBERS:
+        packed[name] = getattr(options, name)
+    motion = astuple(options.motion)
+    packed["noise"], packed["bias_sigmas"], packed["camera"] = motion[:6], motion[6:], packed_camera(options.camera)
+    packed["descriptor_gate_squared"], packed["descriptor_variance"] = (
+        options.descriptor_gate**2,
+        options.descriptor_sigma**2,
+    )
+    packed["log_density"], packed["landmark_walk"] = np.log(options.new_landmark_density), options.landmark_walk
+    packed["closure_after"] = options.smoothing.closure_after
+    packed["is_fastslam1"] = options.proposal == "fastslam1"
+    return packed
 
 
 def robot_batches(num_robots: int, one_by_one: bool) -> tuple[tuple[int, int, bool], ...]:

@@ -13,7 +13,7 @@ from slam_backend.core.validation import FloatArray, IntArray, argument_error
 from slam_backend.fastslam._kernels import LANES
 from slam_backend.fastslam.consistency import LISTS, RENEWED, SIGN_OF, SIGNS, SUMS, WEIGHTS
 from slam_backend.fastslam.existence import ExistenceUpdate
-from slam_backend.fastslam.options import MAX_ROBOTS, FilterOptions, pack_options
+from slam_backend.fastslam.options import MAX_ROBOTS, FilterOptions, kernel_options
 from slam_backend.fastslam.particle_maps import MAPS_KEPT
 from slam_backend.fastslam.rejuvenation import SCHEDULE
 from slam_backend.fastslam.reports import PoseEstimates
@@ -112,7 +112,7 @@ def check_consistency(name: str, state: Any) -> None:
 def _check_fit(name: str, options: FilterOptions) -> None:
     """Refuse options that are valid one by one, but not together."""
     try:
-        pack_options(options)
+        kernel_options(options)
         if options.existence is not None:
             ExistenceUpdate(options.existence, options.camera)
     except Exception as error:  # of any kind: numbers too large for floats, or unfit for the camera

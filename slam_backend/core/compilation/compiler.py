@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from queue import Queue
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from numba import from_dtype, types
 from numba.core.registry import CPUDispatcher
@@ -39,6 +39,7 @@ LOGGER = logging.getLogger("slam_backend")
 SIGNATURES = "kernel_signatures.json"  # file in the folder of each package
 WORKER = "slam_backend.core.compilation.worker"  # run as `python -m`, so that user scripts need no main guard
 LOCK = "vslam-compile.lock"
+RECORD = "slam_backend.fastslam.options.KERNEL_OPTIONS"  # the only structured type of arrays, written `RECORD[]`
 READ_ONLY = "r"  # suffix of the code of a read-only array
 WORD = re.compile(r"[^\s(]+(?:\([^)]*\))?")  # word of a signature; named tuples are not nested
 
@@ -98,6 +99,8 @@ def _word(argument: types.Type) -> str:
         kind = getattr(argument, "instance_class", tuple)
         return f"{kind.__module__}.{kind.__qualname__}({encode_signature(fields.types)})"
     if isinstance(argument, types.Array):
+        if isinstance(argument.dtype, types.Record):
+            return f"{RECORD}[]"
         read_only = "" if argument.mutable else READ_ONLY
         return f"{argument.dtype}[{argument.ndim}{argument.layout}{read_only}]"
     return str(argument)
@@ -116,6 +119,9 @@ def _type(word: str) -> Any:
         module, _, record = name.rpartition(".")
         from_types: Any = types.BaseTuple.from_types
         return from_types(decode_signature(fields), getattr(importlib.import_module(module), record))
+    if word.endswith("[]"):
+        module, _, name = word.removesuffix("[]").rpartition(".")
+        return types.Array(from_dtype(getattr(importlib.import_module(module), name)), 1, cast(Any, "C"))
     name, _, array = word.partition("[")
     element: Any = from_dtype(dtype(name))
     if not array:

@@ -6,16 +6,7 @@ import numpy as np
 
 from slam_backend.core.jit import in_place
 from slam_backend.core.validation import Float32Array, FloatArray, IntArray
-from slam_backend.fastslam._kernels.layout import (
-    BEGIN,
-    COUNT,
-    COVARIANCES_GIVEN,
-    END,
-    HAS_IDS,
-    MIN_DEPTH,
-    MOTION_KIND,
-    MOVED,
-)
+from slam_backend.fastslam._kernels import layout as L
 
 
 @in_place
@@ -84,8 +75,15 @@ def read_team(
         end, entry = ends[robot], table[robot]
         if end < begin:
             return False
-        entry[MOTION_KIND], entry[BEGIN], entry[END], entry[COVARIANCES_GIVEN], entry[HAS_IDS], entry[COUNT] = (
-            MOVED,
+        (
+            entry[L.MOTION_KIND],
+            entry[L.BEGIN],
+            entry[L.END],
+            entry[L.COVARIANCES_GIVEN],
+            entry[L.HAS_IDS],
+            entry[L.COUNT],
+        ) = (
+            L.MOVED,
             begin,
             end,
             0,
@@ -95,7 +93,7 @@ def read_team(
         begin = end
     to_robot_axes(points, None, measurements)
     nearest, farthest = extent(points)
-    fine = begin == len(points) and nearest >= MIN_DEPTH and farthest <= farthest_point
+    fine = begin == len(points) and nearest >= L.MIN_DEPTH and farthest <= farthest_point
     largest = np.float32(largest_entry)
     for i in range(len(descriptors)):
         for j in range(descriptors.shape[1]):

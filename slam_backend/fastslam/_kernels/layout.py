@@ -30,10 +30,8 @@ INFO00, INFO01, INFO02, INFO11, INFO12, INFO22, GRAD0, GRAD1, GRAD2 = (
 SUM_D, MATCHED, DET, DET_EXP, DEPTHS, DEPTHS_EXP = (LANES * k for k in range(42, 48))  # factors of the likelihood
 CLUTTER = LANES * 48  # log-likelihood of the measurements that are not matched
 # Of one measurement: least and second least cost, matched candidate, whether a landmark in the dead zone forbids a new
-# one, and log-likelihood of the best candidate. Once the choice is made, the first two rows hold the least D of any
-# candidate now and in the evaluation before.
+# one, and log-likelihood of the best candidate.
 BEST_COST, SECOND_COST, CHOSEN, DEAD_ZONE, LOG_BEST = (LANES * k for k in range(49, 54))
-LEAST_D, LEAST_FIRST_D, ANY_HELD = BEST_COST, SECOND_COST, CHOSEN  # names of the same rows once the choice is made
 LOST, SURE, CONTRADICT, IS_WIDE = (LANES * k for k in range(54, 58))
 TAKEN, C01 = LANES * 58, LANES * 59
 KEPT00, KEPT10, KEPT11, KEPT20, KEPT21, KEPT22, KEPT01, KEPT_WIDE = (LANES * k for k in range(60, 68))  # of C
@@ -42,7 +40,10 @@ BIAS0, BIAS1, BIAS2 = (LANES * k for k in range(71, 74))  # odometry bias
 PREDICTED0, PREDICTED1, PREDICTED2 = (
     LANES * k for k in range(74, 77)
 )  # predicted pose, while X0 .. T0 hold the posterior mean
-WORK_SIZE, COV_XI_SIZE = LANES * 77, LANES * 6
+# Of one measurement once the choice is made: least D of any candidate now and in the evaluation before, and whether the
+# lane holds any.
+LEAST_D, LEAST_FIRST_D, ANY_HELD = (LANES * k for k in range(77, 80))
+WORK_SIZE, COV_XI_SIZE = LANES * 80, LANES * 6
 
 # Rows of the record of one candidate.
 Q_INFO00, Q_INFO01, Q_INFO02, Q_INFO11, Q_INFO12, Q_INFO22, Q_GRAD0, Q_GRAD1, Q_GRAD2 = (LANES * k for k in range(9))
@@ -61,13 +62,5 @@ NO_READING, STATIONARY, MOVED, EXACT_POSE = range(
 LOGGED, LOGGED_KIND, HAS_COVARIANCES, USED, MOTION, ESTIMATE, NUM_NOTED = 0, 1, 2, 3, 4, 7, 10
 NAME, NUM_MEASURED = 9, 10  # columns of a logged measurement: associated landmark, behind point and covariance
 ASSOCIATED, CREATED = range(2)  # rows of the data association (2, n)
-# Packed options of a filter: odometry noise (6), sigmas of its bias (3), camera (7), prior sigmas for recovery (3);
-# then one number each.
-NOISE, BIAS, CAMERA, RECOVERY = 0, 6, 9, 16
-(
-    DESCRIPTOR_GATE, DESCRIPTOR_VARIANCE, POSITION_GATE, NEW_LANDMARK_GATE, NEW_LANDMARK_RADIUS, AMBIGUITY_MARGIN,
-    LOG_P0, WALK, IS_ONE_TO_ONE, LONG, RESAMPLE_THRESHOLD,
-) = range(19, 30)  # fmt: skip
-
 TILE = 9 * LANES  # particle m is lane m % LANES of block m // LANES
 BLOCK = np.uint32(LANES)  # as divisor: unsigned division takes half the instructions

@@ -96,6 +96,124 @@ class RobotParts(NamedTuple):
 SLOT, WEIGHT, ROBOT = SlotRows(), WeightRows(), RobotParts()
 
 
+class RobotArrays(NamedTuple):
+    """K robots in all particles, and their estimates over all of them.
+
+    Attributes:
+        parts: (6, K, 3, P), see `RobotParts`.
+        weights: (4, P), see `WeightRows`; read and written up to M.
+        biases: (2, K, 3, 3) covariance of each robot's bias given its path; and, where N(x^, P^) was propagated, that
+            of its pose (rows, robot axes) and bias.
+        propagated_only: (K,) 1 where that was propagated since the last sighting, else 0.
+        gauge: (3, 3) covariance of a motion of the whole map that particles do not show, or zeros.
+        means, covariances: (K, 3), (K, 3, 3) each robot's pose over all particles.
+    """
+
+    parts: FloatArray
+    weights: FloatArray
+    biases: FloatArray
+    propagated_only: IntArray
+    gauge: FloatArray
+    means: FloatArray
+    covariances: FloatArray
+
+
+class InputArrays(NamedTuple):
+    """Input of a step.
+
+    Attributes:
+        rows: (K,) row of each robot in `table`; -1: it did nothing at all.
+        table: (N, 6) int64, see `layout`: kind of motion, first and last row of the measurements among all n, whether
+            these have covariances and names, and the number given. Exact poses are already in the particles.
+        moves: (N, 3) odometry [m, m, rad] of those that moved.
+        normals: (k, M, 3) standard normal draws, for the k robots that are not idle.
+        measurements: (n, 9) [m, m^2] points and, of the robots that have them, covariances, as in `to_robot_axes`.
+        descriptors: (n, d).
+        names: (n,) the caller's names, of the robots that have them; or (0,).
+    """
+
+    rows: IntArray
+    table: IntArray
+    moves: FloatArray
+    normals: FloatArray
+    measurements: FloatArray
+    descriptors: Float32Array
+    names: IntArray
+
+
+class StepResults(NamedTuple):
+    """What became of the n measurements of a step.
+
+    Attributes:
+        found, distances: (n, P), see `Outcome`.
+        associations: (2, n) slots of new landmarks, -1 = none; at the end as in `summarise`.
+        noted: (K, 10) notes of the step for the run log, see `layout`.
+        measured: (>= first + used, 10) measurements and their landmarks for the run log.
+    """
+
+    found: Int32Array
+    distances: FloatArray
+    associations: IntArray
+    noted: FloatArray
+    measured: FloatArray
+
+
+class StepPart(NamedTuple):
+    """Part of a step that one call of the kernel does.
+
+    Attributes:
+        low, high: Range of the robots to process; the step begins with the first robot.
+        is_over: Whether these are the last robots, and the step is concluded.
+        now: Number of the step; 0 if there is no smoother, which alone needs when landmarks were last seen.
+        num_measured: Number of measurements that the run log holds already.
+    """
+
+    low: int
+    high: int
+    is_over: bool
+    now: int
+    num_measured: int
+
+
+class MeasurementCounts(NamedTuple):
+    """What became of the measurements of a step, according to the most probable particle.
+
+    Attributes:
+        long_unseen: Number of landmarks not seen for long that it matched.
+        created: Number of measurements that started a landmark in any particle.
+        new, matched, rejected: Numbers of those that it started, matched and rejected, unused ones included.
+        nis: Mean of its squared distances, without what it predicted behind the camera, NaN if there is none.
+    """
+
+    long_unseen: int
+    created: int
+    new: int
+    matched: int
+    rejected: int
+    nis: float
+
+
+class StepSummary(NamedTuple):
+    """Outcome of a step without the association of each measurement.
+
+    Attributes:
+        best: The most probable particle.
+        long_unseen, created, new, matched, rejected, nis: See `MeasurementCounts`.
+        ess: Effective sample size.
+        needs_resampling: Whether the particles are to be resampled, now that something was measured.
+    """
+
+    best: int
+    long_unseen: int
+    created: int
+    new: int
+    matched: int
+    rejected: int
+    nis: float
+    ess: float
+    needs_resampling: bool
+
+
 class Poses(NamedTuple):
     """One robot in all particles.
 
@@ -119,6 +237,7 @@ class Motion(NamedTuple):
         odometry: (3,) u [m, m, rad], previous robot frame.
         sigmas: (3,) standard deviations of u.
         normals: (M, 3) standard normal draws.
+        exact: Whether the caller gave the pose, which no measurement then moves far.
         biased: Whether the bias of the odometry is estimated; all that follows is unused otherwise.
         jacobian: (3, 3) derivative J of u by the bias.
         spread: (6,) what the bias adds to the covariance of the predicted pose, robot axes, upper triangle.
@@ -130,6 +249,7 @@ class Motion(NamedTuple):
     odometry: FloatArray
     sigmas: FloatArray
     normals: FloatArray
+    exact: bool
     biased: bool
     jacobian: FloatArray
     spread: FloatArray
@@ -158,34 +278,6 @@ class Frame(NamedTuple):
     descriptors: Float32Array
     identities: IntArray
     identified: bool
-
-
-class Rules(NamedTuple):
-    """Thresholds of data association and of the update of landmarks.
-
-    Attributes:
-        descriptor_gate: Largest admitted squared distance E0 of descriptors.
-        descriptor_variance: Divisor of squared distances between descriptors that are weighed against D.
-        position_gate: D0.
-        new_landmark_gate: Upper end of the dead zone, the largest D at which an unmatched measurement is not new.
-        new_landmark_radius: Distance [m] from a landmark of similar descriptor up to which a measurement is not new.
-        ambiguity: Cost within which a runner-up makes a measurement ambiguous: it is rejected.
-        recovery: (3,) prior sigmas [m, m, rad] of the pose of a lost particle, see `FilterOptions`; zeros: no recovery.
-        log_p0: Log-density of a measurement that matches nothing: it starts a landmark, or lies in the dead zone.
-        walk: Variance [m^2] along each axis by which a landmark may have moved between two measurements.
-        one_to_one: Whether a landmark is matched at most once in a frame.
-    """
-
-    descriptor_gate: float
-    descriptor_variance: float
-    position_gate: float
-    new_landmark_gate: float
-    new_landmark_radius: float
-    ambiguity: float
-    recovery: FloatArray
-    log_p0: float
-    walk: float
-    one_to_one: bool
 
 
 class Candidates(NamedTuple):

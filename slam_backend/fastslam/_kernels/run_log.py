@@ -6,17 +6,7 @@ import numpy as np
 
 from slam_backend.core.jit import in_place
 from slam_backend.core.validation import FloatArray, IntArray
-from slam_backend.fastslam._kernels.layout import (
-    ESTIMATE,
-    EXACT_POSE,
-    HAS_COVARIANCES,
-    LOGGED,
-    LOGGED_KIND,
-    MOTION,
-    MOVED,
-    NAME,
-    USED,
-)
+from slam_backend.fastslam._kernels import layout as L
 from slam_backend.fastslam._kernels.records import LogColumns
 from slam_backend.smoother.log_arrays import EXACT, ODOMETRY, STATIONARY
 
@@ -46,20 +36,24 @@ def write_rows(
     for k in range(len(numbers)):
         for other in range(noted.shape[1]):
             note = noted[k, other]
-            end = begin + int(note[USED])
-            if other == robot and k >= first and note[LOGGED] > 0.0:
-                if t == len(columns.steps) or n + end - begin > most or note[HAS_COVARIANCES] > 0.0:
+            end = begin + int(note[L.USED])
+            if other == robot and k >= first and note[L.LOGGED] > 0.0:
+                if t == len(columns.steps) or n + end - begin > most or note[L.HAS_COVARIANCES] > 0.0:
                     return k, t, n
                 columns.steps[t], columns.given[t] = numbers[k], False
                 columns.kinds[t] = (
-                    EXACT if note[LOGGED_KIND] == EXACT_POSE else ODOMETRY if note[LOGGED_KIND] == MOVED else STATIONARY
+                    EXACT
+                    if note[L.LOGGED_KIND] == L.EXACT_POSE
+                    else ODOMETRY
+                    if note[L.LOGGED_KIND] == L.MOVED
+                    else STATIONARY
                 )
                 for axis in range(3):
-                    columns.motions[t, axis] = note[MOTION + axis]
+                    columns.motions[t, axis] = note[L.MOTION + axis]
                 for b in range(begin, end):
                     for axis in range(3):
                         columns.points[n, axis] = measured[b, axis]
-                    columns.ids[n] = int(measured[b, NAME])
+                    columns.ids[n] = int(measured[b, L.NAME])
                     n += 1
                 t += 1
                 columns.starts[t] = n
@@ -77,8 +71,12 @@ def guesses_of(robot: int, numbers: IntArray, noted: FloatArray) -> tuple[IntArr
     Returns:
         The numbers of these steps (t,), the poses (t, 3), and whether the robot was placed in any.
     """
-    kept = noted[:, robot, LOGGED] > 0.0
-    return numbers[kept], noted[kept, robot, ESTIMATE:], bool((noted[kept, robot, LOGGED_KIND] == EXACT_POSE).any())
+    kept = noted[:, robot, L.LOGGED] > 0.0
+    return (
+        numbers[kept],
+        noted[kept, robot, L.ESTIMATE :],
+        bool((noted[kept, robot, L.LOGGED_KIND] == L.EXACT_POSE).any()),
+    )
 
 
 def turn_of(robot: int, k: int, noted: FloatArray, measured: FloatArray) -> dict[str, Any] | None:
@@ -89,15 +87,15 @@ def turn_of(robot: int, k: int, noted: FloatArray, measured: FloatArray) -> dict
         noted, measured: See `write_rows`.
     """
     note = noted[k, robot]
-    if not note[LOGGED]:
+    if not note[L.LOGGED]:
         return None
-    begin = int(noted[:k, :, USED].sum() + noted[k, :robot, USED].sum())
-    own = measured[begin : begin + int(note[USED])]
-    move = note[MOTION:ESTIMATE] if note[LOGGED_KIND] in (MOVED, EXACT_POSE) else None
+    begin = int(noted[:k, :, L.USED].sum() + noted[k, :robot, L.USED].sum())
+    own = measured[begin : begin + int(note[L.USED])]
+    move = note[L.MOTION : L.ESTIMATE] if note[L.LOGGED_KIND] in (L.MOVED, L.EXACT_POSE) else None
     return {
         "odometry": move,
-        "pose": move if note[LOGGED_KIND] == EXACT_POSE else None,
+        "pose": move if note[L.LOGGED_KIND] == L.EXACT_POSE else None,
         "points": own[:, :3],
-        "ids": own[:, NAME].astype(np.int64),
-        "covariances": own[:, 3:NAME] if note[HAS_COVARIANCES] else None,
+        "ids": own[:, L.NAME].astype(np.int64),
+        "covariances": own[:, 3 : L.NAME] if note[L.HAS_COVARIANCES] else None,
     }

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from slam_backend.fastslam._kernels import EXACT_POSE, MOVED, NO_READING
 from slam_backend.fastslam._kernels import STATIONARY as STOOD_STILL
 from slam_backend.fastslam._kernels.layout import ESTIMATE, LOGGED, LOGGED_KIND, MOTION, NAME, NUM_MEASURED, NUM_NOTED
+from slam_backend.fastslam._kernels.records import InputArrays, StepResults
 from slam_backend.fastslam._kernels.run_log import guesses_of
 from slam_backend.fastslam._kernels.step import log_step
 from slam_backend.fastslam.filter import FastSlam
@@ -241,7 +242,9 @@ def test_a_journal_holds_what_robots_of_a_filter_did_and_measured(steps: list[li
             end += max(count, 0)
         moves, sightings, told = rng.normal(size=(4, 3)), rng.normal(size=(end, 9)), rng.integers(-1, 50, (2, end))
         means, noted = rng.normal(size=(3, 3)), np.empty((3, NUM_NOTED))
-        log_step(rows, turns, moves, sightings, told, means, noted, measured, first)
+        nothing = np.empty((0, 0))
+        inputs = InputArrays(rows, turns, moves, nothing, sightings, np.empty((0, 0), np.float32), rows)
+        log_step(inputs, means, StepResults(np.empty((0, 0), np.int32), nothing, told, noted, measured), first)
         assert not noted[1].any()
         for robot in (0, 2):
             act, begin, last, covered, _, count = turns[rows[robot]].tolist()

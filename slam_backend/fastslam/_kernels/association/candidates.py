@@ -1,32 +1,15 @@
 """Candidate landmarks of a measurement, by descriptor or identity, for all particles; how they compete for it."""
 
+from typing import Any
+
 import numpy as np
 
 from slam_backend.core.jit import device, jit_fma, simd, simd_inline, stack_array
 from slam_backend.core.simd_math import WIDE, added_up, log_of
 from slam_backend.core.validation import Float32Array, FloatArray, IntArray
-from slam_backend.fastslam._kernels.layout import (
-    BEST_COST,
-    CHOSEN,
-    DEAD_ZONE,
-    IDENTITIES,
-    IDS,
-    LANES,
-    LOG_2PI,
-    LOG_BEST,
-    NEW_LANDMARK,
-    NO_MATCH,
-    Q_D,
-    Q_DEPTH,
-    Q_DET_POSE,
-    Q_HELD,
-    Q_METRES2,
-    REJECTED,
-    ROW_OF,
-    SECOND_COST,
-    TAKEN,
-)
-from slam_backend.fastslam._kernels.records import Candidates, Frame, MapArrays, Outcome, Rules
+from slam_backend.fastslam._kernels import layout as L
+from slam_backend.fastslam._kernels.layout import LANES
+from slam_backend.fastslam._kernels.records import Candidates, Frame, MapArrays, Outcome
 
 RUN = 64  # descriptors compared in one run
 
@@ -99,7 +82,7 @@ def _squared_distance(measured: Float32Array, b: int, stored: Float32Array, slot
 
 @device
 @jit_fma
-def find_candidates(frame: Frame, maps: MapArrays, rules: Rules) -> tuple[Candidates, IntArray]:
+def find_candidates(frame: Frame, maps: MapArrays, rules: Any) -> tuple[Candidates, IntArray]:
     """List for each measurement the landmarks that may have caused it, nearest descriptor first.
 
     Some components alone rule most landmarks out, for all particles at once; the others are compared in full. Equal
@@ -108,7 +91,7 @@ def find_candidates(frame: Frame, maps: MapArrays, rules: Rules) -> tuple[Candid
     Args:
         frame: Measurements of the robot.
         maps: Landmarks.
-        rules: Thresholds, of which E0 is the largest admitted squared distance of descriptors.
+        rules: `kernel_options`, of which E0 is the largest admitted squared distance of descriptors.
 
     Returns:
         The candidates, and the slots among them, each once.
@@ -116,10 +99,10 @@ def find_candidates(frame: Frame, maps: MapArrays, rules: Rules) -> tuple[Candid
     measured, measured_ids, identities, ids = (
         frame.descriptors,
         frame.identities,
-        maps.table[IDENTITIES],
-        maps.table[IDS],
+        maps.table[L.IDENTITIES],
+        maps.table[L.IDS],
     )
-    num, n, gate = measured.shape[0], len(ids), rules.descriptor_gate
+    num, n, gate = measured.shape[0], len(ids), rules.descriptor_gate_squared
     while n > 0 and ids[n - 1] < 0:
         n -= 1
     stride = measured.shape[1] // max(maps.heads.shape[0], 1)
@@ -158,14 +141,14 @@ def find_candidates(frame: Frame, maps: MapArrays, rules: Rules) -> tuple[Candid
             total += 1
     starts[num] = total
     for q in range(total):
-        last[slots[q]] = REJECTED
+        last[slots[q]] = L.REJECTED
     count = 0
     for b in range(num):
         for q in range(starts[b], starts[b + 1]):
             owners[q] = b
             slot = slots[q]
             same[q] = last[slot]
-            if last[slot] == REJECTED:
+            if last[slot] == L.REJECTED:
                 unique[count] = slot
                 count += 1
             last[slot] = q
@@ -177,12 +160,12 @@ def find_candidates(frame: Frame, maps: MapArrays, rules: Rules) -> tuple[Candid
 def begin_choice(work: FloatArray) -> None:
     """Clear the rows by which candidates compete for one measurement."""
     for i in range(LANES):
-        work[BEST_COST + i] = np.inf
-        work[SECOND_COST + i] = np.inf
-        work[CHOSEN + i] = NO_MATCH
-        work[DEAD_ZONE + i] = 0.0
-        work[LOG_BEST + i] = 0.0
-        work[TAKEN + i] = 0.0
+        work[L.BEST_COST + i] = np.inf
+        work[L.SECOND_COST + i] = np.inf
+        work[L.CHOSEN + i] = L.NO_MATCH
+        work[L.DEAD_ZONE + i] = 0.0
+        work[L.LOG_BEST + i] = 0.0
+        work[L.TAKEN + i] = 0.0
 
 
 @device
@@ -190,12 +173,12 @@ def begin_choice(work: FloatArray) -> None:
 def mark_assigned(work: FloatArray, match: FloatArray, candidates: Candidates, q: int, one_to_one: bool) -> None:
     """Write row TAKEN: 1 where an earlier measurement has taken the landmark that is candidate q."""
     for i in range(LANES):
-        work[TAKEN + i] = 0.0
-    p = candidates.same[q] if one_to_one else REJECTED
+        work[L.TAKEN + i] = 0.0
+    p = candidates.same[q] if one_to_one else L.REJECTED
     while p >= 0:
         earlier, code = match[candidates.owners[p]], float(p)
         for i in range(len(earlier)):
-            work[TAKEN + i] = 1.0 if earlier[i] == code else work[TAKEN + i]
+            work[L.TAKEN + i] = 1.0 if earlier[i] == code else work[L.TAKEN + i]
         p = candidates.same[p]
 
 
@@ -217,26 +200,26 @@ def consider(
         descriptor_cost: Squared distance of its descriptor in units of the descriptor variance.
         cap: Largest D that is counted: the gate where the caller identifies the landmarks and identities decide.
         reach: Largest D that may match.
-        new_landmark_gate, new_landmark_radius: See `Rules`.
+        new_landmark_gate, new_landmark_radius: See `FilterOptions`.
     """
     radius2 = new_landmark_radius * new_landmark_radius
     for i in range(LANES):
-        distance = record[Q_D + i]
-        front = (record[Q_HELD + i] > 0.0) & (distance < np.inf)
+        distance = record[L.Q_D + i]
+        front = (record[L.Q_HELD + i] > 0.0) & (distance < np.inf)
         distance = cap if distance > cap else distance
-        near = front & ((distance <= new_landmark_gate) | (record[Q_METRES2 + i] <= radius2))
-        ok = front & (distance <= reach) & (work[TAKEN + i] == 0.0)
-        work[DEAD_ZONE + i] = 1.0 if near else work[DEAD_ZONE + i]
-        depth = record[Q_DEPTH + i]
+        near = front & ((distance <= new_landmark_gate) | (record[L.Q_METRES2 + i] <= radius2))
+        ok = front & (distance <= reach) & (work[L.TAKEN + i] == 0.0)
+        work[L.DEAD_ZONE + i] = 1.0 if near else work[L.DEAD_ZONE + i]
+        depth = record[L.Q_DEPTH + i]
         # |S| of image coordinates: that of metres over Z^8, see the package docstring
-        log_det = log_of(record[Q_DET_POSE + i] if ok else 1.0) - 8.0 * log_of(depth if ok else 1.0)
+        log_det = log_of(record[L.Q_DET_POSE + i] if ok else 1.0) - 8.0 * log_of(depth if ok else 1.0)
         cost = distance + log_det + descriptor_cost if ok else np.inf
-        best, second = work[BEST_COST + i], work[SECOND_COST + i]
+        best, second = work[L.BEST_COST + i], work[L.SECOND_COST + i]
         better = cost < best
-        work[SECOND_COST + i] = best if better else (cost if cost < second else second)
-        work[BEST_COST + i] = cost if better else best
-        work[CHOSEN + i] = q if better else work[CHOSEN + i]
-        work[LOG_BEST + i] = -0.5 * (distance + log_det + 3.0 * LOG_2PI) if better else work[LOG_BEST + i]
+        work[L.SECOND_COST + i] = best if better else (cost if cost < second else second)
+        work[L.BEST_COST + i] = cost if better else best
+        work[L.CHOSEN + i] = q if better else work[L.CHOSEN + i]
+        work[L.LOG_BEST + i] = -0.5 * (distance + log_det + 3.0 * L.LOG_2PI) if better else work[L.LOG_BEST + i]
 
 
 @device
@@ -261,16 +244,16 @@ def create_once(
     The measurement starts no landmark in lanes that hold the landmark of its identity, wherever they predict it, nor in
     lanes in which an earlier measurement of that identity starts one.
     """
-    row_of, chosen = maps.table[ROW_OF], match[b]
+    row_of, chosen = maps.table[L.ROW_OF], match[b]
     for q in range(candidates.starts[b], candidates.starts[b + 1]):
         seen = maps.counts[row_of[candidates.slots[q]], first : first + LANES]
         for i in range(len(chosen)):
-            chosen[i] = NO_MATCH if chosen[i] == NEW_LANDMARK and seen[i] > 0 else chosen[i]
+            chosen[i] = L.NO_MATCH if chosen[i] == L.NEW_LANDMARK and seen[i] > 0 else chosen[i]
     for a in range(b):
         if identities[a] == identities[b]:
             earlier = match[a]
             for i in range(len(chosen)):
-                chosen[i] = NO_MATCH if chosen[i] == NEW_LANDMARK and earlier[i] == NEW_LANDMARK else chosen[i]
+                chosen[i] = L.NO_MATCH if chosen[i] == L.NEW_LANDMARK and earlier[i] == L.NEW_LANDMARK else chosen[i]
 
 
 @device
@@ -286,7 +269,7 @@ def write_associations(
         own, chosen, new_slot = outcome.found[b, first : first + LANES], match[b], outcome.new_slots[b]
         squares = outcome.distances[b, first : first + LANES]
         for i in range(LANES):
-            own[i] = new_slot if chosen[i] == NEW_LANDMARK else REJECTED
+            own[i] = new_slot if chosen[i] == L.NEW_LANDMARK else L.REJECTED
             squares[i] = np.nan
         for q in range(candidates.starts[b], candidates.starts[b + 1]):
             of_candidate, slot, code = records[q, row : row + LANES], candidates.slots[q], float(q)

@@ -8,59 +8,15 @@ found with it is not confirmed (`undo_unconfirmed`). The same in plain Python, w
 """
 
 import math
+from typing import Any
 
 import numpy as np
 
 from slam_backend.core.jit import device, simd, simd_inline
 from slam_backend.core.validation import FloatArray, Int32Array
+from slam_backend.fastslam._kernels import layout as L
 from slam_backend.fastslam._kernels.association.candidates import begin_choice, consider, mark_assigned, mask_of
-from slam_backend.fastslam._kernels.layout import (
-    ANY_HELD,
-    BEST_COST,
-    C00,
-    C01,
-    C10,
-    C11,
-    C20,
-    C21,
-    C22,
-    CHOSEN,
-    CLUTTER,
-    CONTRADICT,
-    COS,
-    DEAD_ZONE,
-    IS_WIDE,
-    KEPT00,
-    KEPT01,
-    KEPT10,
-    KEPT11,
-    KEPT20,
-    KEPT21,
-    KEPT22,
-    KEPT_WIDE,
-    LANES,
-    LEAST_D,
-    LEAST_FIRST_D,
-    LOG_BEST,
-    LOST,
-    MAX_DISTANCE,
-    NEW_LANDMARK,
-    NO_MATCH,
-    Q_D,
-    Q_DEPTH,
-    Q_DET,
-    Q_FIRST_D,
-    Q_HELD,
-    Q_SQUARE,
-    ROW_OF,
-    SECOND_COST,
-    SIN,
-    SURE,
-    TAKEN,
-    XI0,
-    XI1,
-    XI2,
-)
+from slam_backend.fastslam._kernels.layout import LANES
 from slam_backend.fastslam._kernels.measurement.measurement_model import (
     accumulate_likelihood,
     clear_likelihood,
@@ -75,7 +31,7 @@ from slam_backend.fastslam._kernels.measurement.pose_posterior import (
     sum_matches,
 )
 from slam_backend.fastslam._kernels.particles.map_storage import tile_of
-from slam_backend.fastslam._kernels.records import Candidates, Frame, MapArrays, Rules, Space
+from slam_backend.fastslam._kernels.records import Candidates, Frame, MapArrays, Space
 
 MORE_STEPS = 3  # further Gauss-Newton iterations where the prior is wide
 MIN_CONTRADICTIONS = 3.0  # three points fix a pose with one to spare
@@ -86,22 +42,22 @@ MIN_CONTRADICTIONS = 3.0  # three points fix a pose with one to spare
 def _judge_nearest(work: FloatArray, record: FloatArray, begin: bool) -> None:
     """Fold in one candidate: LEAST_D = least D of landmarks held, LEAST_FIRST_D = least D of the evaluation before."""
     for i in range(LANES):
-        held = record[Q_HELD + i] > 0.0
-        now, before = record[Q_D + i] if held else np.inf, record[Q_FIRST_D + i] if held else np.inf
-        work[LEAST_D + i] = now if begin or now < work[LEAST_D + i] else work[LEAST_D + i]
-        work[LEAST_FIRST_D + i] = before if begin or before < work[LEAST_FIRST_D + i] else work[LEAST_FIRST_D + i]
-        work[ANY_HELD + i] = 1.0 if held else (0.0 if begin else work[ANY_HELD + i])
+        held = record[L.Q_HELD + i] > 0.0
+        now, before = record[L.Q_D + i] if held else np.inf, record[L.Q_FIRST_D + i] if held else np.inf
+        work[L.LEAST_D + i] = now if begin or now < work[L.LEAST_D + i] else work[L.LEAST_D + i]
+        work[L.LEAST_FIRST_D + i] = before if begin or before < work[L.LEAST_FIRST_D + i] else work[L.LEAST_FIRST_D + i]
+        work[L.ANY_HELD + i] = 1.0 if held else (0.0 if begin else work[L.ANY_HELD + i])
 
 
 @device
 @simd
 def associate_unambiguous(
-    space: Space, block: int, maps: MapArrays, frame: Frame, candidates: Candidates, rules: Rules
+    space: Space, block: int, maps: MapArrays, frame: Frame, candidates: Candidates, rules: Any
 ) -> int:
     """Match unambiguous measurements of one block at the predicted pose, and sum their information (first pass).
 
     A measurement is matched to its candidate of least cost (`candidates.consider`) within the gate if the second best
-    costs at least `Rules.ambiguity` more and no earlier measurement of the frame has taken the landmark. A match has
+    costs at least `ambiguity_margin` more and no earlier measurement of the frame has taken the landmark. A match has
     Cauchy's weight 1 / (1 + D / gate). Where the caller identifies landmarks, any D may match. A measurement that has
     candidates, none of which explains it at the predicted pose, contradicts the pose.
 
@@ -109,11 +65,11 @@ def associate_unambiguous(
         The number of suspects: lanes in which enough contradicts the pose.
     """
     work, records, match = space.work, space.records, space.match
-    starts, slots, same, row_of = candidates.starts, candidates.slots, candidates.same, maps.table[ROW_OF]
+    starts, slots, same, row_of = candidates.starts, candidates.slots, candidates.same, maps.table[L.ROW_OF]
     padded, first, gate = maps.counts.shape[1], block * LANES, rules.position_gate
-    reach = MAX_DISTANCE if frame.identified else gate
+    reach = L.MAX_DISTANCE if frame.identified else gate
     for i in range(LANES):
-        work[CONTRADICT + i] = 0.0
+        work[L.CONTRADICT + i] = 0.0
     for b in range(len(starts) - 1):
         low, high, chosen = starts[b], starts[b + 1], match[b]
         if high - low == 1 and (same[low] < 0 or not rules.one_to_one):
@@ -128,28 +84,28 @@ def associate_unambiguous(
             tile, seen = maps.values[tile_of(padded, row, block)], maps.counts[row, first : first + LANES]
             innovate(work, tile, frame, b)
             evaluate(work, tile, records[q], seen, False)
-            consider(work, records[q], float(q), candidates.descriptor_costs[q], MAX_DISTANCE, reach, 0.0, 0.0)
+            consider(work, records[q], float(q), candidates.descriptor_costs[q], L.MAX_DISTANCE, reach, 0.0, 0.0)
         for i in range(LANES):  # the best candidate, if no other comes near
-            second = work[SECOND_COST + i]
-            clear = second == np.inf or second - work[BEST_COST + i] >= rules.ambiguity
-            chosen[i] = work[CHOSEN + i] if clear else NO_MATCH
+            second = work[L.SECOND_COST + i]
+            clear = second == np.inf or second - work[L.BEST_COST + i] >= rules.ambiguity_margin
+            chosen[i] = work[L.CHOSEN + i] if clear else L.NO_MATCH
         for q in range(low, high):
             record, code = records[q], float(q)
             if rules.one_to_one and same[q] >= 0:
                 mark_assigned(work, match, candidates, q, True)
                 for i in range(LANES):
-                    chosen[i] = NO_MATCH if chosen[i] == code and work[TAKEN + i] > 0.0 else chosen[i]
+                    chosen[i] = L.NO_MATCH if chosen[i] == code and work[L.TAKEN + i] > 0.0 else chosen[i]
             sum_matches(work, record, chosen, code, gate)
             for i in range(LANES):  # D at the predicted pose is the NIS
-                record[Q_FIRST_D + i] = record[Q_D + i]
-        for q in range(low, high):  # the choice is made: rows LEAST_D and CHOSEN are free
+                record[L.Q_FIRST_D + i] = record[L.Q_D + i]
+        for q in range(low, high):
             _judge_nearest(work, records[q], q == low)
         if low < high:
             for i in range(LANES):
-                work[CONTRADICT + i] += 1.0 if work[ANY_HELD + i] > 0.0 and not work[LEAST_D + i] <= gate else 0.0
+                work[L.CONTRADICT + i] += 1.0 if work[L.ANY_HELD + i] > 0.0 and not work[L.LEAST_D + i] <= gate else 0.0
     suspects = 0
     for i in range(LANES):
-        suspects += 1 if work[CONTRADICT + i] >= MIN_CONTRADICTIONS else 0
+        suspects += 1 if work[L.CONTRADICT + i] >= MIN_CONTRADICTIONS else 0
     return suspects
 
 
@@ -168,71 +124,70 @@ def _match_alone(
         held = seen[i] > 0
         inside = distance <= gate
         ok = held and distance <= reach
-        chosen[i] = q if ok else NO_MATCH
+        chosen[i] = q if ok else L.NO_MATCH
         add_terms(work, i, ok, gate / (gate + distance), terms)
-        record[Q_FIRST_D + i] = distance
-        work[CONTRADICT + i] += 1.0 if held and not inside else 0.0
+        record[L.Q_FIRST_D + i] = distance
+        work[L.CONTRADICT + i] += 1.0 if held and not inside else 0.0
 
 
 @device
 @simd
-def try_wide_prior(
-    space: Space, block: int, maps: MapArrays, frame: Frame, candidates: Candidates, rules: Rules
-) -> None:
+def try_wide_prior(space: Space, block: int, maps: MapArrays, frame: Frame, candidates: Candidates, rules: Any) -> None:
     """Give suspects of one block a wide prior, and keep it where it explains what the stated uncertainty does not."""
-    work, records, row_of, recovery = space.work, space.records, maps.table[ROW_OF], rules.recovery
+    work, records, row_of = space.work, space.records, maps.table[L.ROW_OF]
+    far, turned = rules.recovery_position, rules.recovery_heading
     starts, slots, gate = candidates.starts, candidates.slots, rules.position_gate
     padded, first = maps.counts.shape[1], block * LANES
-    for i in range(LANES):  # T diag(recovery), T the turn by the predicted heading
-        work[KEPT00 + i], work[KEPT01 + i] = work[C00 + i], work[C01 + i]
-        work[KEPT10 + i], work[KEPT11 + i] = work[C10 + i], work[C11 + i]
-        work[KEPT20 + i], work[KEPT21 + i], work[KEPT22 + i] = work[C20 + i], work[C21 + i], work[C22 + i]
-        work[KEPT_WIDE + i] = work[IS_WIDE + i]
-        suspect = work[CONTRADICT + i] >= MIN_CONTRADICTIONS
-        c, s = work[COS + i], work[SIN + i]
-        work[LOST + i] = 1.0 if suspect else 0.0
-        work[IS_WIDE + i] = 1.0 if suspect else work[IS_WIDE + i]
-        work[C00 + i] = c * recovery[0] if suspect else work[C00 + i]
-        work[C01 + i] = -s * recovery[1] if suspect else work[C01 + i]
-        work[C10 + i] = s * recovery[0] if suspect else work[C10 + i]
-        work[C11 + i] = c * recovery[1] if suspect else work[C11 + i]
-        work[C20 + i] = 0.0 if suspect else work[C20 + i]
-        work[C21 + i] = 0.0 if suspect else work[C21 + i]
-        work[C22 + i] = recovery[2] if suspect else work[C22 + i]
-        work[SURE + i] = 0.0
-        work[CONTRADICT + i] = 0.0
+    for i in range(LANES):  # T diag(far, far, turned), T the turn by the predicted heading
+        work[L.KEPT00 + i], work[L.KEPT01 + i] = work[L.C00 + i], work[L.C01 + i]
+        work[L.KEPT10 + i], work[L.KEPT11 + i] = work[L.C10 + i], work[L.C11 + i]
+        work[L.KEPT20 + i], work[L.KEPT21 + i], work[L.KEPT22 + i] = work[L.C20 + i], work[L.C21 + i], work[L.C22 + i]
+        work[L.KEPT_WIDE + i] = work[L.IS_WIDE + i]
+        suspect = work[L.CONTRADICT + i] >= MIN_CONTRADICTIONS
+        c, s = work[L.COS + i], work[L.SIN + i]
+        work[L.LOST + i] = 1.0 if suspect else 0.0
+        work[L.IS_WIDE + i] = 1.0 if suspect else work[L.IS_WIDE + i]
+        work[L.C00 + i] = c * far if suspect else work[L.C00 + i]
+        work[L.C01 + i] = -s * far if suspect else work[L.C01 + i]
+        work[L.C10 + i] = s * far if suspect else work[L.C10 + i]
+        work[L.C11 + i] = c * far if suspect else work[L.C11 + i]
+        work[L.C20 + i] = 0.0 if suspect else work[L.C20 + i]
+        work[L.C21 + i] = 0.0 if suspect else work[L.C21 + i]
+        work[L.C22 + i] = turned if suspect else work[L.C22 + i]
+        work[L.SURE + i] = 0.0
+        work[L.CONTRADICT + i] = 0.0
     for b in range(len(starts) - 1):
         for q in range(starts[b], starts[b + 1]):
             row, record = row_of[slots[q]], records[q]
             tile, seen = maps.values[tile_of(padded, row, block)], maps.counts[row, first : first + LANES]
             if starts[b + 1] - starts[b] > 1 or not (candidates.same[q] < 0 or not rules.one_to_one):
                 for i in range(LANES):
-                    record[Q_FIRST_D + i] = record[Q_D + i]
+                    record[L.Q_FIRST_D + i] = record[L.Q_D + i]
             innovate(work, tile, frame, b)
             evaluate(work, tile, record, seen, False)
             _judge_nearest(work, record, q == starts[b])
         if starts[b] < starts[b + 1]:  # whether the wide prior explains the measurement, and the narrow one did not
             for i in range(LANES):
-                sure = work[LEAST_D + i] <= gate
-                work[SURE + i] += 1.0 if sure else 0.0
-                work[CONTRADICT + i] += 1.0 if sure and not work[LEAST_FIRST_D + i] <= gate else 0.0
+                sure = work[L.LEAST_D + i] <= gate
+                work[L.SURE + i] += 1.0 if sure else 0.0
+                work[L.CONTRADICT + i] += 1.0 if sure and not work[L.LEAST_FIRST_D + i] <= gate else 0.0
     for i in range(LANES):  # suspects that are not lost after all get back what they had
-        lost = work[CONTRADICT + i] >= MIN_CONTRADICTIONS and 2.0 * work[CONTRADICT + i] > work[SURE + i]
-        _give_back(work, i, work[LOST + i] > 0.0 and not lost)
+        lost = work[L.CONTRADICT + i] >= MIN_CONTRADICTIONS and 2.0 * work[L.CONTRADICT + i] > work[L.SURE + i]
+        _give_back(work, i, work[L.LOST + i] > 0.0 and not lost)
 
 
 @simd_inline
 def _give_back(work: FloatArray, i: int, back: bool) -> None:
     """Where `back`, give a suspect the prior back that it had; it is not lost."""
-    work[C00 + i] = work[KEPT00 + i] if back else work[C00 + i]
-    work[C01 + i] = work[KEPT01 + i] if back else work[C01 + i]
-    work[C10 + i] = work[KEPT10 + i] if back else work[C10 + i]
-    work[C11 + i] = work[KEPT11 + i] if back else work[C11 + i]
-    work[C20 + i] = work[KEPT20 + i] if back else work[C20 + i]
-    work[C21 + i] = work[KEPT21 + i] if back else work[C21 + i]
-    work[C22 + i] = work[KEPT22 + i] if back else work[C22 + i]
-    work[IS_WIDE + i] = work[KEPT_WIDE + i] if back else work[IS_WIDE + i]
-    work[LOST + i] = 0.0 if back else work[LOST + i]
+    work[L.C00 + i] = work[L.KEPT00 + i] if back else work[L.C00 + i]
+    work[L.C01 + i] = work[L.KEPT01 + i] if back else work[L.C01 + i]
+    work[L.C10 + i] = work[L.KEPT10 + i] if back else work[L.C10 + i]
+    work[L.C11 + i] = work[L.KEPT11 + i] if back else work[L.C11 + i]
+    work[L.C20 + i] = work[L.KEPT20 + i] if back else work[L.C20 + i]
+    work[L.C21 + i] = work[L.KEPT21 + i] if back else work[L.C21 + i]
+    work[L.C22 + i] = work[L.KEPT22 + i] if back else work[L.C22 + i]
+    work[L.IS_WIDE + i] = work[L.KEPT_WIDE + i] if back else work[L.IS_WIDE + i]
+    work[L.LOST + i] = 0.0 if back else work[L.LOST + i]
 
 
 @device
@@ -248,11 +203,11 @@ def undo_unconfirmed(
     Returns:
         The number of lanes that were given their prior back. Their pose has to be refined again; xi is then 0.
     """
-    work, match, row_of = space.work, space.match, maps.table[ROW_OF]
+    work, match, row_of = space.work, space.match, maps.table[L.ROW_OF]
     padded, first, num_lost, num_back = maps.counts.shape[1], block * LANES, 0, 0
     for i in range(LANES):
-        work[SURE + i] = 0.0
-        num_lost += 1 if work[LOST + i] > 0.0 else 0
+        work[L.SURE + i] = 0.0
+        num_lost += 1 if work[L.LOST + i] > 0.0 else 0
     for b in range(len(match) if num_lost > 0 else 0):
         for q in range(candidates.starts[b], candidates.starts[b + 1]):
             if mask_of(match[b], float(q), space.mask) > 0:
@@ -261,13 +216,13 @@ def undo_unconfirmed(
                 innovate(work, tile, frame, b)
                 evaluate(work, tile, record, seen, True)
                 for i in range(LANES):
-                    work[SURE + i] += 1.0 if chosen[i] == float(q) and record[Q_D + i] <= gate else 0.0
+                    work[L.SURE + i] += 1.0 if chosen[i] == float(q) and record[L.Q_D + i] <= gate else 0.0
     for i in range(LANES):
-        back = work[LOST + i] > 0.0 and work[SURE + i] < MIN_CONTRADICTIONS
+        back = work[L.LOST + i] > 0.0 and work[L.SURE + i] < MIN_CONTRADICTIONS
         _give_back(work, i, back)
         num_back += 1 if back else 0
     for i in range(LANES if num_back > 0 else 0):
-        work[XI0 + i] = work[XI1 + i] = work[XI2 + i] = 0.0
+        work[L.XI0 + i] = work[L.XI1 + i] = work[L.XI2 + i] = 0.0
     return num_back
 
 
@@ -275,10 +230,10 @@ def undo_unconfirmed(
 @simd
 def iterate_wide(space: Space, block: int, maps: MapArrays, frame: Frame, candidates: Candidates, gate: float) -> None:
     """Take more steps of Gauss-Newton in the lanes of one block whose prior is wide, with the matches as they are."""
-    work, match, row_of = space.work, space.match, maps.table[ROW_OF]
+    work, match, row_of = space.work, space.match, maps.table[L.ROW_OF]
     padded, first, num_wide = maps.counts.shape[1], block * LANES, 0
     for i in range(LANES):
-        num_wide += 1 if work[IS_WIDE + i] > 0.0 else 0
+        num_wide += 1 if work[L.IS_WIDE + i] > 0.0 else 0
     for _ in range(MORE_STEPS if num_wide > 0 else 0):
         set_linearisation_point(work)
         for b in range(len(match)):
@@ -294,29 +249,27 @@ def iterate_wide(space: Space, block: int, maps: MapArrays, frame: Frame, candid
 
 @device
 @simd
-def associate_all(
-    space: Space, block: int, maps: MapArrays, frame: Frame, candidates: Candidates, rules: Rules
-) -> None:
+def associate_all(space: Space, block: int, maps: MapArrays, frame: Frame, candidates: Candidates, rules: Any) -> None:
     """Match, reject or start a landmark for each measurement of one block at the refined pose (second pass).
 
     Measurements are decided in their order; a landmark that an earlier one of the frame has taken cannot be matched
-    again (`Rules.one_to_one`). The free landmark of least cost (`candidates.consider`) with D <= `position_gate` is
-    matched, unless the second best costs less than `ambiguity` more: then the measurement is rejected. Without a match
-    it is rejected as well if a candidate, taken or not, lies in the dead zone: D <= `new_landmark_gate`, or closer than
+    again (`one_to_one`). The free landmark of least cost (`candidates.consider`) with D <= `position_gate` is matched,
+    unless the second best costs less than `ambiguity_margin` more: then the measurement is rejected. Without a match it
+    is rejected as well if a candidate, taken or not, lies in the dead zone: D <= `new_landmark_gate`, or closer than
     `new_landmark_radius`. Otherwise it starts a landmark. Sums the information on the pose and its likelihood. The same
     in plain Python: `slam_backend.reference.fastslam2.decide`.
     """
     work, records, match = space.work, space.records, space.match
-    starts, slots, row_of = candidates.starts, candidates.slots, maps.table[ROW_OF]
+    starts, slots, row_of = candidates.starts, candidates.slots, maps.table[L.ROW_OF]
     padded, first, gate = maps.counts.shape[1], block * LANES, rules.position_gate
     # Of an identified landmark any D matches: an only candidate has no limit, among several D is capped at the gate.
-    reach, cap = (MAX_DISTANCE, gate) if frame.identified else (gate, MAX_DISTANCE)
-    new_landmark_gate = MAX_DISTANCE if frame.identified else rules.new_landmark_gate
+    reach, cap = (L.MAX_DISTANCE, gate) if frame.identified else (gate, L.MAX_DISTANCE)
+    new_landmark_gate = L.MAX_DISTANCE if frame.identified else rules.new_landmark_gate
     clear_likelihood(work)
     for b in range(len(starts) - 1):
         low, high, chosen = starts[b], starts[b + 1], match[b]
         # A density [1/m^3] becomes one of image coordinates by the factor depth^4, see `_kernels/__init__.py`.
-        log_clutter = rules.log_p0 + (0.0 if frame.given else 4.0 * math.log(frame.points[b, 0]))
+        log_clutter = rules.log_density + (0.0 if frame.given else 4.0 * math.log(frame.points[b, 0]))
         if high - low == 1:
             row = row_of[slots[low]]
             tile, seen = maps.values[tile_of(padded, row, block)], maps.counts[row, first : first + LANES]
@@ -344,18 +297,20 @@ def associate_all(
                 rules.new_landmark_radius,
             )
         for i in range(LANES):
-            best, second = work[BEST_COST + i], work[SECOND_COST + i]
-            matched = work[CHOSEN + i] >= 0.0
-            ambiguous = matched and second < np.inf and second - best < rules.ambiguity
-            new = NO_MATCH if work[DEAD_ZONE + i] > 0.0 else NEW_LANDMARK
-            chosen[i] = (NO_MATCH if ambiguous else work[CHOSEN + i]) if matched else new
-            work[CLUTTER + i] += (work[LOG_BEST + i] if ambiguous else 0.0) if matched else log_clutter
+            best, second = work[L.BEST_COST + i], work[L.SECOND_COST + i]
+            matched = work[L.CHOSEN + i] >= 0.0
+            ambiguous = matched and second < np.inf and second - best < rules.ambiguity_margin
+            new = L.NO_MATCH if work[L.DEAD_ZONE + i] > 0.0 else L.NEW_LANDMARK
+            chosen[i] = (L.NO_MATCH if ambiguous else work[L.CHOSEN + i]) if matched else new
+            work[L.CLUTTER + i] += (work[L.LOG_BEST + i] if ambiguous else 0.0) if matched else log_clutter
         for q in range(low, high):
             record = records[q]
             if sum_matches(work, record, chosen, float(q), np.inf) > 0:
                 for i in range(LANES):
                     on = chosen[i] == float(q)
-                    accumulate_likelihood(work, i, on, record[Q_SQUARE + i], record[Q_DET + i], record[Q_DEPTH + i])
+                    accumulate_likelihood(
+                        work, i, on, record[L.Q_SQUARE + i], record[L.Q_DET + i], record[L.Q_DEPTH + i]
+                    )
 
 
 @device
@@ -373,8 +328,8 @@ def _decide_alone(
         terms, square, det, _, depth, metres2, distance = match_terms(work, tile, i, True)
         front = (seen[i] > 0) & (distance < np.inf)  # "and" would make a branch of it, and of all that follows
         near = front & ((distance <= new_landmark_gate) | (metres2 <= radius2))
-        ok = front & (distance <= reach) & (work[TAKEN + i] == 0.0)
-        chosen[i] = q if ok else (NO_MATCH if near else NEW_LANDMARK)
-        work[CLUTTER + i] += 0.0 if ok else log_clutter
+        ok = front & (distance <= reach) & (work[L.TAKEN + i] == 0.0)
+        chosen[i] = q if ok else (L.NO_MATCH if near else L.NEW_LANDMARK)
+        work[L.CLUTTER + i] += 0.0 if ok else log_clutter
         add_terms(work, i, ok, 1.0, terms)
         accumulate_likelihood(work, i, ok, square, det, depth)

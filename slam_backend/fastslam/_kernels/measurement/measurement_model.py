@@ -5,61 +5,8 @@ import numpy as np
 from slam_backend.core.jit import device, simd, simd_inline
 from slam_backend.core.simd_math import LN2, log_of, mantissa_exponent
 from slam_backend.core.validation import FloatArray, Int32Array
-from slam_backend.fastslam._kernels.layout import (
-    C00,
-    C01,
-    C10,
-    C11,
-    C20,
-    C21,
-    C22,
-    CLUTTER,
-    COS,
-    COV_XI00,
-    COV_XI01,
-    COV_XI02,
-    COV_XI11,
-    COV_XI12,
-    COV_XI22,
-    DEPTH,
-    DEPTHS,
-    DEPTHS_EXP,
-    DET,
-    DET_EXP,
-    INNOV0,
-    INNOV1,
-    INNOV2,
-    LANES,
-    LOG_2PI,
-    MATCHED,
-    MIN_DEPTH,
-    N00,
-    N01,
-    N02,
-    N11,
-    N12,
-    N22,
-    Q_D,
-    Q_DEPTH,
-    Q_DET,
-    Q_DET_POSE,
-    Q_GRAD0,
-    Q_GRAD1,
-    Q_GRAD2,
-    Q_HELD,
-    Q_INFO00,
-    Q_INFO01,
-    Q_INFO02,
-    Q_INFO11,
-    Q_INFO12,
-    Q_INFO22,
-    Q_METRES2,
-    Q_SQUARE,
-    SIN,
-    SUM_D,
-    X,
-    Y,
-)
+from slam_backend.fastslam._kernels import layout as L
+from slam_backend.fastslam._kernels.layout import LANES
 from slam_backend.fastslam._kernels.records import Frame
 
 # Share of a match in the system of xi: J (6) and g (3), see the package.
@@ -86,35 +33,35 @@ def innovate(work: FloatArray, tile: FloatArray, frame: Frame, n: int) -> None:
     disparity = (camera[3] / (camera[0] * camera[1])) ** 2
     per_depth = 1.0 / v0
     for i in range(LANES):
-        c, s = work[COS + i], work[SIN + i]
+        c, s = work[L.COS + i], work[L.SIN + i]
         if given:
-            work[INNOV0 + i] = c * (v0 + m0) - s * (v1 + m1) + work[X + i] - tile[i]
-            work[INNOV1 + i] = s * (v0 + m0) + c * (v1 + m1) + work[Y + i] - tile[LANES + i]
-            work[INNOV2 + i] = v2 + m2 - tile[2 * LANES + i]
-            work[N00 + i] = c * c * a - 2.0 * c * s * b + s * s * e
-            work[N01 + i] = c * s * (a - e) + (c * c - s * s) * b
-            work[N02 + i] = c * d - s * f
-            work[N11 + i] = s * s * a + 2.0 * c * s * b + c * c * e
-            work[N12 + i] = s * d + c * f
-            work[N22 + i] = g
-            work[DEPTH + i] = 1.0
+            work[L.INNOV0 + i] = c * (v0 + m0) - s * (v1 + m1) + work[L.X + i] - tile[i]
+            work[L.INNOV1 + i] = s * (v0 + m0) + c * (v1 + m1) + work[L.Y + i] - tile[LANES + i]
+            work[L.INNOV2 + i] = v2 + m2 - tile[2 * LANES + i]
+            work[L.N00 + i] = c * c * a - 2.0 * c * s * b + s * s * e
+            work[L.N01 + i] = c * s * (a - e) + (c * c - s * s) * b
+            work[L.N02 + i] = c * d - s * f
+            work[L.N11 + i] = s * s * a + 2.0 * c * s * b + c * c * e
+            work[L.N12 + i] = s * d + c * f
+            work[L.N22 + i] = g
+            work[L.DEPTH + i] = 1.0
         else:
-            ex = tile[i] - work[X + i] - (c * m0 - s * m1)
-            ey = tile[LANES + i] - work[Y + i] - (s * m0 + c * m1)
+            ex = tile[i] - work[L.X + i] - (c * m0 - s * m1)
+            ey = tile[LANES + i] - work[L.Y + i] - (s * m0 + c * m1)
             ez = tile[2 * LANES + i] - m2
             depth = c * ex + s * ey
             k = depth * per_depth
-            work[INNOV0 + i] = k * (c * v0 - s * v1 - ex)
-            work[INNOV1 + i] = k * (s * v0 + c * v1 - ey)
-            work[INNOV2 + i] = k * (v2 - ez)
+            work[L.INNOV0 + i] = k * (c * v0 - s * v1 - ex)
+            work[L.INNOV1 + i] = k * (s * v0 + c * v1 - ey)
+            work[L.INNOV2 + i] = k * (v2 - ez)
             across, along = pixel * depth * depth, disparity * depth * depth
-            work[N00 + i] = across * s * s + along * ex * ex
-            work[N01 + i] = along * ex * ey - across * c * s
-            work[N02 + i] = along * ex * ez
-            work[N11 + i] = across * c * c + along * ey * ey
-            work[N12 + i] = along * ey * ez
-            work[N22 + i] = across + along * ez * ez
-            work[DEPTH + i] = depth
+            work[L.N00 + i] = across * s * s + along * ex * ex
+            work[L.N01 + i] = along * ex * ey - across * c * s
+            work[L.N02 + i] = along * ex * ez
+            work[L.N11 + i] = across * c * c + along * ey * ey
+            work[L.N12 + i] = along * ey * ez
+            work[L.N22 + i] = across + along * ez * ez
+            work[L.DEPTH + i] = depth
 
 
 @simd_inline
@@ -137,11 +84,11 @@ def match_terms(
         J and g, r^T S^-1 r, |S|, |S + A P A^T|, the predicted depth, r^T r, and the squared distance of the gate,
         infinite behind the camera.
     """
-    rx, ry, rz = work[INNOV0 + i], work[INNOV1 + i], work[INNOV2 + i]
-    depth = work[DEPTH + i]
-    s00, s01 = tile[3 * LANES + i] + work[N00 + i], tile[4 * LANES + i] + work[N01 + i]
-    s02, s11 = tile[5 * LANES + i] + work[N02 + i], tile[6 * LANES + i] + work[N11 + i]
-    s12, s22 = tile[7 * LANES + i] + work[N12 + i], tile[8 * LANES + i] + work[N22 + i]
+    rx, ry, rz = work[L.INNOV0 + i], work[L.INNOV1 + i], work[L.INNOV2 + i]
+    depth = work[L.DEPTH + i]
+    s00, s01 = tile[3 * LANES + i] + work[L.N00 + i], tile[4 * LANES + i] + work[L.N01 + i]
+    s02, s11 = tile[5 * LANES + i] + work[L.N02 + i], tile[6 * LANES + i] + work[L.N11 + i]
+    s12, s22 = tile[7 * LANES + i] + work[L.N12 + i], tile[8 * LANES + i] + work[L.N22 + i]
     per_s22 = 1.0 / s22
     k0, k1 = s02 * per_s22, s12 * per_s22
     t00, t01, t11 = s00 - k0 * s02, s01 - k0 * s12, s11 - k1 * s12
@@ -150,15 +97,15 @@ def match_terms(
     per_det = 1.0 / det
     i00, i01, i11 = t11 * per_det, -t01 * per_det, t00 * per_det  # Eq. 7
     sx, sy = i00 * px + i01 * py, i01 * px + i11 * py
-    hx, hy = work[Y + i] - tile[LANES + i], tile[i] - work[X + i]
-    c20, c21, c22 = work[C20 + i], work[C21 + i], work[C22 + i]
-    a0, a1, a2 = work[C00 + i] + hx * c20, work[C01 + i] + hx * c21, hx * c22
-    b0, b1, b2 = work[C10 + i] + hy * c20, work[C11 + i] + hy * c21, hy * c22
+    hx, hy = work[L.Y + i] - tile[LANES + i], tile[i] - work[L.X + i]
+    c20, c21, c22 = work[L.C20 + i], work[L.C21 + i], work[L.C22 + i]
+    a0, a1, a2 = work[L.C00 + i] + hx * c20, work[L.C01 + i] + hx * c21, hx * c22
+    b0, b1, b2 = work[L.C10 + i] + hy * c20, work[L.C11 + i] + hy * c21, hy * c22
     u0, u1, u2 = i00 * a0 + i01 * b0, i00 * a1 + i01 * b1, i00 * a2 + i01 * b2
     w0, w1, w2 = i01 * a0 + i11 * b0, i01 * a1 + i11 * b1, i01 * a2 + i11 * b2
     if refined:
-        q00, q01, q02 = work[COV_XI00 + i], work[COV_XI01 + i], work[COV_XI02 + i]
-        q11, q12, q22 = work[COV_XI11 + i], work[COV_XI12 + i], work[COV_XI22 + i]
+        q00, q01, q02 = work[L.COV_XI00 + i], work[L.COV_XI01 + i], work[L.COV_XI02 + i]
+        q11, q12, q22 = work[L.COV_XI11 + i], work[L.COV_XI12 + i], work[L.COV_XI22 + i]
         e0, e1, e2 = q00 * a0 + q01 * a1 + q02 * a2, q01 * a0 + q11 * a1 + q12 * a2, q02 * a0 + q12 * a1 + q22 * a2
         f0, f1, f2 = q00 * b0 + q01 * b1 + q02 * b2, q01 * b0 + q11 * b1 + q12 * b2, q02 * b0 + q12 * b1 + q22 * b2
     else:
@@ -172,7 +119,7 @@ def match_terms(
         (a0 * u0 + b0 * w0, a0 * u1 + b0 * w1, a0 * u2 + b0 * w2, a1 * u1 + b1 * w1, a1 * u2 + b1 * w2,
          a2 * u2 + b2 * w2, a0 * sx + b0 * sy, a1 * sx + b1 * sy, a2 * sx + b2 * sy),
         height + px * sx + py * sy, det * s22, det_pose * s22, depth, rx * rx + ry * ry + rz * rz,
-        distance if depth >= MIN_DEPTH else np.inf,
+        distance if depth >= L.MIN_DEPTH else np.inf,
     )  # fmt: skip
 
 
@@ -182,30 +129,30 @@ def evaluate(work: FloatArray, tile: FloatArray, record: FloatArray, seen: Int32
     """Write the record of a candidate: the terms of a match, see `match_terms`, and whether the lanes hold it."""
     for i in range(LANES):
         terms, square, det, det_pose, depth, metres2, distance = match_terms(work, tile, i, refined)
-        record[Q_INFO00 + i], record[Q_INFO01 + i], record[Q_INFO02 + i] = terms[0], terms[1], terms[2]
-        record[Q_INFO11 + i], record[Q_INFO12 + i], record[Q_INFO22 + i] = terms[3], terms[4], terms[5]
-        record[Q_GRAD0 + i], record[Q_GRAD1 + i], record[Q_GRAD2 + i] = terms[6], terms[7], terms[8]
-        record[Q_SQUARE + i] = square
-        record[Q_DET + i] = det
-        record[Q_DET_POSE + i] = det_pose
-        record[Q_DEPTH + i] = depth
-        record[Q_METRES2 + i] = metres2
-        record[Q_D + i] = distance
+        record[L.Q_INFO00 + i], record[L.Q_INFO01 + i], record[L.Q_INFO02 + i] = terms[0], terms[1], terms[2]
+        record[L.Q_INFO11 + i], record[L.Q_INFO12 + i], record[L.Q_INFO22 + i] = terms[3], terms[4], terms[5]
+        record[L.Q_GRAD0 + i], record[L.Q_GRAD1 + i], record[L.Q_GRAD2 + i] = terms[6], terms[7], terms[8]
+        record[L.Q_SQUARE + i] = square
+        record[L.Q_DET + i] = det
+        record[L.Q_DET_POSE + i] = det_pose
+        record[L.Q_DEPTH + i] = depth
+        record[L.Q_METRES2 + i] = metres2
+        record[L.Q_D + i] = distance
     for i in range(LANES):  # by itself: integers among the numbers above cost vectors
-        record[Q_HELD + i] = 1.0 if seen[i] > 0 else 0.0
+        record[L.Q_HELD + i] = 1.0 if seen[i] > 0 else 0.0
 
 
 @simd_inline
 def accumulate_likelihood(work: FloatArray, i: int, on: bool, square: float, det: float, depth: float) -> None:
     """Where `on`, add a match's part of the log-likelihood: r^T S^-1 r, and |S| and the depth as products."""
-    work[SUM_D + i] += square if on else 0.0
-    work[MATCHED + i] += 1.0 if on else 0.0
-    mantissa, exponent = mantissa_exponent(work[DET + i] * (det if on else 1.0))
-    work[DET + i] = mantissa
-    work[DET_EXP + i] += exponent
-    mantissa, exponent = mantissa_exponent(work[DEPTHS + i] * (depth if on else 1.0))
-    work[DEPTHS + i] = mantissa
-    work[DEPTHS_EXP + i] += exponent
+    work[L.SUM_D + i] += square if on else 0.0
+    work[L.MATCHED + i] += 1.0 if on else 0.0
+    mantissa, exponent = mantissa_exponent(work[L.DET + i] * (det if on else 1.0))
+    work[L.DET + i] = mantissa
+    work[L.DET_EXP + i] += exponent
+    mantissa, exponent = mantissa_exponent(work[L.DEPTHS + i] * (depth if on else 1.0))
+    work[L.DEPTHS + i] = mantissa
+    work[L.DEPTHS_EXP + i] += exponent
 
 
 @device
@@ -213,21 +160,21 @@ def accumulate_likelihood(work: FloatArray, i: int, on: bool, square: float, det
 def clear_likelihood(work: FloatArray) -> None:
     """Clear the sums of the log-likelihood of a frame."""
     for i in range(LANES):
-        work[SUM_D + i] = 0.0
-        work[MATCHED + i] = 0.0
-        work[DET + i] = 1.0
-        work[DET_EXP + i] = 0.0
-        work[DEPTHS + i] = 1.0
-        work[DEPTHS_EXP + i] = 0.0
-        work[CLUTTER + i] = 0.0
+        work[L.SUM_D + i] = 0.0
+        work[L.MATCHED + i] = 0.0
+        work[L.DET + i] = 1.0
+        work[L.DET_EXP + i] = 0.0
+        work[L.DEPTHS + i] = 1.0
+        work[L.DEPTHS_EXP + i] = 0.0
+        work[L.CLUTTER + i] = 0.0
 
 
 @simd_inline
 def total_log_likelihood(work: FloatArray, i: int) -> float:
     """Return a lane's sum over matches of log N(r; 0, S) + 4 log depth (Eq. 11), and that of the unmatched."""
-    log_det = log_of(work[DET + i]) + LN2 * work[DET_EXP + i]
-    log_depth = log_of(work[DEPTHS + i]) + LN2 * work[DEPTHS_EXP + i]
-    matched: float = work[SUM_D + i] + 3.0 * LOG_2PI * work[MATCHED + i] + log_det
-    unmatched: float = work[CLUTTER + i]
+    log_det = log_of(work[L.DET + i]) + LN2 * work[L.DET_EXP + i]
+    log_depth = log_of(work[L.DEPTHS + i]) + LN2 * work[L.DEPTHS_EXP + i]
+    matched: float = work[L.SUM_D + i] + 3.0 * L.LOG_2PI * work[L.MATCHED + i] + log_det
+    unmatched: float = work[L.CLUTTER + i]
     total: float = -0.5 * matched + 4.0 * log_depth + unmatched
     return total

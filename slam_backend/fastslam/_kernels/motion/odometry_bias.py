@@ -11,30 +11,8 @@ import math
 from slam_backend.core.jit import device, in_place, simd, stack_array
 from slam_backend.core.simd_math import sine_cosine, wrapped
 from slam_backend.core.validation import FloatArray
-from slam_backend.fastslam._kernels.layout import (
-    BIAS0,
-    BIAS1,
-    BIAS2,
-    DRAW0,
-    DRAW1,
-    DRAW2,
-    LANES,
-    N00,
-    N01,
-    N02,
-    N11,
-    N12,
-    N22,
-    PREDICTED0,
-    PREDICTED1,
-    PREDICTED2,
-    T0,
-    X0,
-    Y0,
-    T,
-    X,
-    Y,
-)
+from slam_backend.fastslam._kernels import layout as L
+from slam_backend.fastslam._kernels.layout import LANES
 from slam_backend.fastslam._kernels.records import Motion
 
 LARGEST_INNOVATION = 30.0  # squared Mahalanobis distance; a pose farther off was recovered and says nothing of the bias
@@ -104,13 +82,17 @@ def add_bias_spread(work: FloatArray, motion: Motion) -> None:
     e = motion.spread
     e0, e1, e2, e3, e4, e5 = e[0], e[1], e[2], e[3], e[4], e[5]
     for i in range(LANES):
-        work[N00 + i] += e0
-        work[N01 + i] += e1
-        work[N02 + i] += e2
-        work[N11 + i] += e3
-        work[N12 + i] += e4
-        work[N22 + i] += e5
-        work[PREDICTED0 + i], work[PREDICTED1 + i], work[PREDICTED2 + i] = work[X0 + i], work[Y0 + i], work[T0 + i]
+        work[L.N00 + i] += e0
+        work[L.N01 + i] += e1
+        work[L.N02 + i] += e2
+        work[L.N11 + i] += e3
+        work[L.N12 + i] += e4
+        work[L.N22 + i] += e5
+        work[L.PREDICTED0 + i], work[L.PREDICTED1 + i], work[L.PREDICTED2 + i] = (
+            work[L.X0 + i],
+            work[L.Y0 + i],
+            work[L.T0 + i],
+        )
 
 
 @device
@@ -124,7 +106,7 @@ def set_bias_gain(work: FloatArray, motion: Motion, covariance: FloatArray, cros
         covariance: (3, 3) P, changed: P - G X.
         cross: (3, 3) X; zeros afterwards.
     """
-    n00, n01, n02, n11, n12, n22 = work[N00], work[N01], work[N02], work[N11], work[N12], work[N22]
+    n00, n01, n02, n11, n12, n22 = work[L.N00], work[L.N01], work[L.N02], work[L.N11], work[L.N12], work[L.N22]
     gain, information = motion.gain, motion.information
     p, q, r = n11 * n22 - n12 * n12, n02 * n12 - n01 * n22, n01 * n12 - n02 * n11
     det = n00 * p + n01 * q + n02 * r
@@ -154,19 +136,19 @@ def correct_bias(work: FloatArray, biases: FloatArray, motion: Motion, first: in
     g, w = motion.gain, motion.information
     w0, w1, w2, w3, w4, w5 = w[0], w[1], w[2], w[3], w[4], w[5]
     for i in range(LANES):
-        s, c = sine_cosine(work[PREDICTED2 + i])
-        dx, dy = work[X + i] - work[PREDICTED0 + i], work[Y + i] - work[PREDICTED1 + i]
-        d0, d1, d2 = c * dx + s * dy, c * dy - s * dx, wrapped(work[T + i] - work[PREDICTED2 + i])
+        s, c = sine_cosine(work[L.PREDICTED2 + i])
+        dx, dy = work[L.X + i] - work[L.PREDICTED0 + i], work[L.Y + i] - work[L.PREDICTED1 + i]
+        d0, d1, d2 = c * dx + s * dy, c * dy - s * dx, wrapped(work[L.T + i] - work[L.PREDICTED2 + i])
         square = d0 * (w0 * d0 + 2.0 * (w1 * d1 + w2 * d2)) + d1 * (w3 * d1 + 2.0 * w4 * d2) + w5 * d2 * d2
         on = square <= LARGEST_INNOVATION
-        work[BIAS0 + i] = d0 if on else 0.0
-        work[BIAS1 + i] = d1 if on else 0.0
-        work[BIAS2 + i] = d2 if on else 0.0
+        work[L.BIAS0 + i] = d0 if on else 0.0
+        work[L.BIAS1 + i] = d1 if on else 0.0
+        work[L.BIAS2 + i] = d2 if on else 0.0
     for k in range(3):
         g0, g1, g2 = g[k, 0], g[k, 1], g[k, 2]
         own = biases[k, first : first + LANES]
         for i in range(LANES):
-            own[i] += g0 * work[BIAS0 + i] + g1 * work[BIAS1 + i] + g2 * work[BIAS2 + i]
+            own[i] += g0 * work[L.BIAS0 + i] + g1 * work[L.BIAS1 + i] + g2 * work[L.BIAS2 + i]
 
 
 @device
@@ -200,4 +182,4 @@ def correct_bias_by_draws(work: FloatArray, biases: FloatArray, motion: Motion, 
         g0, g1, g2 = motion.gain[k, 0], motion.gain[k, 1], motion.gain[k, 2]
         own = biases[k, first : first + LANES]
         for i in range(LANES):
-            own[i] += g0 * work[DRAW0 + i] + g1 * work[DRAW1 + i] + g2 * work[DRAW2 + i]
+            own[i] += g0 * work[L.DRAW0 + i] + g1 * work[L.DRAW1 + i] + g2 * work[L.DRAW2 + i]

@@ -5,7 +5,8 @@ import numpy as np
 from slam_backend.core.jit import device, jit, simd, simd_inline, stack_array
 from slam_backend.core.simd_math import NARROW, WIDE, added_up, added_up_narrow
 from slam_backend.core.validation import FloatArray, IntArray
-from slam_backend.fastslam._kernels.layout import IDS, LANES, MAP_OF, ROW_OF
+from slam_backend.fastslam._kernels import layout as L
+from slam_backend.fastslam._kernels.layout import LANES
 from slam_backend.fastslam._kernels.records import MapArrays
 
 
@@ -94,7 +95,7 @@ def mix(
         weights: (M,), summing to 1.
         scatter: (3, 3) covariance of the map's frame about its origin [m, m, rad].
     """
-    row_of, map_of, ids, counts = maps.table[ROW_OF], maps.table[MAP_OF], maps.table[IDS], maps.counts
+    row_of, map_of, ids, counts = maps.table[L.ROW_OF], maps.table[L.MAP_OF], maps.table[L.IDS], maps.counts
     padded, identity = counts.shape[1], np.arange(counts.shape[1]).astype(np.int32)
     means, covariances = np.empty((len(slots), 3)), np.zeros((len(slots), 3, 3))
     times, names = np.empty(len(slots), np.int64), np.empty(len(slots), np.int64)

@@ -4,17 +4,8 @@ import numpy as np
 
 from slam_backend.core.jit import device, in_place, inline, simd, simd_inline
 from slam_backend.core.validation import FloatArray, Int32Array, IntArray
-from slam_backend.fastslam._kernels.layout import (
-    BLOCK,
-    FAR,
-    FREE_SLOTS,
-    IDENTITIES,
-    IDS,
-    LANES,
-    MAP_OF,
-    ROW_OF,
-    TILE,
-)
+from slam_backend.fastslam._kernels import layout as L
+from slam_backend.fastslam._kernels.layout import LANES, TILE
 from slam_backend.fastslam._kernels.records import Frame, MapArrays
 
 
@@ -35,7 +26,7 @@ def map_summary(
     Returns:
         The row after the last, be it there or not, and whether ids ascend.
     """
-    row_of, map_of, ids = table[ROW_OF], table[MAP_OF], table[IDS]
+    row_of, map_of, ids = table[L.ROW_OF], table[L.MAP_OF], table[L.IDS]
     least, n, last, ascending = max(min_count, 1), first, -1, True
     for slot in range(len(ids)):
         if ids[slot] < 0:
@@ -48,7 +39,7 @@ def map_summary(
         last = ids[slot]
         if n < len(names):
             own = np.uint32(place)
-            at = row * 9 * counts.shape[1] + int(own // BLOCK) * TILE + int(own % BLOCK)
+            at = row * 9 * counts.shape[1] + int(own // L.BLOCK) * TILE + int(own % L.BLOCK)
             for axis in range(3):
                 places[n, axis] = values[at + axis * LANES]
             places[n, 3] = values[at + 3 * LANES] + values[at + 6 * LANES] + values[at + 8 * LANES]
@@ -76,7 +67,7 @@ def register_new(new_slots: IntArray, frame: Frame, maps: MapArrays) -> None:
         frame: Measurements of the robot.
         maps: Landmarks; the next name is `tops[2]`.
     """
-    ids, identities, heads = maps.table[IDS], maps.table[IDENTITIES], maps.heads
+    ids, identities, heads = maps.table[L.IDS], maps.table[L.IDENTITIES], maps.heads
     for b in range(len(new_slots)):
         slot = new_slots[b]
         if slot < 0:
@@ -101,10 +92,10 @@ def release(slots: IntArray, maps: MapArrays) -> None:
 @inline
 def free_slot(slot: int, maps: MapArrays) -> None:
     """Free a slot, up to date, and its row."""
-    maps.table[IDS, slot] = -1
+    maps.table[L.IDS, slot] = -1
     for k in range(maps.heads.shape[0]):
-        maps.heads[k, slot] = FAR
-    maps.free_rows[maps.tops[0]] = maps.table[ROW_OF, slot]
-    maps.table[FREE_SLOTS, maps.tops[1]] = slot
+        maps.heads[k, slot] = L.FAR
+    maps.free_rows[maps.tops[0]] = maps.table[L.ROW_OF, slot]
+    maps.table[L.FREE_SLOTS, maps.tops[1]] = slot
     maps.tops[0] += 1
     maps.tops[1] += 1

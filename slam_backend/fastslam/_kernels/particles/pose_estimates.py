@@ -7,13 +7,8 @@ import numpy as np
 from slam_backend.core.jit import device, in_place, inline, jit, simd, simd_inline, stack_array
 from slam_backend.core.simd_math import sine_cosine, wrapped
 from slam_backend.core.validation import FloatArray, IntArray
-from slam_backend.fastslam._kernels.layout import (
-    COV_XI_SIZE,
-    COVARIANCES,
-    LANES,
-    MEANS,
-    STARTS,
-)
+from slam_backend.fastslam._kernels import layout as L
+from slam_backend.fastslam._kernels.layout import COV_XI_SIZE, LANES
 from slam_backend.fastslam.relative_poses import COVARIANCE, OWN, SIGMAS, START
 
 
@@ -194,8 +189,8 @@ def write_team_poses(
         poses, beliefs: Arrays of the `TeamPoses` of all robots of the team; written, without the sample sizes.
     """
     count = members.shape[1]
-    starts, means = robots[STARTS], robots[MEANS]
-    covariances = robots[COVARIANCES:].reshape((count, 6, robots.shape[3]))
+    starts, means = robots[L.STARTS], robots[L.MEANS]
+    covariances = robots[L.COVARIANCES :].reshape((count, 6, robots.shape[3]))
     for i in range(count):
         if not members[1, i]:
             continue

@@ -7,16 +7,8 @@ import numpy as np
 
 from slam_backend.core.jit import device, in_place, simd
 from slam_backend.core.validation import FloatArray, Int32Array, IntArray
-from slam_backend.fastslam._kernels.layout import (
-    BLOCK,
-    IDS,
-    LANES,
-    LOG_WEIGHTS,
-    MAP_OF,
-    PATH_LOG_WEIGHTS,
-    ROW_OF,
-    TILE,
-)
+from slam_backend.fastslam._kernels import layout as L
+from slam_backend.fastslam._kernels.layout import LANES, TILE
 from slam_backend.fastslam._kernels.particles.map_storage import free_slot
 from slam_backend.fastslam._kernels.records import MapArrays
 
@@ -54,16 +46,16 @@ def resample(
             sources[moves] = parent
             moves += 1
             place += 1
-    path_log_weights, rows = weights[PATH_LOG_WEIGHTS], robots.reshape((-1, robots.shape[3]))
+    path_log_weights, rows = weights[L.PATH_LOG_WEIGHTS], robots.reshape((-1, robots.shape[3]))
     for i in range(moves):
         path_log_weights[targets[i]] = path_log_weights[sources[i]]
-    weights[LOG_WEIGHTS, :count] = -math.log(count)
+    weights[L.LOG_WEIGHTS, :count] = -math.log(count)
     best = int(np.argmax(path_log_weights[:count]))
     for c in range(len(rows)):
         row = rows[c]
         for i in range(moves):
             row[targets[i]] = row[sources[i]]
-    row_of, map_of, ids, users = maps.table[ROW_OF], maps.table[MAP_OF], maps.table[IDS], maps.users
+    row_of, map_of, ids, users = maps.table[L.ROW_OF], maps.table[L.MAP_OF], maps.table[L.IDS], maps.users
     fresh, free = 0, 0
     for e in range(1, len(users)):
         if users[e] > 0:
@@ -121,8 +113,8 @@ def _copy_row(
         ancestor = np.uint32(ancestors[m])  # unsigned: none counts from the end
         if ancestor != m:
             own = np.uint32(m)
-            at = np.int64(ancestor // BLOCK) * TILE + np.int64(ancestor % BLOCK)
-            to = np.int64(own // BLOCK) * TILE + np.int64(own % BLOCK)
+            at = np.int64(ancestor // L.BLOCK) * TILE + np.int64(ancestor % L.BLOCK)
+            to = np.int64(own // L.BLOCK) * TILE + np.int64(own % L.BLOCK)
             seen[m] = before[ancestor]
             for c in range(9):
                 target[to + c * LANES] = source[at + c * LANES]
@@ -134,7 +126,7 @@ def apply_resampling(slots: IntArray, maps: MapArrays) -> None:
 
     One free row is needed: the row that a landmark leaves is taken by the next, while it is still in the cache.
     """
-    row_of, map_of, tops = maps.table[ROW_OF], maps.table[MAP_OF], maps.tops
+    row_of, map_of, tops = maps.table[L.ROW_OF], maps.table[L.MAP_OF], maps.tops
     padded = maps.counts.shape[1]
     size = 9 * padded
     for k in range(len(slots)):

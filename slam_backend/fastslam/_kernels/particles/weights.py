@@ -6,12 +6,7 @@ import numpy as np
 
 from slam_backend.core.jit import device, in_place
 from slam_backend.core.validation import FloatArray
-from slam_backend.fastslam._kernels.layout import (
-    LOG_LIKELIHOOD,
-    LOG_WEIGHTS,
-    PATH_LOG_WEIGHTS,
-    WEIGHTS,
-)
+from slam_backend.fastslam._kernels import layout as L
 
 
 @device
@@ -26,8 +21,8 @@ def weigh(weights: FloatArray, count: int) -> float:
     Returns:
         The effective sample size.
     """
-    log_weights, path_log_weights, own = weights[LOG_WEIGHTS], weights[PATH_LOG_WEIGHTS], weights[WEIGHTS]
-    log_likelihood, largest = weights[LOG_LIKELIHOOD], -np.inf
+    log_weights, path_log_weights, own = weights[L.LOG_WEIGHTS], weights[L.PATH_LOG_WEIGHTS], weights[L.WEIGHTS]
+    log_likelihood, largest = weights[L.LOG_LIKELIHOOD], -np.inf
     for i in range(count):
         path_log_weights[i] += log_likelihood[i]  # Eq. 12
         log_weights[i] += log_likelihood[i]  # Eqs. 3, 11

@@ -8,7 +8,8 @@ import numpy as np
 
 from slam_backend.core.jit import device, in_place, jit, jit_fma, simd, simd_inline
 from slam_backend.core.validation import FloatArray, Int32Array, IntArray
-from slam_backend.fastslam._kernels.layout import BLOCK, IDS, LANES, MAP_OF, ROW_OF
+from slam_backend.fastslam._kernels import layout as L
+from slam_backend.fastslam._kernels.layout import LANES
 from slam_backend.fastslam._kernels.records import MapArrays, ViewBounds, Viewpoint
 
 ROUNDED = 1.0 + 1e-9  # no rounding decides what is looked at in detail
@@ -63,7 +64,7 @@ def landmarks_in_view(
         found: (n, P) slots to which the particles gave the measurements, negative = none.
         new_slots: (n,) slots of the landmarks that the frame started, -1 = none.
     """
-    row_of, map_of, ids = maps.table[ROW_OF], maps.table[MAP_OF], maps.table[IDS]
+    row_of, map_of, ids = maps.table[L.ROW_OF], maps.table[L.MAP_OF], maps.table[L.IDS]
     counts, poses = maps.counts, camera.poses
     values = maps.values.reshape((-1, counts.shape[1] // LANES, 9, LANES))
     matched = np.zeros(len(ids), dtype=np.bool_)
@@ -118,7 +119,7 @@ def _is_expected(
         num = 0
         for m in range(first, min(first + LANES, len(places))):
             place = np.uint32(places[m])
-            block, lane = np.int64(place // BLOCK), np.int64(place % BLOCK)
+            block, lane = np.int64(place // L.BLOCK), np.int64(place % L.BLOCK)
             dx, dy = values[block, 0, lane] - poses[0, m], values[block, 1, lane] - poses[1, m]
             depth, lateral = cosines[m] * dx + sines[m] * dy - m0, cosines[m] * dy - sines[m] * dx - m1
             num += 1 if in_view(depth, lateral, 0.0, wider) and counts[place] > 0 else 0
@@ -146,7 +147,7 @@ def count_expected(
     block, lane = m // LANES, m % LANES
     num = 0
     for k in range(len(slots)):
-        row = maps.table[ROW_OF, slots[k]]
+        row = maps.table[L.ROW_OF, slots[k]]
         if maps.counts[row, m] > 0:
             dx, dy = values[row, block, 0, lane] - pose[0], values[row, block, 1, lane] - pose[1]
             depth, lateral = c * dx + s * dy - mount[0], c * dy - s * dx - mount[1]
@@ -186,7 +187,7 @@ def update_existence(
     num = 0
     for k in range(len(slots)):
         slot = slots[k]
-        row = maps.table[ROW_OF, slot]
+        row = maps.table[L.ROW_OF, slot]
         holders = 0
         for block in range(num_blocks):
             first, last = block * LANES, (block + 1) * LANES

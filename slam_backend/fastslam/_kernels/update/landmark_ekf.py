@@ -8,33 +8,9 @@ import numpy as np
 from slam_backend.core.jit import device, simd, simd_inline, stack_array
 from slam_backend.core.simd_math import Symmetric, inverted, inverted_by_parts, quadratic_form
 from slam_backend.core.validation import FloatArray, Int32Array, IntArray
+from slam_backend.fastslam._kernels import layout as L
 from slam_backend.fastslam._kernels.association.candidates import mask_of
-from slam_backend.fastslam._kernels.layout import (
-    COS,
-    DEPTH,
-    FREE_SLOTS,
-    INNOV0,
-    INNOV1,
-    INNOV2,
-    LANES,
-    MAP_OF,
-    MIN_DEPTH,
-    N00,
-    N01,
-    N02,
-    N11,
-    N12,
-    N22,
-    NEW_LANDMARK,
-    Q_D,
-    REJECTED,
-    ROW_OF,
-    SIN,
-    TAKEN,
-    TILE,
-    X,
-    Y,
-)
+from slam_backend.fastslam._kernels.layout import LANES, TILE
 from slam_backend.fastslam._kernels.measurement.measurement_model import accumulate_likelihood, innovate
 from slam_backend.fastslam._kernels.particles.map_storage import tile_of
 from slam_backend.fastslam._kernels.records import Candidates, Frame, MapArrays, Space
@@ -76,9 +52,9 @@ def _updated(
     i00, i01, i02, i11, i12, i22 = inverse
     p00, p01, p02 = tile[3 * LANES + i], tile[4 * LANES + i], tile[5 * LANES + i]
     p11, p12, p22 = tile[6 * LANES + i], tile[7 * LANES + i], tile[8 * LANES + i]
-    n00, n01, n02 = work[N00 + i], work[N01 + i], work[N02 + i]
-    n11, n12, n22 = work[N11 + i], work[N12 + i], work[N22 + i]
-    rx, ry, rz = work[INNOV0 + i], work[INNOV1 + i], work[INNOV2 + i]
+    n00, n01, n02 = work[L.N00 + i], work[L.N01 + i], work[L.N02 + i]
+    n11, n12, n22 = work[L.N11 + i], work[L.N12 + i], work[L.N22 + i]
+    rx, ry, rz = work[L.INNOV0 + i], work[L.INNOV1 + i], work[L.INNOV2 + i]
     k00, k01, k02 = p00 * i00 + p01 * i01 + p02 * i02, p00 * i01 + p01 * i11 + p02 * i12, (
         p00 * i02 + p01 * i12 + p02 * i22
     )  # Eq. 8  # fmt: skip
@@ -119,8 +95,9 @@ def _updated(
 def _sum(work: FloatArray, tile: FloatArray, i: int) -> Symmetric:
     """Return S = Sigma + R (Eq. 7)."""
     return (
-        tile[3 * LANES + i] + work[N00 + i], tile[4 * LANES + i] + work[N01 + i], tile[5 * LANES + i] + work[N02 + i],
-        tile[6 * LANES + i] + work[N11 + i], tile[7 * LANES + i] + work[N12 + i], tile[8 * LANES + i] + work[N22 + i],
+        tile[3 * LANES + i] + work[L.N00 + i], tile[4 * LANES + i] + work[L.N01 + i],
+        tile[5 * LANES + i] + work[L.N02 + i], tile[6 * LANES + i] + work[L.N11 + i],
+        tile[7 * LANES + i] + work[L.N12 + i], tile[8 * LANES + i] + work[L.N22 + i],
     )  # fmt: skip
 
 
@@ -153,11 +130,11 @@ def update(work: FloatArray, tile: FloatArray, mask: FloatArray, walk: float) ->
     if _any_flat(work, tile):
         for i in range(LANES):
             inverse, _ = inverted_by_parts(_sum(work, tile, i))
-            _updated(work, tile, i, inverse, mask[i] > 0.0 and work[DEPTH + i] >= MIN_DEPTH, walk, True)
+            _updated(work, tile, i, inverse, mask[i] > 0.0 and work[L.DEPTH + i] >= L.MIN_DEPTH, walk, True)
     else:
         for i in range(LANES):
             inverse, _ = inverted(_sum(work, tile, i))
-            _updated(work, tile, i, inverse, mask[i] > 0.0 and work[DEPTH + i] >= MIN_DEPTH, walk, False)
+            _updated(work, tile, i, inverse, mask[i] > 0.0 and work[L.DEPTH + i] >= L.MIN_DEPTH, walk, False)
 
 
 @simd_inline
@@ -169,13 +146,13 @@ def _gate_and_update(
     for i in range(LANES):
         s = _sum(work, tile, i)
         inverse, det = inverted_by_parts(s) if flat else inverted(s)
-        distance = quadratic_form(inverse, work[INNOV0 + i], work[INNOV1 + i], work[INNOV2 + i])
-        depth = work[DEPTH + i]
-        admitted = chosen[i] == NEW_LANDMARK and seen[i] > 0 and work[TAKEN + i] == 0.0
-        match = admitted and distance <= gate and depth >= MIN_DEPTH
+        distance = quadratic_form(inverse, work[L.INNOV0 + i], work[L.INNOV1 + i], work[L.INNOV2 + i])
+        depth = work[L.DEPTH + i]
+        admitted = chosen[i] == L.NEW_LANDMARK and seen[i] > 0 and work[L.TAKEN + i] == 0.0
+        match = admitted and distance <= gate and depth >= L.MIN_DEPTH
         _updated(work, tile, i, inverse, match, walk, flat)
         accumulate_likelihood(work, i, match, distance, det, depth)
-        record[Q_D + i] = distance
+        record[L.Q_D + i] = distance
         chosen[i] = q if match else chosen[i]
         seen[i] += np.int32(1) if match else np.int32(0)
 
@@ -213,7 +190,7 @@ def update_matched(
     space: Space, block: int, maps: MapArrays, frame: Frame, candidates: Candidates, walk: float
 ) -> None:
     """Update at a known pose the landmarks that the lanes of one block matched, young ones by the iterated EKF."""
-    work, match, mask, row_of = space.work, space.match, space.mask, maps.table[ROW_OF]
+    work, match, mask, row_of = space.work, space.match, space.mask, maps.table[L.ROW_OF]
     padded, first = maps.counts.shape[1], block * LANES
     young, before = stack_array(LANES), stack_array(TILE)
     for b in range(len(match)):
@@ -236,9 +213,9 @@ def update_matched(
                 update(work, tile, young, 0.0)
                 innovate(work, tile, frame, b)
                 for i in range(LANES):  # the innovation at the new means is referred to those before
-                    work[INNOV0 + i] += tile[i] - before[i]
-                    work[INNOV1 + i] += tile[LANES + i] - before[LANES + i]
-                    work[INNOV2 + i] += tile[2 * LANES + i] - before[2 * LANES + i]
+                    work[L.INNOV0 + i] += tile[i] - before[i]
+                    work[L.INNOV1 + i] += tile[LANES + i] - before[LANES + i]
+                    work[L.INNOV2 + i] += tile[2 * LANES + i] - before[2 * LANES + i]
                 for j in range(TILE):
                     tile[j] = before[j]
             update(work, tile, mask, walk)
@@ -261,31 +238,31 @@ def new_landmark(
         new_slots: (B,) slots of the landmarks that measurements started, -1 = none; written.
         walk: See `update`.
     """
-    work, row_of, tops = space.work, maps.table[ROW_OF], maps.tops
-    if new_slots[n] == REJECTED:
+    work, row_of, tops = space.work, maps.table[L.ROW_OF], maps.tops
+    if new_slots[n] == L.REJECTED:
         tops[0] -= 1
         tops[1] -= 1
-        row, slot = maps.free_rows[tops[0]], maps.table[FREE_SLOTS, tops[1]]
+        row, slot = maps.free_rows[tops[0]], maps.table[L.FREE_SLOTS, tops[1]]
         size = 9 * maps.counts.shape[1]
         maps.counts[row, :] = 0
         maps.values[row * size : (row + 1) * size] = 0.0
-        row_of[slot], maps.table[MAP_OF, slot], new_slots[n] = row, 0, slot
+        row_of[slot], maps.table[L.MAP_OF, slot], new_slots[n] = row, 0, slot
     row, points, camera = row_of[new_slots[n]], frame.points, frame.camera
     tile = maps.values[tile_of(maps.counts.shape[1], row, block)]
     seen = maps.counts[row, block * LANES : (block + 1) * LANES]
     ahead, left, up = camera[4] + points[n, 0], camera[5] + points[n, 1], camera[6] + points[n, 2]
     for i in range(LANES):
-        c, s = work[COS + i], work[SIN + i]
-        tile[i] = work[X + i] + c * ahead - s * left
-        tile[LANES + i] = work[Y + i] + s * ahead + c * left
+        c, s = work[L.COS + i], work[L.SIN + i]
+        tile[i] = work[L.X + i] + c * ahead - s * left
+        tile[LANES + i] = work[L.Y + i] + s * ahead + c * left
         tile[2 * LANES + i] = up
     innovate(work, tile, frame, n)
     for i in range(LANES):  # l. 31 *: G^-1 R G^-T
-        tile[3 * LANES + i] = work[N00 + i] + walk
-        tile[4 * LANES + i] = work[N01 + i]
-        tile[5 * LANES + i] = work[N02 + i]
-        tile[6 * LANES + i] = work[N11 + i] + walk
-        tile[7 * LANES + i] = work[N12 + i]
-        tile[8 * LANES + i] = work[N22 + i] + walk
+        tile[3 * LANES + i] = work[L.N00 + i] + walk
+        tile[4 * LANES + i] = work[L.N01 + i]
+        tile[5 * LANES + i] = work[L.N02 + i]
+        tile[6 * LANES + i] = work[L.N11 + i] + walk
+        tile[7 * LANES + i] = work[L.N12 + i]
+        tile[8 * LANES + i] = work[L.N22 + i] + walk
     for i in range(len(seen)):
         seen[i] = np.int32(1) if space.mask[i] > 0.0 else np.int32(0)
