@@ -1,24 +1,17 @@
-"""Command line `vslam`: registers the commands, each of which has its own module."""
+"""Command line `vslam`: lists the commands, each of which has its own module and is imported when it is called."""
 
 import errno
 import os
 import sys
+from collections.abc import Iterator, Mapping
+from importlib import import_module
 from importlib.metadata import version
 from signal import Signals
-from typing import Annotated, NoReturn
+from typing import Annotated, Any, NoReturn
 
 import typer
+from typer.core import TyperCommand, TyperGroup
 
-from training.commands.bench import bench
-from training.commands.drive import drive_by_hand
-from training.commands.evaluate import evaluate
-from training.commands.paper import paper
-from training.commands.replay import replay
-from training.commands.report import compare, report
-from training.commands.run import run
-from training.commands.train import train
-from training.commands.warm_up import warm_up
-from training.commands.worlds import worlds
 from training.experiments.console import make_console, print_error
 from training.experiments.interrupt import signals_answered
 from training.experiments.logs import LogLevel, begin_logging
@@ -26,6 +19,84 @@ from training.experiments.logs import LogLevel, begin_logging
 BAD_INPUT = 2
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 INTERRUPTED = 130  # typer's status after a KeyboardInterrupt
+
+
+# Module in `training.commands`, function or group there, and what `vslam --help` says of it, by name of the command.
+COMMANDS = {
+    "run": ("run", "run", "Let robots with unknown starts explore a building, map it, and merge their maps."),
+    "drive": (
+        "drive", "drive_by_hand",
+        "Drive a robot with the arrow keys or WASD; Tab selects the next robot, Escape or Q quits.",
+    ),
+    "train": (
+        "train", "train",
+        "Train one network for all robots by PPO with masked goal actions; use it with vslam run --policy FOLDER.",
+    ),
+    "evaluate": (
+        "evaluate", "evaluate",
+        "Compare a model with baseline policies on the same unseen worlds, with confidence intervals.",
+    ),
+    "report": (
+        "report", "report",
+        "Write report.html into a run folder: playback of the episode, curves and tables, in one file for any browser.",
+    ),
+    "compare": ("report", "compare", "Compare two run folders: options that differ, and metrics side by side."),
+    "warm-up": (
+        "warm_up", "warm_up", "Compile the kernels into the disk cache; takes seconds if they are cached already.",
+    ),
+    "replay": ("replay", "replay", "Run the backend on logs of real robots."),
+    "bench": ("bench", "bench", "Measure accuracy and speed of filters, environments and training."),
+    "paper": ("paper", "paper", "Reproduce figures of the paper."),
+    "worlds": ("worlds", "worlds", "List, preview, check and import worlds."),
+}  # fmt: skip
+
+
+class ImportedCommands(Mapping[str, Any]):
+    """The commands by name, imported when they are looked up."""
+
+    def __getitem__(self, name: str) -> Any:
+        module, attribute, _ = COMMANDS[name]
+        found: Any = getattr(import_module(f"training.commands.{module}"), attribute)
+        if isinstance(found, typer.Typer):
+            command: Any = typer.main.get_group(found)
+        else:
+            alone = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+            alone.command()(found)
+            command = typer.main.get_command(alone)
+        command.name = name
+        return command
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(COMMANDS)
+
+    def __len__(self) -> int:
+        return len(COMMANDS)
+
+
+class Commands(TyperGroup):
+    """The group of all commands, of which only the one that is called is imported."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self.commands: Any = ImportedCommands()
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Return the names of the commands."""
+        return list(COMMANDS)
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """Return a command, imported unless help alone is printed; None if there is none of this name."""
+        if ctx.meta.get(ONLY_HELP):
+            return TyperCommand(cmd_name, help=COMMANDS[cmd_name][-1])
+        return super().get_command(ctx, cmd_name)
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Print the help, for which no command is imported."""
+        ctx.meta[ONLY_HELP] = True
+        super().format_help(ctx, formatter)
+
+
+ONLY_HELP = "training.cli.only_help"  # key of a context's notes
 
 
 def _print_version(is_wanted: bool) -> None:
@@ -36,7 +107,7 @@ def _print_version(is_wanted: bool) -> None:
 
 app = typer.Typer(
     name="vslam", help="Robots that do not know where they start explore, map and merge: runs, replays and figures.",
-    no_args_is_help=True, pretty_exceptions_enable=False,
+    cls=Commands, no_args_is_help=True, pretty_exceptions_enable=False,
 )  # fmt: skip
 
 
@@ -51,19 +122,6 @@ def options(
 ) -> None:
     """Take the options that come before a command."""
     begin_logging(log_level)
-
-
-app.command("run")(run)
-app.command("drive")(drive_by_hand)
-app.command("train")(train)
-app.command("evaluate")(evaluate)
-app.command("report")(report)
-app.command("compare")(compare)
-app.command("warm-up")(warm_up)
-app.add_typer(replay, name="replay")
-app.add_typer(bench, name="bench")
-app.add_typer(paper, name="paper")
-app.add_typer(worlds, name="worlds")
 
 
 def main() -> None:

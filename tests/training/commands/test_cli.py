@@ -25,6 +25,19 @@ def test_a_fault_of_the_program_keeps_its_traceback(monkeypatch: pytest.MonkeyPa
         cli.main()
 
 
+def test_the_list_of_commands_says_what_each_says_of_itself() -> None:
+    """The first sentence of each command's own help stands in the list, for which no command is imported."""
+    group: Any = get_command(cli.app)
+    for name, command in group.commands.items():
+        assert " ".join(command.help.split("\n\n")[0].split()) == cli.COMMANDS[name][-1]
+    program = "import sys\nfrom training import cli\nsys.argv = ['vslam', '--help']\n"
+    program += (
+        "try: cli.main()\nexcept SystemExit: print([n for n in sys.modules if n.startswith('training.commands.')])"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
 @pytest.mark.parametrize("module", ["training", "training.cli", "vslam_env"])
 def test_modules_run_the_command(module: str) -> None:
     """`python -m` of the packages and of the command line has the output and exit status of `vslam`."""
