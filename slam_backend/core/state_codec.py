@@ -12,7 +12,7 @@ and do not overlap: a tree takes about as much memory as its file has bytes.
 import json
 import math
 import struct
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import fields, is_dataclass
 from enum import Enum
 from pathlib import Path
@@ -24,6 +24,7 @@ from numpy.random import SeedSequence
 from numpy.typing import NDArray
 
 from slam_backend.core.read_only import as_read_only
+from slam_backend.core.state import Snapshot
 
 ALIGNMENT = 64  # alignment of arrays [bytes]
 MAX_BYTES = 1 << 30  # limit of a file [bytes]; a state has some megabytes
@@ -152,7 +153,7 @@ class _Writer:
         """Return the row of a value that has parts, after writing the rows of its parts."""
         if cls is np.ndarray:
             return self._array(value)
-        if isinstance(value, Mapping):
+        if cls is dict or cls is Snapshot:
             row: list[Any] = ["dict"]
             for key, part in value.items():
                 row += (self._at(key, key), self._at(key, part))

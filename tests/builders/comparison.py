@@ -1,6 +1,7 @@
 """Comparison of nested results bit for bit, and hashes of them."""
 
 import hashlib
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ def assert_same(one: Any, other: Any, where: str = "state") -> None:
     assert type(one) is type(other), where
     if isinstance(one, np.ndarray):
         np.testing.assert_array_equal(one, other, err_msg=where)
-    elif isinstance(one, dict):
+    elif isinstance(one, Mapping):
         assert list(one) == list(other), where
         for key, value in one.items():
             assert_same(value, other[key], f"{where}.{key}")
@@ -28,7 +29,7 @@ def assert_same(one: Any, other: Any, where: str = "state") -> None:
 
 def digest(value: Any, into: "hashlib._Hash") -> None:
     """Feed nested dicts, sequences, arrays and numbers into a hash, types and shapes included."""
-    if isinstance(value, dict):
+    if isinstance(value, Mapping):
         for key in value:
             into.update(repr(key).encode())
             digest(value[key], into)

@@ -17,7 +17,7 @@ HUGE = (2**62, 10**9, 10**6, 2**31 - 1)
 
 def children(value: Any) -> list[Any]:
     """Return the keys, places or names of the parts of a value; none of what has no parts."""
-    if isinstance(value, dict):
+    if isinstance(value, Mapping):
         return list(value)
     if isinstance(value, (tuple, list)):
         return list(range(len(value)))
@@ -33,8 +33,8 @@ def part(value: Any, key: Any) -> Any:
 
 def with_part(value: Any, key: Any, new: Any) -> Any:
     """Return a copy of a value with another part; no constructor looks at it."""
-    if isinstance(value, dict):
-        return value | {key: new}
+    if isinstance(value, Mapping):
+        return dict(value) | {key: new}
     if is_dataclass(value):
         copied = object.__new__(type(value))
         for field in fields(value):
@@ -77,7 +77,7 @@ def damaged(tree: Any, rng: np.random.Generator) -> tuple[str, Any]:
     name = list(acts)[int(rng.integers(len(acts)))]
     if name == "missing":
         inner = at(tree, way[:-1])
-        if isinstance(inner, dict):
+        if isinstance(inner, Mapping):
             return f"{way} missing", replaced(tree, way[:-1], {k: v for k, v in inner.items() if k != way[-1]})
         name = "none"
     return f"{way} {name}", replaced(tree, way, acts[name]())
@@ -113,7 +113,7 @@ def acts_on(value: Any, tree: Any, rng: np.random.Generator) -> dict[str, Callab
             "empty": lambda: type(value)() if type(value) in (tuple, list) else (),
             "reversed": lambda: value[::-1],
         }
-    elif isinstance(value, dict) and value:
+    elif isinstance(value, Mapping) and value:
         acts |= {"empty": dict, "renamed": lambda: {(k + 1 if isinstance(k, int) else k): v for k, v in value.items()}}
     elif isinstance(value, (set, frozenset)):
         acts |= {"odd": lambda: type(value)((-5, 10**12))}

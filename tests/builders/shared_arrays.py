@@ -1,6 +1,6 @@
 """Which arrays of a state are arrays of something else, too, and could be written to."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType
 from typing import Any
 from weakref import ref
@@ -27,7 +27,7 @@ def arrays_in(root: Any) -> Iterator[tuple[str, np.ndarray]]:
 
 def _parts(value: Any) -> Iterator[tuple[str, Any]]:
     """Yield the parts of a value: entries, and attributes from `__dict__` and `__slots__`."""
-    if isinstance(value, dict):
+    if isinstance(value, Mapping):
         yield from ((f"[{key!r}]", part) for key, part in value.items())
     elif isinstance(value, (tuple, list, set, frozenset)) or hasattr(value, "popleft"):
         yield from ((f"[{place}]", part) for place, part in enumerate(value))

@@ -7,6 +7,7 @@ from builders.comparison import digest
 from builders.environments import MEETING, scored, small_env, standing_at, turning, wander
 
 from agents import make_policy
+from slam_backend.core.state import restore, take
 from slam_backend.fastslam.reports import Associations
 from slam_backend.maps.alignment import Alignment
 from slam_backend.maps.landmark_map import LandmarkMap, TeamMapSummaries
@@ -202,9 +203,9 @@ def test_a_landmark_is_credited_once() -> None:
         credits.record(robot, np.array([1, 2]))
     credits.update(held)
     assert credits.shares.tolist() == [0.125, 0.375]
-    state = credits.get_state()
+    state = take(credits)
     other = RecallCredits(2, 4)
-    other.set_state(state)
+    restore(other, state)
     for each in (credits, other):
         each.record(0, np.array([0, 1, 2]))
         each.update(np.ones((2, 4), np.bool_))

@@ -78,7 +78,7 @@ def summarise(
 
     Args:
         inputs: Robots and their inputs; measurements of other robots are passed over.
-        results: What the particles made of the measurements. `associations` is written: id of the landmark with which
+        results: Outcome of the particles. `associations` is written: id of the landmark with which
             the most probable particle associated each measurement, -1 = rejected; and id of the landmark that it
             created in any particle, -1 = none. The latter row holds the slots of these landmarks before.
         best: The most probable particle.
