@@ -138,78 +138,103 @@ def step_robots(
         The fields of `StepSummary`, zeros before the end.
     """
     step, rules, of, landmarks = StepPart(*part), options[0], RobotArrays(*robots), MapArrays(*maps)
-    read, written = InputArrays(*inputs), StepResults(*results)
-    num_robots, num_particles = len(read.rows), read.normals.shape[1]
-    poses, means = of.parts[L.POSES], of.parts[L.MEANS]
-    covariances = of.parts[L.COVARIANCES :].reshape((num_robots, 6, of.parts.shape[3]))
-    points, noises = read.measurements[:, :3], read.measurements[:, 3:]
-    work, move, sigmas, drawn = stack_array(WORK_SIZE), stack_array(3), stack_array(3), -1
-    jacobian, factor = stack_array(9).reshape(3, 3), stack_array(9).reshape(3, 3)
-    gain, spread, information = stack_array(9).reshape(3, 3), stack_array(6), stack_array(6)
-    bias = rules.bias_sigmas
-    biased = bias[0] > 0.0 or bias[1] > 0.0 or bias[2] > 0.0
+    read, written, drawn = InputArrays(*inputs), StepResults(*results), -1
     if step.low == 0:
         of.weights[L.LOG_LIKELIHOOD][:] = 0.0
     for robot in range(step.high):
         row = read.rows[robot]
-        kind = read.table[row, L.MOTION_KIND] if row >= 0 else L.NO_READING
-        drawn += kind != L.NO_READING
-        if robot < step.low or kind == L.NO_READING:
+        if row < 0 or read.table[row, L.MOTION_KIND] == L.NO_READING:
             continue
-        a, b = read.table[row, L.BEGIN], read.table[row, L.END]
-        exact = kind == L.EXACT_POSE
-        move[:] = 0.0
-        sigmas[:] = 0.0
-        if kind == L.MOVED:
-            move[0], move[1], move[2] = read.moves[row, 0], read.moves[row, 1], read.moves[row, 2]
-            write_sigmas(rules.noise, move, sigmas)
-        own = Poses(poses[robot], means[robot], covariances[robot], of.parts[L.BIASES, robot])
-        motion = Motion(
-            move, sigmas, read.normals[drawn], exact, biased and not exact, jacobian, spread, factor, gain, information
-        )
-        frame = Frame(
-            points[a:b], noises[a:b], read.table[row, L.COVARIANCES_GIVEN] > 0, rules.camera, read.descriptors[a:b],
-            read.names[a:b], read.table[row, L.HAS_IDS] > 0,
-        )  # fmt: skip
-        outcome = Outcome(
-            written.found[a:b], written.distances[a:b], written.associations[L.CREATED, a:b],
-            of.weights[L.LOG_LIKELIHOOD],
-        )  # fmt: skip
-        was_propagated_only = of.propagated_only[robot] > 0 and not exact
-        if not was_propagated_only:
-            of.biases[1, robot] = 0.0
-        if motion.biased:
-            prepare_bias(motion, of.biases[0, robot], of.biases[1, robot])
-        if rules.is_fastslam1:
-            if motion.biased:
-                set_draw_gain(motion, of.biases[0, robot])
-                of.biases[1, robot] = 0.0
-            update_fastslam1(own, not exact, motion, landmarks, frame, rules, work, outcome)
-            register_new(outcome.new_slots, frame, landmarks)
-        elif b > a:
-            biases = of.biases[:, robot]
-            update_fastslam2(own, was_propagated_only, motion, biases, landmarks, frame, rules, work, outcome)
-            register_new(outcome.new_slots, frame, landmarks)
-            was_propagated_only = False
-        elif exact:
-            set_exact(own)
-        else:
-            propagate(own, motion, was_propagated_only, work)
-            was_propagated_only = True
-        of.propagated_only[robot] = was_propagated_only
+        drawn += 1
+        if robot >= step.low:
+            update_robot(robot, read, read.normals[drawn], rules, of, landmarks, written)
     if not step.is_over:
         return 0, 0, 0, 0, 0, 0, 0.0, 0.0, False
-    weights, path_log_weights = of.weights[L.WEIGHTS][:num_particles], of.weights[L.PATH_LOG_WEIGHTS][:num_particles]
-    ess, used = weigh(of.weights, num_particles), 0
+    ess = weigh(of.weights, read.normals.shape[1])  # l. 9
+    return conclude(step, read, ess, rules, of, landmarks, written)
+
+
+@device
+@in_place
+def update_robot(
+    robot: int, inputs: InputArrays, normals: FloatArray, rules: Any, robots: RobotArrays, maps: MapArrays,
+    results: StepResults,
+) -> None:  # fmt: skip
+    """Predict, associate, weigh and update: one robot that is not idle, in all particles (Algorithm 1, l. 6-8).
+
+    Args:
+        robot: Index of the robot.
+        inputs, rules, robots, maps, results: Arguments of `step_robots`.
+        normals: (M, 3) standard normal draws.
+    """
+    row, num_robots = inputs.rows[robot], len(inputs.rows)
+    a, b, kind = inputs.table[row, L.BEGIN], inputs.table[row, L.END], inputs.table[row, L.MOTION_KIND]
+    work, move, sigmas = stack_array(WORK_SIZE), stack_array(3), stack_array(3)
+    move[:] = 0.0
+    sigmas[:] = 0.0
+    if kind == L.MOVED:
+        move[0], move[1], move[2] = inputs.moves[row, 0], inputs.moves[row, 1], inputs.moves[row, 2]
+        write_sigmas(rules.noise, move, sigmas)
+    bias, is_exact = rules.bias_sigmas, kind == L.EXACT_POSE
+    motion = Motion(
+        move, sigmas, normals, is_exact, (bias[0] > 0.0 or bias[1] > 0.0 or bias[2] > 0.0) and not is_exact,
+        stack_array(9).reshape(3, 3), stack_array(6), stack_array(9).reshape(3, 3), stack_array(9).reshape(3, 3),
+        stack_array(6),
+    )  # fmt: skip
+    covariances = robots.parts[L.COVARIANCES :].reshape((num_robots, 6, robots.parts.shape[3]))[robot]
+    own = Poses(robots.parts[L.POSES, robot], robots.parts[L.MEANS, robot], covariances, robots.parts[L.BIASES, robot])
+    frame = Frame(
+        inputs.measurements[a:b, :3], inputs.measurements[a:b, 3:], inputs.table[row, L.COVARIANCES_GIVEN] > 0,
+        rules.camera, inputs.descriptors[a:b], inputs.names[a:b], inputs.table[row, L.HAS_IDS] > 0,
+    )  # fmt: skip
+    outcome = Outcome(
+        results.found[a:b], results.distances[a:b], results.associations[L.CREATED, a:b],
+        robots.weights[L.LOG_LIKELIHOOD],
+    )  # fmt: skip
+    was_propagated_only = robots.propagated_only[robot] > 0 and not is_exact
+    if not was_propagated_only:
+        robots.biases[1, robot] = 0.0
+    if motion.biased:
+        prepare_bias(motion, robots.biases[0, robot], robots.biases[1, robot])
+    robots.propagated_only[robot] = False
+    if rules.is_fastslam1:
+        if motion.biased:
+            set_draw_gain(motion, robots.biases[0, robot])
+            robots.biases[1, robot] = 0.0
+        update_fastslam1(own, not is_exact, motion, maps, frame, rules, work, outcome)
+        register_new(outcome.new_slots, frame, maps)
+        robots.propagated_only[robot] = was_propagated_only
+    elif b > a:
+        biases = robots.biases[:, robot]
+        update_fastslam2(own, was_propagated_only, motion, biases, maps, frame, rules, work, outcome)
+        register_new(outcome.new_slots, frame, maps)
+    elif is_exact:
+        set_exact(own)
+    else:
+        propagate(own, motion, was_propagated_only, work)
+        robots.propagated_only[robot] = True
+
+
+@device
+@in_place
+def conclude(
+    part: StepPart, inputs: InputArrays, ess: float, rules: Any, robots: RobotArrays, maps: MapArrays,
+    results: StepResults,
+) -> tuple[int, int, int, int, int, int, float, float, bool]:  # fmt: skip
+    """Estimate poses and associations over all particles, log the step, and return the fields of `StepSummary`."""
+    num_robots, num_particles = len(inputs.rows), inputs.normals.shape[1]
+    means, weights = robots.parts[L.MEANS], robots.weights[L.WEIGHTS][:num_particles]
+    covariances = robots.parts[L.COVARIANCES :].reshape((num_robots, 6, robots.parts.shape[3]))
+    used = 0
     for robot in range(num_robots):
-        row = read.rows[robot]
-        mixture(means[robot], covariances[robot], weights, of.means[robot], of.covariances[robot])
-        used += read.table[row, L.END] - read.table[row, L.BEGIN] if row >= 0 else 0
-    if of.gauge[0, 0] != 0.0 or of.gauge[2, 2] != 0.0:
-        add_gauge_covariance(of.gauge, of.means, of.covariances)
-    best = int(path_log_weights.argmax())
-    said = summarise(read, written, best, landmarks.table, step.now, rules.closure_after)
-    log_step(read, of.means, written, step.num_measured)
+        row = inputs.rows[robot]
+        mixture(means[robot], covariances[robot], weights, robots.means[robot], robots.covariances[robot])
+        used += inputs.table[row, L.END] - inputs.table[row, L.BEGIN] if row >= 0 else 0
+    if robots.gauge[0, 0] != 0.0 or robots.gauge[2, 2] != 0.0:
+        add_gauge_covariance(robots.gauge, robots.means, robots.covariances)
+    best = int(robots.weights[L.PATH_LOG_WEIGHTS][:num_particles].argmax())
+    said = summarise(inputs, results, best, maps.table, part.now, rules.closure_after)
+    log_step(inputs, robots.means, results, part.num_measured)
     least = rules.resample_threshold * num_particles * (1.0 + 1e-9)  # rounding must not decide
     needs_resampling = used > 0 and ess <= least
     return (

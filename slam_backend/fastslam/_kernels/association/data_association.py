@@ -120,13 +120,13 @@ def _match_alone(
     The largest D that may match is `reach`.
     """
     for i in range(LANES):
-        terms, _, _, _, _, _, distance = match_terms(work, tile, i, False)
+        match = match_terms(work, tile, i, False)
         held = seen[i] > 0
-        inside = distance <= gate
-        ok = held and distance <= reach
+        inside = match.distance <= gate
+        ok = held and match.distance <= reach
         chosen[i] = q if ok else L.NO_MATCH
-        add_terms(work, i, ok, gate / (gate + distance), terms)
-        record[L.Q_FIRST_D + i] = distance
+        add_terms(work, i, ok, gate / (gate + match.distance), match.terms)
+        record[L.Q_FIRST_D + i] = match.distance
         work[L.CONTRADICT + i] += 1.0 if held and not inside else 0.0
 
 
@@ -325,11 +325,11 @@ def _decide_alone(
     """
     radius2 = new_landmark_radius * new_landmark_radius
     for i in range(LANES):
-        terms, square, det, _, depth, metres2, distance = match_terms(work, tile, i, True)
-        front = (seen[i] > 0) & (distance < np.inf)  # "and" would make a branch of it, and of all that follows
-        near = front & ((distance <= new_landmark_gate) | (metres2 <= radius2))
-        ok = front & (distance <= reach) & (work[L.TAKEN + i] == 0.0)
+        match = match_terms(work, tile, i, True)
+        front = (seen[i] > 0) & (match.distance < np.inf)  # "and" would make a branch of it, and of all that follows
+        near = front & ((match.distance <= new_landmark_gate) | (match.metres2 <= radius2))
+        ok = front & (match.distance <= reach) & (work[L.TAKEN + i] == 0.0)
         chosen[i] = q if ok else (L.NO_MATCH if near else L.NEW_LANDMARK)
         work[L.CLUTTER + i] += 0.0 if ok else log_clutter
-        add_terms(work, i, ok, 1.0, terms)
-        accumulate_likelihood(work, i, ok, square, det, depth)
+        add_terms(work, i, ok, 1.0, match.terms)
+        accumulate_likelihood(work, i, ok, match.square, match.det, match.depth)

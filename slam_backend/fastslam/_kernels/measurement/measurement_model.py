@@ -1,5 +1,7 @@
 """Measurement model of all lanes of a block (Eqs. 5-7): innovations, and the log-likelihood of a frame (Eq. 11)."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from slam_backend.core.jit import device, simd, simd_inline
@@ -11,6 +13,28 @@ from slam_backend.fastslam._kernels.records import Frame
 
 # Share of a match in the system of xi: J (6) and g (3), see the package.
 Terms = tuple[float, float, float, float, float, float, float, float, float]
+
+
+class Match(NamedTuple):
+    """What a match of a measurement and a landmark would mean for one particle.
+
+    Attributes:
+        terms: Share in the system of xi.
+        square: r^T S^-1 r.
+        det: |S|.
+        det_pose: |S + A P A^T|.
+        depth: Predicted depth [m].
+        metres2: r^T r [m^2].
+        distance: Squared distance of the gate, infinite behind the camera.
+    """
+
+    terms: Terms
+    square: float
+    det: float
+    det_pose: float
+    depth: float
+    metres2: float
+    distance: float
 
 
 @device
@@ -65,9 +89,7 @@ def innovate(work: FloatArray, tile: FloatArray, frame: Frame, n: int) -> None:
 
 
 @simd_inline
-def match_terms(
-    work: FloatArray, tile: FloatArray, i: int, refined: bool
-) -> tuple[Terms, float, float, float, float, float, float]:
+def match_terms(work: FloatArray, tile: FloatArray, i: int, refined: bool) -> Match:
     """Return what a match would add to the system of xi, and its gate, from the innovation in `work`.
 
     A robot turns about the vertical, so the pose says nothing of heights: r_z is eliminated first, and what is left is
@@ -79,10 +101,6 @@ def match_terms(
         tile: Values of the landmark there.
         i: The lane.
         refined: Whether the covariance P of xi is that of the rows COV_XI00 ..; else it is the identity.
-
-    Returns:
-        J and g, r^T S^-1 r, |S|, |S + A P A^T|, the predicted depth, r^T r, and the squared distance of the gate,
-        infinite behind the camera.
     """
     rx, ry, rz = work[L.INNOV0 + i], work[L.INNOV1 + i], work[L.INNOV2 + i]
     depth = work[L.DEPTH + i]
@@ -115,7 +133,7 @@ def match_terms(
     )  # fmt: skip
     det_pose = d00 * d11 - d01 * d01
     distance = height + (d11 * px * px - 2.0 * d01 * px * py + d00 * py * py) / det_pose
-    return (
+    return Match(
         (a0 * u0 + b0 * w0, a0 * u1 + b0 * w1, a0 * u2 + b0 * w2, a1 * u1 + b1 * w1, a1 * u2 + b1 * w2,
          a2 * u2 + b2 * w2, a0 * sx + b0 * sy, a1 * sx + b1 * sy, a2 * sx + b2 * sy),
         height + px * sx + py * sy, det * s22, det_pose * s22, depth, rx * rx + ry * ry + rz * rz,
@@ -128,16 +146,17 @@ def match_terms(
 def evaluate(work: FloatArray, tile: FloatArray, record: FloatArray, seen: Int32Array, refined: bool) -> None:
     """Write the record of a candidate: the terms of a match, see `match_terms`, and whether the lanes hold it."""
     for i in range(LANES):
-        terms, square, det, det_pose, depth, metres2, distance = match_terms(work, tile, i, refined)
+        match = match_terms(work, tile, i, refined)
+        terms = match.terms
         record[L.Q_INFO00 + i], record[L.Q_INFO01 + i], record[L.Q_INFO02 + i] = terms[0], terms[1], terms[2]
         record[L.Q_INFO11 + i], record[L.Q_INFO12 + i], record[L.Q_INFO22 + i] = terms[3], terms[4], terms[5]
         record[L.Q_GRAD0 + i], record[L.Q_GRAD1 + i], record[L.Q_GRAD2 + i] = terms[6], terms[7], terms[8]
-        record[L.Q_SQUARE + i] = square
-        record[L.Q_DET + i] = det
-        record[L.Q_DET_POSE + i] = det_pose
-        record[L.Q_DEPTH + i] = depth
-        record[L.Q_METRES2 + i] = metres2
-        record[L.Q_D + i] = distance
+        record[L.Q_SQUARE + i] = match.square
+        record[L.Q_DET + i] = match.det
+        record[L.Q_DET_POSE + i] = match.det_pose
+        record[L.Q_DEPTH + i] = match.depth
+        record[L.Q_METRES2 + i] = match.metres2
+        record[L.Q_D + i] = match.distance
     for i in range(LANES):  # by itself: integers among the numbers above cost vectors
         record[L.Q_HELD + i] = 1.0 if seen[i] > 0 else 0.0
 
