@@ -42,6 +42,7 @@ LARGEST = 1e12  # limit of plain numbers [m, rad, 1]; squares and products of a 
 MAX_DISTANCE = 1e7  # limit of poses and landmarks [m, rad]
 MAX_INT = 1 << 62  # limit of counts and steps: sums of two of them fit int64
 MAX_LANDMARKS = 1 << 30  # limit of landmark ids: tables are as long as the largest id
+MAX_DESCRIPTOR = 1e6  # limit of components of descriptors; squared distances do not overflow float32
 
 BOOL, INT8, UINT8 = np.dtype(np.bool_), np.dtype(np.int8), np.dtype(np.uint8)
 INT32, INT64 = np.dtype(np.int32), np.dtype(np.int64)

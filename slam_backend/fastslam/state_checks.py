@@ -9,6 +9,7 @@ import numpy as np
 from slam_backend.core import state_checks as check
 from slam_backend.core.jit import in_place, jit
 from slam_backend.core.read_only import as_read_only
+from slam_backend.core.state import MAX_DESCRIPTOR
 from slam_backend.core.validation import FloatArray, IntArray, argument_error
 from slam_backend.fastslam._kernels import LANES
 from slam_backend.fastslam.consistency import LISTS, RENEWED, SIGN_OF, SIGNS, SUMS, WEIGHTS
@@ -19,7 +20,6 @@ from slam_backend.fastslam.rejuvenation import SCHEDULE
 from slam_backend.fastslam.reports import PoseEstimates
 from slam_backend.fastslam.run_log import ROWS
 from slam_backend.maps.landmark_map import LandmarkMap
-from slam_backend.models.measurements import LARGEST_DESCRIPTOR
 from slam_backend.smoother._kernels import BIAS
 from slam_backend.smoother.graph import NONE, SlamGraph
 from slam_backend.smoother.log_arrays import EXACT, REJECTED, STATIONARY, LogArrays, has_been_checked, note_checked
@@ -190,7 +190,7 @@ def check_landmarks(name: str, landmarks: Any) -> None:
 
 def check_descriptors(name: str, value: Any, n: int, size: int | None = None) -> int:
     """Return the length d of n descriptors, or refuse a wrong array or length."""
-    largest = float(LARGEST_DESCRIPTOR)
+    largest = float(MAX_DESCRIPTOR)
     check.floats(name, value, (n, size), -largest, largest, dtype=check.FLOAT32)
     if value.shape[1] > LONGEST_DESCRIPTOR:
         check.refuse(name, f"at most {LONGEST_DESCRIPTOR} columns", value.shape[1])

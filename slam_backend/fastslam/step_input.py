@@ -12,11 +12,12 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from slam_backend.core.read_only import Act, as_read_only, map_arrays, with_constants, with_read_only
+from slam_backend.core.state import MAX_DESCRIPTOR
 from slam_backend.core.validation import BoolArray, Float32Array, FloatArray, IntArray, argument_error, check_array
 from slam_backend.fastslam import _kernels
 from slam_backend.fastslam._kernels import NO_READING
 from slam_backend.models.camera import MAX_POINT_DISTANCE, StereoCamera
-from slam_backend.models.measurements import LARGEST_DESCRIPTOR, Measurements, TeamMeasurements
+from slam_backend.models.measurements import Measurements, TeamMeasurements
 
 # Input of one robot: kind of motion, first and last row of its used measurements among all n, whether these have
 # covariances, whether they have names, and the number of measurements given, used or not, -1 without a frame.
@@ -163,7 +164,7 @@ def pack_team_input(
         return None
     moves, copied = odometry.copy(), descriptors.copy()
     table, sightings = np.empty((k, 6), np.int64), np.empty((count, 9))
-    limits = farthest_move, farthest_point, LARGEST_DESCRIPTOR
+    limits = farthest_move, farthest_point, MAX_DESCRIPTOR
     if not _kernels.read_team(moves, points, copied, offsets, *limits, table, sightings):
         return None
     return StepInput(table.tolist(), table, moves, {}, sightings, copied, NO_NAMES, frozenset())
@@ -304,8 +305,8 @@ def _split_by_robot(frames: TeamMeasurements) -> list[Measurements]:
         expected = "a descriptor per point, and ascending offsets up to the number of points"
         raise argument_error("measurements", expected, got, "Give the end of each robot's points.")
     largest = float(np.abs(frames.descriptors).max(initial=0.0))
-    if not largest <= LARGEST_DESCRIPTOR:
-        expected = f"numbers within +-{LARGEST_DESCRIPTOR:g}"
+    if not largest <= MAX_DESCRIPTOR:
+        expected = f"numbers within +-{MAX_DESCRIPTOR:g}"
         raise argument_error("measurements.descriptors", expected, largest, "Scale them, preferably to unit length.")
     return frames.per_robot()
 
