@@ -13,9 +13,10 @@ A class lists the parts of its state, from which `take` makes a snapshot and `re
 >>> counter._sums.tolist()
 [0, 0, 0]
 
-Names of parts are names of attributes or properties, with or without a leading underscore. A class may have two hooks:
-`rebuild()` computes what follows from the state, after its parts are set. `check_state(parts, sizes)` raises if kernels
-would go wrong with parts that are within their bounds one by one.
+Names of parts are names of attributes or properties, with or without a leading underscore. A class may have hooks:
+`make_room(snapshot)` provides arrays of the right sizes, before parts are set. `rebuild()` computes what follows from
+the state, after that. `check_state(parts, sizes)` raises if kernels would go wrong with parts that are within their
+bounds one by one.
 
 A snapshot cannot be changed, nor can its arrays: `restore` takes it without checks. Copies, pickles and files of a
 snapshot are plain dicts, which `accepted` turns into a snapshot again. It checks types, shapes and bounds, because
@@ -164,10 +165,12 @@ def restore(owner: Any, snapshot: Snapshot) -> None:
     """Return an object to a snapshot; arrays of the same shape are overwritten in place."""
     assert snapshot.of is type(owner)
     kind: Any = type(owner)
+    if hasattr(owner, "make_room"):
+        owner.make_room(snapshot)
     for name, at, part in kind.STATE.attributes(owner):
-        value = getattr(owner, at, None)
+        value = None if part.is_constant else getattr(owner, at, None)
         new = part._put(value, snapshot[name])
-        if new is not value:
+        if part.is_constant or new is not value:
             setattr(owner, at, new)
     if hasattr(owner, "rebuild"):
         owner.rebuild()
@@ -200,7 +203,7 @@ def accepted(kind: type, name: str, state: Any, sizes: Sizes | None = None) -> S
 def _limit(bound: Bound, sizes: Sizes, default: float) -> Any:
     """Return a bound as a number."""
     if isinstance(bound, str):
-        return sizes[bound] - 1
+        return sizes[bound.removesuffix("+1")] - 1 + bound.endswith("+1")
     return default if bound is None else bound
 
 
@@ -287,9 +290,10 @@ class Array(Part):
 
     Attributes:
         dtype: Type of the numbers.
-        shape: Sizes of the axes: numbers, names, or names with "+1", separated by spaces.
+        shape: Sizes of the axes: numbers, names, names with "+1", or "*" for any size, separated by spaces.
         low, high: The bounds. None: plain limits; integers then are at least 0.
         nan: Whether floats may be NaN.
+        ascending: Whether the numbers ascend, none twice.
         used: Name of the size of the used part of the last axis; None: all of it.
         renewed: Whether the owner replaces the array and never writes to it. Snapshots then share it.
         constant: Whether it is read-only; it is then shared by objects as well.
@@ -300,6 +304,7 @@ class Array(Part):
     low: float | None = None
     high: Bound = None
     nan: bool = False
+    ascending: bool = False
     used: str | None = None
     renewed: bool = False
     constant: bool = False
@@ -337,6 +342,8 @@ class Array(Part):
             if numbers.size and not (low <= numbers.min() and numbers.max() <= high):  # NaN: not
                 kind = f"numbers from {low:g} to {high:g}" if is_float else f"integers from {low} to {high}"
                 refuse(name, kind, "a value out of range" + " or NaN" * is_float)
+        if self.ascending and (value[1:] <= value[:-1]).any():
+            refuse(name, "distinct numbers in ascending order", "a number that is out of order or repeated")
         return as_constant(value)
 
 
@@ -348,7 +355,7 @@ def check_shape(name: str, value: NDArray[Any], shape: str, sizes: Sizes) -> Non
         for axis, size in zip(axes, found, strict=True):
             word, more = axis.removesuffix("+1"), axis.endswith("+1")
             sizes.setdefault(word, int(word) if word.isdigit() else size - more)
-            if sizes[word] + more != size:
+            if axis != "*" and sizes[word] + more != size:
                 break
         else:
             return
@@ -365,12 +372,12 @@ class Each(Part):
 
     Attributes:
         part: Type of the values.
-        size: Name of their number; None: any.
+        size: Their number, or its name; None: any.
         kind: Class of the sequence in the object.
     """
 
     part: Part
-    size: str | None = None
+    size: int | str | None = None
     kind: Callable[[Iterable[Any]], Any] = tuple
 
     @property
@@ -393,8 +400,9 @@ class Each(Part):
         made = frozenset if self.kind in (set, frozenset) else tuple
         if type(value) not in ((set, frozenset) if made is frozenset else (tuple, list)):
             refuse(name, f"a {made.__name__}", f"a {type(value).__name__}")
-        if self.size is not None and len(value) != sizes.setdefault(self.size, len(value)):
-            refuse(name, f"{sizes[self.size]} of them", len(value))
+        size = sizes.setdefault(self.size, len(value)) if isinstance(self.size, str) else self.size
+        if size is not None and len(value) != size:
+            refuse(name, f"{size} of them", len(value))
         return made(self.part._check(f"{name}[{i}]", each, sizes) for i, each in enumerate(value))
 
     def _inner(self) -> Iterable[Part | type]:
