@@ -30,7 +30,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
 from types import FunctionType
-from typing import Any, ClassVar, NoReturn, get_args, get_type_hints
+from typing import Any, ClassVar, NoReturn, TypeVar, get_args, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,6 +50,7 @@ INT32, INT64 = np.dtype(np.int32), np.dtype(np.int64)
 FLOAT32, FLOAT64 = np.dtype(np.float32), np.dtype(np.float64)
 
 CLASS = "class"  # key of the name of a record's class in files
+T = TypeVar("T")
 Sizes = dict[str, Any]  # sizes by name, and whatever else an owner passes down to the checks
 Bound = int | float | str | None  # a number, or the name of a size: less than it
 Kind = type | Callable[[], type]  # a class, or a function that returns one that is not defined yet
@@ -121,6 +122,16 @@ class State:
             names = {name: f"_{name}" if hasattr(owner, f"_{name}") else name for name in self.parts}
             self._attributes = [(name, names[name], part) for name, part in self.parts.items()]
         return self._attributes
+
+
+def with_state(**parts: "Part") -> Callable[[type[T]], type[T]]:
+    """Declare the `STATE` of a named tuple, in whose body type checkers take every name for a field; a decorator."""
+
+    def declare(kind: type[T]) -> type[T]:
+        kind.STATE = State(**parts)  # type: ignore[attr-defined]
+        return kind
+
+    return declare
 
 
 def is_stateful(kind: type) -> bool:
@@ -353,9 +364,11 @@ def check_shape(name: str, value: NDArray[Any], shape: str, sizes: Sizes) -> Non
     found = value.shape
     if len(found) == len(axes):
         for axis, size in zip(axes, found, strict=True):
+            if axis == "*":
+                continue
             word, more = axis.removesuffix("+1"), axis.endswith("+1")
             sizes.setdefault(word, int(word) if word.isdigit() else size - more)
-            if axis != "*" and sizes[word] + more != size:
+            if sizes[word] + more != size:
                 break
         else:
             return
@@ -372,12 +385,12 @@ class Each(Part):
 
     Attributes:
         part: Type of the values.
-        size: Their number, or its name; None: any.
+        size: Name of their number, or the number in digits; None: any.
         kind: Class of the sequence in the object.
     """
 
     part: Part
-    size: int | str | None = None
+    size: str | None = None
     kind: Callable[[Iterable[Any]], Any] = tuple
 
     @property
@@ -400,9 +413,10 @@ class Each(Part):
         made = frozenset if self.kind in (set, frozenset) else tuple
         if type(value) not in ((set, frozenset) if made is frozenset else (tuple, list)):
             refuse(name, f"a {made.__name__}", f"a {type(value).__name__}")
-        size = sizes.setdefault(self.size, len(value)) if isinstance(self.size, str) else self.size
-        if size is not None and len(value) != size:
-            refuse(name, f"{size} of them", len(value))
+        if self.size is not None:
+            wanted = int(self.size) if self.size.isdigit() else sizes.setdefault(self.size, len(value))
+            if len(value) != wanted:
+                refuse(name, f"{wanted} of them", len(value))
         return made(self.part._check(f"{name}[{i}]", each, sizes) for i, each in enumerate(value))
 
     def _inner(self) -> Iterable[Part | type]:

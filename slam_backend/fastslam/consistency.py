@@ -149,9 +149,9 @@ class ConsistencyTest:
         quiet=Int(0, RENEWED),
         nis=Float(0.0),
         matched=Int(),
-        counts=Each(Int(), len(SIGN_OF), list),
-        evidence=Each(Float(0.0), len(WEIGHTS), list),
-        since=Each(Int(-1), len(SIGNS), list),
+        counts=Each(Int(), f"{len(SIGN_OF)}", list),
+        evidence=Each(Float(0.0), f"{len(WEIGHTS)}", list),
+        since=Each(Int(-1), f"{len(SIGNS)}", list),
     )
     __slots__ = ("_begun", "_counts", "_evidence", "_frames", "_matched", "_nis", "_quiet", "_since")
 

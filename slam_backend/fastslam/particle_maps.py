@@ -20,7 +20,18 @@ from slam_backend.core.jit import LINE
 from slam_backend.core.packed_symmetric import UNPACK_INDEX
 from slam_backend.core.read_only import as_read_only
 from slam_backend.core.state import (
-    FLOAT32, FLOAT64, INT32, INT64, LARGEST, MAX_DESCRIPTOR, MAX_DISTANCE, MAX_LANDMARKS, Array, Int, Maybe, Sizes,
+    FLOAT32,
+    FLOAT64,
+    INT32,
+    INT64,
+    LARGEST,
+    MAX_DESCRIPTOR,
+    MAX_DISTANCE,
+    MAX_LANDMARKS,
+    Array,
+    Int,
+    Maybe,
+    Sizes,
     State,
 )
 from slam_backend.core.validation import FloatArray, IntArray
@@ -55,6 +66,11 @@ def _num_heads(descriptor_size: int) -> int:
     return descriptor_size // 2 if descriptor_size >= 32 and descriptor_size % 2 == 0 else descriptor_size
 
 
+def padded_lanes(num_particles: int) -> int:
+    """Return P, M rounded up to whole blocks of lanes."""
+    return -(-num_particles // LANES) * LANES
+
+
 class MapStore:
     """Storage of the landmark Gaussians, counts, descriptors and names of all particles; see the module.
 
@@ -81,7 +97,7 @@ class MapStore:
     def _clear(self, num_particles: int) -> None:
         """Allocate empty arrays for M particles."""
         self.num_particles = num_particles
-        self.padded = -(-num_particles // LANES) * LANES
+        self.padded = padded_lanes(num_particles)
         self.values: FloatArray = empty_aligned((0,), np.float64)
         self.counts: NDArray[np.int32] = empty_aligned((0, self.padded), np.int32)
         self.odds: FloatArray = empty_aligned((0, self.padded), np.float64)

@@ -1,7 +1,7 @@
 """Compact log of one robot's odometry and measurements, the input of the smoother."""
 
 from bisect import bisect_left
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from itertools import pairwise
 from typing import Any, Literal
 
@@ -306,8 +306,9 @@ class RobotLog:
             self._reserve_covariances()[:n] = last.covariances
 
     def rebuild(self) -> None:
-        """Set the last step."""
-        self._last = last_step(self._chunks, self.unfinished)
+        """Find the last step."""
+        t = self._num_rows
+        self._last = int(self._steps[t - 1] if t else self._chunks[-1].steps[-1] if self._chunks else -1)
 
     @staticmethod
     def check_state(parts: Mapping[str, Any], sizes: Sizes) -> None:
@@ -320,9 +321,9 @@ class RobotLog:
             raise ValueError("a step out of order")
 
 
-def last_step(chunks: Sequence[LogArrays], unfinished: LogArrays) -> int:
-    """Return the last step of a log, -1 if there is none."""
-    newest = unfinished if len(unfinished) else chunks[-1] if chunks else None
+def last_step(log: Mapping[str, Any]) -> int:
+    """Return the last step of the state of a log, -1 if there is none."""
+    newest = next((part for part in (log["unfinished"], *reversed(log["chunks"])) if len(part)), None)
     return -1 if newest is None else int(newest.steps[-1])
 
 

@@ -9,7 +9,16 @@ from numpy.typing import NDArray
 
 from slam_backend.core.read_only import as_read_only
 from slam_backend.core.state import (
-    BOOL, FLOAT64, INT8, INT64, MAX_DISTANCE, MAX_LANDMARKS, Array, Maybe, Sizes, State,
+    BOOL,
+    FLOAT64,
+    INT8,
+    INT64,
+    MAX_DISTANCE,
+    MAX_LANDMARKS,
+    Array,
+    Maybe,
+    Sizes,
+    State,
 )
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 
