@@ -287,7 +287,7 @@ class TeamCheck:
         self._next_number = records["next_number"]
         check.keys(f"{name}['log']", records["log"], ("steps",))
         steps = records["log"]["steps"]
-        check.instance(f"{name}['log']['steps']", steps, dict)
+        check.keys(f"{name}['log']['steps']", steps, ())
         check.integers(f"{name}['log']['steps']", tuple(steps), 0, self._step - 1)
         if list(steps) != list(range(self._step - len(steps), self._step)):
             check.refuse(f"{name}['log']['steps']", "the last steps, in order", "a step missing or out of order")
