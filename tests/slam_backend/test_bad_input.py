@@ -19,6 +19,7 @@ from builders.teams import SimulatedTeam, hand_made, standing_team
 
 import slam_backend
 from slam_backend import metrics
+from slam_backend.core.state import take
 from slam_backend.core.validation import (
     argument_error,
     check_array,

@@ -281,10 +281,11 @@ def test_joint_filters_of_longer_runs_keep_more_keyframes(incremental):
         simulation = SimulatedTeam(num_robots=2, seed=101)
         team = simulation.build(attempts=NEVER, rejuvenate_every=20, smoothing=smoothing)
         simulation.run(team, 80)
-        alone = [smoother_of(group) for group in team._groups]
+        alone = [group.trunk.filter.rejuvenation.graph for group in team._groups]
         team.merge(0, 1, false_alignment(simulation, team, np.zeros(3)))
-        latest = np.concatenate([graph["latest"] for graph in alone])
-        return sum(len(graph["poses"]) for graph in alone), len(smoother_of(team._groups[0])["poses"]), latest.sum()
+        latest = np.concatenate([graph.latest for graph in alone])
+        joint = team._groups[0].trunk.filter.rejuvenation.graph
+        return sum(graph.num_keys for graph in alone), joint.num_keys, latest.sum()
 
     alone, joint, _ = joint_keys(10**6)
     assert joint <= 20 + 1 < alone  # each share of the limit may be exceeded by the newest keyframes
