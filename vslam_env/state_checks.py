@@ -251,7 +251,7 @@ class EpisodeCheck:
             if branch["split_from"] in team["numbers"]:
                 numbers.add(branch["split_from"])
             maps = branch["filter"]["maps"]
-            needed = max(1 + maps["ids"].max(initial=-1), maps["next_id"] - MOST_MEASURED * self._tick)
+            needed = max(1 + maps.ids.max(initial=-1), maps.next_id - MOST_MEASURED * self._tick)
             if needed > claims.shape[1]:
                 check.refuse(f"{name}['claims']", f"entries for {needed} landmarks", f"shape {claims.shape}")
         if lacking := numbers.union(state["map_of"]) - set(row_of):
