@@ -7,11 +7,10 @@ import numpy as np
 
 from slam_backend.core import state_checks as check
 from slam_backend.core.state import accepted
-from slam_backend.fastslam.state_checks import check_descriptors
 from slam_backend.frontend import StereoFrame
 from slam_backend.models.measurements import Measurements, TeamMeasurements
 from slam_backend.team.reports import LandmarkIdMap, LandmarksCreated
-from slam_backend.team.state_checks import TeamCheck
+from slam_backend.team.state_checks import TeamCheck, check_descriptors
 from vslam_env.belief.readings import TeamReadings
 from vslam_env.belief.rendezvous import Rendezvous
 from vslam_env.belief.shared_grids import NEVER_MET, GridSnapshot, GridUpdate
@@ -252,7 +251,7 @@ class EpisodeCheck:
             if branch["split_from"] in team["numbers"]:
                 numbers.add(branch["split_from"])
             maps = branch["filter"]["maps"]
-            needed = max(1 + maps["ids"].max(initial=-1), maps["next_id"] - MOST_MEASURED * self._tick)
+            needed = max(1 + maps.ids.max(initial=-1), maps.next_id - MOST_MEASURED * self._tick)
             if needed > claims.shape[1]:
                 check.refuse(f"{name}['claims']", f"entries for {needed} landmarks", f"shape {claims.shape}")
         if lacking := numbers.union(state["map_of"]) - set(row_of):

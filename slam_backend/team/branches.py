@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from slam_backend.core.read_only import with_constants
+from slam_backend.core.state import accepted, restore
 from slam_backend.core.validation import IntArray
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.reports import Associations, StepReport
@@ -120,10 +121,12 @@ class ReplayedStep(NamedTuple):
 
 def restored_filter(state: Mapping[str, Any], at_hand: FastSlam | None = None) -> FastSlam:
     """Return a filter with a state from `FastSlam.get_state`; reuse of a given one is faster than construction."""
-    slam = at_hand if at_hand is not None else FastSlam.from_options(len(state["poses"]), state["options"])
-    slam.restore_checked(state)
-    slam.may_smooth = True  # as in a new one
-    return slam
+    snapshot = accepted(FastSlam, "state['filter']", state)
+    if at_hand is None:
+        return FastSlam.from_state(snapshot)
+    restore(at_hand, snapshot)
+    at_hand.may_smooth = True  # as in a new one
+    return at_hand
 
 
 def landmark_counts(slam: FastSlam) -> dict[int, int]:
@@ -204,8 +207,8 @@ def fork(
         rng: Generator that seeds its random stream.
         at_hand: Filter that is no longer needed, whose memory the copy takes; or None.
     """
-    stream = np.random.default_rng(rng.integers(2**63, size=4)).bit_generator.state
-    slam = restored_filter(branch.filter.get_state() | {"rng": stream}, at_hand)
+    slam = restored_filter(branch.filter.get_state(), at_hand)
+    slam.rng = np.random.default_rng(rng.integers(2**63, size=4))
     return Branch(
         robots=branch.robots,
         active_robots=active_robots,

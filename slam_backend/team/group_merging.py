@@ -8,6 +8,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from slam_backend.core.read_only import with_constants, with_read_only
+from slam_backend.core.state import accepted
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.fastslam import _kernels
 from slam_backend.fastslam.filter import FastSlam
@@ -145,7 +146,8 @@ class JoinedGroups:
     @classmethod
     def from_state(cls, state: Mapping[str, Any]) -> Self:
         """Build it from `get_state`, with arrays that cannot change."""
-        return cls(state["number"], state["alignment"], with_constants(state["sides"]))
+        a, b = (side | {"filter": accepted(FastSlam, "state['filter']", side["filter"])} for side in state["sides"])
+        return cls(state["number"], state["alignment"], with_constants((a, b)))  # bridge
 
     @property
     def oldest_step(self) -> int:

@@ -8,9 +8,9 @@ from typing import Any, ClassVar
 import numpy as np
 
 from slam_backend.core.read_only import with_constants
-from slam_backend.core.state_checks import refuse_malformed
+from slam_backend.core.state import accepted
 from slam_backend.core.validation import IntArray
-from slam_backend.fastslam.state_checks import check_filter
+from slam_backend.fastslam.filter import FastSlam
 from slam_backend.maps.alignment import Alignment
 from slam_backend.team.branches import MAX_REPLAYED, Branch, ReplayedStep, replay
 from slam_backend.team.filter_merging.pairing import Pairing
@@ -451,8 +451,7 @@ class TeamMerges:
         """
         sides = list(self._sides_down_to(joined.number, group.trunk.monitors))
         for side in sides:
-            with refuse_malformed("state"):
-                check_filter("state['filter']", side["filter"], (group.trunk.filter.options,))
+            accepted(FastSlam, "state['filter']", side["filter"])
         return Undoing(joined, group.robots, [Branch.from_state(side) for side in sides], [[] for _ in sides])
 
     def merges_down_to(self, number: int, monitors: Sequence[MergeMonitor]) -> Iterator[JoinedGroups]:

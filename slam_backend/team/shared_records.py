@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from slam_backend.core.read_only import as_read_only, with_constants
+from slam_backend.core.state import accepted, restore, take
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.reports import StepReport
 from slam_backend.fastslam.step_input import InputBuffer
@@ -72,7 +73,7 @@ class SharedRecords:
     def get_state(self) -> dict[str, Any]:
         """Return the complete state of the records."""
         return {
-            "log": self.log.get_state(),
+            "log": take(self.log),
             "exchange": self.exchange.get_state(),
             "rng": copy.deepcopy(self.rng.bit_generator.state),
             "entries": tuple(self.entries),
@@ -81,7 +82,7 @@ class SharedRecords:
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Restore the records from `get_state`."""
-        self.log.set_state(state["log"])
+        restore(self.log, accepted(InputBuffer, "state['log']", state["log"]))
         self.exchange.set_state(state["exchange"])
         self.rng.bit_generator.state = copy.deepcopy(state["rng"])
         self.entries = list(with_constants(state["entries"]))

@@ -6,13 +6,16 @@ from typing import Any
 import numpy as np
 
 from slam_backend.core import state_checks as check
+from slam_backend.core.state import MAX_DESCRIPTOR, Record, accepted
 from slam_backend.core.validation import argument_error
 from slam_backend.fastslam import reports
 from slam_backend.fastslam._kernels import EXACT_POSE
+from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.options import FilterOptions
-from slam_backend.fastslam.state_checks import check_descriptors, check_filter, check_landmarks, last_step
+from slam_backend.fastslam.run_log import last_step
 from slam_backend.fastslam.step_input import StepInput
 from slam_backend.maps.alignment_types import Alignment, AlignmentOptions
+from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.smoother.log_arrays import REJECTED
 from slam_backend.team import reports as team_reports
 from slam_backend.team.branches import ReplayedStep
@@ -178,14 +181,14 @@ class TeamCheck:
             check.refuse(f"{name}['last_steps']", f"the last step of each of {robots}", known)
         check.integer(f"{name}['number']", branch["number"], 0, self._next_number - 1)
         check.integer(f"{name}['epoch']", branch["epoch"])
-        check_filter(f"{name}['filter']", branch["filter"], self._known)
-        if len(branch["filter"]["poses"]) != len(robots):
-            check.refuse(f"{name}['filter']", f"one of {len(robots)} robots", len(branch["filter"]["poses"]))
-        for robot, log in zip(robots, branch["filter"]["logs"], strict=True):
+        state = accepted(FastSlam, f"{name}['filter']", branch["filter"])
+        if len(state["poses"]) != len(robots):
+            check.refuse(f"{name}['filter']", f"one of {len(robots)} robots", len(state["poses"]))
+        for robot, log in zip(robots, state["logs"], strict=True):
             if last_step(log) > known[robot]:
                 check.refuse(f"{name}['last_steps']", f"at least {last_step(log)}, the last step logged", known[robot])
-        self.options.append(branch["filter"]["options"])
-        descriptors = branch["filter"]["maps"]["descriptors"]
+        self.options.append(state["options"])
+        descriptors = state["maps"].descriptors
         if len(descriptors):
             self.descriptor_sizes.add(descriptors.shape[1])
         if branch["report"] is not None:
@@ -284,7 +287,7 @@ class TeamCheck:
         self._next_number = records["next_number"]
         check.keys(f"{name}['log']", records["log"], ("steps",))
         steps = records["log"]["steps"]
-        check.instance(f"{name}['log']['steps']", steps, dict)
+        check.keys(f"{name}['log']['steps']", steps, ())
         check.integers(f"{name}['log']['steps']", tuple(steps), 0, self._step - 1)
         if list(steps) != list(range(self._step - len(steps), self._step)):
             check.refuse(f"{name}['log']['steps']", "the last steps, in order", "a step missing or out of order")
@@ -374,6 +377,18 @@ class TeamCheck:
         check.sequence(name, pair, 2)
         for robots in pair:
             check.robots(name, robots, self._count)
+
+
+def check_descriptors(name: str, value: Any, n: int) -> int:
+    """Return the length d of n descriptors, or refuse a wrong array or length."""
+    check.floats(name, value, (n, None), -MAX_DESCRIPTOR, MAX_DESCRIPTOR, dtype=check.FLOAT32)
+    return int(value.shape[1])
+
+
+def check_landmarks(name: str, landmarks: Any) -> None:
+    """Refuse a value that is not a landmark map."""
+    check.instance(name, landmarks, LandmarkMap)
+    Record(LandmarkMap)._check(name, landmarks, {})
 
 
 def check_turns(name: str, turns: Any, n: int, robots: int | None) -> None:
