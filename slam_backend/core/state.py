@@ -286,7 +286,7 @@ class Array(Part):
 
     Attributes:
         dtype: Type of the numbers.
-        shape: Sizes of the axes: numbers, names, or names with "+1", separated by spaces.
+        shape: Sizes of the axes: numbers, names, names with "+1", or "*" for any, separated by spaces.
         low, high: The bounds. None: plain limits; integers then are at least 0.
         nan: Whether floats may be NaN.
         used: Name of the size of the used part of the last axis; None: all of it.
@@ -346,6 +346,8 @@ def check_shape(name: str, value: NDArray[Any], shape: str, sizes: Sizes) -> Non
     if len(found) == len(axes):
         for axis, size in zip(axes, found, strict=True):
             word, more = axis.removesuffix("+1"), axis.endswith("+1")
+            if word == "*":
+                continue
             sizes.setdefault(word, int(word) if word.isdigit() else size - more)
             if sizes[word] + more != size:
                 break
