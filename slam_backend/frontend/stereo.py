@@ -115,7 +115,7 @@ class StereoMatches(NamedTuple):
         corners=Array(FLOAT64, "n 2", constant=True),
         responses=Array(FLOAT64, "n", constant=True),
         corner_disparity=Array(FLOAT64, "n", constant=True),
-        disparity=Array(FLOAT64, "n", -math.inf, math.inf, nan=True, constant=True),
+        disparity=Array(FLOAT64, "n", -np.inf, np.inf, nan=True, constant=True),
         descriptors=Array(FLOAT32, "n d", constant=True),
         passed=Array(BOOL, "* n", constant=True),
     )

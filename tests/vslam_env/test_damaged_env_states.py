@@ -14,8 +14,7 @@ from builders.environments import MEETING, small_env, wander
 from builders.random_environments import Case, check, drawn
 
 from vslam_env import ExplorationEnv, load_state, save_state
-from vslam_env.snapshots import state_version
-from vslam_env.state_kinds import ENV_KINDS
+from vslam_env.snapshots import ENV_KINDS, state_version
 
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")  # overflows of what is out of place do no harm
 

@@ -8,7 +8,20 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from slam_backend.core.read_only import as_constant, as_read_only
-from slam_backend.core.state import BOOL, FLOAT64, INT64, MAX_DISTANCE, Array, Child, Each, Int, Record, Row, Sizes, State
+from slam_backend.core.state import (
+    BOOL,
+    FLOAT64,
+    INT64,
+    MAX_DISTANCE,
+    Array,
+    Child,
+    Each,
+    Int,
+    Record,
+    Row,
+    Sizes,
+    State,
+)
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.fastslam.relative_poses import TeamPoses
 from slam_backend.geometry import compose, inverse
@@ -200,7 +213,9 @@ class SharedGrids:
         reach = min(float(body.scan_range), camera.max_range)
         self.looks = TeamLooks(num_robots, body.ray_angles, camera.half_fov, reach)
         self._hardware = ray_directions(body.ray_angles), float(body.scan_range), float(body.radius)
-        self._separated_since = np.full((num_robots, num_robots), NEVER_MET)  # tick since which two robots share no scans
+        self._separated_since = np.full(
+            (num_robots, num_robots), NEVER_MET
+        )  # tick since which two robots share no scans
         self._settle(0, [(robot,) for robot in range(num_robots)])
         self._snapshots: list[GridSnapshot] = []
         self._updates: deque[GridUpdate] = deque()
@@ -367,5 +382,7 @@ class SharedGrids:
     def check_state(parts: Mapping[str, Any], sizes: Sizes) -> None:
         """Raise unless robots that share a filter are the same for all of them."""
         groups = parts["same_filter"]
-        if any(robot not in group or any(groups[mate] != group for mate in group) for robot, group in enumerate(groups)):
+        if any(
+            robot not in group or any(groups[mate] != group for mate in group) for robot, group in enumerate(groups)
+        ):
             raise ValueError(f"robots that do not share filters with each other: {groups}")

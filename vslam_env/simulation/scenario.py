@@ -8,7 +8,16 @@ import numpy as np
 from slam_backend.core.read_only import as_constant, as_read_only
 from slam_backend.core.short_repr import short_repr
 from slam_backend.core.state import (
-    BOOL, FLOAT64, INT64, Array, Maybe, Record, Seed, Sizes, State, parts_of,
+    BOOL,
+    FLOAT64,
+    INT64,
+    Array,
+    Maybe,
+    Record,
+    Seed,
+    Sizes,
+    State,
+    parts_of,
 )  # fmt: skip
 from slam_backend.core.validation import FloatArray, IntArray, argument_error
 from vslam_env.config import EnvConfig
@@ -138,15 +147,15 @@ def sample_scenario(
 ) -> tuple[Scenario, dict[str, np.random.Generator]]:
     """Draw the scenario of an episode, with an independent random stream for each concern.
 
-    Returns:
-        The scenario, and the random streams of the episode by name, see `STREAMS`.
-
     Args:
         config: Configuration of the environment.
         source: Source of the world.
         seed: Seed of all streams.
         world_seed: Seed of layout and textures; None: derived from `seed` or drawn from the world split.
         start_poses: (K, 3) [m, m, rad], world frame; None: start poses of the world, or drawn ones.
+
+    Returns:
+        The scenario, and the random streams of the episode by name, see `STREAMS`.
 
     Raises:
         ValueError: If the world does not exist, robots cannot start there, no landmark is observable, or the landmarks
