@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from slam_backend.core.read_only import as_read_only
 from slam_backend.core.short_repr import short_repr
-from slam_backend.core.state import FLOAT32, FLOAT64, INT64, Array, Maybe, Sizes, State
+from slam_backend.core.state import FLOAT32, FLOAT64, INT64, Array, Maybe, Sizes, State, with_state
 from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_array
 from slam_backend.fastslam import _kernels
 
@@ -79,6 +79,11 @@ class Measurements:
 
 
 @short_repr
+@with_state(
+    points=Array(FLOAT64, "n 3", constant=True),
+    descriptors=Array(FLOAT32, "n d", -LARGEST_DESCRIPTOR, LARGEST_DESCRIPTOR, constant=True),
+    offsets=Array(INT64, "K", constant=True),
+)
 class TeamMeasurements(NamedTuple):
     """Concatenated frames of several robots, without covariances.
 
@@ -89,12 +94,6 @@ class TeamMeasurements(NamedTuple):
         descriptors: (n, d) float32. Descriptors of the points.
         offsets: (K,) int64. End of each robot's points, the start of the next robot's.
     """
-
-    STATE = State(
-        points=Array(FLOAT64, "n 3", constant=True),
-        descriptors=Array(FLOAT32, "n d", -LARGEST_DESCRIPTOR, LARGEST_DESCRIPTOR, constant=True),
-        offsets=Array(INT64, "K", constant=True),
-    )
 
     points: FloatArray
     descriptors: NDArray[np.float32]

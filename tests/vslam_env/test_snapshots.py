@@ -270,7 +270,7 @@ def _from_other(**kwargs: Any) -> Callable[[], Any]:
     ("act", "says"),
     [
         (lambda: small_env().set_state(3), "state: expected what get_state returned, got a int. Pass it unchanged"),
-        (_without("drivers"), "state: expected what get_state returned, got a mapping without 'drivers'"),
+        (_without("executor"), "state: expected what get_state returned, got a mapping without 'executor'"),
         (_edited(version="0/0.0.1"), rf"state: expected a state of version '{state_version()}', got '0/0.0.1'"),
         (lambda: small_env().set_state({"version": "0/0.0.1"}), "state: expected a state of version .*, got '0/0.0.1'"),
         (_edited(config={}), "state: expected what get_state returned, got a mapping whose config is a dict"),
@@ -288,8 +288,10 @@ def test_bad_states_are_refused(act: Callable[[], Any], says: str) -> None:
         act()
 
 
-PARTS = ["episode", "drivers", "root", "agents", "team_metrics", "cycle", "objects"]
-PARTS += [f"episode.{part}" for part in ("tick", "streams", "simulator", "belief", "ground_truth", "coverage", "paths")]
+PARTS = ["episode", "executor", "root", "agents", "cycle", "objects"]
+PARTS += [
+    f"episode.{part}" for part in ("tick", "streams", "simulator", "belief", "ground_truth", "coverage", "true_path")
+]
 
 
 def test_a_state_of_which_a_part_is_damaged_is_refused() -> None:

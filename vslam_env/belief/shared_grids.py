@@ -21,6 +21,7 @@ from slam_backend.core.state import (
     Row,
     Sizes,
     State,
+    with_state,
 )
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.fastslam.relative_poses import TeamPoses
@@ -32,6 +33,13 @@ from vslam_env.navigation import OccupancyGrid, TeamGrids, TeamLooks, ray_direct
 from vslam_env.navigation.grid_storage import GridPart, LooksPart
 
 
+@with_state(
+    tick=Int(),
+    shared=Array(INT64, "K K", 0, 1, constant=True),
+    poses=Array(FLOAT64, "K K 3", -MAX_DISTANCE, MAX_DISTANCE, nan=True, constant=True),
+    scans=Array(FLOAT64, "K RAYS", 0.0, constant=True),
+    bumps=Array(BOOL, "K", constant=True),
+)
 class GridUpdate(NamedTuple):
     """Arguments of `TeamGrids.update` for one tick, with read-only arrays.
 
@@ -42,14 +50,6 @@ class GridUpdate(NamedTuple):
         scans: (K, R) [m]. Scans of the robots.
         bumps: (K,) bool. True for robots that bumped into an obstacle.
     """
-
-    STATE = State(
-        tick=Int(),
-        shared=Array(INT64, "K K", 0, 1, constant=True),
-        poses=Array(FLOAT64, "K K 3", -MAX_DISTANCE, MAX_DISTANCE, nan=True, constant=True),
-        scans=Array(FLOAT64, "K RAYS", 0.0, constant=True),
-        bumps=Array(BOOL, "K", constant=True),
-    )
 
     tick: int
     shared: IntArray
@@ -140,6 +140,14 @@ CONNECTED, NEVER_MET = -1, -2  # stand for the tick at which two robots lost con
 MAX_ABSENCE = 1000  # [ticks] after a longer absence whole grids are merged: replaying takes 10 us a tick
 
 
+@with_state(
+    tick=Int(),
+    sides=Row(Each(Int(high="K")), Each(Int(high="K"))),
+    maps=Row(Int(), Int(), Int()),
+    grids=Each(Record(GridPart)),
+    looks=Each(Record(LooksPart)),
+    updates=Each(Record(GridUpdate)),
+)
 class GridSnapshot(NamedTuple):
     """Grids just before a merge.
 
@@ -151,15 +159,6 @@ class GridSnapshot(NamedTuple):
         looks: Looks of these robots.
         updates: Buffered updates at that time.
     """
-
-    STATE = State(
-        tick=Int(),
-        sides=Row(Each(Int(high="K")), Each(Int(high="K"))),
-        maps=Row(Int(), Int(), Int()),
-        grids=Each(Record(GridPart)),
-        looks=Each(Record(LooksPart)),
-        updates=Each(Record(GridUpdate)),
-    )
 
     tick: int
     sides: tuple[tuple[int, ...], tuple[int, ...]]

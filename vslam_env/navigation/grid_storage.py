@@ -1,13 +1,13 @@
 """Memory of occupancy grids that grow with what was seen."""
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.core.read_only import as_constant, as_read_only
-from slam_backend.core.state import INT8, UINT8, Array, Int, Row, Sizes, State
+from slam_backend.core.state import INT8, UINT8, Array, Int, Row, Sizes, with_state
 from vslam_env.navigation._grid_kernels import CELL, GRID_SIZE, LARGEST_SIZE, MOST_CHANGES, Grid
 
 GRID_SIZES = (GRID_SIZE, 600, 1200, 2400, LARGEST_SIZE)  # by doubling, up to 400 m on each side of the start
@@ -108,6 +108,7 @@ def size_for(needed: int) -> int:
 FIRST = Int(-margin(LARGEST_SIZE), LARGEST_SIZE)
 
 
+@with_state(corner=Row(FIRST, FIRST), values=Array(INT8, "h w", -128, 127, constant=True))
 class GridPart(NamedTuple):
     """Evidence in the known part of a grid.
 
@@ -116,12 +117,11 @@ class GridPart(NamedTuple):
         values: (h, w) int8, read-only. Evidence of the cells.
     """
 
-    STATE = State(corner=Row(FIRST, FIRST), values=Array(INT8, "h w", -128, 127, constant=True))
     corner: tuple[int, int]
     values: NDArray[Any]
 
     @classmethod
-    def of(cls, values: NDArray[Any], bounds: NDArray[np.int32]) -> "GridPart":
+    def of(cls, values: NDArray[Any], bounds: NDArray[np.int32]) -> Self:
         """Return a copy of the part of values (S, S) within bounds (4,), see `GridStorage`."""
         top, left, bottom, right = bounds.tolist()
         shift = margin(len(values)) if bottom else 0
@@ -150,8 +150,8 @@ class GridPart(NamedTuple):
                 raise ValueError(f"{count} cells from {first} on, beyond the largest grid")
 
 
+@with_state(corner=Row(FIRST, FIRST), values=Array(UINT8, "h w", constant=True))
 class LooksPart(GridPart):
     """Looks in the part of a grid with any; `values` are uint8."""
 
     __slots__ = ()
-    STATE = State(corner=Row(FIRST, FIRST), values=Array(UINT8, "h w", constant=True))

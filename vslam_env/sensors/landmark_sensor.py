@@ -8,7 +8,7 @@ import numpy as np
 
 from slam_backend.core.read_only import as_read_only
 from slam_backend.core.short_repr import short_repr
-from slam_backend.core.state import INT64, Array, Record, State
+from slam_backend.core.state import INT64, Array, Record, with_state
 from slam_backend.core.validation import (
     BoolArray,
     FloatArray,
@@ -87,6 +87,9 @@ class SensorFrame(NamedTuple):
 
 
 @short_repr
+@with_state(
+    measurements=Record(TeamMeasurements), names=Array(INT64, "K *", -1, "WORLD", constant=True)
+)  # fmt: skip
 class TeamSensorFrames(NamedTuple):
     """The frames of all robots in one tick.
 
@@ -95,10 +98,6 @@ class TeamSensorFrames(NamedTuple):
         names: (K, B) int64. True landmarks of each robot's points, -1 for a false point. Entries beyond a robot's
             points are arbitrary but valid indices.
     """
-
-    STATE = State(
-        measurements=Record(TeamMeasurements), names=Array(INT64, "K *", -1, "WORLD", constant=True)
-    )  # fmt: skip
 
     measurements: TeamMeasurements
     names: IntArray

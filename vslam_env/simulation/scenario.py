@@ -1,5 +1,6 @@
 """Scenario of an episode: everything drawn at its reset and constant afterwards."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
@@ -18,6 +19,7 @@ from slam_backend.core.state import (
     Sizes,
     State,
     parts_of,
+    refuse,
 )  # fmt: skip
 from slam_backend.core.validation import FloatArray, IntArray, argument_error
 from vslam_env.config import EnvConfig
@@ -248,5 +250,7 @@ class ScenarioPart(Record):
 
     def _checked(self, name: str, value: Any, sizes: Sizes) -> Scenario:
         found = parts_of(value) if type(value) is Scenario else value
+        if not isinstance(found, Mapping):
+            refuse(name, "a Scenario", f"a {type(value).__name__}")
         parts = {key: part._check(f"{name}.{key}", found[key], sizes) for key, part in Scenario.STATE.parts.items()}
         return Scenario.from_parts(sizes["CONFIG"], **parts)
