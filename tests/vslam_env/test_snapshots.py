@@ -290,7 +290,8 @@ def test_bad_states_are_refused(act: Callable[[], Any], says: str) -> None:
 
 PARTS = ["episode", "executor", "root", "agents", "cycle", "objects"]
 PARTS += [
-    f"episode.{part}" for part in ("tick", "streams", "simulator", "belief", "ground_truth", "coverage", "true_path")
+    f"episode.{part}"
+    for part in ("tick", "metric_rows", "simulator", "belief", "ground_truth", "coverage", "true_path")
 ]
 
 
