@@ -97,6 +97,11 @@ def check_state(state: Any, config: EnvConfig, objects: Mapping[str, str]) -> Ma
         named = [", ".join(f"{name} ({kind})" for name, kind in each.items()) for each in (objects, custom)]
         hint = "States do not contain these: make the environment with the same ones."
         raise argument_error("state", f"one made with {named[0] or 'no'} objects", f"'{named[1] or 'none'}'", hint)
+    agents = found["agents"]
+    if type(agents) is not tuple or agents not in ((), tuple(config.agents)):
+        refuse("state['agents']", f"{tuple(config.agents)} or none", agents)
+    if agents and found["episode"] is None:
+        refuse("state['episode']", "a running episode", "none")
     return found
 
 

@@ -289,10 +289,7 @@ def test_bad_states_are_refused(act: Callable[[], Any], says: str) -> None:
 
 
 PARTS = ["episode", "executor", "root", "agents", "cycle", "objects"]
-PARTS += [
-    f"episode.{part}"
-    for part in ("tick", "metric_rows", "simulator", "belief", "ground_truth", "coverage", "true_path")
-]
+PARTS += [f"episode.{part}" for part in ("tick", "metric_rows", "simulator", "belief", "ground_truth", "coverage")]
 
 
 def test_a_state_of_which_a_part_is_damaged_is_refused() -> None:

@@ -5,7 +5,7 @@ import dataclasses
 import gc
 import hashlib
 import tracemalloc
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -43,7 +43,7 @@ def _arrays(nest: Any) -> Iterator[np.ndarray]:
     """Yield all arrays in nested dicts, sequences and records."""
     if isinstance(nest, np.ndarray):
         yield nest
-    elif isinstance(nest, dict):
+    elif isinstance(nest, Mapping):
         yield from _arrays(list(nest.values()))
     elif isinstance(nest, (list, tuple)):
         for entry in nest:
