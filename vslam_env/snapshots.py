@@ -85,7 +85,7 @@ def check_state(state: Any, config: EnvConfig, objects: Mapping[str, str]) -> Ma
     """
     found = _checked("state", state)
     custom = found["objects"]
-    if not isinstance(custom, Mapping) or not all(isinstance(name, str) for name in custom):
+    if not isinstance(custom, Mapping) or not all(type(name) is str for pair in custom.items() for name in pair):
         refuse("state['objects']", "class names of the caller's own objects", custom)
     if found["config"] != config:
         name, ours, theirs = _difference(config, found["config"])
@@ -98,7 +98,11 @@ def check_state(state: Any, config: EnvConfig, objects: Mapping[str, str]) -> Ma
         hint = "States do not contain these: make the environment with the same ones."
         raise argument_error("state", f"one made with {named[0] or 'no'} objects", f"'{named[1] or 'none'}'", hint)
     agents = found["agents"]
-    if type(agents) is not tuple or agents not in ((), tuple(config.agents)):
+    if (
+        type(agents) is not tuple
+        or not all(type(agent) is str for agent in agents)
+        or agents not in ((), tuple(config.agents))
+    ):
         refuse("state['agents']", f"{tuple(config.agents)} or none", agents)
     if agents and found["episode"] is None:
         refuse("state['episode']", "a running episode", "none")

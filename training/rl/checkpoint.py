@@ -12,7 +12,7 @@ from slam_backend.core.validation import argument_error
 from training.experiments.run_folder import installed_versions
 from vslam_env.snapshots import ENV_KINDS
 
-FORMAT = 4  # incremented when the content of checkpoints changes
+FORMAT = 5  # incremented when the content of checkpoints changes
 MAGIC = b"vslam train checkpoint "
 CHECKPOINT_FILE = "checkpoint.bin"
 # Packages whose versions must match for an exact resume

@@ -1,6 +1,5 @@
 """Episode: simulation of the world, the sensors, the beliefs and the ground-truth association, tick by tick."""
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -116,7 +115,7 @@ class Episode:
         coverage=Child(CoverageTracker),
         credits=Child(RecallCredits),
         collisions=Each(Int(), "K"),
-        metric_rows=Array(FLOAT64, f"{len(RobotMetrics._fields)} K", 0.0, math.inf, nan=True),
+        metric_rows=Array(FLOAT64, f"{len(RobotMetrics._fields)} K", nan=True),
         odometry=Maybe(Array(FLOAT64, "K 3", renewed=True)),
         scans=Array(FLOAT64, "K RAYS", 0.0, renewed=True),
         in_contact=Maybe(Array(BOOL, "K K", renewed=True)),
