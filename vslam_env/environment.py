@@ -394,8 +394,8 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
     def get_state(self) -> Snapshot:
         """Return the complete state: world, filters, random streams and the seed sequence of later resets.
 
-        An environment that restores it returns the same bytes for the same actions. Constant arrays are shared and
-        read-only; all others are copied. `vslam_env.save_state` writes the state to disk. The recorder, the window and
+        An environment that restores it returns the same bytes for the same actions. The state cannot be changed;
+        `dict(state)` makes a copy that can. `vslam_env.save_state` writes the state to disk. The recorder, the window and
         the internal state of custom reward terms are not included.
 
         Raises:
