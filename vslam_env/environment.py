@@ -395,8 +395,8 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         """Return the complete state: world, filters, random streams and the seed sequence of later resets.
 
         An environment that restores it returns the same bytes for the same actions. The state cannot be changed;
-        `dict(state)` makes a copy that can. `vslam_env.save_state` writes the state to disk. The recorder, the window and
-        the internal state of custom reward terms are not included.
+        `dict(state)` makes a copy that can. `vslam_env.save_state` writes the state to disk. The recorder, the window
+        and the internal state of custom reward terms are not included.
 
         Raises:
             RuntimeError: After a step that was cut short by an exception.
