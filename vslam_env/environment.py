@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
 from slam_backend.core.compilation import ahead
-from slam_backend.core.state_checks import refuse_malformed
+from slam_backend.core.state import Snapshot, accepted, restore, take
 from slam_backend.core.validation import FloatArray, argument_error, check_choice, check_int, did_you_mean
 from slam_backend.team.reports import MergeEvent
 from vslam_env.actions import action_space, checked_actions
@@ -30,7 +30,7 @@ from vslam_env.simulation.controllers import ActionExecutor
 from vslam_env.simulation.episode import Episode, ReadingsHook, Recorder
 from vslam_env.simulation.memory import memory_errors_as_argument_errors
 from vslam_env.simulation.scenario import sample_scenario
-from vslam_env.snapshots import EnvState, check_parts, check_state, sequence_state, snapshot_objects, state_version
+from vslam_env.snapshots import EnvParts, EnvState, check_state, snapshot_objects, state_sizes, state_version
 from vslam_env.world import World, WorldSource, check_source, is_single_layout
 
 AgentID = str
@@ -114,6 +114,8 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         action_spaces: Action spaces by agent.
     """
 
+    STATE = EnvParts.STATE
+
     possible_agents: list[AgentID]
     observation_spaces: dict[AgentID, spaces.Space[Any]]
     action_spaces: dict[AgentID, spaces.Space[Any]]
@@ -162,9 +164,10 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         self._episode: Episode | None = None
         self._is_whole = True  # False while the episode changes, and after a change that was cut short
         self._cycle = 0
+        self._executor = ActionExecutor(self.config)
         self._team_metrics: TeamMetrics  # set at a reset
         self._window = Window(self.metadata["name"])
-        self._objects = snapshot_objects(self._source, self._terms)
+        self._objects, self._version = snapshot_objects(self._source, self._terms), state_version()
 
     # ------------------------------------------------------------------ PettingZoo
 
@@ -201,10 +204,10 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
             check_int("options['world_seed']", world_seed, 0, "Give an int >= 0.")
         ahead.expect(partial(_signatures_of, self.config), LATER)
         with memory_errors_as_argument_errors():
-            scenario = sample_scenario(
+            scenario, streams = sample_scenario(
                 self.config, self._source, root.spawn(1)[0], world_seed, options.get("start_poses")
             )
-        episode = Episode(self.config, scenario, self._hook)
+        episode = Episode(self.config, scenario, streams, self._hook)
         episode.begin()
         metrics = episode.team_metrics(self._reads_beliefs)
         self._is_whole = False
@@ -388,29 +391,18 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
 
     # ------------------------------------------------------------------ snapshots
 
-    def get_state(self) -> EnvState:
+    def get_state(self) -> Snapshot:
         """Return the complete state: world, filters, random streams and the seed sequence of later resets.
 
-        An environment that restores it returns the same bytes for the same actions. Constant arrays are shared and
-        read-only; all others are copied. `vslam_env.save_state` writes the state to disk. The recorder, the window and
-        the internal state of custom reward terms are not included.
+        An environment that restores it returns the same bytes for the same actions. The state cannot be changed;
+        `dict(state)` makes a copy that can. `vslam_env.save_state` writes the state to disk. The recorder, the window
+        and the internal state of custom reward terms are not included.
 
         Raises:
             RuntimeError: After a step that was cut short by an exception.
         """
         self.check_whole("get_state")
-        episode = self._episode
-        return {
-            "version": state_version(),
-            "config": self.config,
-            "objects": dict(self._objects),
-            "root": sequence_state(self._root),
-            "agents": tuple(self.agents),
-            "cycle": 0 if episode is None else self._cycle,
-            "episode": None if episode is None else episode.get_state(),
-            "drivers": [] if episode is None else self._executor.get_state(),
-            "team_metrics": None if episode is None else self._team_metrics,
-        }
+        return take(self)
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Restore a state of `get_state` and continue it exactly, also in another process.
@@ -423,19 +415,15 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
                 unchanged.
         """
         episode = self._episode if self._is_whole else None  # the parts of an episode cut short are not reused
-        with refuse_malformed("state"):
-            state = check_state(state, self.config, self._objects)
-            root, scenario = check_parts(state, self.config, episode, self._reads_beliefs)
+        sizes = state_sizes(self.config, None if episode is None else episode.scenario)
+        snapshot = accepted(type(self), "state", check_state(state, self.config, self._objects), sizes)
+        if (kept := snapshot["episode"]) is not None and (episode is None or episode.scenario is not kept["scenario"]):
+            episode = Episode(self.config, kept["scenario"], {}, self._hook)
         self._is_whole = False
-        self._root, self.agents = root, []
-        if scenario is None:
-            self._episode = None
-        else:
-            self._episode = Episode(self.config, scenario, self._hook) if episode is None else episode
-            self._episode.set_state(state["episode"], scenario)
-            self._executor = ActionExecutor(self.config)
-            self._executor.set_state(state["drivers"])
-            self._team_metrics, self._cycle, self.agents = state["team_metrics"], state["cycle"], list(state["agents"])
+        self._episode = episode
+        restore(self, snapshot)
+        if self._episode is not None:
+            self._team_metrics = self._episode.team_metrics(self._reads_beliefs)
         self._is_whole = True
 
     def check_whole(self, name: str) -> None:

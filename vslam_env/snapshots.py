@@ -9,35 +9,61 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from slam_backend.core import state_checks as check
 from slam_backend.core.files import os_errors_as_argument_errors, write_file
-from slam_backend.core.state_codec import ForeignObjectError, decode, encode, read_file, sequence_of
+from slam_backend.core.state import (
+    Child,
+    Dict,
+    Each,
+    Int,
+    Maybe,
+    Options,
+    Seed,
+    Sizes,
+    State,
+    Text,
+    format_of,
+    options_in,
+    refuse,
+)  # fmt: skip
+from slam_backend.core.state_codec import ForeignObjectError, StateTypes, decode, encode, read_file
 from slam_backend.core.validation import argument_error
+from slam_backend.state_kinds import BACKEND_KINDS
 from vslam_env.config import EnvConfig
 from vslam_env.reward import RewardTerm, is_named
+from vslam_env.simulation.controllers import ActionExecutor
 from vslam_env.simulation.episode import Episode
 from vslam_env.simulation.scenario import Scenario
-from vslam_env.state_checks import EpisodeCheck, check_drivers, check_team_metrics
-from vslam_env.state_kinds import ENV_KINDS
 from vslam_env.world import WorldSource
 
-STATE_FORMAT = 38  # raised when the content of states changes; exact continuation needs the same version
 MAGIC = b"vslam_env state "
-KEYS = ("version", "config", "objects", "root", "agents", "cycle", "episode", "drivers", "team_metrics")
+ENV_KINDS = StateTypes(options_in(EnvConfig)).with_others(BACKEND_KINDS)  # classes of objects in files
 
-EnvState = dict[str, Any]
+EnvState = Mapping[str, Any]
+
+
+class EnvParts:
+    """Parts of the state of an environment."""
+
+    STATE = State(
+        version=Text(),
+        config=Options(EnvConfig),
+        objects=Dict(Text(), Text()),
+        root=Maybe(Seed()),
+        agents=Each(Text(), kind=list),
+        cycle=Int(),
+        episode=Maybe(Child(Episode)),
+        executor=Child(ActionExecutor),
+    )
 
 
 @cache
 def state_version() -> str:
-    """Return the version of states: format number and package version."""
+    """Return the version of states: number of their format and package version; both must agree to continue."""
     try:
         package = version("vslam-env")
     except PackageNotFoundError:  # not installed: run from a source tree
         package = "source"
-    return f"{STATE_FORMAT}/{package}"
+    return f"{format_of(EnvParts)}/{package}"
 
 
 def snapshot_objects(source: WorldSource, terms: Sequence[RewardTerm]) -> dict[str, str]:
@@ -59,8 +85,8 @@ def check_state(state: Any, config: EnvConfig, objects: Mapping[str, str]) -> Ma
     """
     found = _checked("state", state)
     custom = found["objects"]
-    if not isinstance(custom, dict) or not all(isinstance(name, str) for name in custom):
-        check.refuse("state['objects']", "class names of the caller's own objects", custom)
+    if not isinstance(custom, Mapping) or not all(type(name) is str for pair in custom.items() for name in pair):
+        refuse("state['objects']", "class names of the caller's own objects", custom)
     if found["config"] != config:
         name, ours, theirs = _difference(config, found["config"])
         hint = "Restore into an environment of the same configuration."
@@ -71,40 +97,25 @@ def check_state(state: Any, config: EnvConfig, objects: Mapping[str, str]) -> Ma
         named = [", ".join(f"{name} ({kind})" for name, kind in each.items()) for each in (objects, custom)]
         hint = "States do not contain these: make the environment with the same ones."
         raise argument_error("state", f"one made with {named[0] or 'no'} objects", f"'{named[1] or 'none'}'", hint)
+    agents = found["agents"]
+    if (
+        type(agents) is not tuple
+        or not all(type(agent) is str for agent in agents)
+        or agents not in ((), tuple(config.agents))
+    ):
+        refuse("state['agents']", f"{tuple(config.agents)} or none", agents)
+    if agents and found["episode"] is None:
+        refuse("state['episode']", "a running episode", "none")
     return found
 
 
-def check_parts(
-    state: Mapping[str, Any], config: EnvConfig, own: Episode | None, reads_beliefs: bool
-) -> tuple[np.random.SeedSequence | None, Scenario | None]:
-    """Validate all parts of a state that passed `check_state`; return its seed sequence and its scenario.
-
-    Args:
-        state: State of an environment.
-        config: Configuration of the environment.
-        own: Running episode of the environment, if any.
-        reads_beliefs: Whether a reward term reads beliefs, which the metrics then hold.
-
-    Raises:
-        ValueError: If a part is malformed; the message names it.
-    """
-    try:
-        root = restored_sequence(state["root"])
-    except Exception as error:  # any error of numpy
-        raise argument_error("state['root']", "a seed sequence", f"'{error}'", "Pass it unchanged.") from error
-    check.instance("state['agents']", state["agents"], tuple)
-    if state["agents"] not in ((), tuple(config.agents)):
-        check.refuse("state['agents']", f"{tuple(config.agents)} or none", state["agents"])
-    check.integer("state['cycle']", state["cycle"])
-    if state["episode"] is None:
-        if state["agents"]:
-            check.refuse("state['episode']", "a running episode", "none")
-        return root, None
-    episode = EpisodeCheck(config, own)
-    episode.check("state['episode']", state["episode"])
-    check_team_metrics("state['team_metrics']", state["team_metrics"], config.num_robots, reads_beliefs)
-    check_drivers("state['drivers']", state["drivers"], config.num_robots)
-    return root, episode.scenario
+def state_sizes(config: EnvConfig, own: Scenario | None) -> Sizes:
+    """Return the sizes that the checks of states need; `own` is a scenario that need not be rebuilt."""
+    camera = config.stereo.camera
+    return {
+        "K": config.num_robots, "RAYS": config.scan.num_rays, "HEIGHT": camera.height, "WIDTH": camera.width,
+        "CONFIG": config, "SCENARIO": own,
+    }  # fmt: skip
 
 
 def save_state(state: Mapping[str, Any], path: str | Path) -> None:
@@ -160,19 +171,6 @@ def _fingerprint(body: bytes) -> str:
     return hashlib.sha256(body).hexdigest()
 
 
-def sequence_state(sequence: np.random.SeedSequence | None) -> dict[str, Any] | None:
-    """Return the parts of a seed sequence, including the number of spawned children."""
-    if sequence is None:
-        return None
-    names = ("entropy", "spawn_key", "pool_size", "n_children_spawned")
-    return {name: getattr(sequence, name) for name in names}
-
-
-def restored_sequence(state: Mapping[str, Any] | None) -> np.random.SeedSequence | None:
-    """Return the seed sequence with the parts of `sequence_state`."""
-    return None if state is None else sequence_of(**state)
-
-
 def _checked_path(path: Any) -> Path:
     """Return a valid file path, or raise."""
     if not isinstance(path, (str, PathLike)) or "\0" in str(path):
@@ -193,7 +191,7 @@ def _checked(name: str, state: Any) -> Mapping[str, Any]:
         raise argument_error(name, expected, f"a {type(state).__name__}", hint)
     if "version" in state:
         _check_version(name, state["version"])
-    for key in KEYS:
+    for key in EnvParts.STATE.parts:
         if key not in state:
             raise argument_error(name, expected, f"a mapping without {key!r}", hint)
     if not isinstance(state["config"], EnvConfig):

@@ -181,10 +181,25 @@ def restore(owner: Any, snapshot: Snapshot) -> None:
     for name, at, part in kind.STATE.attributes(owner):
         value = None if part.is_constant else getattr(owner, at, None)
         new = part._put(value, snapshot[name])
-        if part.is_constant or new is not value:
+        if part.is_constant or new is None or new is not value:
             setattr(owner, at, new)
     if hasattr(owner, "rebuild"):
         owner.rebuild()
+
+
+def restored(snapshot: Snapshot, owner: Any = None) -> Any:
+    """Return an object in the state of a snapshot: the given one if it is of the same class, else a new one.
+
+    A new one comes from the class method `from_state(snapshot)`. Classes without this method need no constructor, and
+    all parts of their state are attributes without a leading underscore.
+    """
+    kind: Any = snapshot.of
+    if type(owner) is not kind:
+        if hasattr(kind, "from_state"):
+            return kind.from_state(snapshot)
+        owner = object.__new__(kind)
+    restore(owner, snapshot)
+    return owner
 
 
 def accepted(kind: type, name: str, state: Any, sizes: Sizes | None = None) -> Snapshot:
@@ -220,15 +235,23 @@ def _limit(bound: Bound, sizes: Sizes, default: float) -> Any:
 
 @dataclass(frozen=True)
 class Int(Part):
-    """An int within bounds, both included; a name as upper bound stands for an index below that size."""
+    """An int within bounds, both included; a name as upper bound stands for an index below that size.
+
+    Attributes:
+        low, high: The bounds.
+        size: Name of the size that the int is; None: of no size.
+    """
 
     low: int = 0
     high: int | str = MAX_INT
+    size: str | None = None
 
     def _check(self, name: str, value: Any, sizes: Sizes) -> int:
         high = _limit(self.high, sizes, MAX_INT)
         if type(value) is not int or not self.low <= value <= high:
             refuse(name, f"an int from {self.low} to {high}", value)
+        if self.size is not None and sizes.setdefault(self.size, value) != value:
+            refuse(name, f"{sizes[self.size]}", value)
         return value
 
 
@@ -523,7 +546,7 @@ class _OfClass(Part):
 
 
 class Child(_OfClass):
-    """An object with a `STATE` of its own; it is restored in place, or made by `from_state(snapshot)` of its class."""
+    """An object with a `STATE` of its own; it is restored in place, or made anew, see `restored`."""
 
     is_constant = False
 
@@ -531,10 +554,7 @@ class Child(_OfClass):
         return take(value)
 
     def _put(self, value: Any, kept: Snapshot) -> Any:
-        if type(value) is not kept.of:
-            return self.kind.from_state(kept)  # type: ignore[attr-defined]
-        restore(value, kept)
-        return value
+        return restored(kept, value)
 
     def _checked(self, name: str, value: Any, sizes: Sizes) -> Snapshot:
         kind: Any = self.kind
@@ -595,6 +615,41 @@ class OneOf(Part):
 
     def _inner(self) -> Iterable[Part | type]:
         return self._records.values()
+
+
+class ChildOf(Part):
+    """An object of one of several classes with a `STATE`; its snapshot has the name of the class among its parts.
+
+    Args:
+        kinds: The classes, or functions that return them.
+    """
+
+    is_constant = False
+
+    def __init__(self, *kinds: Kind) -> None:
+        self._kinds = kinds
+
+    def _take(self, value: Any) -> Snapshot:
+        return _with_class(take(value))
+
+    def _put(self, value: Any, kept: Snapshot) -> Any:
+        return restored(kept, value)
+
+    def _check(self, name: str, value: Any, sizes: Sizes) -> Snapshot:
+        children = {kind.__name__: Child(kind) for kind in map(_class, self._kinds)}
+        found = value.get(CLASS) if isinstance(value, Mapping) else None
+        if not isinstance(found, str) or found not in children:
+            refuse(name, f"the state of one of {', '.join(children)}", f"a {type(value).__name__}")
+        return _with_class(children[found]._check(name, value, sizes))
+
+    def _inner(self) -> Iterable[Part | type]:
+        return map(_class, self._kinds)
+
+
+def _with_class(snapshot: Snapshot) -> Snapshot:
+    """Return a snapshot with the name of its class among its parts."""
+    assert snapshot.of is not None
+    return Snapshot({CLASS: snapshot.of.__name__} | dict(snapshot), snapshot.of)
 
 
 class Options(_OfClass):

@@ -24,7 +24,7 @@ from numpy.random import SeedSequence
 from numpy.typing import NDArray
 
 from slam_backend.core.read_only import as_read_only
-from slam_backend.core.state import Snapshot, is_stateful
+from slam_backend.core.state import Snapshot, is_stateful, parts_of
 
 ALIGNMENT = 64  # alignment of arrays [bytes]
 MAX_BYTES = 1 << 30  # limit of a file [bytes]; a state has some megabytes
@@ -174,6 +174,8 @@ class _Writer:
             return ["bytes", len(value)]
         if isinstance(value, np.generic) and value.dtype.str in DTYPES:
             return ["number", value.dtype.str, value.tobytes().hex()]
+        if hasattr(cls, "STATE"):  # a record: its reader gets a dict
+            return self._written(parts_of(value), dict)
         if cls in self._kinds:
             kind = self._kinds[cls]
             try:

@@ -16,6 +16,7 @@ import numpy as np
 
 from slam_backend.core.read_only import as_read_only
 from slam_backend.core.short_repr import short_repr
+from slam_backend.core.state import BOOL, FLOAT32, FLOAT64, Array, Record, with_state
 from slam_backend.core.validation import (
     MOST,
     BoolArray,
@@ -98,6 +99,14 @@ class FrontEndOptions:
 
 
 @short_repr
+@with_state(
+    corners=Array(FLOAT64, "n 2", constant=True),
+    responses=Array(FLOAT64, "n", constant=True),
+    corner_disparity=Array(FLOAT64, "n", constant=True),
+    disparity=Array(FLOAT64, "n", -np.inf, np.inf, nan=True, constant=True),
+    descriptors=Array(FLOAT32, "n d", constant=True),
+    passed=Array(BOOL, "* n", constant=True),
+)
 class StereoMatches(NamedTuple):
     """Corners of both images matched by descriptor, with the results of all checks.
 
@@ -119,6 +128,12 @@ class StereoMatches(NamedTuple):
 
 
 @short_repr
+@with_state(
+    measurements=Record(Measurements),
+    pixels=Array(FLOAT64, "n 3", constant=True),
+    responses=Array(FLOAT64, "n", constant=True),
+    matches=Record(StereoMatches),
+)
 class StereoFrame(NamedTuple):
     """Measurements of one pair of images.
 

@@ -1,14 +1,15 @@
 """Measurements of one robot's camera in one step: points, descriptors and optional covariances."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.core.read_only import as_read_only
 from slam_backend.core.short_repr import short_repr
-from slam_backend.core.state import MAX_DESCRIPTOR
+from slam_backend.core.state import FLOAT32, FLOAT64, INT64, MAX_DESCRIPTOR, Array, Maybe, Sizes, State, with_state
 from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_array
 from slam_backend.fastslam import _kernels
 
@@ -32,6 +33,12 @@ class Measurements:
         ValueError: If a shape is wrong, a number is not finite, a descriptor is too large, or a covariance is not
             positive definite or too ill-conditioned or small for float64.
     """
+
+    STATE: ClassVar[State] = State(
+        points=Array(FLOAT64, "n 3", constant=True),
+        descriptors=Array(FLOAT32, "n d", -MAX_DESCRIPTOR, MAX_DESCRIPTOR, constant=True),
+        covariances=Maybe(Array(FLOAT64, "n 3 3", constant=True)),
+    )
 
     points: FloatArray
     descriptors: NDArray[np.float32]
@@ -71,6 +78,11 @@ class Measurements:
 
 
 @short_repr
+@with_state(
+    points=Array(FLOAT64, "n 3", constant=True),
+    descriptors=Array(FLOAT32, "n d", -MAX_DESCRIPTOR, MAX_DESCRIPTOR, constant=True),
+    offsets=Array(INT64, "K", constant=True),
+)
 class TeamMeasurements(NamedTuple):
     """Concatenated frames of several robots, without covariances.
 
@@ -85,6 +97,13 @@ class TeamMeasurements(NamedTuple):
     points: FloatArray
     descriptors: NDArray[np.float32]
     offsets: IntArray
+
+    @staticmethod
+    def check_state(parts: Mapping[str, Any], sizes: Sizes) -> None:
+        """Raise unless the offsets ascend to the number of points."""
+        offsets = parts["offsets"]
+        if (np.diff(offsets) < 0).any() or offsets[-1] != sizes["n"]:
+            raise ValueError(f"offsets that do not ascend to {sizes['n']}")
 
     def per_robot(self) -> list[Measurements]:
         """Return the frame of each robot, as read-only views; the caller must not write to the arrays afterwards."""

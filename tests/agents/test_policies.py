@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from builders.environments import know
 
 from agents import POLICIES, make_policy
 from agents.goal_choice import DrivingPolicy, GoalPolicy, patrol_goal
@@ -147,10 +148,9 @@ def test_blocked_patrol_goals_are_replaced() -> None:
         belief = _belief(env, pose=pose, candidates=_candidates(env, {}), grid=grid.read_only_view())
         speed, turn = policy.act(None, belief, rng)
         if tick == 0:
-            state = grid.get_state()
-            top, left = state["corner"]
-            state["evidence"][row - top + np.arange(-4, 5), col - left - np.arange(-4, 5)] = 1  # across the path to it
-            grid.set_state(state)
+            (top, left), evidence = grid.known.corner, grid.known.values.copy()
+            evidence[row - top + np.arange(-4, 5), col - left - np.arange(-4, 5)] = 1  # across the path to it
+            know(grid, evidence, (top, left))
         pose = compose(pose, [0.1 * speed, 0.0, 0.15 * turn])
         way.append(pose[:2])
     assert np.ptp(way[200:], axis=0).max() > 2.0

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from slam_backend.core.state import accepted, restore
 from slam_backend.core.validation import FloatArray
 from slam_backend.fastslam.relative_poses import TeamPoses
 from slam_backend.geometry import between, compose
@@ -11,6 +12,7 @@ from slam_backend.maps.landmark_map import TeamMapSummaries
 from vslam_env import ExplorationEnv, World, vslam_v0
 from vslam_env.evaluation.map_scores import GroundTruthAssociation
 from vslam_env.evaluation.team_metrics import RobotCounts, RobotMetrics, TeamMetrics
+from vslam_env.navigation import OccupancyGrid
 
 WALLS = np.array(
     [
@@ -129,3 +131,8 @@ def drive(pose: FloatArray, speed: float, turn: float, seconds: float = 0.1) -> 
 def in_start_frame(start: FloatArray, pose: FloatArray) -> FloatArray:
     """Return a pose of the world as seen from the start pose."""
     return between(start, pose)
+
+
+def know(grid: OccupancyGrid, evidence: np.ndarray, corner: tuple[int, int] = (0, 0)) -> None:
+    """Let a grid hold the evidence (h, w) int8 of cells from a corner on, counted in a new grid, and nothing else."""
+    restore(grid, accepted(OccupancyGrid, "state", {"known": {"corner": corner, "values": evidence}}))

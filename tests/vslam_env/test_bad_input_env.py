@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from builders.comparison import assert_same
-from builders.environments import ANGLES, MAX_RANGE, MEETING, WALLS, small_env
+from builders.environments import ANGLES, MAX_RANGE, MEETING, WALLS, know, small_env
 from builders.refusals import check_complete, check_option, refused
 
 from slam_backend.models.camera import StereoCamera
@@ -511,11 +511,9 @@ PAINTED: dict[str, list[Callable[[OccupancyGrid], Any]]] = {
     ],
     "radius: expected a finite number > 0": [lambda grid: grid.clear_disc(POSE, radius=0.0)],
     "self_from_other: expected finite numbers": [lambda grid: grid.merge(OccupancyGrid(), (0.0, NAN, 0.0))],
-    "state['evidence']: expected an array of int8": [
-        lambda grid: grid.set_state({"evidence": np.zeros((2, 3)), "corner": (0, 0)})
-    ],
-    "state['corner'][1]: expected an int from -1850 to 2147": [
-        lambda grid: grid.set_state({"evidence": np.zeros((2, 3), np.int8), "corner": (0, 2148)})
+    "state['known'].values: expected an array of int8": [lambda grid: know(grid, np.zeros((2, 3)))],
+    "state['known']: expected parts that fit together, got '3 cells from 2148 on": [
+        lambda grid: know(grid, np.zeros((2, 3), np.int8), (0, 2148))
     ],
 }  # fmt: skip
 

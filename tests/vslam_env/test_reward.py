@@ -372,9 +372,8 @@ def test_a_worse_map_costs_more(gamma: float) -> None:
 
     def claiming(claim: int) -> ExplorationEnv:
         """Return a twin in which more landmarks of the first robot's map claim the same."""
-        twin, state = env.clone(), env.get_state()
-        state["episode"]["ground_truth"]["claims"][0, held[1:4]] = claim
-        twin.set_state(state)
+        twin = env.clone()
+        twin.episode.ground_truth._claims[0, held[1:4]] = claim
         return twin
 
     def merged(shift: list[float]) -> ExplorationEnv:

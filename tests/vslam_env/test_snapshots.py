@@ -15,15 +15,16 @@ from builders.comparison import assert_same, digest
 from builders.damage import Trap
 from builders.environments import MEETING, small_env, wander
 
+from slam_backend.core.state import format_of
 from slam_backend.core.state_codec import encode
 from slam_backend.team import merge
 from slam_backend.team.branches import Branch
 from vslam_env import EnvConfig, ExplorationEnv, load_state, save_state, vslam_v0
 from vslam_env.reward import RUNNING_COST
-from vslam_env.snapshots import STATE_FORMAT, check_state, state_version
-from vslam_env.state_kinds import ENV_KINDS
+from vslam_env.snapshots import ENV_KINDS, EnvParts, check_state, state_version
 
 FURTHER = 300
+FORMAT = format_of(EnvParts)
 
 
 def _env(action_type: str = "continuous", **kwargs: Any) -> ExplorationEnv:
@@ -269,7 +270,7 @@ def _from_other(**kwargs: Any) -> Callable[[], Any]:
     ("act", "says"),
     [
         (lambda: small_env().set_state(3), "state: expected what get_state returned, got a int. Pass it unchanged"),
-        (_without("drivers"), "state: expected what get_state returned, got a mapping without 'drivers'"),
+        (_without("executor"), "state: expected what get_state returned, got a mapping without 'executor'"),
         (_edited(version="0/0.0.1"), rf"state: expected a state of version '{state_version()}', got '0/0.0.1'"),
         (lambda: small_env().set_state({"version": "0/0.0.1"}), "state: expected a state of version .*, got '0/0.0.1'"),
         (_edited(config={}), "state: expected what get_state returned, got a mapping whose config is a dict"),
@@ -287,8 +288,8 @@ def test_bad_states_are_refused(act: Callable[[], Any], says: str) -> None:
         act()
 
 
-PARTS = ["episode", "drivers", "root", "agents", "team_metrics", "cycle", "objects"]
-PARTS += [f"episode.{part}" for part in ("tick", "streams", "simulator", "belief", "ground_truth", "coverage", "paths")]
+PARTS = ["episode", "executor", "root", "agents", "cycle", "objects"]
+PARTS += [f"episode.{part}" for part in ("tick", "metric_rows", "simulator", "belief", "ground_truth", "coverage")]
 
 
 def test_a_state_of_which_a_part_is_damaged_is_refused() -> None:
@@ -317,7 +318,7 @@ def _marked(content: bytes, body: bytes) -> bytes:
         (lambda content: content[: len(content) // 2], "path: expected an intact state file, got a damaged file"),
         (lambda content: b"hello" + content, "path: expected a state file"),
         (
-            lambda content: content.replace(f"state {STATE_FORMAT}/".encode(), b"state 999/", 1),
+            lambda content: content.replace(f"state {FORMAT}/".encode(), b"state 999/", 1),
             r"expected a state of version .*got '999/",
         ),
         (lambda content: content[:-9] + bytes([content[-9] ^ 1]) + content[-8:], "a damaged file"),
@@ -338,15 +339,15 @@ def test_bad_files_are_refused(spoil: Callable[[bytes], bytes] | None, says: str
         load_state(path)
 
 
-@pytest.mark.parametrize("number", [STATE_FORMAT, STATE_FORMAT - 1])
-def test_a_pickle_in_the_place_of_a_state_is_not_run(number: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [FORMAT, "38"])
+def test_a_pickle_in_the_place_of_a_state_is_not_run(number: str, tmp_path: Path) -> None:
     """Whatever its version and checksum say, a file that holds a pickle runs nothing."""
     path, proof = tmp_path / "state", tmp_path / "proof"
     body = pickle.dumps(_begun(steps=1).get_state() | {"cycle": Trap(proof)})
     save_state(_begun(steps=1).get_state(), path)
     content = _marked(path.read_bytes(), body)
-    path.write_bytes(content.replace(f"state {STATE_FORMAT}/".encode(), f"state {number}/".encode(), 1))
-    with pytest.raises(ValueError, match="readable state file" if number == STATE_FORMAT else f"got '{number}/"):
+    path.write_bytes(content.replace(f"state {FORMAT}/".encode(), f"state {number}/".encode(), 1))
+    with pytest.raises(ValueError, match="readable state file" if number == FORMAT else f"got '{number}/"):
         load_state(path)
     assert not proof.exists()
     pickle.loads(body)

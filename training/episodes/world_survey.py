@@ -41,7 +41,7 @@ def survey(world: str, world_seed: int, robots: int = 3) -> WorldFigures:
     """
     check_int("seed", world_seed, 0, "Use 0 or a positive number.")
     config = EnvConfig(world=world, num_robots=robots)
-    scenario = sample_scenario(config, world, np.random.SeedSequence(world_seed), world_seed)
+    scenario, _ = sample_scenario(config, world, np.random.SeedSequence(world_seed), world_seed)
     x_min, y_min, x_max, y_max = scenario.world.bounds
     starts = scenario.true_starts[:, :2]
     gaps = np.linalg.norm(starts[:, None] - starts, axis=2)[~np.eye(robots, dtype=bool)]

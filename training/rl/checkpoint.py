@@ -10,9 +10,9 @@ from slam_backend.core.files import write_file
 from slam_backend.core.state_codec import MAX_BYTES, decode, encode, read_file
 from slam_backend.core.validation import argument_error
 from training.experiments.run_folder import installed_versions
-from vslam_env.state_kinds import ENV_KINDS
+from vslam_env.snapshots import ENV_KINDS
 
-FORMAT = 4  # incremented when the content of checkpoints changes
+FORMAT = 5  # incremented when the content of checkpoints changes
 MAGIC = b"vslam train checkpoint "
 CHECKPOINT_FILE = "checkpoint.bin"
 # Packages whose versions must match for an exact resume

@@ -7,7 +7,22 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from slam_backend.core.read_only import as_constant, as_read_only, with_constants, with_read_only
+from slam_backend.core.read_only import as_constant, as_read_only
+from slam_backend.core.state import (
+    BOOL,
+    FLOAT64,
+    INT64,
+    MAX_DISTANCE,
+    Array,
+    Child,
+    Each,
+    Int,
+    Record,
+    Row,
+    Sizes,
+    State,
+    with_state,
+)
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.fastslam.relative_poses import TeamPoses
 from slam_backend.geometry import compose, inverse
@@ -15,9 +30,16 @@ from slam_backend.models.camera import StereoCamera
 from slam_backend.team.reports import LandmarkIdMap, MapReleased, MergeUndone, TeamReport
 from vslam_env.belief.belief import RobotHardware
 from vslam_env.navigation import OccupancyGrid, TeamGrids, TeamLooks, ray_directions
-from vslam_env.navigation.looks import looks_reach
+from vslam_env.navigation.grid_storage import GridPart, LooksPart
 
 
+@with_state(
+    tick=Int(),
+    shared=Array(INT64, "K K", 0, 1, constant=True),
+    poses=Array(FLOAT64, "K K 3", -MAX_DISTANCE, MAX_DISTANCE, nan=True, constant=True),
+    scans=Array(FLOAT64, "K RAYS", 0.0, constant=True),
+    bumps=Array(BOOL, "K", constant=True),
+)
 class GridUpdate(NamedTuple):
     """Arguments of `TeamGrids.update` for one tick, with read-only arrays.
 
@@ -34,6 +56,12 @@ class GridUpdate(NamedTuple):
     poses: FloatArray
     scans: FloatArray
     bumps: BoolArray
+
+    @staticmethod
+    def check_state(parts: Mapping[str, Any], sizes: Sizes) -> None:
+        """Raise unless all robots that share scans have poses."""
+        if np.isnan(parts["poses"][parts["shared"] == 1]).any():
+            raise ValueError("robots that share scans without a pose")
 
 
 class GridTransfer(NamedTuple):
@@ -112,6 +140,14 @@ CONNECTED, NEVER_MET = -1, -2  # stand for the tick at which two robots lost con
 MAX_ABSENCE = 1000  # [ticks] after a longer absence whole grids are merged: replaying takes 10 us a tick
 
 
+@with_state(
+    tick=Int(),
+    sides=Row(Each(Int(high="K")), Each(Int(high="K"))),
+    maps=Row(Int(), Int(), Int()),
+    grids=Each(Record(GridPart)),
+    looks=Each(Record(LooksPart)),
+    updates=Each(Record(GridUpdate)),
+)
 class GridSnapshot(NamedTuple):
     """Grids just before a merge.
 
@@ -119,17 +155,29 @@ class GridSnapshot(NamedTuple):
         tick: Tick of the merge; later readings are not in the grids.
         sides: Robots of either group.
         maps: Numbers of map a, map b and the joint map.
-        grids: State of each robot's grid.
-        looks: State of each robot's looks.
+        grids: Grids of the robots of both sides, in turn.
+        looks: Looks of these robots.
         updates: Buffered updates at that time.
     """
 
     tick: int
     sides: tuple[tuple[int, ...], tuple[int, ...]]
     maps: tuple[int, int, int]
-    grids: dict[int, dict[str, Any]]
-    looks: dict[int, dict[str, Any]]
+    grids: tuple[GridPart, ...]
+    looks: tuple[LooksPart, ...]
     updates: tuple[GridUpdate, ...]
+
+    @property
+    def robots(self) -> tuple[int, ...]:
+        """Robots of both sides."""
+        return self.sides[0] + self.sides[1]
+
+    @staticmethod
+    def check_state(parts: Mapping[str, Any], sizes: Sizes) -> None:
+        """Raise unless each robot belongs to one side and has a grid and looks."""
+        robots = parts["sides"][0] + parts["sides"][1]
+        if not len(set(robots)) == len(robots) == len(parts["grids"]) == len(parts["looks"]):
+            raise ValueError(f"not a grid and looks of each of the robots {robots}")
 
 
 class SharedGrids:
@@ -150,16 +198,26 @@ class SharedGrids:
         looks: Looks of all robots at walls; they follow the grids.
     """
 
+    STATE = State(
+        team=Child(TeamGrids),
+        looks=Child(TeamLooks),
+        same_filter=Each(Each(Int(high="K")), "K"),
+        separated_since=Array(INT64, "K K", NEVER_MET),
+        snapshots=Each(Record(GridSnapshot), kind=list),
+        updates=Each(Record(GridUpdate), kind=deque),
+    )
+
     def __init__(self, num_robots: int, body: RobotHardware, camera: StereoCamera) -> None:
         self.team = TeamGrids(num_robots)
         reach = min(float(body.scan_range), camera.max_range)
         self.looks = TeamLooks(num_robots, body.ray_angles, camera.half_fov, reach)
-        self._grids = self.team.grids
         self._hardware = ray_directions(body.ray_angles), float(body.scan_range), float(body.radius)
-        self._parted = np.full((num_robots, num_robots), NEVER_MET)  # tick since which two robots share no scans
+        self._separated_since = np.full(
+            (num_robots, num_robots), NEVER_MET
+        )  # tick since which two robots share no scans
         self._settle(0, [(robot,) for robot in range(num_robots)])
-        self._kept: list[GridSnapshot] = []
-        self._strokes: deque[GridUpdate] = deque()
+        self._snapshots: list[GridSnapshot] = []
+        self._updates: deque[GridUpdate] = deque()
 
     @property
     def shared(self) -> IntArray:
@@ -167,7 +225,7 @@ class SharedGrids:
         return self._shared
 
     def __getitem__(self, robot: int) -> OccupancyGrid:
-        return self._grids[robot]
+        return self.team.grids[robot]
 
     def save_for_undo(self, tick: int, id_map: LandmarkIdMap) -> None:
         """Keep the grids of both sides before a merge.
@@ -178,9 +236,8 @@ class SharedGrids:
         """
         sides = id_map.robots_a, id_map.robots_b
         robots = sides[0] + sides[1]
-        grids = with_read_only({robot: self._grids[robot].get_state() for robot in robots})
-        looks = with_read_only({robot: self.looks.get_state(robot) for robot in robots})
-        self._kept.append(GridSnapshot(tick, sides, id_map.maps, grids, looks, tuple(self._strokes)))
+        grids, looks = tuple(self.team.grids[robot].known for robot in robots), tuple(map(self.looks.part, robots))
+        self._snapshots.append(GridSnapshot(tick, sides, id_map.maps, grids, looks, tuple(self._updates)))
 
     def step(
         self,
@@ -204,15 +261,15 @@ class SharedGrids:
         Raises:
             ValueError: If a pose is not finite, or a range is negative or NaN.
         """
-        if report.map_changes or self._strokes:
+        if report.map_changes or self._updates:
             self._apply_report(tick, report)
-        if mates != self._mates:
+        if mates != self._same_filter:
             self.share_on_contact(tick, mates, team_poses.starts)
         self.team.update(self._shared, team_poses.poses, scans, bumps, *self._hardware)
         self.looks.update(self._shared, team_poses.poses, scans, self.team.size)
-        if self._kept or self._oldest_parting is not None:
+        if self._snapshots or self._oldest_parting is not None:
             poses, scans, bumps = as_constant(team_poses.poses), as_constant(scans), as_constant(bumps)
-            self._strokes.append(GridUpdate(tick, self._shared_then, poses, scans, bumps))
+            self._updates.append(GridUpdate(tick, self._shared_then, poses, scans, bumps))
 
     def _apply_report(self, tick: int, report: TeamReport) -> None:
         """Save grids before merges, restore them at rollbacks, and drop data of merges that became final."""
@@ -222,35 +279,35 @@ class SharedGrids:
             elif isinstance(entry, MergeUndone):
                 self._undo(tick, entry)
             elif isinstance(entry, MapReleased):
-                self._kept = [snapshot for snapshot in self._kept if entry.number not in snapshot.maps[:2]]
+                self._snapshots = [snapshot for snapshot in self._snapshots if entry.number not in snapshot.maps[:2]]
         if self._oldest_parting is not None and self._oldest_parting < tick - MAX_ABSENCE:
             self._update_absences(tick)
         oldest = tick
-        if self._kept:  # in ascending order; updates missing then may have been transferred since
-            oldest = self._kept[0].updates[0].tick if self._kept[0].updates else self._kept[0].tick
+        if self._snapshots:  # in ascending order; updates missing then may have been transferred since
+            oldest = self._snapshots[0].updates[0].tick if self._snapshots[0].updates else self._snapshots[0].tick
         if self._oldest_parting is not None:
             oldest = min(oldest, self._oldest_parting)
-        while self._strokes and self._strokes[0].tick < oldest:
-            self._strokes.popleft()
+        while self._updates and self._updates[0].tick < oldest:
+            self._updates.popleft()
 
     def _undo(self, tick: int, undone: MergeUndone) -> None:
         """Restore the grids before a merge and repaint the later updates of each side."""
-        snapshot = next((snapshot for snapshot in self._kept if snapshot.maps == undone.maps), None)
+        snapshot = next((snapshot for snapshot in self._snapshots if snapshot.maps == undone.maps), None)
         if snapshot is None:
             return  # merged and rolled back within a tick
-        self._kept.remove(snapshot)
-        for robot in snapshot.sides[0] + snapshot.sides[1]:
-            self._grids[robot].set_state(snapshot.grids[robot])
-            self.looks.set_state(robot, snapshot.looks[robot])
-        self._strokes, replayed = map(deque, split_history(self._strokes, snapshot.updates, snapshot.sides))
+        self._snapshots.remove(snapshot)
+        for robot, grid, looks in zip(snapshot.robots, snapshot.grids, snapshot.looks, strict=True):
+            self.team.grids[robot].known = grid
+            self.looks.restore_part(robot, looks)
+        self._updates, replayed = map(deque, split_history(self._updates, snapshot.updates, snapshot.sides))
         for update in replayed:
             self._replay(update)
         side_a, side_b = snapshot.sides
-        self._parted[np.ix_(side_a, side_b)] = self._parted[np.ix_(side_b, side_a)] = NEVER_MET
+        self._separated_since[np.ix_(side_a, side_b)] = self._separated_since[np.ix_(side_b, side_a)] = NEVER_MET
         side_of = {robot: side for side in snapshot.sides for robot in side}
         mates = [
             tuple(mate for mate in group if mate in side_of.get(robot, group))
-            for robot, group in enumerate(self._mates)
+            for robot, group in enumerate(self._same_filter)
         ]
         self._settle(tick, mates)
 
@@ -265,27 +322,27 @@ class SharedGrids:
         transfers = [transfer for now in sorted(set(mates)) for transfer in self._plan_transfers(now, starts)]
         if transfers:
             sources = {each.source for each in transfers if each.is_whole}
-            grids = {robot: (self._grids[robot].copy(), self.looks.counts[robot].copy()) for robot in sources}
+            grids = {robot: (self.team.grids[robot].copy(), self.looks.counts[robot].copy()) for robot in sources}
             for transfer in transfers:
                 if transfer.is_whole:
                     grid, looks = grids[transfer.source]
-                    self._grids[transfer.target].merge(grid, transfer.motion)
+                    self.team.grids[transfer.target].merge(grid, transfer.motion)
                     self.looks.reserve(self.team.size)
                     self.looks.merge(transfer.target, looks, transfer.motion)
-            first = max(0, len(self._strokes) - max(tick - transfer.since for transfer in transfers))
-            after, missing = plan_catch_up(list(islice(self._strokes, first, None)), transfers)
+            first = max(0, len(self._updates) - max(tick - transfer.since for transfer in transfers))
+            after, missing = plan_catch_up(list(islice(self._updates, first, None)), transfers)
             for row, update in enumerate(after, first):
-                self._strokes[row] = update
+                self._updates[row] = update
             for update in missing:
                 self._replay(update)
         self._settle(tick, mates)
 
     def _plan_transfers(self, now: tuple[int, ...], starts: FloatArray) -> Iterator[GridTransfer]:
         """Yield the transfers among robots that now share a filter; whole grids between robots that never met."""
-        before = sorted({tuple(mate for mate in self._mates[robot] if mate in now) for robot in now})
+        before = sorted({tuple(mate for mate in self._same_filter[robot] if mate in now) for robot in now})
         for part, other in permutations(before, 2):
             # Robots that were connected already have the same content, so one robot represents each part.
-            since = int(self._parted[np.ix_(part, other)].min())
+            since = int(self._separated_since[np.ix_(part, other)].min())
             for robot in part:
                 motion = compose(starts[robot], inverse(starts[other[0]]))
                 yield GridTransfer(other[0], robot, motion, since, since == NEVER_MET)
@@ -300,45 +357,31 @@ class SharedGrids:
 
     def _settle(self, tick: int, mates: Sequence[tuple[int, ...]]) -> None:
         """Record which robots share a filter from a tick on."""
-        self._mates = tuple(mates)
+        self._same_filter = tuple(mates)
         together = np.array([[robot in group for robot in range(len(mates))] for group in mates])
         self._shared = together.astype(np.int64)
         self._shared_then = as_constant(self._shared)  # read-only, as in grid updates
-        self._parted[(self._parted == CONNECTED) & ~together] = tick
-        self._parted[together] = CONNECTED
+        self._separated_since[(self._separated_since == CONNECTED) & ~together] = tick
+        self._separated_since[together] = CONNECTED
         self._update_absences(tick)
 
     def _update_absences(self, tick: int) -> None:
         """Find the first tick whose updates separated robots may need; treat long absences as never met."""
-        self._parted[(self._parted >= 0) & (self._parted < tick - MAX_ABSENCE)] = NEVER_MET
-        since = self._parted[self._parted >= 0]
+        self._separated_since[(self._separated_since >= 0) & (self._separated_since < tick - MAX_ABSENCE)] = NEVER_MET
+        since = self._separated_since[self._separated_since >= 0]
         self._oldest_parting = int(since.min()) if len(since) else None
 
-    @property
-    def grid_updates(self) -> dict[int, GridUpdate]:
-        """All buffered updates by `id`; read-only."""
-        histories = (self._strokes, *(snapshot.updates for snapshot in self._kept))
-        return {id(update): update for history in histories for update in history}
-
-    def get_state(self) -> dict[str, Any]:
-        """Return the complete state of the grids; shared arrays are read-only."""
-        return {
-            "grids": [grid.get_state() for grid in self._grids],
-            "looks": [self.looks.get_state(robot) for robot in range(len(self._grids))],
-            "mates": self._mates,
-            "parted": self._parted.copy(),
-            "kept": tuple(self._kept),
-            "strokes": tuple(self._strokes),
-        }
-
-    def set_state(self, state: Mapping[str, Any]) -> None:
-        """Restore a state of `get_state` in place; views of the grids remain valid."""
-        for grid, grid_state in zip(self._grids, state["grids"], strict=True):
-            grid.set_state(grid_state)
-        self.team.reserve(max(map(looks_reach, state["looks"])))
+    def rebuild(self) -> None:
+        """Give grids and looks the same size, and restore what follows from the robots that share filters."""
+        self.team.reserve(self.looks.counts.shape[1] // 2)
         self.looks.reserve(self.team.size)
-        for robot, looks in enumerate(state["looks"]):
-            self.looks.set_state(robot, looks)
-        self._parted[:] = state["parted"]
-        self._settle(0, state["mates"])
-        self._kept, self._strokes = with_constants(list(state["kept"])), deque(with_constants(state["strokes"]))
+        self._settle(0, self._same_filter)
+
+    @staticmethod
+    def check_state(parts: Mapping[str, Any], sizes: Sizes) -> None:
+        """Raise unless robots that share a filter are the same for all of them."""
+        groups = parts["same_filter"]
+        if any(
+            robot not in group or any(groups[mate] != group for mate in group) for robot, group in enumerate(groups)
+        ):
+            raise ValueError(f"robots that do not share filters with each other: {groups}")

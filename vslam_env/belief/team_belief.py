@@ -8,23 +8,24 @@ from typing import Any
 import numpy as np
 
 from slam_backend.core.read_only import as_read_only
-from slam_backend.core.state import accepted, restore, take
+from slam_backend.core.state import FLOAT64, Array, Child, Int, Part, Sizes, State, refuse
 from slam_backend.core.validation import Float32Array, FloatArray, argument_error
 from slam_backend.fastslam.options import FilterOptions
 from slam_backend.fastslam.relative_poses import TeamPoses
-from slam_backend.fastslam.step_input import StepInput
 from slam_backend.geometry import rotate_covariances
 from slam_backend.maps.alignment import Alignment
 from slam_backend.maps.landmark_map import LandmarkMap, TeamMapSummaries
 from slam_backend.team.merge_scheduler import AttemptOptions
 from slam_backend.team.options import MergeOptions
 from slam_backend.team.reports import LandmarkIdMap, TeamReport
+from slam_backend.team.state_checks import TeamCheck
 from slam_backend.team.team import TeamSlam
 from vslam_env.belief.belief import Belief, BeliefBatch, BeliefConfig, Candidates, RobotHardware, Teammate
 from vslam_env.belief.readings import Readings, TeamReadings
 from vslam_env.belief.rendezvous import Rendezvous
-from vslam_env.belief.shared_grids import GridUpdate, SharedGrids
+from vslam_env.belief.shared_grids import SharedGrids
 from vslam_env.navigation import CANDIDATE_FEATURES, CandidateKind, OccupancyGrid, TeamCandidates
+from vslam_env.navigation._grid_kernels import LARGEST_HALF_WIDTH
 from vslam_env.navigation._planning_kernels import FrontierColumns
 from vslam_env.navigation._view_kernels import write_goals
 from vslam_env.navigation.candidates import SLOT_KINDS
@@ -33,6 +34,22 @@ from vslam_env.navigation.global_grids import GlobalGrids
 __all__ = ["Belief", "BeliefConfig", "Candidates", "RobotHardware", "TeamBelief", "Teammate"]
 
 CANDIDATE_TICKS = 10  # once a second
+
+
+class _Team(Part):  # bridge
+    """State of a `TeamSlam`."""
+
+    def _check(self, name: str, value: Any, sizes: Sizes) -> Any:
+        config: BeliefConfig = sizes["CONFIG"].belief
+        team = TeamCheck(sizes["K"], {}, (config.filter,))
+        team.check(name, value)
+        if sizes["CONFIG"].sensor == "landmark" and not team.descriptor_sizes <= {sizes["DESCRIPTOR"]}:
+            refuse(name, f"descriptors of length {sizes['DESCRIPTOR']}", sorted(team.descriptor_sizes))
+        attempts, merging = merge_options(config, not sizes["CONFIG"].oracle_merge)
+        found = [*team.options, value["schedule"]["alignment"], value["schedule"]["options"], value["merging"]]
+        if found != [*[config.filter] * len(team.options), config.alignment, attempts, merging]:
+            refuse(name, "options of the environment's configuration", "others")
+        return value
 
 
 class TeamBelief:
@@ -50,9 +67,19 @@ class TeamBelief:
     Attributes:
         team: Filters of the team; it is changed by the methods of this class alone.
         team_poses: Pose estimates; overwritten in the next step.
+        goals: (K, 2) float64 [m]. Goal of each robot in its own start frame; NaN: none.
         known_groups: Robots known to share a map with each robot, itself included.
         grids: Occupancy grids of the robots; read-only.
     """
+
+    STATE = State(
+        tick=Int(),
+        team=_Team(),
+        grids=Child(SharedGrids),
+        candidates=Child(TeamCandidates),
+        rendezvous=Child(Rendezvous),
+        goals=Array(FLOAT64, "K 2", -LARGEST_HALF_WIDTH, LARGEST_HALF_WIDTH, nan=True, renewed=True),
+    )
 
     def __init__(
         self,
@@ -75,7 +102,7 @@ class TeamBelief:
         self._global_grids = GlobalGrids(num_robots)
         self._candidates = TeamCandidates(num_robots, (camera.half_fov, camera.max_range, body.radius))
         self._rendezvous = Rendezvous(num_robots)
-        self._goals = np.full((num_robots, 2), np.nan)  # of each robot in its own start frame
+        self.goals = np.full((num_robots, 2), np.nan)
         self._seconds_left = math.inf
         self._robots = np.arange(num_robots)
         self._scanned = num_robots, len(body.ray_angles)  # shape of a tick's scans
@@ -124,7 +151,7 @@ class TeamBelief:
         team_poses = self.team_poses
         self._grids.step(self._tick, report, self._topology.same_filter, team_poses, readings.scans, readings.bumps)
         if readings.goals is not None:
-            self._goals = readings.goals
+            self.goals = readings.goals
         turns = self._turns[self._tick % len(self._turns)] if self._tick else range(len(self._robots))
         if len(turns):
             self._whole_map_summaries = self.team.map_summaries(1, self._whole_map_summaries)
@@ -200,35 +227,22 @@ class TeamBelief:
         )
 
     @property
-    def buffered_inputs(self) -> Mapping[int, StepInput]:
-        """Buffered readings by step that some filter may still need; read-only."""
-        return self.team.buffered_inputs
+    def _team(self) -> dict[str, Any]:  # bridge
+        return self.team.get_state()
 
-    @property
-    def grid_updates(self) -> dict[int, GridUpdate]:
-        """Buffered updates of the grids by `id`; read-only."""
-        return self._grids.grid_updates
+    @_team.setter
+    def _team(self, state: Mapping[str, Any]) -> None:  # bridge
+        self.team.restore_checked(state)
 
-    def get_state(self) -> dict[str, Any]:
-        """Return the complete state of the beliefs."""
-        return {
-            "tick": self._tick,
-            "team": self.team.get_state(),
-            "grids": self._grids.get_state(),
-            "candidates": self._candidates.get_state(),
-            "rendezvous": take(self._rendezvous),
-            "goals": self._goals.copy(),
-        }
-
-    def set_state(self, state: Mapping[str, Any]) -> None:
-        """Restore a validated state of `get_state`."""
-        self.team.restore_checked(state["team"])
-        self._tick = state["tick"]
-        self._grids.set_state(state["grids"])
-        self._candidates.set_state(state["candidates"])
-        restore(self._rendezvous, accepted(Rendezvous, "state", state["rendezvous"]))
-        self._goals = state["goals"].copy()
+    def rebuild(self) -> None:
+        """Restore what follows from the filters."""
         self._refresh_poses()
+
+    @staticmethod
+    def check_state(parts: Mapping[str, Any], sizes: Sizes) -> None:
+        """Raise unless the filters are as old as the grids."""
+        if parts["team"]["step"] != parts["tick"] + 1:
+            raise ValueError(f"filters at step {parts['team']['step']}, grids at tick {parts['tick']}")
 
     def _refresh_poses(self) -> None:
         """Update groups and poses after a step or a merge, and clear cached beliefs and maps."""
@@ -246,7 +260,7 @@ class TeamBelief:
     def _known_goals(self) -> FloatArray:
         """Return the current goal (K, K, 2) [m] of robot j in the start frame of robot i; NaN: none, or not known."""
         goals = np.empty((len(self._robots), len(self._robots), 2))
-        write_goals(self.team_poses.starts, self._goals, self._grids.shared, goals)
+        write_goals(self.team_poses.starts, self.goals, self._grids.shared, goals)
         return goals
 
     def _teammates(self, robot: int) -> tuple[Teammate, ...]:

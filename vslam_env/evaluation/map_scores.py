@@ -1,14 +1,15 @@
 """Errors of a team's maps and poses, and the ground-truth association of the estimated landmarks."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import count
 from typing import Any
 
 import numpy as np
 
 from slam_backend.core.jit import in_place
-from slam_backend.core.read_only import with_constants, with_read_only
+from slam_backend.core.read_only import as_read_only
+from slam_backend.core.state import INT64, MAX_LANDMARKS, Array, Dict, Each, Int, Sizes, State
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray, check_float
 from slam_backend.fastslam.relative_poses import OWN, SIGMAS, START, TeamPoses
 from slam_backend.maps.landmark_map import TeamMapSummaries
@@ -104,6 +105,13 @@ class GroundTruthAssociation:
         cutoff: Cutoff c of the map error [m].
     """
 
+    STATE = State(
+        claims=Array(INT64, "maps ids", UNUSED, "LANDMARKS"),
+        row_of=Dict(Int(0, MAX_LANDMARKS), Int(high="maps")),
+        map_of=Each(Int(), "K"),
+        seen=Dict(Int(), Each(Array(INT64, "*", -1, "WORLD", constant=True), "K")),
+    )
+
     def __init__(self, num_robots: int, true_positions: FloatArray, observable: np.ndarray, cutoff: float) -> None:
         self.cutoff = check_float("map_error_cutoff", cutoff, "Give metres.", above=0.0)
         self.true_positions = np.ascontiguousarray(true_positions[observable])
@@ -112,7 +120,7 @@ class GroundTruthAssociation:
         self._claims = np.empty((num_robots, 0), np.int64)  # row: claims of the ids of one map
         self._row_of = {number: number for number in range(num_robots)}
         self._use_maps(tuple(range(num_robots)))
-        self._seen: dict[int, Sequence[IntArray] | IntArray] = {}  # true ids of the measurements by step and robot
+        self._seen: dict[int, tuple[IntArray, ...]] = {}  # true ids of the measurements by step and robot
 
     def record(self, report: TeamReport, true_ids: Sequence[IntArray] | IntArray) -> None:
         """Record all changes of maps in a step.
@@ -122,7 +130,7 @@ class GroundTruthAssociation:
             true_ids: Arrays (n_i or more,) int64 by robot. True landmark of each measurement; -1 for a false point.
                 They are kept; the caller does not write to them afterwards.
         """
-        self._seen[report.step] = true_ids
+        self._seen[report.step] = tuple(map(as_read_only, true_ids))
         for entry in report.map_changes:
             if isinstance(entry, LandmarksCreated):
                 self._enter(entry.number, entry.ids, self._seen[entry.step][entry.robot])
@@ -192,21 +200,16 @@ class GroundTruthAssociation:
             positions, counts_and_ids, map_rows, ground_truth, team_poses.beliefs, true_starts, true_poses, metrics
         )
 
-    def get_state(self) -> dict[str, Any]:
-        """Return a copy of the state; the true ids of measurements are shared and read-only."""
-        self._seen = {step: with_read_only(true_ids) for step, true_ids in self._seen.items()}
-        return {
-            "claims": self._claims.copy(),
-            "row_of": dict(self._row_of),
-            "map_of": self._map_of,
-            "seen": dict(self._seen),
-        }
+    def rebuild(self) -> None:
+        """Look up the rows of the robots' maps."""
+        self._use_maps(self._map_of)
 
-    def set_state(self, state: Mapping[str, Any]) -> None:
-        """Restore a state of `get_state`."""
-        self._claims, self._row_of = state["claims"].copy(), dict(state["row_of"])
-        self._seen = dict(with_constants(state["seen"]))
-        self._use_maps(state["map_of"])
+    @staticmethod
+    def check_state(parts: Mapping[str, Any], sizes: Sizes) -> None:
+        """Raise unless each map has a row of its own."""
+        row_of, map_of = parts["row_of"], parts["map_of"]
+        if len(set(row_of.values())) < len(row_of) or not set(map_of) <= set(row_of):
+            raise ValueError(f"not a row for each map: {dict(row_of)}, {map_of}")
 
     def _use_maps(self, map_of: tuple[int, ...]) -> None:
         """Set the map number of each robot."""
@@ -237,3 +240,45 @@ class GroundTruthAssociation:
         for landmark, true_id in zip(numbers, true_ids.tolist(), strict=False):
             if landmark >= 0:
                 claims[landmark] = self._claim_of[true_id] if true_id >= 0 else FALSE
+
+
+MOST_MEASURED = 1000  # most landmarks that all robots together create in a tick
+
+
+def check_claims(association: Mapping[str, Any], team: Mapping[str, Any], tick: int) -> None:
+    """Raise unless the state of an association holds what kernels and later reports look up without checks.
+
+    Args:
+        association: State of a `GroundTruthAssociation`.
+        team: State of the `TeamSlam` with the maps.
+        tick: Present tick.
+    """
+    claims, seen = association["claims"], association["seen"]
+    numbers: set[int] = set(team["numbers"])
+    for branch in branches_of(team):
+        numbers.add(branch["number"])
+        maps = branch["filter"]["maps"]
+        needed = max(1 + maps["ids"].max(initial=-1), maps["next_id"] - MOST_MEASURED * tick)
+        if needed > claims.shape[1]:
+            raise ValueError(f"claims of {claims.shape[1]} landmarks, of which there are {needed}")
+    if lacking := numbers - set(association["row_of"]):
+        raise ValueError(f"no claims of map {min(lacking)}")
+    for step, inputs in team["records"]["log"]["steps"].items():
+        if step not in seen or any(n > len(ids) for (*_, n), ids in zip(inputs.inputs, seen[step], strict=True)):
+            raise ValueError(f"not all true ids of step {step}")
+    for entry in team["records"]["entries"]:
+        if isinstance(entry, LandmarksCreated) and (
+            entry.step not in seen or len(entry.ids) > len(seen[entry.step][entry.robot])
+        ):
+            raise ValueError(f"not all true ids of step {entry.step}")
+        if isinstance(entry, LandmarkIdMap) and len(entry.ids_b) and entry.ids_b.max() >= claims.shape[1]:
+            raise ValueError(f"claims of {claims.shape[1]} landmarks, of which there are {entry.ids_b.max() + 1}")
+
+
+def branches_of(team: Mapping[str, Any]) -> Iterable[Mapping[str, Any]]:
+    """Yield each branch of a team's state, including those that an undo would restore."""
+    for group in team["groups"]:
+        yield from group["branches"]
+    for process in team["processes"]:
+        yield from process.get("sides", ())
+        yield from process.get("trunks", ())

@@ -1,12 +1,15 @@
 """Candidate slots: frontiers presented to policies under stable indices."""
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from slam_backend.core.state import FLOAT64, INT64, Array, Sizes, State
 from slam_backend.core.validation import BoolArray, FloatArray
+from vslam_env.navigation._grid_kernels import LARGEST_HALF_WIDTH
 from vslam_env.navigation._planning_kernels import (
     SAME_GOAL,
     FrontierColumns,
@@ -34,6 +37,12 @@ class CandidateSlots:
     it is noise or lies behind a corner. Unknown cells within 0.8 m of its goal are then ignored, so that exploration
     ends.
     """
+
+    STATE = State(
+        rows=Array(FLOAT64, f"{NUM_SLOTS} {NUM_COLUMNS}", nan=True),
+        visits=Array(INT64, f"{NUM_SLOTS}"),
+        given_up=Array(FLOAT64, "n 2", -LARGEST_HALF_WIDTH, LARGEST_HALF_WIDTH),
+    )
 
     __slots__ = ("_given_up", "_rows", "_visits")
 
@@ -127,15 +136,17 @@ class CandidateSlots:
             fill_slots(_assign(costs), frontiers, *slots)
         return ways
 
-    def get_state(self) -> dict[str, Any]:
-        """Return a copy of the complete state."""
-        return {"rows": self._rows.copy(), "visits": self._visits.copy(), "given_up": self._given_up.copy()}
+    @staticmethod
+    def check_state(parts: Mapping[str, Any], sizes: Sizes) -> None:
+        """Raise unless kernels find all positions in the grid."""
+        check_rows(parts["rows"])
 
-    def set_state(self, state: dict[str, Any]) -> None:
-        """Restore a state of `get_state`."""
-        self._rows[:] = state["rows"]
-        self._visits = state["visits"].copy()
-        self._given_up = state["given_up"].copy()
+
+def check_rows(rows: FloatArray) -> None:
+    """Raise unless rows (..., 5) of candidates are either NaN or have positions in the grid."""
+    empty = np.isnan(rows)
+    if (empty != empty[..., :1]).any() or (np.abs(rows[..., :2]) > LARGEST_HALF_WIDTH).any():
+        raise ValueError("positions that are not in the grid")
 
 
 def _together(pose: ArrayLike, teammates: ArrayLike) -> FloatArray:

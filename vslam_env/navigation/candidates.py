@@ -1,7 +1,7 @@
 """Candidates of three kinds, in slots with stable numbers: frontiers, places to look from again, and rendezvous."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from enum import IntEnum
 from typing import Any, NamedTuple
 
@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.core.short_repr import short_repr
+from slam_backend.core.state import FLOAT64, INT64, Array, Child, Each, Int, Sizes, State
 from slam_backend.core.validation import FloatArray, IntArray
 from vslam_env.navigation._grid_kernels import CELL
 from vslam_env.navigation._view_kernels import (
@@ -17,7 +18,7 @@ from vslam_env.navigation._view_kernels import (
     describe_candidates,
     renew_candidates,
 )
-from vslam_env.navigation.candidate_slots import NUM_COLUMNS, NUM_SLOTS, CandidateSlots
+from vslam_env.navigation.candidate_slots import NUM_COLUMNS, NUM_SLOTS, CandidateSlots, check_rows
 from vslam_env.navigation.looks import TeamLooks
 from vslam_env.navigation.team_grids import TeamGrids
 
@@ -104,6 +105,16 @@ class TeamCandidates:
         frontiers: Frontier slots of each robot.
     """
 
+    STATE = State(
+        frontiers=Each(Child(CandidateSlots), "K", list),
+        other_rows=Array(FLOAT64, f"K {NUM_CANDIDATES - NUM_SLOTS} {NUM_COLUMNS}", nan=True),
+        gains=Array(FLOAT64, f"K {NUM_CANDIDATES} {NUM_GAINS}", 0.0),
+        views=Array(FLOAT64, f"K {NUM_CANDIDATES} 3", nan=True),
+        lengths=Array(FLOAT64, f"K {NUM_CANDIDATES} K", 0.0, math.inf),
+        visits=Array(INT64, f"K {NUM_REVISITS}"),
+        updates=Each(Int(), "K", list),
+    )
+
     def __init__(
         self, num_robots: int, camera: tuple[float, float, float], near: float = 18.0, share: float = 1600.0
     ) -> None:
@@ -115,6 +126,7 @@ class TeamCandidates:
         self._lengths = np.full((num_robots, NUM_CANDIDATES, num_robots), np.inf)
         self._visits = np.zeros((num_robots, NUM_REVISITS), np.int64)
         self._updates = [0] * num_robots
+        self._other_rows = self._rows[:, NUM_SLOTS:]  # view: the first rows belong to `frontiers`
         self.frontiers = [CandidateSlots.over(rows[:NUM_SLOTS]) for rows in self._rows]
 
     def update(
@@ -176,23 +188,7 @@ class TeamCandidates:
         describe_candidates(self._rows, self._gains, self._lengths, poses, goals, SLOT_KINDS, features)
         return features
 
-    def get_state(self) -> dict[str, Any]:
-        """Return a copy of the complete state."""
-        return {
-            "frontiers": [slots.get_state() for slots in self.frontiers],
-            "rows": self._rows[:, NUM_SLOTS:].copy(),
-            "gains": self._gains.copy(),
-            "views": self._views.copy(),
-            "lengths": self._lengths.copy(),
-            "visits": self._visits.copy(),
-            "updates": tuple(self._updates),
-        }
-
-    def set_state(self, state: Mapping[str, Any]) -> None:
-        """Restore a state of `get_state`."""
-        slot_states: Sequence[dict[str, Any]] = state["frontiers"]
-        for slots, slot_state in zip(self.frontiers, slot_states, strict=True):
-            slots.set_state(slot_state)
-        self._rows[:, NUM_SLOTS:], self._gains[:] = state["rows"], state["gains"]
-        self._lengths[:], self._visits[:] = state["lengths"], state["visits"]
-        self._views[:], self._updates = state["views"], list(state["updates"])
+    @staticmethod
+    def check_state(parts: Mapping[str, Any], sizes: Sizes) -> None:
+        """Raise unless kernels find all positions in the grid."""
+        check_rows(parts["other_rows"])

@@ -3,8 +3,9 @@
 from collections.abc import Mapping
 from typing import Any
 
-from slam_backend.core.read_only import as_read_only
+from slam_backend.core.state import FLOAT64, Array, Float, Maybe, Sizes, State
 from slam_backend.core.validation import FloatArray
+from vslam_env.navigation._grid_kernels import LARGEST_HALF_WIDTH
 from vslam_env.navigation.occupancy_grid import OccupancyGrid
 from vslam_env.navigation.planning import follow_path, plan_path
 
@@ -16,6 +17,12 @@ class Driver:
 
     It plans a path when the goal is set, and again after a bump.
     """
+
+    STATE = State(
+        goal=Maybe(Array(FLOAT64, "2", -LARGEST_HALF_WIDTH, LARGEST_HALF_WIDTH, renewed=True)),
+        heading=Maybe(Float()),
+        path=Maybe(Array(FLOAT64, "n 2", -2.0 * LARGEST_HALF_WIDTH, 2.0 * LARGEST_HALF_WIDTH, renewed=True)),
+    )
 
     def __init__(self) -> None:
         self._goal: FloatArray | None = None
@@ -56,12 +63,8 @@ class Driver:
         path = self.path
         return (0.0, 0.0) if path is None else follow_path(pose, path, final_heading=self._heading, aside=aside)
 
-    def get_state(self) -> dict[str, Any]:
-        """Return goal, heading and path; arrays are read-only."""
-        goal, path = (None if array is None else as_read_only(array) for array in (self._goal, self._path))
-        return {"goal": goal, "heading": self._heading, "path": path}
-
-    def set_state(self, state: Mapping[str, Any]) -> None:
-        """Restore a state of `get_state`, with copies of goal and path."""
-        goal, self._heading, path = state["goal"], state["heading"], state["path"]
-        self._goal, self._path = (None if array is None else array.copy() for array in (goal, path))
+    @staticmethod
+    def check_state(parts: Mapping[str, Any], sizes: Sizes) -> None:
+        """Raise for a path without points."""
+        if parts["path"] is not None and not len(parts["path"]):
+            raise ValueError("a path without points")

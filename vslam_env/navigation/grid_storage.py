@@ -1,12 +1,13 @@
 """Memory of occupancy grids that grow with what was seen."""
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.core import state_checks as check
-from slam_backend.core.read_only import as_read_only
+from slam_backend.core.read_only import as_constant, as_read_only
+from slam_backend.core.state import INT8, UINT8, Array, Int, Row, Sizes, with_state
 from vslam_env.navigation._grid_kernels import CELL, GRID_SIZE, LARGEST_SIZE, MOST_CHANGES, Grid
 
 GRID_SIZES = (GRID_SIZE, 600, 1200, 2400, LARGEST_SIZE)  # by doubling, up to 400 m on each side of the start
@@ -59,10 +60,10 @@ class GridStorage:
 
         Views of the cells that were taken before keep their content but are no longer updated.
         """
-        if 2 * needed <= self.size or self.size == LARGEST_SIZE:
+        size = size_for(needed)
+        if size <= self.size:
             return
         before, old = self.evidence, self.cells
-        size = next((size for size in GRID_SIZES if size >= 2 * needed), LARGEST_SIZE)
         evidence, cells = _empty(len(before), size)
         shift = (size - self.size) // 2
         for k, (top, left, bottom, right) in enumerate(self.bounds.tolist()):
@@ -99,8 +100,58 @@ def margin(size: int) -> int:
     return (size - GRID_SIZE) // 2
 
 
-def check_corner(name: str, corner: Any, shape: tuple[int, ...]) -> None:
-    """Raise unless a value is the first row and column, counted in a new grid, of a part of the largest grid."""
-    check.instance(name, corner, tuple)
-    for (where, first), count in zip(check.named_items(name, corner, 2), shape, strict=True):
-        check.integer(where, first, -margin(LARGEST_SIZE), LARGEST_SIZE - margin(LARGEST_SIZE) - count)
+def size_for(needed: int) -> int:
+    """Return the size of grids that reach a number of cells from their middle in each direction, if any grid does."""
+    return next((size for size in GRID_SIZES if size >= 2 * needed), LARGEST_SIZE)
+
+
+FIRST = Int(-margin(LARGEST_SIZE), LARGEST_SIZE)
+
+
+@with_state(corner=Row(FIRST, FIRST), values=Array(INT8, "h w", -128, 127, constant=True))
+class GridPart(NamedTuple):
+    """Evidence in the known part of a grid.
+
+    Attributes:
+        corner: First row and column, counted in a grid of the first size, so that they may be negative.
+        values: (h, w) int8, read-only. Evidence of the cells.
+    """
+
+    corner: tuple[int, int]
+    values: NDArray[Any]
+
+    @classmethod
+    def of(cls, values: NDArray[Any], bounds: NDArray[np.int32]) -> Self:
+        """Return a copy of the part of values (S, S) within bounds (4,), see `GridStorage`."""
+        top, left, bottom, right = bounds.tolist()
+        shift = margin(len(values)) if bottom else 0
+        return cls((top - shift, left - shift), as_constant(values[top:bottom, left:right]))
+
+    @property
+    def reach(self) -> int:
+        """How many cells a grid needs on each side of its middle to hold this part."""
+        (row, col), (height, width) = self.corner, self.values.shape
+        return int(max(GRID_SIZE // 2 - min(row, col), max(row + height, col + width) - GRID_SIZE // 2))
+
+    def place(self, size: int) -> tuple[tuple[slice, slice], NDArray[np.int32]]:
+        """Return where this part lies in a grid of a size, and the bounds (4,) of its cells that are not 0."""
+        (row, col), (height, width) = self.corner, self.values.shape
+        top, left = row + margin(size), col + margin(size)
+        known = known_bounds(self.values.view(np.uint8))
+        if known[2]:
+            known += np.array([top, left, top, left], np.int32)
+        return (slice(top, top + height), slice(left, left + width)), known
+
+    @staticmethod
+    def check_state(parts: Mapping[str, Any], sizes: Sizes) -> None:
+        """Raise for a part that reaches beyond the largest grid."""
+        for first, count in zip(parts["corner"], parts["values"].shape, strict=True):
+            if first + count > LARGEST_SIZE - margin(LARGEST_SIZE):
+                raise ValueError(f"{count} cells from {first} on, beyond the largest grid")
+
+
+@with_state(corner=Row(FIRST, FIRST), values=Array(UINT8, "h w", constant=True))
+class LooksPart(GridPart):
+    """Looks in the part of a grid with any; `values` are uint8."""
+
+    __slots__ = ()

@@ -1,16 +1,15 @@
 """Looks at walls: how often the camera saw each wall stretch so that its landmarks could be measured."""
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from slam_backend.core import state_checks as check
+from slam_backend.core.state import Each, Record, State
 from slam_backend.core.validation import FloatArray, IntArray
 from vslam_env.navigation._grid_kernels import GRID_SIZE
 from vslam_env.navigation._view_kernels import merge_looks, paint_looks
-from vslam_env.navigation.grid_storage import check_corner, known_bounds, margin
+from vslam_env.navigation.grid_storage import LooksPart, known_bounds, size_for
 from vslam_env.navigation.validation import pose_floats, ray_directions
 
 __all__ = ["TeamLooks"]
@@ -36,6 +35,8 @@ class TeamLooks:
         counts: (K, S, S) uint8. Looks at each cell; a new array when the looks grow.
         bounds: (K, 4) int32. Bounds of the cells with looks, as in `GridStorage`.
     """
+
+    STATE = State(parts=Each(Record(LooksPart), "K"))
 
     def __init__(self, num_robots: int, angles: FloatArray, half_fov: float, reach: float) -> None:
         self._directions, self._reach = ray_directions(angles), reach
@@ -71,33 +72,23 @@ class TeamLooks:
                 if bottom:
                     self.bounds[k] += shift
 
-    def get_state(self, robot: int) -> dict[str, Any]:
-        """Return the looks of a robot: the part that is not zero, and its first row and column in a new grid."""
-        looks = self.counts[robot]
-        top, left, bottom, right = self.bounds[robot].tolist()
-        shift = margin(len(looks)) if bottom else 0
-        return {"counts": looks[top:bottom, left:right].copy(), "corner": (top - shift, left - shift)}
+    @property
+    def _parts(self) -> tuple[LooksPart, ...]:
+        """Copies of the parts with looks of all robots."""
+        return tuple(map(self.part, range(len(self.counts))))
 
-    def set_state(self, robot: int, state: Mapping[str, Any]) -> None:
-        """Restore a state of `get_state` into looks that have the size of the grids."""
-        shift, (row, col) = margin(self.counts.shape[1]), state["corner"]
-        height, width = state["counts"].shape
+    @_parts.setter
+    def _parts(self, parts: Sequence[LooksPart]) -> None:
+        for robot, part in enumerate(parts):
+            self.restore_part(robot, part)
+
+    def part(self, robot: int) -> LooksPart:
+        """Return a copy of the part with looks of a robot."""
+        return LooksPart.of(self.counts[robot], self.bounds[robot])
+
+    def restore_part(self, robot: int, part: LooksPart) -> None:
+        """Set the looks of a robot to a result of `part`."""
+        self.reserve(size_for(part.reach))
+        there, self.bounds[robot] = part.place(self.counts.shape[1])
         self.counts[robot] = 0
-        looks = self.counts[robot, row + shift : row + shift + height, col + shift : col + shift + width]
-        looks[:] = state["counts"]
-        self.bounds[robot] = known_bounds(state["counts"])
-        if self.bounds[robot, 2]:
-            self.bounds[robot] += row + shift, col + shift, row + shift, col + shift
-
-
-def looks_reach(state: Mapping[str, Any]) -> int:
-    """Return how many cells a grid needs on each side of its middle to hold a state of looks."""
-    (row, col), (height, width) = state["corner"], state["counts"].shape
-    return int(max(GRID_SIZE // 2 - min(row, col), max(row + height, col + width) - GRID_SIZE // 2))
-
-
-def check_looks(name: str, state: Any) -> None:
-    """Raise unless a value is a state of the looks of a robot; the message begins with its name."""
-    check.keys(name, state, ("counts", "corner"))
-    check.array(f"{name}['counts']", state["counts"], check.UINT8, (None, None))
-    check_corner(f"{name}['corner']", state["corner"], state["counts"].shape)
+        self.counts[robot][there] = part.values

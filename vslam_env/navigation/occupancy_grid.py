@@ -1,16 +1,14 @@
 """Occupancy grid of one robot in its own start frame."""
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from slam_backend.core import state_checks as check
 from slam_backend.core.short_repr import described
+from slam_backend.core.state import Record, State
 from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_float
 from vslam_env.navigation import _grid_kernels as _painting
 from vslam_env.navigation._grid_kernels import CELL, FREE, GRID_SIZE, HALF_WIDTH, OCCUPIED, UNKNOWN, Grid
-from vslam_env.navigation.grid_storage import GridStorage, check_corner, known_bounds, margin
+from vslam_env.navigation.grid_storage import GridPart, GridStorage, margin
 from vslam_env.navigation.validation import check_ranges, pose_floats, ray_directions
 
 # State of a cell by its evidence, as an unsigned byte.
@@ -63,6 +61,8 @@ class OccupancyGrid:
     nor opens a wall; `cells` holds the resulting states. A new grid covers 60 x 60 m; it doubles when something is seen
     beyond. Readings farther than 400 m from the start are ignored.
     """
+
+    STATE = State(known=Record(GridPart))
 
     __slots__ = ("_read_only", "_row", "_storage")
 
@@ -168,44 +168,29 @@ class OccupancyGrid:
     def copy(self) -> "OccupancyGrid":
         """Return an independent, writable grid with the same content."""
         grid = OccupancyGrid()
-        grid.set_state(self.get_state())
+        grid.known = self.known
         return grid
 
     def read_only_view(self) -> "OccupancyGrid":
         """Return a read-only view of this grid, which follows its changes."""
         return OccupancyGrid.over(self._storage, self._row, read_only=True)
 
-    def get_state(self) -> dict[str, Any]:
-        """Return a copy of the complete state: the evidence of the known part, and its first row and column.
+    @property
+    def known(self) -> GridPart:
+        """Copy of the evidence in the known part; may be assigned to another grid, whose views remain valid."""
+        return GridPart.of(self._grid.evidence, self._grid.bounds)
 
-        Row and column are those of a grid of the first size, so they may be negative.
-        """
-        top, left, bottom, right = self._grid.bounds.tolist()
-        shift = margin(self._storage.size) if bottom else 0
-        return {"evidence": self._grid.evidence[top:bottom, left:right].copy(), "corner": (top - shift, left - shift)}
-
-    def set_state(self, state: dict[str, Any]) -> None:
-        """Restore a state of `get_state` in place; views of the grid remain valid.
-
-        Raises:
-            ValueError: If it is not a state of a grid.
-        """
+    @known.setter
+    def known(self, part: GridPart) -> None:
         self._refuse_if_read_only()
-        check_grid("state", state)
-        evidence, (row, col) = state["evidence"], state["corner"]
-        height, width = evidence.shape
-        needed = max(GRID_SIZE // 2 - min(row, col), max(row + height, col + width) - GRID_SIZE // 2)
-        self._storage.reserve(needed)
-        grid, shift = self._grid, margin(self._storage.size)
+        self._storage.reserve(part.reach)
+        grid = self._grid
         top, left, bottom, right = grid.bounds.tolist()
         grid.evidence[top:bottom, left:right] = grid.cells[top:bottom, left:right] = 0
-        top, left = row + shift, col + shift
-        there = slice(top, top + height), slice(left, left + width)
-        grid.evidence[there] = evidence
-        grid.cells[there] = _CELL_STATES[evidence.view(np.uint8)]
+        there, grid.bounds[:] = part.place(self._storage.size)
+        grid.evidence[there] = part.values
+        grid.cells[there] = _CELL_STATES[part.values.view(np.uint8)]
         grid.changes[0] = -1
-        known = known_bounds(grid.cells[there])
-        grid.bounds[:] = known + np.array([top, left, top, left], np.int32) if known[2] else 0
 
     def _reserve(self, distance: float) -> None:
         """Grow the grid so that it holds what is at most so far from the start [m] along x and y."""
@@ -214,10 +199,3 @@ class OccupancyGrid:
     def _refuse_if_read_only(self) -> None:
         if self._read_only:
             raise RuntimeError("OccupancyGrid: this is a read-only view. Make a copy() to write to.")
-
-
-def check_grid(name: str, state: Any) -> None:
-    """Raise unless a value is a state of an `OccupancyGrid`; the message begins with its name."""
-    check.keys(name, state, ("evidence", "corner"))
-    check.array(f"{name}['evidence']", state["evidence"], check.INT8, (None, None))
-    check_corner(f"{name}['corner']", state["corner"], state["evidence"].shape)

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from slam_backend.core.state import Child, Each, State
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from vslam_env.navigation._grid_kernels import NUM_PAINT_ROWS, update_grids
 from vslam_env.navigation.grid_storage import GridStorage
@@ -18,6 +19,8 @@ class TeamGrids(GridStorage):
     Attributes:
         grids: Grid of each robot.
     """
+
+    STATE = State(grids=Each(Child(OccupancyGrid), "K", list))
 
     def __init__(self, num_robots: int) -> None:
         super().__init__(num_robots)

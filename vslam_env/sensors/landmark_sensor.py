@@ -8,6 +8,7 @@ import numpy as np
 
 from slam_backend.core.read_only import as_read_only
 from slam_backend.core.short_repr import short_repr
+from slam_backend.core.state import INT64, Array, Record, with_state
 from slam_backend.core.validation import (
     BoolArray,
     FloatArray,
@@ -86,6 +87,9 @@ class SensorFrame(NamedTuple):
 
 
 @short_repr
+@with_state(
+    measurements=Record(TeamMeasurements), names=Array(INT64, "K *", -1, "WORLD", constant=True)
+)  # fmt: skip
 class TeamSensorFrames(NamedTuple):
     """The frames of all robots in one tick.
 

@@ -1,10 +1,10 @@
 """Execution of actions: velocity commands, and drives to the candidates chosen by `goal` actions."""
 
-from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from slam_backend.core.state import Child, Each, State
 from vslam_env.config import EnvConfig
 from vslam_env.navigation.driver import Driver
 from vslam_env.simulation.episode import Episode
@@ -18,6 +18,8 @@ class ActionExecutor:
     Args:
         config: Configuration of the environment.
     """
+
+    STATE = State(drivers=Each(Child(Driver), "K", list))
 
     def __init__(self, config: EnvConfig) -> None:
         self._action_type, self._ticks = config.action_type, config.ticks_per_step
@@ -51,12 +53,3 @@ class ActionExecutor:
             ]
             episode.advance(np.array(commands), goals)
         return [int(action != 0 and candidate is None) for action, candidate in zip(chosen, candidates, strict=True)]
-
-    def get_state(self) -> list[dict[str, Any]]:
-        """Return the states of all drivers."""
-        return [driver.get_state() for driver in self._drivers]
-
-    def set_state(self, state: Sequence[Mapping[str, Any]]) -> None:
-        """Restore a state of `get_state`."""
-        for driver, driver_state in zip(self._drivers, state, strict=True):
-            driver.set_state(driver_state)

@@ -5,12 +5,26 @@ from dataclasses import dataclass
 from itertools import combinations
 from operator import add
 from typing import Any
-from weakref import ref
 
 import numpy as np
 
-from slam_backend.core.read_only import as_constant, with_constants, with_read_only
-from slam_backend.core.state import accepted, restore, take
+from slam_backend.core.read_only import as_constant, with_read_only
+from slam_backend.core.state import (
+    BOOL,
+    FLOAT64,
+    Array,
+    Child,
+    Dict,
+    Each,
+    Generator,
+    Int,
+    Maybe,
+    OneOf,
+    Row,
+    Sizes,
+    State,
+    Text,
+)  # fmt: skip
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.geometry import between, compose
 from slam_backend.maps.alignment import Alignment
@@ -19,15 +33,18 @@ from vslam_env.belief.readings import Readings, TeamReadings
 from vslam_env.belief.team_belief import RobotHardware, TeamBelief
 from vslam_env.config import TICK, EnvConfig
 from vslam_env.evaluation.coverage import CoverageTracker
+from vslam_env.evaluation.map_scores import GroundTruthAssociation, check_claims
 from vslam_env.evaluation.recall_credits import RecallCredits
 from vslam_env.evaluation.team_metrics import BeliefSummary, RobotCounts, RobotMetrics, TeamMetrics
 from vslam_env.reward import OWN_RECALL, RUNNING_COST
 from vslam_env.sensors import RenderedFrame, SensorFrame, TeamRenderedFrames, TeamSensorFrames
 from vslam_env.simulation.communication import contacts
-from vslam_env.simulation.scenario import Scenario
+from vslam_env.simulation.scenario import STREAMS, Scenario, ScenarioPart
 from vslam_env.world import Simulator, read_odometry
+from vslam_env.world.spec import FARTHEST_PLACE
 
 MIN_SHARED = 3
+AROUND = 1.0  # [m] tolerated distance of a robot outside the bounds of the walls
 SIGMA = 1e-4  # [m, rad] standard deviation of a true alignment
 
 
@@ -55,21 +72,6 @@ def true_alignment(
 Recorder = Callable[[tuple[Readings, ...]], None]
 
 
-def num_shared(path: Sequence[FloatArray], own: Sequence[FloatArray]) -> int:
-    """Return the length of the common prefix of two paths, if it covers the shorter path; else 0."""
-    known = min(len(path), len(own))
-    try:
-        return known if list(path[:known]) == list(own[:known]) else 0
-    except ValueError:  # comparison of different arrays
-        return 0
-
-
-def path_of(path: Sequence[FloatArray], own: list[FloatArray]) -> list[FloatArray]:
-    """Return a read-only copy of a path that shares its common prefix with an own path."""
-    known = num_shared(path, own)
-    return own[:known] + [as_constant(poses) for poses in path[known:]]
-
-
 @dataclass(slots=True)
 class ReadingsHook:
     """Hook for a recorder of readings, kept by an environment over its episodes."""
@@ -83,6 +85,7 @@ class Episode:
     Args:
         config: Configuration of the environment.
         scenario: Scenario drawn at the reset.
+        streams: Random streams by name; none if a state is restored next.
         hook: Hook whose recorder receives the readings of each tick, including the reset.
 
     Attributes:
@@ -96,18 +99,51 @@ class Episode:
         coverage: Floor that the robots have seen, as of the last `team_metrics`.
         tick: Ticks since the reset.
         readings: Readings of the last tick; unset before `begin`.
+        last_frames: Frames of the last tick with their true landmarks, read-only; unset before `begin`.
         true_path: True poses (K, 3) after each tick, world frame; read-only.
         estimated_path: Estimated poses (K, 3) after each tick, each in the robot's own start frame; read-only.
         merge_ticks: Tick and groups of each merge.
     """
 
-    def __init__(self, config: EnvConfig, scenario: Scenario, hook: ReadingsHook | None = None) -> None:
+    STATE = State(
+        scenario=ScenarioPart(),
+        tick=Int(),
+        simulator=Child(Simulator),
+        streams=Dict(Text(STREAMS), Generator()),
+        belief=Child(TeamBelief),
+        ground_truth=Child(GroundTruthAssociation),
+        coverage=Child(CoverageTracker),
+        credits=Child(RecallCredits),
+        collisions=Each(Int(), "K"),
+        metric_rows=Array(FLOAT64, f"{len(RobotMetrics._fields)} K", nan=True),
+        odometry=Maybe(Array(FLOAT64, "K 3", renewed=True)),
+        scans=Array(FLOAT64, "K RAYS", 0.0, renewed=True),
+        in_contact=Maybe(Array(BOOL, "K K", renewed=True)),
+        last_frames=OneOf(TeamSensorFrames, TeamRenderedFrames),
+        true_path=Each(Array(FLOAT64, "K 3", -FARTHEST_PLACE, FARTHEST_PLACE, constant=True), kind=list),
+        estimated_path=Each(Array(FLOAT64, "K 3", constant=True), kind=list),
+        merge_ticks=Each(Row(Int(), Each(Int(high="K")), Each(Int(high="K"))), kind=list),
+    )
+
+    def __init__(
+        self,
+        config: EnvConfig,
+        scenario: Scenario,
+        streams: Mapping[str, np.random.Generator],
+        hook: ReadingsHook | None = None,
+    ) -> None:
         self._config = config
         self._hook = ReadingsHook() if hook is None else hook
         self._all_hear_all = config.always_in_contact
-        self._streams = {name: np.random.default_rng(0) for name in scenario.stream_states}
-        self._given = ref(scenario)
-        self._load_scenario(scenario)
+        self._streams = dict(streams)
+        self.scenario = scenario
+        self.world, self.true_starts = scenario.world, scenario.true_starts
+        entropy, spawn_key, *_ = scenario.belief_seed
+        self.belief_seed = np.random.SeedSequence(entropy, spawn_key=spawn_key)
+        self._simulator = Simulator(scenario.world, scenario.true_starts, config.robot_radius, TICK)
+        self.ground_truth = scenario.new_ground_truth(config.map_error_cutoff)
+        self.coverage = CoverageTracker(scenario.coverage)
+        self._credits = RecallCredits(config.num_robots, len(self.ground_truth.true_positions))
         self.body = RobotHardware(
             radius=config.robot_radius, ray_angles=config.scan.ray_angles, scan_range=config.scan.max_range
         )
@@ -122,39 +158,23 @@ class Episode:
 
         self.tick = 0
         self._collisions: tuple[int, ...] = (0,) * config.num_robots
-        rows = np.zeros((len(RobotMetrics._fields), config.num_robots))  # distances and error integrals accumulate
-        self._metrics: RobotMetrics[FloatArray] = RobotMetrics(*rows)
+        self._metric_rows = np.zeros((len(RobotMetrics._fields), config.num_robots))  # some of them accumulate
+        self._metrics: RobotMetrics[FloatArray] = RobotMetrics(*self._metric_rows)
         self._integrates = RUNNING_COST in config.reward  # scoring every tick is slow
         self._gives_credit = OWN_RECALL in config.reward
         self.true_path: list[FloatArray] = []
         self.estimated_path: list[FloatArray] = []
         self.merge_ticks: list[tuple[int, tuple[int, ...], tuple[int, ...]]] = []
+        self._odometry: FloatArray | None = None
+        self._scans = np.empty((config.num_robots, config.scan.num_rays))
+        self._in_contact: BoolArray | None = None
         self.readings: TeamReadings  # set by `begin`
-        self._frames: TeamSensorFrames | TeamRenderedFrames  # set by `begin`
-
-    def _load_scenario(self, scenario: Scenario) -> None:
-        """Initialise the simulator, the ground truth and the random streams from a scenario."""
-        self.scenario = scenario
-        self.world, self.true_starts, self.belief_seed = scenario.world, scenario.true_starts, scenario.belief_seed
-        self._simulator = Simulator(scenario.world, scenario.true_starts, self._config.robot_radius, TICK)
-        self.ground_truth = scenario.new_ground_truth(self._config.map_error_cutoff)
-        self.coverage = CoverageTracker(scenario.coverage)
-        self._credits = RecallCredits(self._config.num_robots, len(self.ground_truth.true_positions))
-        for name, state in scenario.stream_states.items():
-            self._streams[name].bit_generator.state = state
+        self.last_frames: TeamSensorFrames | TeamRenderedFrames  # set by `begin`
 
     def begin(self) -> None:
         """Take the first measurements."""
         no_goals = np.full((len(self.true_starts), 2), np.nan)
         self._perceive(None, no_goals if self._config.action_type == "goal" else None)
-
-    @property
-    def given_scenario(self) -> Scenario | None:
-        """Scenario object of the last restored state, for recognising it again; None if it no longer exists.
-
-        The episode itself uses `scenario`, which may be a rebuilt copy.
-        """
-        return self._given()
 
     @property
     def true_poses(self) -> FloatArray:
@@ -164,7 +184,7 @@ class Episode:
     @property
     def frames(self) -> Sequence[SensorFrame | RenderedFrame]:
         """Frames of all robots in the last tick, with the true landmarks of their measurements."""
-        return self._frames.per_robot()
+        return self.last_frames.per_robot()
 
     def advance(self, commands: FloatArray, goals: FloatArray | None = None) -> None:
         """Execute velocity commands (K, 2) [m/s, rad/s] for a tick, read the sensors and update the beliefs.
@@ -212,41 +232,24 @@ class Episode:
 
     # ------------------------------------------------------------------ snapshots
 
-    def get_state(self) -> dict[str, Any]:
-        """Return the complete state of the episode; shared arrays are read-only."""
-        return {
-            "scenario": self.scenario,
-            "tick": self.tick,
-            "simulator": self._simulator.get_state(),
-            "streams": {name: stream.bit_generator.state for name, stream in self._streams.items()},
-            "belief": self.belief.get_state(),
-            "ground_truth": self.ground_truth.get_state(),
-            "coverage": take(self.coverage),
-            "credits": take(self._credits),
-            "counts": (self._collisions, self._metrics.distances.copy(), self._metrics.error_integrals.copy()),
-            "last": with_read_only((self.readings, self._frames)),
-            "paths": (tuple(self.true_path), tuple(self.estimated_path), tuple(self.merge_ticks)),
-        }
+    def rebuild(self) -> None:
+        """Gather the readings of the last tick."""
+        self.readings = self._gathered(self.last_frames, self.belief.goals)
 
-    def set_state(self, state: Mapping[str, Any], scenario: Scenario) -> None:
-        """Restore a validated state of `get_state` and its scenario."""
-        self._given = ref(state["scenario"])
-        if scenario is not self.scenario:
-            self._load_scenario(scenario)
-        self._simulator.set_state(state["simulator"])
-        for name, stream in state["streams"].items():
-            self._streams[name].bit_generator.state = stream
-        self.belief.set_state(state["belief"])
-        self.ground_truth.set_state(state["ground_truth"])
-        restore(self.coverage, accepted(CoverageTracker, "state", state["coverage"]))
-        restore(self._credits, accepted(RecallCredits, "state", state["credits"]))
-        self.tick = state["tick"]
-        self._collisions, self._metrics.distances[:], self._metrics.error_integrals[:] = state["counts"]
-        self.readings, self._frames = with_constants(state["last"])
-        true_path, estimated_path, merge_ticks = state["paths"]
-        self.true_path = path_of(true_path, self.true_path)
-        self.estimated_path = path_of(estimated_path, self.estimated_path)
-        self.merge_ticks = list(merge_ticks)
+    @staticmethod
+    def check_state(parts: Mapping[str, Any], sizes: Sizes) -> None:
+        """Raise unless the parts belong to one tick and all robots are inside the world."""
+        tick, (x_min, y_min, x_max, y_max) = parts["tick"], parts["scenario"].world.bounds
+        if set(parts["streams"]) != set(STREAMS):
+            raise ValueError(f"streams {', '.join(parts['streams'])}")
+        if not tick == parts["belief"]["tick"] == len(parts["true_path"]) - 1 == len(parts["estimated_path"]) - 1:
+            raise ValueError(f"other parts than those of tick {tick}")
+        if isinstance(parts["last_frames"], TeamRenderedFrames) != (sizes["CONFIG"].sensor == "stereo"):
+            raise ValueError("frames of another sensor")
+        places = parts["simulator"]["poses"][:, :2]  # far outside, the physics would not terminate
+        if ((places < (x_min - AROUND, y_min - AROUND)) | (places > (x_max + AROUND, y_max + AROUND))).any():
+            raise ValueError("robots outside the world")
+        check_claims(parts["ground_truth"], parts["belief"]["team"], tick)
 
     # ------------------------------------------------------------------ helpers
 
@@ -264,20 +267,10 @@ class Episode:
     def _perceive(self, odometry: FloatArray | None, goals: FloatArray | None = None) -> None:
         """Read the sensors at the true poses and update the beliefs and the ground-truth association."""
         config, poses = self._config, self._simulator.poses
-        self._frames = frames = self.scenario.sensor.measure(poses, self._streams["sensor"])
-        scans = self.scenario.scan.measure(poses, self._streams["scan"])
-        in_contact = None if self._all_hear_all else self._contacts(poses)
-        self.readings = TeamReadings(
-            odometry,
-            frames.measurements,
-            scans,
-            self._simulator.bumped,
-            between(self.true_starts, poses) if config.oracle_pose else None,
-            frames.true_ids if config.oracle_association else None,
-            in_contact,
-            frames.left if config.observe_images and isinstance(frames, TeamRenderedFrames) else None,
-            goals,
-        )
+        frames = self.scenario.sensor.measure(poses, self._streams["sensor"])
+        self._odometry, self._scans = odometry, self.scenario.scan.measure(poses, self._streams["scan"])
+        self._in_contact = in_contact = None if self._all_hear_all else self._contacts(poses)
+        self.last_frames, self.readings = with_read_only(frames), self._gathered(frames, goals)
         if self._hook.recorder is not None:
             self._hook.recorder(self.readings.per_robot())
         report = self.belief.step(self.readings)
@@ -293,6 +286,21 @@ class Episode:
             self._merge_by_oracle(contact_components(in_contact, config.num_robots))
         self.true_path.append(as_constant(poses))
         self.estimated_path.append(as_constant(self.belief.team_poses.own))
+
+    def _gathered(self, frames: TeamSensorFrames | TeamRenderedFrames, goals: FloatArray | None) -> TeamReadings:
+        """Return the readings of a tick, given the frames of all robots and their goals (K, 2) [m], if any."""
+        config = self._config
+        return TeamReadings(
+            self._odometry,
+            frames.measurements,
+            self._scans,
+            self._simulator.bumped,
+            between(self.true_starts, self._simulator.poses) if config.oracle_pose else None,
+            frames.true_ids if config.oracle_association else None,
+            self._in_contact,
+            frames.left if config.observe_images and isinstance(frames, TeamRenderedFrames) else None,
+            goals if config.action_type == "goal" else None,
+        )
 
     def _contacts(self, poses: FloatArray) -> BoolArray:
         """Return the matrix of contacts (K, K)."""

@@ -1,25 +1,42 @@
 """Scenario of an episode: everything drawn at its reset and constant afterwards."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
 from slam_backend.core.read_only import as_constant, as_read_only
 from slam_backend.core.short_repr import short_repr
-from slam_backend.core.validation import FloatArray, argument_error
+from slam_backend.core.state import (
+    BOOL,
+    FLOAT64,
+    INT64,
+    Array,
+    Maybe,
+    Record,
+    Seed,
+    Sizes,
+    State,
+    parts_of,
+    refuse,
+)  # fmt: skip
+from slam_backend.core.validation import FloatArray, IntArray, argument_error
 from vslam_env.config import EnvConfig
 from vslam_env.evaluation.coverage import CoverageCells
 from vslam_env.evaluation.map_scores import GroundTruthAssociation
-from vslam_env.sensors import LandmarkSensor, RangeFinder, ScanConfig, StereoSensor, StereoSensorConfig
+from vslam_env.sensors import LandmarkSensor, RangeFinder, StereoSensor
 from vslam_env.sensors.stereo.ground_truth import TextureCorners
-from vslam_env.sensors.stereo.textures import check_textures
+from vslam_env.sensors.stereo.textures import WallTextures, check_textures
 from vslam_env.simulation.memory import available_memory, check_memory
 from vslam_env.world import FreeSpace, World, WorldSource, draw_bias, draw_world_seed, make_world, place_landmarks
+from vslam_env.world.spec import FARTHEST_PLACE
+
+STREAMS = ("odometry", "sensor", "scan", "radio")  # random streams of an episode
 
 
 @short_repr
-@dataclass(frozen=True, slots=True, weakref_slot=True, kw_only=True, eq=False)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Scenario:
     """World, start poses and sensors of an episode, shared with its snapshots; arrays are read-only.
 
@@ -27,19 +44,29 @@ class Scenario:
         world: Walls and landmarks.
         true_starts: (K, 3) float64 [m, m, rad], world frame. Start poses.
         bias: (K, 2) float64. Odometry biases of the robots, see `draw_bias`.
-        belief_seed: Seed of the team's beliefs.
-        stream_states: Initial states of the random streams (odometry, sensor, scan, radio) by name.
+        belief_seed: Seed of the team's beliefs: entropy, spawn key, size of the pool and number of children.
         sensor: Cameras of the robots.
         scan: Range finders of the robots.
         coverage: Cells of the free floor in the robots' grids.
         observable_landmarks: (N',) bool. True for landmarks visible from some reachable place; only these are scored.
     """
 
+    STATE: ClassVar[State] = State(
+        world=Record(World),
+        true_starts=Array(FLOAT64, "K 3", -FARTHEST_PLACE, FARTHEST_PLACE, constant=True),
+        bias=Array(FLOAT64, "K 2", constant=True),
+        belief_seed=Seed(),
+        cells=Array(FLOAT64, "cells 2", -2.0 * FARTHEST_PLACE, 2.0 * FARTHEST_PLACE, constant=True),
+        observable_landmarks=Array(BOOL, "landmarks", constant=True),
+        textures=Maybe(Record(WallTextures)),
+        corner_faces=Maybe(Array(INT64, "landmarks", constant=True)),
+        corner_offsets=Maybe(Array(FLOAT64, "landmarks 2", constant=True)),
+    )
+
     world: World
     true_starts: FloatArray
     bias: FloatArray
-    belief_seed: np.random.SeedSequence
-    stream_states: dict[str, Any]
+    belief_seed: tuple[Any, ...]
     sensor: LandmarkSensor | StereoSensor
     scan: RangeFinder
     coverage: CoverageCells
@@ -49,47 +76,59 @@ class Scenario:
         for name in ("true_starts", "bias", "observable_landmarks"):
             object.__setattr__(self, name, as_constant(getattr(self, name)))
 
-    def to_parts(self) -> tuple[Any, ...]:
-        """Return the parts that define the scenario, without derived ones."""
-        sensor = self.sensor
-        texture_parts = None
-        if isinstance(sensor, StereoSensor):
-            texture_parts = sensor.textures, sensor.corners.faces, sensor.corners.offsets
-        return (
-            self.world, self.true_starts, self.bias, self.belief_seed, self.stream_states, sensor.config,
-            sensor.robot_radius, texture_parts, self.scan.config, self.coverage.cells, self.observable_landmarks,
-        )  # fmt: skip
+    @property
+    def cells(self) -> FloatArray:
+        """(n, 2) float64 [m], world frame. Centres of the cells of the free floor."""
+        return self.coverage.cells
+
+    @property
+    def textures(self) -> WallTextures | None:
+        """Textures of the walls, if cameras render them."""
+        return self.sensor.textures if isinstance(self.sensor, StereoSensor) else None
+
+    @property
+    def corner_faces(self) -> IntArray | None:
+        """(N',) int64, ascending. Faces of the landmarks, if cameras render these."""
+        return self.sensor.corners.faces if isinstance(self.sensor, StereoSensor) else None
+
+    @property
+    def corner_offsets(self) -> FloatArray | None:
+        """(N', 2) float64 [m]. Position of each landmark along its wall, and height, if cameras render these."""
+        return self.sensor.corners.offsets if isinstance(self.sensor, StereoSensor) else None
 
     @classmethod
     def from_parts(
-        cls, world: World, true_starts: FloatArray, bias: FloatArray, belief_seed: np.random.SeedSequence,
-        stream_states: dict[str, Any], sensor_config: Any, robot_radius: float, texture_parts: Any, scan: ScanConfig,
-        cells: FloatArray, observable_landmarks: np.ndarray,
+        cls, config: EnvConfig, world: World, true_starts: FloatArray, bias: FloatArray, belief_seed: tuple[Any, ...],
+        cells: FloatArray, observable_landmarks: np.ndarray, textures: WallTextures | None,
+        corner_faces: IntArray | None, corner_offsets: FloatArray | None,
     ) -> Self:  # fmt: skip
-        """Rebuild a scenario, including its sensors, from the result of `to_parts`.
+        """Build a scenario, including its sensors, from the parts of its state.
 
         Raises:
             ValueError: If the parts are inconsistent.
         """
-        landmarks = world.landmarks
-        if landmarks is None:
-            raise ValueError("a world without landmarks")
+        landmarks, radius = world.landmarks, config.robot_radius
+        if landmarks is None or len(landmarks) != len(observable_landmarks) or not observable_landmarks.any():
+            raise ValueError("a world without observable landmarks")
         sensor: LandmarkSensor | StereoSensor
-        if isinstance(sensor_config, StereoSensorConfig):
-            textures, faces, offsets = texture_parts
+        if config.sensor == "stereo":
+            if textures is None or corner_faces is None or corner_offsets is None:
+                raise ValueError("walls without textures and corners")
             check_textures(textures, world.walls)
-            corners = TextureCorners.found(world.walls, landmarks, faces, offsets, sensor_config.tolerance)
-            sensor = StereoSensor.of_textures(sensor_config, world.walls, textures, corners, robot_radius)
+            if (np.diff(corner_faces) < 0).any() or corner_faces.max(initial=0) >= 2 * len(world.walls):
+                raise ValueError("corners whose faces do not ascend")
+            tolerance = config.stereo.tolerance
+            corners = TextureCorners.found(world.walls, landmarks, corner_faces, corner_offsets, tolerance)
+            sensor = StereoSensor.of_textures(config.stereo, world.walls, textures, corners, radius)
         else:
-            sensor = LandmarkSensor(sensor_config, world.walls, landmarks, robot_radius)
+            sensor = LandmarkSensor(config.landmark_sensor, world.walls, landmarks, radius)
         return cls(
             world=world,
             true_starts=true_starts,
             bias=bias,
             belief_seed=belief_seed,
-            stream_states=stream_states,
             sensor=sensor,
-            scan=RangeFinder(scan, world.walls, robot_radius),
+            scan=RangeFinder(config.scan, world.walls, radius),
             coverage=CoverageCells(cells, true_starts),
             observable_landmarks=observable_landmarks,
         )
@@ -107,7 +146,7 @@ def sample_scenario(
     seed: np.random.SeedSequence,
     world_seed: int | None = None,
     start_poses: Any = None,
-) -> Scenario:
+) -> tuple[Scenario, dict[str, np.random.Generator]]:
     """Draw the scenario of an episode, with an independent random stream for each concern.
 
     Args:
@@ -116,6 +155,9 @@ def sample_scenario(
         seed: Seed of all streams.
         world_seed: Seed of layout and textures; None: derived from `seed` or drawn from the world split.
         start_poses: (K, 3) [m, m, rad], world frame; None: start poses of the world, or drawn ones.
+
+    Returns:
+        The scenario, and the random streams of the episode by name, see `STREAMS`.
 
     Raises:
         ValueError: If the world does not exist, robots cannot start there, no landmark is observable, or the landmarks
@@ -144,21 +186,18 @@ def sample_scenario(
     check_memory(int(np.count_nonzero(observable)), config.belief.filter.num_particles, available_memory())
     world = World(bare.name, bare.walls, landmarks, bare.start_poses)
     true_starts = _starts(config, world, free_space, start_poses, np.random.default_rng(starts))
-    streams = {
-        name: np.random.default_rng(stream)
-        for name, stream in (("odometry", odometry), ("sensor", detections), ("scan", scan), ("radio", radio))
-    }
-    return Scenario(
+    streams = dict(zip(STREAMS, map(np.random.default_rng, (odometry, detections, scan, radio)), strict=True))
+    scenario = Scenario(
         world=world,
         true_starts=as_read_only(true_starts),
         bias=as_read_only(draw_bias(config.odometry, config.num_robots, streams["odometry"])),
-        belief_seed=belief_seed,
-        stream_states={name: stream.bit_generator.state for name, stream in streams.items()},
+        belief_seed=(belief_seed.entropy, belief_seed.spawn_key, belief_seed.pool_size, 0),
         sensor=sensor,
         scan=RangeFinder(config.scan, world.walls, config.robot_radius),
         coverage=CoverageCells(free_space.free_area_cells, true_starts),
         observable_landmarks=as_read_only(observable),
     )
+    return scenario, streams
 
 
 def _starts(
@@ -189,3 +228,29 @@ def _starts(
         landmarks=world.landmarks,
         max_incidence=sensor.max_incidence,
     )
+
+
+class ScenarioPart(Record):
+    """A scenario, which is rebuilt from its parts unless it is the one given as the size `SCENARIO`.
+
+    Sizes that follow: `WORLD` and `LANDMARKS`, the numbers of all and of the observable landmarks, `DESCRIPTOR`, the
+    length of their descriptors, and `CELLS`, the number of cells of the free floor.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(Scenario)
+
+    def _check(self, name: str, value: Any, sizes: Sizes) -> Scenario:
+        scenario: Scenario = value if value is sizes["SCENARIO"] else super()._check(name, value, sizes)
+        landmarks = scenario.world.landmarks
+        assert landmarks is not None
+        sizes |= {"WORLD": len(landmarks), "LANDMARKS": int(np.count_nonzero(scenario.observable_landmarks))}
+        sizes |= {"DESCRIPTOR": landmarks.descriptors.shape[1], "CELLS": len(scenario.cells)}
+        return scenario
+
+    def _checked(self, name: str, value: Any, sizes: Sizes) -> Scenario:
+        found = parts_of(value) if type(value) is Scenario else value
+        if not isinstance(found, Mapping):
+            refuse(name, "a Scenario", f"a {type(value).__name__}")
+        parts = {key: part._check(f"{name}.{key}", found[key], sizes) for key, part in Scenario.STATE.parts.items()}
+        return Scenario.from_parts(sizes["CONFIG"], **parts)

@@ -8,6 +8,7 @@ import pymunk
 
 from slam_backend.core.jit import in_place
 from slam_backend.core.read_only import as_read_only
+from slam_backend.core.state import BOOL, FLOAT64, MAX_DISTANCE, Array, State
 from slam_backend.core.validation import FloatArray, check_array, check_float
 from vslam_env.world.spec import World
 
@@ -79,6 +80,10 @@ class Simulator:
         ValueError: If a number is out of range or poses are not (K, 3) finite numbers.
     """
 
+    STATE = State(
+        poses=Array(FLOAT64, "K 3", -MAX_DISTANCE, MAX_DISTANCE, renewed=True), bumped=Array(BOOL, "K", constant=True)
+    )
+
     def __init__(self, world: World, start_poses: FloatArray, radius: float = 0.2, tick: float = 0.1) -> None:
         self.radius = check_float("radius", radius, "Give the radius of a robot in metres.", above=0.0)
         self.tick = check_float("tick", tick, "Give seconds.", above=0.0)
@@ -126,17 +131,6 @@ class Simulator:
     def _checked(self, commands: Any) -> FloatArray:
         """Return validated commands (K, 2), or raise."""
         return check_array("commands", commands, self._shape, "Give (v, omega) for each robot.", within=MAX_SPEED)
-
-    def get_state(self) -> dict[str, Any]:
-        """Return a copy of the complete state."""
-        return {"poses": self.poses.copy(), "bumped": self.bumped.copy()}
-
-    def set_state(self, state: dict[str, Any]) -> None:
-        """Restore a state of `get_state` and continue it exactly."""
-        robots = len(self.poses)
-        hint = "Pass what get_state returned for the same number of robots."
-        self.poses = check_array("state['poses']", state["poses"], (robots, 3), hint)
-        self.bumped = as_read_only(check_array("state['bumped']", state["bumped"], (robots,), hint, dtype=np.bool_))
 
 
 class _ContactSpace:

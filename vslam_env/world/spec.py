@@ -1,13 +1,15 @@
 """Immutable, validated description of a world: walls, landmarks and optional start poses."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.core.read_only import as_read_only
 from slam_backend.core.short_repr import short_repr
+from slam_backend.core.state import FLOAT32, FLOAT64, INT64, Array, Maybe, Record, Sizes, State, Text
 from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_array
 
 SHORTEST_WALL = 1e-3  # [m] below, the direction is ill-defined
@@ -45,6 +47,13 @@ class Landmarks:
         ValueError: If a shape is wrong, a number is not finite, or a vector is not of length 1.
     """
 
+    STATE: ClassVar[State] = State(
+        positions=Array(FLOAT64, "n 3", constant=True),
+        normals=Array(FLOAT64, "n 2", constant=True),
+        walls=Array(INT64, "n", constant=True),
+        descriptors=Array(FLOAT32, "n d", constant=True),
+    )
+
     positions: FloatArray
     normals: FloatArray
     walls: IntArray
@@ -66,6 +75,11 @@ class Landmarks:
                 raise argument_error(f"landmarks.{name}", "unit vectors", f"a length of {worst:g}", "Normalise them.")
         for name, array in zip(self.__slots__, (positions, normals, walls, descriptors), strict=True):
             object.__setattr__(self, name, as_read_only(array))
+
+    @classmethod
+    def check_state(cls, parts: Mapping[str, Any], sizes: Sizes) -> None:
+        """Raise unless the constructor accepts the parts."""
+        cls(**parts)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Keep copies and unpickled instances read-only."""
@@ -94,6 +108,13 @@ class World:
     >>> World("room", [[0, 0, 4, 0], [4, 0, 4, 3], [4, 3, 0, 3], [0, 3, 0, 0]]).bounds
     (0.0, 0.0, 4.0, 3.0)
     """
+
+    STATE: ClassVar[State] = State(
+        name=Text(),
+        walls=Array(FLOAT64, "walls 4", constant=True),
+        landmarks=Maybe(Record(Landmarks)),
+        start_poses=Maybe(Array(FLOAT64, "starts 3", constant=True)),
+    )
 
     name: str
     walls: FloatArray
@@ -143,6 +164,11 @@ class World:
             hint = "Give rows x y theta in metres and radians."
             starts: Any = check_array("world.start_poses", self.start_poses, (None, 3), hint, within=FARTHEST_PLACE)
             object.__setattr__(self, "start_poses", as_read_only(starts))
+
+    @classmethod
+    def check_state(cls, parts: Mapping[str, Any], sizes: Sizes) -> None:
+        """Raise unless the constructor accepts the parts."""
+        cls(**parts)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Keep copies and unpickled instances read-only."""

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from builders.environments import know
 
 from agents import make_policy, make_team_policy
 from agents.planners.hungarian import assign_all, hungarian
@@ -24,12 +25,12 @@ RNG = np.random.default_rng(0)
 def _targets(positions: list[tuple[float, float]], places: list[tuple[float, float]], wall: bool = False) -> Targets:
     """Return targets on free floor of 18 x 18 m, all lengths straight; with a wall along x = 0 but for a door."""
     grid = OccupancyGrid()
-    state = {"evidence": np.zeros((300, 300), np.int8), "corner": (0, 0)}
-    state["evidence"][105:195, 105:195] = -10
+    evidence = np.zeros((300, 300), np.int8)
+    evidence[105:195, 105:195] = -10
     if wall:
-        state["evidence"][105:195, 150] = 10
-        state["evidence"][170:175, 150] = -10
-    grid.set_state(state)
+        evidence[105:195, 150] = 10
+        evidence[170:175, 150] = -10
+    know(grid, evidence)
     robots, goals = np.array(positions), np.array(places)
     lengths = np.linalg.norm(robots[:, None] - goals[None], axis=-1)
     slots = np.tile(np.arange(len(goals)), (len(robots), 1))

@@ -35,7 +35,7 @@ from training.rl.network import GoalPolicy, check_finite
 from training.rl.trainer import Training, as_arrays, as_tensors, check_device, stored_checkpoint
 from training.vec_env import ExplorationVecEnv
 from vslam_env import NUM_CANDIDATES
-from vslam_env.state_kinds import ENV_KINDS
+from vslam_env.snapshots import ENV_KINDS
 
 SMOKE = TrainConfig.from_mapping({"preset": "smoke", "seed": 5})
 runner = CliRunner()

@@ -5,7 +5,7 @@ import dataclasses
 import gc
 import hashlib
 import tracemalloc
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ import pytest
 from builders.comparison import digest
 from builders.environments import MEETING, small_env, turning, wander
 
+from slam_backend.core.state import take
 from vslam_env import ExplorationEnv
 from vslam_env.belief.team_belief import TeamBelief
 
@@ -42,7 +43,7 @@ def _arrays(nest: Any) -> Iterator[np.ndarray]:
     """Yield all arrays in nested dicts, sequences and records."""
     if isinstance(nest, np.ndarray):
         yield nest
-    elif isinstance(nest, dict):
+    elif isinstance(nest, Mapping):
         yield from _arrays(list(nest.values()))
     elif isinstance(nest, (list, tuple)):
         for entry in nest:
@@ -123,8 +124,8 @@ def test_a_belief_keeps_no_array_of_the_caller() -> None:
                     array.fill(1)
         assert belief is not None
         assert any(event.kind == "merge" for event in belief.team.events)
-        states.append(belief.get_state())
-    assert states[0]["grids"]["strokes"]
+        states.append(take(belief))
+    assert states[0]["grids"]["updates"]
     for one, other in zip(*map(_arrays, states), strict=True):
         np.testing.assert_array_equal(one, other)
 
@@ -133,7 +134,7 @@ def test_true_ids_in_frames_are_copies() -> None:
     """The simulator reads its own again when robots return; writing to frames does not change them."""
     env = small_env()
     env.reset(seed=5, options={"start_poses": MEETING})
-    names = env.episode._frames.names
+    names = env.episode.last_frames.names
     frames = env.episode.frames
     assert any(len(frame.true_ids) for frame in frames)
     assert not any(np.shares_memory(frame.true_ids, names) for frame in frames)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from builders.environments import ANGLES, MAX_RANGE, MEETING, building, cast, small_env, turning
 
+from slam_backend.core.state import restore, take
 from slam_backend.fastslam.relative_poses import TeamPoses
 from slam_backend.fastslam.reports import Associations
 from slam_backend.geometry import between, compose, inverse
@@ -103,8 +104,8 @@ def test_the_history_of_scans_is_bounded() -> None:
     drive.on(ALL)
     for _ in range(MAX_ABSENCE + 5):
         drive.on(((0, 1), (0, 1), (2,)))
-        assert len(drive.grids.get_state()["strokes"]) <= MAX_ABSENCE + 1
-    assert not drive.grids.get_state()["strokes"]
+        assert len(drive.grids._updates) <= MAX_ABSENCE + 1
+    assert not drive.grids._updates
     alone = drive.cells()
     drive.on(ALL)
     known = drive.cells() != UNKNOWN
@@ -117,7 +118,7 @@ def test_restored_grids_continue_with_missed_scans() -> None:
     for mates in [ALL] * 3 + [parted(rng) for _ in range(20)]:
         drive.on(mates)
     other = SharedGrids(3, BODY, StereoCamera())
-    other.set_state(drive.grids.get_state())
+    restore(other, take(drive.grids))
     team_poses, nothing = stand(STARTS), np.full((3, len(ANGLES)), MAX_RANGE)
     report = TeamReport(
         drive.tick, Associations.from_arrays([NOTHING], [NOTHING]), ALL, (), (), (0, 0, 0), (), drive.tick + 1
@@ -132,21 +133,21 @@ def test_restored_grids_continue_with_missed_scans() -> None:
 def test_scans_are_sent_once() -> None:
     """Of two that hold the same, one sends it; what is known is noted, not sent; others hand on what they received."""
     shared = np.array([[1, 1, 0], [1, 1, 0], [0, 0, 1]])
-    strokes = GridUpdate(7, shared, np.zeros((3, 3, 3)), np.ones((3, 2)), np.zeros(3, np.bool_))
+    update = GridUpdate(7, shared, np.zeros((3, 3, 3)), np.ones((3, 2)), np.zeros(3, np.bool_))
     motion = np.array([1.0, 2.0, 0.5])
     tellings = [
         GridTransfer(0, 2, motion, 0, False),
         GridTransfer(1, 2, motion, 0, False),
         GridTransfer(2, 0, -motion, 0, True),
     ]
-    (after,), (missed,) = plan_catch_up([strokes], tellings)
+    (after,), (missed,) = plan_catch_up([update], tellings)
     assert missed.shared.tolist() == [[0, 0, 0], [0, 0, 0], [1, 1, 0]]
     assert after.shared.tolist() == [[1, 1, 1], [1, 1, 0], [1, 1, 1]]
     np.testing.assert_array_equal(missed.poses[2, :2], [motion, motion])
     (later,), (missed,) = plan_catch_up([after], [GridTransfer(0, 1, motion, 0, False)])
     assert later.shared.all()
     assert missed.shared.tolist() == [[0, 0, 0], [0, 0, 1], [0, 0, 0]]
-    assert strokes.shared is shared
+    assert update.shared is shared
     assert shared.sum() == 5
     assert plan_catch_up([], tellings) == ([], [])
 
@@ -191,13 +192,12 @@ def test_scans_shared_within_a_side_survive_an_undo() -> None:
 
 
 def test_a_scan_history_owns_its_arrays() -> None:
-    """Strokes that were added to own their arrays: views would keep the whole history of each meeting alive."""
+    """Updates that were added to own their arrays: views would keep the whole history of each meeting alive."""
     rng, drive = np.random.default_rng(100), Drive(100)
     for mates in [ALL] * 2 + [((0,), (1,), (2,)), ((0, 1), (0, 1), (2,))] * 20 + [parted(rng) for _ in range(20)]:
         drive.on(mates)
-    strokes = drive.grids.get_state()["strokes"]
-    assert strokes
-    for own in strokes:
+    assert drive.grids._updates
+    for own in drive.grids._updates:
         for array in (own.shared, own.poses):
             assert isinstance(array.base, memoryview)
             assert array.base.nbytes == array.nbytes

@@ -49,7 +49,7 @@ def _score(
     ground_truth: GroundTruthAssociation, robot: int, held: LandmarkMap, world_from_group: np.ndarray
 ) -> SimpleNamespace:
     """Score one robot's map, the others having none."""
-    robots = len(ground_truth.get_state()["map_of"])
+    robots = len(ground_truth._map_of)
     maps, poses = [LandmarkMap.empty(2)] * robots, np.zeros((robots, 3))
     maps[robot], poses[robot] = held, world_from_group
     summaries = TeamMapSummaries.from_maps([each.summary for each in maps])
@@ -120,8 +120,8 @@ def test_claims_follow_copies_deletions_and_snapshots() -> None:
         report = TeamReport(step, associations, ((0,), (1,)), (), (), maps, tuple(entries), step + 1)
         ground_truth.record(report, [true_ids, _ids()])
         if turn % 50 == 0:
-            state, ground_truth = ground_truth.get_state(), GroundTruthAssociation(2, TRUTHS, COUNTABLE, 1.0)
-            ground_truth.set_state(state)
+            state, ground_truth = take(ground_truth), GroundTruthAssociation(2, TRUTHS, COUNTABLE, 1.0)
+            restore(ground_truth, state)
         for robot, number in enumerate(maps):
             expected = plain[number]
             assert ground_truth.true_ids(robot, np.array([*expected], np.int64)).tolist() == [*expected.values()]
@@ -212,7 +212,7 @@ def test_coverage_is_a_union() -> None:
     grids = team.grids
     meter = CoverageCells(centres, starts)
     coverage, shares = CoverageTracker(meter), []
-    kept = grids[1].get_state()
+    kept = take(grids[1])
     angles = np.linspace(-0.6, 0.6, 32)
     for turn in range(40):
         for grid in grids:
@@ -224,7 +224,7 @@ def test_coverage_is_a_union() -> None:
         if turn % 7 == 3:
             grids[0].merge(grids[2], rng.uniform(-1.0, 1.0, 3))
         if turn in (20, 30):
-            grids[1].set_state(kept)
+            restore(grids[1], kept)
         shares.append(coverage.update(team, starts, np.empty(len(starts))))
         assert shares[-1] == _plain_share(centres, starts, grids)
     assert shares[-1] > 0.1

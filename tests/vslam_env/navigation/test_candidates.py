@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from builders.environments import MEETING, small_env, turning
+from builders.environments import MEETING, know, small_env, turning
 from builders.kernels import python_entry
 
 from slam_backend.core.state import restore, take
@@ -120,21 +120,21 @@ def test_looks_grow_with_the_grid() -> None:
     looks = TeamLooks(1, ANGLES, HALF_FOV, REACH)
     args = ALONE, np.zeros((1, 1, 3)), facing_wall(3.1)[None]
     looks.update(*args, GRID_SIZE)
-    before, state = looks.counts[0].copy(), looks.get_state(0)
+    before, state = looks.counts[0].copy(), looks.part(0)
     looks.update(*args, GRID_SIZES[1])
     inner = slice(margin(GRID_SIZES[1]), -margin(GRID_SIZES[1]))
     assert before.any()
     assert (looks.counts[0, inner, inner] == 2 * before).all()
-    looks.set_state(0, state)
+    looks.restore_part(0, state)
     assert looks.counts.sum() == before.sum()
     assert (looks.counts[0, inner, inner] == before).all()
-    again = looks.get_state(0)
-    assert again["corner"] == state["corner"]
-    assert (again["counts"] == state["counts"]).all()
-    assert state["counts"].size < 60
+    again = looks.part(0)
+    assert again.corner == state.corner
+    assert (again.values == state.values).all()
+    assert state.values.size < 60
     assert (looks.bounds[0] == known_bounds(looks.counts[0])).all()
     empty = TeamLooks(1, ANGLES, HALF_FOV, REACH)
-    looks.set_state(0, empty.get_state(0))
+    looks.restore_part(0, empty.part(0))
     assert not looks.counts.any()
     assert not looks.bounds.any()
 
@@ -244,7 +244,7 @@ class Robot:
     def __init__(self, cells: np.ndarray) -> None:
         self.grids, self.candidates = TeamGrids(1), TeamCandidates(1, (HALF_FOV, REACH, 0.2))
         evidence = np.where(cells == FREE, -5, np.where(cells == OCCUPIED, 5, 0)).astype(np.int8)
-        self.grids.grids[0].set_state({"evidence": evidence, "corner": (0, 0)})
+        know(self.grids.grids[0], evidence)
         self.team_looks = TeamLooks(1, ANGLES, HALF_FOV, REACH)
         self.looks = self.team_looks.counts[0]
 
@@ -374,7 +374,7 @@ def test_teammates_paths_are_those_of_a_search_from_them() -> None:
     row = cell_of((0.0, 2.0))[0]
     cells[row : row + 7, cell_of((3.0, 0.0))[1]] = FREE  # a door
     evidence = np.where(cells == FREE, -5, np.where(cells == OCCUPIED, 5, 0)).astype(np.int8)
-    grids.grids[1].set_state({"evidence": evidence, "corner": (0, 0)})
+    know(grids.grids[1], evidence)
     poses = np.full((3, 3, 3), np.nan)
     poses[1, 1], poses[1, 0] = [0.0, 0.0, 0.0], [5.0, -2.0, 1.0]
     for _ in range(2):

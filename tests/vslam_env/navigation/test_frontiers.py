@@ -6,6 +6,7 @@ from builders.environments import ANGLES, building, clearance, drive, in_start_f
 from builders.kernels import python_entry
 from scipy.optimize import linear_sum_assignment
 
+from slam_backend.core.state import restore, take
 from slam_backend.core.validation import FloatArray
 from slam_backend.geometry import inverse, transform_points
 from vslam_env.navigation import (
@@ -165,19 +166,18 @@ def test_passing_robots_drop_no_frontier() -> None:
 
 
 def test_restored_slots_continue_bit_for_bit() -> None:
-    """After set_state, the same updates lead to the same candidates, visits included."""
+    """After a restoration, the same updates lead to the same candidates, visits included."""
     cells = room((-4.0, 4.4))
     slots, again = CandidateSlots(), CandidateSlots()
     slots.update(cells, (0.0, 0.0, 0.0))
     pose = np.array([*slots.goals[0], slots.headings[0]])
     for _ in range(3):
         slots.update(cells, pose)
-    again.set_state(slots.get_state())
+    restore(again, take(slots))
     for each in (slots, again):
         each.update(cells, pose)
     assert slots.valid.sum() == 1
-    for name, value in slots.get_state().items():
-        assert np.array_equal(value, again.get_state()[name], equal_nan=True)
+    assert take(slots) == take(again)
 
 
 def explore(seed: int, start: FloatArray, max_ticks: int = 2000) -> tuple[OccupancyGrid, CandidateSlots, FloatArray]:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from slam_backend.core.state import restore, take
 from vslam_env.navigation import OccupancyGrid
 from vslam_env.navigation._view_kernels import COARSE, NUM_COARSE, write_global_grid
 from vslam_env.navigation.global_grids import GlobalGrids
@@ -48,11 +49,11 @@ def test_pictures_follow_scans_merges_and_restored_states(seed: int) -> None:
             looks.reserve(grids.size)
             looks.merge(1, looks.counts[0].copy(), rng.uniform(-5.0, 5.0, 3))
         elif kind == 1:
-            kept = grids.grids[0].get_state(), looks.get_state(0)
+            kept = take(grids.grids[0]), looks.part(0)
         elif kind == 2 and kept is not None:
-            grids.grids[0].set_state(kept[0])
+            restore(grids.grids[0], kept[0])
             looks.reserve(grids.size)
-            looks.set_state(0, kept[1])
+            looks.restore_part(0, kept[1])
         kinds.add(int(kind))
         if rng.random() < 0.7:
             assert_drawn(pictures, grids, looks)

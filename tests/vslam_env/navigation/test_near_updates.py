@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from builders.environments import know
 
 from vslam_env.navigation import (
     CELL,
@@ -55,7 +56,7 @@ class Robot:
         """Let the robots know other cells from now on."""
         evidence = np.where(cells == FREE, -5, np.where(cells == OCCUPIED, 5, 0)).astype(np.int8)
         for grid in self.grids.grids:
-            grid.set_state({"evidence": evidence, "corner": (0, 0)})
+            know(grid, evidence)
 
     def update(self, x: float, *mates: tuple[float, float], places: np.ndarray = NO_PLACES) -> np.ndarray:
         """Update the first robot's candidates at (x, 0), and return the rows of its frontiers, by x."""

@@ -7,6 +7,7 @@ from builders.plain_scan_update import PLAIN_SIZE, plain_scan_update
 from hypothesis import given
 from hypothesis import strategies as st
 
+from slam_backend.core.state import restore, take
 from slam_backend.geometry import transform_points
 from vslam_env.navigation import (
     CELL,
@@ -42,7 +43,7 @@ def cells_at(grid: OccupancyGrid, points: np.ndarray) -> np.ndarray:
 
 def evidence_of(grid: OccupancyGrid, size: int) -> np.ndarray:
     """Return the evidence (size, size) of a grid."""
-    evidence, (row, col) = grid.get_state().values()
+    (row, col), evidence = grid.known
     shift, whole = (size - GRID_SIZE) // 2, np.zeros((size, size), np.int8)
     whole[row + shift : row + shift + len(evidence), col + shift : col + shift + evidence.shape[1]] = evidence
     return whole
@@ -127,7 +128,7 @@ def test_a_grid_reports_changed_cells() -> None:
         changed = np.argwhere(grid.cells != before) + (LARGEST_SIZE - GRID_SIZE) // 2
         assert set((changed @ [LARGEST_SIZE, 1]).tolist()) <= set(changes[1 : 1 + changes[0]].tolist())
     assert 0 <= changes[0] < 200
-    grid.set_state(grid.get_state())
+    restore(grid, take(grid))
     assert changes[0] == -1
 
 
@@ -139,7 +140,7 @@ def test_a_grid_keeps_the_bounds_of_what_it_knows() -> None:
     assert bounds.tolist() == [0, 0, 0, 0]
     other.update_from_scan((3.0, -2.0, 1.0), wall_ranges(4.0), ANGLES)
     for k in range(30):
-        before = grid.get_state()
+        before = take(grid)
         pose = np.append(rng.uniform(-31.0, 31.0, 2) if k % 3 == 0 else rng.uniform(-3.0, 3.0, 2), rng.uniform(-3, 3))
         grid.update_from_scan(pose, rng.uniform(0.3, 9.0, 32), ANGLES)
         grid.clear_disc(pose)
@@ -147,7 +148,7 @@ def test_a_grid_keeps_the_bounds_of_what_it_knows() -> None:
         if k % 5 == 0:
             grid.merge(other, pose)
         if k % 7 == 0:
-            grid.set_state(before)
+            restore(grid, before)
         rows, columns = np.nonzero(grid.cells)
         if len(rows) > 0:
             assert bounds.tolist() == [rows.min(), columns.min(), rows.max() + 1, columns.max() + 1]
@@ -246,7 +247,7 @@ def test_a_grid_grows_with_what_was_seen_and_stays_the_same() -> None:
     small, large, other = OccupancyGrid(), OccupancyGrid(), OccupancyGrid()
     large.clear_disc((250.0, 0.0, 0.0))
     assert len(large.cells) == GRID_SIZES[-1]
-    large.set_state(small.get_state())
+    restore(large, take(small))
     other.update_from_scan((25.0, 4.0, 0.0), wall_ranges(5.0), ANGLES)
     sizes = set()
     for x in np.arange(0.0, 130.0, 2.0):
@@ -257,9 +258,9 @@ def test_a_grid_grows_with_what_was_seen_and_stays_the_same() -> None:
             grid.bump(pose)
             if x % 40 == 0:
                 grid.merge(other, pose)
-        state, expected = small.get_state(), large.get_state()
-        assert state["corner"] == expected["corner"]
-        assert (state["evidence"] == expected["evidence"]).all()
+        state, expected = small.known, large.known
+        assert state.corner == expected.corner
+        assert (state.values == expected.values).all()
         sizes.add(len(small.cells))
     assert sizes == set(GRID_SIZES[:4])
     for x in np.arange(0.0, 130.0, 0.5):  # a way through what the scans drew
@@ -282,16 +283,16 @@ def test_views_and_states_follow_a_grid_that_grows() -> None:
     team = TeamGrids(2)
     grid, view = team.grids[0], team.grids[0].read_only_view()
     grid.update_from_scan((0.0, 0.0, 0.0), wall_ranges(3.0), ANGLES)
-    before, known = grid.get_state(), cells_at(grid, ALL_CENTRES.reshape(-1, 2))
+    before, known = take(grid), cells_at(grid, ALL_CENTRES.reshape(-1, 2))
     grid.update_from_scan((60.0, 0.0, 0.0), wall_ranges(3.0), ANGLES)
     assert (view.cells == grid.cells).all()
     assert cells_at(view, np.array([[60.5, 0.1]])) == [FREE]
     assert len(team.cells[1]) == len(view.cells) > GRID_SIZE
     assert not team.cells[1].any()
-    grid.set_state(before)
+    restore(grid, before)
     assert (cells_at(view, ALL_CENTRES.reshape(-1, 2)) == known).all()
     assert np.count_nonzero(view.cells) == np.count_nonzero(known)
-    assert len(grid.get_state()["evidence"]) < 60
+    assert len(grid.known.values) < 60
 
 
 @given(st.tuples(st.floats(-8, 8), st.floats(-8, 8), st.floats(-4, 4)))
@@ -332,7 +333,7 @@ def test_copies_are_independent_and_views_follow() -> None:
         lambda: view.clear_disc((0, 0, 0)),
         lambda: view.bump((0, 0, 0)),
         lambda: view.merge(grid, (0, 0, 0)),
-        lambda: view.set_state(grid.get_state()),
+        lambda: restore(view, take(grid)),
     ):
         with pytest.raises(RuntimeError, match=r"read-only view. Make a copy\(\)"):
             write()

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from builders.environments import know
 
 from vslam_env.navigation import (
     DistanceMap,
@@ -22,8 +23,7 @@ LEFT, RIGHT, DOOR = (-3.0, 1.0), (3.0, -1.0), (0.1, 0.1)  # two rooms of about 6
 def grid() -> OccupancyGrid:
     """Two rooms side by side, with a door of 1 m between them; an unknown corner in the right one."""
     grid = OccupancyGrid()
-    state = {"evidence": np.zeros((300, 300), np.int8), "corner": (0, 0)}
-    evidence = state["evidence"]
+    evidence = np.zeros((300, 300), np.int8)
     evidence[140:161, 120:181] = -10
     for walls in (
         np.s_[140, 120:181],
@@ -35,7 +35,7 @@ def grid() -> OccupancyGrid:
         evidence[walls] = 10
     evidence[148:154, 150] = -10  # the door
     evidence[156:160, 176:180] = 0
-    grid.set_state(state)
+    know(grid, evidence)
     return grid
 
 

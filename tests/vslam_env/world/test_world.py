@@ -149,7 +149,7 @@ def test_starts_are_free_reachable_and_apart(family: str) -> None:
     """Three robots start 5 m apart, or 7 m if that is asked, off the walls, in the same part, sharing no view."""
     for seed, apart in ((0, 5.0), (1, 7.0), (2, 5.0)):
         config = EnvConfig(world=family, min_start_distance=apart)
-        scenario = sample_scenario(config, family, np.random.SeedSequence(seed))
+        scenario, _ = sample_scenario(config, family, np.random.SeedSequence(seed))
         starts = scenario.true_starts
         gaps = np.linalg.norm(starts[:, None, :2] - starts[:, :2], axis=2)[~np.eye(3, dtype=bool)]
         assert gaps.min() >= apart

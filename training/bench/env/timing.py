@@ -96,7 +96,7 @@ def play_env(env: ExplorationEnv, seed: int, steps: int) -> Play:
 
 def time_simulator(config: EnvConfig, seed: int, steps: int, warm_up: int) -> dict[str, float]:
     """Time ticks of the simulator: physics, odometry, landmark sensor and scans, without filter and observations."""
-    scenario = sample_scenario(config, config.world, np.random.SeedSequence(seed).spawn(1)[0])
+    scenario, _ = sample_scenario(config, config.world, np.random.SeedSequence(seed).spawn(1)[0])
     simulator = Simulator(scenario.world, scenario.true_starts, config.robot_radius, TICK)
     odometry, sensor, scan = (np.random.default_rng(seed + i) for i in range(3))
     rng = np.random.default_rng(seed)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from slam_backend.core.short_repr import short_repr
+from slam_backend.core.state import INT64, UINT8, Array, Each, Record, with_state
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray, argument_error, check_float
 from slam_backend.frontend import CornerOptions, FrontEndOptions, StereoFrame, StereoFrontEnd
 from slam_backend.frontend.images import LARGEST, SMALLEST, Image
@@ -97,6 +98,13 @@ class RenderedFrame(NamedTuple):
 
 
 @short_repr
+@with_state(
+    measurements=Each(Record(Measurements), "K"),
+    true_ids=Each(Array(INT64, "*", -1, "WORLD", constant=True), "K"),
+    left=Each(Array(UINT8, "HEIGHT WIDTH", constant=True), "K"),
+    right=Each(Array(UINT8, "HEIGHT WIDTH", constant=True), "K"),
+    seen=Each(Record(StereoFrame), "K"),
+)
 class TeamRenderedFrames(NamedTuple):
     """The frames of all robots in one tick, with the fields of `RenderedFrame` by robot."""
 

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from slam_backend.core.image_files import read_grey_image
 from slam_backend.core.lazy_import import LazyModule
 from slam_backend.core.read_only import as_constant, as_read_only
 from slam_backend.core.short_repr import short_repr
+from slam_backend.core.state import FLOAT64, INT32, INT64, Array, Options, State
 from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_array, check_choice, check_float
 from slam_backend.frontend.images import Image
 
@@ -81,6 +82,14 @@ class WallTextures:
         columns: (2 S,) int64. Number of texel columns of each face.
         widths: (2 S,) float64 [m]. Texel width of each face; the height is `config.texel`.
     """
+
+    STATE: ClassVar[State] = State(
+        config=Options(TextureConfig),
+        sums=Array(INT32, "* *", constant=True),
+        starts=Array(INT64, "faces", constant=True),
+        columns=Array(INT64, "faces", constant=True),
+        widths=Array(FLOAT64, "faces", constant=True),
+    )
 
     config: TextureConfig
     sums: NDArray[np.int32]
