@@ -172,6 +172,21 @@ def restore(owner: Any, snapshot: Snapshot) -> None:
         owner.rebuild()
 
 
+def restored(snapshot: Snapshot, owner: Any = None) -> Any:
+    """Return an object in the state of a snapshot: the given one if it is of the same class, else a new one.
+
+    A new one comes from the class method `from_state(snapshot)`. Classes without this method need no constructor, and
+    all parts of their state are attributes without a leading underscore.
+    """
+    kind: Any = snapshot.of
+    if type(owner) is not kind:
+        if hasattr(kind, "from_state"):
+            return kind.from_state(snapshot)
+        owner = object.__new__(kind)
+    restore(owner, snapshot)
+    return owner
+
+
 def accepted(kind: type, name: str, state: Any, sizes: Sizes | None = None) -> Snapshot:
     """Return a state as a snapshot of a class, or raise a ValueError that names the part that is wrong.
 
@@ -205,15 +220,23 @@ def _limit(bound: Bound, sizes: Sizes, default: float) -> Any:
 
 @dataclass(frozen=True)
 class Int(Part):
-    """An int within bounds, both included; a name as upper bound stands for an index below that size."""
+    """An int within bounds, both included; a name as upper bound stands for an index below that size.
+
+    Attributes:
+        low, high: The bounds.
+        size: Name of the size that the int is; None: of no size.
+    """
 
     low: int = 0
     high: int | str = MAX_INT
+    size: str | None = None
 
     def _check(self, name: str, value: Any, sizes: Sizes) -> int:
         high = _limit(self.high, sizes, MAX_INT)
         if type(value) is not int or not self.low <= value <= high:
             refuse(name, f"an int from {self.low} to {high}", value)
+        if self.size is not None and sizes.setdefault(self.size, value) != value:
+            refuse(name, f"{sizes[self.size]}", value)
         return value
 
 
@@ -364,7 +387,7 @@ class Each(Part):
 
     Attributes:
         part: Type of the values.
-        size: Name of their number; None: any.
+        size: Name of their number, or the number in digits; None: any.
         kind: Class of the sequence in the object.
     """
 
@@ -392,8 +415,10 @@ class Each(Part):
         made = frozenset if self.kind in (set, frozenset) else tuple
         if type(value) not in ((set, frozenset) if made is frozenset else (tuple, list)):
             refuse(name, f"a {made.__name__}", f"a {type(value).__name__}")
-        if self.size is not None and len(value) != sizes.setdefault(self.size, len(value)):
-            refuse(name, f"{sizes[self.size]} of them", len(value))
+        if self.size is not None:
+            wanted = int(self.size) if self.size.isdigit() else sizes.setdefault(self.size, len(value))
+            if len(value) != wanted:
+                refuse(name, f"{wanted} of them", len(value))
         return made(self.part._check(f"{name}[{i}]", each, sizes) for i, each in enumerate(value))
 
     def _inner(self) -> Iterable[Part | type]:
@@ -500,7 +525,7 @@ class _OfClass(Part):
 
 
 class Child(_OfClass):
-    """An object with a `STATE` of its own; it is restored in place, or made by `from_state(snapshot)` of its class."""
+    """An object with a `STATE` of its own; it is restored in place, or made anew, see `restored`."""
 
     is_constant = False
 
@@ -508,10 +533,7 @@ class Child(_OfClass):
         return take(value)
 
     def _put(self, value: Any, kept: Snapshot) -> Any:
-        if type(value) is not kept.of:
-            return self.kind.from_state(kept)  # type: ignore[attr-defined]
-        restore(value, kept)
-        return value
+        return restored(kept, value)
 
     def _checked(self, name: str, value: Any, sizes: Sizes) -> Snapshot:
         kind: Any = self.kind
@@ -572,6 +594,41 @@ class OneOf(Part):
 
     def _inner(self) -> Iterable[Part | type]:
         return self._records.values()
+
+
+class ChildOf(Part):
+    """An object of one of several classes with a `STATE`; its snapshot has the name of the class among its parts.
+
+    Args:
+        kinds: The classes, or functions that return them.
+    """
+
+    is_constant = False
+
+    def __init__(self, *kinds: Kind) -> None:
+        self._kinds = kinds
+
+    def _take(self, value: Any) -> Snapshot:
+        return _with_class(take(value))
+
+    def _put(self, value: Any, kept: Snapshot) -> Any:
+        return restored(kept, value)
+
+    def _check(self, name: str, value: Any, sizes: Sizes) -> Snapshot:
+        children = {kind.__name__: Child(kind) for kind in map(_class, self._kinds)}
+        found = value.get(CLASS) if isinstance(value, Mapping) else None
+        if not isinstance(found, str) or found not in children:
+            refuse(name, f"the state of one of {', '.join(children)}", f"a {type(value).__name__}")
+        return _with_class(children[found]._check(name, value, sizes))
+
+    def _inner(self) -> Iterable[Part | type]:
+        return map(_class, self._kinds)
+
+
+def _with_class(snapshot: Snapshot) -> Snapshot:
+    """Return a snapshot with the name of its class among its parts."""
+    assert snapshot.of is not None
+    return Snapshot({CLASS: snapshot.of.__name__} | dict(snapshot), snapshot.of)
 
 
 class Options(_OfClass):

@@ -1,18 +1,32 @@
 """Merges of groups as processes with phases, and their owner in a team."""
 
-import copy
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
 
-from slam_backend.core.read_only import with_constants
-from slam_backend.core.state_checks import refuse_malformed
+from slam_backend.core.state import (
+    Child,
+    ChildOf,
+    Dict,
+    Each,
+    Flag,
+    Generator,
+    Int,
+    Maybe,
+    Options,
+    Record,
+    Row,
+    Sizes,
+    Snapshot,
+    State,
+    restored,
+)
 from slam_backend.core.validation import IntArray
-from slam_backend.fastslam.state_checks import check_filter
 from slam_backend.maps.alignment import Alignment
 from slam_backend.team.branches import MAX_REPLAYED, Branch, ReplayedStep, replay
+from slam_backend.team.bridge import ALIGNMENT
 from slam_backend.team.filter_merging.pairing import Pairing
 from slam_backend.team.group_merging import (
     JoinedGroups,
@@ -39,7 +53,7 @@ from slam_backend.team.merge_attempt import (
     representatives,
 )
 from slam_backend.team.merge_monitor import MergeMonitor, are_both_connected
-from slam_backend.team.merge_scheduler import MergeScheduler, PairKey
+from slam_backend.team.merge_scheduler import PAIR, ROBOTS, MergeScheduler, PairKey
 from slam_backend.team.options import MergeOptions
 from slam_backend.team.reports import LandmarkIdMap, MergeEvent, MergeUndone
 from slam_backend.team.shared_records import SharedRecords
@@ -76,6 +90,7 @@ class MergeProcess:
         phase: Present phase, with what it needs.
     """  # noqa: E501
 
+    STATE = State(pair=PAIR, phase=ChildOf(lambda: Smoothing, lambda: Watched, lambda: Undoing, lambda: Undone))
     pair: PairKey
     phase: "Phase"
 
@@ -95,16 +110,6 @@ class MergeProcess:
     def oldest_step(self) -> int | None:
         """First step that an undo would replay; None if there will be none."""
         return None if self.joined is None else self.joined.oldest_step
-
-    def get_state(self) -> dict[str, Any]:
-        """Return the complete state of the process."""
-        assert isinstance(self.phase, (Smoothing, Watched, Undoing, Undone))  # the others end in the step they begin
-        return {"pair": self.pair, "phase": self.phase.name, **self.phase.get_state()}
-
-    @classmethod
-    def from_state(cls, state: Mapping[str, Any]) -> "MergeProcess":
-        """Build a process from `get_state`."""
-        return cls(state["pair"], STORED[state["phase"]].from_state(state))
 
 
 # ---------------------------------------------------------------------- before the merge
@@ -130,7 +135,7 @@ class Attempt:
         return Smoothing(map_numbers(self.groups), alignment, team.step)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class Smoothing:
     """Smoothing of both maps, which are then aligned again.
 
@@ -142,6 +147,7 @@ class Smoothing:
     """
 
     name: ClassVar[str] = "smoothing"
+    STATE = State(numbers=Row(Int(), Int()), unsmoothed=ALIGNMENT, since=Int(high="STEPS"), ready=Flag())
     numbers: tuple[int, int]
     unsmoothed: Alignment
     since: int
@@ -155,20 +161,12 @@ class Smoothing:
             return ABANDONED
         if not (self.ready and are_connected(groups, team.networks)):
             is_smooth = not any(group.trunk.filter.rejuvenation_requested for group in groups)
-            return replace(self, ready=self.ready or is_late or is_smooth)
+            self.ready |= is_late or is_smooth
+            return self
         maps = mixture_maps(groups)
         alignment = align_smoothed(groups, maps, self.unsmoothed, team.schedule, team.rng)
         team.records.exchange.record_smoothed(*representatives(groups), *maps)
         return Trial(MergePlan(groups, maps, alignment), self.unsmoothed)
-
-    def get_state(self) -> dict[str, Any]:
-        """Return what the phase holds."""
-        return {"numbers": self.numbers, "unsmoothed": self.unsmoothed, "since": self.since, "ready": self.ready}
-
-    @classmethod
-    def from_state(cls, state: Mapping[str, Any]) -> "Smoothing":
-        """Build the phase from the state of a process."""
-        return cls(state["numbers"], state["unsmoothed"], state["since"], state["ready"])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -213,11 +211,12 @@ class Trial:
 # ---------------------------------------------------------------------- after the merge
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class Watched:
     """Monitoring of a merge that can be undone."""
 
     name: ClassVar[str] = "watched"
+    STATE = State(joined=Record(JoinedGroups))
     joined: JoinedGroups
 
     def advance(self, team: "TeamMerges") -> "Phase":
@@ -227,15 +226,6 @@ class Watched:
         if not (is_due and is_refuted(self.joined.number, group.trunk, team.merging, team.schedule.alignment)):
             return self
         return team.rollback(self.joined, group)
-
-    def get_state(self) -> dict[str, Any]:
-        """Return what the phase holds."""
-        return self.joined.get_state()
-
-    @classmethod
-    def from_state(cls, state: Mapping[str, Any]) -> "Watched":
-        """Build the phase from the state of a process."""
-        return cls(JoinedGroups.from_state(state))
 
 
 @dataclass(slots=True, eq=False)
@@ -250,6 +240,10 @@ class Undoing:
     """
 
     name: ClassVar[str] = "undoing"
+    STATE = State(
+        joined=Record(JoinedGroups), robots=ROBOTS, trunks=Each(Child(Branch), "sides", list),
+        replayed=Each(Each(Record(ReplayedStep), kind=list), "sides", list),
+    )  # fmt: skip
     joined: JoinedGroups
     robots: tuple[int, ...]
     trunks: list[Branch]
@@ -285,39 +279,18 @@ class Undoing:
             replayed += replay(trunk, records.log, wanted, share)
         return all(last >= joint.last_steps[robot] for trunk in self.trunks for robot, last in trunk.last_steps.items())
 
-    def get_state(self) -> dict[str, Any]:
-        """Return what the phase holds."""
-        trunks = tuple(trunk.get_state() for trunk in self.trunks)
-        replayed = tuple(tuple(steps) for steps in self.replayed)
-        return self.joined.get_state() | {"robots": self.robots, "trunks": trunks, "replayed": replayed}
 
-    @classmethod
-    def from_state(cls, state: Mapping[str, Any]) -> "Undoing":
-        """Build the phase from the state of a process."""
-        trunks = [Branch.from_state(trunk) for trunk in state["trunks"]]
-        replayed = [list(with_constants(steps)) for steps in state["replayed"]]
-        return cls(JoinedGroups.from_state(state), state["robots"], trunks, replayed)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class Undone:
     """Time after an undo in which forks of the joint filter remain."""
 
     name: ClassVar[str] = "undone"
+    STATE = State(joined=Record(JoinedGroups))
     joined: JoinedGroups
 
     def advance(self, team: "TeamMerges") -> "Phase":
         """Wait for the robots of these forks."""
         return self
-
-    def get_state(self) -> dict[str, Any]:
-        """Return what the phase holds."""
-        return self.joined.get_state()
-
-    @classmethod
-    def from_state(cls, state: Mapping[str, Any]) -> "Undone":
-        """Build the phase from the state of a process."""
-        return cls(JoinedGroups.from_state(state))
 
 
 @dataclass(frozen=True, slots=True)
@@ -333,7 +306,6 @@ class Ended:
 
 REFUSED, ABANDONED, FINAL = Ended("refused"), Ended("abandoned"), Ended("final")
 Phase = Attempt | Smoothing | Trial | Watched | Undoing | Undone | Ended
-STORED: dict[str, Any] = {phase.name: phase for phase in (Smoothing, Watched, Undoing, Undone)}
 
 
 # ---------------------------------------------------------------------- all merges of a team
@@ -357,6 +329,12 @@ class TeamMerges:
         networks: (K,) robots with the same number are in contact.
         is_stale: Whether groups, branches or monitors have changed since the last `topology`.
     """
+
+    STATE = State(
+        groups=Each(Child(Group), kind=list), schedule=Child(MergeScheduler), merging=Options(MergeOptions),
+        rng=Generator(), epoch=Int(), events=Each(Record(MergeEvent), kind=list),
+        attempt=Maybe(Child(MergeProcess)), joined=Dict(Int(), Child(MergeProcess)),
+    )  # fmt: skip
 
     groups: list[Group]
     records: SharedRecords
@@ -444,16 +422,9 @@ class TeamMerges:
         self.is_stale = True
 
     def rollback(self, joined: JoinedGroups, group: Group) -> Undoing:
-        """Return the start of an undo of a group's merge.
-
-        Raises:
-            ValueError: If a filter from before it is damaged: states share the dicts that hold it with the team.
-        """
-        sides = list(self._sides_down_to(joined.number, group.trunk.monitors))
-        for side in sides:
-            with refuse_malformed("state"):
-                check_filter("state['filter']", side["filter"], (group.trunk.filter.options,))
-        return Undoing(joined, group.robots, [Branch.from_state(side) for side in sides], [[] for _ in sides])
+        """Return the start of an undo of a group's merge."""
+        trunks = [restored(side) for side in self._sides_down_to(joined.number, group.trunk.monitors)]
+        return Undoing(joined, group.robots, trunks, [[] for _ in trunks])
 
     def merges_down_to(self, number: int, monitors: Sequence[MergeMonitor]) -> Iterator[JoinedGroups]:
         """Yield the merges to undo, the last one first, to undo the one that made map `number`."""
@@ -495,26 +466,52 @@ class TeamMerges:
         merges = [joined for number in monitored if (joined := self.joined[number].joined) is not None]
         return TeamTopology.of(self.groups, [(joined.oldest_step, set(joined.map_numbers)) for joined in merges])
 
-    def get_state(self) -> dict[str, Any]:
-        """Return the complete state of the merges; groups and records have states of their own."""
-        processes = [*self.joined.values(), *([] if self.attempt is None else [self.attempt])]
-        return {
-            "epoch": self.epoch,
-            "rng": copy.deepcopy(self.rng.bit_generator.state),
-            "events": tuple(self.events),
-            "merging": self.merging,
-            "schedule": self.schedule.get_state(),
-            "processes": tuple(process.get_state() for process in processes),
-        }
+    @staticmethod
+    def check_state(parts: Mapping[str, Any], sizes: Sizes) -> None:
+        """Raise unless groups share out all robots, and each monitor and each undo fits a merge."""
+        trunks = [group["branches"][0]["robots"] for group in parts["groups"]]
+        if trunks != sorted(trunks) or sorted(sum(trunks, ())) != list(range(sizes["K"])):
+            raise ValueError("groups that do not share out all robots, ordered by their first ones")
+        if parts["attempt"] is not None and parts["attempt"]["phase"].of is not Smoothing:
+            raise ValueError("an attempt in another phase than smoothing")
+        pairs: dict[int, PairKey] = {}
+        for number, process in parts["joined"].items():
+            phase = process["phase"]
+            if phase.of is Smoothing or phase["joined"].number != number or number < max(pairs, default=0):
+                raise ValueError("merges out of order")
+            for side in phase["joined"].sides:
+                _check_monitors(side, pairs)  # of earlier merges only
+            pairs[number] = phase["joined"].pair
+            if process["pair"] != pairs[number]:
+                raise ValueError("a merge of other robots")
+        for group in parts["groups"]:
+            for branch in group["branches"]:
+                _check_monitors(branch, pairs)
+        for process in parts["joined"].values():
+            if process["phase"].of is Undoing:
+                undoing = process["phase"]
+                for trunk in undoing["trunks"]:
+                    _check_monitors(trunk, pairs)
+                apart = sum((trunk["robots"] for trunk in undoing["trunks"]), ())
+                if undoing["robots"] not in trunks or tuple(sorted(apart)) != undoing["robots"]:
+                    raise ValueError("an undo in no group")
 
-    def set_state(self, state: Mapping[str, Any]) -> None:
-        """Restore a state from `get_state`."""
-        self.epoch, self.merging, self.events = state["epoch"], state["merging"], list(state["events"])
-        self.rng.bit_generator.state = copy.deepcopy(state["rng"])
-        self.schedule.set_state(state["schedule"])
-        self.attempt, self.joined = None, {}
-        for process in state["processes"]:
-            self._keep(MergeProcess.from_state(process))
+
+def _check_monitors(branch: Mapping[str, Any], pairs: Mapping[int, PairKey]) -> None:
+    """Raise unless the monitors of a branch are of merges of its robots."""
+    for monitor in branch["monitors"]:
+        pair = pairs.get(monitor["number"])
+        if pair is None or monitor["pair"] != pair or not {*pair[0], *pair[1]} <= set(branch["robots"]):
+            raise ValueError("a monitor of no merge")
+
+
+def branches_in(merges: Mapping[str, Any]) -> Iterator[Snapshot]:
+    """Yield the states of all branches in a state of `TeamMerges`: in use, from before a merge, and replaying."""
+    for group in merges["groups"]:
+        yield from group["branches"]
+    for process in merges["joined"].values():
+        yield from process["phase"]["joined"].sides
+        yield from process["phase"].get("trunks", ())
 
 
 def _robots_undoing(process: MergeProcess) -> tuple[int, ...] | None:
