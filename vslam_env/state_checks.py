@@ -1,6 +1,6 @@
 """Validation of environment states before they are restored."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -10,8 +10,9 @@ from slam_backend.core.state import accepted
 from slam_backend.fastslam.state_checks import check_descriptors
 from slam_backend.frontend import StereoFrame
 from slam_backend.models.measurements import Measurements, TeamMeasurements
+from slam_backend.team.merge import branches_in
 from slam_backend.team.reports import LandmarkIdMap, LandmarksCreated
-from slam_backend.team.state_checks import TeamCheck
+from slam_backend.team.team import TeamSlam
 from vslam_env.belief.readings import TeamReadings
 from vslam_env.belief.rendezvous import Rendezvous
 from vslam_env.belief.shared_grids import NEVER_MET, GridSnapshot, GridUpdate
@@ -156,20 +157,18 @@ class EpisodeCheck:
         if belief["tick"] != self._tick or type(belief["tick"]) is not int:
             check.refuse(f"{name}['tick']", f"{self._tick}, the tick of the episode", belief["tick"])
         own = None if self._own is None else self._own.belief
-        team = TeamCheck(self._count, {} if own is None else own.buffered_inputs, (self._config.belief.filter,))
-        team.check(f"{name}['team']", belief["team"])
-        if belief["team"]["step"] != self._tick + 1:
-            check.refuse(f"{name}['team']['step']", f"{self._tick + 1}", belief["team"]["step"])
+        team = accepted(TeamSlam, f"{name}['team']", belief["team"], {"K": self._count, "STEPS": self._tick + 1})
+        branches, merges = list(branches_in(team["merges"])), team["merges"]
         landmarks = scenario.world.landmarks
         assert landmarks is not None
-        if self._config.sensor == "landmark" and not team.descriptor_sizes <= {landmarks.descriptors.shape[1]}:
-            sizes = sorted(team.descriptor_sizes)
-            check.refuse(f"{name}['team']", f"descriptors of length {landmarks.descriptors.shape[1]}", sizes)
-        config, given = self._config.belief, belief["team"]
-        attempts, merging = merge_options(config, not self._config.oracle_merge)
-        found = [*team.options, given["schedule"]["alignment"], given["schedule"]["options"]]
-        wanted = [config.filter] * len(team.options) + [config.alignment, attempts]
-        if [*found, given["merging"]] != [*wanted, merging]:
+        for branch in branches:
+            descriptors, size = branch["filter"]["maps"]["descriptors"], landmarks.descriptors.shape[1]
+            if self._config.sensor == "landmark" and len(descriptors) and descriptors.shape[1] != size:
+                check.refuse(f"{name}['team']", f"descriptors of length {size}", descriptors.shape[1])
+        config, schedule = self._config.belief, merges["schedule"]
+        found = [branch["filter"]["options"] for branch in branches]
+        wanted = [config.filter] * len(found) + [config.alignment, *merge_options(config, not self._config.oracle_merge)]
+        if [*found, schedule["alignment"], schedule["options"], merges["merging"]] != wanted:
             check.refuse(f"{name}['team']", "options of the environment's configuration", "others")
         updates = {} if own is None else own.grid_updates
         self._check_grids(f"{name}['grids']", belief["grids"], updates)
@@ -247,7 +246,7 @@ class EpisodeCheck:
         check.integers(f"{name}['map_of']", state["map_of"])
         check.sequence(f"{name}['map_of']", state["map_of"], count)
         numbers: set[int] = set(team["numbers"])
-        for branch in branches_of(team):
+        for branch in branches_in(team["merges"]):
             numbers.add(branch["number"])
             if branch["split_from"] in team["numbers"]:
                 numbers.add(branch["split_from"])
@@ -344,15 +343,6 @@ class EpisodeCheck:
 
 
 MOST_MEASURED = 1000  # most landmarks that all robots together create in a tick
-
-
-def branches_of(team: Mapping[str, Any]) -> Iterable[Mapping[str, Any]]:
-    """Yield each branch of a team's state, including those that an undo would restore."""
-    for group in team["groups"]:
-        yield from group["branches"]
-    for process in team["processes"]:
-        yield from process.get("sides", ())
-        yield from process.get("trunks", ())
 
 
 def check_streams(name: str, streams: Any) -> None:

@@ -166,7 +166,7 @@ def restore(owner: Any, snapshot: Snapshot) -> None:
     for name, at, part in kind.STATE.attributes(owner):
         value = getattr(owner, at, None)
         new = part._put(value, snapshot[name])
-        if new is not value:
+        if new is None or new is not value:
             setattr(owner, at, new)
     if hasattr(owner, "rebuild"):
         owner.rebuild()

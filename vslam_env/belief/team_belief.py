@@ -222,7 +222,7 @@ class TeamBelief:
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Restore a validated state of `get_state`."""
-        self.team.restore_checked(state["team"])
+        restore(self.team, accepted(TeamSlam, "state", state["team"]))
         self._tick = state["tick"]
         self._grids.set_state(state["grids"])
         self._candidates.set_state(state["candidates"])
