@@ -167,8 +167,9 @@ class EpisodeCheck:
                 check.refuse(f"{name}['team']", f"descriptors of length {size}", descriptors.shape[1])
         config, schedule = self._config.belief, merges["schedule"]
         found = [branch["filter"]["options"] for branch in branches]
-        wanted = [config.filter] * len(found) + [config.alignment, *merge_options(config, not self._config.oracle_merge)]
-        if [*found, schedule["alignment"], schedule["options"], merges["merging"]] != wanted:
+        given = *found, schedule["alignment"], schedule["options"], merges["merging"]
+        attempts, merging = merge_options(config, not self._config.oracle_merge)
+        if given != (*[config.filter] * len(found), config.alignment, attempts, merging):
             check.refuse(f"{name}['team']", "options of the environment's configuration", "others")
         updates = {} if own is None else own.grid_updates
         self._check_grids(f"{name}['grids']", belief["grids"], updates)

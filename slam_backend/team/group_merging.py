@@ -159,6 +159,12 @@ class JoinedGroups:
         return self.sides[0]["number"], self.sides[1]["number"]
 
     @property
+    def earlier(self) -> tuple[list[int], list[int]]:
+        """Numbers of the earlier merges that each side monitored, oldest first."""
+        a, b = ([monitor["number"] for monitor in side["monitors"]] for side in self.sides)
+        return a, b
+
+    @property
     def pair(self) -> PairKey:
         """Robots of both groups."""
         return self.sides[0]["robots"], self.sides[1]["robots"]

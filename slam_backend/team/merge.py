@@ -52,7 +52,7 @@ from slam_backend.team.merge_attempt import (
     refused_if_uncertain,
     representatives,
 )
-from slam_backend.team.merge_monitor import MergeMonitor, are_both_connected
+from slam_backend.team.merge_monitor import are_both_connected
 from slam_backend.team.merge_scheduler import PAIR, ROBOTS, MergeScheduler, PairKey
 from slam_backend.team.options import MergeOptions
 from slam_backend.team.reports import LandmarkIdMap, MergeEvent, MergeUndone
@@ -255,7 +255,7 @@ class Undoing:
         if self.joined.number not in group.merge_numbers:
             team.is_stale = True
             return Watched(self.joined)
-        merges = list(team.merges_down_to(self.joined.number, group.trunk.monitors))
+        merges = list(team.merges_down_to(self.joined.number, group.merge_numbers))
         has_caught_up = self._catch_up(group.trunk, team.records)
         active_robots = group.trunk.active_robots
         if not has_caught_up or not all(are_both_connected(each.pair, active_robots) for each in merges):
@@ -394,7 +394,7 @@ class TeamMerges:
     def watched(self) -> list[JoinedGroups]:
         """Merges that joint filters monitor, oldest first."""
         numbers = sorted(number for group in self.groups for number in group.merge_numbers)
-        return [joined for number in numbers if (joined := self.joined[number].joined) is not None]
+        return [self._joined(number) for number in numbers]
 
     def merge(self, plan: MergePlan, step: int, known: bool = False) -> LandmarkIdMap:
         """Merge two groups by a given alignment before a step, without an attempt; see `merge_filters` for `known`."""
@@ -423,28 +423,29 @@ class TeamMerges:
 
     def rollback(self, joined: JoinedGroups, group: Group) -> Undoing:
         """Return the start of an undo of a group's merge."""
-        trunks = [restored(side) for side in self._sides_down_to(joined.number, group.trunk.monitors)]
+        trunks = [restored(side) for side in self._sides_down_to(joined.number, group.merge_numbers)]
         return Undoing(joined, group.robots, trunks, [[] for _ in trunks])
 
-    def merges_down_to(self, number: int, monitors: Sequence[MergeMonitor]) -> Iterator[JoinedGroups]:
-        """Yield the merges to undo, the last one first, to undo the one that made map `number`."""
-        joined = self._newest(monitors)
+    def merges_down_to(self, number: int, monitored: Sequence[int]) -> Iterator[JoinedGroups]:
+        """Yield the merges to undo, the last of those monitored first, to undo the one that made map `number`."""
+        joined = self._joined(monitored[-1])
         yield joined
-        for side in joined.sides:
-            if any(monitor.number == number for monitor in side["monitors"]):
-                yield from self.merges_down_to(number, side["monitors"])
+        for earlier in joined.earlier:
+            if number in earlier:
+                yield from self.merges_down_to(number, earlier)
 
-    def _sides_down_to(self, number: int, monitors: Sequence[MergeMonitor]) -> Iterator[Mapping[str, Any]]:
+    def _sides_down_to(self, number: int, monitored: Sequence[int]) -> Iterator[Snapshot]:
         """Yield the states of the trunks that remain when these merges are undone."""
-        for side in self._newest(monitors).sides:
-            if any(monitor.number == number for monitor in side["monitors"]):
-                yield from self._sides_down_to(number, side["monitors"])
+        joined = self._joined(monitored[-1])
+        for side, earlier in zip(joined.sides, joined.earlier, strict=True):
+            if number in earlier:
+                yield from self._sides_down_to(number, earlier)
             else:
                 yield side
 
-    def _newest(self, monitors: Sequence[MergeMonitor]) -> JoinedGroups:
-        """Return the newest of some monitored merges."""
-        joined = self.joined[monitors[-1].number].joined
+    def _joined(self, number: int) -> JoinedGroups:
+        """Return what it takes to undo a monitored merge."""
+        joined = self.joined[number].joined
         assert joined is not None
         return joined
 
@@ -456,14 +457,13 @@ class TeamMerges:
             number = waiting.pop()
             if number not in monitored:
                 monitored.add(number)
-                joined = self.joined[number].joined
-                assert joined is not None
-                waiting += [monitor.number for side in joined.sides for monitor in side["monitors"]]
+                for earlier in self._joined(number).earlier:
+                    waiting += earlier
         for number, process in list(self.joined.items()):
             if number not in monitored and not isinstance(process.phase, Undoing):
                 self.joined.pop(number).phase = FINAL
         self.is_stale = False
-        merges = [joined for number in monitored if (joined := self.joined[number].joined) is not None]
+        merges = [self._joined(number) for number in monitored]
         return TeamTopology.of(self.groups, [(joined.oldest_step, set(joined.map_numbers)) for joined in merges])
 
     @staticmethod

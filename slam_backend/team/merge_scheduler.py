@@ -213,7 +213,8 @@ class MergeScheduler:
             self._records = {key: value for key, value in self._records.items() if not gone & set(key[0] + key[1])}
             self._near = {key: value for key, value in self._near.items() if not gone >= set(key[0] + key[1])}
             return
-        wait, longest = self._records[pair].wait if pair in self._records else self._options.every, self._options.longest_wait
+        wait = self._records[pair].wait if pair in self._records else self._options.every
+        longest = self._options.longest_wait
         tried = frozenset() if smoothed else frozenset(self._proposed.get(pair, ()))
         growth = math.ceil(MIN_LOG_GROWTH * step) if smoothed else 0
         self._records[pair] = AttemptRecord(min(2 * wait, longest), step, step + max(wait, min(growth, longest)), tried)

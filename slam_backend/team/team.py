@@ -470,11 +470,6 @@ class TeamSlam:
     # ------------------------------------------------------------------ snapshots
 
     @property
-    def buffered_inputs(self) -> Mapping[int, StepInput]:
-        """Inputs of the last steps that some filter may replay, by step; not to be changed."""
-        return self._records.log.buffered
-
-    @property
     def filter_options(self) -> FilterOptions:
         """Options of all filters, except for their number of particles."""
         return self._groups[0].trunk.filter.options

@@ -12,7 +12,6 @@ from slam_backend.core.state import accepted, restore, take
 from slam_backend.core.validation import Float32Array, FloatArray, argument_error
 from slam_backend.fastslam.options import FilterOptions
 from slam_backend.fastslam.relative_poses import TeamPoses
-from slam_backend.fastslam.step_input import StepInput
 from slam_backend.geometry import rotate_covariances
 from slam_backend.maps.alignment import Alignment
 from slam_backend.maps.landmark_map import LandmarkMap, TeamMapSummaries
@@ -198,11 +197,6 @@ class TeamBelief:
         return BeliefBatch(
             self._robots, self.team_poses, self.map_summaries, *of_grids, self._features(), self._seconds_left
         )
-
-    @property
-    def buffered_inputs(self) -> Mapping[int, StepInput]:
-        """Buffered readings by step that some filter may still need; read-only."""
-        return self.team.buffered_inputs
 
     @property
     def grid_updates(self) -> dict[int, GridUpdate]:
