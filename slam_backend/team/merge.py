@@ -394,7 +394,7 @@ class TeamMerges:
     def watched(self) -> list[JoinedGroups]:
         """Merges that joint filters monitor, oldest first."""
         numbers = sorted(number for group in self.groups for number in group.merge_numbers)
-        return [self._joined(number) for number in numbers]
+        return [self._monitored(number) for number in numbers]
 
     def merge(self, plan: MergePlan, step: int, known: bool = False) -> LandmarkIdMap:
         """Merge two groups by a given alignment before a step, without an attempt; see `merge_filters` for `known`."""
@@ -428,7 +428,7 @@ class TeamMerges:
 
     def merges_down_to(self, number: int, monitored: Sequence[int]) -> Iterator[JoinedGroups]:
         """Yield the merges to undo, the last of those monitored first, to undo the one that made map `number`."""
-        joined = self._joined(monitored[-1])
+        joined = self._monitored(monitored[-1])
         yield joined
         for earlier in joined.earlier:
             if number in earlier:
@@ -436,14 +436,14 @@ class TeamMerges:
 
     def _sides_down_to(self, number: int, monitored: Sequence[int]) -> Iterator[Snapshot]:
         """Yield the states of the trunks that remain when these merges are undone."""
-        joined = self._joined(monitored[-1])
+        joined = self._monitored(monitored[-1])
         for side, earlier in zip(joined.sides, joined.earlier, strict=True):
             if number in earlier:
                 yield from self._sides_down_to(number, earlier)
             else:
                 yield side
 
-    def _joined(self, number: int) -> JoinedGroups:
+    def _monitored(self, number: int) -> JoinedGroups:
         """Return what it takes to undo a monitored merge."""
         joined = self.joined[number].joined
         assert joined is not None
@@ -457,13 +457,13 @@ class TeamMerges:
             number = waiting.pop()
             if number not in monitored:
                 monitored.add(number)
-                for earlier in self._joined(number).earlier:
+                for earlier in self._monitored(number).earlier:
                     waiting += earlier
         for number, process in list(self.joined.items()):
             if number not in monitored and not isinstance(process.phase, Undoing):
                 self.joined.pop(number).phase = FINAL
         self.is_stale = False
-        merges = [self._joined(number) for number in monitored]
+        merges = [self._monitored(number) for number in monitored]
         return TeamTopology.of(self.groups, [(joined.oldest_step, set(joined.map_numbers)) for joined in merges])
 
     @staticmethod
