@@ -15,10 +15,10 @@ from slam_backend.core.compilation.compiler import (
 )
 from slam_backend.core.compilation.messages import watch_compilation
 from slam_backend.core.jit import IS_PLAIN
+from slam_backend.core.read_only import as_read_only
 from slam_backend.fastslam.existence import ExistenceModel
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.options import FilterOptions
-from slam_backend.fastslam.state_checks import are_linked
 from slam_backend.frontend import StereoFrontEnd
 from slam_backend.geometry import inverse
 from slam_backend.maps.alignment import align_maps
@@ -124,10 +124,7 @@ def run_all_paths(extras: Collection[str]) -> float:
                 slam.step([move], [plain])
             slam.set_state(slam.get_state())
         state_checks.compile_checks()
-        root = np.array([-1])
-        are_linked(root, root)  # of an unpickled state
-        root.setflags(write=False)
-        are_linked(root, root)
+        root = as_read_only(np.array([-1]))
         retract_on_se2(np.zeros((1, 3)), root, np.zeros((1, 3, 1)))
         inverse(np.zeros((2, 3)))  # of starts in a fixed gauge
         find_only(points, descriptors, points, descriptors, 1.0, 1.0, ids.copy())

@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 
 from slam_backend.core import state_checks as check
-from slam_backend.core.state import accepted
-from slam_backend.fastslam.state_checks import check_descriptors
+from slam_backend.core.state import MAX_DESCRIPTOR, accepted
 from slam_backend.frontend import StereoFrame
 from slam_backend.models.measurements import Measurements, TeamMeasurements
 from slam_backend.team.merge import branches_in
@@ -162,7 +161,7 @@ class EpisodeCheck:
         landmarks = scenario.world.landmarks
         assert landmarks is not None
         for branch in branches:
-            descriptors, size = branch["filter"]["maps"]["descriptors"], landmarks.descriptors.shape[1]
+            descriptors, size = branch["filter"]["maps"].descriptors, landmarks.descriptors.shape[1]
             if self._config.sensor == "landmark" and len(descriptors) and descriptors.shape[1] != size:
                 check.refuse(f"{name}['team']", f"descriptors of length {size}", descriptors.shape[1])
         config, schedule = self._config.belief, merges["schedule"]
@@ -252,7 +251,7 @@ class EpisodeCheck:
             if branch["split_from"] in team["numbers"]:
                 numbers.add(branch["split_from"])
             maps = branch["filter"]["maps"]
-            needed = max(1 + maps["ids"].max(initial=-1), maps["next_id"] - MOST_MEASURED * self._tick)
+            needed = max(1 + maps.ids.max(initial=-1), maps.next_id - MOST_MEASURED * self._tick)
             if needed > claims.shape[1]:
                 check.refuse(f"{name}['claims']", f"entries for {needed} landmarks", f"shape {claims.shape}")
         if lacking := numbers.union(state["map_of"]) - set(row_of):
@@ -341,6 +340,12 @@ class EpisodeCheck:
             check.refuse(f"{name}.measurements", "TeamMeasurements", "others")
         if np.diff(frames.measurements.offsets, prepend=0).max() > most:
             check.refuse(f"{name}.measurements", f"at most {most} per robot", "more")
+
+
+def check_descriptors(name: str, value: Any, n: int, size: int | None = None) -> int:  # bridge
+    """Return the length of n descriptors, or refuse a wrong array or length."""
+    check.floats(name, value, (n, size), -MAX_DESCRIPTOR, MAX_DESCRIPTOR, dtype=check.FLOAT32)
+    return int(value.shape[1])
 
 
 MOST_MEASURED = 1000  # most landmarks that all robots together create in a tick

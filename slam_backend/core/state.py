@@ -13,9 +13,10 @@ A class lists the parts of its state, from which `take` makes a snapshot and `re
 >>> counter._sums.tolist()
 [0, 0, 0]
 
-Names of parts are names of attributes or properties, with or without a leading underscore. A class may have two hooks:
-`rebuild()` computes what follows from the state, after its parts are set. `check_state(parts, sizes)` raises if kernels
-would go wrong with parts that are within their bounds one by one.
+Names of parts are names of attributes or properties, with or without a leading underscore. A class may have hooks:
+`make_room(snapshot)` provides arrays of the right sizes, before parts are set. `rebuild()` computes what follows from
+the state, after that. `check_state(parts, sizes)` raises if kernels would go wrong with parts that are within their
+bounds one by one.
 
 A snapshot cannot be changed, nor can its arrays: `restore` takes it without checks. Copies, pickles and files of a
 snapshot are plain dicts, which `accepted` turns into a snapshot again. It checks types, shapes and bounds, because
@@ -29,7 +30,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
 from types import FunctionType
-from typing import Any, ClassVar, NoReturn, get_args, get_type_hints
+from typing import Any, ClassVar, NoReturn, TypeVar, get_args, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,12 +43,14 @@ LARGEST = 1e12  # limit of plain numbers [m, rad, 1]; squares and products of a 
 MAX_DISTANCE = 1e7  # limit of poses and landmarks [m, rad]
 MAX_INT = 1 << 62  # limit of counts and steps: sums of two of them fit int64
 MAX_LANDMARKS = 1 << 30  # limit of landmark ids: tables are as long as the largest id
+MAX_DESCRIPTOR = 1e6  # limit of components of descriptors; squared distances do not overflow float32
 
 BOOL, INT8, UINT8 = np.dtype(np.bool_), np.dtype(np.int8), np.dtype(np.uint8)
 INT32, INT64 = np.dtype(np.int32), np.dtype(np.int64)
 FLOAT32, FLOAT64 = np.dtype(np.float32), np.dtype(np.float64)
 
 CLASS = "class"  # key of the name of a record's class in files
+T = TypeVar("T")
 Sizes = dict[str, Any]  # sizes by name, and whatever else an owner passes down to the checks
 Bound = int | float | str | None  # a number, or the name of a size: less than it
 Kind = type | Callable[[], type]  # a class, or a function that returns one that is not defined yet
@@ -121,6 +124,16 @@ class State:
         return self._attributes
 
 
+def with_state(**parts: "Part") -> Callable[[type[T]], type[T]]:
+    """Declare the `STATE` of a named tuple, in whose body type checkers take every name for a field; a decorator."""
+
+    def declare(kind: type[T]) -> type[T]:
+        kind.STATE = State(**parts)  # type: ignore[attr-defined]
+        return kind
+
+    return declare
+
+
 def is_stateful(kind: type) -> bool:
     """Return whether a class declares a state."""
     return isinstance(getattr(kind, "STATE", None), State)
@@ -163,10 +176,12 @@ def restore(owner: Any, snapshot: Snapshot) -> None:
     """Return an object to a snapshot; arrays of the same shape are overwritten in place."""
     assert snapshot.of is type(owner)
     kind: Any = type(owner)
+    if hasattr(owner, "make_room"):
+        owner.make_room(snapshot)
     for name, at, part in kind.STATE.attributes(owner):
-        value = getattr(owner, at, None)
+        value = None if part.is_constant else getattr(owner, at, None)
         new = part._put(value, snapshot[name])
-        if new is None or new is not value:
+        if part.is_constant or new is None or new is not value:
             setattr(owner, at, new)
     if hasattr(owner, "rebuild"):
         owner.rebuild()
@@ -214,7 +229,7 @@ def accepted(kind: type, name: str, state: Any, sizes: Sizes | None = None) -> S
 def _limit(bound: Bound, sizes: Sizes, default: float) -> Any:
     """Return a bound as a number."""
     if isinstance(bound, str):
-        return sizes[bound] - 1
+        return sizes[bound.removesuffix("+1")] - 1 + bound.endswith("+1")
     return default if bound is None else bound
 
 
@@ -309,9 +324,10 @@ class Array(Part):
 
     Attributes:
         dtype: Type of the numbers.
-        shape: Sizes of the axes: numbers, names, or names with "+1", separated by spaces.
+        shape: Sizes of the axes: numbers, names, names with "+1", or "*" for any size, separated by spaces.
         low, high: The bounds. None: plain limits; integers then are at least 0.
         nan: Whether floats may be NaN.
+        ascending: Whether the numbers ascend, none twice.
         used: Name of the size of the used part of the last axis; None: all of it.
         renewed: Whether the owner replaces the array and never writes to it. Snapshots then share it.
         constant: Whether it is read-only; it is then shared by objects as well.
@@ -322,6 +338,7 @@ class Array(Part):
     low: float | None = None
     high: Bound = None
     nan: bool = False
+    ascending: bool = False
     used: str | None = None
     renewed: bool = False
     constant: bool = False
@@ -359,6 +376,8 @@ class Array(Part):
             if numbers.size and not (low <= numbers.min() and numbers.max() <= high):  # NaN: not
                 kind = f"numbers from {low:g} to {high:g}" if is_float else f"integers from {low} to {high}"
                 refuse(name, kind, "a value out of range" + " or NaN" * is_float)
+        if self.ascending and (value[1:] <= value[:-1]).any():
+            refuse(name, "distinct numbers in ascending order", "a number that is out of order or repeated")
         return as_constant(value)
 
 
@@ -368,6 +387,8 @@ def check_shape(name: str, value: NDArray[Any], shape: str, sizes: Sizes) -> Non
     found = value.shape
     if len(found) == len(axes):
         for axis, size in zip(axes, found, strict=True):
+            if axis == "*":
+                continue
             word, more = axis.removesuffix("+1"), axis.endswith("+1")
             sizes.setdefault(word, int(word) if word.isdigit() else size - more)
             if sizes[word] + more != size:

@@ -24,7 +24,7 @@ from numpy.random import SeedSequence
 from numpy.typing import NDArray
 
 from slam_backend.core.read_only import as_read_only
-from slam_backend.core.state import Snapshot
+from slam_backend.core.state import Snapshot, is_stateful
 
 ALIGNMENT = 64  # alignment of arrays [bytes]
 MAX_BYTES = 1 << 30  # limit of a file [bytes]; a state has some megabytes
@@ -77,6 +77,14 @@ class StateTypes:
 
 def _kind_of(cls: type) -> StateType:
     """Return the conversion of a class to its fields and back by its constructor."""
+    if is_stateful(cls):
+        names = list(cls.STATE.parts)  # type: ignore[attr-defined]
+        build = getattr(cls, "from_parts", cls)
+        return StateType(
+            cls.__name__,
+            lambda each: [getattr(each, name) for name in names],
+            lambda *parts: build(**dict(zip(names, parts, strict=True))),
+        )
     if issubclass(cls, Enum):
         return StateType(cls.__name__, lambda member: (member.value,), cls)
     if is_dataclass(cls):

@@ -29,6 +29,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
+from slam_backend.core.state import Each, Float, Int, Sizes, State
+
 FALSE_ALARM_RATE = 0.01  # largest share of consistent filters that ever raise a warning, all signs together
 NIS_BOUNDS = (7.81, 11.34)  # 95 and 99 % of chi-square with three degrees of freedom; conservative with two
 LOW_ESS = 0.1  # share of the particles
@@ -49,7 +51,6 @@ SHARE = 0.47  # the sum of 1 / (n ln^2 n) over n = 2, 3, ... is 2.11
 WEIGHTS = tuple(SHARE / len(BETS) / SIGN_OF.count(sign) for sign in SIGN_OF for _ in BETS)
 THRESHOLD = len(SIGNS) / FALSE_ALARM_RATE
 HIGHEST = 1e6 * THRESHOLD  # limit of the evidence
-SUMS, LISTS = ("frames", "begun", "quiet", "nis", "matched"), ("counts", "evidence", "since")
 CAUTIOUS = 1.0  # mean NIS below which covariances are at least twice too large, even in the plane
 OVER_CONFIDENT = 4.0  # mean NIS, ideally 3, above which covariances are at least a quarter too small, even in space
 VERDICTS = {  # words for a filter, with their conditions; the first one that holds applies
@@ -142,6 +143,16 @@ class Consistency:
 class ConsistencyTest:
     """Running sums of the consistency test of one filter."""
 
+    STATE = State(
+        frames=Int(),
+        begun=Int(),
+        quiet=Int(0, RENEWED),
+        nis=Float(0.0),
+        matched=Int(),
+        counts=Each(Int(), f"{len(SIGN_OF)}", list),
+        evidence=Each(Float(0.0), f"{len(WEIGHTS)}", list),
+        since=Each(Int(-1), f"{len(SIGNS)}", list),
+    )
     __slots__ = ("_begun", "_counts", "_evidence", "_frames", "_matched", "_nis", "_quiet", "_since")
 
     def __init__(self) -> None:
@@ -152,6 +163,12 @@ class ConsistencyTest:
         self._counts = [0] * len(SIGN_OF)
         self._evidence = [0.0] * len(WEIGHTS)
         self._since = [-1] * len(SIGNS)  # step of the warning, -1 = none
+
+    @staticmethod
+    def check_state(parts: Mapping[str, Any], sizes: Sizes) -> None:
+        """Refuse a state whose evidence begins after its last frame."""
+        if parts["begun"] > parts["frames"]:
+            raise ValueError("evidence that begins later")
 
     def update(self, step: int, nis: float, ess: float, used: int, rejected: int) -> None:
         """Add a frame.
@@ -227,17 +244,3 @@ class ConsistencyTest:
         for sign, both in enumerate(zip(a._since, b._since, strict=True)):
             joint._since[sign] = min((since for since in both if since >= 0), default=-1)
         return joint
-
-    # ------------------------------------------------------------------ snapshots
-
-    def get_state(self) -> dict[str, Any]:
-        """Return all sums."""
-        sums = {name: getattr(self, f"_{name}") for name in SUMS}
-        return sums | {name: tuple(getattr(self, f"_{name}")) for name in LISTS}
-
-    def set_state(self, state: Mapping[str, Any]) -> None:
-        """Restore the sums from `get_state`."""
-        for name in SUMS:
-            setattr(self, f"_{name}", state[name])
-        for name in LISTS:
-            setattr(self, f"_{name}", list(state[name]))

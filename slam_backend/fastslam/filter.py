@@ -5,7 +5,6 @@ one moves, matches its measurements to the map as updated by the robots before i
 landmarks. Then the joint particles are resampled.
 """
 
-import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal
@@ -13,7 +12,25 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from slam_backend.core.state_checks import HINT, refuse_malformed, restore_generator
+from slam_backend.core.state import (
+    FLOAT64,
+    INT64,
+    MAX_DISTANCE,
+    Array,
+    Child,
+    Each,
+    Generator,
+    Int,
+    Maybe,
+    Options,
+    Record,
+    Sizes,
+    Snapshot,
+    State,
+    accepted,
+    restore,
+    take,
+)
 from slam_backend.core.validation import (
     BoolArray,
     FloatArray,
@@ -40,9 +57,17 @@ from slam_backend.fastslam.options import (
     packed_camera,
     robot_batches,
 )
-from slam_backend.fastslam.particle_maps import ParticleMaps, best_map, present_slots, write_summary, zeros_aligned
+from slam_backend.fastslam.particle_maps import (
+    CompactMaps,
+    ParticleMaps,
+    best_map,
+    padded_lanes,
+    present_slots,
+    write_summary,
+    zeros_aligned,
+)
 from slam_backend.fastslam.pending_steps import LONGEST, PendingSteps, record_rejected
-from slam_backend.fastslam.rejuvenation import NewLandmarks, RejuvenationScheduler
+from slam_backend.fastslam.rejuvenation import NewLandmarks, RejuvenationScheduler, check_rejected
 from slam_backend.fastslam.relative_poses import TeamPoses, membership_table
 from slam_backend.fastslam.reports import (
     Associations,
@@ -52,8 +77,7 @@ from slam_backend.fastslam.reports import (
     RejuvenationReport,
     StepReport,
 )
-from slam_backend.fastslam.run_log import RobotLog
-from slam_backend.fastslam.state_checks import KEPT, check_filter, last_step
+from slam_backend.fastslam.run_log import RobotLog, last_step
 from slam_backend.fastslam.step_input import MAX_POSE, RobotRows, StepInput, rows_of, validate_step
 from slam_backend.geometry import between, compose, wrap_angle
 from slam_backend.maps.landmark_map import LandmarkMap, MapSummary, MapSummaryRows, unchecked_map
@@ -62,6 +86,7 @@ from slam_backend.reference.filter import ReferenceFastSlam
 from slam_backend.resampling import RESAMPLING
 from slam_backend.smoother.rejuvenation import Particles
 
+LEAST = float(np.finfo(np.float64).min)  # lower limit of log-weights
 NO_WEIGHTS = np.empty(0)  # unused where all particles start at the same pose
 
 
@@ -112,6 +137,30 @@ class FastSlam:
         >>> slam.map().means.round(3).tolist()          # two metres ahead: x of the map frame
         [[2.0, 0.0, 0.0]]
     """
+
+    STATE = State(
+        options=Options(FilterOptions),
+        mixture_weights=Array(FLOAT64, "M", 0.0, 1.0),
+        log_weights=Array(FLOAT64, "M", LEAST),
+        path_log_weights=Array(FLOAT64, "M", LEAST),
+        poses=Array(FLOAT64, "K 3 P", -MAX_DISTANCE, MAX_DISTANCE, used="M"),
+        starts=Array(FLOAT64, "K 3 P", -MAX_DISTANCE, MAX_DISTANCE, used="M"),
+        means=Array(FLOAT64, "K 3 P", -MAX_DISTANCE, MAX_DISTANCE, used="M"),
+        biases=Array(FLOAT64, "K 3 P", -MAX_DISTANCE, MAX_DISTANCE, used="M"),
+        covariances=Array(FLOAT64, "K 6 P", used="M"),
+        gauge_covariance=Array(FLOAT64, "3 3"),
+        start_covariances=Array(FLOAT64, "K 3 3"),
+        bias_covariances=Array(FLOAT64, "2 K 3 3"),
+        propagated_only=Array(INT64, "K", 0, 1),
+        estimate_means=Array(FLOAT64, "K 3", -MAX_DISTANCE, MAX_DISTANCE),
+        estimate_covariances=Array(FLOAT64, "K 3 3"),
+        next_step=Int(),
+        maps=Record(CompactMaps),
+        logs=Each(Child(RobotLog), "K", list),  # before the smoother, which learns of pending steps from them
+        rejuvenation=Maybe(Child(RejuvenationScheduler)),
+        consistency=Child(ConsistencyTest),
+        rng=Generator(),
+    )
 
     @with_fields_of(FilterOptions)
     def __init__(
@@ -189,7 +238,7 @@ class FastSlam:
         self._consistency = ConsistencyTest()
         self.estimates = self._mixtures()
         self._batches = robot_batches(k, existence is not None)  # robots of each kernel call: one by one with existence
-        self._logs = [RobotLog() for _ in range(k)]
+        self._robot_logs = [RobotLog() for _ in range(k)]
         self._pending = PendingSteps(k)
         self._associations: Int32Array = np.empty((0, padded), np.int32)  # work space of `update_fastslam2`
         self._mahalanobis_sq: FloatArray = np.empty((0, padded))
@@ -358,7 +407,7 @@ class FastSlam:
                 shape = 2 * len(inputs.measurements), maps.padded
                 self._associations, self._mahalanobis_sq = np.empty(shape, np.int32), np.empty(shape)
         if len(pending.steps) == LONGEST:
-            pending.flush(self._logs, self.rejuvenation)
+            pending.flush(self._robot_logs, self.rejuvenation)
         pending.reserve(used)
         now = 0 if self.rejuvenation is None else self.rejuvenation.steps + 1
         normals = self.rng.standard_normal((active, maps.num_particles, 3))
@@ -475,16 +524,10 @@ class FastSlam:
         self.mixture_weights[:] = np.exp(new.log_weights)
         self.estimates.means[:], self.estimates.covariances[:] = new.means, new.covariances
 
-    @property
-    def logs(self) -> list[RobotLog]:
-        """Log of each robot, up to date."""
-        self.update_logs()
-        return self._logs
-
     def update_logs(self) -> None:
         """Bring the logs up to date, and what the smoother knows of them."""
         if self._pending.steps:
-            self._pending.flush(self._logs, self.rejuvenation)
+            self._pending.flush(self._robot_logs, self.rejuvenation)
 
     # ------------------------------------------------------------------ estimates
 
@@ -670,7 +713,7 @@ class FastSlam:
             self.propagated_only,
         ):
             array[:] = array[order]
-        self._logs = [self.logs[robot] for robot in order]
+        self._robot_logs = [self.logs[robot] for robot in order]
         self.estimates = PoseEstimates(*(of_all[order] for of_all in self.estimates))
         if self.rejuvenation is not None:
             self.rejuvenation.reorder(order)
@@ -689,7 +732,9 @@ class FastSlam:
         self.estimates = self._mixtures()
         if self.gauge_covariance.any():
             add_gauge_covariance(self.gauge_covariance, *self.estimates)
-        self._logs = [log.copy() for log in a.logs] + [log.renamed(renamed[:, 0], renamed[:, 1]) for log in b.logs]
+        self._robot_logs = [log.copy() for log in a.logs] + [
+            log.renamed(renamed[:, 0], renamed[:, 1]) for log in b.logs
+        ]
         if self.rejuvenation is not None and a.rejuvenation is not None and b.rejuvenation is not None:
             starts = [slam.starts[:, :, : slam.num_particles] for slam in (a, b, self)]
             frames = a.gauge_covariance, b.gauge_covariance
@@ -698,15 +743,39 @@ class FastSlam:
 
     # ------------------------------------------------------------------ snapshots
 
-    def get_state(self) -> dict[str, Any]:
-        """Return the complete state of the filter, its random stream included; shared parts are read-only."""
-        logs = tuple(log.get_state() for log in self.logs)  # first, as it also updates the smoother
-        state: dict[str, Any] = {name: array.copy() for name, array in self._kept.items()}
-        state |= {"steps": self.next_step, "estimates": self.estimates.copy(), "maps": self.maps.get_state()}
-        state |= {"logs": logs, "consistency": self._consistency.get_state()}
-        if self.rejuvenation is not None:
-            state["rejuvenation"] = self.rejuvenation.get_state()
-        return state | {"options": self.options, "rng": copy.deepcopy(self.rng.bit_generator.state)}
+    @property
+    def logs(self) -> list[RobotLog]:
+        """Log of each robot, up to date."""
+        self.update_logs()
+        return self._robot_logs
+
+    @logs.setter
+    def logs(self, logs: list[RobotLog]) -> None:
+        self._robot_logs = logs
+
+    @property
+    def estimate_means(self) -> FloatArray:
+        """Means of `estimates`, (K, 3) [m, m, rad]."""
+        return self.estimates.means
+
+    @property
+    def estimate_covariances(self) -> FloatArray:
+        """Covariances of `estimates`, (K, 3, 3) [m, m, rad]."""
+        return self.estimates.covariances
+
+    @property
+    def _maps(self) -> CompactMaps:
+        """Content of `maps`."""
+        return self.maps.compact()
+
+    @_maps.setter
+    def _maps(self, content: CompactMaps) -> None:
+        self.maps.load(content)
+
+    def get_state(self) -> Snapshot:
+        """Return the complete state of the filter, its random stream included."""
+        self.update_logs()
+        return take(self)
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Restore a state from `get_state`; the filter then continues identically.
@@ -714,32 +783,45 @@ class FastSlam:
         Raises:
             ValueError: If `state` is not from `get_state`.
         """
-        with refuse_malformed("state"):
-            check_filter("state", state, (self.options,))
-        if (last := max(map(last_step, state["logs"]))) >= state["steps"]:
-            raise argument_error("state['steps']", f"an int > {last}, the last step logged", state["steps"], HINT)
-        self.restore_checked(state)
+        restore(self, accepted(FastSlam, "state", state))
 
-    def restore_checked(self, state: Mapping[str, Any]) -> None:
-        """Restore a state that was validated, in the arrays at hand if they fit."""
-        fits = state["poses"].shape == self.poses.shape and len(state["weights"]) == self.num_particles
-        if not fits or state["options"] != self.options:
-            self._allocate(len(state["poses"]), state["options"], 0, len(state["weights"]))
-        for name, array in self._kept.items():
-            array[:] = state[name]
+    @classmethod
+    def from_state(cls, state: Snapshot) -> "FastSlam":
+        """Build a filter with a state from `get_state`."""
+        slam = cls.from_options(len(state["poses"]), state["options"])
+        restore(slam, state)
+        return slam
+
+    def make_room(self, state: Snapshot) -> None:
+        """Provide arrays and parts for the sizes and options of a state, without pending steps."""
+        k, m = len(state["poses"]), len(state["mixture_weights"])
+        if (k, m) != (self.num_robots, self.num_particles) or state["options"] != self.options:
+            self._allocate(k, state["options"], 0, m)
+        self._pending.clear()
+
+    def rebuild(self) -> None:
+        """Compute what follows from the weights and the start poses."""
         self._refresh_starts()
         self._refresh_best_particle()
-        self.maps.set_state(state["maps"])
-        self._pending.clear()
-        for log, logged in zip(self._logs, state["logs"], strict=True):
-            log.set_state(logged)
-        if self.rejuvenation is not None:
-            self.rejuvenation.set_state(state["rejuvenation"])
-        self._consistency.set_state(state["consistency"])
-        self.next_step, self.estimates = state["steps"], state["estimates"].copy()
-        self.rng = restore_generator(state["rng"])  # a new one: the old one may be shared or of another kind
 
-    @property
-    def _kept(self) -> dict[str, NDArray[Any]]:
-        """Arrays that make up a state, by their names in it."""
-        return {name: self.mixture_weights if name == "weights" else getattr(self, name) for name in KEPT}
+    @staticmethod
+    def check_state(parts: Mapping[str, Any], sizes: Sizes) -> None:
+        """Refuse parts that do not fit together: options, sizes, logs, and what the smoother knows of them."""
+        options, maps, rejuvenation = parts["options"], parts["maps"], parts["rejuvenation"]
+        k, m = sizes["K"], sizes["M"]
+        kernel_options(options)
+        if options.existence is not None:
+            ExistenceUpdate(options.existence, options.camera)
+        if not 1 <= k <= MAX_ROBOTS or m < 1 or sizes["P"] != padded_lanes(m):
+            raise ValueError(f"{k} robots and {sizes['P']} lanes of {m} particles")
+        if not abs(float(parts["mixture_weights"].sum()) - 1.0) < 1e-6:
+            raise ValueError("weights that do not sum to 1")
+        if max(map(last_step, parts["logs"])) >= parts["next_step"]:
+            raise ValueError(f"next_step {parts['next_step']} that is logged already")
+        if (options.existence is None) != (maps.odds is None):
+            raise ValueError("odds without an existence model, or none with one")
+        if (options.rejuvenate_every is None) != (rejuvenation is None):
+            raise ValueError("a smoother without rejuvenate_every, or none with it")
+        if rejuvenation is not None:
+            for rejected, log in zip(rejuvenation["rejected"], parts["logs"], strict=True):
+                check_rejected(rejected, log, maps.descriptors.shape[1])

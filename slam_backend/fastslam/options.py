@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.core.short_repr import short_repr
+from slam_backend.core.state import MAX_DESCRIPTOR
 from slam_backend.core.validation import (
     MOST,
     FloatArray,
@@ -18,7 +19,6 @@ from slam_backend.core.validation import (
 )
 from slam_backend.fastslam.existence import ExistenceModel
 from slam_backend.models.camera import StereoCamera
-from slam_backend.models.measurements import LARGEST_DESCRIPTOR
 from slam_backend.models.odometry import LARGEST_SIGMA, OdometryModel
 from slam_backend.resampling import RESAMPLING
 from slam_backend.smoother.options import SmoothingOptions
@@ -106,7 +106,7 @@ class FilterOptions:
             check_float(name, getattr(self, name), "Give a positive number.", above=0.0)
         for name in ("descriptor_gate", "descriptor_sigma"):
             value = getattr(self, name)
-            check_float(name, value, "Give a positive number.", at_least=1e-9, at_most=2.0 * LARGEST_DESCRIPTOR)
+            check_float(name, value, "Give a positive number.", at_least=1e-9, at_most=2.0 * MAX_DESCRIPTOR)
         check_float(
             "new_landmark_gate", self.new_landmark_gate, "It starts where the gate ends.", at_least=self.position_gate
         )

@@ -9,6 +9,8 @@ particle are at its own place. Thus no two particles share values that one of th
 """
 
 import math
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,6 +18,22 @@ from numpy.typing import NDArray
 
 from slam_backend.core.jit import LINE
 from slam_backend.core.packed_symmetric import UNPACK_INDEX
+from slam_backend.core.read_only import as_read_only
+from slam_backend.core.state import (
+    FLOAT32,
+    FLOAT64,
+    INT32,
+    INT64,
+    LARGEST,
+    MAX_DESCRIPTOR,
+    MAX_DISTANCE,
+    MAX_LANDMARKS,
+    Array,
+    Int,
+    Maybe,
+    Sizes,
+    State,
+)
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.fastslam import _kernels
 from slam_backend.fastslam._kernels import LANES
@@ -48,6 +66,11 @@ def _num_heads(descriptor_size: int) -> int:
     return descriptor_size // 2 if descriptor_size >= 32 and descriptor_size % 2 == 0 else descriptor_size
 
 
+def padded_lanes(num_particles: int) -> int:
+    """Return P, M rounded up to whole blocks of lanes."""
+    return -(-num_particles // LANES) * LANES
+
+
 class MapStore:
     """Storage of the landmark Gaussians, counts, descriptors and names of all particles; see the module.
 
@@ -74,7 +97,7 @@ class MapStore:
     def _clear(self, num_particles: int) -> None:
         """Allocate empty arrays for M particles."""
         self.num_particles = num_particles
-        self.padded = -(-num_particles // LANES) * LANES
+        self.padded = padded_lanes(num_particles)
         self.values: FloatArray = empty_aligned((0,), np.float64)
         self.counts: NDArray[np.int32] = empty_aligned((0, self.padded), np.int32)
         self.odds: FloatArray = empty_aligned((0, self.padded), np.float64)
@@ -236,10 +259,7 @@ class MapStore:
 
 
 MAX_MAPS = 512  # limit of ancestor maps; beyond it the slots of the least used maps are refreshed
-MAPS_KEPT = (  # parts of a state
-    "num_particles", "values", "counts", "odds", "maps", "map_of", "ids", "identities", "last_seen", "descriptors",
-    "next_id",
-)  # fmt: skip
+LONGEST_DESCRIPTOR = 1 << 16
 
 
 class ParticleMaps(MapStore):
@@ -353,45 +373,97 @@ class ParticleMaps(MapStore):
 
     # ------------------------------------------------------------------ snapshots
 
-    def get_state(self) -> dict[str, Any]:
-        """Return the complete state of the maps, compact. Nothing is shared."""
+    def compact(self) -> "CompactMaps":
+        """Return the content; equal maps give equal contents. Nothing is shared."""
         used = self.used_slots()
         of, rows = self.map_of[used], self.row_of[used]
         live, first = np.unique(of[of > 0], return_index=True)
-        live = live[np.argsort(first)]  # ordered by their first users: equal maps give equal states
+        live = live[np.argsort(first)]  # ordered by their first users
         number = np.zeros(len(self.users), dtype=np.int64)
         number[live] = np.arange(1, len(live) + 1)
-        return {
-            "num_particles": self.num_particles,
-            "values": np.take(self.values.reshape(-1, 9 * self.padded), rows, axis=0),
-            "counts": np.take(self.counts, rows, axis=0),
-            "odds": None if self.log_odds_prior is None else np.take(self.odds, used, axis=0),
-            "maps": np.take(self.maps, live, axis=0),
-            "map_of": number[of],
-            "ids": self.ids[used],
-            "identities": self.identities[used],
-            "last_seen": self.last_seen[used],
-            "descriptors": self.descriptors[used],
-            "next_id": self.next_id,
-        }
+        odds = None if self.log_odds_prior is None else as_read_only(np.take(self.odds, used, axis=0))
+        return CompactMaps(
+            values=as_read_only(np.take(self.values.reshape(-1, 9 * self.padded), rows, axis=0)),
+            counts=as_read_only(np.take(self.counts, rows, axis=0)),
+            odds=odds,
+            maps=as_read_only(np.take(self.maps, live, axis=0)),
+            map_of=as_read_only(number[of]),
+            ids=as_read_only(self.ids[used]),
+            identities=as_read_only(self.identities[used]),
+            last_seen=as_read_only(self.last_seen[used]),
+            descriptors=as_read_only(self.descriptors[used]),
+            next_id=self.next_id,
+        )
 
-    def set_state(self, state: dict[str, Any]) -> None:
-        """Restore the maps from `get_state`; allocated rows are reused."""
-        n, m, maps = len(state["ids"]), int(state["num_particles"]), state["maps"]
-        if m != self.num_particles:
-            self._clear(m)
-        self._begin(n, state["descriptors"].shape[1])
-        self.values.reshape(-1, 9 * self.padded)[:n] = state["values"]
-        self.counts[:n] = state["counts"]
-        if self.log_odds_prior is not None:
-            self.odds[:n] = state["odds"]
+    def load(self, content: "CompactMaps") -> None:
+        """Replace the content by that of maps with as many particles; allocated rows are reused."""
+        n = len(content.ids)
+        self._begin(n, content.descriptors.shape[1])
+        self.values.reshape(-1, 9 * self.padded)[:n], self.counts[:n] = content.values, content.counts
+        if content.odds is not None:
+            self.odds[:n] = content.odds
         for name in ("map_of", "ids", "identities", "last_seen", "descriptors"):
-            getattr(self, name)[:n] = state[name]
+            getattr(self, name)[:n] = getattr(content, name)
         self._prepare_search(n)
-        self.maps = np.concatenate([np.zeros((1, self.padded), dtype=np.int32), maps])
-        self.users = np.bincount(state["map_of"], minlength=len(maps) + 1).astype(np.int64)
+        self.maps = np.concatenate([np.zeros((1, self.padded), dtype=np.int32), content.maps])
+        self.users = np.bincount(content.map_of, minlength=len(self.maps)).astype(np.int64)
         self.users[0], self._free_maps = 0, 0
-        self.tops[2] = state["next_id"]
+        self.tops[2] = content.next_id
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CompactMaps:
+    """Content of the maps of M particles: n landmarks by ascending id, and the a ancestor maps that they use.
+
+    Attributes:
+        values, counts, odds: (n, 9 P) float64, (n, P) int32, (n, P) float64 or None; see `MapStore`.
+        maps: (a, P) int32. The ancestor maps but the identity.
+        map_of: (n,) int64. The ancestor map of each landmark, from 1; 0 is the identity.
+        ids, identities, last_seen: (n,) int64, see `MapStore`.
+        descriptors: (n, d) float32.
+        next_id: Name of the next landmark.
+    """
+
+    STATE = State(
+        values=Array(FLOAT64, "n *", -math.inf, math.inf, nan=True),
+        counts=Array(INT32, "n P", 0, MAX_LANDMARKS, used="M"),
+        odds=Maybe(Array(FLOAT64, "n P", used="M")),
+        maps=Array(INT32, "a P", 0, "P"),
+        map_of=Array(INT64, "n", 0, "a+1"),
+        ids=Array(INT64, "n", 0, MAX_LANDMARKS, ascending=True),
+        identities=Array(INT64, "n", -1),
+        last_seen=Array(INT64, "n"),
+        descriptors=Array(FLOAT32, "n d", -MAX_DESCRIPTOR, MAX_DESCRIPTOR),
+        next_id=Int(0, MAX_LANDMARKS),
+    )
+    values: FloatArray
+    counts: NDArray[np.int32]
+    odds: FloatArray | None
+    maps: NDArray[np.int32]
+    map_of: IntArray
+    ids: IntArray
+    identities: IntArray
+    last_seen: IntArray
+    descriptors: NDArray[np.float32]
+    next_id: int
+
+    @staticmethod
+    def check_state(parts: Mapping[str, Any], sizes: Sizes) -> None:
+        """Refuse maps with a landmark of a particle that has no valid Gaussian, or with indices of no particle."""
+        m, padded, n = sizes["M"], sizes["P"], len(parts["ids"])
+        if parts["values"].shape[1] != 9 * padded:
+            raise ValueError(f"values of {parts['values'].shape[1]} columns for {padded} lanes")
+        blocks = parts["values"].reshape(n, -1, 9, LANES).swapaxes(2, 3).reshape(n, padded, 9)
+        held = blocks[:, :m][parts["counts"][:, :m] > 0]
+        limits = np.repeat([MAX_DISTANCE, LARGEST], [3, 6])
+        if not ((np.abs(held) <= limits).all() and (held[:, [3, 6, 8]] > 0.0).all()):
+            raise ValueError("a Gaussian out of range")
+        if n and parts["ids"][-1] >= parts["next_id"]:
+            raise ValueError("an id from next_id on")
+        if (parts["maps"][:, :m] >= m).any():
+            raise ValueError("an ancestor beyond the particles")
+        if sizes["d"] > LONGEST_DESCRIPTOR:
+            raise ValueError("descriptors that are too long")
 
 
 def write_summary(maps: ParticleMaps, m: int, min_count: int, rows: MapSummaryRows, first: int) -> int:

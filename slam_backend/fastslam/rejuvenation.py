@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.core.blas import single_threaded_blas
-from slam_backend.core.read_only import with_constants, with_read_only
+from slam_backend.core.read_only import as_read_only, with_read_only
+from slam_backend.core.state import MAX_INT, Dict, Each, Flag, Int, Maybe, Record, Sizes, State
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.fastslam import _kernels
 from slam_backend.fastslam.options import FilterOptions
@@ -155,7 +156,6 @@ def joint_graph(
 MIN_CLOSURE_MATCHES = 3  # matches with landmarks not seen for long that count as a loop closure in one step
 MIN_INTERVAL_FRACTION = 5  # a loop closure shortens the interval to a fifth at most
 MIN_ROWS = 8  # least steps of each log in a slice, so that the work keeps up with the input
-SCHEDULE = ("_asked", "_waited", "_read", "_closed", "_exact", "_last_closing", "steps")
 
 
 class RejuvenationScheduler:
@@ -169,6 +169,20 @@ class RejuvenationScheduler:
         steps: Number of steps recorded.
     """
 
+    STATE = State(
+        graph=Maybe(Record(SlamGraph)),
+        draft=Maybe(Record(Draft)),
+        requested=Flag(),
+        waited=Int(),
+        read=Int(),
+        closed=Flag(),
+        exact=Flag(),
+        last_closing=Int(),
+        steps=Int(),
+        initial_poses=Each(Record(InitialPoses), "K"),
+        rejected=Each(Dict(Int(), Record(RejectedMeasurements)), "K", list),
+    )
+
     def __init__(self, options: FilterOptions, num_robots: int) -> None:
         assert options.rejuvenate_every is not None
         self.steps = 0
@@ -181,14 +195,14 @@ class RejuvenationScheduler:
         self._share: int  # steps of a robot in a slice
         self._set_graph(None)
         self._draft: Draft | None = None  # the graph with new steps, before convergence
-        self._asked = False  # rejuvenation requested
+        self._requested = False  # rejuvenation requested
         self._waited = 0  # steps since the last rejuvenation
         self._read = 0  # measurements since then
         self._closed = False  # loop closure since then
         self._exact = False  # an exact pose disables rejuvenation for good
         self._last_closing = 0  # last step with matches of landmarks not seen for long
         self._guesses = [InitialPoses.empty() for _ in range(num_robots)]
-        self._refused: list[dict[int, RejectedMeasurements]] = [{} for _ in range(num_robots)]
+        self._rejected: list[dict[int, RejectedMeasurements]] = [{} for _ in range(num_robots)]
 
     # ------------------------------------------------------------------ in each step
 
@@ -197,17 +211,17 @@ class RejuvenationScheduler:
         if is_placed:
             self._exact = True
             self._guesses = [InitialPoses.empty() for _ in self._guesses]
-            for refused in self._refused:
-                refused.clear()
+            for rejected in self._rejected:
+                rejected.clear()
         if not (self._exact or self._noiseless):
             self._guesses[robot] = self._guesses[robot].with_later(steps, poses)
 
     def add_rejected(self, robot: int, step: int, ids: IntArray, descriptors: NDArray[np.float32]) -> None:
         """Record which of a robot's measurements without names were neither matched nor new, by their ids (n,)."""
-        refused = [row for row, name in enumerate(ids.tolist()) if name < 0]
-        if refused and not self._why_disabled:
-            rows = np.array(refused)
-            self._refused[robot][step] = with_read_only(RejectedMeasurements(rows, descriptors[rows]))
+        rejected = [row for row, name in enumerate(ids.tolist()) if name < 0]
+        if rejected and not self._why_disabled:
+            rows = np.array(rejected)
+            self._rejected[robot][step] = with_read_only(RejectedMeasurements(rows, descriptors[rows]))
 
     def record_step(self, matched: int, long_unseen: int) -> None:
         """Record a step: number of measurements matched or new, and of matches with landmarks not seen for long."""
@@ -221,7 +235,7 @@ class RejuvenationScheduler:
 
     def request(self) -> None:
         """Make a rejuvenation due now, as before a merge."""
-        self._asked = True
+        self._requested = True
 
     @property
     def graph(self) -> SlamGraph | None:
@@ -231,7 +245,7 @@ class RejuvenationScheduler:
     @property
     def requested(self) -> bool:
         """Whether `request` was called and the rejuvenation is still outstanding."""
-        return self._asked
+        return self._requested
 
     @property
     def is_disabled(self) -> bool:
@@ -248,7 +262,7 @@ class RejuvenationScheduler:
     @property
     def is_due(self) -> bool:
         """Whether a rejuvenation is due."""
-        if self._asked:
+        if self._requested:
             return True
         haste = MIN_INTERVAL_FRACTION if self._closed else 1
         if haste * self._waited < self._every:
@@ -343,9 +357,9 @@ class RejuvenationScheduler:
     ) -> list[LogArrays]:  # fmt: skip
         """Return the log entries after a graph's last steps; rejected measurements are matched again."""
         new = log_tails(logs, graph)
-        if not any(self._refused):
+        if not any(self._rejected):
             return new
-        return reassociate(new, self._refused, self._guesses, landmark_table(maps, best), self._options)
+        return reassociate(new, self._rejected, self._guesses, landmark_table(maps, best), self._options)
 
     @single_threaded_blas
     def join(
@@ -373,7 +387,7 @@ class RejuvenationScheduler:
         self._set_graph(graph)
         self._draft = Draft(graph=graph)
         self._guesses = a._guesses + [InitialPoses(steps, compose(motion, poses)) for steps, poses in b._guesses]
-        self._refused = [dict(refused) for refused in (*a._refused, *b._refused)]
+        self._rejected = [dict(rejected) for rejected in (*a._rejected, *b._rejected)]
         self._read, self._exact = a._read + b._read, a._exact or b._exact
         self._waited = self._every
 
@@ -415,12 +429,12 @@ class RejuvenationScheduler:
         self._set_graph(graph)
         for robot, latest in enumerate(graph.latest.tolist()):
             self._guesses[robot] = self._guesses[robot].after(latest)
-            for step in [step for step in self._refused[robot] if step <= latest]:
-                del self._refused[robot][step]
+            for step in [step for step in self._rejected[robot] if step <= latest]:
+                del self._rejected[robot][step]
 
     def _restart_interval(self) -> None:
         """Start a new interval."""
-        self._asked, self._waited, self._read, self._closed = False, 0, 0, False
+        self._requested, self._waited, self._read, self._closed = False, 0, 0, False
 
     def reorder(self, order: IntArray) -> None:
         """Renumber the robots: robot i becomes the one that was `order[i]`."""
@@ -428,32 +442,46 @@ class RejuvenationScheduler:
         if self._draft is not None:
             self._draft = self._draft._replace(graph=self._draft.graph.reordered(order))
         self._guesses = [self._guesses[robot] for robot in order]
-        self._refused = [self._refused[robot] for robot in order]
+        self._rejected = [self._rejected[robot] for robot in order]
 
     # ------------------------------------------------------------------ snapshots
 
-    def get_state(self) -> dict[str, Any]:
-        """Return the complete state; arrays of graphs and of rejected measurements are shared and read-only."""
-        draft = self._draft
-        return {
-            "graph": None if self._graph is None else self._graph.to_mapping(),
-            "draft": None if draft is None else (draft.graph.to_mapping(), draft.damping, draft.steps),
-            "schedule": {name: getattr(self, name) for name in SCHEDULE},
-            "guesses": tuple((steps.copy(), poses.copy()) for steps, poses in self._guesses),
-            "refused": tuple(dict(refused) for refused in self._refused),
-        }
+    @property
+    def initial_poses(self) -> tuple[InitialPoses, ...]:
+        """Initial poses of each robot; read-only views."""
+        return tuple(InitialPoses(as_read_only(steps), as_read_only(poses)) for steps, poses in self._guesses)
 
-    def set_state(self, state: Mapping[str, Any]) -> None:
-        """Restore the state from `get_state`."""
-        self._set_graph(None if state["graph"] is None else SlamGraph.of_mapping(state["graph"]))
-        self._draft = None
-        if state["draft"] is not None:
-            graph, damping, steps = state["draft"]
-            self._draft = Draft(graph=SlamGraph.of_mapping(graph), damping=damping, steps=steps)
-        for name in SCHEDULE:
-            setattr(self, name, state["schedule"][name])
-        self._guesses = [InitialPoses(steps.copy(), poses.copy()) for steps, poses in state["guesses"]]
-        self._refused = [dict(with_constants(refused)) for refused in state["refused"]]
+    @initial_poses.setter
+    def initial_poses(self, poses: Sequence[InitialPoses]) -> None:
+        self._guesses = [InitialPoses(steps.copy(), each.copy()) for steps, each in poses]  # writable, as kernels need
+
+    def rebuild(self) -> None:
+        """Compute what depends on the graph."""
+        self._set_graph(self._graph)
+
+    @staticmethod
+    def check_state(parts: Mapping[str, Any], sizes: Sizes) -> None:
+        """Refuse a draft of no graph."""
+        if parts["draft"] is not None and parts["graph"] is None:
+            raise ValueError("a draft without a graph")
+
+
+def check_rejected(rejected: Mapping[int, RejectedMeasurements], log: Mapping[str, Any], size: int) -> None:
+    """Refuse measurements that were not logged, or with descriptors of another length than d.
+
+    Args:
+        rejected: Rejected measurements of a robot by step.
+        log: State of the robot's log.
+        size: d.
+    """
+    counts: dict[int, int] = {}
+    for part in reversed((*log["chunks"], log["unfinished"])) if rejected else ():
+        counts |= dict(zip(part.steps.tolist(), np.diff(part.starts).tolist(), strict=True))
+        if len(part) and part.steps[0] <= min(rejected):
+            break
+    for step, (rows, descriptors) in rejected.items():
+        if descriptors.shape[1] != size or (len(rows) and rows[-1] >= counts.get(step, MAX_INT)):
+            raise ValueError(f"rejected measurements of step {step} that were not logged")
 
 
 def _failed(graph: SlamGraph, reason: str) -> Rejuvenation:

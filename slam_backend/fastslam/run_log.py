@@ -2,12 +2,13 @@
 
 from bisect import bisect_left
 from collections.abc import Iterator, Mapping
+from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from slam_backend.core.read_only import with_constants, with_read_only
+from slam_backend.core.state import Each, Record, Sizes, State, accepted, restore, take
 from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_array, check_choice, check_int
 from slam_backend.fastslam._kernels.records import LogColumns
 from slam_backend.fastslam._kernels.run_log import turn_of, write_rows
@@ -18,7 +19,6 @@ from slam_backend.smoother.log_arrays import (
     STATIONARY,
     LogArrays,
     LogStep,
-    has_been_checked,
     join,
 )
 
@@ -44,6 +44,7 @@ class RobotLog:
         (2, 1, [0, 1, 1])
     """
 
+    STATE = State(chunks=Each(Record(LogArrays), kind=list), unfinished=Record(LogArrays))
     __slots__ = ("_chunks", "_covariances", "_given", "_ids", "_kinds", "_last", "_motions",
                  "_num_measurements", "_num_rows", "_points", "_starts", "_steps")  # fmt: skip
 
@@ -101,7 +102,7 @@ class RobotLog:
             raise self._refusal(step, odometry, pose, points, ids, covariances)
         start, t = self._num_measurements, self._num_rows
         if t == ROWS or (start and start + n > MEASUREMENTS):
-            self._chunks.append(with_read_only(self._unfinished()))
+            self._chunks.append(self._copy_of_open())
             self._open(max(MEASUREMENTS, n))
             start = t = 0
         elif n > len(self._ids):  # one huge frame after steps without measurements
@@ -169,7 +170,7 @@ class RobotLog:
             self._covariances = np.full((len(self._ids), 6), np.nan)
         return self._covariances
 
-    def _unfinished(self, first: int = 0) -> LogArrays:
+    def _copy_of_open(self, first: int = 0) -> LogArrays:
         """Return a copy of the open chunk from a row on, trimmed to its content."""
         t, start = self._num_rows, int(self._starts[first])
         measured = slice(start, self._num_measurements)
@@ -215,8 +216,8 @@ class RobotLog:
         while first > 0 and self._chunks[first - 1].steps[-1] >= since:
             first -= 1
         if first == len(self._chunks):
-            return self._unfinished(bisect_left(self._steps, since, 0, self._num_rows))
-        return join([*self._chunks[first:], self._unfinished()]).since(since)
+            return self._copy_of_open(bisect_left(self._steps, since, 0, self._num_rows))
+        return join([*self._chunks[first:], self._copy_of_open()]).since(since)
 
     @property
     def has_exact_poses(self) -> bool:
@@ -236,14 +237,14 @@ class RobotLog:
 
     def __iter__(self) -> Iterator[LogStep]:
         """Iterate over the steps in order, in a snapshot taken when the loop begins."""
-        for chunk in [*self._chunks, self._unfinished()]:
+        for chunk in [*self._chunks, self._copy_of_open()]:
             yield from map(chunk.row, range(len(chunk)))
 
     # ------------------------------------------------------------------ copies
 
     def copy(self) -> "RobotLog":
         """Return an independent log; finished chunks are shared."""
-        return _restored(self.get_state())
+        return _restored(take(self))
 
     __copy__ = copy
 
@@ -251,7 +252,7 @@ class RobotLog:
         return self.copy()
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _restored, (self.get_state(),)
+        return _restored, (take(self),)
 
     def renamed(
         self, old_ids: ArrayLike, new_ids: ArrayLike, others: Literal["reject", "keep"] = "reject"
@@ -279,26 +280,22 @@ class RobotLog:
         if len(unique) < len(old):
             raise argument_error("old_ids", "distinct ids", old.tolist(), "Give one new name per landmark.")
         keep = check_choice("others", others, ("reject", "keep")) == "keep"
-        state = self.get_state()
-        chunks = tuple(chunk.renamed(unique, new[order], keep) for chunk in state["chunks"])
-        return _restored({"chunks": chunks, "unfinished": state["unfinished"].renamed(unique, new[order], keep)})
+        log = RobotLog()
+        log._chunks = [chunk.renamed(unique, new[order], keep) for chunk in self._chunks]
+        log.unfinished = self.unfinished.renamed(unique, new[order], keep)
+        log.rebuild()
+        return log
 
-    def get_state(self) -> dict[str, Any]:
-        """Return the content of the log; finished chunks are shared and read-only, the last one is a copy."""
-        return {"chunks": tuple(self._chunks), "unfinished": self._unfinished()}
+    # ------------------------------------------------------------------ snapshots
 
-    def set_state(self, state: Mapping[str, Any]) -> None:
-        """Replace the content by that of the log that returned `state`.
+    @property
+    def unfinished(self) -> LogArrays:
+        """Steps of the open chunk. A copy."""
+        return self._copy_of_open()
 
-        Raises:
-            ValueError: If `state` is not from `get_state`.
-        """
-        for name in ("chunks", "unfinished"):
-            if name not in state:
-                raise argument_error("state", "a dict from RobotLog.get_state", f"no {name!r}", "Pass it unchanged.")
-        last: LogArrays = state["unfinished"]
+    @unfinished.setter
+    def unfinished(self, last: LogArrays) -> None:
         t, n = len(last), len(last.ids)
-        self._chunks = [chunk if has_been_checked(chunk) else with_constants(chunk) for chunk in state["chunks"]]
         self._open(max(MEASUREMENTS, n))
         self._num_rows, self._num_measurements = t, n
         self._steps[:t], self._kinds[:t], self._motions[:t], self._given[:t] = (
@@ -307,12 +304,31 @@ class RobotLog:
         self._starts[: t + 1], self._points[:n], self._ids[:n] = last.starts, last.points, last.ids
         if last.covariances is not None:
             self._reserve_covariances()[:n] = last.covariances
-        newest = last if t else self._chunks[-1] if self._chunks else None
-        self._last = -1 if newest is None else int(newest.steps[-1])
+
+    def rebuild(self) -> None:
+        """Find the last step."""
+        t = self._num_rows
+        self._last = int(self._steps[t - 1] if t else self._chunks[-1].steps[-1] if self._chunks else -1)
+
+    @staticmethod
+    def check_state(parts: Mapping[str, Any], sizes: Sizes) -> None:
+        """Refuse chunks that are empty, too long or out of order."""
+        chunks, unfinished = parts["chunks"], parts["unfinished"]
+        if not all(map(len, chunks)) or len(unfinished) > ROWS:
+            raise ValueError(f"an empty chunk or more than {ROWS} steps after the chunks")
+        filled = [chunk.steps for chunk in (*chunks, unfinished) if len(chunk)]
+        if any(later[0] <= earlier[-1] for earlier, later in pairwise(filled)):
+            raise ValueError("a step out of order")
+
+
+def last_step(log: Mapping[str, Any]) -> int:
+    """Return the last step of the state of a log, -1 if there is none."""
+    newest = next((part for part in (log["unfinished"], *reversed(log["chunks"])) if len(part)), None)
+    return -1 if newest is None else int(newest.steps[-1])
 
 
 def _restored(state: Mapping[str, Any]) -> RobotLog:
     """Return a log with the given state."""
     log = RobotLog()
-    log.set_state(state)
+    restore(log, accepted(RobotLog, "state", state))
     return log

@@ -11,20 +11,64 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from slam_backend.core.read_only import Act, as_read_only, map_arrays, with_constants, with_read_only
+from slam_backend.core.read_only import Act, as_read_only, map_arrays, with_read_only
+from slam_backend.core.state import (
+    BOOL,
+    FLOAT32,
+    FLOAT64,
+    INT64,
+    LARGEST,
+    MAX_DESCRIPTOR,
+    MAX_DISTANCE,
+    MAX_LANDMARKS,
+    Array,
+    Dict,
+    Each,
+    Int,
+    Record,
+    Row,
+    Sizes,
+    State,
+    with_state,
+)
 from slam_backend.core.validation import BoolArray, Float32Array, FloatArray, IntArray, argument_error, check_array
 from slam_backend.fastslam import _kernels
-from slam_backend.fastslam._kernels import NO_READING
+from slam_backend.fastslam._kernels import EXACT_POSE, NO_READING
 from slam_backend.models.camera import MAX_POINT_DISTANCE, StereoCamera
-from slam_backend.models.measurements import LARGEST_DESCRIPTOR, Measurements, TeamMeasurements
+from slam_backend.models.measurements import Measurements, TeamMeasurements
 
 # Input of one robot: kind of motion, first and last row of its used measurements among all n, whether these have
 # covariances, whether they have names, and the number of measurements given, used or not, -1 without a frame.
 # `_kernels.layout` names the numbers.
 RobotInput = Sequence[int]
 NO_INPUT = (NO_READING, 0, 0, 0, 0, -1)
+ROBOT_INPUT = Row(Int(0, EXACT_POSE), Int(), Int(), Int(0, 1), Int(0, 1), Int(-1, MAX_LANDMARKS))
+MASKS = Dict(Int(0, "K"), Array(BOOL, "*"))
 
 
+def check_rows(inputs: Sequence[RobotInput], masks: Mapping[int, BoolArray], n: int) -> None:
+    """Refuse inputs of robots whose measurements do not lie among n, robot by robot, and masks of others."""
+    last = 0
+    for _, begin, end, _, _, _ in inputs:
+        if not (last <= begin <= end <= n or begin == end == 0):
+            raise ValueError("rows of other measurements")
+        last = max(last, end)
+    for robot, mask in masks.items():
+        _, begin, end, _, _, count = inputs[robot]
+        if len(mask) != max(count, 0) or np.count_nonzero(mask) != end - begin:
+            raise ValueError("a mask of other measurements")
+
+
+@with_state(
+    inputs=Each(ROBOT_INPUT, "K"),
+    inputs_table=Array(INT64, "K 6", -1),
+    moves=Array(FLOAT64, "K 3", -MAX_DISTANCE, MAX_DISTANCE),
+    masks=MASKS,
+    measurements=Array(FLOAT64, "n 9", -math.inf, math.inf, nan=True),
+    descriptors=Array(FLOAT32, "n d", -MAX_DESCRIPTOR, MAX_DESCRIPTOR),
+    names=Array(INT64, "*", -1),
+    inactive=Each(Int(0, "K"), kind=frozenset),
+)
 class StepInput(NamedTuple):
     """Validated input of N robots in one step; filters do not write to it.
 
@@ -50,6 +94,23 @@ class StepInput(NamedTuple):
     descriptors: Float32Array
     names: IntArray
     inactive: frozenset[int]
+
+    @staticmethod
+    def check_state(parts: Mapping[str, Any], sizes: Sizes) -> None:
+        """Refuse inputs whose measurements, names and masks do not fit together."""
+        inputs, measurements, names = parts["inputs"], parts["measurements"], parts["names"]
+        check_rows(inputs, parts["masks"], len(measurements))
+        if [list(one) for one in inputs] != parts["inputs_table"].tolist():
+            raise ValueError("a table that differs from the inputs")
+        if not (np.abs(measurements[:, :3]) <= MAX_DISTANCE).all():
+            raise ValueError("a point out of range")
+        for _, begin, end, has_covariances, has_names, _ in inputs:
+            if has_names and len(names) != len(measurements):
+                raise ValueError("names of other measurements")
+            if has_covariances and not (np.abs(measurements[begin:end]) <= LARGEST).all():
+                raise ValueError("a covariance out of range")
+        if len(names) not in (0, len(measurements)):
+            raise ValueError("names of other measurements")
 
     def with_arrays(self, act: Act) -> Self:
         """Return the input with `act` applied to each array; itself if that changes nothing."""
@@ -86,6 +147,8 @@ def rows_of(rows: tuple[int, ...]) -> RobotRows:
 class InputBuffer:
     """Buffer of the inputs of all robots, step by step."""
 
+    STATE = State(steps=Dict(Int(), Record(StepInput)))
+
     def __init__(self) -> None:
         self._steps: dict[int, StepInput] = {}
 
@@ -110,18 +173,6 @@ class InputBuffer:
         """Remove the steps before this one."""
         while self._steps and (oldest := next(iter(self._steps))) < step:  # in order of time
             del self._steps[oldest]
-
-    def get_state(self) -> dict[str, Any]:
-        """Return the content; inputs are read-only and shared."""
-        return {"steps": dict(self.buffered)}
-
-    def set_state(self, state: Mapping[str, Any]) -> None:
-        """Restore the content from `get_state`."""
-        previous = self._steps
-        steps: Mapping[int, StepInput] = state["steps"]
-        self._steps = {
-            step: inputs if previous.get(step) is inputs else with_constants(inputs) for step, inputs in steps.items()
-        }
 
 
 NO_MEASUREMENTS = np.zeros((0, 9))
@@ -163,7 +214,7 @@ def pack_team_input(
         return None
     moves, copied = odometry.copy(), descriptors.copy()
     table, sightings = np.empty((k, 6), np.int64), np.empty((count, 9))
-    limits = farthest_move, farthest_point, LARGEST_DESCRIPTOR
+    limits = farthest_move, farthest_point, MAX_DESCRIPTOR
     if not _kernels.read_team(moves, points, copied, offsets, *limits, table, sightings):
         return None
     return StepInput(table.tolist(), table, moves, {}, sightings, copied, NO_NAMES, frozenset())
@@ -304,8 +355,8 @@ def _split_by_robot(frames: TeamMeasurements) -> list[Measurements]:
         expected = "a descriptor per point, and ascending offsets up to the number of points"
         raise argument_error("measurements", expected, got, "Give the end of each robot's points.")
     largest = float(np.abs(frames.descriptors).max(initial=0.0))
-    if not largest <= LARGEST_DESCRIPTOR:
-        expected = f"numbers within +-{LARGEST_DESCRIPTOR:g}"
+    if not largest <= MAX_DESCRIPTOR:
+        expected = f"numbers within +-{MAX_DESCRIPTOR:g}"
         raise argument_error("measurements.descriptors", expected, largest, "Scale them, preferably to unit length.")
     return frames.per_robot()
 

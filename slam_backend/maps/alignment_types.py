@@ -8,6 +8,7 @@ import numpy as np
 
 from slam_backend.core.read_only import as_read_only
 from slam_backend.core.short_repr import short_repr
+from slam_backend.core.state import FLOAT64, INT64, Array, Flag, Float, State, Text
 from slam_backend.core.validation import (
     MOST,
     FloatArray,
@@ -134,6 +135,18 @@ class Alignment:
         excess: Value of the missed bound over its limit, above 1 [-]; NaN if none is missed.
     """
 
+    STATE = State(
+        success=Flag(),
+        reason=Text(("", *REASONS)),
+        tx=Float(nan=True),
+        ty=Float(nan=True),
+        theta=Float(nan=True),
+        covariance=Array(FLOAT64, "3 3", nan=True),
+        inliers=Array(INT64, "inliers 2"),
+        ratio=Float(0.0),
+        missed=Text(("", *BOUNDS)),
+        excess=Float(0.0, math.inf, nan=True),
+    )
     success: bool
     reason: str
     tx: float

@@ -1,6 +1,6 @@
 """Landmark maps: positions with covariances, descriptors, counts and ids in one frame."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -13,6 +13,17 @@ from slam_backend.core.array_files import read_arrays
 from slam_backend.core.files import checked_path, write_file
 from slam_backend.core.read_only import as_read_only
 from slam_backend.core.short_repr import short_repr
+from slam_backend.core.state import (
+    FLOAT32,
+    FLOAT64,
+    INT64,
+    MAX_DESCRIPTOR,
+    MAX_DISTANCE,
+    MAX_LANDMARKS,
+    Array,
+    Sizes,
+    State,
+)
 from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_array, check_int
 from slam_backend.geometry import rotate_covariances, transform_points
 
@@ -116,6 +127,13 @@ class LandmarkMap:
     1
     """
 
+    STATE = State(
+        means=Array(FLOAT64, "n 3", -MAX_DISTANCE, MAX_DISTANCE),
+        covariances=Array(FLOAT64, "n 3 3"),
+        descriptors=Array(FLOAT32, "n d", -MAX_DESCRIPTOR, MAX_DESCRIPTOR),
+        counts=Array(INT64, "n"),
+        ids=Array(INT64, "n", 0, MAX_LANDMARKS),
+    )
     means: FloatArray
     covariances: FloatArray
     descriptors: NDArray[np.float32]
@@ -144,6 +162,17 @@ class LandmarkMap:
     def __reduce__(self) -> tuple[Any, ...]:
         """Keep copies and unpickled maps read-only, without the constructor, which may round covariances."""
         return unchecked_map, tuple(getattr(self, name) for name in FIELDS)
+
+    @staticmethod
+    def from_parts(**arrays: Any) -> "LandmarkMap":
+        """Return the map with these parts of a state, without the constructor, which may round covariances."""
+        return unchecked_map(**arrays)
+
+    @staticmethod
+    def check_state(parts: Mapping[str, Any], sizes: Sizes) -> None:
+        """Refuse a state with a repeated id."""
+        if len(np.unique(parts["ids"])) < len(parts["ids"]):
+            raise ValueError("a repeated id")
 
     def __len__(self) -> int:
         return len(self.means)

@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 
 from slam_backend.core.read_only import as_read_only
 from slam_backend.core.short_repr import short_repr
+from slam_backend.core.state import MAX_DESCRIPTOR
 from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_array
 from slam_backend.fastslam import _kernels
 
-LARGEST_DESCRIPTOR = 1e6  # limit of a component; squared distances do not overflow float32
 LEAST_VARIANCE, LARGEST_VARIANCE = 1e-14, 1e12  # [m^2]; keeps differences of log-weights representable in float64
 LARGEST_CONDITION = 1e8  # about 1 / sqrt(machine epsilon); beyond it float64 updates lose positive definiteness
 
@@ -42,9 +42,9 @@ class Measurements:
         hint = "Give one row per measured point."
         points: Any = check_array("points", self.points, (None, 3), hint + " Drop points that are not finite.")
         descriptors: Any = check_array("descriptors", self.descriptors, (len(points), None), hint, dtype=np.float32)
-        if descriptors.size and np.abs(descriptors).max() > LARGEST_DESCRIPTOR:
+        if descriptors.size and np.abs(descriptors).max() > MAX_DESCRIPTOR:
             largest = float(np.abs(descriptors).max())
-            expected = f"numbers within +-{LARGEST_DESCRIPTOR:g}"
+            expected = f"numbers within +-{MAX_DESCRIPTOR:g}"
             raise argument_error("descriptors", expected, largest, "Scale them, best to unit length.")
         object.__setattr__(self, "points", points)
         object.__setattr__(self, "descriptors", descriptors)

@@ -1,5 +1,6 @@
 """Pose-landmark graph of all robots: keyframes, odometry between them, and measurements."""
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
@@ -7,7 +8,18 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.core.read_only import as_read_only, with_constants
+from slam_backend.core.read_only import as_read_only
+from slam_backend.core.state import (
+    BOOL,
+    FLOAT64,
+    INT64,
+    LARGEST,
+    MAX_DISTANCE,
+    MAX_LANDMARKS,
+    Array,
+    Sizes,
+    State,
+)
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.geometry import between, wrap_angle
 from slam_backend.models.odometry import OdometryModel
@@ -78,6 +90,36 @@ class SlamGraph:
         latest: (K,) int64. Newest step of each robot's log in the graph, -1 before the first.
     """
 
+    STATE = State(
+        robots=Array(INT64, "k", BIAS, "K"),
+        poses=Array(FLOAT64, "k 3", -MAX_DISTANCE, MAX_DISTANCE),
+        parents=Array(INT64, "k", NONE, "k"),
+        odometry=Array(FLOAT64, "k 3", -MAX_DISTANCE, MAX_DISTANCE),
+        odometry_covariances=Array(FLOAT64, "k 3 3"),
+        bias_jacobians=Array(FLOAT64, "k 3 3"),
+        transition_variances=Array(FLOAT64, "k", 0.0),
+        rigid_variances=Array(FLOAT64, "k", 0.0),
+        frame_keys=Array(INT64, "f", 0, "k"),
+        frame_offsets=Array(FLOAT64, "f 3", -MAX_DISTANCE, MAX_DISTANCE),
+        landmark_ids=Array(INT64, "l", 0, MAX_LANDMARKS),
+        landmarks=Array(FLOAT64, "l 3", -MAX_DISTANCE, MAX_DISTANCE),
+        points=Array(FLOAT64, "n 3", -MAX_DISTANCE, MAX_DISTANCE),
+        point_noises=Array(FLOAT64, "n 6", -math.inf, math.inf, nan=True),
+        has_covariance=Array(BOOL, "n"),
+        point_frames=Array(INT64, "n", 0, "f"),
+        point_landmarks=Array(INT64, "n", 0, "l"),
+        condensed_keys=Array(INT64, "s", 0, "k"),
+        condensed_landmarks=Array(INT64, "s", 0, "l"),
+        linearisation_points=Array(FLOAT64, "s 3"),
+        information=Array(FLOAT64, "s 6"),
+        gradients=Array(FLOAT64, "s 3"),
+        counts=Array(INT64, "s", 0, MAX_LANDMARKS),
+        merged_ids=Array(INT64, "merged 2", 0, MAX_LANDMARKS),
+        first_keys=Array(INT64, "K", 0, "k"),
+        bias_keys=Array(INT64, "K", NONE, "k"),
+        last_keys=Array(INT64, "K", 0, "k"),
+        latest=Array(INT64, "K", -1),
+    )
     robots: IntArray = field(default_factory=_no_index)
     poses: FloatArray = field(default_factory=lambda: _empty(0, 3))
     parents: IntArray = field(default_factory=_no_index)
@@ -172,12 +214,24 @@ class SlamGraph:
             latest=np.full(k, -1),
         )
 
-    @classmethod
-    def of_mapping(cls, columns: Mapping[str, NDArray[Any]]) -> "SlamGraph":
-        """Return the graph from the arrays of `to_mapping`; writable arrays are copied."""
-        graph = object.__new__(cls)
-        vars(graph).update(with_constants(columns))
-        return graph
+    @staticmethod
+    def check_state(parts: Mapping[str, Any], sizes: Sizes) -> None:
+        """Refuse a graph with keys that do not lead back to a start, or that belong to another robot."""
+        robots, parents, biases = parts["robots"], parts["parents"], parts["bias_keys"]
+        every = np.arange(sizes["K"])
+        if len(np.unique(parts["landmark_ids"])) < sizes["l"]:
+            raise ValueError("a repeated landmark")
+        if not (np.abs(parts["point_noises"][parts["has_covariance"]]) <= LARGEST).all():
+            raise ValueError("a covariance out of range")
+        if (robots[parts["first_keys"]] != every).any() or (robots[parts["last_keys"]] != every).any():
+            raise ValueError("a key of another robot")
+        held = biases[biases >= 0]
+        if len(held) not in (0, len(every)) or sorted(held) != np.flatnonzero(robots == BIAS).tolist():
+            raise ValueError("keys of biases that do not belong to the robots")
+        if (parents[held] < 0).any() or (robots[parents[held]] != NONE).any():
+            raise ValueError("a bias without the origin before it")
+        if not _are_linked(parents, robots):
+            raise ValueError("keys that do not lead back to a start")
 
     def reordered(self, order: IntArray) -> "SlamGraph":
         """Return the graph with robot `order[i]` as robot i; (K,) a permutation."""
@@ -210,10 +264,6 @@ class SlamGraph:
         """Return some of the columns."""
         return kind(*map(vars(self).__getitem__, kind._fields))
 
-    def to_mapping(self) -> dict[str, Any]:
-        """Return all arrays by name, read-only."""
-        return dict(vars(self))
-
     @property
     def num_keys(self) -> int:
         """Number of keys, starts included."""
@@ -241,6 +291,17 @@ class SlamGraph:
     def nbytes(self) -> int:
         """Size of all arrays in bytes."""
         return sum(column.nbytes for column in vars(self).values())
+
+
+def _are_linked(parents: IntArray, robots: IntArray) -> bool:
+    """Return whether each key (k,) leads back to a start, with the keys of one robot in order of time."""
+    keys = np.arange(len(parents))
+    if ((parents >= keys) & (robots[parents] == robots)).any():
+        return False
+    before = np.where(parents < 0, keys, parents)
+    for _ in range(len(keys).bit_length()):  # each time twice as far back
+        before = before[before]
+    return bool((parents[before] < 0).all())
 
 
 def mean_pose(poses: FloatArray) -> FloatArray:

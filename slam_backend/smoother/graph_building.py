@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from slam_backend.core.state import FLOAT64, INT64, MAX_DISTANCE, Array, with_state
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray, argument_error
 from slam_backend.geometry import between, compose, rotation
 from slam_backend.models.odometry import OdometryModel
@@ -15,6 +16,7 @@ from slam_backend.smoother.graph import NONE, RIGID, UNINFORMATIVE, Part, SlamGr
 from slam_backend.smoother.log_arrays import EXACT, LogArrays
 
 
+@with_state(steps=Array(INT64, "n", ascending=True), poses=Array(FLOAT64, "n 3", -MAX_DISTANCE, MAX_DISTANCE))
 class InitialPoses(NamedTuple):
     """Poses of a robot after some steps.
 

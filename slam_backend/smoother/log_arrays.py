@@ -1,14 +1,25 @@
 """Log of one robot's run as flat, read-only arrays, the input of a smoother."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple
-from weakref import WeakSet
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.core.read_only import Act, map_arrays, with_constants, with_read_only
+from slam_backend.core.read_only import as_read_only
+from slam_backend.core.state import (
+    BOOL,
+    FLOAT64,
+    INT8,
+    INT64,
+    MAX_DISTANCE,
+    MAX_LANDMARKS,
+    Array,
+    Maybe,
+    Sizes,
+    State,
+)
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 
 STATIONARY: Final = 0  # kinds of motion
@@ -41,9 +52,9 @@ class LogStep(NamedTuple):
 COLUMNS = ("steps", "kinds", "motions", "given", "starts", "points", "ids", "covariances")
 
 
-@dataclass(frozen=True, slots=True, weakref_slot=True, eq=False, kw_only=True)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class LogArrays:
-    """Log of T steps with n measurements in all, as read-only arrays; shared ones are `with_read_only`.
+    """Log of T steps with n measurements in all, as read-only arrays.
 
     Attributes:
         steps: (T,) int64. Index of each step in the run, ascending; steps without events may be missing.
@@ -56,6 +67,16 @@ class LogArrays:
         covariances: (n, 6) float64 [m^2], robot axes, upper triangles by rows; NaN where not given. None: all NaN.
     """
 
+    STATE = State(
+        steps=Array(INT64, "T", ascending=True),
+        kinds=Array(INT8, "T", STATIONARY, EXACT),
+        motions=Array(FLOAT64, "T 3", -MAX_DISTANCE, MAX_DISTANCE),
+        given=Array(BOOL, "T"),
+        starts=Array(INT64, "T+1"),
+        points=Array(FLOAT64, "n 3", -MAX_DISTANCE, MAX_DISTANCE),
+        ids=Array(INT64, "n", REJECTED, MAX_LANDMARKS),
+        covariances=Maybe(Array(FLOAT64, "n 6", nan=True)),
+    )
     steps: IntArray
     kinds: NDArray[np.int8]
     motions: FloatArray
@@ -69,22 +90,26 @@ class LogArrays:
         for name in COLUMNS:
             array = getattr(self, name)
             if array is not None:
-                array.setflags(write=False)
+                object.__setattr__(self, name, as_read_only(array))
+
+    @staticmethod
+    def check_state(parts: Mapping[str, Any], sizes: Sizes) -> None:
+        """Refuse a state whose measurements are not those of its steps."""
+        starts, covariances = parts["starts"], parts["covariances"]
+        if starts[0] != 0 or starts[-1] != sizes["n"] or (starts[1:] < starts[:-1]).any():
+            raise ValueError("measurements of no step")
+        given = np.repeat(parts["given"], np.diff(starts))
+        if parts["given"].any() and (covariances is None or np.isnan(covariances[given]).any()):
+            raise ValueError("no given covariances")
 
     def __len__(self) -> int:
         return len(self.steps)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "LogArrays":
-        return with_constants(self)
+        return self
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _from_columns, (self._columns(),)  # plain pickling loses the read-only flags
-
-    def with_arrays(self, act: Act) -> "LogArrays":
-        """Return the log with `act` applied to each array; itself if nothing changes."""
-        before = self._columns()
-        after = map_arrays(before, act)
-        return self if after is before else LogArrays(**after)
 
     @property
     def nbytes(self) -> int:
@@ -138,23 +163,9 @@ class LogArrays:
         return replace(self, ids=ids)
 
 
-_checked: WeakSet[LogArrays] = WeakSet()
-
-
-def has_been_checked(rows: Any) -> bool:
-    """Return whether a log was checked before; its arrays are read-only, so the result is still valid."""
-    return type(rows) is LogArrays and rows in _checked
-
-
-def note_checked(rows: LogArrays) -> None:
-    """Mark a log as checked if its arrays are read-only."""
-    if with_read_only(rows) is rows:
-        _checked.add(rows)
-
-
 def _from_columns(columns: dict[str, Any]) -> LogArrays:
     """Restore a log from its arrays after unpickling."""
-    return with_read_only(LogArrays(**columns))
+    return LogArrays(**columns)
 
 
 def join(parts: Sequence[LogArrays]) -> LogArrays:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from slam_backend.core.jit import in_place
 from slam_backend.core.packed_symmetric import UNPACK_INDEX
+from slam_backend.core.state import FLOAT32, INT64, MAX_DESCRIPTOR, Array, with_state
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.fastslam.options import FilterOptions
 from slam_backend.geometry import rotation
@@ -26,6 +27,10 @@ NO_ONE = -1
 ROUNDING = 1e-12  # [m^2]; keeps covariances of sensors without noise invertible
 
 
+@with_state(
+    rows=Array(INT64, "n", ascending=True),
+    descriptors=Array(FLOAT32, "n d", -MAX_DESCRIPTOR, MAX_DESCRIPTOR),
+)
 class RejectedMeasurements(NamedTuple):
     """Measurements of one robot's step that neither matched a landmark nor started one.
 

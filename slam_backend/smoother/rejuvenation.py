@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from slam_backend.core.state import Float, Int, Record, with_state
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.geometry import wrap_angle
 from slam_backend.models.odometry import OdometryModel
@@ -221,6 +222,7 @@ STEPS = 2  # Gauss-Newton iterations in a slice: the second usually confirms the
 LAST_STEPS = 3  # Gauss-Newton iterations in the slice that draws: only the last few keys are not at the mode
 
 
+@with_state(graph=Record(SlamGraph), damping=Float(0.0), steps=Int())
 class Draft(NamedTuple):
     """A graph in the middle of a descent.
 

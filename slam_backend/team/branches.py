@@ -11,13 +11,12 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from slam_backend.core.state import Child, Dict, Each, Int, Maybe, Sizes, State
+from slam_backend.core.state import Child, Dict, Each, Int, Maybe, Record, Sizes, State, restored, take, with_state
 from slam_backend.core.validation import IntArray
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.reports import Associations, StepReport
-from slam_backend.fastslam.state_checks import last_step
+from slam_backend.fastslam.run_log import last_step
 from slam_backend.fastslam.step_input import InputBuffer, RobotRows, StepInput, rows_of
-from slam_backend.team.bridge import FILTER, INPUTS, REPORT, put_filter
 from slam_backend.team.merge_monitor import MergeMonitor
 from slam_backend.team.merge_scheduler import LANDMARK, ROBOT, ROBOTS
 
@@ -44,8 +43,9 @@ class Branch:
     """
 
     STATE = State(
-        robots=Each(ROBOT, "n"), active_robots=ROBOTS, filter=FILTER, last_steps=Dict(ROBOT, Int(-1, "STEPS")),
-        number=Int(), epoch=Int(), report=Maybe(REPORT), monitors=Each(Child(MergeMonitor), kind=list),
+        robots=Each(ROBOT, "n"), active_robots=ROBOTS, filter=Child(FastSlam, K="n"),
+        last_steps=Dict(ROBOT, Int(-1, "STEPS")), number=Int(), epoch=Int(), report=Maybe(Record(StepReport)),
+        monitors=Each(Child(MergeMonitor), kind=list),
         split_from=Maybe(Int()), split_counts=Dict(LANDMARK, Int()),
     )  # fmt: skip
 
@@ -103,6 +103,7 @@ class Branch:
             raise ValueError("monitors out of order")
 
 
+@with_state(step=Int(high="STEPS"), robots=ROBOTS, inputs=Record(StepInput), report=Record(StepReport))
 class ReplayedStep(NamedTuple):
     """Step that a filter processed later.
 
@@ -117,8 +118,6 @@ class ReplayedStep(NamedTuple):
     robots: tuple[int, ...]
     inputs: StepInput
     report: StepReport
-
-    STATE = State(step=Int(high="STEPS"), robots=ROBOTS, inputs=INPUTS, report=REPORT)
 
 
 def landmark_counts(slam: FastSlam) -> dict[int, int]:
@@ -199,7 +198,7 @@ def fork(
         rng: Generator that seeds its random stream.
         at_hand: Filter that is no longer needed, whose memory the copy takes; or None.
     """
-    slam = put_filter(branch.filter.get_state(), at_hand)
+    slam = restored(take(branch.filter), at_hand)
     slam.may_smooth, slam.rng = True, np.random.default_rng(rng.integers(2**63, size=4))
     return Branch(
         robots=branch.robots,

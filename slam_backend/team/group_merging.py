@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from slam_backend.core.state import Each, Int, Saved, Sizes, Snapshot, State, take
+from slam_backend.core.state import Each, Int, Record, Saved, Sizes, Snapshot, State, take
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.fastslam import _kernels
 from slam_backend.fastslam.filter import FastSlam
@@ -18,7 +18,6 @@ from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.smoother.graph import SlamGraph
 from slam_backend.smoother.joint_graphs import RelativeStart, relative_start
 from slam_backend.team.branches import Branch, fork
-from slam_backend.team.bridge import ALIGNMENT
 from slam_backend.team.filter_merging.landmarks import merge_by_identity, renaming
 from slam_backend.team.filter_merging.merging import merge_filters, pair_filters, transform_covariance
 from slam_backend.team.filter_merging.pairing import Pairing
@@ -129,7 +128,7 @@ class JoinedGroups:
         sides: States of their trunks just before, with monitors of earlier merges.
     """
 
-    STATE = State(number=Int(), alignment=ALIGNMENT, sides=Each(Saved(Branch), "2"))
+    STATE = State(number=Int(), alignment=Record(Alignment), sides=Each(Saved(Branch), "2"))
     number: int
     alignment: Alignment
     sides: tuple[Snapshot, Snapshot]

@@ -26,7 +26,6 @@ from slam_backend.core.state import (
 from slam_backend.core.validation import IntArray
 from slam_backend.maps.alignment import Alignment
 from slam_backend.team.branches import MAX_REPLAYED, Branch, ReplayedStep, replay
-from slam_backend.team.bridge import ALIGNMENT
 from slam_backend.team.filter_merging.pairing import Pairing
 from slam_backend.team.group_merging import (
     JoinedGroups,
@@ -147,7 +146,7 @@ class Smoothing:
     """
 
     name: ClassVar[str] = "smoothing"
-    STATE = State(numbers=Row(Int(), Int()), unsmoothed=ALIGNMENT, since=Int(high="STEPS"), ready=Flag())
+    STATE = State(numbers=Row(Int(), Int()), unsmoothed=Record(Alignment), since=Int(high="STEPS"), ready=Flag())
     numbers: tuple[int, int]
     unsmoothed: Alignment
     since: int

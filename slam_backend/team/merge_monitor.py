@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from slam_backend.core.state import Each, Int, Row, State
+from slam_backend.core.state import Each, Int, Record, Row, State
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.fastslam.reports import StepReport
 from slam_backend.geometry import transform_points
@@ -33,7 +33,6 @@ from slam_backend.maps.alignment import (
 from slam_backend.maps.correspondences import candidates, has_enough_candidates, match_table, too_many
 from slam_backend.maps.landmark_map import LandmarkMap, unchecked_map
 from slam_backend.maps.near_pairs import Appearance, NearPairs, near_pairs
-from slam_backend.team.bridge import LANDMARKS
 from slam_backend.team.merge_scheduler import LANDMARK, PAIR, PairKey
 from slam_backend.team.options import MergeOptions
 
@@ -52,7 +51,7 @@ class MergeMonitor:
     """
 
     STATE = State(
-        number=Int(), pair=PAIR, pre_merge_maps=Row(LANDMARKS, LANDMARKS),
+        number=Int(), pair=PAIR, pre_merge_maps=Row(Record(LandmarkMap), Record(LandmarkMap)),
         exclusive_landmarks=Each(Each(LANDMARK, kind=set), "2"), steps=Int(),
     )  # fmt: skip
 

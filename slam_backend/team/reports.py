@@ -8,11 +8,23 @@ from typing import Any, Literal, NamedTuple
 
 from slam_backend.core.read_only import as_constant
 from slam_backend.core.short_repr import short_repr
-from slam_backend.core.state import INT64, MAX_LANDMARKS, Array, Float, Int, Maybe, OneOf, Row, State, Text
+from slam_backend.core.state import (
+    INT64,
+    MAX_LANDMARKS,
+    Array,
+    Float,
+    Int,
+    Maybe,
+    OneOf,
+    Record,
+    Row,
+    State,
+    Text,
+    with_state,
+)
 from slam_backend.core.validation import IntArray
 from slam_backend.fastslam.reports import Associations, RejuvenationReport
 from slam_backend.maps.alignment_types import REASONS, Alignment
-from slam_backend.team.bridge import ALIGNMENT
 from slam_backend.team.merge_scheduler import ROBOT, ROBOTS
 
 
@@ -34,8 +46,9 @@ class MergeEvent:
     """
 
     STATE = State(
-        step=Int(), kind=Text(("attempt", "merge", "undo")), robots_a=ROBOTS, robots_b=ROBOTS, alignment=ALIGNMENT,
-        unsmoothed_alignment=Maybe(ALIGNMENT), uncertainty=Float(0.0, math.inf, nan=True),
+        step=Int(), kind=Text(("attempt", "merge", "undo")), robots_a=ROBOTS, robots_b=ROBOTS,
+        alignment=Record(Alignment), unsmoothed_alignment=Maybe(Record(Alignment)),
+        uncertainty=Float(0.0, math.inf, nan=True),
     )  # fmt: skip
 
     step: int
@@ -97,6 +110,7 @@ class MapReleased:
 
 
 @short_repr
+@with_state(number=Int(), robot=ROBOT, step=Int(), ids=Array(INT64, "n", -1, MAX_LANDMARKS))
 class LandmarksCreated(NamedTuple):
     """Landmarks that a robot's measurements of one step created in a map.
 
@@ -106,8 +120,6 @@ class LandmarksCreated(NamedTuple):
         step: Step of the measurements; in a replay earlier than the step of the report.
         ids: (n,) int64, read-only. Id of the landmark that each measurement created, -1 = none.
     """
-
-    STATE = State(number=Int(), robot=ROBOT, step=Int(), ids=Array(INT64, "n", -1, MAX_LANDMARKS))
 
     number: int
     robot: int

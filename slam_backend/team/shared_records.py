@@ -10,7 +10,6 @@ from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.reports import StepReport
 from slam_backend.fastslam.step_input import InputBuffer
 from slam_backend.team.branches import ReplayedStep
-from slam_backend.team.bridge import BUFFER
 from slam_backend.team.communication import TrafficCounter
 from slam_backend.team.reports import MAP_CHANGE, LandmarksCreated, MapChange, MapForked
 
@@ -32,7 +31,7 @@ class SharedRecords:
     """
 
     STATE = State(
-        log=BUFFER, exchange=Child(TrafficCounter), rng=Generator(), entries=Each(MAP_CHANGE, kind=list),
+        log=Child(InputBuffer), exchange=Child(TrafficCounter), rng=Generator(), entries=Each(MAP_CHANGE, kind=list),
         next_number=Int(0, MAX_LANDMARKS),
     )  # fmt: skip
 

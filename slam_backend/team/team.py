@@ -511,7 +511,7 @@ class TeamSlam:
         first = 1 + min(last for branch in branches for last in branch["last_steps"].values())
         if list(inputs) != list(range(step - len(inputs), step)) or first < step - len(inputs):
             raise ValueError("inputs that lack a step")
-        descriptors = [branch["filter"]["maps"]["descriptors"] for branch in branches]
+        descriptors = [branch["filter"]["maps"].descriptors for branch in branches]
         descriptors += [of_step.descriptors for of_step in inputs.values()]
         if len({rows.shape[1] for rows in descriptors if len(rows)}) > 1:
             raise ValueError("descriptors of several lengths")

@@ -8,8 +8,8 @@ import numpy as np
 
 
 def assert_same(one: Any, other: Any, where: str = "state") -> None:
-    """Two nests of dicts, sequences, records and arrays agree bit for bit."""
-    assert type(one) is type(other), where
+    """Two nests of mappings, sequences, records and arrays agree bit for bit."""
+    assert _kind(one) is _kind(other), where
     if isinstance(one, np.ndarray):
         np.testing.assert_array_equal(one, other, err_msg=where)
     elif isinstance(one, Mapping):
@@ -25,6 +25,11 @@ def assert_same(one: Any, other: Any, where: str = "state") -> None:
             assert_same(getattr(one, name), getattr(other, name), f"{where}.{name}")
     else:
         assert one == other or (one != one and other != other), where
+
+
+def _kind(value: Any) -> type:
+    """Return the type of a value; snapshots and dicts are alike, and so are tuples and lists."""
+    return Mapping if isinstance(value, Mapping) else tuple if type(value) is list else type(value)
 
 
 def digest(value: Any, into: "hashlib._Hash") -> None:

@@ -136,16 +136,15 @@ def contents(slam: FastSlam) -> dict[str, Any]:
     Places beyond the last particle, which mean nothing, are left out.
     """
     ids, means, covariances, counts = dense(slam)  # brings all landmarks to their places
-    state, count, held = slam.get_state(), slam.num_particles, counts > 0
-    maps = state["maps"]
-    np.testing.assert_array_equal(maps["ids"], ids)
-    np.testing.assert_array_equal(maps["map_of"], 0)
-    for name in ("values", "map_of", "maps"):
-        del maps[name]
-    maps["counts"] = counts
-    maps["means"], maps["covariances"] = (np.where(held[:, None], values, 0.0) for values in (means, covariances))
-    if maps.get("odds") is not None:
-        maps["odds"] = np.where(held, maps["odds"][:, :count], 0.0)
+    count, held, maps = slam.num_particles, counts > 0, slam.maps.compact()
+    np.testing.assert_array_equal(maps.ids, ids)
+    np.testing.assert_array_equal(maps.map_of, 0)
+    landmarks = {name: getattr(maps, name) for name in ("ids", "identities", "last_seen", "descriptors", "next_id")}
+    landmarks |= {"counts": counts, "odds": None if maps.odds is None else np.where(held, maps.odds[:, :count], 0.0)}
+    landmarks["means"], landmarks["covariances"] = (
+        np.where(held[:, None], values, 0.0) for values in (means, covariances)
+    )
+    state = slam.get_state() | {"maps": landmarks}
     for name in ("poses", "starts", "means", "covariances"):
         state[name] = state[name][:, :, :count]
     return state

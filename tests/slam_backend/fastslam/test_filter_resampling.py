@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -265,7 +266,7 @@ def arrays_in(nest: Any) -> list[Any]:
     """Return all arrays in nested dicts, sequences and records."""
     if isinstance(nest, np.ndarray):
         return [nest]
-    if isinstance(nest, dict):
+    if isinstance(nest, Mapping):
         nest = list(nest.values())
     elif hasattr(nest, "__dataclass_fields__"):
         nest = [getattr(nest, name) for name in nest.__dataclass_fields__]

@@ -63,13 +63,12 @@ def test_the_kernel_agrees_with_plain_sums() -> None:
 def test_computing_a_mixture_changes_nothing() -> None:
     """Maps that wait to be brought up to date still wait afterwards."""
     slam = filter_with_gaps(33, 8)
-    before = slam.maps.get_state()
-    assert before["map_of"].any()
+    before = slam.maps.compact()
+    assert before.map_of.any()
     slam.map("mixture")
-    after = slam.maps.get_state()
-    for name in ("map_of", "maps", "counts"):
-        np.testing.assert_array_equal(after[name], before[name])
-    np.testing.assert_array_equal(np.concatenate(after["values"]), np.concatenate(before["values"]))
+    after = slam.maps.compact()
+    for name in ("map_of", "maps", "counts", "values"):
+        np.testing.assert_array_equal(getattr(after, name), getattr(before, name))
 
 
 def test_slots_that_no_particle_holds_are_not_read() -> None:
@@ -180,7 +179,7 @@ def test_the_join_agrees_with_matrices(sizes: tuple[int, int]) -> None:
     rows_a, rows_b = np.array([*range(len(a.slots)), -1, -1]), np.full(len(a.slots) + 2, -1)
     rows_b[[1, 2, 3, 4, -2, -1]] = [5, 0, 1, 4, 2, 3]
     motion = rng.uniform(-2.0, 2.0, (40, 3))
-    before = [side.get_state() for side in maps]
+    before = [side.compact() for side in maps]
     tiles = np.full((len(rows_a) + 1, 1, 9, LANES), np.nan)
     write_joint(a, b, rows_a, rows_b, motion, EXTRA, np.full(len(rows_a), SCALE), tiles)
     plain, plain_counts = plain_join(a, b, rows_a, rows_b, motion)
@@ -192,7 +191,7 @@ def test_the_join_agrees_with_matrices(sizes: tuple[int, int]) -> None:
     both = (a.counts[[1, 2, 3, 4]] > 0) & (b.counts[[5, 0, 1, 4]] > 0)
     assert both.any()
     for side, state in zip(maps, before, strict=True):
-        np.testing.assert_array_equal(side.get_state()["map_of"], state["map_of"])
+        np.testing.assert_array_equal(side.compact().map_of, state.map_of)
 
 
 def test_landmarks_are_read_wherever_they_lie() -> None:

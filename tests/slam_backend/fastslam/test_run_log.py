@@ -11,6 +11,7 @@ from builders.kernels import python_entry
 from hypothesis import given
 from hypothesis import strategies as st
 
+from slam_backend.core.state import accepted, restore, take
 from slam_backend.fastslam._kernels import EXACT_POSE, MOVED, NO_READING
 from slam_backend.fastslam._kernels import STATIONARY as STOOD_STILL
 from slam_backend.fastslam._kernels.layout import ESTIMATE, LOGGED, LOGGED_KIND, MOTION, NAME, NUM_MEASURED, NUM_NOTED
@@ -113,32 +114,32 @@ def test_a_restored_log_continues_bit_for_bit(seed: int, cut: int, most: int) ->
     """From a snapshot, pickled or not, and from any kind of copy, the same steps give the same bytes."""
     steps = random_steps(60, seed, most)
     log = log_of(steps[:cut])
-    state = log.get_state()
+    state = take(log)
     restored = RobotLog()
     restored.append(3, odometry=np.ones(3))
-    restored.set_state(pickle.loads(pickle.dumps(state)))
+    restore(restored, accepted(RobotLog, "state", pickle.loads(pickle.dumps(state))))
     others = [restored, log.copy(), copy.copy(log), copy.deepcopy(log), pickle.loads(pickle.dumps(log))]
     for step in steps[cut:]:
         log.append(**step)
         for other in others:
             other.append(**step)
     for other in others:
-        assert_same(other.get_state(), log.get_state())
+        assert_same(take(other), take(log))
         assert other.nbytes == log.nbytes
-    log.set_state(state)
-    assert_same(log.get_state(), log_of(steps[:cut]).get_state())
+    restore(log, state)
+    assert_same(take(log), take(log_of(steps[:cut])))
 
 
 def test_finished_chunks_are_shared_and_cannot_be_written() -> None:
     """Snapshots and copies hold the very chunks of the log, and they cannot be written, after a pickle neither."""
     log = log_of(random_steps(900, 8))
-    chunks = log.get_state()["chunks"]
+    chunks = take(log)["chunks"]
     assert len(chunks) > 3
     twin = log.copy()
-    for one, other in zip(chunks, twin.get_state()["chunks"], strict=True):
+    for one, other in zip(chunks, take(twin)["chunks"], strict=True):
         assert one is other
-    assert copy.deepcopy(log.get_state())["chunks"][0] is chunks[0]
-    for state in (log.get_state(), pickle.loads(pickle.dumps(log.get_state()))):
+    assert copy.deepcopy(take(log))["chunks"][0] is chunks[0]
+    for state in (take(log), pickle.loads(pickle.dumps(take(log)))):
         for part in (*state["chunks"], state["unfinished"]):
             for name in ("steps", "kinds", "motions", "given", "starts", "points", "ids"):
                 with pytest.raises(ValueError, match="read-only"):
@@ -153,7 +154,7 @@ def test_appended_steps_are_copied() -> None:
     points, ids, motion = np.ones((2, 3)), np.array([4, 5]), np.ones(3)
     log = RobotLog()
     log.append(0, odometry=motion, points=points, ids=ids)
-    state, arrays = log.get_state(), log.arrays()
+    state, arrays = take(log), log.arrays()
     points[:], ids[:], motion[:] = 9.0, 9, 9.0
     log.append(1, odometry=motion, points=points, ids=ids)
     for held in (state["unfinished"], arrays):
@@ -174,8 +175,8 @@ def test_renamed_is_a_dictionary_applied_to_each_id(others: Any) -> None:
     expected = [names.get(i, i if others == "keep" else -1) for i in before.ids.tolist()]
     np.testing.assert_array_equal(renamed.arrays().ids, expected)
     np.testing.assert_array_equal(renamed.arrays().points, before.points)
-    assert renamed.get_state()["chunks"][0].points is log.get_state()["chunks"][0].points
-    assert_same(log.get_state(), log_of(steps).get_state())
+    assert take(renamed)["chunks"][0].points is take(log)["chunks"][0].points
+    assert_same(take(log), take(log_of(steps)))
     log.append(10_000, odometry=np.zeros(3))
     renamed.append(10_000, odometry=np.ones(3))
     assert log.arrays().motions[-1].tolist() != renamed.arrays().motions[-1].tolist()
@@ -194,7 +195,7 @@ def test_a_frame_larger_than_a_chunk(before: int) -> None:
     assert [len(row.ids) for row in log][before:] == [big, 2, big, 0, MEASUREMENTS, 1]
     for row, step in zip(log, steps, strict=True):
         np.testing.assert_array_equal(row.points, step.get("points", np.empty((0, 3))))
-    assert_same(log.copy().get_state(), log.get_state())
+    assert_same(take(log.copy()), take(log))
 
 
 @pytest.mark.parametrize(("most", "optional", "together"), [(5, 0.0, 32), (90, 0.0, 7), (300, 0.0, 32), (5, 0.1, 3)])
@@ -224,10 +225,10 @@ def test_steps_of_a_journal_equal_steps_appended_one_by_one(most: int, optional:
                     expected.append(step, move, pose, seen[:, :3], ids, spreads)
         log.extend(own, steps, noted, np.concatenate(measured))
     assert len(log) > 1.5 * ROWS
-    assert_same(log.get_state(), expected.get_state())
+    assert_same(take(log), take(expected))
     with pytest.raises(ValueError, match="Log steps in order"):
         log.extend(own, steps, noted, np.concatenate(measured))
-    assert_same(log.get_state(), expected.get_state())
+    assert_same(take(log), take(expected))
 
 
 @given(st.lists(st.lists(st.tuples(st.integers(0, 3), st.integers(-1, 3), st.booleans()), min_size=4, max_size=4)))

@@ -17,7 +17,7 @@ from slam_backend.geometry import between, compose, inverse, rotation, transform
 from slam_backend.smoother import rejuvenation
 from slam_backend.smoother._kernels import LANES
 from slam_backend.smoother.gauge import compute_gauge_fix, fix_gauge, fix_start, move
-from slam_backend.smoother.graph import RIGID, SlamGraph
+from slam_backend.smoother.graph import RIGID
 from training.bench.accuracy.runs import RunSpec, simulate_run
 
 add_gauge_to_landmarks = python_entry(add_gauge_to_landmarks)
@@ -222,7 +222,7 @@ def test_groups_with_few_common_landmarks_add_both_gauge_covariances():
     no_names = np.zeros((0, 2), dtype=np.int64)
     given = np.zeros(1, dtype=np.bool_)
     joint.join(a, b, (starts[:1], starts[:1], starts), (given, given), (SCATTER, 0.5 * SCATTER), no_names, np.zeros(7))
-    graph = SlamGraph(**joint.get_state()["graph"])
+    graph = joint.graph
     slopes, turn = np.eye(3), np.eye(3)
     slopes[:2, 2] = -motion[1], motion[0]
     turn[:2, :2] = rotation(motion[2])

@@ -141,7 +141,7 @@ def test_aliases_of_a_landmark_follow_it():
     run = small_run(2, seed=104)
     (a, _), (b, renamed) = group_graph(run, [0]), group_graph(run, [1], OFFSET)
     old, kept = renamed[0], renamed[1]
-    b = SlamGraph(**b.to_mapping() | {"merged_ids": np.array([[old[0], kept[0]]])})
+    b = b.with_columns(merged_ids=np.array([[old[0], kept[0]]]))
     both = merge_graphs(a, b, np.zeros(3), renamed)
     assert both.resolve_ids(np.array([old[1], kept[1]])).tolist() == [kept[1], kept[1]]
 
@@ -235,21 +235,22 @@ def test_a_merge_continues_from_the_smoothed_graphs_of_both_groups():
     team = build(simulation, incremental=True)
     before = {}
     for _ in range(90):
-        known = {group: state["latest"] for group, state in before.items()}
+        known = before
         report = team.step(*simulation.read())
-        before = {group.robots: smoother_of(group) for group in team._groups}
+        before = {group.robots: latest_of(group) for group in team._groups}
         for renaming in report.id_maps:
             robots = renaming.robots_a + renaming.robots_b
-            latest = before[tuple(sorted(robots))]["latest"][np.argsort(np.argsort(robots))]
+            latest = before[tuple(sorted(robots))][np.argsort(np.argsort(robots))]
             asked = np.concatenate([known[renaming.robots_a], known[renaming.robots_b]])
             assert (latest >= asked).all()
             assert (asked >= 0).all()
     assert team.groups == ((0, 1, 2),)
 
 
-def smoother_of(group):
-    """Return the graph of a group's joint filter as its state holds it."""
-    return group.trunk.filter.get_state()["rejuvenation"]["graph"] or {"latest": np.full(len(group.robots), -1)}
+def latest_of(group):
+    """Return the newest step of each robot in the graph of a group's joint filter."""
+    graph = group.trunk.filter.rejuvenation.graph
+    return np.full(len(group.robots), -1) if graph is None else graph.latest
 
 
 def test_no_two_filters_work_on_their_smoothers_in_one_step(monkeypatch):
@@ -280,10 +281,11 @@ def test_joint_filters_of_longer_runs_keep_more_keyframes(incremental):
         simulation = SimulatedTeam(num_robots=2, seed=101)
         team = simulation.build(attempts=NEVER, rejuvenate_every=20, smoothing=smoothing)
         simulation.run(team, 80)
-        alone = [smoother_of(group) for group in team._groups]
+        alone = [group.trunk.filter.rejuvenation.graph for group in team._groups]
         team.merge(0, 1, false_alignment(simulation, team, np.zeros(3)))
-        latest = np.concatenate([graph["latest"] for graph in alone])
-        return sum(len(graph["poses"]) for graph in alone), len(smoother_of(team._groups[0])["poses"]), latest.sum()
+        latest = np.concatenate([graph.latest for graph in alone])
+        joint = team._groups[0].trunk.filter.rejuvenation.graph
+        return sum(graph.num_keys for graph in alone), joint.num_keys, latest.sum()
 
     alone, joint, _ = joint_keys(10**6)
     assert joint <= 20 + 1 < alone  # each share of the limit may be exceeded by the newest keyframes

@@ -58,10 +58,10 @@ def test_a_rejuvenation_waits_for_enough_measurements():
     run = small_run()
     slam = rejuvenated(run, every=2, smoothing=SmoothingOptions(effort=0.5, free_sightings=0))
     tried = [slam.step(**reading).rejuvenation is not None for reading in run.readings()]
-    graph = slam.rejuvenation.get_state()["graph"]
+    graph = slam.rejuvenation.graph
     assert tried[1]  # at first there is nothing to redo
     assert np.diff(np.flatnonzero(tried)).max() > 2
-    assert len(graph["points"]) > 0
+    assert len(graph.points) > 0
 
 
 def test_a_loop_closure_brings_the_rejuvenation_forward():

@@ -1,6 +1,6 @@
 """Smoothing in slices, one per step: the result of smoothing at once, with bounded work per step."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -179,9 +179,9 @@ def test_a_failing_descent_does_not_block_the_smoother(incremental):
     reasons = [slam.step(**reading).rejuvenation for reading in run.readings()]
     told = [report.reason for report in reasons if report is not None]
     assert any(reason.endswith("; measurements since the last rejuvenation are dropped") for reason in told)
-    graph: Mapping[str, np.ndarray] = slam.get_state()["rejuvenation"]["graph"]
-    assert graph["latest"][0] > 6
-    assert len(slam.get_state()["rejuvenation"]["guesses"][0][0]) <= 2 * 6
+    smoother = slam.get_state()["rejuvenation"]
+    assert smoother["graph"].latest[0] > 6
+    assert len(smoother["initial_poses"][0].steps) <= 2 * 6
 
 
 @pytest.mark.parametrize(("seed", "kernel", "tolerance"), [(139, 0.3, 1e-6), (150, 4.0, 1e-6), (101, 16.0, 1e-300)])
@@ -261,8 +261,8 @@ def test_memory_is_bounded_while_a_robot_waits(before: int) -> None:
     for reading in at_rest(run, before, 4 * MAX_FRAMES):
         if slam.step(**reading).rejuvenation is not None:
             state = slam.get_state()["rejuvenation"]
-            held.append(len(state["graph"]["points"]) + len(state["graph"]["condensed_keys"]))
-            assert len(state["guesses"][0][0]) < EVERY
+            held.append(len(state["graph"].points) + len(state["graph"].condensed_keys))
+            assert len(state["initial_poses"][0].steps) < EVERY
     assert len(held) >= 4 * MAX_FRAMES // EVERY
     assert max(held) <= run.spec.measurements * (before + MAX_FRAMES + EVERY)
 
