@@ -173,7 +173,7 @@ def test_uncertain_starts_do_not_widen_the_pose_in_the_start_frame() -> None:
     """Moving robot and start of each particle alike, as a merge does, leaves the pose in the start frame as it was."""
     slam = _moved(2)
     before, particles = slam.pose_from_start(1), slam.particles_from_start(1)
-    state = slam.get_state()
+    state = copy.deepcopy(slam.get_state())
     motions = np.random.default_rng(5).normal(0.0, 0.5, (13, 3))
     for name in ("starts", "poses", "means"):  # (K, 3, P), P >= M
         state[name][1, :, :13] = compose(motions, state[name][1, :, :13].T).T
