@@ -453,7 +453,7 @@ class CompactMaps:
         m, padded, n = sizes["M"], sizes["P"], len(parts["ids"])
         if parts["values"].shape[1] != 9 * padded:
             raise ValueError(f"values of {parts['values'].shape[1]} columns for {padded} lanes")
-        blocks = parts["values"].reshape(n, -1, 9, LANES).swapaxes(2, 3).reshape(n, padded, 9)
+        blocks = parts["values"].reshape(n, padded // LANES, 9, LANES).swapaxes(2, 3).reshape(n, padded, 9)
         held = blocks[:, :m][parts["counts"][:, :m] > 0]
         limits = np.repeat([MAX_DISTANCE, LARGEST], [3, 6])
         if not ((np.abs(held) <= limits).all() and (held[:, [3, 6, 8]] > 0.0).all()):

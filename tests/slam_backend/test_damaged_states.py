@@ -125,7 +125,7 @@ def test_damaged_states_are_refused_or_harmless(kind: str, seeds: range) -> None
     ("way", "says"),
     [
         (("maps", "map_of"), r"state\['maps'\]\.map_of: expected integers from 0 to \d+, got a value out of range"),
-        (("maps", "maps"), r"state\['maps'\]\.maps: expected integers from 0 to 6"),
+        (("maps", "maps"), r"state\['maps'\]\.maps: expected integers from 0 to \d+"),
         (
             ("rejuvenation", "graph", "last_keys"),
             r"state\['rejuvenation'\]\['graph'\]\.last_keys: expected integers from",
