@@ -45,8 +45,7 @@ class Branch:
     STATE = State(
         robots=Each(ROBOT, "n"), active_robots=ROBOTS, filter=Child(FastSlam, K="n"),
         last_steps=Dict(ROBOT, Int(-1, "STEPS")), number=Int(), epoch=Int(), report=Maybe(Record(StepReport)),
-        monitors=Each(Child(MergeMonitor), kind=list),
-        split_from=Maybe(Int()), split_counts=Dict(LANDMARK, Int()),
+        monitors=Each(Child(MergeMonitor), kind=list), split_from=Maybe(Int()), split_counts=Dict(LANDMARK, Int()),
     )  # fmt: skip
 
     robots: tuple[int, ...]

@@ -131,7 +131,7 @@ class Group:
             raise ValueError("a robot that is not active in exactly one branch")
         for branch in parts["branches"]:
             last = {branch["last_steps"][robot] for robot in branch["active_robots"]}
-            if last != {sizes["STEPS"] - 1} and sizes["STEPS"]:
+            if last != {sizes["STEPS"] - 1}:
                 raise ValueError("a branch without active robots, or with one whose last step is not that of the team")
 
 

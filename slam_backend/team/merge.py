@@ -475,33 +475,21 @@ class TeamMerges:
             raise ValueError("an attempt in another phase than smoothing")
         pairs: dict[int, PairKey] = {}
         for number, process in parts["joined"].items():
-            phase = process["phase"]
-            if phase.of is Smoothing or phase["joined"].number != number or number < max(pairs, default=0):
-                raise ValueError("merges out of order")
-            for side in phase["joined"].sides:
-                _check_monitors(side, pairs)  # of earlier merges only
-            pairs[number] = phase["joined"].pair
-            if process["pair"] != pairs[number]:
-                raise ValueError("a merge of other robots")
-        for group in parts["groups"]:
-            for branch in group["branches"]:
-                _check_monitors(branch, pairs)
-        for process in parts["joined"].values():
+            joined = process["phase"].get("joined")
+            if joined is None or joined.number != number or process["pair"] != joined.pair:
+                raise ValueError("a merge of other groups")
+            if any(other >= number for earlier in joined.earlier for other in earlier):
+                raise ValueError("a merge that undoes a later one")
+            pairs[number] = joined.pair
             if process["phase"].of is Undoing:
-                undoing = process["phase"]
-                for trunk in undoing["trunks"]:
-                    _check_monitors(trunk, pairs)
-                apart = sum((trunk["robots"] for trunk in undoing["trunks"]), ())
-                if undoing["robots"] not in trunks or tuple(sorted(apart)) != undoing["robots"]:
+                robots, parted = process["phase"]["robots"], [trunk["robots"] for trunk in process["phase"]["trunks"]]
+                if robots not in trunks or tuple(sorted(sum(parted, ()))) != robots:
                     raise ValueError("an undo in no group")
-
-
-def _check_monitors(branch: Mapping[str, Any], pairs: Mapping[int, PairKey]) -> None:
-    """Raise unless the monitors of a branch are of merges of its robots."""
-    for monitor in branch["monitors"]:
-        pair = pairs.get(monitor["number"])
-        if pair is None or monitor["pair"] != pair or not {*pair[0], *pair[1]} <= set(branch["robots"]):
-            raise ValueError("a monitor of no merge")
+        for branch in branches_in(parts):
+            for monitor in branch["monitors"]:
+                pair = pairs.get(monitor["number"])
+                if pair is None or monitor["pair"] != pair or not {*pair[0], *pair[1]} <= set(branch["robots"]):
+                    raise ValueError("a monitor of no merge")
 
 
 def branches_in(merges: Mapping[str, Any]) -> Iterator[Snapshot]:

@@ -407,7 +407,7 @@ class TeamSlam:
         check_kind("merge", merge, MergeEvent, "Give one of the events of a step's report.")
         for joined in self._merges.watched:
             if joined.alignment is merge.alignment:
-                map_a, map_b = (restored(side).filter.map() for side in joined.sides)
+                map_a, map_b = (restored(side["filter"]).map() for side in joined.sides)
                 return map_a, map_b
         expected, got = "a merge still monitored", f"the {merge.kind} of step {merge.step}"
         raise argument_error("merge", expected, got, "Call this in the step of the merge.")
@@ -518,10 +518,10 @@ class TeamSlam:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copy and pickle the team as its state."""
-        return _with_state, (self.get_state(),)
+        return _unpickled, (self.get_state(),)
 
 
-def _with_state(state: Mapping[str, Any]) -> TeamSlam:
+def _unpickled(state: Mapping[str, Any]) -> TeamSlam:
     """Return a team in a state."""
     team = TeamSlam(state["num_robots"])
     team.set_state(state)
