@@ -216,7 +216,7 @@ BAD: dict[str, tuple[Any, str]] = {
     "mode": ("still", "expected one of slow, fast"),
     "rng": ({"bit_generator": "load"}, "expected the state of one of PCG64"),
     "root": ((1, (), 1 << 40, 0), r"state\['root'\]\[2\]: expected an int from 4 to 64"),
-    "wheels": (({"turns": np.zeros(2), "saved": None},) * 2, r"state\['wheels'\]\[0\]\['turns'\]: expected an array of sh"),
+    "wheels": (({"turns": np.zeros(2), "saved": None},) * 2, r"state\['wheels'\]\[0\]\['turns'\]: expected an array"),
     "history": ((Sighting(1, np.zeros((1, 2)), np.array([5])),), r"\['history'\]\[0\].rows: expected integers from 0"),
     "changes": ((Outer(),), "expected one of Sighting, Ended"),
     "groups": (((3,),), r"state\['groups'\]\[0\]\[0\]: expected an int from 0 to 2"),
