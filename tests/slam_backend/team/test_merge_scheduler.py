@@ -162,19 +162,6 @@ def test_a_merge_drops_the_records_of_the_merged_groups() -> None:
     assert not plan.may_try(other, 25)
 
 
-def test_a_schedule_continues_from_its_state() -> None:
-    """A restored schedule has the same waits, memory and options, and shares nothing with the first."""
-    plan, twin = schedule(every=10), schedule()
-    plan.choose({FIRST: pair_of([0, 1, 2, 3])}, 49)
-    plan.record(FIRST, 9, success=False)
-    restore(twin, take(plan))
-    plan.record(FIRST, 19, success=False)
-    assert twin.may_try(FIRST, 19)
-    assert not twin.may_try(FIRST, 18)
-    assert twin.is_due(9)
-    assert twin.choose({FIRST: pair_of([0, 1, 2, 3])}, 49) is None
-
-
 @pytest.mark.parametrize("every", [25, 10])
 def test_a_team_tries_at_most_one_pair_in_so_many_steps(every: int) -> None:
     """At most one attempt falls into each stretch of `every` steps, and its merge follows in the same step."""
@@ -298,16 +285,6 @@ def test_a_robot_that_has_left_does_not_send() -> None:
     counter = TrafficCounter(3)
     counter.record_step(report_of((0, -1, 2), [[4], [7], [2]], [[4], [-1], [-1]]), 13)
     assert counter.sent == [POSE_BYTES + LANDMARK_BYTES + LOOK, 0, POSE_BYTES + LANDMARK_BYTES]
-
-
-def test_a_traffic_counter_continues_from_its_state() -> None:
-    """A restored counter continues like the original, and shares nothing with it."""
-    counter, twin = TrafficCounter(2), TrafficCounter(2)
-    counter.record_maps(0, 1, counted_map({1: 4}), counted_map({2: 1}))
-    restore(twin, take(counter))
-    for one in (counter, twin):
-        one.record_maps(0, 1, counted_map({1: 5}), counted_map({2: 1}))
-    assert twin.sent == counter.sent == [2 * LANDMARK_BYTES + LOOK, LANDMARK_BYTES + LOOK]
 
 
 def test_robots_that_merge_send_maps_and_then_a_few_hundred_bytes_a_step() -> None:
