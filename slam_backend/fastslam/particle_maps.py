@@ -453,10 +453,10 @@ class CompactMaps:
         m, padded, n = sizes["M"], sizes["P"], len(parts["ids"])
         if parts["values"].shape[1] != 9 * padded:
             raise ValueError(f"values of {parts['values'].shape[1]} columns for {padded} lanes")
-        blocks = parts["values"].reshape(n, padded // LANES, 9, LANES).swapaxes(2, 3).reshape(n, padded, 9)
-        held = blocks[:, :m][parts["counts"][:, :m] > 0]
-        limits = np.repeat([MAX_DISTANCE, LARGEST], [3, 6])
-        if not ((np.abs(held) <= limits).all() and (held[:, [3, 6, 8]] > 0.0).all()):
+        blocks = parts["values"].reshape(n, padded // LANES, 9, LANES)
+        valid = (np.abs(blocks[:, :, :3]) <= MAX_DISTANCE).all(axis=2) & (blocks[:, :, [3, 6, 8]] > 0.0).all(axis=2)
+        valid &= (np.abs(blocks[:, :, 3:]) <= LARGEST).all(axis=2)
+        if (~valid.reshape(n, padded) & (parts["counts"] > 0))[:, :m].any():
             raise ValueError("a Gaussian out of range")
         if n and parts["ids"][-1] >= parts["next_id"]:
             raise ValueError("an id from next_id on")
