@@ -19,7 +19,7 @@ from slam_backend.smoother.reassociation import RejectedMeasurements
 from slam_backend.smoother.rejuvenation import Draft
 from slam_backend.team import reports as team_reports
 from slam_backend.team.branches import ReplayedStep
-from slam_backend.team.merge_monitor import MergeMonitor
+from slam_backend.team.group_merging import JoinedGroups
 from slam_backend.team.merge_scheduler import AttemptOptions, AttemptRecord
 from slam_backend.team.options import MergeOptions
 
@@ -29,7 +29,7 @@ CONFIGURATIONS = (
 )  # fmt: skip
 RECORDS = (
     Alignment, AttemptRecord, CompactMaps, Draft, InitialPoses, LandmarkMap, LogArrays, Measurements,
-    RejectedMeasurements, ReplayedStep, SlamGraph, StepInput, TeamMeasurements, MergeMonitor, reports.Associations,
+    RejectedMeasurements, ReplayedStep, SlamGraph, StepInput, TeamMeasurements, JoinedGroups, reports.Associations,
     reports.RejuvenationReport, reports.StepReport, team_reports.LandmarkIdMap, team_reports.LandmarksCreated,
     team_reports.MapForked, team_reports.MapReleased, team_reports.MergeEvent, team_reports.MergeUndone,
 )  # fmt: skip

@@ -35,7 +35,7 @@ from typing import Any, ClassVar, NoReturn, TypeVar, get_args, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.core.read_only import as_constant, as_read_only
+from slam_backend.core.read_only import as_constant, as_read_only, constant_copy
 from slam_backend.core.validation import argument_error
 
 HINT = "Pass it unchanged."
@@ -351,7 +351,7 @@ class Array(Part):
     def _take(self, value: NDArray[Any]) -> NDArray[Any]:
         if self.constant:
             return value
-        return as_read_only(value if self.renewed else value.copy())
+        return as_read_only(value) if self.renewed else constant_copy(value)
 
     def _put(self, value: Any, kept: NDArray[Any]) -> NDArray[Any]:
         if self.constant:

@@ -1,19 +1,36 @@
 """Reports of filters: associations, pose estimates, step reports. All frozen."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
 from slam_backend.core.read_only import Act, as_read_only, map_arrays
 from slam_backend.core.short_repr import short_repr
+from slam_backend.core.state import (
+    INT64,
+    MAX_LANDMARKS,
+    Array,
+    Each,
+    Flag,
+    Float,
+    Int,
+    Maybe,
+    Record,
+    Sizes,
+    State,
+    Text,
+    with_state,
+)
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.fastslam._kernels import REJECTED, STATIONARY
-from slam_backend.fastslam.step_input import NO_INPUT, RobotInput, StepInput
+from slam_backend.fastslam.step_input import MASKS, NO_INPUT, ROBOT_INPUT, RobotInput, StepInput, check_rows
 
 
 @short_repr
+@with_state(ids=Array(INT64, "2 n", REJECTED, MAX_LANDMARKS), inputs=Each(ROBOT_INPUT, "K"), masks=MASKS)
 class Associations(NamedTuple):
     """Data association of N robots' measurements in one step; read-only.
 
@@ -27,6 +44,11 @@ class Associations(NamedTuple):
     ids: IntArray
     inputs: Sequence[RobotInput]
     masks: Mapping[int, BoolArray]
+
+    @staticmethod
+    def check_state(parts: Mapping[str, Any], sizes: Sizes) -> None:
+        """Refuse inputs or masks of other measurements."""
+        check_rows(parts["inputs"], parts["masks"], sizes["n"])
 
     @classmethod
     def allocate(cls, inputs: StepInput) -> tuple[Self, IntArray]:
@@ -144,6 +166,11 @@ class PoseEstimates(NamedTuple):
 
 
 @short_repr
+@with_state(
+    all_associations=Record(Associations), rows=Each(Int(-1, "K")), num_created=Int(), num_new=Int(),
+    num_matched=Int(), num_rejected=Int(), ess=Float(0.0), nis=Float(0.0, math.inf, nan=True), resampled=Flag(),
+    rejuvenation=Maybe(Record(lambda: RejuvenationReport)),
+)  # fmt: skip
 class StepReport(NamedTuple):
     """Outcome of one step of `FastSlam`.
 
@@ -199,6 +226,8 @@ class RejuvenationReport:
         iterations: Number of iterations of the smoother.
         num_keys: Number of keyframes in the graph.
     """
+
+    STATE = State(reason=Text(), ess=Float(0.0, nan=True), iterations=Int(), num_keys=Int())
 
     reason: str
     ess: float

@@ -42,13 +42,28 @@ from slam_backend.models.measurements import Measurements, TeamMeasurements
 # `_kernels.layout` names the numbers.
 RobotInput = Sequence[int]
 NO_INPUT = (NO_READING, 0, 0, 0, 0, -1)
+ROBOT_INPUT = Row(Int(0, EXACT_POSE), Int(), Int(), Int(0, 1), Int(0, 1), Int(-1, MAX_LANDMARKS))
+MASKS = Dict(Int(0, "K"), Array(BOOL, "*"))
+
+
+def check_rows(inputs: Sequence[RobotInput], masks: Mapping[int, BoolArray], n: int) -> None:
+    """Refuse inputs of robots whose measurements do not lie among n, robot by robot, and masks of others."""
+    last = 0
+    for _, begin, end, _, _, _ in inputs:
+        if not (last <= begin <= end <= n or begin == end == 0):
+            raise ValueError("rows of other measurements")
+        last = max(last, end)
+    for robot, mask in masks.items():
+        _, begin, end, _, _, count = inputs[robot]
+        if len(mask) != max(count, 0) or np.count_nonzero(mask) != end - begin:
+            raise ValueError("a mask of other measurements")
 
 
 @with_state(
-    inputs=Each(Row(Int(0, EXACT_POSE), Int(), Int(), Int(0, 1), Int(0, 1), Int(-1, MAX_LANDMARKS)), "K"),
+    inputs=Each(ROBOT_INPUT, "K"),
     inputs_table=Array(INT64, "K 6", -1),
     moves=Array(FLOAT64, "K 3", -MAX_DISTANCE, MAX_DISTANCE),
-    masks=Dict(Int(0, "K"), Array(BOOL, "*")),
+    masks=MASKS,
     measurements=Array(FLOAT64, "n 9", -math.inf, math.inf, nan=True),
     descriptors=Array(FLOAT32, "n d", -MAX_DESCRIPTOR, MAX_DESCRIPTOR),
     names=Array(INT64, "*", -1),
@@ -84,23 +99,18 @@ class StepInput(NamedTuple):
     def check_state(parts: Mapping[str, Any], sizes: Sizes) -> None:
         """Refuse inputs whose measurements, names and masks do not fit together."""
         inputs, measurements, names = parts["inputs"], parts["measurements"], parts["names"]
-        n, last = len(measurements), 0
+        check_rows(inputs, parts["masks"], len(measurements))
         if [list(one) for one in inputs] != parts["inputs_table"].tolist():
             raise ValueError("a table that differs from the inputs")
         if not (np.abs(measurements[:, :3]) <= MAX_DISTANCE).all():
             raise ValueError("a point out of range")
         for _, begin, end, has_covariances, has_names, _ in inputs:
-            if not (last <= begin <= end <= n or begin == end == 0) or (has_names and len(names) != n):
-                raise ValueError("rows of other measurements")
+            if has_names and len(names) != len(measurements):
+                raise ValueError("names of other measurements")
             if has_covariances and not (np.abs(measurements[begin:end]) <= LARGEST).all():
                 raise ValueError("a covariance out of range")
-            last = max(last, end)
-        if len(names) not in (0, n):
+        if len(names) not in (0, len(measurements)):
             raise ValueError("names of other measurements")
-        for robot, mask in parts["masks"].items():
-            _, begin, end, _, _, count = inputs[robot]
-            if len(mask) != max(count, 0) or np.count_nonzero(mask) != end - begin:
-                raise ValueError("a mask of other measurements")
 
     def with_arrays(self, act: Act) -> Self:
         """Return the input with `act` applied to each array; itself if that changes nothing."""

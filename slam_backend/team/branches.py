@@ -11,13 +11,14 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from slam_backend.core.read_only import with_constants
-from slam_backend.core.state import accepted, restore
+from slam_backend.core.state import Child, Dict, Each, Int, Maybe, Record, Sizes, State, restored, take, with_state
 from slam_backend.core.validation import IntArray
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.reports import Associations, StepReport
+from slam_backend.fastslam.run_log import last_step
 from slam_backend.fastslam.step_input import InputBuffer, RobotRows, StepInput, rows_of
 from slam_backend.team.merge_monitor import MergeMonitor
+from slam_backend.team.merge_scheduler import LANDMARK, ROBOT, ROBOTS
 
 MAX_REPLAYED = 20  # buffered steps that a filter replays per tick
 TURNS = 4  # each robot's filter may smooth in one of this many steps; a joint filter in the turns of all its robots
@@ -40,6 +41,12 @@ class Branch:
         split_counts: Number of measurements, when last received, of each landmark of that map whose descriptor its
             robots know, by id.
     """
+
+    STATE = State(
+        robots=Each(ROBOT, "n"), active_robots=ROBOTS, filter=Child(FastSlam, K="n"),
+        last_steps=Dict(ROBOT, Int(-1, "STEPS")), number=Int(), epoch=Int(), report=Maybe(Record(StepReport)),
+        monitors=Each(Child(MergeMonitor), kind=list), split_from=Maybe(Int()), split_counts=Dict(LANDMARK, Int()),
+    )  # fmt: skip
 
     robots: tuple[int, ...]
     active_robots: tuple[int, ...]
@@ -73,36 +80,29 @@ class Branch:
                     self.split_counts.setdefault(name, 0)
         return self.split_counts
 
-    def get_state(self) -> dict[str, Any]:
-        """Return the complete state of the branch."""
-        return {
-            "robots": self.robots,
-            "active_robots": self.active_robots,
-            "filter": self.filter.get_state(),
-            "last_steps": dict(self.last_steps),
-            "number": self.number,
-            "epoch": self.epoch,
-            "report": self.report,
-            "monitors": tuple(monitor.copy() for monitor in self.monitors),
-            "split_from": self.split_from,
-            "split_counts": dict(self.split_counts),
-        }
+    def rebuild(self) -> None:
+        """Let the filter smooth, as a new one."""
+        self.filter.may_smooth = True
 
-    @classmethod
-    def from_state(cls, state: Mapping[str, Any], at_hand: FastSlam | None = None) -> "Branch":
-        """Build a branch from `get_state`; a given filter is reused."""
-        slam = restored_filter(state["filter"], at_hand)
-        rest = {name: state[name] for name in ("robots", "active_robots", "number", "epoch", "split_from")}
-        return cls(
-            filter=slam,
-            last_steps=dict(state["last_steps"]),
-            monitors=[monitor.copy() for monitor in state["monitors"]],
-            split_counts=dict(state["split_counts"]),
-            report=with_constants(state["report"]),
-            **rest,
-        )
+    @staticmethod
+    def check_state(parts: Mapping[str, Any], sizes: Sizes) -> None:
+        """Raise if robots, steps, report or monitors belong to another branch."""
+        robots, active, known, report = (parts[name] for name in ("robots", "active_robots", "last_steps", "report"))
+        if list(robots) != sorted(set(robots)) or list(active) != sorted(set(active) & set(robots)):
+            raise ValueError("robots out of order, or active ones that are not in the filter")
+        if set(known) != set(robots):
+            raise ValueError("last steps of other robots")
+        for robot, log in zip(robots, parts["filter"]["logs"], strict=True):
+            if last_step(log) > known[robot]:
+                raise ValueError("logs beyond the last steps")
+        if report is not None and len(report.rows) != len(robots):
+            raise ValueError("a report about other robots")
+        numbers = [monitor["number"] for monitor in parts["monitors"]]
+        if numbers != sorted(set(numbers)):
+            raise ValueError("monitors out of order")
 
 
+@with_state(step=Int(high="STEPS"), robots=ROBOTS, inputs=Record(StepInput), report=Record(StepReport))
 class ReplayedStep(NamedTuple):
     """Step that a filter processed later.
 
@@ -117,16 +117,6 @@ class ReplayedStep(NamedTuple):
     robots: tuple[int, ...]
     inputs: StepInput
     report: StepReport
-
-
-def restored_filter(state: Mapping[str, Any], at_hand: FastSlam | None = None) -> FastSlam:
-    """Return a filter with a state from `FastSlam.get_state`; reuse of a given one is faster than construction."""
-    snapshot = accepted(FastSlam, "state['filter']", state)
-    if at_hand is None:
-        return FastSlam.from_state(snapshot)
-    restore(at_hand, snapshot)
-    at_hand.may_smooth = True  # as in a new one
-    return at_hand
 
 
 def landmark_counts(slam: FastSlam) -> dict[int, int]:
@@ -207,8 +197,8 @@ def fork(
         rng: Generator that seeds its random stream.
         at_hand: Filter that is no longer needed, whose memory the copy takes; or None.
     """
-    slam = restored_filter(branch.filter.get_state(), at_hand)
-    slam.rng = np.random.default_rng(rng.integers(2**63, size=4))
+    slam = restored(take(branch.filter), at_hand)
+    slam.may_smooth, slam.rng = True, np.random.default_rng(rng.integers(2**63, size=4))
     return Branch(
         robots=branch.robots,
         active_robots=active_robots,

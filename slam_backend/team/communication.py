@@ -1,16 +1,17 @@
 """Communication within a team: connected components and a traffic count."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from slam_backend.core.state import Dict, Each, Int, Row, State
 from slam_backend.core.validation import BoolArray, IntArray, argument_error, check_array
 from slam_backend.fastslam._kernels import EXACT_POSE, MOVED
 from slam_backend.fastslam.reports import StepReport
 from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.team.branches import ReplayedStep
+from slam_backend.team.merge_scheduler import LANDMARK, ROBOT
 
 
 def check_contacts(contacts: ArrayLike, num_robots: int) -> BoolArray:
@@ -67,6 +68,8 @@ class TrafficCounter:
     Attributes:
         sent: Bytes that each robot has sent.
     """
+
+    STATE = State(sent=Each(Int(), "K", list), known=Dict(Row(ROBOT, ROBOT), Dict(LANDMARK, Int())))
 
     def __init__(self, num_robots: int) -> None:
         self.sent = [0] * num_robots
@@ -129,17 +132,3 @@ class TrafficCounter:
         """Count the maps again after smoothing: all landmarks have moved, no descriptor has changed."""
         for sender, landmarks in ((robot_a, map_a), (robot_b, map_b)):
             self.sent[sender] += len(landmarks) * LANDMARK_BYTES
-
-    def get_state(self) -> dict[str, Any]:
-        """Return a copy of the counts."""
-        return {"bytes_sent": tuple(self.sent), "known": _copied(self._known)}
-
-    def set_state(self, state: Mapping[str, Any]) -> None:
-        """Restore the counts from `get_state`."""
-        self.sent = list(state["bytes_sent"])
-        self._known = _copied(state["known"])
-
-
-def _copied(known: Mapping[tuple[int, int], Mapping[int, int]]) -> dict[tuple[int, int], dict[int, int]]:
-    """Return a copy of the counts of all pairs of robots."""
-    return {pair: dict(counts) for pair, counts in known.items()}

@@ -7,8 +7,7 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from slam_backend.core.read_only import with_constants, with_read_only
-from slam_backend.core.state import accepted
+from slam_backend.core.state import Each, Int, Record, Saved, Sizes, Snapshot, State, take
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.fastslam import _kernels
 from slam_backend.fastslam.filter import FastSlam
@@ -126,28 +125,26 @@ class JoinedGroups:
     Attributes:
         number: Number of the joint map when it began; it names the merge.
         alignment: Alignment by which they were joined.
-        sides: States of their trunks just before, with monitors of earlier merges; arrays are read-only.
+        sides: States of their trunks just before, with monitors of earlier merges.
     """
 
+    STATE = State(number=Int(), alignment=Record(Alignment), sides=Each(Saved(Branch), "2"))
     number: int
     alignment: Alignment
-    sides: tuple[Mapping[str, Any], Mapping[str, Any]]
+    sides: tuple[Snapshot, Snapshot]
+
+    @staticmethod
+    def check_state(parts: Mapping[str, Any], sizes: Sizes) -> None:
+        """Raise if a robot is on both sides."""
+        a, b = parts["sides"]
+        if set(a["robots"]) & set(b["robots"]):
+            raise ValueError("sides with a common robot")
 
     @classmethod
     def of(cls, plan: MergePlan, number: int) -> Self:
         """Return what it takes to separate the groups of a plan that have been joined to map `number`."""
-        a, b = (with_read_only(group.trunk.get_state()) for group in plan.groups)
+        a, b = (take(group.trunk) for group in plan.groups)
         return cls(number, plan.alignment, (a, b))
-
-    def get_state(self) -> dict[str, Any]:
-        """Return all of it; the states of the sides are shared."""
-        return {"number": self.number, "alignment": self.alignment, "sides": self.sides}
-
-    @classmethod
-    def from_state(cls, state: Mapping[str, Any]) -> Self:
-        """Build it from `get_state`, with arrays that cannot change."""
-        a, b = (side | {"filter": accepted(FastSlam, "state['filter']", side["filter"])} for side in state["sides"])
-        return cls(state["number"], state["alignment"], with_constants((a, b)))  # bridge
 
     @property
     def oldest_step(self) -> int:
@@ -159,6 +156,12 @@ class JoinedGroups:
     def map_numbers(self) -> tuple[int, int]:
         """Numbers of the maps that a separation would restore."""
         return self.sides[0]["number"], self.sides[1]["number"]
+
+    @property
+    def earlier(self) -> tuple[list[int], list[int]]:
+        """Numbers of the earlier merges that each side monitored, oldest first."""
+        a, b = ([monitor["number"] for monitor in side["monitors"]] for side in self.sides)
+        return a, b
 
     @property
     def pair(self) -> PairKey:

@@ -5,8 +5,8 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
+from slam_backend.core.state import Child, Each, Sizes, State
 from slam_backend.core.validation import IntArray
-from slam_backend.fastslam.filter import FastSlam
 from slam_backend.team.branches import Branch, StepRouting, fork, landmark_counts, missing, replay, split_by_component
 from slam_backend.team.shared_records import SharedRecords
 
@@ -21,6 +21,8 @@ class Group:
     Attributes:
         branches: The trunk, then the forks. Each robot uses exactly one of them.
     """
+
+    STATE = State(branches=Each(Child(Branch), kind=list))
 
     def __init__(self, trunk: Branch, forks: Sequence[Branch] = ()) -> None:
         self.branches = [trunk, *forks]
@@ -121,18 +123,16 @@ class Group:
             if robot not in branch.active_robots
         ]
 
-    def get_state(self) -> dict[str, Any]:
-        """Return the complete state of the group."""
-        return {"branches": tuple(branch.get_state() for branch in self.branches)}
-
-    @classmethod
-    def from_state(cls, state: Mapping[str, Any], at_hand: Mapping[tuple[int, ...], FastSlam] | None = None) -> "Group":
-        """Build a group from `get_state`; a given filter with the trunk's robots is reused."""
-        at_hand = {} if at_hand is None else at_hand
-        trunk, *forks = state["branches"]
-        return cls(
-            Branch.from_state(trunk, at_hand.get(trunk["robots"])), [Branch.from_state(branch) for branch in forks]
-        )
+    @staticmethod
+    def check_state(parts: Mapping[str, Any], sizes: Sizes) -> None:
+        """Raise unless each robot of the group is active in one branch, which is up to date with it."""
+        active = [robot for branch in parts["branches"] for robot in branch["active_robots"]]
+        if not parts["branches"] or tuple(sorted(active)) != parts["branches"][0]["robots"]:
+            raise ValueError("a robot that is not active in exactly one branch")
+        for branch in parts["branches"]:
+            last = {branch["last_steps"][robot] for robot in branch["active_robots"]}
+            if last != {sizes["STEPS"] - 1}:
+                raise ValueError("a branch without active robots, or with one whose last step is not that of the team")
 
 
 class TeamTopology(NamedTuple):

@@ -1,16 +1,29 @@
 """Merges of groups as processes with phases, and their owner in a team."""
 
-import copy
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
 
-from slam_backend.core.read_only import with_constants
-from slam_backend.core.state import accepted
+from slam_backend.core.state import (
+    Child,
+    ChildOf,
+    Dict,
+    Each,
+    Flag,
+    Generator,
+    Int,
+    Maybe,
+    Options,
+    Record,
+    Row,
+    Sizes,
+    Snapshot,
+    State,
+    restored,
+)
 from slam_backend.core.validation import IntArray
-from slam_backend.fastslam.filter import FastSlam
 from slam_backend.maps.alignment import Alignment
 from slam_backend.team.branches import MAX_REPLAYED, Branch, ReplayedStep, replay
 from slam_backend.team.filter_merging.pairing import Pairing
@@ -38,8 +51,8 @@ from slam_backend.team.merge_attempt import (
     refused_if_uncertain,
     representatives,
 )
-from slam_backend.team.merge_monitor import MergeMonitor, are_both_connected
-from slam_backend.team.merge_scheduler import MergeScheduler, PairKey
+from slam_backend.team.merge_monitor import are_both_connected
+from slam_backend.team.merge_scheduler import PAIR, ROBOTS, MergeScheduler, PairKey
 from slam_backend.team.options import MergeOptions
 from slam_backend.team.reports import LandmarkIdMap, MergeEvent, MergeUndone
 from slam_backend.team.shared_records import SharedRecords
@@ -76,6 +89,7 @@ class MergeProcess:
         phase: Present phase, with what it needs.
     """  # noqa: E501
 
+    STATE = State(pair=PAIR, phase=ChildOf(lambda: Smoothing, lambda: Watched, lambda: Undoing, lambda: Undone))
     pair: PairKey
     phase: "Phase"
 
@@ -95,16 +109,6 @@ class MergeProcess:
     def oldest_step(self) -> int | None:
         """First step that an undo would replay; None if there will be none."""
         return None if self.joined is None else self.joined.oldest_step
-
-    def get_state(self) -> dict[str, Any]:
-        """Return the complete state of the process."""
-        assert isinstance(self.phase, (Smoothing, Watched, Undoing, Undone))  # the others end in the step they begin
-        return {"pair": self.pair, "phase": self.phase.name, **self.phase.get_state()}
-
-    @classmethod
-    def from_state(cls, state: Mapping[str, Any]) -> "MergeProcess":
-        """Build a process from `get_state`."""
-        return cls(state["pair"], STORED[state["phase"]].from_state(state))
 
 
 # ---------------------------------------------------------------------- before the merge
@@ -130,7 +134,7 @@ class Attempt:
         return Smoothing(map_numbers(self.groups), alignment, team.step)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class Smoothing:
     """Smoothing of both maps, which are then aligned again.
 
@@ -142,6 +146,7 @@ class Smoothing:
     """
 
     name: ClassVar[str] = "smoothing"
+    STATE = State(numbers=Row(Int(), Int()), unsmoothed=Record(Alignment), since=Int(high="STEPS"), ready=Flag())
     numbers: tuple[int, int]
     unsmoothed: Alignment
     since: int
@@ -155,20 +160,12 @@ class Smoothing:
             return ABANDONED
         if not (self.ready and are_connected(groups, team.networks)):
             is_smooth = not any(group.trunk.filter.rejuvenation_requested for group in groups)
-            return replace(self, ready=self.ready or is_late or is_smooth)
+            self.ready |= is_late or is_smooth
+            return self
         maps = mixture_maps(groups)
         alignment = align_smoothed(groups, maps, self.unsmoothed, team.schedule, team.rng)
         team.records.exchange.record_smoothed(*representatives(groups), *maps)
         return Trial(MergePlan(groups, maps, alignment), self.unsmoothed)
-
-    def get_state(self) -> dict[str, Any]:
-        """Return what the phase holds."""
-        return {"numbers": self.numbers, "unsmoothed": self.unsmoothed, "since": self.since, "ready": self.ready}
-
-    @classmethod
-    def from_state(cls, state: Mapping[str, Any]) -> "Smoothing":
-        """Build the phase from the state of a process."""
-        return cls(state["numbers"], state["unsmoothed"], state["since"], state["ready"])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -213,11 +210,12 @@ class Trial:
 # ---------------------------------------------------------------------- after the merge
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class Watched:
     """Monitoring of a merge that can be undone."""
 
     name: ClassVar[str] = "watched"
+    STATE = State(joined=Record(JoinedGroups))
     joined: JoinedGroups
 
     def advance(self, team: "TeamMerges") -> "Phase":
@@ -227,15 +225,6 @@ class Watched:
         if not (is_due and is_refuted(self.joined.number, group.trunk, team.merging, team.schedule.alignment)):
             return self
         return team.rollback(self.joined, group)
-
-    def get_state(self) -> dict[str, Any]:
-        """Return what the phase holds."""
-        return self.joined.get_state()
-
-    @classmethod
-    def from_state(cls, state: Mapping[str, Any]) -> "Watched":
-        """Build the phase from the state of a process."""
-        return cls(JoinedGroups.from_state(state))
 
 
 @dataclass(slots=True, eq=False)
@@ -250,6 +239,10 @@ class Undoing:
     """
 
     name: ClassVar[str] = "undoing"
+    STATE = State(
+        joined=Record(JoinedGroups), robots=ROBOTS, trunks=Each(Child(Branch), "sides", list),
+        replayed=Each(Each(Record(ReplayedStep), kind=list), "sides", list),
+    )  # fmt: skip
     joined: JoinedGroups
     robots: tuple[int, ...]
     trunks: list[Branch]
@@ -261,7 +254,7 @@ class Undoing:
         if self.joined.number not in group.merge_numbers:
             team.is_stale = True
             return Watched(self.joined)
-        merges = list(team.merges_down_to(self.joined.number, group.trunk.monitors))
+        merges = list(team.merges_down_to(self.joined.number, group.merge_numbers))
         has_caught_up = self._catch_up(group.trunk, team.records)
         active_robots = group.trunk.active_robots
         if not has_caught_up or not all(are_both_connected(each.pair, active_robots) for each in merges):
@@ -285,39 +278,18 @@ class Undoing:
             replayed += replay(trunk, records.log, wanted, share)
         return all(last >= joint.last_steps[robot] for trunk in self.trunks for robot, last in trunk.last_steps.items())
 
-    def get_state(self) -> dict[str, Any]:
-        """Return what the phase holds."""
-        trunks = tuple(trunk.get_state() for trunk in self.trunks)
-        replayed = tuple(tuple(steps) for steps in self.replayed)
-        return self.joined.get_state() | {"robots": self.robots, "trunks": trunks, "replayed": replayed}
 
-    @classmethod
-    def from_state(cls, state: Mapping[str, Any]) -> "Undoing":
-        """Build the phase from the state of a process."""
-        trunks = [Branch.from_state(trunk) for trunk in state["trunks"]]
-        replayed = [list(with_constants(steps)) for steps in state["replayed"]]
-        return cls(JoinedGroups.from_state(state), state["robots"], trunks, replayed)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class Undone:
     """Time after an undo in which forks of the joint filter remain."""
 
     name: ClassVar[str] = "undone"
+    STATE = State(joined=Record(JoinedGroups))
     joined: JoinedGroups
 
     def advance(self, team: "TeamMerges") -> "Phase":
         """Wait for the robots of these forks."""
         return self
-
-    def get_state(self) -> dict[str, Any]:
-        """Return what the phase holds."""
-        return self.joined.get_state()
-
-    @classmethod
-    def from_state(cls, state: Mapping[str, Any]) -> "Undone":
-        """Build the phase from the state of a process."""
-        return cls(JoinedGroups.from_state(state))
 
 
 @dataclass(frozen=True, slots=True)
@@ -333,7 +305,6 @@ class Ended:
 
 REFUSED, ABANDONED, FINAL = Ended("refused"), Ended("abandoned"), Ended("final")
 Phase = Attempt | Smoothing | Trial | Watched | Undoing | Undone | Ended
-STORED: dict[str, Any] = {phase.name: phase for phase in (Smoothing, Watched, Undoing, Undone)}
 
 
 # ---------------------------------------------------------------------- all merges of a team
@@ -357,6 +328,12 @@ class TeamMerges:
         networks: (K,) robots with the same number are in contact.
         is_stale: Whether groups, branches or monitors have changed since the last `topology`.
     """
+
+    STATE = State(
+        groups=Each(Child(Group), kind=list), schedule=Child(MergeScheduler), merging=Options(MergeOptions),
+        rng=Generator(), epoch=Int(), events=Each(Record(MergeEvent), kind=list),
+        attempt=Maybe(Child(MergeProcess)), joined=Dict(Int(), Child(MergeProcess)),
+    )  # fmt: skip
 
     groups: list[Group]
     records: SharedRecords
@@ -416,7 +393,7 @@ class TeamMerges:
     def watched(self) -> list[JoinedGroups]:
         """Merges that joint filters monitor, oldest first."""
         numbers = sorted(number for group in self.groups for number in group.merge_numbers)
-        return [joined for number in numbers if (joined := self.joined[number].joined) is not None]
+        return [self._monitored(number) for number in numbers]
 
     def merge(self, plan: MergePlan, step: int, known: bool = False) -> LandmarkIdMap:
         """Merge two groups by a given alignment before a step, without an attempt; see `merge_filters` for `known`."""
@@ -444,35 +421,30 @@ class TeamMerges:
         self.is_stale = True
 
     def rollback(self, joined: JoinedGroups, group: Group) -> Undoing:
-        """Return the start of an undo of a group's merge.
+        """Return the start of an undo of a group's merge."""
+        trunks = [restored(side) for side in self._sides_down_to(joined.number, group.merge_numbers)]
+        return Undoing(joined, group.robots, trunks, [[] for _ in trunks])
 
-        Raises:
-            ValueError: If a filter from before it is damaged: states share the dicts that hold it with the team.
-        """
-        sides = list(self._sides_down_to(joined.number, group.trunk.monitors))
-        for side in sides:
-            accepted(FastSlam, "state['filter']", side["filter"])
-        return Undoing(joined, group.robots, [Branch.from_state(side) for side in sides], [[] for _ in sides])
-
-    def merges_down_to(self, number: int, monitors: Sequence[MergeMonitor]) -> Iterator[JoinedGroups]:
-        """Yield the merges to undo, the last one first, to undo the one that made map `number`."""
-        joined = self._newest(monitors)
+    def merges_down_to(self, number: int, monitored: Sequence[int]) -> Iterator[JoinedGroups]:
+        """Yield the merges to undo, the last of those monitored first, to undo the one that made map `number`."""
+        joined = self._monitored(monitored[-1])
         yield joined
-        for side in joined.sides:
-            if any(monitor.number == number for monitor in side["monitors"]):
-                yield from self.merges_down_to(number, side["monitors"])
+        for earlier in joined.earlier:
+            if number in earlier:
+                yield from self.merges_down_to(number, earlier)
 
-    def _sides_down_to(self, number: int, monitors: Sequence[MergeMonitor]) -> Iterator[Mapping[str, Any]]:
+    def _sides_down_to(self, number: int, monitored: Sequence[int]) -> Iterator[Snapshot]:
         """Yield the states of the trunks that remain when these merges are undone."""
-        for side in self._newest(monitors).sides:
-            if any(monitor.number == number for monitor in side["monitors"]):
-                yield from self._sides_down_to(number, side["monitors"])
+        joined = self._monitored(monitored[-1])
+        for side, earlier in zip(joined.sides, joined.earlier, strict=True):
+            if number in earlier:
+                yield from self._sides_down_to(number, earlier)
             else:
                 yield side
 
-    def _newest(self, monitors: Sequence[MergeMonitor]) -> JoinedGroups:
-        """Return the newest of some monitored merges."""
-        joined = self.joined[monitors[-1].number].joined
+    def _monitored(self, number: int) -> JoinedGroups:
+        """Return what it takes to undo a monitored merge."""
+        joined = self.joined[number].joined
         assert joined is not None
         return joined
 
@@ -484,36 +456,49 @@ class TeamMerges:
             number = waiting.pop()
             if number not in monitored:
                 monitored.add(number)
-                joined = self.joined[number].joined
-                assert joined is not None
-                waiting += [monitor.number for side in joined.sides for monitor in side["monitors"]]
+                for earlier in self._monitored(number).earlier:
+                    waiting += earlier
         for number, process in list(self.joined.items()):
             if number not in monitored and not isinstance(process.phase, Undoing):
                 self.joined.pop(number).phase = FINAL
         self.is_stale = False
-        merges = [joined for number in monitored if (joined := self.joined[number].joined) is not None]
+        merges = [self._monitored(number) for number in monitored]
         return TeamTopology.of(self.groups, [(joined.oldest_step, set(joined.map_numbers)) for joined in merges])
 
-    def get_state(self) -> dict[str, Any]:
-        """Return the complete state of the merges; groups and records have states of their own."""
-        processes = [*self.joined.values(), *([] if self.attempt is None else [self.attempt])]
-        return {
-            "epoch": self.epoch,
-            "rng": copy.deepcopy(self.rng.bit_generator.state),
-            "events": tuple(self.events),
-            "merging": self.merging,
-            "schedule": self.schedule.get_state(),
-            "processes": tuple(process.get_state() for process in processes),
-        }
+    @staticmethod
+    def check_state(parts: Mapping[str, Any], sizes: Sizes) -> None:
+        """Raise unless groups share out all robots, and each monitor and each undo fits a merge."""
+        trunks = [group["branches"][0]["robots"] for group in parts["groups"]]
+        if trunks != sorted(trunks) or sorted(sum(trunks, ())) != list(range(sizes["K"])):
+            raise ValueError("groups that do not share out all robots, ordered by their first ones")
+        if parts["attempt"] is not None and parts["attempt"]["phase"].of is not Smoothing:
+            raise ValueError("an attempt in another phase than smoothing")
+        pairs: dict[int, PairKey] = {}
+        for number, process in parts["joined"].items():
+            joined = process["phase"].get("joined")
+            if joined is None or joined.number != number or process["pair"] != joined.pair:
+                raise ValueError("a merge of other groups")
+            if any(other >= number for earlier in joined.earlier for other in earlier):
+                raise ValueError("a merge that undoes a later one")
+            pairs[number] = joined.pair
+            if process["phase"].of is Undoing:
+                robots, parted = process["phase"]["robots"], [trunk["robots"] for trunk in process["phase"]["trunks"]]
+                if robots not in trunks or tuple(sorted(sum(parted, ()))) != robots:
+                    raise ValueError("an undo in no group")
+        for branch in branches_in(parts):
+            for monitor in branch["monitors"]:
+                pair = pairs.get(monitor["number"])
+                if pair is None or monitor["pair"] != pair or not {*pair[0], *pair[1]} <= set(branch["robots"]):
+                    raise ValueError("a monitor of no merge")
 
-    def set_state(self, state: Mapping[str, Any]) -> None:
-        """Restore a state from `get_state`."""
-        self.epoch, self.merging, self.events = state["epoch"], state["merging"], list(state["events"])
-        self.rng.bit_generator.state = copy.deepcopy(state["rng"])
-        self.schedule.set_state(state["schedule"])
-        self.attempt, self.joined = None, {}
-        for process in state["processes"]:
-            self._keep(MergeProcess.from_state(process))
+
+def branches_in(merges: Mapping[str, Any]) -> Iterator[Snapshot]:
+    """Yield the states of all branches in a state of `TeamMerges`: in use, from before a merge, and replaying."""
+    for group in merges["groups"]:
+        yield from group["branches"]
+    for process in merges["joined"].values():
+        yield from process["phase"]["joined"].sides
+        yield from process["phase"].get("trunks", ())
 
 
 def _robots_undoing(process: MergeProcess) -> tuple[int, ...] | None:

@@ -19,6 +19,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from slam_backend.core.state import Each, Int, Record, Row, State
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.fastslam.reports import StepReport
 from slam_backend.geometry import transform_points
@@ -32,7 +33,7 @@ from slam_backend.maps.alignment import (
 from slam_backend.maps.correspondences import candidates, has_enough_candidates, match_table, too_many
 from slam_backend.maps.landmark_map import LandmarkMap, unchecked_map
 from slam_backend.maps.near_pairs import Appearance, NearPairs, near_pairs
-from slam_backend.team.merge_scheduler import PairKey
+from slam_backend.team.merge_scheduler import LANDMARK, PAIR, PairKey
 from slam_backend.team.options import MergeOptions
 
 
@@ -49,6 +50,11 @@ class MergeMonitor:
         steps: Number of steps since the merge with robots of both sides in contact.
     """
 
+    STATE = State(
+        number=Int(), pair=PAIR, pre_merge_maps=Row(Record(LandmarkMap), Record(LandmarkMap)),
+        exclusive_landmarks=Each(Each(LANDMARK, kind=set), "2"), steps=Int(),
+    )  # fmt: skip
+
     number: int
     pair: PairKey
     pre_merge_maps: tuple[LandmarkMap, LandmarkMap]
@@ -56,6 +62,10 @@ class MergeMonitor:
     steps: int = field(default=0)
     # Pairs of landmarks with near descriptors in the last check; not part of a state.
     _near: NearPairs | None = field(default=None, init=False, repr=False)
+
+    def rebuild(self) -> None:
+        """Forget the near pairs."""
+        self._near = None
 
     def copy(self, new_ids: Mapping[int, int] | None = None) -> "MergeMonitor":
         """Return an independent monitor, with landmarks renamed if needed; constant parts are shared."""

@@ -2,11 +2,23 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass
 
-from slam_backend.core.read_only import as_constant, with_constants
+from slam_backend.core.read_only import as_constant
 from slam_backend.core.short_repr import short_repr
+from slam_backend.core.state import (
+    FLOAT64,
+    MAX_LANDMARKS,
+    Array,
+    Dict,
+    Each,
+    Float,
+    Int,
+    Options,
+    Record,
+    Row,
+    State,
+)
 from slam_backend.core.validation import MOST, BoolArray, FloatArray, IntArray, argument_error, check_int, known_names
 from slam_backend.geometry import wrap_angle
 from slam_backend.maps.alignment import (
@@ -19,6 +31,9 @@ from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.maps.near_pairs import Appearance, NearPairs, near_pairs
 
 PairKey = tuple[tuple[int, ...], tuple[int, ...]]  # two groups, as tuples of robots
+LANDMARK, ROBOT = Int(0, MAX_LANDMARKS), Int(high="K")
+ROBOTS = Each(ROBOT)
+PAIR = Row(ROBOTS, ROBOTS)
 MIN_LOG_GROWTH = 0.125  # least share of new entries in the logs before they are smoothed again for the same pair
 MIN_IMPROVEMENT = 0.7  # waiting helps if the uncertainty falls below this share of its last value
 
@@ -51,18 +66,22 @@ class AttemptOptions:
             raise argument_error("attempts.enabled", "True or False", self.enabled, "Give a bool.")
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class AttemptRecord:
-    """Past attempts of one pair of groups."""
+    """Past attempts of one pair of groups.
 
+    Attributes:
+        wait: Least wait after the next refusal [steps].
+        last_step: Step of the last attempt.
+        next_step: Step from which the pair may try again.
+        tried: Candidate matches of the last attempt, by landmark ids.
+    """
+
+    STATE = State(wait=Int(), last_step=Int(), next_step=Int(), tried=Each(Row(LANDMARK, LANDMARK), kind=frozenset))
     wait: int
-    last_step: int = 0
-    next_step: int = 0
-    tried: set[tuple[int, int]] = field(default_factory=set)  # candidate matches of the last attempt, by landmark ids
-
-    def copy(self) -> "AttemptRecord":
-        """Return an independent copy."""
-        return replace(self, tried=set(self.tried))
+    last_step: int
+    next_step: int
+    tried: frozenset[tuple[int, int]]
 
 
 class MergeScheduler:
@@ -72,6 +91,13 @@ class MergeScheduler:
         options: Options of the schedule.
         alignment: Options of alignments, with the gate of candidate matches and the least number of inliers.
     """
+
+    STATE = State(
+        options=Options(AttemptOptions), alignment=Options(AlignmentOptions),
+        records=Dict(PAIR, Record(AttemptRecord)), blocks=Each(Row(PAIR, Int()), kind=list),
+        uncertainties=Dict(Row(ROBOT, ROBOT), Float(0.0, math.inf)),
+        motions=Dict(Row(ROBOT, ROBOT), Array(FLOAT64, "3", constant=True)),
+    )  # fmt: skip
 
     def __init__(self, options: AttemptOptions, alignment: AlignmentOptions) -> None:
         self._options = options
@@ -187,30 +213,19 @@ class MergeScheduler:
             self._records = {key: value for key, value in self._records.items() if not gone & set(key[0] + key[1])}
             self._near = {key: value for key, value in self._near.items() if not gone >= set(key[0] + key[1])}
             return
-        record = self._records.setdefault(pair, AttemptRecord(self._options.every))
-        record.tried = set() if smoothed else self._proposed.get(pair, set())
-        record.last_step = step
+        wait = self._records[pair].wait if pair in self._records else self._options.every
+        longest = self._options.longest_wait
+        tried = frozenset() if smoothed else frozenset(self._proposed.get(pair, ()))
         growth = math.ceil(MIN_LOG_GROWTH * step) if smoothed else 0
-        record.next_step = step + max(record.wait, min(growth, self._options.longest_wait))
-        record.wait = min(2 * record.wait, self._options.longest_wait)
+        self._records[pair] = AttemptRecord(min(2 * wait, longest), step, step + max(wait, min(growth, longest)), tried)
 
     def block(self, pair: PairKey, until: int) -> None:
         """Block all pairs of groups with a robot of each side of a pair before a step."""
         self._blocks = [*(block for block in self._blocks if block[0] != pair), (pair, until)]
 
-    def get_state(self) -> dict[str, Any]:
-        """Return the options and a copy of the memory; arrays are read-only."""
-        records = {pair: record.copy() for pair, record in self._records.items()}
-        memory: dict[str, Any] = {"records": records, "blocks": tuple(self._blocks)}
-        memory |= {"uncertainties": dict(self._uncertainties), "motions": dict(self._motions)}
-        return {"options": self._options, "alignment": self.alignment} | memory
-
-    def set_state(self, state: Mapping[str, Any]) -> None:
-        """Restore options and memory from `get_state`."""
-        self._options, self.alignment, self._near = state["options"], state["alignment"], {}
-        self._records = {pair: record.copy() for pair, record in state["records"].items()}
-        self._blocks = list(state["blocks"])
-        self._uncertainties, self._motions = dict(state["uncertainties"]), dict(with_constants(state["motions"]))
+    def rebuild(self) -> None:
+        """Forget the near pairs."""
+        self._near = {}
 
 
 def _touches(pair: PairKey, blocked: PairKey) -> bool:

@@ -1,5 +1,6 @@
 """Reports of teams: merge events, changes of maps, step reports, and counts of attempts. All frozen."""
 
+import math
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -7,9 +8,24 @@ from typing import Any, Literal, NamedTuple
 
 from slam_backend.core.read_only import as_constant
 from slam_backend.core.short_repr import short_repr
+from slam_backend.core.state import (
+    INT64,
+    MAX_LANDMARKS,
+    Array,
+    Float,
+    Int,
+    Maybe,
+    OneOf,
+    Record,
+    Row,
+    State,
+    Text,
+    with_state,
+)
 from slam_backend.core.validation import IntArray
 from slam_backend.fastslam.reports import Associations, RejuvenationReport
 from slam_backend.maps.alignment_types import REASONS, Alignment
+from slam_backend.team.merge_scheduler import ROBOT, ROBOTS
 
 
 @short_repr
@@ -28,6 +44,12 @@ class MergeEvent:
         uncertainty: Uncertainty of the motion between aligned maps over the particles of the merge, relative to the
             limit for a merge; beyond 1 the merge may be deferred. NaN if not computed.
     """
+
+    STATE = State(
+        step=Int(), kind=Text(("attempt", "merge", "undo")), robots_a=ROBOTS, robots_b=ROBOTS,
+        alignment=Record(Alignment), unsmoothed_alignment=Maybe(Record(Alignment)),
+        uncertainty=Float(0.0, math.inf, nan=True),
+    )  # fmt: skip
 
     step: int
     kind: Literal["attempt", "merge", "undo"]
@@ -51,6 +73,10 @@ class LandmarkIdMap:
             restores them.
     """
 
+    STATE = State(
+        robots_a=ROBOTS, robots_b=ROBOTS, ids_b=Array(INT64, "n 2", high=MAX_LANDMARKS), maps=Row(Int(), Int(), Int())
+    )
+
     robots_a: tuple[int, ...]
     robots_b: tuple[int, ...]
     ids_b: IntArray
@@ -68,6 +94,8 @@ class LandmarkIdMap:
 class MapForked:
     """Fork of a filter: map number `copy` starts as a copy of map number `source`."""
 
+    STATE = State(source=Int(), copy=Int())
+
     source: int
     copy: int
 
@@ -76,10 +104,13 @@ class MapForked:
 class MapReleased:
     """End of map number `number`."""
 
+    STATE = State(number=Int())
+
     number: int
 
 
 @short_repr
+@with_state(number=Int(), robot=ROBOT, step=Int(), ids=Array(INT64, "n", -1, MAX_LANDMARKS))
 class LandmarksCreated(NamedTuple):
     """Landmarks that a robot's measurements of one step created in a map.
 
@@ -104,10 +135,13 @@ class MergeUndone:
         maps: Numbers of a's map, of b's and of the joint one, as in its `LandmarkIdMap`.
     """
 
+    STATE = State(maps=Row(Int(), Int(), Int()))
+
     maps: tuple[int, int, int]
 
 
 MapChange = MapForked | MapReleased | LandmarksCreated | MergeUndone | LandmarkIdMap
+MAP_CHANGE = OneOf(MapForked, MapReleased, LandmarksCreated, MergeUndone, LandmarkIdMap)
 
 
 @short_repr

@@ -1,19 +1,17 @@
 """Records shared by the groups of a team: inputs, traffic, and changes of maps."""
 
-import copy
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 
-from slam_backend.core.read_only import as_read_only, with_constants
-from slam_backend.core.state import accepted, restore, take
+from slam_backend.core.read_only import as_read_only
+from slam_backend.core.state import MAX_LANDMARKS, Child, Each, Generator, Int, State
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.reports import StepReport
 from slam_backend.fastslam.step_input import InputBuffer
 from slam_backend.team.branches import ReplayedStep
 from slam_backend.team.communication import TrafficCounter
-from slam_backend.team.reports import LandmarksCreated, MapChange, MapForked
+from slam_backend.team.reports import MAP_CHANGE, LandmarksCreated, MapChange, MapForked
 
 
 class SharedRecords:
@@ -31,6 +29,11 @@ class SharedRecords:
         spare: Filter of the last fork that ended, or None. The next fork takes its memory, for new memory can take ten
             times as long as the copy. Not part of a state.
     """
+
+    STATE = State(
+        log=Child(InputBuffer), exchange=Child(TrafficCounter), rng=Generator(), entries=Each(MAP_CHANGE, kind=list),
+        next_number=Int(0, MAX_LANDMARKS),
+    )  # fmt: skip
 
     def __init__(self, num_robots: int, seed: np.random.SeedSequence) -> None:
         self.log = InputBuffer()
@@ -65,25 +68,3 @@ class SharedRecords:
         """Record the landmarks that a replay created in a map."""
         for done in replayed:
             self.note_created(number, done.step, done.report)
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return the attributes for copies and pickles, which need no spare memory."""
-        return vars(self) | {"spare": None}
-
-    def get_state(self) -> dict[str, Any]:
-        """Return the complete state of the records."""
-        return {
-            "log": take(self.log),
-            "exchange": self.exchange.get_state(),
-            "rng": copy.deepcopy(self.rng.bit_generator.state),
-            "entries": tuple(self.entries),
-            "next_number": self._next_number,
-        }
-
-    def set_state(self, state: Mapping[str, Any]) -> None:
-        """Restore the records from `get_state`."""
-        restore(self.log, accepted(InputBuffer, "state['log']", state["log"]))
-        self.exchange.set_state(state["exchange"])
-        self.rng.bit_generator.state = copy.deepcopy(state["rng"])
-        self.entries = list(with_constants(state["entries"]))
-        self._next_number = state["next_number"]

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from slam_backend.core.state_checks import refuse_malformed
+from slam_backend.core.state import Child, Each, Int, Sizes, Snapshot, State, accepted, restore, restored, take
 from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_int, check_kind, check_seed
 from slam_backend.fastslam.consistency import Consistency
 from slam_backend.fastslam.filter import FastSlam
@@ -28,12 +28,12 @@ from slam_backend.geometry import inverse
 from slam_backend.maps.alignment import Alignment, AlignmentOptions
 from slam_backend.maps.landmark_map import LandmarkMap, TeamMapSummaries
 from slam_backend.models.measurements import Measurements, TeamMeasurements
-from slam_backend.team.branches import Branch, process_step, restored_filter
+from slam_backend.team.branches import Branch, process_step
 from slam_backend.team.communication import TrafficCounter, check_contacts, contact_components
 from slam_backend.team.filter_merging.merging import inverse_alignment
 from slam_backend.team.group_merging import MergePlan
 from slam_backend.team.groups import Group, TeamTopology
-from slam_backend.team.merge import TeamMerges
+from slam_backend.team.merge import TeamMerges, branches_in
 from slam_backend.team.merge_scheduler import AttemptOptions, MergeScheduler
 from slam_backend.team.options import MergeOptions
 from slam_backend.team.reports import (
@@ -46,7 +46,6 @@ from slam_backend.team.reports import (
     refusals_of,
 )
 from slam_backend.team.shared_records import SharedRecords
-from slam_backend.team.state_checks import TeamCheck
 
 Rejuvenation = tuple[tuple[int, ...], RejuvenationReport]  # active robots of a filter, and outcome
 
@@ -65,6 +64,11 @@ class TeamSlam:
     Raises:
         ValueError: If an argument is unknown or out of its range; the text names it.
     """
+
+    STATE = State(
+        num_robots=Int(1, MAX_ROBOTS, size="K"), step=Int(size="STEPS"), records=Child(SharedRecords),
+        merges=Child(TeamMerges), numbers=Each(Int(), kind=frozenset),
+    )  # fmt: skip
 
     def __init__(
         self,
@@ -102,7 +106,7 @@ class TeamSlam:
             Group(Branch((robot,), (robot,), FastSlam.from_options(1, options, rng), {robot: -1}, robot))
             for robot, rng in enumerate(map(np.random.default_rng, streams))
         ]
-        self._num_robots, self._groups, self._records = count, groups, SharedRecords(count, of_forks)
+        self._num_robots, self._records = count, SharedRecords(count, of_forks)
         merging = MergeOptions() if merging is None else merging
         self._merges = TeamMerges(groups, self._records, schedule, merging, np.random.default_rng(stream))
         self._together = contact_components(None, count)
@@ -403,7 +407,7 @@ class TeamSlam:
         check_kind("merge", merge, MergeEvent, "Give one of the events of a step's report.")
         for joined in self._merges.watched:
             if joined.alignment is merge.alignment:
-                map_a, map_b = (restored_filter(side["filter"]).map() for side in joined.sides)
+                map_a, map_b = (restored(side["filter"]).map() for side in joined.sides)
                 return map_a, map_b
         expected, got = "a merge still monitored", f"the {merge.kind} of step {merge.step}"
         raise argument_error("merge", expected, got, "Call this in the step of the merge.")
@@ -466,27 +470,18 @@ class TeamSlam:
     # ------------------------------------------------------------------ snapshots
 
     @property
-    def buffered_inputs(self) -> Mapping[int, StepInput]:
-        """Inputs of the last steps that some filter may replay, by step; not to be changed."""
-        return self._records.log.buffered
-
-    @property
     def filter_options(self) -> FilterOptions:
         """Options of all filters, except for their number of particles."""
         return self._groups[0].trunk.filter.options
 
-    def get_state(self) -> dict[str, Any]:
-        """Return the complete state of the team, random streams included.
+    @property
+    def _groups(self) -> list[Group]:
+        """The groups, by ascending robots."""
+        return self._merges.groups
 
-        Snapshots kept for an undo, inputs and reports are shared and read-only, all else is copied.
-        """
-        return {
-            "step": self._step,
-            "groups": [group.get_state() for group in self._groups],
-            "numbers": sorted(self._numbers),
-            "records": self._records.get_state(),
-            **self._merges.get_state(),
-        }
+    def get_state(self) -> Snapshot:
+        """Return the complete state of the team, random streams included."""
+        return take(self)
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Restore a state from `get_state`; the team then continues identically.
@@ -494,17 +489,40 @@ class TeamSlam:
         Raises:
             ValueError: If `state` is not from `get_state`, or from a team of another size.
         """
-        with refuse_malformed("state"):
-            TeamCheck(self._num_robots, self.buffered_inputs, (self.filter_options,)).check("state", state)
-        self.restore_checked(state)
+        snapshot = accepted(TeamSlam, "state", state)
+        if snapshot["num_robots"] != self._num_robots:
+            expected = f"one of {self._num_robots} robots"
+            raise argument_error("state", expected, snapshot["num_robots"], "Build a team of the same size.")
+        restore(self, snapshot)
 
-    def restore_checked(self, state: Mapping[str, Any]) -> None:
-        """Restore a state that was validated."""
-        self._step = state["step"]
-        at_hand = {group.robots: group.trunk.filter for group in self._groups}  # reuse is faster than construction
-        self._groups[:] = [Group.from_state(group, at_hand) for group in state["groups"]]
-        self._merges.set_state(state)
-        self._records.set_state(state["records"])
+    def rebuild(self) -> None:
+        """Recompute the assignment of robots to filters."""
         self._refresh_topology()
         self._last_topology, self._size = None, 0
-        self._numbers = frozenset(state["numbers"])
+
+    @staticmethod
+    def check_state(parts: Mapping[str, Any], sizes: Sizes) -> None:
+        """Raise if a number of a map is not known, an input to replay is missing, or descriptors differ in length."""
+        step, merges, inputs = parts["step"], parts["merges"], parts["records"]["log"]["steps"]
+        branches = list(branches_in(merges))
+        numbers = {*parts["numbers"], *merges["joined"], *(branch["number"] for branch in branches)}
+        if max(numbers) >= parts["records"]["next_number"]:
+            raise ValueError("a number of a map that is to come")
+        first = 1 + min(last for branch in branches for last in branch["last_steps"].values())
+        if list(inputs) != list(range(step - len(inputs), step)) or first < step - len(inputs):
+            raise ValueError("inputs that lack a step")
+        descriptors = [branch["filter"]["maps"].descriptors for branch in branches]
+        descriptors += [of_step.descriptors for of_step in inputs.values()]
+        if len({rows.shape[1] for rows in descriptors if len(rows)}) > 1:
+            raise ValueError("descriptors of several lengths")
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copy and pickle the team as its state."""
+        return _unpickled, (self.get_state(),)
+
+
+def _unpickled(state: Mapping[str, Any]) -> TeamSlam:
+    """Return a team in a state."""
+    team = TeamSlam(state["num_robots"])
+    team.set_state(state)
+    return team

@@ -531,9 +531,11 @@ def test_foreign_snapshots_are_refused() -> None:
     """A state of something else, or of a team of another size, is refused, and the team is as before."""
     team = TeamSlam(3, num_particles=7)
     before = copy.deepcopy(team.get_state())
-    refused(lambda: team.set_state({}), "state: expected a dict from get_state, got no 'step'")
-    refused(lambda: team.set_state(None), "state: expected a dict from get_state, got a NoneType")
-    refused(lambda: team.set_state(SimulatedTeam(2).build().get_state()), "state: expected one of 3 robots, got 2")
+    refused(lambda: team.set_state({}), "state: expected what get_state returned, got a mapping without 'n")
+    refused(lambda: team.set_state(None), "state: expected what get_state returned, got a NoneType")
+    other = SimulatedTeam(2).build().get_state()
+    for state in (other, dict(other)):
+        refused(lambda state=state: team.set_state(state), "state: expected one of 3 robots, got 2")
     assert_same(team.get_state(), before)
 
 

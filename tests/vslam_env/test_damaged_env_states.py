@@ -52,7 +52,7 @@ def split() -> ExplorationEnv:
     env = ExplorationEnv(config, twin.world)
     env.reset(seed=5, options={"start_poses": MEETING})
     go_on(env, 150)
-    while len(env.get_state()["episode"]["belief"]["team"]["groups"][0]["branches"]) == 1:
+    while len(env.get_state()["episode"]["belief"]["team"]["merges"]["groups"][0]["branches"]) == 1:
         go_on(env, 1)
     return env
 
@@ -112,9 +112,9 @@ def test_damaged_states_are_refused_or_harmless(kind: str, seeds: range) -> None
     ("way", "index", "says"),
     [
         (
-            ["belief", "team", "groups", 0, "branches", 0, "filter", "maps", "map_of"],
+            ["belief", "team", "merges", "groups", 0, "branches", 0, "filter", "maps", "map_of"],
             10**9,
-            r"\['map_of'\]: expected int",
+            r"\.map_of: expected int",
         ),
         (["belief", "grids", "separated_since"], -9, r"\['grids'\]\['separated_since'\]: expected integers from -2 to"),
         (["ground_truth", "claims"], 10**9, r"\['ground_truth'\]\['claims'\]: expected integers from -3 to"),

@@ -383,9 +383,10 @@ def test_a_file_restores_sharing_and_write_protection(tmp_path: Path) -> None:
     save_state(state, tmp_path / "state")
     loaded = load_state(tmp_path / "state")
     assert encode(loaded, ENV_KINDS) == encode(state, ENV_KINDS)
-    team = loaded["episode"]["belief"]["team"]
-    event = next(event for event in team["events"] if event.kind == "merge")
-    assert team["processes"][0]["alignment"] is event.alignment
+    merges = loaded["episode"]["belief"]["team"]["merges"]
+    event = next(event for event in merges["events"] if event.kind == "merge")
+    (process,) = merges["joined"].values()
+    assert process["phase"]["joined"].alignment is event.alignment
 
 
 def test_files_are_whole_or_not_there(tmp_path: Path) -> None:

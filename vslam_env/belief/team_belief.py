@@ -8,17 +8,17 @@ from typing import Any
 import numpy as np
 
 from slam_backend.core.read_only import as_read_only
-from slam_backend.core.state import FLOAT64, Array, Child, Int, Part, Sizes, State, refuse
+from slam_backend.core.state import FLOAT64, Array, Child, Int, Sizes, State
 from slam_backend.core.validation import Float32Array, FloatArray, argument_error
 from slam_backend.fastslam.options import FilterOptions
 from slam_backend.fastslam.relative_poses import TeamPoses
 from slam_backend.geometry import rotate_covariances
 from slam_backend.maps.alignment import Alignment
 from slam_backend.maps.landmark_map import LandmarkMap, TeamMapSummaries
+from slam_backend.team.merge import branches_in
 from slam_backend.team.merge_scheduler import AttemptOptions
 from slam_backend.team.options import MergeOptions
 from slam_backend.team.reports import LandmarkIdMap, TeamReport
-from slam_backend.team.state_checks import TeamCheck
 from slam_backend.team.team import TeamSlam
 from vslam_env.belief.belief import Belief, BeliefBatch, BeliefConfig, Candidates, RobotHardware, Teammate
 from vslam_env.belief.readings import Readings, TeamReadings
@@ -34,22 +34,6 @@ from vslam_env.navigation.global_grids import GlobalGrids
 __all__ = ["Belief", "BeliefConfig", "Candidates", "RobotHardware", "TeamBelief", "Teammate"]
 
 CANDIDATE_TICKS = 10  # once a second
-
-
-class _Team(Part):  # bridge
-    """State of a `TeamSlam`."""
-
-    def _check(self, name: str, value: Any, sizes: Sizes) -> Any:
-        config: BeliefConfig = sizes["CONFIG"].belief
-        team = TeamCheck(sizes["K"], {}, (config.filter,))
-        team.check(name, value)
-        if sizes["CONFIG"].sensor == "landmark" and not team.descriptor_sizes <= {sizes["DESCRIPTOR"]}:
-            refuse(name, f"descriptors of length {sizes['DESCRIPTOR']}", sorted(team.descriptor_sizes))
-        attempts, merging = merge_options(config, not sizes["CONFIG"].oracle_merge)
-        found = [*team.options, value["schedule"]["alignment"], value["schedule"]["options"], value["merging"]]
-        if found != [*[config.filter] * len(team.options), config.alignment, attempts, merging]:
-            refuse(name, "options of the environment's configuration", "others")
-        return value
 
 
 class TeamBelief:
@@ -74,7 +58,7 @@ class TeamBelief:
 
     STATE = State(
         tick=Int(),
-        team=_Team(),
+        team=Child(TeamSlam),
         grids=Child(SharedGrids),
         candidates=Child(TeamCandidates),
         rendezvous=Child(Rendezvous),
@@ -227,22 +211,25 @@ class TeamBelief:
         )
 
     @property
-    def _team(self) -> dict[str, Any]:  # bridge
-        return self.team.get_state()
-
-    @_team.setter
-    def _team(self, state: Mapping[str, Any]) -> None:  # bridge
-        self.team.restore_checked(state)
-
     def rebuild(self) -> None:
         """Restore what follows from the filters."""
         self._refresh_poses()
 
     @staticmethod
     def check_state(parts: Mapping[str, Any], sizes: Sizes) -> None:
-        """Raise unless the filters are as old as the grids."""
-        if parts["team"]["step"] != parts["tick"] + 1:
-            raise ValueError(f"filters at step {parts['team']['step']}, grids at tick {parts['tick']}")
+        """Raise unless the filters are as old as the grids, and their options those of the environment."""
+        team, config = parts["team"], sizes["CONFIG"]
+        if team["step"] != parts["tick"] + 1:
+            raise ValueError(f"filters at step {team['step']}, grids at tick {parts['tick']}")
+        merges, schedule = team["merges"], team["merges"]["schedule"]
+        filters = [branch["filter"] for branch in branches_in(merges)]
+        given = schedule["alignment"], schedule["options"], merges["merging"], *(each["options"] for each in filters)
+        attempts, merging = merge_options(config.belief, not config.oracle_merge)
+        if given != (config.belief.alignment, attempts, merging, *[config.belief.filter] * len(filters)):
+            raise ValueError("options that differ from the environment's configuration")
+        lengths = {each["maps"].descriptors.shape[1] for each in filters if len(each["maps"].ids)}
+        if config.sensor == "landmark" and not lengths <= {sizes["DESCRIPTOR"]}:
+            raise ValueError(f"descriptors of length {max(lengths)} in a world with {sizes['DESCRIPTOR']}")
 
     def _refresh_poses(self) -> None:
         """Update groups and poses after a step or a merge, and clear cached beliefs and maps."""

@@ -1,7 +1,7 @@
 """Errors of a team's maps and poses, and the ground-truth association of the estimated landmarks."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import count
 from typing import Any
 
@@ -13,6 +13,7 @@ from slam_backend.core.state import INT64, MAX_LANDMARKS, Array, Dict, Each, Int
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray, check_float
 from slam_backend.fastslam.relative_poses import OWN, SIGMAS, START, TeamPoses
 from slam_backend.maps.landmark_map import TeamMapSummaries
+from slam_backend.team.merge import branches_in
 from slam_backend.team.reports import LandmarkIdMap, LandmarksCreated, MapForked, MapReleased, TeamReport
 from vslam_env.evaluation.team_metrics import RobotMetrics
 
@@ -255,10 +256,10 @@ def check_claims(association: Mapping[str, Any], team: Mapping[str, Any], tick: 
     """
     claims, seen = association["claims"], association["seen"]
     numbers: set[int] = set(team["numbers"])
-    for branch in branches_of(team):
+    for branch in branches_in(team["merges"]):
         numbers.add(branch["number"])
         maps = branch["filter"]["maps"]
-        needed = max(1 + maps["ids"].max(initial=-1), maps["next_id"] - MOST_MEASURED * tick)
+        needed = max(1 + maps.ids.max(initial=-1), maps.next_id - MOST_MEASURED * tick)
         if needed > claims.shape[1]:
             raise ValueError(f"claims of {claims.shape[1]} landmarks, of which there are {needed}")
     if lacking := numbers - set(association["row_of"]):
@@ -273,12 +274,3 @@ def check_claims(association: Mapping[str, Any], team: Mapping[str, Any], tick: 
             raise ValueError(f"not all true ids of step {entry.step}")
         if isinstance(entry, LandmarkIdMap) and len(entry.ids_b) and entry.ids_b.max() >= claims.shape[1]:
             raise ValueError(f"claims of {claims.shape[1]} landmarks, of which there are {entry.ids_b.max() + 1}")
-
-
-def branches_of(team: Mapping[str, Any]) -> Iterable[Mapping[str, Any]]:
-    """Yield each branch of a team's state, including those that an undo would restore."""
-    for group in team["groups"]:
-        yield from group["branches"]
-    for process in team["processes"]:
-        yield from process.get("sides", ())
-        yield from process.get("trunks", ())

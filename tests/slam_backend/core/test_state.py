@@ -17,6 +17,7 @@ from slam_backend.core.state import (
     INT64,
     Array,
     Child,
+    ChildOf,
     Dict,
     Each,
     Flag,
@@ -87,16 +88,30 @@ class Wheel:
         self._saved: Snapshot | None = None
 
 
+class Axle:
+    """Another child, made without a constructor."""
+
+    STATE = State(length=Float())
+
+    def __init__(self, length: float) -> None:
+        self.length = length
+
+    def rebuild(self) -> None:
+        """Compute what is not part of the state."""
+        self.half = 0.5 * self.length
+
+
 class Everything:
     """Object with a part of each type."""
 
     STATE = State(
         options=Options(Outer), counts=Array(INT64, "K"), table=Array(FLOAT64, "M K+1"), mask=Array(BOOL, "M"),
         goal=Maybe(Array(FLOAT64, "2", renewed=True)), steps=Int(), share=Float(0.0, 1.0), done=Flag(),
-        mode=Text(("slow", "fast")), rng=Generator(), root=Seed(), wheels=Each(Child(Wheel), "wheels", list),
+        mode=Text(("slow", "fast")), rng=Generator(), root=Seed(), num_wheels=Int(size="wheels"),
+        wheels=Each(Child(Wheel), "wheels", list),
         history=Each(Record(Sighting), kind=deque), changes=Each(OneOf(Sighting, Ended), kind=list),
         groups=Each(Each(Int(high="K"))), pairs=Dict(Row(Int(), Text()), Each(Int(), kind=set)),
-        row_of=Dict(Int(), Int(high="M")),
+        row_of=Dict(Int(), Int(high="M")), front=ChildOf(lambda: Axle, Wheel), ends=Each(Float(), "2"),
     )  # fmt: skip
 
     def __init__(self) -> None:
@@ -106,6 +121,8 @@ class Everything:
         self.steps, self.share, self.done, self.mode = 4, 0.25, True, "slow"
         self.rng, self.root = np.random.default_rng(3), np.random.SeedSequence(5)
         self.wheels = [Wheel(), Wheel()]
+        self.num_wheels, self.ends = 2, (0.5, 1.5)
+        self.front: Axle | Wheel = Axle(3.0)
         one = Sighting(2, as_constant(np.ones((2, 2))), as_constant(np.array([4, 0])))
         self.wheels[0]._saved = take(self.wheels[1])
         self.history, self.changes = deque([one]), [one, Ended(7)]
@@ -121,7 +138,7 @@ class Everything:
         self._table *= 2.0
         self.goal, self.steps, self.done, self.mode = None, 9, False, "fast"
         self.rng.random(3), self.root.spawn(2)
-        self.wheels[0].turns[:] = 0.0
+        self.wheels[0].turns[:], self.front = 0.0, Wheel()
         self.history.clear(), self.changes.clear(), self.pairs[1, "a"].add(9)
 
 
@@ -144,6 +161,8 @@ def test_an_object_returns_to_a_snapshot() -> None:
         assert subject.rng.random(3).tolist() == draws.tolist()
         restore(subject, before)
     assert subject.rebuilt == 6
+    assert isinstance(subject.front, Axle)
+    assert subject.front.half == 1.5
     assert subject.history[0] is before["history"][0]
 
 
@@ -197,11 +216,14 @@ BAD: dict[str, tuple[Any, str]] = {
     "mode": ("still", "expected one of slow, fast"),
     "rng": ({"bit_generator": "load"}, "expected the state of one of PCG64"),
     "root": ((1, (), 1 << 40, 0), r"state\['root'\]\[2\]: expected an int from 4 to 64"),
-    "wheels": (({"turns": np.zeros(2), "saved": None},), r"state\['wheels'\]\[0\]\['turns'\]: expected an array of sh"),
+    "wheels": (({"turns": np.zeros(2), "saved": None},) * 2, r"state\['wheels'\]\[0\]\['turns'\]: expected an array"),
     "history": ((Sighting(1, np.zeros((1, 2)), np.array([5])),), r"\['history'\]\[0\].rows: expected integers from 0"),
     "changes": ((Outer(),), "expected one of Sighting, Ended"),
     "groups": (((3,),), r"state\['groups'\]\[0\]\[0\]: expected an int from 0 to 2"),
     "pairs": ({3: {1}}, r"state\['pairs'\]: key: expected 2 values"),
+    "num_wheels": (3, r"state\['wheels'\]: expected 3 of them, got 2"),
+    "front": ({"class": "Ended", "length": 1.0}, r"state\['front'\]: expected the state of one of Axle, Wheel"),
+    "ends": ((0.5,), r"state\['ends'\]: expected 2 of them, got 1"),
     "row_of": ({1: 5}, r"state\['row_of'\]\[1\]: expected an int from 0 to 4"),
 }  # fmt: skip
 

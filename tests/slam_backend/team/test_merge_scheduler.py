@@ -6,6 +6,7 @@ from builders.comparison import assert_same
 from builders.filters import looks
 from builders.teams import SIZE, SimulatedTeam, driven
 
+from slam_backend.core.state import restore, take
 from slam_backend.fastslam.reports import Associations, StepReport
 from slam_backend.maps.alignment import AlignmentOptions
 from slam_backend.maps.landmark_map import LandmarkMap
@@ -87,7 +88,7 @@ def test_waiting_times_carry_over_to_larger_groups() -> None:
     plan = schedule()
     assert plan.should_defer(((0,), (2,)), 4.0)
     other = schedule()
-    other.set_state(plan.get_state())
+    restore(other, take(plan))
     for known in (plan, other):
         assert not known.should_defer(((0, 1), (2, 3)), 4.0)
         assert known.should_defer(((0,), (4,)), 4.0)
@@ -103,7 +104,7 @@ def test_a_barred_pair_does_not_try_in_larger_groups_either() -> None:
     assert all(plan.may_try(pair, 59) for pair in free)
     assert all(plan.may_try(pair, 60) for pair in barred)
     other = schedule()
-    other.set_state(plan.get_state())
+    restore(other, take(plan))
     assert not other.may_try(barred[0], 59)
 
 
@@ -161,19 +162,6 @@ def test_a_merge_drops_the_records_of_the_merged_groups() -> None:
     assert not plan.may_try(other, 25)
 
 
-def test_a_schedule_continues_from_its_state() -> None:
-    """A restored schedule has the same waits, memory and options, and shares nothing with the first."""
-    plan, twin = schedule(every=10), schedule()
-    plan.choose({FIRST: pair_of([0, 1, 2, 3])}, 49)
-    plan.record(FIRST, 9, success=False)
-    twin.set_state(plan.get_state())
-    plan.record(FIRST, 19, success=False)
-    assert twin.may_try(FIRST, 19)
-    assert not twin.may_try(FIRST, 18)
-    assert twin.is_due(9)
-    assert twin.choose({FIRST: pair_of([0, 1, 2, 3])}, 49) is None
-
-
 @pytest.mark.parametrize("every", [25, 10])
 def test_a_team_tries_at_most_one_pair_in_so_many_steps(every: int) -> None:
     """At most one attempt falls into each stretch of `every` steps, and its merge follows in the same step."""
@@ -225,7 +213,7 @@ def test_trials_of_two_frames_are_compared() -> None:
     plan = schedule()
     assert plan.change(FIRST, np.array([1.0, 2.0, 3.1])) == np.inf
     other = schedule()
-    other.set_state(plan.get_state())
+    restore(other, take(plan))
     for known in (plan, other):
         larger: PairKey = ((0, 2), (1, 3))  # joins the same frames
         assert known.change(larger, np.array([1.3, 2.4, 3.1])) == pytest.approx(2.0)
@@ -297,16 +285,6 @@ def test_a_robot_that_has_left_does_not_send() -> None:
     counter = TrafficCounter(3)
     counter.record_step(report_of((0, -1, 2), [[4], [7], [2]], [[4], [-1], [-1]]), 13)
     assert counter.sent == [POSE_BYTES + LANDMARK_BYTES + LOOK, 0, POSE_BYTES + LANDMARK_BYTES]
-
-
-def test_a_traffic_counter_continues_from_its_state() -> None:
-    """A restored counter continues like the original, and shares nothing with it."""
-    counter, twin = TrafficCounter(2), TrafficCounter(2)
-    counter.record_maps(0, 1, counted_map({1: 4}), counted_map({2: 1}))
-    twin.set_state(counter.get_state())
-    for one in (counter, twin):
-        one.record_maps(0, 1, counted_map({1: 5}), counted_map({2: 1}))
-    assert twin.sent == counter.sent == [2 * LANDMARK_BYTES + LOOK, LANDMARK_BYTES + LOOK]
 
 
 def test_robots_that_merge_send_maps_and_then_a_few_hundred_bytes_a_step() -> None:

@@ -38,7 +38,7 @@ def oldest_unknown(team: TeamSlam, branch: Branch, now: int) -> int:
         joined = team._merges.joined[waiting.pop()].joined
         assert joined is not None
         undone.append(joined.oldest_step)
-        waiting += [monitor.number for side in joined.sides for monitor in side["monitors"]]
+        waiting += [number for earlier in joined.earlier for number in earlier]
     return min([now + 1, *held, *undone])
 
 
