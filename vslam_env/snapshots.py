@@ -21,13 +21,12 @@ from slam_backend.core.state import (
     Sizes,
     State,
     Text,
+    built_options,
     format_of,
-    options_in,
     refuse,
 )  # fmt: skip
-from slam_backend.core.state_codec import ForeignObjectError, StateTypes, decode, encode, read_file
+from slam_backend.core.state_codec import ForeignObjectError, decode, encode, read_file
 from slam_backend.core.validation import argument_error
-from slam_backend.state_kinds import BACKEND_KINDS
 from vslam_env.config import EnvConfig
 from vslam_env.reward import RewardTerm, is_named
 from vslam_env.simulation.controllers import ActionExecutor
@@ -36,7 +35,6 @@ from vslam_env.simulation.scenario import Scenario
 from vslam_env.world import WorldSource
 
 MAGIC = b"vslam_env state "
-ENV_KINDS = StateTypes(options_in(EnvConfig)).with_others(BACKEND_KINDS)  # classes of objects in files
 
 EnvState = Mapping[str, Any]
 
@@ -130,7 +128,7 @@ def save_state(state: Mapping[str, Any], path: str | Path) -> None:
     _checked("state", state)
     path = _checked_path(path)
     try:
-        body = encode(dict(state), ENV_KINDS)
+        body = encode(dict(state))
     except ForeignObjectError as error:
         hint = "Your own objects are not stored: make the environment that loads the state with them."
         raise argument_error("state", "numbers, arrays and configurations of this package", str(error), hint) from error
@@ -160,7 +158,7 @@ def load_state(path: str | Path) -> EnvState:
     if digest.decode(errors="replace") != _fingerprint(body):
         raise argument_error("path", "an intact state file", f"a damaged file {path}", "Save it again.")
     try:
-        state = decode(body, ENV_KINDS)
+        state = decode(body)
     except ValueError as error:
         hint = f"Save it again; the reader says: {error}."
         raise argument_error("path", "a readable state file", Path(path), hint) from error
@@ -194,9 +192,9 @@ def _checked(name: str, state: Any) -> Mapping[str, Any]:
     for key in EnvParts.STATE.parts:
         if key not in state:
             raise argument_error(name, expected, f"a mapping without {key!r}", hint)
-    if not isinstance(state["config"], EnvConfig):
-        raise argument_error(name, expected, f"a mapping whose config is a {type(state['config']).__name__}", hint)
-    return state
+    if isinstance(state["config"], EnvConfig):
+        return state
+    return dict(state) | {"config": built_options(EnvConfig, f"{name}['config']", state["config"])}  # of a file
 
 
 def _difference(ours: Any, theirs: Any, name: str = "") -> tuple[str, Any, Any]:

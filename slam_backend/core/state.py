@@ -666,6 +666,12 @@ class Options(_OfClass):
         return built
 
 
+def built_options(kind: type[T], name: str, value: Any) -> T:
+    """Return options of a class, or of a mapping of a file, rebuilt by their constructors, or raise a ValueError."""
+    built: T = Options(kind)._check(name, value, {})
+    return built
+
+
 def _built(value: Any, classes: Mapping[str, type]) -> Any:
     """Return options rebuilt by their constructors, from an object or from a mapping of a file."""
     is_mapping = isinstance(value, Mapping)

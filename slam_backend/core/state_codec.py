@@ -1,8 +1,9 @@
 """Binary format of state trees. It holds data only: reading a file runs none of its content.
 
-A tree consists of None, bools, ints, floats, texts, bytes, dicts, lists, tuples, sets, arrays of plain numbers, numpy
-scalars, and objects of the classes that the caller lists (`StateTypes`). Parts that are shared in a tree are shared
-after reading, too. Floats keep every bit. Arrays keep their memory layout and whether they are writable.
+A tree consists of None, bools, ints, floats, texts, bytes, dicts, lists, tuples, sets, arrays of plain numbers and
+numpy scalars. Snapshots, records with a `STATE` and dataclasses of options are written as dicts of their parts: what
+declares them builds them again (`slam_backend.core.state`). Parts that are shared in a tree are shared after reading,
+too. Floats keep every bit. Arrays keep their memory layout and whether they are writable.
 
 The bytes are the length of a table, the table as JSON, and the bytes of the arrays. Rows of the table are the parts of
 the tree. Each row refers to earlier rows only, so that reading neither recurses nor loops. Arrays are not compressed
@@ -12,15 +13,13 @@ and do not overlap: a tree takes about as much memory as its file has bytes.
 import json
 import math
 import struct
-from collections.abc import Callable, Iterable
-from dataclasses import fields, is_dataclass
-from enum import Enum
+from collections.abc import Callable
+from dataclasses import is_dataclass
 from pathlib import Path
 from stat import S_ISREG
-from typing import Any, NamedTuple, Self
+from typing import Any
 
 import numpy as np
-from numpy.random import SeedSequence
 from numpy.typing import NDArray
 
 from slam_backend.core.read_only import as_read_only
@@ -43,94 +42,19 @@ SEQUENCES: dict[type, tuple[str, Callable[[list[Any]], Any]]] = {
 BUILT = dict(SEQUENCES.values())
 
 
-class StateType(NamedTuple):
-    """Conversion of the objects of one class to parts and back.
-
-    Attributes:
-        name: Name of the class in files.
-        apart: Function that returns the parts of an object; each part is a tree.
-        build: Function that returns the object made of these parts, or raises a ValueError.
-    """
-
-    name: str
-    apart: Callable[[Any], Iterable[Any]]
-    build: Callable[..., Any]
-
-
-class StateTypes:
-    """Classes whose objects a tree may hold; no other class is written or called.
-
-    Args:
-        classes: Dataclasses, named tuples and enumerations. Their constructors rebuild them from their fields.
-        special: Conversions of other classes.
-    """
-
-    def __init__(self, classes: Iterable[type] = (), special: dict[type, StateType] | None = None) -> None:
-        self.by_class: dict[type, StateType] = {cls: _kind_of(cls) for cls in classes} | (special or {})
-        self.by_name = {kind.name: kind for kind in self.by_class.values()}
-        assert len(self.by_name) == len(self.by_class)
-
-    def with_others(self, others: "StateTypes") -> Self:
-        """Return the union of two sets of classes."""
-        return type(self)((), self.by_class | others.by_class)
-
-
-def _kind_of(cls: type) -> StateType:
-    """Return the conversion of a class to its fields and back by its constructor."""
-    if is_stateful(cls):
-        names = list(cls.STATE.parts)  # type: ignore[attr-defined]
-        build = getattr(cls, "from_parts", cls)
-        return StateType(
-            cls.__name__,
-            lambda each: [getattr(each, name) for name in names],
-            lambda *parts: build(**dict(zip(names, parts, strict=True))),
-        )
-    if issubclass(cls, Enum):
-        return StateType(cls.__name__, lambda member: (member.value,), cls)
-    if is_dataclass(cls):
-        names = [field.name for field in fields(cls) if field.init]
-        return StateType(
-            cls.__name__,
-            lambda each: [getattr(each, name) for name in names],
-            lambda *parts: cls(**dict(zip(names, parts, strict=True))),
-        )
-    assert issubclass(cls, tuple)
-    return StateType(cls.__name__, tuple, cls)
-
-
-def sequence_parts(sequence: SeedSequence) -> tuple[Any, ...]:
-    """Return the arguments that rebuild a seed sequence, its count of children included."""
-    return sequence.entropy, sequence.spawn_key, sequence.pool_size, sequence.n_children_spawned
-
-
-def sequence_of(entropy: Any, spawn_key: Any, pool_size: int, n_children_spawned: int) -> SeedSequence:
-    """Return the seed sequence with these arguments, or raise a ValueError."""
-    if not 4 <= pool_size <= 64:  # numpy would allocate any size
-        raise ValueError(f"a seed sequence has a pool of {pool_size} words")
-    return SeedSequence(entropy, spawn_key=spawn_key, pool_size=pool_size, n_children_spawned=n_children_spawned)
-
-
-SEEDS = StateTypes(special={SeedSequence: StateType("SeedSequence", sequence_parts, sequence_of)})
-
-
 class ForeignObjectError(ValueError):
-    """Tree with an object that cannot be written: its class is not listed."""
+    """Tree with an object that cannot be written."""
 
 
 # ---------------------------------------------------------------------- writing
 
 
 class _Writer:
-    """Writer of the table of a tree; it lists the arrays.
+    """Writer of the table of a tree; it lists the arrays."""
 
-    Args:
-        kinds: Classes that the tree may hold.
-    """
-
-    def __init__(self, kinds: StateTypes) -> None:
+    def __init__(self) -> None:
         self.rows: list[list[Any]] = []
         self.blobs: list[bytes | NDArray[Any]] = []
-        self._kinds = kinds.by_class
         self._row_of: dict[int, Any] = {}  # row by `id` of an object; None while its parts are being written
         self._kept: list[Any] = []  # written objects, so that their `id` stays unique
 
@@ -174,15 +98,12 @@ class _Writer:
             return ["bytes", len(value)]
         if isinstance(value, np.generic) and value.dtype.str in DTYPES:
             return ["number", value.dtype.str, value.tobytes().hex()]
-        if hasattr(cls, "STATE"):  # a record: its reader gets a dict
-            return self._written(parts_of(value), dict)
-        if cls in self._kinds:
-            kind = self._kinds[cls]
+        if is_stateful(cls) or is_dataclass(cls):
             try:
-                parts = list(kind.apart(value))
+                parts = parts_of(value)
             except Exception as error:  # of any kind: the object may not come from a constructor of its class
-                raise ForeignObjectError(f"a damaged {kind.name} ({error})") from error
-            return ["object", kind.name, *(self._at(place, part) for place, part in enumerate(parts))]
+                raise ForeignObjectError(f"a damaged {cls.__name__} ({error})") from error
+            return self._written(parts, dict)
         raise ForeignObjectError(f"a {cls.__module__}.{cls.__qualname__}")
 
     def _at(self, place: Any, part: Any) -> Any:
@@ -200,13 +121,13 @@ class _Writer:
         return ["array", value.dtype.str, list(value.shape), int(by_columns), int(value.flags.writeable)]
 
 
-def encode(tree: Any, kinds: StateTypes) -> bytes:
+def encode(tree: Any) -> bytes:
     """Return a tree as bytes.
 
     Raises:
-        ForeignObjectError: If an object is neither plain data nor of the listed classes; the text says what and where.
+        ForeignObjectError: If an object is none of what a tree consists of; the text says what and where.
     """
-    writer = _Writer(kinds)
+    writer = _Writer()
     root = writer.entry(tree)
     table = json.dumps([writer.rows, root], separators=(",", ":"), allow_nan=False).encode()
     pieces: list[bytes | memoryview] = [f"{len(table)}\n".encode(), table]
@@ -227,14 +148,13 @@ class _Reader:
 
     Args:
         body: Bytes that `encode` returned, or any others.
-        kinds: Classes that the tree may hold.
     """
 
-    def __init__(self, body: bytes, kinds: StateTypes) -> None:
+    def __init__(self, body: bytes) -> None:
         digits, newline, _ = body[:16].partition(b"\n")
         if not newline or not digits.isdigit() or not 0 < (length := int(digits)) <= MAX_TABLE:
             raise ValueError("no table")
-        self._body, self._kinds = body, kinds.by_name
+        self._body = body
         self._at = len(digits) + 1 + length
         content = json.loads(body[len(digits) + 1 : self._at])
         if type(content) is not list or len(content) != 2 or type(content[0]) is not list:
@@ -268,9 +188,6 @@ class _Reader:
             return dict(zip(values[::2], values[1::2], strict=True))
         if tag in BUILT:
             return BUILT[tag](list(map(self._value, entries)))
-        if tag == "object":
-            name, *parts = entries
-            return self._kinds[name].build(*map(self._value, parts))
         (first, *rest) = entries
         if tag == "int":
             return int(first, 16)
@@ -302,15 +219,15 @@ class _Reader:
         return memoryview(self._body)[start : self._at]
 
 
-def decode(body: bytes, kinds: StateTypes) -> Any:
+def decode(body: bytes) -> Any:
     """Return the tree that `encode` wrote; the bytes are never executed.
 
     Raises:
-        ValueError: If `encode` did not write the bytes for these kinds; the text says what was found.
+        ValueError: If `encode` did not write the bytes; the text says what was found.
     """
     try:
-        return _Reader(body, kinds).tree()
-    except Exception as error:  # damaged bytes, or values that constructors of the listed classes refuse
+        return _Reader(body).tree()
+    except Exception as error:  # of any kind: the bytes may be damaged
         raise ValueError(str(error) or type(error).__name__) from error
 
 

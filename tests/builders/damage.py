@@ -143,7 +143,6 @@ def element(value: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 def try_damaged(
     subject: Any,
     seeds: Iterable[int],
-    kinds: Mapping[str, Any],
     is_unchanged: Callable[[], bool],
     go_on: Callable[[Any], None],
 ) -> dict[str, int]:
@@ -152,7 +151,6 @@ def try_damaged(
     Args:
         subject: Object with get_state and set_state.
         seeds: Seeds of the damages.
-        kinds: Classes of objects that its states hold.
         is_unchanged: Returns whether the subject is as before; asked after some refusals.
         go_on: Lets the subject go on from a state that it has accepted, which it gets.
     """
@@ -161,7 +159,7 @@ def try_damaged(
         what, other = damaged(state, np.random.default_rng(seed))
         try:
             if seed % 4 == 0:
-                other = decode(encode(other, kinds), kinds)
+                other = decode(encode(other))
             subject.set_state(other)
         except ForeignObjectError:
             continue

@@ -12,7 +12,6 @@ from slam_backend.core.state_codec import encode
 from slam_backend.fastslam.existence import ExistenceModel
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.smoother.options import SmoothingOptions
-from slam_backend.state_kinds import BACKEND_KINDS
 from slam_backend.team.merge_scheduler import AttemptOptions
 from slam_backend.team.options import MergeOptions
 from slam_backend.team.team import TeamSlam
@@ -105,7 +104,7 @@ def play(subject: FastSlam | TeamSlam, readings: list[Any]) -> None:
 def test_damaged_states_are_refused_or_harmless(kind: str, seeds: range) -> None:
     """Of the damaged states of each kind most are refused, which changes nothing; from the others it goes on."""
     subject, readings = SUBJECTS[kind]()
-    whole = encode(subject.get_state(), BACKEND_KINDS)
+    whole = encode(subject.get_state())
 
     def go_on(_: Any) -> None:
         try:
@@ -114,9 +113,7 @@ def test_damaged_states_are_refused_or_harmless(kind: str, seeds: range) -> None
             if not re.search("expected vectors of size|Use one kind of descriptor", str(error)):
                 raise
 
-    counts = try_damaged(
-        subject, seeds, BACKEND_KINDS, lambda: encode(subject.get_state(), BACKEND_KINDS) == whole, go_on
-    )
+    counts = try_damaged(subject, seeds, lambda: encode(subject.get_state()) == whole, go_on)
     assert counts["refused"] > 0.57 * len(seeds)
     assert counts["accepted"] > 0.057 * len(seeds)
 

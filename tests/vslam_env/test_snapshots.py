@@ -21,7 +21,7 @@ from slam_backend.team import merge
 from slam_backend.team.branches import Branch
 from vslam_env import EnvConfig, ExplorationEnv, load_state, save_state, vslam_v0
 from vslam_env.reward import RUNNING_COST
-from vslam_env.snapshots import ENV_KINDS, EnvParts, check_state, state_version
+from vslam_env.snapshots import EnvParts, check_state, state_version
 
 FURTHER = 300
 FORMAT = format_of(EnvParts)
@@ -273,7 +273,7 @@ def _from_other(**kwargs: Any) -> Callable[[], Any]:
         (_without("executor"), "state: expected what get_state returned, got a mapping without 'executor'"),
         (_edited(version="0/0.0.1"), rf"state: expected a state of version '{state_version()}', got '0/0.0.1'"),
         (lambda: small_env().set_state({"version": "0/0.0.1"}), "state: expected a state of version .*, got '0/0.0.1'"),
-        (_edited(config={}), "state: expected what get_state returned, got a mapping whose config is a dict"),
+        (_edited(config={}), "state['config']: expected EnvConfig that can be built"),
         (_from_other(num_robots=4), "state: expected one made with world = 'room', got 'office'"),
         (
             lambda: small_env().set_state(small_env(num_particles=30).get_state()),
@@ -325,7 +325,7 @@ def _marked(content: bytes, body: bytes) -> bytes:
         (lambda content: content + b".", "a damaged file"),
         (lambda content: content[: content.index(b"\n") + 1] + pickle.dumps(3), "a damaged file"),
         (lambda content: _marked(content, pickle.dumps(3)), "expected a readable state file"),
-        (lambda content: _marked(content, encode(3, ENV_KINDS)), "expected what get_state returned, got a int"),
+        (lambda content: _marked(content, encode(3)), "expected what get_state returned, got a int"),
         (None, "path: expected a state file, .*no such file|No such file"),
     ],
 )
@@ -382,7 +382,7 @@ def test_a_file_restores_sharing_and_write_protection(tmp_path: Path) -> None:
     state = env.get_state()
     save_state(state, tmp_path / "state")
     loaded = load_state(tmp_path / "state")
-    assert encode(loaded, ENV_KINDS) == encode(state, ENV_KINDS)
+    assert encode(loaded) == encode(state)
     merges = loaded["episode"]["belief"]["team"]["merges"]
     event = next(event for event in merges["events"] if event.kind == "merge")
     (process,) = merges["joined"].values()

@@ -10,7 +10,6 @@ from slam_backend.core.files import write_file
 from slam_backend.core.state_codec import MAX_BYTES, decode, encode, read_file
 from slam_backend.core.validation import argument_error
 from training.experiments.run_folder import installed_versions
-from vslam_env.snapshots import ENV_KINDS
 
 FORMAT = 5  # incremented when the content of checkpoints changes
 MAGIC = b"vslam train checkpoint "
@@ -27,7 +26,7 @@ def write_checkpoint(file: Path, content: Mapping[str, Any]) -> None:
     Raises:
         ValueError: If it cannot be written.
     """
-    packed = encode(dict(content), ENV_KINDS)
+    packed = encode(dict(content))
     mark = {
         "format": FORMAT, "versions": _versions(), "bytes": len(packed), "sha256": hashlib.sha256(packed).hexdigest(),
     }  # fmt: skip
@@ -70,7 +69,7 @@ def read_checkpoint(file: Path) -> dict[str, Any]:
             hint = f"Install {package}=={versions.get(package)}, or train again."
             raise argument_error("resume", f"a checkpoint made with {package} {here}", versions.get(package), hint)
     try:
-        content = decode(packed, ENV_KINDS)
+        content = decode(packed)
         if not isinstance(content, dict) or not {"config", "seed"} <= set(content):
             raise ValueError("it has no configuration and seed")
     except (ValueError, TypeError, RecursionError) as error:

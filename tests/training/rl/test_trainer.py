@@ -35,7 +35,6 @@ from training.rl.network import GoalPolicy, check_finite
 from training.rl.trainer import Training, as_arrays, as_tensors, check_device, stored_checkpoint
 from training.vec_env import ExplorationVecEnv
 from vslam_env import NUM_CANDIDATES
-from vslam_env.snapshots import ENV_KINDS
 
 SMOKE = TrainConfig.from_mapping({"preset": "smoke", "seed": 5})
 runner = CliRunner()
@@ -204,7 +203,7 @@ def test_pickles_are_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         with pytest.raises(ValueError, match=f"resume: .*{says}"):
             stored_checkpoint(tmp_path, SMOKE)
     assert not proof.exists()
-    file.write_bytes(_marked(encode([1, 2], ENV_KINDS), FORMAT))
+    file.write_bytes(_marked(encode([1, 2]), FORMAT))
     with pytest.raises(ValueError, match="resume: expected the checkpoint of a training, got a broken file"):
         stored_checkpoint(tmp_path, SMOKE)
 
@@ -217,8 +216,8 @@ def test_tensors_are_kept_as_arrays() -> None:
     optimizer.step()
     for state in (layer.state_dict(), optimizer.state_dict(), torch.get_rng_state(), None):
         arrays = as_arrays(state)
-        back = as_tensors(decode(encode(arrays, ENV_KINDS), ENV_KINDS))
-        assert encode(as_arrays(back), ENV_KINDS) == encode(arrays, ENV_KINDS)
+        back = as_tensors(decode(encode(arrays)))
+        assert encode(as_arrays(back)) == encode(arrays)
     optimizer.load_state_dict(as_tensors(as_arrays(optimizer.state_dict())))
 
 
