@@ -210,7 +210,6 @@ class TeamBelief:
             self._robots, self.team_poses, self.map_summaries, *of_grids, self._features(), self._seconds_left
         )
 
-    @property
     def rebuild(self) -> None:
         """Restore what follows from the filters."""
         self._refresh_poses()
