@@ -4,7 +4,6 @@ from collections.abc import Collection
 
 import numpy as np
 
-from slam_backend.core import state_checks
 from slam_backend.core.compilation import ahead
 from slam_backend.core.compilation.compiler import (
     Progress,
@@ -123,7 +122,6 @@ def run_all_paths(extras: Collection[str]) -> float:
             for _ in range(STEPS):
                 slam.step([move], [plain])
             slam.set_state(slam.get_state())
-        state_checks.compile_checks()
         root = as_read_only(np.array([-1]))
         retract_on_se2(np.zeros((1, 3)), root, np.zeros((1, 3, 1)))
         inverse(np.zeros((2, 3)))  # of starts in a fixed gauge

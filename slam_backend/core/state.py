@@ -25,8 +25,7 @@ kernels trust the indices that they get.
 Sizes have names. The first array with a name in its shape defines it; names in capitals also hold for children.
 """
 
-import hashlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
 from types import FunctionType
@@ -93,6 +92,8 @@ class Snapshot(Mapping[Any, Any]):
         return self._parts | dict(other)
 
     def __eq__(self, other: object) -> bool:
+        from slam_backend.core.state_format import equal  # which builds on this module
+
         return isinstance(other, Mapping) and equal(self, other)
 
     __hash__ = None  # type: ignore[assignment]
@@ -700,132 +701,3 @@ def _check_together(kind: type, name: str, parts: Mapping[str, Any], sizes: Size
             kind.check_state(parts, sizes)
         except ValueError as error:
             raise argument_error(name, "parts that fit together", f"'{error}'", HINT) from error
-
-
-# ---------------------------------------------------------------------- random streams
-
-STREAMS = ("PCG64", "PCG64DXSM", "MT19937", "Philox", "SFC64")
-PLACES = {"has_uint32": 1, "uinteger": 2**32 - 1, "buffer_pos": 4, "pos": 624}  # largest numbers; numpy checks none
-
-
-def _frozen(state: Any) -> Any:
-    """Return the state of a bit generator with read-only mappings and arrays."""
-    if isinstance(state, Mapping):
-        return Snapshot({key: _frozen(value) for key, value in state.items()})
-    return as_read_only(state) if isinstance(state, np.ndarray) else state
-
-
-def _thawed(state: Any) -> Any:
-    """Return the state of a bit generator as numpy takes it."""
-    return {key: _thawed(value) for key, value in state.items()} if isinstance(state, Mapping) else state
-
-
-@dataclass(frozen=True)
-class Generator(Part):
-    """A random generator of numpy, which is replaced by a new one: its bit generator may be shared, or another kind."""
-
-    is_constant: ClassVar[bool] = False
-
-    def _take(self, value: np.random.Generator) -> Snapshot:
-        frozen: Snapshot = _frozen(value.bit_generator.state)
-        return frozen
-
-    def _put(self, value: Any, kept: Snapshot) -> np.random.Generator:
-        bits = getattr(np.random, kept["bit_generator"])(0)
-        bits.state = _thawed(kept)
-        return np.random.Generator(bits)
-
-    def _check(self, name: str, value: Any, sizes: Sizes) -> Snapshot:
-        if not isinstance(value, Mapping) or value.get("bit_generator") not in STREAMS:
-            refuse(name, "the state of one of " + ", ".join(STREAMS), value)
-        state: Snapshot = _like(name, "", value, getattr(np.random, value["bit_generator"])(0).state)
-        return state
-
-
-def _like(name: str, key: str, value: Any, other: Any) -> Any:
-    """Return a part of the state of a bit generator, read-only, or raise unless it has the form of another one."""
-    if isinstance(other, Mapping):
-        if not isinstance(value, Mapping) or set(value) != set(other):
-            refuse(name, f"a dict with {', '.join(other)}", value)
-        return Snapshot({key: _like(f"{name}[{key!r}]", key, value[key], part) for key, part in other.items()})
-    if isinstance(other, np.ndarray):
-        return Array(other.dtype, " ".join(map(str, other.shape)), 0, np.iinfo(other.dtype).max)._check(name, value, {})
-    return (Text((other,)) if isinstance(other, str) else Int(0, PLACES.get(key, 2**128 - 1)))._check(name, value, {})
-
-
-@dataclass(frozen=True)
-class Seed(Part):
-    """A seed sequence of numpy, with the number of its children."""
-
-    is_constant: ClassVar[bool] = False
-
-    def _take(self, value: np.random.SeedSequence) -> tuple[Any, ...]:
-        entropy = value.entropy if isinstance(value.entropy, (int, type(None))) else tuple(map(int, value.entropy))
-        return entropy, tuple(value.spawn_key), value.pool_size, value.n_children_spawned
-
-    def _put(self, value: Any, kept: tuple[Any, ...]) -> np.random.SeedSequence:
-        entropy, spawn_key, pool, children = kept
-        return np.random.SeedSequence(entropy, spawn_key=spawn_key, pool_size=pool, n_children_spawned=children)
-
-    def _check(self, name: str, value: Any, sizes: Sizes) -> tuple[Any, ...]:
-        number = Int(0, 1 << 4096)
-        is_many = type(value) in (tuple, list) and len(value) > 0 and type(value[0]) in (tuple, list)
-        return Row(Each(number) if is_many else Maybe(number), Each(number), Int(4, 64), Int(0, 2**32 - 1))._check(
-            name, value, sizes
-        )
-
-
-# ---------------------------------------------------------------------- comparison and version
-
-
-def equal(one: Any, other: Any) -> bool:
-    """Return whether two states are equal bit for bit; whether they are snapshots or plain dicts does not matter."""
-    if isinstance(one, np.ndarray) and isinstance(other, np.ndarray):
-        return (one.dtype, one.shape, one.tobytes()) == (other.dtype, other.shape, other.tobytes())
-    if isinstance(one, Mapping) and isinstance(other, Mapping):
-        return list(one) == list(other) and all(map(equal, one.values(), other.values()))
-    if type(one) in (tuple, list) and type(other) in (tuple, list):
-        return len(one) == len(other) and all(map(equal, one, other))
-    if type(one) is type(other) and (hasattr(one, "STATE") or is_dataclass(one)):
-        return one is other or equal(parts_of(one), parts_of(other))
-    return type(one) is type(other) and bool(one == other or (one != one and other != other))
-
-
-def parts_of(record: Any) -> dict[str, Any]:
-    """Return the fields of a record or of options by name, with the name of the class."""
-    kind: Any = type(record)
-    names = kind.STATE.parts if hasattr(kind, "STATE") else [f.name for f in fields(record) if f.init]
-    return {CLASS: kind.__name__} | {name: getattr(record, name) for name in names}
-
-
-def format_of(kind: type) -> str:
-    """Return a number of the declarations that the state of a class depends on; another one after any change."""
-    waiting: list[Part | type] = [kind]
-    texts: dict[type, str] = {}
-    while waiting:
-        one = waiting.pop()
-        if isinstance(one, Part):
-            waiting += one._inner()
-        elif one not in texts and hasattr(one, "STATE"):
-            texts[one] = " ".join(f"{name}={_text(part)}" for name, part in one.STATE.parts.items())
-            waiting += one.STATE.parts.values()
-        elif one not in texts:
-            texts[one] = " ".join(f.name for f in fields(one))
-            waiting += options_in(one)
-    lines = sorted(f"{one.__name__}: {text}" for one, text in texts.items())
-    return hashlib.sha256("\n".join(lines).encode()).hexdigest()[:12]
-
-
-def _text(value: Any) -> str:
-    """Return a declaration as text."""
-    if isinstance(value, FunctionType) and value.__name__ == "<lambda>":
-        value = value()
-    if isinstance(value, (type, FunctionType)):
-        return value.__name__
-    if isinstance(value, Part):
-        return f"{type(value).__name__}({', '.join(f'{name}={_text(part)}' for name, part in vars(value).items())})"
-    if isinstance(value, (tuple, Sequence)) and not isinstance(value, str):
-        return f"({', '.join(map(_text, value))})"
-    if isinstance(value, Mapping):
-        return f"({', '.join(f'{name}={_text(part)}' for name, part in value.items())})"
-    return repr(value)

@@ -23,7 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.core.read_only import as_read_only
-from slam_backend.core.state import Snapshot, is_stateful, parts_of
+from slam_backend.core.state import Snapshot, is_stateful
+from slam_backend.core.state_format import parts_of
 
 ALIGNMENT = 64  # alignment of arrays [bytes]
 MAX_BYTES = 1 << 30  # limit of a file [bytes]; a state has some megabytes

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from slam_backend.core.random_state import Generator
 from slam_backend.core.state import (
     FLOAT64,
     INT64,
@@ -19,7 +20,6 @@ from slam_backend.core.state import (
     Array,
     Child,
     Each,
-    Generator,
     Int,
     Maybe,
     Options,

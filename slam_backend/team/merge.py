@@ -6,13 +6,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from slam_backend.core.random_state import Generator
 from slam_backend.core.state import (
     Child,
     ChildOf,
     Dict,
     Each,
     Flag,
-    Generator,
     Int,
     Maybe,
     Options,

@@ -10,7 +10,7 @@ import torch
 from stable_baselines3.common.logger import configure
 
 from agents.trained import MODEL_FILE, load_model, save_model
-from slam_backend.core.state_checks import generator as check_generator
+from slam_backend.core.random_state import checked_stream
 from slam_backend.core.validation import argument_error
 from training.experiments.run_folder import installed_versions
 from training.rl.callbacks import Row, TrainingCallback
@@ -136,7 +136,7 @@ class Training:
         self.env.set_state(kept["environments"])
         self.watch.set_state(kept["watch"])
         random.setstate(draws["python"])
-        check_generator("draws", draws["numpy"])
+        checked_stream("draws", {name: draws["numpy"][name] for name in ("bit_generator", "state")})
         np.random.set_state(draws["numpy"])  # noqa: NPY002
         torch.set_rng_state(as_tensors(draws["torch"]))
         if draws["cuda"] is not None and torch.cuda.is_available():

@@ -6,21 +6,11 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
+from slam_backend.core.random_state import Seed
 from slam_backend.core.read_only import as_constant, as_read_only
 from slam_backend.core.short_repr import short_repr
-from slam_backend.core.state import (
-    BOOL,
-    FLOAT64,
-    INT64,
-    Array,
-    Maybe,
-    Record,
-    Seed,
-    Sizes,
-    State,
-    parts_of,
-    refuse,
-)  # fmt: skip
+from slam_backend.core.state import BOOL, FLOAT64, INT64, Array, Maybe, Record, Sizes, State, refuse
+from slam_backend.core.state_format import parts_of
 from slam_backend.core.validation import FloatArray, IntArray, argument_error
 from vslam_env.config import EnvConfig
 from vslam_env.evaluation.coverage import CoverageCells

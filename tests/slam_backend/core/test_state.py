@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
+from slam_backend.core.random_state import Generator, Seed
 from slam_backend.core.read_only import as_constant
 from slam_backend.core.state import (
     BOOL,
@@ -22,7 +23,6 @@ from slam_backend.core.state import (
     Each,
     Flag,
     Float,
-    Generator,
     Int,
     Maybe,
     OneOf,
@@ -30,16 +30,14 @@ from slam_backend.core.state import (
     Record,
     Row,
     Saved,
-    Seed,
     Snapshot,
     State,
     Text,
     accepted,
-    equal,
-    format_of,
     restore,
     take,
 )
+from slam_backend.core.state_format import equal, format_of
 
 
 @dataclass(frozen=True)
