@@ -547,7 +547,7 @@ class _OfClass(Part):
 
 
 class Child(_OfClass):
-    """An object with a `STATE` of its own; it is restored in place, or made anew, see `restored`."""
+    """An object with a `STATE` of its own; it is restored in place, or made as a new one, see `restored`."""
 
     is_constant = False
 
