@@ -11,7 +11,7 @@ from slam_backend.core.read_only import with_constants
 from slam_backend.core.state_checks import refuse_malformed
 from slam_backend.core.validation import IntArray
 from slam_backend.fastslam.state_checks import check_filter
-from slam_backend.maps.alignment import Alignment
+from slam_backend.maps.alignment import Alignment, align_maps
 from slam_backend.team.branches import MAX_REPLAYED, Branch, ReplayedStep, replay
 from slam_backend.team.filter_merging.pairing import Pairing
 from slam_backend.team.group_merging import (
@@ -27,7 +27,6 @@ from slam_backend.team.groups import Group, TeamTopology
 from slam_backend.team.merge_attempt import (
     GroupPair,
     MapPair,
-    align_pair,
     align_smoothed,
     are_connected,
     choose_pair,
@@ -120,7 +119,7 @@ class Attempt:
 
     def advance(self, team: "TeamMerges") -> "Phase":
         """Align the maps."""
-        alignment = align_pair(self.groups, self.maps, team.schedule, team.rng)
+        alignment = align_maps(*self.maps, rng=team.rng, options=team.schedule.alignment)
         team.records.exchange.record_maps(*representatives(self.groups), *self.maps)
         can_smooth = all(group.trunk.filter.can_rejuvenate for group in self.groups)
         if not (alignment.success and team.merging.smooth_first and can_smooth):
@@ -157,7 +156,7 @@ class Smoothing:
             is_smooth = not any(group.trunk.filter.rejuvenation_requested for group in groups)
             return replace(self, ready=self.ready or is_late or is_smooth)
         maps = mixture_maps(groups)
-        alignment = align_smoothed(groups, maps, self.unsmoothed, team.schedule, team.rng)
+        alignment = align_smoothed(maps, self.unsmoothed, team.schedule.alignment, team.rng)
         team.records.exchange.record_smoothed(*representatives(groups), *maps)
         return Trial(MergePlan(groups, maps, alignment), self.unsmoothed)
 
