@@ -10,7 +10,7 @@ from slam_backend.maps.alignment_types import FEWEST_INLIERS
 from slam_backend.maps.registration import cosine_sine, gauss_newton_step, squared_distances
 
 SAME_DISTANCE, SAME_ANGLE = 0.25, math.radians(2.5)  # half of what makes two alignments differ
-BATCH = 2**15  # residuals that are computed together
+FEWEST, MOST = 2**13, 2**16  # residuals that are computed together
 
 
 def motions_of_pairs(
@@ -58,12 +58,13 @@ def search(
         is the sum of 1 - D / gate over the inliers.
     """
     found, most, best = [np.empty((0, 5))], min_inliers, np.full(3, np.nan)
-    batch = max(BATCH // len(table), 1)
-    for drawn in range(0, len(samples), batch):
+    drawn, batch = 0, max(FEWEST // len(table), 1)
+    while drawn < len(samples):
         # Half of the pairs of a consensus set are taken to lie too close together to be useful.
         if drawn >= log_failure / math.log(1.0 - 0.5 * min(max_ratio * most / len(table), 1.0) ** 2):
             break
         n = samples[drawn : drawn + batch]
+        drawn, batch = drawn + batch, max(min(2 * batch, MOST // len(table)), 1)
         i = ((1.0 + np.sqrt(1.0 + 8.0 * n)) // 2.0).astype(np.int64)
         i -= i * (i - 1) // 2 > n
         i += i * (i + 1) // 2 <= n

@@ -63,9 +63,10 @@ def residuals(table: FloatArray, motions: FloatArray, floor: FloatArray | float)
     ax, ay, az, bx, by, bz, axx, axy, axz, ayy, ayz, azz, bxx, bxy, bxz, byy, byz, bzz = table.T
     cos, sin = cosine_sine(motions[..., 2:])
     rx, ry, rz = ax - cos * bx + sin * by - motions[..., :1], ay - sin * bx - cos * by - motions[..., 1:2], az - bz
-    sxx = axx + cos * cos * bxx - 2.0 * cos * sin * bxy + sin * sin * byy + floor  # Eqs. 16-17, corrected
-    sxy = axy + cos * sin * (bxx - byy) + (cos * cos - sin * sin) * bxy
-    syy = ayy + sin * sin * bxx + 2.0 * cos * sin * bxy + cos * cos * byy + floor
+    half_sum, half_difference = 0.5 * (bxx + byy) + floor, 0.5 * (bxx - byy)
+    cos2, sin2 = cos * cos - sin * sin, 2.0 * cos * sin  # of twice the angle
+    turned = cos2 * half_difference - sin2 * bxy  # Eqs. 16-17, corrected
+    sxx, sxy, syy = axx + half_sum + turned, axy + sin2 * half_difference + cos2 * bxy, ayy + half_sum - turned
     sxz, syz, szz = axz + cos * bxz - sin * byz, ayz + sin * bxz + cos * byz, azz + bzz + floor
     kx, ky = sxz / szz, syz / szz
     x, y, sxx, sxy, syy = rx - kx * rz, ry - ky * rz, sxx - kx * sxz, sxy - kx * syz, syy - ky * syz
@@ -87,21 +88,20 @@ def lever_arms(table: FloatArray, motions: FloatArray) -> tuple[FloatArray, Floa
     return -sin * bx - cos * by, cos * bx - sin * by
 
 
-def shares(table: FloatArray, motions: FloatArray, floor: float) -> tuple[FloatArray, FloatArray]:
-    """Return J^T S^-1 J (..., k, 3, 3) and J^T S^-1 r (..., k, 3) of each match, J = [e_x, e_y, dR/dtheta p_b]."""
+def shares(table: FloatArray, motions: FloatArray, floor: float) -> list[FloatArray]:
+    """Return the parts of J^T S^-1 J, by rows, and of J^T S^-1 r, each (..., k), with J = [e_x, e_y, dR/dtheta p_b]."""
     _, x, y, wxx, wxy, wyy = residuals(table, motions, floor)
     jx, jy = lever_arms(table, motions)
     wx, wy, vx, vy = wxx * x + wxy * y, wxy * x + wyy * y, wxx * jx + wxy * jy, wxy * jx + wyy * jy
-    information = np.stack([wxx, wxy, vx, wxy, wyy, vy, vx, vy, jx * vx + jy * vy], axis=-1)
-    return information.reshape(*x.shape, 3, 3), np.stack([wx, wy, jx * wx + jy * wy], axis=-1)
+    return [wxx, wxy, vx, wxy, wyy, vy, vx, vy, jx * vx + jy * vy, wx, wy, jx * wx + jy * wy]
 
 
 def information(
     table: FloatArray, members: BoolArray, motions: FloatArray, floor: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return H = sum J^T S^-1 J (..., 3, 3) and g = sum J^T S^-1 r (..., 3) over the members (..., k)."""
-    h, g = shares(table, motions, floor)
-    return (h * members[..., None, None]).sum(axis=-3), (g * members[..., None]).sum(axis=-2)
+    sums = np.stack([np.einsum("...k,...k->...", part, members) for part in shares(table, motions, floor)], axis=-1)
+    return sums[..., :9].reshape(*sums.shape[:-1], 3, 3), sums[..., 9:]
 
 
 def gauss_newton_step(table: FloatArray, members: BoolArray, motions: FloatArray, floor: float) -> FloatArray:
@@ -176,7 +176,8 @@ def largest_influence(table: FloatArray, members: BoolArray, motion: FloatArray,
 
     To first order: the step from `motion`, at which all members together rest, with one's information taken away.
     """
-    own, pulls = shares(table[members], motion, floor)
+    parts = np.stack(shares(table[members], motion, floor), axis=-1)
+    own, pulls = parts[:, :9].reshape(-1, 3, 3), parts[:, 9:]
     h = own.sum(axis=0)
     rest = h - own
     if not len(own) or (np.linalg.det(rest) <= 1e-9 * h[0, 0] * h[1, 1] * h[2, 2]).any():
