@@ -5,9 +5,9 @@ import math
 import numpy as np
 
 from slam_backend.core.validation import FloatArray, IntArray
-from slam_backend.geometry import transform_points, wrap_angle
+from slam_backend.geometry import cosine_sine, transform_points, wrap_angle
 from slam_backend.maps.alignment_types import FEWEST_INLIERS
-from slam_backend.maps.registration import cosine_sine, gauss_newton_step, squared_distances
+from slam_backend.maps.registration import gauss_newton_step, squared_distances
 
 SAME_DISTANCE, SAME_ANGLE = 0.25, math.radians(2.5)  # half of what makes two alignments differ
 FEWEST, MOST = 2**13, 2**16  # residuals that are computed together

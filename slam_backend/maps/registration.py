@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from slam_backend.core.validation import BoolArray, FloatArray
-from slam_backend.geometry import wrap_angle
+from slam_backend.geometry import cosine_sine, wrap_angle
 from slam_backend.metrics import align_se2
 
 MIN_VARIANCE = 1e-8  # [m^2], (0.1 mm)^2: keeps exact landmarks (Sigma = 0) solvable
@@ -43,13 +43,6 @@ class Residuals(NamedTuple):
     wxx: FloatArray
     wxy: FloatArray
     wyy: FloatArray
-
-
-def cosine_sine(angles: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return cosines and sines of angles [rad] by the C library: numpy's depend on the processor."""
-    flat = angles.ravel().tolist()
-    cos, sin = np.array([math.cos(angle) for angle in flat]), np.array([math.sin(angle) for angle in flat])
-    return cos.reshape(angles.shape), sin.reshape(angles.shape)
 
 
 def residuals(table: FloatArray, motions: FloatArray, floor: FloatArray | float) -> Residuals:

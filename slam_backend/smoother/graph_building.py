@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray, argument_error
-from slam_backend.geometry import between, compose, rotation
+from slam_backend.geometry import between, compose, cosine_sine, rotation
 from slam_backend.models.odometry import OdometryModel
 from slam_backend.smoother import _kernels
 from slam_backend.smoother._kernels import BIAS, Condensed, Frames, Keys, Landmarks, Log, Points
@@ -121,7 +121,7 @@ def extend_graph(
         is_guided &= _kernels.add_keyframes(arrays, guessed, robot, rigid_within, tips, ends, keys, frames, raw)
     num_keys, num_frames, num_points = ends.tolist()
     held = places if is_guided and places is not None else NO_LANDMARK_POSITIONS
-    landmarks = _kernels.number_landmarks(
+    landmarks = number_landmarks(
         graph.merged_ids, mapped(raw, lambda column: column[len(graph.points) : num_points]), graph.point_landmarks,
         graph.part(Condensed), graph.part(Landmarks), held, frames, keys.poses, mount,
     )  # fmt: skip
@@ -129,6 +129,48 @@ def extend_graph(
     parts = ((keys, num_keys), (frames, num_frames), (raw, num_points), (landmarks, None))
     columns = {name: column[:num] for part, num in parts for name, column in part._asdict().items()}
     return graph.with_columns(**columns, last_keys=tips, latest=np.array(latest, dtype=np.int64))
+
+
+def number_landmarks(
+    aliases: IntArray, new: Points, old_landmarks: IntArray, frozen: Condensed, known: Landmarks,
+    held: LandmarkPositions, frames: Frames, poses: FloatArray, mount: FloatArray,
+) -> Landmarks:  # fmt: skip
+    """Number the landmarks of new measurements, and return all landmarks.
+
+    A new landmark is placed where it was first measured. A landmark that has more new measurements than old ones is
+    placed where the filter holds it to be.
+
+    Args:
+        aliases: (a, 2) rows (name, name it goes by), applied in order.
+        new: New measurements; `point_landmarks` holds the names of their landmarks, and is overwritten by rows.
+        old_landmarks: (n,) landmark of each old raw measurement.
+        frozen: Frozen sightings.
+        known: Landmarks so far.
+        held: Landmark positions of the filter.
+        frames: Frames of the measurements.
+        poses: (k, 3) of the keys, map frame.
+        mount: (3,) [m] of the camera on the robot.
+    """
+    names, count = new.point_landmarks, len(known.landmark_ids)
+    for name, other in aliases:
+        names[names == name] = other
+    first = np.sort(np.unique(names, return_index=True)[1])
+    first = first[~np.isin(names[first], known.landmark_ids)]
+    ids = np.concatenate([known.landmark_ids, names[first]])
+    order = ids.argsort()
+    names[:] = order[np.searchsorted(ids, names, sorter=order)]
+    at = compose(poses[frames.frame_keys[new.point_frames[first]]], frames.frame_offsets[new.point_frames[first]])
+    landmarks = np.concatenate([known.landmarks, new.points[first] + mount])
+    cos, sin = cosine_sine(at[:, 2])
+    ahead, left = landmarks[count:, :2].T.copy()
+    landmarks[count:, :2] = at[:, :2] + np.column_stack([cos * ahead - sin * left, sin * ahead + cos * left])
+    if len(held.ids):
+        more = np.bincount(names, minlength=len(ids)) - np.bincount(old_landmarks, minlength=len(ids))
+        np.subtract.at(more, frozen.condensed_landmarks, frozen.counts)
+        place = np.minimum(np.searchsorted(held.ids, ids), len(held.ids) - 1)
+        moved = (more > 0) & (held.ids[place] == ids)
+        landmarks[moved] = held.means[place[moved]]
+    return Landmarks(ids, landmarks)
 
 
 def _with_room(part: Part, extra: int) -> Part:

@@ -6,23 +6,37 @@ import numpy as np
 
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.smoother import _kernels
-from slam_backend.smoother._kernels import (
-    CholeskyFactor,
-    Condensed,
-    EquationBlocks,
-    Frames,
-    Keys,
-    LandmarkFactors,
-    Points,
-)
+from slam_backend.smoother._kernels import CholeskyFactor, EquationBlocks, Frames, Keys, LandmarkFactors, Points
 from slam_backend.smoother.graph import SlamGraph
 from slam_backend.smoother.options import SmoothingOptions
 
 
 def gathered(graph: SlamGraph) -> LandmarkFactors:
-    """Return a graph's sightings; those of raw measurements are still to be linearised."""
-    parts = graph.part(Condensed), graph.part(Points), graph.part(Frames)
-    return _kernels.gather(*parts, graph.num_keys, len(graph.landmark_ids))
+    """Return a graph's sightings by landmark and key, frozen ones before the others of a pair.
+
+    Forms of raw measurements are zeros: they are still to be linearised.
+    """
+    num_frozen, num_points = len(graph.counts), len(graph.points)
+    of_key = np.concatenate([graph.condensed_keys, graph.frame_keys[graph.point_frames]])
+    of_landmark = np.concatenate([graph.condensed_landmarks, graph.point_landmarks])
+    order = np.lexsort((of_key, of_landmark))
+    is_frozen, pairs = order < num_frozen, np.stack([of_key, of_landmark])[:, order]
+    begins = np.ones(len(order), np.bool_)  # raw measurements of a landmark from one key are one sighting
+    begins[1:] = is_frozen[1:] | is_frozen[:-1] | (pairs[:, 1:] != pairs[:, :-1]).any(axis=0)
+    place, first = np.cumsum(begins) - 1, np.flatnonzero(begins)
+    counts, of_points = np.bincount(place, minlength=len(first)), np.empty(num_points, np.int64)
+    of_points[order[~is_frozen] - num_frozen] = place[~is_frozen]
+    centres, infos, slopes = np.zeros((len(first), 3)), np.zeros((len(first), 6)), np.zeros((len(first), 3))
+    at, held = place[is_frozen], order[is_frozen]
+    centres[at], infos[at] = graph.linearisation_points[held], graph.information[held]
+    slopes[at] = graph.gradients[held]
+    counts[at] = graph.counts[held]
+    keys, landmarks = pairs[:, first]
+    starts = np.zeros(len(graph.landmark_ids) + 1, np.int64)
+    starts[1:] = np.cumsum(np.bincount(landmarks, minlength=len(graph.landmark_ids)))
+    return LandmarkFactors(
+        keys, landmarks, starts, is_frozen[first], centres, infos, slopes, counts, of_points, np.zeros(num_points)
+    )
 
 
 def linearise(
@@ -100,11 +114,6 @@ class MapEstimate(NamedTuple):
         """Return the joint covariance (3 r, 3 r) [m, m, rad] of r unknown keys (r,) of a successful estimate."""
         assert self.system is not None
         return self.system.covariance(self.columns[keys])
-
-    def transition_variances(self) -> FloatArray:
-        """Return the variances (k,) [m^2] of the motions from the previous keys, headings weighted by `LEVER`."""
-        assert self.system is not None
-        return self.system.transition_variances(self.poses)
 
 
 def optimize(
@@ -221,7 +230,3 @@ class NormalEquations:
     def covariance(self, columns: IntArray) -> FloatArray:
         """Return the joint covariance (3 r, 3 r) of poses given by their columns (r,)."""
         return _kernels.covariance(self.factor, self.pattern, columns // 3)
-
-    def transition_variances(self, poses: FloatArray) -> FloatArray:
-        """Return the variances of the motions to poses (k, 3), see `MapEstimate.transition_variances`."""
-        return _kernels.transition_variances(poses, self.columns, self.graph.parents, self.factor, self.pattern)
