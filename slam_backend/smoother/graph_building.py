@@ -151,25 +151,26 @@ def number_landmarks(
         poses: (k, 3) of the keys, map frame.
         mount: (3,) [m] of the camera on the robot.
     """
-    names, count = new.point_landmarks, len(known.landmark_ids)
+    names, ids, landmarks = new.point_landmarks, known.landmark_ids, known.landmarks
     for name, other in aliases:
         names[names == name] = other
-    first = np.sort(np.unique(names, return_index=True)[1])
-    first = first[~np.isin(names[first], known.landmark_ids)]
-    ids = np.concatenate([known.landmark_ids, names[first]])
+    unknown = np.flatnonzero(~np.isin(names, ids))
+    if len(unknown):
+        first = np.sort(unknown[np.unique(names[unknown], return_index=True)[1]])
+        frame = new.point_frames[first]
+        at, points = compose(poses[frames.frame_keys[frame]], frames.frame_offsets[frame]), new.points[first] + mount
+        cos, sin = cosine_sine(at[:, 2])
+        x, y = at[:, 0] + cos * points[:, 0] - sin * points[:, 1], at[:, 1] + sin * points[:, 0] + cos * points[:, 1]
+        ids = np.concatenate([ids, names[first]])
+        landmarks = np.concatenate([landmarks, np.column_stack([x, y, points[:, 2]])])
     order = ids.argsort()
     names[:] = order[np.searchsorted(ids, names, sorter=order)]
-    at = compose(poses[frames.frame_keys[new.point_frames[first]]], frames.frame_offsets[new.point_frames[first]])
-    landmarks = np.concatenate([known.landmarks, new.points[first] + mount])
-    cos, sin = cosine_sine(at[:, 2])
-    ahead, left = landmarks[count:, :2].T.copy()
-    landmarks[count:, :2] = at[:, :2] + np.column_stack([cos * ahead - sin * left, sin * ahead + cos * left])
     if len(held.ids):
         more = np.bincount(names, minlength=len(ids)) - np.bincount(old_landmarks, minlength=len(ids))
         np.subtract.at(more, frozen.condensed_landmarks, frozen.counts)
         place = np.minimum(np.searchsorted(held.ids, ids), len(held.ids) - 1)
         moved = (more > 0) & (held.ids[place] == ids)
-        landmarks[moved] = held.means[place[moved]]
+        landmarks = np.where(moved[:, None], held.means[place], landmarks)
     return Landmarks(ids, landmarks)
 
 
