@@ -1,6 +1,7 @@
 """Registration of matched landmarks: residuals, the rigid motion that fits them, and its covariance.
 
-Functions take one motion (3,) or several (h, 3) at once, a_from_b [m, m, rad], and the table (k, 18) of `match_table`.
+Functions take one motion (3,) or several (h, 3) at once, a_from_b [m, m, rad], and the table (k, 18) of `match_table`,
+or one table per motion (h, k, 18).
 """
 
 import math
@@ -29,31 +30,34 @@ OUTSIDE = 1e-3  # weight of those beyond it; never nothing: the fit stays define
 
 
 class Residuals(NamedTuple):
-    """Residuals of k matches under motions (...): the height is eliminated first, so that a 2x2 system remains.
+    """Residuals r of k matches under motions (...), with covariances S.
 
     Attributes:
-        distances: (..., k) squared Mahalanobis distances in all three axes, D = r^T S^-1 r.
-        x, y: (..., k) planar residual given that of the height [m].
-        wxx, wxy, wyy: (..., k) inverse of its covariance [m^-2].
+        distances: (..., k) squared Mahalanobis distances, D = r^T S^-1 r.
+        pulls: Three (..., k) components of S^-1 r [1/m].
+        wxx, wxy, wyy: (..., k) planar part of S^-1 [1/m^2].
+        determinants: (..., k) |S| [m^6].
     """
 
     distances: FloatArray
-    x: FloatArray
-    y: FloatArray
+    pulls: tuple[FloatArray, FloatArray, FloatArray]
     wxx: FloatArray
     wxy: FloatArray
     wyy: FloatArray
+    determinants: FloatArray
 
 
 def residuals(table: FloatArray, motions: FloatArray, floor: FloatArray | float) -> Residuals:
     """Return the residuals of all matches under p_a = R p_b + t, with S = Sigma_a + R Sigma_b R^T + floor I.
 
+    The height is eliminated first, so that a 2x2 system remains.
+
     Args:
-        table: (k, 18) matches.
+        table: (..., k, 18) matches.
         motions: (..., 3) [m, m, rad].
         floor: Added to each variance [m^2]; (..., 1) or a number.
     """
-    ax, ay, az, bx, by, bz, axx, axy, axz, ayy, ayz, azz, bxx, bxy, bxz, byy, byz, bzz = table.T
+    ax, ay, az, bx, by, bz, axx, axy, axz, ayy, ayz, azz, bxx, bxy, bxz, byy, byz, bzz = np.moveaxis(table, -1, 0)
     cos, sin = cosine_sine(motions[..., 2:])
     rx, ry, rz = ax - cos * bx + sin * by - motions[..., :1], ay - sin * bx - cos * by - motions[..., 1:2], az - bz
     half_sum, half_difference = 0.5 * (bxx + byy) + floor, 0.5 * (bxx - byy)
@@ -65,8 +69,9 @@ def residuals(table: FloatArray, motions: FloatArray, floor: FloatArray | float)
     x, y, sxx, sxy, syy = rx - kx * rz, ry - ky * rz, sxx - kx * sxz, sxy - kx * syz, syy - ky * syz
     determinant = sxx * syy - sxy * sxy
     wxx, wxy, wyy = syy / determinant, -sxy / determinant, sxx / determinant
-    distances = rz * rz / szz + wxx * x * x + 2.0 * wxy * x * y + wyy * y * y
-    return Residuals(distances, x, y, wxx, wxy, wyy)
+    vx, vy = wxx * x + wxy * y, wxy * x + wyy * y
+    pulls = vx, vy, rz / szz - kx * vx - ky * vy
+    return Residuals(rz * rz / szz + vx * x + vy * y, pulls, wxx, wxy, wyy, determinant * szz)
 
 
 def squared_distances(table: FloatArray, motions: FloatArray, floor: FloatArray | float) -> FloatArray:
@@ -77,28 +82,30 @@ def squared_distances(table: FloatArray, motions: FloatArray, floor: FloatArray 
 def lever_arms(table: FloatArray, motions: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return dR/dtheta p_b, both coordinates (..., k) [m]."""
     cos, sin = cosine_sine(motions[..., 2:])
-    bx, by = table[:, 3], table[:, 4]
+    bx, by = table[..., 3], table[..., 4]
     return -sin * bx - cos * by, cos * bx - sin * by
 
 
-def shares(table: FloatArray, motions: FloatArray, floor: float) -> list[FloatArray]:
+def shares(table: FloatArray, motions: FloatArray, floor: FloatArray | float) -> list[FloatArray]:
     """Return the parts of J^T S^-1 J, by rows, and of J^T S^-1 r, each (..., k), with J = [e_x, e_y, dR/dtheta p_b]."""
-    _, x, y, wxx, wxy, wyy = residuals(table, motions, floor)
+    _, (x, y, _), wxx, wxy, wyy, _ = residuals(table, motions, floor)
     jx, jy = lever_arms(table, motions)
-    wx, wy, vx, vy = wxx * x + wxy * y, wxy * x + wyy * y, wxx * jx + wxy * jy, wxy * jx + wyy * jy
-    return [wxx, wxy, vx, wxy, wyy, vy, vx, vy, jx * vx + jy * vy, wx, wy, jx * wx + jy * wy]
+    vx, vy = wxx * jx + wxy * jy, wxy * jx + wyy * jy
+    return [wxx, wxy, vx, wxy, wyy, vy, vx, vy, jx * vx + jy * vy, x, y, jx * x + jy * y]
 
 
 def information(
-    table: FloatArray, members: BoolArray, motions: FloatArray, floor: float
+    table: FloatArray, members: BoolArray, motions: FloatArray, floor: FloatArray | float
 ) -> tuple[FloatArray, FloatArray]:
     """Return H = sum J^T S^-1 J (..., 3, 3) and g = sum J^T S^-1 r (..., 3) over the members (..., k)."""
     sums = np.stack([np.einsum("...k,...k->...", part, members) for part in shares(table, motions, floor)], axis=-1)
     return sums[..., :9].reshape(*sums.shape[:-1], 3, 3), sums[..., 9:]
 
 
-def gauss_newton_step(table: FloatArray, members: BoolArray, motions: FloatArray, floor: float) -> FloatArray:
-    """Return the motions (..., 3) after a weighted Gauss-Newton step; unchanged where members leave the rotation open.
+def gauss_newton_step(
+    table: FloatArray, members: BoolArray, motions: FloatArray, floor: FloatArray | float
+) -> FloatArray:
+    """Return the motions (..., 3) after a weighted Gauss-Newton step; members that leave the rotation open do not turn.
 
     The translation is eliminated first: u = H_tt^-1 H_t,theta and v = H_tt^-1 g_t.
     """
@@ -110,9 +117,9 @@ def gauss_newton_step(table: FloatArray, members: BoolArray, motions: FloatArray
         vx = (hyy * g[..., 0] - hxy * g[..., 1]) / determinant
         vy = (hxx * g[..., 1] - hxy * g[..., 0]) / determinant
         remaining = turning - hx * ux - hy * uy
-        turn = (g[..., 2] - hx * vx - hy * vy) / remaining
+        turn = np.where(remaining > 1e-12 * turning, (g[..., 2] - hx * vx - hy * vy) / remaining, 0.0)
     step = np.stack([vx - ux * turn, vy - uy * turn, turn], axis=-1)
-    moved = motions + np.where(((determinant > 0.0) & (remaining > 1e-12 * turning))[..., None], step, 0.0)
+    moved = motions + np.where((determinant > 0.0)[..., None], step, 0.0)
     moved[..., 2] = wrap_angle(moved[..., 2])
     return moved
 
@@ -143,7 +150,7 @@ def drop_unverified(table: FloatArray, members: BoolArray, motion: FloatArray, f
 
     Where landmarks lie close together, a few wrong matches far away would turn the fit until they fit themselves.
     """
-    _, _, _, wxx, wxy, wyy = residuals(table, motion, floor)
+    _, _, wxx, wxy, wyy, _ = residuals(table, motion, floor)
     arm_x, arm_y = lever_arms(table, motion)
     while count := np.count_nonzero(members):
         hxx, hxy, hyy = ((weights * members).sum() for weights in (wxx, wxy, wyy))

@@ -5,13 +5,13 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.core.packed_symmetric import UNPACK_INDEX
+from slam_backend.core.packed_symmetric import UNPACK_INDEX, UPPER
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray, argument_error
 from slam_backend.fastslam._kernels import LANES
 from slam_backend.fastslam.existence import ExistenceModel
 from slam_backend.fastslam.particle_maps import ParticleMaps
 from slam_backend.geometry import rotation
-from slam_backend.team.filter_merging._kernels.joint_map import Side, by_particle, join
+from slam_backend.maps.fusion import fuse_landmarks
 
 
 class Landmarks(NamedTuple):
@@ -56,7 +56,7 @@ class Landmarks(NamedTuple):
     @property
     def values_by_particle(self) -> FloatArray:
         """(M, n, 9) float64, as `values`. A copy."""
-        return by_particle(self.maps.values, self.where, LANES)
+        return np.ascontiguousarray(self.values.transpose(2, 0, 1))
 
     @property
     def held_by_particle(self) -> BoolArray:
@@ -173,10 +173,42 @@ def write_joint(
     Raises:
         ValueError: If two estimates of a landmark are exact along one direction.
     """
-    one, two = (Side(each.maps.values, each.where, each.counts, rows) for each, rows in ((a, rows_a), (b, rows_b)))
-    if not join(one, two, motion, extra, scales, LANES, blocks):
+    (means, spreads, in_a), (means_b, spreads_b, in_b) = (
+        _widened(side, rows, extra, scales) for side, rows in ((a, rows_a), (b, rows_b))
+    )
+    turn = np.zeros((len(motion), 3, 3))
+    turn[:, :2, :2], turn[:, 2, 2] = rotation(motion[:, 2]), 1.0
+    means_b = (turn @ means_b[..., None])[..., 0]
+    means_b[..., :2] += motion[:, :2]
+    spreads_b = turn @ spreads_b @ turn.transpose(0, 2, 1)  # Eq. 16 *
+    means, spreads = np.where(in_a[..., None], means, means_b), np.where(in_a[..., None, None], spreads, spreads_b)
+    both = in_a & in_b
+    try:
+        means[both], spreads[both] = fuse_landmarks(means[both], spreads[both], means_b[both], spreads_b[both])
+    except ValueError as error:
         cure = "Give each landmark some uncertainty in every direction."
-        raise argument_error("landmarks in common", "positive definite covariances", "singular ones", cure)
+        raise argument_error("landmarks in common", "positive definite covariances", "singular ones", cure) from error
+    _, count, _, lanes = blocks.shape
+    joint = np.zeros((len(rows_a), count * lanes, 9))
+    joint[:, : len(motion), :3], joint[:, : len(motion), 3:] = means, spreads[..., *UPPER]
+    joint[:, : len(motion)] *= (in_a | in_b)[..., None]
+    blocks[: len(rows_a)] = joint.reshape(-1, count, lanes, 9).transpose(0, 1, 3, 2)
+
+
+def _widened(
+    side: Landmarks, rows: IntArray, extra: float, scales: FloatArray
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Return means (n, M, 3) and widened covariances (n, M, 3, 3) of one side's part in joint landmarks, and its mask.
+
+    Landmarks that a particle lacks are zeros.
+    """
+    held, values = np.zeros((len(rows), len(side.chosen)), np.bool_), np.zeros((len(rows), len(side.chosen), 9))
+    there = rows >= 0
+    held[there] = side.counts[rows[there]] > 0
+    values[there] = side.values[rows[there]].transpose(0, 2, 1)
+    values[~held] = 0.0
+    covariances = (values[..., 3:][..., UNPACK_INDEX] + extra * np.eye(3)) * scales[:, None, None, None]
+    return values[..., :3], covariances, held
 
 
 def birge_ratios(a: Landmarks, b: Landmarks, motion: FloatArray, extra: float) -> FloatArray:
