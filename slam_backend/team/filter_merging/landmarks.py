@@ -10,7 +10,7 @@ from slam_backend.core.validation import BoolArray, FloatArray, IntArray, argume
 from slam_backend.fastslam._kernels import LANES
 from slam_backend.fastslam.existence import ExistenceModel
 from slam_backend.fastslam.particle_maps import ParticleMaps
-from slam_backend.geometry import rotation
+from slam_backend.geometry import cosine_sine, rotation
 from slam_backend.maps.fusion import fuse_landmarks
 
 
@@ -173,42 +173,50 @@ def write_joint(
     Raises:
         ValueError: If two estimates of a landmark are exact along one direction.
     """
-    (means, spreads, in_a), (means_b, spreads_b, in_b) = (
-        _widened(side, rows, extra, scales) for side, rows in ((a, rows_a), (b, rows_b))
-    )
-    turn = np.zeros((len(motion), 3, 3))
-    turn[:, :2, :2], turn[:, 2, 2] = rotation(motion[:, 2]), 1.0
-    means_b = (turn @ means_b[..., None])[..., 0]
-    means_b[..., :2] += motion[:, :2]
-    spreads_b = turn @ spreads_b @ turn.transpose(0, 2, 1)  # Eq. 16 *
-    means, spreads = np.where(in_a[..., None], means, means_b), np.where(in_a[..., None, None], spreads, spreads_b)
-    both = in_a & in_b
+    (in_a,), (in_b,) = np.nonzero(rows_a >= 0), np.nonzero(rows_b >= 0)
+    joint = np.zeros((len(rows_a), 9, len(motion)))
+    joint[in_a] = _widened(a, rows_a[in_a], extra, scales[in_a])
+    ours, theirs = joint[in_b], _moved(_widened(b, rows_b[in_b], extra, scales[in_b]), motion)
+    held_a, held_b = np.zeros((len(rows_a), len(motion)), np.bool_), b.counts[rows_b[in_b]] > 0
+    held_a[in_a] = a.counts[rows_a[in_a]] > 0
+    joint[in_b] = np.where(held_a[in_b][:, None], ours, theirs * held_b[:, None])
+    both = np.nonzero(held_a[in_b] & held_b)
+    one, two = ours.transpose(0, 2, 1)[both], theirs.transpose(0, 2, 1)[both]
     try:
-        means[both], spreads[both] = fuse_landmarks(means[both], spreads[both], means_b[both], spreads_b[both])
+        means, spreads = fuse_landmarks(
+            one[:, :3], one[:, 3:][:, UNPACK_INDEX], two[:, :3], two[:, 3:][:, UNPACK_INDEX]
+        )
     except ValueError as error:
         cure = "Give each landmark some uncertainty in every direction."
         raise argument_error("landmarks in common", "positive definite covariances", "singular ones", cure) from error
+    joint[in_b[both[0]], :, both[1]] = np.column_stack([means, spreads[:, *UPPER]])
     _, count, _, lanes = blocks.shape
-    joint = np.zeros((len(rows_a), count * lanes, 9))
-    joint[:, : len(motion), :3], joint[:, : len(motion), 3:] = means, spreads[..., *UPPER]
-    joint[:, : len(motion)] *= (in_a | in_b)[..., None]
-    blocks[: len(rows_a)] = joint.reshape(-1, count, lanes, 9).transpose(0, 1, 3, 2)
+    padded = np.zeros((len(rows_a), 9, count * lanes))
+    padded[:, :, : len(motion)] = joint
+    blocks[: len(rows_a)] = padded.reshape(-1, 9, count, lanes).transpose(0, 2, 1, 3)
 
 
-def _widened(
-    side: Landmarks, rows: IntArray, extra: float, scales: FloatArray
-) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Return means (n, M, 3) and widened covariances (n, M, 3, 3) of one side's part in joint landmarks, and its mask.
+def _widened(side: Landmarks, rows: IntArray, extra: float, scales: FloatArray) -> FloatArray:
+    """Return some landmarks (n, 9, M) with `extra` added to their variances, then times `scales` (n,); zeros: lacking.
 
-    Landmarks that a particle lacks are zeros.
+    The nine numbers are those of `Landmarks.values`.
     """
-    held, values = np.zeros((len(rows), len(side.chosen)), np.bool_), np.zeros((len(rows), len(side.chosen), 9))
-    there = rows >= 0
-    held[there] = side.counts[rows[there]] > 0
-    values[there] = side.values[rows[there]].transpose(0, 2, 1)
-    values[~held] = 0.0
-    covariances = (values[..., 3:][..., UNPACK_INDEX] + extra * np.eye(3)) * scales[:, None, None, None]
-    return values[..., :3], covariances, held
+    values = side.values[rows]
+    values[:, [3, 6, 8]] += extra
+    values[:, 3:] *= scales[:, None, None]
+    return np.where((side.counts[rows] > 0)[:, None], values, 0.0)
+
+
+def _moved(landmarks: FloatArray, motion: FloatArray) -> FloatArray:
+    """Return landmarks (n, 9, M), moved by the motion (M, 3) of each particle."""
+    x, y, z, xx, xy, xz, yy, yz, zz = landmarks.transpose(1, 0, 2)
+    c, s = cosine_sine(motion[:, 2])
+    parts = (
+        c * x - s * y + motion[:, 0], s * x + c * y + motion[:, 1], z,
+        c * c * xx - 2.0 * c * s * xy + s * s * yy, c * s * (xx - yy) + (c * c - s * s) * xy, c * xz - s * yz,
+        s * s * xx + 2.0 * c * s * xy + c * c * yy, s * xz + c * yz, zz,
+    )  # fmt: skip
+    return np.stack(parts, axis=1)  # Eq. 16 *
 
 
 def birge_ratios(a: Landmarks, b: Landmarks, motion: FloatArray, extra: float) -> FloatArray:
