@@ -154,22 +154,25 @@ def number_landmarks(
     names, ids, landmarks = new.point_landmarks, known.landmark_ids, known.landmarks
     for name, other in aliases:
         names[names == name] = other
-    unknown = np.flatnonzero(~np.isin(names, ids))
-    if len(unknown):
-        first = np.sort(unknown[np.unique(names[unknown], return_index=True)[1]])
-        frame = new.point_frames[first]
-        at, points = compose(poses[frames.frame_keys[frame]], frames.frame_offsets[frame]), new.points[first] + mount
+    row_of = {name: row for row, name in enumerate(ids.tolist())}
+    first = []
+    for n, name in enumerate(names.tolist()):
+        if name not in row_of:
+            row_of[name] = len(row_of)
+            first.append(n)
+    if first:
+        frame, points = new.point_frames[first], new.points[first] + mount
+        at = compose(poses[frames.frame_keys[frame]], frames.frame_offsets[frame])
         cos, sin = cosine_sine(at[:, 2])
         x, y = at[:, 0] + cos * points[:, 0] - sin * points[:, 1], at[:, 1] + sin * points[:, 0] + cos * points[:, 1]
         ids = np.concatenate([ids, names[first]])
         landmarks = np.concatenate([landmarks, np.column_stack([x, y, points[:, 2]])])
-    order = ids.argsort()
-    names[:] = order[np.searchsorted(ids, names, sorter=order)]
+    names[:] = [row_of[name] for name in names.tolist()]
     if len(held.ids):
-        more = np.bincount(names, minlength=len(ids)) - np.bincount(old_landmarks, minlength=len(ids))
-        np.subtract.at(more, frozen.condensed_landmarks, frozen.counts)
+        old = np.bincount(frozen.condensed_landmarks, frozen.counts, len(ids))
+        old += np.bincount(old_landmarks, minlength=len(ids))
         place = np.minimum(np.searchsorted(held.ids, ids), len(held.ids) - 1)
-        moved = (more > 0) & (held.ids[place] == ids)
+        moved = (np.bincount(names, minlength=len(ids)) > old) & (held.ids[place] == ids)
         landmarks = np.where(moved[:, None], held.means[place], landmarks)
     return Landmarks(ids, landmarks)
 

@@ -16,26 +16,26 @@ def gathered(graph: SlamGraph) -> LandmarkFactors:
 
     Forms of raw measurements are zeros: they are still to be linearised.
     """
-    num_frozen, num_points = len(graph.counts), len(graph.points)
-    of_key = np.concatenate([graph.condensed_keys, graph.frame_keys[graph.point_frames]])
-    of_landmark = np.concatenate([graph.condensed_landmarks, graph.point_landmarks])
-    order = np.lexsort((of_key, of_landmark))
-    is_frozen, pairs = order < num_frozen, np.stack([of_key, of_landmark])[:, order]
+    num_frozen, num_points, num_keys = len(graph.counts), len(graph.points), graph.num_keys
+    pairs = np.concatenate([
+        graph.condensed_landmarks * num_keys + graph.condensed_keys,
+        graph.point_landmarks * num_keys + graph.frame_keys[graph.point_frames],
+    ])  # fmt: skip
+    order = pairs.argsort(kind="stable")
+    pairs, is_frozen = pairs[order], order < num_frozen
     begins = np.ones(len(order), np.bool_)  # raw measurements of a landmark from one key are one sighting
-    begins[1:] = is_frozen[1:] | is_frozen[:-1] | (pairs[:, 1:] != pairs[:, :-1]).any(axis=0)
-    place, first = np.cumsum(begins) - 1, np.flatnonzero(begins)
-    counts, of_points = np.bincount(place, minlength=len(first)), np.empty(num_points, np.int64)
-    of_points[order[~is_frozen] - num_frozen] = place[~is_frozen]
+    begins[1:] = is_frozen[1:] | is_frozen[:-1] | (pairs[1:] != pairs[:-1])
+    place, first = begins.cumsum() - 1, begins.nonzero()[0]
+    counts, places = np.diff(first, append=len(order)), np.empty(len(order), np.int64)
+    places[order] = place
+    at, condensed = places[:num_frozen], is_frozen[first]
     centres, infos, slopes = np.zeros((len(first), 3)), np.zeros((len(first), 6)), np.zeros((len(first), 3))
-    at, held = place[is_frozen], order[is_frozen]
-    centres[at], infos[at] = graph.linearisation_points[held], graph.information[held]
-    slopes[at] = graph.gradients[held]
-    counts[at] = graph.counts[held]
-    keys, landmarks = pairs[:, first]
-    starts = np.zeros(len(graph.landmark_ids) + 1, np.int64)
-    starts[1:] = np.cumsum(np.bincount(landmarks, minlength=len(graph.landmark_ids)))
+    centres[at], infos[at], slopes[at] = graph.linearisation_points, graph.information, graph.gradients
+    counts[at] = graph.counts
+    landmarks, keys = np.divmod(pairs[first], num_keys)
+    starts = np.searchsorted(landmarks, np.arange(len(graph.landmark_ids) + 1))
     return LandmarkFactors(
-        keys, landmarks, starts, is_frozen[first], centres, infos, slopes, counts, of_points, np.zeros(num_points)
+        keys, landmarks, starts, condensed, centres, infos, slopes, counts, places[num_frozen:], np.zeros(num_points)
     )
 
 
