@@ -5,7 +5,6 @@ from collections.abc import Collection
 import numpy as np
 
 from slam_backend.core import state_checks
-from slam_backend.core.compilation import ahead
 from slam_backend.core.compilation.compiler import (
     Progress,
     Signatures,
@@ -69,9 +68,8 @@ def warm_up(
     if IS_PLAIN:
         return 0.0
     extras = EXTRAS if everything else extras_of(FilterOptions() if options is None else options)
-    with ahead.set_aside():
-        seconds = compile_kernels(needed(recorded_signatures("slam_backend"), extras), workers, progress)
-        seconds += run_all_paths(extras)
+    seconds = compile_kernels(needed(recorded_signatures("slam_backend"), extras), workers, progress)
+    seconds += run_all_paths(extras)
     exempt_from_collection()
     return seconds
 
