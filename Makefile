@@ -28,7 +28,7 @@ lint: $(VENV)/.dev  ## style, types, the direction of imports, and prose
 	$(BIN)/python benchmarks/prose.py
 
 kernels: $(VENV)/.dev  ## compile all kernels
-	$(BIN)/vslam warm-up --all
+	$(BIN)/vslam warm-up --all --report
 
 metrics: $(VENV)/.core  ## metrics of the code: sizes, folders, path of a measurement, private accesses, import cycles
 	$(BIN)/python benchmarks/code_metrics.py

@@ -54,9 +54,9 @@ for line in sys.stdin:
         env.reset(seed=100)
     micros = []
     for action in actions[first:last]:
-        begin = time.perf_counter_ns()
+        begin = time.process_time_ns()
         env.step(action)
-        micros.append((time.perf_counter_ns() - begin) / 1e3)
+        micros.append((time.process_time_ns() - begin) / 1e3)
     print(json.dumps(micros), flush=True)
 """
 

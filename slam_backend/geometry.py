@@ -21,6 +21,13 @@ def wrap_angle(angle: ArrayLike) -> Any:
     return (np.asarray(angle, dtype=np.float64) + np.pi) % (2.0 * np.pi) - np.pi
 
 
+def cosine_sine(angles: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return cosines and sines (...) of angles (...) [rad] by the C library: numpy's depend on the processor."""
+    flat = angles.ravel().tolist()
+    cos, sin = np.array([math.cos(angle) for angle in flat]), np.array([math.sin(angle) for angle in flat])
+    return cos.reshape(angles.shape), sin.reshape(angles.shape)
+
+
 def rotation(theta: ArrayLike) -> FloatArray:
     """Return the rotation matrices (..., 2, 2) of angles (...) [rad]."""
     theta = np.asarray(theta, dtype=np.float64)

@@ -4,7 +4,6 @@ from collections.abc import Collection
 
 import numpy as np
 
-from slam_backend.core.compilation import ahead
 from slam_backend.core.compilation.compiler import (
     Progress,
     Signatures,
@@ -27,7 +26,6 @@ from slam_backend.models.measurements import Measurements, TeamMeasurements
 from slam_backend.models.odometry import OdometryModel
 from slam_backend.smoother import gauge
 from slam_backend.smoother.options import SmoothingOptions
-from slam_backend.smoother.reassociation import find_only
 from slam_backend.smoother.sampling import retract_on_se2
 from slam_backend.team.merge_scheduler import AttemptOptions
 from slam_backend.team.options import MergeOptions
@@ -69,9 +67,8 @@ def warm_up(
     if IS_PLAIN:
         return 0.0
     extras = EXTRAS if everything else extras_of(FilterOptions() if options is None else options)
-    with ahead.set_aside():
-        seconds = compile_kernels(needed(recorded_signatures("slam_backend"), extras), workers, progress)
-        seconds += run_all_paths(extras)
+    seconds = compile_kernels(needed(recorded_signatures("slam_backend"), extras), workers, progress)
+    seconds += run_all_paths(extras)
     exempt_from_collection()
     return seconds
 
@@ -125,7 +122,6 @@ def run_all_paths(extras: Collection[str]) -> float:
         root = as_read_only(np.array([-1]))
         retract_on_se2(np.zeros((1, 3)), root, np.zeros((1, 3, 1)))
         inverse(np.zeros((2, 3)))  # of starts in a fixed gauge
-        find_only(points, descriptors, points, descriptors, 1.0, 1.0, ids.copy())
         gauge.move(np.zeros((1, 3, 1)), np.zeros((1, 3)), np.zeros((1, 3, 1)))  # of unknown starts
         attempts, merging = AttemptOptions(every=1), MergeOptions(watch_every=1)
         team = TeamSlam(2, num_particles=4, rejuvenate_every=None, attempts=attempts, merging=merging)

@@ -4,7 +4,6 @@ from collections.abc import Collection
 
 import numpy as np
 
-from slam_backend.core.compilation import ahead
 from slam_backend.core.compilation.compiler import (
     Progress,
     compile_kernels,
@@ -31,6 +30,7 @@ def warm_up(
     everything: bool = False,
     workers: int | None = None,
     progress: Progress | None = None,
+    costs: dict[str, float] | None = None,
 ) -> float:
     """Compile the kernels that an environment needs, or load them from the cache; see `slam_backend.warm_up`.
 
@@ -40,6 +40,7 @@ def warm_up(
             compiled at their first call.
         workers: Number of processes that compile; None: one per core.
         progress: Callback that receives the number of compiled kernels, their total and the estimated time left [s].
+        costs: Processor time [s] of each kernel compiled, by dotted name, is added to this dict.
 
     Returns:
         Time spent compiling [s]; 0 if all kernels came from the cache, or numba's compiler is switched off.
@@ -48,10 +49,10 @@ def warm_up(
         return 0.0
     chosen = EnvConfig() if config is None else config
     extras = set(EXTRAS) if everything else _extras_of(chosen)
-    with ahead.set_aside():
-        seconds = compile_kernels(needed(recorded_signatures("slam_backend", "vslam_env"), extras), workers, progress)
-        with watch_compilation(lambda name: None) as watch:
-            _run_all_paths(extras)
+    signatures = needed(recorded_signatures("slam_backend", "vslam_env"), extras)
+    seconds = compile_kernels(signatures, workers, progress, costs)
+    with watch_compilation(lambda name: None) as watch:
+        _run_all_paths(extras)
     exempt_from_collection()
     return seconds + watch.seconds
 

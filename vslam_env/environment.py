@@ -12,7 +12,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
-from slam_backend.core.compilation import ahead
+from slam_backend.core.compilation.compiler import expect
 from slam_backend.core.state import Snapshot, accepted, restore, take
 from slam_backend.core.validation import FloatArray, argument_error, check_choice, check_int, did_you_mean
 from slam_backend.team.reports import MergeEvent
@@ -39,7 +39,6 @@ RESET_OPTIONS = ("world_seed", "start_poses")
 PROBE = "options"  # option with which the test suite of PettingZoo resets any environment
 RENDER_MODES = ("human", "rgb_array")
 # Kernels of rejuvenations and merges, which the first steps do not call
-LATER = ("slam_backend.smoother.", "slam_backend.maps.", "slam_backend.team.")
 
 
 class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # PettingZoo has no type information
@@ -202,7 +201,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         world_seed = options.get("world_seed")
         if world_seed is not None:
             check_int("options['world_seed']", world_seed, 0, "Give an int >= 0.")
-        ahead.expect(partial(_signatures_of, self.config), LATER)
+        expect(partial(_signatures_of, self.config))
         with memory_errors_as_argument_errors():
             scenario, streams = sample_scenario(
                 self.config, self._source, root.spawn(1)[0], world_seed, options.get("start_poses")

@@ -5,7 +5,6 @@ import math
 import numpy as np
 
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray, argument_error, check_choice
-from slam_backend.maps import _kernels as kernels
 from slam_backend.maps import initial_estimates as proposals
 from slam_backend.maps.alignment_types import (
     DISTINCT_ROTATION,
@@ -15,8 +14,11 @@ from slam_backend.maps.alignment_types import (
     AlignmentOptions,
     Reason,
 )
-from slam_backend.maps.correspondences import candidates, match_table, too_many
+from slam_backend.maps.correspondences import candidates, too_many
 from slam_backend.maps.landmark_map import LandmarkMap
+from slam_backend.maps.match_table import match_table, planar_points
+from slam_backend.maps.ransac import search
+from slam_backend.maps.registration import information, largest_influence, refine
 from slam_backend.maps.verification import (
     covariance_of,
     has_perceptual_alias,
@@ -102,15 +104,7 @@ def align_maps(
     options, rng = _checked(map_a, map_b, method, rng, options)
     if too_many(map_a, map_b, options):
         return Alignment.refused("too many candidates")
-    return align_candidates(map_a, map_b, candidates(map_a, map_b, options), method, rng, options)
-
-
-def align_candidates(
-    map_a: LandmarkMap, map_b: LandmarkMap, found: tuple[IntArray, BoolArray], method: str, rng: np.random.Generator,
-    options: AlignmentOptions,
-) -> Alignment:  # fmt: skip
-    """Return the result of `align_maps`, which takes the other arguments, with the result of `candidates`."""
-    matches, distinctive = found
+    matches, distinctive = candidates(map_a, map_b, options)
     if len(matches) < options.min_inliers:
         return Alignment.refused("too few candidates")
     table = match_table(map_a, map_b, matches)
@@ -119,11 +113,11 @@ def align_candidates(
     start = _propose(method, map_a, map_b, matches, distinctive, table, hypotheses, options)
     if start is None:
         return Alignment.refused("too few inliers")
-    pose, members, variance = kernels.refine(table, start, floor, gate)
+    pose, members, variance = refine(table, start, floor, gate)
     inside = inlier_mask(table, matches, pose, floor, gate)
     if not one_to_one(matches):  # of several matches of one landmark, only the closest is used
         members = np.zeros(len(matches), np.bool_)
-        pose, members[inside], variance = kernels.refine(table[inside], pose, floor, gate)
+        pose, members[inside], variance = refine(table[inside], pose, floor, gate)
         inside = inlier_mask(table, matches, pose, floor, gate)
     inliers = matches[inside]
     if len(inliers) < options.min_inliers or is_chance_alignment(table, map_a, matches, pose, variance, options):
@@ -142,8 +136,8 @@ def align_candidates(
     if principal_extent(points_b) < options.min_spread:
         return Alignment.refused("poorly spread", ratio)
     contradiction = unexplained(table, members, pose, variance)
-    covariance = covariance_of(kernels.information(table, members, pose, variance)[0] / contradiction)
-    influence = kernels.largest_influence(table, members, pose, variance)
+    covariance = covariance_of(information(table, members, pose, variance)[0] / contradiction)
+    influence = largest_influence(table, members, pose, variance)
     missed, excess = worst_bound(covariance, influence, options)
     if covariance is None or not excess <= 1.0:
         return Alignment.refused("too uncertain", ratio, missed, excess)
@@ -224,7 +218,7 @@ def _propose(
         return hypotheses[hypotheses[:, 4].argmax(), :3].copy() if len(hypotheses) else None
     if method == "impicp":
         return proposals.improved_icp(map_a, map_b, matches, table, floor, gate)
-    fit = align_se2(*kernels.planar_points(table))
+    fit = align_se2(*planar_points(table))
     return fit if method == "svd" else proposals.icp(map_a, map_b, fit)
 
 
@@ -233,7 +227,7 @@ def _search(table: FloatArray, rng: np.random.Generator, options: AlignmentOptio
     pairs = len(table) * (len(table) - 1) // 2
     few = pairs <= options.max_samples
     samples = rng.permutation(pairs) if few else rng.integers(0, pairs, options.max_samples)
-    return kernels.search(
+    return search(
         table,
         samples,
         options.position_floor**2,

@@ -9,8 +9,8 @@ import numpy as np
 
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.geometry import transform_points
-from slam_backend.maps import _kernels as kernels
 from slam_backend.maps.landmark_map import LandmarkMap
+from slam_backend.maps.registration import squared_distances
 from slam_backend.metrics import align_se2
 
 ICP_ROUNDS = 50
@@ -51,5 +51,5 @@ def improved_icp(
     closer = matches[unlike <= np.median(unlike)]
     starts = (align_se2(map_a.means[some[:, 0], :2], map_b.means[some[:, 1], :2]) for some in (matches, closer))
     ends = [icp(map_a, map_b, start) for start in starts]
-    scores = [np.maximum(0.0, 1.0 - kernels.squared_distances(table, end, floor) / gate).sum() for end in ends]
+    scores = [np.maximum(0.0, 1.0 - squared_distances(table, end, floor) / gate).sum() for end in ends]
     return ends[int(np.argmax(scores))]

@@ -6,10 +6,12 @@ import numpy as np
 
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.geometry import transform_points, wrap_angle
-from slam_backend.maps import _kernels as kernels
 from slam_backend.maps.alignment_types import DISTINCT_ROTATION, DISTINCT_TRANSLATION, AlignmentOptions
-from slam_backend.maps.correspondences import match_table, similar_pairs
+from slam_backend.maps.descriptor_matching import similar_pairs
 from slam_backend.maps.landmark_map import LandmarkMap
+from slam_backend.maps.match_table import match_table, mirrored, planar_points, planar_variances
+from slam_backend.maps.ransac import search
+from slam_backend.maps.registration import CHANCE_EXCESS, MEDIAN_CHI2_3, refine, squared_distances
 
 MOST_RECURRING = 0.2  # share of the shared landmarks, without the two that a motion can always fit
 NEEDLESS = 0.05  # rate of false refusals by a chance repetition; a later attempt may succeed
@@ -48,14 +50,14 @@ def has_perceptual_alias(landmarks: LandmarkMap, rows: IntArray, variance: float
     table = match_table(landmarks, landmarks, matches[:, ::-1])  # motions take the constellation b to its repetition
     count = len(matches) * (len(matches) - 1) // 2
     samples = np.random.default_rng(0).integers(0, count, min(SAMPLES, count))
-    found = kernels.search(
+    found = search(
         table, samples, variance, options.position_gate, 0.25 * options.min_spread, beyond + 2, options.max_ratio,
         math.log(1.0 - options.success_probability),
     )  # fmt: skip
     found = found[are_distinct(found[:, :3], np.zeros(3), points[rows, :2].mean(axis=0))]
     chance = _chance(table, landmarks, matches, len(rows), variance, options)
     for start in found[np.argsort(-found[:, 3], kind="stable")[:STRONGEST], :3]:
-        pose = kernels.refine(table, start.copy(), variance, options.position_gate)[0]
+        pose = refine(table, start, variance, options.position_gate)[0]
         more = np.count_nonzero(inlier_mask(table, matches, pose, variance, options.position_gate)) - 2
         if more >= beyond and count * bdtrc(more - 1, len(rows) - 2, chance) <= NEEDLESS:
             return True
@@ -66,7 +68,7 @@ def _chance(
     table: FloatArray, landmarks: LandmarkMap, matches: IntArray, size: int, variance: float, options: AlignmentOptions
 ) -> float:
     """Return the mean probability that a motion takes a landmark near a similar one by chance."""
-    spread = kernels.planar_variances(table) + variance
+    spread = planar_variances(table) + variance
     area = np.prod(np.ptp(landmarks.means[:, :2], axis=0))
     share = np.minimum(np.pi * options.position_gate * spread / max(area, 1e-9), 1.0)
     owners = np.unique(matches[:, 0], return_inverse=True)[1]
@@ -87,7 +89,7 @@ def one_to_one(matches: IntArray) -> bool:
 
 def inlier_mask(table: FloatArray, matches: IntArray, pose: FloatArray, floor: float, gate: float) -> BoolArray:
     """Return the mask (k,) of candidates within the gate under `pose`, made one-to-one greedily by distance."""
-    distances = kernels.squared_distances(table, pose, floor)
+    distances = squared_distances(table, pose, floor)
     inside = distances <= gate
     rows = np.flatnonzero(inside)
     if not one_to_one(matches[rows]):
@@ -124,10 +126,10 @@ def is_chance_alignment(
     from scipy.special import bdtrc
 
     inside = inlier_mask(table, matches, pose, variance, options.position_gate)
-    spread = kernels.planar_variances(table) + variance
+    spread = planar_variances(table) + variance
     reach = np.sqrt(options.position_gate * spread)
     if options.appearance:
-        moved = transform_points(pose, kernels.planar_points(table)[1])
+        moved = transform_points(pose, planar_points(table)[1])
         near = KDTree(map_a.means[:, :2]).query_ball_point(moved, reach, return_length=True)
         fitted = np.isin(matches[:, 1], matches[inside, 1])  # one of the near landmarks is the inlier itself
         share = (np.asarray(near, dtype=np.float64) - fitted).clip(min=0.0) / len(map_a)
@@ -154,11 +156,11 @@ def runner_up_ratio(
     floor, gate = options.position_floor**2, options.position_gate
 
     ours = inlier_mask(table, matches, pose, variance, gate)
-    others = np.ascontiguousarray(hypotheses[are_distinct(hypotheses[:, :3], pose, centre_b), :3])
-    promise = kernels.own_support(table, others, ours, floor, gate)
+    others = hypotheses[are_distinct(hypotheses[:, :3], pose, centre_b), :3]
+    promise = (squared_distances(table[~ours], others, floor) <= gate).sum(axis=1)
     strongest = 0.0
     for i in np.argsort(-promise, kind="stable")[:RIVALS]:
-        refined = kernels.refine(table, others[i].copy(), floor, gate)[0]
+        refined = refine(table, others[i], floor, gate)[0]
         if are_distinct(refined[None], pose, centre_b)[0]:
             theirs = inlier_mask(table, matches, refined, variance, gate)
             exclusive = max(float(np.count_nonzero(ours & ~theirs)), 0.5 * float(np.count_nonzero(ours)), 1.0)
@@ -173,10 +175,10 @@ def is_mirrored(
 
     One wall of a mirrored corridor also fits a motion; the other landmarks then fit the mirror image.
     """
-    points = kernels.planar_points(table)[1][inside]
+    points = planar_points(table)[1][inside]
     centre = points.mean(axis=0)
     axis = np.linalg.eigh((points - centre).T @ (points - centre))[1][:, -1]
-    image = kernels.mirrored(table, centre, axis)
+    image = mirrored(table, centre, axis)
     fits = inlier_mask(image, matches, pose, options.position_floor**2, options.position_gate)
     more = np.count_nonzero(fits & ~inside) - np.count_nonzero(inside & ~fits)
     share = min(OF_INLIERS * np.count_nonzero(inside), OF_REST * np.count_nonzero(~inside))
@@ -208,9 +210,9 @@ def unexplained(table: FloatArray, members: BoolArray, pose: FloatArray, floor: 
     k = np.count_nonzero(members)
     if k < 2:
         return 1.0
-    median = np.median(kernels.squared_distances(table[members], pose, floor))
-    ratio = float(median / (kernels.MEDIAN_CHI2_3 * (1.0 - 1.0 / k)))
-    return ratio if ratio > 1.0 + kernels.CHANCE_EXCESS / math.sqrt(k) else 1.0
+    median = np.median(squared_distances(table[members], pose, floor))
+    ratio = float(median / (MEDIAN_CHI2_3 * (1.0 - 1.0 / k)))
+    return ratio if ratio > 1.0 + CHANCE_EXCESS / math.sqrt(k) else 1.0
 
 
 def covariance_of(h: FloatArray) -> FloatArray | None:

@@ -2,9 +2,9 @@
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from slam_backend.core.blas import single_threaded_blas
-from slam_backend.core.jit import jit
 from slam_backend.core.packed_symmetric import UNPACK_INDEX
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.smoother.graph import SlamGraph
@@ -30,8 +30,8 @@ def find_duplicates(
         descriptors: (l, d) by row of `graph.landmark_ids`; NaN for a landmark that must stay as it is.
         descriptor_gate: Largest L2 distance of similar descriptors.
     """
-    order, seen = mode.landmarks[:, 0].argsort(), mode.sightings
-    pairs = similar_pairs(order, mode.landmarks, descriptors, seen.keys, seen.starts, REACH, descriptor_gate)
+    seen = mode.sightings
+    pairs = similar_pairs(mode.landmarks, descriptors, seen.keys, seen.starts, REACH, descriptor_gate)
     if not len(pairs):
         return pairs
     taken: set[int] = set()
@@ -43,51 +43,24 @@ def find_duplicates(
     return np.array(rows, dtype=np.int64).reshape(-1, 2)
 
 
-@jit
 def similar_pairs(
-    order: IntArray, landmarks: FloatArray, descriptors: NDArray[np.float32], keys: IntArray, starts: IntArray,
-    reach: float, gate: float,
-) -> IntArray:  # fmt: skip
+    landmarks: FloatArray, descriptors: NDArray[np.float32], keys: IntArray, starts: IntArray, reach: float, gate: float
+) -> IntArray:
     """Return pairs (n, 2) of landmarks that are near, have similar descriptors and have no key in common.
 
     Args:
-        order: (l,) int64. Landmarks by ascending x.
         landmarks: (l, 3) float64 [m].
         descriptors: (l, d) float32. A descriptor with NaN is similar to none.
-        keys, starts: (s,), (l + 1,) int64. Key of each sighting, ascending for each landmark; landmark i has the rows
-            starts[i] to starts[i + 1]. A landmark without sightings is in no pair.
+        keys, starts: (s,), (l + 1,) int64. Key of each sighting; landmark i has the rows starts[i] to starts[i + 1]. A
+            landmark without sightings is in no pair.
         reach: Largest distance of a pair [m].
         gate: Largest L2 distance of similar descriptors.
     """
-    pairs, num = np.empty((16, 2), dtype=np.int64), 0
-    for i in range(len(order)):
-        for j in range(i + 1, len(order)):
-            a, b = min(order[i], order[j]), max(order[i], order[j])
-            dx, dy = landmarks[a, 0] - landmarks[b, 0], landmarks[a, 1] - landmarks[b, 1]
-            dz = landmarks[a, 2] - landmarks[b, 2]
-            if abs(dx) > reach:
-                break
-            if dx * dx + dy * dy + dz * dz > reach * reach:
-                continue
-            square = 0.0
-            for k in range(descriptors.shape[1]):
-                square += (descriptors[a, k] - descriptors[b, k]) * (descriptors[a, k] - descriptors[b, k])
-            if not square <= gate * gate:
-                continue
-            p, q = starts[a], starts[b]
-            apart = p < starts[a + 1] and q < starts[b + 1]
-            while apart and p < starts[a + 1] and q < starts[b + 1]:
-                apart = keys[p] != keys[q]
-                if keys[p] < keys[q]:
-                    p += 1
-                else:
-                    q += 1
-            if apart:
-                if num == len(pairs):
-                    pairs = np.concatenate((pairs, np.empty_like(pairs)))
-                pairs[num, 0], pairs[num, 1] = a, b
-                num += 1
-    return pairs[:num]
+    pairs = KDTree(landmarks).query_pairs(reach, output_type="ndarray").reshape(-1, 2)
+    pairs = pairs[np.linalg.norm(descriptors[pairs[:, 0]] - descriptors[pairs[:, 1]], axis=1) <= gate]
+    keys_of = {i: set(keys[starts[i] : starts[i + 1]].tolist()) for i in np.unique(pairs).tolist()}
+    apart = [bool(keys_of[a] and keys_of[b]) and keys_of[a].isdisjoint(keys_of[b]) for a, b in pairs.tolist()]
+    return np.asarray(pairs[np.array(apart, np.bool_)], np.int64)
 
 
 @single_threaded_blas

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from slam_backend.core.state import FLOAT64, INT64, MAX_DISTANCE, Array, with_state
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray, argument_error
-from slam_backend.geometry import between, compose, rotation
+from slam_backend.geometry import between, compose, cosine_sine, rotation
 from slam_backend.models.odometry import OdometryModel
 from slam_backend.smoother import _kernels
 from slam_backend.smoother._kernels import BIAS, Condensed, Frames, Keys, Landmarks, Log, Points
@@ -123,7 +123,7 @@ def extend_graph(
         is_guided &= _kernels.add_keyframes(arrays, guessed, robot, rigid_within, tips, ends, keys, frames, raw)
     num_keys, num_frames, num_points = ends.tolist()
     held = places if is_guided and places is not None else NO_LANDMARK_POSITIONS
-    landmarks = _kernels.number_landmarks(
+    landmarks = number_landmarks(
         graph.merged_ids, mapped(raw, lambda column: column[len(graph.points) : num_points]), graph.point_landmarks,
         graph.part(Condensed), graph.part(Landmarks), held, frames, keys.poses, mount,
     )  # fmt: skip
@@ -131,6 +131,52 @@ def extend_graph(
     parts = ((keys, num_keys), (frames, num_frames), (raw, num_points), (landmarks, None))
     columns = {name: column[:num] for part, num in parts for name, column in part._asdict().items()}
     return graph.with_columns(**columns, last_keys=tips, latest=np.array(latest, dtype=np.int64))
+
+
+def number_landmarks(
+    aliases: IntArray, new: Points, old_landmarks: IntArray, frozen: Condensed, known: Landmarks,
+    held: LandmarkPositions, frames: Frames, poses: FloatArray, mount: FloatArray,
+) -> Landmarks:  # fmt: skip
+    """Number the landmarks of new measurements, and return all landmarks.
+
+    A new landmark is placed where it was first measured. A landmark that has more new measurements than old ones is
+    placed where the filter holds it to be.
+
+    Args:
+        aliases: (a, 2) rows (name, name it goes by), applied in order.
+        new: New measurements; `point_landmarks` holds the names of their landmarks, and is overwritten by rows.
+        old_landmarks: (n,) landmark of each old raw measurement.
+        frozen: Frozen sightings.
+        known: Landmarks so far.
+        held: Landmark positions of the filter.
+        frames: Frames of the measurements.
+        poses: (k, 3) of the keys, map frame.
+        mount: (3,) [m] of the camera on the robot.
+    """
+    names, ids, landmarks = new.point_landmarks, known.landmark_ids, known.landmarks
+    for name, other in aliases:
+        names[names == name] = other
+    row_of = {name: row for row, name in enumerate(ids.tolist())}
+    first = []
+    for n, name in enumerate(names.tolist()):
+        if name not in row_of:
+            row_of[name] = len(row_of)
+            first.append(n)
+    if first:
+        frame, points = new.point_frames[first], new.points[first] + mount
+        at = compose(poses[frames.frame_keys[frame]], frames.frame_offsets[frame])
+        cos, sin = cosine_sine(at[:, 2])
+        x, y = at[:, 0] + cos * points[:, 0] - sin * points[:, 1], at[:, 1] + sin * points[:, 0] + cos * points[:, 1]
+        ids = np.concatenate([ids, names[first]])
+        landmarks = np.concatenate([landmarks, np.column_stack([x, y, points[:, 2]])])
+    names[:] = [row_of[name] for name in names.tolist()]
+    if len(held.ids):
+        old = np.bincount(frozen.condensed_landmarks, frozen.counts, len(ids))
+        old += np.bincount(old_landmarks, minlength=len(ids))
+        place = np.minimum(np.searchsorted(held.ids, ids), len(held.ids) - 1)
+        moved = (np.bincount(names, minlength=len(ids)) > old) & (held.ids[place] == ids)
+        landmarks = np.where(moved[:, None], held.means[place], landmarks)
+    return Landmarks(ids, landmarks)
 
 
 def _with_room(part: Part, extra: int) -> Part:

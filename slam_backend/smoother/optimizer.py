@@ -6,23 +6,37 @@ import numpy as np
 
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.smoother import _kernels
-from slam_backend.smoother._kernels import (
-    CholeskyFactor,
-    Condensed,
-    EquationBlocks,
-    Frames,
-    Keys,
-    LandmarkFactors,
-    Points,
-)
+from slam_backend.smoother._kernels import CholeskyFactor, EquationBlocks, Frames, Keys, LandmarkFactors, Points
 from slam_backend.smoother.graph import SlamGraph
 from slam_backend.smoother.options import SmoothingOptions
 
 
 def gathered(graph: SlamGraph) -> LandmarkFactors:
-    """Return a graph's sightings; those of raw measurements are still to be linearised."""
-    parts = graph.part(Condensed), graph.part(Points), graph.part(Frames)
-    return _kernels.gather(*parts, graph.num_keys, len(graph.landmark_ids))
+    """Return a graph's sightings by landmark and key, frozen ones before the others of a pair.
+
+    Forms of raw measurements are zeros: they are still to be linearised.
+    """
+    num_frozen, num_points, num_keys = len(graph.counts), len(graph.points), graph.num_keys
+    pairs = np.concatenate([
+        graph.condensed_landmarks * num_keys + graph.condensed_keys,
+        graph.point_landmarks * num_keys + graph.frame_keys[graph.point_frames],
+    ])  # fmt: skip
+    order = pairs.argsort(kind="stable")
+    pairs, is_frozen = pairs[order], order < num_frozen
+    begins = np.ones(len(order), np.bool_)  # raw measurements of a landmark from one key are one sighting
+    begins[1:] = is_frozen[1:] | is_frozen[:-1] | (pairs[1:] != pairs[:-1])
+    place, first = begins.cumsum() - 1, begins.nonzero()[0]
+    counts, places = np.diff(first, append=len(order)), np.empty(len(order), np.int64)
+    places[order] = place
+    at, condensed = places[:num_frozen], is_frozen[first]
+    centres, infos, slopes = np.zeros((len(first), 3)), np.zeros((len(first), 6)), np.zeros((len(first), 3))
+    centres[at], infos[at], slopes[at] = graph.linearisation_points, graph.information, graph.gradients
+    counts[at] = graph.counts
+    landmarks, keys = np.divmod(pairs[first], num_keys)
+    starts = np.searchsorted(landmarks, np.arange(len(graph.landmark_ids) + 1))
+    return LandmarkFactors(
+        keys, landmarks, starts, condensed, centres, infos, slopes, counts, places[num_frozen:], np.zeros(num_points)
+    )
 
 
 def linearise(
@@ -100,11 +114,6 @@ class MapEstimate(NamedTuple):
         """Return the joint covariance (3 r, 3 r) [m, m, rad] of r unknown keys (r,) of a successful estimate."""
         assert self.system is not None
         return self.system.covariance(self.columns[keys])
-
-    def transition_variances(self) -> FloatArray:
-        """Return the variances (k,) [m^2] of the motions from the previous keys, headings weighted by `LEVER`."""
-        assert self.system is not None
-        return self.system.transition_variances(self.poses)
 
 
 def optimize(
@@ -221,7 +230,3 @@ class NormalEquations:
     def covariance(self, columns: IntArray) -> FloatArray:
         """Return the joint covariance (3 r, 3 r) of poses given by their columns (r,)."""
         return _kernels.covariance(self.factor, self.pattern, columns // 3)
-
-    def transition_variances(self, poses: FloatArray) -> FloatArray:
-        """Return the variances of the motions to poses (k, 3), see `MapEstimate.transition_variances`."""
-        return _kernels.transition_variances(poses, self.columns, self.graph.parents, self.factor, self.pattern)

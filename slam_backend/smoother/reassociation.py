@@ -5,7 +5,6 @@ to a similar landmark to start a new one, and would always be rejected. A single
 several from different frames that agree with each other are evidence.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -13,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.core.jit import in_place
 from slam_backend.core.packed_symmetric import UNPACK_INDEX
 from slam_backend.core.state import FLOAT32, INT64, MAX_DESCRIPTOR, Array, with_state
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
@@ -145,10 +143,9 @@ def _locate(
 
 def _find_owners(points: _Points, logs: Sequence[LogArrays], known: LandmarkTable, options: FilterOptions) -> IntArray:
     """Return the row (n,) in `known` of the only possible landmark of each point; `NO_ONE`: none, or several."""
-    owners = np.empty(len(points.means), dtype=np.int64)
-    find_only(
-        points.means, points.descriptors, np.ascontiguousarray(known.means), known.descriptors,
-        options.new_landmark_radius, options.descriptor_gate, owners,
+    owners = find_only(
+        points.means, points.descriptors, known.means, known.descriptors, options.new_landmark_radius,
+        options.descriptor_gate,
     )  # fmt: skip
     for n in np.flatnonzero(owners != NO_ONE):
         log = logs[points.robots[n]]
@@ -158,35 +155,27 @@ def _find_owners(points: _Points, logs: Sequence[LogArrays], known: LandmarkTabl
     return owners
 
 
-@in_place
 def find_only(
     means: FloatArray, descriptors: NDArray[np.float32], known_means: FloatArray,
-    known_descriptors: NDArray[np.float32], radius: float, gate: float, owners: IntArray,
-) -> None:  # fmt: skip
-    """Find the only landmark within a radius of each point that has a similar descriptor.
+    known_descriptors: NDArray[np.float32], radius: float, gate: float,
+) -> IntArray:  # fmt: skip
+    """Return the only landmark within a radius of each point that has a similar descriptor.
 
     Args:
         means, descriptors: (n, 3) [m], (n, d). Positions and descriptors of the points.
         known_means, known_descriptors: (l, 3) [m], (l, d). Positions and descriptors of the landmarks.
         radius: Largest distance from the point [m].
         gate: Largest L2 distance of similar descriptors.
-        owners: (n,), result. Row of the landmark, `NO_ONE` if there is none or more than one.
+
+    Returns:
+        (n,) row of the landmark, `NO_ONE` if there is none or more than one.
     """
-    for n in range(len(means)):
-        owners[n], fits = NO_ONE, 0
-        for row in range(len(known_means)):
-            dx, dy = means[n, 0] - known_means[row, 0], means[n, 1] - known_means[row, 1]
-            dz = means[n, 2] - known_means[row, 2]
-            if math.sqrt(dx * dx + dy * dy + dz * dz) > radius:
-                continue
-            distance = 0.0
-            for i in range(descriptors.shape[1]):
-                off = descriptors[n, i] - known_descriptors[row, i]
-                distance += off * off
-            if math.sqrt(distance) <= gate:
-                owners[n], fits = row, fits + 1
-        if fits != 1:
-            owners[n] = NO_ONE
+    point, row = np.nonzero(np.linalg.norm(means[:, None] - known_means, axis=2) <= radius)
+    alike = np.linalg.norm(descriptors[point] - known_descriptors[row], axis=1) <= gate
+    owners = np.full(len(means), NO_ONE)
+    owners[point[alike]] = row[alike]
+    owners[np.bincount(point[alike], minlength=len(means)) > 1] = NO_ONE
+    return owners
 
 
 def _agreeing(points: _Points, members: IntArray, gate: float) -> BoolArray:

@@ -35,6 +35,7 @@ from slam_backend.smoother.sampling import (
     replay,
     sample_paths,
     tempered,
+    transition_variances,
 )
 
 DRAFT_TOLERANCE = 10.0  # factor on the tolerance of descents without draws
@@ -128,7 +129,8 @@ def relinearised_and_reduced(
     """
     if graph.num_keys <= keyframe_limit(options, len(graph.landmark_ids), graph.latest) + graph.num_biases:
         return relinearise(graph, mode)
-    return reduce_keyframes(relinearise(graph, mode, mode.transition_variances()), camera, options, mode.sightings)
+    variances = transition_variances(graph, mode)
+    return reduce_keyframes(relinearise(graph, mode, variances), camera, options, mode.sightings)
 
 
 def sample_particles(

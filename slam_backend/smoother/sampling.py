@@ -207,9 +207,9 @@ def importance_weights(
     chosen = chosen[seen.keys[seen.starts[chosen]] != seen.keys[seen.starts[chosen + 1] - 1]]
     one_tile = np.empty(9 * LANES)
     _kernels.replay(rows.reshape(-1), len(poses), blocks, mode.landmarks, seen, chosen, one_tile, log_likelihood)
-    log_odometry, transition_variances = odometry_log_density(graph, mode, rows, num_paths)
+    log_odometry, variances = odometry_log_density(graph, mode, rows, num_paths)
     log_weights = log_likelihood[:num_paths] + log_odometry - log_proposals  # (2)
-    return PathSamples.weighed(poses, log_weights, transition_variances)
+    return PathSamples.weighed(poses, log_weights, variances)
 
 
 def lane_rows(poses: FloatArray) -> FloatArray:
@@ -251,6 +251,18 @@ def replay(
     return tiles, log_likelihood[:num_particles]
 
 
+VARIANCE_DRAWS = 64
+
+
+def transition_variances(graph: SlamGraph, mode: MapEstimate) -> FloatArray:
+    """Return the variances (k,) [m^2] of the motions from the previous keys over some paths about the mode.
+
+    The draws are the same in each call, headings are felt at `LEVER`.
+    """
+    poses, _ = mode.paths(VARIANCE_DRAWS, np.random.default_rng(0))
+    return odometry_log_density(graph, mode, lane_rows(poses), VARIANCE_DRAWS)[1]
+
+
 def odometry_log_density(
     graph: SlamGraph, mode: MapEstimate, rows: FloatArray, num_particles: int
 ) -> tuple[FloatArray, FloatArray]:
@@ -267,9 +279,9 @@ def odometry_log_density(
         scatter, headings felt at `LEVER`.
     """
     blocks, k = rows.shape[:2]
-    log_density, transition_variances = np.empty(blocks * LANES), np.empty(k)
+    log_density, variances = np.empty(blocks * LANES), np.empty(k)
     _kernels.odometry_log_density(
         rows.reshape(-1), k, blocks, num_particles, graph.part(Keys), graph.biases_of_odometry(), mode.odometry_infos,
-        mode.poses, log_density, transition_variances,
+        mode.poses, log_density, variances,
     )  # fmt: skip
-    return log_density[:num_particles], transition_variances
+    return log_density[:num_particles], variances

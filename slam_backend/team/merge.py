@@ -24,7 +24,7 @@ from slam_backend.core.state import (
     restored,
 )
 from slam_backend.core.validation import IntArray
-from slam_backend.maps.alignment import Alignment
+from slam_backend.maps.alignment import Alignment, align_maps
 from slam_backend.team.branches import MAX_REPLAYED, Branch, ReplayedStep, replay
 from slam_backend.team.filter_merging.pairing import Pairing
 from slam_backend.team.group_merging import (
@@ -40,7 +40,6 @@ from slam_backend.team.groups import Group, TeamTopology
 from slam_backend.team.merge_attempt import (
     GroupPair,
     MapPair,
-    align_pair,
     align_smoothed,
     are_connected,
     choose_pair,
@@ -124,7 +123,7 @@ class Attempt:
 
     def advance(self, team: "TeamMerges") -> "Phase":
         """Align the maps."""
-        alignment = align_pair(self.groups, self.maps, team.schedule, team.rng)
+        alignment = align_maps(*self.maps, rng=team.rng, options=team.schedule.alignment)
         team.records.exchange.record_maps(*representatives(self.groups), *self.maps)
         can_smooth = all(group.trunk.filter.can_rejuvenate for group in self.groups)
         if not (alignment.success and team.merging.smooth_first and can_smooth):
@@ -163,7 +162,7 @@ class Smoothing:
             self.ready |= is_late or is_smooth
             return self
         maps = mixture_maps(groups)
-        alignment = align_smoothed(groups, maps, self.unsmoothed, team.schedule, team.rng)
+        alignment = align_smoothed(maps, self.unsmoothed, team.schedule.alignment, team.rng)
         team.records.exchange.record_smoothed(*representatives(groups), *maps)
         return Trial(MergePlan(groups, maps, alignment), self.unsmoothed)
 

@@ -5,11 +5,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from slam_backend.core.validation import IntArray
-from slam_backend.fastslam.particle_maps import present_slots
-from slam_backend.maps.alignment import Alignment, align_candidates
+from slam_backend.maps.alignment import Alignment, AlignmentOptions, align_maps
 from slam_backend.maps.correspondences import has_enough_candidates
 from slam_backend.maps.landmark_map import LandmarkMap
-from slam_backend.maps.near_pairs import Appearance
 from slam_backend.team.groups import Group
 from slam_backend.team.merge_scheduler import MergeScheduler, PairKey
 from slam_backend.team.options import MergeOptions
@@ -33,24 +31,20 @@ def choose_pair(
     """
     connected = (pair for pair in pairs_of(groups) if are_connected(pair, networks))
     pairs = {key_of(pair): pair for pair in connected if schedule.may_try(key_of(pair), step)}
-    appearances = {group.robots: _appearance(group) for group in _distinct(pairs)}
-    pairs = {key: pair for key, pair in pairs.items() if _may_align(key, appearances, schedule)}
+    looks = {group.robots: group.trunk.filter.descriptors() for group in _distinct(pairs)}
+    pairs = {
+        (a, b): pair for (a, b), pair in pairs.items() if has_enough_candidates(looks[a], looks[b], schedule.alignment)
+    }  # with too few no maps need to be built
     maps = {group.robots: group.trunk.filter.map("mixture") for group in _distinct(pairs)}
     chosen = schedule.choose({key: (maps[key[0]], maps[key[1]]) for key in pairs}, step)
     return None if chosen is None else (pairs[chosen], (maps[chosen[0]], maps[chosen[1]]))
 
 
-def align_pair(pair: GroupPair, maps: MapPair, schedule: MergeScheduler, rng: np.random.Generator) -> Alignment:
-    """Return the result of `align_maps`; descriptors compared in earlier attempts are not compared again."""
-    candidates = schedule.candidates(key_of(pair), *maps)
-    return align_candidates(*maps, candidates, "ransac", rng, schedule.alignment)
-
-
 def align_smoothed(
-    pair: GroupPair, maps: MapPair, unsmoothed: Alignment, schedule: MergeScheduler, rng: np.random.Generator
+    maps: MapPair, unsmoothed: Alignment, options: AlignmentOptions, rng: np.random.Generator
 ) -> Alignment:
     """Align smoothed maps, which must keep most inliers of the unsmoothed ones."""
-    alignment = align_pair(pair, maps, schedule, rng)
+    alignment = align_maps(*maps, rng=rng, options=options)
     fewer = alignment.success and len(alignment.inliers) < MIN_REMAINING_INLIERS * len(unsmoothed.inliers)
     if fewer or alignment.reason == "too few inliers":
         return Alignment.refused("too few inliers", alignment.ratio)
@@ -102,20 +96,6 @@ def are_connected(pair: GroupPair, networks: IntArray) -> bool:
     """Return whether two groups are in contact."""
     robot_a, robot_b = representatives(pair)
     return bool(networks[robot_a] == networks[robot_b])
-
-
-def _appearance(group: Group) -> Appearance:
-    """Return the landmarks of a group's `map`."""
-    slam = group.trunk.filter
-    slots = present_slots(slam.maps, slam.best_particle, 1)
-    return Appearance(slam.maps.ids[slots], slam.maps.descriptors[slots])
-
-
-def _may_align(key: PairKey, appearances: Mapping[tuple[int, ...], Appearance], schedule: MergeScheduler) -> bool:
-    """Return whether the maps of two groups may have enough candidates; with too few no maps need to be built."""
-    a, b = (appearances[robots] for robots in key)
-    near = schedule.near_pairs(key, a, b)
-    return has_enough_candidates(a.descriptors, b.descriptors, schedule.alignment, near)
 
 
 def _distinct(pairs: Mapping[PairKey, GroupPair]) -> list[Group]:

@@ -23,16 +23,16 @@ from slam_backend.core.state import Each, Int, Record, Row, State
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.fastslam.reports import StepReport
 from slam_backend.geometry import transform_points
-from slam_backend.maps import _kernels as kernels
 from slam_backend.maps.alignment import (
     DISTINCT_ROTATION,
     DISTINCT_TRANSLATION,
     AlignmentOptions,
-    align_candidates,
+    align_maps,
 )
-from slam_backend.maps.correspondences import candidates, has_enough_candidates, match_table, too_many
+from slam_backend.maps.correspondences import has_enough_candidates
 from slam_backend.maps.landmark_map import LandmarkMap, unchecked_map
-from slam_backend.maps.near_pairs import Appearance, NearPairs, near_pairs
+from slam_backend.maps.match_table import match_table
+from slam_backend.maps.registration import count_moved_away
 from slam_backend.team.merge_scheduler import LANDMARK, PAIR, PairKey
 from slam_backend.team.options import MergeOptions
 
@@ -60,12 +60,6 @@ class MergeMonitor:
     pre_merge_maps: tuple[LandmarkMap, LandmarkMap]
     exclusive_landmarks: tuple[set[int], set[int]]
     steps: int = field(default=0)
-    # Pairs of landmarks with near descriptors in the last check; not part of a state.
-    _near: NearPairs | None = field(default=None, init=False, repr=False)
-
-    def rebuild(self) -> None:
-        """Forget the near pairs."""
-        self._near = None
 
     def copy(self, new_ids: Mapping[int, int] | None = None) -> "MergeMonitor":
         """Return an independent monitor, with landmarks renamed if needed; constant parts are shared."""
@@ -92,17 +86,12 @@ class MergeMonitor:
             return True
         ids = joint.ids.tolist()
         masks = [np.fromiter(map(side.__contains__, ids), np.bool_, len(ids)) for side in self.exclusive_landmarks]
-        a, b = (Appearance(joint.ids[mask], joint.descriptors[mask]) for mask in masks)
-        if min(len(a.ids), len(b.ids)) < options.min_inliers:
+        if min(map(np.count_nonzero, masks)) < options.min_inliers:
             return False
-        self._near = near_pairs(a, b, options, self._near)
-        if not has_enough_candidates(a.descriptors, b.descriptors, options, self._near):
+        if not has_enough_candidates(joint.descriptors[masks[0]], joint.descriptors[masks[1]], options):
             return False
         parts = joint.subset(masks[0]), joint.subset(masks[1])
-        if too_many(*parts, options):
-            return False
-        pairs = candidates(*parts, options, self._near)
-        rival = align_candidates(*parts, pairs, "ransac", np.random.default_rng(0), options)
+        rival = align_maps(*parts, options=options)
         if not rival.success or self._joined(options) > options.max_ratio * len(rival.inliers):
             return False
         return is_significant_motion(rival.transform, parts[1].means[rival.inliers[:, 1]])
@@ -139,7 +128,7 @@ def deformed_fraction(old: LandmarkMap, joint: LandmarkMap, options: AlignmentOp
     if len(rows) < options.min_inliers:
         return 0.0
     table = match_table(joint, old, rows)
-    return kernels.moved_away(table, options.position_floor**2, options.position_gate) / len(rows)
+    return count_moved_away(table, options.position_floor**2, options.position_gate) / len(rows)
 
 
 def is_significant_motion(motion: FloatArray, points: FloatArray) -> bool:

@@ -19,7 +19,7 @@ from slam_backend.core.state import (
     Row,
     State,
 )
-from slam_backend.core.validation import MOST, BoolArray, FloatArray, IntArray, argument_error, check_int, known_names
+from slam_backend.core.validation import MOST, FloatArray, argument_error, check_int, known_names
 from slam_backend.geometry import wrap_angle
 from slam_backend.maps.alignment import (
     DISTINCT_ROTATION,
@@ -28,7 +28,6 @@ from slam_backend.maps.alignment import (
 )
 from slam_backend.maps.correspondences import candidates, too_many
 from slam_backend.maps.landmark_map import LandmarkMap
-from slam_backend.maps.near_pairs import Appearance, NearPairs, near_pairs
 
 PairKey = tuple[tuple[int, ...], tuple[int, ...]]  # two groups, as tuples of robots
 LANDMARK, ROBOT = Int(0, MAX_LANDMARKS), Int(high="K")
@@ -104,7 +103,6 @@ class MergeScheduler:
         self.alignment = alignment
         self._records: dict[PairKey, AttemptRecord] = {}
         self._proposed: dict[PairKey, set[tuple[int, int]]] = {}
-        self._near: dict[PairKey, NearPairs] = {}  # results of `near_pairs`; not part of the state
         self._blocks: list[tuple[PairKey, int]] = []  # blocked pairs, and the step when the block ends
         self._uncertainties: dict[tuple[int, int], float] = {}  # least uncertainty by robots of both sides
         self._motions: dict[tuple[int, int], FloatArray] = {}  # last motion by the robots that define the frames
@@ -120,25 +118,6 @@ class MergeScheduler:
             return False
         return pair not in self._records or step >= self._records[pair].next_step
 
-    def near_pairs(self, pair: PairKey, a: Appearance, b: Appearance) -> NearPairs | None:
-        """Return the near pairs of two groups' landmarks; None: too many, or matching is not by appearance.
-
-        Those of the last call for these groups, or for groups that have merged into them, are not sought again.
-        """
-        one, other = map(set, pair)
-        earlier = [key for key in self._near if one | other >= {*key[0], *key[1]}]
-        known = {key: self._near.pop(key) for key in earlier}
-        fitting = [near for key, near in known.items() if one.issuperset(key[0]) and other.issuperset(key[1])]
-        near = near_pairs(a, b, self.alignment, max(fitting, key=lambda near: len(near.rows), default=None))
-        if near is not None:
-            self._near[pair] = near
-        return near
-
-    def candidates(self, pair: PairKey, map_a: LandmarkMap, map_b: LandmarkMap) -> tuple[IntArray, BoolArray]:
-        """Return the result of `correspondences.candidates` for two groups' maps."""
-        a, b = (Appearance(landmarks.ids, landmarks.descriptors) for landmarks in (map_a, map_b))
-        return candidates(map_a, map_b, self.alignment, self.near_pairs(pair, a, b))
-
     def choose(self, maps: Mapping[PairKey, tuple[LandmarkMap, LandmarkMap]], step: int) -> PairKey | None:
         """Return the pair with the most new candidate matches, if it has enough for an attempt; the first of equals."""
         best: PairKey | None = None
@@ -149,7 +128,7 @@ class MergeScheduler:
                 continue  # an empty map has no descriptor length yet
             if too_many(map_a, map_b, self.alignment):
                 continue
-            rows = self.candidates(pair, map_a, map_b)[0]
+            rows = candidates(map_a, map_b, self.alignment)[0]
             if len(rows) < self.alignment.min_inliers:
                 continue
             matches = set(zip(map_a.ids[rows[:, 0]].tolist(), map_b.ids[rows[:, 1]].tolist(), strict=True))
@@ -211,7 +190,6 @@ class MergeScheduler:
         if success:
             gone = set(pair[0]) | set(pair[1])
             self._records = {key: value for key, value in self._records.items() if not gone & set(key[0] + key[1])}
-            self._near = {key: value for key, value in self._near.items() if not gone >= set(key[0] + key[1])}
             return
         wait = self._records[pair].wait if pair in self._records else self._options.every
         longest = self._options.longest_wait
@@ -222,10 +200,6 @@ class MergeScheduler:
     def block(self, pair: PairKey, until: int) -> None:
         """Block all pairs of groups with a robot of each side of a pair before a step."""
         self._blocks = [*(block for block in self._blocks if block[0] != pair), (pair, until)]
-
-    def rebuild(self) -> None:
-        """Forget the near pairs."""
-        self._near = {}
 
 
 def _touches(pair: PairKey, blocked: PairKey) -> bool:

@@ -72,13 +72,13 @@ class KernelCache(NullCache):
         return any(_read(file) is not None for file in self._files(signature, codegen))
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Return the kernel of a signature; None: no usable one, even after waiting for a worker that compiles it."""
-        from slam_backend.core.compilation import ahead  # which builds on this module
+        """Return the kernel of a signature; None: no usable one, even with all that the program expects."""
+        from slam_backend.core.compilation.compiler import compile_expected  # which builds on this module
 
         check_address_space()
         target_context.refresh()
         found = self._load(sig, target_context)
-        if found is None and ahead.await_kernel(self._kernel, sigutils.normalize_signature(sig)[0]):  # type: ignore[no-untyped-call]
+        if found is None and compile_expected():
             found = self._load(sig, target_context)
         return found
 

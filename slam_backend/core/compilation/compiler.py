@@ -193,13 +193,20 @@ def divide_tasks(tasks: Sequence[Task], workers: int) -> list[list[Task]]:
 # ---------------------------------------------------------------------- compilation
 
 
-def compile_kernels(signatures: Signatures, workers: int | None = None, progress: Progress | None = None) -> float:
+def compile_kernels(
+    signatures: Signatures,
+    workers: int | None = None,
+    progress: Progress | None = None,
+    costs: dict[str, float] | None = None,
+) -> float:
     """Compile the kernels that the disk cache lacks, in several processes, after waiting for any other such process.
 
     Args:
         signatures: Signatures by dotted name of a kernel, see `encode_signature`.
         workers: Number of processes; None: one for each core. With one, kernels are compiled when they are called.
         progress: Called after each kernel; None: one line says that the compiler runs.
+        costs: Processor time [s] of each kernel compiled, by dotted name, is added. What several kernels call counts
+            as part of the first in each process.
 
     Returns:
         Seconds that this took; 0 if no kernel was missing.
@@ -218,7 +225,7 @@ def compile_kernels(signatures: Signatures, workers: int | None = None, progress
         tasks = missing_tasks(signatures)  # another process may have compiled them meanwhile
         if tasks and progress is None:
             announce()
-        for done, left in _compiled(divide_tasks(tasks, workers), begun):
+        for done, left in _compiled(divide_tasks(tasks, workers), begun, {} if costs is None else costs):
             if progress is not None:
                 progress(done, len(tasks), left)
     except OSError as error:  # kernels are compiled when they are called
@@ -228,8 +235,28 @@ def compile_kernels(signatures: Signatures, workers: int | None = None, progress
     return time.perf_counter() - begun
 
 
+_expected: Callable[[], Signatures] | None = None  # what this program will call, until a kernel is missing
+
+
+def expect(needed: Callable[[], Signatures]) -> None:
+    """Say what this program will call: the first of it that the cache lacks is then compiled with all the rest.
+
+    Args:
+        needed: Function that returns signatures by dotted name of a kernel.
+    """
+    global _expected
+    _expected = needed
+
+
+def compile_expected() -> bool:
+    """Compile with all cores what the program will call, if it has said so; return whether anything was compiled."""
+    global _expected
+    needed, _expected = _expected, None
+    return needed is not None and compile_kernels(needed()) > 0.0
+
+
 def cache_lock() -> "FileLock":
-    """Return the lock of the process that fills the cache; any thread may release it.
+    """Return the lock of the process that fills the cache.
 
     Raises:
         OSError: If there is no cache.
@@ -239,7 +266,7 @@ def cache_lock() -> "FileLock":
     folder = cache_folder(Path(__file__).parent, CONFIG.CACHE_DIR)
     if folder is None:
         raise OSError("no folder of the cache can be written")
-    return FileLock(folder / LOCK, thread_local=False)
+    return FileLock(folder / LOCK)
 
 
 def available_cores() -> int:
@@ -247,7 +274,7 @@ def available_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _compiled(shares: Sequence[Sequence[Task]], begun: float) -> Iterator[tuple[int, float]]:
+def _compiled(shares: Sequence[Sequence[Task]], begun: float, costs: dict[str, float]) -> Iterator[tuple[int, float]]:
     """Compile each share in a process of its own; yield after each kernel the number compiled and the seconds left.
 
     Kernels of a process that fails are compiled when they are called.
@@ -271,6 +298,9 @@ def _compiled(shares: Sequence[Sequence[Task]], begun: float) -> Iterator[tuple[
             if line is None:
                 ended += 1
                 continue
+            line, _, seconds = line.rpartition(" ")
+            name = line.partition(" ")[0]
+            costs[name] = costs.get(name, 0.0) + float(seconds)
             done, size = done + 1, size + sizes.get(line, 0)
             yield done, (time.perf_counter() - begun) * (whole - size) / max(size, 1)
     finally:
@@ -300,14 +330,14 @@ def _forward_lines(process: subprocess.Popen[str], lines: "Queue[str | None]") -
     lines.put(None)
 
 
-def compile_lines(lines: Iterator[str], report: Callable[[str], Any]) -> None:
-    """Compile the kernels named by lines, each with its signature; report each line once its kernel is cached."""
+def compile_lines(lines: Iterator[str], report: Callable[[str, float], Any]) -> None:
+    """Compile the kernels named by lines, each with its signature; report each line and its processor time [s]."""
     for line in lines:
         name, _, words = line.strip().partition(" ")
-        kernel = find_kernel(name)
+        kernel, begun = find_kernel(name), time.process_time()
         if kernel is not None:
             kernel.compile(decode_signature(words))
-        report(line.strip())
+        report(line.strip(), time.process_time() - begun)
 
 
 def exempt_from_collection() -> None:

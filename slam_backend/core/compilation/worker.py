@@ -1,6 +1,6 @@
 """Worker process that compiles kernels.
 
-Each input line names a kernel and a signature; it is printed when the kernel is compiled.
+Each input line names a kernel and a signature; it is printed when the kernel is compiled, with the processor time [s].
 
 python -m slam_backend.core.compilation.worker PARENT   # number of the process with which it ends
 """
@@ -27,4 +27,4 @@ if __name__ == "__main__":
     threading.Thread(target=end_with, args=(int(sys.argv[1]),), daemon=True).start()
     gc.freeze()
     gc.set_threshold(COLLECT_EVERY, 20, 1000)
-    compile_lines(iter(sys.stdin.readline, ""), lambda line: print(line, flush=True))
+    compile_lines(iter(sys.stdin.readline, ""), lambda line, seconds: print(line, f"{seconds:.3f}", flush=True))

@@ -2,9 +2,8 @@
 
 from slam_backend.smoother._kernels.factors import condense, sum_pose_information
 from slam_backend.smoother._kernels.graph_reduction import add_sightings, merge_keys
-from slam_backend.smoother._kernels.keyframes import add_keyframes, number_landmarks
-from slam_backend.smoother._kernels.marginal_covariances import transition_variances
-from slam_backend.smoother._kernels.normal_equations import form, gather, step
+from slam_backend.smoother._kernels.keyframes import add_keyframes
+from slam_backend.smoother._kernels.normal_equations import form, step
 from slam_backend.smoother._kernels.odometry_bias import condition_bias
 from slam_backend.smoother._kernels.records import (
     BIAS,
@@ -60,17 +59,14 @@ __all__ = [
     "draw",
     "factorise",
     "form",
-    "gather",
     "lay_out",
     "merge_keys",
     "normalise",
-    "number_landmarks",
     "odometry_log_density",
     "place_landmarks",
     "replay",
     "step",
     "sum_pose_information",
     "to_lanes",
-    "transition_variances",
     "weigh_deviations",
 ]  # fmt: skip

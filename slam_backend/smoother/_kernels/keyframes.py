@@ -6,82 +6,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from slam_backend.core.jit import jit
-from slam_backend.core.validation import FloatArray, IntArray
-from slam_backend.smoother._kernels.records import LEVER, Condensed, Frames, Keys, Landmarks, Log, Points
+from slam_backend.core.validation import IntArray
+from slam_backend.smoother._kernels.records import LEVER, Frames, Keys, Log, Points
 from slam_backend.smoother.log_arrays import ODOMETRY, REJECTED
 
 if TYPE_CHECKING:
-    from slam_backend.smoother.graph_building import InitialPoses, LandmarkPositions
-
-
-@jit
-def number_landmarks(
-    aliases: IntArray, new: Points, old_landmarks: IntArray, frozen: Condensed, known: Landmarks,
-    held: "LandmarkPositions",
-    frames: Frames, poses: FloatArray, mount: FloatArray,
-) -> Landmarks:  # fmt: skip
-    """Number the landmarks of new measurements, and return all landmarks.
-
-    A new landmark is placed where it was first measured. A landmark that has more new measurements than old ones is
-    placed where the filter holds it to be.
-
-    Args:
-        aliases: (a, 2) rows (name, name it goes by), applied in order.
-        new: New measurements; `point_landmarks` holds the names of their landmarks, and is overwritten by rows.
-        old_landmarks: (n,) landmark of each old raw measurement.
-        frozen: Frozen sightings.
-        known: Landmarks so far.
-        held: Landmark positions of the filter.
-        frames: Frames of the measurements.
-        poses: (k, 3) of the keys, map frame.
-        mount: (3,) [m] of the camera on the robot.
-    """
-    names, num = new.point_landmarks, len(known.landmark_ids)
-    ids, landmarks = np.empty(num + len(names), np.int64), np.empty((num + len(names), 3))
-    ids[:num], landmarks[:num] = known.landmark_ids, known.landmarks
-    for row in range(len(aliases)):
-        for n in range(len(names)):
-            if names[n] == aliases[row, 0]:
-                names[n] = aliases[row, 1]
-    order = np.argsort(known.landmark_ids)
-    for n in range(len(names)):
-        name, low, high = names[n], 0, len(order)
-        while low < high:
-            middle = (low + high) // 2
-            if ids[order[middle]] < name:
-                low = middle + 1
-            else:
-                high = middle
-        row = order[low] if low < len(order) and ids[order[low]] == name else len(order)
-        if row == len(order):
-            while row < num and ids[row] != name:
-                row += 1
-            if row == num:
-                frame, point = new.point_frames[n], new.points[n]
-                pose, offset = poses[frames.frame_keys[frame]], frames.frame_offsets[frame]
-                c, s = math.cos(pose[2]), math.sin(pose[2])
-                x, y = pose[0] + c * offset[0] - s * offset[1], pose[1] + s * offset[0] + c * offset[1]
-                c, s = math.cos(pose[2] + offset[2]), math.sin(pose[2] + offset[2])
-                ahead, left = point[0] + mount[0], point[1] + mount[1]
-                landmarks[num, 0], landmarks[num, 1] = x + c * ahead - s * left, y + s * ahead + c * left
-                landmarks[num, 2] = point[2] + mount[2]
-                ids[num] = name
-                num += 1
-        names[n] = row
-    if len(held.ids) > 0:
-        more = np.zeros(num, np.int64)  # new measurements of each landmark less the old ones
-        for n in range(len(frozen.counts)):
-            more[frozen.condensed_landmarks[n]] -= frozen.counts[n]
-        for landmark in old_landmarks:
-            more[landmark] -= 1
-        for landmark in names:
-            more[landmark] += 1
-        for landmark in range(num):
-            if more[landmark] > 0:
-                at = np.searchsorted(held.ids, ids[landmark])
-                if at < len(held.ids) and held.ids[at] == ids[landmark]:
-                    landmarks[landmark] = held.means[at]
-    return Landmarks(ids[:num], landmarks[:num])
+    from slam_backend.smoother.graph_building import InitialPoses
 
 
 @jit

@@ -16,80 +16,12 @@ from slam_backend.smoother._kernels.records import (
     FREE,
     NONE,
     CholeskyFactor,
-    Condensed,
     EquationBlocks,
-    Frames,
     Keys,
     LandmarkFactors,
-    Points,
     SymbolicFactor,
 )
 from slam_backend.smoother._kernels.sparse_cholesky import sweep
-
-
-@jit
-def gather(frozen: Condensed, raw: Points, frames: Frames, num_keys: int, num_landmarks: int) -> LandmarkFactors:
-    """Return the sightings of a graph by landmark and key, frozen ones before the others of a pair.
-
-    Forms of raw measurements are zeros: they are still to be linearised.
-
-    Args:
-        frozen, raw, frames: Parts of the graph.
-        num_keys, num_landmarks: Sizes of the graph.
-    """
-    num_frozen, num_points = len(frozen.counts), len(raw.point_frames)
-    most = num_frozen + num_points
-    of_key, of_landmark = np.empty(most, np.int64), np.empty(most, np.int64)
-    of_key[:num_frozen], of_landmark[:num_frozen] = frozen.condensed_keys, frozen.condensed_landmarks
-    for n in range(num_points):
-        of_key[num_frozen + n] = frames.frame_keys[raw.point_frames[n]]
-        of_landmark[num_frozen + n] = raw.point_landmarks[n]
-    order = np.arange(most)
-    for codes, num_codes in (
-        (of_key, num_keys),
-        (of_landmark, num_landmarks),
-    ):  # sorted by counting
-        tops, later = np.zeros(num_codes + 1, dtype=np.int64), np.empty(most, dtype=np.int64)
-        for item in order:
-            tops[codes[item] + 1] += 1
-        for code in range(num_codes):
-            tops[code + 1] += tops[code]
-        for item in order:
-            later[tops[codes[item]]] = item
-            tops[codes[item]] += 1
-        order = later
-    keys, landmarks, is_frozen = np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most, np.bool_)
-    centres, infos, slopes = np.zeros((most, 3)), np.zeros((most, 6)), np.zeros((most, 3))
-    counts, of_points = np.empty(most, np.int64), np.empty(num_points, np.int64)
-    starts = np.zeros(num_landmarks + 1, np.int64)
-    num = 0
-    for item in order:
-        key, landmark = of_key[item], of_landmark[item]
-        again = item >= num_frozen and num > 0 and not is_frozen[num - 1]
-        if again and keys[num - 1] == key and landmarks[num - 1] == landmark:
-            counts[num - 1] += 1
-            of_points[item - num_frozen] = num - 1
-            continue
-        keys[num], landmarks[num], is_frozen[num] = key, landmark, item < num_frozen
-        if item < num_frozen:
-            centres[num], infos[num], slopes[num] = (
-                frozen.linearisation_points[item],
-                frozen.information[item],
-                frozen.gradients[item],
-            )
-            counts[num] = frozen.counts[item]
-        else:
-            counts[num] = 1
-            of_points[item - num_frozen] = num
-        starts[landmark + 1] += 1
-        num += 1
-    for landmark in range(num_landmarks):
-        starts[landmark + 1] += starts[landmark]
-    return LandmarkFactors(
-        keys[:num], landmarks[:num], starts, is_frozen[:num], centres[:num], infos[:num], slopes[:num], counts[:num],
-        of_points, np.zeros(num_points),
-    )  # fmt: skip
-
 
 # Information [1/m^2] of a landmark about where it stands now, 1 km along each axis: where all its sightings have lost
 # their weight nothing else holds it. It takes part in every step, and moves nothing that has come to rest.

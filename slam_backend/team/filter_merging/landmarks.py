@@ -5,13 +5,13 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.core.packed_symmetric import UNPACK_INDEX
+from slam_backend.core.packed_symmetric import UNPACK_INDEX, UPPER
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray, argument_error
 from slam_backend.fastslam._kernels import LANES
 from slam_backend.fastslam.existence import ExistenceModel
 from slam_backend.fastslam.particle_maps import ParticleMaps
-from slam_backend.geometry import rotation
-from slam_backend.team.filter_merging._kernels.joint_map import Side, by_particle, join
+from slam_backend.geometry import cosine_sine, rotation
+from slam_backend.maps.fusion import fuse_landmarks
 
 
 class Landmarks(NamedTuple):
@@ -56,7 +56,7 @@ class Landmarks(NamedTuple):
     @property
     def values_by_particle(self) -> FloatArray:
         """(M, n, 9) float64, as `values`. A copy."""
-        return by_particle(self.maps.values, self.where, LANES)
+        return np.ascontiguousarray(self.values.transpose(2, 0, 1))
 
     @property
     def held_by_particle(self) -> BoolArray:
@@ -173,10 +173,50 @@ def write_joint(
     Raises:
         ValueError: If two estimates of a landmark are exact along one direction.
     """
-    one, two = (Side(each.maps.values, each.where, each.counts, rows) for each, rows in ((a, rows_a), (b, rows_b)))
-    if not join(one, two, motion, extra, scales, LANES, blocks):
+    (in_a,), (in_b,) = np.nonzero(rows_a >= 0), np.nonzero(rows_b >= 0)
+    joint = np.zeros((len(rows_a), 9, len(motion)))
+    joint[in_a] = _widened(a, rows_a[in_a], extra, scales[in_a])
+    ours, theirs = joint[in_b], _moved(_widened(b, rows_b[in_b], extra, scales[in_b]), motion)
+    held_a, held_b = np.zeros((len(rows_a), len(motion)), np.bool_), b.counts[rows_b[in_b]] > 0
+    held_a[in_a] = a.counts[rows_a[in_a]] > 0
+    joint[in_b] = np.where(held_a[in_b][:, None], ours, theirs * held_b[:, None])
+    both = np.nonzero(held_a[in_b] & held_b)
+    one, two = ours.transpose(0, 2, 1)[both], theirs.transpose(0, 2, 1)[both]
+    try:
+        means, spreads = fuse_landmarks(
+            one[:, :3], one[:, 3:][:, UNPACK_INDEX], two[:, :3], two[:, 3:][:, UNPACK_INDEX]
+        )
+    except ValueError as error:
         cure = "Give each landmark some uncertainty in every direction."
-        raise argument_error("landmarks in common", "positive definite covariances", "singular ones", cure)
+        raise argument_error("landmarks in common", "positive definite covariances", "singular ones", cure) from error
+    joint[in_b[both[0]], :, both[1]] = np.column_stack([means, spreads[:, *UPPER]])
+    _, count, _, lanes = blocks.shape
+    padded = np.zeros((len(rows_a), 9, count * lanes))
+    padded[:, :, : len(motion)] = joint
+    blocks[: len(rows_a)] = padded.reshape(-1, 9, count, lanes).transpose(0, 2, 1, 3)
+
+
+def _widened(side: Landmarks, rows: IntArray, extra: float, scales: FloatArray) -> FloatArray:
+    """Return some landmarks (n, 9, M) with `extra` added to their variances, then times `scales` (n,); zeros: lacking.
+
+    The nine numbers are those of `Landmarks.values`.
+    """
+    values = side.values[rows]
+    values[:, [3, 6, 8]] += extra
+    values[:, 3:] *= scales[:, None, None]
+    return np.where((side.counts[rows] > 0)[:, None], values, 0.0)
+
+
+def _moved(landmarks: FloatArray, motion: FloatArray) -> FloatArray:
+    """Return landmarks (n, 9, M), moved by the motion (M, 3) of each particle."""
+    x, y, z, xx, xy, xz, yy, yz, zz = landmarks.transpose(1, 0, 2)
+    c, s = cosine_sine(motion[:, 2])
+    parts = (
+        c * x - s * y + motion[:, 0], s * x + c * y + motion[:, 1], z,
+        c * c * xx - 2.0 * c * s * xy + s * s * yy, c * s * (xx - yy) + (c * c - s * s) * xy, c * xz - s * yz,
+        s * s * xx + 2.0 * c * s * xy + c * c * yy, s * xz + c * yz, zz,
+    )  # fmt: skip
+    return np.stack(parts, axis=1)  # Eq. 16 *
 
 
 def birge_ratios(a: Landmarks, b: Landmarks, motion: FloatArray, extra: float) -> FloatArray:

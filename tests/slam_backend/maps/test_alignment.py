@@ -18,7 +18,8 @@ from slam_backend.maps.alignment import (
     align_maps,
     candidate_matches,
 )
-from slam_backend.maps.correspondences import has_enough_candidates, mutual_nearest
+from slam_backend.maps.correspondences import has_enough_candidates
+from slam_backend.maps.descriptor_matching import mutual_nearest
 from slam_backend.maps.fusion import alignment_jacobian
 from slam_backend.maps.landmark_map import LandmarkMap, unchecked_map
 

@@ -1,7 +1,5 @@
 """Why maps are not merged, or a merge does not stand."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 from builders.filters import looks
@@ -9,8 +7,6 @@ from builders.teams import driven
 
 from slam_backend.core.validation import FloatArray
 from slam_backend.geometry import rotate_covariances, rotation, transform_points
-from slam_backend.maps import near_pairs
-from slam_backend.maps._kernels import descriptor_matching
 from slam_backend.maps.alignment import REASONS, Alignment, AlignmentOptions, align_maps
 from slam_backend.maps.alignment_types import BOUNDS, HINTS
 from slam_backend.maps.landmark_map import LandmarkMap
@@ -122,29 +118,6 @@ def test_pairs_that_do_not_look_alike_are_no_evidence() -> None:
     """However many a merge joined by chance, landmarks mapped twice undo it."""
     watch, joint = watched(60, turned=1)
     assert watch.is_inconsistent(joint, MergeOptions(), AlignmentOptions())
-
-
-def test_later_checks_of_a_merge_compare_new_landmarks_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A check tells the same as the first one of another monitor, from the pairs that the check before has found."""
-    options, compared = AlignmentOptions(max_ratio=0.6), []
-    near = descriptor_matching.near
-
-    def counted(a: Any, b_columns: Any, *limits: Any) -> Any:
-        compared.append(len(a) * b_columns.shape[1])
-        return near(a, b_columns, *limits)
-
-    monkeypatch.setattr(near_pairs.descriptor_matching, "near", counted)
-    for joined in (7, 8):
-        watch, joint = watched(joined)
-        earlier = np.isin(joint.ids % TWICE, range(TWICE - 1))  # the last one is found later
-        watch.is_inconsistent(joint.subset(earlier), MergeOptions(), options)
-        compared.clear()
-        assert watch.is_inconsistent(joint, MergeOptions(), options) == (joined == 7)
-        assert sum(compared) == TWICE**2 - (TWICE - 1) ** 2
-        fresh, _ = watched(joined)
-        compared.clear()
-        assert fresh.is_inconsistent(joint, MergeOptions(), options) == (joined == 7)
-        assert sum(compared) == TWICE**2
 
 
 FITS = 10

@@ -20,7 +20,6 @@ from slam_backend.smoother._kernels import (
     Log,
     Points,
     add_keyframes,
-    number_landmarks,
 )
 from slam_backend.smoother.graph import LEVER, SlamGraph
 from slam_backend.smoother.graph_building import (
@@ -29,12 +28,13 @@ from slam_backend.smoother.graph_building import (
     LandmarkPositions,
     extend_graph,
     log_head,
+    number_landmarks,
 )
 from slam_backend.smoother.graph_reduction import reduce_keyframes, relinearise
 from slam_backend.smoother.log_arrays import ODOMETRY, REJECTED, STATIONARY
 from slam_backend.smoother.optimizer import optimize
 from slam_backend.smoother.options import SmoothingOptions, keyframe_limit
-from slam_backend.smoother.sampling import lane_rows, replay, sample_paths
+from slam_backend.smoother.sampling import lane_rows, replay, sample_paths, transition_variances
 from training.bench.accuracy.runs import RunSpec, simulate_run
 
 
@@ -79,8 +79,8 @@ def test_joining_rigid_keyframes_keeps_the_estimate():
     run = small_run()
     graph = graph_of(run)
     mode = optimize(graph, camera_of(run), TIGHT)
-    transition_variances = sample_paths(graph, mode, 50, np.random.default_rng(1)).transition_variances
-    fewer = reduce_keyframes(relinearise(graph, mode, transition_variances), camera_of(run), limits(9, 3))
+    variances = sample_paths(graph, mode, 50, np.random.default_rng(1)).transition_variances
+    fewer = reduce_keyframes(relinearise(graph, mode, variances), camera_of(run), limits(9, 3))
     assert fewer.num_keys == 9
     np.testing.assert_allclose(fewer.poses[fewer.last_keys], mode.poses[graph.last_keys])
     again = optimize(fewer, camera_of(run), TIGHT)
@@ -225,7 +225,7 @@ def test_keys_are_joined_as_by_the_plain_program(max_keys, kernel):
     graph = replace(graph, **{name: getattr(graph, name)[~blind] for name in names})
     for _ in range(2):
         mode = optimize(graph, camera_of(run), TIGHT)
-        graph = relinearise(graph, mode, mode.transition_variances())
+        graph = relinearise(graph, mode, transition_variances(graph, mode))
         found, expected = (how(graph, camera_of(run), options) for how in (reduce_keyframes, plain_reduced))
         assert found.num_keys <= max(keyframe_limit(options, len(graph.landmark_ids), graph.latest), 8)
         for name in graph.__dataclass_fields__:

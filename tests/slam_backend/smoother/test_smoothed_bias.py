@@ -14,7 +14,7 @@ from slam_backend.smoother.graph_building import extend_graph, merge_graphs
 from slam_backend.smoother.graph_reduction import reduce_keyframes, relinearise
 from slam_backend.smoother.optimizer import MapEstimate, NormalEquations, optimize
 from slam_backend.smoother.options import SmoothingOptions
-from slam_backend.smoother.sampling import lane_rows, odometry_log_density, sample_paths
+from slam_backend.smoother.sampling import lane_rows, odometry_log_density, sample_paths, transition_variances
 
 MOUNT = np.zeros(3)
 CAMERA = camera_of(small_run())
@@ -181,7 +181,7 @@ def reduced(graph: SlamGraph, mode: MapEstimate, variances: np.ndarray) -> SlamG
 def test_joining_keys_keeps_the_mode_of_paths_and_biases() -> None:
     """The reduced graph has the mode of the whole one, biases included, and its own odometry from key to key."""
     graph, mode = smoothed(length=10.0)
-    after = reduced(graph, mode, mode.transition_variances())
+    after = reduced(graph, mode, transition_variances(graph, mode))
     assert after.num_keys <= 10 + 1
     assert (after.robots[after.bias_keys] == BIAS).all()
     again = optimize(after, CAMERA, TIGHT)
@@ -206,7 +206,7 @@ def test_joining_keys_keeps_the_slope_of_the_cost_by_the_bias() -> None:
             total = total + one.bias_jacobians[b].T @ np.linalg.solve(one.odometry_covariances[b], off)
         return np.asarray(total)
 
-    before = graph.with_columns(poses=poses, transition_variances=mode.transition_variances())
+    before = graph.with_columns(poses=poses, transition_variances=transition_variances(graph, mode))
     options = SmoothingOptions(max_keys=10, further_keys=0, recent_keys=4, kernel=0.0)
     after = reduce_keyframes(before, CAMERA, options)
     assert_allclose(slope(after, after.poses), slope(before, poses), rtol=1e-6, atol=1e-6)
@@ -233,7 +233,7 @@ def test_rigid_motions_tell_of_the_bias_what_landmarks_tell_of_them(known: bool)
 def test_odometry_after_joined_keys_begins_with_their_rigid_motion() -> None:
     """From each key that is left, the corrected odometry leads where it led from the key that went."""
     graph, mode = smoothed(length=10.0)
-    after = reduced(graph, mode, mode.transition_variances())
+    after = reduced(graph, mode, transition_variances(graph, mode))
     bias = mode.poses[graph.bias_keys[0]]
     for b in np.flatnonzero(after.biases_of_odometry() >= 0):
         old = np.flatnonzero(np.abs(mode.poses - after.poses[b]).max(axis=1) < 1e-12)[0]

@@ -14,6 +14,7 @@ from slam_backend.smoother.graph import LEVER, NONE, SlamGraph
 from slam_backend.smoother.graph_reduction import reduce_keyframes, relinearise
 from slam_backend.smoother.optimizer import MapEstimate, NormalEquations, gathered, optimize
 from slam_backend.smoother.options import SmoothingOptions
+from slam_backend.smoother.sampling import transition_variances
 
 
 def order_again(system: NormalEquations, graph: SlamGraph, size: int, few: int) -> None:
@@ -42,7 +43,7 @@ def problem(robots: int, max_keys: int, motion: OdometryModel | None = None, few
     options = SmoothingOptions(max_keys=max_keys, further_keys=0, recent_keys=6, kernel=0.0)
     graph = graph_of(run, motion=motion)
     mode = optimize(graph, camera, TIGHT)
-    graph = reduce_keyframes(relinearise(graph, mode, mode.transition_variances()), camera, options)
+    graph = reduce_keyframes(relinearise(graph, mode, transition_variances(graph, mode)), camera, options)
     mode = optimize(graph, camera, TIGHT)
     system, seen = mode.system, mode.sightings
     assert system is not None
@@ -181,10 +182,14 @@ def test_blocks_of_the_inverse_are_the_solutions_for_unit_vectors(posed):
     np.testing.assert_array_equal(found, 0.5 * (expected + expected.T))
 
 
-def test_relative_pose_covariances_agree_with_the_dense_covariance(posed):
-    """Derivatives of motions by differences, and the dense inverse, give how far each motion scatters."""
+def test_drawn_variances_of_motions_are_those_of_the_dense_covariance(posed):
+    """Derivatives of motions by differences, and the dense inverse, give how far each motion scatters over draws.
+
+    A mean of 63 squares has a standard deviation of at most 18 %, if one direction dominates; 0.7 is 4 sigma.
+    """
     graph, mode = posed.graph, posed.mode
-    covariance, found = np.linalg.inv(information(posed)), mode.transition_variances()
+    covariance, found = np.linalg.inv(information(posed)), transition_variances(graph, mode)
+    ratios = []
     for b, a in enumerate(graph.parents):
         if a < 0:
             assert found[b] == 0.0
@@ -199,7 +204,9 @@ def test_relative_pose_covariances_agree_with_the_dense_covariance(posed):
                 rows.append(mode.columns[key] + axis)
         by = np.array(columns).T
         scatter = np.diag(by @ covariance[np.ix_(rows, rows)] @ by.T)
-        assert found[b] == pytest.approx(scatter[0] + scatter[1] + LEVER**2 * scatter[2], rel=1e-5)
+        ratios.append(found[b] / (scatter[0] + scatter[1] + LEVER**2 * scatter[2]))
+    np.testing.assert_allclose(ratios, 1.0, atol=0.7)
+    assert np.mean(ratios) == pytest.approx(1.0, abs=0.15)
 
 
 def test_a_symbolic_factor_lists_sampled_nodes(posed):

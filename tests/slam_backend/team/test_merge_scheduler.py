@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from builders.comparison import assert_same
 from builders.filters import looks
 from builders.teams import SIZE, SimulatedTeam, driven
 
@@ -10,8 +9,6 @@ from slam_backend.core.state import restore, take
 from slam_backend.fastslam.reports import Associations, StepReport
 from slam_backend.maps.alignment import AlignmentOptions
 from slam_backend.maps.landmark_map import LandmarkMap
-from slam_backend.maps.near_pairs import Appearance, NearPairs, near_pairs
-from slam_backend.team import merge_scheduler
 from slam_backend.team.communication import LANDMARK_BYTES, POSE_BYTES, TrafficCounter
 from slam_backend.team.merge_scheduler import AttemptOptions, MergeScheduler, PairKey
 from slam_backend.team.options import MergeOptions
@@ -305,29 +302,3 @@ def test_robots_that_merge_send_maps_and_then_a_few_hundred_bytes_a_step() -> No
     assert ((team.bytes_sent - sent >= POSE_BYTES) & (team.bytes_sent - sent <= largest)).all()
     team.bytes_sent[:] = 0  # a copy
     assert (team.bytes_sent > 0).all()
-
-
-def test_near_pairs_of_groups_that_merged_are_not_sought_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The larger result for a part of each group is taken over, the others are dropped, and the pairs are the same."""
-    parts: dict[tuple[int, ...], LandmarkMap] = {(0,): map_of([0, 1, 2]), (1,): map_of([3]), (2,): map_of([0, 1, 3, 4])}
-    merged = parts | {(0, 1): map_of([0, 1, 2, 3])}
-    taken = []
-
-    def watched(a: Appearance, b: Appearance, options: AlignmentOptions, known: NearPairs | None) -> NearPairs | None:
-        taken.append(known)
-        return near_pairs(a, b, options, known)
-
-    def near(plan: MergeScheduler, pair: PairKey) -> NearPairs:
-        found = plan.near_pairs(pair, *(Appearance(merged[side].ids, merged[side].descriptors) for side in pair))
-        assert found is not None
-        return found
-
-    monkeypatch.setattr(merge_scheduler, "near_pairs", watched)
-    plan = schedule()
-    earlier = [near(plan, pair) for pair in (((0,), (1,)), ((0,), (2,)), ((1,), (2,)))]
-    plan.record(((0,), (1,)), 24, success=True)
-    joint = ((0, 1), (2,))
-    assert_same(near(plan, joint).rows, near(schedule(), joint).rows)
-    assert taken[3] is earlier[1]
-    assert near(plan, joint).rows.tolist() == [[0, 0], [1, 1], [3, 2]]
-    assert list(plan._near) == [joint]

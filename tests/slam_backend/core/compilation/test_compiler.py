@@ -42,7 +42,7 @@ def tuple_of(record: Any, *fields: types.Type) -> Any:
     return from_types(fields, record)
 
 
-SMALL = "slam_backend.smoother.reassociation.find_only"  # a kernel that calls few others
+SMALL = "slam_backend.geometry._invert_rows"  # a kernel that calls few others
 PROGRAM = """
 import sys
 from slam_backend.core.compilation.compiler import compile_kernels, missing_tasks, recorded_signatures
@@ -108,9 +108,32 @@ def test_a_process_compiles_what_the_cache_lacks(tmp_path: Path) -> None:
 def test_damaged_files_are_missing(tmp_path: Path) -> None:
     """A file that is truncated counts as not kept."""
     program(tmp_path)
-    file = next(tmp_path.rglob("find_only-*.nbc"))
+    file = next(tmp_path.rglob("_invert_rows-*.nbc"))
     file.write_bytes(file.read_bytes()[:-3])
     assert program(tmp_path) == "1 0 [(0, 1), (1, 1)]"
+
+
+EXPECTING = """
+from slam_backend.core.compilation.compiler import decode_signature, expect, find_kernel, missing_tasks
+from slam_backend.core.compilation.compiler import recorded_signatures
+from slam_backend.core.compilation.messages import watch_compilation
+names = ["slam_backend.geometry._invert_rows", "slam_backend.geometry._compose_rows"]
+needed = {name: recorded_signatures("slam_backend")[name] for name in names}
+expect(lambda: needed)
+with watch_compilation(lambda name: None) as watch:
+    find_kernel(names[0]).compile(decode_signature(needed[names[0]][0]))
+print(len(watch.names), len(missing_tasks(needed)))
+"""
+
+
+def test_the_first_kernel_that_is_missing_is_compiled_with_all_that_is_expected(tmp_path: Path) -> None:
+    """Other processes compile both kernels, and this one loads the first; with one core, it compiles what it calls."""
+    for cores, printed in ((2, "0 0"), (1, "1 1")):
+        cores_of = f"import os; os.sched_getaffinity = lambda pid: range({cores})"
+        environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / str(cores)), "PYTHONPATH": str(ROOT)}
+        command = [sys.executable, "-c", cores_of + EXPECTING]
+        found = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+        assert found.stdout.strip() == printed
 
 
 def test_without_a_compiler_nothing_is_missing(tmp_path: Path) -> None:

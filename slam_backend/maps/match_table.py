@@ -1,4 +1,4 @@
-"""The table of matched landmarks that the kernels of alignment read, one row of `COLUMNS` numbers for each match.
+"""The table of matched landmarks that alignment reads, one row of `COLUMNS` numbers for each match.
 
 Columns 0-2 and 3-5 hold the means of a and b [m], 6-11 and 12-17 the upper triangles of their covariances [m^2] by
 rows, each in the frame of its map.
@@ -7,19 +7,24 @@ rows, each in the frame of its map.
 import numpy as np
 
 from slam_backend.core.packed_symmetric import OF_NINE, UNPACK_INDEX, UPPER
-from slam_backend.core.validation import FloatArray
+from slam_backend.core.validation import FloatArray, IntArray
+from slam_backend.maps.landmark_map import LandmarkMap
 
 COLUMNS = 18
 
 
-def table_of(
-    means_a: FloatArray, covariances_a: FloatArray, means_b: FloatArray, covariances_b: FloatArray
-) -> FloatArray:
-    """Return the table (k, 18) of matches by means (k, 3) and covariances (k, 3, 3) of both sides."""
-    table = np.empty((len(means_a), COLUMNS))
-    table[:, :3], table[:, 3:6] = means_a, means_b
-    table[:, 6:12] = covariances_a.reshape(-1, 9).take(OF_NINE, axis=1)
-    table[:, 12:] = covariances_b.reshape(-1, 9).take(OF_NINE, axis=1)
+def match_table(map_a: LandmarkMap, map_b: LandmarkMap, matches: IntArray) -> FloatArray:
+    """Return the table (k, 18) of matched landmarks.
+
+    Args:
+        map_a, map_b: Both maps.
+        matches: (k, 2) int64 rows (row in a, row in b).
+    """
+    rows_a, rows_b = matches.T
+    table = np.empty((len(matches), COLUMNS))
+    table[:, :3], table[:, 3:6] = map_a.means[rows_a], map_b.means[rows_b]
+    table[:, 6:12] = map_a.covariances[rows_a].reshape(-1, 9).take(OF_NINE, axis=1)
+    table[:, 12:] = map_b.covariances[rows_b].reshape(-1, 9).take(OF_NINE, axis=1)
     return table
 
 
