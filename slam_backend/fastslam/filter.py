@@ -363,7 +363,9 @@ class FastSlam:
         """
         if step is not None:
             self.next_step = step
+        used = self._make_room(inputs, robot_rows)
         summary = self._update(inputs, robot_rows, associations_buffer)
+        self._record(inputs, robot_rows, used, associations_buffer, summary)
         if summary.needs_resampling:
             self.resample()
         report = StepReport(
@@ -384,23 +386,10 @@ class FastSlam:
                 return report._replace(rejuvenation=news)
         return report
 
-    def _update(self, inputs: StepInput, robots: RobotRows, associations: IntArray) -> StepSummary:
-        """Move all robots, match their measurements, weigh and update (Algorithm 1, l. 6-8).
-
-        A robot without input draws no random number.
-
-        Args:
-            inputs: Input of these robots, and perhaps of others.
-            robots: Rows of these robots in `inputs`.
-            associations: (2, n) int64, written: data association of their measurements, see `Associations`.
-        """
+    def _make_room(self, inputs: StepInput, robots: RobotRows) -> int:
+        """Provide capacity for the used measurements of a step, and return how many they are."""
         maps, pending = self.maps, self._pending
-        active = used = 0
-        for robot, row in robots.active:
-            kind, begin, end, _, _, _ = inputs.inputs[row]
-            active, used = active + (kind != NO_READING), used + end - begin
-            if kind == EXACT_POSE:
-                self._set_exact_pose(robot, inputs.moves[row])
+        used = sum(inputs.inputs[row].end - inputs.inputs[row].begin for _, row in robots.active)
         if used:
             maps.reserve(used, inputs.descriptors.shape[1])
             if len(self._associations) < len(inputs.measurements):
@@ -409,6 +398,23 @@ class FastSlam:
         if len(pending.steps) == LONGEST:
             pending.flush(self._robot_logs, self.rejuvenation)
         pending.reserve(used)
+        return used
+
+    def _update(self, inputs: StepInput, robots: RobotRows, associations: IntArray) -> StepSummary:
+        """Predict, associate, weigh and update: all robots in turn (Algorithm 1, l. 6-9), see `step_robots`.
+
+        A robot without input draws no random number.
+
+        Args:
+            inputs: Input of these robots, and perhaps of others.
+            robots: Rows of these robots in `inputs`.
+            associations: (2, n) int64, written: data association of their measurements, see `Associations`.
+        """
+        maps, pending, active = self.maps, self._pending, 0
+        for robot, row in robots.active:
+            active += inputs.inputs[row].kind != NO_READING
+            if inputs.inputs[row].kind == EXACT_POSE:
+                self._set_exact_pose(robot, inputs.moves[row])
         now = 0 if self.rejuvenation is None else self.rejuvenation.steps + 1
         normals = self.rng.standard_normal((active, maps.num_particles, 3))
         deleted: list[IntArray] = []
@@ -427,24 +433,28 @@ class FastSlam:
             part = low, high, is_over, now, pending.num_measured
             fields = _kernels.step_robots(part, self._kernel_options, robot_arrays, tuple(maps.arrays), given, results)
             if self._existence is not None and not is_over and (row := robots.rows[low]) >= 0:
-                _, begin, end, _, _, count = inputs.inputs[row]
-                if count >= 0:
+                own = inputs.inputs[row]
+                if own.num_given >= 0:
                     _, started = associations  # by slot, until the step is over
-                    found, new_slots = self._associations[begin:end], started[begin:end]
+                    found, new_slots = self._associations[own.begin : own.end], started[own.begin : own.end]
                     deleted.append(self._existence.update(maps, self.poses[low], self.best_particle, found, new_slots))
-        summary = StepSummary(*fields)
+        for slots in deleted:  # last, as the ids are needed until here
+            maps.release(slots)
+        return StepSummary(*fields)
+
+    def _record(
+        self, inputs: StepInput, robots: RobotRows, used: int, associations: IntArray, summary: StepSummary
+    ) -> None:
+        """Record a step: for the log, for the test of consistency, and its rejected measurements for the smoother."""
         self.best_particle = summary.best
-        pending.steps.append(self.next_step)
-        pending.num_measured += used
+        self._pending.steps.append(self.next_step)
+        self._pending.num_measured += used
         if used:
             unmatched = used - summary.new - summary.matched
             self._consistency.update(self.next_step, summary.nis, summary.ess / self.num_particles, used, unmatched)
         if summary.rejected and self.rejuvenation is not None:
             record_rejected(self.rejuvenation, self.next_step, inputs, robots, associations)
         self.next_step += 1
-        for slots in deleted:  # last, as the ids are needed until here
-            maps.release(slots)
-        return summary
 
     def _set_exact_pose(self, robot: int, pose: FloatArray) -> None:
         """Set a robot's pose in all particles to an exact one (3,) [m, m, rad] in its own start frame."""

@@ -69,6 +69,7 @@ def record_rejected(
     """Pass the rejected measurements of a step to the smoother, without those that have identities."""
     associated, _ = associations
     for robot, row in robots.active:
-        _, begin, end, _, named, _ = inputs.inputs[row]
-        if not named:
-            smoother.add_rejected(robot, step, associated[begin:end], inputs.descriptors[begin:end])
+        given = inputs.inputs[row]
+        if not given.has_names:
+            rows = slice(given.begin, given.end)
+            smoother.add_rejected(robot, step, associated[rows], inputs.descriptors[rows])

@@ -26,11 +26,11 @@ from slam_backend.core.state import (
 )
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.fastslam._kernels import REJECTED, STATIONARY
-from slam_backend.fastslam.step_input import MASKS, NO_INPUT, ROBOT_INPUT, RobotInput, StepInput, check_rows
+from slam_backend.fastslam.step_input import MASKS, NO_INPUT, RobotInput, StepInput, check_rows
 
 
 @short_repr
-@with_state(ids=Array(INT64, "2 n", REJECTED, MAX_LANDMARKS), inputs=Each(ROBOT_INPUT, "K"), masks=MASKS)
+@with_state(ids=Array(INT64, "2 n", REJECTED, MAX_LANDMARKS), inputs=Each(Record(RobotInput), "K"), masks=MASKS)
 class Associations(NamedTuple):
     """Data association of N robots' measurements in one step; read-only.
 
@@ -66,7 +66,7 @@ class Associations(NamedTuple):
         ids = as_read_only(np.stack([np.concatenate(associations), np.concatenate(created)]))
         inputs, begin = [], 0
         for of_robot in associations:
-            inputs.append((STATIONARY, begin, begin + len(of_robot), False, False, len(of_robot)))
+            inputs.append(RobotInput(STATIONARY, begin, begin + len(of_robot), 0, 0, len(of_robot)))
             begin += len(of_robot)
         return cls(ids, inputs, {})
 
@@ -78,8 +78,7 @@ class Associations(NamedTuple):
 
     def num_measurements(self, row: int) -> int:
         """Return how many measurements a robot was given, used or not."""
-        _, _, _, _, _, count = self.inputs[row]
-        return max(count, 0)
+        return max(self.inputs[row].num_given, 0)
 
     def associated(self, row: int) -> IntArray:
         """Return a copy of the landmark (n_i,) of each measurement of a robot, REJECTED: none; empty for robot -1."""
@@ -103,14 +102,14 @@ class Associations(NamedTuple):
 
     def _valid_ids(self, row: int, became: IntArray) -> list[int]:
         """Return the names among what became of the measurements of a robot."""
-        _, begin, end, _, _, _ = self.inputs[row] if row >= 0 else NO_INPUT
-        found: list[int] = became[begin:end].tolist()
+        one = self.inputs[row] if row >= 0 else NO_INPUT
+        found: list[int] = became[one.begin : one.end].tolist()
         return [name for name in found if name != REJECTED]
 
     def _per_measurement(self, row: int, became: IntArray) -> IntArray:
         """Return what became of the measurements of a robot, -1 for those that were not used."""
-        _, begin, end, _, _, _ = self.inputs[row] if row >= 0 else NO_INPUT
-        used: IntArray = became[begin:end].copy()
+        one = self.inputs[row] if row >= 0 else NO_INPUT
+        used: IntArray = became[one.begin : one.end].copy()
         if row not in self.masks:
             return used
         every: IntArray = np.full(len(self.masks[row]), REJECTED)

@@ -26,7 +26,6 @@ from slam_backend.core.state import (
     Each,
     Int,
     Record,
-    Row,
     Sizes,
     State,
     with_state,
@@ -37,30 +36,48 @@ from slam_backend.fastslam._kernels import EXACT_POSE, NO_READING
 from slam_backend.models.camera import MAX_POINT_DISTANCE, StereoCamera
 from slam_backend.models.measurements import Measurements, TeamMeasurements
 
-# Input of one robot: kind of motion, first and last row of its used measurements among all n, whether these have
-# covariances, whether they have names, and the number of measurements given, used or not, -1 without a frame.
-# `_kernels.layout` names the numbers.
-RobotInput = Sequence[int]
-NO_INPUT = (NO_READING, 0, 0, 0, 0, -1)
-ROBOT_INPUT = Row(Int(0, EXACT_POSE), Int(), Int(), Int(0, 1), Int(0, 1), Int(-1, MAX_LANDMARKS))
+
+@with_state(
+    kind=Int(0, EXACT_POSE), begin=Int(), end=Int(), has_covariances=Int(0, 1), has_names=Int(0, 1),
+    num_given=Int(-1, MAX_LANDMARKS),
+)  # fmt: skip
+class RobotInput(NamedTuple):
+    """Input of one robot: a row of the table that kernels read, see `_kernels.layout`.
+
+    Attributes:
+        kind: Kind of motion.
+        begin, end: First and last row of its used measurements among all n.
+        has_covariances, has_names: 1 where the measurements have covariances, and names; else 0.
+        num_given: Number of measurements given, used or not; -1 without a frame.
+    """
+
+    kind: int
+    begin: int
+    end: int
+    has_covariances: int
+    has_names: int
+    num_given: int
+
+
+NO_INPUT = RobotInput(NO_READING, 0, 0, 0, 0, -1)
 MASKS = Dict(Int(0, "K"), Array(BOOL, "*"))
 
 
 def check_rows(inputs: Sequence[RobotInput], masks: Mapping[int, BoolArray], n: int) -> None:
     """Refuse inputs of robots whose measurements do not lie among n, robot by robot, and masks of others."""
     last = 0
-    for _, begin, end, _, _, _ in inputs:
-        if not (last <= begin <= end <= n or begin == end == 0):
+    for one in inputs:
+        if not (last <= one.begin <= one.end <= n or one.begin == one.end == 0):
             raise ValueError("rows of other measurements")
-        last = max(last, end)
+        last = max(last, one.end)
     for robot, mask in masks.items():
-        _, begin, end, _, _, count = inputs[robot]
-        if len(mask) != max(count, 0) or np.count_nonzero(mask) != end - begin:
+        one = inputs[robot]
+        if len(mask) != max(one.num_given, 0) or np.count_nonzero(mask) != one.end - one.begin:
             raise ValueError("a mask of other measurements")
 
 
 @with_state(
-    inputs=Each(ROBOT_INPUT, "K"),
+    inputs=Each(Record(RobotInput), "K"),
     inputs_table=Array(INT64, "K 6", -1),
     moves=Array(FLOAT64, "K 3", -MAX_DISTANCE, MAX_DISTANCE),
     masks=MASKS,
@@ -180,6 +197,12 @@ NO_DESCRIPTORS = np.zeros((0, 0), dtype=np.float32)
 NO_NAMES = np.zeros(0, dtype=np.int64)
 KINDS = *map(np.dtype, (np.float64, np.float32, np.int64)), 2, 2, 1  # dtypes and dimensions of `TeamMeasurements`
 
+
+def _robot_inputs(table: IntArray) -> list[RobotInput]:
+    """Return the rows of a table by name."""
+    return list(map(RobotInput._make, table.tolist()))
+
+
 Span = tuple[int, int, bool, bool, int]  # a `RobotInput` without the kind of motion
 # One robot's points, covariances or None, descriptors, names or None.
 Used = tuple[FloatArray, FloatArray | None, Float32Array, IntArray | None]
@@ -217,7 +240,7 @@ def pack_team_input(
     limits = farthest_move, farthest_point, MAX_DESCRIPTOR
     if not _kernels.read_team(moves, points, copied, offsets, *limits, table, sightings):
         return None
-    return StepInput(table.tolist(), table, moves, {}, sightings, copied, NO_NAMES, frozenset())
+    return StepInput(_robot_inputs(table), table, moves, {}, sightings, copied, NO_NAMES, frozenset())
 
 
 def pack_step_input(
@@ -245,7 +268,7 @@ def pack_step_input(
                 inactive.append(robot)
         inputs.append((kind, begin, end, covered, named, count))
     table = np.array(inputs, dtype=np.int64)
-    return StepInput(table.tolist(), table, moves, masks, sightings, descriptors, names, frozenset(inactive))
+    return StepInput(_robot_inputs(table), table, moves, masks, sightings, descriptors, names, frozenset(inactive))
 
 
 def pack_measurements(frames: Sequence[Measurements | None], names: Sequence[IntArray | None]) -> Seen:

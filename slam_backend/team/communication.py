@@ -98,10 +98,10 @@ class TrafficCounter:
         for done in replayed:
             each = POINT_BYTES + 4 * done.inputs.descriptors.shape[1]
             for robot in done.robots:
-                kind, _, _, covered, _, count = done.inputs.inputs[robot]
-                if kind in (MOVED, EXACT_POSE):
+                given = done.inputs.inputs[robot]
+                if given.kind in (MOVED, EXACT_POSE):
                     self.sent[robot] += POSE_BYTES
-                self.sent[robot] += max(count, 0) * (each + covered * COVARIANCE_BYTES)
+                self.sent[robot] += max(given.num_given, 0) * (each + given.has_covariances * COVARIANCE_BYTES)
 
     def record_return(
         self, sender: int, known: Mapping[int, int], counts: Mapping[int, int], descriptor_size: int
