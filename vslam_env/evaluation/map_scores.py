@@ -266,7 +266,7 @@ def check_claims(association: Mapping[str, Any], team: Mapping[str, Any], tick: 
         raise ValueError(f"no claims of map {min(lacking)}")
     for step, inputs in team["records"]["log"]["steps"].items():
         if step not in seen or any(
-            given.count > len(ids) for given, ids in zip(inputs.inputs, seen[step], strict=True)
+            given.num_given > len(ids) for given, ids in zip(inputs.inputs, seen[step], strict=True)
         ):
             raise ValueError(f"not all true ids of step {step}")
     for entry in team["records"]["entries"]:
