@@ -24,6 +24,8 @@ def is_read_only(array: NDArray[Any]) -> bool:
     >>> is_read_only(frozen), is_read_only(as_read_only(frozen)), is_read_only(as_read_only(frozen)[1:])
     (False, True, True)
     """
+    if array.flags.writeable:  # perhaps on bytes, as pickles leave it
+        return False
     base: Any = array.base
     while type(base) is ndarray:
         base = base.base

@@ -2,6 +2,7 @@
 
 A class lists the parts of its state, from which `take` makes a snapshot and `restore` returns to it:
 
+>>> from slam_backend.core.random_state import Generator
 >>> class Counter:
 ...     STATE = State(sums=Array(INT64, "K", low=0), rng=Generator())
 ...     def __init__(self) -> None:
@@ -115,13 +116,13 @@ class State:
 
     def __init__(self, **parts: "Part") -> None:
         self.parts = parts
-        self._attributes: list[tuple[str, str, Part]] | None = None
+        self._attributes: list[tuple[str, str, Part, bool]] | None = None
 
-    def attributes(self, owner: Any) -> list[tuple[str, str, "Part"]]:
-        """Return name, attribute and type of each part, given an object of the class."""
+    def attributes(self, owner: Any) -> list[tuple[str, str, "Part", bool]]:
+        """Return name, attribute and type of each part, and whether its values never change, given an object."""
         if self._attributes is None:
             names = {name: f"_{name}" if hasattr(owner, f"_{name}") else name for name in self.parts}
-            self._attributes = [(name, names[name], part) for name, part in self.parts.items()]
+            self._attributes = [(name, names[name], part, part.is_constant) for name, part in self.parts.items()]
         return self._attributes
 
 
@@ -169,7 +170,10 @@ class Part:
 def take(owner: Any) -> Snapshot:
     """Return a snapshot of an object; the object does not change."""
     kind: Any = type(owner)
-    parts = {name: part._take(getattr(owner, at)) for name, at, part in kind.STATE.attributes(owner)}
+    parts = {
+        name: getattr(owner, at) if is_constant else part._take(getattr(owner, at))
+        for name, at, part, is_constant in kind.STATE.attributes(owner)
+    }
     return Snapshot(parts, kind)
 
 
@@ -179,10 +183,10 @@ def restore(owner: Any, snapshot: Snapshot) -> None:
     kind: Any = type(owner)
     if hasattr(owner, "make_room"):
         owner.make_room(snapshot)
-    for name, at, part in kind.STATE.attributes(owner):
-        value = None if part.is_constant else getattr(owner, at, None)
+    for name, at, part, is_constant in kind.STATE.attributes(owner):
+        value = None if is_constant else getattr(owner, at, None)
         new = part._put(value, snapshot[name])
-        if part.is_constant or new is None or new is not value:
+        if is_constant or new is None or new is not value:
             setattr(owner, at, new)
     if hasattr(owner, "rebuild"):
         owner.rebuild()
@@ -547,7 +551,7 @@ class _OfClass(Part):
 
 
 class Child(_OfClass):
-    """An object with a `STATE` of its own; it is restored in place, or made anew, see `restored`."""
+    """An object with a `STATE` of its own; it is restored in place, or made as a new one, see `restored`."""
 
     is_constant = False
 

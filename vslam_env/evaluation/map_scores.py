@@ -261,7 +261,7 @@ def check_claims(association: Mapping[str, Any], team: Mapping[str, Any], tick: 
         maps = branch["filter"]["maps"]
         needed = max(1 + maps.ids.max(initial=-1), maps.next_id - MOST_MEASURED * tick)
         if needed > claims.shape[1]:
-            raise ValueError(f"claims of {claims.shape[1]} landmarks, of which there are {needed}")
+            raise ValueError(f"claims of {claims.shape[1]} landmarks, not {needed}")
     if lacking := numbers - set(association["row_of"]):
         raise ValueError(f"no claims of map {min(lacking)}")
     for step, inputs in team["records"]["log"]["steps"].items():
@@ -273,4 +273,4 @@ def check_claims(association: Mapping[str, Any], team: Mapping[str, Any], tick: 
         ):
             raise ValueError(f"not all true ids of step {entry.step}")
         if isinstance(entry, LandmarkIdMap) and len(entry.ids_b) and entry.ids_b.max() >= claims.shape[1]:
-            raise ValueError(f"claims of {claims.shape[1]} landmarks, of which there are {entry.ids_b.max() + 1}")
+            raise ValueError(f"claims of {claims.shape[1]} landmarks, not {entry.ids_b.max() + 1}")

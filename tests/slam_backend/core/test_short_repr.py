@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from slam_backend import state_kinds as of_backend
 from slam_backend.core.short_repr import short_repr
 from slam_backend.core.state import options_in
 from slam_backend.maps.landmark_map import LandmarkMap
@@ -16,7 +15,7 @@ from slam_backend.models.measurements import Measurements
 from tests.regression.public_api import MODULES, PACKAGES
 from vslam_env import EnvConfig, preset_config, vslam_v0
 
-CONFIGURATIONS = tuple(dict.fromkeys((*of_backend.CONFIGURATIONS, *options_in(EnvConfig))))
+CONFIGURATIONS = options_in(EnvConfig)
 SHORT = short_repr(type("Sample", (), {})).__repr__
 
 
