@@ -105,7 +105,7 @@ def information(
 def gauss_newton_step(
     table: FloatArray, members: BoolArray, motions: FloatArray, floor: FloatArray | float
 ) -> FloatArray:
-    """Return the motions (..., 3) after a weighted Gauss-Newton step; members that leave the rotation open do not turn.
+    """Return the motions (..., 3) after a weighted Gauss-Newton step; unchanged where members leave the rotation open.
 
     The translation is eliminated first: u = H_tt^-1 H_t,theta and v = H_tt^-1 g_t.
     """
@@ -117,9 +117,9 @@ def gauss_newton_step(
         vx = (hyy * g[..., 0] - hxy * g[..., 1]) / determinant
         vy = (hxx * g[..., 1] - hxy * g[..., 0]) / determinant
         remaining = turning - hx * ux - hy * uy
-        turn = np.where(remaining > 1e-12 * turning, (g[..., 2] - hx * vx - hy * vy) / remaining, 0.0)
+        turn = (g[..., 2] - hx * vx - hy * vy) / remaining
     step = np.stack([vx - ux * turn, vy - uy * turn, turn], axis=-1)
-    moved = motions + np.where((determinant > 0.0)[..., None], step, 0.0)
+    moved = motions + np.where(((determinant > 0.0) & (remaining > 1e-12 * turning))[..., None], step, 0.0)
     moved[..., 2] = wrap_angle(moved[..., 2])
     return moved
 

@@ -19,24 +19,23 @@ from slam_backend.core.compilation.wheel import build_wheel
 ROOT = Path(__file__).parents[4]
 LEVEL = "x86-64-v3"
 IS_LEVEL = LEVELS[LEVEL] <= host_features()
-PART = "slam_backend.frontend."  # kernels that the wheel of these tests holds: all that a stereo pair needs
-# Measures a pair of images after it has compiled some kernels in a given order; prints the result's bytes, and how many
-# kernels were compiled in all.
-MEASURE = """
+PART = "slam_backend.frontend."  # kernels that the wheel of these tests holds
+# Describes the corners of an image after it has compiled some kernels in a given order; prints the result's bytes, and
+# how many kernels were compiled in all.
+DESCRIBE = """
 import json, sys
 import numpy as np
-from slam_backend import StereoCamera
 from slam_backend.core.compilation.messages import watch_compilation
 from slam_backend.core.compilation.compiler import compile_lines
-from slam_backend.frontend import StereoFrontEnd
+from slam_backend.frontend import harris_corners, usurf_descriptors
 
 with watch_compilation(lambda name: None) as watch:
     compile_lines(iter(sys.argv[1].splitlines()), lambda line, seconds: None)
-    blocks = np.kron(np.random.default_rng(0).integers(0, 256, (10, 20)), np.ones((12, 12))).astype(np.uint8)
-    front_end = StereoFrontEnd(StereoCamera(focal_px=100.0, width=224, height=120))
-    found = front_end.measure(blocks[:, :224], blocks[:, 8:232]).measurements
-assert len(found) > 0
-print(json.dumps([found.points.tobytes().hex() + found.descriptors.tobytes().hex(), len(watch.names)]))
+    image = np.kron(np.random.default_rng(0).integers(0, 256, (10, 20)), np.ones((12, 12))).astype(np.uint8)
+    corners = harris_corners(image)
+    looks = usurf_descriptors(image, corners.points, 2.3)
+assert len(looks) > 5
+print(json.dumps([corners.points.tobytes().hex() + looks.tobytes().hex(), len(watch.names)]))
 """
 
 
@@ -121,9 +120,9 @@ def test_shipped_kernels_compile_nothing_and_give_the_same_bytes(site: Path, tmp
         shutil.copytree(ROOT / package, sources / package, ignore=shutil.ignore_patterns("__pycache__"))
     for folder in [folder for folder in sources.rglob("*") if folder.is_dir()]:
         (folder / "__pycache__").touch()  # where a cache would be
-    shipped, warnings = python(MEASURE, "", site=site, sources=sources, **no_place)
+    shipped, warnings = python(DESCRIBE, "", site=site, sources=sources, **no_place)
     assert (shipped[1], warnings) == (0, "")
-    here, _ = python(MEASURE, "")
+    here, _ = python(DESCRIBE, "")
     assert here[0] == shipped[0]
 
 
@@ -132,8 +131,8 @@ def test_the_order_of_compilation_decides_nothing(tmp_path: Path) -> None:
     """Kernels compiled backwards, by one process, give the bytes of those that several processes compile forwards."""
     names = [name for name in recorded_signatures("slam_backend") if name.startswith(PART)]
     backwards = [f"{name} {words}" for name in reversed(names) for words in recorded_signatures("slam_backend")[name]]
-    there, _ = python(MEASURE, "\n".join(backwards), NUMBA_CACHE_DIR=str(tmp_path))
-    here, _ = python(MEASURE, "")
+    there, _ = python(DESCRIBE, "\n".join(backwards), NUMBA_CACHE_DIR=str(tmp_path))
+    here, _ = python(DESCRIBE, "")
     assert there[1] > 3
     assert there[0] == here[0]
 
