@@ -13,11 +13,13 @@ STREAMS = ("PCG64", "PCG64DXSM", "MT19937", "Philox", "SFC64")
 PLACES = {"has_uint32": 1, "uinteger": 2**32 - 1, "buffer_pos": 4, "pos": 624}  # largest numbers; numpy checks none
 
 
-def _frozen(state: Any) -> Any:
+def _frozen(state: dict[str, Any]) -> Snapshot:
     """Return the state of a bit generator with read-only mappings and arrays."""
-    if isinstance(state, Mapping):
-        return Snapshot({key: _frozen(value) for key, value in state.items()})
-    return as_read_only(state) if isinstance(state, np.ndarray) else state
+    parts: dict[str, Any] = {}
+    for key, value in state.items():
+        kind = type(value)
+        parts[key] = _frozen(value) if kind is dict else as_read_only(value) if kind is np.ndarray else value
+    return Snapshot(parts)
 
 
 def _thawed(state: Any) -> Any:
@@ -32,8 +34,7 @@ class Generator(Part):
     is_constant: ClassVar[bool] = False
 
     def _take(self, value: np.random.Generator) -> Snapshot:
-        frozen: Snapshot = _frozen(value.bit_generator.state)
-        return frozen
+        return _frozen(value.bit_generator.state)  # type: ignore[arg-type]
 
     def _put(self, value: Any, kept: Snapshot) -> np.random.Generator:
         bits = getattr(np.random, kept["bit_generator"])(0)
