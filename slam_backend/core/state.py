@@ -388,20 +388,25 @@ class Array(Part):
 
 def check_shape(name: str, value: NDArray[Any], shape: str, sizes: Sizes) -> None:
     """Raise unless an array has a shape, see `Array`; sizes with new names are added to `sizes`."""
-    axes = shape.split()
-    found = value.shape
+    axes, found = _axes(shape), value.shape
     if len(found) == len(axes):
-        for axis, size in zip(axes, found, strict=True):
-            if axis == "*":
+        for (word, number, more), size in zip(axes, found, strict=True):
+            if word == "*":
                 continue
-            word, more = axis.removesuffix("+1"), axis.endswith("+1")
-            sizes.setdefault(word, int(word) if word.isdigit() else size - more)
-            if sizes[word] + more != size:
+            wanted = sizes.setdefault(word, size - more) if number is None else number
+            if wanted + more != size:
                 break
         else:
             return
-    wanted = [str(sizes.get(axis, axis)) for axis in axes]
-    refuse(name, f"an array of shape ({', '.join(wanted)})", f"shape {found}")
+    expected = ", ".join(str(sizes.get(axis, axis)) for axis in shape.split())
+    refuse(name, f"an array of shape ({expected})", f"shape {found}")
+
+
+@cache
+def _axes(shape: str) -> tuple[tuple[str, int | None, bool], ...]:
+    """Return word, number if it is one, and whether one more is meant, of each axis."""
+    words = [(axis.removesuffix("+1"), axis.endswith("+1")) for axis in shape.split()]
+    return tuple((word, int(word) if word.isdigit() else None, more) for word, more in words)
 
 
 # ---------------------------------------------------------------------- containers
