@@ -24,7 +24,9 @@ def warm_up(
         seconds = vslam_env.warm_up(everything=everything, workers=workers, progress=progress, costs=costs)
     if report and costs:
         for name, cost in sorted(costs.items(), key=lambda item: -item[1]):
-            make_console().print(f"{cost:7.1f} s  {name}", highlight=False)
-        make_console().print(f"{sum(costs.values()):7.1f} s  {len(costs)} kernels that Python calls", highlight=False)
+            make_console().print(f"{cost:7.1f} s  {name}", highlight=False, soft_wrap=True)
+        make_console().print(
+            f"{sum(costs.values()):7.1f} s  {len(costs)} kernels that Python calls", highlight=False, soft_wrap=True
+        )
     if not seconds:
         make_console().print("There is nothing to compile." if IS_PLAIN else "All kernels are in the cache.")
