@@ -65,12 +65,6 @@ def with_read_only(tree: Tree) -> Tree:
     return result
 
 
-def with_constants(tree: Tree) -> Tree:
-    """Return such a tree with arrays that cannot change: copies unless they are read-only already."""
-    result: Tree = map_arrays(tree, as_constant)
-    return result
-
-
 def map_arrays(tree: Any, act: Act) -> Any:
     """Return a tree with `act` applied to all its arrays; parts that do not change are returned themselves."""
     cls = type(tree)

@@ -624,22 +624,22 @@ class FastSlam:
         of the start after a merge does not enter.
         """
         index, every = self._check_robot(robot), tuple(range(self.num_robots))
-        points = TeamPoses(len(every))
-        self.write_team_poses(every, every, 1.0, points)
-        return PoseEstimate(points.own[index].copy(), points.covariances[index].copy())
+        team_poses = TeamPoses(len(every))
+        self.write_team_poses(every, every, 1.0, team_poses)
+        return PoseEstimate(team_poses.own[index].copy(), team_poses.covariances[index].copy())
 
     def write_team_poses(
-        self, names: tuple[int, ...], active_robots: tuple[int, ...], ess: float, points: TeamPoses
+        self, robots: tuple[int, ...], active_robots: tuple[int, ...], ess: float, team_poses: TeamPoses
     ) -> None:
-        """Write the poses of the robots in `active_robots`; `names` are the team's indices of all, `ess` is copied."""
+        """Write the poses of the robots in `active_robots`; `robots` are the team's indices of all, `ess` is copied."""
         weights = NO_WEIGHTS if self.starts_at_origin else self.weights
         _kernels.write_team_poses(
             self.pose_arrays, self.start_covariances, weights, self.best_particle, *self.estimates,
-            membership_table(names, active_robots), points.poses, points.beliefs,
+            membership_table(robots, active_robots), team_poses.poses, team_poses.beliefs,
         )  # fmt: skip
-        for robot in names:
+        for robot in robots:
             if robot in active_robots:
-                points.ess[robot] = ess
+                team_poses.ess[robot] = ess
 
     def particles_from_start(self, robot: int = 0) -> FloatArray:
         """Return a robot's poses (M, 3) [m, m, rad], each relative to its start pose in the same particle."""

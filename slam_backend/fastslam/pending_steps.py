@@ -6,7 +6,7 @@ import numpy as np
 
 from slam_backend.core.validation import IntArray
 from slam_backend.fastslam._kernels import NUM_MEASURED, NUM_NOTED
-from slam_backend.fastslam._kernels.run_log import guesses_of
+from slam_backend.fastslam._kernels.run_log import initial_poses_of
 from slam_backend.fastslam.rejuvenation import RejuvenationScheduler
 from slam_backend.fastslam.run_log import RobotLog
 from slam_backend.fastslam.step_input import RobotRows, StepInput
@@ -59,7 +59,7 @@ class PendingSteps:
         for robot, log in enumerate(logs):
             log.extend(robot, steps, noted, measured)
             if smoother is not None:
-                smoother.add_initial_poses(robot, *guesses_of(robot, steps, noted))
+                smoother.add_initial_poses(robot, *initial_poses_of(robot, steps, noted))
         self.clear()
 
 

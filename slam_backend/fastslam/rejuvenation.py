@@ -201,7 +201,7 @@ class RejuvenationScheduler:
         self._closed = False  # loop closure since then
         self._exact = False  # an exact pose disables rejuvenation for good
         self._last_closing = 0  # last step with matches of landmarks not seen for long
-        self._guesses = [InitialPoses.empty() for _ in range(num_robots)]
+        self._initial = [InitialPoses.empty() for _ in range(num_robots)]
         self._rejected: list[dict[int, RejectedMeasurements]] = [{} for _ in range(num_robots)]
 
     # ------------------------------------------------------------------ in each step
@@ -210,11 +210,11 @@ class RejuvenationScheduler:
         """Record the estimated poses (n, 3) of a robot after steps (n,) with input; `is_placed` marks exact poses."""
         if is_placed:
             self._exact = True
-            self._guesses = [InitialPoses.empty() for _ in self._guesses]
+            self._initial = [InitialPoses.empty() for _ in self._initial]
             for rejected in self._rejected:
                 rejected.clear()
         if not (self._exact or self._noiseless):
-            self._guesses[robot] = self._guesses[robot].with_later(steps, poses)
+            self._initial[robot] = self._initial[robot].with_later(steps, poses)
 
     def add_rejected(self, robot: int, step: int, ids: IntArray, descriptors: NDArray[np.float32]) -> None:
         """Record which of a robot's measurements without names were neither matched nor new, by their ids (n,)."""
@@ -340,12 +340,12 @@ class RejuvenationScheduler:
             if waiting < share and not is_due:
                 return None
             taken = [log_head(log, share) for log in self._new_log_rows(logs, graph, maps, best)]
-            outcome = smoother.add_logs(graph, taken, self._guesses, landmark_positions(maps, best))
+            outcome = smoother.add_logs(graph, taken, self._initial, landmark_positions(maps, best))
             return self._finish_slice(graph, outcome, lambda: taken, smoother)
         last = self._new_log_rows(logs, graph, maps, best)
         positions = landmark_positions(maps, best)
         descriptors = landmark_descriptors(maps, self._options.descriptor_gate)
-        drawn = smoother.draw(graph, last, self._guesses, positions, num_particles, descriptors)
+        drawn = smoother.draw(graph, last, self._initial, positions, num_particles, descriptors)
         if isinstance(drawn, Rejuvenation):
             self._restart_interval()
             self._accept(drawn.graph)
@@ -359,7 +359,7 @@ class RejuvenationScheduler:
         new = log_tails(logs, graph)
         if not any(self._rejected):
             return new
-        return reassociate(new, self._rejected, self._guesses, landmark_table(maps, best), self._options)
+        return reassociate(new, self._rejected, self._initial, landmark_table(maps, best), self._options)
 
     @single_threaded_blas
     def join(
@@ -386,7 +386,7 @@ class RejuvenationScheduler:
         graph, motion = joint_graph(graph_a, graph_b, starts, frames, renamed, camera, options)
         self._set_graph(graph)
         self._draft = Draft(graph=graph)
-        self._guesses = a._guesses + [InitialPoses(steps, compose(motion, poses)) for steps, poses in b._guesses]
+        self._initial = a._initial + [InitialPoses(steps, compose(motion, poses)) for steps, poses in b._initial]
         self._rejected = [dict(rejected) for rejected in (*a._rejected, *b._rejected)]
         self._read, self._exact = a._read + b._read, a._exact or b._exact
         self._waited = self._every
@@ -428,7 +428,7 @@ class RejuvenationScheduler:
         """Continue from a graph at its mode."""
         self._set_graph(graph)
         for robot, latest in enumerate(graph.latest.tolist()):
-            self._guesses[robot] = self._guesses[robot].after(latest)
+            self._initial[robot] = self._initial[robot].after(latest)
             for step in [step for step in self._rejected[robot] if step <= latest]:
                 del self._rejected[robot][step]
 
@@ -441,7 +441,7 @@ class RejuvenationScheduler:
         self._graph = None if self._graph is None else self._graph.reordered(order)
         if self._draft is not None:
             self._draft = self._draft._replace(graph=self._draft.graph.reordered(order))
-        self._guesses = [self._guesses[robot] for robot in order]
+        self._initial = [self._initial[robot] for robot in order]
         self._rejected = [self._rejected[robot] for robot in order]
 
     # ------------------------------------------------------------------ snapshots
@@ -449,11 +449,11 @@ class RejuvenationScheduler:
     @property
     def initial_poses(self) -> tuple[InitialPoses, ...]:
         """Initial poses of each robot; read-only views."""
-        return tuple(InitialPoses(as_read_only(steps), as_read_only(poses)) for steps, poses in self._guesses)
+        return tuple(InitialPoses(as_read_only(steps), as_read_only(poses)) for steps, poses in self._initial)
 
     @initial_poses.setter
     def initial_poses(self, poses: Sequence[InitialPoses]) -> None:
-        self._guesses = [InitialPoses(steps.copy(), each.copy()) for steps, each in poses]  # writable, as kernels need
+        self._initial = [InitialPoses(steps.copy(), each.copy()) for steps, each in poses]  # writable, as kernels need
 
     def rebuild(self) -> None:
         """Compute what depends on the graph."""

@@ -77,7 +77,7 @@ def extend_graph(
     logs: Sequence[LogArrays],
     motion: OdometryModel,
     mount: FloatArray,
-    guesses: Sequence[InitialPoses] | None = None,
+    initial_poses: Sequence[InitialPoses] | None = None,
     rigid_within: float = 0.0,
     places: LandmarkPositions | None = None,
 ) -> SlamGraph:
@@ -92,7 +92,7 @@ def extend_graph(
         logs: One log per robot, with the steps after `graph.latest`.
         motion: Noise of the odometry.
         mount: (3,) [m]. Position of the camera on the robot.
-        guesses: Initial poses of each robot after some of these steps; all others come from odometry.
+        initial_poses: Initial poses of each robot after some of these steps; all others come from odometry.
         rigid_within: Limit [m], see `SmoothingOptions`.
         places: Landmark positions from the filter, the initial estimates of landmarks with mostly new sightings: if a
             first sighting is an outlier, a robust kernel would reject the later ones instead. None, or with initial
@@ -105,7 +105,7 @@ def extend_graph(
     keys, frames = _with_room(graph.part(Keys), steps), _with_room(graph.part(Frames), steps)
     raw = _with_room(graph.part(Points), most)
     tips, ends = graph.last_keys.copy(), np.array([graph.num_keys, len(graph.frame_keys), len(graph.points)])
-    is_guided = guesses is not None
+    is_guided = initial_poses is not None
     for robot, log in enumerate(logs):
         if EXACT in log.kinds.tolist():
             raise argument_error("logs", "odometry", "a pose that was given as exact", "There is nothing to smooth.")
@@ -119,8 +119,8 @@ def extend_graph(
             log.steps, log.kinds, log.motions, log.given, log.starts, log.points, log.ids, covariances, variances,
             jacobians, graph.poses[bias].copy() if bias >= 0 else NO_BIAS,
         )  # fmt: skip
-        guessed = NO_INITIAL_POSES if guesses is None else guesses[robot]
-        is_guided &= _kernels.add_keyframes(arrays, guessed, robot, rigid_within, tips, ends, keys, frames, raw)
+        initial = NO_INITIAL_POSES if initial_poses is None else initial_poses[robot]
+        is_guided &= _kernels.add_keyframes(arrays, initial, robot, rigid_within, tips, ends, keys, frames, raw)
     num_keys, num_frames, num_points = ends.tolist()
     held = places if is_guided and places is not None else NO_LANDMARK_POSITIONS
     landmarks = number_landmarks(

@@ -73,7 +73,7 @@ class _Points(NamedTuple):
 def reassociate(
     logs: Sequence[LogArrays],
     rejected: Sequence[Mapping[int, RejectedMeasurements]],
-    guesses: Sequence[InitialPoses],
+    initial_poses: Sequence[InitialPoses],
     known: LandmarkTable,
     options: FilterOptions,
 ) -> list[LogArrays]:
@@ -86,11 +86,11 @@ def reassociate(
     Args:
         logs: One log per robot.
         rejected: Rejected measurements of each robot by step; steps outside its log are ignored.
-        guesses: Initial poses of each robot.
+        initial_poses: Initial poses of each robot.
         known: Landmarks of the map.
         options: Gates and camera of the filter.
     """
-    points = _locate(logs, rejected, guesses, options)
+    points = _locate(logs, rejected, initial_poses, options)
     if points is None or not len(known.ids):
         return list(logs)
     owners = _find_owners(points, logs, known, options)
@@ -114,14 +114,14 @@ def reassociate(
 def _locate(
     logs: Sequence[LogArrays],
     rejected: Sequence[Mapping[int, RejectedMeasurements]],
-    guesses: Sequence[InitialPoses],
+    initial_poses: Sequence[InitialPoses],
     options: FilterOptions,
 ) -> _Points | None:
     """Return the rejected measurements in the map frame, from the initial poses; None if there are none."""
     found = []
-    for robot, (log, of_steps, guessed) in enumerate(zip(logs, rejected, guesses, strict=True)):
+    for robot, (log, of_steps, initial) in enumerate(zip(logs, rejected, initial_poses, strict=True)):
         row_of = {step: t for t, step in enumerate(log.steps.tolist()) if step in of_steps}
-        poses = guessed.at(log.steps)
+        poses = initial.at(log.steps)
         held = [(step, t) for step, t in row_of.items() if not np.isnan(poses[t, 0])]
         if not held:
             continue

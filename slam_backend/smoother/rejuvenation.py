@@ -255,20 +255,26 @@ class Smoother(NamedTuple):
     rng: np.random.Generator
 
     def add_logs(
-        self, graph: SlamGraph, logs: Sequence[LogArrays], guesses: Sequence[InitialPoses], places: LandmarkPositions
+        self,
+        graph: SlamGraph,
+        logs: Sequence[LogArrays],
+        initial_poses: Sequence[InitialPoses],
+        places: LandmarkPositions,
     ) -> SlamGraph | Draft | str:
         """Add all rows of short logs to the graph, and do the first iterations.
 
         Args:
             graph: Graph at its mode.
             logs: One log per robot, with the steps after `graph.latest`.
-            guesses: Initial poses of each robot after some of these steps.
+            initial_poses: Initial poses of each robot after some of these steps.
             places: Initial landmark positions from the filter, see `extend_graph`.
 
         Returns:
             Same result as `optimise_slice`.
         """
-        grown = extend_graph(graph, logs, self.motion, self.camera[4:], guesses, self.options.rigid_within, places)
+        grown = extend_graph(
+            graph, logs, self.motion, self.camera[4:], initial_poses, self.options.rigid_within, places
+        )
         return self.optimise_slice(Draft(graph=grown))
 
     def optimise_slice(self, draft: Draft) -> SlamGraph | Draft | str:
@@ -288,7 +294,7 @@ class Smoother(NamedTuple):
         self,
         graph: SlamGraph,
         logs: Sequence[LogArrays],
-        guesses: Sequence[InitialPoses],
+        initial_poses: Sequence[InitialPoses],
         places: LandmarkPositions,
         num_particles: int,
         appearance: LandmarkDescriptors,
@@ -299,14 +305,16 @@ class Smoother(NamedTuple):
         if they do not reach it, as slices after them would end there again.
 
         Args:
-            graph, logs, guesses, places: Same arguments as `add_logs`.
+            graph, logs, initial_poses, places: Same arguments as `add_logs`.
             num_particles: M.
             appearance: Descriptors to detect duplicate landmarks.
 
         Returns:
             The result of the draws, or without draws the same result as `optimise_slice`.
         """
-        grown = extend_graph(graph, logs, self.motion, self.camera[4:], guesses, self.options.rigid_within, places)
+        grown = extend_graph(
+            graph, logs, self.motion, self.camera[4:], initial_poses, self.options.rigid_within, places
+        )
         draft = Draft(graph=grown)
         is_last = not any(map(len, logs))
         mode = optimize(grown, self.camera, self.options, None if is_last else self._most(LAST_STEPS))

@@ -74,8 +74,8 @@ def rejuvenate(
             result = smoother.optimise_slice(result)
             continue
         rest = [log.since(int(latest) + 1) for log, latest in zip(logs, result.latest, strict=True)]
-        guesses = [InitialPoses.empty() for _ in logs]
-        result = smoother.draw(result, rest, guesses, NO_LANDMARK_POSITIONS, num_particles, NAMELESS)
+        initial_poses = [InitialPoses.empty() for _ in logs]
+        result = smoother.draw(result, rest, initial_poses, NO_LANDMARK_POSITIONS, num_particles, NAMELESS)
     return result
 
 

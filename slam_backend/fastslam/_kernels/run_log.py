@@ -61,7 +61,7 @@ def write_rows(
     return len(numbers), t, n
 
 
-def guesses_of(robot: int, numbers: IntArray, noted: FloatArray) -> tuple[IntArray, FloatArray, bool]:
+def initial_poses_of(robot: int, numbers: IntArray, noted: FloatArray) -> tuple[IntArray, FloatArray, bool]:
     """Return the steps in which one of K robots did or measured anything, and where it was thought to be then.
 
     Args:

@@ -16,14 +16,14 @@ if TYPE_CHECKING:
 
 @jit
 def add_keyframes(
-    log: Log, guesses: "InitialPoses", robot: int, rigid_within: float, tips: IntArray, ends: IntArray, keys: Keys,
-    frames: Frames, raw: Points,
+    log: Log, initial_poses: "InitialPoses", robot: int, rigid_within: float, tips: IntArray, ends: IntArray,
+    keys: Keys, frames: Frames, raw: Points,
 ) -> bool:  # fmt: skip
     """Take in the steps of a robot's log: what becomes a key, and what was measured.
 
     Args:
         log: New steps.
-        guesses: Poses of the robot after some of them; elsewhere odometry is chained.
+        initial_poses: Poses of the robot after some of them; elsewhere odometry is chained.
         robot: Robot of the log.
         rigid_within: [m]. A step that measured something becomes a key unless odometry since the last key scatters
             less; see `SmoothingOptions`.
@@ -33,10 +33,10 @@ def add_keyframes(
             place of their rows. The rigid variance of the newest old key is changed where frames are attached to it.
 
     Returns:
-        Whether there is a guess for the first step that measured something, or no such step.
+        Whether there is a pose for the first step that measured something, or no such step.
     """
     starts, ids = log.starts, log.ids
-    key, frame, num, tip, guess = ends[0], ends[1], ends[2], tips[robot], 0
+    key, frame, num, tip, row_of_pose = ends[0], ends[1], ends[2], tips[robot], 0
     pose, chain, noise = keys.poses[tip].copy(), np.zeros(3), np.zeros((3, 3))
     jacobian, move, bias, biased = np.zeros((3, 3)), np.zeros(3), log.bias, len(log.jacobians) > 0
     moved, measured, is_guided = False, False, True
@@ -81,15 +81,15 @@ def add_keyframes(
             pose[1] += s * move[0] + c * move[1]
             pose[2] = (pose[2] + move[2] + math.pi) % (2.0 * math.pi) - math.pi
             moved = True
-        while guess < len(guesses.steps) and guesses.steps[guess] < log.steps[t]:
-            guess += 1
-        is_guessed = guess < len(guesses.steps) and guesses.steps[guess] == log.steps[t]
-        if is_guessed and not math.isnan(guesses.poses[guess, 0]):
-            pose[:] = guesses.poses[guess]
+        while row_of_pose < len(initial_poses.steps) and initial_poses.steps[row_of_pose] < log.steps[t]:
+            row_of_pose += 1
+        is_given = row_of_pose < len(initial_poses.steps) and initial_poses.steps[row_of_pose] == log.steps[t]
+        if is_given and not math.isnan(initial_poses.poses[row_of_pose, 0]):
+            pose[:] = initial_poses.poses[row_of_pose]
         else:
-            is_guessed = False
+            is_given = False
         if not measured and starts[t + 1] > 0:
-            measured, is_guided = True, is_guessed
+            measured, is_guided = True, is_given
         scatter = noise[0, 0] + noise[1, 1] + LEVER * LEVER * noise[2, 2]
         far = num > first and scatter >= rigid_within * rigid_within
         if moved and (far or t == len(log.steps) - 1):

@@ -16,7 +16,7 @@ from slam_backend.fastslam._kernels import EXACT_POSE, MOVED, NO_READING
 from slam_backend.fastslam._kernels import STATIONARY as STOOD_STILL
 from slam_backend.fastslam._kernels.layout import ESTIMATE, LOGGED, LOGGED_KIND, MOTION, NAME, NUM_MEASURED, NUM_NOTED
 from slam_backend.fastslam._kernels.records import InputArrays, StepResults
-from slam_backend.fastslam._kernels.run_log import guesses_of
+from slam_backend.fastslam._kernels.run_log import initial_poses_of
 from slam_backend.fastslam._kernels.step import log_step
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.pending_steps import LONGEST, ROOM
@@ -276,7 +276,7 @@ def test_a_filter_logs_all_of_its_input() -> None:
     )
 
 
-def test_guesses_are_of_the_steps_in_which_a_robot_did_or_measured_anything() -> None:
+def test_initial_poses_are_of_the_steps_in_which_a_robot_did_or_measured_anything() -> None:
     """One row for each of these, of one robot of the filter; and whether its pose was given."""
     num_steps, rng = 40, np.random.default_rng(8)
     numbers, noted = np.arange(7, 7 + num_steps), rng.normal(size=(num_steps, 3, NUM_NOTED))
@@ -284,7 +284,7 @@ def test_guesses_are_of_the_steps_in_which_a_robot_did_or_measured_anything() ->
         did = noted[:, robot, LOGGED_KIND] = rng.choice(acts, num_steps)
         kept = did != NO_READING
         noted[:, robot, LOGGED] = kept
-        steps, poses, is_placed = guesses_of(robot, numbers, noted)
+        steps, poses, is_placed = initial_poses_of(robot, numbers, noted)
         np.testing.assert_array_equal(steps, numbers[kept])
         np.testing.assert_array_equal(poses, noted[kept, robot, ESTIMATE:])
         assert 0 < len(steps) < num_steps

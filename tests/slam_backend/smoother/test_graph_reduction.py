@@ -264,15 +264,17 @@ def room_for(keys, frames, points):
     )  # fmt: skip
 
 
-def walked(kinds, motions, variances, counts, guesses, start, rigid_within):
+def walked(kinds, motions, variances, counts, initial_poses, start, rigid_within):
     """Return what the compiled walk of robot 1 found: keys, odometry between them, its noise, slack, frames."""
     keys, frames, raw = room_for(OLD + len(kinds), OLD + len(kinds), int(counts.sum()))
     keys.poses[TIP] = start
-    tips, ends, known = np.array([0, TIP, 3]), np.array([OLD, OLD, 0]), np.flatnonzero(np.isfinite(guesses[:, 0]))
+    tips, ends, known = np.array([0, TIP, 3]), np.array([OLD, OLD, 0]), np.flatnonzero(np.isfinite(initial_poses[:, 0]))
     log = log_of(kinds, motions, variances, counts)
-    is_guided = add_keyframes(log, InitialPoses(known, guesses[known]), 1, rigid_within, tips, ends, keys, frames, raw)
+    is_guided = add_keyframes(
+        log, InitialPoses(known, initial_poses[known]), 1, rigid_within, tips, ends, keys, frames, raw
+    )
     first = np.flatnonzero(counts)[:1]
-    assert is_guided == np.isfinite(guesses[first, 0]).all()
+    assert is_guided == np.isfinite(initial_poses[first, 0]).all()
     num_keys, num_frames, num_points = ends
     new = np.arange(OLD, num_keys)
     chain = np.array([TIP, *new])
@@ -294,7 +296,7 @@ def scatter(noises):
     return noises[:, 0, 0] + noises[:, 1, 1] + LEVER**2 * noises[:, 2, 2]
 
 
-def plainly_walked(kinds, motions, variances, counts, guesses, start, rigid_within):
+def plainly_walked(kinds, motions, variances, counts, initial_poses, start, rigid_within):
     """Return the same, step by step with whole matrices."""
     pose, keys, slack, frames = start, [], [0.0], []
     chain, noise, moved = np.zeros(3), np.zeros((3, 3)), False
@@ -302,8 +304,8 @@ def plainly_walked(kinds, motions, variances, counts, guesses, start, rigid_with
         if kinds[t] == ODOMETRY:
             chain, noise = chained(chain, noise, motions[t], np.diag(variances[t]))
             pose, moved = compose(pose, motions[t]), True
-        if np.isfinite(guesses[t]).all():
-            pose = guesses[t]
+        if np.isfinite(initial_poses[t]).all():
+            pose = initial_poses[t]
         far = counts[t] > 0 and scatter(noise[None])[0] >= rigid_within**2
         if moved and (far or t == len(kinds) - 1):
             keys.append((pose, chain, noise))
@@ -328,10 +330,10 @@ def test_the_compiled_walk_is_the_plain_one(steps, rigid_within, seed):
     rng = np.random.default_rng(seed)
     kinds = rng.choice([STATIONARY, ODOMETRY], steps, p=[0.2, 0.8]).astype(np.int8)
     motions = np.where(kinds[:, None] == ODOMETRY, rng.normal(size=(steps, 3)) * [0.2, 0.05, 0.5], 0.0)
-    guesses = np.where(rng.random((steps, 1)) < 0.3, rng.normal(size=(steps, 3)), np.nan)
+    initial_poses = np.where(rng.random((steps, 1)) < 0.3, rng.normal(size=(steps, 3)), np.nan)
     arguments = (
-        kinds, motions, OdometryModel().variances(motions), rng.integers(0, 3, steps), guesses, rng.normal(size=3),
-        rigid_within,
+        kinds, motions, OdometryModel().variances(motions), rng.integers(0, 3, steps), initial_poses,
+        rng.normal(size=3), rigid_within,
     )  # fmt: skip
     for found, expected in zip(walked(*arguments), plainly_walked(*arguments), strict=True):
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)

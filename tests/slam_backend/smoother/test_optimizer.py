@@ -75,20 +75,20 @@ def test_a_landmark_with_mostly_new_sightings_starts_where_the_filter_has_it():
     start = relinearise(start, optimize(start, camera, options))
     assert np.linalg.norm(start.landmarks[start.landmark_ids == name][0] - run.landmarks[name]) > 1.0
     rest = [log.since(first + 1)]
-    guesses = [InitialPoses(np.arange(len(run.true_paths[0])), run.true_paths[0])]
+    initial_poses = [InitialPoses(np.arange(len(run.true_paths[0])), run.true_paths[0])]
     places = LandmarkPositions(np.arange(120), run.landmarks + 0.02)
 
-    def error(guesses, places):
-        graph = extend_graph(start, rest, motion, mount, guesses, places=places)
+    def error(initial_poses, places):
+        graph = extend_graph(start, rest, motion, mount, initial_poses, places=places)
         mode = optimize(graph, camera, options)
         assert mode.reason == ""
         return np.linalg.norm(mode.landmarks[graph.landmark_ids == name][0] - run.landmarks[name])
 
-    assert error(guesses, places) < 0.05
-    assert error(guesses, None) > 2.0
+    assert error(initial_poses, places) < 0.05
+    assert error(initial_poses, None) > 2.0
     assert error([InitialPoses.empty()], places) == error([InitialPoses.empty()], None)
     few = [log_head(rest[0], 1)]
-    grown = extend_graph(start, few, motion, mount, guesses, places=places)
+    grown = extend_graph(start, few, motion, mount, initial_poses, places=places)
     old = np.flatnonzero(np.isin(grown.landmark_ids, start.landmark_ids))
     np.testing.assert_array_equal(grown.landmarks[old], start.landmarks[old])
 

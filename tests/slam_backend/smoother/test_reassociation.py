@@ -43,7 +43,7 @@ def seen_from(pose, place):
     return transform_points(inverse(pose), place[None])[0] - OPTIONS.camera.mount
 
 
-def guesses_of(poses):
+def initial_poses_of(poses):
     """Return the robot's poses, by step, as the smoother takes them."""
     return [InitialPoses(np.array(list(poses)), np.array(list(poses.values())))]
 
@@ -71,7 +71,7 @@ def known(off=(0.0, 0.5, 0.0), count=1, sigma=0.2, look=LOOK):
 def names(places, held, looks=None, poses=POSES):
     """Return the names (3,) of what was refused, after all."""
     logs, refused = logs_and_refused(places, looks)
-    found = reassociate(logs, refused, guesses_of(poses), held, OPTIONS)[0]
+    found = reassociate(logs, refused, initial_poses_of(poses), held, OPTIONS)[0]
     assert found.ids[::2].tolist() == [3, 3, 3]
     assert logs[0].ids[1::2].tolist() == [REJECTED] * 3
     return found.ids[1::2].tolist()
@@ -113,7 +113,7 @@ def test_agreement_follows_the_covariances_of_the_sensor():
     for sigma, found in ((0.2, [9, 9, 9]), (0.05, [REJECTED] * 3)):
         noise = np.tile(np.array([1.0, 0.0, 0.0, 1.0, 0.0, 1.0]) * sigma**2, (2, 1))
         logs, refused = logs_and_refused(apart, covariances=noise)
-        assert reassociate(logs, refused, guesses_of(POSES), known(), OPTIONS)[0].ids[1::2].tolist() == found
+        assert reassociate(logs, refused, initial_poses_of(POSES), known(), OPTIONS)[0].ids[1::2].tolist() == found
 
 
 def test_without_rejected_measurements_logs_are_unchanged():
@@ -121,7 +121,7 @@ def test_without_rejected_measurements_logs_are_unchanged():
     logs, refused = logs_and_refused([PLACE] * 3)
     nothing = LandmarkTable(*(array[:0] for array in known()))
     for missed, held in (([{}], known()), (refused, nothing)):
-        found = reassociate(logs, missed, guesses_of(POSES), held, OPTIONS)
+        found = reassociate(logs, missed, initial_poses_of(POSES), held, OPTIONS)
         assert found[0].ids is logs[0].ids
 
 
