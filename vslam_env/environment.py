@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 
 from slam_backend.core.compilation.compiler import expect
-from slam_backend.core.state import Snapshot, accepted, restore, take
 from slam_backend.core.validation import FloatArray, argument_error, check_choice, check_int, did_you_mean
+from slam_backend.state import Snapshot, accepted, restore, take
 from slam_backend.team.reports import MergeEvent
 from vslam_env.actions import action_space, checked_actions
 from vslam_env.belief.observation import flatten, observation_space, observe_team

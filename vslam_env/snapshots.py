@@ -9,12 +9,11 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from slam_backend.core.files import os_errors_as_argument_errors, write_file
-from slam_backend.core.random_state import Seed
-from slam_backend.core.state import Child, Dict, Each, Int, Maybe, Options, Sizes, State, Text, built_options, refuse
-from slam_backend.core.state_codec import ForeignObjectError, decode, encode, read_file
-from slam_backend.core.state_format import format_of
+from slam_backend.core.files import os_errors_as_argument_errors, read_file, write_file
 from slam_backend.core.validation import argument_error
+from slam_backend.state import Child, Dict, Each, Int, Maybe, Options, Seed, Sizes, State, Text, built_options, refuse
+from slam_backend.state.codec import ForeignObjectError, decode, encode
+from slam_backend.state.format import format_of
 from vslam_env.config import EnvConfig
 from vslam_env.reward import RewardTerm, is_named
 from vslam_env.simulation.controllers import ActionExecutor

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from slam_backend.core.state_codec import MAX_BYTES, read_file
+from slam_backend.core.files import MAX_BYTES, read_file
 
 HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 KINDS = "biufUS"  # dtype kinds of numbers and texts; objects would be pickles

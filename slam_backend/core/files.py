@@ -1,4 +1,4 @@
-"""Atomic output of files. A path that is not a regular file is written into, never replaced."""
+"""Bounded input and atomic output of files. A path that is not a regular file is written into, never replaced."""
 
 import errno
 import os
@@ -22,6 +22,8 @@ IN_PLACE = (
     errno.EACCES,
     errno.EROFS,
 )  # writable files that cannot be replaced
+
+MAX_BYTES = 1 << 30  # limit of a file that is read whole [bytes]
 
 AnyPath = str | PathLike[str]
 
@@ -259,3 +261,17 @@ def _own_descriptor(path: AnyPath) -> int | None:
             return None
         place = os.path.join(folder, link)
     return None
+
+
+def read_file(path: Path) -> bytes:
+    """Return the content of a regular file of bounded size.
+
+    Raises:
+        OSError: If it cannot be read, is not a regular file, or exceeds `MAX_BYTES`.
+    """
+    found = path.stat()
+    if not stat.S_ISREG(found.st_mode):
+        raise OSError("not a regular file")
+    if found.st_size > MAX_BYTES:
+        raise OSError(f"the file has more than {MAX_BYTES >> 20} MiB")
+    return path.read_bytes()

@@ -29,7 +29,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
-from slam_backend.core.state import Each, Float, Int, Sizes, State
+from slam_backend.state import Each, Float, Int, Sizes, State
 
 FALSE_ALARM_RATE = 0.01  # largest share of consistent filters that ever raise a warning, all signs together
 NIS_BOUNDS = (7.81, 11.34)  # 95 and 99 % of chi-square with three degrees of freedom; conservative with two

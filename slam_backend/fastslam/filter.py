@@ -12,25 +12,6 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from slam_backend.core.random_state import Generator
-from slam_backend.core.state import (
-    FLOAT64,
-    INT64,
-    MAX_DISTANCE,
-    Array,
-    Child,
-    Each,
-    Int,
-    Maybe,
-    Options,
-    Record,
-    Sizes,
-    Snapshot,
-    State,
-    accepted,
-    restore,
-    take,
-)
 from slam_backend.core.validation import (
     BoolArray,
     FloatArray,
@@ -85,6 +66,25 @@ from slam_backend.models.measurements import Measurements
 from slam_backend.reference.filter import ReferenceFastSlam
 from slam_backend.resampling import RESAMPLING
 from slam_backend.smoother.rejuvenation import Particles
+from slam_backend.state import (
+    FLOAT64,
+    INT64,
+    MAX_DISTANCE,
+    Array,
+    Child,
+    Each,
+    Generator,
+    Int,
+    Maybe,
+    Options,
+    Record,
+    Sizes,
+    Snapshot,
+    State,
+    accepted,
+    restore,
+    take,
+)
 
 LEAST = float(np.finfo(np.float64).min)  # lower limit of log-weights
 NO_WEIGHTS = np.empty(0)  # unused where all particles start at the same pose

@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.core.short_repr import short_repr
-from slam_backend.core.state import MAX_DESCRIPTOR
 from slam_backend.core.validation import (
     MOST,
     FloatArray,
@@ -22,6 +21,7 @@ from slam_backend.models.camera import StereoCamera
 from slam_backend.models.odometry import LARGEST_SIGMA, OdometryModel
 from slam_backend.resampling import RESAMPLING
 from slam_backend.smoother.options import SmoothingOptions
+from slam_backend.state import MAX_DESCRIPTOR
 
 PROPOSALS = ("fastslam2", "fastslam1")
 MAX_ROBOTS, MAX_PARTICLES = 1_000, 1_000_000  # beyond any memory

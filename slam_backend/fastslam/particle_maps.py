@@ -19,7 +19,12 @@ from numpy.typing import NDArray
 from slam_backend.core.jit import LINE
 from slam_backend.core.packed_symmetric import UNPACK_INDEX
 from slam_backend.core.read_only import as_read_only
-from slam_backend.core.state import (
+from slam_backend.core.validation import FloatArray, IntArray
+from slam_backend.fastslam import _kernels
+from slam_backend.fastslam._kernels import LANES
+from slam_backend.fastslam._kernels.records import SLOT
+from slam_backend.maps.landmark_map import MapSummaryRows
+from slam_backend.state import (
     FLOAT32,
     FLOAT64,
     INT32,
@@ -34,11 +39,6 @@ from slam_backend.core.state import (
     Sizes,
     State,
 )
-from slam_backend.core.validation import FloatArray, IntArray
-from slam_backend.fastslam import _kernels
-from slam_backend.fastslam._kernels import LANES
-from slam_backend.fastslam._kernels.records import SLOT
-from slam_backend.maps.landmark_map import MapSummaryRows
 
 
 def empty_aligned(shape: tuple[int, ...], dtype: Any) -> Any:

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from slam_backend.core.blas import single_threaded_blas
 from slam_backend.core.read_only import as_read_only, with_read_only
-from slam_backend.core.state import MAX_INT, Dict, Each, Flag, Int, Maybe, Record, Sizes, State
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.fastslam import _kernels
 from slam_backend.fastslam.options import FilterOptions
@@ -24,6 +23,7 @@ from slam_backend.smoother.options import SmoothingOptions
 from slam_backend.smoother.reassociation import LandmarkTable, RejectedMeasurements, reassociate
 from slam_backend.smoother.rejuvenation import Draft, LandmarkDescriptors, Particles, Rejuvenation, Smoother
 from slam_backend.smoother.sampling import PathLandmarks
+from slam_backend.state import MAX_INT, Dict, Each, Flag, Int, Maybe, Record, Sizes, State
 
 
 def landmark_positions(maps: ParticleMaps, best: int) -> LandmarkPositions:

@@ -9,7 +9,10 @@ import numpy as np
 
 from slam_backend.core.read_only import Act, as_read_only, map_arrays
 from slam_backend.core.short_repr import short_repr
-from slam_backend.core.state import (
+from slam_backend.core.validation import BoolArray, FloatArray, IntArray
+from slam_backend.fastslam._kernels import REJECTED, STATIONARY
+from slam_backend.fastslam.step_input import MASKS, NO_INPUT, RobotInput, StepInput, check_rows
+from slam_backend.state import (
     INT64,
     MAX_LANDMARKS,
     Array,
@@ -24,9 +27,6 @@ from slam_backend.core.state import (
     Text,
     with_state,
 )
-from slam_backend.core.validation import BoolArray, FloatArray, IntArray
-from slam_backend.fastslam._kernels import REJECTED, STATIONARY
-from slam_backend.fastslam.step_input import MASKS, NO_INPUT, RobotInput, StepInput, check_rows
 
 
 @short_repr

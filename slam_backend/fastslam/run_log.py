@@ -8,7 +8,6 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from slam_backend.core.state import Each, Record, Sizes, State, accepted, restore, take
 from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_array, check_choice, check_int
 from slam_backend.fastslam._kernels.records import LogColumns
 from slam_backend.fastslam._kernels.run_log import turn_of, write_rows
@@ -21,6 +20,7 @@ from slam_backend.smoother.log_arrays import (
     LogStep,
     join,
 )
+from slam_backend.state import Each, Record, Sizes, State, accepted, restore, take
 
 ROWS = 256  # steps of a chunk
 MEASUREMENTS = 2048  # measurements of a chunk, unless one frame alone has more

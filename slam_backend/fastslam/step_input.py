@@ -12,7 +12,12 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from slam_backend.core.read_only import Act, as_read_only, map_arrays, with_read_only
-from slam_backend.core.state import (
+from slam_backend.core.validation import BoolArray, Float32Array, FloatArray, IntArray, argument_error, check_array
+from slam_backend.fastslam import _kernels
+from slam_backend.fastslam._kernels import EXACT_POSE, NO_READING
+from slam_backend.models.camera import MAX_POINT_DISTANCE, StereoCamera
+from slam_backend.models.measurements import Measurements, TeamMeasurements
+from slam_backend.state import (
     BOOL,
     FLOAT32,
     FLOAT64,
@@ -30,11 +35,6 @@ from slam_backend.core.state import (
     State,
     with_state,
 )
-from slam_backend.core.validation import BoolArray, Float32Array, FloatArray, IntArray, argument_error, check_array
-from slam_backend.fastslam import _kernels
-from slam_backend.fastslam._kernels import EXACT_POSE, NO_READING
-from slam_backend.models.camera import MAX_POINT_DISTANCE, StereoCamera
-from slam_backend.models.measurements import Measurements, TeamMeasurements
 
 
 @with_state(

@@ -16,7 +16,6 @@ import numpy as np
 
 from slam_backend.core.read_only import as_read_only
 from slam_backend.core.short_repr import short_repr
-from slam_backend.core.state import BOOL, FLOAT32, FLOAT64, Array, Record, with_state
 from slam_backend.core.validation import (
     MOST,
     BoolArray,
@@ -35,6 +34,7 @@ from slam_backend.frontend.descriptors import DESCRIPTOR_TYPES, DESCRIPTORS, des
 from slam_backend.frontend.images import Image, check_image
 from slam_backend.models.camera import StereoCamera
 from slam_backend.models.measurements import Measurements, TeamMeasurements
+from slam_backend.state import BOOL, FLOAT32, FLOAT64, Array, Record, with_state
 
 MATCH_CHECKS = ("mutual", "patch", "rows", "back", "range")
 LEAST_SCALE, LARGEST_SCALE = 1.0, 8.0  # px; limits for windows of constant physical size

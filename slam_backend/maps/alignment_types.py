@@ -8,7 +8,6 @@ import numpy as np
 
 from slam_backend.core.read_only import as_read_only
 from slam_backend.core.short_repr import short_repr
-from slam_backend.core.state import FLOAT64, INT64, Array, Flag, Float, State, Text
 from slam_backend.core.validation import (
     MOST,
     FloatArray,
@@ -19,6 +18,7 @@ from slam_backend.core.validation import (
     check_int,
     known_names,
 )
+from slam_backend.state import FLOAT64, INT64, Array, Flag, Float, State, Text
 
 Reason = Literal[
     "", "too few candidates", "too many candidates", "too few inliers", "ambiguous", "mirrored", "poorly spread",

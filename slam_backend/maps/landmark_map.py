@@ -13,7 +13,9 @@ from slam_backend.core.array_files import read_arrays
 from slam_backend.core.files import checked_path, write_file
 from slam_backend.core.read_only import as_read_only
 from slam_backend.core.short_repr import short_repr
-from slam_backend.core.state import (
+from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_array, check_int
+from slam_backend.geometry import rotate_covariances, transform_points
+from slam_backend.state import (
     FLOAT32,
     FLOAT64,
     INT64,
@@ -24,8 +26,6 @@ from slam_backend.core.state import (
     Sizes,
     State,
 )
-from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_array, check_int
-from slam_backend.geometry import rotate_covariances, transform_points
 
 FORMAT = "vslam landmark map"
 FORMAT_VERSION = 1

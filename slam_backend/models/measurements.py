@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from slam_backend.core.read_only import as_read_only
 from slam_backend.core.short_repr import short_repr
-from slam_backend.core.state import FLOAT32, FLOAT64, INT64, MAX_DESCRIPTOR, Array, Maybe, Sizes, State, with_state
 from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_array
 from slam_backend.fastslam import _kernels
+from slam_backend.state import FLOAT32, FLOAT64, INT64, MAX_DESCRIPTOR, Array, Maybe, Sizes, State, with_state
 
 LEAST_VARIANCE, LARGEST_VARIANCE = 1e-14, 1e12  # [m^2]; keeps differences of log-weights representable in float64
 LARGEST_CONDITION = 1e8  # about 1 / sqrt(machine epsilon); beyond it float64 updates lose positive definiteness

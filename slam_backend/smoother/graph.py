@@ -9,7 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.core.read_only import as_read_only
-from slam_backend.core.state import (
+from slam_backend.core.validation import BoolArray, FloatArray, IntArray
+from slam_backend.geometry import between, wrap_angle
+from slam_backend.models.odometry import OdometryModel
+from slam_backend.smoother._kernels import BIAS, Condensed, Frames, Keys, Landmarks, Points
+from slam_backend.smoother._kernels import LEVER as LEVER
+from slam_backend.smoother._kernels import NONE as NONE
+from slam_backend.state import (
     BOOL,
     FLOAT64,
     INT64,
@@ -20,12 +26,6 @@ from slam_backend.core.state import (
     Sizes,
     State,
 )
-from slam_backend.core.validation import BoolArray, FloatArray, IntArray
-from slam_backend.geometry import between, wrap_angle
-from slam_backend.models.odometry import OdometryModel
-from slam_backend.smoother._kernels import BIAS, Condensed, Frames, Keys, Landmarks, Points
-from slam_backend.smoother._kernels import LEVER as LEVER
-from slam_backend.smoother._kernels import NONE as NONE
 
 UNINFORMATIVE = (1e4, 1e4, 10.0)  # variances [m^2, m^2, rad^2] of an unknown start
 MIN_BIAS = 1e-6  # standard deviation [m/m, rad/m, rad/rad] of a part of the bias that is said to be none

@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.core.state import FLOAT64, INT64, MAX_DISTANCE, Array, with_state
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray, argument_error
 from slam_backend.geometry import between, compose, cosine_sine, rotation
 from slam_backend.models.odometry import OdometryModel
@@ -14,6 +13,7 @@ from slam_backend.smoother import _kernels
 from slam_backend.smoother._kernels import BIAS, Condensed, Frames, Keys, Landmarks, Log, Points
 from slam_backend.smoother.graph import NONE, RIGID, UNINFORMATIVE, Part, SlamGraph, mapped
 from slam_backend.smoother.log_arrays import EXACT, LogArrays
+from slam_backend.state import FLOAT64, INT64, MAX_DISTANCE, Array, with_state
 
 
 @with_state(steps=Array(INT64, "n", ascending=True), poses=Array(FLOAT64, "n 3", -MAX_DISTANCE, MAX_DISTANCE))

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.core.read_only import as_read_only
-from slam_backend.core.state import (
+from slam_backend.core.validation import BoolArray, FloatArray, IntArray
+from slam_backend.state import (
     BOOL,
     FLOAT64,
     INT8,
@@ -20,7 +21,6 @@ from slam_backend.core.state import (
     Sizes,
     State,
 )
-from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 
 STATIONARY: Final = 0  # kinds of motion
 ODOMETRY: Final = 1

@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.core.packed_symmetric import UNPACK_INDEX
-from slam_backend.core.state import FLOAT32, INT64, MAX_DESCRIPTOR, Array, with_state
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.fastslam.options import FilterOptions
 from slam_backend.geometry import rotation
 from slam_backend.models.camera import ROBOT_FROM_CAMERA
 from slam_backend.smoother.graph_building import InitialPoses
 from slam_backend.smoother.log_arrays import LogArrays
+from slam_backend.state import FLOAT32, INT64, MAX_DESCRIPTOR, Array, with_state
 
 NO_ONE = -1
 ROUNDING = 1e-12  # [m^2]; keeps covariances of sensors without noise invertible

@@ -14,7 +14,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from slam_backend.core.state import Float, Int, Record, with_state
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.geometry import wrap_angle
 from slam_backend.models.odometry import OdometryModel
@@ -37,6 +36,7 @@ from slam_backend.smoother.sampling import (
     tempered,
     transition_variances,
 )
+from slam_backend.state import Float, Int, Record, with_state
 
 DRAFT_TOLERANCE = 10.0  # factor on the tolerance of descents without draws
 

@@ -11,12 +11,12 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from slam_backend.core.state import Child, Dict, Each, Int, Maybe, Record, Sizes, State, restored, take, with_state
 from slam_backend.core.validation import IntArray
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.reports import Associations, StepReport
 from slam_backend.fastslam.run_log import last_step
 from slam_backend.fastslam.step_input import InputBuffer, RobotRows, StepInput, rows_of
+from slam_backend.state import Child, Dict, Each, Int, Maybe, Record, Sizes, State, restored, take, with_state
 from slam_backend.team.merge_monitor import MergeMonitor
 from slam_backend.team.merge_scheduler import LANDMARK, ROBOT, ROBOTS
 

@@ -5,11 +5,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from slam_backend.core.state import Dict, Each, Int, Row, State
 from slam_backend.core.validation import BoolArray, IntArray, argument_error, check_array
 from slam_backend.fastslam._kernels import EXACT_POSE, MOVED
 from slam_backend.fastslam.reports import StepReport
 from slam_backend.maps.landmark_map import LandmarkMap
+from slam_backend.state import Dict, Each, Int, Row, State
 from slam_backend.team.branches import ReplayedStep
 from slam_backend.team.merge_scheduler import LANDMARK, ROBOT
 

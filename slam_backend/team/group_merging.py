@@ -7,7 +7,6 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from slam_backend.core.state import Each, Int, Record, Saved, Sizes, Snapshot, State, take
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.fastslam import _kernels
 from slam_backend.fastslam.filter import FastSlam
@@ -17,6 +16,7 @@ from slam_backend.maps.fusion import check_inliers
 from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.smoother.graph import SlamGraph
 from slam_backend.smoother.joint_graphs import RelativeStart, relative_start
+from slam_backend.state import Each, Int, Record, Saved, Sizes, Snapshot, State, take
 from slam_backend.team.branches import Branch, fork
 from slam_backend.team.filter_merging.landmarks import merge_by_identity, renaming
 from slam_backend.team.filter_merging.merging import merge_filters, pair_filters, transform_covariance

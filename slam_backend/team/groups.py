@@ -5,8 +5,8 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from slam_backend.core.state import Child, Each, Sizes, State
 from slam_backend.core.validation import IntArray
+from slam_backend.state import Child, Each, Sizes, State
 from slam_backend.team.branches import Branch, StepRouting, fork, landmark_counts, missing, replay, split_by_component
 from slam_backend.team.shared_records import SharedRecords
 

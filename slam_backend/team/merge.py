@@ -6,13 +6,15 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from slam_backend.core.random_state import Generator
-from slam_backend.core.state import (
+from slam_backend.core.validation import IntArray
+from slam_backend.maps.alignment import Alignment, align_maps
+from slam_backend.state import (
     Child,
     ChildOf,
     Dict,
     Each,
     Flag,
+    Generator,
     Int,
     Maybe,
     Options,
@@ -23,8 +25,6 @@ from slam_backend.core.state import (
     State,
     restored,
 )
-from slam_backend.core.validation import IntArray
-from slam_backend.maps.alignment import Alignment, align_maps
 from slam_backend.team.branches import MAX_REPLAYED, Branch, ReplayedStep, replay
 from slam_backend.team.filter_merging.pairing import Pairing
 from slam_backend.team.group_merging import (

@@ -19,7 +19,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from slam_backend.core.state import Each, Int, Record, Row, State
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.fastslam.reports import StepReport
 from slam_backend.geometry import transform_points
@@ -33,6 +32,7 @@ from slam_backend.maps.correspondences import has_enough_candidates
 from slam_backend.maps.landmark_map import LandmarkMap, unchecked_map
 from slam_backend.maps.match_table import match_table
 from slam_backend.maps.registration import count_moved_away
+from slam_backend.state import Each, Int, Record, Row, State
 from slam_backend.team.merge_scheduler import LANDMARK, PAIR, PairKey
 from slam_backend.team.options import MergeOptions
 

@@ -6,7 +6,16 @@ from dataclasses import dataclass
 
 from slam_backend.core.read_only import as_constant
 from slam_backend.core.short_repr import short_repr
-from slam_backend.core.state import (
+from slam_backend.core.validation import MOST, FloatArray, argument_error, check_int, known_names
+from slam_backend.geometry import wrap_angle
+from slam_backend.maps.alignment import (
+    DISTINCT_ROTATION,
+    DISTINCT_TRANSLATION,
+    AlignmentOptions,
+)
+from slam_backend.maps.correspondences import candidates, too_many
+from slam_backend.maps.landmark_map import LandmarkMap
+from slam_backend.state import (
     FLOAT64,
     MAX_LANDMARKS,
     Array,
@@ -19,15 +28,6 @@ from slam_backend.core.state import (
     Row,
     State,
 )
-from slam_backend.core.validation import MOST, FloatArray, argument_error, check_int, known_names
-from slam_backend.geometry import wrap_angle
-from slam_backend.maps.alignment import (
-    DISTINCT_ROTATION,
-    DISTINCT_TRANSLATION,
-    AlignmentOptions,
-)
-from slam_backend.maps.correspondences import candidates, too_many
-from slam_backend.maps.landmark_map import LandmarkMap
 
 PairKey = tuple[tuple[int, ...], tuple[int, ...]]  # two groups, as tuples of robots
 LANDMARK, ROBOT = Int(0, MAX_LANDMARKS), Int(high="K")

@@ -8,7 +8,10 @@ from typing import Any, Literal, NamedTuple
 
 from slam_backend.core.read_only import as_constant
 from slam_backend.core.short_repr import short_repr
-from slam_backend.core.state import (
+from slam_backend.core.validation import IntArray
+from slam_backend.fastslam.reports import Associations, RejuvenationReport
+from slam_backend.maps.alignment_types import REASONS, Alignment
+from slam_backend.state import (
     INT64,
     MAX_LANDMARKS,
     Array,
@@ -22,9 +25,6 @@ from slam_backend.core.state import (
     Text,
     with_state,
 )
-from slam_backend.core.validation import IntArray
-from slam_backend.fastslam.reports import Associations, RejuvenationReport
-from slam_backend.maps.alignment_types import REASONS, Alignment
 from slam_backend.team.merge_scheduler import ROBOT, ROBOTS
 
 

@@ -4,12 +4,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from slam_backend.core.random_state import Generator
 from slam_backend.core.read_only import as_read_only
-from slam_backend.core.state import MAX_LANDMARKS, Child, Each, Int, State
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.reports import StepReport
 from slam_backend.fastslam.step_input import InputBuffer
+from slam_backend.state import MAX_LANDMARKS, Child, Each, Generator, Int, State
 from slam_backend.team.branches import ReplayedStep
 from slam_backend.team.communication import TrafficCounter
 from slam_backend.team.reports import MAP_CHANGE, LandmarksCreated, MapChange, MapForked

@@ -15,7 +15,6 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from slam_backend.core.state import Child, Each, Int, Sizes, Snapshot, State, accepted, restore, restored, take
 from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_int, check_kind, check_seed
 from slam_backend.fastslam.consistency import Consistency
 from slam_backend.fastslam.filter import FastSlam
@@ -28,6 +27,7 @@ from slam_backend.geometry import inverse
 from slam_backend.maps.alignment import Alignment, AlignmentOptions
 from slam_backend.maps.landmark_map import LandmarkMap, TeamMapSummaries
 from slam_backend.models.measurements import Measurements, TeamMeasurements
+from slam_backend.state import Child, Each, Int, Sizes, Snapshot, State, accepted, restore, restored, take
 from slam_backend.team.branches import Branch, process_step
 from slam_backend.team.communication import TrafficCounter, check_contacts, contact_components
 from slam_backend.team.filter_merging.merging import inverse_alignment

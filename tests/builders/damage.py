@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.core.state_codec import ForeignObjectError, decode, encode
+from slam_backend.state.codec import ForeignObjectError, decode, encode
 
 REPEATED = 20  # refusals after which it is looked whether anything has changed
 STOP = 0.08  # chance that a container is damaged itself, and not something in it

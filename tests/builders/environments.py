@@ -4,11 +4,11 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.core.state import accepted, restore
 from slam_backend.core.validation import FloatArray
 from slam_backend.fastslam.relative_poses import TeamPoses
 from slam_backend.geometry import between, compose
 from slam_backend.maps.landmark_map import TeamMapSummaries
+from slam_backend.state import accepted, restore
 from vslam_env import ExplorationEnv, World, vslam_v0
 from vslam_env.evaluation.map_scores import GroundTruthAssociation
 from vslam_env.evaluation.team_metrics import RobotCounts, RobotMetrics, TeamMetrics

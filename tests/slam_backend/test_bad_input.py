@@ -19,7 +19,6 @@ from builders.teams import SimulatedTeam, hand_made, standing_team
 
 import slam_backend
 from slam_backend import metrics
-from slam_backend.core.state import take
 from slam_backend.core.validation import (
     argument_error,
     check_array,
@@ -48,6 +47,7 @@ from slam_backend.readers.mrclam import SightingNoise, load_mrclam
 from slam_backend.readers.victoria import TreeNoise, load_victoria
 from slam_backend.reference.filter import ReferenceFastSlam
 from slam_backend.smoother.options import SmoothingOptions
+from slam_backend.state import take
 from slam_backend.team.merge_scheduler import AttemptOptions
 from slam_backend.team.options import MergeOptions
 from slam_backend.team.team import TeamSlam

@@ -8,10 +8,10 @@ import pytest
 from builders.damage import at, replaced, try_damaged
 from builders.teams import SimulatedTeam, begin_undo, driven, links, true_alignment
 
-from slam_backend.core.state_codec import encode
 from slam_backend.fastslam.existence import ExistenceModel
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.smoother.options import SmoothingOptions
+from slam_backend.state.codec import encode
 from slam_backend.team.merge_scheduler import AttemptOptions
 from slam_backend.team.options import MergeOptions
 from slam_backend.team.team import TeamSlam

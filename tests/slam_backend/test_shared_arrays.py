@@ -10,7 +10,7 @@ from builders.shared_arrays import scribble, shared, shared_and_writable
 from test_damaged_states import SUBJECTS, play
 
 from slam_backend.core.read_only import as_constant, as_read_only, is_read_only, with_read_only
-from slam_backend.core.state_codec import decode, encode
+from slam_backend.state.codec import decode, encode
 
 
 @pytest.mark.parametrize("name", SUBJECTS)

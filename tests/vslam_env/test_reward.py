@@ -7,10 +7,10 @@ from builders.comparison import digest
 from builders.environments import MEETING, scored, small_env, standing_at, turning, wander
 
 from agents import make_policy
-from slam_backend.core.state import restore, take
 from slam_backend.fastslam.reports import Associations
 from slam_backend.maps.alignment import Alignment
 from slam_backend.maps.landmark_map import LandmarkMap, TeamMapSummaries
+from slam_backend.state import restore, take
 from slam_backend.team.reports import LandmarksCreated, TeamReport
 from vslam_env import ExplorationEnv, vslam_v0
 from vslam_env.config import TICK

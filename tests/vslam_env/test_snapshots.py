@@ -15,8 +15,8 @@ from builders.comparison import assert_same, digest
 from builders.damage import Trap
 from builders.environments import MEETING, small_env, wander
 
-from slam_backend.core.state_codec import encode
-from slam_backend.core.state_format import equal, format_of
+from slam_backend.state.codec import encode
+from slam_backend.state.format import equal, format_of
 from slam_backend.team import merge
 from slam_backend.team.branches import Branch
 from vslam_env import EnvConfig, ExplorationEnv, load_state, save_state, vslam_v0

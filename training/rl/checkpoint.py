@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from slam_backend.core.files import write_file
-from slam_backend.core.state_codec import MAX_BYTES, decode, encode, read_file
+from slam_backend.core.files import MAX_BYTES, read_file, write_file
 from slam_backend.core.validation import argument_error
+from slam_backend.state.codec import decode, encode
 from training.experiments.run_folder import installed_versions
 
 FORMAT = 5  # incremented when the content of checkpoints changes

@@ -10,8 +10,8 @@ import torch
 from stable_baselines3.common.logger import configure
 
 from agents.trained import MODEL_FILE, load_model, save_model
-from slam_backend.core.random_state import checked_stream
 from slam_backend.core.validation import argument_error
+from slam_backend.state import checked_stream
 from training.experiments.run_folder import installed_versions
 from training.rl.callbacks import Row, TrainingCallback
 from training.rl.checkpoint import CHECKPOINT_FILE, read_checkpoint, write_checkpoint

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from slam_backend.core.jit import in_place, jit, stack_array
-from slam_backend.core.state import BOOL, Array, State
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.fastslam.relative_poses import OWN, SIGMAS, START, TeamPoses
+from slam_backend.state import BOOL, Array, State
 from vslam_env.navigation.candidates import NUM_RENDEZVOUS, LandmarkRows
 
 OWN_START, RICHEST, NUM_FIXED = 0, 1, 2  # slots; the others belong to teammates

@@ -8,7 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from slam_backend.core.read_only import as_constant, as_read_only
-from slam_backend.core.state import (
+from slam_backend.core.validation import BoolArray, FloatArray, IntArray
+from slam_backend.fastslam.relative_poses import TeamPoses
+from slam_backend.geometry import compose, inverse
+from slam_backend.models.camera import StereoCamera
+from slam_backend.state import (
     BOOL,
     FLOAT64,
     INT64,
@@ -23,10 +27,6 @@ from slam_backend.core.state import (
     State,
     with_state,
 )
-from slam_backend.core.validation import BoolArray, FloatArray, IntArray
-from slam_backend.fastslam.relative_poses import TeamPoses
-from slam_backend.geometry import compose, inverse
-from slam_backend.models.camera import StereoCamera
 from slam_backend.team.reports import LandmarkIdMap, MapReleased, MergeUndone, TeamReport
 from vslam_env.belief.belief import RobotHardware
 from vslam_env.navigation import OccupancyGrid, TeamGrids, TeamLooks, ray_directions

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 
 from slam_backend.core.read_only import as_read_only
-from slam_backend.core.state import FLOAT64, Array, Child, Int, Sizes, State
 from slam_backend.core.validation import Float32Array, FloatArray, argument_error
 from slam_backend.fastslam.options import FilterOptions
 from slam_backend.fastslam.relative_poses import TeamPoses
 from slam_backend.geometry import rotate_covariances
 from slam_backend.maps.alignment import Alignment
 from slam_backend.maps.landmark_map import LandmarkMap, TeamMapSummaries
+from slam_backend.state import FLOAT64, Array, Child, Int, Sizes, State
 from slam_backend.team.merge import branches_in
 from slam_backend.team.merge_scheduler import AttemptOptions
 from slam_backend.team.options import MergeOptions

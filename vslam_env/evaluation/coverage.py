@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from slam_backend.core.jit import device, in_place
 from slam_backend.core.read_only import as_constant, as_read_only
-from slam_backend.core.state import INT64, Array, State
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.geometry import inverse, transform_points
+from slam_backend.state import INT64, Array, State
 from vslam_env.navigation import FREE, TeamGrids, cell_of
 from vslam_env.navigation._grid_kernels import LARGEST_SIZE
 

@@ -9,10 +9,10 @@ import numpy as np
 
 from slam_backend.core.jit import in_place
 from slam_backend.core.read_only import as_read_only
-from slam_backend.core.state import INT64, MAX_LANDMARKS, Array, Dict, Each, Int, Sizes, State
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray, check_float
 from slam_backend.fastslam.relative_poses import OWN, SIGMAS, START, TeamPoses
 from slam_backend.maps.landmark_map import TeamMapSummaries
+from slam_backend.state import INT64, MAX_LANDMARKS, Array, Dict, Each, Int, Sizes, State
 from slam_backend.team.merge import branches_in
 from slam_backend.team.reports import LandmarkIdMap, LandmarksCreated, MapForked, MapReleased, TeamReport
 from vslam_env.evaluation.team_metrics import RobotMetrics

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from slam_backend.core.state import BOOL, FLOAT64, Array, State
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
+from slam_backend.state import BOOL, FLOAT64, Array, State
 
 
 class RecallCredits:

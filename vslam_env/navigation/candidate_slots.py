@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from slam_backend.core.state import FLOAT64, INT64, Array, Sizes, State
 from slam_backend.core.validation import BoolArray, FloatArray
+from slam_backend.state import FLOAT64, INT64, Array, Sizes, State
 from vslam_env.navigation._grid_kernels import LARGEST_HALF_WIDTH
 from vslam_env.navigation._planning_kernels import (
     SAME_GOAL,

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.core.short_repr import short_repr
-from slam_backend.core.state import FLOAT64, INT64, Array, Child, Each, Int, Sizes, State
 from slam_backend.core.validation import FloatArray, IntArray
+from slam_backend.state import FLOAT64, INT64, Array, Child, Each, Int, Sizes, State
 from vslam_env.navigation._grid_kernels import CELL
 from vslam_env.navigation._view_kernels import (
     NUM_DESCRIBED,

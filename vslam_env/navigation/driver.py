@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 from typing import Any
 
-from slam_backend.core.state import FLOAT64, Array, Float, Maybe, Sizes, State
 from slam_backend.core.validation import FloatArray
+from slam_backend.state import FLOAT64, Array, Float, Maybe, Sizes, State
 from vslam_env.navigation._grid_kernels import LARGEST_HALF_WIDTH
 from vslam_env.navigation.occupancy_grid import OccupancyGrid
 from vslam_env.navigation.planning import follow_path, plan_path

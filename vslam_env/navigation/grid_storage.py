@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.core.read_only import as_constant, as_read_only
-from slam_backend.core.state import INT8, UINT8, Array, Int, Row, Sizes, with_state
+from slam_backend.state import INT8, UINT8, Array, Int, Row, Sizes, with_state
 from vslam_env.navigation._grid_kernels import CELL, GRID_SIZE, LARGEST_SIZE, MOST_CHANGES, Grid
 
 GRID_SIZES = (GRID_SIZE, 600, 1200, 2400, LARGEST_SIZE)  # by doubling, up to 400 m on each side of the start

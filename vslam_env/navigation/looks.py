@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from slam_backend.core.state import Each, Record, State
 from slam_backend.core.validation import FloatArray, IntArray
+from slam_backend.state import Each, Record, State
 from vslam_env.navigation._grid_kernels import GRID_SIZE
 from vslam_env.navigation._view_kernels import merge_looks, paint_looks
 from vslam_env.navigation.grid_storage import LooksPart, known_bounds, size_for

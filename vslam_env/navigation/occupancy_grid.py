@@ -4,8 +4,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slam_backend.core.short_repr import described
-from slam_backend.core.state import Record, State
 from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_float
+from slam_backend.state import Record, State
 from vslam_env.navigation import _grid_kernels as _painting
 from vslam_env.navigation._grid_kernels import CELL, FREE, GRID_SIZE, HALF_WIDTH, OCCUPIED, UNKNOWN, Grid
 from vslam_env.navigation.grid_storage import GridPart, GridStorage, margin

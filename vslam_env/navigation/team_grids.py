@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from slam_backend.core.state import Child, Each, State
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
+from slam_backend.state import Child, Each, State
 from vslam_env.navigation._grid_kernels import NUM_PAINT_ROWS, update_grids
 from vslam_env.navigation.grid_storage import GridStorage
 from vslam_env.navigation.occupancy_grid import OccupancyGrid

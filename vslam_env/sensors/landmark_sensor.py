@@ -8,7 +8,6 @@ import numpy as np
 
 from slam_backend.core.read_only import as_read_only
 from slam_backend.core.short_repr import short_repr
-from slam_backend.core.state import INT64, Array, Record, with_state
 from slam_backend.core.validation import (
     BoolArray,
     FloatArray,
@@ -20,6 +19,7 @@ from slam_backend.core.validation import (
 )
 from slam_backend.models.camera import StereoCamera
 from slam_backend.models.measurements import Measurements, TeamMeasurements
+from slam_backend.state import INT64, Array, Record, with_state
 from vslam_env.sensors._landmark_kernels import BEYOND, FARTHEST, measure, sample_clutter
 from vslam_env.world._kernels import detect
 from vslam_env.world.spec import Landmarks

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.core.state import Child, Each, State
+from slam_backend.state import Child, Each, State
 from vslam_env.config import EnvConfig
 from vslam_env.navigation.driver import Driver
 from vslam_env.simulation.episode import Episode

@@ -8,12 +8,26 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.core.random_state import Generator
 from slam_backend.core.read_only import as_constant, with_read_only
-from slam_backend.core.state import BOOL, FLOAT64, Array, Child, Dict, Each, Int, Maybe, OneOf, Row, Sizes, State, Text
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.geometry import between, compose
 from slam_backend.maps.alignment import Alignment
+from slam_backend.state import (
+    BOOL,
+    FLOAT64,
+    Array,
+    Child,
+    Dict,
+    Each,
+    Generator,
+    Int,
+    Maybe,
+    OneOf,
+    Row,
+    Sizes,
+    State,
+    Text,
+)
 from slam_backend.team.communication import contact_components
 from vslam_env.belief.readings import Readings, TeamReadings
 from vslam_env.belief.team_belief import RobotHardware, TeamBelief

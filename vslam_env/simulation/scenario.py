@@ -6,12 +6,11 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from slam_backend.core.random_state import Seed
 from slam_backend.core.read_only import as_constant, as_read_only
 from slam_backend.core.short_repr import short_repr
-from slam_backend.core.state import BOOL, FLOAT64, INT64, Array, Maybe, Record, Sizes, State, refuse
-from slam_backend.core.state_format import parts_of
 from slam_backend.core.validation import FloatArray, IntArray, argument_error
+from slam_backend.state import BOOL, FLOAT64, INT64, Array, Maybe, Record, Seed, Sizes, State, refuse
+from slam_backend.state.format import parts_of
 from vslam_env.config import EnvConfig
 from vslam_env.evaluation.coverage import CoverageCells
 from vslam_env.evaluation.map_scores import GroundTruthAssociation
@@ -230,8 +229,9 @@ class ScenarioPart(Record):
     def __init__(self) -> None:
         super().__init__(Scenario)
 
-    def _check(self, name: str, value: Any, sizes: Sizes) -> Scenario:
-        scenario: Scenario = value if value is sizes["SCENARIO"] else super()._check(name, value, sizes)
+    def check(self, name: str, value: Any, sizes: Sizes) -> Scenario:
+        """Return the scenario, or raise; add the sizes that follow."""
+        scenario: Scenario = value if value is sizes["SCENARIO"] else super().check(name, value, sizes)
         landmarks = scenario.world.landmarks
         assert landmarks is not None
         sizes |= {"WORLD": len(landmarks), "LANDMARKS": int(np.count_nonzero(scenario.observable_landmarks))}
@@ -242,5 +242,5 @@ class ScenarioPart(Record):
         found = parts_of(value) if type(value) is Scenario else value
         if not isinstance(found, Mapping):
             refuse(name, "a Scenario", f"a {type(value).__name__}")
-        parts = {key: part._check(f"{name}.{key}", found[key], sizes) for key, part in Scenario.STATE.parts.items()}
+        parts = {key: part.check(f"{name}.{key}", found[key], sizes) for key, part in Scenario.STATE.parts.items()}
         return Scenario.from_parts(sizes["CONFIG"], **parts)

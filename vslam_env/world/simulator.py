@@ -8,8 +8,8 @@ import pymunk
 
 from slam_backend.core.jit import in_place
 from slam_backend.core.read_only import as_read_only
-from slam_backend.core.state import BOOL, FLOAT64, MAX_DISTANCE, Array, State
 from slam_backend.core.validation import FloatArray, check_array, check_float
+from slam_backend.state import BOOL, FLOAT64, MAX_DISTANCE, Array, State
 from vslam_env.world.spec import World
 
 LONGEST_SUBSTEP = 12.5e-3  # [m] largest motion of a robot between contact checks

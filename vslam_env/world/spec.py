@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from slam_backend.core.read_only import as_read_only
 from slam_backend.core.short_repr import short_repr
-from slam_backend.core.state import FLOAT32, FLOAT64, INT64, Array, Maybe, Record, Sizes, State, Text
 from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_array
+from slam_backend.state import FLOAT32, FLOAT64, INT64, Array, Maybe, Record, Sizes, State, Text
 
 SHORTEST_WALL = 1e-3  # [m] below, the direction is ill-defined
 LARGEST_EXTENT = 200.0  # [m] limits the size of the free-space raster

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from slam_backend.core.short_repr import short_repr
-from slam_backend.core.state import options_in
 from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.models.measurements import Measurements
+from slam_backend.state import options_in
 from tests.regression.public_api import MODULES, PACKAGES
 from vslam_env import EnvConfig, preset_config, vslam_v0
 

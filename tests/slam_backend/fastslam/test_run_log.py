@@ -11,7 +11,6 @@ from builders.kernels import python_entry
 from hypothesis import given
 from hypothesis import strategies as st
 
-from slam_backend.core.state import accepted, restore, take
 from slam_backend.fastslam._kernels import EXACT_POSE, MOVED, NO_READING
 from slam_backend.fastslam._kernels import STATIONARY as STOOD_STILL
 from slam_backend.fastslam._kernels.layout import ESTIMATE, LOGGED, LOGGED_KIND, MOTION, NAME, NUM_MEASURED, NUM_NOTED
@@ -23,6 +22,7 @@ from slam_backend.fastslam.pending_steps import LONGEST, ROOM
 from slam_backend.fastslam.run_log import MEASUREMENTS, ROWS, RobotLog
 from slam_backend.models.measurements import Measurements
 from slam_backend.smoother.log_arrays import EXACT, ODOMETRY, STATIONARY
+from slam_backend.state import accepted, restore, take
 
 log_step = python_entry(log_step)
 

@@ -12,13 +12,13 @@ from builders.filters import contents
 from hypothesis import given
 from hypothesis import strategies as st
 
-from slam_backend.core.state import take
 from slam_backend.fastslam._kernels import EXACT_POSE, MOVED, NO_READING, STATIONARY
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.reports import Associations, StepReport
 from slam_backend.fastslam.step_input import StepInput, rows_of, validate_step
 from slam_backend.models.camera import ROBOT_FROM_CAMERA, StereoCamera
 from slam_backend.models.measurements import Measurements, TeamMeasurements
+from slam_backend.state import take
 from slam_backend.team.team import TeamSlam
 
 SIZE = 3  # of descriptors

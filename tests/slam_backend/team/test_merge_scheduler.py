@@ -5,10 +5,10 @@ import pytest
 from builders.filters import looks
 from builders.teams import SIZE, SimulatedTeam, driven
 
-from slam_backend.core.state import restore, take
 from slam_backend.fastslam.reports import Associations, StepReport
 from slam_backend.maps.alignment import AlignmentOptions
 from slam_backend.maps.landmark_map import LandmarkMap
+from slam_backend.state import restore, take
 from slam_backend.team.communication import LANDMARK_BYTES, POSE_BYTES, TrafficCounter
 from slam_backend.team.merge_scheduler import AttemptOptions, MergeScheduler, PairKey
 from slam_backend.team.options import MergeOptions

@@ -27,7 +27,7 @@ from sb3_contrib import MaskablePPO
 
 from agents.goal_network import logits
 from agents.trained import load_model
-from slam_backend.core.state_codec import decode, encode
+from slam_backend.state.codec import decode, encode
 from training.cli import app
 from training.rl.checkpoint import CHECKPOINT_FILE, FORMAT, MAGIC, read_checkpoint, write_checkpoint
 from training.rl.config import TrainConfig

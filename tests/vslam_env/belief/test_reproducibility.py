@@ -13,7 +13,7 @@ import pytest
 from builders.comparison import digest
 from builders.environments import MEETING, small_env, turning, wander
 
-from slam_backend.core.state import take
+from slam_backend.state import take
 from vslam_env import ExplorationEnv
 from vslam_env.belief.team_belief import TeamBelief
 

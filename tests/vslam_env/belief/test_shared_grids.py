@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from builders.environments import ANGLES, MAX_RANGE, MEETING, building, cast, small_env, turning
 
-from slam_backend.core.state import restore, take
 from slam_backend.fastslam.relative_poses import TeamPoses
 from slam_backend.fastslam.reports import Associations
 from slam_backend.geometry import between, compose, inverse
 from slam_backend.models.camera import StereoCamera
+from slam_backend.state import restore, take
 from slam_backend.team.reports import LandmarkIdMap, MergeUndone, TeamReport
 from vslam_env.belief.belief import RobotHardware
 from vslam_env.belief.shared_grids import MAX_ABSENCE, GridTransfer, GridUpdate, SharedGrids, plan_catch_up

@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 from builders.environments import MEETING, scored, small_env, standing_at, turning
 
-from slam_backend.core.state import restore, take
 from slam_backend.core.validation import IntArray
 from slam_backend.fastslam.reports import Associations
 from slam_backend.geometry import compose, inverse, transform_points, wrap_angle
 from slam_backend.maps.landmark_map import LandmarkMap, TeamMapSummaries
 from slam_backend.metrics import map_error, map_rmse
+from slam_backend.state import restore, take
 from slam_backend.team.reports import LandmarkIdMap, LandmarksCreated, MapForked, MapReleased, TeamReport
 from vslam_env.evaluation.coverage import CoverageCells, CoverageTracker
 from vslam_env.evaluation.map_scores import GroundTruthAssociation

@@ -8,10 +8,10 @@ import pytest
 from builders.environments import MEETING, know, small_env, turning
 from builders.kernels import python_entry
 
-from slam_backend.core.state import restore, take
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.fastslam.relative_poses import TeamPoses
 from slam_backend.geometry import compose, inverse
+from slam_backend.state import restore, take
 from vslam_env import CANDIDATE_FEATURES, NUM_CANDIDATES, CandidateKind, vslam_v0
 from vslam_env.belief.rendezvous import OWN_START, RICHEST, Rendezvous
 from vslam_env.navigation import (

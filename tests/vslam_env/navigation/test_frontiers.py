@@ -6,9 +6,9 @@ from builders.environments import ANGLES, building, clearance, drive, in_start_f
 from builders.kernels import python_entry
 from scipy.optimize import linear_sum_assignment
 
-from slam_backend.core.state import restore, take
 from slam_backend.core.validation import FloatArray
 from slam_backend.geometry import inverse, transform_points
+from slam_backend.state import restore, take
 from vslam_env.navigation import (
     CELL,
     FREE,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from slam_backend.core.state import restore, take
+from slam_backend.state import restore, take
 from vslam_env.navigation import OccupancyGrid
 from vslam_env.navigation._view_kernels import COARSE, NUM_COARSE, write_global_grid
 from vslam_env.navigation.global_grids import GlobalGrids

@@ -7,8 +7,8 @@ from builders.plain_scan_update import PLAIN_SIZE, plain_scan_update
 from hypothesis import given
 from hypothesis import strategies as st
 
-from slam_backend.core.state import restore, take
 from slam_backend.geometry import transform_points
+from slam_backend.state import restore, take
 from vslam_env.navigation import (
     CELL,
     FREE,

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from slam_backend.core.state import restore, take
 from slam_backend.geometry import compose, wrap_angle
+from slam_backend.state import restore, take
 from vslam_env.sensors import RangeFinder, ScanConfig
 from vslam_env.world import FreeSpace, OdometryNoise, Simulator, World, draw_bias, make_world, read_odometry
 from vslam_env.world.clearance import distances_to_walls

@@ -7,12 +7,12 @@ from typing import NamedTuple
 import numpy as np
 
 from slam_backend.core.short_repr import short_repr
-from slam_backend.core.state import INT64, UINT8, Array, Each, Record, with_state
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray, argument_error, check_float
 from slam_backend.frontend import CornerOptions, FrontEndOptions, StereoFrame, StereoFrontEnd
 from slam_backend.frontend.images import LARGEST, SMALLEST, Image
 from slam_backend.models.camera import StereoCamera
 from slam_backend.models.measurements import Measurements
+from slam_backend.state import INT64, UINT8, Array, Each, Record, with_state
 from vslam_env.sensors.stereo.cameras import ImagingConfig, StereoRenderer
 from vslam_env.sensors.stereo.ground_truth import TextureCorners
 from vslam_env.sensors.stereo.textures import TextureConfig, WallTextures, draw_textures

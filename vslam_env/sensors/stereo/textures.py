@@ -11,9 +11,9 @@ from slam_backend.core.image_files import read_grey_image
 from slam_backend.core.lazy_import import LazyModule
 from slam_backend.core.read_only import as_constant, as_read_only
 from slam_backend.core.short_repr import short_repr
-from slam_backend.core.state import FLOAT64, INT32, INT64, Array, Options, State
 from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_array, check_choice, check_float
 from slam_backend.frontend.images import Image
+from slam_backend.state import FLOAT64, INT32, INT64, Array, Options, State
 
 if TYPE_CHECKING:
     import cv2

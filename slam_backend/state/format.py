@@ -1,4 +1,4 @@
-"""Comparison of states, their records as dicts, and the number of their format; see `slam_backend.core.state`."""
+"""Comparison of states, their records as dicts, and the number of their format; see `slam_backend.state`."""
 
 import hashlib
 from collections.abc import Mapping, Sequence
@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.core.state import CLASS, Part, options_in
+from slam_backend.state import CLASS, Part, options_in
 
 
 def equal(one: Any, other: Any) -> bool:
@@ -38,7 +38,7 @@ def format_of(kind: type) -> str:
     while waiting:
         one = waiting.pop()
         if isinstance(one, Part):
-            waiting += one._inner()
+            waiting += one.inner()
         elif one not in texts and hasattr(one, "STATE"):
             texts[one] = " ".join(f"{name}={_text(part)}" for name, part in one.STATE.parts.items())
             waiting += one.STATE.parts.values()

@@ -1,4 +1,4 @@
-"""Random streams as parts of states, see `slam_backend.core.state`."""
+"""Random streams as parts of states, see `slam_backend.state`."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -7,7 +7,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from slam_backend.core.read_only import as_read_only
-from slam_backend.core.state import Array, Each, Int, Maybe, Part, Row, Sizes, Snapshot, Text, refuse
+from slam_backend.state.declaration import Part, Sizes, Snapshot, refuse
+from slam_backend.state.values import Array, Each, Int, Maybe, Row, Text
 
 STREAMS = ("PCG64", "PCG64DXSM", "MT19937", "Philox", "SFC64")
 PLACES = {"has_uint32": 1, "uinteger": 2**32 - 1, "buffer_pos": 4, "pos": 624}  # largest numbers; numpy checks none
@@ -33,15 +34,15 @@ class Generator(Part):
 
     is_constant: ClassVar[bool] = False
 
-    def _take(self, value: np.random.Generator) -> Snapshot:
+    def take(self, value: np.random.Generator) -> Snapshot:
         return _frozen(value.bit_generator.state)  # type: ignore[arg-type]
 
-    def _put(self, value: Any, kept: Snapshot) -> np.random.Generator:
+    def put(self, value: Any, kept: Snapshot) -> np.random.Generator:
         bits = getattr(np.random, kept["bit_generator"])(0)
         bits.state = _thawed(kept)
         return np.random.Generator(bits)
 
-    def _check(self, name: str, value: Any, sizes: Sizes) -> Snapshot:
+    def check(self, name: str, value: Any, sizes: Sizes) -> Snapshot:
         return checked_stream(name, value)
 
 
@@ -60,8 +61,8 @@ def _like(name: str, key: str, value: Any, other: Any) -> Any:
             refuse(name, f"a dict with {', '.join(other)}", value)
         return Snapshot({key: _like(f"{name}[{key!r}]", key, value[key], part) for key, part in other.items()})
     if isinstance(other, np.ndarray):
-        return Array(other.dtype, " ".join(map(str, other.shape)), 0, np.iinfo(other.dtype).max)._check(name, value, {})
-    return (Text((other,)) if isinstance(other, str) else Int(0, PLACES.get(key, 2**128 - 1)))._check(name, value, {})
+        return Array(other.dtype, " ".join(map(str, other.shape)), 0, np.iinfo(other.dtype).max).check(name, value, {})
+    return (Text((other,)) if isinstance(other, str) else Int(0, PLACES.get(key, 2**128 - 1))).check(name, value, {})
 
 
 @dataclass(frozen=True)
@@ -70,17 +71,17 @@ class Seed(Part):
 
     is_constant: ClassVar[bool] = False
 
-    def _take(self, value: np.random.SeedSequence) -> tuple[Any, ...]:
+    def take(self, value: np.random.SeedSequence) -> tuple[Any, ...]:
         entropy = value.entropy if isinstance(value.entropy, (int, type(None))) else tuple(map(int, value.entropy))
         return entropy, tuple(value.spawn_key), value.pool_size, value.n_children_spawned
 
-    def _put(self, value: Any, kept: tuple[Any, ...]) -> np.random.SeedSequence:
+    def put(self, value: Any, kept: tuple[Any, ...]) -> np.random.SeedSequence:
         entropy, spawn_key, pool, children = kept
         return np.random.SeedSequence(entropy, spawn_key=spawn_key, pool_size=pool, n_children_spawned=children)
 
-    def _check(self, name: str, value: Any, sizes: Sizes) -> tuple[Any, ...]:
+    def check(self, name: str, value: Any, sizes: Sizes) -> tuple[Any, ...]:
         number = Int(0, 1 << 4096)
         is_many = type(value) in (tuple, list) and len(value) > 0 and type(value[0]) in (tuple, list)
-        return Row(Each(number) if is_many else Maybe(number), Each(number), Int(4, 64), Int(0, 2**32 - 1))._check(
+        return Row(Each(number) if is_many else Maybe(number), Each(number), Int(4, 64), Int(0, 2**32 - 1)).check(
             name, value, sizes
         )

@@ -10,9 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from slam_backend.core.random_state import Generator, Seed
 from slam_backend.core.read_only import as_constant
-from slam_backend.core.state import (
+from slam_backend.state import (
     BOOL,
     FLOAT64,
     INT64,
@@ -23,6 +22,7 @@ from slam_backend.core.state import (
     Each,
     Flag,
     Float,
+    Generator,
     Int,
     Maybe,
     OneOf,
@@ -30,6 +30,7 @@ from slam_backend.core.state import (
     Record,
     Row,
     Saved,
+    Seed,
     Snapshot,
     State,
     Text,
@@ -37,7 +38,7 @@ from slam_backend.core.state import (
     restore,
     take,
 )
-from slam_backend.core.state_format import equal, format_of
+from slam_backend.state.format import equal, format_of
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 A tree consists of None, bools, ints, floats, texts, bytes, dicts, lists, tuples, sets, arrays of plain numbers and
 numpy scalars. Snapshots, records with a `STATE` and dataclasses of options are written as dicts of their parts: what
-declares them builds them again (`slam_backend.core.state`). Parts that are shared in a tree are shared after reading,
+declares them builds them again (`slam_backend.state`). Parts that are shared in a tree are shared after reading,
 too. Floats keep every bit. Arrays keep their memory layout and whether they are writable.
 
 The bytes are the length of a table, the table as JSON, and the bytes of the arrays. Rows of the table are the parts of
@@ -15,19 +15,16 @@ import math
 import struct
 from collections.abc import Callable
 from dataclasses import is_dataclass
-from pathlib import Path
-from stat import S_ISREG
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.core.read_only import as_read_only
-from slam_backend.core.state import Snapshot, is_stateful
-from slam_backend.core.state_format import parts_of
+from slam_backend.state import Snapshot, is_stateful
+from slam_backend.state.format import parts_of
 
 ALIGNMENT = 64  # alignment of arrays [bytes]
-MAX_BYTES = 1 << 30  # limit of a file [bytes]; a state has some megabytes
 MAX_TABLE = 1 << 26  # limit of a table [bytes]; parsed, it takes up to twenty times as much memory
 LARGEST_INT = 1 << 63  # larger ints are written as hexadecimal digits
 DTYPES = {
@@ -230,17 +227,3 @@ def decode(body: bytes) -> Any:
         return _Reader(body).tree()
     except Exception as error:  # of any kind: the bytes may be damaged
         raise ValueError(str(error) or type(error).__name__) from error
-
-
-def read_file(path: Path) -> bytes:
-    """Return the content of a regular file of bounded size.
-
-    Raises:
-        OSError: If it cannot be read, is not a regular file, or exceeds `MAX_BYTES`.
-    """
-    found = path.stat()
-    if not S_ISREG(found.st_mode):
-        raise OSError("not a regular file")
-    if found.st_size > MAX_BYTES:
-        raise OSError(f"the file has more than {MAX_BYTES >> 20} MiB")
-    return path.read_bytes()

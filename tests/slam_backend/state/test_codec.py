@@ -11,8 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from slam_backend.core.state_codec import ForeignObjectError, decode, encode, read_file
+from slam_backend.core.files import read_file
 from slam_backend.fastslam.filter import FastSlam
+from slam_backend.state.codec import ForeignObjectError, decode, encode
 from slam_backend.team.team import TeamSlam
 
 
@@ -109,7 +110,7 @@ class Stranger:
 @pytest.mark.parametrize(
     ("tree", "says"),
     [
-        ({"a": {"b": [Stranger()]}}, "a test_state_codec.Stranger in 'b' in 'a'"),
+        ({"a": {"b": [Stranger()]}}, "a test_codec.Stranger in 'b' in 'a'"),
         (lambda: None, "a builtins.function"),
         (np.array([object()]), "an array of object"),
         (np.array(["text"]), "an array of <U4"),
