@@ -2,7 +2,8 @@
 
 A class lists the parts of its state, from which `take` makes a snapshot and `restore` returns to it:
 
->>> from slam_backend.state.streams import Generator
+>>> import numpy as np
+>>> from slam_backend.state import INT64, Array, Generator, State, restore, take
 >>> class Counter:
 ...     STATE = State(sums=Array(INT64, "K", low=0), rng=Generator())
 ...     def __init__(self) -> None:

@@ -54,7 +54,7 @@ def _team_metrics(
     **rows: Any,
 ) -> TeamMetrics:
     return TeamMetrics(
-        per_robot=RobotMetrics(**FIGURES | rows),
+        per_robot=RobotMetrics(**{name: [0.0, 0.0] for name in RobotMetrics._fields} | FIGURES | rows),
         counts=RobotCounts(collisions, (7, 8)),
         coverage=coverage,
         merges=0,
@@ -261,7 +261,7 @@ def test_a_map_that_is_placed_wrong_has_no_recall() -> None:
     books = GroundTruthAssociation(1, truths, np.ones(3, np.bool_), 1.0)
     ids = np.arange(2)
     entries = (LandmarksCreated(0, 0, 0, ids),)
-    books.record(TeamReport(0, Associations.from_arrays([ids], [ids]), ((0,),), (), (), (0,), entries, 1), [ids])
+    books.record(TeamReport(0, Associations.from_arrays([ids], [ids]), ((0,),), (), (), (0,), entries, 1), ids[None])
     held = LandmarkMap(truths[:2], np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 2)), ids=ids)
     for shift, placed in ((0.0, 2 / 3), (0.4, 2 / 3), (0.6, 0.0)):
         summaries = TeamMapSummaries.from_maps([held.summary])

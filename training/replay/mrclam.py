@@ -23,6 +23,7 @@ from slam_backend.team.team import TeamSlam
 from training.replay.config import MRCLAM_MOTION, MrclamConfig
 from training.replay.single_robot import PLANAR_GATE, RejuvenationCount, is_stage
 from vslam_env.evaluation.map_scores import GroundTruthAssociation
+from vslam_env.sensors.landmark_sensor import padded
 
 # The weights of a joint filter's particles combine the measurements of all its robots, so that depletion is faster:
 # with known starts, the path errors of five robots were 13 % larger with 100 particles than with 500.
@@ -134,7 +135,7 @@ def replay_team(
             if event.kind == "undo":
                 when = float(readings.times[step] - readings.times[0])
                 merges = [replace(m, undone=when) if m.event.alignment is event.alignment else m for m in merges]
-        ground_truth.record(report, rows)
+        ground_truth.record(report, padded(rows))
         for robot in robots:
             paths[robot, step] = team.pose_from_start(robot).mean
         if is_stage(step, num_steps):

@@ -1,7 +1,7 @@
 """Errors of a team's maps and poses, and the ground-truth association of the estimated landmarks."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from itertools import count
 from typing import Any
 
@@ -110,7 +110,7 @@ class GroundTruthAssociation:
         claims=Array(INT64, "maps ids", UNUSED, "LANDMARKS"),
         row_of=Dict(Int(0, MAX_LANDMARKS), Int(high="maps")),
         map_of=Each(Int(), "K"),
-        seen=Dict(Int(), Each(Array(INT64, "*", -1, "WORLD", constant=True), "K")),
+        seen=Dict(Int(), Array(INT64, "K *", -1, "WORLD", constant=True)),
     )
 
     def __init__(self, num_robots: int, true_positions: FloatArray, observable: np.ndarray, cutoff: float) -> None:
@@ -121,17 +121,17 @@ class GroundTruthAssociation:
         self._claims = np.empty((num_robots, 0), np.int64)  # row: claims of the ids of one map
         self._row_of = {number: number for number in range(num_robots)}
         self._use_maps(tuple(range(num_robots)))
-        self._seen: dict[int, tuple[IntArray, ...]] = {}  # true ids of the measurements by step and robot
+        self._seen: dict[int, IntArray] = {}  # true ids of the measurements by step, a row for each robot
 
-    def record(self, report: TeamReport, true_ids: Sequence[IntArray] | IntArray) -> None:
+    def record(self, report: TeamReport, true_ids: IntArray) -> None:
         """Record all changes of maps in a step.
 
         Args:
             report: Report of the filters on the step.
-            true_ids: Arrays (n_i or more,) int64 by robot. True landmark of each measurement; -1 for a false point.
-                They are kept; the caller does not write to them afterwards.
+            true_ids: (K, B) int64. True landmark of each measurement, -1 for a false point; a row for each robot, with
+                anything beyond its measurements. It is kept; the caller does not write to it afterwards.
         """
-        self._seen[report.step] = tuple(map(as_read_only, true_ids))
+        self._seen[report.step] = as_read_only(true_ids)
         for entry in report.map_changes:
             if isinstance(entry, LandmarksCreated):
                 self._enter(entry.number, entry.ids, self._seen[entry.step][entry.robot])
@@ -265,13 +265,11 @@ def check_claims(association: Mapping[str, Any], team: Mapping[str, Any], tick: 
     if lacking := numbers - set(association["row_of"]):
         raise ValueError(f"no claims of map {min(lacking)}")
     for step, inputs in team["records"]["log"]["steps"].items():
-        if step not in seen or any(
-            given.num_given > len(ids) for given, ids in zip(inputs.inputs, seen[step], strict=True)
-        ):
+        if step not in seen or max(given.num_given for given in inputs.inputs) > seen[step].shape[1]:
             raise ValueError(f"not all true ids of step {step}")
     for entry in team["records"]["entries"]:
         if isinstance(entry, LandmarksCreated) and (
-            entry.step not in seen or len(entry.ids) > len(seen[entry.step][entry.robot])
+            entry.step not in seen or len(entry.ids) > seen[entry.step].shape[1]
         ):
             raise ValueError(f"not all true ids of step {entry.step}")
         if isinstance(entry, LandmarkIdMap) and len(entry.ids_b) and entry.ids_b.max() >= claims.shape[1]:

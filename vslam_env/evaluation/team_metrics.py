@@ -14,28 +14,44 @@ Row = TypeVar("Row", covariant=True)  # sequence of one number per robot
 
 @short_repr
 class RobotMetrics(NamedTuple, Generic[Row]):
-    """Metrics of all robots, a row of one number per robot for each; `TeamMetrics` describes them."""
+    """Metrics of all robots, a row of one number per robot for each."""
 
     map_errors: Row
+    """[m] Map error E of each robot."""
     map_rmses: Row
+    """[m] RMSE of the matched landmarks; the cutoff of the map error without a match."""
     map_recalls: Row
+    """Share of the true landmarks in each robot's map, whatever their error."""
     map_precisions: Row
+    """Share of the landmarks in each map that are matched; of duplicates one counts."""
     accurate_recalls: Row
+    """Share of the true landmarks in each robot's map with an error below 0.5 m."""
     pose_errors: Row
+    """[m] Position error of each robot."""
     heading_errors: Row
+    """[rad] Absolute heading error of each robot, in [0, pi]."""
     pose_sigmas: Row
+    """[m] Estimated one sigma of each robot's position in its own start frame."""
     discovered: Row
+    """Share of the free floor that each robot was nearest to when the team first saw it."""
     distances: Row
+    """[m] True distance travelled by each robot since the reset."""
     error_integrals: Row
+    """[m s] Time integral of each robot's map error E since the reset; zeros unless the reward has the term
+    `running_cost`, which requires scores at every tick."""
     own_recalls: Row
+    """Share of the true landmarks that each robot was the first to hold well by its own measurement, see
+    `RecallCredits`; zeros unless the reward has the term `own_recall`."""
 
 
 @short_repr
 class RobotCounts(NamedTuple):
-    """Counts of all robots since the reset; `TeamMetrics` describes them."""
+    """Counts of all robots since the reset."""
 
     collisions: tuple[int, ...]
+    """Number of ticks since the reset in which each robot's motion was blocked."""
     bytes_sent: tuple[int, ...]
+    """Bytes sent by each robot since the reset."""
 
 
 @short_repr
@@ -60,7 +76,8 @@ class BeliefSummary(NamedTuple):
 class TeamMetrics(NamedTuple):
     """Metrics of a team at one tick, computed from ground truth.
 
-    The rows of `per_robot` and `counts` are attributes, too, as new arrays (K,): `metrics.map_errors`.
+    The rows of `RobotMetrics` (float64) and `RobotCounts` (int64) are attributes, too, as new arrays (K,):
+    `metrics.map_errors`.
 
     Attributes:
         per_robot: Metrics of each robot, row by row.
@@ -69,22 +86,6 @@ class TeamMetrics(NamedTuple):
         merges: Number of merges since the reset.
         time: Simulated time since the reset [s].
         beliefs: Belief of each robot; empty unless a reward term reads beliefs, see `vslam_env.reward.RewardTerm`.
-        map_errors: (K,) float64 [m]. Map error E of each robot.
-        map_rmses: (K,) float64 [m]. RMSE of the matched landmarks; the cutoff of the map error without a match.
-        map_recalls: (K,) float64. Share of the true landmarks in each robot's map, whatever their error.
-        map_precisions: (K,) float64. Share of the landmarks in each map that are matched; of duplicates one counts.
-        accurate_recalls: (K,) float64. Share of the true landmarks in each robot's map with an error below 0.5 m.
-        pose_errors: (K,) float64 [m]. Position error of each robot.
-        heading_errors: (K,) float64 [rad]. Absolute heading error of each robot, in [0, pi].
-        pose_sigmas: (K,) float64 [m]. Estimated one sigma of each robot's position in its own start frame.
-        discovered: (K,) float64. Share of the free floor that each robot was nearest to when the team first saw it.
-        distances: (K,) float64 [m]. True distance travelled by each robot since the reset.
-        error_integrals: (K,) float64 [m s]. Time integral of each robot's map error E since the reset; zeros unless the
-            reward has the term `running_cost`, which requires scores at every tick.
-        own_recalls: (K,) float64. Share of the true landmarks that each robot was the first to hold well by its own
-            measurement, see `RecallCredits`; zeros unless the reward has the term `own_recall`.
-        collisions: (K,) int64. Number of ticks since the reset in which each robot's motion was blocked.
-        bytes_sent: (K,) int64. Bytes sent by each robot since the reset.
     """
 
     per_robot: RobotMetrics[Sequence[float]]

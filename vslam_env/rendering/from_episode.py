@@ -1,7 +1,5 @@
 """Conversion of an episode to a `Scene`: the truth, and the estimates moved by the robots' true start poses."""
 
-import numpy as np
-
 from slam_backend.core.validation import FloatArray
 from slam_backend.geometry import compose
 from vslam_env.config import TICK
@@ -21,8 +19,7 @@ def build_scene(episode: Episode, metrics: TeamMetrics) -> Scene:
     """
     landmarks = episode.world.landmarks
     assert landmarks is not None
-    paths = (episode.true_path, episode.estimated_path)
-    truth, estimates = (np.concatenate(path).reshape(len(path), -1, 3) for path in paths)
+    truth, estimates = episode.true_path, episode.estimated_path
     return Scene(
         walls=episode.world.walls,
         landmarks=landmarks.positions,

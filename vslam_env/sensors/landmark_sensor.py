@@ -1,5 +1,6 @@
 """Landmark sensor: noisy measurements of the landmarks in view of each camera."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from operator import itemgetter
 from typing import NamedTuple
@@ -88,29 +89,39 @@ class SensorFrame(NamedTuple):
 
 @short_repr
 @with_state(
-    measurements=Record(TeamMeasurements), names=Array(INT64, "K *", -1, "WORLD", constant=True)
+    measurements=Record(TeamMeasurements), padded_ids=Array(INT64, "K *", -1, "WORLD", constant=True)
 )  # fmt: skip
 class TeamSensorFrames(NamedTuple):
     """The frames of all robots in one tick.
 
     Attributes:
         measurements: Measurements of the team.
-        names: (K, B) int64. True landmarks of each robot's points, -1 for a false point. Entries beyond a robot's
+        padded_ids: (K, B) int64. True landmarks of each robot's points, -1 for a false point. Entries beyond a robot's
             points are arbitrary but valid indices.
     """
 
     measurements: TeamMeasurements
-    names: IntArray
+    padded_ids: IntArray
 
     @property
     def true_ids(self) -> list[IntArray]:
         """Copies of the true landmarks of each robot's points."""
         ends = self.measurements.offsets.tolist()
-        return [row[: end - begin].copy() for row, begin, end in zip(self.names, [0, *ends[:-1]], ends, strict=True)]
+        return [
+            row[: end - begin].copy() for row, begin, end in zip(self.padded_ids, [0, *ends[:-1]], ends, strict=True)
+        ]
 
     def per_robot(self) -> list[SensorFrame]:
         """Return the frame of each robot."""
         return list(map(SensorFrame, self.measurements.per_robot(), self.true_ids))
+
+
+def padded(true_ids: Sequence[IntArray]) -> IntArray:
+    """Return the true landmarks (n_i,) of the points of K robots as one array (K, B), -1 beyond a robot's points."""
+    rows = np.full((len(true_ids), max(map(len, true_ids))), -1)
+    for row, ids in zip(rows, true_ids, strict=True):
+        row[: len(ids)] = ids
+    return rows
 
 
 class LandmarkSensor:

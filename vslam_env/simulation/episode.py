@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.core.read_only import as_constant, with_read_only
+from slam_backend.core.read_only import as_constant, as_read_only, with_read_only
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.geometry import between, compose
 from slam_backend.maps.alignment import Alignment
@@ -41,7 +41,6 @@ from vslam_env.sensors import RenderedFrame, SensorFrame, TeamRenderedFrames, Te
 from vslam_env.simulation.communication import contacts
 from vslam_env.simulation.scenario import STREAMS, Scenario, ScenarioPart
 from vslam_env.world import Simulator, read_odometry
-from vslam_env.world.spec import FARTHEST_PLACE
 
 MIN_SHARED = 3
 AROUND = 1.0  # [m] tolerated distance of a robot outside the bounds of the walls
@@ -100,8 +99,6 @@ class Episode:
         tick: Ticks since the reset.
         readings: Readings of the last tick; unset before `begin`.
         last_frames: Frames of the last tick with their true landmarks, read-only; unset before `begin`.
-        true_path: True poses (K, 3) after each tick, world frame; read-only.
-        estimated_path: Estimated poses (K, 3) after each tick, each in the robot's own start frame; read-only.
         merge_ticks: Tick and groups of each merge.
     """
 
@@ -120,8 +117,7 @@ class Episode:
         scans=Array(FLOAT64, "K RAYS", 0.0, renewed=True),
         in_contact=Maybe(Array(BOOL, "K K", renewed=True)),
         last_frames=OneOf(TeamSensorFrames, TeamRenderedFrames),
-        true_path=Each(Array(FLOAT64, "K 3", -FARTHEST_PLACE, FARTHEST_PLACE, constant=True), kind=list),
-        estimated_path=Each(Array(FLOAT64, "K 3", constant=True), kind=list),
+        paths=Array(FLOAT64, "TICKS 2 K 3", renewed=True),
         merge_ticks=Each(Row(Int(), Each(Int(high="K")), Each(Int(high="K"))), kind=list),
     )
 
@@ -160,10 +156,7 @@ class Episode:
         self._collisions: tuple[int, ...] = (0,) * config.num_robots
         self._metric_rows = np.zeros((len(RobotMetrics._fields), config.num_robots))  # some of them accumulate
         self._metrics: RobotMetrics[FloatArray] = RobotMetrics(*self._metric_rows)
-        self._integrates = RUNNING_COST in config.reward  # scoring every tick is slow
-        self._gives_credit = OWN_RECALL in config.reward
-        self.true_path: list[FloatArray] = []
-        self.estimated_path: list[FloatArray] = []
+        self._path_buffer = np.empty((64, 2, config.num_robots, 3))  # true and estimated poses; rows up to `tick`
         self.merge_ticks: list[tuple[int, tuple[int, ...], tuple[int, ...]]] = []
         self._odometry: FloatArray | None = None
         self._scans = np.empty((config.num_robots, config.scan.num_rays))
@@ -180,6 +173,16 @@ class Episode:
     def true_poses(self) -> FloatArray:
         """(K, 3) float64 [m, m, rad], world frame. Copy of the true poses."""
         return self._simulator.poses.copy()
+
+    @property
+    def true_path(self) -> FloatArray:
+        """(T, K, 3) float64 [m, m, rad], world frame. True poses after each tick since the reset; read-only."""
+        return as_read_only(self._paths[:, 0])
+
+    @property
+    def estimated_path(self) -> FloatArray:
+        """(T, K, 3) float64 [m, m, rad], own start frames. Poses as estimated after each tick; read-only."""
+        return as_read_only(self._paths[:, 1])
 
     @property
     def frames(self) -> Sequence[SensorFrame | RenderedFrame]:
@@ -203,7 +206,7 @@ class Episode:
         self.tick += 1
         odometry = read_odometry(before, simulator.poses, self.scenario.bias, noise, stream, self._metrics.distances)
         self._perceive(odometry, goals)
-        if self._integrates:
+        if RUNNING_COST in self._config.reward:  # scoring every tick is slow
             self._score(simulator.poses)
             self._metrics.error_integrals[:] += self._metrics.map_errors * TICK
 
@@ -219,7 +222,7 @@ class Episode:
         """
         belief, poses = self.belief, self._simulator.poses
         self._score(poses)
-        if self._gives_credit:
+        if OWN_RECALL in self._config.reward:
             self._credits.update(self.ground_truth.accurate)
             self._metrics.own_recalls[:] = self._credits.shares
         coverage = self.coverage.update(belief.grids, poses, self._metrics.discovered)
@@ -232,6 +235,15 @@ class Episode:
 
     # ------------------------------------------------------------------ snapshots
 
+    @property
+    def _paths(self) -> FloatArray:
+        """(T, 2, K, 3). True and estimated poses after each tick; later ticks change none of them."""
+        return self._path_buffer[: self.tick + 1]
+
+    @_paths.setter
+    def _paths(self, paths: FloatArray) -> None:
+        self._path_buffer = paths
+
     def rebuild(self) -> None:
         """Gather the readings of the last tick."""
         self.readings = self._gathered(self.last_frames, self.belief.goals)
@@ -242,7 +254,7 @@ class Episode:
         tick, (x_min, y_min, x_max, y_max) = parts["tick"], parts["scenario"].world.bounds
         if set(parts["streams"]) != set(STREAMS):
             raise ValueError(f"streams {', '.join(parts['streams'])}")
-        if not tick == parts["belief"]["tick"] == len(parts["true_path"]) - 1 == len(parts["estimated_path"]) - 1:
+        if not tick == parts["belief"]["tick"] == len(parts["paths"]) - 1:
             raise ValueError(f"other parts than those of tick {tick}")
         if isinstance(parts["last_frames"], TeamRenderedFrames) != (sizes["CONFIG"].sensor == "stereo"):
             raise ValueError("frames of another sensor")
@@ -274,18 +286,20 @@ class Episode:
         if self._hook.recorder is not None:
             self._hook.recorder(self.readings.per_robot())
         report = self.belief.step(self.readings)
-        self.ground_truth.record(report, frames.names)
-        if self._gives_credit:
+        padded_ids = frames.padded_ids
+        self.ground_truth.record(report, padded_ids)
+        if OWN_RECALL in self._config.reward:
             for robot, (associated, created) in enumerate(zip(report.associations, report.created, strict=True)):
-                true_ids = frames.names[robot][: len(associated)]
+                true_ids = padded_ids[robot, : len(associated)]
                 used = np.maximum(associated, created) >= 0
                 self._credits.record(robot, self.ground_truth.rows_of(true_ids[used]))
         for id_map in report.id_maps:
             self.merge_ticks.append((self.tick, id_map.robots_a, id_map.robots_b))
         if config.oracle_merge:
             self._merge_by_oracle(contact_components(in_contact, config.num_robots))
-        self.true_path.append(as_constant(poses))
-        self.estimated_path.append(as_constant(self.belief.team_poses.own))
+        if self.tick == len(self._path_buffer):
+            self._path_buffer = np.concatenate([self._path_buffer, np.empty_like(self._path_buffer)])
+        self._path_buffer[self.tick, 0], self._path_buffer[self.tick, 1] = poses, self.belief.team_poses.own
 
     def _gathered(self, frames: TeamSensorFrames | TeamRenderedFrames, goals: FloatArray | None) -> TeamReadings:
         """Return the readings of a tick, given the frames of all robots and their goals (K, 2) [m], if any."""

@@ -134,7 +134,7 @@ def test_true_ids_in_frames_are_copies() -> None:
     """The simulator reads its own again when robots return; writing to frames does not change them."""
     env = small_env()
     env.reset(seed=5, options={"start_poses": MEETING})
-    names = env.episode.last_frames.names
+    names = env.episode.last_frames.padded_ids
     frames = env.episode.frames
     assert any(len(frame.true_ids) for frame in frames)
     assert not any(np.shares_memory(frame.true_ids, names) for frame in frames)

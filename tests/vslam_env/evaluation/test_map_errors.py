@@ -41,7 +41,7 @@ def _map(means: np.ndarray, ids: IntArray) -> LandmarkMap:
 def _ground_truth() -> GroundTruthAssociation:
     """Return claims of two robots: the first holds 0, 1 and a false point, the second 1, 3 and what does not count."""
     ground_truth = GroundTruthAssociation(2, TRUTHS, COUNTABLE, 1.0)
-    ground_truth.record(_report((_ids(0, 1, -1, 2), _ids(0, 1, 2))), [_ids(0, 1, 3, -1), _ids(1, 3, 2)])
+    ground_truth.record(_report((_ids(0, 1, -1, 2), _ids(0, 1, 2))), np.array([[0, 1, 3, -1], [1, 3, 2, -1]]))
     return ground_truth
 
 
@@ -118,7 +118,7 @@ def test_claims_follow_copies_deletions_and_snapshots() -> None:
         maps = tuple(rng.choice(numbers, 2).tolist())
         associations = Associations.from_arrays([ids, _ids()], [ids, _ids()])
         report = TeamReport(step, associations, ((0,), (1,)), (), (), maps, tuple(entries), step + 1)
-        ground_truth.record(report, [true_ids, _ids()])
+        ground_truth.record(report, np.vstack([true_ids, true_ids]))
         if turn % 50 == 0:
             state, ground_truth = take(ground_truth), GroundTruthAssociation(2, TRUTHS, COUNTABLE, 1.0)
             restore(ground_truth, state)
@@ -143,7 +143,7 @@ def test_scores_agree_with_the_metrics() -> None:
         ground_truth = GroundTruthAssociation(1, truths, countable, 0.8)
         held = rng.integers(-1, 9, 13)
         ids = np.arange(13)
-        ground_truth.record(_report((ids,)), [held])
+        ground_truth.record(_report((ids,)), held[None])
         pose = rng.uniform(-3.0, 3.0, 3)
         means = transform_points(pose, truths[held] + rng.normal(0.0, 0.4, (13, 3)))
         claims = ground_truth.true_ids(0, ids)

@@ -87,7 +87,7 @@ def record_episode(env: ExplorationEnv, policies: Mapping[str, Policy] | Guarded
     assert landmarks is not None
     return RecordedEpisode(
         config=env.config, belief_seed=episode.belief_seed, readings=tuple(readings), true_ids=tuple(true_ids),
-        true_paths=np.stack(episode.true_path, axis=1), landmarks=landmarks.positions.copy(),
+        true_paths=episode.true_path.swapaxes(0, 1).copy(), landmarks=landmarks.positions.copy(),
         observable=np.flatnonzero(episode.scenario.observable_landmarks), record=record,
     )  # fmt: skip
 

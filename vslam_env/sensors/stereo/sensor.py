@@ -13,6 +13,7 @@ from slam_backend.frontend.images import LARGEST, SMALLEST, Image
 from slam_backend.models.camera import StereoCamera
 from slam_backend.models.measurements import Measurements
 from slam_backend.state import INT64, UINT8, Array, Each, Record, with_state
+from vslam_env.sensors.landmark_sensor import padded
 from vslam_env.sensors.stereo.cameras import ImagingConfig, StereoRenderer
 from vslam_env.sensors.stereo.ground_truth import TextureCorners
 from vslam_env.sensors.stereo.textures import TextureConfig, WallTextures, draw_textures
@@ -115,9 +116,9 @@ class TeamRenderedFrames(NamedTuple):
     seen: Sequence[StereoFrame]
 
     @property
-    def names(self) -> Sequence[IntArray]:
-        """Alias of `true_ids`, common to the frames of all sensors."""
-        return self.true_ids
+    def padded_ids(self) -> IntArray:
+        """(K, B) int64. True landmarks of each robot's points; -1 for a false point and beyond them."""
+        return padded(self.true_ids)
 
     def per_robot(self) -> list[RenderedFrame]:
         """Return the frame of each robot, with copies of the true ids."""
