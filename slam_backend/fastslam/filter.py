@@ -364,7 +364,7 @@ class FastSlam:
         if step is not None:
             self.next_step = step
         used = self._make_room(inputs, robot_rows)
-        summary = self._update(inputs, robot_rows, associations_buffer)
+        summary = self._update_robots(inputs, robot_rows, associations_buffer)
         self._record(inputs, robot_rows, used, associations_buffer, summary)
         if summary.needs_resampling:
             self.resample()
@@ -400,7 +400,7 @@ class FastSlam:
         pending.reserve(used)
         return used
 
-    def _update(self, inputs: StepInput, robots: RobotRows, associations: IntArray) -> StepSummary:
+    def _update_robots(self, inputs: StepInput, robots: RobotRows, associations: IntArray) -> StepSummary:
         """Predict, associate, weigh and update: all robots in turn (Algorithm 1, l. 6-9), see `step_robots`.
 
         A robot without input draws no random number.

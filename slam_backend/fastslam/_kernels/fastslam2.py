@@ -30,7 +30,7 @@ from slam_backend.fastslam._kernels.motion.motion_model import predict, store_ro
 from slam_backend.fastslam._kernels.motion.odometry_bias import correct_bias, set_bias_gain
 from slam_backend.fastslam._kernels.particles.resampling import apply_resampling
 from slam_backend.fastslam._kernels.records import Candidates, Frame, MapArrays, Motion, Outcome, Poses, Space
-from slam_backend.fastslam._kernels.update.landmark_ekf import new_landmark, update_matched
+from slam_backend.fastslam._kernels.update.landmark_ekf import correct_matched, new_landmark
 
 
 @device
@@ -141,7 +141,7 @@ def update_landmarks(
     space: Space, block: int, maps: MapArrays, frame: Frame, candidates: Candidates, rules: Any, outcome: Outcome
 ) -> None:
     """Update matched landmarks at the sampled pose, start new ones, and write the associations."""
-    update_matched(space, block, maps, frame, candidates, rules.landmark_walk)
+    correct_matched(space, block, maps, frame, candidates, rules.landmark_walk)
     for b in range(len(frame.points)):
         if mask_of(space.match[b], L.NEW_LANDMARK, space.mask) > 0:
             new_landmark(space, block, maps, frame, b, outcome.new_slots, rules.landmark_walk)

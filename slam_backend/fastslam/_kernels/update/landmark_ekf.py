@@ -42,10 +42,10 @@ def _congruent(m: Matrix, a: Symmetric) -> Symmetric:
 
 
 @simd_inline
-def _updated(
+def _correct_lane(
     work: FloatArray, tile: FloatArray, i: int, inverse: Symmetric, match: bool, walk: float, flat: bool
 ) -> None:
-    """Update a landmark where `match`, by S^-1 (Eqs. 8-10), and let it walk: Sigma + walk I.
+    """Correct a landmark where `match`, by S^-1 (Eqs. 8-10), and let it walk: Sigma + walk I.
 
     `flat` (a constant) says that K has lost digits which K R cannot do without: then by Joseph's form.
     """
@@ -118,8 +118,8 @@ def _any_flat(work: FloatArray, tile: FloatArray) -> bool:
 
 @device
 @simd
-def update(work: FloatArray, tile: FloatArray, mask: FloatArray, walk: float) -> None:
-    """Update the landmark at a known pose where `mask` is 1 and it lies ahead of the camera (Eqs. 5-10).
+def correct(work: FloatArray, tile: FloatArray, mask: FloatArray, walk: float) -> None:
+    """Correct the landmark at a known pose where `mask` is 1 and it lies ahead of the camera (Eqs. 5-10).
 
     Args:
         work: Rows of the block.
@@ -130,11 +130,11 @@ def update(work: FloatArray, tile: FloatArray, mask: FloatArray, walk: float) ->
     if _any_flat(work, tile):
         for i in range(LANES):
             inverse, _ = inverted_by_parts(_sum(work, tile, i))
-            _updated(work, tile, i, inverse, mask[i] > 0.0 and work[L.DEPTH + i] >= L.MIN_DEPTH, walk, True)
+            _correct_lane(work, tile, i, inverse, mask[i] > 0.0 and work[L.DEPTH + i] >= L.MIN_DEPTH, walk, True)
     else:
         for i in range(LANES):
             inverse, _ = inverted(_sum(work, tile, i))
-            _updated(work, tile, i, inverse, mask[i] > 0.0 and work[L.DEPTH + i] >= L.MIN_DEPTH, walk, False)
+            _correct_lane(work, tile, i, inverse, mask[i] > 0.0 and work[L.DEPTH + i] >= L.MIN_DEPTH, walk, False)
 
 
 @simd_inline
@@ -150,7 +150,7 @@ def _gate_and_update(
         depth = work[L.DEPTH + i]
         admitted = chosen[i] == L.NEW_LANDMARK and seen[i] > 0 and work[L.TAKEN + i] == 0.0
         match = admitted and distance <= gate and depth >= L.MIN_DEPTH
-        _updated(work, tile, i, inverse, match, walk, flat)
+        _correct_lane(work, tile, i, inverse, match, walk, flat)
         accumulate_likelihood(work, i, match, distance, det, depth)
         record[L.Q_D + i] = distance
         chosen[i] = q if match else chosen[i]
@@ -176,7 +176,7 @@ def gate_and_update(
         seen: (LANES,) counts of the landmark, raised there.
         q: Number of the candidate.
         gate: D0.
-        walk: See `update`.
+        walk: See `correct`.
     """
     if _any_flat(work, tile):
         _gate_and_update(work, tile, record, chosen, seen, q, gate, walk, True)
@@ -186,10 +186,10 @@ def gate_and_update(
 
 @device
 @simd
-def update_matched(
+def correct_matched(
     space: Space, block: int, maps: MapArrays, frame: Frame, candidates: Candidates, walk: float
 ) -> None:
-    """Update at a known pose the landmarks that the lanes of one block matched, young ones by the iterated EKF."""
+    """Correct at a known pose the landmarks that the lanes of one block matched, young ones by the iterated EKF."""
     work, match, mask, row_of = space.work, space.match, space.mask, maps.table[L.ROW_OF]
     padded, first = maps.counts.shape[1], block * LANES
     young, before = stack_array(LANES), stack_array(TILE)
@@ -210,7 +210,7 @@ def update_matched(
             if num_young > 0:
                 for j in range(TILE):
                     before[j] = tile[j]
-                update(work, tile, young, 0.0)
+                correct(work, tile, young, 0.0)
                 innovate(work, tile, frame, b)
                 for i in range(LANES):  # the innovation at the new means is referred to those before
                     work[L.INNOV0 + i] += tile[i] - before[i]
@@ -218,7 +218,7 @@ def update_matched(
                     work[L.INNOV2 + i] += tile[2 * LANES + i] - before[2 * LANES + i]
                 for j in range(TILE):
                     tile[j] = before[j]
-            update(work, tile, mask, walk)
+            correct(work, tile, mask, walk)
 
 
 @device
@@ -236,7 +236,7 @@ def new_landmark(
         maps: Landmarks.
         frame, n: Measurements of the robot, and the one that starts the landmark.
         new_slots: (B,) slots of the landmarks that measurements started, -1 = none; written.
-        walk: See `update`.
+        walk: See `correct`.
     """
     work, row_of, tops = space.work, maps.table[L.ROW_OF], maps.tops
     if new_slots[n] == L.REJECTED:
