@@ -121,6 +121,7 @@ OBSERVATION_TYPES = ("dict", "flat")
 SENSORS = ("landmark", "stereo")
 MAX_ROBOTS = 8
 TICK = 0.1  # [s]
+TICKS_PER_SECOND = 10
 GOAL_DECISION_TICKS = 10
 MAX_TICKS = 10**9  # per step; three years of simulated time
 MAX_SECONDS = 100.0  # [s] default length of an episode

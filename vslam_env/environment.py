@@ -20,12 +20,12 @@ from vslam_env.actions import action_space, checked_actions
 from vslam_env.belief.observation import flatten, observation_space, observe_team
 from vslam_env.belief.readings import Readings, TeamReadings
 from vslam_env.belief.team_belief import Belief, TeamBelief
-from vslam_env.config import TICK, EnvConfig
+from vslam_env.config import TICK, TICKS_PER_SECOND, EnvConfig
 from vslam_env.evaluation.team_metrics import TeamMetrics
 from vslam_env.rendering import Scene, draw_frame
 from vslam_env.rendering.from_episode import build_scene
 from vslam_env.rendering.window import Window
-from vslam_env.reward import RewardSpec, evaluate, make_terms, reads_beliefs, totals
+from vslam_env.reward import RewardSpec, evaluate, make_terms, reads_beliefs, reads_coverage, totals
 from vslam_env.simulation.controllers import ActionExecutor
 from vslam_env.simulation.episode import Episode, ReadingsHook, Recorder
 from vslam_env.simulation.memory import memory_errors_as_argument_errors
@@ -159,6 +159,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         self.state_space = spaces.Box(-np.inf, np.inf, (size,), np.float32)
         self._nothing = [0.0] * config.num_robots
         self._reads_beliefs = any(map(reads_beliefs, self._terms))
+        self._reads_coverage = config.action_type == "goal" or any(map(reads_coverage, self._terms))
         self._root: np.random.SeedSequence | None = None
         self._episode: Episode | None = None
         self._is_whole = True  # False while the episode changes, and after a change that was cut short
@@ -253,7 +254,9 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         self._is_whole = False
         invalid = self._executor.execute(episode, chosen)
         before = self._team_metrics
-        self._team_metrics = episode.team_metrics(self._reads_beliefs)
+        ticks = self.config.ticks_per_step
+        is_new_second = episode.tick // TICKS_PER_SECOND > (episode.tick - ticks) // TICKS_PER_SECOND
+        self._team_metrics = episode.team_metrics(self._reads_beliefs, self._reads_coverage or is_new_second)
         self._cycle += 1
 
         recall = self.config.stop_at_recall
@@ -315,10 +318,10 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         episode = self._running_episode("state")
         both = episode.true_path[-1], episode.estimated_poses()
         rows = [np.column_stack([poses[:, :2], np.cos(poses[:, 2]), np.sin(poses[:, 2])]) for poses in both]
-        metrics = self._team_metrics
+        metrics, coverage = self._team_metrics, episode.coverage.share_now(episode.belief.grids)
         frames = [group[0] for group in episode.belief.known_groups]
         scores = np.column_stack([metrics.map_errors, metrics.map_recalls, metrics.heading_errors, frames])
-        state = np.concatenate([np.hstack([*rows, scores]).ravel(), [metrics.coverage, metrics.merges]])
+        state = np.concatenate([np.hstack([*rows, scores]).ravel(), [coverage, metrics.merges]])
         return np.asarray(state, dtype=np.float32)
 
     # ------------------------------------------------------------------ extensions
@@ -422,7 +425,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         self._episode = episode
         restore(self, snapshot)
         if self._episode is not None:
-            self._team_metrics = self._episode.team_metrics(self._reads_beliefs)
+            self._team_metrics = self._episode.team_metrics(self._reads_beliefs, False)
         self._is_whole = True
 
     def check_whole(self, name: str) -> None:

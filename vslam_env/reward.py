@@ -103,16 +103,17 @@ def _shared_by_all(reward: float, after: TeamMetrics) -> list[float]:
 
 # Potentials telescope: their sum over an episode is what the value has improved between its first and last step, so
 # that oscillation gains nothing. Costs are never positive.
-OWN_RECALL, INFORMATION = "own_recall", "information"
+COVERAGE, OWN_COVERAGE, OWN_RECALL, INFORMATION = "coverage", "own_coverage", "own_recall", "information"
 READS_BELIEFS = frozenset({INFORMATION})  # built-in terms whose metrics contain beliefs, which takes time
+READS_COVERAGE = frozenset({COVERAGE, OWN_COVERAGE})  # built-in terms whose metrics have the coverage of every step
 POTENTIALS: dict[str, RewardFunction] = {
     "map_error": _fall_of("map_errors"),
     "map_error_squared": _map_error_squared,
     "team_map_error": _team_map_error,
     "recall": _rise_of("accurate_recalls"),
     "pose_uncertainty": _fall_of("pose_sigmas"),
-    "coverage": _coverage,
-    "own_coverage": _rise_of("discovered"),
+    COVERAGE: _coverage,
+    OWN_COVERAGE: _rise_of("discovered"),
     OWN_RECALL: _rise_of("own_recalls"),
     INFORMATION: _information,
 }
@@ -167,6 +168,11 @@ def is_named(term: RewardTerm) -> bool:
 def reads_beliefs(term: RewardTerm) -> bool:
     """Return whether a term reads `TeamMetrics.beliefs`."""
     return bool(getattr(term, "reads_beliefs", False))
+
+
+def reads_coverage(term: RewardTerm) -> bool:
+    """Return whether a term may read the coverage of every step; all custom terms may."""
+    return not is_named(term) or term.name in READS_COVERAGE
 
 
 def evaluate(

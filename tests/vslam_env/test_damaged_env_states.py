@@ -148,7 +148,7 @@ def test_arrays_of_sensors_in_a_copied_state_are_rebuilt() -> None:
     state = copy.deepcopy(env.get_state())
     expected = go_on(env)
     sensor, scan = state["episode"]["scenario"].sensor, state["episode"]["scenario"].scan
-    inner = (*sensor._sight, *scan._sight, state["episode"]["scenario"].coverage.laid)
+    inner = (*sensor._sight, *scan._sight, state["episode"]["scenario"].coverage.rows)
     for array in (part for part in inner if isinstance(part, np.ndarray)):
         array[:] = np.iinfo(np.int32).max if array.dtype.kind == "i" else np.nan
     env.set_state(state)

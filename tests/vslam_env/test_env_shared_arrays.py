@@ -86,14 +86,14 @@ def test_writing_into_a_state_changes_no_environment(name: str) -> None:
 
 
 def test_the_coverage_cells_of_a_scenario_cannot_be_written() -> None:
-    """A kernel goes by it unchecked; an environment that is set to its own state does not look at it again."""
+    """Snapshots share them; an environment that is set to its own state does not look at it again."""
     env = merged()
     state = env.get_state()
     scenario = state["episode"]["scenario"]
     with pytest.raises(ValueError, match="read-only"):
-        scenario.coverage.laid[:] = 2**31 - 1
+        scenario.coverage.rows[:] = 2**31 - 1
     with pytest.raises(ValueError, match="cannot set WRITEABLE flag"):
-        scenario.coverage.laid.setflags(write=True)
+        scenario.coverage.rows.setflags(write=True)
     assert not any(array.size and can_be_written(array) for _, array in arrays_in(scenario))
     twin = env.clone()
     env.set_state(state)

@@ -212,12 +212,12 @@ class _Log:
         ticks = np.array(self._ticks)
         reckoned = [dead_reckoning(np.zeros(3), odometry[1:, robot])[ticks] for robot in range(len(self._agents))]
         last = {robot: self._env.belief(agent) for robot, agent in enumerate(self._agents)}
-        ground_truth = self._env.episode.ground_truth
+        episode, ground_truth = self._env.episode, self._env.episode.ground_truth
         maps = {**self._maps, **{r: belief.map for r, belief in last.items() if r not in self._alone_until}}
         return EpisodeRecord(
             times=ticks * TICK, true_poses=np.stack(self._true, axis=1), estimated=np.stack(self._estimated, axis=1),
             reckoned=np.stack(reckoned), map_errors=np.array(self._errors).T, nees=self._nees(),
-            coverage=np.array(self._coverage), overlap=self._env.episode.coverage.overlap,
+            coverage=np.array(self._coverage), overlap=episode.coverage.overlap(episode.belief.grids),
             merges=tuple(self._merges), attempts=sum(event.kind == "attempt" for event in self._env.events),
             pairs=count_attempts(self._env.events), groups=tuple(sorted({belief.group for belief in last.values()})),
             infos=tuple(dict(self._infos[agent]) for agent in self._agents),

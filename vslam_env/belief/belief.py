@@ -1,9 +1,10 @@
 """Belief of one robot after a tick, and the configuration of beliefs."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -171,7 +172,9 @@ class Candidates:
 class Belief:
     """Belief of one robot after a tick, in its own start frame and without ground truth.
 
-    All arrays, including those of candidates and teammates, are read-only copies.
+    All arrays, including those of candidates and teammates, are read-only copies. In beliefs of an environment each
+    attribute is made when it is first read, which must be before the next step; from then on it stays. Copies and
+    pickles have all attributes.
 
     Attributes:
         robot: Index of the robot.
@@ -211,6 +214,36 @@ class Belief:
 
     def __post_init__(self) -> None:
         _freeze_arrays(self)
+
+    @classmethod
+    def on_demand(cls, make: Callable[[str], Any], **known: Any) -> Self:
+        """Return a belief whose attributes are made by `make(name)` when they are read; `known` are made already."""
+        self = object.__new__(cls)
+        self.__dict__.update(known, _make=make)
+        return self
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            """Make an attribute."""
+            if name not in type(self).__dataclass_fields__ or "_make" not in self.__dict__:
+                raise AttributeError(f"'Belief' has no attribute '{name}'")
+            self.__dict__[name] = value = _frozen(self._make(name))
+            return value
+
+    def materialise(self) -> Self:
+        """Make all attributes, so that they can also be read after the next step, and return the belief.
+
+        Raises:
+            RuntimeError: If an attribute is missing after the next step.
+        """
+        for item in fields(self):
+            getattr(self, item.name)
+        self.__dict__.pop("_make", None)
+        return self
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.materialise().__dict__
 
     @cached_property
     def map(self) -> LandmarkMap:
@@ -271,8 +304,11 @@ def position_sigma(covariance: FloatArray) -> float:
 def _freeze_arrays(record: Any) -> None:
     """Replace the arrays of a frozen record by read-only copies, which policies cannot share with the filters."""
     for item in fields(record):
-        value = getattr(record, item.name)
-        if isinstance(value, np.ndarray):
-            object.__setattr__(record, item.name, as_read_only(value.copy()))
-        elif isinstance(value, CandidateGains):
-            object.__setattr__(record, item.name, CandidateGains(*(as_read_only(gain.copy()) for gain in value)))
+        object.__setattr__(record, item.name, _frozen(getattr(record, item.name)))
+
+
+def _frozen(value: Any) -> Any:
+    """Return a value with read-only copies of its arrays."""
+    if isinstance(value, np.ndarray):
+        return as_read_only(value.copy())
+    return CandidateGains(*map(_frozen, value)) if isinstance(value, CandidateGains) else value

@@ -1,11 +1,13 @@
 """Beliefs of a team: its filters, occupancy grids and candidates."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
 from typing import Any
+from weakref import WeakValueDictionary
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slam_backend.core.read_only import as_read_only
 from slam_backend.core.validation import Float32Array, FloatArray, argument_error
@@ -93,7 +95,8 @@ class TeamBelief:
         self._turns = _candidate_schedule(num_robots, decision_ticks)
         self._tick = -1
         self._confirm_after = config.confirm_after
-        self._beliefs: dict[int, Belief] = {}  # beliefs of this tick, made on demand
+        self._beliefs: WeakValueDictionary[int, Belief] = WeakValueDictionary()  # of this tick
+        self._version = 0  # of what beliefs are made from
         self._maps: dict[int, LandmarkMap] = {}  # maps of this tick by number
         self.team_poses = TeamPoses(num_robots)
         self._map_summaries = TeamMapSummaries.allocate(num_robots, 0)  # of this tick, filled on demand
@@ -184,6 +187,10 @@ class TeamBelief:
         """Return the occupancy grid of a robot, updated in later ticks."""
         return self._grids[robot]
 
+    def looks(self, robot: int) -> NDArray[np.uint8]:
+        """Return the looks (S, S) of a robot at walls, see `TeamLooks`; a read-only view."""
+        return as_read_only(self._grids.looks.counts[robot])
+
     def set_seconds_left(self, seconds: float) -> None:
         """Set the time until the episode is truncated [s], which beliefs and observations contain."""
         if seconds != self._seconds_left:
@@ -198,7 +205,8 @@ class TeamBelief:
     def belief(self, robot: int) -> Belief:
         """Return the belief of a robot after the last tick."""
         if robot not in self._beliefs:
-            self._beliefs[robot] = self._make_belief(robot)
+            self._beliefs[robot] = belief = self._make_belief(robot)
+            return belief
         return self._beliefs[robot]
 
     def view(self) -> BeliefBatch:
@@ -236,6 +244,7 @@ class TeamBelief:
         self.known_groups = self._topology.known_robots
         self.team.team_poses(self.team_poses)
         self._beliefs.clear()
+        self._version += 1
         self._maps.clear()
         self._has_summaries = False
 
@@ -249,7 +258,7 @@ class TeamBelief:
         write_goals(self.team_poses.starts, self.goals, self._grids.shared, goals)
         return goals
 
-    def _teammates(self, robot: int) -> tuple[Teammate, ...]:
+    def teammates(self, robot: int) -> tuple[Teammate, ...]:
         """Return a robot's teammates; those out of contact with their last known pose."""
         team_poses, team = self.team_poses, self.team
         turn, goals = float(team_poses.starts[robot, 2]), self._known_goals()[robot]
@@ -260,7 +269,7 @@ class TeamBelief:
             for mate, covariance in zip(others, covariances, strict=True)
         )
 
-    def _make_candidates(self, robot: int) -> Candidates:
+    def candidates(self, robot: int) -> Candidates:
         """Build the candidates of a robot."""
         rows, features = FrontierColumns.of(self._candidates.rows(robot)), self._features()[robot]
         valid = ~np.isnan(rows.x)
@@ -283,26 +292,33 @@ class TeamBelief:
         return self._candidates.features(self.team_poses.poses, self._known_goals())
 
     def _make_belief(self, robot: int) -> Belief:
-        """Build the belief of a robot."""
-        team_poses, group = self.team_poses, self._topology.known_robots[robot]
-        return Belief(
-            robot=robot,
-            tick=self._tick,
-            frame=group[0],
-            group=group,
-            pose=team_poses.own[robot],
-            covariance=team_poses.covariances[robot],
-            particles=self.team.particles_from_start(robot),
-            log_weights=self.team.particles(robot)[1],
-            ess=float(team_poses.ess[robot]),
-            grid=self._grids[robot].read_only_view(),
-            candidates=self._make_candidates(robot),
-            teammates=self._teammates(robot),
-            looks=as_read_only(self._grids.looks.counts[robot]),
-            seconds_left=self._seconds_left,
-            start_from_group=team_poses.starts[robot],
-            group_map=self.group_map(robot),
-        )
+        """Return the belief of a robot, whose attributes are made on demand."""
+        tick, version = self._tick, self._version
+
+        def make(name: str) -> Any:
+            if self._version != version:
+                hint = "Read it before the next step, or call materialise()."
+                raise RuntimeError(f"belief of tick {tick}: {name!r} was not read in time. {hint}")
+            return BELIEF_FIELDS[name](self, robot)
+
+        return Belief.on_demand(make, robot=robot, tick=tick, seconds_left=self._seconds_left)
+
+
+BELIEF_FIELDS: dict[str, Callable[[TeamBelief, int], Any]] = {  # what makes each attribute of a belief
+    "frame": lambda team, robot: team.known_groups[robot][0],
+    "group": lambda team, robot: team.known_groups[robot],
+    "pose": lambda team, robot: team.team_poses.own[robot],
+    "covariance": lambda team, robot: team.team_poses.covariances[robot],
+    "particles": lambda team, robot: team.team.particles_from_start(robot),
+    "log_weights": lambda team, robot: team.team.particles(robot)[1],
+    "ess": lambda team, robot: float(team.team_poses.ess[robot]),
+    "grid": lambda team, robot: team.grid(robot).read_only_view(),
+    "candidates": TeamBelief.candidates,
+    "teammates": TeamBelief.teammates,
+    "looks": TeamBelief.looks,
+    "start_from_group": lambda team, robot: team.team_poses.starts[robot],
+    "group_map": TeamBelief.group_map,
+}
 
 
 def merge_options(config: BeliefConfig, attempts: bool) -> tuple[AttemptOptions, MergeOptions]:

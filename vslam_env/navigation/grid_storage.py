@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from slam_backend.core.read_only import as_constant, as_read_only
 from slam_backend.state import INT8, UINT8, Array, Int, Row, Sizes, with_state
-from vslam_env.navigation._grid_kernels import CELL, GRID_SIZE, LARGEST_SIZE, MOST_CHANGES, Grid
+from vslam_env.navigation._grid_kernels import CELL, GRID_SIZE, LARGEST_SIZE, Grid
 
 GRID_SIZES = (GRID_SIZE, 600, 1200, 2400, LARGEST_SIZE)  # by doubling, up to 400 m on each side of the start
 
@@ -25,9 +25,6 @@ class GridStorage:
     Attributes:
         evidence: (K, S, S) int8. Hits minus passes of each cell.
         cells: (K, S, S) uint8. State of each cell.
-        changes: (K, 1 + n) int32. Number of cells of each grid that changed state since the reader last set this number
-            to 0, followed by their places (flat indices in a grid of the largest size), possibly with duplicates. -1 if
-            any cell may have changed, as initially.
         bounds: (K, 4) int32. First row and column of the known part of each grid, and one past the last ones; zeros if
             nothing is known.
         views: Arrays of each grid.
@@ -35,14 +32,13 @@ class GridStorage:
     """
 
     def __init__(self, num_grids: int) -> None:
-        self.changes = np.full((num_grids, 1 + MOST_CHANGES), -1, np.int32)
         self.bounds = np.zeros((num_grids, 4), np.int32)
         self._adopt(*_empty(num_grids, GRID_SIZE))
 
     def _adopt(self, evidence: NDArray[np.int8], cells: NDArray[np.uint8]) -> None:
         """Use given arrays for evidence and cells."""
         self.evidence, self.cells = evidence, cells
-        self.views = list(map(Grid, evidence, cells, self.changes, self.bounds))
+        self.views = list(map(Grid, evidence, cells, self.bounds))
         self.read_only_cells = [as_read_only(view.cells) for view in self.views]
 
     @property
@@ -53,7 +49,7 @@ class GridStorage:
     @property
     def arrays(self) -> Grid:
         """The arrays of all grids."""
-        return Grid(self.evidence, self.cells, self.changes, self.bounds)
+        return Grid(self.evidence, self.cells, self.bounds)
 
     def reserve(self, needed: int) -> None:
         """Grow until the grids reach a number of cells from their middle in each direction, or are the largest ones.

@@ -190,7 +190,6 @@ class OccupancyGrid:
         there, grid.bounds[:] = part.place(self._storage.size)
         grid.evidence[there] = part.values
         grid.cells[there] = _CELL_STATES[part.values.view(np.uint8)]
-        grid.changes[0] = -1
 
     def _reserve(self, distance: float) -> None:
         """Grow the grid so that it holds what is at most so far from the start [m] along x and y."""

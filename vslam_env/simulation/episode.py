@@ -95,7 +95,7 @@ class Episode:
         body: Hardware of the robots.
         belief: Beliefs of the team.
         ground_truth: Ground-truth association of the estimated landmarks.
-        coverage: Floor that the robots have seen, as of the last `team_metrics`.
+        coverage: Floor that the robots had seen at its last update.
         tick: Ticks since the reset.
         readings: Readings of the last tick; unset before `begin`.
         last_frames: Frames of the last tick with their true landmarks, read-only; unset before `begin`.
@@ -214,24 +214,26 @@ class Episode:
         """Return the estimated poses (K, 3) [m, m, rad], moved by the true start poses to the world frame."""
         return compose(self.true_starts, self.estimated_path[-1])
 
-    def team_metrics(self, with_beliefs: bool = False) -> TeamMetrics:
-        """Score the team now, update coverage and credits, and return the metrics.
+    def team_metrics(self, with_beliefs: bool = False, with_coverage: bool = True) -> TeamMetrics:
+        """Score the team now, update credits, and return the metrics.
 
         Args:
             with_beliefs: Whether they include the beliefs, which takes longer.
+            with_coverage: Whether the coverage is updated; if not, it is that of the last update.
         """
         belief, poses = self.belief, self._simulator.poses
         self._score(poses)
         if OWN_RECALL in self._config.reward:
             self._credits.update(self.ground_truth.accurate)
             self._metrics.own_recalls[:] = self._credits.shares
-        coverage = self.coverage.update(belief.grids, poses, self._metrics.discovered)
+        if with_coverage:
+            self._metrics.discovered[:] = self.coverage.update(belief.grids, poses)
         counts, metrics = (
             RobotCounts(self._collisions, tuple(belief.team.exchange.sent)),
             RobotMetrics(*[row.tolist() for row in self._metrics]),
         )
         beliefs = tuple(map(self._summary, range(len(poses)))) if with_beliefs else ()
-        return TeamMetrics(metrics, counts, coverage, len(self.merge_ticks), self.tick * TICK, beliefs)
+        return TeamMetrics(metrics, counts, self.coverage.share, len(self.merge_ticks), self.tick * TICK, beliefs)
 
     # ------------------------------------------------------------------ snapshots
 

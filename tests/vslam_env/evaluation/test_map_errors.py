@@ -4,7 +4,8 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from builders.environments import MEETING, scored, small_env, standing_at, turning
+import pytest
+from builders.environments import MEETING, scored, small_env, standing_at, turning, wander
 
 from slam_backend.core.validation import IntArray
 from slam_backend.fastslam.reports import Associations
@@ -225,21 +226,25 @@ def test_coverage_is_a_union() -> None:
             grids[0].merge(grids[2], rng.uniform(-1.0, 1.0, 3))
         if turn in (20, 30):
             restore(grids[1], kept)
-        shares.append(coverage.update(team, starts, np.empty(len(starts))))
+        coverage.update(team, starts)
+        shares.append(coverage.share)
         assert shares[-1] == _plain_share(centres, starts, grids)
     assert shares[-1] > 0.1
     assert min(np.diff(shares)) < 0.0  # walls were seen where floor had been, and a grid was restored
-    assert CoverageTracker(meter).update(team, starts, np.empty(3)) == shares[-1]
+    fresh = CoverageTracker(meter)
+    assert fresh.share_now(team) == shares[-1]
+    assert fresh.share == 0.0
 
 
 SQUARES = np.stack(np.meshgrid(np.arange(0.1, 8.0, 0.2), np.arange(0.1, 4.0, 0.2)), -1).reshape(-1, 2)
 
 
 def test_newly_covered_cells_agree_with_a_plain_count() -> None:
-    """However grids change, each cell counts once for the nearest robot, as a look at all cells every time says."""
+    """However grids change, each cell counts once, for the robot that is nearest when it is first seen."""
     rng = np.random.default_rng(2)
     starts = rng.uniform(0.0, 6.0, (3, 3))
-    coverage, team = CoverageTracker(CoverageCells(SQUARES, starts)), TeamGrids(3)
+    cells, team = CoverageCells(SQUARES, starts), TeamGrids(3)
+    coverage = CoverageTracker(cells)
     ever, found, angles = np.zeros(len(SQUARES), np.bool_), np.zeros(3), np.linspace(-0.6, 0.6, 32)
     for turn in range(60):
         for grid in team.grids:
@@ -248,15 +253,37 @@ def test_newly_covered_cells_agree_with_a_plain_count() -> None:
         if turn == 30:
             restore(coverage, take(coverage))
         positions = rng.uniform(0.0, 8.0, (3, 2))
-        said = np.empty(3)
-        share = coverage.update(team, positions, said)
-        fresh = (coverage._tally.seers > 0) & ~ever
+        said, seen = coverage.update(team, positions), cells.seen(team).any(axis=0)
+        fresh = seen & ~ever
         nearest = np.hypot(*np.moveaxis(SQUARES[:, None] - positions, -1, 0)).argmin(axis=1)
         found += np.bincount(nearest[fresh], minlength=3) / len(SQUARES)
         ever |= fresh
         np.testing.assert_allclose(said, found)
-        assert share == np.mean(coverage._tally.seers > 0)
+        assert coverage.share == np.mean(seen)
     assert ever.mean() > 0.3
+
+
+@pytest.mark.parametrize(("changes", "exact"), [
+    ({"max_cycles": 37}, {10, 20, 30, 37}), ({"max_cycles": 13, "decision_ticks": 3}, {12, 21, 30, 39}),
+    ({"max_cycles": 37, "reward": {"coverage": 1.0}}, set(range(1, 38))),
+    ({"action_type": "goal", "max_cycles": 4}, {10, 20, 30, 40}),
+])  # fmt: skip
+def test_coverage_is_found_once_a_second_or_when_it_is_read(changes: dict[str, Any], exact: set[int]) -> None:
+    """It is exact after the ticks named, also after a restore, and else that of the last of them; `state` always is."""
+    env, twin = (small_env(**changes) for _ in range(2))
+    expected = env.reset(seed=4)[1]["robot_0"]["coverage"]
+    rng = np.random.default_rng(3)
+    while env.agents:
+        if env.episode.tick in (13, 15):
+            twin.set_state(env.get_state())
+            env, twin = twin, env
+        infos = env.step(wander(env, rng))[4]
+        episode = env.episode
+        share = episode.coverage.share_now(episode.belief.grids)
+        expected = share if episode.tick in exact else expected
+        assert infos["robot_0"]["coverage"] == infos["robot_1"]["coverage"] == expected
+        assert env.state()[-2] == np.float32(share)
+    assert expected > 0.05
 
 
 def test_own_coverage_sums_to_team_coverage_and_survives_snapshots() -> None:

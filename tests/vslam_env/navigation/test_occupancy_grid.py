@@ -112,26 +112,6 @@ def test_a_scan_update_agrees_with_the_plain_definition(seed: int, fan: np.ndarr
     assert len(grid.cells) == PLAIN_SIZE
 
 
-def test_a_grid_reports_changed_cells() -> None:
-    """It reports all that changed since the last question, and after a restore that anything may have changed."""
-    rng = np.random.default_rng(4)
-    team = TeamGrids(1)
-    (grid,), (changes,) = team.grids, team.changes
-    assert changes[0] == -1
-    for k in range(30):
-        pose = np.append(rng.uniform(-9.0, 9.0, 2), rng.uniform(-3.0, 3.0))
-        before, changes[0] = grid.cells.copy(), 0
-        grid.update_from_scan(pose, rng.uniform(0.3, 9.0, 32), ANGLES)
-        grid.clear_disc(pose)
-        if k % 3 == 0:
-            grid.bump(pose)
-        changed = np.argwhere(grid.cells != before) + (LARGEST_SIZE - GRID_SIZE) // 2
-        assert set((changed @ [LARGEST_SIZE, 1]).tolist()) <= set(changes[1 : 1 + changes[0]].tolist())
-    assert 0 <= changes[0] < 200
-    restore(grid, take(grid))
-    assert changes[0] == -1
-
-
 def test_a_grid_keeps_the_bounds_of_what_it_knows() -> None:
     """However it is painted, joined and restored, they are the least and largest row and column of it."""
     rng = np.random.default_rng(5)
@@ -346,12 +326,10 @@ HARDWARE = ray_directions(ANGLES), MAX_RANGE, RADIUS
 
 
 def test_a_combined_update_equals_its_parts() -> None:
-    """Each grid holds, and reports as changed, the result of scan, disc and bump in ascending order of robots."""
+    """Each grid holds the result of scan, disc and bump in ascending order of robots."""
     rng = np.random.default_rng(4)
     team, apart = TeamGrids(3), [TeamGrids(1) for _ in range(3)]
     parts = [single.grids[0] for single in apart]
-    for one in (team, *apart):
-        one.changes[:, 0] = 0
     for _ in range(30):
         shared = rng.integers(0, 2, (3, 3))
         poses = rng.uniform(-1.0, 1.0, (3, 3, 3)) * [9.0, 9.0, 3.0]
@@ -367,7 +345,3 @@ def test_a_combined_update_equals_its_parts() -> None:
             assert (evidence_of(whole, GRID_SIZE) == evidence_of(part, GRID_SIZE)).all()
             assert (whole.cells == part.cells).all()
             assert (team.cells[robot] == part.cells).all()
-            count = 1 + apart[robot].changes[0, 0]
-            assert count > 0
-            assert (team.changes[robot, :count] == apart[robot].changes[0, :count]).all()
-            team.changes[robot, 0] = apart[robot].changes[0, 0] = 0

@@ -13,7 +13,7 @@ UNKNOWN, FREE, OCCUPIED = 0, 1, 2
 
 # Cells along a side of a new grid and of the largest one. The start pose is the middle of both. Indices of cells are
 # floored in the new grid and then moved by a whole number of cells (`margin_of`), so that the size of a grid changes no
-# rounding. What is recorded for longer than a grid keeps its size is the flat index in the largest grid (`place_of`).
+# rounding.
 GRID_SIZE, LARGEST_SIZE = 300, 4000
 HALF_WIDTH = 0.5 * GRID_SIZE * CELL  # [m]
 LARGEST_HALF_WIDTH = 0.5 * LARGEST_SIZE * CELL  # [m]
@@ -22,8 +22,6 @@ LARGEST_HALF_WIDTH = 0.5 * LARGEST_SIZE * CELL  # [m]
 # no thickness survives rays that graze its cell; the bounds let a few seconds of new readings overrule any old ones.
 HIT = 3
 MOST_FREE, MOST_OCCUPIED = -8, 12
-
-MOST_CHANGES = 4096  # a grid keeps so many; a scan makes a hundred at most
 
 
 class Grid(NamedTuple):
@@ -34,14 +32,11 @@ class Grid(NamedTuple):
     Attributes:
         evidence: (S, S) int8. Hits against passes.
         cells: (S, S) uint8. Verdict on each cell.
-        changes: (1 + n,) int32. Number of changed verdicts, -1 if it is not known; then the places of these cells, see
-            `place_of`.
         bounds: (4,) int32. First row and column of what is known, and one past the last ones; zeros if nothing is.
     """
 
     evidence: NDArray[np.int8]
     cells: NDArray[np.uint8]
-    changes: NDArray[np.int32]
     bounds: NDArray[np.int32]
 
 
@@ -49,13 +44,6 @@ class Grid(NamedTuple):
 def margin_of(size: int) -> int:
     """Return how many rows a grid of a size has before the first row of a new grid."""
     return (size - GRID_SIZE) // 2
-
-
-@inline
-def place_of(row: int, col: int, size: int) -> int:
-    """Return the flat index in the largest grid of a cell of a grid of a size."""
-    inset = (LARGEST_SIZE - size) // 2
-    return (row + inset) * LARGEST_SIZE + col + inset
 
 
 @inline
@@ -78,17 +66,11 @@ def widen_bounds(bounds: Any, row: int, col: int) -> None:
 @device
 @in_place
 def set_state(grid: Grid, row: int, col: int, verdict: int) -> None:
-    """Set the verdict on a cell; if it is a new one, note the change and widen the bounds."""
-    cells, changes, bounds = grid.cells, grid.changes, grid.bounds
-    if cells[row, col] != verdict:
-        if cells[row, col] == UNKNOWN:
-            widen_bounds(bounds, row, col)
-        cells[row, col] = verdict
-        if 0 <= changes[0] < len(changes) - 1:
-            changes[0] += 1
-            changes[changes[0]] = place_of(row, col, len(cells))
-        else:
-            changes[0] = -1
+    """Set the verdict on a cell, and widen the bounds if it was unknown."""
+    cells = grid.cells
+    if cells[row, col] == UNKNOWN:
+        widen_bounds(grid.bounds, row, col)
+    cells[row, col] = verdict
 
 
 @inline

@@ -54,7 +54,7 @@ def mark_bump(grid: Grid, x: float, y: float, theta: float, radius: float) -> No
 
 @in_place
 def update_grids(
-    grids: tuple[Any, Any, Any, Any],
+    grids: tuple[Any, Any, Any],
     shared: IntArray,
     poses: FloatArray,
     scans: FloatArray,
@@ -81,7 +81,7 @@ def update_grids(
         Owner and robot of a pose or a scan that is invalid, -1 if all are valid; and the number of cells that a grid
         needs on each side of its middle. If something is invalid or the grids are smaller, nothing is written.
     """
-    evidence, cells, changes, bounds = grids
+    evidence, cells, bounds = grids
     farthest = 0.0
     for robot in range(len(scans)):
         good, longest = True, 0.0
@@ -103,7 +103,7 @@ def update_grids(
         scan_geometry(scans[robot], directions, max_range, buffer[:NUM_ROWS])
         for owner in range(len(shared)):
             if shared[owner, robot]:
-                grid = Grid(evidence[owner], cells[owner], changes[owner], bounds[owner])
+                grid = Grid(evidence[owner], cells[owner], bounds[owner])
                 x, y, theta = poses[owner, robot]
                 update_from_geometry(grid, x, y, theta, buffer)
                 clear_disc(grid, x, y, radius)
