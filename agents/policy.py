@@ -8,7 +8,12 @@ from vslam_env.belief.team_belief import Belief
 
 
 class Policy(Protocol):
-    """Policy of one robot. Each robot needs a policy object of its own."""
+    """Policy of one robot. Each robot needs a policy object of its own.
+
+    A policy may have an attribute `observation_keys`, a tuple of the keys of observations that it reads. It takes them
+    from the belief where an observation lacks them, see `vslam_env.belief.observation.observe`; environments that are
+    made for it then compute no other keys.
+    """
 
     def reset(self) -> None:
         """Clear the state of the last episode."""

@@ -30,7 +30,7 @@ from agents.trained import FORMAT, OWN_GOAL, TrainedGoalPolicy, _digest, check_o
 from vslam_env import CANDIDATE_FEATURES, NUM_CANDIDATES, vslam_v0
 from vslam_env.belief.observation import action_mask, observation_space
 
-SPACE = observation_space(32, 8.0, True, False)
+SPACE = observation_space()
 ABOUT = {"version": "0", "environment": ""}
 
 
@@ -297,8 +297,6 @@ def test_other_spaces_are_refused() -> None:
     short = observation | {"scan": observation["scan"][:16]}
     with pytest.raises(ValueError, match=r"observation: expected 'scan' of shape \(32,\), .* got shape \(16,\)"):
         TrainedGoalPolicy(_weights()).act(short, None, np.random.default_rng(0))  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match=r"observation: expected 'local_grid' .* got no 'local_grid'. Use dict"):
-        TrainedGoalPolicy(_weights()).act(np.zeros(9), None, np.random.default_rng(0))  # type: ignore[arg-type]
     shapes = {name: np.shape(value) for name, value in observation.items() if name != "action_mask"}
     with pytest.raises(ValueError, match=r"observation: expected 'action_mask' .* got no 'action_mask'. Use dict"):
         check_observation(shapes)

@@ -22,7 +22,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:The old environment creation API
 def test_gymnasium_env(action_type: str, observation_type: str) -> None:
     """Gymnasium's checker passes the environment of one robot."""
     env = gymnasium.make(
-        "vslam_env/SoloExploration-v0",
+        "vslam_env/SoloExploration-v1",
         world=room(),
         num_particles=20,
         max_cycles=10,
@@ -38,7 +38,7 @@ def test_gymnasium_env(action_type: str, observation_type: str) -> None:
 def test_stable_baselines3(observation_type: str) -> None:
     """Stable-Baselines3's checker passes the environment of one robot."""
     env = gymnasium.make(
-        "vslam_env/SoloExploration-v0", world=room(), num_particles=20, max_cycles=10, observation_type=observation_type
+        "vslam_env/SoloExploration-v1", world=room(), num_particles=20, max_cycles=10, observation_type=observation_type
     )
     sb3_check_env(env.unwrapped)
 
@@ -57,7 +57,7 @@ def test_pettingzoo_make() -> None:
 def test_metadata_and_spaces() -> None:
     """Names, spaces and attributes are those that PettingZoo's wrappers look for."""
     env = small_env()
-    assert env.metadata["name"] == str(env) == "vslam_env/Exploration-v0"
+    assert env.metadata["name"] == str(env) == "vslam_env/Exploration"
     assert env.metadata["render_modes"] == ["human", "rgb_array"]
     assert env.metadata["is_parallelizable"]
     assert env.possible_agents == ["robot_0", "robot_1"]
@@ -108,7 +108,7 @@ def test_action_masks() -> None:
 
 def test_registered_name() -> None:
     """Gymnasium makes it by name; pictures come through the wrappers."""
-    env = gymnasium.make("vslam_env/SoloExploration-v0", world=room(), num_particles=20, render_mode="rgb_array")
+    env = gymnasium.make("vslam_env/SoloExploration-v1", world=room(), num_particles=20, render_mode="rgb_array")
     env.reset(seed=0)
     frame = env.render()
     assert isinstance(frame, np.ndarray)

@@ -1,7 +1,7 @@
 """Beliefs of a team: its filters, occupancy grids and candidates."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import fields, replace
 from typing import Any
 
@@ -21,6 +21,7 @@ from slam_backend.team.options import MergeOptions
 from slam_backend.team.reports import LandmarkIdMap, TeamReport
 from slam_backend.team.team import TeamSlam
 from vslam_env.belief.belief import Belief, BeliefBatch, BeliefConfig, Candidates, RobotHardware, Teammate
+from vslam_env.belief.observation_keys import KEYS, READ_CANDIDATES, READ_GLOBAL_GRIDS
 from vslam_env.belief.readings import Readings, TeamReadings
 from vslam_env.belief.rendezvous import Rendezvous
 from vslam_env.belief.shared_grids import SharedGrids
@@ -52,6 +53,7 @@ class TeamBelief:
         team: Filters of the team; it is changed by the methods of this class alone.
         team_poses: Pose estimates; overwritten in the next step.
         goals: (K, 2) float64 [m]. Goal of each robot in its own start frame; NaN: none.
+        scans: (K, R) float64 [m]. Last scans.
         known_groups: Robots known to share a map with each robot, itself included.
         grids: Occupancy grids of the robots; read-only.
     """
@@ -63,6 +65,7 @@ class TeamBelief:
         candidates=Child(TeamCandidates),
         rendezvous=Child(Rendezvous),
         goals=Array(FLOAT64, "K 2", -LARGEST_HALF_WIDTH, LARGEST_HALF_WIDTH, nan=True, renewed=True),
+        scans=Array(FLOAT64, "K RAYS", 0.0, renewed=True),
     )
 
     def __init__(
@@ -89,7 +92,8 @@ class TeamBelief:
         self.goals = np.full((num_robots, 2), np.nan)
         self._seconds_left = math.inf
         self._robots = np.arange(num_robots)
-        self._scanned = num_robots, len(body.ray_angles)  # shape of a tick's scans
+        self._no_features = np.empty((num_robots, 0, len(CANDIDATE_FEATURES)), np.float32)
+        self.scans = np.zeros((num_robots, len(body.ray_angles)))
         self._turns = _candidate_schedule(num_robots, decision_ticks)
         self._tick = -1
         self._confirm_after = config.confirm_after
@@ -117,9 +121,9 @@ class TeamBelief:
         """
         if not isinstance(readings, TeamReadings):
             readings = TeamReadings.stack(readings)
-        if readings.scans.shape != self._scanned:
+        if readings.scans.shape != self.scans.shape:
             got, hint = f"shape {readings.scans.shape}", "Give one range per ray and robot."
-            raise argument_error("readings.scans", f"an array of shape {self._scanned}", got, hint)
+            raise argument_error("readings.scans", f"an array of shape {self.scans.shape}", got, hint)
         if len(readings.bumps) != len(self._robots):
             got, hint = f"shape {readings.bumps.shape}", "Give one bool per robot."
             raise argument_error("readings.bumps", f"an array of shape ({len(self._robots)},)", got, hint)
@@ -134,6 +138,7 @@ class TeamBelief:
         self._refresh_poses()
         team_poses = self.team_poses
         self._grids.step(self._tick, report, self._topology.same_filter, team_poses, readings.scans, readings.bumps)
+        self.scans = readings.scans.copy()
         if readings.goals is not None:
             self.goals = readings.goals
         turns = self._turns[self._tick % len(self._turns)] if self._tick else range(len(self._robots))
@@ -201,13 +206,20 @@ class TeamBelief:
             self._beliefs[robot] = self._make_belief(robot)
         return self._beliefs[robot]
 
-    def view(self) -> BeliefBatch:
-        """Return the observable part of all robots' beliefs, sharing memory with the grids."""
-        grids = self.grids
-        self._global_grids.update(grids, self._grids.looks)
-        of_grids = grids.cells, self._global_grids
+    def view(self, keys: Collection[str] = KEYS) -> BeliefBatch:
+        """Return what these keys of observations read of all robots' beliefs, sharing memory with the grids."""
+        grids, describes = self.grids, not READ_CANDIDATES.isdisjoint(keys)
+        if not READ_GLOBAL_GRIDS.isdisjoint(keys):
+            self._global_grids.update(grids, self._grids.looks)
         return BeliefBatch(
-            self._robots, self.team_poses, self.map_summaries, *of_grids, self._features(), self._seconds_left
+            robots=self._robots,
+            team_poses=self.team_poses,
+            map_summaries=self.map_summaries,
+            cells=grids.cells,
+            global_grids=self._global_grids,
+            features=self._features() if describes else self._no_features,
+            scans=self.scans,
+            seconds_left=self._seconds_left,
         )
 
     def rebuild(self) -> None:
@@ -299,6 +311,7 @@ class TeamBelief:
             candidates=self._make_candidates(robot),
             teammates=self._teammates(robot),
             looks=as_read_only(self._grids.looks.counts[robot]),
+            scan=self.scans[robot],
             seconds_left=self._seconds_left,
             start_from_group=team_poses.starts[robot],
             group_map=self.group_map(robot),
