@@ -4,15 +4,16 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from vslam_env.belief.observation_keys import MASK
 from vslam_env.belief.team_belief import Belief
 
 
 class Policy(Protocol):
     """Policy of one robot. Each robot needs a policy object of its own.
 
-    A policy may have an attribute `observation_keys`, a tuple of the keys of observations that it reads. It takes them
-    from the belief where an observation lacks them, see `vslam_env.belief.observation.observe`; environments that are
-    made for it then compute no other keys.
+    A policy may have an attribute `observation_keys`, a tuple of the keys of observations that it reads: environments
+    that are made for it then compute no others. `vslam_env.belief.observation.observe` takes from the belief what an
+    observation lacks.
     """
 
     def reset(self) -> None:
@@ -29,3 +30,17 @@ class Policy(Protocol):
         Returns:
             An action of the robot's action space.
         """
+
+
+def keys_of(policy: Policy) -> tuple[str, ...] | None:
+    """Return the keys of observations that a policy reads; None: it does not say, and may read any."""
+    keys: tuple[str, ...] | None = getattr(policy, "observation_keys", None)
+    return keys
+
+
+def keys_for(policy: Policy, action_type: str) -> str | tuple[str, ...]:
+    """Return the keys that the environment of a policy observes, at least the pose, see `EnvConfig`."""
+    keys = keys_of(policy)
+    if keys is None:
+        return "all"
+    return (*{"pose", *keys} - {MASK}, *([MASK] if action_type == "goal" else []))
