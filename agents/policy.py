@@ -11,9 +11,9 @@ from vslam_env.belief.team_belief import Belief
 class Policy(Protocol):
     """Policy of one robot. Each robot needs a policy object of its own.
 
-    A policy may have an attribute `observation_keys`, a tuple of the keys of observations that it reads: environments
-    that are made for it then compute no others. `vslam_env.belief.observation.observe` takes from the belief what an
-    observation lacks.
+    A policy may have an attribute `observation_keys`: a tuple of the keys of observations that it reads, or the name of
+    a set. Commands then make environments that observe exactly these. `vslam_env.belief.observation.observe` takes from
+    the belief what an observation lacks.
     """
 
     def reset(self) -> None:
@@ -32,15 +32,16 @@ class Policy(Protocol):
         """
 
 
-def keys_of(policy: Policy) -> tuple[str, ...] | None:
+def keys_of(policy: Policy) -> str | tuple[str, ...] | None:
     """Return the keys of observations that a policy reads; None: it does not say, and may read any."""
-    keys: tuple[str, ...] | None = getattr(policy, "observation_keys", None)
+    keys: str | tuple[str, ...] | None = getattr(policy, "observation_keys", None)
     return keys
 
 
 def keys_for(policy: Policy, action_type: str) -> str | tuple[str, ...]:
-    """Return the keys that the environment of a policy observes, at least the pose, see `EnvConfig`."""
+    """Return the keys that the environment of a policy observes, see `EnvConfig`; the pose if it reads none."""
     keys = keys_of(policy)
-    if keys is None:
-        return "all"
-    return (*{"pose", *keys} - {MASK}, *([MASK] if action_type == "goal" else []))
+    if keys is None or isinstance(keys, str):
+        return "all" if keys is None else keys
+    others = tuple(key for key in keys if key != MASK) or ("pose",)
+    return (*others, MASK) if action_type == "goal" else others
