@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.policy import Policy
+from agents.policy import Policy, keys_of
 from slam_backend.core.validation import FloatArray, IntArray
 from vslam_env.belief.team_belief import Belief, Candidates
 from vslam_env.navigation import CandidateKind, distance_map
@@ -44,6 +44,8 @@ class GoalPolicy:
         planner: Planner of this robot.
     """
 
+    observation_keys = ()
+
     def __init__(self, planner: Planner) -> None:
         self._planner = planner
 
@@ -71,6 +73,7 @@ class DrivingPolicy:
 
     def __init__(self, chooser: Policy, discrete: bool = False, sweeps: bool = False) -> None:
         self._chooser, self._discrete, self._sweeps = chooser, discrete, sweeps and not discrete
+        self.observation_keys = keys_of(chooser)
         self.reset()
 
     def reset(self) -> None:

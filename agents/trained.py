@@ -14,7 +14,8 @@ from agents.goal_network import NAMES, SHAPES, Weights, logits, weight_shapes
 from slam_backend.core.array_files import read_arrays
 from slam_backend.core.files import write_file
 from slam_backend.core.validation import argument_error
-from vslam_env.belief.observation import action_mask
+from vslam_env.belief.observation import action_mask, observe
+from vslam_env.belief.observation_keys import MASK
 from vslam_env.belief.team_belief import Belief
 from vslam_env.navigation import CANDIDATE_FEATURES
 
@@ -22,17 +23,20 @@ FORMAT = 3  # incremented when the network or the meaning of observations change
 SUFFIX = ".npz"
 MODEL_FILE = "model" + SUFFIX
 ABOUT = "about"
-MASK = "action_mask"
 OWN_GOAL = CANDIDATE_FEATURES.index("own_goal")
 
 
 class TrainedGoalPolicy:
-    """A trained policy for `goal` actions and dict observations; also the choice of goals for a `DrivingPolicy`.
+    """A trained policy for `goal` actions; also the choice of goals for a `DrivingPolicy`.
+
+    It takes from the belief what the observation lacks.
 
     Args:
         weights: Weights of the network, as `load_model` returns them.
         greedy: Whether to take the best action of the network; otherwise one is drawn from its distribution.
     """
+
+    observation_keys = NAMES
 
     def __init__(self, weights: Weights, greedy: bool = False) -> None:
         self._weights = weights
@@ -47,10 +51,13 @@ class TrainedGoalPolicy:
         """Return 0 to stay, or 1 + the slot of a valid candidate.
 
         Raises:
-            ValueError: If the observation lacks an input of the network.
+            ValueError: If an input of the network has another shape.
         """
         named = observation if isinstance(observation, Mapping) else {}
-        if MASK not in named and "candidates" in named:  # the robot drives itself; only it knows its goal
+        missing = [name for name in NAMES if name not in named and name != MASK]
+        if missing:
+            named = {**named, **observe(belief, missing)}
+        if MASK not in named:  # the robot drives itself; only it knows its goal
             candidates = np.array(named["candidates"])
             mask = action_mask(candidates)
             if self._last > 0:
@@ -78,7 +85,7 @@ def check_observation(shapes: Mapping[str, tuple[int, ...]]) -> None:
     """
     for name, shape in SHAPES.items():
         if shapes.get(name) != shape:
-            hint = "Use dict observations and the standard scan."
+            hint = 'Use dict observations, observation_keys="goal" and the standard scan.'
             got = f"no {name!r}" if name not in shapes else f"shape {shapes[name]}"
             raise argument_error("observation", f"{name!r} of shape {shape}, as the model was trained on", got, hint)
 

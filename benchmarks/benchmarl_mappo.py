@@ -29,7 +29,7 @@ from agents.trained import MODEL_FILE, save_model
 from training.experiments.run_folder import installed_versions
 from training.rl.config import SPLIT_TRAIN, SPLIT_TRY, TrainConfig
 from training.rl.network import GoalPolicy, actor_part
-from vslam_env import NUM_CANDIDATES, vslam_v0
+from vslam_env import NUM_CANDIDATES, vslam_v1
 from vslam_env.belief.observation import observation_space
 
 CRITIC_CELLS = [128, 128]
@@ -44,7 +44,7 @@ class Exploration(PettingZooClass):
         """Return a function that makes an environment."""
         seeds = itertools.count(1000 * (seed or 0))
         return lambda: PettingZooWrapper(
-            vslam_v0.parallel_env(config=self.config["env_config"]), return_state=True, seed=next(seeds), device=device
+            vslam_v1.parallel_env(config=self.config["env_config"]), return_state=True, seed=next(seeds), device=device
         )
 
     def supports_continuous_actions(self) -> bool:
@@ -70,7 +70,7 @@ class GoalActor(Model):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(**kwargs)
-        space = observation_space(32, 8.0, True, False)
+        space = observation_space()
         policy = GoalPolicy(space, spaces.Discrete(1 + NUM_CANDIDATES), lambda left: 1.0)
         del policy.mlp_extractor.value_hidden  # the critic is another network
         self.features_extractor, self.mlp_extractor = policy.features_extractor, policy.mlp_extractor

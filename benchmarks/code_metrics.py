@@ -20,7 +20,7 @@ import numpy as np
 from numba.core.dispatcher import Dispatcher
 
 from slam_backend import FastSlam, Measurements
-from vslam_env import vslam_v0
+from vslam_env import vslam_v1
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("slam_backend", "vslam_env", "agents", "training")
@@ -168,7 +168,7 @@ def step_of_filter() -> set[str]:
 
 def step_of_environment() -> set[str]:
     """Return the files executed by a step of the default environment without a merge."""
-    env = vslam_v0.parallel_env()
+    env = vslam_v1.parallel_env()
     env.reset(seed=0)
     actions = {agent: np.array([0.5, 0.1], np.float32) for agent in env.agents}
     env.step(actions)

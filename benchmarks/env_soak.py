@@ -27,7 +27,8 @@ import numpy as np
 import typer
 
 from slam_backend.core.validation import check_int
-from vslam_env import EnvConfig, ExplorationEnv, load_state, preset_config, save_state, vslam_v0
+from vslam_env import EnvConfig, ExplorationEnv, load_state, preset_config, save_state, vslam_v1
+from vslam_env.belief.observation_keys import SETS
 from vslam_env.world import WORLD_FAMILIES
 from vslam_env.world.clearance import distances_to_walls
 
@@ -47,6 +48,7 @@ def random_config(rng: np.random.Generator) -> EnvConfig:
         action_type=action_type,
         decision_ticks=int(rng.integers(1, 6)) if action_type == "goal" else int(rng.integers(1, 3)),
         observation_type=str(rng.choice(["dict", "flat"])),
+        observation_keys=str(rng.choice(list(SETS))),
         max_cycles=int(rng.integers(50, 500)),
         min_start_distance=float(rng.uniform(1.0, 4.0)),
         shared_start_view=True,
@@ -103,8 +105,8 @@ def check(env: ExplorationEnv, returned: tuple[Any, ...]) -> None:
 def beginning(seed: int, steps: int, beside: bool) -> str:
     """Return the hash of the first steps of an episode in a new environment, optionally with another in between."""
     rng = np.random.default_rng(seed)
-    env = vslam_v0.parallel_env(config=random_config(rng))
-    other, other_rng = vslam_v0.parallel_env(world="fig5", num_robots=2, num_particles=5), np.random.default_rng(1)
+    env = vslam_v1.parallel_env(config=random_config(rng))
+    other, other_rng = vslam_v1.parallel_env(world="fig5", num_robots=2, num_particles=5), np.random.default_rng(1)
     if beside:
         other.reset(seed=seed + 1)
     total = hashlib.sha256()
@@ -181,7 +183,7 @@ class Soak:
         assert keep is not None
         state, rng = load_state(keep), np.random.default_rng()
         rng.bit_generator.state = self.rng_state
-        env = vslam_v0.parallel_env(config=state["config"])
+        env = vslam_v1.parallel_env(config=state["config"])
         env.set_state(state)
         return env, rng
 
@@ -198,7 +200,7 @@ class Soak:
             )
             self.again += 1
         rng = np.random.default_rng(seed)
-        env = vslam_v0.parallel_env(config=random_config(rng))
+        env = vslam_v1.parallel_env(config=random_config(rng))
         self._take(env, env.reset(seed=seed))
         self.episodes += 1
         return env, rng

@@ -38,7 +38,7 @@ from training.episodes.runner import Progress, run_episode
 from training.experiments.statistics import format_ci, mean_ci
 from training.experiments.tables import markdown_table
 from training.rl.config import SPLIT_TRAIN, TrainConfig
-from vslam_env import CANDIDATE_FEATURES, NUM_CANDIDATES, ExplorationEnv, vslam_v0
+from vslam_env import CANDIDATE_FEATURES, NUM_CANDIDATES, ExplorationEnv, vslam_v1
 from vslam_env.belief.team_belief import Belief
 from vslam_env.reward import RUNNING_COST
 
@@ -219,7 +219,7 @@ def returns(
     """Run scripted policies, and print their returns by discount."""
     check_int("seeds", seeds, 2, "A confidence interval needs two or more.")
     check_int("first_seed", first_seed, 0, "Use 0 or a positive number.")
-    env = vslam_v0.parallel_env(reward={"map_error": 1.0, RUNNING_COST: 1.0})
+    env = vslam_v1.parallel_env(reward={"map_error": 1.0, RUNNING_COST: 1.0})
     every = [(policy, seed) for seed in range(first_seed, first_seed + seeds) for policy in PLAYERS]
     found: dict[tuple[str, float, str], list[float]] = {}
     for policy, seed in track(every, "Playing", console=Console(stderr=True), transient=True):
@@ -238,7 +238,7 @@ def choices(
 ) -> None:
     """Run random goals, and print the correlation of advantages with choices."""
     chosen_config = TrainConfig(reward=dict.fromkeys(TERMS, 1.0))
-    env = vslam_v0.parallel_env(config=chosen_config.make_env_config(SPLIT_TRAIN))
+    env = vslam_v1.parallel_env(config=chosen_config.make_env_config(SPLIT_TRAIN))
     played = [play(env, seed) for seed in range(first_seed, first_seed + episodes)]
     paid, chosen, seen = (np.array([episode[part] for episode in played]) for part in range(3))
     table = Table("reward", "lambda", "value explains", *CHOICES, title="Correlation of advantage and choice (t value)")

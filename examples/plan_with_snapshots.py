@@ -15,7 +15,7 @@ import numpy as np
 import typer
 
 from agents import make_policy
-from vslam_env import ExplorationEnv, vslam_v0
+from vslam_env import ExplorationEnv, vslam_v1
 
 Plan = dict[str, int]  # slot of each robot's first goal; 0: base policy
 
@@ -75,7 +75,7 @@ def best_plan(env: ExplorationEnv, twin: ExplorationEnv, rollouts: int, horizon:
 
 def play(seed: int, decisions: int, rollouts: int, horizon: int) -> float:
     """Run an episode with a new plan every `horizon` decisions; without rollouts the base policy decides."""
-    env = vslam_v0.parallel_env(action_type="goal", num_robots=2, max_cycles=decisions)
+    env = vslam_v1.parallel_env(action_type="goal", num_robots=2, max_cycles=decisions)
     env.reset(seed=seed)
     twin, rng, total = env.clone(), np.random.default_rng(seed), 0.0
     while env.agents:

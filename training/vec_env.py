@@ -13,7 +13,7 @@ from training.experiments.compilation import prepare
 from training.rl.cluster import ClusterEnvs
 from training.rl.slots import MASK, WHOLE, MakeEnv, StepResult, SyncEnvs
 from training.rl.workers import ProcessEnvs, WorkerEnvs
-from vslam_env import vslam_v0, warm_up
+from vslam_env import vslam_v1, warm_up
 from vslam_env.config import EnvConfig
 from vslam_env.reward import RewardSpec
 
@@ -37,7 +37,7 @@ def make_vec_env(
         workers: Number of worker processes; 0: this process. Results do not depend on it. A script that uses workers
             needs the guard `if __name__ == "__main__":`, because each worker imports it.
         seed: Seed of all environments; None: the learner's own `seed` decides.
-        reward: Reward in place of that of `config`, such as a list with custom terms, see `vslam_v0.parallel_env`. The
+        reward: Reward in place of that of `config`, such as a list with custom terms, see `vslam_v1.parallel_env`. The
             environments of a process share these terms, which must keep no state.
         cluster: Address of a Ray cluster that runs the workers, see `ray.init`; 0 workers are then one per core, at
             most one per environment. None: this machine.
@@ -52,7 +52,7 @@ def make_vec_env(
     configs = [config] if isinstance(config, EnvConfig) else list(config)
     if not configs:
         raise argument_error("config", "at least one configuration", configs, "Give an EnvConfig.")
-    make = partial(vslam_v0.parallel_env, render_mode=render_mode, reward=reward)
+    make = partial(vslam_v1.parallel_env, render_mode=render_mode, reward=reward)
     makers: list[MakeEnv] = [partial(make, config=configs[i % len(configs)]) for i in range(num_envs)]
     if wrap is not None:
         makers = [partial(_wrapped, maker, wrap) for maker in makers]
@@ -71,7 +71,7 @@ def _wrapped(make: MakeEnv, wrap: Callable[[Any], Any]) -> Any:
 
 def load_kernels(config: EnvConfig) -> None:
     """Load or compile the kernels that an environment needs, those of the first steps first."""
-    env = vslam_v0.parallel_env(config=config)
+    env = vslam_v1.parallel_env(config=config)
     env.reset(seed=0)
     for _ in range(min(2, config.num_cycles)):
         env.step({agent: env.action_space(agent).sample() for agent in env.agents})

@@ -1,7 +1,7 @@
 """PettingZoo environment for multi-robot SLAM exploration: robots with unknown starts build one visual map.
 
-Importing the package registers `vslam_env/Exploration-v0` with PettingZoo and `vslam_env/SoloExploration-v0` with
-Gymnasium. Numerical modules are imported at the first use of a name.
+Importing the package registers `vslam_env/Exploration-v0` and `-v1` with PettingZoo and `vslam_env/SoloExploration-v0`
+and `-v1` with Gymnasium. Numerical modules are imported at the first use of a name.
 """
 
 from importlib import import_module
@@ -84,7 +84,13 @@ def __dir__() -> list[str]:
     return sorted({*globals(), *__all__, *MODULES})
 
 
-if hasattr(pettingzoo, "register"):  # since 1.27
-    pettingzoo.register("parallel", "vslam_env/Exploration-v0", "vslam_env.vslam_v0:parallel_env")
-    pettingzoo.register("aec", "vslam_env/Exploration-v0", "vslam_env.vslam_v0:env")
-gymnasium.register("vslam_env/SoloExploration-v0", "vslam_env.solo:SoloExplorationEnv")
+for _version in (0, 1):
+    if hasattr(pettingzoo, "register"):  # since 1.27
+        _constructors = f"vslam_env.vslam_v{_version}"
+        pettingzoo.register("parallel", f"vslam_env/Exploration-v{_version}", f"{_constructors}:parallel_env")
+        pettingzoo.register("aec", f"vslam_env/Exploration-v{_version}", f"{_constructors}:env")
+    gymnasium.register(
+        f"vslam_env/SoloExploration-v{_version}",
+        "vslam_env.solo:SoloExplorationEnv",
+        kwargs={"version": _version},
+    )

@@ -7,7 +7,7 @@ import numpy as np
 from gymnasium import spaces
 
 from slam_backend.core.validation import FloatArray, argument_error, check_array
-from vslam_env.belief.observation import NUM_ACTIONS
+from vslam_env.belief.observation_keys import NUM_ACTIONS
 from vslam_env.navigation.planning import MAX_SPEED, MAX_TURN
 
 MAX_REVERSE = 0.3  # [m/s]

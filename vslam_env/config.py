@@ -4,7 +4,7 @@ import dataclasses
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, Self, TypeVar
@@ -18,6 +18,7 @@ from slam_backend.core.validation import argument_error, check_choice, check_flo
 from slam_backend.smoother.options import SmoothingOptions
 from slam_backend.team.options import MergeOptions
 from vslam_env.belief.belief import BeliefConfig
+from vslam_env.belief.observation_keys import checked_keys
 from vslam_env.sensors import LandmarkSensorConfig, ScanConfig, StereoSensorConfig
 from vslam_env.world import SPLITS, LandmarkConfig, OdometryNoise
 from vslam_env.world.spec import LARGEST_EXTENT
@@ -69,7 +70,7 @@ def to_plain(value: Any) -> Any:
         return {f.name: to_plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
     if isinstance(value, Mapping):
         return {key: to_plain(entry) for key, entry in value.items()}
-    if isinstance(value, tuple):
+    if isinstance(value, (tuple, Set)):
         return [to_plain(entry) for entry in value]
     return value.item() if isinstance(value, np.generic) else value
 
@@ -171,6 +172,8 @@ class EnvConfig:
             unless `max_cycles` is given. At most one of the two can be given.
         stop_at_recall: Map recall of all robots at which the episode terminates; None: never.
         observation_type: `"dict"`: named arrays. `"flat"`: one float32 vector.
+        observation_keys: `"driver"`, `"goal"` or `"all"`, sets of keys, or keys in any order; see
+            `vslam_env.belief.observation_keys.SETS`. Beliefs hold all that is left out.
         observe_images: Whether a robot observes its left image, `"image"` (H, W, 1) uint8; with `sensor="stereo"` only.
         reward: Weights of the named reward terms. Learners discount by at least 0.999 per tick: see `vslam_env.reward`.
         shared_reward: Whether each robot gets the mean of all robots' rewards, term by term.
@@ -205,6 +208,7 @@ class EnvConfig:
     max_seconds: float | None = None
     stop_at_recall: float | None = None
     observation_type: Literal["dict", "flat"] = "dict"
+    observation_keys: Any = "all"  # a name or a tuple; errors of `checked_keys` are clearer than those of pydantic
     observe_images: bool = False
     reward: Mapping[str, float] = field(default_factory=lambda: {"map_error": 1.0})
     shared_reward: bool = False
@@ -236,6 +240,9 @@ class EnvConfig:
         check_choice("sensor", self.sensor, SENSORS)
         check_choice("action_type", self.action_type, ACTION_TYPES)
         check_choice("observation_type", self.observation_type, OBSERVATION_TYPES)
+        keys = self.observed
+        if not isinstance(self.observation_keys, str):
+            object.__setattr__(self, "observation_keys", keys)
         if self.decision_ticks is not None:
             check_int("decision_ticks", self.decision_ticks, 1, "Give a number of ticks of 0.1 s.", MAX_TICKS)
         if self.max_cycles is not None:
@@ -274,6 +281,11 @@ class EnvConfig:
             expected = f"noise that allows the use of points {sensor.farthest:g} m away"
             hint = "Raise sigma_px or baseline, lower sigma_disparity_px, or the max_range of the true camera."
             raise argument_error("belief.filter.camera", expected, f"a limit of {usable:g} m", hint)
+
+    @property
+    def observed(self) -> tuple[str, ...]:
+        """Keys of observations, in their order, without images."""
+        return checked_keys(self.observation_keys, self.action_type)
 
     @property
     def always_in_contact(self) -> bool:

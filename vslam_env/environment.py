@@ -18,7 +18,8 @@ from slam_backend.state import Snapshot, accepted, restore, take
 from slam_backend.team.reports import MergeEvent
 from vslam_env.actions import action_space, checked_actions
 from vslam_env.belief.observation import flatten, observation_space, observe_team
-from vslam_env.belief.readings import Readings, TeamReadings
+from vslam_env.belief.observation_keys import MASK
+from vslam_env.belief.readings import Readings
 from vslam_env.belief.team_belief import Belief, TeamBelief
 from vslam_env.config import TICK, TICKS_PER_SECOND, EnvConfig
 from vslam_env.evaluation.team_metrics import TeamMetrics
@@ -44,7 +45,7 @@ RENDER_MODES = ("human", "rgb_array")
 class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # PettingZoo has no type information
     """Multi-robot exploration of a building: robots with unknown starts build maps and merge them after alignment.
 
-    Numbers are the defaults of `EnvConfig`; `vslam_v0.parallel_env` takes the most common options as arguments. A tick
+    Numbers are the defaults of `EnvConfig`; `vslam_v1.parallel_env` takes the most common options as arguments. A tick
     is 0.1 s, a step `decision_ticks` ticks: 1, or 10 with `goal` actions.
 
     **World.** Each reset draws walls from the world family, landmarks on all wall faces (1.4 per metre, each with a
@@ -63,6 +64,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
 
     **Observations** are float32 unless said, in estimated frames, and depend on the robot's own readings and received
     messages alone. The start frame is the robot's start pose; the robot frame has x ahead and y to the left.
+    `observation_keys` chooses among these keys; what none of them shows is not computed.
 
     | key | shape | content | bounds |
     |---|---|---|---|
@@ -91,8 +93,8 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
     **End.** All agents truncate together after `max_cycles` steps, which are 100 s. They terminate together if
     `stop_at_recall` is set and the map of each robot has that share of the landmarks.
 
-    >>> from vslam_env import vslam_v0
-    >>> env = vslam_v0.parallel_env("hall", num_robots=2, max_seconds=0.3)
+    >>> from vslam_env import vslam_v1
+    >>> env = vslam_v1.parallel_env("hall", num_robots=2, max_seconds=0.3)
     >>> observations, infos = env.reset(seed=1)
     >>> while env.agents:
     ...     actions = {agent: env.action_space(agent).sample() for agent in env.agents}
@@ -120,7 +122,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
     action_spaces: dict[AgentID, spaces.Space[Any]]
 
     metadata: ClassVar[dict[str, Any]] = {
-        "name": "vslam_env/Exploration-v0",
+        "name": "vslam_env/Exploration",
         "render_modes": list(RENDER_MODES),
         "render_fps": 10,
         "is_parallelizable": True,
@@ -147,8 +149,9 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         self.config = dataclasses.replace(config, reward={term.name: term.weight for term in self._terms})
         self.possible_agents = config.agents
         self.agents: list[AgentID] = []
-        self._shown_as = config.action_type == "goal", config.observation_type == "flat"
-        self._observed = observation_space(config.scan.num_rays, config.scan.max_range, *self._shown_as)
+        self._shown_as = config.observed, config.observation_type == "flat"
+        scan, (keys, is_flat) = config.scan, self._shown_as
+        self._observed = observation_space(keys, scan.num_rays, scan.max_range, is_flat)
         if config.observe_images and isinstance(self._observed, spaces.Dict):
             shape = (config.stereo.camera.height, config.stereo.camera.width, 1)
             image = spaces.Box(0, 255, shape, np.uint8)
@@ -457,7 +460,7 @@ class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # 
         """Return observations and infos by agent after the last tick; `terms` are the reward terms of the step."""
         agents, belief = self.possible_agents, episode.belief
         belief.set_seconds_left(self._seconds_left)
-        observations = build_observations(agents, belief, episode.readings, *self._shown_as)
+        observations = build_observations(agents, belief, *self._shown_as, episode.readings.images)
         return observations, build_infos(agents, belief.known_groups, self._team_metrics, terms, invalid)
 
     @property
@@ -528,31 +531,33 @@ def build_infos(
 
 
 def build_observations(
-    agents: Sequence[str], belief: TeamBelief, readings: TeamReadings | Sequence[Readings], goal: bool, flat: bool
+    agents: Sequence[str],
+    belief: TeamBelief,
+    keys: Sequence[str],
+    flat: bool,
+    images: Sequence[NDArray[np.uint8]] | None = None,
 ) -> dict[str, Any]:
     """Return the observations by agent after a tick.
 
     Args:
         agents: Names of the K robots.
         belief: Belief of the team.
-        readings: Readings of the tick, with images if these are observed.
-        goal: Whether actions are masked.
+        keys: Keys to observe, in their order.
         flat: Whether an observation is one vector instead of named arrays.
+        images: (H, W) uint8. Left image of each robot, if images are observed.
 
     Returns:
-        New arrays by name, see `ExplorationEnv`; if flat, one vector, or with masked actions
+        New arrays by name, see `ExplorationEnv`; if flat, one vector, or with an action mask
         `{"observation", "action_mask"}`.
     """
-    if not isinstance(readings, TeamReadings):
-        readings = TeamReadings.stack(readings)
-    named = observe_team(belief.view(), readings.scans, goal)
-    if readings.images is not None:
-        for observation, image in zip(named, readings.images, strict=True):
+    named = observe_team(belief.view(keys), keys)
+    if images is not None:
+        for observation, image in zip(named, images, strict=True):
             observation["image"] = image[:, :, None].copy()
     if not flat:
         return dict(zip(agents, named, strict=True))
     return {
-        agent: {"observation": flatten(each), "action_mask": each["action_mask"]} if goal else flatten(each)
+        agent: {"observation": flatten(each), MASK: each[MASK]} if MASK in each else flatten(each)
         for agent, each in zip(agents, named, strict=True)
     }
 

@@ -1,5 +1,6 @@
 """Gymnasium environment of one robot."""
 
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import gymnasium
@@ -8,12 +9,13 @@ from numpy.typing import NDArray
 
 from slam_backend.core.validation import argument_error, check_int
 from slam_backend.team.reports import MergeEvent
+from vslam_env import vslam_v0, vslam_v1
 from vslam_env.belief.team_belief import Belief
 from vslam_env.config import EnvConfig
 from vslam_env.environment import ExplorationEnv
-from vslam_env.vslam_v0 import parallel_env
 
 AGENT = "robot_0"
+VERSIONS: dict[int, Callable[..., ExplorationEnv]] = {0: vslam_v0.parallel_env, 1: vslam_v1.parallel_env}
 
 
 class SoloExplorationEnv(gymnasium.Env[Any, Any]):
@@ -21,7 +23,8 @@ class SoloExplorationEnv(gymnasium.Env[Any, Any]):
 
     Args:
         render_mode: `"human"`, `"rgb_array"` or None.
-        **kwargs: Arguments of `parallel_env` except `num_robots`.
+        version: 1, or 0 for all keys of observations by default.
+        **kwargs: Arguments of `vslam_v1.parallel_env` except `num_robots`.
 
     Attributes:
         parallel: Underlying parallel environment of one robot, with `belief`, `events` and `scene`.
@@ -32,10 +35,12 @@ class SoloExplorationEnv(gymnasium.Env[Any, Any]):
         "render_fps": ExplorationEnv.metadata["render_fps"],
     }
 
-    def __init__(self, render_mode: str | None = None, **kwargs: Any) -> None:
+    def __init__(self, render_mode: str | None = None, version: int = 1, **kwargs: Any) -> None:
         if kwargs.get("num_robots", 1) != 1:
-            raise argument_error("num_robots", "1", kwargs["num_robots"], "Use vslam_v0.parallel_env for a team.")
-        self.parallel = parallel_env(**kwargs | {"num_robots": 1, "render_mode": render_mode})
+            raise argument_error("num_robots", "1", kwargs["num_robots"], "Use vslam_v1.parallel_env for a team.")
+        if version not in VERSIONS:
+            raise argument_error("version", "0 or 1", version, "Omit it for the current version.")
+        self.parallel = VERSIONS[version](**kwargs | {"num_robots": 1, "render_mode": render_mode})
         self.render_mode = render_mode
         self.observation_space = self.parallel.observation_space(AGENT)
         self.action_space = self.parallel.action_space(AGENT)

@@ -8,9 +8,10 @@ from pettingzoo.utils.wrappers import BaseParallelWrapper
 
 from slam_backend.core.validation import argument_error
 from vslam_env.belief.observation import flatten, observation_space
+from vslam_env.belief.observation_keys import MASK
 from vslam_env.environment import ExplorationEnv
 
-MASK, VECTOR, WHOLE = "action_mask", "observation", "observations"
+VECTOR, WHOLE = "observation", "observations"
 
 
 class _MaskWrapper(BaseParallelWrapper):  # type: ignore[misc]   # its types are not checked
@@ -65,7 +66,8 @@ class MasksBesideVectors(_MaskWrapper):
         if "image" in space.spaces:
             raise argument_error("observe_images", "False: images are no part of a vector", True, "Omit it.")
         scan = self._config.scan
-        vector = observation_space(scan.num_rays, scan.max_range, True, True)[VECTOR]  # type: ignore[index]
+        flat = observation_space(self._config.observed, scan.num_rays, scan.max_range, flat=True)
+        vector = flat[VECTOR]  # type: ignore[index]
         return spaces.Dict({WHOLE: vector, MASK: spaces.Box(0.0, 1.0, space[MASK].shape, np.float32)})
 
     def _changed(self, observations: Any, infos: Any) -> tuple[Any, Any]:

@@ -10,6 +10,8 @@ from vslam_env.belief.team_belief import Belief
 class RandomGoals:
     """Policy for `goal` actions that draws a valid candidate at every decision and stays if there is none."""
 
+    observation_keys = ()
+
     def reset(self) -> None:
         """Do nothing; the policy has no state."""
 

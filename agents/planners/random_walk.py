@@ -18,6 +18,8 @@ class RandomWalk:
         discrete: Whether actions are `discrete`; otherwise they are `continuous`.
     """
 
+    observation_keys = ()
+
     def __init__(self, discrete: bool = False) -> None:
         self._discrete = discrete
         self.reset()

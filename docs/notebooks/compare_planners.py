@@ -21,14 +21,14 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from agents import make_policy
-from vslam_env import vslam_v0
+from vslam_env import vslam_v1
 
 PLANNERS, SEEDS, SECONDS = ("random_goals", "frontier", "next_best_view"), range(3), 40
 
 
 def episode(planner: str, seed: int) -> np.ndarray:
     """Return map error [m] and coverage after each second."""
-    env = vslam_v0.parallel_env(world="hall", num_robots=2, action_type="goal", max_seconds=SECONDS)
+    env = vslam_v1.parallel_env(world="hall", num_robots=2, action_type="goal", max_seconds=SECONDS)
     observations, _ = env.reset(seed=seed)
     policies, rng = {agent: make_policy(planner, "goal") for agent in env.agents}, np.random.default_rng(seed)
     rows = []

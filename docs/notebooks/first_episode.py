@@ -21,9 +21,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from agents import make_policy
-from vslam_env import vslam_v0
+from vslam_env import vslam_v1
 
-env = vslam_v0.parallel_env(world="hall", num_robots=2, action_type="goal", max_seconds=60, render_mode="rgb_array")
+env = vslam_v1.parallel_env(world="hall", num_robots=2, action_type="goal", max_seconds=60, render_mode="rgb_array")
 observations, infos = env.reset(seed=0)
 policies = {agent: make_policy("frontier", "goal") for agent in env.agents}
 rng = np.random.default_rng(0)

@@ -5,6 +5,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -25,12 +26,13 @@ from agents.goal_network import (
     WIDTH,
     logits,
 )
-from agents.registry import LEARNED
+from agents.policy import keys_for, keys_of
+from agents.registry import LEARNED, POLICIES, action_types
 from agents.trained import FORMAT, OWN_GOAL, TrainedGoalPolicy, _digest, check_observation, load_model, save_model
-from vslam_env import CANDIDATE_FEATURES, NUM_CANDIDATES, vslam_v0
+from vslam_env import CANDIDATE_FEATURES, NUM_CANDIDATES, EnvConfig, vslam_v0, vslam_v1
 from vslam_env.belief.observation import action_mask, observation_space
 
-SPACE = observation_space(32, 8.0, True, False)
+SPACE = observation_space()
 ABOUT = {"version": "0", "environment": ""}
 
 
@@ -178,6 +180,45 @@ def test_the_robots_of_a_model_drive_to_its_goals(action_type: str) -> None:
     assert chosen >= 3
 
 
+@pytest.mark.parametrize("action_type", ["continuous", "discrete", "goal"])
+def test_the_policy_acts_alike_whatever_is_observed(action_type: str) -> None:
+    """What the network reads comes from the belief where it is not observed: all actions are those of version 0."""
+    options: dict[str, Any] = {"world": "fig5", "num_robots": 2, "num_particles": 5, "max_seconds": 4.0}
+    some: tuple[str, ...] = ("pose", "scan", *(["action_mask"] if action_type == "goal" else []))
+    ways: list[dict[str, Any]] = [{"observation_keys": keys} for keys in ("all", "driver", "goal", some)]
+    found = []
+    for way in [*ways, {"observation_type": "flat"}]:
+        env = vslam_v1.parallel_env(**options, action_type=action_type, **way)
+        seen, _ = env.reset(seed=2)
+        policies = {agent: make_policy("learned", action_type) for agent in env.agents}
+        rng, taken = np.random.default_rng(0), []
+        while env.agents:
+            actions = {agent: policies[agent].act(seen[agent], env.belief(agent), rng) for agent in env.agents}
+            taken.append(list(actions.values()))
+            seen = env.step(actions)[0]
+        found.append(np.array(taken))
+    assert len(np.unique(found[0], axis=0)) > 1
+    for actions in found[1:]:
+        np.testing.assert_array_equal(actions, found[0])
+
+
+def test_policies_say_what_they_read() -> None:
+    """Planners read beliefs alone, `learned` the inputs of its network; a policy that does not say may read all."""
+    for name in POLICIES:
+        read = tuple(SHAPES) if name == "learned" else ()
+        for action_type in action_types(name):
+            policy = make_policy(name, action_type)
+            assert keys_of(policy) == read
+            config = EnvConfig(action_type=action_type, observation_keys=keys_for(policy, action_type))
+            mask = {"action_mask"} if action_type == "goal" else set()
+            assert set(config.observed) == set(read or ("pose",)) - {"action_mask"} | mask
+    other: Any = SimpleNamespace()
+    assert keys_of(other) is None
+    assert keys_for(other, "goal") == "all"
+    other.observation_keys = "driver"
+    assert keys_for(other, "goal") == "driver"
+
+
 def test_without_a_mask_the_last_choice_is_marked_as_the_goal() -> None:
     """Where the environment does not drive, the policy tells the network which candidates exist and which it chose."""
     weights, observation = _weights(), _observation(seed=3)
@@ -297,8 +338,6 @@ def test_other_spaces_are_refused() -> None:
     short = observation | {"scan": observation["scan"][:16]}
     with pytest.raises(ValueError, match=r"observation: expected 'scan' of shape \(32,\), .* got shape \(16,\)"):
         TrainedGoalPolicy(_weights()).act(short, None, np.random.default_rng(0))  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match=r"observation: expected 'local_grid' .* got no 'local_grid'. Use dict"):
-        TrainedGoalPolicy(_weights()).act(np.zeros(9), None, np.random.default_rng(0))  # type: ignore[arg-type]
     shapes = {name: np.shape(value) for name, value in observation.items() if name != "action_mask"}
     with pytest.raises(ValueError, match=r"observation: expected 'action_mask' .* got no 'action_mask'. Use dict"):
         check_observation(shapes)

@@ -11,7 +11,7 @@ from pettingzoo import ParallelEnv
 from vslam_env import NUM_CANDIDATES
 from vslam_env.belief.observation import observation_space
 
-SPACE = observation_space(32, 8.0, True, False)
+SPACE = observation_space()
 
 
 class GoalChoices(ParallelEnv):  # type: ignore[misc]

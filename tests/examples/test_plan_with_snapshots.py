@@ -18,7 +18,7 @@ def test_planning_beats_its_base_policy() -> None:
 
 def test_planning_does_not_change_the_environment() -> None:
     """Evaluating plans in a twin does not change later steps of the environment."""
-    envs = [example.vslam_v0.parallel_env(action_type="goal", num_robots=2, world="fig5") for _ in range(2)]
+    envs = [example.vslam_v1.parallel_env(action_type="goal", num_robots=2, world="fig5") for _ in range(2)]
     for env in envs:
         env.reset(seed=5)
     example.best_plan(envs[0], envs[0].clone(), 2, 2, np.random.default_rng(0))

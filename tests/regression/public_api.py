@@ -26,7 +26,8 @@ PACKAGES = (
 MODULES = (
     "slam_backend.trajectory", "slam_backend.fastslam.existence", "slam_backend.readers.calibration",
     "slam_backend.readers.kitti", "slam_backend.readers.mrclam", "slam_backend.readers.victoria",
-    "vslam_env.vslam_v0", "vslam_env.reward", "vslam_env.solo", "vslam_env.wrappers", "training.vec_env",
+    "vslam_env.vslam_v0", "vslam_env.vslam_v1", "vslam_env.reward", "vslam_env.solo", "vslam_env.wrappers",
+    "training.vec_env",
 )  # fmt: skip
 OWN = re.compile(r"\b(?:slam_backend|vslam_env|agents|training)(?:\.\w+)*\.(\w+)")
 ADDRESS = re.compile(r" at 0x[0-9a-f]+")

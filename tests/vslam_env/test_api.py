@@ -10,7 +10,7 @@ from builders.environments import room, small_env
 from gymnasium.utils.env_checker import check_env as gymnasium_check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
-from vslam_env import ExplorationEnv, vslam_v0
+from vslam_env import ExplorationEnv, vslam_v0, vslam_v1
 from vslam_env.solo import SoloExplorationEnv
 
 # pettingzoo.test imports connect_four in a way that pettingzoo itself deprecates
@@ -22,7 +22,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:The old environment creation API
 def test_gymnasium_env(action_type: str, observation_type: str) -> None:
     """Gymnasium's checker passes the environment of one robot."""
     env = gymnasium.make(
-        "vslam_env/SoloExploration-v0",
+        "vslam_env/SoloExploration-v1",
         world=room(),
         num_particles=20,
         max_cycles=10,
@@ -38,18 +38,20 @@ def test_gymnasium_env(action_type: str, observation_type: str) -> None:
 def test_stable_baselines3(observation_type: str) -> None:
     """Stable-Baselines3's checker passes the environment of one robot."""
     env = gymnasium.make(
-        "vslam_env/SoloExploration-v0", world=room(), num_particles=20, max_cycles=10, observation_type=observation_type
+        "vslam_env/SoloExploration-v1", world=room(), num_particles=20, max_cycles=10, observation_type=observation_type
     )
     sb3_check_env(env.unwrapped)
 
 
 @pytest.mark.skipif(not hasattr(pettingzoo, "make"), reason="pettingzoo.make came with 1.27")
-def test_pettingzoo_make() -> None:
-    """Both kinds of environment are made by name."""
-    env = pettingzoo.make("parallel", "vslam_env/Exploration-v0", world=room(), num_robots=2, max_cycles=3)
+@pytest.mark.parametrize(("version", "keys"), [(0, "all"), (1, "driver")])
+def test_pettingzoo_make(version: int, keys: str) -> None:
+    """Both kinds of environment are made by name, with the keys of the version."""
+    name = f"vslam_env/Exploration-v{version}"
+    env = pettingzoo.make("parallel", name, world=room(), num_robots=2, max_cycles=3)
     assert isinstance(env.unwrapped, ExplorationEnv)
-    assert env.max_cycles == 3
-    turns = pettingzoo.make("aec", "vslam_env/Exploration-v0", world=room(), num_robots=2)
+    assert (env.max_cycles, env.config.observation_keys) == (3, keys)
+    turns = pettingzoo.make("aec", name, world=room(), num_robots=2)
     turns.reset(seed=0)
     assert turns.agent_selection == "robot_0"
 
@@ -57,7 +59,7 @@ def test_pettingzoo_make() -> None:
 def test_metadata_and_spaces() -> None:
     """Names, spaces and attributes are those that PettingZoo's wrappers look for."""
     env = small_env()
-    assert env.metadata["name"] == str(env) == "vslam_env/Exploration-v0"
+    assert env.metadata["name"] == str(env) == "vslam_env/Exploration"
     assert env.metadata["render_modes"] == ["human", "rgb_array"]
     assert env.metadata["is_parallelizable"]
     assert env.possible_agents == ["robot_0", "robot_1"]
@@ -68,11 +70,14 @@ def test_metadata_and_spaces() -> None:
     assert env.action_space("robot_0") == env.action_space("robot_1")
 
 
-@pytest.mark.parametrize("make", [vslam_v0.env, vslam_v0.raw_env])
-def test_turn_based_environments_take_the_same_arguments(make: Callable[..., Any]) -> None:
-    """The signature is that of `parallel_env`, and the world may come first without its name."""
+@pytest.mark.parametrize(
+    "make", [vslam_v0.parallel_env, vslam_v0.env, vslam_v0.raw_env, vslam_v1.env, vslam_v1.raw_env]
+)
+def test_all_constructors_take_the_same_arguments(make: Callable[..., Any]) -> None:
+    """The signature is that of `vslam_v1.parallel_env`, and the world may come first without its name."""
     parameters = inspect.signature(make).parameters
-    assert parameters == inspect.signature(vslam_v0.parallel_env).parameters
+    assert parameters == inspect.signature(vslam_v1.parallel_env).parameters
+    assert make.__doc__
     assert make(room(), 2).possible_agents == ["robot_0", "robot_1"]
 
 
@@ -108,7 +113,7 @@ def test_action_masks() -> None:
 
 def test_registered_name() -> None:
     """Gymnasium makes it by name; pictures come through the wrappers."""
-    env = gymnasium.make("vslam_env/SoloExploration-v0", world=room(), num_particles=20, render_mode="rgb_array")
+    env = gymnasium.make("vslam_env/SoloExploration-v1", world=room(), num_particles=20, render_mode="rgb_array")
     env.reset(seed=0)
     frame = env.render()
     assert isinstance(frame, np.ndarray)

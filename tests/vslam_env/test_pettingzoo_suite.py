@@ -14,7 +14,7 @@ import pytest
 from builders.environments import MEETING, room
 from pettingzoo.utils.conversions import aec_to_parallel
 
-from vslam_env import World, vslam_v0
+from vslam_env import World, vslam_v0, vslam_v1
 
 pytestmark = [
     # pettingzoo.test imports connect_four in a way that pettingzoo itself deprecates
@@ -40,6 +40,9 @@ TABLE: dict[str, dict[str, Any]] = {
     "shared rewards": {"reward": {"map_error": 1.0, "coverage": 0.5, "collisions": 0.1}, "shared_reward": True},
     "a family": {"world": "fig5"},
     "rendered eyes": {"sensor": "stereo"},
+    "version 1": {"version": vslam_v1},
+    "version 1, goals, flat": {"version": vslam_v1, "action_type": "goal", "observation_type": "flat"},
+    "two keys": {"observation_keys": ("scan", "pose")},
 }
 
 
@@ -51,12 +54,12 @@ def suite() -> Any:
     return pettingzoo.test
 
 
-def _parallel(**kwargs: Any) -> Any:
-    return vslam_v0.parallel_env(**BASE | kwargs)
+def _parallel(version: Any = vslam_v0, **kwargs: Any) -> Any:
+    return version.parallel_env(**BASE | kwargs)
 
 
-def _turns(**kwargs: Any) -> Any:
-    return vslam_v0.env(**BASE | kwargs)
+def _turns(version: Any = vslam_v0, **kwargs: Any) -> Any:
+    return version.env(**BASE | kwargs)
 
 
 @pytest.mark.parametrize("options", TABLE.values(), ids=TABLE)

@@ -86,7 +86,7 @@ def test_environments_without_masks_are_refused() -> None:
 def test_actions_out_of_bounds_name_the_cure() -> None:
     """The error names both wrappers that clip actions, and the one of Gymnasium mends it."""
     env = gymnasium.make(
-        "vslam_env/SoloExploration-v0", world=room(), num_particles=10, max_cycles=3, disable_env_checker=True
+        "vslam_env/SoloExploration-v1", world=room(), num_particles=10, max_cycles=3, disable_env_checker=True
     )
     env.reset(seed=0)
     with pytest.raises(

@@ -253,12 +253,12 @@ def first_steps(environment: "EnvConfig", player: "Player", seed: int, decision_
     from training.bench.exploration.players import BOUND
     from training.episodes.guard import PolicyError
     from training.episodes.runner import run_episode
-    from vslam_env import vslam_v0
+    from vslam_env import vslam_v1
 
     steps = iter(range(2))
     if player.role == BOUND:
         return
-    env = vslam_v0.parallel_env(config=environment)
+    env = vslam_v1.parallel_env(config=environment)
     with suppress(PolicyError):
         team = player.make(env, decision_limit)
         run_episode(env, team, seed, should_stop=lambda: next(steps, None) is None)

@@ -202,10 +202,10 @@ def _parts(data: Path, descriptors: Sequence[str], real: Path | None) -> "list[R
 def bench_env(call: Call[EnvBenchConfig]) -> None:
     """Time steps of environments with the filter in the loop, on one thread, with a breakdown by part."""
     from training.bench.env.bench import count_trials, print_env_result, run_bench
-    from vslam_env import vslam_v0
+    from vslam_env import vslam_v1
 
     for load in call.config.loads():  # detects configurations that cannot be built before the folder is created
-        vslam_v0.parallel_env(config=load.config())
+        vslam_v1.parallel_env(config=load.config())
     console, _ = call.begin()
     with trial_progress(console, count_trials(call.config)) as (on_trial, interrupted):
         result = run_bench(call.config, on_trial, interrupted)

@@ -36,17 +36,18 @@ def drive_by_hand(
     from contextlib import ExitStack
 
     from agents import make_policy
+    from agents.policy import keys_for
     from slam_backend.core.validation import argument_error
     from training.episodes.teleoperation import KEYS, drive
     from training.episodes.video import VideoWriter
     from training.experiments.interrupt import interrupt_flag
     from training.experiments.tables import E_SCALE
-    from vslam_env import vslam_v0
+    from vslam_env import vslam_v1
     from vslam_env.rendering.window import Window, display_unavailable_reason
 
     if max_cycles is None and max_seconds is None:
         max_seconds = EPISODE_S
-    env = vslam_v0.parallel_env(
+    env = vslam_v1.parallel_env(
         world=world,
         world_split=world_split,
         num_robots=robots,
@@ -54,6 +55,7 @@ def drive_by_hand(
         preset=preset,
         max_cycles=max_cycles,
         max_seconds=max_seconds,
+        observation_keys="driver" if policy == "none" else keys_for(make_policy(policy, "continuous"), "continuous"),
     )
     policies = {} if policy == "none" else {a: make_policy(policy, "continuous") for a in env.possible_agents}
     env.reset(seed=seed)  # detects a world that cannot be built first

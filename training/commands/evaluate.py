@@ -22,10 +22,10 @@ def evaluate(call: Call[EvaluateConfig], workers: Workers = 1) -> None:
     from slam_backend.core.validation import argument_error
     from training.experiments.run_folder import plain
     from training.rl.evaluation import leads, play, print_evaluation, summarise
-    from vslam_env import vslam_v0
+    from vslam_env import vslam_v1
 
     chosen = call.config
-    env = vslam_v0.parallel_env(config=chosen.environment())  # detects bad input before the folder is created
+    env = vslam_v1.parallel_env(config=chosen.environment())  # detects bad input before the folder is created
     if "split" in call.given and env.config.world_split is None:
         hint = "Omit --world-split: starts and noise differ from the training anyway."
         raise argument_error("world_split", "a world family or folder", env.config.world, hint)

@@ -162,10 +162,13 @@ class RunConfig(ExperimentConfig):
         )  # fmt: skip
 
     def make_env(self) -> "ExplorationEnv":
-        """Build the environment."""
-        from vslam_env import vslam_v0
+        """Build the environment, which observes what the policy reads."""
+        from agents.policy import keys_for
+        from agents.registry import make_policy
+        from vslam_env import vslam_v1
 
-        return vslam_v0.parallel_env(config=self.environment())
+        keys = keys_for(make_policy(self.policy, self.action_type), self.action_type)
+        return vslam_v1.parallel_env(config=self.environment(), observation_keys=keys)
 
     def make_policies(self, env: "ExplorationEnv") -> "GuardedTeam":
         """Build one policy for each agent."""

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam_backend.core.validation import check_int
-from vslam_env import vslam_v0
+from vslam_env import vslam_v1
 from vslam_env.config import EnvConfig
 from vslam_env.rendering import draw_frame
 from vslam_env.rendering.canvas import write
@@ -77,7 +77,7 @@ def contact_sheet(world: str, first_seed: int, count: int, robots: int) -> NDArr
     """
     check_int("seeds", count, 1, "Use at least one world.")
     check_int("first_seed", first_seed, 0, "Use 0 or a positive number.")
-    env = vslam_v0.parallel_env(world=world, num_robots=robots)
+    env = vslam_v1.parallel_env(world=world, num_robots=robots)
     tiles: list[Any] = []
     for seed in range(first_seed, first_seed + count):
         env.reset(seed=seed, options={"world_seed": seed})

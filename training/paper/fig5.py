@@ -14,7 +14,7 @@ from slam_backend.core.validation import BoolArray, FloatArray
 from training.experiments.plotting import picture, save_png
 from training.experiments.tables import csv_text
 from training.paper.config import Fig5Config
-from vslam_env import EnvConfig, vslam_v0
+from vslam_env import EnvConfig, vslam_v1
 from vslam_env.environment import ExplorationEnv
 from vslam_env.rendering.palette import robot_colour
 from vslam_env.sensors import LandmarkSensor
@@ -68,7 +68,7 @@ class Fig5:
 def simulate_fig5(config: Fig5Config) -> Fig5:
     """Let robots explore the room for a while, and return what each sees at the end."""
     chosen = EnvConfig().replace(landmark_sensor={"max_measurements": config.measurements})
-    env = vslam_v0.parallel_env(
+    env = vslam_v1.parallel_env(
         world="fig5", num_robots=config.robots, action_type="goal", max_cycles=config.decisions, config=chosen
     )
     _explore(env, config.seed)

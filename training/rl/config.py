@@ -172,6 +172,7 @@ class TrainConfig(ExperimentConfig):
             split: Split of the worlds.
             world: World; None: the first.
         """
+        from agents.goal_network import NAMES
         from vslam_env.belief.belief import motion_without_smoother
         from vslam_env.presets import preset_config
         from vslam_env.world import is_single_layout
@@ -184,7 +185,8 @@ class TrainConfig(ExperimentConfig):
         return config.replace(
             world=world, world_split=None if is_single_layout(world) else split, num_robots=self.robots,
             action_type="goal", decision_ticks=self.decision_ticks, max_cycles=self.max_cycles,
-            reward=dict(self.reward), belief={"filter": assumed, "merging": {"smooth_first": self.straighten}},
+            reward=dict(self.reward), observation_keys=NAMES,
+            belief={"filter": assumed, "merging": {"smooth_first": self.straighten}},
         )  # fmt: skip
 
 
@@ -249,6 +251,8 @@ class EvaluateConfig(ExperimentConfig):
     def environment(self) -> "EnvConfig":
         """Return the environment. Its reward is the decrease of the map error, whatever the reward of the training.
 
+        Policies observe all keys.
+
         Raises:
             ValueError: If the model cannot be read, or its environment is not supported.
         """
@@ -263,7 +267,7 @@ class EvaluateConfig(ExperimentConfig):
         }  # fmt: skip
         changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
         changes["world_split"] = None if is_single_layout(changes.get("world", config.world)) else self.split
-        return config.replace(**changes, reward={"map_error": 1.0}, shared_reward=False)
+        return config.replace(**changes, reward={"map_error": 1.0}, shared_reward=False, observation_keys="all")
 
     def trials(self) -> list[EvaluateTrial]:
         """Return all trials, ordered by seed."""

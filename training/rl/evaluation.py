@@ -16,7 +16,7 @@ from training.experiments.policy_names import parted_label
 from training.experiments.statistics import format_ci, mean_ci, paired_difference, summarise_means
 from training.experiments.tables import E_SCALE, console_table
 from training.rl.config import MODEL, EvaluateConfig, EvaluateTrial
-from vslam_env import vslam_v0
+from vslam_env import vslam_v1
 from vslam_env.environment import ExplorationEnv
 
 LAST = ("map_error", "map_recall", "map_precision", "coverage", "merges", "collisions", "distance")
@@ -42,7 +42,7 @@ def play(config: EvaluateConfig, trial: EvaluateTrial) -> dict[str, Any]:
 
 @cache
 def _environment(config: EvaluateConfig) -> ExplorationEnv:
-    return vslam_v0.parallel_env(config=config.environment())
+    return vslam_v1.parallel_env(config=config.environment())
 
 
 def _policy(config: EvaluateConfig, name: str) -> Policy:

@@ -30,6 +30,7 @@ from agents.goal_network import (
     WIDTH,
     Weights,
 )
+from agents.trained import check_observation
 from training.rl.true_state import STATE
 
 GROUP = 60  # observations that attention pads to the same number of tokens
@@ -88,6 +89,7 @@ class GoalFeatures(BaseFeaturesExtractor):  # type: ignore[misc]
     """Tokens of the robot and of its candidates after attention, the mask of valid candidates, and the true state."""
 
     def __init__(self, observation_space: Any) -> None:
+        check_observation({name: box.shape for name, box in getattr(observation_space, "spaces", {}).items()})
         super().__init__(observation_space, KEPT + _state_size(observation_space))
         first, second = PATCHES
         self.picture = nn.Sequential(

@@ -103,8 +103,8 @@ def write_observations(
         cells: (n, S, S) uint8. Occupancy grids.
         scans: (n, R) float64 [m].
         observed: Written to, in the order of the table of `observation`: (n, 3), (n, 3) and (n, 6) float32;
-            (n, 3, 48, 48) uint8; (n, R), (n, C, F) and (n, 7, 5) float32; (n, 7) int8; (n, 5) float32. The candidates
-            hold their features without bounds before.
+            (n, 3, 48, 48) uint8, or (n, 0, 48, 48) for no pictures; (n, R), (n, C, F) and (n, 7, 5) float32; (n, 7)
+            int8; (n, 5) float32. The candidates hold their features without bounds before.
     """
     pose, pose_std, map_stats, local_grid, scan, features, teammates, present, landmark_counts = observed
     for k in range(len(robots)):
@@ -159,4 +159,5 @@ def write_observations(
 
         for i in range(landmark_counts.shape[1]):
             landmark_counts[k, i] = _clip(landmark_counts[k, i], 0.0, MAP_STATS_LIMIT[0])
-        paint(cells[k], belief, positions[parts[k, 0] : parts[k, 1]], local_grid[k])
+        if local_grid.shape[1] > 0:
+            paint(cells[k], belief, positions[parts[k, 0] : parts[k, 1]], local_grid[k])

@@ -1,7 +1,7 @@
 """Belief of one robot after a tick, and the configuration of beliefs."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
@@ -21,7 +21,8 @@ from slam_backend.models.odometry import OdometryModel
 from slam_backend.smoother.options import SmoothingOptions
 from slam_backend.team.merge_scheduler import AttemptOptions
 from slam_backend.team.options import MergeOptions
-from vslam_env.navigation import CandidateGains, CandidateKind, OccupancyGrid
+from vslam_env.belief.observation_keys import READ_CANDIDATES, READ_GLOBAL_GRIDS
+from vslam_env.navigation import CANDIDATE_FEATURES, CandidateGains, CandidateKind, OccupancyGrid
 from vslam_env.navigation.global_grids import GlobalGrids
 
 
@@ -187,9 +188,11 @@ class Belief:
         log_weights: (M,) float64. Normalised logarithmic weights of the particles.
         ess: Effective sample size as a share of M.
         grid: Read-only view of the occupancy grid, updated in later ticks; use `copy()` to keep its content.
-        candidates: Candidate places to explore.
+        candidates: Candidate places to explore. They are found from when they are first read on, or from the reset if
+            the environment observes `candidates` or has `goal` actions.
         teammates: Other robots of the group; for those out of contact, the last estimate before contact was lost.
         looks: (S, S) uint8. Looks at walls by cell of the grid, see `TeamLooks`; a read-only view, as `grid.cells`.
+        scan: (R,) float64 [m]. Last scan.
         seconds_left: Time until the episode is truncated [s]; inf if the belief is not used by an environment.
         start_from_group: (3,) float64 [m, m, rad]. Motion from the group's map frame to the own start frame.
         group_map: Confirmed landmarks in the group's map frame; see `map` for the own start frame.
@@ -208,6 +211,7 @@ class Belief:
     candidates: Candidates
     teammates: tuple[Teammate, ...]
     looks: NDArray[np.uint8]
+    scan: FloatArray
     seconds_left: float
     start_from_group: FloatArray
     group_map: LandmarkMap
@@ -255,6 +259,8 @@ class Belief:
 class BeliefBatch(NamedTuple):
     """Observable part of n robots' beliefs, without copies: valid until the next step.
 
+    What no key reads is left out: the global grids are then not drawn, and there are no candidates.
+
     Attributes:
         robots: (n,) int64. Indices of the robots.
         team_poses: Poses, with one row per robot and columns for the team up to the last known robot.
@@ -262,6 +268,7 @@ class BeliefBatch(NamedTuple):
         cells: (n, S, S) uint8. Cells of the occupancy grids.
         global_grids: Pictures of all that was seen.
         features: (n, C, F) float32, robot frames. Features of the candidates; a new array.
+        scans: (n, R) float64 [m]. Last scans.
         seconds_left: Time until the episode is truncated [s].
     """
 
@@ -271,11 +278,12 @@ class BeliefBatch(NamedTuple):
     cells: NDArray[np.uint8]
     global_grids: GlobalGrids
     features: NDArray[np.float32]
+    scans: FloatArray
     seconds_left: float
 
     @classmethod
-    def of(cls, belief: Belief) -> "BeliefBatch":
-        """Return the batch of a single belief."""
+    def of(cls, belief: Belief, keys: Collection[str]) -> "BeliefBatch":
+        """Return the batch of a single belief, with what these keys of observations read."""
         known = {mate.robot: (mate.pose, mate.position_sigma) for mate in belief.teammates}
         known[belief.robot] = belief.pose, position_sigma(belief.covariance)
         team_poses = TeamPoses(1, max(known) + 1)
@@ -285,15 +293,21 @@ class BeliefBatch(NamedTuple):
         team_poses.sigmas.fill(np.nan)
         for robot, (pose, sigma) in known.items():
             team_poses.poses[0, robot], team_poses.sigmas[0, robot] = pose, sigma
+        draws, describes = not READ_GLOBAL_GRIDS.isdisjoint(keys), not READ_CANDIDATES.isdisjoint(keys)
+        features = belief.candidates.features if describes else NO_FEATURES
         return cls(
             robots=np.array([belief.robot]),
             team_poses=team_poses,
             map_summaries=TeamMapSummaries.from_maps([belief.group_map.summary]),
             cells=belief.grid.cells[None],
-            global_grids=GlobalGrids.of(belief.grid, belief.looks),
-            features=belief.candidates.features[None].copy(),
+            global_grids=GlobalGrids.of(belief.grid, belief.looks) if draws else GlobalGrids(1),
+            features=features[None].copy(),
+            scans=belief.scan[None],
             seconds_left=belief.seconds_left,
         )
+
+
+NO_FEATURES = np.empty((0, len(CANDIDATE_FEATURES)), np.float32)
 
 
 def position_sigma(covariance: FloatArray) -> float:

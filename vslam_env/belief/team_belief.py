@@ -1,7 +1,7 @@
 """Beliefs of a team: its filters, occupancy grids and candidates."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import fields, replace
 from typing import Any
 from weakref import WeakValueDictionary
@@ -16,13 +16,14 @@ from slam_backend.fastslam.relative_poses import TeamPoses
 from slam_backend.geometry import rotate_covariances
 from slam_backend.maps.alignment import Alignment
 from slam_backend.maps.landmark_map import LandmarkMap, TeamMapSummaries
-from slam_backend.state import FLOAT64, Array, Child, Int, Sizes, State
+from slam_backend.state import FLOAT64, Array, Child, Flag, Int, Sizes, State
 from slam_backend.team.merge import branches_in
 from slam_backend.team.merge_scheduler import AttemptOptions
 from slam_backend.team.options import MergeOptions
 from slam_backend.team.reports import LandmarkIdMap, TeamReport
 from slam_backend.team.team import TeamSlam
 from vslam_env.belief.belief import Belief, BeliefBatch, BeliefConfig, Candidates, RobotHardware, Teammate
+from vslam_env.belief.observation_keys import KEYS, READ_CANDIDATES, READ_GLOBAL_GRIDS
 from vslam_env.belief.readings import Readings, TeamReadings
 from vslam_env.belief.rendezvous import Rendezvous
 from vslam_env.belief.shared_grids import SharedGrids
@@ -49,22 +50,27 @@ class TeamBelief:
         decision_ticks: Ticks between updates of the candidates, for policies that choose among them; None: each robot
             every ten ticks, in turn.
         attempts: Whether the team attempts merges itself; if not, merges from outside are final.
+        keeps_candidates: Whether candidates are found from the first tick on; if not, from when they are first read.
 
     Attributes:
         team: Filters of the team; it is changed by the methods of this class alone.
         team_poses: Pose estimates; overwritten in the next step.
         goals: (K, 2) float64 [m]. Goal of each robot in its own start frame; NaN: none.
+        scans: (K, R) float64 [m]. Last scans.
         known_groups: Robots known to share a map with each robot, itself included.
         grids: Occupancy grids of the robots; read-only.
+        keeps_candidates: Whether candidates are found every second, or at decisions.
     """
 
     STATE = State(
         tick=Int(),
         team=Child(TeamSlam),
         grids=Child(SharedGrids),
+        keeps_candidates=Flag(),
         candidates=Child(TeamCandidates),
         rendezvous=Child(Rendezvous),
         goals=Array(FLOAT64, "K 2", -LARGEST_HALF_WIDTH, LARGEST_HALF_WIDTH, nan=True, renewed=True),
+        scans=Array(FLOAT64, "K RAYS", 0.0, renewed=True),
     )
 
     def __init__(
@@ -75,6 +81,7 @@ class TeamBelief:
         body: RobotHardware,
         decision_ticks: int | None = None,
         attempts: bool = True,
+        keeps_candidates: bool = False,
     ) -> None:
         if isinstance(seed, np.random.SeedSequence):
             # A new sequence: the number of children spawned before must not matter.
@@ -83,6 +90,7 @@ class TeamBelief:
         schedule, merging = merge_options(config, attempts)
         self.team = TeamSlam(num_robots, config.alignment, seed, schedule, merging, **options)
         camera = config.filter.camera
+        self.keeps_candidates = keeps_candidates
         self._grids = SharedGrids(num_robots, body, camera)
         self.grids = self._grids.team
         self._global_grids = GlobalGrids(num_robots)
@@ -91,7 +99,8 @@ class TeamBelief:
         self.goals = np.full((num_robots, 2), np.nan)
         self._seconds_left = math.inf
         self._robots = np.arange(num_robots)
-        self._scanned = num_robots, len(body.ray_angles)  # shape of a tick's scans
+        self._no_features = np.empty((num_robots, 0, len(CANDIDATE_FEATURES)), np.float32)
+        self.scans = np.zeros((num_robots, len(body.ray_angles)))
         self._turns = _candidate_schedule(num_robots, decision_ticks)
         self._tick = -1
         self._confirm_after = config.confirm_after
@@ -120,9 +129,9 @@ class TeamBelief:
         """
         if not isinstance(readings, TeamReadings):
             readings = TeamReadings.stack(readings)
-        if readings.scans.shape != self._scanned:
+        if readings.scans.shape != self.scans.shape:
             got, hint = f"shape {readings.scans.shape}", "Give one range per ray and robot."
-            raise argument_error("readings.scans", f"an array of shape {self._scanned}", got, hint)
+            raise argument_error("readings.scans", f"an array of shape {self.scans.shape}", got, hint)
         if len(readings.bumps) != len(self._robots):
             got, hint = f"shape {readings.bumps.shape}", "Give one bool per robot."
             raise argument_error("readings.bumps", f"an array of shape ({len(self._robots)},)", got, hint)
@@ -135,21 +144,35 @@ class TeamBelief:
         )
         self._tick += 1
         self._refresh_poses()
-        team_poses = self.team_poses
-        self._grids.step(self._tick, report, self._topology.same_filter, team_poses, readings.scans, readings.bumps)
+        self._grids.step(
+            self._tick, report, self._topology.same_filter, self.team_poses, readings.scans, readings.bumps
+        )
+        self.scans = readings.scans.copy()
         if readings.goals is not None:
             self.goals = readings.goals
-        turns = self._turns[self._tick % len(self._turns)] if self._tick else range(len(self._robots))
-        if len(turns):
-            self._whole_map_summaries = self.team.map_summaries(1, self._whole_map_summaries)
-        for robot in turns:
-            first, last = self._whole_map_summaries.parts[robot]
-            rows = self._whole_map_summaries.rows
+        if self.keeps_candidates:
+            turns = self._turns[self._tick % len(self._turns)] if self._tick else range(len(self._robots))
+            if len(turns):
+                self._renew_candidates(turns)
+        return report
+
+    def _renew_candidates(self, robots: Iterable[int]) -> None:
+        """Find the candidates of some robots."""
+        team_poses = self.team_poses
+        self._whole_map_summaries = rows, parts = self.team.map_summaries(1, self._whole_map_summaries)
+        for robot in robots:
+            first, last = parts[robot]
             landmarks = rows.positions[first:last], rows.counts_and_ids[first:last], team_poses.starts[robot]
             known, shared = self._topology.known_robots[robot], self._grids.shared[robot]
             places = self._rendezvous.update(robot, team_poses, known, shared, landmarks)
             self._candidates.update(robot, self.grids, self._grids.looks, team_poses.poses, landmarks, places)
-        return report
+
+    def _kept_candidates(self) -> TeamCandidates:
+        """Return the candidates, which are found from the first call on."""
+        if not self.keeps_candidates:
+            self.keeps_candidates = True
+            self._renew_candidates(range(len(self._robots)))
+        return self._candidates
 
     def merge(self, robot_a: int, robot_b: int, alignment: Alignment, known: bool = False) -> LandmarkIdMap:
         """Merge the groups of two robots with a given alignment of their filter maps; see `TeamSlam.merge`."""
@@ -209,13 +232,20 @@ class TeamBelief:
             return belief
         return self._beliefs[robot]
 
-    def view(self) -> BeliefBatch:
-        """Return the observable part of all robots' beliefs, sharing memory with the grids."""
-        grids = self.grids
-        self._global_grids.update(grids, self._grids.looks)
-        of_grids = grids.cells, self._global_grids
+    def view(self, keys: Collection[str] = KEYS) -> BeliefBatch:
+        """Return what these keys of observations read of all robots' beliefs, sharing memory with the grids."""
+        grids, describes = self.grids, not READ_CANDIDATES.isdisjoint(keys)
+        if not READ_GLOBAL_GRIDS.isdisjoint(keys):
+            self._global_grids.update(grids, self._grids.looks)
         return BeliefBatch(
-            self._robots, self.team_poses, self.map_summaries, *of_grids, self._features(), self._seconds_left
+            robots=self._robots,
+            team_poses=self.team_poses,
+            map_summaries=self.map_summaries,
+            cells=grids.cells,
+            global_grids=self._global_grids,
+            features=self._features() if describes else self._no_features,
+            scans=self.scans,
+            seconds_left=self._seconds_left,
         )
 
     def rebuild(self) -> None:
@@ -271,7 +301,8 @@ class TeamBelief:
 
     def candidates(self, robot: int) -> Candidates:
         """Build the candidates of a robot."""
-        rows, features = FrontierColumns.of(self._candidates.rows(robot)), self._features()[robot]
+        kept, features = self._kept_candidates(), self._features()[robot]
+        rows = FrontierColumns.of(kept.rows(robot))
         valid = ~np.isnan(rows.x)
         return Candidates(
             goals=rows.goals,
@@ -280,8 +311,8 @@ class TeamBelief:
             valid=valid,
             kinds=np.where(valid, SLOT_KINDS, CandidateKind.NONE),
             sizes=rows.size,
-            gains=self._candidates.gains(robot),
-            teammate_lengths=self._candidates.lengths(robot)[:, self._others(robot)],
+            gains=kept.gains(robot),
+            teammate_lengths=kept.lengths(robot)[:, self._others(robot)],
             own_goal=features[:, CANDIDATE_FEATURES.index("own_goal")] > 0.0,
             teammate_goal=features[:, CANDIDATE_FEATURES.index("teammate_goal")] > 0.0,
             features=features,
@@ -289,7 +320,7 @@ class TeamBelief:
 
     def _features(self) -> Float32Array:
         """Return the features (K, C, F) float32 of all robots' candidates; a new array."""
-        return self._candidates.features(self.team_poses.poses, self._known_goals())
+        return self._kept_candidates().features(self.team_poses.poses, self._known_goals())
 
     def _make_belief(self, robot: int) -> Belief:
         """Return the belief of a robot, whose attributes are made on demand."""
@@ -316,6 +347,7 @@ BELIEF_FIELDS: dict[str, Callable[[TeamBelief, int], Any]] = {  # what makes eac
     "candidates": TeamBelief.candidates,
     "teammates": TeamBelief.teammates,
     "looks": TeamBelief.looks,
+    "scan": lambda team, robot: team.scans[robot],
     "start_from_group": lambda team, robot: team.team_poses.starts[robot],
     "group_map": TeamBelief.group_map,
 }

@@ -29,6 +29,7 @@ from slam_backend.state import (
     Text,
 )
 from slam_backend.team.communication import contact_components
+from vslam_env.belief.observation_keys import READ_CANDIDATES
 from vslam_env.belief.readings import Readings, TeamReadings
 from vslam_env.belief.team_belief import RobotHardware, TeamBelief
 from vslam_env.config import TICK, EnvConfig
@@ -114,7 +115,6 @@ class Episode:
         collisions=Each(Int(), "K"),
         metric_rows=Array(FLOAT64, f"{len(RobotMetrics._fields)} K", nan=True),
         odometry=Maybe(Array(FLOAT64, "K 3", renewed=True)),
-        scans=Array(FLOAT64, "K RAYS", 0.0, renewed=True),
         in_contact=Maybe(Array(BOOL, "K K", renewed=True)),
         last_frames=OneOf(TeamSensorFrames, TeamRenderedFrames),
         paths=Array(FLOAT64, "TICKS 2 K 3", renewed=True),
@@ -150,6 +150,7 @@ class Episode:
             self.body,
             decision_ticks=config.ticks_per_step if config.action_type == "goal" else None,
             attempts=not config.oracle_merge,
+            keeps_candidates=not READ_CANDIDATES.isdisjoint(config.observed),
         )
 
         self.tick = 0
@@ -159,7 +160,6 @@ class Episode:
         self._path_buffer = np.empty((64, 2, config.num_robots, 3))  # true and estimated poses; rows up to `tick`
         self.merge_ticks: list[tuple[int, tuple[int, ...], tuple[int, ...]]] = []
         self._odometry: FloatArray | None = None
-        self._scans = np.empty((config.num_robots, config.scan.num_rays))
         self._in_contact: BoolArray | None = None
         self.readings: TeamReadings  # set by `begin`
         self.last_frames: TeamSensorFrames | TeamRenderedFrames  # set by `begin`
@@ -248,7 +248,7 @@ class Episode:
 
     def rebuild(self) -> None:
         """Gather the readings of the last tick."""
-        self.readings = self._gathered(self.last_frames, self.belief.goals)
+        self.readings = self._gathered(self.last_frames, self.belief.scans, self.belief.goals)
 
     @staticmethod
     def check_state(parts: Mapping[str, Any], sizes: Sizes) -> None:
@@ -282,9 +282,9 @@ class Episode:
         """Read the sensors at the true poses and update the beliefs and the ground-truth association."""
         config, poses = self._config, self._simulator.poses
         frames = self.scenario.sensor.measure(poses, self._streams["sensor"])
-        self._odometry, self._scans = odometry, self.scenario.scan.measure(poses, self._streams["scan"])
+        self._odometry, scans = odometry, self.scenario.scan.measure(poses, self._streams["scan"])
         self._in_contact = in_contact = None if self._all_hear_all else self._contacts(poses)
-        self.last_frames, self.readings = with_read_only(frames), self._gathered(frames, goals)
+        self.last_frames, self.readings = with_read_only(frames), self._gathered(frames, scans, goals)
         if self._hook.recorder is not None:
             self._hook.recorder(self.readings.per_robot())
         report = self.belief.step(self.readings)
@@ -303,13 +303,15 @@ class Episode:
             self._path_buffer = np.concatenate([self._path_buffer, np.empty_like(self._path_buffer)])
         self._path_buffer[self.tick, 0], self._path_buffer[self.tick, 1] = poses, self.belief.team_poses.own
 
-    def _gathered(self, frames: TeamSensorFrames | TeamRenderedFrames, goals: FloatArray | None) -> TeamReadings:
-        """Return the readings of a tick, given the frames of all robots and their goals (K, 2) [m], if any."""
+    def _gathered(
+        self, frames: TeamSensorFrames | TeamRenderedFrames, scans: FloatArray, goals: FloatArray | None
+    ) -> TeamReadings:
+        """Return the readings of a tick, given frames, scans (K, R) [m] and goals (K, 2) [m], if any, of all robots."""
         config = self._config
         return TeamReadings(
             self._odometry,
             frames.measurements,
-            self._scans,
+            scans,
             self._simulator.bumped,
             between(self.true_starts, self._simulator.poses) if config.oracle_pose else None,
             frames.true_ids if config.oracle_association else None,

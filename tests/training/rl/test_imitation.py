@@ -33,7 +33,7 @@ SMALL = {
     "rounds": 2, "epochs": 2, "batch": 8, "thin": 1, "seed": 5,
 }  # fmt: skip
 CONFIG = TrainConfig.from_mapping(SMALL)
-SPACE = observation_space(32, 8.0, True, False)
+SPACE = observation_space()
 ABOUT = {"environment": "this one", "seed": 3}
 runner = CliRunner()
 

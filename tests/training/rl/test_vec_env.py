@@ -112,6 +112,27 @@ def test_slots_equal_separate_environments(where: str, request: pytest.FixtureRe
             _assert_equal(info, results[e][4][agent])
 
 
+@pytest.mark.parametrize("observation_type", ["dict", "flat"])
+@pytest.mark.parametrize("keys", ["driver", ("time_left", "pose", "action_mask")])
+def test_slots_observe_the_chosen_keys(keys: Any, observation_type: str) -> None:
+    """Arrays of the slots are those of each environment alone, with masks, whatever keys are chosen."""
+    config = GOALS.replace(observation_keys=keys, observation_type=observation_type)
+    env, alone = make_vec_env(config, 2, seed=5), [vslam_v0.parallel_env(config=config) for _ in range(2)]
+    seen = [one.reset(seed=seed)[0] for one, seed in zip(alone, env_seeds(5, 2), strict=True)]
+    observations = env.reset()
+    for _ in range(2):
+        for slot, (e, agent) in enumerate([(e, agent) for e in range(2) for agent in config.agents]):
+            _assert_equal({name: rows[slot] for name, rows in observations.items()}, seen[e][agent])
+        masks = env.env_method("action_masks")
+        np.testing.assert_array_equal(masks, observations["action_mask"] != 0)
+        actions = [int(np.flatnonzero(mask)[-1]) for mask in masks]
+        observations = env.step(np.array(actions))[0]
+        seen = [
+            one.step(dict(zip(config.agents, actions[2 * e : 2 * e + 2], strict=True)))[0]
+            for e, one in enumerate(alone)
+        ]
+
+
 def test_rollouts_equal_a_loop() -> None:
     """PPO's buffer has the observations and rewards of a loop; at the time limit the final value is added."""
     config = GOALS.replace(action_type="continuous", observation_type="flat", max_cycles=5)

@@ -87,3 +87,24 @@ def test_forgotten_beliefs_keep_nothing_alive() -> None:
         assert team() is None
     finally:
         gc.enable()
+
+
+def test_candidates_are_found_from_when_they_are_first_read_on() -> None:
+    """If that is at the reset, they are those of an environment that observes them; later they are valid places, too."""
+    observing, reading, late = (
+        small_env(observation_keys=keys, max_cycles=200) for keys in ("all", "driver", "driver")
+    )
+    for env in (observing, reading, late):
+        env.reset(seed=5, options={"start_poses": MEETING})
+    for tick in range(60):
+        expected, read = (env.belief("robot_0").candidates for env in (observing, reading))
+        assert_same(read, expected)
+        if tick == 30:
+            late.set_state(late.get_state())
+            found = late.belief("robot_1").candidates
+            assert found.valid.any()
+            assert np.isfinite(found.lengths[found.valid]).all()
+        assert late.episode.belief.keeps_candidates == (tick >= 30)
+        for env in (observing, reading, late):
+            seen = env.step(turning(env.agents))[0]
+            assert ("candidates" in seen["robot_0"]) == (env is observing)

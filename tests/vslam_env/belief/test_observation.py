@@ -3,6 +3,7 @@
 import ast
 import dataclasses
 import inspect
+import re
 from functools import reduce
 from pathlib import Path
 from typing import Any
@@ -11,18 +12,15 @@ import numpy as np
 import pytest
 from builders.environments import MEETING, small_env, turning, wander
 
+from agents.goal_network import NAMES
 from slam_backend.geometry import between, inverse, transform_points
-from vslam_env import EnvConfig, ExplorationEnv, preset_config, vslam_v0
+from vslam_env import EnvConfig, ExplorationEnv, preset_config, vslam_v0, vslam_v1
 from vslam_env.belief.observation import flatten, observe
+from vslam_env.belief.observation_keys import KEYS, MASK, SETS
 from vslam_env.belief.readings import Readings, TeamReadings
 from vslam_env.belief.team_belief import Belief, TeamBelief
 from vslam_env.navigation import CELL, FREE, OCCUPIED, UNKNOWN, cell_of
 from vslam_env.reward import TERMS
-
-KEYS = [
-    "pose", "pose_std", "map_stats", "local_grid", "scan", "candidates", "teammates", "teammates_mask",
-    "landmark_counts", "time_left", "global_grid", "global_grid_frame",
-]  # fmt: skip
 
 
 def _record(env: ExplorationEnv, steps: int) -> tuple[list[tuple[Readings, ...]], list[dict[str, Any]]]:
@@ -55,7 +53,7 @@ def test_observations_are_rebuilt_from_readings_alone(action_type: str, steps: i
             continue
         belief.set_seconds_left(0.1 * (400 * ticks - tick))
         for robot, agent in enumerate(env.possible_agents):
-            rebuilt = observe(belief.belief(robot), now[robot].scan, goal)
+            rebuilt = observe(belief.belief(robot), env.config.observed)
             expected = recorded[tick // ticks][agent]
             assert list(rebuilt) == list(expected)
             for name, value in rebuilt.items():
@@ -76,7 +74,7 @@ def test_readings_of_a_team_are_those_of_its_robots() -> None:
 def test_every_part_of_an_observation_varies() -> None:
     """Over an episode with a merge each part of the observation carries information: none is constant."""
     _, observations = _record(small_env(max_cycles=400), 300)
-    for name in KEYS:
+    for name in observations[0]["robot_0"]:
         values = np.array([step["robot_0"][name] for step in observations]).reshape(len(observations), -1)
         changing = (values != values[0]).any(axis=0)
         if name in ("pose", "pose_std", "map_stats", "scan"):
@@ -114,7 +112,7 @@ def test_local_grid_agrees_with_a_plain_one() -> None:
     for spread in (2.0, 31.0):
         for _ in range(30):
             moved = dataclasses.replace(belief, pose=np.append(rng.uniform(-spread, spread, 2), rng.uniform(-3.0, 3.0)))
-            picture, expected = observe(moved, env.readings[0].scan, False)["local_grid"], _plain_local_grid(moved)
+            picture, expected = observe(moved, ["local_grid"])["local_grid"], _plain_local_grid(moved)
             assert (picture != expected).mean() < 1e-3  # a centre on the border of two cells may fall to either side
 
 
@@ -234,9 +232,26 @@ def test_observations_are_as_the_page_says() -> None:
 
 
 def test_the_flat_vector_is_as_long_as_the_page_says() -> None:
-    """The page names the shape of the flat observation."""
+    """The page names the shape of the flat observation of all keys, and of those of drivers."""
     space = small_env(observation_type="flat").observation_space("robot_0")
-    assert f"float32 vector {space.shape}" in PAGE
+    assert f"float32 vector, {space.shape} for all keys" in PAGE
+    driver = small_env(observation_type="flat", observation_keys="driver").observation_space("robot_0")
+    assert f'that of `"driver"` has {driver.shape}' in PAGE
+
+
+def test_sets_are_as_the_page_says() -> None:
+    """The page lists the keys of each set, and the default of each version; the shipped network reads none else."""
+    rows = {name.strip('"'): row["keys"] for name, row in by_name("set").items()}
+    assert rows.keys() == SETS.keys()
+    driver, goal = (set(re.findall(r"`(\w+)`", rows[name])) for name in ("driver", "goal"))
+    assert (driver, driver | goal) == (set(SETS["driver"]), set(SETS["goal"]))
+    assert set(NAMES) <= {*SETS["goal"], MASK}
+    assert SETS["all"] == KEYS
+    for version in (vslam_v0, vslam_v1):
+        for action_type in ("continuous", "discrete", "goal"):
+            config = version.parallel_env(action_type=action_type).config
+            expected = "all" if version is vslam_v0 else "goal" if action_type == "goal" else "driver"
+            assert config.observation_keys == expected
 
 
 def test_infos_are_as_the_page_says() -> None:

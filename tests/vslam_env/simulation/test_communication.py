@@ -116,7 +116,7 @@ def test_beliefs_with_contact_now_and_then_follow_from_readings_alone(options: A
         belief.step(readings)
         belief.set_seconds_left(0.1 * (400 - tick))
         for robot, agent in enumerate(env.possible_agents):
-            again = observe(belief.belief(robot), readings[robot].scan, False)
+            again = observe(belief.belief(robot), env.config.observed)
             for name, value in expected[agent].items():
                 np.testing.assert_array_equal(again[name], value, err_msg=name)
 

@@ -25,7 +25,7 @@ from training.bench.config import AccuracyConfig, EpisodeTrial
 from training.bench.exploration.players import parted
 from training.episodes.guard import PolicyError
 from training.experiments.trial_store import FAILED
-from vslam_env import vslam_v0
+from vslam_env import vslam_v1
 from vslam_env.world import OdometryNoise
 
 EPISODES_FILE = "episodes.jsonl"
@@ -76,7 +76,7 @@ def play(config: AccuracyConfig, trial: EpisodeTrial) -> dict[str, Any]:
     If the policy fails, the trial is returned with the error as `failed`, and no metrics.
     """
     begin = time.perf_counter()
-    env = vslam_v0.parallel_env(config=config.environment(trial))
+    env = vslam_v1.parallel_env(config=config.environment(trial))
     try:
         episode = record_episode(env, parted(trial.policy).make(env, LONGEST_DECISION), trial.seed)
     except PolicyError as error:

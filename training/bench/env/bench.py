@@ -22,7 +22,7 @@ from training.bench.env.timing import (
 )
 from training.experiments.tables import console_table
 from training.experiments.timing import describe_machine, print_caveats, run_named_trials
-from vslam_env import vslam_v0
+from vslam_env import vslam_v1
 from vslam_env.config import EnvConfig
 
 WARM_UP = 60  # number of steps after which maps contain landmarks
@@ -75,7 +75,7 @@ def run_bench(
     }  # fmt: skip
 
     def time_row(load: EnvLoad, with_peer: bool = False) -> None:
-        env = vslam_v0.parallel_env(config=load.config())
+        env = vslam_v1.parallel_env(config=load.config())
         plays = [play_env(env, seed, WARM_UP + steps)]
         if with_peer and (peer := play_peer(load.robots, seed, WARM_UP + steps)) is not None:
             plays.append(peer)
@@ -85,7 +85,7 @@ def run_bench(
             result.update(peer=summarise_us(beside[0]), ratio_to_peer=ratio_of_bursts(own, beside[0]))
 
     def time_budget() -> None:
-        env = vslam_v0.parallel_env(config=base)
+        env = vslam_v1.parallel_env(config=base)
         actions = record_actions(env, seed, WARM_UP + steps)
         env.reset(seed=seed)
         for action in actions[:WARM_UP]:
@@ -93,7 +93,7 @@ def run_bench(
         result["budget"] = measure_budget(env.step, actions[WARM_UP:])
 
     def time_others(name: str) -> None:
-        env = vslam_v0.parallel_env(config=base)
+        env = vslam_v1.parallel_env(config=base)
         if name == "reset":
             result[name] = time_resets(env, seed, min(20, steps))
         else:

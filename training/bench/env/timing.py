@@ -12,7 +12,7 @@ import numpy as np
 from agents.registry import make_policy
 from slam_backend.core.validation import FloatArray
 from training.experiments.timing import clock, no_garbage_collection
-from vslam_env import vslam_v0
+from vslam_env import vslam_v1
 from vslam_env.config import TICK, EnvConfig
 from vslam_env.environment import ExplorationEnv
 from vslam_env.simulation.scenario import sample_scenario
@@ -131,7 +131,7 @@ def time_snapshots(env: ExplorationEnv, seed: int, steps: int, repeats: int) -> 
     """Time get_state, set_state and clones after `steps` steps of the nearest-frontier policy."""
     record_actions(env, seed, steps)
     state = env.get_state()
-    other = vslam_v0.parallel_env(config=env.config)
+    other = vslam_v1.parallel_env(config=env.config)
     other.reset(seed=seed + 1)
     states = [other.get_state(), state]
     some: list[int] = list(range(repeats))

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 from agents.bounds import BOUNDS, make_bound
 from agents.plugins import is_plugin, plugin_file
+from agents.policy import keys_for
 from agents.registry import action_types, make_policy, make_team_policy, model_file
 from slam_backend.core.validation import check_choice
 from training.episodes.guard import GuardedTeam
@@ -34,6 +35,11 @@ class Player(NamedTuple):
     def policy(self) -> str:
         """Name of a policy: that of the base policy for a bound."""
         return BASE if self.role == BOUND else self.name
+
+    @property
+    def observation_keys(self) -> str | tuple[str, ...]:
+        """Keys of the observations of its environment."""
+        return keys_for(make_policy(self.policy, self.action_type), self.action_type)
 
     def source_digest(self) -> str:
         """Return 16 hexadecimal digits of SHA-256 over a custom policy's file or a model; empty for planners."""

@@ -21,7 +21,7 @@ from training.episodes.guard import PolicyError
 from training.episodes.metrics import score_episode
 from training.episodes.runner import EpisodeRecord, MergeRecord, run_episode
 from training.experiments.trial_store import FAILED
-from vslam_env import vslam_v0
+from vslam_env import vslam_v1
 from vslam_env.config import EnvConfig
 
 TRIALS_FILE = "trials.jsonl"
@@ -64,8 +64,9 @@ def play(config: Bench, trial: Any) -> dict[str, Any]:
 
     If the policy fails, the trial is returned with the error as `failed`, and no metrics.
     """
-    env = vslam_v0.parallel_env(config=config.environment(trial))
-    team = parted(trial.policy).make(env, config.decision_limit)
+    player = parted(trial.policy)
+    env = vslam_v1.parallel_env(config=config.environment(trial), observation_keys=player.observation_keys)
+    team = player.make(env, config.decision_limit)
     invalid = 0
 
     def count(progress: Any) -> None:
@@ -103,7 +104,7 @@ def play(config: Bench, trial: Any) -> dict[str, Any]:
         "curves": {"time_s": points} | {
             name: values_at(record.times, line, points) for name, line in zip(CURVES, lines, strict=True)
         },
-        "digest": episode_digest(record), "policy_digest": parted(trial.policy).source_digest(), "machine": machine(),
+        "digest": episode_digest(record), "policy_digest": player.source_digest(), "machine": machine(),
     }  # fmt: skip
 
 

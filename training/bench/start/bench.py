@@ -31,8 +31,8 @@ KERNELS = "import vslam_env; print(vslam_env.warm_up(everything=True, workers={w
 FIRST_STEPS = """
 import time
 begun = time.perf_counter()
-from vslam_env import vslam_v0
-env = vslam_v0.parallel_env()
+from vslam_env import vslam_v1
+env = vslam_v1.parallel_env()
 env.reset(seed=0)
 for _ in range(10):
     env.step({agent: env.action_space(agent).sample() for agent in env.agents})

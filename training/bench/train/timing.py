@@ -17,7 +17,7 @@ from training.experiments.timing import clock, no_garbage_collection
 from training.rl.config import TrainConfig
 from training.rl.learner import GoalPPO
 from training.vec_env import ExplorationVecEnv, make_vec_env
-from vslam_env import vslam_v0
+from vslam_env import vslam_v1
 from vslam_env.config import EnvConfig
 
 ADAPTER_STEPS = 400
@@ -54,7 +54,7 @@ class Recording:
 
 def record(config: EnvConfig, seed: int) -> Recording:
     """Record some steps of an environment with `goal` actions."""
-    env = vslam_v0.parallel_env(config=config.replace(max_cycles=RECORDED + 1))
+    env = vslam_v1.parallel_env(config=config.replace(max_cycles=RECORDED + 1))
     spaces = env.observation_space(env.possible_agents[0]), env.action_space(env.possible_agents[0])
     rng = np.random.default_rng(seed)
     first, steps = env.reset(seed=seed), []

@@ -12,7 +12,7 @@ from agents.planners.next_best_view import decide
 from slam_backend.core.validation import BoolArray, Float32Array
 from training.rl.imitation.labels import Labels, joined, pack
 from training.vec_env import ExplorationVecEnv, load_kernels
-from vslam_env import vslam_v0
+from vslam_env import vslam_v1
 from vslam_env.config import EnvConfig
 
 
@@ -27,7 +27,7 @@ class TaughtEnv:
     """
 
     def __init__(self, config: EnvConfig) -> None:
-        self._env = vslam_v0.parallel_env(config=config)
+        self._env = vslam_v1.parallel_env(config=config)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._env, name)

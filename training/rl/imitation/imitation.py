@@ -68,7 +68,7 @@ class Imitation:
         self._workers, self._cluster = workers, cluster
         self._rounds = config.rounds
         torch.manual_seed(config.seed)
-        space, actions = observation_space(32, 8.0, True, False), spaces.Discrete(SHAPES["action_mask"][0])
+        space, actions = observation_space(NAMES), spaces.Discrete(SHAPES["action_mask"][0])
         self.policy = GoalPolicy(space, actions, lambda left: config.learning_rate).to(device)
         if config.start_file is not None:
             self.policy.load_actor(load_model(config.start_file)[0])
