@@ -70,7 +70,7 @@ class GoalActor(Model):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(**kwargs)
-        space = observation_space()
+        space = observation_space(NAMES)
         policy = GoalPolicy(space, spaces.Discrete(1 + NUM_CANDIDATES), lambda left: 1.0)
         del policy.mlp_extractor.value_hidden  # the critic is another network
         self.features_extractor, self.mlp_extractor = policy.features_extractor, policy.mlp_extractor

@@ -64,7 +64,7 @@ def test_a_stopped_soak_leaves_a_whole_snapshot(tmp_path: Path, how: signal.Sign
 @pytest.mark.usefixtures("quick")
 def test_violated_invariants_are_detected(monkeypatch: pytest.MonkeyPatch) -> None:
     """A robot in a wall, an observation outside its space and a non-numeric info each end the soak test."""
-    env = env_soak.vslam_v0.parallel_env(world="fig5", num_robots=2, num_particles=3)
+    env = env_soak.vslam_v1.parallel_env(world="fig5", num_robots=2, num_particles=3)
     returned: tuple[Any, ...] = env.reset(seed=1)
     env_soak.check(env, returned)
     returned[1]["robot_0"]["map_error"] = np.nan

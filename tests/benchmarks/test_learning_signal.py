@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from builders.scripts import load_script
 
-from vslam_env import CANDIDATE_FEATURES, NUM_CANDIDATES, vslam_v0
+from vslam_env import CANDIDATE_FEATURES, NUM_CANDIDATES, vslam_v1
 from vslam_env.config import TICK
 
 PATH = Path(__file__).parents[2] / "benchmarks" / "learning_signal.py"
@@ -82,7 +82,7 @@ def test_spinning_and_idle_policies() -> None:
 def test_episode_records_have_rewards_and_errors() -> None:
     """The record has the environment's rewards and the errors between them; the last map is smoothed after its cost."""
     weights = {"map_error": 1.0, "running_cost": 1.0}
-    env = vslam_v0.parallel_env(world="fig5", num_robots=2, num_particles=5, max_cycles=12, reward=weights)
+    env = vslam_v1.parallel_env(world="fig5", num_robots=2, num_particles=5, max_cycles=12, reward=weights)
     paid, errors = learning_signal.play_ticks(env, learning_signal.PLAYERS["spin"], 0)
     assert (paid.shape, errors.shape) == ((12, 2), (13,))
     expected = np.column_stack([errors[:-1] - errors[1:], -TICK * errors[1:]])
@@ -109,7 +109,7 @@ def test_the_table_compares_with_the_frontier() -> None:
 @pytest.mark.slow
 def test_returns_are_printed(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """In two short episodes each the frontier has the largest default reward in each line."""
-    monkeypatch.setattr(learning_signal.vslam_v0, "parallel_env", partial(vslam_v0.parallel_env, max_cycles=400))
+    monkeypatch.setattr(learning_signal.vslam_v1, "parallel_env", partial(vslam_v1.parallel_env, max_cycles=400))
     learning_signal.returns(seeds=2)
     lines = [line.split(" | ") for line in capsys.readouterr().out.splitlines() if line.startswith("| default")]
     assert len(lines) == len(learning_signal.PLAYERS)

@@ -7,6 +7,8 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from pettingzoo.utils.wrappers import BaseParallelWrapper
 
+from slam_backend.core.validation import argument_error
+
 STATE = "state"
 TEAM_VALUES = 2  # coverage and merges, the last values of `ExplorationEnv.state`
 # Factors that scale the values of a robot to the order of one: true and estimated pose (x, y, cos, sin), map error,
@@ -22,10 +24,16 @@ class WithTrueState(BaseParallelWrapper):  # type: ignore[misc]   # its types ar
 
     Args:
         env: `ExplorationEnv` with dict observations.
+
+    Raises:
+        ValueError: If observations are flat.
     """
 
     def __init__(self, env: Any) -> None:
         super().__init__(env)
+        kind = env.unwrapped.config.observation_type
+        if kind != "dict":
+            raise argument_error("observation_type", "'dict', to which the state is added", kind, "Choose dicts.")
         size = len(env.possible_agents) * len(ROBOT_SCALE) + TEAM_VALUES
         box = spaces.Box(-np.inf, np.inf, (size,), np.float32)
         self._spaces = {

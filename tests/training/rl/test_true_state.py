@@ -31,6 +31,16 @@ SIZE = 3 * len(ROBOT_SCALE) + TEAM_VALUES
 WITH_STATE = spaces.Dict({**SPACE.spaces, STATE: spaces.Box(-np.inf, np.inf, (SIZE,), np.float32)})
 
 
+def test_environments_that_do_not_fit_name_the_cure() -> None:
+    """Flat observations take no state, and the network says which key is not observed."""
+    with pytest.raises(ValueError, match=r"observation_type: expected 'dict', to which .* got 'flat'\. Choose dicts\."):
+        WithTrueState(vslam_v0.parallel_env(config=GOALS.replace(observation_type="flat")))
+    env = vslam_v0.parallel_env(config=GOALS.replace(observation_keys="driver"))
+    says = r"observation: expected 'landmark_counts' .* got no 'landmark_counts'\. .*observation_keys=\"goal\""
+    with pytest.raises(ValueError, match=says):
+        GoalPolicy(env.observation_space("robot_0"), env.action_space("robot_0"), lambda left: 1.0)
+
+
 def test_each_robot_comes_first_in_its_own_state() -> None:
     """States hold `ExplorationEnv.state`, scaled, with the observing robot first; all else stays as it is."""
     env, plain = WithTrueState(vslam_v0.parallel_env(config=GOALS)), vslam_v0.parallel_env(config=GOALS)

@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-from builders.environments import MEETING, room, small_env
+from builders.environments import MEETING, SMALL_STEREO, room, small_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -130,6 +130,15 @@ def test_environments_of_one_robot_follow_the_keys(keys: Any) -> None:
     many.close()
 
 
+def test_images_come_beside_the_chosen_keys() -> None:
+    """`observe_images` adds the image to whatever keys are chosen."""
+    config = EnvConfig(num_robots=1, sensor="stereo", observe_images=True, observation_keys=("scan",))
+    env = vslam_v1.parallel_env(room(), config=config.replace(stereo=SMALL_STEREO), num_particles=5)
+    seen = env.reset(seed=0)[0]["robot_0"]
+    assert list(seen) == ["scan", "image"]
+    assert env.observation_space("robot_0").contains(seen)
+
+
 def test_version_0_observes_all() -> None:
     """Names of version 0 mean all keys, unless keys or a configuration with keys are given."""
     with pytest.warns(DeprecationWarning, match="out of date"):
@@ -143,6 +152,7 @@ def test_version_0_observes_all() -> None:
         assert version.parallel_env(config=EnvConfig()).config.observation_keys == "all"
         assert version.env(room(), 1).unwrapped.config.observation_keys == kept
         assert version.raw_env(room(), 1).unwrapped.config.observation_keys == kept
+    assert vslam_v1.parallel_env(preset="large").config.observation_keys == "goal"
     with pytest.raises(ValueError, match=r"^version: expected 0 or 1, got 2\. Omit it"):
         gymnasium.make("vslam_env/SoloExploration-v1", version=2)
 
