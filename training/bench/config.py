@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 from pydantic import Field
 
@@ -296,6 +296,9 @@ class MrclamPairsConfig(ExperimentConfig):
     particles: int = option(100, "Number of particles per filter.", ge=1, hint="Use at least one particle.")
 
 
+Mode = Literal["driver", "poses", "odometry", "identities", "association", "merging", "all", "flat", "goal"]
+
+
 class EnvBenchConfig(ExperimentConfig):
     """Environment benchmark. Each row changes one number of the base, which has the first entry of each list."""
 
@@ -304,11 +307,10 @@ class EnvBenchConfig(ExperimentConfig):
     )
     particles: tuple[Positive, ...] = option((100, 30, 300, 1000), "Numbers of particles M.", hint=ONE_PARTICLE)
     worlds: tuple[str, ...] = option(("office", "fig5", "maze", "hall", "loops"), "World families or paths.")
-    modes: tuple[Literal["dict", "flat", "goal"], ...] = option(
-        ("dict", "flat", "goal"), "Observations and actions: dict, flat, or goal with a decision at every tick.",
-        shown="all",
-    )  # fmt: skip
-    steps: int = option(600, "Number of timed steps per row.", ge=2, hint="Use at least two steps.")
+    modes: tuple[Mode, ...] = option(
+        get_args(Mode), "What is in the loop, from known poses to goal actions.", shown="all"
+    )
+    steps: int = option(1000, "Number of steps of an episode.", ge=2, hint="Use at least two steps.")
     plays: int = setting(5, "Number of repeats of each episode, to reduce the influence of other load.", ge=1)
     seed: int = option(100, "Seed of the episodes.", ge=0, hint="Use 0 or a positive number.")
     peer: bool = option(True, "Time simple_spread of MPE2 interleaved with the first row.")

@@ -107,7 +107,7 @@ def test_plays_alternate_in_bursts() -> None:
     def play(name: str) -> Play:
         return Play(lambda: heard.append((name, -1)), lambda i: heard.append((name, i)), range(count))
 
-    assert play_alternating([play("a"), play("b")], 5, 2).shape == (2, 2, count - 5)
+    assert play_alternating([play("a"), play("b")], 2).shape == (2, 2, count)
     for name in "ab":
         assert [i for each, i in heard if each == name] == [-1, *range(count)] * 2
     first, second, third = range(BURST), range(BURST, 2 * BURST), range(2 * BURST, count)
@@ -123,7 +123,7 @@ def test_ratios_do_not_depend_on_machine_speed() -> None:
 
 def test_each_load_changes_one_number_of_the_base() -> None:
     """The first numbers are the base; every other row changes one of them."""
-    loads = EnvBenchConfig(robots=(2, 1), particles=(10, 20), worlds=("fig5", "hall"), modes=("dict", "goal")).loads()
+    loads = EnvBenchConfig(robots=(2, 1), particles=(10, 20), worlds=("fig5", "hall"), modes=("driver", "goal")).loads()
     assert len(loads) == 5
     base = loads[0]
     for load in loads[1:]:
@@ -132,7 +132,7 @@ def test_each_load_changes_one_number_of_the_base() -> None:
 
 def test_stopping_early_keeps_finished_results() -> None:
     """A benchmark stopped after two trials is incomplete and contains only its measurements."""
-    config = EnvBenchConfig(robots=(1,), particles=(5,), worlds=("fig5",), modes=("dict",), steps=3, peer=False)
+    config = EnvBenchConfig(robots=(1,), particles=(5,), worlds=("fig5",), modes=("merging",), steps=3, peer=False)
     asked: list[bool] = []
 
     def should_stop() -> bool:

@@ -90,7 +90,7 @@ def test_forgotten_beliefs_keep_nothing_alive() -> None:
 
 
 def test_candidates_are_found_from_when_they_are_first_read_on() -> None:
-    """If that is at the reset, they are those of an environment that observes them; later they are valid places, too."""
+    """If that is at the reset, they are those of an environment that observes them; later they are valid."""
     observing, reading, late = (
         small_env(observation_keys=keys, max_cycles=200) for keys in ("all", "driver", "driver")
     )

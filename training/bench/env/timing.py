@@ -61,8 +61,8 @@ class Play:
     arguments: Sequence[Any]  # Arguments of its calls, in order
 
 
-def play_alternating(plays: Sequence[Play], warm_up: int, repeats: int) -> FloatArray:
-    """Return the durations of the calls of each play (plays, repeats, n - warm_up) [s]; all plays have n calls.
+def play_alternating(plays: Sequence[Play], repeats: int) -> FloatArray:
+    """Return the durations of the calls of each play (plays, repeats, n) [s]; all plays have n calls.
 
     Plays alternate in bursts of calls, each with its own order, so that variations of the machine's speed affect all
     of them equally.
@@ -77,7 +77,7 @@ def play_alternating(plays: Sequence[Play], warm_up: int, repeats: int) -> Float
                 chosen = slice(first, first + BURST)
                 for k in range(len(plays))[:: 1 if (burst + repeat) % 2 == 0 else -1]:
                     durations[k, repeat, chosen] = clock(plays[k].call, plays[k].arguments[chosen])
-    return durations[:, :, warm_up:]
+    return durations
 
 
 def ratio_of_bursts(ours: FloatArray, others: FloatArray) -> float:
@@ -90,11 +90,13 @@ def ratio_of_bursts(ours: FloatArray, others: FloatArray) -> float:
 
 
 def play_env(env: ExplorationEnv, seed: int, steps: int) -> Play:
-    """Return an episode of the nearest-frontier policy as a play."""
-    return Play(partial(env.reset, seed=seed), env.step, record_actions(env, seed, steps))
+    """Return a whole episode of the nearest-frontier policy as a play."""
+    actions = record_actions(env, seed, steps)
+    env.max_cycles = steps
+    return Play(partial(env.reset, seed=seed), env.step, actions)
 
 
-def time_simulator(config: EnvConfig, seed: int, steps: int, warm_up: int) -> dict[str, float]:
+def time_simulator(config: EnvConfig, seed: int, steps: int) -> dict[str, float]:
     """Time ticks of the simulator: physics, odometry, landmark sensor and scans, without filter and observations."""
     scenario, _ = sample_scenario(config, config.world, np.random.SeedSequence(seed).spawn(1)[0])
     simulator = Simulator(scenario.world, scenario.true_starts, config.robot_radius, TICK)
@@ -110,10 +112,10 @@ def time_simulator(config: EnvConfig, seed: int, steps: int, warm_up: int) -> di
         scenario.scan.measure(after, scan)
 
     commands, turn = [], np.zeros(config.num_robots)
-    for _ in range(warm_up + steps):  # random drives with occasional wall contacts
+    for _ in range(steps):  # random drives with occasional wall contacts
         turn = np.clip(0.9 * turn + 0.4 * rng.standard_normal(config.num_robots), -1.5, 1.5)
         commands.append(np.column_stack([np.full(config.num_robots, 0.5), turn]))
-    return _timed(tick, commands, warm_up)
+    return _timed(tick, commands, 0)
 
 
 def _timed(call: Callable[[Any], Any], arguments: Sequence[Any], warm_up: int) -> dict[str, float]:
