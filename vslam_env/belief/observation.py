@@ -7,6 +7,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from slam_backend.core.validation import check_choice
 from vslam_env.belief._observation_kernels import (
     CHANNELS,
     COUNT_BINS,
@@ -34,7 +35,12 @@ def observe(belief: Belief, keys: Collection[str]) -> Observation:
 
     Returns:
         New arrays by key, see `vslam_env.environment.ExplorationEnv`.
+
+    Raises:
+        ValueError: If a key is unknown.
     """
+    for key in keys:
+        check_choice("keys", key, KEYS, "Give keys, as in ('pose', 'scan').")
     return observe_team(BeliefBatch.of(belief, keys), keys)[0]
 
 

@@ -59,7 +59,7 @@ def _box(low: FloatArray, high: FloatArray) -> spaces.Box:
 KEYS = tuple(key_spaces(2, 1.0))
 DRIVER = ("pose", "pose_std", "map_stats", "local_grid", "scan", "teammates", "teammates_mask")
 CHOICE = ("candidates", "landmark_counts", "time_left", "global_grid", "global_grid_frame")
-SETS: dict[str, tuple[str, ...]] = {"driver": DRIVER, "goal": DRIVER + CHOICE, "all": KEYS}  # all but the mask count
+SETS: dict[str, tuple[str, ...]] = {"driver": DRIVER, "goal": DRIVER + CHOICE, "all": KEYS}  # mask: by action type
 READ_CANDIDATES = frozenset(("candidates", MASK))
 READ_GLOBAL_GRIDS = frozenset(("global_grid", "global_grid_frame"))
 

@@ -184,6 +184,8 @@ def test_beliefs_offer_every_key(some: list[str]) -> None:
         keys = [*some, MASK]
         ours = observe(env.belief(agent), keys)
         _assert_same(ours, {key: expected[agent][key] for key in KEYS if key in keys})
+    with pytest.raises(ValueError, match=r"^keys: expected .*, got 'poze'\. .*Give keys, as in \('pose', 'scan'\)\."):
+        observe(env.belief("robot_0"), ["poze"])
 
 
 @cache
