@@ -196,7 +196,7 @@ def _parts(data: Path, descriptors: Sequence[str], real: Path | None) -> "list[R
 @bench.command("env")
 @options(
     EnvBenchConfig, "bench env",
-    quick={"robots": (3,), "particles": (100,), "worlds": ("office",), "modes": ("dict",), "steps": 300},
+    quick={"robots": (3,), "particles": (100,), "worlds": ("office",), "modes": ("driver",), "steps": 300},
     quick_help="Base configuration only, 300 steps.",
 )  # fmt: skip
 def bench_env(call: Call[EnvBenchConfig]) -> None:
