@@ -51,6 +51,7 @@ from training.episodes.runner import Progress, is_false_merge, run_episode
 from training.experiments.run_folder import plain
 from vslam_env import ExplorationEnv, preset_config
 from vslam_env.evaluation.map_scores import GroundTruthAssociation
+from vslam_env.sensors.landmark_sensor import padded
 
 KINDS = ("aisles", "environment", "both")
 WORLDS = ("office", "loops", "maze", "hall", "fig5")
@@ -207,7 +208,7 @@ def play_aisles(seed: int, cycles: int, setting: Setting) -> RunOutcomes:
         if broken:
             change = np.triu(np.where(up, rng.random(up.shape) < LOSES, rng.random(up.shape) < FINDS), 1)
             up = up ^ (change | change.T)
-        ground_truth.record(team.step(reading["odometry"], reading["measurements"], up), names)
+        ground_truth.record(team.step(reading["odometry"], reading["measurements"], up), padded(names))
         if setting.forced and not team.events and min(len(team.map(robot)) for robot in range(2)) >= ENOUGH:
             team.merge(0, 1, forced_alignment(starts, team.map(0), team.map(1), rng, setting.shift))
         follower.note(step)

@@ -60,7 +60,7 @@ BAD: dict[type[ExperimentConfig], dict[str, dict[Any, str]]] = {
         "seeds": {0: AT_LEAST_1}, "hard": {-1: AT_LEAST_0}, "methods": {("magic",): "one of 'ransac'"},
     },
     bench.EnvBenchConfig: {
-        "robots": {(9,): ROBOTS}, "modes": {("image",): "one of 'dict', 'flat', 'goal'"}, "steps": {1: "an int >= 2"},
+        "robots": {(9,): ROBOTS}, "modes": {("image",): "one of 'driver', 'poses'"}, "steps": {1: "an int >= 2"},
         "particles": {(0,): AT_LEAST_1}, "plays": {0: AT_LEAST_1}, "peer": {1: "a bool"},
     },
     bench.ExplorationBenchConfig: {

@@ -112,7 +112,7 @@ def test_options_of_a_run_reach_its_filters(sensor: str) -> None:
     assert (chosen.belief.filter.num_particles, chosen.belief.filter.rejuvenate_every) == (17, 9)
     expected = preset_config("hard", sensor).replace(world="fig5", max_seconds=180.0)
     usual = {"filter": {"num_particles": 100, "rejuvenate_every": expected.belief.filter.rejuvenate_every}}
-    assert chosen.replace(belief=usual) == expected
+    assert chosen.replace(belief=usual, observation_keys="all") == expected
 
 
 def test_runs_have_the_environments_default_interval() -> None:
