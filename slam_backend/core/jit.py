@@ -95,8 +95,8 @@ def simd_inline(function: Callable[P, T]) -> Callable[P, T]:
 def device(kernel: Callable[P, T]) -> Callable[P, T]:
     """Omit the Python wrapper of a kernel that only other kernels call; goes above the kernel's own decorator.
 
-    The wrapper takes as long to compile as a small kernel, and machine code is made for the calling kernels only. A
-    call from Python raises TypeError.
+    The wrapper takes as long to compile as a small kernel, and only the calling kernels are optimised and become
+    machine code. A call from Python raises TypeError.
     """
     if isinstance(kernel, CPUDispatcher):
         kernel.targetoptions["no_cpython_wrapper"] = True
