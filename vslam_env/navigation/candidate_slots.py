@@ -219,8 +219,8 @@ def untold(ways: Ways, bounds: NDArray[np.int32], size: int, rows: FloatArray) -
     cells, first, end = cell_of(rows[is_untold, :2], size), np.array(corner), np.add(corner, cost.shape)
     low = np.where(first + PAD <= bounds[:2], first, first + PAD + CUT_MARGIN)
     high = np.where(end - PAD >= bounds[2:], end, end - PAD - CUT_MARGIN)
-    is_told = np.asarray(((low <= cells) & (cells < high)).all(axis=1))
-    row, col = (cells[is_told] - corner).T
-    is_told[is_told] = (weights[row, col] == 0) | (cost[row, col] != UNREACHED)
-    is_untold[is_untold] = ~is_told
+    settled = np.asarray(((low <= cells) & (cells < high)).all(axis=1))
+    row, col = (cells[settled] - corner).T
+    settled[settled] = (weights[row, col] == 0) | (cost[row, col] != UNREACHED)
+    is_untold[is_untold] = ~settled
     return is_untold
