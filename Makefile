@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --constraint constraints.txt
 
-.PHONY: demo test test-all checks lint kernels metrics docs wheel kernels-wheel clients compat clean
+.PHONY: demo test test-all test-nightly checks lint kernels metrics docs wheel kernels-wheel clients compat clean
 
 demo: $(VENV)/.core  ## run three robots that explore an office, build maps and merge them; writes a folder under runs/
 	$(BIN)/vslam run --world office --robots 3 --policy frontier --seed 0
@@ -14,8 +14,11 @@ PYTEST := -m pytest --numprocesses auto --maxprocesses 4 --dist worksteal
 test: checks  ## linters, and all tests that are not marked slow
 	$(BIN)/python $(PYTEST) -m "not slow"
 
-test-all: checks  ## linters and all tests
-	$(BIN)/python $(PYTEST)
+test-all: checks  ## linters and all tests that are not marked nightly
+	$(BIN)/python $(PYTEST) -m "not nightly"
+
+test-nightly: $(VENV)/.dev  ## the tests that compile kernels from scratch or soak for minutes
+	$(BIN)/python $(PYTEST) -m nightly
 
 checks: $(VENV)/.dev  # linters, and meanwhile the compilation of the kernels
 	@$(MAKE) --no-print-directory --jobs 2 kernels lint

@@ -166,18 +166,8 @@ def rotate_covariances(theta: float, covariances: FloatArray) -> FloatArray:
     Returns:
         A new array of the same shape.
     """
-    result = np.array(covariances, dtype=np.float64, order="C")
-    _rotate_rows(math.cos(theta), math.sin(theta), result.reshape(-1, 3, 3))
+    c, s, result = math.cos(theta), math.sin(theta), np.array(covariances, dtype=np.float64, order="C")
+    for both in (result, result.swapaxes(-1, -2)):  # R Sigma, then (R Sigma) R^T
+        x, y = both[..., 0, :].copy(), both[..., 1, :].copy()
+        both[..., 0, :], both[..., 1, :] = c * x - s * y, s * x + c * y
     return result
-
-
-@jit
-def _rotate_rows(c: float, s: float, covariances: FloatArray) -> None:
-    """Rotate covariances (n, 3, 3) in place, like `rotate_covariances`."""
-    for full in covariances:
-        for j in range(3):  # R Sigma
-            x, y = full[0, j], full[1, j]
-            full[0, j], full[1, j] = c * x - s * y, s * x + c * y
-        for i in range(3):  # (R Sigma) R^T
-            x, y = full[i, 0], full[i, 1]
-            full[i, 0], full[i, 1] = c * x - s * y, s * x + c * y

@@ -24,7 +24,6 @@ from slam_backend.metrics.maps import map_error
 from slam_backend.models.camera import StereoCamera
 from slam_backend.models.measurements import Measurements, TeamMeasurements
 from slam_backend.models.odometry import OdometryModel
-from slam_backend.smoother import gauge
 from slam_backend.smoother.options import SmoothingOptions
 from slam_backend.smoother.sampling import retract_on_se2
 from slam_backend.team.merge_scheduler import AttemptOptions
@@ -122,7 +121,6 @@ def run_all_paths(extras: Collection[str]) -> float:
         root = as_read_only(np.array([-1]))
         retract_on_se2(np.zeros((1, 3)), root, np.zeros((1, 3, 1)))
         inverse(np.zeros((2, 3)))  # of starts in a fixed gauge
-        gauge.move(np.zeros((1, 3, 1)), np.zeros((1, 3)), np.zeros((1, 3, 1)))  # of unknown starts
         attempts, merging = AttemptOptions(every=1), MergeOptions(watch_every=1)
         team = TeamSlam(2, num_particles=4, rejuvenate_every=None, attempts=attempts, merging=merging)
         for _ in range(STEPS):

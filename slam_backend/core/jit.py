@@ -15,6 +15,7 @@ from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from slam_backend.core.compilation.cache import KernelCache
+from slam_backend.core.compilation.device import DeviceCompiler
 from slam_backend.core.compilation.shipped import CONFIG
 from slam_backend.core.validation import FloatArray
 
@@ -94,10 +95,13 @@ def simd_inline(function: Callable[P, T]) -> Callable[P, T]:
 def device(kernel: Callable[P, T]) -> Callable[P, T]:
     """Omit the Python wrapper of a kernel that only other kernels call; goes above the kernel's own decorator.
 
-    The wrapper takes as long to compile as a small kernel. A call from Python raises TypeError.
+    The wrapper takes as long to compile as a small kernel, and only the calling kernels are optimised and become
+    machine code. A call from Python raises TypeError.
     """
     if isinstance(kernel, CPUDispatcher):
         kernel.targetoptions["no_cpython_wrapper"] = True
+        compiler: Any = kernel._compiler  # type: ignore[attr-defined]
+        compiler.pipeline_class = DeviceCompiler
         kernel.__class__ = DeviceKernel
     return kernel
 

@@ -304,6 +304,9 @@ def _masked(
     )
 
 
+TURNED_SIGNS = np.array([1.0, -1.0, -1.0, 1.0, 1.0, 1.0])  # of covariances, by the turn into the robot's axes
+
+
 def _joined(used: Sequence[Used]) -> tuple[FloatArray, Float32Array, IntArray]:
     """Return sightings, descriptors and names of all measurements, robot by robot."""
     if not used:
@@ -320,11 +323,10 @@ def _joined(used: Sequence[Used]) -> tuple[FloatArray, Float32Array, IntArray]:
             covariances = np.concatenate([np.zeros((len(one[0]), 3, 3)) if one[1] is None else one[1] for one in used])
         if named:
             names = np.concatenate([np.zeros(len(own[0]), np.int64) if own[3] is None else own[3] for own in used])
-    points.setflags(write=False)  # as those of a frame: the kernel is compiled for one kind of array
+    sightings = np.zeros((len(points), 9))  # in the robot's axes: x ahead, y left, z up
+    sightings[:, 0], sightings[:, 1], sightings[:, 2] = points[:, 2], -points[:, 0], -points[:, 1]
     if covariances is not None:
-        covariances.setflags(write=False)
-    sightings = np.empty((len(points), 9))
-    _kernels.to_robot_axes(points, covariances, sightings)
+        sightings[:, 3:] = covariances[:, (2, 2, 2, 0, 0, 1), (2, 0, 1, 0, 1, 1)] * TURNED_SIGNS
     return sightings, descriptors, NO_NAMES if names is None else names
 
 

@@ -13,9 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from slam_backend.core.jit import device, in_place, jit
 from slam_backend.core.validation import FloatArray, IntArray
-from slam_backend.geometry import between, wrap_angle
+from slam_backend.geometry import between, cosine_sine, inverse, wrap_angle
 from slam_backend.smoother.graph import LEVER
 
 XX, YY = 3, 6  # rows of a tile: variances of a landmark in the plane
@@ -88,7 +87,6 @@ def fix_start(
     return np.asarray((weights * apart.T) @ apart)  # (9)
 
 
-@jit
 def compute_gauge_fix(
     tiles: FloatArray, seen: IntArray, landmarks: FloatArray, poses: FloatArray, means: FloatArray,
     weights: FloatArray, lever: float,
@@ -99,82 +97,43 @@ def compute_gauge_fix(
         tiles, seen, landmarks, poses, means, weights: See `fix_gauge`.
         lever: Lever arm of headings [m].
     """
-    n, m, num_lanes = len(seen), len(weights), tiles.shape[3]
-    points, shares = np.empty((n, 2, m)), np.empty(n)
-    total = 0.0
-    for k in range(n):
-        mean, target = 0.0, landmarks[seen[k]]
-        for block in range(tiles.shape[1]):
-            tile, first = tiles[seen[k], block], block * num_lanes
-            for lane in range(min(num_lanes, m - first)):
-                x, y = tile[0, lane], tile[1, lane]
-                points[k, 0, first + lane], points[k, 1, first + lane] = x, y
-                dx, dy = x - target[0], y - target[1]
-                mean += (dx * dx + dy * dy + tile[XX, lane] + tile[YY, lane]) * weights[first + lane]
-        shares[k] = 1.0 / max(mean, 1e-300)
-        total += shares[k]
-    for k in range(n):
-        shares[k] /= total
-    motions, moved, scatter = np.empty((m, 3)), np.empty(poses.shape), np.zeros((3, 3))
-    fit_rigid_2d(points, landmarks[seen], shares, motions)
-    move(poses, motions, moved)
-    gained = 0.0
-    for i in range(m):
-        before, after = 0.0, 0.0
-        for robot in range(len(poses)):
-            x, y, heading = means[robot, 0], means[robot, 1], means[robot, 2]
-            dx, dy = poses[robot, 0, i] - x, poses[robot, 1, i] - y
-            turn = lever * ((poses[robot, 2, i] - heading + math.pi) % (2.0 * math.pi) - math.pi)
-            before = before + dx * dx + dy * dy + turn * turn
-            dx, dy = moved[robot, 0, i] - x, moved[robot, 1, i] - y
-            turn = lever * ((moved[robot, 2, i] - heading + math.pi) % (2.0 * math.pi) - math.pi)
-            after = after + dx * dx + dy * dy + turn * turn
-        gained += weights[i] * (before - after)
-        x, y, turn = motions[i, 0], motions[i, 1], motions[i, 2]
-        c, s = math.cos(turn), math.sin(turn)
-        back = (-(c * x + s * y), s * x - c * y, -turn)
-        for row in range(3):
-            for column in range(3):
-                scatter[row, column] += weights[i] * back[row] * back[column]  # (9)
+    targets = landmarks[seen, :2]
+    values = tiles[seen][:, :, [0, 1, XX, YY]].transpose(0, 2, 1, 3).reshape(len(seen), 4, -1)[:, :, : len(weights)]
+    points, spreads = values[:, :2], ((values[:, :2] - targets[:, :, None]) ** 2 + values[:, 2:]).sum(axis=1)
+    shares = 1.0 / np.maximum((weights * spreads).sum(axis=1), 1e-300)
+    motions = fit_rigid_2d(points, targets, shares / shares.sum())
+    moved = move(poses, motions)
+
+    def scatter_of(each: FloatArray) -> FloatArray:
+        off = each - means[:, :, None]
+        off[:, 2] = lever * wrap_angle(each[:, 2] - means[:, 2, None])
+        return np.asarray((off * off).sum(axis=(0, 1)))
+
+    gained = float((weights * (scatter_of(poses) - scatter_of(moved))).sum())
+    back = inverse(motions).T
+    scatter = (weights * back[:, None] * back).sum(axis=2)  # (9)
     return gained, GaugeFix(moved, motions, scatter)
 
 
-@device
-@in_place
-def fit_rigid_2d(points: FloatArray, targets: FloatArray, shares: FloatArray, motions: FloatArray) -> None:
-    """Write the rigid motions (M, 3) that best align points (n, 2, M) with targets (n, 2 or 3), weighted by (n,)."""
-    target_x, target_y = 0.0, 0.0
-    for n in range(len(shares)):
-        target_x += shares[n] * targets[n, 0]
-        target_y += shares[n] * targets[n, 1]
-    for i in range(len(motions)):
-        centre_x, centre_y = 0.0, 0.0
-        for n in range(len(shares)):
-            centre_x += shares[n] * points[n, 0, i]
-            centre_y += shares[n] * points[n, 1, i]
-        along, across = 0.0, 0.0
-        for n in range(len(shares)):
-            x, y = points[n, 0, i] - centre_x, points[n, 1, i] - centre_y
-            aim_x, aim_y = shares[n] * (targets[n, 0] - target_x), shares[n] * (targets[n, 1] - target_y)
-            along += aim_x * x + aim_y * y
-            across += aim_y * x - aim_x * y
-        turn = math.atan2(across, along)
-        c, s = math.cos(turn), math.sin(turn)
-        motions[i, 0] = target_x - (c * centre_x - s * centre_y)
-        motions[i, 1] = target_y - (s * centre_x + c * centre_y)
-        motions[i, 2] = turn
+def fit_rigid_2d(points: FloatArray, targets: FloatArray, shares: FloatArray) -> FloatArray:
+    """Return the rigid motions (M, 3) that best align points (n, 2, M) with targets (n, 2), weighted by (n,)."""
+    centre, target = (shares[:, None, None] * points).sum(axis=0), (shares[:, None] * targets).sum(axis=0)
+    (x, y), (u, v) = (points - centre).transpose(1, 0, 2), (shares[:, None] * (targets - target)).T[:, :, None]
+    across, along = (v * x - u * y).sum(axis=0).tolist(), (u * x + v * y).sum(axis=0).tolist()
+    motions = np.zeros((points.shape[2], 3))
+    motions[:, 2] = list(map(math.atan2, across, along))
+    c, s = cosine_sine(motions[:, 2])
+    motions[:, 0], motions[:, 1] = (
+        target[0] - (c * centre[0] - s * centre[1]),
+        target[1] - (s * centre[0] + c * centre[1]),
+    )
+    return motions
 
 
-@in_place
-def move(poses: FloatArray, motions: FloatArray, moved: FloatArray) -> None:
-    """Write poses (K, 3, M) moved by each particle's motion (M, 3); `moved` may be `poses`."""
-    for i in range(len(motions)):
-        c, s = math.cos(motions[i, 2]), math.sin(motions[i, 2])
-        for robot in range(len(poses)):
-            x, y, heading = poses[robot, 0, i], poses[robot, 1, i], poses[robot, 2, i]
-            moved[robot, 0, i] = motions[i, 0] + c * x - s * y
-            moved[robot, 1, i] = motions[i, 1] + s * x + c * y
-            turned = motions[i, 2] + heading + math.pi
-            if not 0.0 <= turned < 2.0 * math.pi:  # where it lies there, `%` would not change it
-                turned %= 2.0 * math.pi
-            moved[robot, 2, i] = turned - math.pi
+def move(poses: FloatArray, motions: FloatArray) -> FloatArray:
+    """Return poses (K, 3, M) moved by each particle's motion (M, 3)."""
+    (c, s), moved = cosine_sine(motions[:, 2]), np.empty(poses.shape)
+    moved[:, 0] = motions[:, 0] + c * poses[:, 0] - s * poses[:, 1]
+    moved[:, 1] = motions[:, 1] + s * poses[:, 0] + c * poses[:, 1]
+    moved[:, 2] = wrap_angle(motions[:, 2] + poses[:, 2])
+    return moved

@@ -6,7 +6,7 @@ import numpy as np
 
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.smoother import _kernels
-from slam_backend.smoother._kernels import CholeskyFactor, EquationBlocks, Frames, Keys, LandmarkFactors, Points
+from slam_backend.smoother._kernels import FREE, CholeskyFactor, EquationBlocks, Frames, Keys, LandmarkFactors, Points
 from slam_backend.smoother.graph import SlamGraph
 from slam_backend.smoother.options import SmoothingOptions
 
@@ -135,7 +135,7 @@ def optimize(
         damping: Damping of the first iteration.
         looseness: Factor on the tolerance of the options.
     """
-    columns, informations, size, is_noisy = _kernels.sum_pose_information(graph.parents, graph.odometry_covariances)
+    columns, informations, size, is_noisy = sum_pose_information(graph.parents, graph.odometry_covariances)
     sightings = gathered(graph)
     poses, landmarks = graph.poses.copy(), graph.landmarks.copy()
     tolerance = looseness * options.tolerance
@@ -176,6 +176,30 @@ def optimize(
                 return given_up("no descent", iteration)
             cost = system.form(poses, landmarks)
     return given_up(f"no convergence in {most} iterations", most, cost)
+
+
+def sum_pose_information(previous: IntArray, noises: FloatArray) -> tuple[IntArray, FloatArray, int, bool]:
+    """Number the poses that are sought, and invert the covariances of the odometry that leads to them.
+
+    Args:
+        previous: (k,) key that odometry comes from, `NONE` where a pose is given.
+        noises: (k, 3, 3) covariance of that odometry.
+
+    Returns:
+        (k,) First of the three rows of each pose that is sought, `FREE` of the others; (k, 3, 3) information of the
+        odometry, zeros where a pose is given; how many poses are sought; whether all of their odometry has noise.
+    """
+    sought = np.flatnonzero(previous >= 0)
+    columns, informations = np.full(len(previous), FREE), np.zeros(noises.shape)
+    columns[sought] = 3 * np.arange(len(sought))
+    (xx, xy, xt), (_, yy, yt), (_, _, tt) = noises[sought].transpose(1, 2, 0)
+    p, q, r = yy * tt - yt * yt, xt * yt - xy * tt, xy * yt - xt * yy
+    determinants = xx * p + xy * q + xt * r
+    has_noise = (xx > 0.0) & (xx * yy - xy * xy > 0.0) & (determinants > 0.0)
+    u, v, w = xx * tt - xt * xt, xy * xt - xx * yt, xx * yy - xy * xy
+    inverses = np.array([[p, q, r], [q, u, v], [r, v, w]]).transpose(2, 0, 1)
+    informations[sought[has_noise]] = inverses[has_noise] / determinants[has_noise, None, None]
+    return columns, informations, len(sought), bool(has_noise.all())
 
 
 class NormalEquations:

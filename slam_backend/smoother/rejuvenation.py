@@ -200,14 +200,12 @@ def _particles(graph: SlamGraph, mode: MapEstimate, draws: PathSamples) -> Parti
     tiles, _ = replay(mode, paths, len(weights), in_sight)
     held = fix_gauge(tiles, np.arange(len(in_sight)), mode.landmarks[in_sight], poses, means, weights)
     if held is not None:
-        moved = np.empty_like(draws.poses)
-        move(draws.poses, held.motions, moved)
-        paths, poses, frame = lane_rows(moved), held.poses, held.scatter
+        paths, poses, frame = lane_rows(move(draws.poses, held.motions)), held.poses, held.scatter
     unknown = (mode.columns[graph.first_keys] >= 0).nonzero()[0].tolist()
     for index in unknown:
         start = starts[index : index + 1]
         if held is not None:
-            move(start, held.motions, start)
+            start[:] = move(start, held.motions)
         at = mode.poses[graph.first_keys[index]], means[index]
         start_scatters[index] = fix_start(start[0], poses[index], *at, weights)
     for array in (poses, starts, means):

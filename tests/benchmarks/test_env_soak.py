@@ -20,6 +20,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.usefixtures("quick")
 def test_a_resumed_soak_equals_an_uninterrupted_one(tmp_path: Path) -> None:
     """A soak test that stops at a snapshot and resumes in a new object returns the same bytes as an unbroken one."""
@@ -34,6 +35,7 @@ def test_a_resumed_soak_equals_an_uninterrupted_one(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
 def test_a_stopped_soak_leaves_a_whole_snapshot(tmp_path: Path, how: signal.Signals) -> None:
@@ -83,6 +85,7 @@ def test_violated_invariants_are_detected(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_beginnings_do_not_depend_on_the_process() -> None:
     """The first steps of an episode have the same bytes beside another environment and with another hash seed."""
     reference = env_soak.beginning(5, 6, False)

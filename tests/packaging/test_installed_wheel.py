@@ -17,7 +17,7 @@ from slam_backend.core.compilation.cache import cache_folder
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("slam_backend", "vslam_env", "agents", "training")
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.nightly]
 
 
 def run(*command: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:

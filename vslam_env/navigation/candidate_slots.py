@@ -1,4 +1,7 @@
-"""Candidate slots: frontiers presented to policies under stable indices."""
+"""Candidate slots: frontiers presented to policies under stable indices.
+
+This runs once a second, on at most a few dozen places; only the search before it is compiled.
+"""
 
 import math
 from collections.abc import Mapping
@@ -7,16 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from slam_backend.core.validation import BoolArray, FloatArray
+from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.state import FLOAT64, INT64, Array, Sizes, State
 from vslam_env.navigation._grid_kernels import LARGEST_HALF_WIDTH
-from vslam_env.navigation._planning_kernels import (
-    SAME_GOAL,
-    FrontierColumns,
-    fill_slots,
-    update_slots,
-)
-from vslam_env.navigation.occupancy_grid import OccupancyGrid
+from vslam_env.navigation._planning_kernels import PAD, UNREACHED, FrontierColumns, dijkstra, frontiers_reached
+from vslam_env.navigation.occupancy_grid import OccupancyGrid, cell_of
 from vslam_env.navigation.planning import known_part
 from vslam_env.navigation.validation import pose_floats, positions_array
 
@@ -25,13 +23,20 @@ __all__ = ["NUM_SLOTS", "CandidateSlots"]
 NUM_SLOTS = 16
 Ways = tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.int32], NDArray[np.int32], int, int]
 NUM_COLUMNS = len(FrontierColumns._fields)
+NO_CANDIDATE = np.full((1, NUM_COLUMNS), np.nan)
 ROBOT_RADIUS = 0.2  # [m]
+SAME_GOAL = 1.0  # [m] between updates the goal of a living candidate moves less than this
+AT_GOAL = 0.5  # [m]
+LOOKING = 0.6  # [rad] a robot whose heading is this near to a candidate's looks at the unknown
+LOOK_COUNTS = 4  # times as much as a visit without a look, for a teammate's direction is not told
+PATIENCE = 16  # visits, after which what is still unseen there never will be seen
+CUT_MARGIN = 25  # [cells] from where a search was cut off: what is to be seen from there may lie beyond
 
 
 class CandidateSlots:
     """Sixteen slots for candidate places to explore; a candidate keeps its slot while its frontier exists.
 
-    An update assigns the old candidates to the current frontiers at minimal total distance. Pairs less than 1 m apart
+    An update assigns the old candidates to the current frontiers, nearest pairs first. Pairs less than 1 m apart
     persist; other candidates are dropped. New frontiers fill free slots, nearest first. A frontier that persists
     although the robot looked at it from its goal at 4 updates (or a robot of its group was there at 16) cannot be seen:
     it is noise or lies behind a corner. Unknown cells within 0.8 m of its goal are then ignored, so that exploration
@@ -128,13 +133,32 @@ class CandidateSlots:
             robot: Row of the robot in `poses`.
             reach: Distance [m] from the robot along x and y beyond which candidates stay as they are.
         """
-        slots = self._rows, self._visits
-        frontiers, costs, is_clear, self._given_up, ways = update_slots(
-            cells, bounds, ROBOT_RADIUS, poses, robot, *slots, self._given_up, float(reach)
-        )
-        if not is_clear:
-            fill_slots(_assign(costs), frontiers, *slots)
+        self._count_visits(poses, robot)
+        x, y, _ = poses[robot].tolist()
+        ways = dijkstra(cells, bounds, x, y, ROBOT_RADIUS, math.nan, math.nan, float(reach))
+        frontiers = frontiers_reached(ways, len(cells), self._given_up)
+        if reach < math.inf:
+            told = frontiers[~untold(ways, bounds, len(cells), frontiers)]
+            others = self._rows[untold(ways, bounds, len(cells), self._rows)]
+            frontiers = np.concatenate([told, others[~(_distances(others, told) < SAME_GOAL).any(axis=1)]])
+        found = pair_up(self._rows, frontiers)
+        gaps, is_new = np.flatnonzero(found < 0), np.ones(len(frontiers), np.bool_)
+        self._visits[gaps], is_new[found[found >= 0]] = 0, False
+        new = np.flatnonzero(is_new)[: len(gaps)]
+        found[gaps[: len(new)]] = new
+        self._rows[:] = np.concatenate([frontiers, NO_CANDIDATE])[found]
         return ways
+
+    def _count_visits(self, poses: FloatArray, robot: int) -> None:
+        """Count the visits of the robot and its teammates, see `renew`; where patience runs out, give up."""
+        gaps = _distances(self._rows, poses)
+        for slot in np.flatnonzero((gaps <= AT_GOAL).any(axis=1)).tolist():
+            x, y, heading, _, _ = self._rows[slot].tolist()
+            looked = gaps[slot, robot] <= AT_GOAL and math.cos(heading - poses[robot, 2]) > math.cos(LOOKING)
+            self._visits[slot] += LOOK_COUNTS if looked else 1
+            if self._visits[slot] >= PATIENCE:
+                self._visits[slot] = 0
+                self._given_up = np.concatenate([self._given_up, [[x, y]]])
 
     @staticmethod
     def check_state(parts: Mapping[str, Any], sizes: Sizes) -> None:
@@ -157,10 +181,46 @@ def _together(pose: ArrayLike, teammates: ArrayLike) -> FloatArray:
     return poses
 
 
-def _assign(costs: FloatArray) -> FloatArray:
-    """Return the costs (m, n) of the minimal assignment, and `SAME_GOAL` for all other pairs."""
-    from scipy.optimize import linear_sum_assignment  # slow import, not always needed
+def _distances(goals: FloatArray, places: FloatArray) -> FloatArray:
+    """Return the distances (m, n) [m] between goals (m, 2 or more) and places (n, 2 or more); NaN where either is."""
+    return np.asarray(np.hypot(goals[:, 0, None] - places[:, 0], goals[:, 1, None] - places[:, 1]))
 
-    chosen, pairs = np.full_like(costs, SAME_GOAL), linear_sum_assignment(costs)
-    chosen[pairs] = costs[pairs]
-    return chosen
+
+def pair_up(goals: FloatArray, places: FloatArray) -> IntArray:
+    """Return the place (m,) that each goal (m, 2 or more) is now, of places (n, 2 or more); -1: none.
+
+    Pairs are less than `SAME_GOAL` apart, the nearest ones are chosen first, and each place is chosen once.
+    """
+    found, distances = np.full(len(goals), -1), _distances(goals, places)
+    slots, sources = (distances < SAME_GOAL).nonzero()
+    taken: set[int] = set()
+    for k in distances[slots, sources].argsort(kind="stable").tolist():
+        source = int(sources[k])
+        if found[slots[k]] < 0 and source not in taken:
+            found[slots[k]] = source
+            taken.add(source)
+    return found
+
+
+def untold(ways: Ways, bounds: NDArray[np.int32], size: int, rows: FloatArray) -> BoolArray:
+    """Return the mask (m,) of candidates (m, 5) of which a search over a part of the known floor tells nothing.
+
+    It tells what there is at a cell unless that is open and not reached, or within `CUT_MARGIN` of an edge where the
+    search was cut off.
+
+    Args:
+        ways: Paths of the search, of `dijkstra`.
+        bounds: (4,) int32. Bounds of the known part of the grid.
+        size: Number of cells along a side of the grid.
+        rows: (m, 5). Candidates; NaN in empty slots, which are not in the mask.
+    """
+    _, weights, cost, _, *corner = ways
+    is_untold = ~np.isnan(rows[:, 0])
+    cells, first, end = cell_of(rows[is_untold, :2], size), np.array(corner), np.add(corner, cost.shape)
+    low = np.where(first + PAD <= bounds[:2], first, first + PAD + CUT_MARGIN)
+    high = np.where(end - PAD >= bounds[2:], end, end - PAD - CUT_MARGIN)
+    settled = np.asarray(((low <= cells) & (cells < high)).all(axis=1))
+    row, col = (cells[settled] - corner).T
+    settled[settled] = (weights[row, col] == 0) | (cost[row, col] != UNREACHED)
+    is_untold[is_untold] = ~settled
+    return is_untold

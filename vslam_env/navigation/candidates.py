@@ -12,13 +12,14 @@ from slam_backend.core.short_repr import short_repr
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.state import FLOAT64, INT64, Array, Child, Each, Int, Sizes, State
 from vslam_env.navigation._grid_kernels import CELL
+from vslam_env.navigation._planning_kernels import PAD
 from vslam_env.navigation._view_kernels import (
     NUM_DESCRIBED,
     NUM_GAINS,
     describe_candidates,
     renew_candidates,
 )
-from vslam_env.navigation.candidate_slots import NUM_COLUMNS, NUM_SLOTS, CandidateSlots, check_rows
+from vslam_env.navigation.candidate_slots import NUM_COLUMNS, NUM_SLOTS, CandidateSlots, check_rows, untold
 from vslam_env.navigation.looks import TeamLooks
 from vslam_env.navigation.team_grids import TeamGrids
 
@@ -151,8 +152,12 @@ class TeamCandidates:
         ways = frontiers.renew(cells, bounds, poses[robot], robot, reach)
         if reach < math.inf and any_before and not frontiers.valid.any():
             ways = frontiers.renew(cells, bounds, poses[robot], robot)
+        rows, (height, width) = self._rows[robot], ways[0].shape
+        searched = [ways[4] + PAD, ways[5] + PAD, ways[4] + height - PAD, ways[5] + width - PAD]
+        is_whole = searched == bounds.tolist()
+        distant = np.zeros(len(rows), np.bool_) if is_whole else untold(ways, bounds, len(cells), rows)
         gains = self._gains[robot], self._views[robot]
-        slots = self._rows[robot], self._visits[robot], *gains, self._lengths[robot], robot, self._updates[robot]
+        slots = rows, distant, self._visits[robot], *gains, self._lengths[robot], robot, self._updates[robot]
         seen = looks.counts[robot], looks.bounds[robot]
         renew_candidates(cells, bounds, seen, ways, landmarks, poses[robot], self._camera, places, slots)
 

@@ -1,5 +1,6 @@
 """Looks at walls: how often the camera saw each wall stretch so that its landmarks could be measured."""
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -7,9 +8,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.state import Each, Record, State
-from vslam_env.navigation._grid_kernels import GRID_SIZE
-from vslam_env.navigation._view_kernels import merge_looks, paint_looks
+from vslam_env.navigation._grid_kernels import GRID_SIZE, LARGEST_HALF_WIDTH
+from vslam_env.navigation._view_kernels import MOST_LOOKS, paint_looks
 from vslam_env.navigation.grid_storage import LooksPart, known_bounds, size_for
+from vslam_env.navigation.occupancy_grid import cell_of, centre_of
 from vslam_env.navigation.validation import pose_floats, ray_directions
 
 __all__ = ["TeamLooks"]
@@ -58,8 +60,17 @@ class TeamLooks:
 
     def merge(self, robot: int, other: NDArray[np.uint8], self_from_other: ArrayLike) -> None:
         """Add another robot's looks (S', S') uint8; its start pose in this robot's frame is (3,) [m, m, rad]."""
-        motion = pose_floats(self_from_other, "self_from_other")
-        merge_looks(self.counts[robot], self.bounds[robot], other, known_bounds(other), *motion)
+        x, y, theta = pose_floats(self_from_other, "self_from_other")
+        c, s, counts = math.cos(theta), math.sin(theta), self.counts[robot]
+        u, v = centre_of(np.argwhere(other), len(other)).T
+        points, far = np.column_stack([x + c * u - s * v, y + s * u + c * v]), 2.0 * LARGEST_HALF_WIDTH
+        cells = cell_of(points.clip(-far, far), len(counts))
+        inside = ((cells >= 0) & (cells < len(counts))).all(axis=1)
+        places, which = np.unique(cells[inside], axis=0, return_inverse=True)
+        more = np.bincount(which.ravel(), other[other > 0][inside], minlength=len(places)).astype(np.int64)
+        there = tuple(places.T)
+        counts[there] = np.minimum(counts[there] + more, MOST_LOOKS)
+        self.bounds[robot] = known_bounds(counts)
 
     def reserve(self, size: int) -> None:
         """Grow to the size S of the grids, unless the looks have it; views taken before are no longer updated."""

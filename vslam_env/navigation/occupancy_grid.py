@@ -1,5 +1,7 @@
 """Occupancy grid of one robot in its own start frame."""
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -7,8 +9,19 @@ from slam_backend.core.short_repr import described
 from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_float
 from slam_backend.state import Record, State
 from vslam_env.navigation import _grid_kernels as _painting
-from vslam_env.navigation._grid_kernels import CELL, FREE, GRID_SIZE, HALF_WIDTH, OCCUPIED, UNKNOWN, Grid
-from vslam_env.navigation.grid_storage import GridPart, GridStorage, margin
+from vslam_env.navigation._grid_kernels import (
+    CELL,
+    FREE,
+    GRID_SIZE,
+    HALF_WIDTH,
+    LARGEST_HALF_WIDTH,
+    MOST_FREE,
+    MOST_OCCUPIED,
+    OCCUPIED,
+    UNKNOWN,
+    Grid,
+)
+from vslam_env.navigation.grid_storage import GridPart, GridStorage, known_bounds, margin
 from vslam_env.navigation.validation import check_ranges, pose_floats, ray_directions
 
 # State of a cell by its evidence, as an unsigned byte.
@@ -155,15 +168,44 @@ class OccupancyGrid:
     def merge(self, other: "OccupancyGrid", self_from_other: ArrayLike) -> None:
         """Add the evidence of another robot's grid.
 
+        Each cell takes the other's value at its centre, or the firmest wall among four points around it: without these,
+        a wall one cell thick would come out of a rotation with holes.
+
         Args:
             other: Grid to add; unchanged.
             self_from_other: (3,) float64 [m, m, rad]. The other's start pose in this robot's start frame.
         """
         self._refuse_if_read_only()
         x, y, theta = pose_floats(self_from_other, "self_from_other")
-        self._storage.reserve(_painting.reach_of_merge(other.bounds, len(other.cells), x, y, theta))
-        source = other.copy() if other._grid is self._grid else other
-        _painting.merge_grid(self._grid, source._grid.evidence, source.bounds, x, y, theta)
+        part = other.known
+        height, width = part.values.shape
+        if not height:
+            return
+        c, s, (top, left) = math.cos(theta), math.sin(theta), part.corner
+        u = np.array([left, left, left + width, left + width]) * CELL - HALF_WIDTH
+        v = np.array([top, top + height, top, top + height]) * CELL - HALF_WIDTH
+        far = 2.0 * LARGEST_HALF_WIDTH  # as good as anywhere outside
+        corners = np.clip(np.column_stack([x + c * u - s * v, y + s * u + c * v]), -far, far)
+        self._reserve(float(np.abs(corners).max()))
+        grid, size = self._grid, self._storage.size
+        first, last = np.clip([cell_of(corners.min(axis=0), size), cell_of(corners.max(axis=0), size) + 1], 0, size)
+        here = slice(first[0], last[0]), slice(first[1], last[1])
+        u, v = np.moveaxis(centre_of(np.moveaxis(np.mgrid[here], 0, -1), size) - (x, y), -1, 0)
+        columns, rows = (c * u + s * v + HALF_WIDTH) / CELL - left, (-s * u + c * v + HALF_WIDTH) / CELL - top
+        around = np.pad(part.values, 1).astype(np.int64)  # nothing is known of what lies outside
+
+        def evidence_at(ahead: float, aside: float) -> IntArray:
+            row, col = np.floor(rows + ahead).astype(np.int64) + 1, np.floor(columns + aside).astype(np.int64) + 1
+            return np.asarray(around[row.clip(0, height + 1), col.clip(0, width + 1)])
+
+        evidence = evidence_at(0.0, 0.0)
+        wall = np.maximum.reduce([evidence_at(ahead, aside) for ahead in (-0.25, 0.25) for aside in (-0.25, 0.25)])
+        evidence = np.where(wall > np.maximum(evidence, 0), wall, evidence)
+        total = np.clip(grid.evidence[here] + evidence, MOST_FREE, MOST_OCCUPIED)
+        total[(total == 0) & (evidence != 0)] = -1  # 0 is kept for cells that were never touched
+        grid.evidence[here] = total
+        grid.cells[here] = _CELL_STATES[grid.evidence[here].view(np.uint8)]
+        grid.bounds[:] = known_bounds(grid.cells)
 
     def copy(self) -> "OccupancyGrid":
         """Return an independent, writable grid with the same content."""

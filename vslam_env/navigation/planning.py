@@ -24,8 +24,8 @@ from vslam_env.navigation._planning_kernels import (
     GOAL_CELLS,
     UNREACHED,
     FrontierColumns,
-    compute_frontiers,
     dijkstra,
+    frontiers_reached,
     nearest_open,
     part_within,
     shorten_path,
@@ -86,7 +86,9 @@ def find_frontiers(cells: Cells, start_xy: ArrayLike, radius: float = 0.2, ignor
         ValueError: If an array has the wrong shape, or a number is not finite.
     """
     points = positions_array(ignored, "ignored")
-    rows = compute_frontiers(*known_part(cells), *_checked_start(start_xy, radius), points)
+    states, bounds = known_part(cells)
+    ways = dijkstra(states, bounds, *_checked_start(start_xy, radius), math.nan, math.nan, math.inf)
+    rows = frontiers_reached(ways, len(states), points)
     columns = FrontierColumns.of(rows)
     return Frontiers(
         goals=columns.goals, headings=columns.heading.copy(), sizes=columns.size.copy(), lengths=columns.length.copy()

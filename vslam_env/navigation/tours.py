@@ -148,9 +148,7 @@ def _share_places(first: Any, between: Any) -> Any:
     is_better = True
     while is_better:
         is_better = False
-        longest = 0
-        for robot in range(num_robots):
-            longest = robot if lengths[robot] > lengths[longest] else longest
+        longest: Any = np.argmax(lengths)
         best, best_place, best_robot, best_own, best_other = lengths[longest] - 1e-9, -1, -1, 0.0, 0.0
         for place in range(n):
             if owner[place] != longest:

@@ -12,37 +12,6 @@ FARTHEST, BEYOND = 1e3, 1.2  # [m], and in ranges of the camera: no camera repor
 
 
 @in_place
-def sample_clutter(
-    places: FloatArray, looks: FloatArray, common: FloatArray, own_share: float, view: FloatArray, points: FloatArray
-) -> None:
-    """Make up points that are no landmarks: uniform in the image and in depth, unit descriptors like the others'.
-
-    Args:
-        places: (3, m) float64, uniform in [0, 1).
-        looks: (m, d) float64, standard normal.
-        common: (d,) float64. Common part of all descriptors.
-        own_share: Length of the part that each descriptor has alone.
-        view: (7,) float64. See `view_limits`.
-        points: (m, 3 + d) float64. Written to: points [m], camera frame, and descriptors.
-    """
-    max_range, across, upright = view[3], view[4], view[5]
-    for j in range(len(points)):
-        right, down = (2.0 * places[0, j] - 1.0) * across, (2.0 * places[1, j] - 1.0) * upright
-        farthest = max_range / np.sqrt(right * right + down * down + 1.0)
-        ahead = max(min(NEAREST_FALSE_POINT, max_range), places[2, j] * farthest)
-        points[j, 0], points[j, 1], points[j, 2] = right * ahead, down * ahead, ahead
-        look, square = points[j, 3:], 0.0
-        for i in range(len(look)):
-            square += looks[j, i] ** 2
-        scale, square = own_share / np.sqrt(square), 0.0
-        for i in range(len(look)):
-            look[i] = looks[j, i] * scale + common[i]
-            square += look[i] ** 2
-        for i in range(len(look)):
-            look[i] *= 1.0 / np.sqrt(square)
-
-
-@in_place
 def measure(
     ids: IntArray,
     counts: IntArray,

@@ -21,7 +21,7 @@ from slam_backend.core.validation import (
 from slam_backend.models.camera import StereoCamera
 from slam_backend.models.measurements import Measurements, TeamMeasurements
 from slam_backend.state import INT64, Array, Record, with_state
-from vslam_env.sensors._landmark_kernels import BEYOND, FARTHEST, measure, sample_clutter
+from vslam_env.sensors._landmark_kernels import BEYOND, FARTHEST, NEAREST_FALSE_POINT, measure
 from vslam_env.world._kernels import detect
 from vslam_env.world.spec import Landmarks
 from vslam_env.world.visibility import (
@@ -189,25 +189,46 @@ class LandmarkSensor:
         ids, ends = np.empty((robots, most), np.int64), np.empty(robots, np.int64)
         ids.fill(-1)
         total, extra = detect(poses, self._sight, keys, config.detection_probability, num_false, ids, ends)
-        false_points = self._no_false_points
+        made_up = self._no_false_points
         if extra:
             total += extra
-            false_points = self._sample_clutter(extra, rng)
+            made_up = self._sample_clutter(extra, rng)
             shuffle_clutter(num_false, rng.random(total), ids, ends)
         noise = rng.standard_normal((total, size))
         points, descriptors = np.empty((total, 3)), np.empty((total, size - 3), np.float32)
-        count = measure(ids, ends, poses, self._points, false_points, noise, self._optics, points, descriptors)
+        count = measure(ids, ends, poses, self._points, made_up, noise, self._optics, points, descriptors)
         if count < total:
             points, descriptors = points[:count], descriptors[:count]
         return TeamSensorFrames(TeamMeasurements(points, descriptors, ends), ids)
 
     def _sample_clutter(self, count: int, rng: np.random.Generator) -> FloatArray:
         """Draw false points and their descriptors (count, 3 + d)."""
-        size = len(self._common)
-        positions, descriptors = rng.random((3, count)), rng.standard_normal((count, size))
-        points = np.empty((count, 3 + size))
-        sample_clutter(positions, descriptors, self._common, self._own_share, self._view, points)
-        return points
+        places, looks = rng.random((3, count)), rng.standard_normal((count, len(self._common)))
+        return false_points(places, looks, self._common, self._own_share, self._view)
+
+
+def false_points(
+    places: FloatArray, looks: FloatArray, common: FloatArray, own_share: float, view: FloatArray
+) -> FloatArray:
+    """Return points that are no landmarks: uniform in the image and in depth, unit descriptors like the others'.
+
+    Args:
+        places: (3, m) float64, uniform in [0, 1).
+        looks: (m, d) float64, standard normal.
+        common: (d,) float64. Common part of all descriptors.
+        own_share: Length of the part that each descriptor has alone.
+        view: (7,) float64. See `view_limits`.
+
+    Returns:
+        (m, 3 + d) float64. Points [m], camera frame, and descriptors.
+    """
+    max_range, across, upright = view[3:6].tolist()
+    right, down = (2.0 * places[0] - 1.0) * across, (2.0 * places[1] - 1.0) * upright
+    farthest = max_range / np.sqrt(right * right + down * down + 1.0)
+    ahead = np.maximum(min(NEAREST_FALSE_POINT, max_range), places[2] * farthest)
+    descriptors = looks * (own_share / np.sqrt((looks**2).sum(axis=1, keepdims=True))) + common
+    descriptors *= 1.0 / np.sqrt((descriptors**2).sum(axis=1, keepdims=True))
+    return np.column_stack([right * ahead, down * ahead, ahead, descriptors])
 
 
 def shuffle_clutter(num_false: IntArray, keys: FloatArray, ids: IntArray, counts: IntArray) -> None:

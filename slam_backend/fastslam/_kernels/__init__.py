@@ -25,7 +25,7 @@ special case. With A = (dr/dx) C and S = Sigma + R, a match adds A^T S^-1 A to t
 (`COV_XI..`). The turn into map axes is by (`COS`, `SIN`); R above is that turn, R in S the measurement noise.
 """
 
-from slam_backend.fastslam._kernels.inputs import extent, read_team, to_robot_axes
+from slam_backend.fastslam._kernels.inputs import extent, read_team
 from slam_backend.fastslam._kernels.layout import (
     EXACT_POSE,
     FAR,
@@ -67,7 +67,6 @@ __all__ = [
     "release",
     "resample",
     "step_robots",
-    "to_robot_axes",
     "write_sigmas",
     "write_team_poses",
 ]  # fmt: skip

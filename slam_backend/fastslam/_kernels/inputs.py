@@ -1,4 +1,4 @@
-"""What robots read in a step: how far its points reach, measurements in the robots' axes, all of it in one table."""
+"""What robots read in a step: how far its points reach, and all of it in one table."""
 
 import math
 
@@ -23,27 +23,6 @@ def extent(points: FloatArray) -> tuple[float, float]:
                 return np.nan, np.nan
             farthest = max(farthest, abs(points[n, c]))
     return nearest, farthest
-
-
-@in_place
-def to_robot_axes(points: FloatArray, covariances: FloatArray | None, measurements: FloatArray) -> None:
-    """Turn measured points from camera axes to the robot's: x ahead, y left, z up.
-
-    Args:
-        points: (n, 3) [m], camera frame.
-        covariances: (n, 3, 3) [m^2], camera frame, or None.
-        measurements: (n, 9), written: the points relative to the camera centre, and the upper triangles of their
-            covariances by rows, or zeros.
-    """
-    for i in range(len(points)):
-        measurements[i, 0], measurements[i, 1], measurements[i, 2] = points[i, 2], -points[i, 0], -points[i, 1]
-        for c in range(3, 9):
-            measurements[i, c] = 0.0
-    if covariances is not None:
-        for i in range(len(points)):
-            own, noise = covariances[i], measurements[i, 3:]
-            noise[0], noise[1], noise[2] = own[2, 2], -own[2, 0], -own[2, 1]
-            noise[3], noise[4], noise[5] = own[0, 0], own[0, 1], own[1, 1]
 
 
 @in_place
@@ -91,7 +70,10 @@ def read_team(
             end - begin,
         )
         begin = end
-    to_robot_axes(points, None, measurements)
+    for n in range(len(points)):  # to the robots' axes: x ahead, y left, z up
+        measurements[n, 0], measurements[n, 1], measurements[n, 2] = points[n, 2], -points[n, 0], -points[n, 1]
+        for c in range(3, 9):
+            measurements[n, c] = 0.0
     nearest, farthest = extent(points)
     fine = begin == len(points) and nearest >= L.MIN_DEPTH and farthest <= farthest_point
     largest = np.float32(largest_entry)

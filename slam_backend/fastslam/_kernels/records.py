@@ -127,7 +127,8 @@ class InputArrays(NamedTuple):
             these have covariances and names, and the number given. Exact poses are already in the particles.
         moves: (N, 3) odometry [m, m, rad] of those that moved.
         normals: (k, M, 3) standard normal draws, for the k robots that are not idle.
-        measurements: (n, 9) [m, m^2] points and, of the robots that have them, covariances, as in `to_robot_axes`.
+        measurements: (n, 9) [m, m^2] points and, of the robots that have them, upper triangles of covariances,
+            in the robots' axes: x ahead, y left, z up.
         descriptors: (n, d).
         names: (n,) the caller's names, of the robots that have them; or (0,).
     """

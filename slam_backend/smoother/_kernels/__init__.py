@@ -1,6 +1,6 @@
 """Compiled inner loops of the smoother: forms of sightings, normal equations, their factor, many paths at a time."""
 
-from slam_backend.smoother._kernels.factors import condense, sum_pose_information
+from slam_backend.smoother._kernels.factors import condense
 from slam_backend.smoother._kernels.graph_reduction import add_sightings, merge_keys
 from slam_backend.smoother._kernels.keyframes import add_keyframes
 from slam_backend.smoother._kernels.normal_equations import form, step
@@ -66,7 +66,6 @@ __all__ = [
     "place_landmarks",
     "replay",
     "step",
-    "sum_pose_information",
     "to_lanes",
     "weigh_deviations",
 ]  # fmt: skip

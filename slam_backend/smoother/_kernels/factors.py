@@ -8,11 +8,9 @@ as their upper triangles by rows (6).
 
 import math
 
-import numpy as np
-
-from slam_backend.core.jit import in_place, inline, jit, stack_array
-from slam_backend.core.validation import FloatArray, IntArray
-from slam_backend.smoother._kernels.records import FREE, Frames, LandmarkFactors, Points
+from slam_backend.core.jit import in_place, inline, stack_array
+from slam_backend.core.validation import FloatArray
+from slam_backend.smoother._kernels.records import Frames, LandmarkFactors, Points
 
 MIN_DEPTH = 0.05  # [m]; a landmark predicted nearer than this to the camera plane is linearised where it was measured
 
@@ -59,40 +57,6 @@ def invert(matrix: FloatArray, inverse: FloatArray) -> None:
         for c in range(r, 3):
             inverse[r, c] = inverse[c, r] = result[at]
             at += 1
-
-
-@jit
-def sum_pose_information(previous: IntArray, noises: FloatArray) -> tuple[IntArray, FloatArray, int, bool]:
-    """Number the poses that are sought, and invert the covariances of the odometry that leads to them.
-
-    Args:
-        previous: (k,) key that odometry comes from, `NONE` where a pose is given.
-        noises: (k, 3, 3) covariance of that odometry.
-
-    Returns:
-        (k,) First of the three rows of each pose that is sought, `FREE` of the others; (k, 3, 3) information of the
-        odometry, zeros where a pose is given; how many poses are sought; whether all of their odometry has noise.
-    """
-    columns, informations = np.full(len(previous), FREE), np.zeros(noises.shape)
-    upper, inverse = stack_array(6), stack_array(6)
-    size, is_noisy = 0, True
-    for n in range(len(previous)):
-        if previous[n] < 0:
-            continue
-        columns[n] = 3 * size
-        size += 1
-        a, b = noises[n], informations[n]
-        upper[0], upper[1], upper[2], upper[3], upper[4], upper[5] = (
-            a[0, 0], a[0, 1], a[0, 2], a[1, 1], a[1, 2], a[2, 2],
-        )  # fmt: skip
-        minor = upper[0] * upper[3] - upper[1] * upper[1]
-        if not (upper[0] > 0.0 and minor > 0.0 and _inverse(upper, inverse) > 0.0):
-            is_noisy = False
-            continue
-        b[0, 0], b[1, 1], b[2, 2] = inverse[0], inverse[3], inverse[5]
-        b[0, 1], b[0, 2], b[1, 2] = inverse[1], inverse[2], inverse[4]
-        b[1, 0], b[2, 0], b[2, 1] = inverse[1], inverse[2], inverse[4]
-    return columns, informations, size, is_noisy
 
 
 @in_place

@@ -223,14 +223,11 @@ def merge_keys(
                     x, y = jacobians[b, 0, i], jacobians[b, 1, i]
                     jacobians[b, 0, i], jacobians[b, 1, i] = c * x - s * y, s * x + c * y
         n = numbers[b]
-        robots[n], poses[n], previous[n] = robots[b], poses[b], previous[b]
-        motions[n], noises[n], jacobians[n], costs[n], rigid[n] = (
-            motions[b],
-            noises[b],
-            jacobians[b],
-            costs[b],
-            rigid[b],
-        )
+        robots[n], previous[n], costs[n], rigid[n] = robots[b], previous[b], costs[b], rigid[b]
+        for i in range(3):
+            poses[n, i], motions[n, i] = poses[b, i], motions[b, i]
+            for j in range(3):
+                noises[n, i, j], jacobians[n, i, j] = noises[b, i, j], jacobians[b, i, j]
     return number, roots, numbers, offsets
 
 

@@ -44,15 +44,16 @@ def add_keyframes(
         first = num
         for row in range(starts[t], starts[t + 1]):
             if ids[row] != REJECTED:
-                raw.points[num], raw.has_covariance[num] = log.points[row], log.given[t]
-                raw.point_frames[num], raw.point_landmarks[num] = frame, ids[row]
-                if len(log.covariances) > 0:
-                    raw.point_noises[num] = log.covariances[row]
-                else:
-                    raw.point_noises[num] = 0.0
+                raw.has_covariance[num], raw.point_frames[num], raw.point_landmarks[num] = log.given[t], frame, ids[row]
+                for i in range(3):
+                    raw.points[num, i] = log.points[row, i]
+                for i in range(6):
+                    raw.point_noises[num, i] = log.covariances[row, i] if len(log.covariances) > 0 else 0.0
                 num += 1
         if log.kinds[t] == ODOMETRY:
-            move[:], variances = log.motions[t], log.variances[t]
+            variances = log.variances[t]
+            for axis in range(3):
+                move[axis] = log.motions[t, axis]
             if biased:
                 j = log.jacobians[t]
                 for axis in range(3):
@@ -85,7 +86,8 @@ def add_keyframes(
             row_of_pose += 1
         is_given = row_of_pose < len(initial_poses.steps) and initial_poses.steps[row_of_pose] == log.steps[t]
         if is_given and not math.isnan(initial_poses.poses[row_of_pose, 0]):
-            pose[:] = initial_poses.poses[row_of_pose]
+            for i in range(3):
+                pose[i] = initial_poses.poses[row_of_pose, i]
         else:
             is_given = False
         if not measured and starts[t + 1] > 0:
@@ -93,22 +95,26 @@ def add_keyframes(
         scatter = noise[0, 0] + noise[1, 1] + LEVER * LEVER * noise[2, 2]
         far = num > first and scatter >= rigid_within * rigid_within
         if moved and (far or t == len(log.steps) - 1):
-            keys.robots[key], keys.parents[key], keys.poses[key] = robot, tip, pose
-            keys.odometry[key], keys.odometry_covariances[key], keys.transition_variances[key] = chain, noise, scatter
-            keys.bias_jacobians[key] = jacobian
-            if biased:
+            keys.robots[key], keys.parents[key], keys.transition_variances[key] = robot, tip, scatter
+            for i in range(3):
+                keys.poses[key, i], keys.odometry[key, i] = pose[i], chain[i]
                 for axis in range(3):
-                    own = jacobian[axis]
-                    keys.odometry[key, axis] += own[0] * bias[0] + own[1] * bias[1] + own[2] * bias[2]
-                jacobian[:] = 0.0
+                    keys.odometry_covariances[key, i, axis] = noise[i, axis]
+                    keys.bias_jacobians[key, i, axis] = jacobian[i, axis]
+                if biased:
+                    own = jacobian[i]
+                    keys.odometry[key, i] += own[0] * bias[0] + own[1] * bias[1] + own[2] * bias[2]
             chain[:] = 0.0
             noise[:] = 0.0
+            jacobian[:] = 0.0
             scatter, moved = 0.0, False
             tip, keys.rigid_variances[key] = key, 0.0
             key += 1
         if num > first:
             keys.rigid_variances[tip] = max(keys.rigid_variances[tip], scatter)
-            frames.frame_keys[frame], frames.frame_offsets[frame] = tip, chain
+            frames.frame_keys[frame] = tip
+            for i in range(3):
+                frames.frame_offsets[frame, i] = chain[i]
             frame += 1
     tips[robot] = tip
     ends[0], ends[1], ends[2] = key, frame, num

@@ -214,7 +214,7 @@ def lay_out(
         for p in range(tops[j], tops[j + 1]):
             row_columns[done[rows[p]]] = j
             done[rows[p]] += 1
-    done[:] = tops
+    done = tops.copy()
     for row in range(num):
         for n in range(row_tops[row], row_tops[row + 1]):
             p = done[row_columns[n]]

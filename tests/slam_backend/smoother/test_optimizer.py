@@ -23,11 +23,11 @@ from slam_backend.geometry import between, compose
 from slam_backend.models.camera import StereoCamera
 from slam_backend.models.odometry import OdometryModel
 from slam_backend.smoother import _kernels
-from slam_backend.smoother._kernels import FREE, CholeskyFactor, EquationBlocks, SymbolicFactor, sum_pose_information
+from slam_backend.smoother._kernels import FREE, CholeskyFactor, EquationBlocks, SymbolicFactor
 from slam_backend.smoother.graph import SlamGraph
 from slam_backend.smoother.graph_building import InitialPoses, LandmarkPositions, extend_graph, log_head
 from slam_backend.smoother.graph_reduction import relinearise
-from slam_backend.smoother.optimizer import optimize
+from slam_backend.smoother.optimizer import optimize, sum_pose_information
 from slam_backend.smoother.options import SmoothingOptions
 from training.bench.accuracy.batch_ml import batch_ml
 from training.bench.accuracy.runs import NoisePreset, RunSpec, simulate_run
@@ -324,7 +324,7 @@ def test_without_landmarks_the_mode_is_dead_reckoning():
 
 
 def test_small_matrices_are_inverted_as_by_lapack():
-    """The kernel's inverses of 3 x 3 covariances are numpy's; one that is not positive definite is reported."""
+    """The inverses of 3 x 3 covariances are numpy's; one that is not positive definite is reported."""
     rng = np.random.default_rng(5)
     roots = rng.normal(size=(50, 3, 3)) * [1e-3, 1e-2, 1.0]
     matrices = roots @ roots.transpose(0, 2, 1) + 1e-4 * np.eye(3)

@@ -12,7 +12,7 @@ from slam_backend.smoother._kernels import BIAS, LEVER, NONE, Keys
 from slam_backend.smoother.graph import SlamGraph
 from slam_backend.smoother.graph_building import extend_graph, merge_graphs
 from slam_backend.smoother.graph_reduction import reduce_keyframes, relinearise
-from slam_backend.smoother.optimizer import MapEstimate, NormalEquations, optimize
+from slam_backend.smoother.optimizer import MapEstimate, NormalEquations, optimize, sum_pose_information
 from slam_backend.smoother.options import SmoothingOptions
 from slam_backend.smoother.sampling import lane_rows, odometry_log_density, sample_paths, transition_variances
 
@@ -66,7 +66,7 @@ def test_the_slope_of_the_cost_is_its_difference():
     """The gradient by a bias is that of central differences, away from the mode."""
     run = small_run(2)
     graph = graph_of(run, motion=BIASED)
-    columns, infos, size, _ = _kernels.sum_pose_information(graph.parents, graph.odometry_covariances)
+    columns, infos, size, _ = sum_pose_information(graph.parents, graph.odometry_covariances)
     seen = optimize(graph, camera_of(run), TIGHT).sightings
     system = NormalEquations(graph, columns, size, infos, seen, camera_of(run), TIGHT)
     rng = np.random.default_rng(3)

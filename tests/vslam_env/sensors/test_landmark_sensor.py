@@ -12,8 +12,8 @@ from slam_backend.fastslam._kernels import MIN_DEPTH
 from slam_backend.geometry import compose
 from slam_backend.models.camera import StereoCamera
 from vslam_env.sensors import LandmarkSensor, LandmarkSensorConfig
-from vslam_env.sensors._landmark_kernels import NEAREST, measure, sample_clutter
-from vslam_env.sensors.landmark_sensor import shuffle_clutter
+from vslam_env.sensors._landmark_kernels import NEAREST, measure
+from vslam_env.sensors.landmark_sensor import false_points, shuffle_clutter
 from vslam_env.world import FreeSpace, Landmarks, World, make_world, place_landmarks
 from vslam_env.world._kernels import detect
 from vslam_env.world.visibility import group_bounds, landmark_geometry, view_limits, visible_landmarks
@@ -156,8 +156,7 @@ def test_false_points_are_the_plain_definition() -> None:
     rays = np.stack([right, down, np.ones(20)], axis=1)
     ahead = np.maximum(places[2] * 6.0 / np.linalg.norm(rays, axis=1), 0.5)
     looks = common + 0.8 * own / np.linalg.norm(own, axis=1, keepdims=True)
-    points = np.empty((20, 11))
-    sample_clutter(places, own, common, 0.8, view_limits(camera, 1.0), points)
+    points = false_points(places, own, common, 0.8, view_limits(camera, 1.0))
     np.testing.assert_allclose(points[:, :3], rays * ahead[:, None], rtol=1e-12)
     np.testing.assert_allclose(points[:, 3:], looks / np.linalg.norm(looks, axis=1, keepdims=True), rtol=1e-12)
 

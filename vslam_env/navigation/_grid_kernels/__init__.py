@@ -1,4 +1,4 @@
-"""The compiled loops that write range readings, discs and other grids into the evidence of an `OccupancyGrid`."""
+"""The compiled loops that write range readings and discs into the evidence of an `OccupancyGrid`."""
 
 from vslam_env.navigation._grid_kernels.occupancy import (
     CELL,
@@ -7,6 +7,8 @@ from vslam_env.navigation._grid_kernels.occupancy import (
     HALF_WIDTH,
     LARGEST_HALF_WIDTH,
     LARGEST_SIZE,
+    MOST_FREE,
+    MOST_OCCUPIED,
     OCCUPIED,
     UNKNOWN,
     Grid,
@@ -14,8 +16,6 @@ from vslam_env.navigation._grid_kernels.occupancy import (
     cells_to_middle,
     is_occupied,
     margin_of,
-    merge_grid,
-    reach_of_merge,
     to_coordinate,
     to_index,
     widen_bounds,
@@ -30,6 +30,8 @@ __all__ = [
     "HALF_WIDTH",
     "LARGEST_HALF_WIDTH",
     "LARGEST_SIZE",
+    "MOST_FREE",
+    "MOST_OCCUPIED",
     "NUM_PAINT_ROWS",
     "OCCUPIED",
     "UNKNOWN",
@@ -40,8 +42,6 @@ __all__ = [
     "is_occupied",
     "margin_of",
     "mark_bump",
-    "merge_grid",
-    "reach_of_merge",
     "to_coordinate",
     "to_index",
     "update_from_scan",

@@ -1,10 +1,6 @@
-"""The compiled searches over the known part of a grid: where a disc fits, the cheapest ways, frontiers, candidates."""
+"""The compiled searches over the known part of a grid: where a disc fits, the cheapest ways, frontiers."""
 
-from vslam_env.navigation._planning_kernels.candidates import (
-    SAME_GOAL,
-    fill_slots,
-    update_slots,
-)
+from vslam_env.navigation._planning_kernels.costmap import PAD
 from vslam_env.navigation._planning_kernels.dijkstra import (
     GOAL_CELLS,
     UNREACHED,
@@ -13,21 +9,19 @@ from vslam_env.navigation._planning_kernels.dijkstra import (
     part_within,
     shorten_path,
 )
-from vslam_env.navigation._planning_kernels.frontiers import FrontierColumns, compute_frontiers
+from vslam_env.navigation._planning_kernels.frontiers import FrontierColumns, frontiers_reached
 from vslam_env.navigation._planning_kernels.path_lengths import lines_of_sight, path_lengths
 
 __all__ = [
     "GOAL_CELLS",
-    "SAME_GOAL",
+    "PAD",
     "UNREACHED",
     "FrontierColumns",
-    "compute_frontiers",
     "dijkstra",
-    "fill_slots",
+    "frontiers_reached",
     "lines_of_sight",
     "nearest_open",
     "part_within",
     "path_lengths",
     "shorten_path",
-    "update_slots",
 ]  # fmt: skip

@@ -69,9 +69,14 @@ def shorten_path(weights: Any, cost: Any, parent: Any, row: int, col: int) -> An
 
 STRAIGHT, DIAGONAL = 5, 7  # length of a step in fifths of a cell; 7/5 is 1 % short of the diagonal
 NUM_STRAIGHT = 4  # of the eight directions, the first ones
-ESCAPE_CELLS = 25  # a robot that a bump put into a wall's margin, or drift among walls, looks this far for open floor
-GOAL_CELLS = 2  # search radius for an open cell if the goal lies in an inflated wall
-ISLAND = 25  # fewer open cells that lead nowhere else (1 m^2) are no floor to begin at
+# numba compiles a kernel once more for each number of Python that is passed to it, and once for all of numpy's.
+ESCAPE_CELLS: Any = np.int64(
+    25
+)  # a robot that a bump put into a wall's margin, or drift among walls, looks this far for open floor
+GOAL_CELLS: Any = np.int64(2)  # search radius for an open cell if the goal lies in an inflated wall
+ISLAND: Any = np.int64(25)  # fewer open cells that lead nowhere else (1 m^2) are no floor to begin at
+ANY_CELL: Any = np.int64(1)  # an island will do
+NO_GOAL: Any = np.int64(-1)  # ways to all cells are wanted
 NUM_BUCKETS = 64  # a power of two above the dearest step, DIAGONAL * (CLOSE + CLOSE)
 UNREACHED = np.iinfo(np.int32).max
 
@@ -156,7 +161,7 @@ def wavefront(weights: Any, row: int, col: int, goal: int) -> tuple[Any, Any]:
         weights: (h, w) uint8, 0 = closed. The outermost cells must be closed.
         row: The first cell, open; -1 if there is none, and nothing is reached.
         col: Column of the first cell.
-        goal: Flat index of the only cell whose way is wanted; -1: the ways to all cells are.
+        goal: Flat index of the only cell whose way is wanted; `NO_GOAL`: the ways to all cells are.
 
     Returns:
         Cost (h, w) int32 of each cell, `UNREACHED` if there is no path; and the flat index (h, w) int32 of its parent,
@@ -268,12 +273,12 @@ def dijkstra(
     row = cell_index(min(max(y, -far), far), margin_of(size)) - first_row
     col = cell_index(min(max(x, -far), far), margin_of(size)) - first_col
     start_row, start_col = nearest_open(box, weights, row, col, ESCAPE_CELLS, ISLAND)
-    goal = -1
+    goal = NO_GOAL
     if not np.isnan(goal_x):
         row = cell_index(min(max(goal_y, -far), far), margin_of(size)) - first_row
         col = cell_index(min(max(goal_x, -far), far), margin_of(size)) - first_col
-        goal_row, goal_col = nearest_open(box, weights, row, col, GOAL_CELLS, 1)
-        goal = goal_row * box.shape[1] + goal_col if goal_row >= 0 else -1
+        goal_row, goal_col = nearest_open(box, weights, row, col, GOAL_CELLS, ANY_CELL)
+        goal = goal_row * box.shape[1] + goal_col if goal_row >= 0 else NO_GOAL
         start_row = start_row if goal >= 0 else -1  # nowhere to go
     cost, parents = wavefront(weights, start_row, start_col, goal)
     return box, weights, cost, parents, first_row, first_col

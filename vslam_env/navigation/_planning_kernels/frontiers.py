@@ -8,7 +8,7 @@ import numpy as np
 from slam_backend.core.jit import device, in_place, jit
 from slam_backend.core.validation import FloatArray
 from vslam_env.navigation._grid_kernels import CELL, FREE, HALF_WIDTH, UNKNOWN, margin_of
-from vslam_env.navigation._planning_kernels.dijkstra import UNREACHED, dijkstra
+from vslam_env.navigation._planning_kernels.dijkstra import UNREACHED
 
 MIN_CELLS = 3  # a robot needs 0.4 m; what is smaller is a speck or the corner of a wall
 MAX_CELLS = 20  # longer frontiers are cut, as one goal cannot stand for them
@@ -144,26 +144,17 @@ def _leave_out(mark: Any, x: float, y: float, row_centre: float, col_centre: flo
 
 
 @jit
-def compute_frontiers(cells: Any, bounds: Any, x: float, y: float, radius: float, ignored: Any) -> Any:
+def frontiers_reached(ways: tuple[Any, Any, Any, Any, int, int], grid_size: int, ignored: Any) -> Any:
     """Collect the frontiers to which a way is known.
 
     Args:
-        cells: (S, S) uint8. The grid; see `dijkstra` for the next arguments.
-        bounds: (4,) int32.
-        x: Place where the ways begin [m].
-        y: See `x`.
-        radius: Radius of the robot [m].
+        ways: Paths of `dijkstra`.
+        grid_size: Number of cells along a side of the grid.
         ignored: (n, 2) float64 [m]. Points around which, within `GIVEN_UP`, unknown cells do not count.
 
     Returns:
         (n, 5) float64 rows (x, y, heading, size, length), see `FrontierColumns`, by increasing length.
     """
-    return frontiers_reached(dijkstra(cells, bounds, x, y, radius, np.nan, np.nan, np.inf), len(cells), ignored)
-
-
-@jit
-def frontiers_reached(ways: tuple[Any, Any, Any, Any, int, int], grid_size: int, ignored: Any) -> Any:
-    """Collect the frontiers that paths of `dijkstra` over a grid of a size lead to; see `compute_frontiers`."""
     box, _, cost, parents, first_row, first_col = ways
     height, width = box.shape
     before, to_centre = parents.ravel(), 0.5 - margin_of(grid_size)
@@ -207,7 +198,8 @@ def frontiers_reached(ways: tuple[Any, Any, Any, Any, int, int], grid_size: int,
                             up, right = up + i - row, right + j - col
                 at = count
                 while at > 0 and frontiers[at - 1, LENGTH] > length:
-                    frontiers[at] = frontiers[at - 1]
+                    for i in range(NUM_COLUMNS):
+                        frontiers[at, i] = frontiers[at - 1, i]
                     at -= 1
                 frontiers[at, 0] = (first_col + col + to_centre) * CELL - HALF_WIDTH
                 frontiers[at, 1] = (first_row + row + to_centre) * CELL - HALF_WIDTH

@@ -7,7 +7,7 @@ import numpy as np
 
 from slam_backend.core.jit import in_place, jit
 from vslam_env.navigation._grid_kernels import CELL, OCCUPIED
-from vslam_env.navigation._planning_kernels.dijkstra import UNREACHED, wavefront
+from vslam_env.navigation._planning_kernels.dijkstra import NO_GOAL, UNREACHED, wavefront
 
 
 @jit
@@ -24,7 +24,7 @@ def path_lengths(weights: Any, starts: Any, goals: Any) -> Any:
     for i in range(len(starts)):
         if starts[i, 0] < 0:
             continue
-        cost, parents = wavefront(weights, starts[i, 0], starts[i, 1], -1)
+        cost, parents = wavefront(weights, starts[i, 0], starts[i, 1], NO_GOAL)
         before = parents.ravel()
         for j in range(len(goals)):
             row, col = goals[j]

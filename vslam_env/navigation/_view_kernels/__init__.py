@@ -7,17 +7,17 @@ from vslam_env.navigation._view_kernels.global_picture import (
     write_global_grid,
     write_global_grids,
 )
-from vslam_env.navigation._view_kernels.looks import merge_looks, paint_looks
+from vslam_env.navigation._view_kernels.looks import MOST_LOOKS, paint_looks
 from vslam_env.navigation._view_kernels.renewal import renew_candidates
 from vslam_env.navigation._view_kernels.view_gains import NUM_GAINS
 
 __all__ = [
     "COARSE",
+    "MOST_LOOKS",
     "NUM_COARSE",
     "NUM_DESCRIBED",
     "NUM_GAINS",
     "describe_candidates",
-    "merge_looks",
     "paint_looks",
     "renew_candidates",
     "write_global_grid",

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from slam_backend.core.jit import device, in_place, inline
-from vslam_env.navigation._grid_kernels import FREE, OCCUPIED, to_coordinate, to_index, widen_bounds
+from vslam_env.navigation._grid_kernels import FREE, OCCUPIED, to_index, widen_bounds
 
 MOST_LOOKS = 255
 LOOKED = 45  # looks at a border cell and its eight neighbours after which hardly a landmark there is missed
@@ -160,20 +160,3 @@ def paint_looks(
                 if 0 <= row < size and 0 <= col < size and (row != last_row or col != last_col):
                     count_looks_at(looks[owner], bounds[owner], row, col, 1)
                     last_row, last_col = row, col
-
-
-@in_place
-def merge_looks(looks: Any, bounds: Any, other: Any, others_bounds: Any, x: float, y: float, theta: float) -> None:
-    """Add the looks (S', S') uint8 of another grid, whose start pose in this one is (x, y, theta), to looks (S, S).
-
-    Bounds (4,) int32 of the part of either that is not zero are given, as in `GridStorage`; those of looks change.
-    """
-    c, s = math.cos(theta), math.sin(theta)
-    size, others = len(looks), len(other)
-    for other_row in range(others_bounds[0], others_bounds[2]):
-        for other_col in range(others_bounds[1], others_bounds[3]):
-            if other[other_row, other_col] > 0:
-                u, v = to_coordinate(other_col, others), to_coordinate(other_row, others)
-                row, col = to_index(y + s * u + c * v, size), to_index(x + c * u - s * v, size)
-                if 0 <= row < size and 0 <= col < size:
-                    count_looks_at(looks, bounds, row, col, other[other_row, other_col])

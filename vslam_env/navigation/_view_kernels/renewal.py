@@ -7,9 +7,15 @@ import numpy as np
 
 from slam_backend.core.jit import device, in_place, jit
 from vslam_env.navigation._grid_kernels import CELL, to_coordinate, to_index
-from vslam_env.navigation._planning_kernels.candidates import is_settled
 from vslam_env.navigation._planning_kernels.costmap import PAD
-from vslam_env.navigation._planning_kernels.dijkstra import ESCAPE_CELLS, ISLAND, UNREACHED, nearest_open, wavefront
+from vslam_env.navigation._planning_kernels.dijkstra import (
+    ESCAPE_CELLS,
+    ISLAND,
+    NO_GOAL,
+    UNREACHED,
+    nearest_open,
+    wavefront,
+)
 from vslam_env.navigation._planning_kernels.frontiers import HEADING, LENGTH, SIZE, X, Y
 from vslam_env.navigation._view_kernels.looks import MOST_LOOKS, is_border, lack_of_looks
 from vslam_env.navigation._view_kernels.revisits import APART, AT_GOAL, add_revisits, collect_targets, keep_revisits
@@ -150,7 +156,7 @@ def measure_teammates(
         start_row, start_col = nearest_open(box, weights, row, col, ESCAPE_CELLS, ISLAND)
         if not (0 < start_row // 2 < height - 1 and 0 < start_col // 2 < width - 1):
             continue
-        cost, parents = wavefront(wide, start_row // 2, start_col // 2, -1)
+        cost, parents = wavefront(wide, start_row // 2, start_col // 2, NO_GOAL)
         flat = parents.ravel()
         for i in range(len(rows)):
             if np.isnan(rows[i, X]):
@@ -171,7 +177,7 @@ def measure_teammates(
 def renew_candidates(
     cells: Any, bounds: Any, seen: tuple[Any, Any], ways: tuple[Any, Any, Any, Any, int, int],
     landmarks: tuple[Any, Any, Any], poses: Any, camera: Any, places: Any,
-    slots: tuple[Any, Any, Any, Any, Any, int, int],
+    slots: tuple[Any, Any, Any, Any, Any, Any, int, int],
 ) -> None:  # fmt: skip
     """Bring a robot's candidates up to date, given its frontiers.
 
@@ -181,20 +187,21 @@ def renew_candidates(
         seen: Looks of the grid (S, S) uint8, of which those at walls that cannot be seen are set to the largest number;
             and their bounds (4,) int32, see `TeamLooks`.
         ways: Paths from the robot, of `dijkstra`. Where they cover a part of the known floor, candidates of which they
-            tell nothing (`is_settled`) stay as they are.
+            tell nothing (`untold`) stay as they are.
         landmarks: All landmarks of the robot's map (n, 4), their counts (n, 2), and the motion (3,) from the map frame
             to the start frame; see `MapSummaryRows`.
         poses: (K, 3) [m, m, rad]. Poses of all robots in the robot's frame; NaN: unknown.
         camera: (3,). Half the field of view [rad], range [m], radius of the robot [m].
         places: (R, 3) [m, m, rad]. Places for rendezvous; NaN: none.
         slots: Candidates (C, 5): first frontiers, which are given, then V revisit ones, then R rendezvous, NaN in empty
-            slots; visits (V,) int64 of the revisit ones; gains (C, 4), see `view_gains` and `path_lengths_to`; the
-            poses (C, 3) for which they were computed; lengths (C, K) [m] of all robots' paths, inf: unknown or
-            unreachable; all changed; the row of the robot in `poses`; the number of the update: the gains of a
-            candidate that stays are computed in every fourth one, new places to look from are sought in every second.
+            slots; the mask (C,) of those that stay as they are; visits (V,) int64 of the revisit ones; gains (C, 4),
+            see `view_gains` and `path_lengths_to`; the poses (C, 3) for which they were computed; lengths (C, K) [m] of
+            all robots' paths, inf: unknown or unreachable; all changed; the row of the robot in `poses`; the number of
+            the update: the gains of a candidate that stays are computed in every fourth one, new places to look from
+            are sought in every second.
     """
     looks, _ = seen
-    rows, visits, gains, views, lengths, robot, update = slots
+    rows, distant, visits, gains, views, lengths, robot, update = slots
     size, num_places = len(cells), len(places)
     first_revisit, first_rendezvous = len(rows) - num_places - len(visits), len(rows) - num_places
     box, weights, cost, parents, first_row, first_col = ways
@@ -205,12 +212,6 @@ def renew_candidates(
     is_part = False
     for i in range(4):
         is_part |= part[i] != bounds[i]
-    distant = np.zeros(len(rows), np.bool_)
-    if is_part:
-        for i in range(len(rows)):
-            if not np.isnan(rows[i, X]):
-                row, col = to_index(rows[i, Y], size), to_index(rows[i, X], size)
-                distant[i] = not is_settled(weights, cost, corner, bounds, row, col)
     weak, sure = worth_seeing(cells, looks, part, *landmarks)
 
     revisits = rows[first_revisit:first_rendezvous]
@@ -246,4 +247,4 @@ def renew_candidates(
         is_near = moved < MOVED and math.cos(rows[i, HEADING] - views[i, HEADING]) > math.cos(TURNED)
         if not is_near or (i % RECHECKED == update % RECHECKED and not distant[i]):
             view_gains(cells, looks, weak, rows[i], camera, gains[i])
-            views[i] = rows[i, :3]
+            views[i, 0], views[i, 1], views[i, 2] = rows[i, X], rows[i, Y], rows[i, HEADING]

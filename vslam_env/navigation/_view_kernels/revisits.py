@@ -186,7 +186,9 @@ def add_revisits(cells: Any, cost: Any, corner: Any, camera: Any, targets: Any, 
     left, empty = 0, 0
     for t in range(len(values)):  # only what is not covered yet
         if values[t] > 0.0:
-            targets[left], values[left] = targets[t], values[t]
+            values[left] = values[t]
+            for i in range(targets.shape[1]):
+                targets[left, i] = targets[t, i]
             left += 1
     for i in range(len(rows)):
         empty += np.isnan(rows[i, X])

@@ -65,7 +65,7 @@ def view_gains(cells: Any, looks: Any, weak: Any, view: Any, camera: Any, gains:
     for k in range(rays):
         angle = view[2] - half_fov + (k + 0.5) * width
         c, s = math.cos(angle), math.sin(angle)
-        last_row = last_col = -1
+        last_row, last_col = int(start_row) - inset, int(start_col) - inset
         for i in range(steps + 1):
             row, col = int(start_row + i * s) - inset, int(start_col + i * c) - inset
             inside = 1 <= row < size - 1 and 1 <= col < size - 1

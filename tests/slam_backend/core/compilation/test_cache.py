@@ -202,6 +202,7 @@ def test_who_may_write_to_a_folder(user: int, mode: int, is_own: bool, expected:
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_files_of_older_sources_are_removed(tmp_path: Path) -> None:
     """An edited kernel leaves one file, as do other signatures."""
     for number in (1, 1, 2):
@@ -270,6 +271,7 @@ def _run_edited(folder: Path, number: float, first: str = "", body: str = "throu
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("first", "body"),
     [

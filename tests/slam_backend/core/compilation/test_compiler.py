@@ -105,6 +105,7 @@ def test_a_process_compiles_what_the_cache_lacks(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_damaged_files_are_missing(tmp_path: Path) -> None:
     """A file that is truncated counts as not kept."""
     program(tmp_path)

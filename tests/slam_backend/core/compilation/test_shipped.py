@@ -89,6 +89,7 @@ def site(wheel: Path, tmp_path: Path) -> Path:
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_a_wheel_is_tagged_and_pinned(wheel: Path) -> None:
     """It fits one Python, platform, numba and llvmlite, and holds one file per recorded signature."""
     here = versions()
@@ -105,6 +106,7 @@ def test_a_wheel_is_tagged_and_pinned(wheel: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.skipif(not IS_LEVEL, reason=f"this processor is below {LEVEL}")
 def test_shipped_kernels_compile_nothing_and_give_the_same_bytes(site: Path, tmp_path: Path) -> None:
     """From an installation that is only read, and a cache that cannot be written, with nothing to say.
@@ -127,6 +129,7 @@ def test_shipped_kernels_compile_nothing_and_give_the_same_bytes(site: Path, tmp
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_the_order_of_compilation_decides_nothing(tmp_path: Path) -> None:
     """Kernels compiled backwards, by one process, give the bytes of those that several processes compile forwards."""
     names = [name for name in recorded_signatures("slam_backend") if name.startswith(PART)]
@@ -138,6 +141,7 @@ def test_the_order_of_compilation_decides_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.skipif(not IS_LEVEL, reason=f"this processor is below {LEVEL}")
 def test_stale_damaged_or_unwanted_kernels_are_not_used(site: Path, tmp_path: Path) -> None:
     """A file that is damaged and a manifest that does not fit are one line each; a chosen processor is obeyed."""
