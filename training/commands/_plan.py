@@ -172,7 +172,7 @@ def verify_rows(call: Call[ExplorationBenchConfig], folder: Path, count: int, wo
     from training.bench.exploration.verification import HEADINGS, choose, compare, keep, table_rows
     from training.experiments.numerics import variables_for
     from training.experiments.policy_names import check_named
-    from training.experiments.run_folder import CONFIG_FILE, RunFolder, installed_versions, read_config
+    from training.experiments.run_folder import CONFIG_FILE, read_config
     from training.experiments.statistics import grouped
     from training.experiments.tables import console_table
     from training.experiments.trial_store import FAILED, finished_trials, run_in_processes, trial_of
@@ -186,7 +186,7 @@ def verify_rows(call: Call[ExplorationBenchConfig], folder: Path, count: int, wo
         bench, kind = PlanBench(plan, float(values["decision_limit"])), PlanTrial
     else:
         bench = ExplorationBenchConfig.from_mapping(values | {"seed": seed})
-    stored = finished_trials(RunFolder(folder, COMMAND, values, seed, installed_versions()), TRIALS_FILE, kind)
+    stored = finished_trials(folder / TRIALS_FILE, kind)
     chosen = choose(list(stored.values()) or kept_episodes(folder) or [], count, np.random.default_rng())
     if not chosen or any("digest" not in row for row in chosen):
         hint = f"Check {str(folder / CONFIG_FILE)!r}, or play its episodes again with this release."

@@ -83,9 +83,19 @@ def run_trial_sets(
     Returns:
         Rows of all finished trials of each part, in the order of the trials.
     """
+    from training.experiments.trial_store import owned
+
+    with owned(folder.path):
+        return _run_owned(console, folder, parts, timed)
+
+
+def _run_owned(
+    console: Console, folder: "RunFolder", parts: Sequence[TrialSet], timed: bool
+) -> list[list[dict[str, Any]]]:
+    """Run the missing trials of a folder that no other process uses; see `run_trial_sets`."""
     from training.experiments.trial_store import FAILED, finished_trials, run_trials, trial_of
 
-    kept = [finished_trials(folder, part.file, part.kind) for part in parts]
+    kept = [finished_trials(folder.path / part.file, part.kind) for part in parts]
     total = sum(part.cost(trial) for part in parts for trial in part.trials)
     done = sum(part.cost(t) for part, found in zip(parts, kept, strict=True) for t in part.trials if t in found)
     stored, wanted = sum(map(len, kept)), sum(len(part.trials) for part in parts)

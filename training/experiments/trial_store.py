@@ -2,20 +2,26 @@
 
 import json
 import os
+import pickle
+import traceback
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
 from multiprocessing import active_children, get_context
 from pathlib import Path
 from typing import Any, TypeVar
 
-from slam_backend.core.files import append_text
+from filelock import FileLock, Timeout
+
+from slam_backend.core.files import append_text, write_file
 from slam_backend.core.text_files import read_text
 from slam_backend.core.validation import argument_error
 from training.experiments.cluster import SINGLE_THREAD, connected
 from training.experiments.interrupt import begin_worker, signals_held
 from training.experiments.run_folder import CONFIG_FILE, RunFolder, installed_versions, plain, read_config
 
+LOCK_FILE = ".lock"  # in a run folder: held by the process that adds to it
 FAILED = "failed"  # field of the row of a trial without a result: the error, in one line
 
 TrialT = TypeVar("TrialT")
@@ -41,33 +47,62 @@ def open_folder(out: Path | None, command: str, config: Mapping[str, Any], seed:
     return RunFolder(out, command, values, seed, installed_versions())
 
 
-def finished_trials(folder: RunFolder, name: str, kind: type[TrialT]) -> dict[TrialT, dict[str, Any]]:
-    """Read the trials in a folder; a truncated last line is dropped, and removed from the file.
+def finished_trials(file: Path, kind: type[TrialT]) -> dict[TrialT, dict[str, Any]]:
+    """Read the rows of finished trials; a last line that was cut short is left out. The file is not changed.
 
     Args:
+        file: File of rows; it may not exist yet.
         kind: Frozen dataclass of the trials; a row contains its fields and the metrics.
 
     Raises:
-        ValueError: If a line is not such a row.
+        ValueError: If another line is not such a row; the text names it.
     """
-    file = folder.path / name
-    if not file.is_file():
-        return {}
-    rows = []
-    for line in read_text(file, "out", "a file of trials").splitlines():
+    trials: dict[TrialT, dict[str, Any]] = {}
+    lines = read_text(file, "out", "a file of trials").splitlines(keepends=True) if file.is_file() else []
+    for count, line in enumerate(lines, start=1):
         try:
-            rows.append(json.loads(line))
-        except json.JSONDecodeError:
-            break
-        except RecursionError:
-            rows.append(None)
-    try:
-        trials = {trial_of(row, kind): row for row in rows}
-    except (KeyError, TypeError, ValueError) as error:
-        hint = f"Remove {str(file)!r}, or choose another folder. Error: {error}."
-        raise argument_error("out", "trials of an earlier run", "a file with other content", hint) from error
-    folder.write_text(name, "".join(json.dumps(row) + "\n" for row in rows))
+            row = json.loads(line)
+            trials[trial_of(row, kind)] = row
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
+            if count == len(lines) and not line.endswith("\n") and isinstance(error, json.JSONDecodeError):
+                break
+            hint = f"Remove line {count} of {str(file)!r}, whose trial is then repeated, or choose another folder."
+            raise argument_error("out", "a trial in each line", f"a damaged line {count}", hint) from error
     return trials
+
+
+@contextmanager
+def owned(folder: Path) -> Iterator[None]:
+    """Keep other processes from resuming a run folder meanwhile.
+
+    Raises:
+        ValueError: If another process does so; or the folder cannot be written.
+    """
+    lock = FileLock(folder / LOCK_FILE)
+    try:
+        lock.acquire(blocking=False)
+    except Timeout as error:
+        hint = "Wait for it, or choose another folder."
+        raise argument_error("out", "a folder that no process uses", "a folder with a running command", hint) from error
+    except OSError as error:
+        hint = f"Check its permissions. The system says: {error.strerror}."
+        raise argument_error("out", "a folder that can be written", str(folder), hint) from error
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def _end_last_line(file: Path) -> None:
+    """Complete the last line of a file of rows, or remove it if it was cut short."""
+    if file.is_file() and (text := read_text(file, "out", "a file of trials")) and not text.endswith("\n"):
+        *_, last = text.splitlines()
+        try:
+            json.loads(last)
+        except json.JSONDecodeError:
+            write_file(file, text.removesuffix(last), "out")
+        else:
+            append_text(file, "\n", "out")
 
 
 def trial_of(row: Mapping[str, Any], kind: type[TrialT]) -> TrialT:
@@ -92,8 +127,10 @@ def run_trials(
         variables: Variables of the environment of the processes that run the trials.
 
     Raises:
-        ValueError: If a row cannot be written, or the cluster cannot be reached; earlier rows are kept.
+        ValueError: If a row cannot be written, the cluster cannot be reached, or a process was killed; earlier rows are
+            kept.
     """
+    _end_last_line(folder.path / name)
     going = _until(interrupted, trials)
     if cluster is not None:
         played = _over_cluster(play, going, cluster, variables)
@@ -143,12 +180,16 @@ def run_in_processes(
             running: set[Future[dict[str, Any]]] = set()
             for trial in trials:
                 with signals_held():
-                    running.add(pool.submit(play, trial))  # starts a process if there are fewer than the maximum
+                    running.add(pool.submit(_play_one, play, trial))  # starts a process if there is room for one
                 while len(running) >= workers:
                     done, running = wait(running, return_when=FIRST_COMPLETED)
                     yield from (future.result() for future in done)
             for future in running:
                 yield future.result()
+        except BrokenProcessPool as error:
+            hint = "The same command with --out FOLDER goes on; with fewer --workers it needs less memory."
+            got = "a process that was killed"
+            raise argument_error("workers", "processes that run to their end", got, hint) from error
         except BaseException:
             for process in set(active_children()) - others:
                 process.kill()
@@ -182,8 +223,17 @@ def _over_cluster(
 
 
 def _play_one(play: Callable[[TrialT], dict[str, Any]], trial: TrialT) -> dict[str, Any]:
-    """Run a trial in a process of a cluster."""
-    return play(trial)
+    """Run a trial in another process. Its errors arrive as they are, or as text if they cannot be sent."""
+    try:
+        return play(trial)
+    except Exception as error:
+        try:
+            pickle.loads(pickle.dumps(error))
+        except Exception:  # of any kind: its class may do anything
+            text = "".join(traceback.format_exception(error))
+        else:
+            raise
+    raise RuntimeError(f"{trial}: {text}")
 
 
 @contextmanager

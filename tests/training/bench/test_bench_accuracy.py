@@ -190,13 +190,13 @@ def test_finished_trials_are_kept(tmp_path: Path, rows: list[dict[str, Any]]) ->
     file = folder.path / TRIALS_FILE
     file.write_text(file.read_text()[:-20])
     again = _open(tmp_path / "bench", SMALL)
-    kept = finished_trials(again, TRIALS_FILE, Trial)
+    kept = finished_trials(again.path / TRIALS_FILE, Trial)
     assert list(kept) == SMALL.trials()[:2]
     rest: list[dict[str, Any]] = []
     left = [trial for trial in SMALL.trials() if trial not in kept]
     run_trials(again, TRIALS_FILE, play, left, 1, lambda: False, rest.append)
     assert len(rest) == len(rows) - 2
-    assert list(finished_trials(again, TRIALS_FILE, Trial)) == SMALL.trials()
+    assert list(finished_trials(again.path / TRIALS_FILE, Trial)) == SMALL.trials()
     for line, row in zip(file.read_text().splitlines(), rows, strict=True):
         assert json.loads(line)["pose_rms_m"] == row["pose_rms_m"]
 

@@ -54,7 +54,7 @@ def test_trials_of_a_lost_node_are_run_again(cluster: Any, tmp_path: Path) -> No
     assert not cluster.worker_nodes  # both nodes ran trials
     assert sorted(row["square"] for row in rows) == [number**2 for number in range(12)]
     assert {row["threads"] for row in rows} == {"1"}
-    assert set(finished_trials(folder, "trials.jsonl", Waiting)) == set(trials)
+    assert set(finished_trials(folder.path / "trials.jsonl", Waiting)) == set(trials)
     with pytest.raises(ValueError, match="number: expected an int >= 0"):
         run_trials(folder, "bad.jsonl", wait_and_square, [Waiting(-1)], 1, lambda: False, on_trial, cluster.address)
 

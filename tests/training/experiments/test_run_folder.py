@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from slam_backend.trajectory import Trajectory
 from training.experiments.run_folder import METRICS_FILE, RunFolder, plain, read_config, read_versions
-from training.experiments.trial_store import finished_trials
 
 
 @dataclass(frozen=True)
@@ -142,16 +141,3 @@ def test_a_folder_of_another_format_is_refused(tmp_path: Path) -> None:
     file.write_text(text.replace("format = 1", "format = 7", 1))
     with pytest.raises(ValueError, match=r"config: expected one of format 1, got a run folder of format 7\. Use the"):
         read_config(folder.path, "run")
-
-
-def test_invalid_stored_trials_are_refused(tmp_path: Path) -> None:
-    """A truncated line is dropped; a line that is not a trial is reported, and the file is unchanged."""
-    folder = RunFolder.create(tmp_path / "run", "run", {}, 1)
-    file = folder.path / "trials.jsonl"
-    file.write_text('{"seed": 1, "figure": 2}\n{"seed": 2, "fig')
-    assert finished_trials(folder, file.name, Trial) == {Trial(1): {"seed": 1, "figure": 2}}
-    for line in ("[]", "3", '{"figure": 2}', "[" * 100_000, '{"seed": [1]}'):
-        file.write_text(line + "\n")
-        with pytest.raises(ValueError, match="out: expected trials of an earlier run"):
-            finished_trials(folder, file.name, Trial)
-        assert file.read_text() == line + "\n"
