@@ -125,14 +125,19 @@ def options(
 
 
 def main() -> None:
-    """Run the command line; bad input gives one line on stderr and exit status 2.
+    """Run the command line."""
+    run(app, "vslam")
+
+
+def run(app: typer.Typer, name: str) -> None:
+    """Run commands under a name; bad input gives one line on stderr and exit status 2.
 
     A command stopped by SIGINT or SIGTERM, at once or after finishing its current work, exits with 128 + signal number.
     """
     os.environ["MPLBACKEND"] = "agg"  # that of a notebook may not exist here; matplotlib reads it when it is imported
     with signals_answered() as handler:
         try:
-            app(prog_name="vslam")
+            app(prog_name=name)
         except SystemExit as end:
             if handler.number is None or end.code == BAD_INPUT:
                 raise

@@ -28,7 +28,6 @@ from training.replay.config import MRCLAM, log_path
 
 if TYPE_CHECKING:  # numerical modules are imported when a command runs, so that --help is fast
     from training.bench.accuracy.trials import Trial as AccuracyTrial
-    from training.bench.alignment.trials import Trial as AlignmentTrial
     from training.bench.env.bench import EnvLoad
     from training.bench.filter.workload import FilterLoad
     from training.episodes.config import RunConfig
@@ -37,12 +36,6 @@ if TYPE_CHECKING:  # numerical modules are imported when a command runs, so that
 
 Method = Literal["dead_reckoning", "batch_ml", "ideal_online", "fastslam1", "fastslam2", "fastslam2+existence",
                  "fastslam2+rejuvenation"]  # fmt: skip
-AlignmentMethod = Literal["ransac", "svd", "icp", "impicp"]
-# (overlap, outliers): of 200 landmarks in each map, 20 true pairs allow up to 180 wrong ones, 200 allow none.
-GRID = (
-    (1.0, 0.0), (0.5, 0.0), (0.5, 0.5), (0.25, 0.0), (0.25, 0.5), (0.25, 0.75), (0.1, 0.0), (0.1, 0.5), (0.1, 0.8),
-    (0.1, 0.9),
-)  # fmt: skip
 ORACLES = ("pose", "association", "merge")
 NO_ORACLE, ALL_ORACLES = "none", "all"
 ANY_SPLIT = "any"
@@ -253,36 +246,6 @@ def _portable_policy(text: Any) -> Any:
 
     label, policy = parted_label(text) if isinstance(text, str) else ("", text)
     return text if not is_model(policy) else f"{label}{'=' if label else ''}{Path(policy).resolve()}"
-
-
-class AlignmentBenchConfig(ExperimentConfig):
-    """Alignment benchmark: a grid of cells, and the hard sets U and I, whose trials are divided among their cases."""
-
-    methods: tuple[AlignmentMethod, ...] = option(
-        ("ransac", "svd", "icp", "impicp"),
-        "Methods: ransac, svd, icp, impicp.",
-        shown="all",
-    )
-    seeds: int = option(500, "Number of trials of each grid cell and method.", ge=1, hint="Use at least one trial.")
-    hard: int = option(1000, "Number of trials of each hard set and method.", ge=0, hint="Use 0 to omit the hard sets.")
-    seed: int = first_seed()
-
-    def trials(self) -> list["AlignmentTrial"]:
-        """Return all trials, with trials on the same maps in succession."""
-        from training.bench.alignment.trials import Trial, cases
-
-        grid = [
-            Trial(kind="grid", case="", overlap=overlap, outliers=outliers, method=method, seed=self.seed + i)
-            for (overlap, outliers), i, method in product(GRID, range(self.seeds), self.methods)
-        ]
-        kinds: tuple[Literal["U", "I"], ...] = ("U", "I")
-        return grid + [
-            Trial(
-                kind=kind, case=cases(kind)[i % len(cases(kind))], overlap=0.0, outliers=0.0, method=method,
-                seed=self.seed + i,
-            )
-            for kind, i, method in product(kinds, range(self.hard), self.methods)
-        ]  # fmt: skip
 
 
 class MrclamPairsConfig(ExperimentConfig):

@@ -9,7 +9,6 @@ import typer
 
 from training.bench.config import (
     AccuracyConfig,
-    AlignmentBenchConfig,
     EnvBenchConfig,
     EpisodeTrial,
     ExplorationBenchConfig,
@@ -367,34 +366,12 @@ def bench_train(call: Call[TrainBenchConfig]) -> None:
     call.finish()
 
 
-@bench.command("alignment")
-@options(
-    AlignmentBenchConfig, "bench alignment", continues=True, quick={"seeds": 10, "hard": 45},
-    quick_help="10 trials of each grid cell, 45 of each hard set.",
-)  # fmt: skip
-def bench_alignment(call: Call[AlignmentBenchConfig]) -> None:
-    """Compare alignment methods on simulated maps: success rate, error over the Cramer-Rao bound, and time.
+@bench.command("alignment", hidden=True, context_settings={"ignore_unknown_options": True})
+def bench_alignment(arguments: Annotated[list[str] | None, typer.Argument()] = None) -> None:
+    """Say where the study of alignment has gone."""
+    from slam_backend.core.validation import argument_error
 
-    The grid varies the share of common landmarks and of wrong similar pairs; U: maps that must not be aligned; I: maps
-    that can barely be aligned. One process with one thread, for comparable times. Ctrl-C finishes the current trial
-    and summarises the finished ones; the same command with --out FOLDER resumes the run.
-    """
-    from training.bench.alignment.report import draw_alignment, markdown, print_tables, summarise
-    from training.bench.alignment.trials import TRIALS_FILE, Trial, play
-    from training.experiments.run_folder import plain
-
-    console, folder = call.begin()
-    part = TrialSet(
-        file=TRIALS_FILE, kind=Trial, play=play, trials=call.config.trials(),
-        tell=lambda row: f"{row['kind']} {row['case']}".strip(),
-    )  # fmt: skip
-    (rows,) = run_trial_sets(console, folder, part, timed=True)
-    lines = plain(summarise(rows))
-    print_tables(console, lines)
-    call.write({"summary": lines})
-    folder.write_text("tables.md", markdown(lines))
-    draw_alignment(folder.path / "alignment.png", lines)
-    call.finish()
+    raise argument_error("bench", "another command", "alignment", "In a clone: python -m studies.alignment.")
 
 
 @bench.command("mrclam")

@@ -1,4 +1,6 @@
 import json
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -7,7 +9,8 @@ import pytest
 
 from slam_backend.geometry import transform_points
 from slam_backend.maps.alignment import AlignmentOptions, align_maps, candidate_matches
-from training.bench.alignment.map_pairs import (
+from studies.alignment import GRID, STUDY, Config, Trial, play, trials
+from studies.map_pairs import (
     IDENTIFIABLE,
     LANDMARKS,
     LEAST_SPREAD,
@@ -17,9 +20,6 @@ from training.bench.alignment.map_pairs import (
     draw_pair,
     draw_unalignable,
 )
-from training.bench.alignment.report import summarise
-from training.bench.alignment.trials import Trial, play
-from training.bench.config import GRID, AlignmentBenchConfig
 
 
 @pytest.mark.parametrize(("overlap", "outliers"), GRID)
@@ -97,47 +97,60 @@ def refusal(reason: str, **changed: Any) -> dict[str, Any]:
 def test_errors_are_relative_to_the_bound_and_refusals_are_failures() -> None:
     """Errors are RMS over the root of the mean bound; a refused trial is a failure without error."""
     rows = [row(), row(error_m=0.04, error_rad=0.003), refusal("ambiguous")]
-    line = summarise(rows)[0]
-    assert line["right"] == pytest.approx(2 / 3)
-    assert line["translation"] == pytest.approx(np.sqrt(0.5 * (0.02**2 + 0.04**2)) / 0.02)
-    assert line["rotation"] == pytest.approx(np.sqrt(5.0))
-    assert line["reasons"] == {"ambiguous": 1}
-    assert line["anees"] == 1.0
-    assert line["anees_low"] < 1.0 < line["anees_high"]
+    line, pooled = STUDY.tables[0].lines(rows)
+    assert line["right [%]"].value == pytest.approx(2 / 3)
+    assert line["translation/bound"].value == pytest.approx(np.sqrt(0.5 * (0.02**2 + 0.04**2)) / 0.02)
+    assert line["rotation/bound"].value == pytest.approx(np.sqrt(5.0))
+    anees = line["ANEES (consistent)"]
+    assert anees.low < anees.value == 1.0 < anees.high
+    assert pooled == line | {"overlap": "all", "outliers": "all"}
+    refused, _ = STUDY.tables[1].lines([row | {"kind": "U", "case": "mirrored map"} for row in rows])
+    assert refused["refused for"].value == "ambiguous 1"
+    assert refused["accepted"].value == "2 of 3"
 
 
 def test_a_trial_repeats() -> None:
     """The same trial gives the same results, except times, whatever ran before it."""
     trial = Trial(kind="I", case="area", overlap=0.0, outliers=0.0, method="impicp", seed=103)
-    first = play(trial)
-    play(Trial(kind="U", case="half alike", overlap=0.0, outliers=0.0, method="svd", seed=9))
-    again = play(trial)
+    first = play(Config(), trial)
+    play(Config(), Trial(kind="U", case="half alike", overlap=0.0, outliers=0.0, method="svd", seed=9))
+    again = play(Config(), trial)
     assert first.keys() == again.keys()
     assert all(first[name] == again[name] for name in first if "seconds" not in name)
 
 
 def test_all_methods_have_the_same_trials() -> None:
     """Trials are ordered by cell and seed, each once for each method; U and I never share the maps of a seed."""
-    config = AlignmentBenchConfig(methods=("ransac", "icp"), seeds=3, hard=10, seed=100)
-    trials = config.trials()
-    assert len(trials) == len(set(trials)) == 2 * (3 * len(GRID) + 20)
-    assert {trial.case for trial in trials if trial.kind == "I"} == set(IDENTIFIABLE)
-    assert AlignmentBenchConfig.from_mapping(config.to_mapping() | {"seed": 100}) == config
+    config = Config(methods=("ransac", "icp"), seeds=3, hard=10, seed=100)
+    played = trials(config)
+    assert len(played) == len(set(played)) == 2 * (3 * len(GRID) + 20)
+    assert {trial.case for trial in played if trial.kind == "I"} == set(IDENTIFIABLE)
+    assert Config.from_mapping(config.to_mapping() | {"seed": 100}) == config
 
 
-def test_the_command_writes_tables_figure_and_trials(vslam: Any, tmp_path: Path) -> None:
-    """A small benchmark writes its tables; when resumed in the same folder, no trial runs twice."""
-    out, copy = tmp_path / "bench", tmp_path / "copy.json"
-    options = ("--methods", "ransac,icp", "--seeds", "1", "--hard", "9", "--first-seed", "100", "--out", str(out))
-    said = vslam("bench", "alignment", *options, "--json", str(copy))
-    assert said.status == 0
-    assert "Maps that can barely be aligned" in said.out
-    metrics = json.loads((out / "metrics.json").read_text())
-    assert metrics == json.loads(copy.read_text())
+def test_the_program_writes_tables_chart_and_trials(tmp_path: Path) -> None:
+    """A small study writes its tables; when resumed in the same folder, no trial runs twice."""
+    out = tmp_path / "study"
+    program = [sys.executable, "-m", "studies.alignment", "--methods", "ransac,icp", "--seeds", "1", "--hard", "9"]
+    program += ["--first-seed", "100", "--out", str(out)]
+    said = subprocess.run([*program, "--json", "-"], capture_output=True, text=True, check=True)
+    assert "Maps that can barely be aligned" in said.stderr
+    assert json.loads(said.stdout) == json.loads((out / "metrics.json").read_text())
     assert (out / "alignment.png").stat().st_size > 10_000
-    assert "| 10 % | 90 % | ransac | 100.0 |" in (out / "tables.md").read_text()
-    trials = (out / "trials.jsonl").read_text()
-    assert len(trials.splitlines()) == 2 * (len(GRID) + 18)
-    assert vslam("bench", "alignment", *options).status == 0
-    assert (out / "trials.jsonl").read_text() == trials
-    assert "bench alignment" in (out / "config.toml").read_text()
+    assert "| 10 % | 90 % | ransac | 100 |" in (out / "tables.md").read_text()
+    assert "case,method,accepted,refused for" in (out / "unalignable.csv").read_text()
+    rows = (out / "trials.jsonl").read_text()
+    assert len(rows.splitlines()) == 2 * (len(GRID) + 18)
+    assert subprocess.run(program, capture_output=True, check=True).returncode == 0
+    assert (out / "trials.jsonl").read_text() == rows
+    assert "studies alignment" in (out / "config.toml").read_text()
+
+
+def test_the_old_command_names_the_program() -> None:
+    """It is one line, whatever options it is given."""
+    said = subprocess.run(
+        [sys.executable, "-m", "vslam_env", "bench", "alignment", "--seeds", "3"], capture_output=True, text=True,
+        check=False,
+    )  # fmt: skip
+    assert said.returncode == 2
+    assert said.stderr == "error bench: expected another command, got 'alignment'. In a clone: python -m studies.alignment.\n"

@@ -1,0 +1,228 @@
+"""Studies: trials that are played once each, and the tables and the chart that sum them up, declared once.
+
+>>> from dataclasses import dataclass
+>>> rows = [{"method": "icp", "seed": seed, "error_m": 0.1 * (1 + seed)} for seed in range(3)]
+>>> table = ResultTable(name="errors", title="Errors", by=("method",), columns=(
+...     Column("error_m", digits=2, interval=True), Column("error_m", "worst [m]", statistic="worst", digits=2),
+... ))
+>>> [line] = table.lines(rows)
+>>> table.headings, table.cells(line)
+(['method', 'error [m]', 'worst [m]'], ['icp', '0.20 (0.10 .. 0.30)', '0.30'])
+"""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Generic, NamedTuple, TypeVar
+
+import numpy as np
+
+from training.experiments.config import ExperimentConfig
+from training.experiments.statistics import grouped, interval
+from training.experiments.tables import csv_text, in_words, number, titled_markdown
+
+Row = Mapping[str, Any]
+ConfigT = TypeVar("ConfigT", bound=ExperimentConfig)
+TrialT = TypeVar("TrialT")
+ALL = "all"  # cell of a field over whose values a line is pooled
+
+
+class Estimate(NamedTuple):
+    """A statistic of some rows, and the ends of its interval, if it has one."""
+
+    value: Any
+    low: float | None = None
+    high: float | None = None
+
+
+STATISTICS: dict[str, Callable[..., Any]] = {
+    "mean": np.mean, "median": np.median, "worst": np.max, "sum": np.sum,
+    "p95": lambda values, axis=None: np.quantile(values, 0.95, axis=axis),
+}  # fmt: skip
+Statistic = str | Callable[[Sequence[Row]], Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """Column of a table, and quantity of a panel.
+
+    Attributes:
+        name: Field of the rows, or name of the quantity if `statistic` is a function.
+        heading: Heading with its unit; empty: that of `training.experiments.tables.WORDS`, or the name in words.
+        statistic: A name in `STATISTICS`, over the values of the rows that have one; or a function of the rows, which
+            returns a number, a text or an `Estimate`, None if there is none.
+        digits: Digits after the point.
+        factor: Factor of the values shown; None: that of the unit.
+        interval: Whether a 95 % bootstrap interval over the rows is shown.
+    """
+
+    name: str
+    heading: str = ""
+    statistic: Statistic = "mean"
+    digits: int = 3
+    factor: float | None = None
+    interval: bool = False
+
+    @property
+    def title(self) -> str:
+        """Heading with its unit."""
+        words, unit, _ = in_words(self.name)
+        return self.heading or (f"{words} [{unit}]" if unit else words)
+
+    def estimate(self, rows: Sequence[Row]) -> Estimate:
+        """Return the statistic of some rows."""
+        if not isinstance(self.statistic, str):
+            found = self.statistic(rows)
+            return found if isinstance(found, Estimate) else Estimate(found)
+        values = np.array([row[self.name] for row in rows if row.get(self.name) is not None], np.float64)
+        if not len(values):
+            return Estimate(None)
+        statistic = STATISTICS[self.statistic]
+        return Estimate(float(statistic(values)), *(interval(values, statistic) if self.interval else (None, None)))
+
+    def text(self, found: Estimate) -> str:
+        """Return an estimate as the text of a cell."""
+        if isinstance(found.value, str):
+            return found.value
+        factor = in_words(self.name)[2] if self.factor is None else self.factor
+        text, *ends = (number(value, self.digits, factor) for value in found)
+        return text if found.low is None else f"{text} ({' .. '.join(ends)})"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ResultTable:
+    """Table of a study: a line for each combination of some fields of the trials.
+
+    Attributes:
+        name: Name of its file.
+        title: Title.
+        by: Fields of the trials, in the order of the first columns.
+        columns: Further columns.
+        where: Which rows count.
+        pooled: Fields over whose values there are further lines.
+        words: Headings of fields, and texts of their values.
+    """
+
+    name: str
+    title: str
+    by: tuple[str, ...]
+    columns: tuple[Column, ...]
+    where: Callable[[Row], bool] = lambda row: True
+    pooled: tuple[str, ...] = ()
+    words: Mapping[str, tuple[str, Callable[[Any], str]]] = field(default_factory=dict)
+
+    @property
+    def headings(self) -> list[str]:
+        """Headings of all columns."""
+        fields = [self.words[name][0] if name in self.words else in_words(name)[0] for name in self.by]
+        return fields + [column.title for column in self.columns]
+
+    def lines(self, rows: Iterable[Row]) -> list[dict[str, Any]]:
+        """Return a line for each group of rows in the order of first occurrence: the fields and `Estimate`s."""
+        chosen = list(filter(self.where, rows))
+        groups = grouped(chosen, self.by)
+        if self.pooled:
+            others = [name for name in self.by if name not in self.pooled]
+            for key, group in grouped(chosen, others).items():
+                known = dict(zip(others, key, strict=True))
+                groups[tuple(known.get(name, ALL) for name in self.by)] = group
+        return [
+            dict(zip(self.by, key, strict=True)) | {column.title: column.estimate(group) for column in self.columns}
+            for key, group in groups.items()
+        ]
+
+    def cells(self, line: Mapping[str, Any]) -> list[str]:
+        """Return a line as text."""
+        fields = [self._text(name, line[name]) for name in self.by]
+        return fields + [column.text(line[column.title]) for column in self.columns]
+
+    def _text(self, name: str, value: Any) -> str:
+        """Return the value of a field as text."""
+        return self.words[name][1](value) if name in self.words and value != ALL else str(value)
+
+    def markdown(self, lines: Sequence[Mapping[str, Any]]) -> str:
+        """Return the table as Markdown under its title."""
+        return titled_markdown(self.title, self.headings, list(map(self.cells, lines)))
+
+    def csv(self, lines: Sequence[Mapping[str, Any]]) -> str:
+        """Return the table as CSV, with all digits and the ends of intervals in columns of their own."""
+        headings, rows = list(self.by), [[line[name] for name in self.by] for line in lines]
+        for column in self.columns:
+            more = ("", " low", " high") if any(line[column.title].low is not None for line in lines) else ("",)
+            headings += [f"{column.title}{end}" for end in more]
+            for row, line in zip(rows, lines, strict=True):
+                row += line[column.title][: len(more)]
+        return csv_text(headings, rows)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Panel:
+    """Panel of a chart.
+
+    Attributes:
+        column: Quantity on the y axis.
+        log: Whether the y axis is logarithmic.
+        limits: Limits of the y axis; None: as the values need.
+        guide: Height of a dotted line, such as an ideal value; None: there is none.
+    """
+
+    column: Column
+    log: bool = False
+    limits: tuple[float, float] | None = None
+    guide: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Chart:
+    """Chart of a study: a panel for each quantity, a row of panels for each value of a field.
+
+    Attributes:
+        x: Field of the trials on the x axis.
+        label: Label of the x axis.
+        by: Field with a line for each value.
+        panels: Panels of a row.
+        rows: Field with a row for each value; empty: one row.
+        title: Title of a row, given the value.
+        where: Which rows of trials count.
+        factor: Factor of the values of `x`.
+        log: Whether the x axis is logarithmic.
+    """
+
+    x: str
+    label: str
+    by: str
+    panels: tuple[Panel, ...]
+    rows: str = ""
+    title: Callable[[Any], str] = str
+    where: Callable[[Row], bool] = lambda row: True
+    factor: float = 1.0
+    log: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Study(Generic[ConfigT, TrialT]):
+    """Study: what is played, and what is shown of it.
+
+    Attributes:
+        name: Name of its command and of its chart.
+        about: What it measures; its first sentence is the summary of `--help`.
+        config: Class of the configuration, whose fields are options.
+        trial: Frozen dataclass of a trial.
+        trials: Function that returns the trials of a configuration, in order.
+        play: Function of configuration and trial that plays it: the fields of its row besides those of the trial. Other
+            processes import it.
+        tables: Tables of the results.
+        chart: Chart of the results, or none.
+        quick: Values that `--quick` sets.
+        timed: Whether trials are timed, so that they run one after another in this process.
+    """
+
+    name: str
+    about: str
+    config: type[ConfigT]
+    trial: type[TrialT]
+    trials: Callable[[ConfigT], Sequence[TrialT]]
+    play: Callable[[ConfigT, TrialT], Mapping[str, Any]]
+    tables: tuple[ResultTable, ...]
+    chart: Chart | None = None
+    quick: Mapping[str, Any] = field(default_factory=dict)
+    timed: bool = False

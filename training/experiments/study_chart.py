@@ -1,0 +1,73 @@
+"""Charts of studies."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib as mpl
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+
+from training.experiments.plotting import add_legend, picture, save_png
+from training.experiments.statistics import grouped
+from training.experiments.study import Chart, Panel, Row
+from training.experiments.tables import in_words
+
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7f7f7f")  # safe for the colour-blind
+MARKERS = "osD^vxP"
+
+
+@picture
+def draw_chart(file: Path, chart: Chart, rows: Sequence[Row]) -> None:
+    """Draw the chart of a study into a PNG file; nothing if no row counts."""
+    chosen = list(filter(chart.where, rows))
+    facets = grouped(chosen, (chart.rows,) if chart.rows else ())
+    if not facets:
+        return
+    names = list(dict.fromkeys(row[chart.by] for row in chosen))
+    with mpl.rc_context({"font.size": 9, "axes.titlesize": 9}):
+        size = 3.1 * len(chart.panels), 2.7 * len(facets) + 0.4
+        figure = Figure(figsize=size, layout="constrained")
+        axes = figure.subplots(len(facets), len(chart.panels), squeeze=False, sharex=True)
+        for row, (key, group) in zip(axes, facets.items(), strict=True):
+            for ax, panel in zip(row, chart.panels, strict=True):
+                _draw_panel(ax, chart, panel, group, names)
+            if key:
+                row[0].set_title(chart.title(key[0]), loc="left")
+        for ax in axes[-1]:
+            ax.set_xlabel(chart.label)
+        add_legend(figure, axes[0][0])
+        save_png(figure, file, 110)
+
+
+def _draw_panel(ax: Axes, chart: Chart, panel: Panel, rows: Sequence[Row], names: Sequence[str]) -> None:
+    """Draw a quantity over the field of the x axis, a line for each of some names."""
+    column = panel.column
+    factor = in_words(column.name)[2] if column.factor is None else column.factor
+    for place, name in enumerate(names):
+        found = [
+            (chart.factor * x, column.estimate(group))
+            for (x,), group in sorted(grouped([r for r in rows if r[chart.by] == name], (chart.x,)).items())
+        ]
+        known = [(x, estimate) for x, estimate in found if estimate.value is not None]
+        xs, values = [x for x, _ in known], [factor * estimate.value for _, estimate in known]
+        colour = COLOURS[place % len(COLOURS)]
+        ax.plot(
+            xs, values, marker=MARKERS[place % len(MARKERS)], ms=5, mfc="none", lw=1.2, color=colour, label=str(name)
+        )
+        for x, estimate in known:
+            if estimate.low is not None and estimate.high is not None:
+                ax.plot([x, x], [factor * estimate.low, factor * estimate.high], color=colour, lw=0.8)
+    if chart.log:
+        ax.set_xscale("log")
+    if panel.log:
+        ax.set_yscale("log")
+        ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        ax.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        ax.yaxis.set_minor_formatter(NullFormatter())
+    if panel.limits is not None:
+        ax.set_ylim(*panel.limits)
+    if panel.guide is not None:
+        ax.axhline(panel.guide, color="0.5", lw=0.8, ls=":")
+    ax.set_ylabel(column.title)
+    ax.grid(alpha=0.2, which="both")
