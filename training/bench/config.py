@@ -271,7 +271,7 @@ class EnvBenchConfig(ExperimentConfig):
     particles: tuple[Positive, ...] = option((100, 30, 300, 1000), "Numbers of particles M.", hint=ONE_PARTICLE)
     worlds: tuple[str, ...] = option(("office", "fig5", "maze", "hall", "loops"), "World families or paths.")
     modes: tuple[Mode, ...] = option(
-        get_args(Mode), "What is in the loop, from known poses to goal actions.", shown="all"
+        get_args(Mode), "Parts in the loop, from known poses to goal actions.", shown="all"
     )
     steps: int = option(1000, "Number of steps of an episode.", ge=2, hint="Use at least two steps.")
     plays: int = setting(5, "Number of repeats of each episode, to reduce the influence of other load.", ge=1)

@@ -95,7 +95,7 @@ def _try_to_own(folder: Path, said: Any) -> None:
 
 
 def test_the_second_process_in_a_folder_is_refused(tmp_path: Path) -> None:
-    """As long as one process adds to a folder, another one is told so; afterwards it may."""
+    """Only one process at a time may add to a folder."""
     context = get_context("spawn")
 
     def other() -> str:
