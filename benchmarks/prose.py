@@ -15,7 +15,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 CHECKED = (
     *("README.md", "CONTRIBUTING.md", "CODE_OF_CONDUCT.md", "docs", ".github"),
-    *("slam_backend", "vslam_env", "agents", "training", "benchmarks", "examples", "tests"),
+    *("slam_backend", "vslam_env", "agents", "training", "studies", "benchmarks", "examples", "tests"),
 )
 EXEMPT = ("docs/lab/", "benchmarks/prose.py", "tests/benchmarks/test_prose.py")  # measurement logs; the list itself
 PHRASES = (

@@ -17,7 +17,7 @@ from scipy.stats import chi2
 from slam_backend.geometry import wrap_angle
 from slam_backend.maps.alignment import DISTINCT_ROTATION, DISTINCT_TRANSLATION, align_maps
 from studies.map_pairs import IDENTIFIABLE, UNALIGNABLE, MapPair, draw_identifiable, draw_pair, draw_unalignable
-from training.commands._study import run_program
+from training.commands.study import run_program
 from training.experiments.config import ExperimentConfig, first_seed, option
 from training.experiments.statistics import CONFIDENCE
 from training.experiments.study import Chart, Column, Estimate, Panel, ResultTable, Row, Study

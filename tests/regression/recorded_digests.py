@@ -182,21 +182,45 @@ def pair_of_maps(rng: np.random.Generator, count: int) -> tuple[LandmarkMap, Lan
 def commands() -> dict[str, list[str]]:
     """Return the commands whose metrics are hashed."""
     found = {
-        "bench accuracy": ["bench", "accuracy", "--seeds", "1", "--lengths", "20", "--particles", "30"],
-        "bench alignment": ["bench", "alignment", "--seeds", "2", "--hard", "9"],
-        "run": ["run", "--world", "maze", "--robots", "2", "--max-cycles", "120", "--no-video"],
-        "replay mrclam": ["replay", "mrclam", "--path", str(DATA / "mrclam/MRCLAM_Dataset7"), "--duration", "150"],
-        "replay victoria": ["replay", "victoria", "--path", str(DATA / "victoria_park"), "--duration", "100"],
-        "replay kitti": ["replay", "kitti", "--path", str(DATA / "kitti_landmarks/0027.npz"), "--duration", "20"],
+        "bench accuracy": ["training", "bench", "accuracy", "--seeds", "1", "--lengths", "20", "--particles", "30"],
+        "studies alignment": ["studies.alignment", "--seeds", "2", "--hard", "9"],
+        "run": ["training", "run", "--world", "maze", "--robots", "2", "--max-cycles", "120", "--no-video"],
+        "replay mrclam": [
+            "training",
+            "replay",
+            "mrclam",
+            "--path",
+            str(DATA / "mrclam/MRCLAM_Dataset7"),
+            "--duration",
+            "150",
+        ],
+        "replay victoria": [
+            "training",
+            "replay",
+            "victoria",
+            "--path",
+            str(DATA / "victoria_park"),
+            "--duration",
+            "100",
+        ],
+        "replay kitti": [
+            "training",
+            "replay",
+            "kitti",
+            "--path",
+            str(DATA / "kitti_landmarks/0027.npz"),
+            "--duration",
+            "20",
+        ],
     }
     return {name: words for name, words in found.items() if "replay" not in name or DATA.is_dir()}
 
 
 def run_command(arguments: list[str]) -> str:
-    """Run a command; return a digest of the numbers in its `metrics.json`, those of time left out."""
+    """Run a module with options; return a digest of the numbers in its `metrics.json`, those of time left out."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "run"
-        command = [sys.executable, "-m", "training", *arguments, "--out", str(out)]
+        command = [sys.executable, "-m", *arguments, "--out", str(out)]
         done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
         if done.returncode:
             raise RuntimeError(f"{' '.join(command)}: {done.stderr}")

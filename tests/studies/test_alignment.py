@@ -143,7 +143,7 @@ def test_the_program_writes_tables_chart_and_trials(tmp_path: Path) -> None:
     assert len(rows.splitlines()) == 2 * (len(GRID) + 18)
     assert subprocess.run(program, capture_output=True, check=True).returncode == 0
     assert (out / "trials.jsonl").read_text() == rows
-    assert "studies alignment" in (out / "config.toml").read_text()
+    assert "study alignment" in (out / "config.toml").read_text()
 
 
 def test_the_old_command_names_the_program() -> None:
@@ -153,4 +153,7 @@ def test_the_old_command_names_the_program() -> None:
         check=False,
     )  # fmt: skip
     assert said.returncode == 2
-    assert said.stderr == "error bench: expected another command, got 'alignment'. In a clone: python -m studies.alignment.\n"
+    assert (
+        said.stderr
+        == "error bench: expected another command, got 'alignment'. In a clone: python -m studies.alignment.\n"
+    )

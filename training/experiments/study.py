@@ -97,7 +97,7 @@ class ResultTable:
         title: Title.
         by: Fields of the trials, in the order of the first columns.
         columns: Further columns.
-        where: Which rows count.
+        where: Test of the rows that count.
         pooled: Fields over whose values there are further lines.
         words: Headings of fields, and texts of their values.
     """
@@ -178,19 +178,19 @@ class Chart:
     Attributes:
         x: Field of the trials on the x axis.
         label: Label of the x axis.
-        by: Field with a line for each value.
         panels: Panels of a row.
+        by: Field with a line for each value; empty: one line.
         rows: Field with a row for each value; empty: one row.
         title: Title of a row, given the value.
-        where: Which rows of trials count.
+        where: Test of the rows that count.
         factor: Factor of the values of `x`.
         log: Whether the x axis is logarithmic.
     """
 
     x: str
     label: str
-    by: str
     panels: tuple[Panel, ...]
+    by: str = ""
     rows: str = ""
     title: Callable[[Any], str] = str
     where: Callable[[Row], bool] = lambda row: True
@@ -204,7 +204,7 @@ class Study(Generic[ConfigT, TrialT]):
 
     Attributes:
         name: Name of its command and of its chart.
-        about: What it measures; its first sentence is the summary of `--help`.
+        about: Text of `--help`; its first sentence is the summary.
         config: Class of the configuration, whose fields are options.
         trial: Frozen dataclass of a trial.
         trials: Function that returns the trials of a configuration, in order.

@@ -24,7 +24,7 @@ def draw_chart(file: Path, chart: Chart, rows: Sequence[Row]) -> None:
     facets = grouped(chosen, (chart.rows,) if chart.rows else ())
     if not facets:
         return
-    names = list(dict.fromkeys(row[chart.by] for row in chosen))
+    names = [name for (name,) in grouped(chosen, (chart.by,))] if chart.by else [""]
     with mpl.rc_context({"font.size": 9, "axes.titlesize": 9}):
         size = 3.1 * len(chart.panels), 2.7 * len(facets) + 0.4
         figure = Figure(figsize=size, layout="constrained")
@@ -36,7 +36,8 @@ def draw_chart(file: Path, chart: Chart, rows: Sequence[Row]) -> None:
                 row[0].set_title(chart.title(key[0]), loc="left")
         for ax in axes[-1]:
             ax.set_xlabel(chart.label)
-        add_legend(figure, axes[0][0])
+        if chart.by:
+            add_legend(figure, axes[0][0])
         save_png(figure, file, 110)
 
 
@@ -45,10 +46,9 @@ def _draw_panel(ax: Axes, chart: Chart, panel: Panel, rows: Sequence[Row], names
     column = panel.column
     factor = in_words(column.name)[2] if column.factor is None else column.factor
     for place, name in enumerate(names):
-        found = [
-            (chart.factor * x, column.estimate(group))
-            for (x,), group in sorted(grouped([r for r in rows if r[chart.by] == name], (chart.x,)).items())
-        ]
+        of_name = [row for row in rows if not chart.by or row[chart.by] == name]
+        groups = sorted(grouped(of_name, (chart.x,)).items())
+        found = [(chart.factor * x, column.estimate(group)) for (x,), group in groups]
         known = [(x, estimate) for x, estimate in found if estimate.value is not None]
         xs, values = [x for x, _ in known], [factor * estimate.value for _, estimate in known]
         colour = COLOURS[place % len(COLOURS)]

@@ -69,7 +69,6 @@ BAD: dict[str, dict[str, str]] = {
         "--worlds castle": "world: expected one of 'office'",
         "--workers 0": "workers: expected an int >= 1, got 0.",
     },
-    "bench alignment": {"--first-seed -1": "first_seed: expected an int >= 0, got -1."},
     "bench mrclam": {"--path . --durations -1": "durations: expected a finite number >= 0, got -1.0."},
     "bench filter": {
         "--particles 10;20": f"particles: {LIST} '10;20'. Write them like",

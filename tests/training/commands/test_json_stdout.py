@@ -41,7 +41,6 @@ LEAST = {
     ),
     "bench start": ("--parts", "count", "--repeats", "1"),
     "bench train": ("--world", "fig5", "--robots", "1", "--envs", "1", "--workers", "0", "--steps", "2"),
-    "bench alignment": ("--methods", "icp", "--seeds", "1", "--hard", "0", *SEED),
     "bench mrclam": ("--path", "robots", "--durations", "10", "--particles", "3"),
     "paper fig1": ("--length", "3", "--particles", "5", "--every", "2"),
     "paper fig2": ("--seeds", "1", "--length", "5", "--every", "5", "--particles", "5", *SEED),

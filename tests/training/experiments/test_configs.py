@@ -25,7 +25,7 @@ from vslam_env.world import SPLITS
 
 # Required values of each class, and a value that differs from its default.
 CASES: dict[type[ExperimentConfig], dict[str, Any]] = {
-    bench.AccuracyConfig: {"lengths": (5.0, 7.5)}, bench.AlignmentBenchConfig: {"methods": ("icp", "svd")},
+    bench.AccuracyConfig: {"lengths": (5.0, 7.5)},
     bench.EnvBenchConfig: {"worlds": ("fig5",)},
     bench.ExplorationBenchConfig: {"policies": ("frontier@discrete",), "worlds": ("maze",)},
     bench.FilterBenchConfig: {"proposals": ("fastslam1",), "large": True},
@@ -55,9 +55,6 @@ BAD: dict[type[ExperimentConfig], dict[str, dict[Any, str]]] = {
         "presets": {("fine",): "one of 'good', 'coarse', 'paper'"}, "methods": {("magic",): "one of 'dead_reckoning'"},
         "lengths": {(0.1,): "a finite number >= 0.25"}, "noise_factor": {0.0: ABOVE_0},
         "robots": {(16,): "an int >= 16"},
-    },
-    bench.AlignmentBenchConfig: {
-        "seeds": {0: AT_LEAST_1}, "hard": {-1: AT_LEAST_0}, "methods": {("magic",): "one of 'ransac'"},
     },
     bench.EnvBenchConfig: {
         "robots": {(9,): ROBOTS}, "modes": {("image",): "one of 'driver', 'poses'"}, "steps": {1: "an int >= 2"},

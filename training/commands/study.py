@@ -1,7 +1,9 @@
 """Commands of studies: options, trials, tables, chart and report, the same for all of them."""
 
+import sys
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import typer
@@ -20,7 +22,7 @@ def command_of(study: Study[Any, Any], command: str) -> Callable[..., None]:
 
     Args:
         study: The study.
-        command: Its name in run folders.
+        command: Name of the command in run folders.
     """
     quick = ", ".join(f"{name} {value}" for name, value in study.quick.items())
 
@@ -38,12 +40,13 @@ def command_of(study: Study[Any, Any], command: str) -> Callable[..., None]:
 
 
 def run_program(study: Study[Any, Any]) -> None:
-    """Run a study as the program `python -m studies.NAME`."""
+    """Run a study as a program with the options of its configuration; it exits as `vslam` does."""
     from training.cli import run
 
     app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-    app.command()(command_of(study, f"studies {study.name}"))
-    run(app, f"python -m studies.{study.name}")
+    app.command()(command_of(study, f"study {study.name}"))
+    spec = sys.modules["__main__"].__spec__
+    run(app, f"python {Path(sys.argv[0]).name}" if spec is None else f"python -m {spec.name}")
 
 
 def run_study(call: Call[Any], study: Study[Any, Any], workers: int = 1, cluster: str | None = None) -> None:
