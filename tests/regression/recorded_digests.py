@@ -1,7 +1,8 @@
 """Digests of the numbers that the project computes: a move or a rename must keep every one of them.
 
     python tests/regression/recorded_digests.py            # compare with the recorded ones, say which differ
-    python tests/regression/recorded_digests.py --record   # record them, after a change that is meant to change numbers
+    python tests/regression/recorded_digests.py --record   # record them, after a change that is meant to change numbers;
+                                                           # those of some names alone: --record office
 
 Digests hold no names and no texts: observations are hashed in the order of their sorted keys, states and results as
 unordered collections of their arrays and numbers. Last bits depend on the versions of the libraries, and on the
@@ -287,8 +288,10 @@ def main(arguments: list[str]) -> int:
         0 if they are equal, 1 if some differ, `NOT_COMPARABLE` if none are recorded for this environment.
     """
     before = recorded()
-    if arguments == ["--record"]:
-        FILE.write_text(json.dumps({"environment": environment(), "digests": all_digests()}, indent=1) + "\n")
+    if arguments[:1] == ["--record"]:
+        some = {part: digest for name in arguments[1:] for part, digest in digests_of(name).items()}
+        digests = (before or {}) | some if some else all_digests()
+        FILE.write_text(json.dumps({"environment": environment(), "digests": digests}, indent=1) + "\n")
         return 0
     if before is None:
         print(f"Nothing is recorded for {environment()}.")
