@@ -48,12 +48,12 @@ kernels-wheel: $(VENV)/.core  ## build a wheel of kernels compiled for x86-64-v3
 
 CLIENTS := torchrl rllib agilerl tianshou benchmarl
 
-clients: $(CLIENTS:%=client-%)  ## run the page of each learner as written, in its own environment; needs gigabytes
+clients: $(CLIENTS:%=client-%)  ## run the program of each learner as written, in its own environment; needs gigabytes
 
-client-%: docs/how-to/learners/%.md docs/how-to/learners/%.txt
+client-%: docs/how-to/learners.md docs/how-to/learners/%.txt
 	$(PYTHON) -m venv $(VENV)-clients/$*
 	$(VENV)-clients/$*/bin/python -m pip install --quiet --disable-pip-version-check --editable . --requirement docs/how-to/learners/$*.txt
-	$(VENV)-clients/$*/bin/python tests/docs/run_page.py docs/how-to/learners/$*.md
+	$(VENV)-clients/$*/bin/python tests/docs/run_page.py $< $*
 
 compat: compat-opencv compat-pettingzoo  ## all tests with an older OpenCV, and with the versions pinned by RLlib and AgileRL
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from agents import make_policy
-from tests.docs.blocks import PAGES, ROOT, alike, blocks, call, commands
+from tests.docs.blocks import FENCE, PAGES, ROOT, alike, blocks, call, commands
 from vslam_env import vslam_v0
 
 # Pages that take more than a few seconds
@@ -22,6 +22,8 @@ NEEDS = {
     "docs/how-to/training.md": "stable_baselines3",
 }
 KINDS = {"python", "console", "text", "sh", "toml"}
+FOOTER = re.compile(r"^\*[^*]+\*$", re.MULTILINE)  # of a table of figures
+ORIGIN = re.compile(r"\b202\d-\d\d-\d\d\b|\d [A-Z][a-z]+ 202\d\b|\bcommit [0-9a-f]{7}|\bZen \d|\bGHz\b")
 
 
 def name(page: Path) -> str:
@@ -38,6 +40,19 @@ def test_every_block_runs_or_says_why_not(page: Path) -> None:
             assert block.runs or block.why, f"a block that is not run, without a reason: {block.text[:60]!r}"
         if block.runs and block.kind == "console":
             assert block.text.startswith("$ ")
+
+
+@pytest.mark.parametrize("page", [*PAGES, ROOT / "CHANGELOG.md"], ids=name)
+def test_lines_are_short(page: Path) -> None:
+    """Lines have at most 120 columns, outside of code, tables and pictures."""
+    lines = FENCE.sub("", page.read_text(encoding="utf-8")).splitlines()
+    assert [line for line in lines if len(line) > 120 and not line.startswith(("|", "!["))] == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_dates_of_figures_stand_below_tables(page: Path) -> None:
+    """Running text names no dates, commits or processors: pages have current figures."""
+    assert ORIGIN.findall(FOOTER.sub("", FENCE.sub("", page.read_text(encoding="utf-8")))) == []
 
 
 @pytest.mark.parametrize(

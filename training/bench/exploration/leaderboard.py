@@ -1,6 +1,7 @@
 """Leaderboard of a benchmark plan, generated from kept results."""
 
 import gzip
+import textwrap
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -109,13 +110,18 @@ def leaderboard(results: Sequence[Results], figure: str) -> str:
     ]
     headings = ("policy", "episodes", f"again: {OUTCOMES[0]}", *OUTCOMES[1:])
     machines = sorted({str(row["machine"]) for row in rows})
-    return "\n".join([
+    text = "\n".join([
         "# Leaderboard of exploration policies\n", ABOUT, f"![{PICTURE}]({figure})\n",
         markdown(results[0].plan, rows, ()), "### Verification\n",
         "Episodes of each policy that were played again at the last verification: all bits are compared where "
         "versions are the same and the processor can do the same, all results up to a ten-thousandth elsewhere.\n",
         markdown_table(headings, shown), f"Played on: {'; '.join(machines)}.\n",
     ])  # fmt: skip
+    return "\n".join(line if line[:1] in "#!|" else _wrapped(line) for line in text.split("\n"))
+
+
+def _wrapped(line: str) -> str:
+    return textwrap.fill(line, 120, break_long_words=False, break_on_hyphens=False)
 
 
 def _finished(plan: Plan, policy: str, rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
