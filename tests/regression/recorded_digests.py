@@ -1,7 +1,7 @@
 """Digests of the numbers that the project computes: a move or a rename must keep every one of them.
 
     python tests/regression/recorded_digests.py            # compare with the recorded ones, say which differ
-    python tests/regression/recorded_digests.py --record   # record them, after a change that is meant to change numbers;
+    python tests/regression/recorded_digests.py --record   # record all, after a change that is meant to change numbers;
                                                            # those of some names alone: --record office
 
 Digests hold no names and no texts: observations are hashed in the order of their sorted keys, states and results as
