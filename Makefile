@@ -28,13 +28,13 @@ lint: $(VENV)/.dev  ## style, types, the direction of imports, and prose
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/python benchmarks/prose.py
+	$(BIN)/python -m studies.prose
 
 kernels: $(VENV)/.dev  ## compile all kernels
 	$(BIN)/vslam warm-up --all --report
 
 metrics: $(VENV)/.core  ## metrics of the code: sizes, folders, path of a measurement, private accesses, import cycles
-	$(BIN)/python benchmarks/code_metrics.py
+	$(BIN)/python -m studies.code_metrics
 
 docs: $(VENV)/.docs  ## build the site in site/; warnings are errors
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict

@@ -26,13 +26,13 @@ LINK = re.compile(r"\[[^\]]+\]\(([^)\s]+)\)")
 FENCED = re.compile(r"^```[^\n]*\n(.*?)^```", re.DOTALL | re.MULTILINE)
 TOLD = re.compile(r"`(vslam [^`\n]+)`")
 FILE_NAME = re.compile(
-    r"(?<![\w/.:-])((?:slam_backend|vslam_env|agents|training|tests|benchmarks|examples|docs)/[\w/.*-]*\w/?)"
+    r"(?<![\w/.:-])((?:slam_backend|vslam_env|agents|training|studies|tests|benchmarks|examples|docs)/[\w/.*-]*\w/?)"
 )
 MAKE = re.compile(r"(?:^|`)make (\w[\w-]*)", re.MULTILINE)
 PAGE_NAME = re.compile(r"docs/[\w/-]+\.md")
 SOURCES = [
     file
-    for folder in ("slam_backend", "vslam_env", "agents", "training", "benchmarks", "examples", "tests")
+    for folder in ("slam_backend", "vslam_env", "agents", "training", "studies", "examples", "tests")
     for file in sorted((ROOT / folder).rglob("*.py"))
     if PAGE_NAME.search(file.read_text(encoding="utf-8"))
 ]

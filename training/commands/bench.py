@@ -15,8 +15,6 @@ from training.bench.config import (
     ExplorationTrial,
     FilterBenchConfig,
     MrclamPairsConfig,
-    ScaleBenchConfig,
-    ScaleTrial,
     StartBenchConfig,
     StereoBenchConfig,
     TrainBenchConfig,
@@ -244,6 +242,7 @@ def bench_exploration(
     from training.bench.exploration.players import parted
     from training.bench.exploration.trials import TRIALS_FILE, check_same_policies, play
     from training.experiments.run_folder import plain
+    from training.experiments.tables import csv_of
 
     trials = call.config.trials()
     check_same_policies(call.out, call.config.policies)
@@ -265,55 +264,10 @@ def bench_exploration(
     metrics = {"summary": lines, "policies_differ": policies_differ, "oracles_differ": oracles_differ, "trials": rows}
     call.write(metrics)
     folder.write_text("tables.md", report.markdown(lines, policies_differ, oracles_differ))
-    folder.write_text("trials.csv", report.to_csv(rows))
-    folder.write_text("curves.csv", report.to_csv(over_time))
+    folder.write_text("trials.csv", csv_of(rows))
+    folder.write_text("curves.csv", csv_of(over_time))
     if over_time:
         report.draw_exploration(folder.path / "exploration.png", over_time)
-    call.finish()
-    if part.failures:
-        raise typer.Exit(2)
-
-
-@bench.command("scale")
-@options(
-    ScaleBenchConfig, "bench scale", continues=True,
-    quick={"extents": (30.0, 60.0), "robots": (3,), "duration": 60.0, "seeds": 1},
-    quick_help="Worlds of 30 and 60 m, 3 robots, 60 s, 1 seed.",
-)  # fmt: skip
-def bench_scale(call: Call[ScaleBenchConfig], workers: Workers = 1) -> None:
-    """Measure cost and results over the size of the world and the number of robots.
-
-    Times of steps and snapshots, memory, coverage over time, errors of maps and poses, merges. Options in the plural
-    take comma-separated values; all combinations are run. Times are processor times, so that other programs matter
-    little. Episodes of a policy that fails are left out, with status 2 at the end. Ctrl-C finishes the current episode;
-    the same command with --out FOLDER resumes the run.
-    """
-    from training.bench.exploration.players import parted
-    from training.bench.exploration.report import to_csv
-    from training.bench.scale import report
-    from training.bench.scale.trials import DECISION_LIMIT, TRIALS_FILE, play
-    from training.experiments.run_folder import plain
-
-    config = call.config
-    trials = config.trials()
-    firsts = {t.extent: t for t in trials}.values()  # with the most robots
-    checks = (
-        partial(first_steps, config.environment(t), parted(config.policy), t.seed, DECISION_LIMIT) for t in firsts
-    )
-    console, folder = call.begin(*checks)
-    part = TrialSet(
-        file=TRIALS_FILE, kind=ScaleTrial, play=partial(play, config), trials=trials, workers=workers,
-        tell=lambda row: f"{row['extent']:g} m, K={row['robots']}: {row['coverage']:.0%}, {row['median_ms']:.1f} ms",
-    )  # fmt: skip
-    (rows,) = run_trial_sets(console, folder, part)
-    lines, over_time = plain(report.summarise(rows)), plain(report.curves(rows))
-    report.print_tables(console, lines)
-    call.write({"summary": lines, "trials": rows})
-    folder.write_text("tables.md", report.markdown(lines))
-    folder.write_text("trials.csv", to_csv(rows))
-    folder.write_text("curves.csv", to_csv(over_time))
-    if lines:
-        report.draw_scale(folder.path / "scale.png", lines, over_time)
     call.finish()
     if part.failures:
         raise typer.Exit(2)
@@ -366,12 +320,18 @@ def bench_train(call: Call[TrainBenchConfig]) -> None:
     call.finish()
 
 
-@bench.command("alignment", hidden=True, context_settings={"ignore_unknown_options": True})
-def bench_alignment(arguments: Annotated[list[str] | None, typer.Argument()] = None) -> None:
-    """Say where the study of alignment has gone."""
-    from slam_backend.core.validation import argument_error
+def _say_where(name: str) -> None:
+    """Add a hidden command that says where a study has gone."""
 
-    raise argument_error("bench", "another command", "alignment", "In a clone: python -m studies.alignment.")
+    @bench.command(name, hidden=True, context_settings={"ignore_unknown_options": True})
+    def moved(arguments: Annotated[list[str] | None, typer.Argument()] = None) -> None:
+        from slam_backend.core.validation import argument_error
+
+        raise argument_error("bench", "another command", name, f"In a clone: python -m studies.{name}.")
+
+
+for _name in ("alignment", "scale"):
+    _say_where(_name)
 
 
 @bench.command("mrclam")

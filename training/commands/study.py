@@ -56,10 +56,10 @@ def run_study(call: Call[Any], study: Study[Any, Any], workers: int = 1, cluster
         typer.Exit: With status 2 if trials failed.
     """
     from training.experiments.run_folder import plain
-    from training.experiments.study_chart import draw_chart
-    from training.experiments.tables import console_table
+    from training.experiments.study_chart import draw_chart, draw_curves
+    from training.experiments.tables import console_table, csv_of
 
-    console, folder = call.begin()
+    console, folder = call.begin(*study.checks(call.config))
     part = TrialSet(
         file=TRIALS_FILE, kind=study.trial, play=partial(_play, study.play, call.config),
         trials=study.trials(call.config), tell=partial(_told, study.trial), workers=workers, cluster=cluster,
@@ -71,9 +71,13 @@ def run_study(call: Call[Any], study: Study[Any, Any], workers: int = 1, cluster
         folder.write_text(f"{table.name}.csv", table.csv(lines))
     tables = {table.name: [_plain(line) for line in lines] for table, lines in found}
     call.write({"tables": tables, "trials": plain(rows)})
+    folder.write_text("trials.csv", csv_of(rows))
     folder.write_text("tables.md", "\n".join(table.markdown(lines) for table, lines in found))
     if study.chart is not None:
         draw_chart(folder.path / f"{study.name}.png", study.chart, rows)
+    if study.curves is not None:
+        folder.write_text("curves.csv", csv_of(study.curves.lines(rows)))
+        draw_curves(folder.path / "curves.png", study.curves, rows)
     call.finish()
     if part.failures:
         raise typer.Exit(2)

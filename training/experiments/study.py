@@ -17,7 +17,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import numpy as np
 
 from training.experiments.config import ExperimentConfig
-from training.experiments.statistics import grouped, interval
+from training.experiments.statistics import grouped, interval, mean_curves
 from training.experiments.tables import csv_text, in_words, number, titled_markdown
 
 Row = Mapping[str, Any]
@@ -199,6 +199,23 @@ class Chart:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Curves:
+    """Means over time of what trials return as `curves`: a list by name, with their times as `time_s`.
+
+    Attributes:
+        by: Fields of the trials with a line for each combination of their values.
+        columns: Names of the curves, with headings and factors; each has a panel.
+    """
+
+    by: tuple[str, ...]
+    columns: tuple[Column, ...]
+
+    def lines(self, rows: Iterable[Row]) -> list[dict[str, Any]]:
+        """Return a line for each group and time: the fields, `time_s`, and means with the ends of their intervals."""
+        return mean_curves(rows, self.by, [column.name for column in self.columns])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Study(Generic[ConfigT, TrialT]):
     """Study: what is played, and what is shown of it.
 
@@ -212,6 +229,9 @@ class Study(Generic[ConfigT, TrialT]):
             processes import it.
         tables: Tables of the results.
         chart: Chart of the results, or none.
+        curves: Curves over time, or none.
+        checks: Function that returns the first steps of a configuration, which are run before the run folder is made,
+            to detect what cannot be played.
         quick: Values that `--quick` sets.
         timed: Whether trials are timed, so that they run one after another in this process.
     """
@@ -224,5 +244,7 @@ class Study(Generic[ConfigT, TrialT]):
     play: Callable[[ConfigT, TrialT], Mapping[str, Any]]
     tables: tuple[ResultTable, ...]
     chart: Chart | None = None
+    curves: Curves | None = None
+    checks: Callable[[ConfigT], Iterable[Callable[[], object]]] = lambda config: ()
     quick: Mapping[str, Any] = field(default_factory=dict)
     timed: bool = False

@@ -4,17 +4,19 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from training.experiments.plotting import add_legend, picture, save_png
 from training.experiments.statistics import grouped
-from training.experiments.study import Chart, Panel, Row
+from training.experiments.study import Chart, Column, Curves, Panel, Row
 from training.experiments.tables import in_words
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7f7f7f")  # safe for the colour-blind
 MARKERS = "osD^vxP"
+STYLES = "-", "--", ":", "-."
 
 
 @picture
@@ -44,7 +46,7 @@ def draw_chart(file: Path, chart: Chart, rows: Sequence[Row]) -> None:
 def _draw_panel(ax: Axes, chart: Chart, panel: Panel, rows: Sequence[Row], names: Sequence[str]) -> None:
     """Draw a quantity over the field of the x axis, a line for each of some names."""
     column = panel.column
-    factor = in_words(column.name)[2] if column.factor is None else column.factor
+    factor = _factor(column)
     for place, name in enumerate(names):
         of_name = [row for row in rows if not chart.by or row[chart.by] == name]
         groups = sorted(grouped(of_name, (chart.x,)).items())
@@ -71,3 +73,32 @@ def _draw_panel(ax: Axes, chart: Chart, panel: Panel, rows: Sequence[Row], names
         ax.axhline(panel.guide, color="0.5", lw=0.8, ls=":")
     ax.set_ylabel(column.title)
     ax.grid(alpha=0.2, which="both")
+
+
+@picture
+def draw_curves(file: Path, curves: Curves, rows: Sequence[Row]) -> None:
+    """Draw means over time into a PNG file, a panel for each curve; nothing without rows."""
+    lines = curves.lines(rows)
+    if not lines:
+        return
+    with mpl.rc_context({"font.size": 9}):
+        figure = Figure(figsize=(3.1 * len(curves.columns), 3.1), layout="constrained")
+        axes = figure.subplots(1, len(curves.columns), squeeze=False)[0]
+        for ax, column in zip(axes, curves.columns, strict=True):
+            for place, (key, group) in enumerate(grouped(lines, curves.by).items()):
+                values = [np.nan if line[column.name] is None else line[column.name] for line in group]
+                ax.plot(
+                    [line["time_s"] for line in group], _factor(column) * np.array(values), lw=1.2,
+                    color=COLOURS[place % len(COLOURS)], ls=STYLES[place // len(COLOURS) % len(STYLES)],
+                    label=", ".join(map(str, key)),
+                )  # fmt: skip
+            ax.set_xlabel("time [s]")
+            ax.set_ylabel(column.title)
+            ax.grid(alpha=0.2)
+        add_legend(figure, axes[0], title=", ".join(in_words(name)[0] for name in curves.by))
+        save_png(figure, file, 110)
+
+
+def _factor(column: Column) -> float:
+    """Return the factor of the values that a column shows."""
+    return in_words(column.name)[2] if column.factor is None else column.factor

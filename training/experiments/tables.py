@@ -6,7 +6,7 @@ The first column of a table is left-aligned, numbers are right-aligned and have 
 import csv
 import io
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from rich.box import SIMPLE_HEAD
@@ -138,3 +138,10 @@ def csv_text(headings: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     writer.writerow(headings)
     writer.writerows([f"{value:.6g}" if isinstance(value, float) else value for value in row] for row in rows)
     return text.getvalue()
+
+
+def csv_of(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return rows as CSV: numbers have six digits, missing ones are empty; lists and tables are left out."""
+    items = (item for row in rows for item in row.items())
+    names = list(dict.fromkeys(name for name, value in items if not isinstance(value, Mapping | list)))
+    return csv_text(names, ([row.get(name) for name in names] for row in rows))

@@ -96,11 +96,6 @@ BAD: dict[str, dict[str, str]] = {
         "--worlds nowhere": "world: expected",
         "--robots 9": f"{ROBOTS} 9.",
     },
-    "bench scale": {
-        "--policy unknown": "policy: expected one of 'frontier'", "--robots 9": f"{ROBOTS} 9.",
-        "--extents 300": "extent: expected a finite number > 0 and <= 200, got 300",
-        "--family office --extents 20": "extent: expected a finite number >= 30",
-    },
     "paper fig1": {"--robots 10": "robots: expected at most 9, got 10."},
     "paper fig2": {"--length 2": "length: expected a finite number >= 5, got 2.0"},
     "paper fig3": {"--length 1 --particles 5 --seed 101": "length: expected maps that can be aligned, got a refusal: "},

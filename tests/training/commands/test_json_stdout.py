@@ -36,9 +36,6 @@ LEAST = {
         "--policies", "frontier", "--worlds", "fig5", "--robots", "1", "--oracles", "none", "--max-seconds", "2",
         "--particles", "5", "--seeds", "1", *SEED,
     ),
-    "bench scale": (
-        "--extents", "20", "--robots", "1", "--max-seconds", "2", "--particles", "5", "--seeds", "1", *SEED,
-    ),
     "bench start": ("--parts", "count", "--repeats", "1"),
     "bench train": ("--world", "fig5", "--robots", "1", "--envs", "1", "--workers", "0", "--steps", "2"),
     "bench mrclam": ("--path", "robots", "--durations", "10", "--particles", "3"),

@@ -30,7 +30,6 @@ CASES: dict[type[ExperimentConfig], dict[str, Any]] = {
     bench.ExplorationBenchConfig: {"policies": ("frontier@discrete",), "worlds": ("maze",)},
     bench.FilterBenchConfig: {"proposals": ("fastslam1",), "large": True},
     bench.PlanBenchConfig: {"plan": "vslam-bench-v0", "policies": ("frontier",), "quick": True},
-    bench.ScaleBenchConfig: {"extents": (40.0, 75.5), "family": "campus"},
     bench.StartBenchConfig: {"parts": ("import",), "repeats": 1}, bench.StereoBenchConfig: {"descriptors": ("orb",)},
     bench.TrainBenchConfig: {"workers": (0, 2)},
     bench.MrclamPairsConfig: {"path": "log", "durations": (50.0,)},
@@ -75,10 +74,6 @@ BAD: dict[type[ExperimentConfig], dict[str, dict[Any, str]]] = {
     bench.PlanBenchConfig: {
         "decision_limit": {0.0: ABOVE_0}, "quick": {1: "a bool"}, "plan": {3: "a text"},
         "policies": {("frontier", "frontier"): "at least one value, each once"},
-    },
-    bench.ScaleBenchConfig: {
-        "extents": {(0.0,): ABOVE_0, (): "at least one value, each once"}, "robots": {(9,): ROBOTS},
-        "family": {"maze": "one of 'rooms', 'office', 'campus'"}, "duration": {0.0: "a finite number >= 1"},
     },
     bench.StartBenchConfig: {"repeats": {0: AT_LEAST_1}, "parts": {("none",): "one of"}},
     bench.StereoBenchConfig: {

@@ -16,7 +16,7 @@ from training.bench.exploration.trials import CURVES, TEAM
 from training.experiments.plotting import picture, save_png
 from training.experiments.policy_names import parted_label
 from training.experiments.statistics import format_ci, grouped, mean_ci, mean_curves, paired_difference, summarise_means
-from training.experiments.tables import E_SCALE, console_table, csv_text, markdown_table
+from training.experiments.tables import E_SCALE, console_table, markdown_table
 
 Rows = Sequence[Mapping[str, Any]]
 PLACE = ("world", "robots", "oracle")
@@ -178,12 +178,6 @@ def markdown(lines: Rows, policies: Rows, oracles: Rows) -> str:
             headings = [heading, *(text for _, text, _ in COMPARED.values())]
             parts.append(markdown_table(headings, _difference_rows(differences, tuple(COMPARED), False)))
     return "\n".join(parts)
-
-
-def to_csv(rows: Rows) -> str:
-    """Return rows as CSV with a header; numbers have six digits, lists and tables are omitted."""
-    names = [name for name, value in rows[0].items() if not isinstance(value, Mapping | list)] if rows else []
-    return csv_text(names, ([row[name] for name in names] for row in rows))
 
 
 def policy_label(line: Mapping[str, Any], between: str = ", ") -> str:

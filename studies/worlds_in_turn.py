@@ -1,6 +1,6 @@
 """Steps and snapshots of several worlds at given times of their episodes, measured in alternation.
 
-    python benchmarks/worlds_in_turn.py rooms:extent=120@900 rooms:extent=120@1600 office:extent=30@60 --seed 10002
+    python -m studies.worlds_in_turn rooms:extent=120@900 rooms:extent=120@1600 office:extent=30@60 --seed 10002
 
 Each world is played with `frontier` and `goal` actions up to its time; then all go on in turn, in bursts of ten steps,
 with a snapshot after each fifth step that is kept until the next one, as a program does that saves its last state.
@@ -15,8 +15,8 @@ import numpy as np
 import typer
 
 from slam_backend.core.validation import argument_error, check_int
+from studies.scale import DECISION_LIMIT
 from training.bench.exploration.players import parted
-from training.bench.scale.trials import DECISION_LIMIT
 from training.episodes.config import RunConfig
 from vslam_env import warm_up
 from vslam_env.config import TICK
@@ -45,7 +45,8 @@ class Played:
         self._observations = self.env.reset(seed=self.seed)[0]
         self.team.reset()
         self._rngs = {agent: np.random.default_rng(i) for i, agent in enumerate(self.env.possible_agents)}
-        self._rng, self._last = np.random.default_rng(self.seed), None
+        self._rng = np.random.default_rng(self.seed)
+        self._last: Any = None
 
     def step(self) -> float:
         """Do a step and return its time [ms]."""
@@ -72,7 +73,8 @@ def played(named: str, seed: int, robots: int, steps: int) -> Played:
     if not world or not seconds.replace(".", "", 1).isdigit():
         raise argument_error("worlds", "WORLD@SECONDS", named, "Name one like office:extent=30@60.")
     player = parted("frontier")
-    config = RunConfig(world=world, robots=robots, policy=player.policy, action_type=player.action_type, seed=seed)
+    shared: dict[str, Any] = {"policy": player.policy, "action_type": player.action_type}
+    config = RunConfig(world=world, robots=robots, seed=seed, **shared)
     env = ExplorationEnv(config.environment())
     before = round(float(seconds) / (env.config.ticks_per_step * TICK))
     env.max_cycles = before + steps + 1

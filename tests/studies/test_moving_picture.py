@@ -4,7 +4,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from benchmarks.moving_picture import COLOURS, ROOT, SIZE, film, side_by_side, with_few_colours
+from studies.moving_picture import COLOURS, ROOT, SIZE, film, side_by_side, with_few_colours
 from training.episodes.config import RunConfig
 
 

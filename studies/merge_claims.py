@@ -1,10 +1,10 @@
 """Attempts of teams to merge, beside the truth: what they claim to know of the relative start, and its error.
 
-    python benchmarks/merge_claims.py --extent 120 --seconds 1800 --first-seed 10001 --seeds 4
+    python -m studies.merge_claims --extent 120 --seconds 1800 --first-seed 10001 --seeds 4
 
-The episodes are those of `vslam bench scale`. A line of JSON for each attempt whose maps align: time, groups, claimed
-standard deviations, error, and NEES, the squared error in units of the claimed covariance (three degrees of freedom:
-2.4 in the median if claims are right). Then a summary of all.
+The episodes are those of `python -m studies.scale`. A line of JSON for each attempt whose maps align: time, groups,
+claimed standard deviations, error, and NEES, the squared error in units of the claimed covariance (three degrees of
+freedom: 2.4 in the median if claims are right). Then a summary of all.
 """
 
 import json
@@ -18,9 +18,8 @@ from slam_backend.geometry import between, wrap_angle
 from slam_backend.maps.alignment import Alignment
 from slam_backend.team import merge
 from slam_backend.team.groups import Group
-from training.bench.config import ScaleBenchConfig
+from studies.scale import DECISION_LIMIT, Config, environment, trials
 from training.bench.exploration.players import parted
-from training.bench.scale.trials import DECISION_LIMIT
 from training.episodes.runner import Progress, run_episode
 from vslam_env import warm_up
 from vslam_env.environment import ExplorationEnv
@@ -28,11 +27,11 @@ from vslam_env.environment import ExplorationEnv
 Claim = dict[str, Any]
 
 
-def claims_of(config: ScaleBenchConfig) -> tuple[list[Claim], list[tuple[float, float]]]:
+def claims_of(config: Config) -> tuple[list[Claim], list[tuple[float, float]]]:
     """Play the first trial; return its claims, and the error [m, degrees] of each merge."""
-    trial, claims, now = config.trials()[0], [], [0.0]
-    env = ExplorationEnv(config.environment(trial))
-    decide = merge.refused_if_uncertain
+    trial, claims, now = trials(config)[0], [], [0.0]
+    env = ExplorationEnv(environment(config, trial))
+    decide = merge.refused_if_uncertain  # type: ignore[attr-defined]
 
     def noted(found: Alignment, pair: tuple[Group, Group], *args: Any) -> Alignment:
         decided = decide(found, pair, *args)
@@ -53,11 +52,11 @@ def claims_of(config: ScaleBenchConfig) -> tuple[list[Claim], list[tuple[float, 
     def watch(progress: Progress) -> None:
         now[0] = progress.time
 
-    merge.refused_if_uncertain = noted
+    merge.refused_if_uncertain = noted  # type: ignore[attr-defined, assignment]
     try:
         record = run_episode(env, parted(config.policy).make(env, DECISION_LIMIT), trial.seed, watch)
     finally:
-        merge.refused_if_uncertain = decide
+        merge.refused_if_uncertain = decide  # type: ignore[attr-defined]
     return claims, [(merge.error_m, merge.error_deg) for merge in record.merges]
 
 
@@ -75,7 +74,7 @@ def main(
     claims: list[Claim] = []
     errors: list[tuple[float, float]] = []
     for seed in range(first_seed, first_seed + seeds):
-        config = ScaleBenchConfig(extents=(extent,), robots=(robots,), duration=seconds, seed=seed, seeds=1)
+        config = Config(extents=(extent,), robots=(robots,), duration=seconds, seed=seed, seeds=1)
         found, merges = claims_of(config)
         for claim in found:
             print(json.dumps({"seed": seed, **claim}), flush=True)

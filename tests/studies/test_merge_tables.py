@@ -5,16 +5,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from builders.scripts import load_script
 
-PATH = Path(__file__).parents[2] / "benchmarks" / "merge_tables.py"
-KEPT = sorted((PATH.parent / "merge_soak").glob("*.json"))
+from studies import merge_tables as tables
 
-
-@pytest.fixture(scope="module")
-def tables() -> Any:
-    """Script as a module."""
-    return load_script(PATH)
+KEPT = sorted((Path(__file__).parents[2] / "benchmarks" / "merge_soak").glob("*.json"))
 
 
 def merge(seed: int, metres: float, bent: float | None) -> dict[str, Any]:
@@ -26,7 +20,7 @@ def merge(seed: int, metres: float, bent: float | None) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def test_smoothed_and_unsmoothed_errors_are_tabulated(tables: Any) -> None:
+def test_smoothed_and_unsmoothed_errors_are_tabulated() -> None:
     """Merges with both values give root mean square, 95 %, worst, far and false ones; the farthest come first."""
     merges = [merge(1, 0.3, 0.6), merge(2, 0.4, 0.4), merge(3, 0.2, None)]
     lines = tables.straight_table(merges).splitlines()
@@ -38,7 +32,7 @@ def test_smoothed_and_unsmoothed_errors_are_tabulated(tables: Any) -> None:
     assert [line.split()[1] for line in worst] == ["2", "1"]
 
 
-def test_forced_merges_are_excluded_from_comparisons(tables: Any) -> None:
+def test_forced_merges_are_excluded_from_comparisons() -> None:
     """Only merges that were not forced are compared with the truth."""
     soaks = [
         {"setting": {"forced": forced}, "merges": [merge(seed, 0.1, None)]} for seed, forced in ((1, True), (2, 0))
@@ -46,14 +40,14 @@ def test_forced_merges_are_excluded_from_comparisons(tables: Any) -> None:
     assert [found["seed"] for found in tables.own_merges(soaks)] == [2]
 
 
-def test_stored_soaks_can_be_read(tables: Any) -> None:
+def test_stored_soaks_can_be_read() -> None:
     """Each stored soak test has a row."""
     lines = tables.fates_table(tables.read_soaks(KEPT)).splitlines()
     assert [line.split()[1] for line in lines[2:]] == [file.stem for file in KEPT]
 
 
 @pytest.mark.parametrize("content", ["", "[]", json.dumps({"setting": {}})])
-def test_other_files_are_refused(tables: Any, tmp_path: Path, content: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_other_files_are_refused(tmp_path: Path, content: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The error gives the file."""
     monkeypatch.chdir(tmp_path)
     file = Path("other.json")

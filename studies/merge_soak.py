@@ -1,11 +1,11 @@
 """Soak test of merges in random worlds with similar landmarks: are false merges avoided, or detected and undone?
 
-    python benchmarks/merge_soak.py --minutes 10 --json merge_soak.json
-    python benchmarks/merge_soak.py --minutes 10 --forced
-    python benchmarks/merge_soak.py --minutes 10 --kind environment
-    python benchmarks/merge_soak.py --minutes 10 --kind both
-    python benchmarks/merge_soak.py --minutes 60 --world FOLDER_OF_PLANS --seeds 3
-    python benchmarks/merge_soak.py --minutes 60 --world maze --world loops --seeds 10
+    python -m studies.merge_soak --minutes 10 --json merge_soak.json
+    python -m studies.merge_soak --minutes 10 --forced
+    python -m studies.merge_soak --minutes 10 --kind environment
+    python -m studies.merge_soak --minutes 10 --kind both
+    python -m studies.merge_soak --minutes 60 --world FOLDER_OF_PLANS --seeds 3
+    python -m studies.merge_soak --minutes 60 --world maze --world loops --seeds 10
 
 Runs are stereo runs through offices of aisles, 100 m per robot, with classes of one to three similar landmarks, false
 points and wrong descriptors; or episodes of the environment in all world families, in which up to all landmarks have a
@@ -32,7 +32,6 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
-from merge_outcomes import Delay, Follower, MergeOutcome, RunEnd, RunOutcomes, collect_outcomes, summarise
 from rich.console import Console
 
 from agents.registry import make_policy
@@ -44,6 +43,7 @@ from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.team.merge_scheduler import AttemptOptions
 from slam_backend.team.options import MergeOptions
 from slam_backend.team.team import TeamSlam
+from studies.merge_outcomes import Delay, Follower, MergeOutcome, RunEnd, RunOutcomes, collect_outcomes, summarise
 from training.bench.accuracy.runs import STEP, RunSpec, simulate_run
 from training.episodes.config import RunConfig
 from training.episodes.metrics import score_episode
@@ -269,7 +269,8 @@ def shifted_alignment(
 
 def claimed(motion: FloatArray, pairs: IntArray) -> Alignment:
     """Return an alignment that claims a certain transform (3,) and pairs (k, 2)."""
-    return Alignment(True, "", *motion.tolist(), np.diag([1e-3, 1e-3, 1e-4]), pairs, 0.0)
+    x, y, theta = motion.tolist()
+    return Alignment(True, "", x, y, theta, np.diag([1e-3, 1e-3, 1e-4]), pairs, 0.0)
 
 
 def coinciding(points_a: FloatArray, points_b: FloatArray, motion: FloatArray) -> IntArray:
@@ -279,7 +280,7 @@ def coinciding(points_a: FloatArray, points_b: FloatArray, motion: FloatArray) -
     nearest = distances.argmin(axis=1)
     rows = np.arange(len(points_a))
     mutual = (distances.argmin(axis=0)[nearest] == rows) & (distances[rows, nearest] < COINCIDENCE)
-    return np.column_stack([rows, nearest])[mutual]
+    return np.asarray(np.column_stack([rows, nearest])[mutual])
 
 
 def describe_merge(merge: MergeOutcome) -> str:

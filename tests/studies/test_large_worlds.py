@@ -1,22 +1,18 @@
 """Measurements of large worlds, in small ones: claims of attempts beside the truth, and worlds in turn."""
 
 import math
-from pathlib import Path
 
 import pytest
-from builders.scripts import load_script
 
 from slam_backend.team import merge
-from training.bench.config import ScaleBenchConfig
-
-FOLDER = Path(__file__).parents[2] / "benchmarks"
-merge_claims, worlds_in_turn = (load_script(FOLDER / f"{name}.py") for name in ("merge_claims", "worlds_in_turn"))
+from studies import merge_claims, worlds_in_turn
+from studies.scale import Config
 
 
 def test_claims_are_those_of_all_attempts_whose_maps_align() -> None:
     """Each merge has a claim, refused attempts have one, too, and errors are those of the merges."""
     decide = merge.refused_if_uncertain
-    config = ScaleBenchConfig(extents=(40.0,), robots=(3,), duration=120.0, seed=10001, seeds=1)
+    config = Config(extents=(40.0,), robots=(3,), duration=120.0, seed=10001, seeds=1)
     claims, errors = merge_claims.claims_of(config)
     merged = [claim for claim in claims if claim["merged"]]
     assert len(merged) == len(errors) > 0

@@ -1,6 +1,6 @@
 """Soak test of environments with random configurations; invariants are checked at every step.
 
-    python benchmarks/env_soak.py --steps 200000 --keep soak.state
+    python -m studies.env_soak --steps 200000 --keep soak.state
 
 The same command resumes from the last snapshot after a kill. Checked at each step: no robot is inside a wall or another
 robot; observations are in their spaces; rewards, infos and `state()` are finite; shares are in [0, 1]. At intervals,
@@ -69,7 +69,7 @@ def random_actions(env: ExplorationEnv, rng: np.random.Generator) -> dict[str, A
     if env.config.action_type == "continuous":
         return {a: np.array([rng.uniform(-0.2, 1.0), 0.5 * rng.uniform(-1, 1)], np.float32) for a in env.agents}
     count = 4 if env.config.action_type == "discrete" else 17
-    return {agent: int(rng.choice([1, rng.integers(count)])) for agent in env.agents}
+    return {agent: int(rng.choice([1, int(rng.integers(count))])) for agent in env.agents}
 
 
 def digest(value: Any, into: "hashlib._Hash") -> None:

@@ -100,7 +100,8 @@ def import_circles(graph: dict[str, set[str]]) -> list[list[str]]:
     """Return the groups of modules that import each other, directly or indirectly."""
     reach: dict[str, set[str]] = {}
     for start in graph:
-        seen, todo = set(), [start]
+        seen: set[str] = set()
+        todo = [start]
         while todo:
             for module in graph[todo.pop()] - seen:
                 seen.add(module)

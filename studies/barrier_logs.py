@@ -1,7 +1,7 @@
 """Simulated logs of robots among barriers, and results of filters with and without rejuvenation.
 
-    python benchmarks/barrier_logs.py              # one robot
-    python benchmarks/barrier_logs.py --team 3     # three robots that merge
+    python -m studies.barrier_logs              # one robot
+    python -m studies.barrier_logs --team 3     # three robots that merge
 
 Robots drive at up to 0.3 m/s and 30 degrees/s in a hall of 15 x 8 m with 15 landmarks of known identity. Walls block
 the line of sight; one or two measurements per second are read. Noise of odometry and measurements is like that of

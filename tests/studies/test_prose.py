@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import prose
+from studies import prose
 
 
 @pytest.mark.parametrize("phrase", prose.PHRASES)

@@ -1,7 +1,7 @@
 """Linter for prose: phrases to avoid, and descriptions of arguments, fields and options that do not stand alone.
 
-python benchmarks/prose.py                    # `CHECKED`, as in `make lint`
-python benchmarks/prose.py FILE_OR_FOLDER ...
+python -m studies.prose                    # `CHECKED`, as in `make lint`
+python -m studies.prose FILE_OR_FOLDER ...
 """
 
 import ast
@@ -15,9 +15,9 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 CHECKED = (
     *("README.md", "CONTRIBUTING.md", "CODE_OF_CONDUCT.md", "docs", ".github"),
-    *("slam_backend", "vslam_env", "agents", "training", "studies", "benchmarks", "examples", "tests"),
+    *("slam_backend", "vslam_env", "agents", "training", "studies", "examples", "tests"),
 )
-EXEMPT = ("docs/lab/", "benchmarks/prose.py", "tests/benchmarks/test_prose.py")  # measurement logs; the list itself
+EXEMPT = ("docs/lab/", "studies/prose.py", "tests/studies/test_prose.py")  # measurement logs; the list itself
 PHRASES = (
     *("anew", "likewise", "seldom", "nobody", "whoever", "ever after", "of which there", "held against", "told all"),
     *(f"{verb} told" for verb in ("is", "are", "was", "were", "be", "been", "being")),
@@ -74,7 +74,7 @@ def bare_descriptions(source: str) -> Iterator[tuple[int, str]]:
 
 def _bare_text(*texts: ast.expr) -> Iterator[tuple[int, str]]:
     for text in texts:
-        if isinstance(text, ast.Constant) and is_bare(str(text.value)):
+        if isinstance(text, ast.Constant) and isinstance(text.value, str) and is_bare(text.value):
             yield text.lineno, f"bare description: {text.value}"
 
 

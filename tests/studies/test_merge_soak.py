@@ -1,32 +1,19 @@
 """The soak test of merges runs, and reports the outcome of each merge."""
 
 import math
-import sys
 from pathlib import Path
-from typing import Any
 
-import pytest
-from builders.scripts import load_script
-
-FOLDER = Path(__file__).parents[2] / "benchmarks"
+from studies import merge_soak as soak
 
 
-@pytest.fixture(scope="module")
-def soak() -> Any:
-    """Script as a module."""
-    sys.path.insert(0, str(FOLDER))  # it imports a script in its folder
-    yield load_script(FOLDER / "merge_soak.py")
-    sys.path.remove(str(FOLDER))
-
-
-def test_folders_are_replaced_by_their_floor_plans(soak: Any, tmp_path: Path) -> None:
+def test_folders_are_replaced_by_their_floor_plans(tmp_path: Path) -> None:
     """Families keep their names; the plans of a folder are sorted by name."""
     for name in ("b.png", "a.png", "notes.txt"):
         (tmp_path / name).touch()
     assert soak.named_worlds(["maze", str(tmp_path)]) == ["maze", str(tmp_path / "a.png"), str(tmp_path / "b.png")]
 
 
-def test_a_forced_false_merge_is_undone(soak: Any) -> None:
+def test_a_forced_false_merge_is_undone() -> None:
     """Two robots merged by the wrong transform with the best fit count as a false merge that is correctly undone."""
     merges, late, end = soak.play_aisles(9000, 120, soak.Setting(forced=True))
     (merge,) = merges

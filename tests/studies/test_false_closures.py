@@ -1,23 +1,13 @@
 """Look-alike corridors close no loop falsely, and the script would count it if they did."""
 
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
-from builders.scripts import load_script
 
-SCRIPT = Path(__file__).parents[2] / "benchmarks" / "false_closures.py"
-
-
-@pytest.fixture(scope="module")
-def closures() -> Any:
-    """Script as a module."""
-    return load_script(SCRIPT)
+from studies import false_closures as closures
 
 
 @pytest.mark.parametrize("kind", ["seen", "blind", "turned"])
-def test_both_corridors_look_the_same(closures: Any, kind: str) -> None:
+def test_both_corridors_look_the_same(kind: str) -> None:
     """Each landmark of A has one in B with the same descriptor, shifted or turned by half a turn, on a wall."""
     length, pitch = 9.0, 5.0
     built = closures.build_corridors(kind, length, pitch, np.random.default_rng(3))
@@ -38,7 +28,7 @@ def test_both_corridors_look_the_same(closures: Any, kind: str) -> None:
     np.testing.assert_allclose(ways[:, 0] * off[:, 1] - ways[:, 1] * off[:, 0], 0.0, atol=1e-9)
 
 
-def test_a_filter_without_a_position_gate_closes_loops_falsely(closures: Any) -> None:
+def test_a_filter_without_a_position_gate_closes_loops_falsely() -> None:
     """A gate that lets pass what is metres off takes B for A, and the trial says so."""
     trial = closures.run_trial(0, position_gate=1e9, new_landmark_gate=1e9, ambiguity_margin=0.0)
     assert trial.false_closures > 0
@@ -46,7 +36,7 @@ def test_a_filter_without_a_position_gate_closes_loops_falsely(closures: Any) ->
 
 
 @pytest.mark.slow
-def test_look_alike_corridors_close_no_loop_falsely(closures: Any) -> None:
+def test_look_alike_corridors_close_no_loop_falsely() -> None:
     """No trial of any kind has a false loop closure; the way back through A is recognised in most."""
     trials = [closures.run_trial(seed) for seed in range(5000, 5030)]
     assert {trial.kind for trial in trials} == set(closures.KINDS)

@@ -6,10 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from builders.scripts import load_script
 
-PATH = Path(__file__).parents[2] / "benchmarks" / "env_soak.py"
-env_soak = load_script(PATH)
+from studies import env_soak
 
 
 @pytest.fixture
@@ -42,12 +40,12 @@ def test_a_stopped_soak_leaves_a_whole_snapshot(tmp_path: Path, how: signal.Sign
     """A soak test that is killed, or stopped by Ctrl-C, while it writes snapshots leaves a valid one."""
     keep = tmp_path / "soak.state"
     code = (
-        "import signal, sys; sys.path.insert(0, sys.argv[1]); import env_soak, pathlib\n"
+        "import pathlib, signal, sys; from studies import env_soak\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)  # the tests may run where it is ignored\n"
         "env_soak.beginning = env_soak.in_another_process = lambda *_: ''\n"
-        "env_soak.Soak(3).run(10**6, pathlib.Path(sys.argv[2]), keep_every=1, log=lambda t: print(t, flush=True))\n"
+        "env_soak.Soak(3).run(10**6, pathlib.Path(sys.argv[1]), keep_every=1, log=lambda t: print(t, flush=True))\n"
     )
-    command = [sys.executable, "-c", code, str(PATH.parent), str(keep)]
+    command = [sys.executable, "-c", code, str(keep)]
     soak = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
     assert soak.stdout is not None
     for _ in range(12):

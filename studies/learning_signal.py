@@ -1,7 +1,7 @@
 """Learning signal of rewards: correlation of advantages with choices of goals, and effect of discounts on returns.
 
-    python benchmarks/learning_signal.py choices --episodes 60
-    python benchmarks/learning_signal.py returns --seeds 20
+    python -m studies.learning_signal choices --episodes 60
+    python -m studies.learning_signal returns --seeds 20
 
 `choices` measures the signal for the decisions of `vslam train`. Robots drive to random candidates in worlds of the
 training split. For several rewards and values of lambda of the generalised advantage estimate (with a fitted linear
@@ -100,7 +100,9 @@ def play(env: ExplorationEnv, seed: int) -> tuple[FloatArray, FloatArray, FloatA
     """
     observations, _ = env.reset(seed=seed)
     rng, policy = np.random.default_rng(seed), make_policy("random_goals", "goal")
-    paid, chosen, seen = [], [], []
+    paid: list[Any] = []
+    chosen: list[Any] = []
+    seen: list[Any] = []
     while env.agents:
         agents = env.agents
         actions = {agent: policy.act(observations[agent], env.belief(agent), rng) for agent in agents}

@@ -1,8 +1,8 @@
 """Make the moving picture of the README: three robots map an office and merge their maps.
 
-python benchmarks/moving_picture.py                  # docs/figures/episode.webp, about a minute
-python benchmarks/moving_picture.py --seed 1 --out other.webp
-python benchmarks/moving_picture.py --policy learned --beside next_best_view --out both.webp   # the same world twice
+python -m studies.moving_picture                  # docs/figures/episode.webp, about a minute
+python -m studies.moving_picture --seed 1 --out other.webp
+python -m studies.moving_picture --policy learned --beside next_best_view --out both.webp   # the same world twice
 """
 
 import argparse

@@ -1,18 +1,14 @@
 """Learning signal of rewards: advantages by hand, relative choices, discounted returns, tables."""
 
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from builders.scripts import load_script
 
+from studies import learning_signal
 from vslam_env import CANDIDATE_FEATURES, NUM_CANDIDATES, vslam_v1
 from vslam_env.config import TICK
-
-PATH = Path(__file__).parents[2] / "benchmarks" / "learning_signal.py"
-learning_signal = load_script(PATH)
 
 
 def _seen(candidates: list[list[float]]) -> dict[str, Any]:

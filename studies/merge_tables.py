@@ -1,7 +1,7 @@
 """Tables of `docs/explanation/merging.md` from results of `merge_soak.py --json`.
 
-    python benchmarks/merge_tables.py benchmarks/merge_soak/*.json
-    python benchmarks/merge_tables.py benchmarks/merge_soak/both_9000.json --worst 6
+    python -m studies.merge_tables benchmarks/merge_soak/*.json
+    python -m studies.merge_tables benchmarks/merge_soak/both_9000.json --worst 6
 
 The first table has the outcomes of the merges of each soak; the second, over all merges that were not forced, compares
 smoothed with unsmoothed maps; the third lists the merges with the largest errors and their shares of wrong pairs.

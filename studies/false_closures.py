@@ -1,6 +1,6 @@
 """False loop closures in look-alike corridors: does a filter take a corridor for the one that looks the same?
 
-    python benchmarks/false_closures.py --trials 1000 --json false_closures.json
+    python -m studies.false_closures --trials 1000 --json false_closures.json
 
 In each trial a robot with the default noise, camera and filter of environments drives along corridor A, by a way round
 into corridor B, which has the same landmarks with the same descriptors at the same places, along it, and back into A.
