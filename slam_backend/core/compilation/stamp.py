@@ -1,13 +1,16 @@
 """Stamps of kernels: digests of the inputs of their compilation, apart from signature and processor.
 
 A kernel is compiled together with all kernels that it calls, and the constants that these name become part of it. The
-stamp therefore covers the code of the kernel and of all functions that it reaches, in any module, their options and the
-values of their constants. A change of any of these changes the stamp; a change of a comment does not.
+stamp therefore covers the code of the kernel and of all functions that it reaches, in any module, their options and
+compilers, and the values of their constants. A change of any of these changes the stamp; a change of a comment in a
+kernel does not.
 """
 
 from collections.abc import Iterable, Iterator
 from functools import cache
 from hashlib import sha256
+from inspect import getfile
+from pathlib import Path
 from types import BuiltinFunctionType, CodeType, EllipsisType, FunctionType, ModuleType, NoneType
 from typing import Any
 
@@ -58,10 +61,17 @@ def _tools() -> str:
 
 
 def _options(function: Any) -> str:
-    """Return the options of a kernel as a text, sorted; empty for other functions."""
+    """Return the options of a kernel and its compiler as a text, sorted; empty for other functions."""
     if not isinstance(function, CPUDispatcher):
         return ""
-    return repr(sorted((name, sorted(x) if isinstance(x, set) else x) for name, x in function.targetoptions.items()))
+    options = sorted((name, sorted(x) if isinstance(x, set) else x) for name, x in function.targetoptions.items())
+    return repr((options, _compiler_text(function._compiler.pipeline_class)))  # type: ignore[attr-defined]
+
+
+@cache
+def _compiler_text(kind: type) -> str:
+    """Return the name of a compiler and, if it is the project's own, a digest of its module."""
+    return _path(kind) + ("" if _is_library(kind) else sha256(Path(getfile(kind)).read_bytes()).hexdigest())
 
 
 @cache

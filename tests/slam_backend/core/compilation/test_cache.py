@@ -12,6 +12,7 @@ from typing import Any
 import numba
 import numpy as np
 import pytest
+from numba.core.compiler import Compiler
 
 from slam_backend.core import jit as _jit
 from slam_backend.core.compilation import cache, shipped
@@ -223,6 +224,9 @@ def test_options_are_part_of_what_a_kernel_is_compiled_from() -> None:
     stamps.append(_stamp(_jit.device(_jit.jit(double))))
     assert all(stamps.count(stamp) == 1 for stamp in stamps)
     assert stamps[0] == _stamp(_jit.jit(double))
+    own: Any = _jit.device(_jit.jit(double))
+    own._compiler.pipeline_class = Compiler
+    assert _stamp(own) not in stamps
 
 
 def _stamp(kernel: Any) -> str:
