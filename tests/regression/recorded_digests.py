@@ -186,34 +186,13 @@ def commands() -> dict[str, list[str]]:
         "bench accuracy": ["training", "bench", "accuracy", "--seeds", "1", "--lengths", "20", "--particles", "30"],
         "studies alignment": ["studies.alignment", "--seeds", "2", "--hard", "9"],
         "run": ["training", "run", "--world", "maze", "--robots", "2", "--max-cycles", "120", "--no-video"],
-        "replay mrclam": [
-            "training",
-            "replay",
-            "mrclam",
-            "--path",
-            str(DATA / "mrclam/MRCLAM_Dataset7"),
-            "--duration",
-            "150",
-        ],
-        "replay victoria": [
-            "training",
-            "replay",
-            "victoria",
-            "--path",
-            str(DATA / "victoria_park"),
-            "--duration",
-            "100",
-        ],
-        "replay kitti": [
-            "training",
-            "replay",
-            "kitti",
-            "--path",
-            str(DATA / "kitti_landmarks/0027.npz"),
-            "--duration",
-            "20",
-        ],
     }
+    logs = (
+        ("mrclam", "mrclam/MRCLAM_Dataset7", 150), ("victoria", "victoria_park", 100),
+        ("kitti", "kitti_landmarks/0027.npz", 20),
+    )  # fmt: skip
+    for name, path, seconds in logs:
+        found[f"replay {name}"] = ["training", "replay", name, "--path", str(DATA / path), "--duration", str(seconds)]
     return {name: words for name, words in found.items() if "replay" not in name or DATA.is_dir()}
 
 
@@ -231,10 +210,13 @@ def run_command(arguments: list[str]) -> str:
     return digest.hexdigest()[:24]
 
 
+TIMES = "seconds", "_s", "_ms", "_us", "[ms]", "[s]"  # ends of names of times
+
+
 def results_of(content: Any) -> Any:
     """Return a tree of metrics without what describes the run or measures time."""
     if isinstance(content, Mapping):
-        kept = (key for key in content if key not in NOT_RESULTS and not key.endswith(("seconds", "_s", "_ms", "_us")))
+        kept = (key for key in content if key not in NOT_RESULTS and not key.endswith(TIMES))
         return [results_of(content[key]) for key in kept]
     return [results_of(item) for item in content] if isinstance(content, list) else content
 

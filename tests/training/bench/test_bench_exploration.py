@@ -25,10 +25,10 @@ from training.bench.exploration.report import (
     markdown,
     print_tables,
     summarise,
-    to_csv,
 )
 from training.bench.exploration.trials import CURVE_POINTS, CURVES, TRIALS_FILE, count_merges, play
 from training.episodes.runner import MergeRecord
+from training.experiments.tables import csv_of
 from vslam_env import vslam_v0
 
 SMALL = ExplorationBenchConfig(
@@ -241,7 +241,7 @@ def test_tables_fit_into_80_columns(rows: list[dict[str, Any]]) -> None:
 
 def test_curves_are_drawn_and_written(rows: list[dict[str, Any]], tmp_path: Path) -> None:
     """The CSV has a line per policy, oracle and time; the figure is a PNG file."""
-    found = list(csv.DictReader(io.StringIO(to_csv(curves(rows)))))
+    found = list(csv.DictReader(io.StringIO(csv_of(curves(rows)))))
     assert len(found) == 3 * 2 * CURVE_POINTS
     last = [line for line in found if (line["policy"], line["oracle"]) == ("frontier", "none")][-1]
     assert float(last["coverage"]) == pytest.approx(rows[0]["coverage"], rel=1e-5)

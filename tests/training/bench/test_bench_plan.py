@@ -241,7 +241,7 @@ def test_the_leaderboard_is_made_from_kept_results(vslam: Any, run: Path, tiny: 
     with Image.open(tmp_path / "leaderboard.png") as figure:
         assert min(figure.size) > 400
     for section in (run / "tables.md").read_text().split("### ")[1:]:
-        assert section.rstrip("\n") in text
+        assert " ".join(section.split()) in " ".join(text.split())  # lines may end elsewhere
     assert vslam("bench", "leaderboard", str(kept), str(run), "--out", str(page)).status == 0
     assert page.read_text() == text  # a policy in both, such as the baseline, counts once
     played = (run / "episodes.csv").read_text().splitlines()

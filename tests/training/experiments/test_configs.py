@@ -9,6 +9,7 @@ from slam_backend.fastslam.options import PROPOSALS
 from slam_backend.frontend import DESCRIPTORS
 from slam_backend.maps.alignment import METHODS
 from slam_backend.readers.stereo_files import StereoFiles
+from studies import alignment
 from training.bench import config as bench
 from training.bench.accuracy import runs, trials
 from training.episodes.config import RunConfig
@@ -210,7 +211,7 @@ def test_choices_match_the_packages() -> None:
     assert get_args(experiments.NoisePreset) == NOISE_PRESETS
     assert get_args(experiments.Preset) == PRESETS
     assert get_args(experiments.Sensor) == SENSORS
-    assert get_args(bench.AlignmentMethod) == METHODS
+    assert get_args(alignment.Method) == METHODS
     assert get_args(bench.Method) == trials.METHODS
     assert paper.STEP == runs.STEP
     assert tuple(TRAIN_PRESETS) == ("quick", "imitate", "ppo", "smoke")
