@@ -39,7 +39,6 @@ STATE_PER_ROBOT = 12
 RESET_OPTIONS = ("world_seed", "start_poses")
 PROBE = "options"  # option with which the test suite of PettingZoo resets any environment
 RENDER_MODES = ("human", "rgb_array")
-# Kernels of rejuvenations and merges, which the first steps do not call
 
 
 class ExplorationEnv(ParallelEnv[AgentID, Any, Any]):  # type: ignore[misc]   # PettingZoo has no type information

@@ -1,1 +1,1 @@
-"""Alignment benchmarks on simulated and real pairs of maps."""
+"""Alignment of maps of real robots."""
