@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib as mpl
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
@@ -39,7 +38,7 @@ def draw_chart(file: Path, chart: Chart, rows: Sequence[Row]) -> None:
         for ax in axes[-1]:
             ax.set_xlabel(chart.label)
         if chart.by:
-            add_legend(figure, axes[0][0])
+            add_legend(figure, axes[0][0], title=in_words(chart.by)[0])
         save_png(figure, file, 110)
 
 
@@ -86,9 +85,9 @@ def draw_curves(file: Path, curves: Curves, rows: Sequence[Row]) -> None:
         axes = figure.subplots(1, len(curves.columns), squeeze=False)[0]
         for ax, column in zip(axes, curves.columns, strict=True):
             for place, (key, group) in enumerate(grouped(lines, curves.by).items()):
-                values = [np.nan if line[column.name] is None else line[column.name] for line in group]
+                known = [line for line in group if line[column.name] is not None]
                 ax.plot(
-                    [line["time_s"] for line in group], _factor(column) * np.array(values), lw=1.2,
+                    [line["time_s"] for line in known], [_factor(column) * line[column.name] for line in known], lw=1.2,
                     color=COLOURS[place % len(COLOURS)], ls=STYLES[place // len(COLOURS) % len(STYLES)],
                     label=", ".join(map(str, key)),
                 )  # fmt: skip
