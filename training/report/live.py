@@ -45,7 +45,8 @@ class LiveView:
         self._content: Callable[[], Content] = lambda: Content(title="")
         self._should_stop: Callable[[], bool] = lambda: False
         self._changed = threading.Condition()
-        self._version, self._shown = 0, Content(title="vslam run")
+        self._version, self._shown, self._news = 0, Content(title="vslam run"), b""
+        self._page: tuple[Content, bytes] | None = None
         self._is_over = False
         self._asked = -WATCHED_S  # time of the last request for content
         self._sent = 0  # newest version that a page has
@@ -115,20 +116,24 @@ class LiveView:
 
     def _publish(self, is_over: bool = False) -> None:
         begin = time.monotonic()
-        shown = self._content()
+        shown, version = self._content(), self._version + 1
+        news = {"version": version, "over": is_over, "page": shown.to_mapping(), "arrays": shown.packer.text()}
+        text = json.dumps(news, allow_nan=False).encode()  # once, for all pages
         end = time.monotonic()
         self._next = end + max(SHORTEST_S, (end - begin) / SHARE)
         with self._changed:
-            self._shown, self._version, self._is_over = shown, self._version + 1, is_over
+            self._shown, self._news, self._version, self._is_over = shown, text, version, is_over
             self._changed.notify_all()
 
-    def page(self) -> str:
+    def page(self) -> bytes:
         """Return the page with its present content."""
         with self._changed:
-            shown = self._shown
-        return render(shown, live=True)
+            shown, known = self._shown, self._page
+        if known is None or known[0] is not shown:
+            self._page = known = shown, render(shown, live=True).encode()
+        return known[1]
 
-    def answer(self, after: int) -> tuple[int, str]:
+    def answer(self, after: int) -> tuple[int, bytes]:
         """Return the version of the content, and JSON with content newer than `after`, as soon as there is some.
 
         Keys are `version`, `over` (whether the episode has ended), and, where there is newer content, `page` and
@@ -138,11 +143,8 @@ class LiveView:
             self._asked = time.monotonic()
             self._changed.wait_for(lambda: self._version > after or self._is_over, ANSWER_S)
             self._asked = time.monotonic()
-            shown, version, is_over = self._shown, self._version, self._is_over
-        answer: dict[str, Any] = {"version": version, "over": is_over}
-        if version > after:
-            answer |= {"page": shown.to_mapping(), "arrays": shown.packer.text()}
-        return version, json.dumps(answer, allow_nan=False)
+            news, version, is_over = self._news, self._version, self._is_over
+        return version, news if version > after else json.dumps({"version": version, "over": is_over}).encode()
 
     def delivered(self, version: int) -> None:
         """Note that a page has got a version."""
@@ -153,6 +155,7 @@ class LiveView:
 
 class _Server(ThreadingHTTPServer):
     daemon_threads = True
+    request_queue_size = 128  # connections that wait to be accepted; more are refused
     allow_reuse_address = os.name != "nt"  # on Windows two servers could otherwise share a port
 
     def handle_error(self, request: Any, client_address: Any) -> None:
@@ -178,8 +181,7 @@ def _handler_of(view: LiveView) -> type[BaseHTTPRequestHandler]:
             else:
                 self.send_error(HTTPStatus.NOT_FOUND)
 
-        def _send(self, text: str, kind: str) -> None:
-            data = text.encode()
+        def _send(self, data: bytes, kind: str) -> None:
             self.send_response(HTTPStatus.OK)
             self.send_header("Content-Type", kind)
             self.send_header("Content-Length", str(len(data)))

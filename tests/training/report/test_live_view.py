@@ -62,6 +62,22 @@ def test_a_page_gets_newer_content_as_soon_as_there_is_some(running: tuple[LiveV
     assert json.loads(fetched(view, "content?after=2"))["over"]
 
 
+def test_many_pages_that_do_not_read_share_one_text(running: tuple[LiveView, list[str]]) -> None:
+    """Each of 200 connections is accepted while others wait; the content is made once; the view ends without them."""
+    view, _ = running
+    port = int(view.address.rsplit(":")[-1].strip("/"))
+    pages = [socket.create_connection(("127.0.0.1", port), 20.0) for _ in range(200)]
+    for page in pages:
+        page.sendall(b"GET /content?after=0 HTTP/1.1\r\nHost: localhost\r\n\r\n")
+    assert view.answer(0)[1] is view.answer(0)[1]
+    assert json.loads(fetched(view, "content?after=0"))["page"]["title"] == "first"
+    begin = time.monotonic()
+    view.__exit__(None, None, None)
+    assert time.monotonic() - begin < 5.0
+    for page in pages:
+        page.close()
+
+
 def test_only_this_machine_is_answered(running: tuple[LiveView, list[str]]) -> None:
     """Other paths are not found, and requests under the name of another site are refused."""
     view, _ = running
