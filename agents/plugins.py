@@ -1,4 +1,4 @@
-"""Custom policies, imported by module and name: `my_module:Careful`."""
+"""Custom policies, and other parts of users, imported by module and name: `my_module:Careful`."""
 
 import sys
 from collections.abc import Iterator
@@ -10,10 +10,9 @@ from traceback import extract_tb
 from typing import Any
 
 from agents.policy import Policy
-from slam_backend.core.validation import argument_error, check_choice, did_you_mean, is_built_in
+from slam_backend.core.validation import argument_error, check_choice, did_you_mean, is_argument_error, is_built_in
 
 ACTION_TYPES = ("continuous", "discrete", "goal")
-EXPECTED = "MODULE:NAME of a policy"
 METHODS = ("reset", "act")
 NEEDED = (
     "A policy has the methods reset() and act(observation, belief, rng). Name its class or a factory function "
@@ -48,12 +47,12 @@ def load_plugin(name: str) -> Policy:
         ValueError: If the module or the name does not exist, the call raises, or the result is not a policy.
     """
     maker = _find(name)
-    with _one_line(name):
+    with one_line(name):
         policy = maker()
     missing = [method for method in METHODS if not callable(getattr(policy, method, None))]
     if missing:
         got = f"a {type(policy).__name__} without {missing[0]}"
-        raise argument_error("policy", EXPECTED, got, NEEDED)
+        raise argument_error("policy", _expected("policy"), got, NEEDED)
     made: Policy = policy
     return made
 
@@ -67,26 +66,43 @@ def plugin_file(name: str) -> Path:
     _find(name)
     file = sys.modules[name.partition(":")[0]].__file__
     if file is None:
-        raise argument_error("policy", EXPECTED, f"a module without a file: {name}", "Write it into a file.")
+        raise argument_error("policy", _expected("policy"), f"a module without a file: {name}", "Write it into a file.")
     return Path(file)
 
 
-def _find(name: str) -> Any:
-    """Return the class or function that makes the policy."""
+def find_plugin(name: str, what: str = "policy") -> Any:
+    """Return the class or function of a name `MODULE:NAME`; the current folder is searched first.
+
+    Args:
+        what: Kind of the part, for errors.
+
+    Raises:
+        ValueError: If the module or the name does not exist, or the module raises.
+    """
     module, _, factory = name.partition(":")
     try:
-        with _current_folder_first(), _one_line(module):
+        with _current_folder_first(), one_line(module, what):
             imported = import_module(module)
     except ModuleNotFoundError as error:
         hint = "Name an installed module, or change into the folder that contains it."
-        raise argument_error("policy", EXPECTED, f"no module {module!r}", hint) from error
+        raise argument_error(what, _expected(what), f"no module {module!r}", hint) from error
     made = getattr(imported, factory, None)
     if not callable(made):
         hint = did_you_mean(factory, vars(imported)) + "Check the name."
-        raise argument_error("policy", EXPECTED, f"no class or function {factory!r} in {module}", hint)
-    if not _may_make_policies(made):
-        raise argument_error("policy", EXPECTED, f"no policy factory: {name}", NEEDED)
+        raise argument_error(what, _expected(what), f"no class or function {factory!r} in {module}", hint)
     return made
+
+
+def _find(name: str) -> Any:
+    """Return the class or function that makes a policy."""
+    made = find_plugin(name)
+    if not _may_make_policies(made):
+        raise argument_error("policy", _expected("policy"), f"no policy factory: {name}", NEEDED)
+    return made
+
+
+def _expected(what: str) -> str:
+    return f"MODULE:NAME of a {what}"
 
 
 def _may_make_policies(maker: Any) -> bool:
@@ -101,25 +117,30 @@ def _may_make_policies(maker: Any) -> bool:
 
 
 @contextmanager
-def _one_line(name: str) -> Iterator[None]:
-    """Turn what a custom module raises within the block into an error of one line, unless the module is missing."""
+def one_line(name: str, what: str = "policy") -> Iterator[None]:
+    """Turn what a custom module raises within the block into an error of one line, unless the module is missing.
+
+    Errors of arguments, which are such lines, are passed on for all but policies.
+    """
     try:
         yield
     except ModuleNotFoundError as error:
         if error.name is not None and f"{name}.".startswith(f"{error.name}."):
             raise
-        raise _raised(name, error) from error  # one of its own imports is missing
+        raise _raised(name, what, error) from error  # one of its own imports is missing
     except Exception as error:
-        raise _raised(name, error) from error
+        if what != "policy" and is_argument_error(error):
+            raise
+        raise _raised(name, what, error) from error
 
 
-def _raised(name: str, error: Exception) -> ValueError:
+def _raised(name: str, what: str, error: Exception) -> ValueError:
     """Return an error of one line that says what a custom module raised, and where."""
     last = extract_tb(error.__traceback__)[-1]
-    what = " ".join(f"{type(error).__name__}: {error}".split())
+    text = " ".join(f"{type(error).__name__}: {error}".split())
     return ValueError(
-        f"policy {name!r}: expected it to be imported and made, got {what} ({Path(last.filename).name}, line "
-        f"{last.lineno}). Correct the policy."
+        f"{what} {name!r}: expected it to be imported and {'made' if what == 'policy' else 'called'}, got {text} "
+        f"({Path(last.filename).name}, line {last.lineno}). Correct the {what}."
     )
 
 

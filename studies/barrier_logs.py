@@ -25,7 +25,8 @@ from slam_backend.readers.conversions import points_from_polar
 from slam_backend.readers.mrclam import SightingNoise
 from slam_backend.team.merge_scheduler import AttemptOptions
 from slam_backend.team.team import TeamSlam
-from training.replay.mrclam import GATES, MAX_SIGMA_HEADING, MOTION, PARTICLES_PER_ROBOT, POSITION_FLOOR
+from training.replay.core import PARTICLES_PER_ROBOT
+from training.replay.readers import GATES, MAX_SIGMA_HEADING, MOTION, POSITION_FLOOR
 
 DT = 0.25  # [s]
 HALL = np.array([15.0, 8.0])  # [m]

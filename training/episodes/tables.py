@@ -34,25 +34,34 @@ MAP_COLUMNS = ("id", "count", "x_m", "y_m", "z_m", *(f"cov_{pair}_m2" for pair i
 
 
 def print_tables(console: Console, metrics: Mapping[str, Any]) -> None:
-    """Print the metrics of robots and team, a row for each, then the merges."""
-    lines = {str(robot): row for robot, row in enumerate(metrics["robots"])} | {"team": metrics["team"]}
+    """Print the metrics of robots and team, a row for each, then the merges; columns without values are omitted."""
+    lines = [(str(row.get("robot", robot)), row) for robot, row in enumerate(metrics["robots"])]
+    lines += [("team", metrics["team"])] if "team" in metrics else []
     for title, columns, note in (
         ("Maps, each in its robot's start frame", MAPS, E_SCALE), ("Paths", PATHS, ATE_NOTE),
     ):  # fmt: skip
-        rows = [[name, *figures(row, columns)] for name, row in lines.items()]
-        console.print(console_table(title, ("robot", *map(heading, columns)), rows))
+        shown = {name: n for name, n in columns.items() if any(row.get(name) is not None for _, row in lines)}
+        if not set(shown) - {"path_m"}:
+            console.print(f"{title}: no ground truth in this log.")
+            continue
+        rows = [[name, *figures(row, shown)] for name, row in lines]
+        console.print(console_table(title, ("robot", *map(heading, shown)), rows))
         console.print(note)
     if metrics["merges"]:
         console.print(_merges(metrics["merges"]))
         console.print(MAPS_NOTE)
-    else:
+    elif len(metrics["robots"]) > 1:
         console.print("No merge.")
     print_refusals(console, metrics["refusals"])
-    print_groups(console, metrics)
-    console.print(f"Coverage: {number(metrics['coverage'], 1, 100.0)} % of the floor in {metrics['duration_s']:.0f} s.")
+    if len(metrics["robots"]) > 1:
+        _print_groups(console, metrics)
+    if metrics["coverage"] is not None:
+        console.print(
+            f"Coverage: {number(metrics['coverage'], 1, 100.0)} % of the floor in {metrics['duration_s']:.0f} s."
+        )
 
 
-def print_groups(console: Console, metrics: Mapping[str, Any]) -> None:
+def _print_groups(console: Console, metrics: Mapping[str, Any]) -> None:
     """Print the groups at the end, and the number of merge attempts."""
     groups = "; ".join(", ".join(map(str, group)) for group in metrics["groups"])
     console.print(f"Groups of robots with a common map at the end: {groups}.  Merge attempts: {metrics['attempts']}.")

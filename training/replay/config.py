@@ -57,8 +57,9 @@ class ReplayConfig(ExperimentConfig):
     duration: float | None = option(
         None, "Duration to replay [s].", shown="all", gt=0.0, hint="Give seconds, or omit it."
     )
-    estimator: Proposal = option("fastslam2", "Proposal: fastslam2 or fastslam1.", name="proposal")
-    rejuvenate_every: int = option(
+    particles: int | None = option(100, "Number of particles per filter.", ge=1, hint=ONE_PARTICLE)
+    estimator: Proposal | None = option("fastslam2", "Proposal: fastslam2 or fastslam1.", name="proposal")
+    rejuvenate_every: int | None = option(
         REJUVENATE_EVERY, "Steps between rejuvenations of the particles from smoothed paths; 0: never.", ge=0,
         hint="Give a number of steps, or 0 for never.",
     )  # fmt: skip
@@ -91,7 +92,6 @@ class VictoriaConfig(ReplayConfig):
     """Replay of the Victoria Park log."""
 
     path: str = log_path(VICTORIA)
-    particles: int = option(100, "Number of particles per filter.", ge=1, hint=ONE_PARTICLE)
     motion: OdometryModel = setting(VICTORIA_MOTION, "Assumed odometry noise.")
     sensor: TreeNoise = setting({}, "Assumed noise of the tree measurements.")
 
@@ -105,7 +105,6 @@ class KittiConfig(ReplayConfig):
 
     path: str = log_path(KITTI, "Archive of features, folder with an archive, or folder of images.")
     truth: str | None = option(None, "File of the true poses.", shown="file beside the data", is_path=True)
-    particles: int = option(100, "Number of particles per filter.", ge=1, hint=ONE_PARTICLE)
     sigma_px: Pixels = setting(1.0, "Assumed standard deviation of a feature's column [px].")
     sigma_disparity_px: Pixels = setting(0.5, "Assumed standard deviation of its disparity [px].")
 
@@ -134,31 +133,31 @@ class ImagesConfig(ReplayConfig):
         40.0, "Maximum distance of points [m].", shown="12 for two pairs, 40 for a drive", gt=NEAREST,
         hint="Give metres.",
     )  # fmt: skip
-    particles: int = option(100, "Number of particles per filter.", ge=1, hint=ONE_PARTICLE)
     descriptor: Descriptor = option("usurf", "Descriptor: usurf, sift or orb.")
-    estimator: Proposal = "fastslam2"
-    rejuvenate_every: int = setting(REJUVENATE_EVERY, ge=0)
+    estimator: Proposal | None = "fastslam2"
+    rejuvenate_every: int | None = setting(REJUVENATE_EVERY, ge=0)
     sigma_px: Pixels = setting(2.0, "Assumed standard deviation of a feature's column [px].")
     sigma_disparity_px: Pixels = setting(0.5, "Assumed standard deviation of its disparity [px].")
 
-
-class PairsConfig(ExperimentConfig):
-    """Alignment of two stereo pairs; the default file of true poses is `poses_dev.txt`, if present."""
-
-    path: str
-    left: str = "left_img_*.png"
-    right: str = "right_img_*.png"
-    calibration: str = "sensorLeft.yaml,sensorRight.yaml"
-    truth: str | None = None
-    descriptor: Descriptor = "usurf"
-    max_range: float = setting(12.0, "Maximum distance of points [m].", gt=0.0)
-
     @property
     def files(self) -> "StereoFiles":
-        """Names of the files."""
+        """Names of the files, by default those of two pairs."""
         from slam_backend.readers.stereo_files import StereoFiles
 
-        return StereoFiles(left=self.left, right=self.right, calibration=self.calibration, truth=self.truth)
+        given = {name: getattr(self, name) for name in ("left", "right", "calibration", "times", "truth")}
+        return StereoFiles(**{name: value for name, value in given.items() if value is not None})
+
+
+class LogConfig(ReplayConfig):
+    """Replay of a log by a reader of the user; what is not given is as in the log, or else as for other logs."""
+
+    path: str = option(..., "Path that the reader gets.", is_path=True)
+    particles: int | None = option(None, "Number of particles per filter.", shown="as the log", ge=1, hint=ONE_PARTICLE)
+    estimator: Proposal | None = option(None, "Proposal: fastslam2 or fastslam1.", name="proposal", shown="as the log")
+    rejuvenate_every: int | None = option(
+        None, "Steps between rejuvenations of the particles; 0: never.", shown="as the log", ge=0,
+        hint="Give a number of steps, or 0 for never.",
+    )  # fmt: skip
 
 
 def find_log(path: str | None, below: Path, what: str) -> str:

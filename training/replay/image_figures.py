@@ -1,5 +1,6 @@
 """Camera images with corners and landmarks, and image pairs with their matches."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -7,7 +8,9 @@ import numpy as np
 
 from slam_backend.core.files import write_file
 from slam_backend.core.validation import FloatArray, IntArray
+from slam_backend.frontend import StereoFrame
 from slam_backend.frontend.images import Image
+from slam_backend.frontend.odometry import CameraMotion
 from slam_backend.geometry import inverse, transform_points
 from training.experiments.plotting import picture
 
@@ -36,18 +39,15 @@ def draw_frame(
 
 
 @picture
-def draw_matches(file: Path, left: Image, right: Image, a: FloatArray, b: FloatArray, right_ones: IntArray) -> None:
-    """Draw two images, one above the other, with lines between matched points (n, 2) [px].
-
-    Args:
-        right_ones: Rows of the correct matches; the others are drawn in red.
-    """
+def draw_matches(file: Path, images: tuple[Image, Image], frames: Sequence[StereoFrame], motion: CameraMotion) -> None:
+    """Draw two images, one above the other, with lines between matched points; wrong matches are red."""
+    (left, right), good = images, set(np.flatnonzero(motion.inliers).tolist())
+    a, b = (frame.pixels[rows, :2] for frame, rows in zip(frames, motion.pairs.T, strict=True))
     width = max(left.shape[1], right.shape[1])
     canvas = np.zeros((left.shape[0] + right.shape[0], width), np.uint8)
     canvas[: left.shape[0], : left.shape[1]] = left
     canvas[left.shape[0] :, : right.shape[1]] = right
     picture = cv2.cvtColor(canvas, cv2.COLOR_GRAY2BGR)
-    good = set(right_ones.tolist())
     for row in sorted(range(len(a)), key=lambda n: n in good):
         colour = KNOWN if row in good else REFUSED
         ends = _fine(*a[row]), _fine(b[row, 0], b[row, 1] + left.shape[0])

@@ -19,7 +19,7 @@ from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.models.camera import ROBOT_FROM_CAMERA, StereoCamera
 from slam_backend.readers.calibration import Rectified, Rectifier
 from slam_backend.readers.stereo_files import StereoFiles, find_pairs, load_rig, truth_file
-from training.replay.config import PairsConfig
+from training.experiments.config import Descriptor
 
 FILES = StereoFiles()
 POSES_FILE = "poses_dev.txt"
@@ -78,34 +78,34 @@ def load_pairs(path: str | Path, files: StereoFiles = FILES) -> RoomPairs:
     )  # fmt: skip
 
 
-def align_pairs(log: RoomPairs, config: PairsConfig) -> PairsResult:
+def align_pairs(log: RoomPairs, descriptor: Descriptor, max_range: float = 12.0, seed: int = 0) -> PairsResult:
     """Measure both pairs, match their points by appearance, and estimate the motion between the cameras."""
-    rectifier = log.rectifier
-    size = rectifier.camera
+    rectifier, size = log.rectifier, log.rectifier.camera
     camera = rectifier.pair.camera(
-        size.width, size.height, max_range=config.max_range, sigma_px=SIGMA_PX, sigma_disparity_px=SIGMA_DISPARITY_PX
+        size.width, size.height, max_range=max_range, sigma_px=SIGMA_PX, sigma_disparity_px=SIGMA_DISPARITY_PX
     )
-    seen = FrontEndOptions(descriptor=config.descriptor, corners=CornerOptions(most=CORNERS))
+    seen = FrontEndOptions(descriptor=descriptor, corners=CornerOptions(most=CORNERS))
     eye = StereoFrontEnd(camera, seen, rectifier.pair.centre_px)
     rectified = [rectifier.rectify(*pair) for pair in log.images]
     first, second = (eye.measure(*pair) for pair in rectified)
-    rng = np.random.default_rng(config.seed)
-    gate = (
-        2.0 * DESCRIPTOR_TYPES[config.descriptor].gate
-    )  # distant views have less similar descriptors; RANSAC rejects wrong matches
+    # Distant views have less similar descriptors; RANSAC rejects wrong matches.
+    gate = 2.0 * DESCRIPTOR_TYPES[descriptor].gate
+    rng = np.random.default_rng(seed)
     motion = camera_motion(first.measurements, second.measurements, camera, gate, rng, ITERATIONS)
-    nan = float("nan")
-    error_m, error_deg, true_m, true_deg = nan, nan, nan, nan
+    error, apart = (np.nan, np.nan), (np.nan, np.nan)
     if log.poses is not None:
         world = [pose @ rectifier.body_from_camera for pose in log.poses]
         true: FloatArray = np.asarray(np.linalg.solve(world[0], world[1]), dtype=np.float64)
-        true_m, true_deg = float(np.linalg.norm(true[:3, 3])), float(np.degrees(rotation_angle(true[:3, :3])))
+        apart = _size(true[:3, 3], true[:3, :3])
         if motion is not None:
-            error_m = float(np.linalg.norm(motion.translation - true[:3, 3]))
-            error_deg = float(np.degrees(rotation_angle(motion.rotation.T @ true[:3, :3])))
-    images = (rectified[0][0], rectified[1][0])
-    maps = _map_of(first, camera), _map_of(second, camera)
-    return PairsResult(images, (first, second), motion, error_m, error_deg, true_m, true_deg, maps)
+            error = _size(motion.translation - true[:3, 3], motion.rotation.T @ true[:3, :3])
+    images, maps = (rectified[0][0], rectified[1][0]), (_map_of(first, camera), _map_of(second, camera))
+    return PairsResult(images, (first, second), motion, *error, *apart, maps)
+
+
+def _size(translation: FloatArray, rotation: FloatArray) -> tuple[float, float]:
+    """Return the length [m] and the angle [degrees] of a motion."""
+    return float(np.linalg.norm(translation)), float(np.degrees(rotation_angle(rotation)))
 
 
 def _map_of(frame: StereoFrame, camera: StereoCamera) -> LandmarkMap:

@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 from small_logs import write_log
 
-from slam_backend.readers.mrclam import load_mrclam
 from training.bench.alignment.mrclam import align_log, align_pairs, summarise
 from training.bench.config import MrclamPairsConfig
 from training.replay.config import MrclamConfig
-from training.replay.mrclam import replay_team
+from training.replay.core import replay_log
+from training.replay.readers import read_mrclam
 
 
 def test_exact_maps_are_aligned_exactly(tmp_path: Path) -> None:
     """Without noise the maps of both robots are aligned to centimetres, by barcodes and by geometry only."""
     write_log(tmp_path, noise=0.0)
-    log = load_mrclam(tmp_path)
-    rows = align_pairs(replay_team(log, MrclamConfig(path=str(tmp_path), alone=True, particles=20)), log)
+    log = read_mrclam(tmp_path, alone=True)
+    rows = align_pairs(replay_log(log, MrclamConfig(path=str(tmp_path), particles=20)), log)
     assert {(row["barcodes"], row["method"]) for row in rows} == {
         (barcodes, method) for barcodes in ("given", "hidden") for method in ("ransac",)
     }

@@ -40,7 +40,7 @@ CASES: dict[type[ExperimentConfig], dict[str, Any]] = {
     paper.Fig6Config: {"regimes": ("good",)}, replay.ImagesConfig: {"path": "images", "descriptor": "orb"},
     replay.KittiConfig: {"path": "drive", "truth": "poses.txt"},
     replay.MrclamConfig: {"path": "log", "robots": (1, 4), "motion": {"sigma_along": 0.125}},
-    replay.PairsConfig: {"path": "room", "max_range": 7.0},
+    replay.LogConfig: {"path": "log", "particles": 7},
     replay.VictoriaConfig: {"path": "log", "sensor": {"range": 0.25}}, RunConfig: {"world": "maze", "max_cycles": 12},
 }  # fmt: skip
 KINDS = [pytest.param(kind, id=kind.__name__) for kind in CASES]
@@ -109,7 +109,7 @@ BAD: dict[type[ExperimentConfig], dict[str, dict[Any, str]]] = {
         "estimator": {"ekf": "one of 'fastslam2', 'fastslam1'"}, "particles": {0: AT_LEAST_1},
         "drive": {3: "a table of delay, speed, turn"}, "duration": {float("nan"): ABOVE_0},
     },
-    replay.PairsConfig: {"max_range": {0.0: ABOVE_0}, "descriptor": {"surf": "one of 'usurf', 'sift', 'orb'"}},
+    replay.LogConfig: {"particles": {0: AT_LEAST_1}},
     replay.VictoriaConfig: {"particles": {True: AT_LEAST_1, 2.5: AT_LEAST_1}},
     RunConfig: {
         "robots": {0: ROBOTS, 9: ROBOTS}, "sensor": {"sonar": "one of 'landmark', 'stereo'"},
@@ -218,5 +218,4 @@ def test_choices_match_the_packages() -> None:
     assert paper.Fig6Config().regimes == tuple(REGIMES)
     assert bench.EnvBenchConfig().robots[-1] == MAX_ROBOTS
     assert set(SPLITS) < {"train", "validation", "test", "any"}
-    files, pairs = StereoFiles(), replay.PairsConfig(path="room")
-    assert (pairs.left, pairs.right, pairs.calibration) == (files.left, files.right, files.calibration)
+    assert replay.ImagesConfig(path="room").files == StereoFiles()

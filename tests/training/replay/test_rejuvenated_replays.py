@@ -12,10 +12,10 @@ from small_logs import write_drive, write_log, write_park
 from slam_backend.fastslam.rejuvenation import RejuvenationScheduler
 from slam_backend.fastslam.reports import RejuvenationReport
 from slam_backend.smoother.rejuvenation import Rejuvenation
-from training.commands.replay import _rejuvenations
+from training.commands.replay import rejuvenation_lines
 from training.episodes.config import RunConfig
 from training.replay.config import REJUVENATE_EVERY, ImagesConfig, KittiConfig, MrclamConfig, VictoriaConfig
-from training.replay.single_robot import RejuvenationCount
+from training.replay.core import RejuvenationCount
 from vslam_env.config import EnvConfig
 from vslam_env.presets import preset_config
 
@@ -136,24 +136,24 @@ def test_a_run_is_rejuvenated_and_repeats_itself(vslam: Any, tmp_path: Path) -> 
     assert estimates(one) != estimates(plain)
 
 
-def _count_of(*reasons: str | None) -> dict[str, Any]:
-    """Return the count of attempts with these reasons; None: a step without an attempt."""
+def _count_of(*reasons: str) -> dict[str, Any]:
+    """Return the count of attempts with these reasons."""
     count = RejuvenationCount()
     for reason in reasons:
-        count.add(None if reason is None else RejuvenationReport(reason, 1.0, 1, 1))
+        count.add(RejuvenationReport(reason, 1.0, 1, 1))
     return count.to_mapping()
 
 
 def test_refusals_are_counted_by_reason() -> None:
-    """Numbers within a reason are ignored, and steps without an attempt do not count."""
+    """Numbers within a reason are ignored."""
     sizes = [f"an effective sample size of {size}" for size in ("1.5", "29.9")]
     refused = {"an effective sample size of n": 2, "no convergence in n iterations": 1}
-    assert _count_of("", *sizes, None, "", "no convergence in 15 iterations") == {"drawn": 2, "refused": refused}
+    assert _count_of("", *sizes, "", "no convergence in 15 iterations") == {"drawn": 2, "refused": refused}
 
 
 def test_rejuvenations_are_summarised_in_a_line() -> None:
     """Successes only, successes and refusals, and no text without attempts."""
-    assert _rejuvenations(_count_of(None)) == ""
-    assert _rejuvenations(_count_of("", "")) == "Rejuvenated 2 times."
-    line = _rejuvenations(_count_of("no pose to seek", ""))
+    assert not rejuvenation_lines(_count_of())
+    assert rejuvenation_lines(_count_of("", "")) == ["Rejuvenated 2 times."]
+    (line,) = rejuvenation_lines(_count_of("no pose to seek", ""))
     assert line == "Rejuvenated 1 times. Refused: no pose to seek (1)."

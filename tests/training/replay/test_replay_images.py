@@ -11,9 +11,11 @@ from slam_backend.readers.kitti_images import is_image_folder, load_kitti_images
 from slam_backend.readers.stereo_files import StereoFiles, load_stereo_images
 from slam_backend.trajectory import Trajectory
 from training.cli import app
-from training.replay.config import ImagesConfig, PairsConfig
+from training.replay.config import ImagesConfig
+from training.replay.core import replay_log
 from training.replay.image_figures import expected_pixels
-from training.replay.stereo_images import replay_images, score_images
+from training.replay.metrics import score_path
+from training.replay.stereo_images import CameraDrive, read_images
 from training.replay.stereo_pairs import align_pairs, load_pairs
 
 FOCAL, BASELINE, WIDTH, HEIGHT, STEP = 300.0, 0.5, 400, 240, 0.4
@@ -64,16 +66,18 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_drive_towards_a_wall_is_estimated(drive: Path) -> None:
     """Visual odometry and filter estimate the path to 3 %; they use different features."""
-    log = load_kitti_images(drive)
-    result = replay_images(log, ImagesConfig(path=str(drive), max_range=12.0, particles=30))
-    scored = score_images(result.replay, log)
-    assert scored is not None
-    assert scored.length == pytest.approx(5 * STEP)
-    assert scored.ends[1] < 0.03 * scored.length
-    assert scored.ends[0] < 0.03 * scored.length
-    assert result.odometry_inliers[1:].min() > 20
-    assert len(result.last_ids) == -(-result.features[-1] // 2)
-    assert set(result.heights) >= set(result.replay.landmarks.ids.tolist())
+    log = read_images(drive, max_range=12.0)
+    result = replay_log(log, ImagesConfig(path=str(drive), particles=30))
+    score = score_path(result, log)
+    assert score is not None
+    assert score.length == pytest.approx(5 * STEP)
+    for path in score.at_truth:
+        assert np.hypot(*(path[-1] - score.truth[-1])[:2]) < 0.03 * score.length
+    eye = log.source
+    assert isinstance(eye, CameraDrive)
+    assert eye.odometry_inliers[1:].min() > 20
+    assert len(eye.ids) == -(-eye.features[-1] // 2)
+    assert set(eye.heights) >= set(result.maps[0].ids.tolist())
 
 
 def test_the_command_accepts_a_folder_of_images(drive: Path, tmp_path: Path) -> None:
@@ -187,7 +191,7 @@ def test_landmarks_are_projected_into_a_level_camera() -> None:
 def test_real_rooms_are_aligned(data_dir: Path) -> None:
     """On EuRoC's pairs u-SURF has errors within 0.06 m and 2.1 degrees, like SIFT, for views 38 degrees apart."""
     log = load_pairs(data_dir / "euroc_pairs")
-    result = align_pairs(log, PairsConfig(path="", seed=100))
+    result = align_pairs(log, "usurf", seed=100)
     assert result.motion is not None
     assert result.motion.inliers.sum() > 150
     assert result.true_deg == pytest.approx(37.54, abs=0.01)
@@ -199,9 +203,8 @@ def test_real_rooms_are_aligned(data_dir: Path) -> None:
 def test_real_streets_are_replayed(data_dir: Path) -> None:
     """On half of KITTI's snippet the final error is within 3 % of the path."""
     folder = data_dir / "kitti_stereo" / "KITTI_sequence_1"
-    log = load_kitti_images(folder, duration=2.5)
-    result = replay_images(log, ImagesConfig(path=str(folder), seed=100, particles=50))
-    scored = score_images(result.replay, log)
-    assert scored is not None
-    assert scored.length > 25.0
-    assert scored.ends[0] < 0.03 * scored.length
+    log = read_images(folder, duration=2.5, seed=100)
+    score = score_path(replay_log(log, ImagesConfig(path=str(folder), particles=50)), log)
+    assert score is not None
+    assert score.length > 25.0
+    assert np.hypot(*(score.at_truth[0][-1] - score.truth[-1])[:2]) < 0.03 * score.length

@@ -10,26 +10,36 @@ from slam_backend.geometry import compose, inverse, transform_points
 from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.metrics import align_se2
 from slam_backend.models.odometry import OdometryModel
-from slam_backend.readers.mrclam import Drive, SightingNoise, load_mrclam
+from slam_backend.readers.mrclam import Drive, SightingNoise
 from slam_backend.trajectory import Trajectory
 from training.replay.config import MrclamConfig
+from training.replay.core import Replay, replay_log
+from training.replay.log import Log
 from training.replay.metrics import align_to_truth, score_path, summarise
-from training.replay.mrclam import replay_team
+from training.replay.readers import read_mrclam
 
-EXACT = MrclamConfig(
-    path="log", particles=7, drive=Drive(),
-    motion=OdometryModel(sigma_along=1e-3, sigma_across=1e-3, sigma_heading=1e-3, sigma_turn=1e-3),
-    sensor=SightingNoise(range_floor=0.02, range_share=0.0, bearing=0.01, height=0.01),
-)  # fmt: skip
+EXACT = {
+    "drive": Drive(),
+    "motion": OdometryModel(sigma_along=1e-3, sigma_across=1e-3, sigma_heading=1e-3, sigma_turn=1e-3),
+    "sensor": SightingNoise(range_floor=0.02, range_share=0.0, bearing=0.01, height=0.01),
+}  # fmt: skip
+
+
+def played(log: Log, particles: int | None = 7, seed: int = 0) -> Replay:
+    """Replay a log."""
+    return replay_log(log, MrclamConfig(path="log", particles=particles, seed=seed))
+
+
+def metrics_of(result: Replay, log: Log) -> dict[str, Any]:
+    """Return the metrics of a replay."""
+    return summarise(result, log, [score_path(result, log, robot) for robot in range(len(log.robots))])
 
 
 def test_exact_readings_give_exact_results(tmp_path: Path) -> None:
     """Exact readings give one group, and paths, maps and the merge accurate to centimetres."""
     write_log(tmp_path, noise=0.0)
-    log = load_mrclam(tmp_path)
-    result = replay_team(log, EXACT)
-    paths = [score_path(result, robot, own.truth) for robot, own in enumerate(log.robots)]
-    metrics = summarise(result, log, paths)
+    log = read_mrclam(tmp_path, **EXACT)
+    metrics = metrics_of(played(log), log)
     assert metrics["groups"] == [[2, 5]]
     assert len(metrics["merges"]) == 1
     assert metrics["merges"][0]["error_m"] < 0.05
@@ -48,12 +58,12 @@ def test_exact_readings_give_exact_results(tmp_path: Path) -> None:
 def test_the_filter_reduces_the_error_of_dead_reckoning(tmp_path: Path) -> None:
     """With biased odometry each path error is at most a third of dead reckoning's, in both kinds of score."""
     write_log(tmp_path, noise=1.0)
-    log = load_mrclam(tmp_path)
-    result = replay_team(log, MrclamConfig(path=str(tmp_path), particles=25, seed=4))
-    for robot, own in enumerate(log.robots):
-        path = score_path(result, robot, own.truth)
+    log = read_mrclam(tmp_path)
+    result = played(log, particles=25, seed=4)
+    for robot in range(len(log.robots)):
+        path = score_path(result, log, robot)
         assert path is not None
-        assert path.ate_aligned < 0.5 * path.reckoned_aligned
+        assert path.scores[0].aligned < 0.5 * path.scores[1].aligned
     assert len(result.groups) == 1
 
 
@@ -76,8 +86,7 @@ def test_a_run_is_written_and_repeats_itself(tmp_path: Path, monkeypatch: pytest
     names = {f"robot{n}_{kind}.tum" for n in (2, 5) for kind in ("estimate", "dead_reckoning", "truth")}
     assert {file.name for file in first.iterdir()} == {
         "config.toml", "metrics.json", "replay.png", "joint_map_2-5.png", "timing.json", "map_2-5.npz", "map_2-5.csv",
-        "recording.npz", "report.html",
-        *names,
+        "recording.npz", "report.html", *names,
     }  # fmt: skip
     assert "Maps as data: map_2-5" in said.out
     for file in first.glob("*.png"):
@@ -100,9 +109,8 @@ def test_maps_are_written_as_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.chdir(tmp_path)
     options = ("--duration", "20", "--particles", "7", "--alone", "--out", "run")
     assert vslam("replay", "mrclam", "--path", ".", *options).status == 0
-    log = load_mrclam(tmp_path, duration=20.0)
-    config = MrclamConfig.from_mapping(json.loads((tmp_path / "run" / "metrics.json").read_text())["config"])
-    for robot, own in zip((2, 5), replay_team(log, config).maps, strict=True):
+    log = read_mrclam(tmp_path, duration=20.0, alone=True)
+    for robot, own in zip((2, 5), played(log).maps, strict=True):
         found = LandmarkMap.load(tmp_path / "run" / f"map_{robot}.npz")
         for name in ("means", "covariances", "descriptors", "counts", "ids"):
             assert np.array_equal(getattr(found, name), getattr(own, name))
@@ -125,10 +133,9 @@ def test_missing_ground_truth_is_reported(tmp_path: Path, monkeypatch: pytest.Mo
     options = ("--particles", "7", "--seed", "5", "--out", "run")
     said = vslam("replay", "mrclam", "--path", ".", "--duration", "30", *options)
     assert said.status == 0
-    assert "Paths of robots 2, 5: no ground truth in this folder." in said.out
-    assert "Maps of robots 2, 5: no ground truth in this folder." in said.out
-    assert "│" not in said.out.split("Merges")[0]
-    assert "error (m)" not in said.out
+    assert "Paths: no ground truth in this log." in said.out
+    assert "Maps, each in its robot's start frame: no ground truth in this log." in said.out
+    assert "ATE" not in said.out
     assert "Sorted by time: Robot5_Odometry.dat (1 row, up to 0.100 s back)." in said.out.splitlines()
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert metrics["notes"] == ["Sorted by time: Robot5_Odometry.dat (1 row, up to 0.100 s back)."]
@@ -151,9 +158,8 @@ def test_a_log_without_truth_has_no_path_scores(tmp_path: Path) -> None:
     """Without true paths their errors are NaN, while the map is scored."""
     write_log(tmp_path, noise=1.0)
     (tmp_path / "Robot5_Groundtruth.dat").unlink()
-    log = load_mrclam(tmp_path, robots=(5,), duration=10.0)
-    result = replay_team(log, MrclamConfig(path=str(tmp_path), particles=5))
-    row = summarise(result, log, [score_path(result, 0, log.robots[0].truth)])["robots"][0]
+    log = read_mrclam(tmp_path, robots=(5,), duration=10.0)
+    row = metrics_of(played(log, particles=5), log)["robots"][0]
     assert np.isnan([row["ate_aligned_m"], row["dead_reckoning_ate_start_m"], row["map_error"]]).all()
     assert row["map_rmse_m"] < 0.6
 
@@ -161,30 +167,29 @@ def test_a_log_without_truth_has_no_path_scores(tmp_path: Path) -> None:
 def test_map_is_aligned_by_its_most_seen_landmarks(tmp_path: Path) -> None:
     """A duplicate seen once does not rotate the map, but lowers the precision."""
     write_log(tmp_path, noise=0.0)
-    log = load_mrclam(tmp_path)
+    truth = read_mrclam(tmp_path).landmarks
     world_from_map = np.array([1.0, -2.0, 0.7])
     means = transform_points(inverse(world_from_map), LANDMARKS[[0, 3, 5, 3]])
     means[3] += 2.0
     covariances, counts = np.tile(np.eye(3), (4, 1, 1)), np.array([9, 9, 9, 1])
     landmarks = LandmarkMap(np.column_stack([means, np.zeros(4)]), covariances, np.ones((4, 1)), counts)
-    found = align_to_truth(landmarks, np.array([0, 3, 5, 3]), log)
+    found = align_to_truth(landmarks, np.array([0, 3, 5, 3]), truth)
     assert found is not None
     np.testing.assert_allclose(found.world_from_map, world_from_map, atol=1e-9)
     assert found.score.precision == 0.75
     assert found.score.recall == 3 / 14
-    assert align_to_truth(LandmarkMap.empty(14), np.empty(0, dtype=np.int64), log) is None
+    assert align_to_truth(LandmarkMap.empty(14), np.empty(0, dtype=np.int64), truth) is None
 
 
 def test_robots_that_stay_alone_never_merge(tmp_path: Path) -> None:
     """Each single robot ends with its own map, and its estimates do not depend on the other robots."""
     write_log(tmp_path, noise=1.0)
-    config = MrclamConfig(path=str(tmp_path), particles=7, alone=True, seed=4)
-    both, first = load_mrclam(tmp_path, duration=20.0), load_mrclam(tmp_path, (2,), duration=20.0)
-    result = replay_team(both, config)
+    both, first = (read_mrclam(tmp_path, robots=robots, duration=20.0, alone=True) for robots in ((2, 5), (2,)))
+    result = played(both, seed=4)
     assert result.groups == ((0,), (1,))
     assert not result.attempts
     assert not summarise(result, both, [None, None])["refusals"]
-    np.testing.assert_array_equal(result.paths[0][:80], replay_team(first, config).paths[0][:80])
+    np.testing.assert_array_equal(result.paths[0][:80], played(first, seed=4).paths[0][:80])
 
 
 def test_hidden_identities_are_associated_by_position(tmp_path: Path) -> None:
@@ -197,10 +202,10 @@ def test_hidden_identities_are_associated_by_position(tmp_path: Path) -> None:
     file = tmp_path / "Robot2_Measurement.dat"
     kept = [line for line in file.read_text().splitlines() if int(line.split()[1]) - 106 in apart]
     file.write_text("\n".join(kept))
-    log = load_mrclam(tmp_path, (2,))
-    result = replay_team(log, EXACT.replace(identities="hidden"))
+    log = read_mrclam(tmp_path, robots=(2,), identities="hidden", **EXACT)
+    result = played(log)
     assert (result.maps[0].descriptors == 1.0).all()
-    row = summarise(result, log, [score_path(result, 0, log.robots[0].truth)])["robots"][0]
+    row = metrics_of(result, log)["robots"][0]
     assert row["ate_aligned_m"] < 0.05
     assert row["map_rmse_m"] < 0.05
     assert row["map_precision"] == 1.0
@@ -212,9 +217,8 @@ def test_five_real_robots_become_one_team(data_dir: Path) -> None:
 
     The path of robot 1, whose first headings are uncertain, rotates with the merges: a fifth.
     """
-    log = load_mrclam(data_dir / "mrclam" / "MRCLAM_Dataset7")
-    result = replay_team(log, MrclamConfig(path="MRCLAM_Dataset7", particles=100))
-    metrics = summarise(result, log, [score_path(result, robot, own.truth) for robot, own in enumerate(log.robots)])
+    log = read_mrclam(data_dir / "mrclam" / "MRCLAM_Dataset7")
+    metrics = metrics_of(played(log, particles=100), log)
     assert metrics["groups"] == [[1, 2, 3, 4, 5]]
     assert not any(merge["false"] for merge in metrics["merges"])
     shares = [row["ate_aligned_m"] / row["dead_reckoning_ate_start_m"] for row in metrics["robots"]]
@@ -229,9 +233,8 @@ def test_five_real_robots_become_one_team(data_dir: Path) -> None:
 @pytest.mark.slow
 def test_single_real_robots_reach_the_recorded_accuracy(data_dir: Path) -> None:
     """The five single robots have on average a path error of 0.33 m and a map error of 0.13 m."""
-    log = load_mrclam(data_dir / "mrclam" / "MRCLAM_Dataset7")
-    result = replay_team(log, MrclamConfig(path="MRCLAM_Dataset7", alone=True))
-    rows = summarise(result, log, [score_path(result, r, own.truth) for r, own in enumerate(log.robots)])["robots"]
+    log = read_mrclam(data_dir / "mrclam" / "MRCLAM_Dataset7", alone=True)
+    rows = metrics_of(played(log, None), log)["robots"]
     assert np.mean([row["ate_aligned_m"] for row in rows]) <= 0.33
     assert np.mean([row["map_rmse_m"] for row in rows]) <= 0.13
 
@@ -243,9 +246,8 @@ def test_another_log_is_replayed_with_the_same_noise(data_dir: Path) -> None:
     The odometry noise was calibrated on it, and on data set 7.
     """
     truth = data_dir / "mrclam_extra_gt" / "D4_robot3" / "Groundtruth.csv"
-    log = load_mrclam(data_dir / "mrclam" / "MRCLAM_Dataset4", (3,), truth=truth)
-    result = replay_team(log, MrclamConfig(path="MRCLAM_Dataset4"))
-    row = summarise(result, log, [score_path(result, 0, log.robots[0].truth)])["robots"][0]
+    log = read_mrclam(data_dir / "mrclam" / "MRCLAM_Dataset4", robots=(3,), truth=str(truth))
+    row = metrics_of(played(log, None), log)["robots"][0]
     assert row["ate_aligned_m"] <= 0.15
     assert row["map_rmse_m"] <= 0.1
 
@@ -253,13 +255,13 @@ def test_another_log_is_replayed_with_the_same_noise(data_dir: Path) -> None:
 def test_paths_in_start_frames_and_group_frames_agree(tmp_path: Path) -> None:
     """Late poses in the group's frame fit the true poses by the same transform as the group's map."""
     write_log(tmp_path, noise=0.0)
-    log = load_mrclam(tmp_path)
-    result = replay_team(log, EXACT)
+    log = read_mrclam(tmp_path, **EXACT)
+    result = played(log)
     late = compose(inverse(result.start_from_group), result.paths[:, -4])
     group_map = result.maps[0].moved(inverse(result.start_from_group[0]))
     rows = group_map.descriptors.argmax(axis=1)
     world_from_group = align_se2(LANDMARKS[rows], group_map.means[:, :2])
     for pose, own in zip(late, log.robots, strict=True):
-        assert own.truth is not None
+        assert isinstance(own.truth, Trajectory)
         error = compose(inverse(own.truth.at(result.times[-4])), compose(world_from_group, pose))
         assert np.abs(error).max() < 0.05

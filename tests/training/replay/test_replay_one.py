@@ -9,33 +9,34 @@ from small_logs import EAST, TREES, write_drive, write_park
 from slam_backend.geometry import compose, transform_points
 from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.readers.conversions import integrate_commands
-from slam_backend.readers.kitti import load_kitti
 from slam_backend.readers.victoria import axle_velocities, load_victoria, to_filter_steps
 from slam_backend.trajectory import Trajectory
-from training.replay.config import KittiConfig, VictoriaConfig
-from training.replay.kitti import find_loop, mean_drift
-from training.replay.kitti import replay as replay_kitti
-from training.replay.kitti import score as score_kitti
-from training.replay.kitti import summarise as summarise_kitti
-from training.replay.single_robot import path_length, score_positions
-from training.replay.victoria import describe_by_place
-from training.replay.victoria import replay as replay_victoria
-from training.replay.victoria import score as score_victoria
-from training.replay.victoria import summarise as summarise_victoria
+from training.replay.config import ReplayConfig
+from training.replay.core import Replay, replay_log
+from training.replay.log import Log
+from training.replay.metrics import PathScore, mean_drift, path_length, score_path, score_positions, summarise
+from training.replay.readers import Park, find_loop, read_kitti, read_victoria
+
+
+def played(log: Log, **options: Any) -> tuple[Replay, PathScore | None, dict[str, Any]]:
+    """Replay a log of one robot; return the estimates, the score of the path, and the metrics of the robot."""
+    result = replay_log(log, ReplayConfig(path="log", **options))
+    score = score_path(result, log)
+    metrics = summarise(result, log, [score])
+    log.source.complete(metrics, result, score)
+    return result, score, metrics["robots"][0]
 
 
 def test_a_park_is_mapped_by_position_only(tmp_path: Path) -> None:
     """With a steering error of half a degree, unlabelled trees keep the path right, and each is in the map once."""
     write_park(tmp_path, skew=0.01)
-    log = load_victoria(tmp_path)
-    result = replay_victoria(log, VictoriaConfig(path="log", particles=10, seed=3))
-    scored = score_victoria(result, log)
-    row = summarise_victoria(result, scored)["robots"][0]
+    result, score, row = played(read_victoria(tmp_path), particles=10, seed=3)
+    assert score is not None
     assert row["ate_aligned_m"] < 0.1 < 1.0 < row["dead_reckoning_ate_start_m"]
     assert row["ate_start_m"] < 0.2
-    assert result.rejected == 0
-    assert len(result.landmarks) == len(TREES)
-    world = transform_points(scored.scores[0].world_from_path, result.landmarks.means[:, :2])
+    assert result.measurements["rejected"] == 0
+    assert len(result.maps[0]) == len(TREES)
+    world = transform_points(score.scores[0].world_from_path, result.maps[0].means[:, :2])
     nearest = np.hypot(*(world[:, None] - transform_points(EAST, TREES)[None]).transpose(2, 0, 1)).min(axis=1)
     assert nearest.max() < 0.3
 
@@ -44,10 +45,11 @@ def test_exact_dead_reckoning_needs_no_fit(tmp_path: Path) -> None:
     """Exact controls lead the antenna through all fixes; errors from the start and after the fit then agree."""
     write_park(tmp_path)
     log = load_victoria(tmp_path)
-    scored = score_victoria(replay_victoria(log, VictoriaConfig(path="log", particles=2)), log)
-    assert scored.scores[1].start < 0.01
+    _, score, _ = played(read_victoria(tmp_path), particles=2)
+    assert score is not None
+    assert score.scores[1].start < 0.01
     start = integrate_commands(axle_velocities(log.controls), log.scan_times[:1])[0]  # at the first scan
-    np.testing.assert_allclose(scored.scores[1].world_from_path, compose(EAST, start), atol=1e-3)
+    np.testing.assert_allclose(score.scores[1].world_from_path, compose(EAST, start), atol=1e-3)
 
 
 def test_descriptors_of_trees_are_positions(tmp_path: Path) -> None:
@@ -57,7 +59,7 @@ def test_descriptors_of_trees_are_positions(tmp_path: Path) -> None:
     frame = to_filter_steps(log).measurements[0]
     assert frame is not None
     pose = integrate_commands(axle_velocities(log.controls), log.scan_times[:1])[0]
-    found = describe_by_place(frame, pose)
+    found = Park().describe(frame, lambda: pose)
     gaps = np.hypot(*(found.descriptors[:, None] - TREES[None]).transpose(2, 0, 1)).min(axis=1)
     assert gaps.max() < 1e-4
     np.testing.assert_array_equal(found.points, frame.points)
@@ -66,10 +68,9 @@ def test_descriptors_of_trees_are_positions(tmp_path: Path) -> None:
 def test_a_stretch_with_fewer_than_two_fixes_has_no_scores(tmp_path: Path) -> None:
     """A stretch without GPS is replayed, but cannot be scored."""
     write_park(tmp_path)
-    log = load_victoria(tmp_path, duration=0.4)
-    result = replay_victoria(log, VictoriaConfig(path="log", particles=2))
-    assert score_victoria(result, log) is None
-    assert np.isnan(summarise_victoria(result, None)["robots"][0]["ate_aligned_m"])
+    _, score, row = played(read_victoria(tmp_path, duration=0.4), particles=2)
+    assert score is None
+    assert np.isnan(row["ate_aligned_m"])
 
 
 @pytest.mark.parametrize("command", ["victoria", "kitti"])
@@ -82,7 +83,7 @@ def test_missing_ground_truth_is_reported(
     monkeypatch.chdir(tmp_path)
     said = vslam("replay", command, "--path", ".", "--duration", "3", "--particles", "2", "--out", "run")
     assert said.status == 0
-    assert "Errors: no ground truth in this folder." in said.out
+    assert "Paths: no ground truth in this log." in said.out
     assert " - " not in said.out
     assert "RMS" not in said.out
     assert json.loads((tmp_path / "run" / "metrics.json").read_text())["robots"][0]["ate_aligned_m"] is None
@@ -106,11 +107,7 @@ def test_the_command_prints_drift_and_final_error(tmp_path: Path, monkeypatch: p
 def test_tracks_correct_a_wrong_turn_rate(tmp_path: Path) -> None:
     """With a wrong turn rate, tracked features reduce the error to a tenth of dead reckoning's."""
     write_drive(tmp_path, bias=0.05)
-    log = load_kitti(tmp_path)
-    result = replay_kitti(log, KittiConfig(path="log", particles=10, seed=3))
-    scored = score_kitti(result, log)
-    assert scored is not None
-    row = summarise_kitti(result, scored)["robots"][0]
+    _, _, row = played(read_kitti(tmp_path), particles=10, seed=3)
     assert row["dead_reckoning_ate_start_m"] > 5.0
     assert row["ate_start_m"] < 0.1 * row["dead_reckoning_ate_start_m"]
     assert row["loop_error_m"] != row["loop_error_m"]  # there is no loop
@@ -119,22 +116,19 @@ def test_tracks_correct_a_wrong_turn_rate(tmp_path: Path) -> None:
 def test_tracks_on_a_bus_are_refused(tmp_path: Path) -> None:
     """Eight tracks on a bus are rejected once it moves, and the path stays right to a decimetre."""
     write_drive(tmp_path, bus=True)
-    log = load_kitti(tmp_path)
-    result = replay_kitti(log, KittiConfig(path="log", particles=10, seed=3))
-    scored = score_kitti(result, log)
-    assert scored is not None
-    assert scored.scores[0].start < 0.1
-    assert result.rejected > 300
+    result, score, _ = played(read_kitti(tmp_path), particles=10, seed=3)
+    assert score is not None
+    assert score.scores[0].start < 0.1
+    assert result.measurements["rejected"] > 300
 
 
 def test_a_drive_without_truth_has_no_scores(tmp_path: Path) -> None:
     """Without a true path, errors are NaN."""
     write_drive(tmp_path)
     (tmp_path / "poses" / "00.txt").unlink()
-    log = load_kitti(tmp_path, duration=1.0)
-    result = replay_kitti(log, KittiConfig(path="log", particles=2))
-    assert score_kitti(result, log) is None
-    assert np.isnan(summarise_kitti(result, None)["robots"][0]["ate_aligned_m"])
+    _, score, row = played(read_kitti(tmp_path, duration=1.0), particles=2)
+    assert score is None
+    assert np.isnan(row["ate_aligned_m"])
 
 
 def test_loops_are_found_at_revisited_places() -> None:
@@ -164,12 +158,15 @@ def test_drift_is_relative_and_frame_independent() -> None:
 
 
 def test_positions_are_scored_before_and_after_the_fit() -> None:
-    """A rigidly moved path has no error after the fit, and the distance of the motion before it."""
-    points = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 2.0], [4.0, 3.0]])
-    score = score_positions(points, transform_points([3.0, 4.0, 0.0], points), np.zeros(3))
-    assert score.start == pytest.approx(5.0)
+    """A path that turns too far at once has no error after the fit; the one before it is from the true start."""
+    truth = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 2.0, 0.0], [4.0, 3.0, 0.0]])
+    path = truth + np.array([0.0, 0.0, 0.4])  # its headings are wrong, so that its start frame is, too
+    moved = compose([3.0, 4.0, -0.7], path)
+    score = score_positions(moved, truth)
+    turned = transform_points([0.0, 0.0, -0.4], truth[:, :2])
+    assert score.start == pytest.approx(np.sqrt(np.mean(np.hypot(*(turned - truth[:, :2]).T) ** 2)))
     assert score.aligned == pytest.approx(0.0, abs=1e-12)
-    np.testing.assert_allclose(score.world_from_path, [3.0, 4.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(compose(score.world_from_path, [3.0, 4.0, -0.7]), np.zeros(3), atol=1e-12)
 
 
 @pytest.mark.parametrize("command", ["victoria", "kitti"])
@@ -190,7 +187,7 @@ def test_a_run_is_written_and_repeats_itself(
         assert said.status == 0
         monkeypatch.chdir(first)  # the config works from any folder
     assert "times real time" in said.out
-    assert "RMS distance to the truth [m]" in said.out
+    assert "ATE: root mean square distance" in said.out
     truth = {"truth.tum"} if command == "kitti" else set()
     assert {file.name for file in first.iterdir()} == truth | {
         "config.toml", "metrics.json", "replay.png", "timing.json", "estimate.tum", "dead_reckoning.tum",
@@ -213,20 +210,20 @@ def test_victoria_park_has_an_error_below_five_metres(data_dir: Path) -> None:
     """On the whole real log the error of dead reckoning is 149 m, that of the fitted estimate below 5 m."""
     log = load_victoria(data_dir / "victoria_park")
     assert sum(len(scan) for scan in log.scans) == 52_974
-    scored = score_victoria(replay_victoria(log, VictoriaConfig(path="log", particles=30)), log)
-    assert scored.scores[1].start == pytest.approx(149.0, abs=1.0)
-    assert scored.scores[0].aligned < 5.0
-    assert np.median(scored.scores[0].errors) < 2.0
+    _, score, _ = played(read_victoria(data_dir / "victoria_park"), particles=30)
+    assert score is not None
+    assert score.scores[1].start == pytest.approx(149.0, abs=1.0)
+    assert score.scores[0].aligned < 5.0
+    assert np.median(score.scores[0].errors) < 2.0
 
 
 @pytest.mark.slow
 def test_a_real_drive_has_an_error_below_one_per_cent(data_dir: Path) -> None:
     """Over 694 m of KITTI, smoothed tracks give an error below 1 % of the path, and its length to 2 %."""
-    log = load_kitti(data_dir / "kitti_landmarks")
-    result = replay_kitti(log, KittiConfig(path="log", rejuvenate_every=50))
-    scored = score_kitti(result, log)
-    assert scored is not None
-    assert scored.scores[0].aligned < min(6.9, scored.scores[1].aligned / 2.0)
-    assert path_length(scored.paths[0]) == pytest.approx(path_length(scored.truth), rel=0.02)
-    assert result.rejected < 0.1 * (result.matched + result.rejected)
-    assert scored.loop is not None
+    result, score, row = played(read_kitti(data_dir / "kitti_landmarks"), rejuvenate_every=50)
+    assert score is not None
+    assert score.scores[0].aligned < min(6.9, score.scores[1].aligned / 2.0)
+    assert path_length(score.at_truth[0]) == pytest.approx(score.length, rel=0.02)
+    made = result.measurements
+    assert made["rejected"] < 0.1 * (made["matched"] + made["rejected"])
+    assert np.isfinite(row["loop_error_m"])

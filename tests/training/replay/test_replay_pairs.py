@@ -12,7 +12,8 @@ from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.models.camera import ROBOT_FROM_CAMERA, StereoCamera
 from training.bench.stereo.scenes import WALL, Scene, wall_pose
 from training.cli import app
-from training.replay.config import PairsConfig
+from training.experiments.config import Descriptor
+from training.replay.config import ImagesConfig
 from training.replay.stereo_pairs import align_pairs, load_pairs
 
 CAMERA = StereoCamera()
@@ -47,9 +48,9 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("descriptor", ["usurf", "sift", "orb"])
-def test_two_places_are_aligned(room: Path, descriptor: str) -> None:
+def test_two_places_are_aligned(room: Path, descriptor: Descriptor) -> None:
     """With any descriptor the transform between two rendered places is accurate to 3 cm and half a degree."""
-    result = align_pairs(load_pairs(room), PairsConfig.from_mapping({"path": str(room), "descriptor": descriptor}))
+    result = align_pairs(load_pairs(room), descriptor)
     assert result.true_deg == pytest.approx(np.degrees(0.3), abs=1e-6)
     assert 0.5 < result.true_m < 1.0
     assert result.motion is not None
@@ -74,7 +75,7 @@ def test_without_poses_there_are_no_errors(room: Path) -> None:
     poses = (room / "poses_dev.txt").read_text()
     (room / "poses_dev.txt").unlink()
     try:
-        result = align_pairs(load_pairs(room), PairsConfig(path=str(room)))
+        result = align_pairs(load_pairs(room), "usurf")
         assert result.motion is not None
         assert np.isnan(result.error_m)
         (room / "poses_dev.txt").write_text("# nothing\n")
@@ -98,7 +99,7 @@ def test_missing_files_are_named(room: Path, tmp_path: Path) -> None:
     ):
         load_pairs(tmp_path)
     with pytest.raises(ValueError, match="descriptor: expected one of"):
-        PairsConfig.from_mapping({"path": str(room), "descriptor": "surf"})
+        ImagesConfig.from_mapping({"path": str(room), "descriptor": "surf"})
 
 
 def test_other_file_names_are_options(room: Path, tmp_path: Path) -> None:
@@ -137,8 +138,8 @@ def test_rectified_pairs_need_one_file(room: Path, tmp_path: Path) -> None:
     poses = [" ".join(map(str, pose[:3].ravel())) for pose in log.poses]
     (tmp_path / "poses.txt").write_text("\n".join(poses) + "\n")
     calibration, truth = str(tmp_path / "calib.txt"), str(tmp_path / "poses.txt")
-    config = PairsConfig(path=str(room), calibration=calibration, truth=truth)
-    result = align_pairs(load_pairs(room, config.files), config)
+    config = ImagesConfig(path=str(room), calibration=calibration, truth=truth)
+    result = align_pairs(load_pairs(room, config.files), "usurf")
     assert result.true_deg == pytest.approx(np.degrees(0.3), abs=1e-6)
     assert result.error_m < 0.03
     assert result.error_deg < 0.5

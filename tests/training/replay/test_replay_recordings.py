@@ -6,13 +6,10 @@ import numpy as np
 import pytest
 from small_logs import write_log, write_park
 
-from slam_backend.readers.mrclam import load_mrclam
-from slam_backend.readers.victoria import load_victoria
 from training.replay.config import MrclamConfig, VictoriaConfig
-from training.replay.mrclam import replay_team
-from training.replay.recordings import record_one, record_team
-from training.replay.single_robot import MOST_STAGES, is_stage
-from training.replay.victoria import replay as replay_victoria
+from training.replay.core import MOST_STAGES, is_stage, replay_log
+from training.replay.readers import read_mrclam, read_victoria
+from training.replay.recordings import record_replay
 
 
 def test_stages_are_spread_and_end_with_the_last_step() -> None:
@@ -27,23 +24,24 @@ def test_stages_are_spread_and_end_with_the_last_step() -> None:
 def test_the_map_of_one_robot_grows(tmp_path: Path) -> None:
     """Maps have ever more landmarks; the last one is the final map, and lies at the last recorded step."""
     write_park(tmp_path)
-    result = replay_victoria(load_victoria(tmp_path), VictoriaConfig(path="log", particles=2))
-    recording = record_one(result, (result.path, result.reckoned), None, None)
+    log = read_victoria(tmp_path)
+    result = replay_log(log, VictoriaConfig(path="log", particles=2))
+    recording = record_replay(log, result, [None])
     assert len(recording.keyframes) == len(recording.map_ends) > 20
     assert (np.diff(recording.keyframes) > 0).all()
     assert recording.keyframes[-1] == len(recording.times) - 1
     sizes = np.diff(recording.map_ends[:, 0], prepend=0)
     assert sizes[0] < 0.5 * sizes[-1]
-    np.testing.assert_allclose(recording.map_points[-sizes[-1] :, :2], result.landmarks.means[:, :2])
+    np.testing.assert_allclose(recording.map_points[-sizes[-1] :, :2], result.maps[0].means[:, :2])
 
 
 @pytest.mark.parametrize("alone", [True, False])
 def test_maps_of_a_team_are_those_of_its_groups(alone: bool, tmp_path: Path) -> None:
     """Each group has one map, that of its first robot; the last ones are the final maps."""
     write_log(tmp_path, noise=0.0)
-    log = load_mrclam(tmp_path)
-    replay = replay_team(log, MrclamConfig(path=str(tmp_path), alone=alone, particles=5, seed=1))
-    recording = record_team(log, replay, [None, None])
+    log = read_mrclam(tmp_path, alone=alone)
+    replay = replay_log(log, MrclamConfig(path=str(tmp_path), particles=5, seed=1))
+    recording = record_replay(log, replay, [None, None])
     sizes = np.diff(recording.map_ends.ravel(), prepend=0).reshape(recording.map_ends.shape)
     assert (sizes[len(sizes) // 5] > 0).all()  # both robots have a map of their own at first
     firsts = [group[0] for group in replay.groups]

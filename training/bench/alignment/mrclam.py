@@ -8,13 +8,14 @@ from typing import Any
 import numpy as np
 
 from slam_backend.maps.alignment import DISTINCT_ROTATION, DISTINCT_TRANSLATION, AlignmentOptions, align_maps
-from slam_backend.readers.mrclam import MrclamLog, load_mrclam
 from training.bench.config import MrclamPairsConfig
 from training.experiments.statistics import grouped
 from training.experiments.tables import number
 from training.replay.config import MrclamConfig
+from training.replay.core import Replay, replay_log
+from training.replay.log import Log
 from training.replay.metrics import motion_error
-from training.replay.mrclam import Replay, replay_team
+from training.replay.readers import read_mrclam
 
 HEADINGS = (
     "after [s]", "barcodes", "method", "pairs", "aligned", "false", "median [m]", "worst [m]", "median [°]",
@@ -36,19 +37,19 @@ def align_log(config: MrclamPairsConfig, on_part: Callable[[float], None] = lamb
     rows = []
     for place, duration in enumerate(config.durations):
         limit = duration or None
-        log = load_mrclam(config.path, None, limit, None)
+        log = read_mrclam(config.path, duration=limit, alone=True)
         alone = MrclamConfig(path=config.path, duration=limit, alone=True, particles=config.particles, seed=config.seed)
         done = place / len(config.durations)
 
         def on_step(share: float, report: Any, done: float = done) -> None:
             on_part(done + share / len(config.durations))
 
-        result = replay_team(log, alone, on_step)
+        result = replay_log(log, alone, on_step)
         rows += [{"duration_s": limit} | row for row in align_pairs(result, log)]
     return rows
 
 
-def align_pairs(result: Replay, log: MrclamLog) -> list[dict[str, Any]]:
+def align_pairs(result: Replay, log: Log) -> list[dict[str, Any]]:
     """Align the maps of all pairs of robots, with known and unknown barcodes, by all methods.
 
     Returns:
@@ -56,7 +57,7 @@ def align_pairs(result: Replay, log: MrclamLog) -> list[dict[str, Any]]:
         `inliers`; `error_m` at b's landmarks and `error_deg`, relative to the transform between the fits of both maps
         to the true landmarks, None if refused.
     """
-    numbers = [robot.robot for robot in log.robots]
+    numbers = [robot.number for robot in log.robots]
     rows = []
     for a, b in combinations(range(len(numbers)), 2):
         maps, claims = (result.maps[a], result.maps[b]), (result.claims[a], result.claims[b])
@@ -64,7 +65,7 @@ def align_pairs(result: Replay, log: MrclamLog) -> list[dict[str, Any]]:
         for barcodes, options in BARCODES.items():
             for method in METHODS:
                 alignment = align_maps(*maps, method, np.random.default_rng(0), options)
-                error = motion_error(alignment.transform, maps, claims, log) if alignment.success else None
+                error = motion_error(alignment.transform, maps, claims, log.landmarks) if alignment.success else None
                 rows.append(
                     {
                         "robots": [numbers[a], numbers[b]], "shared": shared, "barcodes": barcodes, "method": method,
