@@ -182,7 +182,7 @@ def _of_steps(name: str, values: Any, steps: int) -> Sequence[Any]:
     return values
 
 
-def read_with(name: str, path: Path) -> Log:
+def read_with(name: str, path: str | Path) -> Log:
     """Return the log that a reader of the user, `MODULE:NAME`, makes of a path.
 
     Raises:
@@ -190,5 +190,5 @@ def read_with(name: str, path: Path) -> Log:
     """
     reader = find_plugin(name, "reader")
     with one_line(name, "reader"):
-        log = reader(path)
+        log = reader(Path(path))
     return check_kind("reader", log, Log, f"Let {name} return a training.replay.log.Log.")
