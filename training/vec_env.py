@@ -10,9 +10,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
 from slam_backend.core.validation import BoolArray, FloatArray, argument_error, check_int
 from training.experiments.compilation import prepare
-from training.rl.cluster import ClusterEnvs
-from training.rl.slots import MASK, WHOLE, MakeEnv, StepResult, SyncEnvs
-from training.rl.workers import ProcessEnvs, WorkerEnvs
+from training.rl.envs import MASK, WHOLE, MakeEnv, StepResult, SyncEnvs, WorkerEnvs
 from vslam_env import vslam_v1, warm_up
 from vslam_env.config import EnvConfig
 from vslam_env.reward import RewardSpec
@@ -120,11 +118,8 @@ class ExplorationVecEnv(VecEnv):  # type: ignore[misc]   # its types are not che
         cluster: str | None = None,
     ) -> None:
         check_int("workers", workers, 0, "Use 0 for this process, or a number of processes.")
-        self._slots: SyncEnvs | WorkerEnvs
-        if cluster is not None:
-            self._slots = ClusterEnvs(makers, cluster, workers, prepare)
-        else:
-            self._slots = ProcessEnvs(makers, workers, prepare) if workers else SyncEnvs(makers)
+        is_here = workers == 0 and cluster is None
+        self._slots = SyncEnvs(makers) if is_here else WorkerEnvs(makers, workers, prepare, cluster)
         self._masks: BoolArray | None = None
         ends = np.cumsum(self._slots.counts)
         self.first_slots: list[int] = [0, *ends[:-1].tolist()]

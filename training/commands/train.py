@@ -16,9 +16,8 @@ from training.experiments.console import text_column
 from training.rl.config import SPLIT_TRAIN, TrainConfig, require_extra
 
 if TYPE_CHECKING:  # numerical modules are imported when the command runs, so that --help is fast
-    from training.rl.callbacks import Row
-    from training.rl.imitation.imitation import Imitation
-    from training.rl.trainer import Training
+    from training.rl.imitation import Imitation
+    from training.rl.ppo import Row, Training
 
 
 @options(TrainConfig, "train")
@@ -61,7 +60,8 @@ def train(
     from training.experiments.run_folder import RunFolder, installed_versions, read_config
 
     require_extra()
-    from training.rl.trainer import Training, check_device, stored_checkpoint
+    from training.rl.checkpoint import check_device, stored_checkpoint
+    from training.rl.ppo import Training
     from training.vec_env import load_kernels
 
     if workers is not None:
@@ -91,7 +91,7 @@ def train(
         call.folder = RunFolder(resume, call.command, chosen.to_mapping(), chosen.seed, installed_versions())
     kind: Any = Training
     if chosen.teacher is not None:
-        from training.rl.imitation.imitation import Imitation
+        from training.rl.imitation import Imitation
 
         kind = Imitation
     training = kind(chosen, call.folder.path, crew, device, ray)

@@ -17,7 +17,7 @@ from filelock import FileLock, Timeout
 from slam_backend.core.files import append_text, write_file
 from slam_backend.core.text_files import read_text
 from slam_backend.core.validation import argument_error
-from training.experiments.cluster import SINGLE_THREAD, connected
+from training.experiments.cluster import SINGLE_THREAD, over_cluster
 from training.experiments.interrupt import begin_worker, signals_held
 from training.experiments.run_folder import CONFIG_FILE, RunFolder, installed_versions, plain, read_config
 
@@ -133,7 +133,7 @@ def run_trials(
     _end_last_line(folder.path / name)
     going = _until(interrupted, trials)
     if cluster is not None:
-        played = _over_cluster(play, going, cluster, variables)
+        played = over_cluster(_play_one, ((play, trial) for trial in going), cluster, variables)
     elif workers == 1 and not variables:
         played = _in_turn(play, going)
     else:
@@ -194,32 +194,6 @@ def run_in_processes(
             for process in set(active_children()) - others:
                 process.kill()
             raise
-
-
-def _over_cluster(
-    play: Callable[[TrialT], dict[str, Any]], trials: Iterable[TrialT], address: str,
-    variables: Mapping[str, str] | None,
-) -> Generator[dict[str, Any], None, None]:  # fmt: skip
-    """Run trials on a Ray cluster, one per core, and yield their rows as they end.
-
-    A trial whose process or node is lost is run again elsewhere.
-    """
-    with connected(address, variables) as ray:
-        task: Any = ray.remote(num_cpus=1, max_retries=-1)(_play_one)
-        shared: Any = ray.put(play)
-        running: list[Any] = []
-        cores: Any = ray.cluster_resources
-        try:
-            for trial in trials:
-                running.append(task.remote(shared, trial))
-                while len(running) >= 2 * max(1, int(cores().get("CPU", 1))):  # nodes may come and go
-                    done, running = ray.wait(running)
-                    yield from ray.get(done)
-            while running:
-                done, running = ray.wait(running)
-                yield from ray.get(done)
-        except ray.exceptions.RayTaskError as error:
-            raise error.cause from error
 
 
 def _play_one(play: Callable[[TrialT], dict[str, Any]], trial: TrialT) -> dict[str, Any]:

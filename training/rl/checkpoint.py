@@ -1,19 +1,26 @@
-"""Checkpoints of a training: single files, written atomically and tagged with package versions."""
+"""Checkpoints of a training: single files, written atomically and tagged with package versions; and its model."""
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import torch
+
+from agents.trained import MODEL_FILE, save_model
 from slam_backend.core.files import MAX_BYTES, read_file, write_file
 from slam_backend.core.validation import argument_error
 from slam_backend.state.codec import decode, encode
 from training.experiments.run_folder import installed_versions
+from training.rl.config import SPLIT_TRY, TrainConfig
 
 FORMAT = 5  # incremented when the content of checkpoints changes
 MAGIC = b"vslam train checkpoint "
 CHECKPOINT_FILE = "checkpoint.bin"
+BOARD = "tensorboard"
 # Packages whose versions must match for an exact resume
 DECISIVE = ("vslam-env", "torch", "stable-baselines3", "sb3-contrib", "numpy")
 
@@ -81,3 +88,81 @@ def read_checkpoint(file: Path) -> dict[str, Any]:
 def _versions() -> dict[str, str]:
     installed = installed_versions()
     return {name: installed[name] for name in DECISIVE if name in installed}
+
+
+def save_run(
+    folder: Path, config: TrainConfig, content: Mapping[str, Any], weights: Mapping[str, Any], steps: int
+) -> None:
+    """Write the checkpoint and the current model, for `agents.trained`, into the folder of a training."""
+    mine = {"seed": config.seed, "config": config.to_mapping()}
+    write_checkpoint(folder / CHECKPOINT_FILE, mine | dict(content))
+    about = {
+        "version": installed_versions()["vslam-env"], "environment": config.make_env_config(SPLIT_TRY).to_toml(),
+        "steps": steps,
+    }  # fmt: skip
+    save_model(folder / MODEL_FILE, dict(weights), about | mine)
+
+
+@contextmanager
+def restoring() -> Iterator[None]:
+    """Refuse a checkpoint whose parts do not fit a training.
+
+    Raises:
+        ValueError: If anything is raised within the block.
+    """
+    try:
+        yield
+    except Exception as error:  # torch raises various errors for parts of another model
+        hint = "Another version or another run wrote it: copy the checkpoint again, or train again."
+        raise argument_error("resume", "a checkpoint of this model", "a different one", hint) from error
+
+
+def stored_checkpoint(folder: Path, config: TrainConfig) -> dict[str, Any]:
+    """Return the checkpoint in the folder of a training.
+
+    Raises:
+        ValueError: If it is missing or damaged, or has another configuration or version.
+    """
+    kept = read_checkpoint(folder / CHECKPOINT_FILE)
+    if (kept["config"], kept["seed"]) != (config.to_mapping(), config.seed):
+        hint = "Restore the config.toml of the folder, or train again."
+        raise argument_error("resume", "a checkpoint of the folder's configuration", "a checkpoint of another", hint)
+    return kept
+
+
+def check_device(device: str) -> str:
+    """Return a device that torch can use.
+
+    Raises:
+        ValueError: If it is not a device, or this machine has no such device.
+    """
+    try:
+        kind = torch.device(device).type
+    except RuntimeError as error:
+        raise argument_error("device", "cpu, cuda or cuda:0", device, "Omit it to use the processor.") from error
+    if kind not in ("cpu", "cuda"):
+        raise argument_error("device", "cpu, cuda or cuda:0", device, "Omit it to use the processor.")
+    if kind == "cuda":
+        num_gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
+        if (torch.device(device).index or 0) >= num_gpus:
+            hint = "Omit --device to use the processor, or install a torch build that supports the GPU."
+            raise argument_error("device", "a GPU that torch can use", f"a machine with {num_gpus} of them", hint)
+    return device
+
+
+def as_arrays(value: Any) -> Any:
+    """Return nested dicts, lists and tuples with arrays in place of tensors, for a checkpoint."""
+    if isinstance(value, torch.Tensor):
+        return value.detach().cpu().numpy().copy()
+    if isinstance(value, Mapping):
+        return {key: as_arrays(entry) for key, entry in value.items()}
+    return type(value)(map(as_arrays, value)) if isinstance(value, (list, tuple)) else value
+
+
+def as_tensors(value: Any) -> Any:
+    """Return the inverse of `as_arrays`, with tensors on the CPU."""
+    if isinstance(value, np.ndarray):
+        return torch.from_numpy(value.copy())
+    if isinstance(value, Mapping):
+        return {key: as_tensors(entry) for key, entry in value.items()}
+    return type(value)(map(as_tensors, value)) if isinstance(value, (list, tuple)) else value

@@ -16,11 +16,12 @@ pytest.importorskip("tensorboard", reason="tensorboard is not installed: pip ins
 
 from builders.ray_cluster import two_nodes
 
+from training.experiments import cluster as cluster_module
 from training.experiments.cluster import LostWorkerError, connected
-from training.rl import cluster as cluster_module
+from training.rl.checkpoint import stored_checkpoint
 from training.rl.config import TrainConfig
-from training.rl.imitation.imitation import Imitation
-from training.rl.trainer import Training, stored_checkpoint
+from training.rl.imitation import Imitation
+from training.rl.ppo import Training
 from training.vec_env import make_vec_env
 
 SMOKE = TrainConfig.from_mapping({"preset": "smoke", "seed": 5})

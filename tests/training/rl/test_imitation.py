@@ -19,12 +19,22 @@ from agents import make_policy
 from agents.goal_network import SHAPES, logits
 from agents.trained import load_model
 from training.cli import app
-from training.rl.checkpoint import CHECKPOINT_FILE
+from training.rl.checkpoint import CHECKPOINT_FILE, stored_checkpoint
 from training.rl.config import SPLIT_TRAIN, TrainConfig
-from training.rl.imitation.collection import collect, draw, make_taught_envs
-from training.rl.imitation.imitation import LABELS, Imitation
-from training.rl.imitation.labels import FORMAT, Labels, joined, pack, read_labels, write_labels
-from training.rl.trainer import Training, stored_checkpoint
+from training.rl.imitation import (
+    FORMAT,
+    LABELS,
+    Imitation,
+    Labels,
+    collect,
+    draw,
+    joined,
+    make_taught_envs,
+    pack,
+    read_labels,
+    write_labels,
+)
+from training.rl.ppo import Training
 from vslam_env import vslam_v0
 from vslam_env.belief.observation import observation_space
 

@@ -17,10 +17,10 @@ from sb3_contrib import MaskablePPO
 
 from agents.registry import LEARNED
 from agents.trained import load_model
+from training.rl.checkpoint import stored_checkpoint
 from training.rl.config import TrainConfig
-from training.rl.learner import GoalPPO
 from training.rl.network import GoalPolicy
-from training.rl.trainer import Training, stored_checkpoint
+from training.rl.ppo import GoalPPO, Training
 from training.vec_env import ExplorationVecEnv
 from vslam_env import NUM_CANDIDATES
 

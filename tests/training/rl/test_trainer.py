@@ -29,10 +29,20 @@ from agents.goal_network import logits
 from agents.trained import load_model
 from slam_backend.state.codec import decode, encode
 from training.cli import app
-from training.rl.checkpoint import CHECKPOINT_FILE, FORMAT, MAGIC, read_checkpoint, write_checkpoint
+from training.rl.checkpoint import (
+    CHECKPOINT_FILE,
+    FORMAT,
+    MAGIC,
+    as_arrays,
+    as_tensors,
+    check_device,
+    read_checkpoint,
+    stored_checkpoint,
+    write_checkpoint,
+)
 from training.rl.config import TrainConfig
 from training.rl.network import GoalPolicy, check_finite
-from training.rl.trainer import Training, as_arrays, as_tensors, check_device, stored_checkpoint
+from training.rl.ppo import Training
 from training.vec_env import ExplorationVecEnv
 from vslam_env import NUM_CANDIDATES
 

@@ -16,9 +16,8 @@ from gymnasium import spaces
 from agents.goal_network import logits
 from agents.trained import MODEL_FILE, TrainedGoalPolicy, load_model
 from training.rl.config import TrainConfig
-from training.rl.learner import Update
 from training.rl.network import GoalPolicy
-from training.rl.trainer import Training
+from training.rl.ppo import Training, Update
 from training.rl.true_state import ROBOT_SCALE, STATE, TEAM_VALUES, WithTrueState
 from training.vec_env import make_vec_env
 from vslam_env import NUM_CANDIDATES, vslam_v0

@@ -415,6 +415,6 @@ def test_errors_of_workers_are_raised() -> None:
         env.step(np.zeros(1, np.int64))
     env = ExplorationVecEnv([_toy(fails_at=9)], workers=1)
     env.reset()
-    env._slots._processes[0].kill()
+    env._slots._pool._processes[0].kill()
     with pytest.raises(RuntimeError, match="worker 0: expected an answer of environments 0 to 0, got an exit"):
         env.step(np.zeros(1, np.int64))

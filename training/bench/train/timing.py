@@ -15,7 +15,7 @@ from slam_backend.core.validation import BoolArray, FloatArray
 from training.experiments.statistics import interval
 from training.experiments.timing import clock, no_garbage_collection
 from training.rl.config import TrainConfig
-from training.rl.learner import GoalPPO
+from training.rl.ppo import GoalPPO
 from training.vec_env import ExplorationVecEnv, make_vec_env
 from vslam_env import vslam_v1
 from vslam_env.config import EnvConfig

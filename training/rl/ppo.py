@@ -1,32 +1,45 @@
-"""`GoalPPO`: MaskablePPO for `GoalPolicy`, whose loss may keep the policy near that of the model it began with.
+"""`Training`: PPO with masks for `GoalPolicy`, which may stay near the policy of the model it began with.
 
 The penalty is the Kullback-Leibler divergence from the start policy to the current one, as in Baker et al., "Video
 PreTraining (VPT): learning to act by watching unlabeled online videos", NeurIPS 2022.
+
+From top to bottom: the learner, what watches it, and the training.
 """
 
+import random
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from copy import deepcopy
 from functools import partial
+from pathlib import Path
 from threading import Event
 from typing import Any
 
 import numpy as np
 import torch
 from sb3_contrib import MaskablePPO
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import configure
 from stable_baselines3.common.utils import explained_variance, update_learning_rate
 from torch.nn.functional import mse_loss
 
 from agents.goal_network import SHAPES, Weights
+from agents.trained import load_model
 from slam_backend.core.validation import IntArray
-from training.rl.network import GoalPolicy
-from training.rl.true_state import STATE
+from slam_backend.state import checked_stream
+from training.rl.checkpoint import BOARD, as_arrays, as_tensors, check_device, restoring, save_run
+from training.rl.config import SPLIT_TRAIN, TrainConfig
+from training.rl.network import GoalPolicy, check_finite
+from training.rl.true_state import STATE, WithTrueState
+from training.vec_env import ExplorationVecEnv, make_vec_env
 
 # A value head that leaves the actor's layers alone learns from their features, which is cheap: many small steps.
 VALUE_PASSES, VALUE_BATCH, VALUE_RATE = 4, 720, 1e-3
 EPSILON = 1e-5  # of Adam, as Stable-Baselines3 has it
 CHUNK = 1440  # decisions that are encoded at once
 USED = (*SHAPES, STATE)  # observations of actor and critic
+LAST = ("map_error", "map_recall", "map_precision", "coverage", "merges", "collisions")  # final values of an episode
+Row = dict[str, float]
 
 
 class Update:
@@ -266,3 +279,198 @@ class GoalPPO(MaskablePPO):  # type: ignore[misc]   # its types are not checked
         terms["approx_kl"] = (moved.exp() - 1.0 - moved).mean()
         terms["clip_fraction"] = ((ratio.detach() - 1.0).abs() > clip).float().mean()
         return {"loss": loss, **terms}
+
+
+class TrainingCallback(BaseCallback):  # type: ignore[misc]   # its types are not checked
+    """Callback that summarises the episodes of each rollout, and saves and stops between rollouts only.
+
+    Attributes:
+        rows: One row per rollout: `steps`, and means over its finished episodes of `return`, the final values `LAST`,
+            `invalid_actions` and the sum of each reward term.
+        stopped: Whether the training was stopped early.
+    """
+
+    def __init__(self, env: ExplorationVecEnv, save: Callable[[], None], every: int) -> None:
+        super().__init__()
+        self._save, self._every = save, every
+        self._tell: Callable[[Row], None] = lambda row: None
+        self._should_stop: Callable[[], bool] = lambda: False
+        self._count: Callable[[int], None] = lambda decisions: None
+        self.rows: list[Row] = []
+        self._sums: list[dict[str, float]] = [{} for _ in range(env.num_envs)]
+        self._ended: list[Row] = []
+        self._begun = 0
+        self.stopped = False
+
+    def listen(
+        self,
+        on_update: Callable[[Row], None],
+        should_stop: Callable[[], bool],
+        on_step: Callable[[int], None] = lambda decisions: None,
+    ) -> None:
+        """Set the functions called between rollouts: to report a rollout, and to ask whether to stop.
+
+        Args:
+            should_stop: Function called between two rollouts; if it returns true, a checkpoint is saved and the
+                training ends.
+        """
+        self._tell, self._should_stop, self._count = on_update, should_stop, on_step
+
+    def get_state(self) -> dict[str, Any]:
+        """Return the state of the callback."""
+        return {"rows": [dict(row) for row in self.rows], "sums": [dict(sums) for sums in self._sums]}
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Restore a state of `get_state`."""
+        self.rows, self._sums = [dict(row) for row in state["rows"]], [dict(sums) for sums in state["sums"]]
+        self._begun = len(self.rows)
+
+    def _on_rollout_start(self) -> None:
+        self._ended = []
+        done = len(self.rows)
+        if done > self._begun:
+            self.stopped = self._should_stop()
+            if self.stopped or done % self._every == 0:
+                self._save()
+
+    def _on_step(self) -> bool:
+        if self.stopped:
+            return False  # this step is discarded: the checkpoint was saved before it
+        for slot, (info, done) in enumerate(zip(self.locals["infos"], self.locals["dones"], strict=True)):
+            sums = self._sums[slot]
+            for name, value in info.items():
+                if name.startswith("reward/") or name == "invalid_action":
+                    sums[name] = sums.get(name, 0.0) + value
+            if done:
+                self._ended.append(_finished(sums, info))
+                self._sums[slot] = {}
+        self._count(self.model.num_timesteps)
+        return True
+
+    def _on_rollout_end(self) -> None:
+        row: Row = {"steps": float(self.model.num_timesteps)}
+        for name in self._ended[0] if self._ended else ():
+            row[name] = float(np.mean([episode[name] for episode in self._ended]))
+            self.logger.record(f"episode/{name}", row[name])
+        self.rows.append(row)
+        self._tell(row)
+
+
+def _finished(sums: Mapping[str, float], info: Mapping[str, Any]) -> Row:
+    """Return the metrics of a finished episode: return, final values, and the sum of each reward term."""
+    terms = {name: value for name, value in sums.items() if name.startswith("reward/")}
+    last = {name: float(info[name]) for name in LAST}
+    return {"return": sum(terms.values()), **last, "invalid_actions": sums["invalid_action"], **terms}
+
+
+class Training:
+    """Training in its own folder.
+
+    All sums run on one thread: two trainings of one configuration give the same weights, whether interrupted or not and
+    for any number of processes, on the same machine with the same packages.
+
+    Args:
+        folder: Folder of checkpoint, model and TensorBoard curves.
+        workers: Number of processes that step the environments; 0: this process.
+        device: Torch device: `"cpu"`, `"cuda"` or one of several GPUs.
+        cluster: Address of a Ray cluster that steps the environments; 0 workers are then one per core.
+
+    Attributes:
+        model: The learner.
+        watch: Callback that reports progress and stops the training.
+
+    Raises:
+        ValueError: If the device does not exist, the environment cannot be built, or the cluster cannot be used.
+    """
+
+    def __init__(
+        self, config: TrainConfig, folder: Path, workers: int = 0, device: str = "cpu", cluster: str | None = None
+    ) -> None:
+        check_device(device)
+        torch.set_num_threads(1)
+        self.config, self._folder = config, folder
+        self.env = make_vec_env(
+            config.make_env_configs(SPLIT_TRAIN), config.envs, workers, cluster=cluster, monitor=False,
+            wrap=WithTrueState,
+        )  # fmt: skip
+        self.model = GoalPPO(
+            env=self.env, learning_rate=lambda left: left * config.learning_rate, n_steps=config.max_cycles,
+            batch_size=config.batch, n_epochs=config.epochs, gamma=config.gamma, gae_lambda=config.gae_lambda,
+            clip_range=config.clip, ent_coef=config.entropy, seed=config.seed, device=device, anchor=config.anchor,
+            value_rollouts=config.value_rollouts,
+        )  # fmt: skip
+        if config.start_file is not None:
+            self.model.start_from(load_model(config.start_file)[0])
+        self.watch = TrainingCallback(self.env, self.save, config.checkpoint_updates)
+
+    @property
+    def rows(self) -> list[Row]:
+        """One row per rollout so far."""
+        return self.watch.rows
+
+    def run(self) -> bool:
+        """Train to the end, or until the callback stops the training; save a checkpoint and the model.
+
+        Returns:
+            Whether the training is complete.
+        """
+        left = self.config.updates * self.config.rollout - self.model.num_timesteps
+        if left > 0:
+            self.model.set_logger(configure(str(self._folder / BOARD), [BOARD]))
+            self.model.learn(left, callback=self.watch, reset_num_timesteps=self.model._last_obs is None)
+            self.model.logger.close()
+            if not self.watch.stopped:
+                self.save()
+        return not self.watch.stopped
+
+    def save(self) -> None:
+        """Write the checkpoint and the current model."""
+        model = self.model
+        content = {
+            "learner": as_arrays(model.get_state()),
+            "counts": (model.num_timesteps, model._n_updates, model._current_progress_remaining),
+            "last": (model._last_obs, model._last_episode_starts),
+            "environments": self.env.get_state(),
+            "watch": self.watch.get_state(),
+            "draws": {
+                "python": random.getstate(),
+                "numpy": np.random.get_state(legacy=False),  # noqa: NPY002   # the learner uses the global generator
+                "torch": as_arrays(torch.get_rng_state()),
+                "cuda": as_arrays(_cuda_state()),
+            },
+        }
+        save_run(self._folder, self.config, content, model.trained.actor_weights(), int(model.num_timesteps))
+
+    def restore(self, kept: Mapping[str, Any]) -> None:
+        """Resume from a checkpoint of `stored_checkpoint`.
+
+        Raises:
+            ValueError: If a part does not fit this training.
+        """
+        with restoring():
+            self._go_on_from(kept)
+
+    def _go_on_from(self, kept: Mapping[str, Any]) -> None:
+        """Load the parts of a checkpoint."""
+        model, draws = self.model, kept["draws"]
+        model.set_state(as_tensors(kept["learner"]))
+        check_finite(model.trained)
+        model.num_timesteps, model._n_updates, model._current_progress_remaining = kept["counts"]
+        model._last_obs, model._last_episode_starts = kept["last"]
+        self.env.set_state(kept["environments"])
+        self.watch.set_state(kept["watch"])
+        random.setstate(draws["python"])
+        checked_stream("draws", {name: draws["numpy"][name] for name in ("bit_generator", "state")})
+        np.random.set_state(draws["numpy"])  # noqa: NPY002
+        torch.set_rng_state(as_tensors(draws["torch"]))
+        if draws["cuda"] is not None and torch.cuda.is_available():
+            torch.cuda.set_rng_state_all(as_tensors(draws["cuda"]))
+
+    def close(self) -> None:
+        """Close the environments and their processes, and end an update that is running."""
+        self.model.close()
+        self.env.close()
+
+
+def _cuda_state() -> Any:
+    return torch.cuda.get_rng_state_all() if torch.cuda.is_available() else None
