@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from slam_backend.core.validation import FloatArray, IntArray
+from slam_backend.core.validation import FloatArray, IntArray, argument_error
 from slam_backend.fastslam.consistency import Consistency
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.fastslam.reports import PoseEstimate, RejuvenationReport
@@ -215,6 +215,9 @@ def replay_log(
             stages.append((step, {first: team.map(first).moved(team.start_from_group(first)) for first in firsts}))
         log.source.observe(report)
         on_step((step + 1) / num_steps, report)
+    if not stages or stages[-1][0] < num_steps - 1:
+        hint = "Yield a motion and measurements, or None, for each of the times."
+        raise argument_error("measurements", f"{num_steps} steps", "fewer", hint)
     frames_of = np.array([team.start_from_group(robot) for robot in robots])
     maps = [team.map(robot) for robot in robots]
     reckoned = [

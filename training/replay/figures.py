@@ -93,7 +93,7 @@ def _draw_panel(ax: Axes, log: Log, result: Replay, scores: Scores, group: tuple
     room = MARGIN * float((high - low).max()) + 1e-3
     ax.set_xlim(low[0] - room, high[0] + room)
     ax.set_ylim(low[1] - room, high[1] + room)
-    ax.set_aspect("equal", adjustable="box" if log.team is None else "datalim")
+    ax.set_aspect("equal")
     ax.set_title(_title(log, result, scores, group))
     ax.set_xlabel("x [m]")
     ax.set_ylabel("y [m]")
