@@ -151,7 +151,7 @@ class ImagesConfig(ReplayConfig):
 class LogConfig(ReplayConfig):
     """Replay of a log by a reader of the user; what is not given is as in the log, or else as for other logs."""
 
-    path: str = option(..., "Path that the reader gets.", is_path=True)
+    path: str = option(..., "Path that the reader gets.", hint="Give --path.", is_path=True)
     particles: int | None = option(None, "Number of particles per filter.", shown="as the log", ge=1, hint=ONE_PARTICLE)
     estimator: Proposal | None = option(None, "Proposal: fastslam2 or fastslam1.", name="proposal", shown="as the log")
     rejuvenate_every: int | None = option(

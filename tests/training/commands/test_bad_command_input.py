@@ -59,6 +59,10 @@ BAD: dict[str, dict[str, str]] = {
         "": "path: expected an archive (.npz) of KITTI features, ",
     },
     "replay stereo": {"--path none": "path: expected a folder with two stereo pairs (left_img_0.png, "},
+    "replay MODULE:FUNCTION": {
+        "": "path: expected a value, got 'none'. Give --path.",
+        "--path .": "reader: expected MODULE:NAME of a reader, got ",
+    },
     "bench accuracy": {
         "--presets best": "presets: expected one of 'good', 'coarse', 'paper', got 'best'.",
         "--particles ten": f"particles: {LIST} 'ten'. Write them like 10,100.",
