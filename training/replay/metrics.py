@@ -97,8 +97,8 @@ def score_positions(path: FloatArray, truth: FloatArray) -> PositionScore:
     if truth.shape[1] == 3:
         start = compose(truth[0], inverse(path[0]))
     else:
-        first = np.flatnonzero(_travelled(points) <= KNOWN_START)
-        start = align_se2(known[first], points[first])
+        first = max(2, int(np.count_nonzero(travelled(points) <= KNOWN_START)))
+        start = align_se2(known[:first], points[:first])
     fit = align_se2(known, points)
     raw, fitted = (np.hypot(*(transform_points(pose, points) - known).T) for pose in (start, fit))
     return PositionScore(float(np.sqrt(np.mean(raw**2))), float(np.sqrt(np.mean(fitted**2))), start, fit, fitted)
@@ -109,7 +109,7 @@ def path_length(path: FloatArray) -> float:
     return float(np.hypot(*np.diff(path[:, :2], axis=0).T).sum())
 
 
-def _travelled(points: FloatArray) -> FloatArray:
+def travelled(points: FloatArray) -> FloatArray:
     """Return the length [m] of a path up to each of its points."""
     return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points[:, :2], axis=0).T))])
 
@@ -126,7 +126,7 @@ def mean_drift(path: FloatArray, truth: FloatArray) -> float:
     Returns:
         The relative error; NaN if the true path is shorter than 100 m.
     """
-    driven = _travelled(truth)
+    driven = travelled(truth)
     errors = [np.empty(0)]
     for length in SEGMENTS:
         first = np.arange(0, len(truth), SEGMENT_EVERY)

@@ -20,7 +20,7 @@ from slam_backend.team.merge_scheduler import AttemptOptions
 from training.replay.config import MRCLAM_DRIVE, MRCLAM_MOTION, VICTORIA_MOTION
 from training.replay.core import Replay
 from training.replay.log import Log, RobotLog, Source
-from training.replay.metrics import PathScore, most_seen
+from training.replay.metrics import PathScore, most_seen, travelled
 from training.replay.truth_check import wrong_landmark_notes
 
 # A planar measurement has two degrees of freedom: 99.9 % of correct matches have a smaller squared Mahalanobis
@@ -212,7 +212,7 @@ class _Drive(Source):
 
 def find_loop(truth: FloatArray) -> tuple[int, int] | None:
     """Return the steps (earlier, later) of the closest revisit in (n, 3) poses; None if the car never returned."""
-    driven = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(truth[:, :2], axis=0).T))])
+    driven = travelled(truth)
     apart = np.hypot(*(truth[:, None, :2] - truth[None, :, :2]).transpose(2, 0, 1))
     apart[driven[None, :] - driven[:, None] < LOOP_AFTER] = np.inf
     earlier, later = np.unravel_index(int(np.argmin(apart)), apart.shape)
