@@ -44,11 +44,11 @@ from slam_backend.team.merge_scheduler import AttemptOptions
 from slam_backend.team.options import MergeOptions
 from slam_backend.team.team import TeamSlam
 from studies.merge_outcomes import Delay, Follower, MergeOutcome, RunEnd, RunOutcomes, collect_outcomes, summarise
-from training.bench.accuracy.runs import STEP, RunSpec, simulate_run
 from training.episodes.config import RunConfig
 from training.episodes.metrics import score_episode
 from training.episodes.runner import Progress, is_false_merge, run_episode
 from training.experiments.run_folder import plain
+from training.stereo_runs.runs import STEP, RunSpec, simulate_run
 from vslam_env import ExplorationEnv, preset_config
 from vslam_env.evaluation.map_scores import GroundTruthAssociation
 from vslam_env.sensors.landmark_sensor import padded

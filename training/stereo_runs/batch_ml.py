@@ -17,7 +17,7 @@ import scipy.sparse
 
 from slam_backend.core.validation import FloatArray, IntArray, argument_error, check_float
 from slam_backend.geometry import wrap_angle
-from training.bench.accuracy.batch_problem import START_SIGMAS, BatchProblem, Estimate, Sights
+from training.stereo_runs.batch_problem import START_SIGMAS, BatchProblem, Estimate, Sights
 
 BAND = 5  # super-diagonals of a block-tridiagonal matrix with blocks of 3
 MAX_ITERATIONS = 100
@@ -99,9 +99,8 @@ def _descend(
     system = _System(problem, at, problem.sights(at, metric), robust)
     for iteration in range(MAX_ITERATIONS):
         trial = system.moved(at, *system.solve(damping))
-        sights = problem.sights(trial, metric)
-        changed = _System(problem, trial, sights, robust)
-        if changed.cost <= system.cost and (metric or sights.in_front):
+        changed = _System(problem, trial, problem.sights(trial, metric), robust)
+        if changed.cost <= system.cost:
             decrease = system.cost - changed.cost
             at, system = trial, changed
             if decrease > LEAST_DECREASE * (1.0 + system.cost):

@@ -1,8 +1,11 @@
-"""Losses of accuracy: batch and online estimates of episodes, associations over merges, summary and command."""
+"""Losses of accuracy: batch and online estimates of episodes, associations over merges, results and program."""
 
 import json
+import os
+import subprocess
+import sys
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,50 +15,43 @@ from scipy import stats
 
 from slam_backend.core.validation import FloatArray
 from slam_backend.geometry import between, wrap_angle
-from training.bench.accuracy.batch_ml import BatchEstimate, batch_ml, most_likely
-from training.bench.accuracy.batch_problem import BatchProblem, Estimate
-from training.bench.accuracy.episodes import RecordedEpisode, components, record_episode, replay
-from training.bench.accuracy.losses import (
-    ESTIMATES,
+from studies.bounds.episodes import RecordedEpisode, components, record_episode, replay
+from studies.bounds.ladder import (
     LADDER,
-    LOSSES,
     Associations,
     build_problem,
-    count_revisits,
     estimates,
     fusions_of_merges,
-    play,
-    score_paths,
     true_covariances,
     true_start,
     with_all_keyframes,
 )
-from training.bench.accuracy.losses_report import (
-    condition_name,
-    draw_losses,
-    geometric_mean,
-    losses_of,
-    markdown,
-    summarise,
-)
-from training.bench.accuracy.online_bound import ideal_online
-from training.bench.accuracy.runs import RunSpec, simulate_run
-from training.bench.config import AccuracyConfig
+from studies.bounds.online import ideal_online
+from studies.losses import ESTIMATES, LOSSES, STUDY, Config, count_revisits, environment, play, score_paths, trials
+from training.bench.exploration.players import parted
 from training.experiments.run_folder import plain
+from training.stereo_runs.batch_ml import BatchEstimate, batch_ml, most_likely
+from training.stereo_runs.batch_problem import BatchProblem, Estimate
+from training.stereo_runs.runs import RunSpec, simulate_run
 from vslam_env import vslam_v0
 from vslam_env.config import EnvConfig
 from vslam_env.world import OdometryNoise, read_odometry
 
 FALSE_ALARM = 1e-3
-SMALL = AccuracyConfig(worlds=("fig5",), duration=4.0, particles=(12,), seeds=2, seed=70)
+SMALL = Config(worlds=("fig5",), duration=4.0, particles=(12,), seeds=2, seed=70)
 BIAS = (0.02, 0.01, 0.03)
 
 
-def recorded(config: AccuracyConfig, change: Callable[[EnvConfig], EnvConfig] = lambda env: env) -> RecordedEpisode:
-    """Return the first episode of a benchmark, with a changed environment."""
-    trial = config.episodes()[0]
-    env = vslam_v0.parallel_env(config=change(config.environment(trial)))
-    return record_episode(env, config.run(trial).make_policies(env), trial.seed)
+PROGRAM = [
+    sys.executable, "-m", "studies.losses", "--worlds", "fig5", "--max-seconds", "2", "--particles", "5",
+]  # fmt: skip
+
+
+def recorded(config: Config, seed: int = 70, change: Callable[[EnvConfig], EnvConfig] = lambda env: env) -> Any:
+    """Return an episode of a study, with a changed environment."""
+    (trial,) = (trial for trial in trials(config) if trial.seed == seed)
+    env = vslam_v0.parallel_env(config=change(environment(config, trial)))
+    return record_episode(env, parted(trial.policy).make(env, 600.0), trial.seed)
 
 
 @pytest.fixture(scope="module")
@@ -77,8 +73,8 @@ def batch(problem: BatchProblem) -> BatchEstimate:
 
 @pytest.fixture(scope="module")
 def rows() -> list[dict[str, Any]]:
-    """Trials of a small benchmark, as stored."""
-    return [play(SMALL, trial) for trial in SMALL.episodes()]
+    """Trials of a small study, as stored."""
+    return [plain(asdict(trial) | play(SMALL, trial)) for trial in trials(SMALL)]
 
 
 def shifted(at: Estimate, name: str, step: FloatArray) -> Estimate:
@@ -180,10 +176,10 @@ def test_without_noise_every_estimate_is_exact() -> None:
             landmark_sensor={"camera": {"sigma_px": 1e-7, "sigma_disparity_px": 1e-7}, "false_points": 0.0},
         )  # fmt: skip
 
-    episode = recorded(SMALL, exact)
+    episode = recorded(SMALL, change=exact)
     track = replay(episode, episode.config.belief.filter)
     found = estimates(episode, track) | {"all_keyframes": track.paths}
-    errors = score_paths(episode, found)["position_rms_m"]
+    errors = score_paths(episode, found)
     for name in ESTIMATES:
         if name not in ("filter", "all_keyframes"):
             assert errors[name] < 1e-6, name
@@ -211,9 +207,8 @@ def test_errors_agree_with_the_predicted_covariances() -> None:
     """
     total = 0.0
     config = SMALL.replace(seeds=20, duration=6.0, policies=("random_goals",))
-    for trial in config.episodes():
-        env = vslam_v0.parallel_env(config=config.environment(trial))
-        episode = record_episode(env, config.run(trial).make_policies(env), trial.seed)
+    for seed in range(70, 90):
+        episode: RecordedEpisode = recorded(config, seed)
         noise = episode.config.odometry
         found = Associations(episode.true_ids, ())
         bias = noise.bias_distance, noise.bias_heading_per_metre, 0.0
@@ -247,15 +242,13 @@ def test_groups_follow_merges_and_landmarks_are_fused_then() -> None:
 def test_without_landmarks_all_estimates_are_dead_reckoning() -> None:
     """Where nothing is seen, batch and filter have odometry alone; the report leaves missing figures out."""
     config = SMALL.replace(max_ranges=(0.9,), duration=2.0, seeds=1, seed=72)
-    (trial,) = config.episodes()
-    row = play(config, trial)
+    (trial,) = trials(config)
+    row = plain(asdict(trial) | play(config, trial))
     assert row["num_measurements"] == row["landmarks"] == 0
-    errors = row["position_rms_m"]
     for name in ("batch", "ideal_online", "noise_as_assumed", "own_associations", "online"):
-        assert errors[name] == pytest.approx(errors["odometry"]), name
-    (line,) = summarise(json.loads(json.dumps([plain(row)])))
-    assert line["map_over_batch"]["mean"] is None
-    assert "| - |" in markdown([line])
+        assert row[name] == pytest.approx(row["odometry"]), name
+    (line,) = STUDY.tables[2].lines([row])
+    assert line["map over batch"].value is None
 
 
 def test_losses_multiply_to_the_whole(rows: list[dict[str, Any]]) -> None:
@@ -264,19 +257,15 @@ def test_losses_multiply_to_the_whole(rows: list[dict[str, Any]]) -> None:
     assert LADDER[-1][0] == "filter"
     assert LOSSES == ("assumed noise", "association", "online", "particles", "keyframe reduction")
     for row in rows:
-        assert set(row["position_rms_m"]) == set(ESTIMATES)
-        errors = row["position_rms_m"]
-        assert np.prod(list(losses_of(row).values())) == pytest.approx(errors["filter"] / errors["batch"])
-    (line,) = summarise(rows)
-    whole = line["filter_over_batch"]
-    assert np.prod([found["mean"] for found in line["losses"].values()]) == pytest.approx(whole["mean"])
-    assert whole["seeds"] == line["seeds"] == 2
-    assert whole["low"] <= whole["mean"] <= whole["high"] <= whole["worst"] * (1.0 + 1e-12)
+        assert np.prod([row[f"loss of {loss}"] for loss in LOSSES]) == pytest.approx(row["filter"] / row["batch"])
+    (line,) = STUDY.tables[1].lines(rows)
+    whole = float(np.sqrt(np.prod([row["over_batch"] for row in rows])))
+    assert np.prod([line[loss].value for loss in LOSSES]) == pytest.approx(whole)
 
 
 def test_trials_report_errors_and_associations(rows: list[dict[str, Any]]) -> None:
     """Odometry is worse than batch over both trials, shares are shares, and a trial repeats itself."""
-    batch, odometry = (np.hypot(*(row["position_rms_m"][name] for row in rows)) for name in ("batch", "odometry"))
+    batch, odometry = (np.hypot(*(row[name] for row in rows)) for name in ("batch", "odometry"))
     assert 0.0 < batch < odometry
     for row in rows:
         assert 0.0 <= row["wrong_match_share"] <= 1.0
@@ -284,8 +273,8 @@ def test_trials_report_errors_and_associations(rows: list[dict[str, Any]]) -> No
         assert row["copies_per_landmark"] >= 1.0
         assert 0 <= row["missed_revisits"] <= row["revisits"]
         assert row["duration_s"] == pytest.approx(4.0)
-        assert json.loads(json.dumps(row)) == row
-    again = play(SMALL, SMALL.episodes()[0])
+    first, *_ = trials(SMALL)
+    again = plain(asdict(first) | play(SMALL, first))
     assert {**again, "seconds": 0.0} == {**rows[0], "seconds": 0.0}
 
 
@@ -305,51 +294,17 @@ def test_revisits_are_missed_where_no_measurement_has_an_earlier_label() -> None
     assert count_revisits([], []) == {"revisits": 0, "missed_revisits": 0}
 
 
-def test_failures_of_policies_are_reported(vslam: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An episode whose policy raises is left out with one line; the command goes on and ends with status 2."""
-    (tmp_path / "lost.py").write_text(
-        "class Lost:\n"
-        "    def reset(self):\n        pass\n"
-        "    def act(self, observation, belief, rng):\n        raise KeyError('way')\n"
-    )  # fmt: skip
-    monkeypatch.chdir(tmp_path)
-    arguments = ["bench", "accuracy", "--worlds", "fig5", "--max-seconds", "2", "--particles", "5", "--seeds", "1"]
-    said = vslam(*arguments, "--policies", "lost:Lost,frontier", "--out", "run")
-    assert said.status == 2
-    assert "1 of 2 trials failed" in said.out
-    (line,) = json.loads((tmp_path / "run" / "metrics.json").read_text())["summary"]
-    assert line["policy"] == "frontier"
-
-
-def test_geometric_means_ignore_missing_values() -> None:
-    """Ratios have geometric means with bootstrap intervals; missing ones are left out, a single one has no interval."""
-    found = geometric_mean(np.array([0.5, 2.0, 4.0, np.nan, 0.0]))
-    assert found["mean"] == pytest.approx(4.0 ** (1.0 / 3.0))
-    assert found["seeds"] == 3
-    assert found["low"] <= found["mean"] <= found["high"] <= found["worst"] == 4.0  # type: ignore[operator]
-    assert geometric_mean(np.array([3.0]))["low"] is None
-    assert geometric_mean(np.array([np.nan]))["mean"] is None
-
-
-def test_tables_name_what_differs_from_the_default(rows: list[dict[str, Any]], tmp_path: Path) -> None:
-    """Each condition has a row in each table; the figure is a PNG file."""
-    wide = [row | {"max_range": 12.0, "measurements": 15, "policy": "random_walk"} for row in rows]
-    lines = summarise([*rows, *wide])
-    assert [condition_name(line) for line in lines] == [
-        "fig5, K = 1, M = 12", "fig5, K = 1, random_walk, range 12 m, B = 15, M = 12",
-    ]  # fmt: skip
-    text = markdown(lines)
-    assert text.count("| fig5, K = 1, M = 12 |") == 3
-    assert "keyframe reduction" in text
-    draw_losses(tmp_path / "losses.png", lines)
-    assert (tmp_path / "losses.png").read_bytes().startswith(b"\x89PNG")
+def test_conditions_name_what_differs_from_the_default() -> None:
+    """Trials with equal options but for the seed have one name."""
+    config = SMALL.replace(policies=("random_walk",), max_ranges=(12.0,), measurements=(15,))
+    assert {trial.condition for trial in trials(SMALL)} == {"fig5, K = 1, M = 12"}
+    assert {trial.condition for trial in trials(config)} == {"fig5, K = 1, random_walk, range 12 m, B = 15, M = 12"}
 
 
 def test_cameras_change_in_the_world_and_in_the_filter() -> None:
     """Range and baseline are those of the true and of the assumed camera, and their noise stays as it is."""
     config = SMALL.replace(max_ranges=(4.0,), baselines=(0.24,), measurements=(3,))
-    (trial,) = (trial for trial in config.episodes() if trial.seed == 70)
-    env, usual = config.environment(trial), SMALL.environment(SMALL.episodes()[0])
+    env, usual = (environment(each, trials(each)[0]) for each in (config, SMALL))
     for camera, before in (
         (env.landmark_sensor.camera, usual.landmark_sensor.camera),
         (env.belief.filter.camera, usual.belief.filter.camera),
@@ -359,44 +314,34 @@ def test_cameras_change_in_the_world_and_in_the_filter() -> None:
     assert env.landmark_sensor.max_measurements == 3
 
 
-def test_options_without_effect_are_refused() -> None:
-    """Options of one kind of trial are refused with the other, as are presets and policies that do not exist."""
-    for values, match in (
-        ({"split": "any"}, "world_split: expected no value without --worlds, got 'any'"),
-        ({"duration": 9.0}, "max_seconds: expected no value without --worlds, got 9"),
-        ({"baselines": (0.2,)}, "baselines: expected no value without --worlds"),
-        ({"presets": ("easy",)}, "presets: expected one of 'good', 'coarse', 'paper', got 'easy'"),
-        ({"worlds": ("office",), "lengths": (9.0,)}, "lengths: expected no value with --worlds"),
-        (
-            {"worlds": ("office",), "presets": ("good",)},
-            "presets: expected one of 'easy', 'standard', 'hard', got 'good'",
-        ),
-        ({"worlds": ("nowhere",)}, "world: expected one of 'office'"),
-        ({"worlds": ("office",), "policies": ("magic",)}, "policy"),
-        ({"worlds": ("office",), "policies": ("oracles@bound",)}, "policy: expected a policy of robots or of the team"),
-        ({"worlds": ("office",), "robots": (9,)}, "robots: expected an int from 1 to 8, got 9"),
-    ):
-        with pytest.raises(ValueError, match=match):
-            AccuracyConfig(**values)
+@pytest.mark.parametrize(("values", "match"), [
+    ({"presets": ("good",)}, "presets: expected one of 'easy', 'standard', 'hard', got 'good'"),
+    ({"worlds": ("nowhere",)}, "world: expected one of 'office'"), ({"policies": ("magic",)}, "policy"),
+    ({"policies": ("oracles@bound",)}, "policy: expected a policy of robots or of the team"),
+    ({"robots": (9,)}, "robots: expected an int from 1 to 8, got 9"),
+    ({"duration": 0.0}, "max_seconds: expected a finite number >= 1, got 0.0"),
+    ({"baselines": (0.0,)}, "baselines: expected a finite number > 0, got 0.0"),
+])  # fmt: skip
+def test_what_cannot_be_played_is_refused(values: dict[str, Any], match: str) -> None:
+    """Worlds, policies and numbers are refused, and bounds, which know the truth."""
+    with pytest.raises(ValueError, match=match):
+        Config(**values)
 
 
-def test_the_command_resumes_and_writes_tables(vslam: Any, tmp_path: Path) -> None:
-    """The command writes rows, metrics, tables and a figure; a stopped run continues; its config repeats it."""
-    out, again = tmp_path / "first", tmp_path / "again"
-    arguments = ["bench", "accuracy", "--worlds", "fig5", "--max-seconds", "2", "--particles", "5", "--seeds", "2"]
-    arguments += ["--first-seed", "71"]
-    said = vslam(*arguments, "--out", str(out), "--json", str(out / "copy.json"))
-    assert said.status == 0, said.err
-    metrics = json.loads((out / "copy.json").read_text())
-    assert [row["seed"] for row in metrics["trials"]] == [71, 72]
-    assert (out / "losses.png").is_file()
-    assert "keyframe reduction" in (out / "tables.md").read_text()
-    lines = (out / "episodes.jsonl").read_text().splitlines()
-    (out / "episodes.jsonl").write_text(lines[0] + "\n" + lines[1][:40])
-    assert vslam(*arguments, "--out", str(out)).status == 0
-    first, second = (json.loads(line) for line in (out / "episodes.jsonl").read_text().splitlines())
-    assert first == json.loads(lines[0])
-    assert second | {"seconds": 0.0} == json.loads(lines[1]) | {"seconds": 0.0}
-    assert vslam("bench", "accuracy", "--config", str(out), "--seeds", "1", "--out", str(again)).status == 0
-    (row,) = (json.loads(line) for line in (again / "episodes.jsonl").read_text().splitlines())
-    assert row | {"seconds": 0.0} == first | {"seconds": 0.0}
+def test_the_program_leaves_out_policies_that_fail(tmp_path: Path) -> None:
+    """An episode whose policy raises costs one line; the others are summed up, with status 2 at the end."""
+    (tmp_path / "lost.py").write_text(
+        "class Lost:\n"
+        "    def reset(self):\n        pass\n"
+        "    def act(self, observation, belief, rng):\n        raise KeyError('way')\n"
+    )  # fmt: skip
+    arguments = [*PROGRAM, "--seeds", "1", "--policies", "lost:Lost,frontier", "--out", "run"]
+    paths = {"PYTHONPATH": os.pathsep.join(map(str, (Path.cwd(), tmp_path)))}
+    done = subprocess.run(arguments, cwd=tmp_path, env=os.environ | paths, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert "1 of 2 trials failed" in done.stdout
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert [row["policy"] for row in metrics["trials"]] == ["frontier"]
+    assert [line["condition"] for line in metrics["tables"]["losses"]] == ["fig5, K = 1, M = 5"]
+    assert "| fig5, K = 1, M = 5 |" in (tmp_path / "run" / "tables.md").read_text()
+    assert (tmp_path / "run" / "curves.png").stat().st_size > 10_000

@@ -12,8 +12,8 @@ import scipy.linalg
 
 from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.geometry import wrap_angle
-from training.bench.accuracy.batch_ml import BatchEstimate, prior_terms
-from training.bench.accuracy.batch_problem import BatchProblem, Estimate
+from training.stereo_runs.batch_ml import BatchEstimate, prior_terms
+from training.stereo_runs.batch_problem import BatchProblem, Estimate
 
 EQUAL = 1e-6  # [m]; standard deviation of the difference of two landmarks that are fused
 

@@ -5,11 +5,9 @@ and stereo pairs with the calibration of their rig.
 """
 
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -30,8 +28,10 @@ from slam_backend.frontend.images import Image
 from slam_backend.models.camera import StereoCamera
 from slam_backend.readers.calibration import CameraCalibration, Rectifier
 from slam_backend.readers.stereo_files import load_rig
-from training.bench.stereo.quality import guard_rows
+from studies.front_end.rendered import Disparities
 
+Kind = Literal["checks", "chessboard", "planar", "rig"]
+WAYS = (*DESCRIPTOR_TYPES, "sift_own", "orb_own")  # of matching planar pairs
 ALOE_SPAN = 3740.0 * 0.16  # focal length [px] times baseline [m] of the Middlebury rig of 2006
 ALOE_DISPARITIES = (15.0, 260.0)
 BOARD = (9, 6)  # inner corners of the chessboard
@@ -52,62 +52,21 @@ PLANAR_CORNERS, PLANAR_TOLERANCE = 1000, 4.0  # tolerance in the first image [px
 FARTHEST_SQUARES = 60.0  # maximum distance of points [squares]
 
 
-@dataclass(frozen=True, slots=True)
-class RealPart:
-    """Measurable part of a folder of real images."""
-
-    key: str  # Key in the result of the benchmark
-    name: str  # Displayed name of the part
-    measure: Callable[[], Any]  # Function that returns rows, or one row
-
-
-def find_parts(folder: Path, descriptors: Sequence[str]) -> list[RealPart]:
-    """Return the measurable parts of a folder and of its subfolders.
+def find_images(folder: Path) -> list[tuple[Kind, Path]]:
+    """Return what can be measured in a folder and its subfolders: kind, and folder or, of a planar pair, model file.
 
     Args:
         folder: Folder with some of OpenCV's samples, planar pairs `NAMEA`, `NAMEB` with their homography
             `NAME_model.txt`, or stereo pairs in one of `LAYOUTS` with one of `CALIBRATIONS`.
     """
-    parts: list[RealPart] = []
+    found: list[tuple[Kind, Path]] = []
     for place in (folder, *_folders_in(folder)):
-        if (place / "aloeGT.png").is_file():
-            parts += [RealPart("aloe", f"aloe, {way}", partial(_aloe, place, way)) for way in descriptors]
-        if (place / "left01.jpg").is_file() and not _calibration(place):
-            parts.append(RealPart("chessboard", "chessboard", partial(chessboard, place)))
-        for model in sorted(place.glob(f"*{MODEL}")):
-            parts.append(
-                RealPart("planar", f"planar pair {model.name.removesuffix(MODEL)}", partial(planar_rows, model))
-            )
-        for rig in (place, *(_folders_in(place) if place != folder else ())):
-            if _calibration(rig):
-                parts.append(RealPart("rigs", f"stereo pairs in {rig.name}", partial(rig_rows, rig, descriptors)))
-    return parts
-
-
-def measure_parts(
-    parts: Sequence[RealPart],
-    result: dict[str, Any],
-    on_part: Callable[[str], None] = lambda name: None,
-    interrupted: Callable[[], bool] = lambda: False,
-) -> None:
-    """Measure parts in order, and add each to a result; a part that fails is recorded, and the others continue.
-
-    Args:
-        result: Result of the benchmark; changed. `failed` contains errors by the name of the part.
-    """
-    for part in parts:
-        if interrupted():
-            return
-        on_part(part.name)
-        try:
-            found = part.measure()
-        except Exception as error:  # any error of OpenCV, numpy or this package, since images are arbitrary
-            result.setdefault("failed", {})[part.name] = str(error) or type(error).__name__
-            continue
-        if isinstance(found, list):
-            result.setdefault(part.key, []).extend(found)
-        else:
-            result.setdefault(part.key, {}).update(found)
+        found += [("checks", place)] if (place / "aloeGT.png").is_file() else []
+        found += [("chessboard", place)] if (place / "left01.jpg").is_file() and not _calibration(place) else []
+        found += [("planar", model) for model in sorted(place.glob(f"*{MODEL}"))]
+        rigs = (place, *(_folders_in(place) if place != folder else ()))
+        found += [("rig", rig) for rig in rigs if _calibration(rig)]
+    return found
 
 
 def _folders_in(folder: Path) -> list[Path]:
@@ -115,12 +74,7 @@ def _folders_in(folder: Path) -> list[Path]:
     return sorted(below for below in folder.iterdir() if below.is_dir())
 
 
-def _aloe(folder: Path, descriptor: str) -> dict[str, Any]:
-    """Return `aloe_rows` by the name of the descriptor."""
-    return {descriptor: aloe_rows(folder, descriptor)}
-
-
-def rig_rows(folder: Path, descriptors: Sequence[str]) -> list[dict[str, Any]]:
+def measure_rig(folder: Path, descriptor: Any) -> dict[str, Any]:
     """Measure stereo pairs of a calibrated rig: matches after each match check, depths, and times.
 
     Args:
@@ -128,9 +82,8 @@ def rig_rows(folder: Path, descriptors: Sequence[str]) -> list[dict[str, Any]]:
             evenly chosen.
 
     Returns:
-        One row per descriptor: `rig`, `descriptor`, `pairs`; means over the pairs of `matches`, of the matches after
-        each check (`left`), of `points`, of the median depth `depth_m` (None without points), and the time of a pair
-        `ms`.
+        `pairs`, their number; means over the pairs of `matches`, of the matches after each check, by its name, of
+        `points`, of the median depth `depth_m` (None without points), and the time of a pair `ms`.
 
     Raises:
         ValueError: If there are no such images, or the calibration is invalid.
@@ -143,31 +96,21 @@ def rig_rows(folder: Path, descriptors: Sequence[str]) -> list[dict[str, Any]]:
     span = rig.pair.focal_px * rig.pair.baseline
     camera = rig.pair.camera(width, height, max_range=span / LEAST_DISPARITY)
     rectified = [rig.rectify(*pair) for pair in pairs]
-    rows = []
-    for descriptor in descriptors:
-        nearest_m = span / (LARGEST_DISPARITY * width)
-        kind: Any = descriptor
-        options = FrontEndOptions(descriptor=kind, nearest=nearest_m, corners=CornerOptions(most=1500))
-        eye = StereoFrontEnd(camera, options, rig.pair.centre_px)
-        eye.measure(*rectified[0])  # loads and compiles before the timing
-        began = time.perf_counter()
-        frames = [eye.measure(*pair) for pair in rectified]
-        spent = 1e3 * (time.perf_counter() - began) / len(frames)
-        kept = [np.cumprod(frame.matches.passed, axis=0).sum(axis=1) for frame in frames]
-        depths = np.concatenate([frame.measurements.points[:, 2] for frame in frames])
-        rows.append(
-            {
-                "rig": folder.name,
-                "descriptor": descriptor,
-                "pairs": len(frames),
-                "matches": float(np.mean([frame.matches.passed.shape[1] for frame in frames])),
-                "left": dict(zip(MATCH_CHECKS, np.mean(kept, axis=0).tolist(), strict=True)),
-                "points": float(np.mean([len(frame.measurements) for frame in frames])),
-                "depth_m": float(np.median(depths)) if len(depths) else None,
-                "ms": spent,
-            }
-        )
-    return rows
+    nearest_m = span / (LARGEST_DISPARITY * width)
+    options = FrontEndOptions(descriptor=descriptor, nearest=nearest_m, corners=CornerOptions(most=1500))
+    eye = StereoFrontEnd(camera, options, rig.pair.centre_px)
+    eye.measure(*rectified[0])  # loads and compiles before the timing
+    began = time.perf_counter()
+    frames = [eye.measure(*pair) for pair in rectified]
+    spent = 1e3 * (time.perf_counter() - began) / len(frames)
+    kept = [np.cumprod(frame.matches.passed, axis=0).sum(axis=1) for frame in frames]
+    depths = np.concatenate([frame.measurements.points[:, 2] for frame in frames])
+    return {
+        "pairs": len(frames), "matches": float(np.mean([frame.matches.passed.shape[1] for frame in frames])),
+        **dict(zip(MATCH_CHECKS, np.mean(kept, axis=0).tolist(), strict=True)),
+        "points": float(np.mean([len(frame.measurements) for frame in frames])),
+        "depth_m": float(np.median(depths)) if len(depths) else None, "ms": spent,
+    }  # fmt: skip
 
 
 def _calibration(folder: Path) -> str:
@@ -191,8 +134,9 @@ def _eyes(folder: Path) -> tuple[list[Path], list[Path]]:
     raise argument_error("real", expected, got, f"Check {str(folder)!r}.")
 
 
-def aloe_rows(folder: Path, descriptor: Any) -> list[dict[str, Any]]:
-    """Return errors before and after each match check on the aloe pair, whose true disparities are whole pixels."""
+@lru_cache(maxsize=1)
+def aloe_disparities(folder: Path, descriptor: Any) -> Disparities:
+    """Measure the aloe pair, whose true disparities are whole pixels."""
     left, right = (read_grey_image(folder / f"aloe{eye}.jpg") for eye in "LR")
     true = read_grey_image(folder / "aloeGT.png").astype(np.float64)
     height, width = left.shape
@@ -203,8 +147,9 @@ def aloe_rows(folder: Path, descriptor: Any) -> list[dict[str, Any]]:
     columns, rows = np.rint(matches.corners.T).astype(int)
     known = true[rows, columns] > 0.0
     truth = true[rows, columns][known]
-    by_corners, by_patches = matches.corner_disparity[known] - truth, matches.disparity[known] - truth
-    return guard_rows(by_corners, by_patches, matches.passed[:, known])
+    return Disparities(
+        matches.corner_disparity[known] - truth, matches.disparity[known] - truth, matches.passed[:, known]
+    )
 
 
 def chessboard(folder: Path) -> dict[str, Any]:
@@ -273,36 +218,33 @@ def chessboard(folder: Path) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def planar_rows(file: Path) -> list[dict[str, Any]]:
-    """Return matching scores on one planar pair.
+def match_planar(file: Path, way: str) -> dict[str, Any]:
+    """Match a planar pair.
 
-    Upright descriptors of Harris corners by u-SURF, SIFT and ORB; and OpenCV's SIFT and ORB with their own keypoints
-    and rotations for comparison. A match is a mutual nearest descriptor; it is right if the homography maps it within
-    4 px. Score: share of right matches.
+    A match is a mutual nearest descriptor; it is right if the homography maps it within 4 px.
 
     Args:
         file: `NAME_model.txt`, the homography from image `NAMEB` to the `NAMEA` in the same folder.
+        way: Entry of `WAYS`: upright descriptors of Harris corners, or OpenCV's SIFT and ORB with their own keypoints
+            and rotations.
+
+    Returns:
+        Numbers of `matches` and `right` ones.
 
     Raises:
         ValueError: If the file has no 3 x 3 homography, or an image is missing.
     """
-    name = file.name.removesuffix(MODEL)
-    model = _homography(file)
+    model, name = _homography(file), file.name.removesuffix(MODEL)
     a, b = (read_grey_image(_image(file.parent, f"{name}{side}")) for side in "AB")
-    rows = []
-    for way in (*DESCRIPTOR_TYPES, "sift_own", "orb_own"):
-        (at_a, described_a), (at_b, described_b) = (_described(image, way) for image in (a, b))
-        row = {"pair": name, "way": way, "matches": 0, "right": 0}
-        rows.append(row)
-        if not len(at_a) or not len(at_b):
-            continue
-        there, _ = nearest(described_b, described_a)
-        back, _ = nearest(described_a, described_b)
-        matched = np.flatnonzero(back[there] == np.arange(len(there)))
-        lifted = np.column_stack([at_b[matched], np.ones(len(matched))]) @ model.T
-        errors = np.hypot(*(lifted[:, :2] / lifted[:, 2:] - at_a[there[matched]]).T)
-        row |= {"matches": len(matched), "right": int((errors <= PLANAR_TOLERANCE).sum())}
-    return rows
+    (at_a, described_a), (at_b, described_b) = (_described(image, way) for image in (a, b))
+    if not len(at_a) or not len(at_b):
+        return {"matches": 0, "right": 0}
+    there, _ = nearest(described_b, described_a)
+    back, _ = nearest(described_a, described_b)
+    matched = np.flatnonzero(back[there] == np.arange(len(there)))
+    lifted = np.column_stack([at_b[matched], np.ones(len(matched))]) @ model.T
+    errors = np.hypot(*(lifted[:, :2] / lifted[:, 2:] - at_a[there[matched]]).T)
+    return {"matches": len(matched), "right": int((errors <= PLANAR_TOLERANCE).sum())}
 
 
 def _homography(file: Path) -> FloatArray:

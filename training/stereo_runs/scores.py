@@ -1,53 +1,23 @@
-"""Trial of the accuracy benchmark: errors of one method on a simulated run."""
+"""Errors of estimates of a stereo run: by a filter, or by least squares with true data associations."""
 
 import time
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
-from slam_backend.core.blas import single_threaded_blas
-from slam_backend.core.validation import FloatArray, IntArray
-from slam_backend.fastslam.existence import ExistenceModel
+from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.geometry import transform_points, wrap_angle
 from slam_backend.metrics import align_se2, ate, map_rmse, nees
-from training.bench.accuracy.batch_ml import BatchEstimate, batch_ml
-from training.bench.accuracy.batch_problem import BatchProblem
-from training.bench.accuracy.online_bound import ideal_online
-from training.bench.accuracy.runs import FALSE_POINT, Preset, RunSpec, StereoRun, simulate_run
+from training.stereo_runs.batch_ml import BatchEstimate, batch_ml
+from training.stereo_runs.batch_problem import BatchProblem
+from training.stereo_runs.runs import FALSE_POINT, StereoRun
 
-TRIALS_FILE = "trials.jsonl"
-PEERS = ("dead_reckoning", "batch_ml", "ideal_online")
-FILTERS = ("fastslam1", "fastslam2", "fastslam2+existence", "fastslam2+rejuvenation")
-METHODS = (*PEERS, *FILTERS)
 REJUVENATE_EVERY = 25  # steps
 CONFIRMED = 2  # measurements that confirm a landmark
 LEAST_SIGMA = 1e-5  # [m, rad]; lower limit, because a collapsed particle set has no NEES
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Trial:
-    """Parameters of a trial."""
-
-    preset: Preset  # Noise preset
-    association: Literal["known", "unknown"]  # Methods without a filter always know it
-    robots: int  # K
-    length: float  # Path length of each robot [m]
-    method: str  # One of `METHODS`
-    particles: int  # M of a filter, 0 for other methods
-    seed: int  # Seed of the run and of the filter
-    noise_factor: float = 1.0  # Assumed measurement variance of a filter over the true one
-    landmark_noise: float | None = None  # Landmark noise of a filter [m], see `FilterOptions`
-
-    def __post_init__(self) -> None:
-        _ = self.spec  # validates the other fields
-
-    @property
-    def spec(self) -> RunSpec:
-        """Simulated run."""
-        return RunSpec(robots=self.robots, length=self.length, preset=self.preset, association=self.association)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,56 +29,22 @@ class Answer:
     means: FloatArray | None = None  # (n, 3) float64 [m], world frame. Final map.
     # (n,) int64. True landmark of each landmark of the map, by its index in the run; `FALSE_POINT`: none.
     claims: IntArray | None = None
-    confirmed: Any = None  # (n,) bool. Whether it was measured at least `CONFIRMED` times.
+    confirmed: BoolArray | None = None  # (n,) bool. Whether it was measured at least `CONFIRMED` times.
     extra: dict[str, float] | None = None  # Additional metrics of a filter
 
 
-@single_threaded_blas
-def play(trial: Trial) -> dict[str, Any]:
-    """Run a trial.
+def score(run: StereoRun, answer: Answer) -> dict[str, float]:
+    """Return the errors of an answer.
 
     Returns:
-        Fields of the trial, and: `pose_rms_m` (all robots and steps, not aligned), `pose_aligned_rms_m` (after the
-        SE(2) fit of all paths), `heading_rms_deg`; `map_rmse_m`, `map_aligned_rmse_m`, `map_recall` (of measured
-        landmarks), `map_precision`, `confirmed_recall`, `confirmed_precision` (of landmarks measured at least twice);
-        `nees_median`, `nees_mean` (3-D, ideal 3), `anees` (mean over the dimension, ideal 1); for
-        filters `ess_share` (mean of ESS / M), `nis` (mean, ideal 3), `wrong_match_share` (of all matches of the most
-        probable particle), `held_back_share` (of all measurements, neither matched nor new), `step_ms` (median),
-        `rejuvenation_ms` (median of the steps with an attempt), `refused_share` (of these attempts); and
-        `seconds`. NaN means unknown.
+        `pose_rms_m` (all robots and steps, not aligned), `pose_aligned_rms_m` (after the SE(2) fit of all paths),
+        `heading_rms_deg`; `map_rmse_m`, `map_aligned_rmse_m`, `map_recall` (of measured landmarks), `map_precision`,
+        `confirmed_recall`, `confirmed_precision` (of landmarks measured at least twice); `nees_median`, `nees_mean`
+        (3-D, ideal 3), `anees` (mean over the dimension, ideal 1); for filters `ess_share` (mean of ESS / M), `nis`
+        (mean, ideal 3), `wrong_match_share` (of all matches of the most probable particle), `held_back_share` (of all
+        measurements, neither matched nor new), `step_ms` (median), `rejuvenation_ms` (median of the steps with an
+        attempt), `refused_share` (of these attempts). NaN means unknown.
     """
-    begin = time.perf_counter()
-    run = _run_of(trial.spec, trial.seed)
-    if trial.method in FILTERS:
-        answer = follow(run, _build_filter(run, trial))
-    elif trial.method == "dead_reckoning":
-        answer = Answer(BatchProblem.of_run(run).dead_reckoning().paths)
-    else:
-        answer = optimal(run, trial.method)
-    row = asdict(trial) | score(run, answer)
-    return row | {"seconds": time.perf_counter() - begin}
-
-
-def _build_filter(run: StereoRun, trial: Trial) -> FastSlam:
-    """Return a new filter for the method of a trial.
-
-    "+existence": with the default existence model; "+rejuvenation": every `REJUVENATE_EVERY` steps.
-    """
-    proposal, _, extra = trial.method.partition("+")
-    camera, factor = run.spec.noise.camera, float(np.sqrt(trial.noise_factor))
-    options: dict[str, Any] = {"landmark_noise": trial.landmark_noise}
-    options["camera"] = replace(
-        camera, sigma_px=factor * camera.sigma_px, sigma_disparity_px=factor * camera.sigma_disparity_px
-    )
-    if extra == "existence":
-        options["existence"] = ExistenceModel(frame_limit=run.spec.measurements // run.spec.robots)
-    elif extra == "rejuvenation":
-        options["rejuvenate_every"] = REJUVENATE_EVERY
-    return run.build_filter(trial.particles, proposal, trial.seed, **options)  # type: ignore[arg-type]
-
-
-def score(run: StereoRun, answer: Answer) -> dict[str, float]:
-    """Return the errors of an answer; see `play` for the metrics."""
     errors = answer.paths - run.true_paths
     errors[..., 2] = wrap_angle(errors[..., 2])
     fitted = ate(answer.paths.reshape(-1, 3), run.true_paths.reshape(-1, 3))
@@ -198,26 +134,16 @@ def follow(run: StereoRun, slam: FastSlam) -> Answer:
     )  # fmt: skip
 
 
-def optimal(run: StereoRun, method: str) -> Answer:
-    """Return the batch estimate or the ideal online estimate, both with true data associations."""
-    problem, batch = _batch_of(run)
-    if method == "ideal_online":
-        online = ideal_online(problem, batch)
-        paths, covariances, means = online.paths, online.covariances, online.landmarks
-    else:
-        paths, covariances, means = batch.paths, batch.path_covariances, batch.landmarks
+def least_squares_answer(
+    problem: BatchProblem, paths: FloatArray, covariances: FloatArray, landmarks: FloatArray
+) -> Answer:  # fmt: skip
+    """Return the answer with estimates of the unknowns of a run's problem."""
     sightings = np.bincount(problem.landmarks, minlength=len(problem.names))
-    return Answer(paths, covariances, means, problem.names, sightings >= CONFIRMED)
+    return Answer(paths, covariances, landmarks, problem.names, sightings >= CONFIRMED)
 
 
 @lru_cache(maxsize=1)
-def _run_of(spec: RunSpec, seed: int) -> StereoRun:
-    """Simulate a run once for consecutive trials."""
-    return simulate_run(spec, seed)
-
-
-@lru_cache(maxsize=1)
-def _batch_of(run: StereoRun) -> tuple[BatchProblem, BatchEstimate]:
-    """Optimise a run once for the two methods that use it."""
+def batch_of(run: StereoRun) -> tuple[BatchProblem, BatchEstimate]:
+    """Optimise a run once for consecutive trials."""
     problem = BatchProblem.of_run(run)
     return problem, batch_ml(problem)

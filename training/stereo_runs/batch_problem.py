@@ -12,10 +12,11 @@ import numpy as np
 from slam_backend.core.validation import BoolArray, FloatArray, IntArray
 from slam_backend.geometry import between, compose, rotation, wrap_angle
 from slam_backend.models.camera import ROBOT_FROM_CAMERA, StereoCamera
-from training.bench.accuracy.runs import FALSE_POINT, StereoRun
+from training.stereo_runs.runs import FALSE_POINT, StereoRun
 
 START_SIGMAS = (10.0, 10.0, 1.0)  # [m, m, rad] prior of an unknown start about its initial value: hardly informative
 NO_BIAS = (0.0, 0.0, 0.0)
+NEAREST_SHARE = 0.5  # of the measured depth, below which a predicted depth has no pixel residual
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,7 +39,6 @@ class Sights:
     by_pose: FloatArray
     by_landmark: FloatArray  # (n, 3, 3) float64. Derivatives with respect to the landmark.
     by_base: FloatArray  # (n, 3, 3) float64. Derivatives with respect to the path frame of the robot.
-    in_front: bool  # Whether all landmarks are in front of their cameras
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -138,7 +138,8 @@ class BatchProblem:
         Args:
             metric: False: residual of the predicted (u, v, disparity), the exact noise model. True: residual of the
                 predicted point, with its covariance at the measurement; less exact, but almost linear and defined
-                behind the camera, so that the optimisation may start far away.
+                behind the camera, so that the optimisation may start far away. Landmarks nearer than `NEAREST_SHARE` of
+                the measured depth, as wrong associations have behind the camera, always have it.
         """
         own = at.paths[self.robots, self.steps]
         poses = own if at.bases is None else compose(at.bases[self.robots], own)
@@ -151,23 +152,22 @@ class BatchProblem:
         by_pose[:, :, :2] = -turn[:, :, :2]
         by_pose[:, 0, 2], by_pose[:, 1, 2] = local[:, 1], -local[:, 0]
         predicted = self.camera.camera_from_robot(local)
-        depth = predicted[:, 2]
-        if metric:
-            factors = np.linalg.cholesky(self.camera.covariance(self.points))
-            scale = np.linalg.inv(factors)
-            residuals = np.einsum("nij,nj->ni", scale, predicted - self.points)
-        else:
-            sigmas = np.array([self.camera.sigma_px, self.camera.sigma_px, self.camera.sigma_disparity_px])
-            residuals = (self.camera.project(predicted) - self.camera.project(self.points)) / sigmas
-            focal = self.camera.focal_px / depth
-            scale = np.zeros((len(poses), 3, 3))
-            scale[:, 0, 0] = scale[:, 1, 1] = focal
-            scale[:, :, 2] = (
+        scale = np.linalg.inv(np.linalg.cholesky(self.camera.covariance(self.points)))
+        residuals = np.einsum("nij,nj->ni", scale, predicted - self.points)
+        if not metric:
+            front = predicted[:, 2] > NEAREST_SHARE * self.points[:, 2]
+            seen, sigmas = predicted[front], np.array(3 * [self.camera.sigma_px])
+            sigmas[2] = self.camera.sigma_disparity_px
+            residuals[front] = (self.camera.project(seen) - self.camera.project(self.points[front])) / sigmas
+            focal = self.camera.focal_px / seen[:, 2]
+            by_pixel = np.zeros((len(seen), 3, 3))
+            by_pixel[:, 0, 0] = by_pixel[:, 1, 1] = focal
+            by_pixel[:, :, 2] = (
                 -focal[:, None]
-                / depth[:, None]
-                * np.column_stack([predicted[:, :2], np.full(len(depth), self.camera.baseline)])
+                / seen[:, 2, None]
+                * np.column_stack([seen[:, :2], np.full(len(seen), self.camera.baseline)])
             )
-            scale /= sigmas[:, None]
+            scale[front] = by_pixel / sigmas[:, None]
         scale = scale @ ROBOT_FROM_CAMERA.T
         by_pose = scale @ by_pose
         by_base = by_pose
@@ -177,7 +177,7 @@ class BatchProblem:
             lever = poses[:, :2] - bases[:, :2]
             by_base[:, :, 2] += by_pose[:, :, 1] * lever[:, :1] - by_pose[:, :, 0] * lever[:, 1:]
             by_pose[:, :, :2] = by_pose[:, :, :2] @ rotation(bases[:, 2])
-        return Sights(residuals, by_pose, scale @ turn, by_base, bool((depth > 0.0).all()))
+        return Sights(residuals, by_pose, scale @ turn, by_base)
 
     def moves(self, at: Estimate) -> Moves:
         """Return the residuals of all odometry: the expected reading of the motion between poses minus the reading.

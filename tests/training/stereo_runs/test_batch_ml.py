@@ -10,10 +10,10 @@ from scipy import stats
 from slam_backend.core.validation import FloatArray
 from slam_backend.geometry import between, inverse, transform_points, wrap_angle
 from slam_backend.models.measurements import Measurements
-from training.bench.accuracy.batch_ml import BatchEstimate, batch_ml
-from training.bench.accuracy.batch_problem import BatchProblem, Estimate
-from training.bench.accuracy.online_bound import ideal_online
-from training.bench.accuracy.runs import FALSE_POINT, PRESETS, NoisePreset, RunSpec, StereoRun, simulate_run
+from studies.bounds.online import ideal_online
+from training.stereo_runs.batch_ml import BatchEstimate, batch_ml
+from training.stereo_runs.batch_problem import BatchProblem, Estimate
+from training.stereo_runs.runs import FALSE_POINT, PRESETS, NoisePreset, RunSpec, StereoRun, simulate_run
 
 FALSE_ALARM = 1e-3
 SPEC = RunSpec(robots=2, length=12.0, measurements=9, landmarks=170)
@@ -243,3 +243,24 @@ def test_gtsam_gives_the_same_estimate(preset: str) -> None:
         scale = np.outer(*[np.sqrt(np.diag(covariances[robot]))] * 2)
         assert np.abs(covariances[robot] - batch.path_covariances[robot, -1]).max() < 1e-3 * scale.max()
         assert (np.abs(covariances[robot] - batch.path_covariances[robot, -1]) < 1e-3 * scale).all()
+
+
+def test_wrong_associations_behind_a_camera_do_not_stop_the_descent(run: StereoRun, problem: BatchProblem) -> None:
+    """From the truth, at which such landmarks are behind the robot, and from dead reckoning, one minimum is found."""
+    at = Estimate(run.true_paths, run.landmarks[problem.names])
+    camera, wrong = run.spec.noise.camera, problem.landmarks.copy()
+    often = np.bincount(problem.landmarks)[problem.landmarks] > 5
+    late = np.flatnonzero((problem.steps > 30) & often)[::20]
+    assert len(late) > 3
+    for row in late:
+        pose = run.true_paths[problem.robots[row], problem.steps[row]]
+        local = camera.camera_from_robot(transform_points(inverse(pose), at.landmarks))
+        wrong[row] = np.argmin(local[:, 2])
+        assert local[wrong[row], 2] < 0.0
+    changed = replace(problem, landmarks=wrong)
+    found = [batch_ml(changed, start, robust=3.0) for start in (at, None)]
+    for estimate in found:
+        assert estimate.gradient < 1e-4
+        assert np.abs(pose_errors(estimate.paths, run)[:, 1:]).max() > 1e-3
+    np.testing.assert_allclose(found[0].paths, found[1].paths, atol=1e-5)
+    assert found[0].cost == pytest.approx(found[1].cost)

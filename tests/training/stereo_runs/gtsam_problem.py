@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from slam_backend.core.validation import FloatArray
-from training.bench.accuracy.batch_problem import BatchProblem, Estimate
+from training.stereo_runs.batch_problem import BatchProblem, Estimate
 
 
 def solve_with_gtsam(gtsam: ModuleType, problem: BatchProblem, start: Estimate) -> tuple[Estimate, list[FloatArray]]:

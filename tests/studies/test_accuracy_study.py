@@ -1,26 +1,25 @@
-"""Accuracy benchmark: metrics, summary, and stored trials."""
+"""Study of accuracy: metrics, methods, results and program."""
 
-import io
 import json
-from dataclasses import replace
+import subprocess
+import sys
+from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 from slam_backend.geometry import compose, transform_points
-from training.bench.accuracy import trials as accuracy_trials
-from training.bench.accuracy.report import FIGURES, describe, draw_accuracy, markdown, print_tables, summarise
-from training.bench.accuracy.runs import FALSE_POINT, RunSpec, StereoRun, simulate_run
-from training.bench.accuracy.trials import TRIALS_FILE, Answer, Trial, play, score
-from training.bench.config import AccuracyConfig
-from training.experiments.run_folder import RunFolder, plain
+from studies.accuracy import STUDY, Config, Trial, play, run_of, trials
+from training.experiments.run_folder import plain
 from training.experiments.statistics import interval
-from training.experiments.trial_store import finished_trials, open_folder, run_trials
+from training.experiments.trial_store import run_in_processes
+from training.stereo_runs.runs import FALSE_POINT, RunSpec, StereoRun, simulate_run
+from training.stereo_runs.scores import Answer, score
 
-SMALL = AccuracyConfig(robots=(2,), lengths=(4.0,), particles=(5, 9), seeds=2, seed=31)
+SMALL = Config(robots=(2,), lengths=(4.0,), particles=(5, 9), seeds=2, seed=31)
 
 
 @pytest.fixture(scope="module")
@@ -31,8 +30,8 @@ def run() -> StereoRun:
 
 @pytest.fixture(scope="module")
 def rows() -> list[dict[str, Any]]:
-    """All trials of a small benchmark."""
-    return [plain(play(trial)) for trial in SMALL.trials()]
+    """All trials of a small study, as stored."""
+    return [plain(asdict(trial) | play(SMALL, trial)) for trial in trials(SMALL)]
 
 
 def test_the_truth_scores_zero(run: StereoRun) -> None:
@@ -87,8 +86,8 @@ def test_methods_are_ordered_by_accuracy(rows: list[dict[str, Any]]) -> None:
     mean = {method: np.mean([row["pose_rms_m"] for row in rows if row["method"] == method]) for method in SMALL.methods}
     assert mean["batch_ml"] <= mean["ideal_online"] < mean["fastslam2"] < mean["dead_reckoning"]
     for row in rows:
-        of_all = [figure for figure in FIGURES if figure not in ("rejuvenation_ms", "refused_share")]
-        assert row["particles"] == 0 or all(row[figure] is not None for figure in of_all), row
+        unknown = {name for name, value in row.items() if value is None}
+        assert row["particles"] is None or unknown == {"rejuvenation_ms", "refused_share"}, row
         if row["method"] in ("batch_ml", "ideal_online"):
             assert row["map_recall"] == row["map_precision"] == 1.0
             assert 0.0 < row["anees"] < 10.0
@@ -99,9 +98,9 @@ def test_methods_are_ordered_by_accuracy(rows: list[dict[str, Any]]) -> None:
 
 def test_trials_repeat(rows: list[dict[str, Any]]) -> None:
     """The same trial gives the same metrics, except times, whatever ran before it."""
-    accuracy_trials._run_of.cache_clear()
+    run_of.cache_clear()
     for row in (rows[-1], rows[1]):
-        again = plain(play(Trial(**{name: row[name] for name in Trial.__dataclass_fields__})))
+        again = plain(play(SMALL, Trial(**{name: row[name] for name in Trial.__dataclass_fields__})))
         for name, value in again.items():
             assert name in ("seconds", "step_ms") or row[name] == value, name
 
@@ -111,11 +110,11 @@ def test_unknown_association_is_scored_with_its_errors() -> None:
     trial = Trial(
         preset="coarse", association="unknown", robots=1, length=12.0, method="fastslam2", particles=20, seed=30
     )
-    row = play(trial)
+    row = play(Config(), trial)
     assert row["map_precision"] < 1.0
     assert 0.0 <= row["wrong_match_share"] < 0.2
     assert row["held_back_share"] > 0.0
-    assert play(replace(trial, method="fastslam2+existence"))["map_precision"] > row["map_precision"]
+    assert play(Config(), replace(trial, method="fastslam2+existence"))["map_precision"] > row["map_precision"]
 
 
 def test_rejuvenation_is_a_separate_method() -> None:
@@ -124,7 +123,7 @@ def test_rejuvenation_is_a_separate_method() -> None:
         preset="good", association="known", robots=1, length=12.0, method="fastslam2+rejuvenation", particles=20,
         seed=30,
     )  # fmt: skip
-    row, plain_row = play(trial), play(replace(trial, method="fastslam2"))
+    row, plain_row = (play(Config(), each) for each in (trial, replace(trial, method="fastslam2")))
     assert row["refused_share"] == 0.0
     assert row["rejuvenation_ms"] > row["step_ms"]
     assert np.isnan(plain_row["rejuvenation_ms"])
@@ -135,31 +134,29 @@ def test_rejuvenation_is_a_separate_method() -> None:
 def test_more_assumed_noise_raises_covariances() -> None:
     """More assumed noise of measurements or landmarks raises covariances; the run and other methods are the same."""
     trial = Trial(preset="good", association="known", robots=1, length=12.0, method="fastslam2", particles=20, seed=30)
-    as_it_is = play(trial)["nees_median"]
-    assert play(replace(trial, noise_factor=9.0))["nees_median"] < 0.5 * as_it_is
-    assert play(replace(trial, landmark_noise=0.03))["nees_median"] < 0.9 * as_it_is
-    peer = replace(trial, method="batch_ml", particles=0)
-    assert play(peer)["pose_rms_m"] == play(replace(peer, noise_factor=9.0))["pose_rms_m"]
+    usual, more, moving = Config(), Config(noise_factor=9.0), Config(landmark_noise=0.03)
+    as_it_is = play(usual, trial)["nees_median"]
+    assert play(more, trial)["nees_median"] < 0.5 * as_it_is
+    assert play(moving, trial)["nees_median"] < 0.9 * as_it_is
+    peer = replace(trial, method="batch_ml", particles=None)
+    assert play(usual, peer)["pose_rms_m"] == play(more, peer)["pose_rms_m"]
 
 
-def test_summary_and_intervals(rows: list[dict[str, Any]]) -> None:
-    """There is one line per condition, method and M; the mean is the mean of the rows and is in its interval."""
-    lines = summarise(rows)
-    assert [(line["method"], line["particles"]) for line in lines] == [
-        ("dead_reckoning", 0), ("batch_ml", 0), ("ideal_online", 0),
-        ("fastslam1", 5), ("fastslam1", 9), ("fastslam2", 5), ("fastslam2", 9),
-    ]  # fmt: skip
-    line = lines[-1]
-    values = [row["map_rmse_m"] for row in rows if row["method"] == "fastslam2" and row["particles"] == 9]
-    assert line["seeds"] == len(values) == 2
-    assert line["map_rmse_m"]["mean"] == pytest.approx(np.mean(values))
-    assert line["map_rmse_m"]["worst"] == max(values)
-    assert line["map_rmse_m"]["mean_low"] <= np.mean(values) <= line["map_rmse_m"]["mean_high"]
-    assert lines[0]["anees"] is None
-    assert describe(np.array([2.5])) == {
-        "worst": 2.5, "mean": 2.5, "mean_low": None, "mean_high": None, "median": 2.5, "median_low": None,
-        "median_high": None,
-    }  # fmt: skip
+def test_tables_have_a_line_for_each_method_and_number(rows: list[dict[str, Any]]) -> None:
+    """The mean over the seeds is in its interval; methods without a map or covariances have no line in these tables."""
+    paths, maps, consistency, matches = (table.lines(rows) for table in STUDY.tables)
+    peers, filters = [("batch_ml", None), ("ideal_online", None)], [("fastslam1", 5), ("fastslam1", 9)]
+    filters += [("fastslam2", 5), ("fastslam2", 9)]
+    for lines, expected in (
+        (paths, [("dead_reckoning", None), *peers, *filters]), (maps, peers + filters),
+        (consistency, peers + filters), (matches, filters),
+    ):  # fmt: skip
+        assert [(line["method"], line["particles"]) for line in lines] == expected
+    values = [row["map_rmse_m"] for row in rows if (row["method"], row["particles"]) == ("fastslam2", 9)]
+    found = maps[-1]["map [m]"]
+    assert len(values) == 2
+    assert found.value == pytest.approx(np.mean(values))
+    assert found.low <= found.value <= found.high
 
 
 def test_intervals_cover_what_they_should() -> None:
@@ -177,39 +174,6 @@ def test_intervals_cover_what_they_should() -> None:
     assert 0.86 * 300 < held < 0.98 * 300
 
 
-def _open(out: Path, config: AccuracyConfig) -> RunFolder:
-    return open_folder(out, "bench accuracy", config.to_mapping(), config.seed)
-
-
-def test_finished_trials_are_kept(tmp_path: Path, rows: list[dict[str, Any]]) -> None:
-    """A benchmark stopped after three trials runs only the rest when resumed; a truncated line is run again."""
-    folder = _open(tmp_path / "bench", SMALL)
-    done: list[dict[str, Any]] = []
-    run_trials(folder, TRIALS_FILE, play, SMALL.trials(), 1, lambda: len(done) >= 3, done.append)
-    assert len(done) == 3
-    file = folder.path / TRIALS_FILE
-    file.write_text(file.read_text()[:-20])
-    again = _open(tmp_path / "bench", SMALL)
-    kept = finished_trials(again.path / TRIALS_FILE, Trial)
-    assert list(kept) == SMALL.trials()[:2]
-    rest: list[dict[str, Any]] = []
-    left = [trial for trial in SMALL.trials() if trial not in kept]
-    run_trials(again, TRIALS_FILE, play, left, 1, lambda: False, rest.append)
-    assert len(rest) == len(rows) - 2
-    assert list(finished_trials(again.path / TRIALS_FILE, Trial)) == SMALL.trials()
-    for line, row in zip(file.read_text().splitlines(), rows, strict=True):
-        assert json.loads(line)["pose_rms_m"] == row["pose_rms_m"]
-
-
-def test_a_folder_accepts_one_configuration(tmp_path: Path) -> None:
-    """Other options are refused in the folder of a benchmark."""
-    _open(tmp_path / "bench", SMALL)
-    with pytest.raises(
-        ValueError, match="out: expected a folder of the same bench run, got a folder of a run with other"
-    ):
-        _open(tmp_path / "bench", SMALL.replace(seeds=3))
-
-
 @pytest.mark.slow
 def test_results_do_not_depend_on_processes(tmp_path: Path, rows: list[dict[str, Any]]) -> None:
     """Two processes give the results of one: exactly for the filter, to 1e-7 for batch maximum likelihood.
@@ -218,41 +182,30 @@ def test_results_do_not_depend_on_processes(tmp_path: Path, rows: list[dict[str,
     the processes of a benchmark have one thread each; the descent ends within its tolerance. The only matrix product in
     a run of the filter is with the camera's axes, a signed permutation, which is exact in any order.
     """
-    few = [trial for trial in SMALL.trials() if trial.method in ("batch_ml", "fastslam2")]
-    done: list[dict[str, Any]] = []
-    run_trials(_open(tmp_path / "bench", SMALL), TRIALS_FILE, play, few, 2, lambda: False, done.append)
+    few = [trial for trial in trials(SMALL) if trial.method in ("batch_ml", "fastslam2")]
     expected = {(row["seed"], row["method"], row["particles"]): row["pose_rms_m"] for row in rows}
+    done = list(run_in_processes(partial(_named, SMALL), few, 2))
     assert len(done) == len(few)
     for row in done:
         alone = expected[row["seed"], row["method"], row["particles"]]
         assert row["pose_rms_m"] == (pytest.approx(alone, rel=1e-7) if row["method"] == "batch_ml" else alone)
 
 
-def test_tables_and_figure(tmp_path: Path, rows: list[dict[str, Any]]) -> None:
-    """Tables list each method with its error, on 80 columns and as Markdown; the figure is a PNG file."""
-    lines = plain(summarise(rows))
-    console = Console(width=80, record=True, file=io.StringIO())
-    print_tables(console, lines)
-    text = console.export_text()
-    assert "good stereo, known association, K = 2, 4 m, 2 seeds: paths" in text
-    for line in lines:
-        assert f"{line['pose_rms_m']['mean']:.3f}" in text
-    assert "| fastslam2, 9 |" in markdown(lines)
-    draw_accuracy(tmp_path / "accuracy.png", lines)
-    assert (tmp_path / "accuracy.png").read_bytes().startswith(b"\x89PNG")
+def _named(config: Config, trial: Trial) -> dict[str, Any]:
+    """Return the row of a trial with its fields."""
+    return asdict(trial) | play(config, trial)
 
 
-def test_the_command_from_end_to_end(vslam: Any, tmp_path: Path) -> None:
-    """The command prints its tables, writes JSON, Markdown and figure, and resumes when called again."""
-    out = tmp_path / "bench"
-    arguments = ["bench", "accuracy", "--seeds", "1", "--first-seed", "40", "--lengths", "3,5", "--methods"]
-    arguments += ["dead_reckoning,fastslam2", "--particles", "7", "--out", str(out), "--json", str(out / "copy.json")]
+def test_the_program_from_end_to_end(tmp_path: Path) -> None:
+    """The program prints its tables, writes JSON, Markdown and chart, and resumes when called again."""
+    out = tmp_path / "study"
+    program = [sys.executable, "-m", "studies.accuracy", "--seeds", "1", "--first-seed", "40", "--lengths", "3,5"]
+    program += ["--methods", "dead_reckoning,fastslam2", "--particles", "7", "--out", str(out), "--json", "-"]
     for _ in range(2):
-        said = vslam(*arguments)
-        assert said.status == 0
-        assert "fastslam2, 7" in said.out
-    content = json.loads((out / "copy.json").read_text())
-    assert [line["length"] for line in content["summary"]] == [3.0, 3.0, 5.0, 5.0]
-    assert len(content["trials"]) == len((out / TRIALS_FILE).read_text().splitlines()) == 4
-    assert (out / "tables.md").read_text().startswith("### Good stereo, known association, K = 1, 3 m")
-    assert (out / "accuracy.png").is_file()
+        said = subprocess.run(program, capture_output=True, text=True, check=True)
+    assert "fastslam2" in said.stderr
+    content = json.loads(said.stdout)
+    assert [line["method"] for line in content["tables"]["paths"]] == 2 * ["dead_reckoning", "fastslam2"]
+    assert len(content["trials"]) == len((out / "trials.jsonl").read_text().splitlines()) == 4
+    assert "| good, known, K = 1, 3 m | fastslam2 | 7 |" in (out / "tables.md").read_text()
+    assert (out / "accuracy.png").stat().st_size > 10_000

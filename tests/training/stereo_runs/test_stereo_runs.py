@@ -7,8 +7,8 @@ import pytest
 from scipy import stats
 
 from slam_backend.geometry import between, compose, inverse, transform_points
-from training.bench.accuracy.runs import FALSE_POINT, PRESETS, STEP, RunSpec, StereoRun, simulate_run
-from training.bench.accuracy.world import AISLE, MAX_INCIDENCE, Office, start_crossings
+from training.stereo_runs.office import AISLE, MAX_INCIDENCE, Office, start_crossings
+from training.stereo_runs.runs import FALSE_POINT, PRESETS, STEP, RunSpec, StereoRun, simulate_run
 
 FALSE_ALARM = 1e-3
 

@@ -1,4 +1,4 @@
-"""Seeded stereo runs of one or several robots through an office, with ground truth, for the accuracy benchmark."""
+"""Seeded stereo runs of one or several robots through an office, with ground truth."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -13,8 +13,8 @@ from slam_backend.geometry import between, inverse, transform_points
 from slam_backend.models.camera import StereoCamera
 from slam_backend.models.measurements import Measurements
 from slam_backend.models.odometry import OdometryModel
-from training.bench.accuracy.world import Office, start_crossings
 from training.experiments.config import Checked, Positive, setting
+from training.stereo_runs.office import Office, start_crossings
 
 STEP = 0.25  # distance between frames along the path [m]
 EYE = (0.0, 0.0, 0.9)  # left camera in the robot frame [m]
