@@ -56,6 +56,10 @@ BAD: dict[type[ExperimentConfig], dict[str, dict[Any, str]]] = {
         "lengths": {(0.1,): "a finite number >= 0.25"}, "noise_factor": {0.0: ABOVE_0},
         "robots": {(16,): "an int >= 16"},
     },
+    losses.Config: {
+        "presets": {("fine",): "one of 'easy', 'standard', 'hard'"}, "duration": {0.0: "a finite number >= 1"},
+        "baselines": {(0.0,): ABOVE_0}, "robots": {(9,): ROBOTS},
+    },
     bench.EnvBenchConfig: {
         "robots": {(9,): ROBOTS}, "modes": {("image",): "one of 'driver', 'poses'"}, "steps": {1: "an int >= 2"},
         "particles": {(0,): AT_LEAST_1}, "plays": {0: AT_LEAST_1}, "peer": {1: "a bool"},
