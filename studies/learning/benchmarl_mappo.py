@@ -1,6 +1,6 @@
 """MAPPO of BenchMARL with the truth as the critic's input, in the environment of `vslam train --preset quick`.
 
-    python -m studies.benchmarl_mappo FOLDER [--seed 0] [--preset quick] [--updates 30]
+    python -m studies.learning.benchmarl_mappo FOLDER [--seed 0] [--preset quick] [--updates 30]
 
 The actor is the network of `vslam train`, so that `vslam evaluate FOLDER` plays its model. What differs is the learner:
 the critic sees `state()` alone. Needs `docs/how-to/learners/benchmarl.txt` and the extra `train`.

@@ -1,11 +1,11 @@
 """Soak test of merges in random worlds with similar landmarks: are false merges avoided, or detected and undone?
 
-    python -m studies.merge_soak --minutes 10 --json merge_soak.json
-    python -m studies.merge_soak --minutes 10 --forced
-    python -m studies.merge_soak --minutes 10 --kind environment
-    python -m studies.merge_soak --minutes 10 --kind both
-    python -m studies.merge_soak --minutes 60 --world FOLDER_OF_PLANS --seeds 3
-    python -m studies.merge_soak --minutes 60 --world maze --world loops --seeds 10
+    python -m studies.merging.soak --minutes 10 --json merge_soak.json
+    python -m studies.merging.soak --minutes 10 --forced
+    python -m studies.merging.soak --minutes 10 --kind environment
+    python -m studies.merging.soak --minutes 10 --kind both
+    python -m studies.merging.soak --minutes 60 --world FOLDER_OF_PLANS --seeds 3
+    python -m studies.merging.soak --minutes 60 --world maze --world loops --seeds 10
 
 Runs are stereo runs through offices of aisles, 100 m per robot, with classes of one to three similar landmarks, false
 points and wrong descriptors; or episodes of the environment in all world families, in which up to all landmarks have a
@@ -43,7 +43,7 @@ from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.team.merge_scheduler import AttemptOptions
 from slam_backend.team.options import MergeOptions
 from slam_backend.team.team import TeamSlam
-from studies.merge_outcomes import Delay, Follower, MergeOutcome, RunEnd, RunOutcomes, collect_outcomes, summarise
+from studies.merging.outcomes import Delay, Follower, MergeOutcome, RunEnd, RunOutcomes, collect_outcomes, summarise
 from training.episodes.config import RunConfig
 from training.episodes.metrics import score_episode
 from training.episodes.runner import Progress, is_false_merge, run_episode

@@ -1,6 +1,6 @@
 """Attempts of teams to merge, beside the truth: what they claim to know of the relative start, and its error.
 
-    python -m studies.merge_claims --extent 120 --seconds 1800 --first-seed 10001 --seeds 4
+    python -m studies.merging.claims --extent 120 --seconds 1800 --first-seed 10001 --seeds 4
 
 The episodes are those of `python -m studies.scale`. A line of JSON for each attempt whose maps align: time, groups,
 claimed standard deviations, error, and NEES, the squared error in units of the claimed covariance (three degrees of

@@ -1,6 +1,6 @@
 """Steps and snapshots of several worlds at given times of their episodes, measured in alternation.
 
-    python -m studies.worlds_in_turn rooms:extent=120@900 rooms:extent=120@1600 office:extent=30@60 --seed 10002
+    python -m studies.in_turn.worlds rooms:extent=120@900 rooms:extent=120@1600 office:extent=30@60 --seed 10002
 
 Each world is played with `frontier` and `goal` actions up to its time; then all go on in turn, in bursts of ten steps,
 with a snapshot after each fifth step that is kept until the next one, as a program does that saves its last state.

@@ -1,7 +1,7 @@
 """Learning signal of rewards: correlation of advantages with choices of goals, and effect of discounts on returns.
 
-    python -m studies.learning_signal choices --episodes 60
-    python -m studies.learning_signal returns --seeds 20
+    python -m studies.learning.reward_signal choices --episodes 60
+    python -m studies.learning.reward_signal returns --seeds 20
 
 `choices` measures the signal for the decisions of `vslam train`. Robots drive to random candidates in worlds of the
 training split. For several rewards and values of lambda of the generalised advantage estimate (with a fitted linear

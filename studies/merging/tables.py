@@ -1,7 +1,7 @@
-"""Tables of `docs/explanation/merging.md` from results of `merge_soak.py --json`.
+"""Tables of `docs/explanation/merging.md` from results of `merging.soak --json`.
 
-    python -m studies.merge_tables benchmarks/merge_soak/*.json
-    python -m studies.merge_tables benchmarks/merge_soak/both_9000.json --worst 6
+    python -m studies.merging.tables benchmarks/merge_soak/*.json
+    python -m studies.merging.tables benchmarks/merge_soak/both_9000.json --worst 6
 
 The first table has the outcomes of the merges of each soak; the second, over all merges that were not forced, compares
 smoothed with unsmoothed maps; the third lists the merges with the largest errors and their shares of wrong pairs.
@@ -28,9 +28,9 @@ def read_soaks(files: Sequence[Path]) -> list[dict[str, Any]]:
         try:
             soak = json.loads(file.read_text())
         except (OSError, ValueError) as error:
-            raise argument_error("files", "soaks of merge_soak.py --json", str(file), str(error)) from error
+            raise argument_error("files", "soaks of merging.soak --json", str(file), str(error)) from error
         if not isinstance(soak, dict) or not {"setting", "summary", "merges", "delays"} <= set(soak):
-            raise argument_error("files", "soaks of merge_soak.py --json", str(file), "Give files of this command.")
+            raise argument_error("files", "soaks of merging.soak --json", str(file), "Give files of this command.")
         soaks.append(soak | {"name": file.stem})
     return soaks
 
@@ -109,7 +109,7 @@ def _number(value: float | None) -> float:
 
 
 def main(
-    files: Annotated[list[Path], typer.Argument(help="Files of merge_soak.py --json.")],
+    files: Annotated[list[Path], typer.Argument(help="Files of merging.soak --json.")],
     worst: Annotated[int, typer.Option(help="Number of merges with the largest errors.")] = 6,
 ) -> None:
     """Print the tables."""
