@@ -64,9 +64,9 @@ class Config(ExperimentConfig):
 
     @classmethod
     def completed(cls, values: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Take the images of the data folder, where no other folder is given."""
-        data = os.environ.get("VSLAM_DATA")
-        return {"real": str(Path(data).resolve()) if data and Path(data).is_dir() else None, **values}
+        """Take the images of the data folder, if it has any and no other folder is given."""
+        data = Path(os.environ.get("VSLAM_DATA", "none"))
+        return {"real": str(data.resolve()) if data.is_dir() and find_images(data) else None, **values}
 
     def check(self) -> None:
         """Refuse a folder of real images that does not exist."""
