@@ -15,8 +15,8 @@ from slam_backend.smoother.log_arrays import LogArrays
 from slam_backend.smoother.optimizer import MapEstimate
 from slam_backend.smoother.options import SmoothingOptions
 from slam_backend.smoother.rejuvenation import Draft, LandmarkDescriptors, Rejuvenation, Smoother
-from training.bench.accuracy.batch_problem import BatchProblem
-from training.bench.accuracy.runs import RunSpec, StereoRun, simulate_run
+from training.stereo_runs.batch_problem import BatchProblem
+from training.stereo_runs.runs import RunSpec, StereoRun, simulate_run
 
 SPEC = RunSpec(length=5.0, landmarks=120, measurements=7)
 TIGHT = SmoothingOptions(kernel=0.0, tolerance=1e-12, max_iterations=50, max_keys=1000, recent_keys=1000)

@@ -183,7 +183,7 @@ def pair_of_maps(rng: np.random.Generator, count: int) -> tuple[LandmarkMap, Lan
 def commands() -> dict[str, list[str]]:
     """Return the commands whose metrics are hashed."""
     found = {
-        "bench accuracy": ["training", "bench", "accuracy", "--seeds", "1", "--lengths", "20", "--particles", "30"],
+        "studies accuracy": ["studies.accuracy", "--seeds", "1", "--lengths", "20", "--particles", "30"],
         "studies alignment": ["studies.alignment", "--seeds", "2", "--hard", "9"],
         "run": ["training", "run", "--world", "maze", "--robots", "2", "--max-cycles", "120", "--no-video"],
     }

@@ -5,7 +5,8 @@ import math
 import pytest
 
 from slam_backend.team import merge
-from studies import merge_claims, worlds_in_turn
+from studies.in_turn import worlds as worlds_in_turn
+from studies.merging import claims as merge_claims
 from studies.scale import Config
 
 

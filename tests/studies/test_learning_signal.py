@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from studies import learning_signal
+from studies.learning import reward_signal as learning_signal
 from vslam_env import CANDIDATE_FEATURES, NUM_CANDIDATES, vslam_v1
 from vslam_env.config import TICK
 

@@ -3,7 +3,7 @@
 import math
 from pathlib import Path
 
-from studies import merge_soak as soak
+from studies.merging import soak
 
 
 def test_folders_are_replaced_by_their_floor_plans(tmp_path: Path) -> None:

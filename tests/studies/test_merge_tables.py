@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from studies import merge_tables as tables
+from studies.merging import tables
 
 KEPT = sorted((Path(__file__).parents[2] / "benchmarks" / "merge_soak").glob("*.json"))
 
@@ -52,5 +52,5 @@ def test_other_files_are_refused(tmp_path: Path, content: str, monkeypatch: pyte
     monkeypatch.chdir(tmp_path)
     file = Path("other.json")
     file.write_text(content)
-    with pytest.raises(ValueError, match=r"files: expected soaks of merge_soak\.py --json, got 'other\.json'"):
+    with pytest.raises(ValueError, match=r"files: expected soaks of merging.soak --json, got 'other\.json'"):
         tables.read_soaks([file])

@@ -35,8 +35,9 @@ def command_of(study: Study[Any, Any], command: str) -> Callable[..., None]:
     chosen = run_timed if study.timed else run
     chosen.__doc__ = study.about
     return options(
-        study.config, command, continues=True, quick=study.quick or None, quick_help=f"A short run: {quick}."
-    )(chosen)
+        study.config, command, continues=True, quick=study.quick or None, quick_help=f"A short run: {quick}.",
+        log=study.log,
+    )(chosen)  # fmt: skip
 
 
 def run_program(study: Study[Any, Any]) -> None:

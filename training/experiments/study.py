@@ -12,9 +12,11 @@
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
+from scipy.stats import gmean
 
 from training.experiments.config import ExperimentConfig
 from training.experiments.statistics import grouped, interval, mean_curves
@@ -36,7 +38,7 @@ class Estimate(NamedTuple):
 
 STATISTICS: dict[str, Callable[..., Any]] = {
     "mean": np.mean, "median": np.median, "worst": np.max, "sum": np.sum,
-    "p95": lambda values, axis=None: np.quantile(values, 0.95, axis=axis),
+    "geometric mean": gmean, "p95": lambda values, axis=None: np.quantile(values, 0.95, axis=axis),
 }  # fmt: skip
 Statistic = str | Callable[[Sequence[Row]], Any]
 
@@ -176,7 +178,7 @@ class Chart:
     """Chart of a study: a panel for each quantity, a row of panels for each value of a field.
 
     Attributes:
-        x: Field of the trials on the x axis.
+        x: Field of the trials on the x axis; values of trials without one (None) are level lines.
         label: Label of the x axis.
         panels: Panels of a row.
         by: Field with a line for each value; empty: one line.
@@ -233,6 +235,7 @@ class Study(Generic[ConfigT, TrialT]):
         checks: Function that returns the first steps of a configuration, which are run before the run folder is made,
             to detect what cannot be played.
         quick: Values that `--quick` sets.
+        log: Default of the option `path` below the data folder, and the expected content, worded for an error.
         timed: Whether trials are timed, so that they run one after another in this process.
     """
 
@@ -247,4 +250,5 @@ class Study(Generic[ConfigT, TrialT]):
     curves: Curves | None = None
     checks: Callable[[ConfigT], Iterable[Callable[[], object]]] = lambda config: ()
     quick: Mapping[str, Any] = field(default_factory=dict)
+    log: tuple[Path, str] | None = None
     timed: bool = False

@@ -6,7 +6,7 @@ from pathlib import Path
 import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+from matplotlib.ticker import LogLocator, NullFormatter, NullLocator, StrMethodFormatter
 
 from training.experiments.plotting import add_legend, picture, save_png
 from training.experiments.statistics import grouped
@@ -43,16 +43,21 @@ def draw_chart(file: Path, chart: Chart, rows: Sequence[Row]) -> None:
 
 
 def _draw_panel(ax: Axes, chart: Chart, panel: Panel, rows: Sequence[Row], names: Sequence[str]) -> None:
-    """Draw a quantity over the field of the x axis, a line for each of some names."""
+    """Draw a quantity over the field of the x axis, a line for each of some names; a level one where there is no x."""
     column = panel.column
     factor = _factor(column)
     for place, name in enumerate(names):
         of_name = [row for row in rows if not chart.by or row[chart.by] == name]
+        colour = COLOURS[place % len(COLOURS)]
+        if of_name and all(row[chart.x] is None for row in of_name):
+            level = column.estimate(of_name).value
+            if level is not None:
+                ax.axhline(factor * level, lw=1.2, ls="--", color=colour, label=str(name))
+            continue
         groups = sorted(grouped(of_name, (chart.x,)).items())
         found = [(chart.factor * x, column.estimate(group)) for (x,), group in groups]
         known = [(x, estimate) for x, estimate in found if estimate.value is not None]
         xs, values = [x for x, _ in known], [factor * estimate.value for _, estimate in known]
-        colour = COLOURS[place % len(COLOURS)]
         ax.plot(
             xs, values, marker=MARKERS[place % len(MARKERS)], ms=5, mfc="none", lw=1.2, color=colour, label=str(name)
         )
@@ -61,10 +66,15 @@ def _draw_panel(ax: Axes, chart: Chart, panel: Panel, rows: Sequence[Row], names
                 ax.plot([x, x], [factor * estimate.low, factor * estimate.high], color=colour, lw=0.8)
     if chart.log:
         ax.set_xscale("log")
+        ax.set_xticks(sorted({chart.factor * row[chart.x] for row in rows if row[chart.x] is not None}))
+        ax.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        ax.xaxis.set_minor_locator(NullLocator())
     if panel.log:
         ax.set_yscale("log")
-        ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        ax.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        bottom, top = ax.get_ylim()
+        if top < 1e3 * bottom:  # otherwise powers of ten are easier to read
+            ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            ax.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
         ax.yaxis.set_minor_formatter(NullFormatter())
     if panel.limits is not None:
         ax.set_ylim(*panel.limits)

@@ -25,8 +25,8 @@ class Fig1Config(ExperimentConfig):
 
     def check(self) -> None:
         """Refuse runs that cannot be simulated."""
-        from training.bench.accuracy.world import check_crossings
         from training.paper.fig6.trials import REGIMES
+        from training.stereo_runs.office import check_crossings
 
         REGIMES["paper"].spec(self.robots, self.length)
         check_crossings(self.robots)
@@ -102,7 +102,7 @@ class Fig6Config(ExperimentConfig):
 
     def check(self) -> None:
         """Refuse combinations without a valid trial."""
-        from training.bench.accuracy.world import check_crossings
+        from training.stereo_runs.office import check_crossings
 
         self.error_trials()
         self.time_trials()

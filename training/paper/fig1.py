@@ -14,12 +14,12 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 
 from slam_backend.core.validation import FloatArray, IntArray
-from training.bench.accuracy.batch_problem import BatchProblem
-from training.bench.accuracy.runs import STEP, StereoRun, simulate_run
-from training.bench.accuracy.world import Office
 from training.experiments.plotting import picture, rgb, save_png
 from training.paper.config import Fig1Config
 from training.paper.fig6.trials import FILTER_OPTIONS, REGIMES
+from training.stereo_runs.batch_problem import BatchProblem
+from training.stereo_runs.office import Office
+from training.stereo_runs.runs import STEP, StereoRun, simulate_run
 from vslam_env.rendering.palette import FAINT_INK, TRUE_LANDMARK, WALL, robot_colour
 
 WIDTH = 3.5  # width of a text column [in]

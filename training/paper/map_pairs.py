@@ -9,7 +9,7 @@ from slam_backend.core.validation import FloatArray, IntArray
 from slam_backend.fastslam.filter import FastSlam
 from slam_backend.geometry import between
 from slam_backend.maps.landmark_map import LandmarkMap
-from training.bench.accuracy.runs import FALSE_POINT, STEP, RunSpec, StereoRun, simulate_run
+from training.stereo_runs.runs import FALSE_POINT, STEP, RunSpec, StereoRun, simulate_run
 
 ROBOTS = 2
 MEASUREMENTS = 16  # per step, of both robots together

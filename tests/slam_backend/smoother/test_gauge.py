@@ -18,7 +18,7 @@ from slam_backend.smoother import rejuvenation
 from slam_backend.smoother._kernels import LANES
 from slam_backend.smoother.gauge import compute_gauge_fix, fix_gauge, fix_start, move
 from slam_backend.smoother.graph import RIGID
-from training.bench.accuracy.runs import RunSpec, simulate_run
+from training.stereo_runs.runs import RunSpec, simulate_run
 
 add_gauge_to_landmarks = python_entry(add_gauge_to_landmarks)
 

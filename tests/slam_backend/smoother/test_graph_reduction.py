@@ -35,7 +35,7 @@ from slam_backend.smoother.log_arrays import ODOMETRY, REJECTED, STATIONARY
 from slam_backend.smoother.optimizer import optimize
 from slam_backend.smoother.options import SmoothingOptions, keyframe_limit
 from slam_backend.smoother.sampling import lane_rows, replay, sample_paths, transition_variances
-from training.bench.accuracy.runs import RunSpec, simulate_run
+from training.stereo_runs.runs import RunSpec, simulate_run
 
 
 def limits(max_keys, recent_keys):

@@ -29,8 +29,8 @@ from slam_backend.smoother.graph_building import InitialPoses, LandmarkPositions
 from slam_backend.smoother.graph_reduction import relinearise
 from slam_backend.smoother.optimizer import optimize, sum_pose_information
 from slam_backend.smoother.options import SmoothingOptions
-from training.bench.accuracy.batch_ml import batch_ml
-from training.bench.accuracy.runs import NoisePreset, RunSpec, simulate_run
+from training.stereo_runs.batch_ml import batch_ml
+from training.stereo_runs.runs import NoisePreset, RunSpec, simulate_run
 
 
 def test_chained_odometry_has_the_spread_of_its_samples():

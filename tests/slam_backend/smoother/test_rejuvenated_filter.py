@@ -14,8 +14,8 @@ from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.models.measurements import Measurements
 from slam_backend.smoother.options import SmoothingOptions
 from slam_backend.team.team import TeamSlam
-from training.bench.accuracy.runs import RunSpec, simulate_run
-from training.bench.accuracy.trials import follow, score
+from training.stereo_runs.runs import RunSpec, simulate_run
+from training.stereo_runs.scores import follow, score
 from vslam_env.belief.belief import default_filter_options
 
 EVERY = 8

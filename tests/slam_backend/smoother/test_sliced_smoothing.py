@@ -26,7 +26,7 @@ from slam_backend.smoother.log_arrays import LogArrays
 from slam_backend.smoother.optimizer import MapEstimate, optimize
 from slam_backend.smoother.options import SmoothingOptions, keyframe_limit
 from slam_backend.smoother.rejuvenation import Draft, Smoother
-from training.bench.accuracy.runs import StereoRun
+from training.stereo_runs.runs import StereoRun
 
 NOWHERE = LandmarkPositions(np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
 # Slices of eight steps of each robot: the least

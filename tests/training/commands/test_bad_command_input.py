@@ -1,5 +1,6 @@
 """Bad input of every command gives one line on stderr and exit status 2, before any computation or output."""
 
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -63,34 +64,14 @@ BAD: dict[str, dict[str, str]] = {
         "": "path: expected a value, got 'none'. Give --path.",
         "--path .": "reader: expected MODULE:NAME of a reader, got ",
     },
-    "bench accuracy": {
-        "--presets best": "presets: expected one of 'good', 'coarse', 'paper', got 'best'.",
-        "--particles ten": f"particles: {LIST} 'ten'. Write them like 10,100.",
-        "--particles 9,9": "particles: expected at least one value, each once, got [9, 9].",
-        "--lengths 0": "length: expected a finite number >= 0.25, got 0.0.",
-        "--max-seconds 9": "max_seconds: expected no value without --worlds, got 9.0. Give --worlds, too.",
-        "--worlds office --lengths 9": "lengths: expected no value with --worlds, got (9.0,). Omit --worlds.",
-        "--worlds castle": "world: expected one of 'office'",
-        "--workers 0": "workers: expected an int >= 1, got 0.",
-    },
-    "bench mrclam": {"--path . --durations -1": "durations: expected a finite number >= 0, got -1.0."},
     "bench filter": {
         "--particles 10;20": f"particles: {LIST} '10;20'. Write them like",
         "--landmarks 20": "landmarks: expected an int >= 30, got 20.",
-    },
-    "bench stereo": {
-        "--descriptors surf": "descriptors: expected one of 'usurf', 'sift', 'orb', got 'surf'.",
-        "--real none": "real: expected a folder of real images, got no such folder.",
-        "--real full": "real: expected a folder with pairs with a model file: NAMEA, NAMEB and NAME_model.txt",
     },
     "bench env": {"--robots 9": f"{ROBOTS} 9", "--worlds castle": "world: expected one of 'office'"},
     "bench start": {
         "--parts imports": "parts: expected one of 'demo', 'kernels', 'steps', 'wheel', 'import', 'count'",
         "--parts wheel": "wheel: expected the wheel that `make kernels-wheel` writes, got None.",
-    },
-    "bench train": {
-        "--workers x": f"workers: {LIST}", "--world castle": "world: expected one of 'office'",
-        "--envs 1 --workers 2": "workers: expected at most one per environment, 1, got 2",
     },
     "bench exploration": {
         "--policies unknown": "policy: expected one of 'frontier', 'random_goals', 'random_walk',",
@@ -170,3 +151,13 @@ def test_every_command_has_bad_arguments() -> None:
     """Each command has bad arguments above, except the one that needs a display and those that have moved."""
     moved = {name for name, each in COMMANDS.items() if each.hidden}
     assert BAD.keys() == COMMANDS.keys() - {"drive"} - moved
+
+
+@pytest.mark.parametrize("command", [name for name, each in COMMANDS.items() if each.hidden])
+def test_moved_commands_name_programs(command: str, refusal: Any) -> None:
+    """Whatever options they are given, one line names the programs in a clone, which exist."""
+    said = refusal(*command.split(), "--worlds", "office")
+    beginning = f"error bench: expected another command, got '{command.split()[1]}'. In a clone: python -m "
+    assert said.startswith(beginning)
+    for program in said.removeprefix(beginning).rstrip().rstrip(".").split(" or "):
+        assert find_spec(program) is not None

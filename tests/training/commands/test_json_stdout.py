@@ -24,11 +24,9 @@ LEAST = {
     "replay victoria": ("--path", "park", "--duration", "6", "--particles", "3"),
     "replay kitti": ("--path", "drive", "--duration", "6", "--particles", "3"),
     "replay stereo": (),
-    "bench accuracy": ("--seeds", "1", *SEED, "--lengths", "2", "--methods", "fastslam2", "--particles", "5"),
     "bench filter": (
         "--particles", "5", "--landmarks", "40", "--measurements", "3", "--robots", "1", "--steps", "2",
     ),
-    "bench stereo": ("--quick", "--steps", "2", "--views", "3", "--descriptors", "usurf"),
     "bench env": (
         "--robots", "1", "--particles", "5", "--worlds", "fig5", "--modes", "flat", "--steps", "2", "--no-peer",
     ),
@@ -37,8 +35,6 @@ LEAST = {
         "--particles", "5", "--seeds", "1", *SEED,
     ),
     "bench start": ("--parts", "count", "--repeats", "1"),
-    "bench train": ("--world", "fig5", "--robots", "1", "--envs", "1", "--workers", "0", "--steps", "2"),
-    "bench mrclam": ("--path", "robots", "--durations", "10", "--particles", "3"),
     "paper fig1": ("--length", "3", "--particles", "5", "--every", "2"),
     "paper fig2": ("--seeds", "1", "--length", "5", "--every", "5", "--particles", "5", *SEED),
     "paper fig3": ("--seed", "100", "--length", "20", "--particles", "20"),
@@ -46,7 +42,7 @@ LEAST = {
     "paper fig5": ("--robots", "1", "--max-seconds", "1"),
     "paper fig6": ("--seeds", "1", "--robots", "1", "--particles", "3", "--length", "2", "--regimes", "good", *SEED),
 }  # fmt: skip
-LEARNING = ("train", "evaluate", "bench train")
+LEARNING = ("train", "evaluate")
 
 
 def _commands(group: Any, name: str = "") -> Iterator[str]:
@@ -90,8 +86,6 @@ def test_stdout_is_json(
     if command in LEARNING:
         pytest.importorskip("sb3_contrib")
     arguments = LEAST[command]
-    if command == "bench stereo":
-        monkeypatch.delenv("VSLAM_DATA", raising=False)  # no real images, which are slow
     if command == "replay stereo":
         arguments = ("--path", str(request.getfixturevalue("data_dir") / "euroc_pairs"))
     monkeypatch.chdir(folder)

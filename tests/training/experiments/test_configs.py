@@ -9,9 +9,8 @@ from slam_backend.fastslam.options import PROPOSALS
 from slam_backend.frontend import DESCRIPTORS
 from slam_backend.maps.alignment import METHODS
 from slam_backend.readers.stereo_files import StereoFiles
-from studies import alignment
+from studies import accuracy, alignment, losses, mrclam_pairs, stereo, training_speed
 from training.bench import config as bench
-from training.bench.accuracy import runs, trials
 from training.episodes.config import RunConfig
 from training.experiments import config as experiments
 from training.experiments.config import ExperimentConfig
@@ -20,20 +19,21 @@ from training.paper import config as paper
 from training.paper.fig6.trials import REGIMES
 from training.replay import config as replay
 from training.rl.config import TRAIN_PRESETS, EvaluateConfig, TrainConfig
+from training.stereo_runs import runs
 from vslam_env.config import ACTION_TYPES, MAX_ROBOTS, SENSORS
 from vslam_env.presets import NOISE_PRESETS, PRESETS
 from vslam_env.world import SPLITS
 
 # Required values of each class, and a value that differs from its default.
 CASES: dict[type[ExperimentConfig], dict[str, Any]] = {
-    bench.AccuracyConfig: {"lengths": (5.0, 7.5)},
+    accuracy.Config: {"lengths": (5.0, 7.5)}, losses.Config: {"worlds": ("fig5",), "presets": ("hard",)},
     bench.EnvBenchConfig: {"worlds": ("fig5",)},
     bench.ExplorationBenchConfig: {"policies": ("frontier@discrete",), "worlds": ("maze",)},
     bench.FilterBenchConfig: {"proposals": ("fastslam1",), "large": True},
     bench.PlanBenchConfig: {"plan": "vslam-bench-v0", "policies": ("frontier",), "quick": True},
-    bench.StartBenchConfig: {"parts": ("import",), "repeats": 1}, bench.StereoBenchConfig: {"descriptors": ("orb",)},
-    bench.TrainBenchConfig: {"workers": (0, 2)},
-    bench.MrclamPairsConfig: {"path": "log", "durations": (50.0,)},
+    bench.StartBenchConfig: {"parts": ("import",), "repeats": 1}, stereo.Config: {"descriptors": ("orb",)},
+    training_speed.Config: {"workers": (0, 2)},
+    mrclam_pairs.Config: {"path": "log", "durations": (50.0,)},
     EvaluateConfig: {"model": str(Path("model.npz").resolve()), "policies": ("random_goals",)},
     TrainConfig: {"preset": "smoke", "learning_rate": 1e-4}, paper.Fig1Config: {"every": 2.5},
     paper.Fig2Config: {"length": 25.0}, paper.PairConfig: {"landmarks": 40}, paper.Fig5Config: {"decisions": 3},
@@ -50,11 +50,15 @@ ROBOTS = "an int from 1 to 8"
 ABOVE_0 = "a finite number > 0"
 # Bad values of each class, with the expected part of the error.
 BAD: dict[type[ExperimentConfig], dict[str, dict[Any, str]]] = {
-    bench.AccuracyConfig: {
+    accuracy.Config: {
         "seeds": {0: AT_LEAST_1}, "particles": {(0,): AT_LEAST_1, (): "at least one value, each once"},
         "presets": {("fine",): "one of 'good', 'coarse', 'paper'"}, "methods": {("magic",): "one of 'dead_reckoning'"},
         "lengths": {(0.1,): "a finite number >= 0.25"}, "noise_factor": {0.0: ABOVE_0},
         "robots": {(16,): "an int >= 16"},
+    },
+    losses.Config: {
+        "presets": {("fine",): "one of 'easy', 'standard', 'hard'"}, "duration": {0.0: "a finite number >= 1"},
+        "baselines": {(0.0,): ABOVE_0}, "robots": {(9,): ROBOTS},
     },
     bench.EnvBenchConfig: {
         "robots": {(9,): ROBOTS}, "modes": {("image",): "one of 'driver', 'poses'"}, "steps": {1: "an int >= 2"},
@@ -77,13 +81,13 @@ BAD: dict[type[ExperimentConfig], dict[str, dict[Any, str]]] = {
         "policies": {("frontier", "frontier"): "at least one value, each once"},
     },
     bench.StartBenchConfig: {"repeats": {0: AT_LEAST_1}, "parts": {("none",): "one of"}},
-    bench.StereoBenchConfig: {
+    stereo.Config: {
         "sizes": {(32,): "an int >= 64"}, "walls": {(3,): "an int >= 4"}, "views": {0: AT_LEAST_1},
     },
-    bench.TrainBenchConfig: {
+    training_speed.Config: {
         "robots": {9: ROBOTS}, "workers": {(99,): "at most one per environment, 16"}, "steps": {1: "an int >= 2"},
     },
-    bench.MrclamPairsConfig: {"durations": {(-1.0,): "a finite number >= 0"}, "particles": {0: AT_LEAST_1}},
+    mrclam_pairs.Config: {"durations": {(-1.0,): "a finite number >= 0"}, "particles": {0: AT_LEAST_1}},
     EvaluateConfig: {"seeds": {1: "an int >= 2"}, "split": {"train": "one of 'validation', 'test'"}},
     TrainConfig: {
         "preset": {"slow": "one of 'quick', 'imitate', 'ppo', 'smoke'"}, "rounds": {0: AT_LEAST_1},
@@ -142,7 +146,9 @@ def test_every_configuration_is_covered() -> None:
         subclasses = [each for each in kind.__subclasses__() if each.__module__.startswith("training.")]
         return {each.__name__ for each in subclasses}.union(*map(below, subclasses))
 
-    assert below(ExperimentConfig) - {"ReplayConfig"} == {kind.__name__ for kind in CASES}
+    assert below(ExperimentConfig) - {"ReplayConfig"} == {
+        kind.__name__ for kind in CASES if kind.__module__.startswith("training.")
+    }
     assert BAD.keys() == CASES.keys()
 
 
@@ -212,7 +218,6 @@ def test_choices_match_the_packages() -> None:
     assert get_args(experiments.Preset) == PRESETS
     assert get_args(experiments.Sensor) == SENSORS
     assert get_args(alignment.Method) == METHODS
-    assert get_args(bench.Method) == trials.METHODS
     assert paper.STEP == runs.STEP
     assert tuple(TRAIN_PRESETS) == ("quick", "imitate", "ppo", "smoke")
     assert paper.Fig6Config().regimes == tuple(REGIMES)

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from slam_backend.geometry import transform_points
-from training.bench.accuracy.runs import FALSE_POINT
 from training.paper.config import Fig2Config, PairConfig
 from training.paper.fig2 import ENOUGH_SHARED, METHODS, OURS, check_claims, play, refusals, summarise
 from training.paper.fig3 import AlignedPair, align_pair, fuse_pair
 from training.paper.map_pairs import map_alone, simulate_pair, true_motion
+from training.stereo_runs.runs import FALSE_POINT
 
 SMALL = Fig2Config(length=30.0, every=10.0, particles=30, seeds=2, seed=100)
 

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from training.bench.accuracy.runs import PRESETS, STEP, StereoRun
 from training.paper.config import Fig1Config
 from training.paper.fig1 import Clouds, draw_clouds, path_errors, simulate_fig1
 from training.paper.fig6.trials import FILTER_OPTIONS
+from training.stereo_runs.runs import PRESETS, STEP, StereoRun
 
 SMALL = Fig1Config(robots=2, particles=50, length=12.0, every=3.0, seed=60)
 

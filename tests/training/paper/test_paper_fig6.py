@@ -11,8 +11,6 @@ import numpy as np
 import pytest
 
 from training import cli
-from training.bench.accuracy.runs import FALSE_POINT, StereoRun, simulate_run
-from training.bench.accuracy.trials import Answer
 from training.experiments.run_folder import plain
 from training.paper.config import Fig6Config
 from training.paper.fig6.claims import (
@@ -44,6 +42,8 @@ from training.paper.fig6.trials import (
     rms_of_all,
     time_in_turns,
 )
+from training.stereo_runs.runs import FALSE_POINT, StereoRun, simulate_run
+from training.stereo_runs.scores import Answer
 
 ARGUMENTS = ["paper", "fig6", "--seeds", "2", "--first-seed", "50", "--robots", "1,2", "--particles", "3,10"]
 ARGUMENTS += ["--length", "4", "--regimes", "paper,good"]

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from slam_backend.maps.landmark_map import LandmarkMap
 from slam_backend.models.camera import ROBOT_FROM_CAMERA, StereoCamera
-from training.bench.stereo.scenes import WALL, Scene, wall_pose
+from studies.front_end.scenes import WALL, Scene, wall_pose
 from training.cli import app
 from training.experiments.config import Descriptor
 from training.replay.config import ImagesConfig

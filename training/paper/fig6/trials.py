@@ -9,9 +9,16 @@ import numpy as np
 
 from slam_backend.core.validation import BoolArray, FloatArray, check_choice, check_int
 from slam_backend.fastslam.filter import FastSlam
-from training.bench.accuracy.runs import FALSE_POINT, Preset, RunSpec, StereoRun, simulate_run
-from training.bench.accuracy.trials import REJUVENATE_EVERY, Answer, follow, optimal, score
 from training.experiments.timing import no_garbage_collection
+from training.stereo_runs.runs import FALSE_POINT, Preset, RunSpec, StereoRun, simulate_run
+from training.stereo_runs.scores import (
+    REJUVENATE_EVERY,
+    Answer,
+    batch_of,
+    follow,
+    least_squares_answer,
+    score,
+)
 
 Proposal = Literal["fastslam1", "fastslam2", "fastslam2+rejuvenation", "batch_ml"]
 
@@ -128,13 +135,14 @@ def play_error(trial: ErrorTrial) -> dict[str, Any]:
     """Run a trial.
 
     Returns:
-        Fields of the trial, the metrics of `accuracy.trials.play`, and `map_all_rmse_m`: the RMSE over all landmarks of
+        Fields of the trial, metrics of `score`, and `map_all_rmse_m`: the RMSE over all landmarks of
         the map that have a true landmark, duplicates included, while `map_rmse_m` uses the nearest one.
         Metrics that only filters have are NaN for the bound.
     """
     run = _run_of(trial.spec, trial.seed)
     if trial.proposal == BOUND:
-        answer = optimal(run, BOUND)
+        problem, batch = batch_of(run)
+        answer = least_squares_answer(problem, batch.paths, batch.path_covariances, batch.landmarks)
     else:
         answer = follow(run, _build(run, trial.proposal, trial.particles, trial.seed))
     row = score(run, answer) | {"map_all_rmse_m": rms_of_all(run, answer)}

@@ -1,0 +1,1 @@
+"""Speed of two checkouts, and of several worlds, in alternation on a busy machine."""

@@ -1,0 +1,1 @@
+"""Learning: what the reward tells a learner, and another learning library."""

@@ -1,1 +1,0 @@
-"""Accuracy benchmark: errors and consistency of filters, against batch maximum likelihood."""

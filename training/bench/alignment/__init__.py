@@ -1,1 +1,0 @@
-"""Alignment of maps of real robots."""

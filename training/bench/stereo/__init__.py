@@ -1,1 +1,0 @@
-"""Stereo benchmark: speed and quality of the front end."""

@@ -1,1 +1,0 @@
-"""Training benchmark: time of a decision by part, and speed over worker processes."""
