@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
@@ -10,7 +11,7 @@ from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from training.experiments.plotting import add_legend, picture, save_png
 from training.experiments.statistics import grouped
-from training.experiments.study import Chart, Column, Curves, Panel, Row
+from training.experiments.study import Chart, Column, Curves, Panel, Row, value_text
 from training.experiments.tables import in_words
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7f7f7f")  # safe for the colour-blind
@@ -80,22 +81,43 @@ def draw_curves(file: Path, curves: Curves, rows: Sequence[Row]) -> None:
     lines = curves.lines(rows)
     if not lines:
         return
-    with mpl.rc_context({"font.size": 9}):
-        figure = Figure(figsize=(3.1 * len(curves.columns), 3.1), layout="constrained")
-        axes = figure.subplots(1, len(curves.columns), squeeze=False)[0]
-        for ax, column in zip(axes, curves.columns, strict=True):
-            for place, (key, group) in enumerate(grouped(lines, curves.by).items()):
-                known = [line for line in group if line[column.name] is not None]
-                ax.plot(
-                    [line["time_s"] for line in known], [_factor(column) * line[column.name] for line in known], lw=1.2,
-                    color=COLOURS[place % len(COLOURS)], ls=STYLES[place // len(COLOURS) % len(STYLES)],
-                    label=", ".join(map(str, key)),
-                )  # fmt: skip
+    facets = grouped(lines, curves.rows)
+    keys = list(grouped(lines, curves.by[len(curves.rows) :]))
+    with mpl.rc_context({"font.size": 9, "axes.titlesize": 9}):
+        size = 3.1 * len(curves.columns), 2.7 * len(facets) + 0.4
+        figure = Figure(figsize=size, layout="constrained")
+        axes = figure.subplots(len(facets), len(curves.columns), squeeze=False, sharex=True)
+        for panels, (place, facet) in zip(axes, facets.items(), strict=True):
+            for ax, column in zip(panels, curves.columns, strict=True):
+                for key, group in grouped(facet, curves.by[len(curves.rows) :]).items():
+                    _draw_curve(ax, curves, column, key, keys.index(key), group)
+                ax.set_ylabel(column.title)
+                ax.grid(alpha=0.2)
+            panels[0].set_title(_label(curves, curves.rows, place), loc="left")
+        for ax in axes[-1]:
             ax.set_xlabel("time [s]")
-            ax.set_ylabel(column.title)
-            ax.grid(alpha=0.2)
-        add_legend(figure, axes[0], title=", ".join(in_words(name)[0] for name in curves.by))
+        title = ", ".join(in_words(name)[0] for name in curves.by[len(curves.rows) :])
+        add_legend(figure, axes[0][0], title=title)
         save_png(figure, file, 110)
+
+
+def _draw_curve(ax: Axes, curves: Curves, column: Column, key: Any, place: int, group: Sequence[Row]) -> None:
+    """Draw the mean of a group over time with its interval."""
+    known = [line for line in group if line[column.name] is not None]
+    times, style = [line["time_s"] for line in known], STYLES[place // len(COLOURS) % len(STYLES)]
+    colour, factor = COLOURS[place % len(COLOURS)], _factor(column)
+    ax.plot(
+        times, [factor * line[column.name] for line in known], lw=1.2, color=colour, ls=style,
+        label=_label(curves, curves.by[len(curves.rows) :], key),
+    )  # fmt: skip
+    if known and known[0][f"{column.name}_low"] is not None:
+        low, high = ([factor * line[f"{column.name}_{end}"] for line in known] for end in ("low", "high"))
+        ax.fill_between(times, low, high, color=colour, alpha=0.12, lw=0)
+
+
+def _label(curves: Curves, names: Sequence[str], values: Sequence[Any]) -> str:
+    """Return values of fields as text."""
+    return ", ".join(value_text(curves.words, *item) for item in zip(names, values, strict=True))
 
 
 def _factor(column: Column) -> float:

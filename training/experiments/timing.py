@@ -96,10 +96,14 @@ def processor() -> str:
     return names[0] if names else platform.processor() or platform.machine()
 
 
+def busy_note(machine: Mapping[str, Any]) -> str:
+    """Return a warning if the machine was busy, else nothing."""
+    load = machine["load_before"]
+    return "" if load is None or load <= BUSY else f"The machine was busy (load {load:.1f}): times may be too long."
+
+
 def print_caveats(console: Console, result: Mapping[str, Any]) -> None:
     """Print a warning if the machine was busy or the user stopped the benchmark."""
-    load = result["machine"]["load_before"]
-    if load is not None and load > BUSY:
-        console.print(f"The machine was busy (load {load:.1f}): times may be too long.")
+    console.print(busy_note(result["machine"]), end="\n" if busy_note(result["machine"]) else "")
     if not result["complete"]:
         console.print("Stopped early: the tables contain only the trials up to then.")
