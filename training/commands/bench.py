@@ -11,21 +11,18 @@ from training.bench.config import (
     AccuracyConfig,
     EnvBenchConfig,
     EpisodeTrial,
-    ExplorationBenchConfig,
-    ExplorationTrial,
     FilterBenchConfig,
     MrclamPairsConfig,
     StartBenchConfig,
     StereoBenchConfig,
     TrainBenchConfig,
 )
-from training.commands._options import Workers, options
+from training.bench.exploration.config import ExplorationConfig
+from training.commands._options import Cluster, Workers, options
 from training.commands._plan import (
-    Cluster,
     PlanName,
     Verified,
     VerifiedRows,
-    first_steps,
     is_plan_run,
     run_plan,
     verify_rows,
@@ -34,6 +31,7 @@ from training.commands._plan import (
 from training.commands._progress import TrialSet, run_trial_sets, share_progress, trial_progress
 from training.commands._run_folder import Call
 from training.commands.replay import MRCLAM_LOG
+from training.commands.study import run_study
 from training.experiments.console import print_error
 from training.rl.config import require_extra
 
@@ -91,6 +89,7 @@ def _losses_in_worlds(call: Call[AccuracyConfig], workers: int) -> None:
     from training.bench.accuracy.losses import EPISODES_FILE, LONGEST_DECISION, play
     from training.bench.accuracy.losses_report import draw_losses, markdown, print_tables, summarise
     from training.bench.exploration.players import parted
+    from training.bench.exploration.trials import first_steps
     from training.experiments.run_folder import plain
 
     config = call.config
@@ -213,12 +212,12 @@ def bench_env(call: Call[EnvBenchConfig]) -> None:
 
 @bench.command("exploration")
 @options(
-    ExplorationBenchConfig, "bench exploration", continues=True,
+    ExplorationConfig, "bench exploration", continues=True,
     quick={"worlds": ("office",), "duration": 60.0, "seeds": 3},
     quick_help="Office worlds only, 60 s, 3 seeds; with --plan 2 worlds of four families.",
 )  # fmt: skip
 def bench_exploration(
-    call: Call[ExplorationBenchConfig], plan: PlanName = None, workers: Workers = 1, ray: Cluster = None,
+    call: Call[ExplorationConfig], plan: PlanName = None, workers: Workers = 1, ray: Cluster = None,
     verify: Verified = None, verified_rows: VerifiedRows = 5,
 ) -> None:  # fmt: skip
     """Compare policies over worlds: coverage, map errors, pose errors and merges, with confidence intervals.
@@ -238,39 +237,11 @@ def bench_exploration(
     if plan is not None or is_plan_run(call):
         run_plan(call, plan, workers, ray)
         return
-    from training.bench.exploration import report
-    from training.bench.exploration.players import parted
-    from training.bench.exploration.trials import TRIALS_FILE, check_same_policies, play
-    from training.experiments.run_folder import plain
-    from training.experiments.tables import csv_of
+    from training.bench.exploration.report import STUDY
+    from training.bench.exploration.trials import check_same_policies
 
-    trials = call.config.trials()
     check_same_policies(call.out, call.config.policies)
-    firsts = {(t.policy, t.world, t.robots): t for t in reversed(trials)}.values()
-    config = call.config
-    checks = (
-        partial(first_steps, config.environment(t), parted(t.policy), t.seed, config.decision_limit) for t in firsts
-    )  # fmt: skip
-    console, folder = call.begin(*checks)
-    part = TrialSet(
-        file=TRIALS_FILE, kind=ExplorationTrial, play=partial(play, call.config), trials=trials, workers=workers,
-        cluster=ray,
-        tell=lambda row: f"{row['world']}, {row['policy']}, seed {row['seed']}: {row['coverage']:.0%} seen",
-    )  # fmt: skip
-    (rows,) = run_trial_sets(console, folder, part)
-    lines, over_time = plain(report.summarise(rows)), plain(report.curves(rows))
-    policies_differ, oracles_differ = plain(report.compare_policies(rows)), plain(report.compare_oracles(rows))
-    report.print_tables(console, lines, policies_differ, oracles_differ)
-    metrics = {"summary": lines, "policies_differ": policies_differ, "oracles_differ": oracles_differ, "trials": rows}
-    call.write(metrics)
-    folder.write_text("tables.md", report.markdown(lines, policies_differ, oracles_differ))
-    folder.write_text("trials.csv", csv_of(rows))
-    folder.write_text("curves.csv", csv_of(over_time))
-    if over_time:
-        report.draw_exploration(folder.path / "exploration.png", over_time)
-    call.finish()
-    if part.failures:
-        raise typer.Exit(2)
+    run_study(call, STUDY, workers, ray)
 
 
 @bench.command("leaderboard")

@@ -1,5 +1,6 @@
 """Commands of studies: options, trials, tables, chart and report, the same for all of them."""
 
+import re
 import sys
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -9,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 from rich.console import Console
 
-from training.commands._options import Workers, options
-from training.commands._plan import Cluster
+from training.commands._options import Cluster, Workers, options
 from training.commands._progress import TrialSet, run_trial_sets
 from training.commands._run_folder import Call
 
@@ -101,9 +101,9 @@ def write_tables(
         text = Column("", digits=2).text
         cells = [[c.text, text(c.measured), c.limits, "holds" if c.holds else "does not hold"] for c in claims]
         call.console.print(console_table("The paper's claims", ("claim", "measured", "limits", ""), cells))
-        metrics["claims"] = [_plain(claim._asdict()) for claim in claims]
-    by_name = {table.name: [_plain(line) for line in lines] for table, lines in found}
-    call.write(plain({"tables": by_name, **metrics, "trials": rows}))
+        metrics["claims"] = plain_lines([claim._asdict() for claim in claims])
+    by_name = {table.name: plain_lines(lines) for table, lines in found}
+    call.write({"tables": by_name, **metrics, "trials": plain(rows)})
     call.folder.write_text("trials.csv", csv_of(rows))
     call.folder.write_text("tables.md", "\n".join(table.markdown(lines) for table, lines in found))
 
@@ -113,9 +113,8 @@ def print_table(console: Console, table: "ResultTable", lines: Sequence[dict[str
     from training.experiments.tables import console_table
 
     for title, rows in table.parts(lines):
-        headings, *cells = [
-            [text.replace(" (", "\n(").replace(" [", "\n[") for text in row] for row in (table.headings, *rows)
-        ]
+        headings = [heading.replace(" [", "\n[") for heading in table.headings]
+        cells = [[re.sub(r" \((\S+) \.\. (\S+)\)$", r"\n\1..\2", text) for text in row] for row in rows]
         console.print(console_table(title, headings, cells))
     if table.note:
         console.print(table.note)
@@ -133,13 +132,16 @@ def _told(kind: type[Any], row: dict[str, Any]) -> str:
     return ", ".join(str(row[name]) for name in kind.__dataclass_fields__ if row[name] not in ("", None))
 
 
-def _plain(line: dict[str, Any]) -> dict[str, Any]:
-    """Return a line with the value and the interval of each estimate by name."""
+def plain_lines(lines: "Sequence[Row]") -> list[dict[str, Any]]:
+    """Return lines as plain values, with the value and the interval of each estimate by name."""
+    from training.experiments.run_folder import plain
     from training.experiments.study import Estimate
 
-    plain: dict[str, Any] = {}
-    for name, value in line.items():
-        plain[name] = value.value if isinstance(value, Estimate) else value
-        if isinstance(value, Estimate) and value.low is not None:
-            plain |= {f"{name} low": value.low, f"{name} high": value.high}
-    return plain
+    found: list[dict[str, Any]] = []
+    for line in lines:
+        found.append({})
+        for name, value in line.items():
+            found[-1][name] = plain(value.value if isinstance(value, Estimate) else value)
+            if isinstance(value, Estimate) and value.low is not None:
+                found[-1] |= {f"{name} low": value.low, f"{name} high": value.high}
+    return found

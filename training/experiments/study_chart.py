@@ -33,7 +33,7 @@ def draw_chart(file: Path, chart: Chart, rows: Sequence[Row]) -> None:
         axes = figure.subplots(len(facets), len(chart.panels), squeeze=False, sharex=True)
         for row, (key, group) in zip(axes, facets.items(), strict=True):
             for ax, panel in zip(row, chart.panels, strict=True):
-                _draw_panel(ax, chart, panel, group, names)
+                draw_panel(ax, chart, panel, group, names)
             if key:
                 row[0].set_title(chart.title(key[0]), loc="left")
         for ax in axes[-1]:
@@ -43,7 +43,7 @@ def draw_chart(file: Path, chart: Chart, rows: Sequence[Row]) -> None:
         save_png(figure, file, 110)
 
 
-def _draw_panel(ax: Axes, chart: Chart, panel: Panel, rows: Sequence[Row], names: Sequence[str]) -> None:
+def draw_panel(ax: Axes, chart: Chart, panel: Panel, rows: Sequence[Row], names: Sequence[str]) -> None:
     """Draw a quantity over the field of the x axis, a line for each of some names."""
     column = panel.column
     factor = _factor(column)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 
 from slam_backend.core.text_files import read_toml
 from slam_backend.core.validation import argument_error, choice_error
-from training.bench.config import ALL_ORACLES, ORACLES, world_split
+from training.bench.exploration.config import ALL_ORACLES, ORACLES, world_split
 from training.bench.exploration.players import parted
 from training.experiments.config import Checked, NoisePreset, Positive, RobotCount
 

@@ -1,12 +1,14 @@
 """Policies of the exploration benchmark: of each robot, of the team, and bounds, by their names on the command line."""
 
 import hashlib
+from pathlib import Path
 from typing import NamedTuple
 
 from agents.bounds import BOUNDS, make_bound
 from agents.plugins import is_plugin, plugin_file
 from agents.policy import keys_for
 from agents.registry import action_types, make_policy, make_team_policy, model_file
+from agents.trained import MODEL_FILE
 from slam_backend.core.validation import check_choice
 from training.episodes.guard import GuardedTeam
 from training.experiments.policy_names import parted_label
@@ -66,6 +68,22 @@ class Player(NamedTuple):
             return GuardedTeam(make_team_policy(self.name, self.action_type), self.label, self.action_type, limit)
         policies = {agent: make_policy(self.name, self.action_type) for agent in env.possible_agents}
         return GuardedTeam(policies, self.label, self.action_type, limit)
+
+
+def label(name: str) -> str:
+    """Return the label of a policy or a world for tables and figures: a path is given without its folders.
+
+    >>> label("runs/train-0-1"), label("runs/train-0-1/model.npz"), label("mine=look_again:LookAgain@discrete")
+    ('train-0-1', 'train-0-1/model.npz', 'mine@discrete')
+    """
+    given, policy = parted_label(name)
+    if given:
+        _, at, suffix = policy.rpartition("@")
+        return f"{given}{at}{suffix}" if at else given
+    path = Path(name)
+    if is_plugin(name):
+        return name
+    return f"{path.parent.name}/{path.name}" if path.name == MODEL_FILE else path.name
 
 
 def parted(label: str) -> Player:
