@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import product
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field
 
@@ -14,8 +14,6 @@ from training.experiments.config import (
     ExperimentConfig,
     NonNegative,
     Positive,
-    Proposal,
-    RobotCount,
     first_seed,
     option,
     option_arguments,
@@ -26,8 +24,6 @@ from training.replay.config import MRCLAM, log_path
 
 if TYPE_CHECKING:  # numerical modules are imported when a command runs, so that --help is fast
     from training.bench.accuracy.trials import Trial as AccuracyTrial
-    from training.bench.env.bench import EnvLoad
-    from training.bench.filter.workload import FilterLoad
     from training.episodes.config import RunConfig
     from training.rl.config import TrainConfig
     from vslam_env.config import EnvConfig
@@ -227,77 +223,6 @@ class MrclamPairsConfig(ExperimentConfig):
     particles: int = option(100, "Number of particles per filter.", ge=1, hint="Use at least one particle.")
 
 
-Mode = Literal["driver", "poses", "odometry", "identities", "association", "merging", "all", "flat", "goal"]
-
-
-class EnvBenchConfig(ExperimentConfig):
-    """Environment benchmark. Each row changes one number of the base, which has the first entry of each list."""
-
-    robots: tuple[RobotCount, ...] = option(
-        (3, 1, 2, 4, 6, 8), "Numbers of robots K, starting with the base.", hint="Use 1 to 8 robots."
-    )
-    particles: tuple[Positive, ...] = option((100, 30, 300, 1000), "Numbers of particles M.", hint=ONE_PARTICLE)
-    worlds: tuple[str, ...] = option(("office", "fig5", "maze", "hall", "loops"), "World families or paths.")
-    modes: tuple[Mode, ...] = option(
-        get_args(Mode), "Parts in the loop, from known poses to goal actions.", shown="all"
-    )
-    steps: int = option(1000, "Number of steps of an episode.", ge=2, hint="Use at least two steps.")
-    plays: int = setting(5, "Number of repeats of each episode, to reduce the influence of other load.", ge=1)
-    seed: int = option(100, "Seed of the episodes.", ge=0, hint="Use 0 or a positive number.")
-    peer: bool = option(True, "Time simple_spread of MPE2 interleaved with the first row.")
-
-    def loads(self) -> list["EnvLoad"]:
-        """Return the timed loads, row by row, starting with the base."""
-        from training.bench.env.bench import EnvLoad
-
-        base = EnvLoad(self.robots[0], self.particles[0], self.worlds[0], self.modes[0])
-        rows = [base]
-        rows += [base._replace(robots=robots) for robots in self.robots[1:]]
-        rows += [base._replace(particles=particles) for particles in self.particles[1:]]
-        rows += [base._replace(world=world) for world in self.worlds[1:]]
-        return rows + [base._replace(mode=mode) for mode in self.modes[1:]]
-
-
-class FilterBenchConfig(ExperimentConfig):
-    """Filter benchmark; rows are all combinations of the given numbers."""
-
-    particles: tuple[Positive, ...] = option((100, 1000), "Numbers of particles M.", hint=ONE_PARTICLE)
-    landmarks: tuple[int, ...] = option((100, 300, 1000), "Numbers of landmarks N in the map of each particle.")
-    measurements: tuple[int, ...] = option((5, 15), "Numbers of measurements B per step, of all robots together.")
-    robots: tuple[Positive, ...] = option((1, 2, 3), "Numbers of robots K.", hint="Use 1 to 8 robots.")
-    proposals: tuple[Proposal, ...] = ("fastslam1", "fastslam2")
-    lookalikes: int = option(
-        1, "Number of landmarks that share one descriptor.", name="look_alikes", ge=1,
-        hint="Use 1 for distinct descriptors.",
-    )  # fmt: skip
-    steps: int = option(300, "Number of timed steps per row.", ge=1, hint="Use at least one step.")
-    large: bool = option(False, "Include 10,000 particles with 300 and 1,000 landmarks.")
-    compile: bool = option(False, "Include the compilation time of all kernels with an empty cache.")
-
-    def check(self) -> None:
-        """Refuse combinations that cannot be timed."""
-        self.loads()
-
-    def loads(self) -> list["FilterLoad"]:
-        """Return the timed loads, row by row."""
-        from training.bench.filter.workload import LARGE_LOADS, FilterLoad
-
-        numbers = product(self.proposals, self.particles, self.landmarks, self.measurements, self.robots)
-        rows = [
-            FilterLoad(
-                proposal=p, particles=m, landmarks=n, measurements=b, robots=k, lookalikes=self.lookalikes,
-                seed=self.seed,
-            )
-            for p, m, n, b, k in numbers
-        ]  # fmt: skip
-        if not self.large:
-            return rows
-        return rows + [
-            FilterLoad(**load, proposal=p, lookalikes=self.lookalikes, seed=self.seed)
-            for p, load in product(self.proposals, LARGE_LOADS)
-        ]
-
-
 class StereoBenchConfig(ExperimentConfig):
     """Stereo benchmark. The height of images is three quarters of their width, with a constant field of view."""
 
@@ -309,23 +234,6 @@ class StereoBenchConfig(ExperimentConfig):
         60, "Number of rendered pairs per descriptor for the quality.", ge=1, hint="Use at least one pair."
     )
     descriptors: tuple[Descriptor, ...] = option(("usurf", "sift", "orb"), "Descriptors to compare.")
-
-
-class StartBenchConfig(ExperimentConfig):
-    """The start-up bench: what a user waits for at first."""
-
-    parts: tuple[Literal["demo", "kernels", "steps", "wheel", "import", "count"], ...] = option(
-        ("demo", "kernels", "steps", "import", "count"), "Parts to time: demo, kernels, steps, wheel, import, count."
-    )
-    repeats: int = option(3, "Runs of each part.", ge=1, hint="Time at least one run.")
-    wheel: str | None = option(None, "Wheel of kernels, which adds the part wheel.", shown="none", is_path=True)
-    seed: int = setting(0, "Seed; the bench draws nothing.", ge=0)
-
-    def with_wheel(self) -> "StartBenchConfig":
-        """Return the configuration with the part `wheel`, if there is a wheel."""
-        if self.wheel is None or "wheel" in self.parts:
-            return self
-        return self.model_copy(update={"parts": (*self.parts, "wheel")})
 
 
 class TrainBenchConfig(ExperimentConfig):

@@ -9,15 +9,13 @@ import typer
 
 from training.bench.config import (
     AccuracyConfig,
-    EnvBenchConfig,
     EpisodeTrial,
-    FilterBenchConfig,
     MrclamPairsConfig,
-    StartBenchConfig,
     StereoBenchConfig,
     TrainBenchConfig,
 )
 from training.bench.exploration.config import ExplorationConfig
+from training.bench.speed.config import EnvSpeedConfig, FilterSpeedConfig, StartSpeedConfig
 from training.commands._options import Cluster, Workers, options
 from training.commands._plan import (
     PlanName,
@@ -113,25 +111,6 @@ def _losses_in_worlds(call: Call[AccuracyConfig], workers: int) -> None:
         raise typer.Exit(2)
 
 
-@bench.command("filter")
-@options(
-    FilterBenchConfig, "bench filter", quick={"measurements": (15,), "robots": (1,), "steps": 100},
-    quick_help="15 measurements, 1 robot, 100 steps.",
-)  # fmt: skip
-def bench_filter(call: Call[FilterBenchConfig]) -> None:
-    """Time steps of the filter over particles, landmarks, measurements and robots, on one thread."""
-    from training.bench.filter.bench import count_trials, run_bench
-    from training.bench.filter.report import draw_speed, print_result
-
-    console, folder = call.begin()
-    with trial_progress(console, count_trials(call.config)) as (on_trial, interrupted):
-        result = run_bench(call.config, on_trial, interrupted)
-    print_result(console, result)
-    call.write(result)
-    draw_speed(folder.path / "speed.png", result)
-    call.finish()
-
-
 @bench.command("stereo")
 @options(
     StereoBenchConfig, "bench stereo",
@@ -189,27 +168,6 @@ def _parts(data: Path, descriptors: Sequence[str], real: Path | None) -> "list[R
     return parts
 
 
-@bench.command("env")
-@options(
-    EnvBenchConfig, "bench env",
-    quick={"robots": (3,), "particles": (100,), "worlds": ("office",), "modes": ("driver",), "steps": 300},
-    quick_help="Base configuration only, 300 steps.",
-)  # fmt: skip
-def bench_env(call: Call[EnvBenchConfig]) -> None:
-    """Time steps of environments with the filter in the loop, on one thread, with a breakdown by part."""
-    from training.bench.env.bench import count_trials, print_env_result, run_bench
-    from vslam_env import vslam_v1
-
-    for load in call.config.loads():  # detects configurations that cannot be built before the folder is created
-        vslam_v1.parallel_env(config=load.config())
-    console, _ = call.begin()
-    with trial_progress(console, count_trials(call.config)) as (on_trial, interrupted):
-        result = run_bench(call.config, on_trial, interrupted)
-    print_env_result(console, result, call.config.peer)
-    call.write(result)
-    call.finish()
-
-
 @bench.command("exploration")
 @options(
     ExplorationConfig, "bench exploration", continues=True,
@@ -253,27 +211,48 @@ def bench_leaderboard(
     write_leaderboard(folders, out)
 
 
-@bench.command("start")
+speed = typer.Typer(help="Time steps of filters and environments, and the start-up.", no_args_is_help=True)
+bench.add_typer(speed, name="speed")
+
+
+@speed.command("filter")
 @options(
-    StartBenchConfig, "bench start", quick={"parts": ("import", "count"), "repeats": 1},
+    FilterSpeedConfig, "bench speed filter", continues=True,
+    quick={"measurements": (15,), "robots": (1,), "steps": 100}, quick_help="15 measurements, 1 robot, 100 steps.",
+)  # fmt: skip
+def speed_filter(call: Call[FilterSpeedConfig]) -> None:
+    """Time steps of the filter over particles, landmarks, measurements and robots, on one thread."""
+    from training.bench.speed.filter import STUDY
+
+    run_study(call, STUDY)
+
+
+@speed.command("env")
+@options(
+    EnvSpeedConfig, "bench speed env", continues=True,
+    quick={"robots": (3,), "particles": (100,), "worlds": ("office",), "modes": ("driver",), "steps": 300},
+    quick_help="Base configuration only, 300 steps.",
+)  # fmt: skip
+def speed_env(call: Call[EnvSpeedConfig]) -> None:
+    """Time steps of environments with the filter in the loop, on one thread, with a breakdown by part."""
+    from training.bench.speed.env import STUDY
+
+    run_study(call, STUDY)
+
+
+@speed.command("start")
+@options(
+    StartSpeedConfig, "bench speed start", continues=True, quick={"parts": ("import", "count"), "repeats": 1},
     quick_help="Imports and numbers of kernels, once.",
 )  # fmt: skip
-def bench_start(call: Call[StartBenchConfig]) -> None:
+def speed_start(call: Call[StartSpeedConfig]) -> None:
     """Time what a user waits for at first: compilation, first steps, imports; on two cores, caches and home empty.
 
     The part wheel times the first picture with the kernels that `make kernels-wheel` compiles.
     """
-    from training.bench.start.bench import check_wheel, markdown, print_result, run_bench
+    from training.bench.speed.start import STUDY
 
-    chosen = call.config.with_wheel()
-    check_wheel(chosen)
-    console, folder = call.begin(config=chosen)
-    with trial_progress(console, chosen.repeats * len(chosen.parts)) as (on_trial, interrupted):
-        result = run_bench(chosen, on_trial, interrupted)
-    print_result(console, result)
-    folder.write_text("table.md", markdown(result))
-    call.write(result)
-    call.finish()
+    run_study(call, STUDY)
 
 
 @bench.command("train")
@@ -291,18 +270,20 @@ def bench_train(call: Call[TrainBenchConfig]) -> None:
     call.finish()
 
 
-def _say_where(name: str) -> None:
-    """Add a hidden command that says where a study has gone."""
+def _say_where(name: str, hint: str) -> None:
+    """Add a hidden command that says where a command has gone."""
 
     @bench.command(name, hidden=True, context_settings={"ignore_unknown_options": True})
     def moved(arguments: Annotated[list[str] | None, typer.Argument()] = None) -> None:
         from slam_backend.core.validation import argument_error
 
-        raise argument_error("bench", "another command", name, f"In a clone: python -m studies.{name}.")
+        raise argument_error("bench", "another command", name, hint)
 
 
 for _name in ("alignment", "scale"):
-    _say_where(_name)
+    _say_where(_name, f"In a clone: python -m studies.{_name}.")
+for _name in ("filter", "env", "start"):
+    _say_where(_name, f"Use vslam bench speed {_name}.")
 
 
 @bench.command("mrclam")

@@ -70,7 +70,7 @@ def run_study(
         file=TRIALS_FILE, kind=study.trial, play=partial(_play, study.play, call.config),
         trials=study.trials(call.config), tell=partial(_told, study.trial), workers=workers, cluster=cluster,
     )  # fmt: skip
-    (rows,) = run_trial_sets(console, folder, part, timed=study.timed)
+    rows = study.unfold(run_trial_sets(console, folder, part, timed=study.timed)[0])
     write_tables(call, study.tables, rows, study.claims and study.claims(rows), **machine)
     if machine and (note := busy_note(machine["machine"])):
         console.print(note, soft_wrap=True)

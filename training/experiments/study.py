@@ -274,6 +274,7 @@ class Study(Generic[ConfigT, TrialT]):
         claims: Function that returns the claims that are checked on the rows, or none.
         checks: Function that returns the first steps of a configuration, which are run before the run folder is made,
             to detect what cannot be played.
+        unfold: Function of the rows of all trials that returns those that tables, chart and claims sum up.
         quick: Values that `--quick` sets.
         timed: Whether trials are timed, so that they run one after another in this process.
     """
@@ -289,5 +290,6 @@ class Study(Generic[ConfigT, TrialT]):
     curves: Curves | None = None
     claims: Callable[[Sequence[Row]], Sequence[Claim]] | None = None
     checks: Callable[[ConfigT], Iterable[Callable[[], object]]] = lambda config: ()
+    unfold: Callable[[Sequence[Row]], Sequence[Row]] = lambda rows: rows
     quick: Mapping[str, Any] = field(default_factory=dict)
     timed: bool = False

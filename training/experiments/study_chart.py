@@ -38,6 +38,8 @@ def draw_chart(file: Path, chart: Chart, rows: Sequence[Row]) -> None:
                 row[0].set_title(chart.title(key[0]), loc="left")
         for ax in axes[-1]:
             ax.set_xlabel(chart.label)
+        for ax in axes.flat:
+            ax.set_visible(any(len(line.get_xdata()) for line in ax.lines))
         if chart.by:
             add_legend(figure, axes[0][0], title=in_words(chart.by)[0])
         save_png(figure, file, 110)

@@ -70,7 +70,7 @@ BAD: dict[str, dict[str, str]] = {
         "--workers 0": "workers: expected an int >= 1, got 0.",
     },
     "bench mrclam": {"--path . --durations -1": "durations: expected a finite number >= 0, got -1.0."},
-    "bench filter": {
+    "bench speed filter": {
         "--particles 10;20": f"particles: {LIST} '10;20'. Write them like",
         "--landmarks 20": "landmarks: expected an int >= 30, got 20.",
     },
@@ -79,8 +79,8 @@ BAD: dict[str, dict[str, str]] = {
         "--real none": "real: expected a folder of real images, got no such folder.",
         "--real full": "real: expected a folder with pairs with a model file: NAMEA, NAMEB and NAME_model.txt",
     },
-    "bench env": {"--robots 9": f"{ROBOTS} 9", "--worlds castle": "world: expected one of 'office'"},
-    "bench start": {
+    "bench speed env": {"--robots 9": f"{ROBOTS} 9", "--worlds castle": "world: expected one of 'office'"},
+    "bench speed start": {
         "--parts imports": "parts: expected one of 'demo', 'kernels', 'steps', 'wheel', 'import', 'count'",
         "--parts wheel": "wheel: expected the wheel that `make kernels-wheel` writes, got None.",
     },

@@ -25,18 +25,18 @@ LEAST = {
     "replay kitti": ("--path", "drive", "--duration", "6", "--particles", "3"),
     "replay stereo": (),
     "bench accuracy": ("--seeds", "1", *SEED, "--lengths", "2", "--methods", "fastslam2", "--particles", "5"),
-    "bench filter": (
+    "bench speed filter": (
         "--particles", "5", "--landmarks", "40", "--measurements", "3", "--robots", "1", "--steps", "2",
     ),
     "bench stereo": ("--quick", "--steps", "2", "--views", "3", "--descriptors", "usurf"),
-    "bench env": (
+    "bench speed env": (
         "--robots", "1", "--particles", "5", "--worlds", "fig5", "--modes", "flat", "--steps", "2", "--no-peer",
     ),
     "bench exploration": (
         "--policies", "frontier", "--worlds", "fig5", "--robots", "1", "--oracles", "none", "--max-seconds", "2",
         "--particles", "5", "--seeds", "1", *SEED,
     ),
-    "bench start": ("--parts", "count", "--repeats", "1"),
+    "bench speed start": ("--parts", "count", "--repeats", "1"),
     "bench train": ("--world", "fig5", "--robots", "1", "--envs", "1", "--workers", "0", "--steps", "2"),
     "bench mrclam": ("--path", "robots", "--durations", "10", "--particles", "3"),
     "paper fig1": ("--length", "3", "--particles", "5", "--every", "2"),
