@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import matplotlib as mpl
@@ -16,32 +17,41 @@ from training.experiments.tables import in_words
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7f7f7f")  # safe for the colour-blind
 MARKERS = "osD^vxP"
+WIDTH = 45  # of a title [letters]
 STYLES = "-", "--", ":", "-."
 
 
 @picture
 def draw_chart(file: Path, chart: Chart, rows: Sequence[Row]) -> None:
-    """Draw the chart of a study into a PNG file; nothing if no row counts."""
+    """Draw the chart of a study into a PNG file; nothing if no row counts. Panels without values leave no gaps."""
     chosen = list(filter(chart.where, rows))
-    facets = grouped(chosen, (chart.rows,) if chart.rows else ())
-    if not facets:
+    drawn = [
+        (key, group, panel)
+        for key, group in grouped(chosen, (chart.rows,) if chart.rows else ()).items()
+        for panel in chart.panels
+        if panel.column.estimate(group).value is not None
+    ]
+    if not drawn:
         return
     names = [name for (name,) in grouped(chosen, (chart.by,))] if chart.by else [""]
+    columns = min(len(chart.panels), len(drawn))
+    count = -(-len(drawn) // columns)
     with mpl.rc_context({"font.size": 9, "axes.titlesize": 9}):
-        size = 3.1 * len(chart.panels), 2.7 * len(facets) + 0.4
-        figure = Figure(figsize=size, layout="constrained")
-        axes = figure.subplots(len(facets), len(chart.panels), squeeze=False, sharex=True)
-        for row, (key, group) in zip(axes, facets.items(), strict=True):
-            for ax, panel in zip(row, chart.panels, strict=True):
-                draw_panel(ax, chart, panel, group, names)
-            if key:
-                row[0].set_title(chart.title(key[0]), loc="left")
-        for ax in axes[-1]:
-            ax.set_xlabel(chart.label)
-        for ax in axes.flat:
-            ax.set_visible(any(len(line.get_xdata()) for line in ax.lines))
+        figure = Figure(figsize=(3.1 * columns, 2.7 * count + 0.4), layout="constrained")
+        axes = figure.subplots(count, columns, squeeze=False, sharex=True).ravel()
+        last = None
+        for place, (ax, (key, group, panel)) in enumerate(zip(axes, drawn, strict=False)):
+            draw_panel(ax, chart, panel, group, names)
+            if key and (key != last or place % columns == 0):
+                ax.set_title(fill(chart.title(key[0]), WIDTH), loc="left")
+            last = key
+            if place + columns >= len(drawn):
+                ax.set_xlabel(chart.label)
+                ax.tick_params(labelbottom=True)
+        for ax in axes[len(drawn) :]:
+            ax.set_visible(False)
         if chart.by:
-            add_legend(figure, axes[0][0], title=in_words(chart.by)[0])
+            add_legend(figure, axes[0], title=in_words(chart.by)[0])
         save_png(figure, file, 110)
 
 

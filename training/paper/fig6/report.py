@@ -2,11 +2,12 @@
 
 from functools import partial
 
-from training.experiments.study import Chart, Column, Panel, ResultTable, Study
+from training.experiments.study import Chart, Column, Panel, ResultTable, Study, Words
 from training.paper.config import Fig6Config
 from training.paper.fig6.claims import check_claims, over_robots
 from training.paper.fig6.trials import BOUND, Trial, play, unfold
 
+WORDS: Words = {"particles": ("M", lambda particles: str(particles or "-")), "robots": ("K", str)}
 ERROR = Column("map_rmse_m", "map error [m]", interval=True)
 TIME = Column("median_ms", "step [ms]", digits=2, interval=True)
 
@@ -21,13 +22,14 @@ STUDY = Study(
     tables=(
         ResultTable(
             name="fig6", title="Map error and time of a step", by=("filter", "particles", "robots"), each=("filter",),
+            words=WORDS,
             columns=(
                 ERROR, Column("map_aligned_rmse_m", "after fit [m]", interval=True),
                 Column("map_recall", digits=1), Column("pose_rms_m", "pose [m]"), TIME,
             ),
         ),
         ResultTable(
-            name="robots", title="Map error, most over fewest robots", by=("filter", "particles"),
+            name="robots", title="Map error, most over fewest robots", by=("filter", "particles"), words=WORDS,
             where=lambda row: row.get("map_rmse_m") is not None,
             columns=tuple(
                 Column(name, heading, partial(over_robots, name), digits=2)
