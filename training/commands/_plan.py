@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from training.bench.exploration.config import ExplorationConfig, PlanConfig, Trial
-from training.commands._progress import TrialSet, run_trial_sets, trial_progress
+from training.commands._progress import TrialSet, run_trial_set, trial_progress
 from training.commands._run_folder import Call
 from training.commands.study import plain_lines, print_table
 from training.experiments.console import print_error
@@ -68,7 +68,7 @@ def run_plan(call: Call[ExplorationConfig], name: str | None, workers: int, clus
         variables=variables_for(PORTABLE),
         tell=lambda row: f"{row['part']}, {row['family']}, {row['policy']}, seed {row['seed']}",
     )  # fmt: skip
-    (rows,) = run_trial_sets(console, folder, part)
+    rows = run_trial_set(console, folder, part)
     found = [(table, lines) for table in tables(plan, rows) if (lines := table.lines(ordered(rows)))]
     for table, lines in found[:1]:  # as far as it fits into 80 columns
         print_table(console, replace(table, columns=table.columns[:3]), lines)

@@ -26,7 +26,7 @@ from training.commands._plan import (
     verify_rows,
     write_leaderboard,
 )
-from training.commands._progress import TrialSet, run_trial_sets, share_progress, trial_progress
+from training.commands._progress import TrialSet, run_trial_set, share_progress, trial_progress
 from training.commands._run_folder import Call
 from training.commands.replay import MRCLAM_LOG
 from training.commands.study import run_study
@@ -72,7 +72,7 @@ def _accuracy_of_stereo_runs(call: Call[AccuracyConfig], workers: int) -> None:
 
     trials = call.config.trials()
     part = TrialSet(file=TRIALS_FILE, kind=Trial, play=play, trials=trials, tell=tell, workers=workers)
-    (rows,) = run_trial_sets(console, folder, part)
+    rows = run_trial_set(console, folder, part)
     lines = plain(summarise(rows))
     print_tables(console, lines)
     call.write({"summary": lines, "trials": rows})
@@ -99,7 +99,7 @@ def _losses_in_worlds(call: Call[AccuracyConfig], workers: int) -> None:
         file=EPISODES_FILE, kind=EpisodeTrial, play=partial(play, config), trials=trials, workers=workers,
         tell=lambda row: f"{row['world']}, seed {row['seed']}: {row['position_rms_m']['filter']:.3f} m",
     )  # fmt: skip
-    (rows,) = run_trial_sets(console, folder, part)
+    rows = run_trial_set(console, folder, part)
     lines = plain(summarise(rows))
     print_tables(console, lines)
     call.write({"summary": lines, "trials": rows})

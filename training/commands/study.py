@@ -11,7 +11,7 @@ import typer
 from rich.console import Console
 
 from training.commands._options import Cluster, Workers, options
-from training.commands._progress import TrialSet, run_trial_sets
+from training.commands._progress import TrialSet, run_trial_set
 from training.commands._run_folder import Call
 
 if TYPE_CHECKING:  # numerical modules are imported when a command runs, so that --help is fast
@@ -70,7 +70,7 @@ def run_study(
         file=TRIALS_FILE, kind=study.trial, play=partial(_play, study.play, call.config),
         trials=study.trials(call.config), tell=partial(_told, study.trial), workers=workers, cluster=cluster,
     )  # fmt: skip
-    rows = study.unfold(run_trial_sets(console, folder, part, timed=study.timed)[0])
+    rows = study.unfold(run_trial_set(console, folder, part, timed=study.timed))
     write_tables(call, study.tables, rows, study.claims and study.claims(rows), **machine)
     if machine and (note := busy_note(machine["machine"])):
         console.print(note, soft_wrap=True)
