@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field
 
-from training.bench.exploration.config import with_absolute_paths, world_split
+from training.bench.exploration.config import with_absolute_paths
 from training.experiments.config import (
     ONE_PARTICLE,
     Descriptor,
@@ -201,6 +201,8 @@ class AccuracyConfig(ExperimentConfig):
 
     def environment(self, trial: EpisodeTrial) -> "EnvConfig":
         """Return the environment of an episode; true and assumed camera have the same geometry."""
+        from training.bench.exploration.players import world_split
+
         given = {"max_range": trial.max_range, "baseline": trial.baseline}
         camera = {name: value for name, value in given.items() if value is not None}
         sensor: dict[str, Any] = {"camera": camera}

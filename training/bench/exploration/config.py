@@ -19,7 +19,6 @@ from training.experiments.config import (
 from training.experiments.policy_names import check_labels, parted_label
 
 if TYPE_CHECKING:  # numerical modules are imported when a command runs, so that --help is fast
-    from training.episodes.config import RunConfig
     from vslam_env.config import EnvConfig
 
 ORACLES = ("pose", "association", "merge")
@@ -94,27 +93,14 @@ class ExplorationConfig(ExperimentConfig):
         combined = product(seeds, self.worlds, self.robots, self.oracles, self.policies)
         return [Trial(policy, world, k, oracle, seed) for seed, world, k, oracle, policy in combined]
 
-    def run(self, trial: Trial) -> "RunConfig":
-        """Return the configuration of a trial's run."""
-        from training.bench.exploration.players import parted
-        from training.episodes.config import RunConfig
-
-        player = parted(trial.policy)
-        shared: dict[str, Any] = {
-            "world": trial.world, "robots": trial.robots, "policy": player.policy, "action_type": player.action_type,
-            "particles": self.particles, "rejuvenate_every": self.rejuvenate_every, "preset": self.preset,
-            "sensor": self.sensor, "seed": trial.seed,
-        }  # fmt: skip
-        return RunConfig(**shared, max_seconds=self.duration)
-
     def environment(self, trial: Trial) -> "EnvConfig":
         """Return the environment of a trial: all policies have the same world for one seed and combination."""
-        from training.bench.exploration.players import parted
+        from training.bench.exploration.players import environment_of
 
-        has_all = trial.oracle == ALL_ORACLES or parted(trial.policy).needs_oracles
-        oracles = {f"oracle_{name}": has_all or trial.oracle == name for name in ORACLES}
-        split = world_split(self.split, trial.world)
-        return self.run(trial).environment().replace(world_split=split, **oracles)
+        return environment_of(
+            trial, trial.world, self.split, self.duration, particles=self.particles,
+            rejuvenate_every=self.rejuvenate_every, preset=self.preset, sensor=self.sensor,
+        )  # fmt: skip
 
 
 class PlanConfig(ExperimentConfig):
@@ -141,13 +127,6 @@ class PlanConfig(ExperimentConfig):
         if isinstance(found.get("plan"), str) and Path(found["plan"]).is_file():
             found["plan"] = str(Path(found["plan"]).resolve())
         return found
-
-
-def world_split(split: str, world: str) -> str | None:
-    """Return the split of an environment, None where a world is not drawn or any will do."""
-    from vslam_env.world import is_single_layout
-
-    return None if split == ANY_SPLIT or is_single_layout(world) else split
 
 
 def with_absolute_paths(values: Mapping[str, Any]) -> dict[str, Any]:
