@@ -271,7 +271,7 @@ def _draw_team_sizes(panel: Axes, sizes: Rows) -> None:
     column = Column("map_error", "map error E [m]", _ci("map_error"))
     chart = Chart(x="robots", label="robots", by="particles", panels=(Panel(column=column),))
     draw_panel(panel, chart, chart.panels[0], sizes, sorted({row["particles"] for row in sizes}))
-    panel.set(xlabel="robots", title="team size and particles")
+    panel.set(xlabel="robots", title="team size, by number of particles")
     panel.set_xticks(sorted({row["robots"] for row in sizes}))
 
 
